@@ -1,9 +1,9 @@
-"""Actions and results of one environment as GymAPI messages and back; see `gymapi_leaves` for what goes where.
+"""Actions and results of one environment as GymAPI messages and back; see `gymapi_leaves` for the layout.
 
-What the lists of an action cannot hold exactly (Text, Sequence, images, infinities) is JSON in ``prefix``, marked by
-``bam:``; what the fields of an observation cannot hold is JSON in ``info``, by the name of its leaf. Images go into
-``color_img``, all of them where that is a list and the first one where it is not; depth images of other racks are read
-from ``depth_img``.
+Values that the lists of an action cannot hold exactly (Text, Sequence, images, infinities) are JSON in ``prefix``,
+marked by ``bam:``; values that the fields of an observation cannot hold are JSON in ``info``, by the name of the leaf.
+Images go into ``color_img``: all of them if that is a list, else the first one. Depth images of racks are read from
+``depth_img``.
 """
 
 from collections.abc import Mapping, Sequence
@@ -37,15 +37,15 @@ from bam_envs.rosbridge.encoding import dump_json, load_json
 Trees = dict[str, Any]
 Values = dict[Path, Any]
 DEFAULT = 1
-"""The action_type of an action that is none of the rack's own."""
+"""The action_type of an action that is not a skill of the rack."""
 WAYPOINT = {"target_link": "tcp_world", "planner": "ptp", "max_velocity": 10.0, "blend_radius": 0.0}
 WAYPOINT |= dict.fromkeys(("kp_scale", "kd_scale", "max_effort", "vel_scale", "accel_scale"), 1.0)
 WAYPOINT |= dict.fromkeys(("goal_tol", "path_tol"), 0.2)
-"""How a rack's own client goes to a pose."""
+"""Parameters of a motion to a pose, as in the racks' own client."""
 
 
 class ActionCodec:
-    """Actions of one space as GymAction messages and back; `action_type` is as of `RosbridgeTransport`."""
+    """Actions of one space as GymAction messages and back; for `action_type` see `RosbridgeTransport`."""
 
     def __init__(self, space: Space[Any], action_type: int = DEFAULT) -> None:
         self.space, self.action_type = space, action_type
@@ -104,11 +104,11 @@ class ObservationCodec:
     def encode(
         self, observation: Any, stamp: Mapping[str, int] | None = None, version: Version = JUNE_22
     ) -> tuple[dict[str, Any], Trees]:
-        """Fields of a message, those at their defaults left out, and the exact trees of what is not in them.
+        """Fields of a message, without those at their defaults, and exact trees of the parts that are not in them.
 
         Raises:
-            InvalidValue: It is not one of the space, or NaN is in it.
-            MissingExtra: There is an image and nothing to encode it with.
+            InvalidValue: It is not in the space, or contains NaN.
+            MissingExtra: There is an image, and Pillow is not installed.
         """
         value = exact(self.space, observation, "observation")
         fields: dict[str, Any] = {}
@@ -146,7 +146,7 @@ class ObservationCodec:
         return tuple(leaf for leaf in self._leaves if leaf.kind == kind and leaf.path not in values)
 
     def _read_images(self, feedback: Mapping[str, Any], values: Values) -> None:
-        """Read the depth images that there are (what is not an image may be in the lists), and every colour image."""
+        """Read the depth images, of which some may be in the lists instead, and every colour image."""
         named = set(feedback["observation_names"])
         fitting = [leaf for leaf in self._leaves if is_depth(leaf.space) and leaf.path not in values]
         wanted = [leaf for leaf in fitting if not named & set(leaf.labels)]
@@ -167,27 +167,27 @@ class ObservationCodec:
 
 
 def _lists(kind: str, leaves: tuple[Leaf, ...] = ()) -> Lists:
-    """The lists of a feedback; a rack may tell more in them than the space holds."""
+    """The lists of a feedback, in which a rack may send more than the space contains."""
     if kind == NUMBERS:
         return Lists("observation_names", "observation", leaves, extra=True)
     return Lists("pose_names", "pose", leaves, extra=True)
 
 
 def _listed(images: Any) -> list[Mapping[str, Any]]:
-    """Racks send one image or a list of them, by their version."""
+    """A list of images; racks send one image or a list, depending on their version."""
     return list(images) if isinstance(images, (list, tuple)) else [images]
 
 
 def _shaped(leaf: Leaf, image: np.ndarray[Any, Any], field: str) -> np.ndarray[Any, Any]:
     shape = leaf.space.shape or ()
-    # A grey image has no axis for its one channel in a file.
+    # A grey image in a file has no channel axis.
     if image.shape != shape and (*image.shape, 1) != shape:
         raise ProtocolError(f"{field} must hold an image of shape {shape} for {leaf.name}, not {image.shape}.")
     return image.reshape(shape)
 
 
 class EnvCodec:
-    """Actions and results as messages, one for each environment of `spec`; `foreign`: of a server that is not ours."""
+    """Actions and results as messages, one for each environment of `spec`; `foreign`: of a rack without `bam-serve`."""
 
     def __init__(
         self, spec: EnvSpecMessage, *, foreign: bool = False, action_type: int = DEFAULT, image_format: str = "png"
@@ -211,7 +211,7 @@ class EnvCodec:
     def write_result(
         self, result: tuple[Any, ...], stamp: Mapping[str, int], version: Version = JUNE_22, *, executed: bool = True
     ) -> list[dict[str, Any]]:
-        """The feedback of a reset or step, sent at `stamp`; `executed`: whether the action was done."""
+        """The feedback of a reset or step, sent at `stamp`; `executed`: whether the action was executed."""
         feedback = []
         for observation, *ends, info in self.spec.split(result):
             if self.spec.vector and "final_obs" in info:
@@ -223,15 +223,15 @@ class EnvCodec:
 
     def read_result(self, response: GymResponse) -> tuple[Any, Any, Any, Any, Any]:
         """(observation, reward, terminated, truncated, info). Raises ProtocolError if the feedback does not fit."""
-        size, found = self.spec.num_envs, len(response.feedback)
-        if found != size:
-            raise ProtocolError(f"The response must have {size} feedback, one for each environment, not {found}.")
+        size, count = self.spec.num_envs, len(response.feedback)
+        if count != size:
+            raise ProtocolError(f"The response must have {size} feedback, one for each environment, not {count}.")
         each = zip(response.feedback, response.infos, response.exact, strict=True)
         result: tuple[Any, Any, Any, Any, Any] = self.spec.joined([self._read(*one) for one in each])
         return result
 
-    def _read(self, feedback: Mapping[str, Any], info: Info, ours: Info) -> tuple[Any, float, bool, bool, Info]:
-        trees = ours.get("observation", {})
+    def _read(self, feedback: Mapping[str, Any], info: Info, bam: Info) -> tuple[Any, float, bool, bool, Info]:
+        trees = bam.get("observation", {})
         if not isinstance(trees, dict):
             raise ProtocolError(f"info.bam.observation must be an object, not {brief(trees)}.")
         observation = self._observations.decode(feedback, trees)

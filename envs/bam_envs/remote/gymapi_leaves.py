@@ -1,4 +1,4 @@
-"""How a Gymnasium space lies in the flat lists of a GymAPI message; both ends find the same leaves from the space.
+"""The layout of a Gymnasium space in the flat lists of a GymAPI message; both ends derive the leaves from the space.
 
 ============  =================================================  ============================================
 kind          spaces                                             names
@@ -12,7 +12,7 @@ kind          spaces                                             names
 ``EXACT``     everything else, very long arrays                  ``goal``
 ============  =================================================  ============================================
 
-Keys of Dict and places in Tuple are joined with ``/``. A space where two names would be the same is one exact leaf.
+Keys of Dict and places in Tuple are joined with ``/``. A space in which two names would be equal is one exact leaf.
 """
 
 from collections.abc import Mapping, Sequence
@@ -30,9 +30,9 @@ NUMBERS, POSE, IMAGE, EXACT = "numbers", "pose", "image", "exact"
 GRIPPER_WIDTH = "gripper_width"
 _MOST_NUMBERS = 4096
 _SMALLEST_IMAGE = 8
-"""With fewer pixels a side it is sent as numbers, which can be read in a log."""
+"""An image with fewer pixels a side is sent as numbers, which are readable in a log."""
 _WHOLE = 2**53
-"""Every integer up to this is itself as a float64."""
+"""Every integer up to this is exact as a float64."""
 _CHANNELS = ((), (1,), (3,), (4,))
 _POSE_SHAPES: dict[str, list[tuple[int, ...]]] = {"position": [(3,)], "orientation": [(4,)], GRIPPER_WIDTH: [(), (1,)]}
 
@@ -44,15 +44,15 @@ class Leaf:
     """One part of a value."""
 
     kind: str
-    """See the head of the module."""
+    """See the top of the module."""
     name: str
-    """Unique in its space; the name of the space itself where it has no parts."""
+    """Unique in its space; the name of the space itself if it has no parts."""
     path: Path
     """Keys and places that lead to it."""
     space: Space[Any]
-    """Of this part."""
+    """The space of this part."""
     labels: tuple[str, ...]
-    """Names of its numbers; else its own name."""
+    """Names of its numbers; of other kinds only its name."""
 
     def of(self, value: Any) -> Any:
         """This part of a checked value."""
@@ -70,7 +70,7 @@ def leaves_of(space: Space[Any], name: str, *, gripper: bool = False) -> tuple[L
 
 
 def joined(space: Space[Any], values: Mapping[Path, Any], path: Path = ()) -> Any:
-    """The value of `space` whose leaves are `values`, by path."""
+    """The value of `space` from the `values` of its leaves, by path."""
     if path in values:
         return values[path]
     parts = {key: joined(part, values, (*path, key)) for key, part in _parts(space).items()}
@@ -133,12 +133,12 @@ class Lists:
     values: str
     """Field with the numbers or poses."""
     leaves: tuple[Leaf, ...]
-    """In this order where the names are none of ours."""
+    """In the order of the values if none of the names is known."""
     extra: bool = False
     """Whether the lists may hold more than the leaves."""
 
     def write(self, leaf: Leaf, part: Any, fields: dict[str, Any]) -> bool:
-        """Append a part to the lists in `fields`, if those can hold it exactly; whether they can."""
+        """Append a part to the lists in `fields`; False if those cannot hold it exactly."""
         written = _numbers(part) if leaf.kind == NUMBERS else _pose(part)
         if written is None:
             return False
@@ -147,7 +147,7 @@ class Lists:
         return True
 
     def read(self, message: Mapping[str, Any]) -> dict[Path, Any]:
-        """The value of each leaf. Raises ProtocolError for one that is missing, too much, or does not fit."""
+        """The value of each leaf. Raises ProtocolError for one that is missing, unexpected, or does not fit."""
         ordered = iter(self.in_order(message[self.values], message[self.names]))
         read = _read_pose if self.leaves and self.leaves[0].kind == POSE else _read_numbers
         return {leaf.path: read(leaf, list(islice(ordered, len(leaf.labels)))) for leaf in self.leaves}
@@ -178,7 +178,7 @@ class Lists:
 
 
 def _numbers(value: Any) -> list[Any] | None:
-    """A number or array as a flat list of floats or ints, or None if such a list would not be exactly it."""
+    """A number or array as a flat list of floats or ints, or None if that would not be exact."""
     array = np.asarray(value)
     if array.dtype.kind == "f":
         return array.ravel().tolist() if np.isfinite(array).all() else None
@@ -208,7 +208,7 @@ def _pose(value: Mapping[str, Any]) -> list[dict[str, Any]] | None:
 
 
 def _read_pose(leaf: Leaf, messages: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """The pose in one PoseStamped; a gripper width, which that does not hold, is 0."""
+    """The pose in one PoseStamped; a gripper width, which the message lacks, is 0."""
     pose = messages[0]["pose"]
     numbers = {
         "position": [pose["position"][axis] for axis in "xyz"],

@@ -1,9 +1,9 @@
 """The requests and responses of bam_msgs/GymAPI, the service of a BAM robot rack; pure functions on dicts.
 
 A field that is missing has the default of its type, a field that is unknown is ignored, and one of the wrong kind is
-an error that names it. What has no field of its own travels in fields of text: a `Tag` and the seed 0 in
-``header.frame_id``; options, seeds of several environments and exact actions in ``prefix`` of an action; exact
-observations and infos in ``info``, under ``bam``.
+an error that names it. Values without a field are sent in text fields: a `Tag` and the seed 0 in ``header.frame_id``;
+options, seeds of several environments and exact actions in ``prefix`` of an action; exact observations and infos in
+``info``, under ``bam``.
 """
 
 import json
@@ -25,15 +25,15 @@ from bam_envs.rosbridge.encoding import dump_json, load_json
 
 KIND = "bam_msgs/GymAPI"
 PREFIX = "bam:"
-"""How our text in ``prefix`` of an action begins."""
+"""Start of the text in ``prefix`` of an action from `RosbridgeTransport`."""
 MAX_SEED = 2**31 - 1
-"""Largest seed that the field holds on every rack."""
+"""Largest seed that the field of every rack holds."""
 Message = Mapping[str, Any]
 _SEED_ZERO = " seed=0"
 _MOST_READABLE = 64
-"""Longer arrays are only sent exactly."""
+"""Longest array that is also sent as readable JSON."""
 _UNREAD = ("camera_info", "detections", "masks", "segments")
-"""Fields that no space asks for."""
+"""Fields that no space contains."""
 _NO_OBSERVATION = (
     *("ns", "duplicate_obs_ns", "duplicate_obs", "duplicate_index"),
     *("executed", "reward", "terminated", "truncated", "info"),
@@ -43,7 +43,7 @@ _NOWHERE = {"pose": {"position": dict.fromkeys("xyz", math.nan), "orientation": 
 
 
 class RequestType(IntEnum):
-    """What a request asks for."""
+    """The operation of a request."""
 
     NONE = 0
     STEP = 1
@@ -65,19 +65,19 @@ class GymRequest:
     """One request."""
 
     type: RequestType
-    """What is asked for."""
+    """Its operation."""
     client_id: str = ""
-    """Name of the client, to be shown."""
+    """Name of the client, for display."""
     env_name: str = ""
-    """The environment that is meant; empty for the one that is there."""
+    """The requested environment; empty for the one that is served."""
     actions: tuple[Message, ...] = ()
     """GymAction of each environment."""
     seed: Seed = None
-    """Of a reset, as Gymnasium's."""
+    """Gymnasium's seed of a reset."""
     options: Info | None = None
-    """Of a reset, as Gymnasium's."""
+    """Gymnasium's options of a reset."""
     tag: Tag | None = None
-    """When it was sent and how long it is valid; None from clients that send none."""
+    """Its time and deadline; None from clients that send no tag."""
     take: bool = False
     """Take command from the client that has it."""
 
@@ -87,19 +87,19 @@ class GymResponse:
     """One answer."""
 
     error: RemoteError | None
-    """What went wrong, if anything."""
+    """The error of a failed request, else None."""
     feedback: tuple[Message, ...]
     """Complete GymFeedback of each environment."""
     infos: tuple[Info, ...]
     """The info of each feedback."""
     exact: tuple[Info, ...]
-    """The part of each info under ``bam``; empty dicts from servers that are not ours."""
+    """The part of each info under ``bam``; empty dicts from racks without `bam-serve`."""
     version: Version | None = None
-    """The version of the messages that the server uses; None if that does not show."""
+    """The version of the server's messages; None if it cannot be told."""
 
 
 def base_name(namespace: str = "") -> str:
-    """What the service, and the topics ``request`` and ``reply``, are under."""
+    """Prefix of the service, and of the topics ``request`` and ``reply``."""
     stripped = namespace.strip("/")
     return f"/{stripped}/gym_env" if stripped else "/gym_env"
 
@@ -110,7 +110,7 @@ def service_name(namespace: str = "") -> str:
 
 
 def write_request(request: GymRequest, stamp: Message) -> dict[str, Any]:
-    """The message of `request`, with fields that every version has. `stamp` is as the ROS there spells a time."""
+    """The message of `request`, with fields that every version has. `stamp` has the server's spelling of a time."""
     in_field = request.seed if isinstance(request.seed, int) and 0 < request.seed <= MAX_SEED else 0
     zero = _SEED_ZERO if request.seed == 0 and isinstance(request.seed, int) else ""
     header = {
@@ -125,13 +125,13 @@ def write_request(request: GymRequest, stamp: Message) -> dict[str, Any]:
     actions = [dict(one) for one in request.actions]
     seed = None if in_field or zero else request.seed
     if seed is not None or request.options is not None:
-        words = {"seed": tree_to_json(seed), "options": tree_to_json(plain_info(request.options))}
-        actions.append({"prefix": PREFIX + dump_json(words, "The seed and options of a reset")})
+        content = {"seed": tree_to_json(seed), "options": tree_to_json(plain_info(request.options))}
+        actions.append({"prefix": PREFIX + dump_json(content, "The seed and options of a reset")})
     return {"header": header, "seed": in_field, "env_name": request.env_name, "action": actions}
 
 
 def whole_request(message: Message, version: Version | None) -> dict[str, Any]:
-    """`message` with all fields, for a rack that may look at any: those of `version`, or of all versions."""
+    """`message` with all fields of `version`, or those of all versions, for a rack that may read any of them."""
     busy = (version or JUNE_22).busy
     whole = complete(request_type(KIND), {**message, "header": {**message["header"], busy: False}})
     if version is not None:
@@ -153,7 +153,7 @@ def refuse_foreign(seed: Seed, options: Info | None) -> None:
 
 
 def read_request(message: object) -> GymRequest:
-    """The request in `message`, of any client. Raises InvalidValue or ProtocolError for what cannot be read."""
+    """The request in `message`, of any client. Raises InvalidValue or ProtocolError if it cannot be read."""
     whole = complete(request_type(KIND), message, lenient=True)
     header = whole["header"]
     if header["request_type"] not in list(RequestType):
@@ -164,11 +164,11 @@ def read_request(message: object) -> GymRequest:
         seed = whole["seed"] or (0 if header["frame_id"].endswith(_SEED_ZERO) else None)
         prefix = whole["action"][0]["prefix"] if whole["action"] else ""
         if prefix.startswith(PREFIX):
-            words = load_json(prefix.removeprefix(PREFIX), "prefix")
-            beside, options = tree_from_json(words.get("seed")), tree_from_json(words.get("options"))
+            content = load_json(prefix.removeprefix(PREFIX), "prefix")
+            exact_seed, options = tree_from_json(content.get("seed")), tree_from_json(content.get("options"))
             if not (options is None or isinstance(options, dict)):
                 raise ProtocolError(f"The options of a reset must be an object, not {options!r}.")
-            seed = seed if beside is None else beside
+            seed = seed if exact_seed is None else exact_seed
     return GymRequest(
         type=kind,
         client_id=header["client_id"],
@@ -193,12 +193,12 @@ def write_feedback(
     """The message of one environment; see `write_response`.
 
     Args:
-        fields: What holds the observation.
-        trees: The parts of it that the fields cannot hold, as JSON.
+        fields: The fields of the observation.
+        trees: The parts of the observation that the fields cannot hold, as JSON.
         ends: Reward, terminated, truncated.
         info: A tree.
-        version: Of the messages.
-        executed: Whether the action was done.
+        version: Version of the messages.
+        executed: Whether the action was executed.
     """
     reward, terminated, truncated = ends
     if not math.isfinite(reward):
@@ -213,7 +213,7 @@ def write_response(
 ) -> dict[str, Any]:
     """The message of a success that took `duration` [s] and is sent at `stamp`, with the fields of `version`."""
     code = {"value": int(ErrorCode.SUCCESS)}
-    # How long it travels (transport_duration) only the client can tell.
+    # Only the client can measure transport_duration.
     times = {"process_duration": duration, "response_stamp": dict(stamp)} if version.june else {"duration": duration}
     header = {**times, "error_code": code, "error_msg": "", "calibrated": True}
     return {"header": header, "feedback": list(feedback)}
@@ -231,35 +231,34 @@ def read_response(message: object) -> GymResponse:
     """The answer in `message`, of any server. Raises ProtocolError if a field is of the wrong kind."""
     received = message.get("feedback") if isinstance(message, Mapping) else None
     parts = [_without_nulls(one) for one in received] if isinstance(received, (list, tuple)) else []
-    given = {**message, "feedback": [one for one, _ in parts]} if parts else message  # type: ignore[dict-item]
+    cleaned = {**message, "feedback": [one for one, _ in parts]} if parts else message  # type: ignore[dict-item]
     try:
-        whole = complete(response_type(KIND), given, lenient=True)
+        whole = complete(response_type(KIND), cleaned, lenient=True)
     except InvalidValue as error:
         raise ProtocolError(str(error)) from error
     feedback = whole["feedback"]
     for checked, (_, gaps) in zip(feedback, parts, strict=True):
-        for field, place in gaps:  # NaN: no space takes that
+        for field, place in gaps:  # NaN: no space contains it
             checked[field][place] = math.nan if field == "observation" else _NOWHERE
     read = [read_info(one["info"]) for one in feedback]
-    infos, ours = tuple(info for info, _ in read), tuple(bam for _, bam in read)
+    infos, exact = tuple(info for info, _ in read), tuple(bam for _, bam in read)
     code, text, failure = whole["header"]["error_code"]["value"], whole["header"]["error_msg"], None
     if code != ErrorCode.SUCCESS:
         name = ErrorCode(code).name if code in list(ErrorCode) else "not in the list"
-        refused = bool(ours) and ours[0].get("error") == NotInCommand.__name__
+        refused = bool(exact) and exact[0].get("error") == NotInCommand.__name__
         failure = (NotInCommand if refused else RemoteError)(text or f"The rack answered error code {code} ({name}).")
-    # An entry that is marked as equal to another one gets the observation of that.
+    # An entry that is marked as a duplicate gets the observation of the other entry.
     filled = tuple(
         {**feedback[_source(feedback, at)], **{key: one[key] for key in _NO_OBSERVATION}}
         for at, one in enumerate(feedback)
     )
-    return GymResponse(failure, filled, infos, ours, version_of_response(message))
+    return GymResponse(failure, filled, infos, exact, version_of_response(message))
 
 
 def _without_nulls(feedback: Any) -> tuple[Any, list[tuple[str, int]]]:
     """A feedback with zeros for numbers and poses that are null, and the fields and places of these.
 
-    Every rosbridge writes NaN as null. Whether it is a fault that a sensor or a cup was not there depends on what the
-    space needs.
+    Every rosbridge writes NaN as null. Whether a missing measurement is a fault depends on the space.
     """
     if not isinstance(feedback, Mapping):
         return feedback, []
@@ -273,14 +272,14 @@ def _without_nulls(feedback: Any) -> tuple[Any, list[tuple[str, int]]]:
 
 
 def _has_null(value: Any, depth: int = 3) -> bool:
-    """Whether it is null, or a pose with one."""
+    """Whether `value` is null, or a pose with a null."""
     if depth and isinstance(value, Mapping):
         return any(_has_null(one, depth - 1) for one in value.values())
     return value is None
 
 
 def _source(feedback: Sequence[Message], at: int) -> int:
-    """The place of the observation of the entry at `at`, which may be that of another entry."""
+    """Index of the entry with the observation of the entry `at`, which may be a duplicate."""
     one, path = feedback[at], [at]
     while one["duplicate_obs"]:
         place = one["duplicate_index"]
@@ -293,12 +292,12 @@ def _source(feedback: Sequence[Message], at: int) -> int:
         path.append(place)
     if not one["duplicate_obs_ns"]:
         return path[-1]
-    own = [place for place, other in enumerate(feedback) if not (other["duplicate_obs"] or other["duplicate_obs_ns"])]
-    return next((place for place in own if feedback[place]["ns"] == one["ns"]), path[-1])
+    firsts = [at for at, other in enumerate(feedback) if not (other["duplicate_obs"] or other["duplicate_obs_ns"])]
+    return next((place for place in firsts if feedback[place]["ns"] == one["ns"]), path[-1])
 
 
 def write_info(info: Mapping[str, Any], bam: Mapping[str, Any]) -> str:
-    """`info` as JSON: plain values for every reader, and under ``bam`` the exact ones."""
+    """`info` as JSON: plain values for every reader, and exact ones under ``bam``."""
     plain: Info = {}
     precise: Info = {}
     for key, value in info.items():
@@ -309,12 +308,12 @@ def write_info(info: Mapping[str, Any], bam: Mapping[str, Any]) -> str:
         if key == "bam" or exact != readable:
             precise[key] = exact
     plain.pop("bam", None)
-    ours = {**bam, **({"info": precise} if precise else {})}
-    return dump_json({**plain, **({"bam": ours} if ours else {})}, "info")
+    exact_part = {**bam, **({"info": precise} if precise else {})}
+    return dump_json({**plain, **({"bam": exact_part} if exact_part else {})}, "info")
 
 
 def _for_people(value: Any) -> Any:
-    """A tree as plain JSON: arrays as lists, None for what is too long or not in JSON."""
+    """A tree as plain JSON: arrays as lists, None for values that are too long or not in JSON."""
     if isinstance(value, (np.generic, np.ndarray)):
         return _for_people(value.tolist()) if value.size <= _MOST_READABLE else None
     if isinstance(value, float):
@@ -325,17 +324,17 @@ def _for_people(value: Any) -> Any:
 
 
 def read_info(text: str) -> tuple[Info, Info]:
-    """An info and what it holds under ``bam``. Text that is no JSON object is ``{"text": …}``."""
+    """An info and its part under ``bam``. Text that is not a JSON object becomes ``{"text": …}``."""
     try:
-        words = json.loads(text) if text else {}
+        info = json.loads(text) if text else {}
     except (ValueError, RecursionError):
-        words = None
-    if not isinstance(words, dict):
-        words = {"text": text}
-    bam = words.pop("bam", None)
+        info = None
+    if not isinstance(info, dict):
+        info = {"text": text}
+    bam = info.pop("bam", None)
     if not isinstance(bam, dict):
-        return words, {}
+        return info, {}
     precise = bam.get("info", {})
     if not isinstance(precise, dict):
         raise ProtocolError(f"info.bam.info must be an object, not {precise!r}.")
-    return {**words, **{key: tree_from_json(one) for key, one in precise.items()}}, bam
+    return {**info, **{key: tree_from_json(one) for key, one in precise.items()}}, bam

@@ -1,6 +1,6 @@
-"""The versions of bam_msgs/GymAPI in the field, by the day on which they appeared, and what tells them apart.
+"""The versions of bam_msgs/GymAPI in the field, by the day of their release, and how to tell them apart.
 
-Where the types are compiled (ROS 2), a field that the version there lacks is refused, and not ignored.
+Where the types are compiled (ROS 2), a field that the version lacks is refused, not ignored.
 """
 
 from collections.abc import Mapping
@@ -14,7 +14,7 @@ from bam_envs.rosbridge.bus import Bus
 _FEEDBACK = "bam_msgs/GymFeedback"
 _DETAILS = "/rosapi/message_details"
 _LOOK = 1.0
-"""How long rosapi may take to answer [s]."""
+"""Longest wait for an answer of rosapi [s]."""
 
 
 @dataclass(frozen=True)
@@ -22,20 +22,20 @@ class Version:
     """One version of the messages."""
 
     name: str
-    """The day on which it appeared."""
+    """The day of its release."""
     busy: str
-    """What the request header calls the flag that interrupts a busy rack."""
+    """Field of the request header that interrupts a busy rack."""
     lists: bool
-    """Whether an entry has lists of images, and not one of each kind."""
+    """Whether an entry has lists of images instead of one image of each kind."""
 
     @property
     def june(self) -> bool:
-        """Whether it is of June: with a stamp in the response header, and racks that reset themselves."""
+        """Whether it is from June on: with a stamp in the response header, and racks that reset themselves."""
         return self.busy == "force_busy"
 
     @property
     def no_images(self) -> dict[str, Any]:
-        """The fields of an entry without images; where there is room for one image, the defaults do."""
+        """The image fields of an entry without images; empty if their defaults suffice."""
         return {"color_img": [], "depth_img": [], "camera_info": []} if self.lists else {}
 
 
@@ -53,12 +53,12 @@ def version_named(name: str) -> Version:
 
 
 def version_of_request(message: object) -> Version | None:
-    """The version of a request; None where it could be of several."""
+    """The version of a request; None if it could be of several."""
     return MAY_24 if MAY_24.busy in _header(message) else None
 
 
 def version_of_response(message: object) -> Version | None:
-    """The version of a response, as far as requests to who made it are concerned; None where it does not show."""
+    """The version of a response, which suffices for requests to its server; None if it cannot be told."""
     header = _header(message)
     if "process_duration" in header:
         return JUNE_22
@@ -71,13 +71,13 @@ def _header(message: object) -> Mapping[str, Any]:
 
 
 def version_of_bus(bus: Bus) -> Version | None:
-    """The version of the types that `bus` was compiled with; None where it has none or does not report it."""
-    fields: Mapping[str, bool] = {}  # of GymFeedback; to each, whether it is a list
+    """The version of the types that `bus` was compiled with; None if it has none or does not report it."""
+    fields: Mapping[str, bool] = {}  # name of each field of GymFeedback -> whether it is a list
     if hasattr(bus, "fields"):  # a ROS 2 node
         fields = bus.fields(_FEEDBACK)
     elif hasattr(bus, "call"):  # a link to a rosbridge server
         with suppress(RemoteError, LinkLost, ProtocolError):  # no rosapi there
-            fields = _fields_told(bus.call(_DETAILS, "", {"type": _FEEDBACK}, _LOOK))
+            fields = _read_fields(bus.call(_DETAILS, "", {"type": _FEEDBACK}, _LOOK))
     if fields.get("color_img"):
         return JUNE_22
     if "duplicate_obs" in fields:
@@ -85,8 +85,8 @@ def version_of_bus(bus: Bus) -> Version | None:
     return MAY_24 if "duplicate_obs_ns" in fields else None
 
 
-def _fields_told(details: Mapping[str, Any]) -> dict[str, bool]:
-    """Whether each field is a list, of the first type in an answer of rosapi: there a length of -1 is no list."""
+def _read_fields(details: Mapping[str, Any]) -> dict[str, bool]:
+    """Whether each field of the first type in an answer of rosapi is a list: its length is not -1."""
     definitions = details.get("typedefs")
     first = definitions[0] if isinstance(definitions, list) and definitions else None
     names, lengths = (first.get("fieldnames"), first.get("fieldarraylen")) if isinstance(first, Mapping) else (0, 0)

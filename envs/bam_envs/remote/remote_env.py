@@ -1,4 +1,4 @@
-"""RemoteEnv: an environment that runs somewhere else, as a normal `gymnasium.Env`; and how to make one of a URL."""
+"""RemoteEnv: an environment that runs elsewhere, as a `gymnasium.Env`; and functions that make one from a URL."""
 
 import importlib
 import inspect
@@ -24,14 +24,14 @@ _CLASSES = {
     "wss": "bam_envs.remote.rosbridge_transport:RosbridgeTransport",
     "ros2": "bam_envs.remote.ros2_transport:RclpyTransport",
 }
-"""By the scheme of the URL; imported on use."""
+"""Transport class by scheme of the URL; imported on use."""
 
 
 class RemoteEnv(Described, gym.Env[Any, Any]):
-    """One environment behind a transport, which is connected when something of the other end is first needed.
+    """One environment behind a transport, which connects on first use.
 
-    A lost link is no end of an episode: `LinkLost` and the other faults of the transport go through, and the next
-    `reset` connects again. It is closed when Python ends.
+    A lost link does not end an episode: `LinkLost` and the other faults of the transport are raised, and the next
+    `reset` reconnects. It is closed when Python ends.
     """
 
     def __init__(self, transport: Transport) -> None:
@@ -43,38 +43,38 @@ class RemoteEnv(Described, gym.Env[Any, Any]):
         close_at_exit(self)
 
     def connect(self) -> EnvSpecMessage:
-        """Return the description of the environment there.
+        """Return the description of the remote environment.
 
         Raises:
-            NoServer: Nobody, or nobody who has this environment.
-            InvalidValue: Several environments, which `RemoteVectorEnv` is for.
+            NoServer: No server, or none with this environment.
+            InvalidValue: The server has several environments; use `RemoteVectorEnv`.
         """
         if self._spec is None:
-            there = self.transport.connect()
-            if there.vector:
+            spec = self.transport.connect()
+            if spec.vector:
                 raise InvalidValue(
-                    f"{there.env_id} has {there.num_envs} environments there, and one is wanted. Make it with "
-                    f"num_envs={there.num_envs}, or serve one (bam-serve without --num-envs)."
+                    f"{spec.env_id} has {spec.num_envs} environments there, and one is wanted. Make it with "
+                    f"num_envs={spec.num_envs}, or serve one (bam-serve without --num-envs)."
                 )
-            self._spec = there
+            self._spec = spec
         return self._spec
 
     @property
-    def _there(self) -> EnvSpecMessage:
+    def _description(self) -> EnvSpecMessage:
         return self.connect()
 
     @property
     def observation_space(self) -> Space[Any]:  # type: ignore[override]
-        """The observation space there."""
-        return self._there.observation_space
+        """The observation space of the remote environment."""
+        return self._description.observation_space
 
     @property
     def action_space(self) -> Space[Any]:  # type: ignore[override]
-        """The action space there."""
-        return self._there.action_space
+        """The action space of the remote environment."""
+        return self._description.action_space
 
     def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[Any, Info]:
-        """Begin an episode; seed and options are for the other end."""
+        """Begin an episode; seed and options are sent to the server."""
         super().reset(seed=seed)
         self.connect()
         self._warn_if_truncated()
@@ -84,7 +84,7 @@ class RemoteEnv(Described, gym.Env[Any, Any]):
         return observation, info
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, Info]:
-        """One step there."""
+        """One step of the remote environment."""
         if not self._running:
             raise ResetNeeded("No episode is running: it ended, or never began. Call reset() first.")
         observation, reward, terminated, truncated, info = self.transport.step(action)
@@ -92,7 +92,7 @@ class RemoteEnv(Described, gym.Env[Any, Any]):
         return observation, reward, terminated, truncated, info
 
     def _warn_if_truncated(self) -> None:
-        """Warn once, after the limit of the id here, which `gymnasium.make` puts around this, ended an episode."""
+        """Warn once if the local time limit, which `gymnasium.make` adds, ended an episode before the server's."""
         entry = gym.registry.get(self.spec.id) if self.spec is not None else None
         if entry is None or self._warned or not self._running or self._steps != entry.max_episode_steps:
             return
@@ -104,10 +104,10 @@ class RemoteEnv(Described, gym.Env[Any, Any]):
             )
 
     def render(self) -> None:
-        """Rendered frames are not carried; observations that are images are."""
+        """Do nothing: rendered frames are not sent, unlike observations that are images."""
 
     def close(self) -> None:
-        """Release the environment there and drop the link."""
+        """Release the remote environment and drop the link."""
         self._running = False
         self.transport.close()
 
@@ -116,9 +116,9 @@ def make_remote_env(env_id: str, transport: Where, **options: Any) -> RemoteEnv:
     """The environment `env_id` that runs at `transport`; connects on first use.
 
     Args:
-        env_id: Which one; a server that has another one refuses. "" for whatever is there.
-        transport: A transport, or the URL of `open_transport`, which takes the `options` and raises InvalidValue.
-        options: Such as ``timeout`` and ``token_file``.
+        env_id: Its id; a server with another environment refuses. "" for any environment.
+        transport: A transport, or a URL for `open_transport`, which takes the `options` and raises InvalidValue.
+        options: Options such as ``timeout`` and ``token_file``.
     """
     opened = open_transport(transport, env_id=env_id, **options) if isinstance(transport, str) else transport
     return RemoteEnv(opened)
@@ -127,12 +127,12 @@ def make_remote_env(env_id: str, transport: Where, **options: Any) -> RemoteEnv:
 def make_remote_vector_env(
     env_id: str, transport: Where | Sequence[Where], num_envs: int | None = None, **options: Any
 ) -> RemoteVectorEnv:
-    """The environments `env_id` that run at `transport`, stepped together; as `make_remote_env`.
+    """The environments `env_id` that run at `transport`, stepped together; see `make_remote_env`.
 
     Args:
-        env_id: Which ones.
+        env_id: Their id.
         transport: One, or several, which are stepped at the same time; each may have many environments.
-        num_envs: Environments in all, if they must be so many.
+        num_envs: Expected total number of environments; None for any.
         options: As for `make_remote_env`.
     """
     several = [transport] if isinstance(transport, (str, Transport)) else transport
@@ -152,7 +152,7 @@ def open_transport(
     """The transport of `url`, not connected yet.
 
     =======================  ====================================================
-    url                      what is there
+    url                      server
     =======================  ====================================================
     tcp://host:port          ``bam-serve --tcp PORT``
     ws://host:port/space     a rosbridge server, such as ``bam-serve --port PORT``
@@ -162,10 +162,10 @@ def open_transport(
 
     Args:
         url: `space` is a ROS namespace and may be left out.
-        env_id: Which environment is wanted; "" for the one that is there.
-        ca_file: Certificates that the server's is checked against, with wss://.
+        env_id: The requested environment; "" for the one that is served.
+        ca_file: PEM file of the authorities that wss:// trusts.
         token_file: A file that holds the server's secret.
-        timeout: Longest that an answer is waited for [s]; None for the default of the transport's class.
+        timeout: Longest wait for an answer [s]; None for the default of the transport's class.
         options: Other keywords of that class, such as ``connect_timeout``.
 
     Raises:
@@ -178,11 +178,11 @@ def open_transport(
         schemes = ", ".join(f"{one}://" for one in _CLASSES)
         raise InvalidValue(f"{url}: {UnknownName('transport', scheme, _CLASSES)} It must be one of {schemes}.")
     endpoint = Endpoint.with_token_file(url, ca_file=ca_file, token_file=token_file)
-    given = {"ca_file": ca_file, "token": endpoint.token, "timeout": timeout}
-    options |= {name: value for name, value in given.items() if value is not None}
+    arguments = {"ca_file": ca_file, "token": endpoint.token, "timeout": timeout}
+    options |= {name: value for name, value in arguments.items() if value is not None}
     module, _, name = _CLASSES[scheme].partition(":")
     make: Any = getattr(importlib.import_module(module), name)
-    # A class that hands options on to its parent takes those of the parent.
+    # A class that passes options on to its parent takes the parent's options too.
     signatures = [inspect.signature(kind) for kind in make.__mro__ if "__init__" in vars(kind) and kind is not object]
     known = dict.fromkeys(name for signature in signatures for name in signature.parameters)
     names = [name for name in known if name not in ("url", "env_id", "options")]

@@ -1,4 +1,4 @@
-"""RemoteVectorEnv: environments that run somewhere else, as one `gymnasium.vector.VectorEnv`."""
+"""RemoteVectorEnv: environments that run elsewhere, as one `gymnasium.vector.VectorEnv`."""
 
 import os
 from collections.abc import Callable, Mapping, Sequence
@@ -26,22 +26,22 @@ Seeds = list[int | None]
 
 
 class Rack:
-    """The environments of one transport, from number `first` on; reset in the step that ends an episode in any case."""
+    """The environments of one transport, from number `first` on; always reset in the step that ends an episode."""
 
     def __init__(self, transport: Transport, spec: EnvSpecMessage, first: int) -> None:
         self.transport, self.spec = transport, spec
         self.part = slice(first, first + spec.num_envs)
-        """Its environments among those of all racks."""
+        """The slice of its environments among those of all racks."""
 
     def reset(
         self, seeds: Seeds, mask: NDArray[np.bool_], options: Info | None, before: list[Any]
     ) -> list[tuple[Any, ...]]:
-        """Begin episodes in the environments of `mask` (n,); (observation, info) of every one of this rack.
+        """Begin episodes in the environments of `mask`; returns (observation, info) of every one of this rack.
 
         Args:
             seeds: One for each environment.
-            mask: Which of them begin an episode.
-            options: For the other end.
+            mask: Which of them begin an episode. Shape: (n,).
+            options: For the server.
             before: The last observation of each.
         """
         if not mask.any():
@@ -51,22 +51,22 @@ class Rack:
                 options = {**(options or {}), "reset_mask": mask}
             seeded = any(seed is not None for seed in seeds)
             return self.spec.split(self.transport.reset(seeds if seeded else None, options))
-        first, those = seeds[0], f"The {len(seeds)} environments of {self.spec.env_id} begin together"
+        first, rule = seeds[0], f"The {len(seeds)} environments of {self.spec.env_id} begin together"
         if not mask.all():
-            raise InvalidValue(f"{those}; reset_mask must hold all of them or none.")
+            raise InvalidValue(f"{rule}; reset_mask must hold all of them or none.")
         if seeds != [None if first is None else first + number for number in range(len(seeds))]:
-            raise InvalidValue(f"{those}, from one seed s that stands for s, s + 1, …; not from {seeds}.")
+            raise InvalidValue(f"{rule}, from one seed s that stands for s, s + 1, …; not from {seeds}.")
         return self.spec.split(self.transport.reset(first, options))
 
     def step(self, actions: list[Any]) -> list[tuple[Any, ...]]:
-        """Step every environment, and reset those whose episode ended; the result of each.
+        """Step every environment, and reset those whose episode ended; returns the result of each.
 
-        Where an episode ended, observation and info are of the next one, with ``final_obs`` and ``final_info``.
+        If an episode ended, observation and info are those of the next one, with ``final_obs`` and ``final_info``.
         """
         each = self.spec.split(self.transport.step(actions if self.spec.vector else actions[0]))
         if (self.spec.vector and self.spec.autoreset) or not any(one[2] or one[3] for one in each):
             return each
-        # There is one reset for all, so all episodes end; that of another one is a time limit to those that go on.
+        # One reset is for all environments: it truncates the episodes that have not ended.
         begun = self.spec.split(self.transport.reset(None, None))
         return [
             (first, reward, terminated, truncated or not terminated, {**info, "final_obs": last, "final_info": final})
@@ -78,40 +78,40 @@ class Described:
     """Properties of the environment at the other end, from the description that the server sends on connecting."""
 
     @property
-    def _there(self) -> EnvSpecMessage:
+    def _description(self) -> EnvSpecMessage:
         raise NotImplementedError
 
     @property
     def env_id(self) -> str:
-        """The Gymnasium id there."""
-        return self._there.env_id
+        """The Gymnasium id of the remote environment."""
+        return self._description.env_id
 
     @property
     def period(self) -> float | None:
         """Time between two actions [s]; None if the server does not report it."""
-        return self._there.period
+        return self._description.period
 
     @property
     def max_episode_steps(self) -> int | None:
-        """Steps after which the other end truncates an episode."""
-        return self._there.max_episode_steps
+        """Steps after which the server truncates an episode."""
+        return self._description.max_episode_steps
 
     def describe(self) -> dict[str, Any]:
-        """What every number of observation, action, state and command means; empty if not reported."""
-        return dict(self._there.signals)
+        """The meaning of every number of observation, action, state and command; empty if not reported."""
+        return dict(self._description.signals)
 
 
 class RemoteVectorEnv(Described, gym.vector.VectorEnv[Any, Any, Any]):
     """The environments of one or several transports with the same spaces, stepped at the same time.
 
-    One whose episode ends is reset in the same step (`AutoresetMode.SAME_STEP`). The arms of a rack that is not ours
-    have one reset: when an episode of one ends, those of its others are truncated. It connects when something of the
-    other end is first needed. Faults go through, once every transport has answered; a `reset` is needed then. It is
-    closed when Python ends.
+    An environment whose episode ends is reset in the same step (`AutoresetMode.SAME_STEP`). The arms of a rack without
+    `bam-serve` have one reset: when the episode of one arm ends, those of the others are truncated. It connects on
+    first use. Faults are raised once every transport has answered; then a `reset` is needed. It is closed when Python
+    ends.
 
     Args:
-        transports: Each is one request a step.
-        num_envs: Environments in all, if they must be so many.
+        transports: Each takes one request per step.
+        num_envs: Expected total number of environments; None for any.
     """
 
     def __init__(self, transports: Transport | Sequence[Transport], num_envs: int | None = None) -> None:
@@ -130,7 +130,7 @@ class RemoteVectorEnv(Described, gym.vector.VectorEnv[Any, Any, Any]):
         """Return the description of each transport's environments.
 
         Raises:
-            NoServer: Nobody, or nobody who has this environment.
+            NoServer: No server, or none with this environment.
             InvalidValue: The spaces differ, or there are not `num_envs` environments.
         """
         if not self._racks:
@@ -150,23 +150,23 @@ class RemoteVectorEnv(Described, gym.vector.VectorEnv[Any, Any, Any]):
         return [rack.spec for rack in self._racks]
 
     @property
-    def _there(self) -> EnvSpecMessage:
+    def _description(self) -> EnvSpecMessage:
         return self.connect()[0]
 
     @property
     def num_envs(self) -> int:  # type: ignore[override]
-        """Environments in all."""
+        """Total number of environments."""
         return sum(spec.num_envs for spec in self.connect())
 
     @property
     def single_observation_space(self) -> Space[Any]:  # type: ignore[override]
         """The observation space of one environment."""
-        return self._there.observation_space
+        return self._description.observation_space
 
     @property
     def single_action_space(self) -> Space[Any]:  # type: ignore[override]
         """The action space of one environment."""
-        return self._there.action_space
+        return self._description.action_space
 
     @cached_property
     def observation_space(self) -> Space[Any]:  # type: ignore[override]
@@ -182,8 +182,8 @@ class RemoteVectorEnv(Described, gym.vector.VectorEnv[Any, Any, Any]):
         """Begin an episode in every environment, or in those of ``options["reset_mask"]`` (n,) bool.
 
         Args:
-            seed: Environment i is seeded with ``seed + i`` or ``seed[i]``; a rack that is not ours with its first one.
-            options: ``reset_mask``, and what the other ends take.
+            seed: Environment i is seeded with ``seed + i`` or ``seed[i]``; a rack with one reset takes its first seed.
+            options: ``reset_mask``, and options for the servers.
         """
         if seed is None or isinstance(seed, (int, np.integer)):
             seeds: Seeds = [None if seed is None else int(seed) + number for number in range(self.num_envs)]
@@ -218,14 +218,14 @@ class RemoteVectorEnv(Described, gym.vector.VectorEnv[Any, Any, Any]):
             raise InvalidValue(f"The actions must have shape {self.action_space.shape}, not {np.shape(actions)}.")
         if len(each) != self.num_envs:
             raise InvalidValue(f"There must be one action for each of {self.num_envs} environments, not {len(each)}.")
-        self._observations = None  # until it went well
+        self._observations = None  # until the step succeeds
         parts = self._at_once(lambda rack: rack.step(each[rack.part]), self._racks)
         columns: Any = map(list, zip(*chain(*parts), strict=True))
         self._observations, rewards, terminated, truncated, infos = columns
         joined, space = join_infos(infos), self.single_observation_space
-        if "final_obs" in joined and isinstance(space, spaces.Box):  # where an episode goes on, what is seen
-            seen = zip(infos, self._observations, strict=True)
-            joined["final_obs"] = stack(space, [info.get("final_obs", last) for info, last in seen])
+        if "final_obs" in joined and isinstance(space, spaces.Box):  # the observation if the episode continues
+            pairs = zip(infos, self._observations, strict=True)
+            joined["final_obs"] = stack(space, [info.get("final_obs", last) for info, last in pairs])
         elif "final_obs" in joined:
             joined["final_obs"] = np.full(len(infos), None, dtype=object)
             for i, info in enumerate(infos):
@@ -239,7 +239,7 @@ class RemoteVectorEnv(Described, gym.vector.VectorEnv[Any, Any, Any]):
         )
 
     def _at_once(self, call: Callable[[Item], Result], items: Sequence[Item]) -> list[Result]:
-        """`call` of every item at the same time; the first fault, once all have ended."""
+        """Apply `call` to every item at the same time; raises the first fault once all have ended."""
         if len(items) == 1:
             return [call(items[0])]
         if self._threads is None or self._process != os.getpid():  # a forked child has no threads of its parent's
@@ -250,7 +250,7 @@ class RemoteVectorEnv(Described, gym.vector.VectorEnv[Any, Any, Any]):
         return [future.result() for future in futures]
 
     def close_extras(self, **kwargs: Any) -> None:
-        """Release the environments there and drop the links."""
+        """Release the remote environments and drop the links."""
         self._observations = None
         for transport in self.transports:
             transport.close()
@@ -260,7 +260,7 @@ class RemoteVectorEnv(Described, gym.vector.VectorEnv[Any, Any, Any]):
 
 
 def join_infos(each: Sequence[Info]) -> dict[str, Any]:
-    """Vector infos with Gymnasium's masks, of one info for each environment."""
+    """Gymnasium's vector infos with masks, from one info for each environment."""
     infos: dict[str, Any] = {}
     for key in dict.fromkeys(key for info in each for key in info):
         mask = np.array([key in info for info in each])

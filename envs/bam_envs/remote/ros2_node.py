@@ -1,4 +1,4 @@
-"""The Bus as a native ROS 2 node. rclpy is imported when it starts: it comes with ROS, not with this package."""
+"""A Bus as a native ROS 2 node. rclpy, which comes with ROS, is imported when the node starts."""
 
 import importlib
 import logging
@@ -15,9 +15,9 @@ from bam_envs.rosbridge.bus import UNKNOWN_CALLER, Bus, Handler, Listener, Messa
 
 _log = logging.getLogger(__name__)
 _DEPTH = 10
-"""Messages that ROS keeps for a slow reader."""
+"""Messages that ROS queues for a slow subscriber."""
 _THREADS = 8
-"""Requests that are answered together."""
+"""Requests that are answered at the same time."""
 _KIND = re.compile(r"(?P<package>[A-Za-z]\w*)/(?:(?:msg|srv)/)?(?P<name>[A-Za-z]\w*)")
 _LIST = re.compile(r"sequence<(?P<open>.+?)(?:, \d+)?>|(?P<fixed>.+)\[\d+\]")
 _BYTES = {"uint8", "octet", "byte"}
@@ -27,30 +27,30 @@ _INSTALL = "pip install 'ros-jazzy-rclpy[fastrtps]' ros-jazzy-std-msgs ros-jazzy
 
 
 class RclpyBus(Bus):
-    """Topics and services of one ROS 2 node; ROS reports neither who sends nor who leaves.
+    """Topics and services of one ROS 2 node; ROS reports neither senders nor clients that leave.
 
     Args:
-        name: Of the node.
-        domain: ROS domain; None for that of the environment variable ROS_DOMAIN_ID.
-        serves: Whether it answers services, several at once; a client needs no pool of threads, which Python ends
-            before anybody can close it.
+        name: Name of the node.
+        domain: ROS domain; None for the environment variable ROS_DOMAIN_ID.
+        serves: Whether it answers services, several at once; a client needs no pool of threads, which Python would end
+            before the node is closed.
     """
 
     def __init__(self, name: str = "bam_serve", *, domain: int | None = None, serves: bool = True) -> None:
         self.name, self._domain, self._serves = name, domain, serves
         self.refused: dict[str, str] = {}
-        """Services that are not offered, and why."""
+        """Services that are not offered -> reason."""
         self._lock = threading.Lock()
         self._publishers: dict[str, tuple[Any, Any]] = {}  # topic -> class of its messages, publisher
         self._context: Any = None
         self._node: Any = None  # topics
-        self._caller: Any = None  # services, which may take long: a node of their own, so that no topic waits for them
+        self._caller: Any = None  # services, which may take long: a separate node, so that no topic waits for them
         self._clients: dict[str, Any] = {}
         self._waiting: set[threading.Event] = set()  # of calls for their answers
         self._spinning: list[tuple[Any, threading.Thread]] = []  # executors and their threads
 
     def start(self) -> None:
-        """Create the node; raises InvalidValue if rclpy is not here. Signals stay the program's own."""
+        """Create the node; raises InvalidValue if rclpy is not installed. Leaves signal handlers unchanged."""
         try:
             import rclpy
             from rclpy.context import Context
@@ -115,8 +115,8 @@ class RclpyBus(Bus):
                 publisher.publish(message)
 
     def subscribe(self, topic: str, kind: str, listener: Listener) -> Callable[[], None]:
-        """Call `listener` for each message, until what is returned is called."""
-        logged = ""  # a refusal is logged once, however often it comes in a row: ROS cannot tell the sender
+        """Call `listener` for each message. Returns a function that ends the subscription."""
+        logged = ""  # of equal refusals in a row only the first is logged, because ROS cannot report them to the sender
 
         def receive(message: Any) -> None:
             nonlocal logged
@@ -135,10 +135,10 @@ class RclpyBus(Bus):
         return stop
 
     def serve(self, service: str, kind: str, handler: Handler) -> None:
-        """Answer `service`, also when the handler fails: ROS has no failed responses, and a client waits for ever.
+        """Answer `service`, even when the handler fails: ROS has no failed responses, and a client waits forever.
 
-        Then the response is as ROS makes it, with the error's text where there is room. A service whose type is in no
-        package here is not offered; see `refused`.
+        Such a response has ROS's default values, and the error's text if it has a field ``message``. A service whose
+        type is not installed is not offered; see `refused`.
         """
         from rclpy.callback_groups import ReentrantCallbackGroup
 
@@ -164,7 +164,7 @@ class RclpyBus(Bus):
         """The response of `service`.
 
         Raises:
-            InvalidValue: `request` does not fit `kind`, or that is in no package here.
+            InvalidValue: `request` does not fit `kind`, or that type is not installed.
             LinkLost: There was no answer within `timeout` [s], or before the node was closed.
         """
         types, answered = interface(kind, "srv"), threading.Event()
@@ -188,7 +188,7 @@ class RclpyBus(Bus):
         return to_dict(future.result())
 
     def fields(self, kind: str) -> dict[str, bool]:
-        """The fields of messages of type `kind`; to each, whether it is a list. Nothing for a type that is not here."""
+        """Each field of messages of type `kind` -> whether it is a list; empty for a type that is not installed."""
         try:
             types = interface(kind, "msg").get_fields_and_field_types()
         except InvalidValue:
@@ -220,7 +220,7 @@ class RclpyBus(Bus):
         for executor, thread in spinning:
             executor.shutdown()
             thread.join()
-            # Its own shutdown leaves the threads of a MultiThreadedExecutor waiting for ever.
+            # The shutdown of a MultiThreadedExecutor leaves its threads waiting forever.
             if (workers := getattr(executor, "_executor", None)) is not None:
                 workers.shutdown()
         for node in nodes:
@@ -261,13 +261,13 @@ def _plain(value: Any, kind: str) -> Any:
 
 
 def _element(kind: str) -> str | None:
-    """What a list type, as ROS 2 writes it, is a list of; None for what is no list."""
+    """The element type of a list type in ROS 2's spelling; None for other types."""
     match = _LIST.fullmatch(kind)
     return None if match is None else match["open"] or match["fixed"]
 
 
 def to_message(make: Any, fields: Mapping[str, Any], where: str) -> Any:
-    """A message of the class `make`; fields that `fields` has not are as ROS makes them.
+    """A message of the class `make`; fields that are not in `fields` have ROS's default values.
 
     Raises InvalidValue if `make` has no such field, or a value does not fit or is not finite.
     """
@@ -294,7 +294,7 @@ def _ros(value: Any, kind: str, default: Any, where: str) -> Any:
 
 
 def _single(value: Any, kind: str, make: Any, where: str) -> Any:
-    """The generated setters check nothing unless they are asked to, and what is wrong then goes wrong in C."""
+    """Check one value: the generated setters do not check by default, and a wrong value fails in C."""
     if "/" in kind:
         if not isinstance(value, Mapping):
             raise InvalidValue(f"{where} must be an object with the fields of {kind}, not {value!r}.")

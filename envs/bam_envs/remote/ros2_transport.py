@@ -13,18 +13,18 @@ from bam_envs.remote.rosbridge_transport import RosbridgeTransport
 from bam_envs.ros.messages import write_stamp
 
 _LOOK = 0.02
-"""Time between two looks at who is in the graph [s]."""
+"""Time between two checks for the environment in the graph [s]."""
 
 
 class RclpyTransport(RosbridgeTransport):
-    """Carries an environment as `RosbridgeTransport` does, by a node of its own.
+    """A `RosbridgeTransport` over a ROS 2 node instead of a bridge.
 
     Args:
         url: ``ros2://namespace``; the namespace may be left out.
-        env_id: The environment that is wanted; "" for the one that is there.
+        env_id: The requested environment; "" for the one that is served.
         channel: ``"topics"``, a pair of std_msgs/String, or ``"service"``, for racks; that needs the package bam_msgs.
-        domain: ROS domain; None for that of the environment variable ROS_DOMAIN_ID.
-        options: What else `RosbridgeTransport` takes, but for certificates and token.
+        domain: ROS domain; None for the environment variable ROS_DOMAIN_ID.
+        options: Other options of `RosbridgeTransport`, except ``ca_file`` and ``token``.
     """
 
     def __init__(
@@ -57,7 +57,7 @@ class RclpyLink(RclpyBus):
         stripped = rest.strip("/")
         self.url, self.namespace = url, f"/{stripped}" if stripped else ""
         self.epoch = 0
-        """Counts the connections: 1 from `connect` on."""
+        """Number of the connection: 1 from `connect` on."""
         self._channel, self._timeout = channel, timeout
 
     @property
@@ -94,5 +94,5 @@ class RclpyLink(RclpyBus):
         """Do nothing: a ROS graph has no connection that drops."""
 
     def stamp(self, seconds: float) -> dict[str, int]:
-        """A time as ROS 2 spells it."""
+        """A time [s] in the spelling of ROS 2."""
         return write_stamp(seconds)

@@ -1,4 +1,4 @@
-"""RosbridgeTransport: an environment behind the GymAPI service of a rosbridge server, ours or a BAM rack's."""
+"""RosbridgeTransport: an environment behind the GymAPI service of `bam-serve` or of a BAM rack, through rosbridge."""
 
 import os
 import socket
@@ -36,9 +36,9 @@ from bam_envs.rosbridge.sessions import is_over, read_session
 from bam_envs.rosbridge.string_rpc import StringRpc
 
 _QUESTIONS = 3
-"""Times that the description is asked for: a ROS 2 bridge makes a client for each call, and the answer is lost where it
-comes before the two ends have found each other."""
-_CLOSE_TIMEOUT = 1.0  # [s]; a server that is gone must not hold up `close`
+"""Most requests for the description: a ROS 2 bridge creates a client for each call, and loses an answer that comes
+before the two ends have discovered each other."""
+_CLOSE_TIMEOUT = 1.0  # [s]; a server that is gone must not delay `close`
 
 
 class RosbridgeTransport:
@@ -46,8 +46,8 @@ class RosbridgeTransport:
 
     Args:
         url: ``ws://host:port/namespace`` or ``wss://…``; the namespace may be left out.
-        env_id: The environment that is wanted, as the server calls it; "" for the one that is there.
-        channel: ``"service"``, which every rack has, or ``"topics"``, a pair of topics, which our servers have and
+        env_id: The requested environment, by the server's name; "" for the one that is served.
+        channel: ``"service"``, which every rack has, or ``"topics"``, a pair of topics, which `bam-serve` has and
             which is several times faster through a real rosbridge.
         timeout: Longest time for a request [s]; a rack's pick takes seconds.
         connect_timeout: Longest time to connect [s].
@@ -55,18 +55,18 @@ class RosbridgeTransport:
         ca_file: PEM file of the authorities to trust instead of the system's.
         token: The server's shared secret, if it has one.
         take: Take command from the client that has it.
-        observation_space: Of a single environment. This and what follows is for racks that do not describe their
-            environment, as servers of bam-train do; they are sent only what racks understand.
-        action_space: Likewise.
-        num_envs: Environments (arms), which begin their episodes together.
-        period: Time between two actions [s]; None if nobody knows.
+        observation_space: Of a single environment. This and the following are for racks that do not describe their
+            environment; they are sent only the fields that racks know.
+        action_space: Of a single environment.
+        num_envs: Number of environments (arms), which begin their episodes together.
+        period: Time between two actions [s]; None if it is not known.
         action_type: Of the actions: 1 default, 2 pick and lift, 3 pick and place, 4 open, 5 fold.
-        gymapi_version: Version of the messages; None to find out by the first answer.
-        autoreset: Whether the rack begins the next episode in the step that ends one; None: as racks of its version do,
-            from June on.
+        gymapi_version: Version of the messages; None to detect it from the first answer.
+        autoreset: Whether the rack begins the next episode in the step that ends one; None: True for versions from
+            June on.
 
     Raises:
-        InvalidValue: The URL or an option is not possible.
+        InvalidValue: The URL or an option is not valid.
     """
 
     def __init__(
@@ -97,27 +97,27 @@ class RosbridgeTransport:
         self._version = None if gymapi_version is None else version_named(gymapi_version)
         self._name, self._lock, self._closed = name, threading.Lock(), False
         self._described_epoch: int | None = None
-        self._known_epoch: int | None = None  # of the connection on which the state over there is known
+        self._known_epoch: int | None = None  # of the connection since which the environment's state is known
         self._last: list[Any] = []  # the last observation of each environment
         self._begin_process()
 
     def connect(self) -> EnvSpecMessage:
-        """Open the link and ask what is there. Raises NoServer, also for another rack whose spaces were not given."""
+        """Open the link and read the description. Raises NoServer, also for a rack whose spaces are not known."""
         with self._lock:
             return self._connect().spec
 
     def reset(self, seed: Seed = None, options: Info | None = None) -> tuple[Any, Any]:
-        """Begin an episode; waits for a link that dropped, at most as long as connecting may take."""
+        """Begin an episode; waits for a link that dropped, at most the time to connect."""
         with self._lock:
-            there = self._connect()
+            codec = self._connect()
             self._known_epoch = None
             plain = plain_seed(seed)
-            if there.foreign:
+            if codec.foreign:
                 refuse_foreign(plain, options)
             epoch = self._link.epoch
             response = self._ask(RequestType.RESET, seed=plain, options=options, take=self.take)
-            result = there.read_result(response)
-            self._known_epoch, self._last = epoch, [one[0] for one in there.spec.split(result)]
+            result = codec.read_result(response)
+            self._known_epoch, self._last = epoch, [one[0] for one in codec.spec.split(result)]
             return result[0], result[-1]
 
     def step(self, action: Any) -> tuple[Any, Any, Any, Any, Any]:
@@ -127,34 +127,34 @@ class RosbridgeTransport:
             LinkLost: Nothing was sent: the link is down, or it dropped or timed out since the last reset.
         """
         with self._lock:
-            there = self._there
-            if there is None or self._closed or self._known_epoch != self._link.epoch or os.getpid() != self._pid:
+            codec = self._codec
+            if codec is None or self._closed or self._known_epoch != self._link.epoch or os.getpid() != self._pid:
                 lost = "the link was lost, or is not open, so what the environment did since is unknown"
                 reason = "this transport is closed" if self._closed else lost
                 raise LinkLost(f"{self.url}: {reason}, and nothing was sent. Call reset() first.")
-            result = there.read_result(self._ask(RequestType.STEP, actions=there.write_actions(action)))
+            result = codec.read_result(self._ask(RequestType.STEP, actions=codec.write_actions(action)))
             june = self._version is not None and self._version.june
-            if there.foreign and (june if self._autoreset is None else self._autoreset):
-                # The rack has begun the next episode, and the last observation of the old one never comes: that of the
-                # step before stands in its place.
-                each, before = there.spec.split(result), self._last
+            if codec.foreign and (june if self._autoreset is None else self._autoreset):
+                # The rack has begun the next episode, and never sends the last observation of the old one: that of the
+                # step before replaces it.
+                each, before = codec.spec.split(result), self._last
                 self._last = [one[0] for one in each]
                 for i, (_, reward, terminated, truncated, info) in enumerate(each):
                     if terminated or truncated:
                         info = {**info, "stale_observation": True}
                         each[i] = (before[i], reward, terminated, truncated, info)
-                result = there.spec.joined(each)
+                result = codec.spec.joined(each)
             return result
 
     def close(self) -> None:
-        """Release the environment there and drop the link; a request under way ends with `LinkLost`."""
+        """Release the environment and drop the link; a request under way ends with `LinkLost`."""
         if os.getpid() != self._pid:
             return  # the link is the parent's
         self._closed = True
         if self._lock.acquire(blocking=False):
             try:
-                if self._there is not None and self._link.is_up:
-                    # A server of ours finds out by itself that the link is gone.
+                if self._codec is not None and self._link.is_up:
+                    # A `bam-serve` notices by itself that the link is gone.
                     with suppress(LinkLost, ProtocolError, RemoteError):
                         self._ask(RequestType.CLOSE, timeout=min(self.timeout, _CLOSE_TIMEOUT))
             finally:
@@ -167,16 +167,16 @@ class RosbridgeTransport:
 
     def _begin_process(self) -> None:
         self._pid, self._tagger, self._link = os.getpid(), Tagger(), self._make_link()
-        self._there: EnvCodec | None = None
+        self._codec: EnvCodec | None = None
         self._base = base_name(self._link.namespace)
         self._rpc = StringRpc(self._link, self._base, self._tagger)
 
     def _connect(self) -> EnvCodec:
         if self._closed:
             raise LinkLost(f"{self.url}: this transport is closed; make a new one.")
-        if os.getpid() != self._pid:  # after a fork the link is the parent's, which must not notice
+        if os.getpid() != self._pid:  # after a fork: the parent's link must stay as it is
             self._begin_process()
-        before = self._there
+        before = self._codec
         if before is None:
             self._link.connect()
         else:
@@ -184,17 +184,17 @@ class RosbridgeTransport:
         if before is not None and self._described_epoch == self._link.epoch:
             return before
         epoch = self._link.epoch
-        there = self._asked() if None in self._spaces else self._rack()
-        if before is not None and spec_to_json(before.spec) != spec_to_json(there.spec):
-            raise ProtocolError(f"{self.url}: it serves another environment than before: {there.spec.env_id}.")
-        self._there, self._described_epoch, self._known_epoch = there, epoch, epoch
-        if self.channel == "topics" and not there.foreign and not self._tagger.signs:
-            # Everybody can read requests on topics: they are signed.
+        codec = self._described() if None in self._spaces else self._rack()
+        if before is not None and spec_to_json(before.spec) != spec_to_json(codec.spec):
+            raise ProtocolError(f"{self.url}: it serves another environment than before: {codec.spec.env_id}.")
+        self._codec, self._described_epoch, self._known_epoch = codec, epoch, epoch
+        if self.channel == "topics" and not codec.foreign and not self._tagger.signs:
+            # Requests on topics are signed, because every client can read them.
             service = f"{self._base}/session"
             with suppress(RemoteError):  # an older server
                 answer = self._link.call(service, "std_srvs/Trigger", {}, self.endpoint.connect_timeout)
                 self._sign_with(read_session(answer, service))
-        return there
+        return codec
 
     def _sign_with(self, tagger: Tagger) -> None:
         self._rpc.close()
@@ -202,7 +202,7 @@ class RosbridgeTransport:
         self._rpc = StringRpc(self._link, self._base, tagger)
 
     def _rack(self) -> EnvCodec:
-        """How values travel to another rack; spaces that were not given are those of `env_id` registered here."""
+        """The codec for a rack without a description; missing spaces are those of `env_id` in the local registry."""
         observation_space, action_space = self._spaces
         if observation_space is None or action_space is None:
             env: gym.Env[Any, Any] = gym.make(resolve_id(self.env_id))
@@ -219,15 +219,15 @@ class RosbridgeTransport:
         )
         return EnvCodec(spec, foreign=True, action_type=self._action_type)
 
-    def _asked(self) -> EnvCodec:
-        """Ask the server for its description, which moves nothing; an answer without one is that of another rack."""
+    def _described(self) -> EnvCodec:
+        """Request the server's description, which moves nothing; an answer without one is that of a rack."""
         limit, questions = max(self.endpoint.connect_timeout, 1.0) / _QUESTIONS, _QUESTIONS
         while True:
             try:
                 response = self._exchange(RequestType.NONE, None, timeout=limit)
                 break
             except RemoteError as error:
-                # No such service, or a rack that fails at what it does not know; a session that is over is ours.
+                # No such service, or a rack that does not know the request; else the session of this client is over.
                 if not (self._tagger.signs and is_over(error)):
                     return self._foreign(str(error))
                 self._sign_with(Tagger())
@@ -235,7 +235,7 @@ class RosbridgeTransport:
                 questions -= 1
                 if not questions:
                     raise NoServer(self.url, f"rosbridge is there, and {self._where()} is silent: {error}") from error
-        if response.error is not None and any(response.exact):  # of our server
+        if response.error is not None and any(response.exact):  # of a `bam-serve`
             raise NoServer(self.url, str(response.error)) from response.error
         spec = response.exact[0].get("spec") if response.exact else None
         if spec is None:
@@ -245,7 +245,7 @@ class RosbridgeTransport:
     def _foreign(self, reason: str) -> EnvCodec:
         namespace = f" --namespace {self._link.namespace.strip('/')}" if self._link.namespace else ""
         remedy = f"Start one: bam-serve --env {self.env_id or 'bam/pick'}{namespace}"
-        if "does not exist" in reason:  # the text of every bridge but one
+        if "does not exist" in reason:  # the text of all bridges but one
             elsewhere = namespaces_with(self._link, "services", service_name(""))
             raise NoServer(self.url, f"{reason}.{elsewhere} {remedy}")
         try:
@@ -261,13 +261,13 @@ class RosbridgeTransport:
         return service_name(self._link.namespace) if self.channel == "service" else f"{self._base}/request"
 
     def _ask(self, kind: RequestType, **fields: Any) -> GymResponse:
-        """Send a request and return its success; after an error that is no refusal, a reset is needed."""
+        """Send a request and return its response; after any error but a refusal, a reset is needed."""
         epoch = self._known_epoch if kind is RequestType.STEP else self._link.epoch
         try:
             response = self._exchange(kind, epoch, **fields)
         except RemoteError:
             raise
-        except BaseException:  # also Ctrl-C: the request may be under way
+        except BaseException:  # even Ctrl-C: the request may be under way
             self._known_epoch = None
             raise
         if response.error is not None:
@@ -278,7 +278,7 @@ class RosbridgeTransport:
         self, kind: RequestType, epoch: int | None, *, timeout: float | None = None, **fields: Any
     ) -> GymResponse:
         limit = self.timeout if timeout is None else timeout
-        foreign = self._there is not None and self._there.foreign
+        foreign = self._codec is not None and self._codec.foreign
         tag = None if foreign or epoch is None else self._tagger.next(epoch, limit)
         client = self._name or f"{socket.gethostname()}:{self._pid}"
         request = GymRequest(kind, client_id=client, env_name=self.env_id, tag=tag, **fields)

@@ -28,7 +28,7 @@ from bam_envs.remote.values import Tree, plain_info
 from bam_envs.ros.freshness import Tagger
 from bam_envs.rosbridge.endpoint import Endpoint
 
-_LEAVE_TIMEOUT = 1.0  # [s]; a server that is gone must not hold up `close`
+_LEAVE_TIMEOUT = 1.0  # [s]; a server that is gone must not delay `close`
 
 
 class TcpTransport:
@@ -38,7 +38,7 @@ class TcpTransport:
 
     Args:
         url: ``tcp://host:port``.
-        env_id: The environment that is wanted; "" for the one that is served.
+        env_id: The requested environment; "" for the one that is served.
         timeout: Longest time for a request [s].
         connect_timeout: Longest time to connect [s].
         token: The server's shared secret, if it has one. Nothing is encrypted.
@@ -80,12 +80,12 @@ class TcpTransport:
         self._closed = False
 
     def connect(self) -> EnvSpecMessage:
-        """Open the link and ask what is there. Raises NoServer if nobody, something else, or it refuses this client."""
+        """Open the link and read the description. Raises NoServer without a usable server, or if it refuses."""
         with self._lock:
             return self._connected()
 
     def reset(self, seed: Seed = None, options: Info | None = None) -> tuple[Any, Any]:
-        """Begin an episode; connects again if the link dropped."""
+        """Begin an episode; reconnects if the link dropped."""
         plain = plain_seed(seed)
         with self._lock:
             spec = self._connected()
@@ -120,7 +120,7 @@ class TcpTransport:
         return self._frames is not None and self._pid == os.getpid()
 
     def _connected(self) -> EnvSpecMessage:
-        """Connect if the link is down; the environment there."""
+        """Connect if the link is down; returns the description of the environment."""
         if self._spec is not None and not self._closed and self._is_up():
             return self._spec
         if self._frames is not None and not self._closed:  # after a fork: the link and the session are the parent's
@@ -151,7 +151,7 @@ class TcpTransport:
             self._frames = FrameSocket(_dial(self._host, self._port, deadline))
         except OSError as error:
             if isinstance(error, ConnectionRefusedError):
-                reason = "nobody listens there (is the port open?)"
+                reason = "nothing listens there (is the port open?)"
             elif isinstance(error, TimeoutError):
                 limit = f"{self.endpoint.connect_timeout:g} s"
                 reason = f"no answer within {limit} (is the address right, and no firewall between?)"
@@ -196,7 +196,7 @@ class TcpTransport:
             elif time.monotonic() >= deadline:
                 reason = f"no answer to {type(request).__name__.lower()} within {limit:g} s"
             raise LinkLost(f"{self.url}: {reason}.") from error
-        except BaseException:  # also Ctrl-C: the answer may still come, and be taken for that of the next request
+        except BaseException:  # even Ctrl-C: a late answer would be taken for that of the next request
             self._drop()
             raise
         finally:
@@ -216,7 +216,7 @@ class TcpTransport:
 
 
 def _dial(host: str, port: int, deadline: float) -> socket.socket:
-    """A socket that is connected before `deadline`, however many addresses the name has."""
+    """A socket that is connected before `deadline` to one of the addresses of the name."""
     refusal = OSError("it has no address")
     for *_, address in socket.getaddrinfo(host, port, type=socket.SOCK_STREAM):
         try:

@@ -22,8 +22,8 @@ message                              content of the answer
 ["leave", tag]                       None
 ===================================  ====================================================
 
-An answer is [number of the request, "ok", content] or [number, kind of the error, its text]. Of a batch of
-environments, each value has one entry for each.
+An answer is [number of the request, "ok", content] or [number, kind of the error, its text]. With a batch of
+environments, each value has one entry for each environment.
 
 `encode` and `decode` are pure; `FrameSocket` owns the socket.
 """
@@ -54,28 +54,28 @@ _ALIGN = 16
 _ARRAY, _SCALAR = 1, 2
 _MAX_HEADER, _MAX_DIMENSIONS = 2**24, 32
 _KEEPALIVE = {"TCP_KEEPIDLE": 4, "TCP_KEEPINTVL": 2, "TCP_KEEPCNT": 3}
-"""A computer that vanished without a word is noticed after 10 s."""
+"""A computer that silently vanished is noticed after 10 s."""
 
 
 class Hello(msgspec.Struct, frozen=True):
     """The first message of a client."""
 
     session: Annotated[str, msgspec.Meta(min_length=1)]
-    """One client, from its start to its end."""
+    """Identifies one client from its start to its end."""
     epoch: int
-    """Counts its connections."""
+    """Number of the client's connection."""
     name: str
     """Its name, shown to other clients."""
     token: str
     """The shared secret, or ""."""
     env_id: str
-    """The environment that it wants; "" for any."""
+    """The requested environment; "" for any."""
     end: str = "\r\n\r\n"
     """The blank line makes a server of HTTP answer at once."""
 
 
 class TagMessage(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=True):
-    """A `Tag` without a signature: who sent a request, when, and how long it is valid."""
+    """A `Tag` without a signature: sender, time and deadline of a request."""
 
     session: str
     epoch: int
@@ -118,18 +118,18 @@ class Leave(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=
 Request = Reset | Step | Leave
 """A message after the hello."""
 Greeting = tuple[Literal["hello"], Hello]
-"""The hello, as it travels."""
+"""The first message."""
 _Answer = tuple[int, str, Any]
 
 
 def refusal(sequence: int, error: BamEnvsError) -> Tree:
-    """The answer that a request failed."""
+    """The answer to a request that failed."""
     text = str(error).encode(errors="replace").decode()  # halves of surrogate pairs cannot be sent
     return [sequence, "NotInCommand" if isinstance(error, NotInCommand) else "RemoteError", text]
 
 
 def content_of(answer: Tree, sequence: int) -> Tree:
-    """The content of `answer`, which must be that to request number `sequence`; raises the error of a `refusal`."""
+    """The content of the `answer` to request number `sequence`; raises the error of a `refusal`."""
     try:
         number, kind, content = msgspec.convert(answer, _Answer)
     except msgspec.ValidationError:
@@ -142,7 +142,7 @@ def content_of(answer: Tree, sequence: int) -> Tree:
 
 
 def action_size(spec: EnvSpecMessage) -> int:
-    """About the most that the actions of all environments hold [bytes]."""
+    """Approximate maximum size of the actions of all environments [bytes]."""
     try:
         return 8 * spaces.flatdim(spec.action_space) * spec.num_envs
     except (NotImplementedError, ValueError):  # sequences may be of any length
@@ -165,7 +165,7 @@ def pack_result(spec: EnvSpecMessage, result: tuple[Any, ...]) -> Tree:
 
 
 def _pack_each(spec: EnvSpecMessage, space: spaces.Space[Any], values: Any, name: str) -> Tree:
-    """The tree of a value, or of one for each environment: of a Box one array, which travels quicker than many."""
+    """The tree of a value, or of one for each environment; those of a Box are one array, which is faster than many."""
     if not spec.vector:
         return pack(space, values[0], name)
     trees = [pack(space, one, f"{name} of environment {i}") for i, one in enumerate(values)]
@@ -173,7 +173,7 @@ def _pack_each(spec: EnvSpecMessage, space: spaces.Space[Any], values: Any, name
 
 
 def read_result(spec: EnvSpecMessage, tree: Tree, size: int) -> tuple[Any, ...]:
-    """The result of `size` values that `pack_result` was given. Raises ProtocolError if it is something else."""
+    """The result of `size` values that `pack_result` encoded. Raises ProtocolError for anything else."""
     if not isinstance(tree, list) or len(tree) != size:
         raise ProtocolError(f"Expected a result of {size} values, found {brief(tree)}.")
     for column in tree if spec.vector else ():
@@ -194,7 +194,7 @@ def read_result(spec: EnvSpecMessage, tree: Tree, size: int) -> tuple[Any, ...]:
     return result
 
 
-class ForeignPeer(ProtocolError):  # noqa: N818 - reads as what was found
+class ForeignPeer(ProtocolError):  # noqa: N818 - named for the peer
     """The other end speaks another protocol; the text names it where it can be recognised."""
 
 
@@ -204,7 +204,7 @@ def encode(message: Tree) -> bytes:
     size = 0
 
     def add(value: Any) -> Ext:
-        """What stands for `value` in the header; arrays go into the body."""
+        """The placeholder of `value` in the header; arrays go into the body."""
         nonlocal size
         if isinstance(value, np.generic):
             return Ext(_SCALAR, msgspec.msgpack.encode([value.dtype.str, value.tobytes()]))
@@ -240,7 +240,7 @@ def read_prefix(prefix: bytes | bytearray) -> tuple[int, int]:
 
 
 def decode(header: bytes | memoryview, body: NDArray[np.uint8], kind: Any = Any) -> Any:
-    """The message of the type `kind` in a frame; its arrays lie in `body`. Raises ProtocolError if it is damaged."""
+    """The message of the type `kind` in a frame; its arrays are views of `body`. Raises ProtocolError if damaged."""
 
     def restore(code: int, data: memoryview) -> Any:
         if code == _SCALAR:
@@ -276,10 +276,10 @@ class FrameSocket:
         self._socket = sock
 
     def send(self, frame: bytes, deadline: float = math.inf) -> None:
-        """Send a frame before `deadline` [s, monotonic]. Raises LinkLost if the other end is gone, or takes nothing."""
+        """Send a frame before `deadline` [s, monotonic]. Raises LinkLost if the other end is gone or does not read."""
         try:
             self._set_timeout(deadline)
-            self._socket.sendall(frame)  # all of it within the time
+            self._socket.sendall(frame)  # the timeout is for the whole frame
         except OSError as error:
             raise LinkLost(error.strerror or str(error)) from error
 
@@ -307,7 +307,7 @@ class FrameSocket:
             if header > _MAX_HEADER:
                 raise ProtocolError(f"A header of {header} bytes is too large; {_MAX_HEADER} are allowed.")
             buffer = np.empty(header + body + _ALIGN, np.uint8)
-            # The body begins where arrays of all kinds may begin.
+            # The body is aligned for arrays of every dtype.
             start = -(buffer.ctypes.data + header) % _ALIGN
             view = buffer.data[start : start + header + body]
             self._fill(view, min(deadline, time.monotonic() + patience))
@@ -333,15 +333,15 @@ class FrameSocket:
         self._socket.settimeout(left if left < math.inf else None)
 
     def abandon(self) -> None:
-        """Close it here after a fork; the connection is the parent's and stays up."""
+        """Close the child's copy after a fork; the connection of the parent stays up."""
         self._socket.close()
 
     def hang_up(self) -> None:
-        """End the connection; a thread that waits for a frame gets `LinkLost`. Idempotent, from any thread."""
+        """End the connection; a thread that waits for a frame gets `LinkLost`. Idempotent, thread-safe."""
         with suppress(OSError):  # it was closed before, by either end
             self._socket.shutdown(socket.SHUT_RDWR)
 
     def close(self) -> None:
-        """End the connection, in the thread that uses it: another one could wait on a number that is given anew."""
+        """End the connection, in the thread that uses it: its file descriptor may be reused at once."""
         self.hang_up()
         self._socket.close()

@@ -1,4 +1,4 @@
-"""The Transport protocol: what carries a whole environment, one or a batch of them, to wherever it runs."""
+"""The Transport protocol: access to an environment, or a batch of them, that runs elsewhere."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -14,7 +14,7 @@ from bam_envs.remote.values import plain_info, tree_from_json, tree_to_json
 
 Info = dict[str, Any]
 Seed = int | list[int | None] | None
-"""Of a reset: one, or one for each environment of a batch."""
+"""The seed of a reset: one, or one for each environment of a batch."""
 _MAX_SEED = 2**64 - 1
 
 
@@ -33,13 +33,13 @@ class EnvSpecMessage:
     vector: bool = False
     """Whether values are lists with one entry for each environment."""
     autoreset: bool = True
-    """With `vector`, whether an environment whose episode ends is reset in the same step; always so on our servers."""
+    """With `vector`, whether an environment whose episode ends is reset in the same step; True on our servers."""
     period: float | None = None
     """Time between two actions [s]; None if the server does not report it."""
     max_episode_steps: int | None = None
-    """The time limit there; `truncated` comes from there."""
+    """The server's time limit, after which it sends `truncated`."""
     signals: Mapping[str, Any] = field(default_factory=dict)
-    """What `describe()` of the environment there returns; empty if the server does not report it."""
+    """The result of the environment's `describe()`; empty if the server does not report it."""
 
     def each(self, action: Any) -> list[Any]:
         """The action of each environment. Raises InvalidValue if there are too many or too few."""
@@ -53,16 +53,16 @@ class EnvSpecMessage:
         return each
 
     def split(self, result: Iterable[Any]) -> list[tuple[Any, ...]]:
-        """The result of each environment, out of what `Transport.reset` or `Transport.step` returns."""
+        """The result of each environment, from a result of `Transport.reset` or `Transport.step`."""
         return list(zip(*result, strict=True)) if self.vector else [tuple(result)]
 
     def joined(self, each: Sequence[tuple[Any, ...]]) -> Any:
-        """What `Transport.reset` or `Transport.step` returns, of the result of each environment."""
+        """A result of `Transport.reset` or `Transport.step`, from the result of each environment."""
         return tuple(map(list, zip(*each, strict=True))) if self.vector else each[0]
 
 
 def plain_seed(seed: Any) -> Seed:
-    """A seed, or one for each environment, as Python's numbers. Raises InvalidValue if it is not of 64 bits."""
+    """A seed, or one for each environment, as Python integers. Raises InvalidValue if it is not of 64 bits."""
     if seed is None:
         return None
     if isinstance(seed, (list, tuple, np.ndarray)):
@@ -73,7 +73,7 @@ def plain_seed(seed: Any) -> Seed:
 
 
 def spec_to_json(spec: EnvSpecMessage) -> dict[str, Any]:
-    """The description that a server sends of its environment, as strict JSON values."""
+    """A server's description of its environment as strict JSON values."""
     return {
         "env_id": spec.env_id,
         "observation_space": space_to_json(spec.observation_space),
@@ -113,7 +113,7 @@ class Transport(Protocol):
     """
 
     def connect(self) -> EnvSpecMessage:
-        """Open the link and ask what is there; NoServer if nobody knows this environment. Moves nothing; idempotent."""
+        """Open the link and read the description; NoServer without this environment. Moves nothing; idempotent."""
 
     def reset(self, seed: Seed = None, options: Info | None = None) -> tuple[Any, Any]:
         """Begin an episode; (observation, info).
@@ -124,7 +124,7 @@ class Transport(Protocol):
         """
 
     def step(self, action: Any) -> tuple[Any, Any, Any, Any, Any]:
-        """(observation, reward, terminated, truncated, info). Raises as `reset` does; never sent twice."""
+        """(observation, reward, terminated, truncated, info). Raises the errors of `reset`; never sent twice."""
 
     def close(self) -> None:
-        """Release the environment there, which halts its robot, and drop the link. Idempotent."""
+        """Release the environment, which halts its robot, and drop the link. Idempotent."""

@@ -1,6 +1,6 @@
 """Values of Gymnasium spaces as plain trees and back, bit for bit; every transport checks and sends these.
 
-A tree is made of dicts, lists, numbers, text and NumPy arrays, and nothing else:
+A tree consists only of dicts, lists, numbers, text and NumPy arrays:
 
 =====================================  ============================================================
 space                                  in the tree
@@ -13,9 +13,9 @@ Dict                                   a dict, in the order of the space
 =====================================  ============================================================
 
 NaN is refused everywhere, infinity where a Box has a finite bound on that side. Finite numbers beyond the bounds of a
-Box are let through: environments clip their actions, and observations overshoot.
+Box are accepted: environments clip their actions, and observations overshoot.
 
-`tree_to_json` writes any tree as strict JSON, which has no arrays, no NaN and no infinities.
+`tree_to_json` encodes any tree as strict JSON, which has no arrays, no NaN and no infinities.
 """
 
 import base64
@@ -39,11 +39,11 @@ _DTYPE = re.compile("[<>|=]?[biuf][0-9]{1,2}")
 
 
 def pack(space: Space[Any], value: Any, name: str = "value", *, typed: bool = False) -> Tree:
-    """The tree of `value`, which may be one already; with `typed`, the value of `exact`.
+    """The tree of `value`, which may be a tree already; with `typed`, the result of `exact`.
 
     Raises:
         InvalidValue: It does not fit; the text names the place, such as ``action['arm'][2]``.
-        UnknownName: No value of such a space can be sent.
+        UnknownName: Values of such a space cannot be sent.
     """
     if isinstance(space, spaces.Box):
         return _finite(space, _array(space, value, name), name)
@@ -87,18 +87,18 @@ def pack(space: Space[Any], value: Any, name: str = "value", *, typed: bool = Fa
 
 
 def exact(space: Space[Any], value: Any, name: str = "value") -> Any:
-    """Check `value`, which may be a tree, and return it with the types and dtypes of its space. Raises as `pack`."""
+    """Check `value`, which may be a tree, and return it with the types and dtypes of its space. See `pack`."""
     return pack(space, value, name, typed=True)
 
 
 def stack(space: Space[Any], each: Sequence[Any]) -> Any:
-    """One batch of several values of `space`, in arrays of its own."""
+    """One batch of several values of `space`, in new arrays."""
     empty = create_empty_array(space, len(each))
     return concatenate(space, each, empty) if each else empty
 
 
 def _array(space: Space[Any], value: Any, name: str) -> NDArray[Any]:
-    """`value` with the dtype and shape of `space`: rounding floats is allowed, changing anything else is not."""
+    """`value` with the dtype and shape of `space`; floats may be rounded, other numbers must not change."""
     if not isinstance(value, np.ndarray):
         try:
             value = np.asarray(value)
@@ -123,7 +123,7 @@ def _array(space: Space[Any], value: Any, name: str) -> NDArray[Any]:
 
 
 def _finite(space: spaces.Box, array: NDArray[Any], name: str) -> NDArray[Any]:
-    """`array`, without NaN, and without infinity beyond a finite bound."""
+    """`array`, checked for NaN, and for infinity beyond a finite bound."""
     if array.dtype.kind != "f" or np.isfinite(array).all():
         return array
     bad = np.isnan(array)
@@ -174,9 +174,9 @@ def _unstacked(feature: Space[Any], value: Any, name: str) -> list[Any]:
 
 
 def plain_info(value: Any) -> Tree:
-    """An info as a tree: tuples and sets become lists, keys and other objects their text, and NumPy's numbers stay.
+    """An info as a tree: tuples and sets become lists, keys and other objects text; NumPy numbers are unchanged.
 
-    NaN is let through: nothing learns from an info.
+    NaN is accepted, because no policy learns from an info.
     """
     if isinstance(value, str):  # first: NumPy's texts would be taken for numbers
         return value.encode(errors="replace").decode()  # halves of surrogate pairs cannot be sent
@@ -216,7 +216,7 @@ def tree_to_json(tree: Tree) -> Any:
 
 
 def tree_from_json(value: Any) -> Tree:
-    """The tree that `tree_to_json` was given. Raises ProtocolError where an array in it is not one."""
+    """The tree that `tree_to_json` encoded. Raises ProtocolError for an invalid array in it."""
     if isinstance(value, list):
         return [tree_from_json(one) for one in value]
     if not isinstance(value, Mapping):
@@ -247,7 +247,7 @@ _MARKS: dict[str, Callable[[Any], Any]] = {
 
 
 def number_dtype(text: Any) -> np.dtype[Any]:
-    """The dtype in a message. Raises ValueError unless it is of numbers: no objects, no records."""
+    """The dtype in a message. Raises ValueError unless it is numeric: no objects, no records."""
     if not isinstance(text, str) or not _DTYPE.fullmatch(text):
         raise ValueError(f"{brief(text)} is no dtype of numbers")
     return np.dtype(text)

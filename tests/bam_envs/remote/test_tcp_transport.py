@@ -120,7 +120,7 @@ def test_nobody_listens():
     with socket.create_server(("127.0.0.1", 0)) as free:
         port = free.getsockname()[1]
     assert refused(f"tcp://127.0.0.1:{port}") == (
-        f"nobody listens there (is the port open?). Start one: bam-serve --env bam/pick --tcp {port}"
+        f"nothing listens there (is the port open?). Start one: bam-serve --env bam/pick --tcp {port}"
     )
     assert refused(f"tcp://127.0.0.1:{port}", env_id="bam/reach").endswith(f"bam-serve --env bam/reach --tcp {port}")
 

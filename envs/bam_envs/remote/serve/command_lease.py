@@ -1,4 +1,4 @@
-"""Which client is in command: one at a time; the others see its name."""
+"""The lease on command: one client is in command at a time; the others see its name."""
 
 import threading
 import time
@@ -9,23 +9,23 @@ from bam_envs.core.errors import NotInCommand
 from bam_envs.rosbridge.bus import UNKNOWN_CALLER, Caller
 
 Change = Callable[[str | None, str | None], None]
-"""Called with the names, as others see them, of the client that was in command and of the one that is, or None."""
+"""Called with the shown names of the clients that were and are in command; each may be None."""
 LEASE_SECONDS = 2.0
-"""Usual time without a sign of life after which another client may take command [s]."""
+"""Default time without a sign of life after which another client may take command [s]."""
 
 
 class CommandLease:
-    """Command of one robot or environment. The first to ask has it, until it leaves or another one may take it.
+    """Command of one robot or environment. The first client to ask has it until it leaves or another one may take it.
 
     A client without a sign of life for longer than `seconds` [s] keeps command until another one asks. A sign of life
-    is a request, `renew`, or what the connection shows by itself. Safe to call from any thread.
+    is a request, `renew`, or activity of the connection. Thread-safe.
     """
 
     def __init__(self, seconds: float = LEASE_SECONDS, clock: Callable[[], float] = time.monotonic) -> None:
         self.seconds = seconds
         self._clock, self._lock = clock, threading.RLock()
         self._holder: str | None = None
-        self._shown: str | None = None  # what the holder is called where others read it
+        self._shown: str | None = None  # the holder's name for other clients
         self._heard, self._caller = 0.0, UNKNOWN_CALLER  # the connection on which it was taken
         self._running = 0
         self._listeners: list[Change] = []
@@ -36,22 +36,22 @@ class CommandLease:
         return self._holder
 
     def on_change(self, listener: Change) -> None:
-        """Call `listener` whenever command changes, in the thread that changes it, which holds no lock of this."""
+        """Call `listener` whenever command changes, in the thread that changes it, without this object's lock."""
         self._listeners.append(listener)
 
     def take(
         self, client: str, caller: Caller = UNKNOWN_CALLER, *, force: bool = False, shown: str | None = None
     ) -> bool:
-        """Put `client` in command; whether it was not before.
+        """Put `client` in command; True if it was not before.
 
         Args:
             client: Its name.
-            caller: The connection on which it asks.
-            force: Take it from the client that has it.
-            shown: What other clients see instead of its name, where that is a secret.
+            caller: Its connection.
+            force: Take command from the client that has it.
+            shown: The name that other clients see, if `client` is a secret.
 
         Raises:
-            NotInCommand: Another client has it, and gave a sign of life within `seconds`.
+            NotInCommand: Another client has command, and gave a sign of life within `seconds`.
         """
         with self._lock:
             if self._holder not in (None, client) and not force:
@@ -82,7 +82,7 @@ class CommandLease:
 
     @contextmanager
     def busy(self, client: str) -> Iterator[None]:
-        """While a request of `client` runs, however long it takes, it does not count as silent."""
+        """A context in which `client` does not count as silent, for a request of any duration."""
         with self._lock:
             self.require(client)
             self._running += 1
@@ -94,10 +94,10 @@ class CommandLease:
                     self._running, self._heard = max(0, self._running - 1), self._clock()
 
     def release(self, client: str | None = None, connection: str = "") -> bool:
-        """Take command from `client`, or from who took it on the `connection` of that name; whether it had it."""
+        """Take command from `client`, or from the client of `connection`; True if it had command."""
         with self._lock:
-            its_own = bool(connection) and connection == self._caller.name
-            if self._holder is None or not (its_own or client == self._holder):
+            connected = bool(connection) and connection == self._caller.name
+            if self._holder is None or not (connected or client == self._holder):
                 return False
             before, self._shown = self._shown, None
             self._holder, self._running = None, 0

@@ -1,8 +1,7 @@
-"""One environment, its episode and who is in command of it; every service of `bam-serve` asks it.
+"""One environment, its episode and the lease on it, shared by all services of `bam-serve`.
 
-The environment runs in the thread that asks, one request at a time under `EnvServer.lock`. A thread of its own would
-cost two hand-overs a step, which is more than a step through TCP, and only rendering would need it: that is not
-served.
+The environment runs in the calling thread, one request at a time under `EnvServer.lock`. A separate thread would cost
+two hand-overs a step, more than a step through TCP, and only rendering, which is not served, would need it.
 """
 
 import re
@@ -79,18 +78,18 @@ def _other_names() -> dict[str, str]:
 
 
 class EnvServer:
-    """Serves an environment to clients, one of them in command. Safe to call from any thread; calls wait their turn.
+    """Serves an environment to clients, one of them in command. Thread-safe; calls run one after another.
 
     Args:
         env: Any Gymnasium environment, or a vector environment that resets in the same step.
         lease: Time without a sign of life after which another client may take command [s], or a lease that is shared.
         realtime: A step returns no sooner than one period after the one before.
-        env_id: What to call it; its Gymnasium id by default.
+        env_id: The id for clients; its Gymnasium id by default.
         clock: A monotonic clock [s].
         sleep: Waits [s].
 
     Raises:
-        InvalidValue: `env` resets in another step, or `realtime` and it has no period.
+        InvalidValue: `env` resets in another step, or has no period for `realtime`.
     """
 
     def __init__(
@@ -110,23 +109,23 @@ class EnvServer:
         self._spec = describe_env(env, env_id)
         if realtime and self._spec.period is None:
             raise InvalidValue(
-                f"{self._spec.env_id} does not say its period, so it has no real time; serve it with --fast."
+                f"{self._spec.env_id} does not report its period, so it has no real time; serve it with --fast."
             )
         self._pacer = Pacer(self._spec.period, now=clock, sleep=sleep) if realtime else None
         self._clock, self._ended, self._closed = clock, False, False
-        self._episode: str | None = None  # whose is running
-        self._over: str | None = None  # whose came to its end
+        self._episode: str | None = None  # the client whose episode is running
+        self._over: str | None = None  # the client whose episode has ended
         self.lease.on_change(self._end_episode)
 
     def spec(self) -> EnvSpecMessage:
-        """What is served."""
+        """The description of the environment."""
         return self._spec
 
     def require_name(self, name: str) -> None:
-        """Raise RemoteError unless `name` is "" or a name of what is served.
+        """Raise RemoteError unless `name` is "" or a name of the environment.
 
-        Namespace, version, case and punctuation do not count: ``PickPlace`` and ``bam/pick-place-v0`` are one name; so
-        are robo-gym's name and ours.
+        Namespace, version, case and punctuation are ignored: ``PickPlace`` and ``bam/pick-place-v0`` are one name. The
+        environment's name in robo-gym is accepted too.
         """
         wanted, served = (_other_names().get(one, one) for one in (_plain_name(name), _plain_name(self._spec.env_id)))
         if name and wanted != served:
@@ -143,16 +142,16 @@ class EnvServer:
         caller: Caller = UNKNOWN_CALLER,
         shown: str | None = None,
     ) -> tuple[Any, Any]:
-        """Put `client` in command and begin an episode; as `Transport.reset`.
+        """Put `client` in command and begin an episode; see `Transport.reset`.
 
         Args:
             client: Its name.
-            seed: See above.
-            options: See above.
+            seed: As for Gymnasium.
+            options: As for Gymnasium.
             take: Take command from the client that has it, which only an operator may.
-            deadline: When it is too late to begin [s], on the clock of this server.
-            caller: The connection on which it asks.
-            shown: What other clients see instead of its name, where that is a secret.
+            deadline: Latest time to begin [s], on the clock of this server.
+            caller: Its connection.
+            shown: The name that other clients see, if `client` is a secret.
 
         Raises:
             NotInCommand: Another client is in command.
@@ -168,10 +167,10 @@ class EnvServer:
         with self.lease.busy(client), self._turn(client, deadline):
             self._episode = self._over = None
             with _errors_of_environment():
-                given = None if options is None else dict(options)  # environments may change it
-                if given and "reset_mask" in given:
-                    given["reset_mask"] = np.asarray(given["reset_mask"], dtype=bool)
-                observation, info = self.env.reset(seed=seed, options=given)  # type: ignore[arg-type]
+                copy = None if options is None else dict(options)  # environments may change it
+                if copy and "reset_mask" in copy:
+                    copy["reset_mask"] = np.asarray(copy["reset_mask"], dtype=bool)
+                observation, info = self.env.reset(seed=seed, options=copy)  # type: ignore[arg-type]
                 begun: tuple[Any, Any] = self._checked(observation, info)
             self._episode = client
         if self._pacer is not None:
@@ -180,7 +179,7 @@ class EnvServer:
         return begun
 
     def step(self, client: str, action: Any, *, deadline: float | None = None) -> tuple[Any, Any, Any, Any, Any]:
-        """Do `action` before `deadline` [s], on the clock of this server; as `Transport.step`.
+        """Execute `action` before `deadline` [s], on the clock of this server; see `Transport.step`.
 
         Raises:
             NotInCommand: Another client is in command.
@@ -198,28 +197,28 @@ class EnvServer:
                 each = enumerate(self._spec.each(action)) if vector else ()
                 many = [exact(space, one, f"action of environment {i}") for i, one in each]
                 checked = stack(space, many) if vector else exact(space, action, "action")
-                self._episode = None  # until it went well
+                self._episode = None  # until the step succeeds
                 with _errors_of_environment():
                     observation, reward, terminated, truncated, info = self.env.step(checked)
                     stepped: tuple[Any, Any, Any, Any, Any]
                     stepped = self._checked(observation, reward, terminated, truncated, info)
-                goes_on = vector or not (stepped[2] or stepped[3])
-                self._episode, self._over = (client, None) if goes_on else (None, client)
+                running = vector or not (stepped[2] or stepped[3])
+                self._episode, self._over = (client, None) if running else (None, client)
             if self._pacer is not None:
                 self._pacer.wait()
         return stepped
 
     def has_ended(self, client: str) -> bool:
-        """Whether `client` is in command, and its last episode came to its end."""
+        """Whether `client` is in command, and its last episode has ended."""
         return self._over == client
 
     def leave(self, client: str | None = None, connection: str = "") -> None:
-        """Release command as `CommandLease.release`: the robot halts and another client may take command."""
+        """Release command, see `CommandLease.release`: the robot halts and another client may take command."""
         if self.lease.release(client, connection):
             self._halt()
 
     def end(self) -> None:
-        """Refuse every request from now on; returns when the one that runs is done."""
+        """Refuse every request from now on; returns when the running one has ended."""
         with self.lock:
             self._ended = True
 
@@ -240,7 +239,7 @@ class EnvServer:
 
     @contextmanager
     def _turn(self, client: str, deadline: float | None) -> Iterator[None]:
-        """Wait for the environment; then `client` must still be in command, and the time not over."""
+        """Wait for the environment; raises if `client` is no longer in command or the deadline has passed."""
         with self.lock:
             self.lease.require(client)
             if deadline is not None and self._clock() > deadline:
@@ -260,7 +259,7 @@ class EnvServer:
         return spec.joined([self._checked_one(f" of environment {i}", *row) for i, row in rows])
 
     def _checked_one(self, where: str, last: Any, observation: Any, *rest: Any) -> tuple[Any, ...]:
-        """The result of one environment, whose episode before ended with the observation `last` in this step."""
+        """The checked result of one environment; `last` is the final observation of an episode that ended, or None."""
         space, (*ends, info) = self._spec.observation_space, rest
         checked = [exact(space, observation, f"observation{where}")]
         if ends:
@@ -279,10 +278,10 @@ class EnvServer:
 
 @contextmanager
 def _errors_of_environment() -> Iterator[None]:
-    """Tell the client what the environment raises; the server goes on."""
+    """Raise errors of the environment as `RemoteError`, which the client gets; the server continues."""
     try:
         yield
-    except Exception as error:  # environments are other people's code and raise anything
+    except Exception as error:  # environments may raise anything
         raise RemoteError(f"{type(error).__name__}: {' '.join(str(error).split())}") from error
 
 

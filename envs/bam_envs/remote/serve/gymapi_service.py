@@ -38,18 +38,18 @@ _LONGEST_NAME = 100
 
 
 class GymApiService:
-    """Answers GymAPI requests for an `EnvServer`: those of racks' own clients, and of `RosbridgeTransport`.
+    """Answers GymAPI requests for an `EnvServer`: those of the racks' own clients, and of `RosbridgeTransport`.
 
-    A request with a tag is executed once and only in time; without one, which is a rack's own client, it is executed
-    as it comes, and a step after the end of an episode begins the next one. The name of a client is ``client_id`` with
-    its session, or with its connection.
+    A request with a tag is executed once and only in time. A request without one, of a rack's own client, is always
+    executed, and a step after the end of an episode begins the next one. The name of a client is ``client_id`` with
+    its session or its connection.
 
     Args:
-        env: What is served.
-        bus: Where.
-        namespace: Put before every name.
+        env: The served environment.
+        bus: The bus for the service and the topics.
+        namespace: Prefix of every name.
         image_format: ``"png"``, which keeps every bit, or ``"jpeg"``.
-        version: Of the answers, such as ``"2025-06-17"``, where the request does not show its own; None for that of the
+        version: Version of the answers, such as ``"2025-06-17"``, if the request does not show it; None for that of the
             compiled types on the other side of `bus`, or the newest.
         clock: Wall clock [s], for stamps.
     """
@@ -71,12 +71,12 @@ class GymApiService:
         self._freshness = FreshnessCheck()
         self._leaving = ThreadPoolExecutor(1, "bam-gymapi-leaving")
         self._sessions = Sessions()
-        # Everybody can read what is published: the tag in it proves nothing.
+        # Every client can read published requests, so the tag in one proves nothing.
         published = partial(self.handle, published=True)
         self._topics = StringRpcService(bus, base_name(namespace), published, self._sessions)
 
     def start(self) -> GymApiService:
-        """Offer the service and the topics; itself."""
+        """Offer the service and the topics. Returns itself."""
         if self._version is None:
             self._version = version_of_bus(self.bus)
         self.bus.on_leave(self._on_leave)
@@ -86,23 +86,23 @@ class GymApiService:
         return self
 
     def close(self) -> None:
-        """Answer on the topics no more. The service ends with its bus."""
+        """Stop answering on the topics. The service ends with its bus."""
         self._topics.close()
         self._leaving.shutdown()
 
     def handle(self, message: Message, caller: Caller, *, published: bool = False) -> dict[str, Any]:
-        """The response to a request; never raises: what goes wrong is the text of a failure."""
+        """The response to a request; never raises: an error becomes the text of a failure."""
         begun, version = time.monotonic(), version_of_request(message) or self._version or JUNE_22
         try:
             request = read_request(message)
-            if request.tag is not None and not published:  # what carries a published one has looked at a tag of its own
+            if request.tag is not None and not published:  # `StringRpcService` has checked the tag of a published one
                 self._freshness.require(request.tag)
             deadline = None if request.tag is None else begun + request.tag.deadline - request.tag.sent
             feedback = self._perform(request, version, caller, deadline, published)
             return write_response(feedback, time.monotonic() - begun, self._stamp(), version)
         except BamEnvsError as error:
             failure = error
-        except Exception as error:  # a service always answers, whatever the environment does
+        except Exception as error:  # a service always answers
             _log.exception("%s failed", service_name(self.namespace))
             failure = RemoteError(f"{type(error).__name__}: {error}")
         return write_failure(failure, time.monotonic() - begun, self._stamp(), version)
@@ -112,8 +112,8 @@ class GymApiService:
     ) -> list[dict[str, Any]]:
         self.env.require_name(request.env_name)
         name = request.client_id[:_LONGEST_NAME] or "somebody"
-        # The same client when it comes back on another connection: the session in the tag of a service call is known to
-        # nobody else, so it is never shown to others.
+        # The session in the tag of a service call identifies a client on any of its connections. It is a secret, so it
+        # is never shown to others.
         mark = (caller.session or caller.name) if published or request.tag is None else request.tag.session
         client = f"{name}#{mark}" if mark else name
         shown = f"{name} ({caller.address})" if caller.address else name
@@ -140,6 +140,6 @@ class GymApiService:
 
     def _on_leave(self, caller: Caller) -> None:
         self._sessions.left(caller)
-        # In another thread: it waits for a step that runs, and this is the thread of the network.
+        # In another thread, because it waits for a running step, and this is the network thread.
         with suppress(RuntimeError):  # closed meanwhile
             self._leaving.submit(self.env.leave, connection=caller.name)

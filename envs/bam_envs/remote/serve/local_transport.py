@@ -10,7 +10,7 @@ from bam_envs.remote.transport import EnvSpecMessage, Info, Seed
 
 
 class LocalTransport:
-    """An environment in this process, without a network. Results are those of the other transports bit for bit.
+    """An environment in this process, without a network. Results equal those of the other transports bit for bit.
 
     Args:
         env: An environment (see `EnvServer`), or a server, which others may share.
@@ -41,7 +41,7 @@ class LocalTransport:
             return self.server.step(self.client, action)
 
     def close(self) -> None:
-        """Release the environment; one that no server shares is closed."""
+        """Release the environment, and close it unless it came with a server."""
         self._closed = True
         self.server.leave(self.client)
         if self._owned:
@@ -54,7 +54,7 @@ class LocalTransport:
 
 @contextmanager
 def _as_over_a_network() -> Iterator[None]:
-    """Raise the errors of the server as the client of another transport gets them."""
+    """Raise the server's errors as other transports do."""
     try:
         yield
     except (RemoteError, InvalidValue):

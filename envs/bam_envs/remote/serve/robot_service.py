@@ -1,10 +1,10 @@
 """The topics of a served robot: states out, commands in from one client at a time; halt, scene, and its description.
 
-Commands are checked in the thread of the network, where they arrive, and refusals go back to their sender. An
-accepted command goes into one slot; the clock's thread takes it from there, moves the robot and publishes.
+Commands are checked in the network thread, where they arrive, and refusals go back to their sender. An accepted
+command goes into one slot; the clock's thread takes it from there, moves the robot and publishes.
 
-Everything that moves the robot, or keeps it from moving, is in this file, so that one can see that a halt wins over
-each of them.
+Everything that moves the robot, or keeps it from moving, is in this file, to show that a halt has priority over all of
+it.
 """
 
 import logging
@@ -32,23 +32,23 @@ from bam_envs.rosbridge.string_rpc import StringRpcService
 _log = logging.getLogger(__name__)
 
 IDLE_PERIOD = 0.05
-"""Time between two states when time goes on only with commands, and none come [s]."""
+"""Time between two states in lockstep without commands [s]."""
 _ROUNDING = 1e-9
-"""How far beyond a limit a number may be that went through text and other units."""
+"""Tolerance of limits, for numbers that were converted to text and other units."""
 
 
 @dataclass(frozen=True)
 class Order:
-    """What the messages since the last look command together."""
+    """The combined command of the messages since the last tick."""
 
     values: Mapping[int, float] = field(default_factory=dict)
-    """Place in the command -> number [SI]; places that are not in it stay as they are."""
+    """Index in the command -> number [SI]; missing indices keep their values."""
     complete: bool = False
-    """Whether the message that makes a command complete is among them."""
+    """Whether the message that completes a command is among them."""
     tag: str = ""
-    """`Tag.echo` of the newest one."""
+    """`Tag.echo` of the newest message."""
     client: str = ""
-    """Who sent them."""
+    """The client that sent them."""
 
 
 class CommandSlot:
@@ -58,14 +58,14 @@ class CommandSlot:
         self._lock, self._order = threading.Lock(), Order()
 
     def put(self, new: Order) -> None:
-        """Add what a message commands; what was there for the same places, or of another client, is forgotten."""
+        """Add the values of a message; they replace those of the same indices, and all values of another client."""
         with self._lock:
             old = self._order if self._order.client == new.client else Order()
             values, complete = {**old.values, **new.values}, old.complete or new.complete
             self._order = Order(values, complete, new.tag or old.tag, new.client)
 
     def take(self, *, complete: bool = False) -> Order:
-        """What came, once; an order without values if nothing did, or with `complete` as long as it is not complete."""
+        """Remove and return the order; it has no values if none came or, with `complete`, it is not complete yet."""
         with self._lock:
             if complete and not self._order.complete:
                 return Order()
@@ -77,11 +77,11 @@ class RobotService:
     """Puts one simulated robot on a bus.
 
     Args:
-        robot: Everything else that moves it does so through this object, too.
+        robot: The robot; everything else that moves it must use this object too.
         profile: Its topics; those of commands that `robot` does not take are not offered.
-        bus: Carries them.
-        lease: Who is in command; shared with everything else that moves the robot.
-        namespace: Before every topic, such as ``/cell_1``; or nothing.
+        bus: The bus of its topics.
+        lease: The lease on command; shared with everything else that moves the robot.
+        namespace: Prefix of every topic, such as ``/cell_1``; or empty.
     """
 
     def __init__(
@@ -92,7 +92,7 @@ class RobotService:
         self._namespace, lockstep = namespace, not robot.realtime
         text = f"{profile.name}, served in real time; it rests {robot.command_timeout:g} s after the last command"
         if lockstep:
-            text = f"{profile.name}, served in lockstep: its time goes on with commands, {robot.spec.period:g} s each"
+            text = f"{profile.name}, served in lockstep: its time advances with commands, {robot.spec.period:g} s each"
         self.info = RobotInfo(profile.name, True, lockstep, robot.spec.period, text)
         """Its description for clients."""
         self._slot = CommandSlot()
@@ -101,7 +101,7 @@ class RobotService:
         self._low, self._high = np.array(robot.spec.command.low), np.array(robot.spec.command.high)
         self._answered = ""  # `Tag.echo` of the last command that was executed
         self._connected = True
-        self._moving = threading.Lock()  # an order that was taken is begun before a halt, or not at all
+        self._moving = threading.Lock()  # an order is begun before a halt, or not at all
         self._unsubscribe: list[Callable[[], None]] = []
         self._scene = StringRpcService(bus, namespace + SCENE_TOPIC, self._set_scene, self._sessions)
         self.clock = Ticker(self.tick, IDLE_PERIOD if lockstep else robot.tick_period)
@@ -171,12 +171,12 @@ class RobotService:
             self._lease.release(client)
 
     def _on_halt(self, message: Message, caller: Caller) -> None:
-        """Halt, for any client. In lockstep the one whose command it overtook gets its answer: nothing moved."""
+        """Halt, for any client. In lockstep a command that the halt overtook is answered, but not executed."""
         if self._rest().complete and self.info.lockstep:
             self.clock.wake()
 
     def _rest(self) -> Order:
-        """Halt; the order that was to be executed next, and is not."""
+        """Halt; returns the pending order, which is not executed."""
         with self._moving:
             order = self._slot.take()
             self._robot.halt()
@@ -191,7 +191,7 @@ class RobotService:
         self._lease.release(caller.client)
 
     def _on_change(self, before: str | None, after: str | None) -> None:
-        if before is not None:  # what it sent is not to go on under another one
+        if before is not None:  # its command must not continue under another client
             self._rest()
             self._answered = ""
 
@@ -211,7 +211,7 @@ class RobotService:
         return {}
 
     def tick(self) -> None:
-        """Let time pass, as the clock does: in lockstep a period if a command is complete, else a part of one."""
+        """Advance the robot, called by the clock: in lockstep a period if a command is complete, else part of one."""
         lockstep = self.info.lockstep
         with self._moving:
             order = self._slot.take(complete=lockstep)
@@ -233,21 +233,21 @@ class RobotService:
 
     def _publish(self) -> None:
         state = self._robot.state
-        if state is None or self._robot.fault is not None:  # who listens sees that it has become stale
+        if state is None or self._robot.fault is not None:  # subscribers see that the state becomes stale
             return
-        if getattr(self._bus, "clients", 1) == 0:  # an embedded server knows that nobody listens
+        if getattr(self._bus, "clients", 1) == 0:  # an embedded server without clients
             return
         stamp: Callable[[float], Mapping[str, int]] = getattr(self._bus, "stamp", write_stamp)
         try:
             envelopes = encode_state(self._profile, state, 0, stamp(time.time()), self._answered)
             self._bus.publish_all([(self._namespace + topic, message) for topic, _, message in envelopes])
             self._connected = True
-        except LinkLost as error:  # nobody hears it, and the command timeout holds the robot
+        except LinkLost as error:  # the command timeout holds the robot
             if self._connected:
                 _log.warning("%s: %s", self._profile.name, error)
             self._connected = False
 
 
 def _only_one(value: object) -> object:
-    """A list with the value of one robot is that value."""
+    """The value of one robot, which may be in a list."""
     return value[0] if isinstance(value, list) and len(value) == 1 else value

@@ -1,4 +1,4 @@
-"""Where an environment is served, and how its time passes; imports nothing that serves."""
+"""The options of a served environment: its addresses and how its time passes; imports no server."""
 
 import ipaddress
 import re
@@ -16,36 +16,36 @@ _EXCLUDE = (("realtime", "fast"), ("via", "rclpy"), ("via", "cert"), ("rclpy", "
 
 @dataclass(frozen=True)
 class ServeOptions:
-    """Where an environment is served, and how its time passes."""
+    """The addresses of a served environment, and how its time passes."""
 
     port: Port = 9090
     """Port of the rosbridge server; 0 takes a free one."""
     bind: str = "127.0.0.1"
-    """Address to listen on; 127.0.0.1 is this computer alone, 0.0.0.0 every network it is in."""
+    """Address to listen on; 127.0.0.1 is this computer only, 0.0.0.0 all its networks."""
     namespace: str = ""
-    """Name before every topic and service, such as bam_001."""
+    """Prefix of every topic and service, such as bam_001."""
     tcp: Port | None = None
     """Serve the environment on this TCP port too, which is faster; 0 takes a free one."""
     via: str | None = None
-    """Offer everything through the rosbridge server at this address (ws://10.0.0.5:9090) instead of one here."""
+    """Offer everything through the rosbridge server at this address (ws://10.0.0.5:9090) instead of a new one."""
     rclpy: bool = False
-    """Be a ROS 2 node instead of a rosbridge server; needs rclpy."""
+    """Run as a ROS 2 node instead of a rosbridge server; needs rclpy."""
     realtime: bool = False
-    """Time passes as on the clock: the default of an environment with a robot."""
+    """Time passes in real time: the default of an environment with a robot."""
     fast: bool = False
     """Time passes only with steps and commands, as fast as they come: the default of other environments."""
     lease: Positive = LEASE_SECONDS
-    """A client that gives no sign of life for so long may lose command to another one [s]."""
+    """Time without a sign of life after which a client may lose command to another one [s]."""
     cert: str | None = None
     """Certificate in PEM, for wss:// instead of ws://."""
     key: str | None = None
     """Its key, if it is in another file."""
     token_file: str | None = None
-    """File with a secret that clients must show; with --via, the one to show there."""
+    """File with a secret that clients must show; with --via, the secret of that server."""
     operator_token_file: str | None = None
-    """File with another secret: who shows that one may take command from others."""
+    """File with another secret: clients that show it may take command from others."""
     no_token: bool = False
-    """Listen on a network without a token: anybody who reaches this computer may command what is served."""
+    """Listen on a network without a token: anybody who reaches this computer may command the environment."""
     ca_file: str | None = None
     """With --via wss://: certificates to trust instead of the system's."""
     image_format: str = "png"
@@ -70,7 +70,7 @@ class ServeOptions:
             raise InvalidValue("--token-file protects nothing with --rclpy: ROS 2 has no token. Leave it out.")
         if self.operator_token_file and not self.listens:
             raise InvalidValue("--operator-token-file means something only where clients connect to this program.")
-        # Nobody is let in from a network by oversight.
+        # Networks without a token need an explicit flag.
         if self._is_open and not self.token_file and not self.no_token:
             raise InvalidValue(
                 f"Anybody who reaches {self._place} could command what is served here: give --token-file, or "
@@ -105,12 +105,12 @@ class ServeOptions:
         if not self._is_open or self.cert:
             return None
         if self.no_token:
-            return f"Anybody who reaches {self._place} may command what is served here, as --no-token says."
-        clear = f"The token travels in the clear to {self._place}, and so does all else"
+            return f"Anybody who reaches {self._place} may command what is served here, because of --no-token."
+        clear = f"The token is sent unencrypted to {self._place}, and so is everything else"
         return f"{clear}: give --cert, or trust that network."
 
     @property
     def prefix(self) -> str:
-        """What stands before every name: ``/bam_001``, or nothing."""
+        """The prefix of every name: ``/bam_001``, or an empty text."""
         stripped = self.namespace.strip("/")
         return f"/{stripped}" if stripped else ""

@@ -1,4 +1,4 @@
-"""Everything that `bam-serve` runs: an environment, the topics of its robot, its services, and what carries them."""
+"""Everything that `bam-serve` runs: an environment, the topics of its robot, its services, and their servers."""
 
 from __future__ import annotations
 
@@ -28,9 +28,9 @@ from bam_envs.rosbridge.tokens import read_token
 from bam_envs.safety.gate import SafeRobot
 
 _LOOK = 3.0
-"""How long a robot that may be there already may take to answer [s]."""
+"""Longest wait for the answer of another robot with the same names [s]."""
 _WITHIN, _AGAIN, _ANSWER = 3.0, 0.2, 3.0
-"""Longest that a ROS graph takes to know of what was declared, time between two looks, longest answer [s]."""
+"""Longest time until a ROS graph lists a declaration, time between two checks, longest wait for an answer [s]."""
 
 
 class ServedEnvironment:
@@ -38,12 +38,12 @@ class ServedEnvironment:
 
     Args:
         env: The environment; it is closed at the end.
-        options: Where and how.
+        options: Its addresses and modes.
         tell: Called with one line of text when another client takes command, and when a link is lost.
 
     Raises:
         InvalidValue: Options that exclude each other.
-        RemoteError: On entering: the server of `via` carries nothing of use.
+        RemoteError: On entering: the server of `via` carries no usable topic or service.
     """
 
     def __init__(self, env: Env, options: ServeOptions, tell: Callable[[str], None] = lambda line: None) -> None:
@@ -52,9 +52,9 @@ class ServedEnvironment:
         self.endpoints: list[str] = []
         """One line for each address where it is served; known when it is started."""
         self.lease = CommandLease(options.lease)
-        """Who is in command."""
+        """The lease on command."""
         self.bus: Bus | None = None
-        """What carries topics and services."""
+        """The bus for topics and services."""
         self.tcp: TcpServer | None = None
         """The TCP transport, if there is one."""
         self._tell, self._stack = tell, ExitStack()
@@ -81,7 +81,7 @@ class ServedEnvironment:
         self._stack.close()
 
     def require_running(self) -> None:
-        """Check that everything that it needs still runs. Raises RemoteError: the robot's clock stands still."""
+        """Raise RemoteError if the robot's clock has stopped."""
         if self.robot_service is not None and not self.robot_service.clock.running:
             raise RemoteError("The clock of the robot stands still.")
 
@@ -124,7 +124,7 @@ class ServedEnvironment:
 
     @property
     def prefix(self) -> str:
-        """What stands before every name; that of the address of ``--via`` if no other is given."""
+        """The prefix of every name; by default the namespace in the address of ``--via``."""
         inherited = self.bus.namespace if isinstance(self.bus, RosbridgeLink) else ""
         return self.options.prefix or inherited
 
@@ -209,7 +209,7 @@ class ServedEnvironment:
         if not offered and not refused & {f"{base}/request", f"{base}/reply"}:
             offered = [f'{base}/request and reply (channel="topics")']
         if profile is not None:
-            # A robot is of use if every state gets out, and commands get in by one mode at least.
+            # A robot is usable if all its states are carried, and the commands of at least one mode.
             modes = [{prefix + sink.topic for sink in mode} for mode in profile.commands.values()]
             states = {prefix + source.topic for source in profile.state}
             if not states & refused and any(not mode & refused for mode in modes):
@@ -220,9 +220,9 @@ class ServedEnvironment:
 
 
 def _profile_of(env: Env) -> RobotProfile | None:
-    """The topics of the environment's robot, if it is alone, simulated, and one that a profile describes."""
+    """The profile of the environment's robot, if it is a single simulated robot with a profile; else None."""
     robot: Any = getattr(env.unwrapped, "robot", None)
-    if getattr(robot, "num_robots", 0) != 1 or isinstance(robot, SafeRobot):  # a live one has topics of its own
+    if getattr(robot, "num_robots", 0) != 1 or isinstance(robot, SafeRobot):  # a live one has topics already
         return None
     try:
         return profile_for(robot.spec)
@@ -242,7 +242,7 @@ def _take_robot(env: Env, profile: RobotProfile, realtime: bool) -> ServedRobot:
 
 
 def _unlisted(link: RosbridgeLink) -> list[str] | None:
-    """Ids of the declarations that rosapi does not know after a while; None if there is no rosapi."""
+    """Ids of the declarations that rosapi does not list in time; None if there is no rosapi."""
     deadline = time.monotonic() + _WITHIN
     while True:
         try:

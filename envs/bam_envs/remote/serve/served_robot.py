@@ -1,7 +1,7 @@
-"""One robot that an environment, topics and a clock use together: how time passes for it, and its command timeout.
+"""One robot that an environment, topics and a clock share: its time and its command timeout.
 
-Time passes in one of two modes. Fast: a period passes at once with each step, and none between steps. In real time: a
-clock calls `ServedRobot.tick`, a command is executed over the period that follows it, and without fresh commands the
+Time passes in one of two modes. Fast: each step takes a period at once, and no time passes between steps. In real time:
+a clock calls `ServedRobot.tick`, a command is executed over the period that follows it, and without fresh commands the
 robot rests.
 """
 
@@ -20,7 +20,7 @@ from bam_envs.core.robot import EnvIds, Initial, Robot, RobotState, checked_comm
 Array = NDArray[np.float64]
 
 PARTS = 5
-"""Ticks a period, of robots that can be stepped in parts (`slices`); others are stepped a period at a time."""
+"""Ticks per period of robots that can be stepped in parts (`slices`); others are stepped a period at a time."""
 
 
 class ServedRobot:
@@ -28,10 +28,10 @@ class ServedRobot:
 
     Args:
         robot: The robot that moves.
-        command_timeout: For how long a command is executed at most [s].
-        zero_rests: Whether a command of zeros is rest, as for speeds; else the robot rests where it is.
-        realtime: How time passes; see the module.
-        patience: In real time, how long a step waits for a clock that stands still [s].
+        command_timeout: Longest time for which a command is executed [s].
+        zero_rests: Whether a command of zeros is rest, as for speeds; else the robot rests at its position.
+        realtime: Whether time passes in real time; see the module.
+        patience: In real time, longest wait of a step for a stopped clock [s].
         now: Monotonic clock [s].
     """
 
@@ -50,9 +50,9 @@ class ServedRobot:
         self.tick_period = robot.spec.period / (PARTS if hasattr(robot, "slices") else 1)
         """Time between two ticks [s]."""
         self.state: RobotState | None = None
-        """The newest one; None before the first `reset`."""
+        """The newest state; None before the first `reset`."""
         self.fault: RobotFault | None = None
-        """What went wrong; cleared by `reset`."""
+        """The fault of the robot, if any; cleared by `reset`."""
         self._robot, self._zero_rests, self._patience, self._now = robot, zero_rests, patience, now
         self._changed = threading.Condition(threading.RLock())
         self._target: Array = np.zeros((self.num_robots, len(robot.spec.command.labels)))
@@ -65,7 +65,7 @@ class ServedRobot:
         self._orders = self._begun = self._done = 0  # commands given, begun, executed over a whole period
 
     def __getattr__(self, name: str) -> Any:
-        """Whatever else the robot has, such as `connect`, `render` and `state_dict`."""
+        """Other attributes of the robot, such as `connect`, `render` and `state_dict`."""
         if name.startswith("_"):
             raise AttributeError(name)
         value = getattr(self._robot, name)
@@ -77,7 +77,7 @@ class ServedRobot:
         return call if callable(value) else value
 
     def reset(self, env_ids: EnvIds, initial: Initial) -> RobotState:
-        """Bring the robot to `initial`; ends what was being executed, and clears a fault."""
+        """Bring the robot to `initial`; ends a running command, and clears a fault."""
         with self._changed:
             self._drop_parts()
             self.fault = None
@@ -86,7 +86,7 @@ class ServedRobot:
             return self.state
 
     def step(self, command: Array) -> RobotState:
-        """Send `command` (n, m); the state one period later. Raises RobotFault; `reset` brings the robot back."""
+        """Send `command` (n, m); returns the state one period later. After a RobotFault a `reset` is needed."""
         with self._changed:
             command = checked_command(command, self._target.shape)
             if not self.realtime:
@@ -113,13 +113,13 @@ class ServedRobot:
     def follow(self, command: Array, *, at_once: bool = True) -> None:
         """Execute the finite `command` (n, m) from the next tick on, at most for the command timeout.
 
-        With `at_once` it does not wait for the end of the period that runs.
+        With `at_once` it does not wait for the end of the current period.
         """
         with self._changed:
             self._target = command
             self._expires, self.resting = self._now() + self.command_timeout, False
             self._orders += 1
-            # With one part to go, a command that came a little early is not worth losing that part for.
+            # A command that came slightly early must not drop the last part of a period.
             if at_once and self._left != 1:
                 self._drop_parts()
 
@@ -129,7 +129,7 @@ class ServedRobot:
             return self._target + 0.0
 
     def tick(self) -> None:
-        """In real time: one part of a period passes. Never raises what the robot raises: see `fault`."""
+        """In real time: one part of a period passes. Stores a fault of the robot in `fault` instead of raising it."""
         with self._changed:
             if self.state is None or self.fault is not None:
                 return
@@ -152,8 +152,8 @@ class ServedRobot:
                 self._changed.notify_all()
 
     def _reachable(self) -> Array:
-        """The target, no farther than the robot may go in a period from where it is."""
-        # The robot itself counts from its last command, which one that comes early finds half executed.
+        """The target, limited to the distance that the robot may move in a period. Shape: (n, m)."""
+        # The robot limits the change from its last command, of which an early command finds only a part executed.
         rate, setpoint = self.spec.command.max_rate, getattr(self._robot, "setpoint", None)
         if not self._midway or rate is None or setpoint is None:
             return self._target
@@ -170,8 +170,8 @@ class ServedRobot:
         """Set the scene of a simulated robot, which stays as it is. Raises RemoteError if it has none.
 
         Args:
-            pose: Where its object is to lie: x, y [m], yaw [rad]; None leaves it. Shape: (n, 3).
-            seeds: For what the robot itself draws. Shape: (n,).
+            pose: Pose of its object: x, y [m], yaw [rad]; None leaves it in place. Shape: (n, 3).
+            seeds: Seeds of the robot's own random numbers. Shape: (n,).
         """
         with self._changed:
             place = getattr(self._robot, "place_object", None)
@@ -180,10 +180,10 @@ class ServedRobot:
             self.state = self.state if place is None else place(pose, seeds)
 
     def halt(self) -> None:
-        """Rest: where it is, or at speed zero. Time goes on, and a step that is waited for ends in time."""
+        """Rest at the current position, or at speed zero. Time continues, and a waiting step ends in time."""
         with self._changed:
             if self.resting:
-                return  # each time it would begin from where gravity has pulled it since
+                return  # a repeated halt would hold the arm lower each time, as gravity has pulled it
             self._robot.halt()
             if self.state is None:
                 return
@@ -191,13 +191,13 @@ class ServedRobot:
             self._target, self.resting = self._rest(self.state), True
 
     def _rest(self, state: RobotState) -> Array:
-        """The command that keeps the robot as it was halted. Shape: (n, m)."""
+        """The command that keeps a halted robot at rest. Shape: (n, m)."""
         if self._zero_rests:
             return np.zeros_like(self._target)
-        setpoint: Array | None = getattr(self._robot, "setpoint", None)  # where its controllers pull now
-        if setpoint is not None:  # it includes how hard a gripper holds
+        setpoint: Array | None = getattr(self._robot, "setpoint", None)  # of its controllers
+        if setpoint is not None:  # it includes the force of a gripper
             return setpoint
-        # What is measured, in place of what was commanded.
+        # The measured values, or the commanded ones if not measured.
         measured = {
             (label, unit): state.signals[signal.name][:, place]
             for signal in self.spec.signals

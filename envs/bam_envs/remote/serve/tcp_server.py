@@ -31,24 +31,24 @@ from bam_envs.rosbridge.server.admission import listening_error
 from bam_envs.rosbridge.tokens import Guesses, Tokens
 
 _LOG = logging.getLogger(__name__)
-_POLL = 0.2  # seconds between two looks at whether the server is closing
-_HELLO_TIMEOUT, _HELLO_LIMIT = 5.0, 65536  # [s], [bytes]: all that a stranger gets
+_POLL = 0.2  # time between two checks whether the server is closing [s]
+_HELLO_TIMEOUT, _HELLO_LIMIT = 5.0, 65536  # limits on the first message of a client [s], [bytes]
 _STRANGERS, _STRANGERS_OF_ONE = 64, 16
 """Most connections without a hello yet: in all, and of one address. The oldest is dropped for a new one."""
 _ROOM = 2**20
-"""What a request may hold beside an action [bytes]."""
+"""Most data in a request beside an action [bytes]."""
 
 
 class TcpServer:
-    """Listens on one port. Nothing that one client sends or leaves undone affects the others or the environment.
+    """Listens on one port. No misbehaving client affects the others or the environment.
 
     Args:
-        server: What is served.
-        host: The interface; 127.0.0.1 is this computer alone.
-        port: 0 for any that is free.
-        token: A secret that clients must know. Nothing is encrypted: whoever reads the network learns it.
-        operator_token: Who shows this one instead may take command from others.
-        max_clients: How many may be connected.
+        server: The served environment.
+        host: The interface; 127.0.0.1 is this computer only.
+        port: 0 takes a free one.
+        token: A secret that clients must show. Nothing is encrypted, so it can be read on the network.
+        operator_token: A client that shows this one instead may take command from others.
+        max_clients: Most clients that may be connected.
         patience: Longest time for the rest of a message, and for a client to take its answer [s].
     """
 
@@ -76,7 +76,7 @@ class TcpServer:
 
     @property
     def url(self) -> str:
-        """What clients connect to."""
+        """Address for clients."""
         return f"tcp://{f'[{self.host}]' if ':' in self.host else self.host}:{self.port}"
 
     def start(self) -> None:
@@ -96,7 +96,7 @@ class TcpServer:
         listener, self._listener = self._listener, None
         if listener is None or self._thread is None:
             return
-        with suppress(OSError):  # wakes the thread on some systems; on others it looks up by itself
+        with suppress(OSError):  # wakes the thread on some systems; on others it polls
             listener.shutdown(socket.SHUT_RDWR)
         self._thread.join()
         listener.close()
@@ -135,10 +135,10 @@ class TcpServer:
         with self._lock:
             self._connections[connection] = None
             strangers = [one for one in self._connections if one.caller is None and not one.dropped]
-            mine = [one for one in strangers if one.host == connection.host]
+            neighbours = [one for one in strangers if one.host == connection.host]
         # Silent connections must not keep others out: a new one is always accepted.
-        if len(mine) > _STRANGERS_OF_ONE:
-            mine[0].drop()
+        if len(neighbours) > _STRANGERS_OF_ONE:
+            neighbours[0].drop()
         elif len(strangers) > _STRANGERS:
             host, _ = Counter(one.host for one in strangers).most_common(1)[0]
             next(one for one in strangers if one.host == host).drop()
@@ -150,7 +150,7 @@ class TcpServer:
             raise
 
     def admit(self, hello: Hello, connection: _Connection) -> None:
-        """Let a client in, and drop its older connections; RemoteError if it may not be here, or there is no room."""
+        """Admit a client, and drop its older connections; RemoteError if it is not allowed, or there is no room."""
         role = None
         if self._tokens.needed or (hello.token and self._tokens.exist):
             if not self._guesses.may_try(connection.host):
@@ -167,7 +167,7 @@ class TcpServer:
             present = sum(one.caller is not None for one in self._connections) - len(older)
             if present >= self.max_clients:
                 raise RemoteError(f"All {self.max_clients} places for clients are taken; try again when one has left.")
-            # As long as the connection is there, the system at its other end is: that is its sign of life.
+            # An open connection is a sign of life of the system at its other end.
             name, operator = connection.client, role == "operator"
             connection.caller = Caller(name, name, operator=operator, silence=lambda: 0.0)
         for one in older:
@@ -175,18 +175,18 @@ class TcpServer:
             self.server.leave(one.client)
 
     def forget(self, connection: _Connection) -> None:
-        """A connection has ended."""
+        """Remove a connection that has ended."""
         self.server.leave(connection.client)
         with self._lock:
             self._connections.pop(connection, None)
 
 
 class _Connection:
-    """One client, in a thread of its own."""
+    """One client, with its thread."""
 
     def __init__(self, owner: TcpServer, sock: socket.socket, host: str, port: int) -> None:
         self.host, self.client, self.session = host, f"{host}:{port}", ""
-        self.caller: Caller | None = None  # known when it is let in
+        self.caller: Caller | None = None  # known after its admission
         self.dropped = False  # hung up; its thread has yet to end
         self._owner, self._frames = owner, FrameSocket(sock)
         self.thread = threading.Thread(target=self._run, name=f"bam-tcp {self.client}", daemon=True)

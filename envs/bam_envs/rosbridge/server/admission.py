@@ -1,4 +1,4 @@
-"""Which clients may come in: tokens, the number of clients, the server's certificate; and why it cannot listen."""
+"""The admission of clients: tokens, the number of clients, the server's certificate; and errors of listening."""
 
 import asyncio
 import contextlib
@@ -28,12 +28,12 @@ _PAGE_REFUSED = (
     'To let it in, start the server with one, and send it as the first message: {"op": "auth", "token": TOKEN}.'
 )
 _FIRST = 'The first message of a page must be its token, within {:g} s: {{"op": "auth", "token": TOKEN}}'
-_POLICY_VIOLATION = 1008  # close code of who does not show its token
+_POLICY_VIOLATION = 1008  # close code for a client that does not show its token
 _logger = logging.getLogger(__name__)
 
 
 class Admission:
-    """Lets clients in, or says why not; `present` says how many there are."""
+    """Admits or refuses clients; `present` returns the number of clients."""
 
     def __init__(self, tokens: Tokens, options: ServerOptions, present: Callable[[], int]) -> None:
         self._tokens, self._guesses = tokens, Guesses()
@@ -56,7 +56,7 @@ class Admission:
             _logger.warning(_PAGE_REFUSED, ", ".join(request.headers.get_all("Origin"))[:100])
             return connection.respond(HTTPStatus.FORBIDDEN, _NO_PAGES + "\n")
         elif is_page:
-            return None  # browsers set no headers, and an address with a token is logged: it may be a message, too
+            return None  # browsers set no headers, and an address with a token is logged; `greet` reads a message
         elif self._tokens.needed:
             return _unauthorized(connection)
         if full := self._full():
@@ -65,7 +65,7 @@ class Admission:
         return None
 
     async def greet(self, connection: BridgeConnection) -> None:
-        """See to it that who came in without a token shows it now, or is closed."""
+        """Close a connection that was opened without a token unless its first message shows one."""
         if connection.role is not None:
             return
         limit = self._options.token_timeout
@@ -80,7 +80,7 @@ class Admission:
             await connection.close(_POLICY_VIOLATION, reason)
 
     def _judge(self, connection: BridgeConnection, shown: list[str]) -> str | None:
-        """Set the role of who shows these; why it gets none, or None."""
+        """Set the role of a client that shows these tokens; returns the reason for a refusal, or None."""
         if not self._guesses.may_try(connection.host):
             return _TOO_OFTEN
         connection.role = self._tokens.role(shown)
@@ -101,7 +101,7 @@ def _unauthorized(connection: BridgeConnection) -> Response:
 
 
 def tls_context(cert: str, key: str | None) -> ssl.SSLContext:
-    """A server's side of TLS, from the files of its certificate chain and of its key (None: in the same one)."""
+    """TLS settings of a server, from the files of its certificate chain and its key (None: in the same file)."""
     context, files = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER), " and ".join(filter(None, (cert, key)))
     try:
         context.load_cert_chain(cert, key)
@@ -116,7 +116,7 @@ def tls_context(cert: str, key: str | None) -> ssl.SSLContext:
 
 
 def listening_error(host: str, port: int, error: OSError | UnicodeError) -> InvalidValue:
-    """Why a server cannot listen, and what to do."""
+    """The error of a server that cannot listen, with a remedy."""
     number = error.errno if isinstance(error, OSError) else None
     if number == errno.EADDRINUSE:
         return InvalidValue(

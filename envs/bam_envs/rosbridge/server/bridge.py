@@ -1,7 +1,7 @@
-"""The rosbridge v2 protocol of a server without any I/O: frames in, things to do out, the time passed in.
+"""The server side of the rosbridge v2 protocol without I/O: it takes frames and the time, and returns events.
 
-Whatever a client sends, it is answered: a request by its response, everything else that does not work by a message
-``status``. Every operation of the protocol is here.
+Every message of a client is answered: a request by its response, any other failure by a message ``status``. Every
+operation of the protocol is here.
 """
 
 import contextlib
@@ -46,14 +46,14 @@ _NO_AUTH = "The op auth is for the first message of a web page; this client has 
 
 
 class Incoming(NamedTuple):
-    """A frame of a client, read."""
+    """A decoded frame of a client."""
 
     message: Mapping[str, Any]
-    kind: str  # the type that its content was checked for; empty where there was nothing to check
-    content: Any  # what it carries (a message, arguments, a response), complete, or the error why not
+    kind: str  # the type that its content was checked for; empty without content
+    content: Any  # its complete content (a message, arguments, a response), or the error of the check
 
     def content_of(self, kind: str) -> Any:
-        """The content, or the error that it does not fit, or should be of another type by now."""
+        """The content; raises if it does not fit, or the type has changed meanwhile."""
         if self.kind != kind:
             raise ProtocolError(f"Expected a {kind}, found a {self.kind}: the type was another one a moment ago.")
         if isinstance(self.content, BamEnvsError):
@@ -85,11 +85,11 @@ class Bridge:
     # ---- clients
 
     def open(self, caller: Caller) -> Session:
-        """A client connected."""
+        """Add a client that connected."""
         return Session(caller, self.options)
 
     def lost(self, session: Session) -> None:
-        """Its connection ended: everything of it ends."""
+        """Remove a client whose connection ended, with everything that it declared."""
         self._fragmented.discard(session)
         self.services.leave(session)
         self.topics.leave(session)
@@ -97,7 +97,7 @@ class Bridge:
             tell(callback, session.caller)
 
     def read(self, frame: str | bytes, *, joined: bool = False) -> Incoming | ProtocolError:
-        """What a frame, or the text `joined` from fragments, says, for `take`: maybe long work, in any thread."""
+        """Decode a frame, or the text `joined` from fragments, for `take`. May take long; thread-safe."""
         try:
             message = decode_frame(frame)
             if joined and message.get("op") == "fragment":
@@ -112,7 +112,7 @@ class Bridge:
             return Incoming(message, kind, error)
 
     def _carried(self, message: Mapping[str, Any]) -> tuple[str, Callable[[], Any]]:
-        """The type of what a message carries, empty where it carries nothing, and what completes it."""
+        """The type of a message's content, empty without content, and the function that completes the content."""
         operation = message.get("op")
         if operation == "publish":
             topic = self.topics.get(read_name(message, "topic"))
@@ -130,7 +130,7 @@ class Bridge:
         return "", lambda: None
 
     def take(self, session: Session, incoming: Incoming | ProtocolError, now: float) -> str | None:
-        """Do what a frame says, at `now` [s, steady]; returns the text of a message whose last fragment it was."""
+        """Execute a frame at `now` [s, steady]; returns the joined text if it was the last fragment of a message."""
         if isinstance(incoming, ProtocolError):
             self._status(session, str(incoming))
             return None
@@ -151,7 +151,7 @@ class Bridge:
         return None
 
     def tick(self, now: float) -> None:
-        """Do what `next_deadline` was about."""
+        """Execute the work that is due at `next_deadline`."""
         self.services.expire(now)
         self.topics.tick(now)
         for session in list(self._fragmented):
@@ -166,7 +166,7 @@ class Bridge:
         return min(self.services.deadline, self.topics.deadline, *fragments)
 
     def events(self) -> list[Event]:
-        """What is to be done, in this order; empties the list."""
+        """Return the events in their order, and clear them."""
         events = self._events[:]
         self._events.clear()
         return events
@@ -174,18 +174,18 @@ class Bridge:
     # ---- this process; names and types as in `Bus`, and a wrong one raises InvalidValue
 
     def advertise(self, topic: str, kind: str, *, latch: bool = False) -> None:
-        """This process publishes `topic`."""
-        found = self.topics.require(canonical(topic), kind)
-        found.publishers.add(None)
+        """Declare that this process publishes `topic`."""
+        entry = self.topics.require(canonical(topic), kind)
+        entry.publishers.add(None)
         if latch:
-            found.latching.add(None)
+            entry.latching.add(None)
 
     def publication(self, topic: str, message: Message) -> Publication:
-        """A message of this process, checked; from any thread. For `publish`."""
+        """Check a message of this process, for `publish`. Thread-safe."""
         return _publication(self._existing(canonical(topic)), message)
 
     def publish(self, publication: Publication, now: float, publisher: Session | None = None) -> None:
-        """Send a message, of this process unless a client is its `publisher`, to all who want it."""
+        """Send a message, of this process unless a client is its `publisher`, to all subscribers."""
         topic = self.topics.get(publication.topic)
         if topic is None or topic.kind != publication.kind:
             return
@@ -194,29 +194,29 @@ class Bridge:
             self._deliver(listener, publication, publisher)
 
     def subscribe(self, topic: str, kind: str, listener: Listener) -> Callable[[], None]:
-        """Call `listener` for each message of `topic`, the latched one at once, until what is returned is called."""
-        found = self.topics.require(canonical(topic), kind)
-        found.listeners.append(listener)
-        if found.latched is not None:
-            publisher, publication = found.latched
+        """Call `listener` for each message of `topic`, the latched one at once. Returns a function that ends this."""
+        entry = self.topics.require(canonical(topic), kind)
+        entry.listeners.append(listener)
+        if entry.latched is not None:
+            publisher, publication = entry.latched
             self._deliver(listener, publication, publisher)
 
         def unsubscribe() -> None:
-            if listener in found.listeners:
-                found.listeners.remove(listener)
-                self.topics.forget(found)
+            if listener in entry.listeners:
+                entry.listeners.remove(listener)
+                self.topics.forget(entry)
 
         return unsubscribe
 
     def serve(self, service: str, kind: str, handler: Handler) -> None:
-        """Answer `service` with `handler`; the events that are a `Call` say when."""
+        """Answer `service` with `handler`, which runs for each event that is a `Call`."""
         self.services.offer(Service(canonical(service), normal_name(kind), service, handler=handler))
 
     def on_leave(self, callback: Callable[[Caller], None]) -> None:
         """Call `callback` when a client's connection ends."""
         self._leave.append(callback)
 
-    # ---- what clients may say: one function for each op
+    # ---- messages of clients: one function for each op
 
     def _advertise(self, session: Session, incoming: Incoming, now: float) -> None:
         message = incoming.message
@@ -275,7 +275,7 @@ class Bridge:
         message = incoming.message
         spelling = message.get("service")
         call = Call(session, read_id(message), spelling if isinstance(spelling, str) else "")
-        # A call is answered by a response also when it is wrong: who called waits for nothing else.
+        # Even an invalid call is answered by a response, which its caller waits for.
         try:
             name = read_name(message, "service")
             service = self.services.get(name)
@@ -339,7 +339,7 @@ class Bridge:
         (self._fragmented.add if session.fragments.size else self._fragmented.discard)(session)
 
     def _deliver(self, listener: Listener, publication: Publication, publisher: Session | None) -> None:
-        # One listener's mistake must not end the connection of the client that published, nor silence other listeners.
+        # An error of one listener must not end the publisher's connection, nor skip the other listeners.
         text = deliver(
             listener, publication.message, publisher.caller if publisher is not None else _PROCESS, publication.topic
         )
@@ -351,7 +351,7 @@ class Bridge:
             self._status(publisher, text)
 
     def _status(self, session: Session, text: str, name: Id = None) -> None:
-        """Tell a client an error, unless it does not want to hear of errors."""
+        """Send an error to a client, unless its level excludes errors."""
         if session.level != "none":
             message = {"op": "status", "level": "error", "msg": text}
             packet = pack(message if name is None else {**message, "id": name}, stream="status")
@@ -361,13 +361,13 @@ class Bridge:
 def _publication(topic: Topic, content: Any) -> Publication:
     publication = Publication(topic.name, topic.kind, complete(topic.kind, {} if content is None else content))
     for stream in list(topic.streams.values()):
-        if stream.wish.throttle == 0.0:  # packed here, in any thread: the network thread need not
+        if stream.wish.throttle == 0.0:  # packed here, in any thread, to relieve the network thread
             publication.packet(stream.name, stream.wish)
     return publication
 
 
 def _require_not_ours(topic: Topic) -> None:
-    # Where this process publishes, no client may: it could say where the robot is.
+    # Clients must not publish on topics of this process, such as the state of the robot.
     if None in topic.publishers:
         raise ProtocolError(f"Topic {topic.name} is published by this server alone; its clients may subscribe.")
 
@@ -378,16 +378,16 @@ def _require_room(used: int, most: int, what: str) -> None:
 
 
 def _time_of_day(now: float) -> dict[str, int]:
-    """`now` in both spellings: clients of ROS 1 read the one, clients of ROS 2 the other."""
+    """`now` in the spellings of both ROS 1 and ROS 2."""
     return {**write_stamp(now), **write_stamp(now, ros1=True)}
 
 
 def _type_of(table: Topics | Services, request: Message, field: str) -> dict[str, str]:
-    found = table.get(read_name(request, field))
-    return {"type": found.kind if found else ""}
+    entry = table.get(read_name(request, field))
+    return {"type": entry.kind if entry else ""}
 
 
-def _title(message: Mapping[str, Any], said: str) -> str:
-    """What a message was about, for the status that says what is wrong with it; no name that is `said` there."""
-    names = [name for name in (message.get("topic"), message.get("service")) if f" {name} " not in said]
+def _title(message: Mapping[str, Any], text: str) -> str:
+    """The operation and names of a message, for the status with the error `text`; without names that are in it."""
+    names = [name for name in (message.get("topic"), message.get("service")) if f" {name} " not in text]
     return " ".join(part[:80] for part in (message.get("op"), *names) if isinstance(part, str)) or "message"

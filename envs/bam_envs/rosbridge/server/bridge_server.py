@@ -1,7 +1,7 @@
-"""The embedded rosbridge server: the protocol of `bridge` on WebSockets, in a thread of its own.
+"""The embedded rosbridge server: the protocol of `bridge` on WebSockets, in a network thread.
 
 The network thread runs the protocol and the listeners; handlers of services run in a pool of threads, and long messages
-are read in a thread of their own, so that no halt waits for them.
+are decoded in another thread, so that no halt waits for them.
 """
 
 import asyncio
@@ -32,11 +32,11 @@ from bam_envs.rosbridge.tokens import Tokens
 T = TypeVar("T")
 
 _HANDLER_THREADS = 32
-_SHORT = 4096  # a frame up to this is read in the thread of the network [bytes]
-_TURN = 4  # frames of one client that are read before the others have their turn
-_QUEUE = 2  # messages of a client that are taken from its socket before they are done
+_SHORT = 4096  # longest frame that is decoded in the network thread [bytes]
+_TURN = 4  # frames of one client that are read before those of other clients
+_QUEUE = 2  # messages of a client that are read from its socket before they are processed
 _logger = logging.getLogger(__name__)
-# Of `websockets`, to which every port scanner is worth a traceback.
+# The logger of `websockets`, which reports every port scanner with a traceback.
 _quiet = logging.getLogger(f"{__name__}.websockets")
 _quiet.setLevel(logging.CRITICAL)
 
@@ -45,14 +45,14 @@ class BridgeServer(Bus):
     """A rosbridge server, and in its own process a `Bus`.
 
     Args:
-        host: Address to listen on; others than this computer reach it only if it is not loopback.
-        port: 0 takes a free one, `port` says which.
+        host: Address to listen on; other computers reach it only if it is not loopback.
+        port: 0 takes a free one, which the attribute `port` then holds.
         cert: File with the certificate chain in PEM, for ``wss://``.
-        key: File with its key, if it is not the same one.
+        key: File with its key, if that is another file.
         token: Clients must show it: ``Authorization: Bearer TOKEN``, or ``?token=TOKEN`` in the URL; a page in a
-            browser also by its first message, ``{"op": "auth", "token": TOKEN}``. Without one no page comes in.
-        operator_token: Who shows this one instead is an operator (`Caller.operator`).
-        options: The rest.
+            browser also by its first message, ``{"op": "auth", "token": TOKEN}``. Without a token no page is admitted.
+        operator_token: A client that shows this one instead is an operator (`Caller.operator`).
+        options: Limits and timeouts.
     """
 
     def __init__(
@@ -80,23 +80,23 @@ class BridgeServer(Bus):
         self._numbers = itertools.count(1)
         self._thread = LoopThread("bam-bridge-server")
         self._workers = Workers(_HANDLER_THREADS, "bam-bridge-handler")
-        self._reader = Workers(1, "bam-bridge-reader")  # one: each more would leave the network less of the interpreter
+        self._reader = Workers(1, "bam-bridge-reader")  # one: more would slow the network thread down
         self._timer: asyncio.TimerHandle | None = None
         self._stop: asyncio.Event | None = None
 
     @property
     def url(self) -> str:
-        """Where clients find it."""
+        """Address for clients."""
         return Address(self.host, self.port, self._cert is not None, "").url
 
     @property
     def clients(self) -> int:
-        """How many there are."""
+        """Number of clients."""
         return len(self._connections)
 
     @property
     def held(self) -> tuple[int, int]:
-        """What all sockets hold that is not a message yet, and what waits for clients that read slowly [bytes]."""
+        """Size of unfinished messages in all sockets, and of messages that wait for slow clients [bytes]."""
         sockets = list(self._sockets)
         return sum(one.unfinished for one in sockets), sum(one.outbox.size for one in sockets)
 
@@ -128,7 +128,7 @@ class BridgeServer(Bus):
     # ---- the Bus; see there
 
     def advertise(self, topic: str, kind: str, *, latch: bool = False) -> None:
-        """Say that `topic` of type `kind` will be published."""
+        """Declare that `topic` of type `kind` will be published."""
         self._do(lambda: self._bridge.advertise(topic, kind, latch=latch))
 
     def publish_all(self, messages: Sequence[tuple[str, Message]]) -> None:
@@ -139,30 +139,30 @@ class BridgeServer(Bus):
             for publication in publications:
                 self._bridge.publish(publication, time.monotonic())
 
-        if self._thread.is_current:  # in a listener: what made that run flushes afterwards
+        if self._thread.is_current:  # in a listener, whose caller flushes afterwards
             publish()
         elif not self._post(publish):
             raise LinkLost(f"{messages[0][0]}: the server is not running; nothing was sent.")
 
     def subscribe(self, topic: str, kind: str, listener: Listener) -> Callable[[], None]:
-        """Call `listener` in the thread of the network for each message, until what is returned is called."""
+        """Call `listener` in the network thread for each message. Returns a function that ends the subscription."""
         unsubscribe = self._do(lambda: self._bridge.subscribe(topic, kind, listener))
         return lambda: self._do(unsubscribe)
 
     def serve(self, service: str, kind: str, handler: Handler) -> None:
-        """Answer `service` of type `kind`: always, also when the handler fails."""
+        """Answer `service` of type `kind`, even when the handler fails."""
         self._do(lambda: self._bridge.serve(service, kind, handler))
 
     def on_leave(self, callback: Callable[[Caller], None]) -> None:
-        """Call `callback` in the thread of the network when a client's connection ends."""
+        """Call `callback` in the network thread when a client's connection ends."""
         self._do(lambda: self._bridge.on_leave(callback))
 
-    # ---- the thread of the network: connections
+    # ---- the network thread: connections
 
     async def _main(self, tls: ssl.SSLContext | None, listening: Future[None]) -> None:
         self._stop, options = asyncio.Event(), self.options
         extra: dict[str, Any] = {"ssl": tls, "ssl_handshake_timeout": options.open_timeout} if tls else {}
-        # `websockets` does not know that what its handlers get is what this makes.
+        # `websockets` does not know that its handlers get the connections that this makes.
         extra["create_connection"] = functools.partial(BridgeConnection, sockets=self._sockets, limits=options)
         extra["process_request"], handler = self._admission.check, cast(Any, self._serve)
         server = await serve(
@@ -185,8 +185,8 @@ class BridgeServer(Bus):
         await self._shut(server)
 
     async def _shut(self, server: Server) -> None:
-        # asyncio leaks a socket that was accepted just before its server is closed: accept no more, let those become
-        # connections in the next turns of the loop, and close then.
+        # asyncio leaks a socket that was accepted just before its server is closed. So accept no more, let accepted
+        # sockets become connections in the next turns of the loop, and then close.
         for listener in server.sockets:
             asyncio.get_running_loop().remove_reader(listener.fileno())
         await _turns()
@@ -194,7 +194,7 @@ class BridgeServer(Bus):
             opening.transport.abort()
         server.close(reason="the server is closing")
         await _turns()
-        # Not for server.wait_closed(): it waits for sockets in the middle of their TLS handshake, too.
+        # Not server.wait_closed(), which also waits for sockets in the middle of their TLS handshake.
         goodbyes = [asyncio.create_task(connection.wait_closed()) for connection in self._sockets]
         if goodbyes:
             await asyncio.wait(goodbyes, timeout=2 * self.options.close_timeout + 1.0)
@@ -235,12 +235,12 @@ class BridgeServer(Bus):
                 incoming = await self._incoming(text, joined)
                 text, joined = self._bridge.take(session, incoming, time.monotonic()), True
             self._flush()
-            # Frames that are there already come without a pause; the other clients must not wait for them all.
+            # Frames that have arrived already are read without a pause; other clients must not wait for all of them.
             if number % _TURN == 0:
                 await asyncio.sleep(0)
 
     async def _incoming(self, text: bytes | str, joined: bool) -> Incoming | ProtocolError:
-        """What a frame says; a long one is read in another thread, and its client's next one waits for it."""
+        """The content of a frame; a long one is decoded in another thread while its client's next frame waits."""
         if len(text) <= _SHORT:
             return self._bridge.read(text, joined=joined)
         done: asyncio.Future[Incoming | ProtocolError] = asyncio.get_running_loop().create_future()
@@ -252,7 +252,7 @@ class BridgeServer(Bus):
         self._reader.submit(read)
         return await done
 
-    # ---- the thread of the network: doing what the protocol wants done
+    # ---- the network thread: executing the events of the protocol
 
     def _flush(self) -> None:
         written: dict[BridgeConnection, None] = {}
@@ -284,11 +284,11 @@ class BridgeServer(Bus):
         self._flush()
 
     def _post(self, work: Callable[[], object]) -> bool:
-        """Have `work` done in the thread of the network, and what follows from it; False if it is not running."""
+        """Run `work` and its events in the network thread; False if that is not running."""
         return self._thread.post(lambda: self._then_flush(work))
 
     def _do(self, work: Callable[[], T]) -> T:
-        """The same, and wait for its result. While the server is not running, `work` is done here."""
+        """As `_post`, and return the result. While the server is not running, `work` runs in the calling thread."""
         return self._thread.do(lambda: self._then_flush(work))
 
     def _then_flush(self, work: Callable[[], T]) -> T:
@@ -299,6 +299,6 @@ class BridgeServer(Bus):
 
 
 async def _turns() -> None:
-    """Let what is ready happen, and what follows from it."""
+    """Let ready callbacks, and those that they schedule, run."""
     for _ in range(5):
         await asyncio.sleep(0)

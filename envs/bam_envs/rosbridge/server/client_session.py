@@ -1,4 +1,4 @@
-"""One client of the rosbridge server: what it may use, declared and asked, how its fields are read, what it is sent."""
+"""One client of the rosbridge server: its limits, declarations and calls, its fields, and packets for it."""
 
 import itertools
 import math
@@ -28,37 +28,37 @@ _LONGEST_QUEUE = 100
 
 @dataclass(frozen=True)
 class ServerOptions:
-    """What clients of a `BridgeServer` may use: beyond it one is told so, and the others do not notice."""
+    """Limits on the clients of a `BridgeServer`: a client that exceeds one gets an error, and others are unaffected."""
 
-    max_clients: int = 256  # the next one is told 503
-    service_timeout: float = 30.0  # for the answer of a client's service [s], if the caller names no other time
-    handler_timeout: float = 300.0  # the same for services of this process [s]: a robot's motion may take its time
+    max_clients: int = 256  # the next one gets HTTP status 503
+    service_timeout: float = 30.0  # for the answer of a client's service [s], if the caller gives no timeout
+    handler_timeout: float = 300.0  # the same for services of this process [s]: a robot's motion may take long
     max_message: int = 64 * 2**20  # largest answer to a client [bytes]
     max_incoming: int = 16 * 2**20  # largest message of a client, and most of its unfinished fragments together [bytes]
-    # Unfinished fragments of all clients, and unfinished frames [bytes]: the client that holds most loses its own.
+    # Most unfinished fragments of all clients, and unfinished frames [bytes]; the client with most of them loses them.
     unfinished: int = 64 * 2**20
     topics: int = 1024  # most subscriptions, and most advertisements, of a client
     services: int = 256  # most services that a client offers
     calls: int = 256  # most unanswered calls of a client
-    at_once: int = 4  # of which so many are with handlers of this process; the others wait their turn
-    fragment_lifetime: float = 10.0  # within which a message that comes in fragments must be whole [s]
-    outbox_size: int = 8 * 2**20  # most that waits for a client that reads slowly [bytes]
+    at_once: int = 4  # most calls of a client that handlers of this process run at once; the others wait
+    fragment_lifetime: float = 10.0  # within which a message in fragments must be complete [s]
+    outbox_size: int = 8 * 2**20  # most data that waits for a slow client [bytes]
     outbox_of_a_topic: int = 100  # most messages of one topic that wait for it, unless it asked for fewer
     open_timeout: float = 5.0  # within which a socket must have become a WebSocket [s]
     token_timeout: float = 2.0  # within which a web page must have shown its token [s]
-    ping_interval: float = 1.0  # between two pings [s]: who drives and does not answer loses command soon
+    ping_interval: float = 1.0  # between two pings [s]: a driver that does not answer loses command soon
     ping_timeout: float = 20.0  # for their answer [s]
     close_timeout: float = 1.0  # for the closing handshake [s]
 
 
 @dataclass(frozen=True)
 class Wish:
-    """How a client wants messages to be sent."""
+    """A client's options for the messages of a topic or the answer of a service."""
 
     compression: str = "none"  # one of `encoding.COMPRESSIONS`
     fragment_size: int = _NEVER_SPLIT  # most characters of a message in one frame; CBOR is never split
     throttle: float = 0.0  # least time between two messages of a topic [s]
-    queue_length: int = 0  # how many messages of a topic may wait; 0: no limit of its own
+    queue_length: int = 0  # most messages of a topic that may wait; 0: the server's limit
 
 
 @dataclass(frozen=True)
@@ -68,7 +68,7 @@ class Packet:
     frames: tuple[bytes, ...]
     text: bool  # whether they are text frames
     stream: str | None = None
-    """What it belongs to, if a newer one of the same may take its place; None for what must arrive."""
+    """Name of the stream in which a newer packet may replace it; None for a required packet."""
 
     @property
     def size(self) -> int:
@@ -91,14 +91,14 @@ def pack(
 
 
 class Publication:
-    """One checked, complete message of type `kind` on `topic`, on its way to any number of subscribers."""
+    """One checked, complete message of type `kind` on `topic`, for any number of subscribers."""
 
     def __init__(self, topic: str, kind: str, message: Mapping[str, Any]) -> None:
         self.topic, self.kind, self.message = topic, kind, message
         self._packets: dict[tuple[str, str, int], Packet] = {}
 
     def packet(self, name: str, wish: Wish) -> Packet:
-        """Packed for those who call the topic `name` and want it like `wish`; made once for all of them."""
+        """The packet for clients that call the topic `name` and have the options `wish`; made once for all of them."""
         key = (name, wish.compression, wish.fragment_size)
         packet = self._packets.get(key)
         if packet is None:
@@ -109,38 +109,38 @@ class Publication:
 
 @dataclass(frozen=True)
 class Send:
-    """To do: send a packet to a client."""
+    """Event: send a packet to a client."""
 
     session: "Session"
     packet: Packet
-    keep: int = 0  # most packets of the same stream that may wait for a slow client; 0: as many as there is room for
+    keep: int = 0  # most packets of the same stream that may wait for a slow client; 0: the server's limit
 
 
 @dataclass(frozen=True)
 class Service:
-    """A service, and who offers it."""
+    """A service and its provider."""
 
     name: str  # with a leading slash
     kind: str  # normal name of its type
     spelling: str  # its name as its provider spells it
     provider: "Session | None" = None  # the client that offers it; None for this process
-    handler: Handler | None = None  # what answers it in this process
-    inline: bool = False  # whether the handler is quick and may run in the thread of the network
+    handler: Handler | None = None  # answers it in this process
+    inline: bool = False  # whether the handler is quick and may run in the network thread
 
 
 @dataclass(eq=False)
 class Call:
-    """What a client asks of a service; the rest is known once it is one of `Services`.
+    """A client's call of a service; `Services.call` fills the last fields.
 
-    To do, as an event: `Services.packed_answer` off the network's thread; `Services.finish` takes what it returns.
+    As an event: run `Services.packed_answer` outside the network thread, and give its result to `Services.finish`.
     """
 
     session: "Session"
     id: Id
     name: str  # of the service, as the client spells it
     wish: Wish = field(default_factory=Wish)
-    timeout: float = 0.0  # after which time it is answered in any case [s]; 0: the usual time
-    deadline: float = math.inf  # when that is [s], clock of `Bridge`
+    timeout: float = 0.0  # time after which it fails [s]; 0: the default
+    deadline: float = math.inf  # when it fails [s], clock of `Bridge`
     number: int = 0
     service: Service = field(init=False)
     values: Message = field(init=False)  # its arguments, complete
@@ -157,12 +157,12 @@ class Session:
     options: ServerOptions
     level: str = "error"  # the status messages it wants: this one of LEVELS and those before it
     advertised: dict[str, set[Id]] = field(default_factory=dict)
-    """Its topics, with the ids of its advertisements of each."""
+    """Its topics, each with the ids of its advertisements."""
     streams: "dict[str, Stream]" = field(default_factory=dict)  # what it has subscribed, by topic
     services: set[str] = field(default_factory=set)
     calls: set[int] = field(default_factory=set)  # numbers of its unanswered calls
-    running: int = 0  # how many of its calls are with handlers
-    waiting: deque[Call] = field(default_factory=deque)  # its calls that wait for their turn
+    running: int = 0  # number of its calls that handlers run
+    waiting: deque[Call] = field(default_factory=deque)  # its calls that wait for a handler
 
     def __post_init__(self) -> None:
         self.fragments = Fragments(self.options.max_incoming, self.options.fragment_lifetime)
@@ -170,19 +170,19 @@ class Session:
 
 @lru_cache(maxsize=1024)
 def canonical(name: str) -> str:
-    """The name of a topic or service with its leading slash; `InvalidValue` for what is no such name."""
+    """The name of a topic or service with its leading slash; `InvalidValue` if it is not a valid name."""
     if len(name) > _LONGEST or not _NAME.fullmatch(name):
         raise InvalidValue(f"Name: expected one such as '/joint_states', found {brief(name)}.")
     return name if name.startswith("/") else f"/{name}"
 
 
 def read_name(message: Mapping[str, Any], what: str) -> str:
-    """The topic or service that a message is about, with a leading slash."""
+    """The name of the topic or service in a message, with a leading slash."""
     return canonical(read_text(message, what))
 
 
 def read_text(message: Mapping[str, Any], name: str) -> str:
-    """A field that must be there."""
+    """A required text field."""
     value = message.get(name)
     if not isinstance(value, str) or not value:
         raise ProtocolError(f"{name}: expected a text, found {brief(value)}.")
@@ -190,7 +190,7 @@ def read_text(message: Mapping[str, Any], name: str) -> str:
 
 
 def read_number(message: Mapping[str, Any], name: str, otherwise: float) -> float:
-    """A number >= 0, or `otherwise` if it is left out."""
+    """A numeric field >= 0, or `otherwise` if it is missing."""
     value = message.get(name)
     if value is None:
         return otherwise
@@ -200,7 +200,7 @@ def read_number(message: Mapping[str, Any], name: str, otherwise: float) -> floa
 
 
 def read_wish(message: Mapping[str, Any]) -> Wish:
-    """How the client wants what it asks for."""
+    """The options in a client's message."""
     throttle = read_number(message, "throttle_rate", 0) / 1000
     queue_length = int(min(read_number(message, "queue_length", 0), _LONGEST_QUEUE))
     compression = message.get("compression") or "none"

@@ -15,14 +15,14 @@ from bam_envs.rosbridge.tokens import Role
 TRY_AGAIN_LATER = 1013  # close code of a client that does not read what it must get
 # Most sockets without an admitted client, in all and of one address; the oldest is closed for a new one.
 _STRANGERS, _STRANGERS_OF_ONE = 128, 32
-_OF_A_STRANGER = 65536  # what a stranger may say [bytes]
-_FRAME = 200  # about what a frame costs beside what it holds [bytes]
+_OF_A_STRANGER = 65536  # most unread data of a client before its admission [bytes]
+_FRAME = 200  # approximate overhead of a frame [bytes]
 
 
 class Outbox:
-    """A queue for one client that drops the oldest message of a topic for a newer one, and nothing else.
+    """A queue for one client that drops the oldest messages of a topic for newer ones, and no other messages.
 
-    At most `most_bytes` wait, and one message more; of one topic at most `most_of_a_stream` messages.
+    At most `most_bytes` and one more message wait; of one topic at most `most_of_a_stream` messages.
     """
 
     def __init__(self, most_bytes: int, most_of_a_stream: int) -> None:
@@ -35,7 +35,7 @@ class Outbox:
         return len(self._packets)
 
     def add(self, packet: Packet, keep: int = 0) -> bool:
-        """Queue a packet, at most `keep` of its stream (0: the usual); False if one that must arrive has no room."""
+        """Queue a packet, at most `keep` of its stream (0: the default); False if a required one has no room."""
         if packet.stream is not None:
             most = min(keep or self._most_of_a_stream, self._most_of_a_stream)
             while self._waiting[packet.stream] >= most and self._drop(packet.stream):
@@ -72,26 +72,26 @@ class Outbox:
 
 
 class BridgeConnection(ServerConnection):
-    """A connection with an `Outbox`, that knows what it holds and is one of `sockets`, all open ones of the server."""
+    """A connection with an `Outbox` that counts its unread data; one of `sockets`, the open ones of the server."""
 
     def __init__(self, *args: Any, sockets: set["BridgeConnection"], limits: ServerOptions, **options: Any) -> None:
         super().__init__(*args, **options)
         self._sockets, self._most_unfinished = sockets, limits.unfinished
         self._most_unsent = limits.max_message + limits.outbox_size
         self.outbox = Outbox(limits.outbox_size, limits.outbox_of_a_topic)
-        self.role: Role | None = None  # what the client was let in as; None before
+        self.role: Role | None = None  # of an admitted client; None before
         self.host = ""  # the IP address of the client
         self.heard = time.monotonic()  # when data last arrived [s, monotonic]
         self.born = self.heard  # when the socket opened [s, monotonic]
-        self._waiting = 0  # what whole frames cost that are not taken yet [bytes]
-        self._message, self._whole = 0, deque[int]()  # what those of the unfinished message cost, and of whole ones
+        self._waiting = 0  # size of complete frames that are not taken yet [bytes]
+        self._message, self._whole = 0, deque[int]()  # sizes of the unfinished message and of complete messages
         self._takes_more = True
         self._closing: asyncio.Task[None] | None = None
 
     # ---- outgoing
 
     def put(self, packet: Packet, keep: int) -> None:
-        """Send `packet` at the next `flush`, or when the socket takes more; close it if that must arrive and cannot."""
+        """Send `packet` at the next `flush`, or when the socket takes more; close if a required one has no room."""
         if self.state is not State.OPEN or self.transport.is_closing():
             return
         if self._takes_more and not self.outbox:
@@ -101,12 +101,12 @@ class BridgeConnection(ServerConnection):
             self._closing = self.loop.create_task(self.close(TRY_AGAIN_LATER, reason))
 
     def flush(self) -> None:
-        """Write what was put, in one piece: a client that waits for several messages wakes up once."""
+        """Write the packets together, so that a client that waits for several messages wakes up once."""
         parts = self.protocol.data_to_send()
         whole = b"".join(parts)
         if whole and not self.transport.is_closing():
             self.transport.write(whole)
-        if parts and not parts[-1] and self.transport.can_write_eof():  # how the protocol says: half-close
+        if parts and not parts[-1] and self.transport.can_write_eof():  # the protocol's sign for a half-close
             self.transport.write_eof()
 
     def pause_writing(self) -> None:
@@ -123,7 +123,7 @@ class BridgeConnection(ServerConnection):
             self.flush()
 
     def _write(self, packet: Packet) -> None:
-        # Not send(), which waits: how much waits is for the outbox to say.
+        # Not send(), which waits: the outbox limits what waits.
         write = self.protocol.send_text if packet.text else self.protocol.send_binary
         for frame in packet.frames:
             write(frame)
@@ -131,18 +131,18 @@ class BridgeConnection(ServerConnection):
     # ---- incoming
 
     async def next_frame(self) -> bytes:
-        """The next message."""
+        """Wait for the next message."""
         message = await self.recv(decode=False)
         self._waiting -= self._whole.popleft()
         return message
 
     @property
     def unfinished(self) -> int:
-        """What it holds that was not taken yet [bytes]."""
+        """Size of received data that is not taken yet [bytes]."""
         return self._waiting + len(self.protocol.reader.buffer)
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        """asyncio: a socket opened. Of those that say nothing the oldest is closed, so that they keep no client out."""
+        """asyncio: a socket opened. Too many silent sockets: the oldest is closed, so that they keep no client out."""
         super().connection_made(transport)
         self.host = str((self.remote_address or [""])[0])
         self._sockets.add(self)
@@ -157,7 +157,7 @@ class BridgeConnection(ServerConnection):
         super().connection_lost(exc)
 
     def data_received(self, data: bytes) -> None:
-        """asyncio: bytes came."""
+        """asyncio: data arrived."""
         self.heard = time.monotonic()
         super().data_received(data)
         if self.role is None and self.unfinished > _OF_A_STRANGER:
@@ -169,7 +169,7 @@ class BridgeConnection(ServerConnection):
             self.transport.abort()
 
     def process_event(self, event: Event) -> None:
-        """A frame came."""
+        """websockets: a frame arrived."""
         if isinstance(event, Frame) and event.opcode in DATA_OPCODES:
             cost = len(event.data) + _FRAME
             self._waiting += cost

@@ -1,6 +1,6 @@
-"""The services of a rosbridge server: who offers them, which calls are unanswered. Every call is answered.
+"""The services of a rosbridge server, their providers, and the unanswered calls. Every call is answered.
 
-Every end that a call can have is in this file, which shows that none is missing.
+Every possible end of a call is in this file, which shows that none is missing.
 """
 
 import itertools
@@ -14,23 +14,23 @@ from bam_envs.ros.interfaces import complete, request_type, response_type, varia
 from bam_envs.rosbridge.bus import Message, answer
 from bam_envs.rosbridge.server.client_session import Call, Event, Packet, Send, Service, Session, pack
 
-_GROWING = "bam_msgs/GymAPI"  # of which fields of a newer version are ignored, as every transport does
+_GROWING = "bam_msgs/GymAPI"  # unknown fields of this type, of a newer version, are ignored, as in every transport
 _LONGEST_NUMBER = 20  # digits of the number of a call
 
 
 class Services(dict[str, Service]):
-    """Every service of a server by name, and the unanswered calls; `emit` takes what is to be done."""
+    """Every service of a server by name, and the unanswered calls; `emit` takes the events."""
 
     def __init__(self, emit: Callable[[Event], None]) -> None:
         super().__init__()
         self._emit = emit
         self._calls: dict[int, Call] = {}
         self._numbers = itertools.count(1)
-        self.deadline = math.inf  # when to call `expire` next [s]; a call that was answered may have set it
+        self.deadline = math.inf  # when to call `expire` next [s]; may be that of an answered call
 
     def offer(self, service: Service) -> Service | None:
-        """Add a service; returns the one of another client whose place it takes."""
-        # A client that comes back after a cut does not wait until its old connection is noticed to be dead.
+        """Add a service; returns the service of another client that it replaces."""
+        # A client that reconnects after a cut does not wait until the old connection is found dead.
         before = self.get(service.name)
         if before is not None:
             if before.provider is None:
@@ -42,7 +42,7 @@ class Services(dict[str, Service]):
         return before if before is not None and before.provider is not service.provider else None
 
     def withdraw(self, service: Service) -> None:
-        """Remove a service; who waits for it is told."""
+        """Remove a service; its unanswered calls fail."""
         del self[service.name]
         if service.provider is not None:
             service.provider.services.discard(service.name)
@@ -50,7 +50,7 @@ class Services(dict[str, Service]):
             self._fail(call, f"Service {service.name} is gone: the client that offered it left or withdrew it.")
 
     def leave(self, session: Session) -> None:
-        """A client left: its calls are forgotten, its services end."""
+        """Forget the calls of a client that left, and withdraw its services."""
         for number in session.calls:
             self._calls.pop(number, None)
         session.calls.clear()
@@ -59,7 +59,7 @@ class Services(dict[str, Service]):
             self.withdraw(self[name])
 
     def call(self, call: Call, service: Service, values: Message, now: float) -> None:
-        """Pass a call with complete `values` on to who offers `service`; a client may have so many unanswered."""
+        """Pass a call with complete `values` on to the provider of `service`; limits a client's unanswered calls."""
         session, options = call.session, call.session.options
         if max(len(session.calls), len(session.waiting)) >= options.calls:
             raise ProtocolError(f"At most {options.calls} calls may be unanswered; wait for an answer first.")
@@ -87,40 +87,40 @@ class Services(dict[str, Service]):
                 self._emit(call)
 
     def packed_answer(self, call: Call) -> Packet | None:
-        """What the handler answers, as a packet; None if the call is answered already. From any thread."""
+        """The answer of the handler, as a packet; None if the call is answered already. Thread-safe."""
         handler, service = call.service.handler, call.service
         if handler is None or call.number not in self._calls:
             return None
         try:
             values = answer(handler, call.values, call.session.caller, f"Service {service.name}")
-            if not service.inline:  # what /rosapi/get_time answers spells the time for ROS 1 and for ROS 2
+            if not service.inline:  # the answer of /rosapi/get_time has fields of ROS 1 and of ROS 2
                 values = checked(service.kind, response_type, values)
             return _packed(call, values, True)
         except BamEnvsError as error:
             return _packed(call, str(error), False)
 
     def finish(self, call: Call, packet: Packet | None) -> None:
-        """Send what `packed_answer` returned, if the call is still unanswered; the next call's turn."""
+        """Send the result of `packed_answer` if the call is still unanswered, and start the next waiting call."""
         if call.number in self._calls:
             self._answer(call, packet)
         call.session.running -= 1
         self._start_waiting(call.session)
 
     def call_named(self, name: object) -> Call | None:
-        """The unanswered call with the id `name`. From any thread."""
+        """The unanswered call with the id `name`, or None. Thread-safe."""
         known = isinstance(name, str) and len(name) < _LONGEST_NUMBER and name.isascii() and name.isdigit()
         return self._calls.get(int(str(name))) if known else None
 
     def respond(self, provider: Session, message: Mapping[str, Any], values: Callable[[str], Any]) -> None:
-        """Pass on what a client answers to a call of its service; `values` gives its content, complete for a type."""
+        """Pass on a client's answer to a call of its service; `values` completes its content for a type."""
         call = self.call_named(message.get("id"))
         if call is None or call.service.provider is not provider:
             raise ProtocolError(f"Nobody waits for a response with the id {brief(message.get('id'))}.")
         name = call.service.name
         if message.get("result", True) is not True:
             reason = message.get("values")
-            told = reason if isinstance(reason, str) and reason else f"Service {name} failed and gave no reason."
-            self._fail(call, told)
+            text = reason if isinstance(reason, str) and reason else f"Service {name} failed and gave no reason."
+            self._fail(call, text)
             return
         try:
             self._answer(call, _packed(call, values(response_type(call.service.kind)), True))
@@ -129,7 +129,7 @@ class Services(dict[str, Service]):
             raise ProtocolError(f"Response of {name}: {error}") from None
 
     def expire(self, now: float) -> None:
-        """Answer the calls whose time is over."""
+        """Fail the calls that have timed out."""
         if now < self.deadline:
             return
         for call in [one for one in self._calls.values() if one.deadline <= now]:
@@ -156,7 +156,7 @@ def _packed(call: Call, values: Any, result: bool) -> Packet:
 
 
 def packed_response(call: Call, values: Any, result: bool) -> Packet:
-    """A message ``service_response``; of a failed one, `values` is the reason."""
+    """A message ``service_response``; `values` of a failed call is the reason."""
     message = {"op": "service_response", "service": call.name, "values": values, "result": result}
     return pack(message if call.id is None else {**message, "id": call.id}, call.wish)
 

@@ -1,4 +1,4 @@
-"""The topics of a rosbridge server: who publishes, who listens, how often and how many messages may wait."""
+"""The topics of a rosbridge server: publishers, subscribers, throttling and queues."""
 
 import math
 from collections import deque
@@ -14,12 +14,12 @@ from bam_envs.rosbridge.server.client_session import Publication, Send, Session,
 
 
 class Stream:
-    """All subscriptions of one client to one topic, which it calls `name`: it gets each message once."""
+    """All subscriptions of one client to one topic, which it calls `name`; the client gets each message once."""
 
     def __init__(self, session: Session, topic: str, name: str) -> None:
         self.session, self.topic, self.name = session, topic, name
         self.wishes: dict[Id, Wish] = {}
-        self.wish = Wish()  # all of them together
+        self.wish = Wish()  # all of them combined
         self._waiting: deque[Publication] = deque(maxlen=1)
         self._next = -math.inf
 
@@ -39,21 +39,21 @@ class Stream:
 
     @property
     def deadline(self) -> float:
-        """When a waiting message may go [s]; infinite if none waits."""
+        """When a waiting message may be sent [s]; infinite if none waits."""
         return self._next if self._waiting else math.inf
 
     def offer(self, publication: Publication, now: float) -> Send | None:
-        """A new message: what to send now, if anything. What comes too early waits; the oldest is dropped."""
+        """Take a new message; returns what to send now, or None. Early messages wait; the oldest is dropped."""
         if self.wish.throttle == 0.0:
             return self._send(publication)
         self._waiting.append(publication)
         return self.due(now)
 
     def due(self, now: float) -> Send | None:
-        """What waited long enough, if anything."""
+        """The message that has waited long enough, or None."""
         if not self._waiting or now < self._next:
             return None
-        # On a grid, so that a topic of just this rate does not lose every second message to jitter.
+        # On a grid, so that a topic of exactly this rate does not lose every second message to jitter.
         on_grid = self._next + self.wish.throttle
         self._next = on_grid if on_grid > now else now + self.wish.throttle
         return self._send(self._waiting.popleft())
@@ -73,7 +73,7 @@ class Topic:
     listeners: list[Listener] = field(default_factory=list)  # those of this process
     latching: set[Session | None] = field(default_factory=set)
     """The publishers whose last message is repeated to newcomers."""
-    latched: tuple[Session | None, Publication] | None = None  # that message, and whose it is
+    latched: tuple[Session | None, Publication] | None = None  # that message, with its publisher
 
 
 class Topics(dict[str, Topic]):
@@ -86,11 +86,11 @@ class Topics(dict[str, Topic]):
 
     @property
     def kinds(self) -> list[str]:
-        """Their types."""
+        """The types of all topics."""
         return [topic.kind for topic in self.values()]
 
     def require(self, name: str, kind: str | None) -> Topic:
-        """The topic `name`; a new one if there is none. `InvalidValue` if it has another type, or needs one."""
+        """The topic `name`, created if it does not exist. `InvalidValue` if it has another type, or needs one."""
         topic = self.get(name)
         if topic is None and kind is None:
             raise InvalidValue(f"Topic {name} does not exist yet; its type is needed.")
@@ -101,13 +101,13 @@ class Topics(dict[str, Topic]):
         return topic
 
     def subscribe(self, stream: Stream, topic: Topic, now: float) -> None:
-        """Let a new stream have the messages of `topic`, the latched one at once."""
+        """Send the messages of `topic` to a new stream, the latched one at once."""
         topic.streams[stream.session] = stream
         if topic.latched is not None:
             self._note(stream, stream.offer(topic.latched[1], now))
 
     def unsubscribe(self, stream: Stream) -> None:
-        """Let a stream have no more messages."""
+        """Stop sending messages to a stream."""
         self._delayed.discard(stream)
         topic = self.get(stream.topic)
         if topic is not None and topic.streams.pop(stream.session, None) is not None:
@@ -122,16 +122,16 @@ class Topics(dict[str, Topic]):
 
     @property
     def deadline(self) -> float:
-        """When a message that came too early for a subscriber may go [s]; infinite if none waits."""
+        """When the next waiting message may be sent [s]; infinite if none waits."""
         return min((one.deadline for one in self._delayed), default=math.inf)
 
     def tick(self, now: float) -> None:
-        """Send what waited long enough."""
+        """Send the messages that have waited long enough."""
         for stream in list(self._delayed):
             self._note(stream, stream.due(now))
 
     def retire(self, topic: Topic, publisher: Session | None) -> None:
-        """`publisher` publishes no more."""
+        """Remove a publisher of `topic`, and its latched message."""
         topic.publishers.discard(publisher)
         topic.latching.discard(publisher)
         if topic.latched is not None and topic.latched[0] is publisher:
@@ -145,7 +145,7 @@ class Topics(dict[str, Topic]):
             del self[topic.name]
 
     def leave(self, session: Session) -> None:
-        """A client left."""
+        """Remove a client that left."""
         for name in session.advertised:
             self.retire(self[name], session)
         for stream in session.streams.values():

@@ -256,7 +256,7 @@ def test_in_real_time_steps_last_a_period():
 
 def test_real_time_needs_a_period():
     assert raised(InvalidValue, lambda: EnvServer(FakeEnv(), realtime=True)) == (
-        "FakeEnv does not say its period, so it has no real time; serve it with --fast."
+        "FakeEnv does not report its period, so it has no real time; serve it with --fast."
     )
 
 

@@ -129,7 +129,7 @@ def test_an_arm_without_gripper_offers_no_topics_of_one(serve, bus):
 @pytest.mark.parametrize(
     ("realtime", "text"),
     [
-        (False, "ur5e, served in lockstep: its time goes on with commands, 0.05 s each"),
+        (False, "ur5e, served in lockstep: its time advances with commands, 0.05 s each"),
         (True, "ur5e, served in real time; it rests 0.1 s after the last command"),
     ],
 )

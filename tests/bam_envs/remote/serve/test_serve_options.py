@@ -48,8 +48,8 @@ def test_what_cannot_be(options, text):
     assert str(error.value) == text
 
 
-CLEAR = "The token travels in the clear to {}, and so does all else: give --cert, or trust that network."
-OPEN = "Anybody who reaches {} may command what is served here, as --no-token says."
+CLEAR = "The token is sent unencrypted to {}, and so is everything else: give --cert, or trust that network."
+OPEN = "Anybody who reaches {} may command what is served here, because of --no-token."
 REFUSED = (
     "Anybody who reaches {} could command what is served here: give --token-file, or --bind 127.0.0.1; or --no-token, "
     "if everybody there is to."
