@@ -146,7 +146,8 @@ class BridgeConnection(ServerConnection):
         super().connection_made(transport)
         self.host = str((self.remote_address or [""])[0])
         self._sockets.add(self)
-        strangers = [one for one in self._sockets if one.role is None]
+        here = (one for one in self._sockets if one is self or not one.transport.is_closing())
+        strangers = [one for one in here if one.role is None]
         host, most = Counter(one.host for one in strangers).most_common(1)[0]
         if most > _STRANGERS_OF_ONE or len(strangers) > _STRANGERS:
             min((one for one in strangers if one.host == host), key=lambda one: one.born).transport.abort()

@@ -432,6 +432,19 @@ def test_unfinished_frames_of_all_clients_are_bounded(new_server, new_client):
     survivor.sync()
 
 
+def test_of_many_sockets_at_once_that_say_nothing_few_stay_open(new_server, new_client):
+    server = new_server(options=ServerOptions(open_timeout=100.0))
+    with contextlib.ExitStack() as sockets:
+        silent = [
+            sockets.enter_context(socket.create_connection(("127.0.0.1", server.port), timeout=DEADLINE))
+            for _ in range(100)
+        ]
+        for one in silent[:68]:
+            with contextlib.suppress(ConnectionResetError):
+                assert one.recv(1) == b""
+        new_client(server.url).sync()
+
+
 def test_it_closes_at_once_beside_sockets_that_say_nothing(threads, new_server, certificates):
     cert, _ = certificates("127.0.0.1")
     for server in (new_server(), new_server(cert=cert, key=cert.replace("cert.pem", "key.pem"))):
