@@ -47,9 +47,7 @@ def resolve(given: Mapping[str, Any]) -> TrainSettings:
     env = _resolve_env(asked.env, elsewhere=bool(asked.transport))
     require_algorithm(asked.trainer, asked.algo)
     entry = entry_of(env)  # robo-gym's ids are names of ours
-    preset = read_preset(
-        env if entry is None else entry.id, asked.algo, asked.trainer
-    )  # robo-gym's ids are names of ours
+    preset = read_preset(env if entry is None else entry.id, asked.algo, asked.trainer)
     settings = TrainSettings.from_mapping(merge(preset, given, {"env": env}))
     _require_of_trainer(settings)
     require_env_kwargs(env, settings.env_kwargs)
