@@ -173,6 +173,14 @@ def test_nesting_has_an_end():
     assert "at most 32" in refusal("my_msgs/Thing", message)
 
 
+@pytest.mark.parametrize("numbers", [[1.5], [1, 2]])
+def test_numbers_are_no_nesting(numbers):
+    for _ in range(31):
+        numbers = [numbers]
+    assert complete("my_msgs/Thing", {"a": numbers}) == {"a": numbers}
+    assert "at most 32" in refusal("my_msgs/Thing", {"a": [numbers]})
+
+
 def test_null_is_plain_outside_of_messages():
     require_plain({"id": None}, "Message")
     with pytest.raises(InvalidValue, match=r"^Message\.id: expected a finite number, found nan\.$"):
