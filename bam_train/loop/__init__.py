@@ -4,7 +4,7 @@
 
     from bam_train.loop import Agent, Agents, TemporalAgent, Workspace
 
-The core needs NumPy only. What needs torch, and what only programs written for BBRL need, is imported on use.
+The core needs NumPy only. Names that need torch, and names for programs written for BBRL, are imported on use.
 """
 
 import importlib
@@ -49,7 +49,7 @@ _ON_USE = {
     "compat.bbrl.remote_agents": ("AsynchronousAgent", "NRemoteAgent", "RemoteAgent"),
     "errors": ("RemoteAgentError",),
 }
-"""Module of `bam_train` to the names that it has."""
+"""Names by module of `bam_train`."""
 _MODULES = {name: module for module, names in _ON_USE.items() for name in names}
 
 __all__ = [
@@ -73,7 +73,7 @@ def __getattr__(name: str) -> Any:
         value = getattr(importlib.import_module(f"bam_train.{_MODULES[name]}"), name)
     except ModuleNotFoundError as error:
         if error.name == "torch":
-            import_torch(f"bam_train.loop.{name}")  # says how to install it
+            import_torch(f"bam_train.loop.{name}")  # its error message tells how to install torch
         raise
     globals()[name] = value
     return value

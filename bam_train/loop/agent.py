@@ -1,6 +1,6 @@
 """An agent reads variables of a workspace and writes others: BBRL's `Agent`.
 
-Made after torch was imported, it is an `nn.Module` too: its class is a subclass of its own class and of `nn.Module`.
+An agent made after torch was imported is an `nn.Module` too: an instance of a subclass of its class and `nn.Module`.
 Without torch it is a plain object, which is enough for NumPy arrays.
 
 Differences from BBRL: after an exception the agent can be used again; two threads in one agent are an error; `reads`,
@@ -29,18 +29,18 @@ else:
 
 
 class Agent(_Base):  # type: ignore[misc]
-    """Override ``forward(self, t, **kwargs)``; in it, use `get` and `set`.
+    """Base class of agents: override ``forward(self, t, **kwargs)``, which uses `get` and `set`.
 
     Args:
-        name: What `get_by_name` finds.
+        name: The name for `get_by_name`.
         verbose: An attribute that BBRL's agents have, as `prefix`; nothing here uses it.
 
     Attributes:
         workspace: The workspace during a call, else None.
-        reads: Names it reads at t, which agents before it must write; None if it does not say.
-        reads_previous: Names it reads at t - 1, which any agent may write.
-        writes: Names it writes at t; None if it does not say.
-        live: Whether it moves something real: a chain with such an agent is checked as it is built.
+        reads: Names of the variables read at t, which agents before it must write; None if undeclared.
+        reads_previous: Names of the variables read at t - 1, which any agent may write.
+        writes: Names of the variables written at t; None if undeclared.
+        live: Whether it moves a real robot: a chain with such an agent is checked when it is built.
     """
 
     reads: tuple[str, ...] | None = None
@@ -53,7 +53,7 @@ class Agent(_Base):  # type: ignore[misc]
     _name: str | None = None
 
     def __new__(cls, *args: Any, **kwargs: Any) -> Self:
-        """A plain object; once torch is imported, an `nn.Module` too, as a `pathlib.Path` is a `PosixPath`."""
+        """Make a plain object or, once torch is imported, an `nn.Module`, as `pathlib.Path` makes a `PosixPath`."""
         kind: Any = cls
         agent: Self = super().__new__(kind if sys.modules.get("torch") is None else _module_class(kind))
         return agent
@@ -74,37 +74,37 @@ class Agent(_Base):  # type: ignore[misc]
         """
         if workspace is None:
             raise LoopError(f"{agent_name(self)} needs a workspace, found None.")
-        # Straight into the instance's dictionary: nn.Module's __setattr__ costs 1.4 µs, this 0.05 µs. `setdefault` is
-        # atomic, and every call has a dictionary of keywords of its own.
-        own = self.__dict__
+        # Writing to the instance dictionary takes 0.05 µs, nn.Module's __setattr__ 1.4 µs. `setdefault` is atomic, and
+        # every call has another `kwargs` object.
+        attributes = self.__dict__
         try:
-            if own.setdefault("_call", kwargs) is not kwargs:
+            if attributes.setdefault("_call", kwargs) is not kwargs:
                 raise AgentInUse(
                     f"{agent_name(self)} is running already, in another thread or around this call; "
                     f"give each its own: agent.clone()."
                 )
-            own["workspace"] = workspace
+            attributes["workspace"] = workspace
             self.forward(**kwargs)
-        finally:  # no calls in here: Ctrl-C would come between them
-            if "_call" in own and own["_call"] is kwargs:
-                own["workspace"] = None
-                del own["_call"]
+        finally:  # without function calls, between which Ctrl-C could interrupt
+            if "_call" in attributes and attributes["_call"] is kwargs:
+                attributes["workspace"] = None
+                del attributes["_call"]
 
     def forward(self, *args: Any, **kwargs: Any) -> Any:
-        """What the agent does at time t; to be overridden."""
+        """Act at time t; a subclass overrides this."""
         raise NotImplementedError(f"{type(self).__name__} must override forward(self, t, **kwargs).")
 
     def close(self) -> None:
-        """Stop what moves and release what is open; called when an exception leaves the loop.
+        """Stop robots and release resources; called when an exception leaves the loop.
 
-        By default it closes the agents in it, the live ones first; a failure is raised at the end.
+        By default it closes the inner agents, the live ones first; a failure is raised at the end.
         """
-        with ExitStack() as stack:  # closes what is left when one fails, last one first
+        with ExitStack() as stack:  # closes the others when one fails, the last one first
             for agent in sorted(self._inner(), key=is_live):
                 stack.callback(agent.close)
 
     def _inner(self) -> tuple[Agent, ...]:
-        """The agents in it."""
+        """The inner agents."""
         return ()
 
     def _declare(
@@ -115,7 +115,7 @@ class Agent(_Base):  # type: ignore[misc]
         writes: Iterable[str],
         reads_previous: Iterable[str] = (),
     ) -> None:
-        """Say what ``owner.forward`` reads and writes; a subclass with a forward of its own may do otherwise."""
+        """Declare the variables of ``owner.forward``; ignored for a subclass that overrides `forward`."""
         if type(self).forward is owner.forward:
             self.reads = None if reads is None else tuple(reads)
             self.writes, self.reads_previous = tuple(writes), tuple(reads_previous)
@@ -143,7 +143,7 @@ class Agent(_Base):  # type: ignore[misc]
 
     @property
     def name(self) -> str | None:
-        """What `get_by_name` finds; a subclass may redefine it."""
+        """The name for `get_by_name`; a subclass may redefine it."""
         return self._name
 
     @name.setter
@@ -155,27 +155,27 @@ class Agent(_Base):  # type: ignore[misc]
         return self._name
 
     def set_name(self, n: str | None) -> Self:
-        """Set the name; the agent itself is returned."""
+        """Set the name; returns the agent."""
         self._name = n
         return self
 
     def get_by_name(self, n: str) -> list[Agent]:
-        """The agents of that name in the tree: those in it first, then itself."""
-        found = [one for agent in self._inner() for one in agent.get_by_name(n)]
-        return [*found, self] if n == self._name else found
+        """All agents with that name in the tree, the inner ones first."""
+        inner = [match for agent in self._inner() for match in agent.get_by_name(n)]
+        return [*inner, self] if n == self._name else inner
 
     def with_prefix(self, prefix: str) -> Self:
-        """Set `prefix`; the agent itself is returned."""
+        """Set `prefix`; returns the agent."""
         self.prefix = prefix
         return self
 
     def seed(self, seed: int) -> Any:
-        """Seed the agents in it; an agent that draws random numbers overrides this."""
+        """Seed the inner agents; an agent that draws random numbers overrides this."""
         for agent in self._inner():
             agent.seed(seed)
 
     def clone(self) -> Self:
-        """A deep copy that belongs to no workspace; the gradients of this one are zeroed, as BBRL does."""
+        """Return a deep copy without a workspace; zeroes the gradients of this agent, as BBRL does."""
         if is_module(self):
             self.zero_grad()
         return copy.deepcopy(self)
@@ -184,18 +184,18 @@ class Agent(_Base):  # type: ignore[misc]
         return {**{key: value for key, value in self.__dict__.items() if key != "_call"}, "workspace": None}
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """For pickle and copy: by the class that can be imported, since `_module_class` makes the other one."""
+        """For pickle and copy: store the importable class, because `_module_class` makes the other at run time."""
         plain = getattr(type(self), "_plain_class", None)
         return _new_agent, (plain or type(self), plain is not None), self.__getstate__()
 
     # -- files -----------------------------------------------------------------------------------------------------
 
     def save_model(self, filename: Any) -> None:
-        """Save the whole agent with ``torch.save``: a pickle, which runs code when it is read."""
+        """Save the agent with ``torch.save``, as a pickle, which can run any code when it is loaded."""
         import_torch("Agent.save_model()").save(self, filename)
 
     def load_model(self, filename: Any) -> Any:
-        """The agent in a file of `save_model`. It is a pickle and runs what is in it: read only files you trust."""
+        """Load an agent of `save_model`, from a pickle, which can run any code: load only files that you trust."""
         return import_torch("Agent.load_model()").load(filename, weights_only=False)
 
     def _workspace(self) -> Any:
@@ -205,7 +205,7 @@ class Agent(_Base):  # type: ignore[misc]
 
 
 def import_torch(purpose: str) -> Any:
-    """The module torch; `MissingExtra` says how to install it for `purpose`."""
+    """Import torch; without it, raise a `MissingExtra` that tells how to install it for `purpose`."""
     try:
         import torch
     except ModuleNotFoundError as error:
@@ -216,24 +216,24 @@ def import_torch(purpose: str) -> Any:
 
 
 def agent_name(agent: Agent) -> str:
-    """Its class, and its name if it has one, for error messages."""
+    """The agent's class, and its name if it has one, for error messages."""
     return type(agent).__name__ + (f" {agent._name!r}" if agent._name else "")
 
 
 def is_live(agent: Agent) -> bool:
-    """Whether it, or an agent in it, moves something real."""
-    return agent.live or any(is_live(one) for one in agent._inner())
+    """Whether the agent or an inner agent moves a real robot."""
+    return agent.live or any(is_live(inner) for inner in agent._inner())
 
 
 def is_module(agent: Agent) -> bool:
-    """Whether it has become an `nn.Module`."""
+    """Whether the agent is an `nn.Module`."""
     torch = sys.modules.get("torch")
     return torch is not None and isinstance(agent, torch.nn.Module)
 
 
 @cache
 def _module_class(cls: Any) -> Any:
-    """The subclass of the class `cls` and of `nn.Module`; one for each class, with the same name."""
+    """The subclass of `cls` and `nn.Module` with the name of `cls`, made once."""
     from torch import nn
 
     if issubclass(cls, nn.Module):
@@ -243,12 +243,12 @@ def _module_class(cls: Any) -> Any:
 
 
 class _Quiet:
-    """Keeps ``__init_subclass__`` of a class from being called for its `_module_class`."""
+    """Prevents the call of a class's ``__init_subclass__`` for its `_module_class`."""
 
     def __init_subclass__(cls) -> None:
         """Nothing."""
 
 
 def _new_agent(cls: Any, is_module: bool) -> Any:
-    """An agent whose attributes follow, for pickle and copy."""
+    """Make an agent without attributes, which pickle and copy then set."""
     return object.__new__(_module_class(cls) if is_module else cls)

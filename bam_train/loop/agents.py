@@ -1,7 +1,7 @@
-"""Agents that are made of others, and a few small ones.
+"""Agents composed of others, and a few small ones.
 
 Differences from BBRL: `KWAgentWrapper` wraps `Agents` too; `CopyTAgent` detaches without t as well; `PrintAgent`
-without names prints what there is each time.
+without names prints the variables that exist at each call.
 """
 
 import sys
@@ -15,10 +15,10 @@ from bam_train.loop.agent import Agent, agent_name, is_module
 
 
 class Agents(Agent):
-    """Runs its members, which it has in `agents` (an ``nn.ModuleList`` once torch is imported), with the same keywords.
+    """Runs its members `agents`, an ``nn.ModuleList`` once torch is imported, in order and with the same keywords.
 
     Raises:
-        LoopError: One of them is no agent.
+        LoopError: A member is not an agent.
     """
 
     def __init__(self, *agents: Agent, name: str | None = None) -> None:
@@ -52,14 +52,14 @@ class Agents(Agent):
         return tuple(self._members())
 
     def _members(self) -> Iterable[Agent]:
-        # Around nn.Module's __getattr__ and ModuleList's own, which cost as much as a small agent.
-        own = self.__dict__
-        listed: Iterable[Agent] | None = own.get("agents")  # a module list is elsewhere
-        return own["_modules"]["agents"]._modules.values() if listed is None else listed
+        # Avoids the __getattr__ of nn.Module and ModuleList, which cost as much as a small agent.
+        attributes = self.__dict__
+        listed: Iterable[Agent] | None = attributes.get("agents")  # nn.Module keeps a module list in _modules
+        return attributes["_modules"]["agents"]._modules.values() if listed is None else listed
 
 
 class KWAgentWrapper(Agent):
-    """Runs `agent` with more keywords."""
+    """Runs `agent` with additional keywords."""
 
     def __init__(self, agent: Agent, **kwargs: Any) -> None:
         super().__init__()
@@ -75,7 +75,7 @@ class KWAgentWrapper(Agent):
 
 
 class CopyTAgent(Agent):
-    """Copies a variable, cut off the graph with `detach`: at time t, or all of it when the call has no t."""
+    """Copies a variable at time t, or all times when the call has no t; `detach` cuts the copy off the graph."""
 
     def __init__(self, input_name: str, output_name: str, detach: bool = False, name: str | None = None) -> None:
         super().__init__(name=name)
@@ -83,7 +83,7 @@ class CopyTAgent(Agent):
         self._declare(CopyTAgent, reads=(input_name,), writes=(output_name,))
 
     def forward(self, t: int | None = None, **kwargs: Any) -> None:
-        """Copy the time t, or everything."""
+        """Copy the value at time t, or all times."""
         value = self.get(self.input_name if t is None else (self.input_name, t))
         if self.detach and hasattr(value, "detach"):
             value = value.detach()
@@ -91,7 +91,7 @@ class CopyTAgent(Agent):
 
 
 class PrintAgent(Agent):
-    """Prints variables at time t; without names all that there are."""
+    """Prints the named variables, or all, at time t."""
 
     def __init__(self, *names: str, name: str | None = None) -> None:
         super().__init__(name=name)
@@ -110,7 +110,7 @@ class PrintAgent(Agent):
 
 
 class EpisodesDone(Agent):
-    """Writes to `out_var` (B,) whether `in_var` (B,) was true at t or before: a running OR, begun again at t = 0."""
+    """Writes to `out_var` (B,) whether `in_var` (B,) was true at t or before: a running OR, restarted at t = 0."""
 
     def __init__(self, in_var: str = "env/done", out_var: str = "env/done") -> None:
         super().__init__()
@@ -119,7 +119,7 @@ class EpisodesDone(Agent):
         self.state: Any = None
 
     def forward(self, t: int, **kwargs: Any) -> None:
-        """Read the flag at t and write the running one."""
+        """Read the flag at t and write the running OR."""
         done = self.get((self.in_var, t))
         done = done.astype(bool) if isinstance(done, np.ndarray) else done.bool()
         self.state = done if t == 0 or self.state is None else self.state | done
@@ -136,10 +136,10 @@ class SeedableAgent(Agent):
         self._seed = seed
 
     def seed(self, seed: int) -> Any:
-        """Take the seed; the agent itself is returned.
+        """Set the seed; returns the agent.
 
         Raises:
-            LoopError: It has one already.
+            LoopError: The agent has a seed already.
         """
         if self._seed is not None:
             raise LoopError(

@@ -1,4 +1,4 @@
-"""A workspace as a picture (matplotlib) and as a table (pandas); both are imported on use."""
+"""Workspaces as figures (matplotlib) and as tables (pandas); both libraries are imported on use."""
 
 from __future__ import annotations
 
@@ -21,24 +21,24 @@ if TYPE_CHECKING:
     from bam_train.loop.workspace import Workspace
 
 MAX_LINES = 10
-"""Lines in one picture; matplotlib has as many colours."""
+"""Maximum lines in one plot, the number of matplotlib's colours."""
 MAX_VALUE_AXES = 2
 """A value with more axes than this is an image."""
 
 
 def plot(workspace: Workspace, *names: str, batch: int | Sequence[int] | None = None) -> Figure:
-    """Draws variables over time: one picture below the other, one line for each batch column and component.
+    """Draw variables over time: one plot below the other, with one line for each batch column and component.
 
-    Numbers with a fraction are drawn as lines, bool and integers as steps; at most 10 lines in a picture, whose title
-    then says of how many. A notebook shows the figure, which does not belong to pyplot, as the last value of a cell.
+    Floats are drawn as lines, bool and integers as steps. A plot has at most 10 lines; its title then gives the total.
+    A notebook shows the figure, which does not belong to pyplot, as the last value of a cell.
 
     Args:
-        workspace: What is drawn.
-        *names: The variables, in this order; without names all, but for images.
+        workspace: The workspace to draw.
+        *names: The variables, in this order; by default all except images.
         batch: The batch column or columns to draw; None draws all.
 
     Raises:
-        WorkspaceError: There is nothing to draw, a variable holds images, or it does not have these batch columns.
+        WorkspaceError: There is nothing to draw, a variable holds images, or it lacks one of the batch columns.
         MissingExtra: matplotlib is not installed.
     """
     try:
@@ -62,11 +62,11 @@ def plot(workspace: Workspace, *names: str, batch: int | Sequence[int] | None = 
 
 
 def to_dataframe(workspace: Workspace, *names: str) -> DataFrame:
-    """The variables as a table with one line for each time and batch column, indexed by ``("time", "batch")``.
+    """Return the variables as a table with one row for each time and batch column, indexed by ``("time", "batch")``.
 
-    A scalar variable is one column of its name, a vector ``name[0]``, ``name[1]``, …, a matrix ``name[0,0]``, ….
-    Where a variable is shorter than another, numbers with a fraction are NaN; bool and integers are NA, in pandas'
-    nullable types. Names and errors are those of `plot`.
+    A scalar variable is one column with its name, a vector ``name[0]``, ``name[1]``, …, a matrix ``name[0,0]``, ….
+    Where a variable is shorter than another, floats are NaN; bool and integers are NA, in pandas' nullable types.
+    Names and errors are those of `plot`.
     """
     try:
         import pandas
@@ -78,17 +78,17 @@ def to_dataframe(workspace: Workspace, *names: str) -> DataFrame:
     rows = pandas.MultiIndex.from_product([range(first, first + length), range(width)], names=["time", "batch"])
     columns = {}
     for name, array in arrays.items():
-        own = pandas.MultiIndex.from_product([range(first, first + len(array)), range(array.shape[1])])
-        flat = array.reshape(own.size, -1)
+        written = pandas.MultiIndex.from_product([range(first, first + len(array)), range(array.shape[1])])
+        flat = array.reshape(written.size, -1)
         for label, values in zip(_labels(array.shape[2:]), flat.T, strict=True):
-            if not own.equals(rows) and values.dtype.kind != "f":
-                values = pandas.array(values)  # such as Int64 and boolean, which know NA
-            columns[name + label] = pandas.Series(values, index=own).reindex(rows)
+            if not written.equals(rows) and values.dtype.kind != "f":
+                values = pandas.array(values)  # such as Int64 and boolean, which have NA
+            columns[name + label] = pandas.Series(values, index=written).reindex(rows)
     return pandas.DataFrame(columns, index=rows)
 
 
 def _arrays(workspace: Workspace, names: tuple[str, ...], purpose: str) -> dict[str, np.ndarray]:
-    """The named variables, (T, B, ...) each, without images; all where no name is given."""
+    """The named variables, or all, (T, B, ...) each, without images."""
     arrays = {name: to_array(workspace.get_full(name)) for name in names or workspace.keys()}
     arrays = {name: array if array.ndim > 1 else array[:, None] for name, array in arrays.items()}  # without a batch
     images = [name for name, array in arrays.items() if array.ndim > 2 + MAX_VALUE_AXES]
@@ -135,7 +135,7 @@ def _draw(axes: Axes, times: np.ndarray, name: str, array: np.ndarray, columns: 
 
 
 def _png(figure: Figure) -> bytes:
-    """What a notebook shows that never imported pyplot."""
+    """The figure as a PNG, for notebooks that have not imported pyplot."""
     file = io.BytesIO()
     figure.savefig(file, format="png")
     return file.getvalue()

@@ -1,4 +1,4 @@
-"""What a TemporalAgent shows while it runs: steps, steps per second, time left; below a microsecond a step."""
+"""The progress display of a TemporalAgent: steps, steps per second, time left; costs less than a microsecond a step."""
 
 import importlib
 import io
@@ -33,17 +33,17 @@ def progress_display(
     description: str = "steps",
     clock: Callable[[], float] = time.perf_counter,
 ) -> Iterator[Advance]:
-    """Shows how far a loop has come; gives a function to be called with the number of steps just done.
+    """Show the progress of a loop; yields a function to be called with the number of steps just done.
 
-    A loop that ends early is shown as finished; one that an exception leaves stays where it was.
+    A loop that ends early is shown as finished; one that ends with an exception keeps its last position.
 
     Args:
-        progress: The caller's display, which gets one more task, or True for one on stderr, drawn on a terminal and in
-            a notebook only.
-        n_steps: The most steps there will be; None where only a stop variable ends the loop.
+        progress: The caller's display, to which a task is added, or True for a new one on stderr, drawn only on a
+            terminal and in a notebook.
+        n_steps: The maximum number of steps; None where only a stop variable ends the loop.
         t: The time of the first step.
-        description: What is written in front of the bar.
-        clock: Seconds, for the time between two pictures.
+        description: The text in front of the bar.
+        clock: Time in seconds, for the interval between two updates of the display.
     """
     shown: AbstractContextManager[Any] = nullcontext()
     if isinstance(progress, Progress):
@@ -58,7 +58,7 @@ def progress_display(
             TimeRemainingColumn(elapsed_when_finished=True),
             console=console,
             auto_refresh=False,  # no thread: the loop itself redraws
-            redirect_stdout=sys.stdout.isatty(),  # what is printed goes above the bar; into a file it goes as always
+            redirect_stdout=sys.stdout.isatty(),  # prints appear above the bar; a file gets them as usual
             disable=not (console.is_terminal or console.is_jupyter),
         )
         if console.is_jupyter:
@@ -71,14 +71,14 @@ def progress_display(
 
 
 def _nothing() -> None:
-    """Draw nothing: the caller does."""
+    """Do nothing: the caller draws its display."""
 
 
 @contextmanager
 def _task(
     progress: Progress, n_steps: int | None, text: str, redraw: Callable[[], None], clock: Callable[[], float]
 ) -> Iterator[Advance]:
-    """One task of a display, updated every REDRAW_SECONDS."""
+    """Add a task to a display, and update it every REDRAW_SECONDS."""
     task, done = progress.add_task(text, total=n_steps), 0
     due = clock() + REDRAW_SECONDS
 
@@ -104,7 +104,7 @@ def _task(
 
 
 def _notebook_line(display: Progress) -> Callable[[], None]:
-    """One line of a notebook's output that is written over; rich itself needs ipywidgets for this."""
+    """Return a function that rewrites one line of a notebook's output, for which rich itself needs ipywidgets."""
     show_in_notebook = importlib.import_module("IPython.display").display
     handle: Any = None
 

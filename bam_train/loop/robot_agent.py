@@ -1,4 +1,4 @@
-"""What a deployment runs on, on NumPy arrays: one environment, usually a robot's, and a policy that is no agent."""
+"""The agents of a deployment, on NumPy arrays: one environment, usually with a robot, and a policy."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -12,23 +12,23 @@ from bam_train.loop.gym.gym_agent import NUMBERS
 from bam_train.loop.gym.gym_spaces import Kind, flat, kinds, names, pack
 
 SUCCESS = "info/is_success"
-"""Whether the task is done, where the environment's info says ``is_success``."""
+"""Variable with ``is_success`` of the environment's info: whether the task is done."""
 SAYS_SUCCESS = "info/_is_success"
-"""Whether it says so; Gymnasium's name for such a mask."""
+"""Variable with Gymnasium's mask for it: whether the info has ``is_success``."""
 
 
 class RobotAgent(Agent):
-    """At t = 0 resets the environment, later steps it with the action of t - 1.
+    """Resets the environment at t = 0, and steps it at t > 0 with the action of t - 1.
 
-    It writes, with a batch of one, what `ParallelGymAgent` writes with ``arrays="numpy"`` and
-    ``info_keys=("is_success",)``. Run it until ``env/done``; a call at t = 0 begins the next episode.
+    It writes the variables of `ParallelGymAgent` with ``arrays="numpy"`` and ``info_keys=("is_success",)``, for a batch
+    of one. Run it until ``env/done``; a call at t = 0 begins the next episode.
 
-    An environment with a robot is live: a chain with it is checked when it is built, before the robot is connected.
+    With a robot the agent is live: its chain is checked when it is built, before the robot is connected.
 
     Args:
         env: The environment; closed by `close`.
         input_string: The variable with the action.
-        output_string: Put before the names of all variables that it writes.
+        output_string: Prefix of the names of all variables that it writes.
     """
 
     def __init__(
@@ -56,7 +56,7 @@ class RobotAgent(Agent):
             robot.connect()
 
     def halt(self) -> None:
-        """Stop the robot moving, if there is one; may be called from any thread."""
+        """Stop the robot, if there is one; may be called from any thread."""
         robot = robot_of(self.env)
         if robot is not None:
             robot.halt()
@@ -68,14 +68,14 @@ class RobotAgent(Agent):
             return
         try:
             self.halt()
-        except Exception:  # no third Ctrl-C, which quits as the halt hangs: closing would halt again
+        except Exception:  # not a third Ctrl-C, which quits while the halt hangs: closing would halt again
             self.env.close()  # type: ignore[no-untyped-call]
             raise
         self.env.close()  # type: ignore[no-untyped-call]
         self._closed = True
 
     def forward(self, t: int, seed: int | None = None, **kwargs: Any) -> None:
-        """Reset with `seed` at t = 0, else step; refused when no episode is running."""
+        """Reset with `seed` at t = 0, else step; raises LoopError if no episode is running."""
         if t == 0:
             self._closed = False
             observation, info = self.env.reset(seed=seed)
@@ -116,13 +116,13 @@ def robot_of(env: gym.Env[Any, Any]) -> Any:
 class PolicyAgent(Agent):
     """Reads the observation at t and writes the action.
 
-    The policy's recurrent state is forgotten where an episode begins (``env/timestep`` is 0); so with environments that
-    leave out the last state (``include_last_state=False``) a recurrent policy forgets one step late.
+    The policy's recurrent state is reset where an episode begins (``env/timestep`` is 0). With environments that leave
+    out the last state (``include_last_state=False``) it is therefore reset one step late.
 
     Args:
         policy: Has ``reset(env_ids=None)`` and ``act_batch(observations)``, or ``act(observation)`` with `single`.
-        observation_names: The variables that make up its observation; of a Dict ``env/env_obs/<key>`` each.
-        single: The batch is one environment, and the policy's `act` takes it without a batch axis.
+        observation_names: The variables of its observation; for a Dict, one ``env/env_obs/<key>`` for each key.
+        single: Whether the batch is one environment, whose observation `act` takes without a batch axis.
     """
 
     def __init__(
@@ -144,10 +144,10 @@ class PolicyAgent(Agent):
         self._declare(PolicyAgent, reads=(*self.names, self._timestep, self._done), writes=(output_string,))
 
     def forward(self, t: int, seed: int | Sequence[int] | None = None, **kwargs: Any) -> None:
-        """Act on the observation at t; `seed`, of the episode or of each environment's, is for an error message.
+        """Act on the observation at t; error messages name `seed`, of the episode or of each environment's.
 
         Raises:
-            PolicyError: An action that is not finite.
+            PolicyError: An action is not finite.
         """
         steps = self.get((self._timestep, t))
         if not steps.all():
@@ -158,7 +158,7 @@ class PolicyAgent(Agent):
             values = [value[0].copy() for value in values]  # the policy may keep it
         observation = values[0] if self._keys is None else dict(zip(self._keys, values, strict=True))
         action = np.asarray(self.policy.act(observation) if self.single else self.policy.act_batch(observation))
-        # Once all have ended, the action is not used.
+        # Once all episodes have ended, the action is not used.
         if action.dtype.kind == "f" and not (np.isfinite(action).all() or self.get((self._done, t)).all()):
             index = tuple(int(i) for i in np.argwhere(~np.isfinite(action))[0])
             which = "the episode" if seed is None else f"the episode with seed {seed}"

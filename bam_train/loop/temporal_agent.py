@@ -1,7 +1,7 @@
-"""The loop: one agent, run at one time after the other.
+"""The loop: runs one agent at consecutive times.
 
-Differences from BBRL's `TemporalAgent`: what agents read is checked before the first of them runs; an exception says at
-which time and closes every agent's environment and robot; a progress display.
+Differences from BBRL's `TemporalAgent`: the variables that agents read are checked before the first of them runs; an
+exception names the time, and closes every agent's environment and robot; a progress display.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ class TemporalAgent(Agent):
     """Runs an agent at times t, t + 1, ....
 
     Args:
-        agent: What to run; often an `Agents` whose first member is the environment.
+        agent: The agent to run; often an `Agents` whose first member is the environment.
         progress: True for a progress display on standard error, or a ``rich.progress.Progress`` to add a task to.
 
     Raises:
-        LoopError: `agent` is no agent.
-        WiringError: The agent moves a robot, and something in it reads what nobody writes.
+        LoopError: `agent` is not an agent.
+        WiringError: The agent moves a robot, and an inner agent reads a variable that no agent writes.
     """
 
     def __init__(self, agent: Agent, name: str | None = None, *, progress: bool | Progress = False) -> None:
@@ -51,17 +51,17 @@ class TemporalAgent(Agent):
         """Run the agent from time t on. After an exception every agent is closed; earlier times stay readable.
 
         Args:
-            workspace: What it reads and writes.
+            workspace: The workspace to read and write.
             t: The first time.
-            n_steps: The number of times; at least one is run, as in BBRL. None: until the stop variable says.
-            stop_variable: Stop after a time at which it is true for the whole batch.
-            kwargs: Given to every agent.
+            n_steps: The number of times, of which one is always run, as in BBRL; None for no limit.
+            stop_variable: Name of a variable (B,): the loop stops after a time at which it is true for the whole batch.
+            kwargs: Passed to every agent.
 
         Raises:
             AgentInUse: It is running already: loops are not shared by threads.
             LoopError: Neither `n_steps` nor `stop_variable`, or no workspace.
-            WiringError: An agent reads what nobody writes, or nobody writes the stop variable.
-            UnknownVariable: Nobody has written the stop variable at the first time.
+            WiringError: An agent reads a variable that no agent writes, or no agent writes the stop variable.
+            UnknownVariable: No agent has written the stop variable at the first time.
         """
         if n_steps is None and stop_variable is None:
             raise LoopError("TemporalAgent: when should it stop? Give n_steps, stop_variable or both.")
@@ -70,7 +70,7 @@ class TemporalAgent(Agent):
         super().__call__(workspace, t=t, n_steps=n_steps, stop_variable=stop_variable, **kwargs)
 
     def forward(self, t: int, n_steps: int | None, stop_variable: str | None, **kwargs: Any) -> None:
-        """Check the agents, run them, and close them when an exception comes."""
+        """Check the agents, run them, and close them after an exception."""
         workspace = self.workspace
         try:
             _check(self.agent, workspace, stop_variable)
@@ -81,7 +81,7 @@ class TemporalAgent(Agent):
                 display = progress_display(self.progress, n_steps, t, self.name or "steps")
             with display as advance:
                 self._run(workspace, t, n_steps, stop_variable, advance, kwargs)
-        except BaseException as error:  # the one to be seen, also if closing fails
+        except BaseException as error:  # raised even if closing fails
             try:
                 self.agent.close()
             except Exception as failure:
@@ -99,13 +99,13 @@ class TemporalAgent(Agent):
     ) -> None:
         calls = [
             (agent, agent.__call__) for agent in _unfolded(self.agent, (Agents,))
-        ]  # bound: quicker than agent(...)
+        ]  # a bound method is faster than agent(...)
         end = None if n_steps is None else t + n_steps
         while True:
             for agent, call in calls:
                 try:
                     call(workspace, t=t, **kwargs)
-                except BaseException as error:  # noqa: PERF203 - free of cost until it happens
+                except BaseException as error:  # noqa: PERF203 - costs nothing without an exception
                     _note(error, f"In {agent_name(agent)} of {_describe(self.agent)} at t={t}.")
                     raise
             if advance is not None:
@@ -123,20 +123,20 @@ class TemporalAgent(Agent):
         return (self.agent,)
 
     def __getstate__(self) -> dict[str, Any]:
-        """A display of the caller's stays with the original."""
+        """Copies do not keep the caller's progress display."""
         return {**super().__getstate__(), "progress": self.progress is True}
 
 
 def _unfolded(agent: Agent, kinds: tuple[type[Agent], ...]) -> list[Agent]:
-    """The agents in it, in the order in which they run; itself unless it is of these kinds and does nothing else."""
-    own = type(agent)
-    if any(own.forward is kind.forward and own.__call__ is kind.__call__ for kind in kinds):
-        return [one for inner in agent._inner() for one in _unfolded(inner, kinds)]
+    """The agents of the tree in the order in which they run; agents of `kinds` are replaced by their inner agents."""
+    cls = type(agent)
+    if any(cls.forward is kind.forward and cls.__call__ is kind.__call__ for kind in kinds):
+        return [leaf for inner in agent._inner() for leaf in _unfolded(inner, kinds)]
     return [agent]
 
 
 def _describe(agent: Agent) -> str:
-    """Such as ``Agents(RobotAgent, PolicyAgent)``."""
+    """The agent's structure, such as ``Agents(RobotAgent, PolicyAgent)``."""
     return f"Agents({', '.join(map(_describe, agent))})" if isinstance(agent, Agents) else agent_name(agent)
 
 
@@ -146,10 +146,10 @@ def _note(error: BaseException, text: str) -> None:
 
 
 def _check(agent: Agent, held: Iterable[str], stop_variable: str | None) -> None:
-    """Check that what the agents read and the stop variable are written, before anything runs.
+    """Check, before anything runs, that the stop variable and all variables that agents read are written.
 
-    In a chain with a robot every agent has to say what it reads and writes. In any other one, what the workspace holds
-    already (`held`) counts as written, and as long as one agent does not say what it writes, anything may be.
+    In a chain with a robot every agent must declare the variables that it reads and writes. In other chains, variables
+    in the workspace (`held`) count as written, and nothing is checked if an agent does not declare what it writes.
     """
     chain, before = _unfolded(agent, (Agents, KWAgentWrapper, TemporalAgent)), set(held)
     if is_live(agent):

@@ -1,8 +1,8 @@
 """One variable of a workspace: a list with one array for each time, or one array of all times.
 
-A variable that `set` writes is a list. One that `set_full` writes is one array, until the next `set`. The joined form
-of a list is kept until the next write through the workspace, so that a second full read costs only a copy. A stored
-value that is changed in place after a full read does not show in the next full read.
+A variable that `set` writes is a list; a variable that `set_full` writes is one array until the next `set`. The joined
+array of a list is cached until the next write through the workspace, so a second full read costs only a copy. It does
+not show a stored value that was changed in place since the first full read.
 """
 
 from collections.abc import Sequence
@@ -21,9 +21,9 @@ class Variable:
     KIND = "a numpy.ndarray"
     """The same, for error messages."""
     COPIES = True
-    """Whether values are copied in; else the objects themselves are kept."""
+    """Whether values are copied when they are written; else the objects themselves are kept."""
     library: Any = np
-    """Has `stack` and `concatenate` for them."""
+    """The module with `stack` and `concatenate` for these values."""
 
     def __init__(self, name: str, first: int = 0) -> None:
         self.name, self.first = name, first
@@ -37,12 +37,12 @@ class Variable:
 
     @property
     def size(self) -> Any:
-        """The shape of one time of a list, of all times of one array, as in BBRL."""
+        """The shape of one time (of a list) or of all times (of one array), as in BBRL."""
         return self._whole.shape if self._values is None else self.shape or ()
 
     @property
     def device(self) -> Any:
-        """Where the values are."""
+        """The device of the values."""
         return "cpu"
 
     def time_size(self) -> int:
@@ -50,7 +50,7 @@ class Variable:
         return self.first + len(self._whole if self._values is None else self._values)
 
     def batch_size(self) -> int:
-        """B; refused without a batch axis, as `set_full` takes shape (T,) too."""
+        """B; raises WorkspaceError without a batch axis, as `set_full` accepts shape (T,) too."""
         if not self.shape:
             raise WorkspaceError(f"{self.name!r} has no batch axis; write it as T x B x ....")
         return int(self.shape[0])
@@ -72,7 +72,7 @@ class Variable:
 
     def get(self, t: int) -> Any:
         """The value at time t, B x ...; -1 is the last."""
-        values = self._whole if self._values is None else self._values  # both take an index
+        values = self._whole if self._values is None else self._values  # array or list
         index = t - self.first if t >= 0 else len(values) + t
         if 0 <= index < len(values):
             return values[index]
@@ -81,7 +81,7 @@ class Variable:
     # -- all times -------------------------------------------------------------------------------------------------
 
     def set_full(self, value: Any) -> None:
-        """Write T x B x .... Over a list it overwrites the first T times and leaves the rest, as in BBRL."""
+        """Write T x B x .... In a list it overwrites the first T times and leaves later ones, as in BBRL."""
         self._check_full(value)
         if self._values:
             for k in range(len(value)):
@@ -95,7 +95,7 @@ class Variable:
         return self.copied(self.view())
 
     def view(self) -> Any:
-        """All times kept, T x B x ..., to be read at once and not to be changed."""
+        """All times kept, T x B x ..., to be read before the next write and not to be changed."""
         if self._values is None:
             return self._whole
         if self._joined is None:
@@ -103,7 +103,7 @@ class Variable:
         return self._joined
 
     def truncated(self, begin: int, end: int) -> Any:
-        """Times [begin, end), cut off at the end; a view of one array, a copy of a list."""
+        """Times [begin, end), clipped to those written; a view of one array, or a copy of a list."""
         times = slice(max(0, begin - self.first), max(0, end - self.first))
         if self._values is None:
             return self._whole[times]
@@ -116,13 +116,13 @@ class Variable:
         self.first, self._joined = first, None
 
     def copy_time(self, begin: int, to: int, count: int) -> None:
-        """Copy times [begin, begin + count) onto [to, to + count): the objects of a list, memory of one array."""
+        """Copy times [begin, begin + count) to [to, to + count): the objects of a list, or the memory of an array."""
         if self._values is not None:
             for k in range(count):
                 self.set(to + k, self.get(begin + k))
         elif count:
             for t in (begin, begin + count - 1, to, to + count - 1):
-                self.get(t)  # refuses times that are not there
+                self.get(t)  # raises TimeNotWritten
             self._whole[to : to + count] = self.copied(self._whole[begin : begin + count])
 
     def detach(self) -> None:
@@ -131,24 +131,24 @@ class Variable:
     # -- what `TensorVariable` overrides ---------------------------------------------------------------------------
 
     def _fits(self, value: Any) -> bool:
-        """Whether the value is like those before; quick."""
+        """Whether the value has the shape, dtype and device of the variable; fast."""
         return type(value) is np.ndarray and value.shape == self.shape and value.dtype == self.dtype
 
     def _join(self, values: Sequence[Any]) -> Any:
         """T values B x ..., at least one, as one new array T x B x ...."""
         if not self.shape:
             return np.stack(values)
-        return np.concatenate(values).reshape(len(values), *self.shape)  # several times as quick as `stack`
+        return np.concatenate(values).reshape(len(values), *self.shape)  # several times faster than `stack`
 
     def _zeros(self) -> Any:
-        """A time that nobody wrote."""
+        """The value at a time that was not written."""
         return np.zeros(self.shape, self.dtype)
 
     @staticmethod
     def index(index: Any, like: Any) -> Any:
         """`index` (integers or booleans) as an array that indexes `like`."""
         array = np.asarray(index)
-        empty = array.dtype.kind == "f" and not array.size  # what an empty list becomes
+        empty = array.dtype.kind == "f" and not array.size  # from an empty list
         return np.empty(0, dtype=np.int64) if empty else array
 
     @staticmethod
@@ -158,7 +158,7 @@ class Variable:
 
     @staticmethod
     def on_device(array: Any, device: Any) -> Any:
-        """The array on `device`; itself if it is there."""
+        """The array on `device`; the same object if it is there already."""
         if str(device).partition(":")[0] != "cpu":
             raise WorkspaceError(f"A NumPy array cannot be moved to {device}; only tensors can.")
         return array
@@ -192,7 +192,7 @@ class Variable:
         self.shape, self.dtype = shape, value.dtype
 
     def _check(self, value: Any, where: str) -> None:
-        """Take the shape and dtype of the first value; say what differs in any other."""
+        """Take the shape and dtype of the first value; raise ValueMismatch if another value differs."""
         if not isinstance(value, self.ARRAY):
             raise kind_mismatch(self.name, where, self.KIND, value)
         if self.shape is None:
@@ -200,12 +200,12 @@ class Variable:
                 raise no_batch(self.name, where)
             self._be_like(value.shape, value)  # type: ignore[attr-defined]
         for what in ("shape", "dtype", "device"):
-            ours, theirs = getattr(self, what), getattr(value, what, "cpu")  # arrays of NumPy 1 have no device
-            if ours != theirs:
-                raise mismatch(self.name, where, what, ours, theirs)
+            expected, found = getattr(self, what), getattr(value, what, "cpu")  # arrays of NumPy 1 have no device
+            if expected != found:
+                raise mismatch(self.name, where, what, expected, found)
 
     def _check_full(self, value: Any) -> None:
-        """Refuse what is not an array with a time axis."""
+        """Raise ValueMismatch unless the value is an array with a time axis."""
         if not isinstance(value, self.ARRAY):
             raise kind_mismatch(self.name, "all times", self.KIND, value)
         if value.ndim == 0:  # type: ignore[attr-defined]
@@ -217,7 +217,7 @@ class Variable:
         return TimeNotWritten(f"{self.name!r} is not written at t={t}; {self.kept_times()}.")
 
     def kept_times(self) -> str:
-        """Which times there are, for an error message."""
+        """The times kept, for an error message."""
         if self.time_size() <= self.first:
             return "it has none"
         several = self.time_size() - self.first > 1
@@ -232,8 +232,8 @@ def kind_name(value: Any) -> str:
 
 
 def mismatch(name: str, where: str, what: str, expected: Any, found: Any) -> ValueMismatch:
-    """The error for a value that differs from those before."""
-    shown = [str(tuple(one)) if isinstance(one, tuple) else str(one) for one in (expected, found)]
+    """The error for a value that differs from earlier ones."""
+    shown = [str(tuple(part)) if isinstance(part, tuple) else str(part) for part in (expected, found)]
     return ValueMismatch(f"{name!r} at {where}: expected {what} {shown[0]}, found {shown[1]}.")
 
 
@@ -245,7 +245,7 @@ def no_batch(name: str, where: str) -> ValueMismatch:
 
 
 def kind_mismatch(name: str, where: str, expected: str, found: Any) -> ValueMismatch:
-    """The error for a value that is no array of the expected kind."""
+    """The error for a value that is not an array of the expected kind."""
     kind = kind_name(found)
     return ValueMismatch(
         f"{name!r} at {where}: expected {expected}, found {'an' if kind[0] in 'aeiou' else 'a'} {kind}."
@@ -253,7 +253,7 @@ def kind_mismatch(name: str, where: str, expected: str, found: Any) -> ValueMism
 
 
 def to_array(value: Any) -> np.ndarray:
-    """A tensor or array as an array; shares its memory where it can."""
+    """A tensor or array as an array, which shares its memory where possible."""
     if isinstance(value, np.ndarray):
         return value
     try:

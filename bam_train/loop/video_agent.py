@@ -1,4 +1,4 @@
-"""Videos of an environment at work, one picture at every time of the loop."""
+"""Videos of an environment, with one picture at every time of the loop."""
 
 from collections.abc import Callable
 from contextlib import nullcontext
@@ -16,7 +16,7 @@ from bam_train.video import Frame, open_video, picture, require_video_path
 
 
 class VideoAgent(Agent):
-    """Gives a picture of an environment at each t to `add`, and counts them; stands behind the environment's agent."""
+    """Calls `add` with a picture of an environment at each t; belongs after the environment's agent."""
 
     reads = ()
     writes = ()
@@ -26,22 +26,22 @@ class VideoAgent(Agent):
         self.env, self.add, self.count = env, add, 0
 
     def forward(self, t: int, **kwargs: Any) -> None:
-        """Take the picture; refused where the environment gives none."""
+        """Add one picture; raises SettingsError if the environment renders none."""
         self.add(picture(self.env))
         self.count += 1
 
 
 def record_video(env: gym.Env[Any, Any], policy: Agent, path: str | Path, *, arrays: str = "torch") -> Path:
-    """Record one episode in a file, whose path is returned; the environment is closed at the end.
+    """Record one episode in a file and return its path; the environment is closed at the end.
 
     BBRL writes ``<path without suffix>/rl-video-episode-0.mp4``; this writes `path` itself.
 
     Args:
         env: Made with ``render_mode="rgb_array"``.
-        policy: Called with ``t`` after every observation (of a `TemporalAgent`, the agent in it); it finds what
-            `ParallelGymAgent` writes.
+        policy: Called with ``t`` after every observation (of a `TemporalAgent`, its inner agent); it reads the
+            variables that `ParallelGymAgent` writes.
         path: Ends in ``.mp4`` or ``.gif``; without a suffix it is an ``.mp4``. Its folder is made.
-        arrays: What the policy reads and writes: ``"torch"``, without gradients, or ``"numpy"``.
+        arrays: The values that the policy reads and writes: ``"torch"``, without gradients, or ``"numpy"``.
 
     Raises:
         SettingsError: Another suffix, or the environment gives no picture.
@@ -56,7 +56,7 @@ def record_video(env: gym.Env[Any, Any], policy: Agent, path: str | Path, *, arr
     try:
         gradients = nullcontext() if arrays == "numpy" else import_torch("record_video()").no_grad()
         with gradients, open_video(path, env.metadata.get("render_fps", 30)) as add:
-            # Not seeded: as the environment is. The policy gets no keyword but t.
+            # The environment keeps its seed. The policy gets no keyword but t.
             stepper = KWAgentWrapper(ParallelGymAgent(lambda: env, 1, arrays=arrays), seed=[None])
             loop = TemporalAgent(Agents(stepper, VideoAgent(env, add), agent))
             loop(Workspace(), t=0, stop_variable="env/done")

@@ -1,19 +1,19 @@
 """The workspace: named variables over time, which agents read and write.
 
-A variable is T x B x ...: time first, batch second; at one time it is B x .... Values are torch tensors, kept as they
-are, with their graph, or NumPy arrays, which are copied in.
+A variable is T x B x ...: time first, batch second; at one time it is B x .... Values are torch tensors, which are kept
+as they are, with their graph, or NumPy arrays, which are copied.
 
 It is BBRL's `Workspace`, with these differences:
 
-- What BBRL asserts is an exception here that names the variable, what was expected and what was found; a first write
-  that fails leaves nothing behind.
-- A full read is kept until the next write, see `bam_train.loop.variables`.
-- `to`, `cat_batch` and `sample_subworkspace` with more than one window work; `copy_n_last_steps` copies the variables
-  that it was given only, and once.
-- A workspace with a window gives old times to a sink and forgets them: memory stays flat however long the loop runs.
-  What is made of it (`contiguous`, `select_batch`, `to`, a copy) holds the times kept, and begins at time 0 again.
+- BBRL's assertions are exceptions that name the variable, the expected and the found value; a first write that fails
+  does not make the variable.
+- A full read is cached until the next write, see `bam_train.loop.variables`.
+- `to`, `cat_batch` and `sample_subworkspace` with more than one window work; `copy_n_last_steps` copies only the
+  variables that it was given, and once.
+- A workspace with a window passes old times to a sink and forgets them: its memory is bounded in a loop of any length.
+  Workspaces made from it (`contiguous`, `select_batch`, `to`, a copy) hold the times kept, and start at time 0.
 
-Longer than most files: BBRL's users find every member in one class.
+The file is longer than most, so that BBRL's users find every member in one class.
 """
 
 from __future__ import annotations
@@ -32,20 +32,20 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 Sink = Callable[[int, dict[str, Any]], None]
-"""Called with the first time of a piece and its variables, T x B x ... each."""
+"""Called with the first time of a piece and the piece's variables, T x B x ... each."""
 
 _LEAST_PIECE = 64
-"""The fewest times that leave a window together: moving them one by one would be slow."""
+"""The minimum number of times that leave a window together: moving them one by one would be slow."""
 
 
 class Workspace:
-    """Named variables over time. Whatever is given the name of a variable that nobody wrote raises `UnknownVariable`.
+    """Named variables over time. Methods raise `UnknownVariable` for the name of a variable that was not written.
 
     Args:
-        workspace: Begin as a copy of this one, sharing no memory.
-        window: Keep at least the last so many times and forget older ones; None keeps all.
-        sink: Gets what leaves the window, in order: ``sink(first_time, {name: array (n, B, ...)})``. A variable that
-            nobody wrote at these times is shorter or absent. The write that needs room waits for it.
+        workspace: A workspace to copy, without sharing memory.
+        window: The number of times to keep at least, before older ones are forgotten; None keeps all.
+        sink: Called with the times that leave the window, in order: ``sink(first_time, {name: array (n, B, ...)})``. A
+            variable not written at these times is shorter or absent. The call blocks the write that needs room.
 
     Attributes:
         variables: The variables by name, in the order of their first write.
@@ -99,7 +99,7 @@ class Workspace:
         """The value at time t, B x ...; -1 is the last.
 
         Raises:
-            TimeNotWritten: Nobody wrote it at t, or t has left the window.
+            TimeNotWritten: It was not written at t, or t has left the window.
         """
         try:
             variable = self.variables[name]
@@ -113,7 +113,7 @@ class Workspace:
     def set_full(self, name: str, value: Any) -> None:
         """Write all times at once, T x B x ....
 
-        On a variable that was written time by time it overwrites times 0 to T - 1 and leaves later ones.
+        In a variable that was written time by time, it overwrites times 0 to T - 1 and leaves later ones.
 
         Raises:
             ValueMismatch: Not an array, or it differs from the times already written.
@@ -132,18 +132,18 @@ class Workspace:
         return self._variable(name).full()
 
     def get_time_truncated(self, name: str, from_time: int, to_time: int) -> Any:
-        """Times [from_time, to_time) of one variable, ``0 <= from_time < to_time``, cut off at the end."""
+        """Times [from_time, to_time) of one variable, ``0 <= from_time < to_time``, clipped to those written."""
         variable = self._variable(name)
         self._require_times(name, from_time, to_time)
         return variable.truncated(from_time, to_time)
 
     def remove_variable(self, name: str) -> None:
-        """Forget one variable; it may come back with another shape."""
+        """Forget one variable; it may be written again with another shape."""
         self._variable(name)
         del self.variables[name]
 
     def clear(self, name: str | None = None) -> None:
-        """Forget one variable, or everything. What is in the window does not go to the sink: see `flush`."""
+        """Forget one variable, or all. The times in the window do not go to the sink: see `flush`."""
         if name is not None:
             self.remove_variable(name)
             return
@@ -155,7 +155,7 @@ class Workspace:
         return self.variables.keys()
 
     def __getitem__(self, key: str | Iterable[str]) -> Any:
-        """`get_full` of one name; of several names, a generator over theirs, in that order."""
+        """`get_full` of one name; for several names, a generator over their values, in that order."""
         if isinstance(key, str):
             return self.get_full(key)
         return (self.get_full(name) for name in key)
@@ -169,11 +169,11 @@ class Workspace:
     # -- sizes -----------------------------------------------------------------------------------------------------
 
     def time_size(self) -> int | None:
-        """One after the last time written; None when empty, `WorkspaceError` where the variables differ."""
+        """One after the last time written; None if empty. Raises `WorkspaceError` if the variables differ."""
         return _common("time", {name: one.time_size() for name, one in self.variables.items()})
 
     def batch_size(self) -> int | None:
-        """B; None when empty, `WorkspaceError` where the variables differ."""
+        """B; None if empty. Raises `WorkspaceError` if the variables differ."""
         return _common("batch", {name: one.batch_size() for name, one in self.variables.items()})
 
     def __str__(self) -> str:
@@ -186,12 +186,12 @@ class Workspace:
     # -- time ------------------------------------------------------------------------------------------------------
 
     def copy_time(self, from_time: int, to_time: int, n_steps: int, var_names: Sequence[str] | None = None) -> None:
-        """Copy times [from_time, from_time + n_steps) onto [to_time, to_time + n_steps), of some or all variables."""
+        """Copy times [from_time, from_time + n_steps) to [to_time, to_time + n_steps), of some or all variables."""
         for one in self._chosen(var_names).values():
             one.copy_time(from_time, to_time, n_steps)
 
     def copy_n_last_steps(self, n: int, var_names: Sequence[str] | None = None) -> None:
-        """Copy the last n times onto the first n; the length, which must be common, does not change."""
+        """Copy the last n times to the first n; the length, which must be the same for all, does not change."""
         size = _common("time", {name: one.time_size() for name, one in self._chosen(var_names).items()})
         if size is None:
             return
@@ -200,7 +200,7 @@ class Workspace:
         self.copy_time(size - n, 0, n, var_names)
 
     def subtime(self, from_t: int, to_t: int) -> Workspace:
-        """A new workspace of times [from_t, to_t) of all variables, which have one length, by Python's slice rules."""
+        """A new workspace of times [from_t, to_t), by Python's slice rules; all variables must have one length."""
         begin, end, _ = slice(from_t, to_t).indices(self.time_size() or 0)
         for name in self.variables if begin < end else ():
             self._require_times(name, begin, end)
@@ -213,7 +213,7 @@ class Workspace:
     # -- batch -----------------------------------------------------------------------------------------------------
 
     def select_batch(self, batch_indexes: Any) -> Workspace:
-        """A new workspace of these batch columns: integers (order and repeats kept) or a mask of booleans."""
+        """A new workspace of these batch columns: integers, in any order and repeated, or a boolean mask (B,)."""
         self.batch_size()
         views = {name: (one, one.view()) for name, one in self.variables.items()}
         return _of({name: array[:, one.index(batch_indexes, array)] for name, (one, array) in views.items()})
@@ -227,7 +227,7 @@ class Workspace:
         return self.select_batch(torch.randint(size, (n,)) if torch else np.random.randint(size, size=n))
 
     def select_subtime(self, t: Any, window_size: int) -> Workspace:
-        """A new workspace where column b has times t[b] to t[b] + window_size - 1; `t` is (B,), int."""
+        """A new workspace whose column b has the times t[b] to t[b] + window_size - 1; `t` is (B,), int."""
         result = {}
         for name, one in self.variables.items():
             array = one.view()
@@ -244,8 +244,8 @@ class Workspace:
     def sample_subworkspace(self, n_times: int, n_batch_elements: int, n_timesteps: int) -> Workspace:
         """A new workspace of `n_times` random windows, side by side over the batch.
 
-        Each has `n_timesteps` times and `n_batch_elements` columns, drawn without replacement (all if there are not
-        more).
+        Each has `n_timesteps` times and `n_batch_elements` columns, drawn without replacement, or all columns if there
+        are fewer.
         """
         times = self.time_size() or 0
         if n_timesteps > times or n_times < 1:
@@ -257,7 +257,7 @@ class Workspace:
         for _ in range(n_times):
             window = self
             if n_timesteps < times:
-                start = int(np.random.randint(times - n_timesteps))  # BBRL's draw: the last window never comes
+                start = int(np.random.randint(times - n_timesteps))  # as BBRL, which never draws the last window
                 window = self.subtime(start, start + n_timesteps)
             if n_batch_elements < columns:
                 drawn = torch.randperm(columns) if torch else np.random.permutation(columns)
@@ -267,7 +267,7 @@ class Workspace:
 
     @staticmethod
     def cat_batch(workspaces: Sequence[Workspace]) -> Workspace:
-        """A new workspace: these, which have one length, side by side over the batch."""
+        """A new workspace of several, side by side over the batch; all must have one length."""
         if not workspaces:
             raise WorkspaceError("cat_batch: expected one workspace or more, found none.")
         times = workspaces[0].time_size()
@@ -286,8 +286,8 @@ class Workspace:
     def get_transitions(self, no_final_state: bool = False, filter_key: str = "env/done") -> Workspace:
         """A new workspace of pairs of neighbouring times, 2 x N x ..., time-major, then over the batch.
 
-        A pair whose first step has `filter_key` true joins the last state of an episode to the first of the next one;
-        such pairs are left out, unless `no_final_state`, which needs no `filter_key`.
+        A pair whose first step has `filter_key` true joins the last state of an episode and the first of the next. Such
+        pairs are left out, unless `no_final_state` is true, which needs no `filter_key`.
         """
         inside = None
         if not no_final_state:
@@ -319,7 +319,7 @@ class Workspace:
         return _of({name: one.on_device(one.full(), device) for name, one in self.variables.items()})
 
     def flush(self) -> None:
-        """Give all that is left to the sink, forget it, and begin again at time 0."""
+        """Pass all remaining times to the sink, forget them, and start again at time 0."""
         stop = max((one.time_size() for one in self.variables.values()), default=0)
         try:
             if stop > self.first_time:
@@ -367,7 +367,7 @@ class Workspace:
         return {name: self._variable(name) for name in (self.variables if names is None else names)}
 
     def _torch(self) -> Any:
-        """The module torch where there are tensors, which are drawn from with its random numbers; else None."""
+        """The module torch, whose random numbers are used, if there are tensors; else None."""
         return None if all(one.ARRAY is np.ndarray for one in self.variables.values()) else sys.modules["torch"]
 
     def _require_times(self, name: str, begin: int, end: int) -> None:
@@ -378,21 +378,21 @@ class Workspace:
             raise TimeNotWritten(f"{name!r} has lost t={begin}: times before {self.first_time} have left the window.")
 
     def _forget(self, stop: int) -> None:
-        """Forget the times before `stop`; they go to the sink."""
+        """Forget the times before `stop`, and pass them to the sink."""
         first, self.first_time = self.first_time, stop
         piece = {
-            name: one.copied(one.truncated(first, min(stop, one.time_size())))  # of one array it would be a view
+            name: one.copied(one.truncated(first, min(stop, one.time_size())))  # of an array it would be a view
             for name, one in self.variables.items()
             if one.time_size() > first and self._sink is not None
         }
         for one in self.variables.values():
             one.drop(stop)
         if self._sink is not None:
-            self._sink(first, piece)  # last: each piece goes there once, also if it fails
+            self._sink(first, piece)  # last, so that a piece is passed once even if this fails
 
 
 def _of(arrays: Mapping[str, Any]) -> Workspace:
-    """A new workspace of full arrays."""
+    """A new workspace of arrays T x B x ...."""
     workspace = Workspace()
     for name, array in arrays.items():
         workspace.set_full(name, array)
@@ -400,7 +400,7 @@ def _of(arrays: Mapping[str, Any]) -> Workspace:
 
 
 def _pairs(one: Variable, inside: Any) -> Any:
-    """Neighbouring times of a variable, 2 x N x ...; those where `inside` (T - 1, B) is true, or all."""
+    """Pairs of neighbouring times of a variable, 2 x N x ...: those where `inside` (T - 1, B) is true, or all."""
     array = one.view()
     if inside is not None:
         chosen = one.index(inside, array)
@@ -410,7 +410,7 @@ def _pairs(one: Variable, inside: Any) -> Any:
 
 
 def _common(what: str, sizes: Mapping[str, int]) -> int | None:
-    """The one size that all variables have; None when there are none."""
+    """The size that all variables have; None if there are no variables."""
     (first, common), *others = sizes.items() or [("", None)]
     for name, size in others:
         if size != common:

@@ -1,4 +1,4 @@
-"""What the agents of Gymnasium environments have in common: variables, spaces, seeds, stepping."""
+"""The base class of agents of Gymnasium environments: variables, spaces, seeds, stepping."""
 
 from __future__ import annotations
 
@@ -28,23 +28,23 @@ class GymAgent(SeedableAgent):
     """Base of `ParallelGymAgent` and `VecGymAgent`.
 
     Args:
-        input_string: The variable with the action; where actions are dicts, the first part of their names.
-        output_string: Put before the names of all variables that it writes.
+        input_string: The variable with the action; for dict actions, the prefix of the variables' names.
+        output_string: Prefix of the names of all variables that it writes.
         reward_at_t: Write the reward and the cumulated reward of action[t] at t, not at t + 1. The reward at the
             newest time is 0 until the next step overwrites it.
-        include_last_state: Whether the time at which an episode ends has its last observation; without it that time
-            has the first observation of the next episode. Without auto-reset it is always True.
-        arrays: ``"torch"``: tensors, float32 and int64. ``"numpy"``: arrays, observations of the space's dtype,
-            rewards float64; torch is not needed.
-        info_keys: Entries k of the environments' infos to write too: ``info/k`` beside the mask ``info/_k``.
+        include_last_state: Whether the time at which an episode ends has its last observation, or else the first
+            observation of the next episode. Without auto-reset it is always True.
+        arrays: ``"torch"`` for tensors, float32 and int64; ``"numpy"`` for arrays, with observations of the space's
+            dtype and rewards of float64, without torch.
+        info_keys: Keys k of the environments' infos to write too, as ``info/k`` with the mask ``info/_k``.
         kwargs: ``seed``, ``name``, ``verbose``.
 
     Attributes:
         ghost_params: An empty parameter; its device is where observations are put. None with NumPy.
-        default_seed: The seed of an agent that was given none when it first runs.
+        default_seed: The seed of an agent that has no other seed when it first runs.
 
     Raises:
-        SettingsError: `arrays` is neither of the two.
+        SettingsError: `arrays` is neither ``"torch"`` nor ``"numpy"``.
     """
 
     default_seed = 42
@@ -55,7 +55,7 @@ class GymAgent(SeedableAgent):
     _SEED_AGAIN = "give a run another seed with agent(workspace, t=0, seed={seed})."
 
     def __new__(cls, *args: Any, arrays: str = "torch", **kwargs: Any) -> Self:
-        """See `Agent`; with tensors it is an `nn.Module` also where nobody has imported torch yet."""
+        """Make an agent, which with tensors is always an `nn.Module`: torch is imported for it."""
         if arrays == "torch":
             import_torch(f'{cls.__name__} (unless arrays="numpy" is given)')
         return super().__new__(cls)
@@ -91,32 +91,32 @@ class GymAgent(SeedableAgent):
 
     @abstractmethod
     def _open(self) -> None:
-        """Make the environments `envs`, and call `_opened`."""
+        """Make the environments `envs`, and call `_opened` with their spaces."""
 
     def _opened(self, observation_space: Space[Any], action_space: Space[Any]) -> None:
-        """Take the spaces of one environment and declare what is written."""
+        """Store the spaces of one environment, and declare the variables that are written."""
         self.observation_space, self.action_space = observation_space, action_space
         self._declare(GymAgent, reads=None, writes=self._written())
 
     @abstractmethod
     def _begin(self, seeds: Any) -> Arrays:
-        """Begin an episode in every environment; `seeds` is a number to count from, or one for each environment."""
+        """Begin an episode in every environment; `seeds` is the seed of the first, or one for each environment."""
 
     @abstractmethod
     def _step(self, t: int) -> Arrays:
         """Step every environment with its action of time t."""
 
     def forward(self, t: int = 0, **kwargs: Any) -> None:
-        """One step of every environment with the action of t - 1; at t = 0 all are reset.
+        """Reset all environments at t = 0; at t > 0 step each with the action of t - 1.
 
         Args:
             t: The time.
-            kwargs: ``seed``: at t = 0, what environment k is reset with: a number s for s + k, or one number for
-                each. Without it BBRL's rule holds: num_envs * r * seed + k + 1, r counting the resets from 2.
+            kwargs: ``seed``, used at t = 0: a number s, so that environment k gets s + k, or a list with one seed for
+                each. By default BBRL's rule: num_envs * r * seed + k + 1, where r counts the resets from 2.
 
         Raises:
-            LoopError: t > 0 and the environments were never reset, or closed since; or nobody wrote an action, or one
-                that does not fit the action space.
+            LoopError: t > 0, and the environments were never reset or have been closed; or the action is missing or
+                does not fit the action space.
         """
         if t == 0:
             seed = kwargs.get("seed")
@@ -145,7 +145,7 @@ class GymAgent(SeedableAgent):
         self._put(frame, t)
 
     def _frame(self, observations: Arrays, rewards: Any, terminated: Array, truncated: Array, infos: Arrays) -> Arrays:
-        """What n environments gave at one time: new arrays (n, ...) by name, without the output prefix."""
+        """The variables of n environments at one time: new arrays (n, ...) by name, without the output prefix."""
         reward = np.array(rewards, dtype=self._floats)
         if reward.ndim != 1:
             raise ValueMismatch(f"'reward': expected one number from each environment, found {rewards[0]!r}.")
@@ -167,7 +167,7 @@ class GymAgent(SeedableAgent):
                 workspace.set(prefix + name, t, array)
             return
         from_numpy = sys.modules["torch"].from_numpy
-        ghost = self.__dict__["_parameters"]["ghost_params"]  # around nn.Module's __getattr__, which costs much
+        ghost = self.__dict__["_parameters"]["ghost_params"]  # without nn.Module's slow __getattr__
         for name, array in arrays.items():
             value = from_numpy(array)
             workspace.set(prefix + name, t, value if ghost.is_cpu else value.to(ghost.device))
@@ -178,13 +178,13 @@ class GymAgent(SeedableAgent):
         return tuple(self.output + name for name in (*names(self.observation_space), *NUMBERS, *infos))
 
     def _reset_seeds(self, seed: Any) -> int | list[int | None]:
-        """What the environments are reset with: one seed to count from, or one for each; None for the own rule."""
+        """Seeds for a reset: that of the first environment, or one for each (None: its own rule)."""
         if seed is None:
             return self.num_envs * self._nb_reset * int(self._seed or 0) + 1
         if isinstance(seed, (int, np.integer)):
             return int(seed)
         try:
-            seeds = [None if one is None else int(one) for one in seed]
+            seeds = [None if entry is None else int(entry) for entry in seed]
         except (TypeError, ValueError):
             raise SettingsError(f"seed: expected a whole number or a list of them, found {seed!r}.") from None
         if len(seeds) != self.num_envs:
@@ -192,7 +192,7 @@ class GymAgent(SeedableAgent):
         return seeds
 
     def close(self) -> None:
-        """Close the environments; they are made anew at the next t = 0."""
+        """Close the environments; the next t = 0 makes new ones."""
         envs, self.envs, self._running = self.envs, None, False
         with ExitStack() as stack:  # all of them, also when one fails
             for env in envs if isinstance(envs, list) else [envs]:
@@ -210,9 +210,9 @@ class GymAgent(SeedableAgent):
         return self.action_space
 
     def get_obs_and_actions_sizes(self) -> tuple[Any, Any]:
-        """Sizes of observation and action: length, or number of choices; with a warning, the shape of more dimensions.
+        """Sizes of observation and action: the length, or the number of choices.
 
-        A space without a size, such as a dict, raises `LoopError`.
+        More than one dimension gives the shape, with a warning; a space without a size, such as a dict, a `LoopError`.
         """
         return _size(self.observation_space), _size(self.action_space)
 

@@ -2,8 +2,8 @@
 
 An observation is one variable ``env_obs``, or, for a (nested) dict, one for each entry: ``env_obs/<key>/<key>``. An
 action is the variable ``action``, or ``action/<key>/<key>``. As in Gymnasium's vector environments, entry k of the
-infos is the variable ``info/k`` beside the mask ``info/_k``. It begins with the first value that any environment gives,
-since its dtype and shape are not known earlier; from then on it is written at every time, zero where the mask is False.
+infos is the variable ``info/k`` with the mask ``info/_k``. It is written from the first value that any environment
+returns, since its dtype and shape are not known earlier, at every time, and is zero where the mask is False.
 """
 
 from collections.abc import Mapping, Sequence
@@ -21,14 +21,14 @@ Arrays = dict[str, Array]
 NAME = "env_obs"
 _WHOLE = (spaces.Discrete, spaces.MultiDiscrete, spaces.MultiBinary)
 _GIVEN = {"f": np.float64, "i": np.int64, "u": np.int64, "b": np.bool_}
-"""What single environments are given, by kind of action."""
+"""Dtype of the actions that single environments get, by kind of dtype."""
 
 
 # -- observations ------------------------------------------------------------------------------------------------------
 
 
 class Kind(NamedTuple):
-    """What one variable of an observation is written as."""
+    """Dtype and shape in which one variable of an observation is written."""
 
     dtype: np.dtype[Any]
     shape: tuple[int, ...]
@@ -36,7 +36,7 @@ class Kind(NamedTuple):
 
 
 def names(space: Space[Any]) -> tuple[str, ...]:
-    """The variables that observations of `space` are written to."""
+    """Names of the variables for observations of `space`."""
     return tuple(flat(space))
 
 
@@ -45,19 +45,19 @@ def flat(value: Any, name: str = NAME) -> dict[str, Any]:
     if isinstance(value, np.ndarray):  # the usual case
         return {name: value}
     if isinstance(value, Mapping):
-        return {path: one for key, part in value.items() for path, one in flat(part, f"{name}/{key}").items()}
+        return {path: leaf for key, part in value.items() for path, leaf in flat(part, f"{name}/{key}").items()}
     return {name: value.detach().cpu().numpy() if hasattr(value, "detach") else value}
 
 
 def kinds(parts: Mapping[str, Any], space: Space[Any] | None, for_torch: bool) -> dict[str, Kind]:
-    """What the variables of an observation are written as.
+    """Dtypes and shapes of the variables of an observation.
 
     Args:
         parts: `flat` of the observation of one environment: arrays or numbers; anything else raises `ValueMismatch`.
-        space: Where the dtypes come from unless `for_torch`; None for the observation's own.
-        for_torch: Floats become float32 and integers int64, whatever they are.
+        space: Determines the dtypes unless `for_torch`; None for those of the observation.
+        for_torch: Whether all floats become float32 and all integers int64.
     """
-    found, of_space = {}, flat(space)
+    by_name, of_space = {}, flat(space)
     for name, value in parts.items():
         dtype = None if isinstance(value, (tuple, str)) else np.asarray(value).dtype
         if dtype is None or dtype.kind not in "fiub":
@@ -70,18 +70,18 @@ def kinds(parts: Mapping[str, Any], space: Space[Any] | None, for_torch: bool) -
             dtype = np.dtype(np.float32 if dtype.kind == "f" else whole)
         elif (wanted := getattr(of_space.get(name), "dtype", None)) is not None:
             dtype = np.dtype(wanted)
-        found[name] = Kind(dtype, np.shape(value))
-    return found
+        by_name[name] = Kind(dtype, np.shape(value))
+    return by_name
 
 
 def pack(kinds: Mapping[str, Kind], observations: Sequence[Any]) -> Arrays:
-    """New arrays (n, ...) by variable from the observations of n environments, which have these shapes and keys."""
-    rows, packed = [flat(one) for one in observations], {}
+    """New arrays (n, ...) by variable from the observations of n environments; raises ValueMismatch if they differ."""
+    rows, packed = [flat(observation) for observation in observations], {}
     for name, (dtype, shape) in kinds.items():
         values = [pick(row, name) for row in rows]
         try:
             array = np.array(values, dtype=dtype)
-        except ValueError:  # they differ among each other
+        except ValueError:  # the shapes differ among the environments
             array = np.empty(0)
         if array.shape != (len(rows), *shape):
             k, other = next((k, s) for k, s in enumerate(map(np.shape, values)) if s != shape)
@@ -91,7 +91,7 @@ def pack(kinds: Mapping[str, Kind], observations: Sequence[Any]) -> Arrays:
 
 
 def pick(parts: Mapping[str, Any], name: str) -> Any:
-    """One variable's part of an observation."""
+    """The part of an observation for one variable."""
     if name not in parts:
         raise ValueMismatch(f"{name!r}: the environment gave an observation without it.")
     return parts[name]
@@ -101,7 +101,7 @@ def pick(parts: Mapping[str, Any], name: str) -> Any:
 
 
 class InfoRecorder:
-    """Takes the entries named `keys` out of infos; floats become `floats`, float32 or float64."""
+    """Reads the entries `keys` of infos; floats are converted to `floats`, float32 or float64."""
 
     def __init__(self, keys: Sequence[str], num_envs: int, floats: np.dtype[Any]) -> None:
         self._keys, self._num_envs = tuple(keys), num_envs
@@ -110,7 +110,7 @@ class InfoRecorder:
         self._known: dict[str, tuple[np.dtype[Any], tuple[int, ...]]] = {}
 
     def of_each(self, infos: Sequence[Mapping[str, Any]]) -> Arrays:
-        """From one info for each environment."""
+        """The entries' variables, (n, ...) each, from a list of n infos."""
         found: Arrays = {}
         for key in self._keys:
             mask = np.array([key in info for info in infos])
@@ -118,7 +118,7 @@ class InfoRecorder:
         return found
 
     def of_vector(self, infos: Mapping[str, Any]) -> Arrays:
-        """From the infos of a vector environment."""
+        """The entries' variables, (n, ...) each, from the infos of a vector environment."""
         found: Arrays = {}
         for key in self._keys:
             mask = np.zeros(self._num_envs, dtype=bool)
@@ -130,10 +130,10 @@ class InfoRecorder:
     def _record(self, found: Arrays, key: str, mask: Array, given: Sequence[tuple[Any, Any]]) -> None:
         """Add one entry to `found`; `given` has indices of environments, and their values."""
         for index, value in given:
-            one = value[0] if np.ndim(index) else value
-            array = np.asarray(one)
-            if array.dtype.kind not in self._dtypes:  # at every time: NumPy writes None as NaN and "2" as 2
-                raise ValueMismatch(f"info {key!r}: expected a number or an array of them, found a {kind_name(one)}.")
+            first = value[0] if np.ndim(index) else value
+            array = np.asarray(first)
+            if array.dtype.kind not in self._dtypes:  # at every time: NumPy converts None to NaN and "2" to 2
+                raise ValueMismatch(f"info {key!r}: expected a number or an array of them, found a {kind_name(first)}.")
             self._known.setdefault(key, (self._dtypes[array.dtype.kind], array.shape))
         if key not in self._known:
             return
@@ -155,10 +155,10 @@ def each_action(workspace: Any, t: int, name: str, space: Space[Any], num_envs: 
     Actions of other spaces than Box, Discrete, MultiDiscrete, MultiBinary and Dict are not checked.
 
     Args:
-        workspace: Raises `UnknownVariable` or `TimeNotWritten` where nobody wrote an action.
+        workspace: The workspace; raises `UnknownVariable` or `TimeNotWritten` if no action was written.
         t: The time.
-        name: The variable; where actions are dicts, the first part of the variables' names.
-        space: Of one environment; what does not fit it raises `ValueMismatch`.
+        name: The variable; for dict actions, the prefix of the variables' names.
+        space: Action space of one environment; an action that does not fit raises `ValueMismatch`.
         num_envs: The number of environments.
     """
     if isinstance(space, spaces.Dict):
@@ -168,11 +168,11 @@ def each_action(workspace: Any, t: int, name: str, space: Space[Any], num_envs: 
     if array.ndim > 1:
         return list(array.astype(_GIVEN[array.dtype.kind]))
     plain: list[Any] = array.tolist()
-    return [np.asarray(one) for one in plain] if array.dtype.kind == "f" else plain
+    return [np.asarray(number) for number in plain] if array.dtype.kind == "f" else plain
 
 
 def batch_action(workspace: Any, t: int, name: str, space: Space[Any], num_envs: int) -> Any:
-    """All actions together, see `each_action`: a new array of the space's dtype, or a nested dict of these."""
+    """The actions of `each_action` as one new array (n, ...) of the space's dtype, or a nested dict of these."""
     if isinstance(space, spaces.Dict):
         return {key: batch_action(workspace, t, f"{name}/{key}", part, num_envs) for key, part in space.items()}
     array = _read(workspace, t, name, space, num_envs)
@@ -181,7 +181,7 @@ def batch_action(workspace: Any, t: int, name: str, space: Space[Any], num_envs:
 
 
 def _read(workspace: Any, t: int, name: str, space: Space[Any], num_envs: int) -> Array:
-    """One variable of the actions, checked."""
+    """Read one variable of the actions, (n, ...), and check it against its space."""
     array = to_array(workspace.get(name, t))
     if not isinstance(space, (spaces.Box, *_WHOLE)):
         if len(array) != num_envs:
@@ -194,9 +194,9 @@ def _read(workspace: Any, t: int, name: str, space: Space[Any], num_envs: int) -
         raise ValueMismatch(f"{name!r} at t={t}: {space} takes whole numbers, found {array.dtype}.")
     if isinstance(space, spaces.Discrete):
         first, last = int(space.start), int(space.start + space.n - 1)
-        plain = array.tolist()  # quicker than NumPy for few environments
+        plain = array.tolist()  # faster than NumPy for few environments
         if min(plain) < first or max(plain) > last:
-            k, found = next((k, one) for k, one in enumerate(plain) if not first <= one <= last)
+            k, found = next((k, number) for k, number in enumerate(plain) if not first <= number <= last)
             raise ValueMismatch(
                 f"{name!r} at t={t}: {space} takes {first} to {last}, found {found} for environment {k}."
             )

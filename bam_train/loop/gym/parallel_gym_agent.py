@@ -2,15 +2,15 @@
 
 Differences from bbrl 1.0.1:
 
-- An action that is missing or does not fit the action space, and an observation that is no array, number or dict of
-  them, are exceptions that name the variable.
-- What environments give is written in the dtype of the table below, whatever its Python type; BBRL writes NumPy
-  integers as float32, float16 as int64, and flags 0 and 1 as int64.
+- An action that is missing or does not fit the action space, and an observation that is not an array, number or dict of
+  them, raise exceptions that name the variable.
+- Values are written in the dtype of the table below, whatever their Python type; BBRL writes NumPy integers as float32,
+  float16 as int64, and flags 0 and 1 as int64.
 - `seed` in the call, `info_keys`, `arrays="numpy"`, `close`.
 - With `reward_at_t` the cumulated reward at two times is two tensors, not one.
 
-Kept though odd: with ``include_last_state=False`` timestep is one short from the second episode on; the seeds of the
-environments depend on the number of resets; rewards that are NumPy float32 are summed in float32.
+Oddities of BBRL that are kept: with ``include_last_state=False`` timestep is one too small from the second episode on;
+the seeds of the environments depend on the number of resets; rewards of NumPy float32 are summed in float32.
 """
 
 from __future__ import annotations
@@ -35,12 +35,12 @@ Env = gym.Env[Any, Any]
 def make_env(
     env_name: str, autoreset: bool = False, wrappers: Iterable[Callable[[Env], Env]] = (), **kwargs: Any
 ) -> Env:
-    """A Gymnasium environment, ``gymnasium.make(env_name, **kwargs)``, in its wrappers.
+    """Make a Gymnasium environment, ``gymnasium.make(env_name, **kwargs)``, and apply wrappers.
 
-    Gymnasium's checker, which looks at every step and changes nothing, is off; ``disable_env_checker=False`` has it.
+    Gymnasium's environment checker is off; ``disable_env_checker=False`` turns it on.
 
     Args:
-        env_name: Its id.
+        env_name: Gymnasium id.
         autoreset: Put Gymnasium's `Autoreset` outermost.
         wrappers: Applied in this order: with [A, B] the environment is B(A(env)).
         kwargs: For `gymnasium.make`.
@@ -61,22 +61,22 @@ def has_autoreset(env: Env) -> bool:
 
 
 def _repeat(result: tuple[Any, ...], action: Any) -> tuple[Any, ...]:
-    """The step of an environment that has ended for good."""
+    """The step of an environment that has ended and is not reset."""
     return result
 
 
 class ParallelGymAgent(GymAgent):
     """Resets n environments at t = 0, and at t > 0 steps each with its action of t - 1.
 
-    It is auto-resetting if a Gymnasium `Autoreset` wrapper is in the first environment's chain. Then the time after the
-    one at which an episode ends is the first of the next episode, with reward 0; the action at the end is not used.
-    Otherwise the last frame of an ended environment is repeated with reward 0 until the caller stops.
+    It resets ended environments if the first environment has a Gymnasium `Autoreset` wrapper. Then the time after the
+    end of an episode is the first of the next episode, with reward 0; the action at the end is not used. Otherwise the
+    last values of an ended environment are repeated with reward 0 until the caller stops.
 
     ========================  ===============================  ======================================================
     variable                  dtype and shape (B = num_envs)   value
     ========================  ===============================  ======================================================
     env/env_obs               float32 or int64, B x ...        the observation after the step
-    env/env_obs/<key>/<key>   float32 or int64, B x ...        instead of it, for dict observations
+    env/env_obs/<key>/<key>   float32 or int64, B x ...        the same, for dict observations
     env/terminated            bool, B                          the task's end
     env/truncated             bool, B                          the time limit's
     env/done                  bool, B                          either
@@ -142,7 +142,7 @@ class ParallelGymAgent(GymAgent):
         return self._frame(pack(self._kinds, observations), [0.0] * n, no, no.copy(), self._infos.of_each(infos))
 
     def _step(self, t: int) -> Arrays:
-        """Step every environment that has not ended for good."""
+        """Step every environment; one that has ended without auto-reset repeats its last values."""
         actions = each_action(self.workspace, t, self.input, self.action_space, self.num_envs)
         results = [step(action) for step, action in zip(self._steps, actions, strict=True)]
         observations, rewards, terminated, truncated, infos = zip(*results, strict=True)
@@ -151,7 +151,7 @@ class ParallelGymAgent(GymAgent):
         ended = [k for k in range(self.num_envs) if terminated[k] or truncated[k]]
         if ended and self._is_autoreset and not self.include_last_state:
             firsts = {k: self._steps[k](None)[0] for k in ended}
-            observations = tuple(firsts.get(k, one) for k, one in enumerate(observations))
+            observations = tuple(firsts.get(k, observation) for k, observation in enumerate(observations))
         ends = np.array(terminated, dtype=bool), np.array(truncated, dtype=bool)
         frame = self._frame(pack(self._kinds, observations), rewards, *ends, self._infos.of_each(infos))
         for k in ended:
@@ -165,7 +165,7 @@ class ParallelGymAgent(GymAgent):
 
     @staticmethod
     def _format_frame(frame: Any) -> dict[str, Any]:
-        """One observation as tensors with a batch dimension of 1, by the names of its variables without prefix."""
+        """One observation as tensors, 1 x ... each, by variable without prefix."""
         import torch
 
         arrays = pack(kinds(flat(frame), None, for_torch=True), [frame])
@@ -173,7 +173,7 @@ class ParallelGymAgent(GymAgent):
 
 
 def _require_envs(envs: Sequence[Any]) -> None:
-    """Refuse what cannot be stepped one by one, and a live robot, whose chain has to be checked before it moves."""
+    """Refuse vector environments, and live robots, whose chain must be checked before they move."""
     for env in envs:
         if isinstance(env, gym.vector.VectorEnv):
             raise SettingsError("make_env_fn: expected single environments, found a vector one: use VecGymAgent.")

@@ -3,18 +3,18 @@
 Unlike bbrl 1.0.1's `VecGymAgent`, which fails with more than one environment and never restarts cumulated_reward, it
 has the variables and the seeds of `ParallelGymAgent` in every autoreset mode. Rewards are summed in float64.
 
-With `include_last_state` the time at which an episode ends has the last observation, and the next time is a first
-observation with reward 0:
+With `include_last_state` the time at which an episode ends has its last observation, and the next time has the first
+observation of the next episode, with reward 0:
 
 ==========  ==========================================================================================================
-NEXT_STEP   does just this
-SAME_STEP   the last observation is in ``infos["final_obs"]``. At the next time the environment is a step into the new
-            episode; that step is thrown away: the environment is reset again, by a reset mask
-DISABLED    made SAME_STEP here, by a reset mask, so that no ended environment is ever stepped
+NEXT_STEP   behaves so itself
+SAME_STEP   the last observation is in ``infos["final_obs"]``. At the next time the environment has taken a step of the
+            new episode; this step is discarded: the environment is reset again, by a reset mask
+DISABLED    behaves as SAME_STEP, by a reset mask, so that no ended environment is ever stepped
 ==========  ==========================================================================================================
 
-Without it the time at which an episode ends has the first observation of the next: NEXT_STEP cannot do this. Without
-auto-reset the frame of an ended environment is repeated with reward 0, whatever it does underneath.
+Without `include_last_state`, the time at which an episode ends has the first observation of the next, which NEXT_STEP
+does not support. Without auto-reset, the last values of an ended environment are repeated with reward 0 in every mode.
 """
 
 from __future__ import annotations
@@ -40,12 +40,12 @@ class VecGymAgent(GymAgent):
     Args:
         make_envs_fn: Makes the vector environment.
         vec_env_args: Keywords of `make_envs_fn`.
-        auto_reset: False repeats the last frame of an ended environment, with reward 0, until the caller stops.
+        auto_reset: False repeats the last values of an ended environment, with reward 0, until the caller stops.
         kwargs: See `GymAgent`.
 
     Raises:
-        SettingsError: The environment does not say in its metadata what it does with ended environments, or resets
-            them in the next step and `include_last_state` is False.
+        SettingsError: The environment's metadata has no autoreset mode, or the mode is NEXT_STEP and
+            `include_last_state` is False.
     """
 
     def __init__(
@@ -69,9 +69,9 @@ class VecGymAgent(GymAgent):
                 f"make_envs_fn: expected it to return a gymnasium.vector.VectorEnv, found {type(self.envs).__name__}; "
                 f"single environments are ParallelGymAgent's."
             )
-        # Read now: Gymnasium's own write it into a dict that all vector environments of one class share.
+        # Read now: Gymnasium writes it into a dict that all vector environments of one class share.
         mode = self.envs.metadata.get("autoreset_mode")
-        known = [one for one in AutoresetMode if mode in (one, one.value)]
+        known = [member for member in AutoresetMode if mode in (member, member.value)]
         problem = ""
         if not known:
             problem = (
@@ -93,7 +93,7 @@ class VecGymAgent(GymAgent):
 
     def _begin(self, seeds: int | Sequence[int | None]) -> Arrays:
         observations, infos = self.envs.reset(seed=seeds)
-        first = {name: one if isinstance(one, tuple) else one[0] for name, one in flat(observations).items()}
+        first = {name: part if isinstance(part, tuple) else part[0] for name, part in flat(observations).items()}
         self._kinds = kinds(first, self.observation_space, self.arrays == "torch")
         no = np.zeros(self.num_envs, dtype=bool)
         self._due, self._over = no.copy(), no.copy()
@@ -117,7 +117,7 @@ class VecGymAgent(GymAgent):
         np.add(self._timestep, 1, out=self._timestep)
         frame = self._frame(packed, rewards, terminated, truncated, recorded)
         if not self.auto_reset:
-            if over:  # for good: the last frame again, with reward 0
+            if over:  # repeat the last values, with reward 0
                 _replace(frame, self._last, self._over)
                 frame["reward"][self._over] = 0
             self._over, self._last = frame["done"].copy(), _copies(frame)
@@ -133,8 +133,8 @@ class VecGymAgent(GymAgent):
     def _turn(
         self, packed: Arrays, rewards: Array, terminated: Array, truncated: Array, infos: Any, recorded: Arrays
     ) -> None:
-        """Put the last observation where episodes end, and the first where they begin; changes what it is given."""
-        begin = self._due.copy()  # each is a step into its next episode when its first observation is due
+        """Put the last observation where episodes end, and the first where they begin; changes its arguments."""
+        begin = self._due.copy()  # these have taken a step of the episode whose first observation is due
         ended = terminated | truncated
         if self._mode == AutoresetMode.SAME_STEP and ended.any():
             if self.include_last_state:
@@ -156,7 +156,7 @@ class VecGymAgent(GymAgent):
         rewards[begin], terminated[begin], truncated[begin] = 0, False, False
 
     def _take_final(self, packed: Arrays, ended: Array, infos: Mapping[str, Any]) -> None:
-        """The last observation where episodes ended."""
+        """Put the last observation into `packed` where episodes ended."""
         if "final_obs" not in infos:
             raise LoopError(f'{self.envs} is AutoresetMode.SAME_STEP but gave no infos["final_obs"] at an end.')
         final = infos["final_obs"]
@@ -169,12 +169,12 @@ class VecGymAgent(GymAgent):
                 array[k] = pick(parts, name)
 
     def _packed(self, observations: Any) -> Arrays:
-        """Copies of the observations' arrays by variable, in the dtype they are written as."""
+        """Copies of the observations' arrays (n, ...) by variable, in the dtype of the variable."""
         parts = flat(observations)
         return {name: np.array(pick(parts, name), dtype=kind.dtype) for name, kind in self._kinds.items()}
 
     def __getstate__(self) -> dict[str, Any]:
-        """A copy makes its own environment at its next t = 0: processes and simulators cannot be copied."""
+        """A copy makes new environments at its next t = 0: processes and simulators cannot be copied."""
         return {**super().__getstate__(), "envs": None, "_running": False}
 
 
@@ -183,7 +183,7 @@ def _copies(arrays: Arrays) -> Arrays:
 
 
 def _replace(new: Arrays, old: Arrays, chosen: Array) -> None:
-    """In `new`, take the environments `chosen` (n,) bool from `old`; 0 where `old` has nothing."""
+    """Copy the environments `chosen` (n,) bool from `old` to `new`, or zeros for variables that `old` lacks."""
     for name, array in old.items():
         new.setdefault(name, np.zeros_like(array))
     for name, array in new.items():

@@ -1,1 +1,1 @@
-"""The torch layer of the loop: the only place in it that imports torch when it is imported."""
+"""The torch layer of the loop: its only package that imports torch when it is imported."""

@@ -1,10 +1,10 @@
-"""A ring of transitions (or of longer pieces of time) that off-policy algorithms draw batches from.
+"""A ring buffer of transitions, or of longer sequences, from which off-policy algorithms draw batches.
 
 Differences from BBRL's `ReplayBuffer`:
 
-- One `put` of more than `max_size` items keeps the newest `max_size`; BBRL's raises or writes onto itself.
+- One `put` of more than `max_size` items keeps the newest `max_size`; BBRL's raises or overwrites its own items.
 - A `put` that does not fit is refused before anything changes; BBRL's stores a part of it.
-- `to` moves what is put and drawn later, too, and returns the buffer. NumPy workspaces are taken as well.
+- `to` applies to items that are put and drawn later too, and returns the buffer. NumPy workspaces are accepted.
 """
 
 from __future__ import annotations
@@ -16,12 +16,12 @@ from bam_train.loop.workspace import Workspace
 
 
 class ReplayBuffer:
-    """The newest `max_size` (at least 1) items that were put in; an item is T times of every variable.
+    """Holds the newest `max_size` (at least 1) items; an item is T times of every variable.
 
     The first `put` fixes the names, T, shapes and dtypes.
 
     Attributes:
-        variables: Name to tensor, max_size x T x ...; items from `size()` on are zeros that nobody wrote.
+        variables: Name to tensor, max_size x T x ...; items from `size()` on are zeros.
         position: The item that the next `put` writes first.
         is_full: Whether `max_size` items have been put in.
     """
@@ -38,7 +38,7 @@ class ReplayBuffer:
     def put(self, workspace: Workspace) -> None:
         """Add the N columns of a workspace (T x N x ..., such as transitions, where T is 2) as N items, detached.
 
-        The oldest items make room.
+        They replace the oldest items of a full buffer.
 
         Raises:
             UnknownVariable: A variable that the buffer has is missing.
@@ -89,7 +89,7 @@ class ReplayBuffer:
         return workspace
 
     def to(self, device: torch.device | str) -> ReplayBuffer:
-        """Move the items, and those put later, to a device; returns the buffer."""
+        """Move present and later items to a device; returns the buffer."""
         self.device = torch.device(device)
         self.variables = {name: value.to(self.device) for name, value in self.variables.items()}
         return self

@@ -152,7 +152,7 @@ def _with_last_zero(differences: torch.Tensor) -> torch.Tensor:
 
 
 def _flags(function: str, times: torch.Tensor, must_bootstrap: torch.Tensor) -> torch.Tensor:
-    """One flag for each transition, (T - 1) x B; of `get_transitions`, where T is 2, (B,) will do."""
+    """One flag for each transition, (T - 1) x B; for `get_transitions`, where T is 2, also (B,)."""
     if len(times) == 2 and must_bootstrap.shape == times.shape[1:]:
         return must_bootstrap.unsqueeze(0)
     _require_shapes(function, times[1:].shape, must_bootstrap=must_bootstrap)

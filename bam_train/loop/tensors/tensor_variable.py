@@ -26,16 +26,16 @@ class TensorVariable(Variable):
         return self._device
 
     def full(self) -> torch.Tensor:
-        """All times kept, T x B x ...: one tensor itself, of a list a copy."""
+        """All times kept, T x B x ...: the tensor itself, or a copy of a list."""
         return self._whole if self._values is None else self.view().clone()
 
     def view(self) -> torch.Tensor:
-        """All times kept, T x B x ..., to be read at once and not to be changed."""
+        """All times kept, T x B x ..., to be read before the next write and not to be changed."""
         if self._values is None:
             whole: torch.Tensor = self._whole
             return whole
         grad = torch.is_grad_enabled()
-        # Joined while gradients were off it lacks the graph; joined while they were on it may have one too many.
+        # A tensor joined with gradients off lacks the graph; one joined with gradients on may have one in excess.
         if self._joined is not None and self._joined_with_grad != grad and (grad or self._joined.requires_grad):
             self._joined = None
         if self._joined is None:
