@@ -1,6 +1,6 @@
 """Training with RLlib on its new API stack.
 
-Importing this registers every environment of ours with RLlib, so that a script needs no more than::
+Importing this package registers every environment of `bam_envs` with RLlib, so that a script needs no more than::
 
     import bam_train.trainers.rllib
     from ray.rllib.algorithms.ppo import PPOConfig
@@ -30,14 +30,14 @@ __all__ = ["RobotEnvRunner"]
 
 
 def register() -> None:
-    """Give RLlib every environment of ours, under its id and under its id without a version."""
+    """Register every environment of `bam_envs` with RLlib, under its id and under its id without a version."""
     for env_id in own_ids():
         for name in {env_id, env_id.rpartition("-v")[0]}:
             _register(name, env_id)
 
 
 def register_foreign(env_id: str) -> str:
-    """Give RLlib an environment that this process has registered with Gymnasium; its name there is `env_id`."""
+    """Register with RLlib, as `env_id`, an environment that this process has registered with Gymnasium."""
     if env_id not in own_ids():
         module, _, name = env_id.rpartition(":")
         if module:
@@ -47,25 +47,25 @@ def register_foreign(env_id: str) -> str:
 
 
 def own_ids() -> list[str]:
-    """Ids of our environments: those of the table, and what else `bam_envs` registers."""
+    """Ids of the environments of `bam_envs`: those of its table, and others that it registers."""
     made_here = (spec.id for spec in gym.registry.values() if str(spec.entry_point).startswith("bam_envs."))
     return sorted({*ENVIRONMENTS, *made_here})
 
 
 def _register(name: str, env: str | gym.envs.registration.EnvSpec) -> None:
-    """RLlib hands the function to its runners: one elsewhere imports this module, and with it our environments."""
+    """Register a function with RLlib; its runners on other computers import this module, and with it `bam_envs`."""
     from ray.tune.registry import register_env
 
     register_env(name, functools.partial(create, env))
 
 
 def create(env: str | gym.envs.registration.EnvSpec, context: Mapping[str, Any]) -> gym.Env[Any, Any]:
-    """One environment, as RLlib's own runner takes it; `context` is what ``env_config`` was: keyword arguments."""
+    """Make one environment for RLlib's own runner; `context` holds the keyword arguments of ``env_config``."""
     name = env if isinstance(env, str) else env.id
     return from_zero(FiniteEnv(gym.make(env, disable_env_checker=True, **dict(context)), name))
 
 
-if importlib.util.find_spec("ray") is not None:  # the old layout of RLlib's files is read without it
+if importlib.util.find_spec("ray") is not None:  # checkpoints of the old API stack are read without Ray
     register()
 
 

@@ -1,8 +1,8 @@
-"""RLlib's `MeanStdFilter`, for a batch at once, and right where several runners are merged.
+"""RLlib's `MeanStdFilter` for whole batches, with correct statistics when several runners are merged.
 
-A runner sends what it saw since the last merge as "deltas", which `RunningStat.update` takes for the count, mean and
-sum of squares of those observations alone. RLlib's own `RunningStat.push` writes into them how far the overall mean
-moved, so that with remote runners its merged mean goes towards 0. Here they are what the merge expects.
+A runner sends its observations since the last merge as "deltas", which `RunningStat.update` expects to be the count,
+mean and sum of squares of those observations alone. RLlib's `RunningStat.push` instead stores the change of the overall
+mean in them, so that with remote runners the merged mean approaches 0. Here the deltas are as the merge expects.
 """
 
 from typing import Any
@@ -20,23 +20,23 @@ Array = NDArray[Any]
 
 
 class MeanStdFilter(_MeanStdFilter):  # type: ignore[misc]
-    """RLlib's filter, which `normalize` runs over n observations of one array at once. Same name, state and files."""
+    """RLlib's filter with `normalize` for an array of n observations; same name, state and files."""
 
     def normalize(self, observations: Array, update: bool = True) -> NDArray[np.float32]:
-        """Normalise observations, (n, ...), and count them in first unless `update` is False."""
+        """Normalise observations, (n, ...), after adding them to the statistics unless `update` is False."""
         if self._filters is None:
             self._init_new_filters()
-        own = self._filters[None]
-        stat: RunningStat = own.running_stats
+        options = self._filters[None]
+        stat: RunningStat = options.running_stats
         if update and self._update_stats and len(observations):
             push(stat, observations)
-        value = observations - stat.mean if own.demean else observations
-        if own.destd:
+        value = observations - stat.mean if options.demean else observations
+        if options.destd:
             value = value / (stat.std + SMALL_NUMBER)
-        return np.asarray(np.clip(value, -own.clip, own.clip) if own.clip else value, np.float32)
+        return np.asarray(np.clip(value, -options.clip, options.clip) if options.clip else value, np.float32)
 
     def __call__(self, *, episodes: list[Any], **kwargs: Any) -> Any:
-        """As RLlib's, one observation after the other, with the deltas that a merge expects."""
+        """As RLlib's, for one observation at a time, with the deltas that a merge expects."""
         if self._filters is None:
             self._init_new_filters()
         if None not in self._filters or not isinstance(self._filters[None].running_stats, RunningStat):
@@ -49,7 +49,7 @@ class MeanStdFilter(_MeanStdFilter):  # type: ignore[misc]
         return kwargs["batch"]
 
     def set_state(self, state: Any) -> None:
-        """As RLlib's, but for the deltas of the sender, which would be counted twice.
+        """As RLlib's, without the deltas of the sender, which would be counted twice.
 
         Raises:
             FormatError: A packed array holds more than numbers, which RLlib would unpickle.
@@ -58,20 +58,20 @@ class MeanStdFilter(_MeanStdFilter):  # type: ignore[misc]
             if isinstance(text, str):
                 unpacked_array(text)
         super().set_state(state)
-        for own in self._filters.values():
-            for stat in tree.flatten(own.running_stats):
+        for filter_ in self._filters.values():
+            for stat in tree.flatten(filter_.running_stats):
                 forget_deltas(stat)
 
 
 def forget_deltas(stat: RunningStat) -> None:
-    """The next merge is sent what comes from here on."""
+    """Reset the deltas: the next merge gets only later observations."""
     stat.num_pushes_delta = 0
     stat.mean_delta_array = np.zeros_like(stat.mean_delta_array)
     stat.sum_sq_diff_delta_array = np.zeros_like(stat.sum_sq_diff_delta_array)
 
 
 def push(stat: RunningStat, observations: Array) -> None:
-    """Count observations (n, ...) into the statistics and into what the next merge is sent.
+    """Add observations (n, ...) to the statistics and to the deltas of the next merge.
 
     Counts, means and sums of squares of two sets combine exactly (Chan, Golub and LeVeque 1979).
     """
@@ -80,10 +80,10 @@ def push(stat: RunningStat, observations: Array) -> None:
     new_squares = np.square(new - new_mean).sum(axis=0)
 
     def combine(count: int, mean: Array, squares: Array) -> int:
-        both, delta = count + n, new_mean - mean
-        mean += delta * (n / both)
-        squares += new_squares + np.square(delta) * (count * n / both)
-        return both
+        total, delta = count + n, new_mean - mean
+        mean += delta * (n / total)
+        squares += new_squares + np.square(delta) * (count * n / total)
+        return total
 
     stat.num_pushes = combine(stat.num_pushes, stat.mean_array, stat.sum_sq_diff_array)
     stat.num_pushes_delta = combine(stat.num_pushes_delta, stat.mean_delta_array, stat.sum_sq_diff_delta_array)

@@ -1,8 +1,8 @@
-"""Ray for one training run: a quiet one of its own on this computer, or a cluster that is there already.
+"""Ray for one training run: a private instance on this computer, or an existing cluster.
 
-The own one listens on the loopback device only, asks for a token that nobody else has, and is gone when the run ends,
-however it ends. A cluster is joined and left as it was. Ray tries a silent address for minutes and may end the whole
-process; so a socket, then another process, tries it first.
+The private instance listens on the loopback device only, requires a secret token, and is removed when the run ends for
+any reason. A cluster is joined, and not changed. Ray tries an address without an answer for minutes and may end the
+whole process; so the address is first tested by a socket, then by another process.
 """
 
 import contextlib
@@ -30,16 +30,16 @@ from bam_train.settings import TrainSettings
 from bam_train.signals import at_quit, interrupt, waiting
 from bam_train.trainers.rllib.ray_resources import cores, gpus, require_resources
 
-psutil: Any = importlib.import_module("psutil")  # Ray has it in a folder of its own
+psutil: Any = importlib.import_module("psutil")  # Ray brings its own copy
 
-OBJECT_STORE = 200 * 2**20  # bytes that the own Ray shares samples and weights through; they are a few megabytes
-GRACE = 3.0  # s that a process of Ray's may take to end by itself once Ray has shut down
+OBJECT_STORE = 200 * 2**20  # bytes of the private Ray for samples and weights, which are a few megabytes
+GRACE = 3.0  # s in which Ray's processes may end by themselves after Ray has shut down
 
 SOCKET_TIMEOUT = 5.0
-"""How long the host of a cluster may take to accept a connection [s]."""
+"""Longest wait for the host of a cluster to accept a connection [s]."""
 
 REACH_TIMEOUT = 13.0
-"""How long joining a cluster may take then [s]; about 2 s are usual."""
+"""Longest time for joining the cluster after that [s]; about 2 s are usual."""
 
 _TOKEN = secrets.token_hex(32)
 _LOGGERS = ("ray", "ray.rllib", "ray.tune", "ray.train", "ray.data")
@@ -48,11 +48,11 @@ _MODE, _TOKENS = "RAY_AUTH_MODE", ("RAY_AUTH_TOKEN", "RAY_AUTH_TOKEN_PATH")
 
 @contextlib.contextmanager
 def cluster(settings: TrainSettings) -> Iterator[None]:
-    """Ray for a run, within this: one that runs in this process already, the cluster at `address`, else its own.
+    """Within the ``with`` block, Ray runs: an instance of this process, the cluster at `address`, or a private one.
 
     Raises:
-        SettingsError: More is asked for than there is, or the address cannot be one.
-        TrainingFailed: Ray does not start, or the cluster does not answer or refuses us; within 20 s.
+        SettingsError: More resources are requested than exist, or the address is malformed.
+        TrainingFailed: Ray does not start, or the cluster does not answer or refuses to be joined; within 20 s.
     """
     with _quiet(), contextlib.ExitStack() as stack:
         if settings.address is not None and not ray.is_initialized():
@@ -63,18 +63,18 @@ def cluster(settings: TrainSettings) -> Iterator[None]:
                 ray.init(address=place, log_to_driver=False, configure_logging=False)
         require_resources(settings)
         if not ray.is_initialized():
-            stack.enter_context(_own(settings))
+            stack.enter_context(_private(settings))
         yield
 
 
 @contextlib.contextmanager
-def _own(settings: TrainSettings) -> Iterator[None]:
+def _private(settings: TrainSettings) -> Iterator[None]:
     before = set(psutil.Process().children())
     root = "/tmp" if os.path.isdir("/tmp") else None  # paths of Ray's sockets must be short
     with (
         tempfile.TemporaryDirectory(prefix="bam-ray-", dir=root, ignore_cleanup_errors=True) as folder,
         at_quit(lambda: shutil.rmtree(folder, ignore_errors=True)),
-        at_quit(lambda: _kill(_started_since(before))),  # comes first; two of Ray's would go on for a minute
+        at_quit(lambda: _kill(_started_since(before))),  # called first; two of Ray's processes would run for a minute
         _private_token(),
     ):
         try:
@@ -90,17 +90,17 @@ def _own(settings: TrainSettings) -> Iterator[None]:
                         configure_logging=False,
                         _temp_dir=folder,
                     )
-            except Exception as error:  # Ray has no one error for what may go wrong with its processes
+            except Exception as error:  # Ray has no common class for failures of its processes
                 why = str(error).strip().partition("\n")[0].rstrip(".")
                 text = f"Ray does not start on this computer: {why}. Is there enough memory and disk?"
                 raise TrainingFailed(text) from error
             yield
         finally:
-            # Another Ctrl-C waits until Ray is gone: half of it would be left. A handler that quits at once may do so.
+            # Another Ctrl-C waits, as it would leave a part of Ray running, unless its handler quits at once.
             quits = signal.getsignal(signal.SIGINT) is not signal.default_int_handler
             with contextlib.nullcontext() if quits else waiting():
                 started = _started_since(before)  # with their children: once a parent is gone, they cannot be found
-                with contextlib.suppress(Exception):  # whatever it says about its end, nothing of it must be left
+                with contextlib.suppress(Exception):  # after any failure its processes are killed below
                     _shut_down(wait_for_processes=True)
                 _, alive = psutil.wait_procs(started, timeout=GRACE)
                 _kill(alive)
@@ -108,13 +108,13 @@ def _own(settings: TrainSettings) -> Iterator[None]:
 
 
 def _started_since(before: set[Any]) -> list[Any]:
-    """The processes below this one whose ancestor here is not among those of `before`."""
-    found: set[Any] = set()
+    """The child processes that are not in `before`, and all their descendants."""
+    started: set[Any] = set()
     for child in set(psutil.Process().children()) - before:
-        found.add(child)
+        started.add(child)
         with contextlib.suppress(psutil.Error):
-            found.update(child.children(recursive=True))
-    return list(found)
+            started.update(child.children(recursive=True))
+    return list(started)
 
 
 def _kill(processes: list[Any]) -> None:
@@ -125,9 +125,9 @@ def _kill(processes: list[Any]) -> None:
 
 @contextlib.contextmanager
 def _private_token() -> Iterator[None]:
-    """A token of this process alone for the own Ray, instead of the one that Ray would write into the home folder."""
+    """Give the private Ray a token of this process, instead of one that Ray would write into the home folder."""
     if any(name in os.environ for name in (_MODE, *_TOKENS)):
-        yield  # whoever set them knows
+        yield  # the user has configured the token
         return
     raylet: Any = importlib.import_module("ray._raylet")
 
@@ -145,7 +145,7 @@ def _private_token() -> Iterator[None]:
 
 @contextlib.contextmanager
 def _environment(**variables: str) -> Iterator[None]:
-    """Within this, these environment variables are set so, for what is started too."""
+    """Set environment variables within the ``with`` block, for this process and those that it starts."""
     before = {name: os.environ.get(name) for name in variables}
     os.environ.update(variables)
     try:
@@ -160,10 +160,10 @@ def _environment(**variables: str) -> Iterator[None]:
 
 @contextlib.contextmanager
 def loopback_only() -> Iterator[None]:
-    """Ray started within this takes 127.0.0.1 for its computer's address, and its servers bind to nothing else.
+    """Within the ``with`` block, Ray starts with 127.0.0.1 as its address, to which all its servers bind.
 
-    There is no public way to it: Ray puts an address that others can reach in the place of
-    `ray.init(_node_ip_address="127.0.0.1")`, unless this constant, which it reads when it is imported, is unset.
+    Ray has no public option for this: it replaces `ray.init(_node_ip_address="127.0.0.1")` by an address that others
+    can reach, unless this constant, which it reads when it is imported, is unset.
     """
     from ray._private import ray_constants
 
@@ -178,10 +178,10 @@ def loopback_only() -> Iterator[None]:
 
 @contextlib.contextmanager
 def _out_of_the_group() -> Iterator[None]:
-    """Ray started within this has sessions of its own, and ends with this process as before, as Linux kills it then.
+    """Within the ``with`` block, Ray's processes start in sessions of their own; Linux kills them with this process.
 
-    ``timeout``, batch systems and terminals signal the whole process group: Ray's processes would be gone before the
-    update is finished and saved, and Ray has no public way to start them elsewhere. On other systems they stay in it.
+    ``timeout``, batch systems and terminals signal the whole process group: Ray's processes would end before the update
+    is finished and saved, and Ray has no public option for this. On other systems they stay in the group.
     """
     from ray._private import services, utils
 
@@ -196,12 +196,12 @@ def _out_of_the_group() -> Iterator[None]:
         services.ConsolePopen = before
 
 
-# Any Ray
+# Private instances and clusters
 
 
 @contextlib.contextmanager
 def _quiet() -> Iterator[None]:
-    """Within this, Ray's and RLlib's loggers are silent: `RunnerWatch` and errors tell what the user needs to know."""
+    """Silence the loggers of Ray and RLlib within the ``with`` block: `RunnerWatch` and exceptions inform the user."""
     loggers = [logging.getLogger(name) for name in _LOGGERS]
     before = [(logger, logger.handlers[:], logger.propagate) for logger in loggers]
     _hush()
@@ -213,7 +213,7 @@ def _quiet() -> Iterator[None]:
 
 
 def _hush() -> None:
-    """Silence the loggers of Ray; `ray.init` changes them."""
+    """Silence the loggers of Ray, which `ray.init` changes."""
     for name in _LOGGERS:
         logger = logging.getLogger(name)
         logger.handlers[:], logger.propagate = [logging.NullHandler()], False
@@ -221,9 +221,9 @@ def _hush() -> None:
 
 @contextlib.contextmanager
 def _starting() -> Iterator[None]:
-    """Around `ray.init`: its C++ part learns to be quiet, and says so on standard error; signals wait.
+    """Around `ray.init`: silence its C++ part, which reports this on standard error, and delay signals.
 
-    An exception that a signal raises would make the C++ part abort. `ray.init` handles SIGTERM itself, by SystemExit.
+    An exception of a signal handler would make the C++ part abort. `ray.init` handles SIGTERM itself, by SystemExit.
     """
     sys.stderr.flush()
     kept, nowhere = os.dup(2), os.open(os.devnull, os.O_WRONLY)
@@ -242,31 +242,31 @@ def _starting() -> Iterator[None]:
         _hush()
 
 
-def _shut_down(**given: bool) -> None:
-    """Shut Ray down; its C++ part leaves SIGTERM to kill the process, so the handler is installed once more."""
+def _shut_down(**options: bool) -> None:
+    """Shut Ray down; its C++ part resets SIGTERM to kill the process, so the handler is installed again."""
     try:
-        ray.shutdown(**given)
+        ray.shutdown(**options)
     finally:
         handler = signal.getsignal(signal.SIGTERM)
         if handler is not None and threading.current_thread() is threading.main_thread():
             signal.signal(signal.SIGTERM, handler)
 
 
-# A cluster that is there already
+# Existing clusters
 
 
 def find(address: str) -> str:
-    """The ``host:port`` of a cluster from ``auto`` or ``host:port``; RAY_ADDRESS is what ``auto`` means if it is set.
+    """The ``host:port`` of a cluster from ``auto`` or ``host:port``; ``auto`` reads RAY_ADDRESS first.
 
     Raises:
-        SettingsError: It is no address of a cluster.
-        TrainingFailed: ``auto``, and no cluster was started on this computer.
+        SettingsError: The address is malformed.
+        TrainingFailed: The address is ``auto``, and no cluster was started on this computer.
     """
     place, name = address, "address"
     if address == "auto" and (variable := os.environ.get("RAY_ADDRESS")):
         place, name = variable, "RAY_ADDRESS"
     if place == "auto":
-        from ray._private.utils import read_ray_address  # what ``ray start`` wrote
+        from ray._private.utils import read_ray_address  # the address that ``ray start`` wrote
 
         place = read_ray_address() or ""
         if not place:
@@ -295,14 +295,14 @@ ray.init(address=sys.argv[1], log_to_driver=False, logging_level=logging.CRITICA
 print("joined", flush=True)
 ray.shutdown()
 """
-"""Joins a cluster, and prints how far it came."""
+"""Program that joins a cluster, and prints each step that succeeded."""
 
 
 def reach(place: str, timeout: float = REACH_TIMEOUT) -> None:
-    """Find out whether a run can join the cluster at ``host:port``, within `timeout` s once the host accepts.
+    """Check that a run can join the cluster at ``host:port`` within `timeout` s after the host accepts a connection.
 
     Raises:
-        TrainingFailed: Nothing answers there, what answers is no cluster, or it refuses us; says which.
+        TrainingFailed: Nothing answers there, the server is not a cluster, or it refuses to be joined.
     """
     host, _, port = place.rpartition(":")
     try:
@@ -315,26 +315,26 @@ def reach(place: str, timeout: float = REACH_TIMEOUT) -> None:
         ) from error
     command = [sys.executable, "-c", _PROBE, place]
     try:
-        said = subprocess.run(
+        output = subprocess.run(
             command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, timeout=timeout, check=False
         ).stdout
     except subprocess.TimeoutExpired as error:
-        said = error.stdout or b""
-    text = said.decode(errors="replace")
+        output = error.stdout or b""
+    text = output.decode(errors="replace")
     if "joined" not in text.splitlines():
         raise TrainingFailed(f"{place}: {reason(text)}")
 
 
-def reason(said: str) -> str:
-    """Why another process, which printed this, could not join a cluster, and what to do."""
-    if re.search("InvalidAuthToken|AuthenticationError|authentication token", said):
+def reason(output: str) -> str:
+    """Why the process that printed `output` could not join a cluster, and the remedy."""
+    if re.search("InvalidAuthToken|AuthenticationError|authentication token", output):
         return (
             "the cluster does not accept the token, or none was given. Set RAY_AUTH_MODE=token, and RAY_AUTH_TOKEN to "
             "what ray get-auth-token says on its head"
         )
-    if "ersion mismatch" in said:
+    if "ersion mismatch" in output:
         return "the cluster runs another Python or Ray than this computer. Install the same versions everywhere"
-    if "known" not in said.splitlines():
+    if "known" not in output.splitlines():
         return "something answers there, but it is no Ray cluster. Check the port: that of ray start --head is 6379"
     return (
         f"the cluster is there, but could not be joined within {REACH_TIMEOUT:.0f} s: this computer is not part of it, "

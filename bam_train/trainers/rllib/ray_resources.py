@@ -1,4 +1,4 @@
-"""How many CPUs and GPUs a run asks for, held against how many there are: RLlib would wait for more without a word."""
+"""CPUs and GPUs of a run, checked against those that exist: RLlib would silently wait for more."""
 
 import os
 import time
@@ -13,10 +13,10 @@ LONGEST_BUSY = 10.0  # s to wait for CPUs and GPUs that others in the cluster us
 
 
 def gpus(settings: TrainSettings) -> int:
-    """GPUs that the learners of a run use in all: ``--num-gpus``, else RLLIB_NUM_GPUS, else none.
+    """GPUs that the learners of a run use in all: ``--num-gpus``, else RLLIB_NUM_GPUS, else 0.
 
     Raises:
-        SettingsError: RLLIB_NUM_GPUS is no whole number from 0.
+        SettingsError: RLLIB_NUM_GPUS is not a whole number of at least 0.
     """
     if settings.num_gpus is not None:
         return settings.num_gpus
@@ -30,7 +30,7 @@ def learners(settings: TrainSettings) -> tuple[int, int]:
     """RLlib's ``num_learners``, where 0 is the trainer's own process, and ``num_gpus_per_learner``.
 
     Raises:
-        SettingsError: The GPUs cannot be shared out evenly among the learners asked for.
+        SettingsError: The GPUs cannot be shared evenly among the learners.
     """
     number, wanted = settings.num_learners, gpus(settings)
     if number == 0:
@@ -49,12 +49,12 @@ def cores() -> int:
 
 
 def require_resources(settings: TrainSettings) -> None:
-    """Refuse a run that asks for more than there is, on the cluster that runs in this process, else on this computer.
+    """Refuse a run that needs more CPUs or GPUs than the joined cluster, or else this computer, has.
 
-    Each runner and each learner without a GPU asks Ray for a CPU, a learner with one for a GPU.
+    Each runner and each learner without a GPU needs a CPU; a learner with a GPU needs only that.
 
     Raises:
-        SettingsError: Says what was asked for, what there is, and what to do.
+        SettingsError: The message gives the wanted and the existing numbers, and a remedy.
     """
     import torch
 
@@ -88,7 +88,7 @@ def _require_gpus(settings: TrainSettings, wanted: int, there: int, where: str) 
 
 
 def _require_free(wanted: dict[str, int]) -> None:
-    """Refuse what others in the cluster use; a run that has just ended may hold it for some seconds more."""
+    """Wait some seconds for CPUs and GPUs that others in the cluster use, such as a run that has just ended."""
     end = time.monotonic() + LONGEST_BUSY
     while True:
         free = ray.available_resources()

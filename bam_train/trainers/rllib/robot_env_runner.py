@@ -1,8 +1,8 @@
-"""RLlib's runner over one batched simulation: arrays of all environments from step to step, episodes at the end.
+"""An env runner of RLlib over one batched simulation: arrays of all environments during steps, episodes at the end.
 
 RLlib's own `SingleAgentEnvRunner` appends to n Python episodes at every step, and runs its connectors over each. Here a
-step of n environments is one pass of the module, one batched action and one `RobotVectorEnv.step`. What comes out is
-the same: a list of `SingleAgentEpisode`, the ones that ended with what they observed last, the running ones in pieces.
+step of n environments is one pass of the module, one batched action and one `RobotVectorEnv.step`. The result is the
+same: a list of `SingleAgentEpisode`, ended ones with their last observation, running ones in pieces.
 """
 
 import contextlib
@@ -37,11 +37,11 @@ from bam_train.trainers.rllib.runner_deaths import FaultReporting
 Array = NDArray[Any]
 
 ENDS = "ends"
-"""Metric beside RLlib's own: return, length and success of every episode that ended, one after the other."""
+"""Additional metric: return, length and success of every episode that ended, in order."""
 
 
 def log_end(metrics: Any, length: int, total: float, success: bool | None) -> None:
-    """Note how an episode went: its steps, its undiscounted return, and whether it succeeded if that is known."""
+    """Log the length of an episode, its undiscounted return, and its success if that is known."""
     metrics.log_value((ENDS, "return"), total, reduce="item_series")
     metrics.log_value((ENDS, "length"), length, reduce="item_series")
     if success is not None:
@@ -50,7 +50,7 @@ def log_end(metrics: Any, length: int, total: float, success: bool | None) -> No
 
 @dataclass
 class _Running:
-    """The running episode of an environment: its name, its steps so far, and what it has earned."""
+    """The running episode of an environment: its id, and its length and return so far."""
 
     id: str = field(default_factory=lambda: uuid.uuid4().hex)
     length: int = 0
@@ -58,10 +58,10 @@ class _Running:
 
 
 class RobotEnvRunner(FaultReporting, SingleAgentEnvRunner):  # type: ignore[misc]
-    """Collects episodes on ``num_envs_per_env_runner`` batched copies of one of our environments.
+    """Collects episodes on ``num_envs_per_env_runner`` batched copies of an environment of `bam_envs`.
 
-    Its connectors are RLlib's defaults and, before them, `MeanStdFilter` or nothing; its module has no state.
-    Callbacks on environments, single steps and episodes are not called.
+    The only connector besides RLlib's defaults may be `MeanStdFilter`, and the module must not be recurrent. Callbacks
+    on environments, single steps and episodes are not called.
     """
 
     env: Any
@@ -70,7 +70,7 @@ class RobotEnvRunner(FaultReporting, SingleAgentEnvRunner):  # type: ignore[misc
     def __init__(self, *, config: Any, **kwargs: Any) -> None:
         super().__init__(config=config, **kwargs)
         self._observation: Array = np.empty(0)
-        """What the module sees next, (n, ...)."""
+        """The module's next observations, (n, ...)."""
         self._running = [_Running() for _ in range(self.num_envs)]
         pieces = list(self._env_to_module.connectors)
         filters = [piece for piece in pieces if isinstance(piece, MeanStdFilter)]
@@ -89,7 +89,7 @@ class RobotEnvRunner(FaultReporting, SingleAgentEnvRunner):  # type: ignore[misc
             )
 
     def make_env(self) -> None:
-        """One vector environment, with automatic resets in the same step."""
+        """Make one vector environment, with automatic resets in the same step."""
         if self.env is not None:
             self.env.close()
         name = self.config.env
@@ -113,7 +113,7 @@ class RobotEnvRunner(FaultReporting, SingleAgentEnvRunner):  # type: ignore[misc
         random_actions: bool = False,
         force_reset: bool = False,
     ) -> list[SingleAgentEpisode]:
-        """As many steps as asked for, up to the next multiple of the number of environments; or whole episodes."""
+        """Collect `num_timesteps` steps, rounded up to a multiple of the number of environments, or whole episodes."""
         if force_reset or num_episodes is not None or self._needs_initial_reset:
             self._begin()
         self._needs_initial_reset = num_episodes is not None
@@ -124,14 +124,14 @@ class RobotEnvRunner(FaultReporting, SingleAgentEnvRunner):  # type: ignore[misc
             else:
                 episodes = self._collect_episodes(num_episodes or 1, explore, random_actions)
             if episodes is None:
-                self._begin()  # the environment failed and was made anew: what was collected is lost
+                self._begin()  # the environment failed and was made anew: its samples are lost
         steps = sum(map(len, episodes))
         self._log_env_steps(metric=self._metrics_num_env_steps_sampled, num_steps=steps)
         self._increase_sampled_metrics(steps, sum(episode.is_done for episode in episodes))
         return episodes
 
     def _begin(self) -> None:
-        """Begin an episode everywhere; environment i of the k-th runner is seeded by how many come before it."""
+        """Reset all environments, each with the run's seed plus the number of environments before it in all runners."""
         seed, index = None, self.worker_index or 0
         if self._needs_initial_reset and self._seed is not None:
             seed = int(self._seed - index + max(0, index - 1) * self.num_envs)
@@ -140,7 +140,7 @@ class RobotEnvRunner(FaultReporting, SingleAgentEnvRunner):  # type: ignore[misc
         self._running = [_Running() for _ in range(self.num_envs)]
 
     def _filtered(self, observations: Array) -> Array:
-        """Observations as the module sees them: a copy, for the environment may write into its own."""
+        """The module's observations (n, ...), as a copy, because the environment may reuse its array."""
         return np.array(observations) if self._filter is None else self._filter.normalize(observations)
 
     def _collect_episodes(self, count: int, explore: bool, random_actions: bool) -> list[SingleAgentEpisode] | None:
@@ -151,7 +151,7 @@ class RobotEnvRunner(FaultReporting, SingleAgentEnvRunner):  # type: ignore[misc
             collected = self._collect(32, explore, random_actions)
             if collected is None:
                 return None
-            for piece in sorted(collected, key=lambda one: one.t_started):
+            for piece in sorted(collected, key=lambda piece: piece.t_started):
                 episode = begun.setdefault(piece.id_, piece)
                 if episode is not piece:
                     episode.concat_episode(piece)
@@ -163,12 +163,12 @@ class RobotEnvRunner(FaultReporting, SingleAgentEnvRunner):  # type: ignore[misc
         """Step every environment `steps` times; None if the environment failed and was made anew.
 
         Returns:
-            Episodes and pieces of episodes, those that ended first.
+            Episodes and pieces of episodes; those that ended come first.
         """
         seen: list[Array] = [self._observation]
         taken: list[dict[str, Array]] = []
         finals: dict[tuple[int, int], tuple[Array, bool | None]] = {}
-        """Of (environment, step): last observation, success."""
+        """Last observation and success by (environment, step)."""
         for t in range(steps):
             if random_actions:
                 actions = self.env.action_space.sample()
@@ -189,13 +189,13 @@ class RobotEnvRunner(FaultReporting, SingleAgentEnvRunner):  # type: ignore[misc
             seen.append(self._observation)
             ends = {Columns.TERMINATEDS: np.array(terminated), Columns.TRUNCATEDS: np.array(truncated)}
             taken.append({**columns, Columns.REWARDS: np.array(rewards, np.float32), **ends})
-        table = {name: np.stack([one[name] for one in taken], axis=1) for name in taken[0]}
+        table = {name: np.stack([columns[name] for columns in taken], axis=1) for name in taken[0]}
         return self._cut(np.stack(seen, axis=1), table, finals)
 
     def _cut(
         self, seen: Array, table: dict[str, Array], finals: Mapping[tuple[int, int], tuple[Array, bool | None]]
     ) -> list[SingleAgentEpisode]:
-        """Observations (n, T + 1, ...) and columns (n, T, ...) as episodes; the running ones are continued."""
+        """Cut observations (n, T + 1, ...) and columns (n, T, ...) into episodes, and continue the running ones."""
         ended, open_ = [], []
         space, action_space = self._env_to_module.observation_space, self.env.single_action_space
         dones = {name: table.pop(name) for name in (Columns.TERMINATEDS, Columns.TRUNCATEDS)}
@@ -204,7 +204,7 @@ class RobotEnvRunner(FaultReporting, SingleAgentEnvRunner):  # type: ignore[misc
             ends = np.flatnonzero(dones[Columns.TERMINATEDS][env_id] | dones[Columns.TRUNCATEDS][env_id]) + 1
             for start, stop in itertools.pairwise(np.unique([0, *ends, seen.shape[1] - 1]).tolist()):
                 observations = seen[env_id, start : stop + 1].copy()
-                terminated, truncated = (bool(one[env_id, stop - 1]) for one in dones.values())
+                terminated, truncated = (bool(flags[env_id, stop - 1]) for flags in dones.values())
                 if terminated or truncated:
                     observations[-1], success = finals[env_id, stop - 1]
                 columns = {name: values[env_id, start:stop].copy() for name, values in table.items()}
@@ -219,7 +219,7 @@ class RobotEnvRunner(FaultReporting, SingleAgentEnvRunner):  # type: ignore[misc
                     infos=[{}] * (stop - start + 1),
                     terminated=terminated,
                     truncated=truncated and not terminated,
-                    extra_model_outputs={name: InfiniteLookbackBuffer(one, 0) for name, one in columns.items()},
+                    extra_model_outputs={name: InfiniteLookbackBuffer(part, 0) for name, part in columns.items()},
                     t_started=running.length,
                     len_lookback_buffer=0,
                 )
@@ -235,17 +235,17 @@ class RobotEnvRunner(FaultReporting, SingleAgentEnvRunner):  # type: ignore[misc
         return ended + open_
 
     def _act(self, step: int, explore: bool) -> tuple[dict[str, Array], Array]:
-        """The module's outputs with its actions, each (n, ...), and the actions as the environment takes them."""
+        """The module's outputs with its actions, each (n, ...), and the actions in the environment's action space."""
         batch = {Columns.OBS: torch.from_numpy(self._observation).to(self._device)}
         with torch.inference_mode(), self.metrics.log_time(RLMODULE_INFERENCE_TIMER):
             if explore:
                 runners = self.config.num_env_runners or 1
-                own = self.num_env_steps_sampled_lifetime // runners + step * self.num_envs
-                outputs = self.module.forward_exploration(batch, t=own * runners)
+                steps = self.num_env_steps_sampled_lifetime // runners + step * self.num_envs
+                outputs = self.module.forward_exploration(batch, t=steps * runners)
             else:
                 outputs = self.module.forward_inference(batch)
             outputs = dict(outputs)
-            if Columns.ACTIONS not in outputs:  # the module did not choose them itself
+            if Columns.ACTIONS not in outputs:  # the module returns a distribution
                 module = self.module
                 kind = module.get_exploration_action_dist_cls if explore else module.get_inference_action_dist_cls
                 distribution = kind().from_logits(outputs[Columns.ACTION_DIST_INPUTS])
@@ -264,13 +264,13 @@ class RobotEnvRunner(FaultReporting, SingleAgentEnvRunner):  # type: ignore[misc
 
 @contextlib.contextmanager
 def _cores(count: float | None) -> Iterator[None]:
-    """Within, this thread sees no more cores than a runner was given: a simulation takes a thread for each it sees."""
+    """Limit this thread to `count` cores: a simulation made in the ``with`` block starts a thread for each core."""
     if count is None or not hasattr(os, "sched_setaffinity"):
         yield
         return
-    all_of_them = os.sched_getaffinity(0)
-    os.sched_setaffinity(0, sorted(all_of_them)[: max(1, int(count))])
+    before = os.sched_getaffinity(0)
+    os.sched_setaffinity(0, sorted(before)[: max(1, int(count))])
     try:
         yield
     finally:
-        os.sched_setaffinity(0, all_of_them)
+        os.sched_setaffinity(0, before)

@@ -1,8 +1,8 @@
-"""What a run does when an env runner dies: it goes on with the others while a new one takes its place.
+"""Deaths of env runners: the run continues with the other runners while a new one is started.
 
-Lost is what the dead runner had sampled since its last delivery: an update takes and counts the samples that were
-delivered. RLlib keeps the cause in a log file on the runner's computer; so a runner writes it into the cluster's
-key-value store before it ends.
+The samples that the dead runner had not delivered are lost; an update uses and counts only delivered ones. RLlib writes
+the cause to a log file on the runner's computer, so a runner also writes it to the cluster's key-value store before it
+ends.
 """
 
 import time
@@ -19,37 +19,37 @@ from ray.rllib.env.single_agent_env_runner import SingleAgentEnvRunner
 from bam_train.errors import ProcessesLost, SettingsError, TrainingFailed
 
 LONGEST_CAUSE = 500  # characters
-SAMPLE_TIMEOUT = 60.0  # s that an update waits for the samples of its slowest runner
+SAMPLE_TIMEOUT = 60.0  # longest wait of an update for the samples of its slowest runner [s]
 
 PROBE_TIMEOUT = 0.25
-"""How long each update waits for a sign of life of the runners that are gone [s]; RLlib's own is half a minute.
+"""Longest wait of an update for an answer of dead runners [s]; RLlib's default is half a minute.
 
-They answer within milliseconds once they are back, and are asked again before the next update.
+Restarted runners answer within milliseconds, and are asked again before the next update.
 """
 
-RESTART_DELAY = 1.0  # s between the failure of a runner's environment and its restart; RLlib's own is a minute
+RESTART_DELAY = 1.0  # s between the failure of a runner's environment and its restart; RLlib's default is a minute
 
 MOST_DEATHS, WINDOW = 5, 20
-"""How often one runner may die within so many updates; those made while no runner was there do not count."""
+"""Most deaths of one runner within a number of updates; updates without any runner do not count."""
 
-LONGEST_ALONE = 180.0  # s that a run waits while all runners are gone; a busy computer takes half a minute to start one
+LONGEST_ALONE = 180.0  # longest wait while all runners are dead [s]; a busy computer starts one in half a minute
 
 
 class FaultReporting:
-    """Before a runner class: what goes wrong while it is made, or in `sample`, is reported, and raised as it was."""
+    """Mixin for a runner class: exceptions in its constructor and in `sample` are reported, and raised again."""
 
-    def __init__(self, **named: Any) -> None:
+    def __init__(self, **kwargs: Any) -> None:
         try:
-            super().__init__(**named)
+            super().__init__(**kwargs)
         except Exception as error:
-            if index := int(named.get("worker_index") or 0):
+            if index := int(kwargs.get("worker_index") or 0):
                 _report(index, _own_cause(error))
             raise
 
-    def sample(self, *arguments: Any, **named: Any) -> Any:
+    def sample(self, *args: Any, **kwargs: Any) -> Any:
         """Collect samples as the runner does."""
         try:
-            return super().sample(*arguments, **named)  # type: ignore[misc]
+            return super().sample(*args, **kwargs)  # type: ignore[misc]
         except Exception as error:
             cause = _own_cause(error)
             if index := int(getattr(self, "worker_index", 0) or 0):
@@ -59,22 +59,22 @@ class FaultReporting:
 
 
 class ReportingEnvRunner(FaultReporting, SingleAgentEnvRunner):  # type: ignore[misc]
-    """RLlib's own runner of single agents, which says why it dies."""
+    """RLlib's own runner of single agents, which reports the cause of its death."""
 
     def make_env(self) -> None:
-        """As RLlib's, which registers the same name every time, and Gymnasium warns of it from the second time on."""
+        """As RLlib's, without Gymnasium's warning that its name is registered already."""
         gym.registry.pop("rllib-single-agent-env-v0", None)
         super().make_env()
 
 
 def _report(index: int, error: BaseException) -> None:
-    """Keep why the runner with this index dies."""
+    """Store the cause of death of the runner with this index."""
     text = f"{type(error).__name__}: {' '.join(str(error).split())}"[:LONGEST_CAUSE].rstrip(": ")
     internal_kv._internal_kv_put(_key(index), text.encode())
 
 
 def cause_of_death(index: int) -> str | None:
-    """Why the runner with this index died last, if it could report it; the next call does not say it again."""
+    """The last cause of death of the runner with this index, if it was reported; a second call returns None."""
     text: bytes | None = internal_kv._internal_kv_get(_key(index))
     if text is None:
         return None
@@ -83,7 +83,7 @@ def cause_of_death(index: int) -> str | None:
 
 
 def first_cause_of_death(number: int) -> str | None:
-    """Why the first that died of runners 1 to `number` did, if one could report it."""
+    """The first reported cause of death among runners 1 to `number`."""
     if not internal_kv._internal_kv_initialized():
         return None
     causes = ((index, cause_of_death(index)) for index in range(1, number + 1))
@@ -95,16 +95,16 @@ def _key(index: int) -> bytes:
 
 
 def _own_cause(error: Exception) -> Exception:
-    """RLlib raises a bare RuntimeError from what an environment raised."""
+    """The exception of the environment, from which RLlib raises a bare RuntimeError."""
     cause = error.__cause__
     return cause if type(error) is RuntimeError and not error.args and isinstance(cause, Exception) else error
 
 
 class RunnerWatch:
-    """Looks after the runners of an algorithm of `make_config`, which is trained by `train` from now on.
+    """Watches the runners of an algorithm of `make_config`, which must then be trained by `train`.
 
-    It looks before each training step and after the last of an iteration; `clock` is monotonic time [s], and `cause_of`
-    says why the runner of an index died.
+    Runners are checked before each training step and after the last of an iteration. `clock` is monotonic time [s];
+    `cause_of` returns the cause of death of the runner with an index.
     """
 
     def __init__(
@@ -124,14 +124,14 @@ class RunnerWatch:
         self._lines: list[str] = []
         if self._all:
             self._rllibs_restore = algorithm.restore_env_runners
-            algorithm.restore_env_runners = self._restore  # an algorithm without samples may never leave its loop
+            algorithm.restore_env_runners = self._restore  # without samples, an algorithm may never leave its loop
 
     def train(self) -> tuple[dict[str, Any], list[str]]:
-        """One iteration: RLlib's result, and what the user should know about runners, one line each.
+        """Train one iteration; returns RLlib's result, and messages about runners for the user, one line each.
 
         Raises:
-            ProcessesLost: A runner dies again and again, or all are gone for good; says why they died if they could.
-            TrainingFailed: A learner died, or the cluster did.
+            ProcessesLost: A runner dies repeatedly, or all runners are lost; the message has the cause if it is known.
+            TrainingFailed: A learner or the cluster died.
         """
         try:
             result: dict[str, Any] = self._algorithm.train()
@@ -146,7 +146,7 @@ class RunnerWatch:
         return result, lines
 
     def _restore(self, group: Any) -> list[int]:
-        """Replaces the algorithm's own `restore_env_runners`, which it calls."""
+        """Replacement of the algorithm's `restore_env_runners`, which it calls."""
         if group is not self._group:
             return list(self._rllibs_restore(group))
         self._look()
@@ -162,7 +162,7 @@ class RunnerWatch:
         return back
 
     def _look(self) -> None:
-        """Note who died since the last look."""
+        """Record the runners that died since the last check."""
         died = self._all - set(self._group.healthy_env_runner_ids()) - self._gone if self._all else set()
         if not died:
             return

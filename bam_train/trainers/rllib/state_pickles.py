@@ -1,8 +1,8 @@
-"""Read the states in RLlib's pickles: dicts, lists, tuples, text, numbers and arrays of numbers; nothing is run.
+"""Read the states in RLlib's pickles, without running them: dicts, lists, tuples, text, numbers and arrays of numbers.
 
-A pickle is a program that can call any function of any module. Here no name in it is looked up: a handful of names have
-stand-ins below, and every other one is refused, or replaced by an inert `Unread`. Instructions are counted before they
-run, and values afterwards, so that a file wastes no more memory and time than its own size explains.
+A pickle is a program that can call any function of any module. Here no name in it is imported: a few names have
+stand-ins below, and others are refused, or replaced by an inert `Unread`. Instructions are counted before they run, and
+values afterwards, so that memory and time are proportional to the size of the file.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from bam_train.errors import FormatError
 Array = NDArray[Any]
 
 _MOST_INSTRUCTIONS = 5_000_000
-_MOST_VALUES = 10_000_000  # shared ones counted wherever they are: forty lists of the one before, twice, are 2**40
+_MOST_VALUES = 10_000_000  # shared values count at each use: 40 lists, each of the one before twice, are 2**40 values
 _MOST_BYTES = 2**30  # of one array that is packed into text
 _DAMAGE = (pickle.UnpicklingError, EOFError, ValueError, TypeError, LookupError, AttributeError, RecursionError)
 
@@ -36,7 +36,7 @@ class RefusedPickle(FormatError):  # noqa: N818 - reads as what happened
 
 
 class Unread:
-    """An object that is not read: it accepts whatever a pickle does with it, and does nothing."""
+    """An object that is not read: it accepts all operations of a pickle, and does nothing."""
 
     def __new__(cls, *args: Any, **kwargs: Any) -> Unread:
         """Ignore any arguments."""
@@ -54,14 +54,14 @@ def read_state(data: bytes, *, skip_objects: bool = False) -> Any:
     """Read a state; with `skip_objects`, an object of any other kind becomes an `Unread`.
 
     Raises:
-        RefusedPickle: It names something else; nothing was looked up or called.
-        FormatError: Truncated, damaged, or made to exhaust its reader.
+        RefusedPickle: It names another function or class; nothing was imported or called.
+        FormatError: It is truncated, damaged, or too large.
     """
     try:
         for count, (instruction, argument, _) in enumerate(pickletools.genops(data), 1):
             if count > _MOST_INSTRUCTIONS:
                 raise FormatError(f"has more than {_MOST_INSTRUCTIONS} instructions")
-            if "PUT" in instruction.name and int(argument or 0) > count:  # memory for as many values is taken
+            if "PUT" in instruction.name and int(argument or 0) > count:  # would allocate memory for so many values
                 raise FormatError(f"numbers a value {argument} after {count} instructions")
         value = _Reader(io.BytesIO(data), skip_objects).load()
         _count(value, {})
@@ -74,10 +74,10 @@ def read_state(data: bytes, *, skip_objects: bool = False) -> Any:
 
 
 def unpacked_array(text: str) -> Array:
-    """Read an array that RLlib packed into text: base64 of zlib of npy. Python objects in it are refused.
+    """Read an array (any shape) that RLlib packed into text: base64 of zlib of npy, without Python objects.
 
     Raises:
-        FormatError: It is something else.
+        FormatError: The text is not such an array.
     """
     try:
         stream = zlib.decompressobj()
@@ -90,7 +90,7 @@ def unpacked_array(text: str) -> Array:
 
 
 def _count(value: Any, sizes: dict[int, int]) -> int:
-    """How many values there are in one, written out; a value in itself and too many are refused."""
+    """Number of values in a nested value, shared ones counted at each use; raises FormatError for cycles."""
     if not isinstance(value, (dict, list, tuple, set, frozenset)):
         return 1
     if id(value) not in sizes:
@@ -117,7 +117,7 @@ class _Reader(pickle.Unpickler):
 
 
 class _StandIn:
-    """A class in place of a function of NumPy's: a pickle can call it, and change nothing about it."""
+    """A class in place of a function of NumPy: a pickle can call it, but not set its state."""
 
     def __setstate__(self, state: Any) -> None:
         raise RefusedPickle("the state of a function")
@@ -155,7 +155,7 @@ class _Scalar(_StandIn):
 
 
 class _Array(np.ndarray[Any, Any]):
-    """`numpy.ndarray`, which `_Reconstruct` alone makes, empty: its state fills it from the file."""
+    """`numpy.ndarray`, made empty by `_Reconstruct` only, and filled by its state from the file."""
 
     def __new__(cls, *args: Any) -> Any:
         raise RefusedPickle("numpy.ndarray called")
@@ -180,7 +180,7 @@ class _DefaultDict(_StandIn):
 
 
 def _numbers(data: Any, dtype: Any) -> Array:
-    if not isinstance(data, (bytes, bytearray)):  # of a number, `bytes` would make so many zeros
+    if not isinstance(data, (bytes, bytearray)):  # `bytes` of a number n would be n zeros
         raise RefusedPickle(f"an array whose data are a {type(data).__name__}")
     if not isinstance(dtype, _Dtype):
         raise RefusedPickle("an array without a plain dtype")
@@ -202,4 +202,4 @@ _KNOWN: dict[tuple[str, str], Any] = {
     ("numpy._core.multiarray", "scalar"): _Scalar,
     ("numpy._core.multiarray", "_reconstruct"): _Reconstruct,
 }
-"""Module and name to what stands for it."""
+"""Stand-ins by module and name."""
