@@ -1,4 +1,4 @@
-"""Training: one protocol, `Trainer`, and the libraries behind it, imported when they are used."""
+"""Training: one protocol, `Trainer`, and its implementations by library, which are imported on use."""
 
 from bam_train.trainers.algorithms import TRAINERS, load_trainer, require_algorithm
 

@@ -1,4 +1,4 @@
-"""The trainers and their algorithms, as tables: reading them imports no learning library."""
+"""Tables of the trainers and their algorithms, which import no learning library."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ TRAINERS: dict[str, str] = {
     "rllib": "bam_train.trainers.rllib.rllib_trainer:RLlibTrainer",
     "sb3": "bam_train.trainers.sb3.sb3_trainer:SB3Trainer",
 }
-"""Name of a trainer to its ``"module:Class"``."""
+"""``"module:Class"`` of each trainer, by name."""
 
 EXTRAS: dict[str, str] = {"rllib": "rllib", "sb3": "train"}
-"""Name of a trainer to the extra of bam-train that brings all it needs."""
+"""Extra of bam-train that installs the packages of each trainer, by name."""
 
 
 @dataclass(frozen=True)
@@ -28,17 +28,17 @@ class Algorithm:
     """One algorithm of a library."""
 
     name: str
-    """As ``--algo`` takes it."""
+    """The value of ``--algo``."""
     reference: str
     """``"module:Class"`` of the algorithm in stable-baselines3 or sb3-contrib, of its configuration in RLlib."""
     actions: tuple[str, ...]
-    """Kinds of action space that it can learn on."""
+    """Kinds of action space that it supports."""
     on_policy: bool = False
     """Whether it learns from fresh rollouts; the others keep a replay buffer or recorded episodes."""
     recurrent: bool = False
-    """Whether its policy has a memory."""
+    """Whether its policy is recurrent."""
     offline: bool = False
-    """Whether it learns from recorded episodes, and takes no step in an environment."""
+    """Whether it learns from recorded episodes only, without stepping an environment."""
 
     def load(self) -> Any:
         """The class; imports its library."""
@@ -49,8 +49,8 @@ class Algorithm:
         if kind in self.actions:
             return
         table = next(table for table in ALGORITHMS.values() if self in table.values())
-        others = [one for one in table.values() if one.offline == self.offline and kind in one.actions]
-        fitting = ", ".join(sorted(one.name for one in others))
+        others = [other for other in table.values() if other.offline == self.offline and kind in other.actions]
+        fitting = ", ".join(sorted(other.name for other in others))
         remedy = f"Use one of: {fitting}." if fitting else "No algorithm here does."
         raise SettingsError(
             f"{self.name} does not fit {env}: it takes {' or '.join(self.actions)} actions, found {kind}. {remedy}"
@@ -87,14 +87,14 @@ _RLLIB = (
     Algorithm("cql", "ray.rllib.algorithms.cql:CQLConfig", _BOX, offline=True),
     Algorithm("iql", "ray.rllib.algorithms.iql:IQLConfig", _BOX, offline=True),
 )
-SB3_ALGORITHMS = {one.name: one for one in _SB3}
-RLLIB_ALGORITHMS = {one.name: one for one in _RLLIB}
+SB3_ALGORITHMS = {algorithm.name: algorithm for algorithm in _SB3}
+RLLIB_ALGORITHMS = {algorithm.name: algorithm for algorithm in _RLLIB}
 ALGORITHMS = {"rllib": RLLIB_ALGORITHMS, "sb3": SB3_ALGORITHMS}
-"""Name of a trainer to its algorithms by name."""
+"""Algorithms by trainer and name."""
 
 
 def load_trainer(name: str) -> type[Trainer]:
-    """The class of a trainer; this imports its library, or raises MissingExtra."""
+    """Import the class of a trainer with its library; raises MissingExtra without the library."""
     if name not in TRAINERS:
         raise SettingsError(f"Unknown trainer {name!r}. {did_you_mean(name, TRAINERS)}")
     try:
@@ -105,12 +105,12 @@ def load_trainer(name: str) -> type[Trainer]:
 
 
 def require_algorithm(trainer: str, algorithm: str) -> None:
-    """Refuse an algorithm that the trainer does not have, with the closest match or the trainer that has it."""
+    """Refuse an algorithm that the trainer lacks; the error names the closest match or the trainer that has it."""
     if trainer not in ALGORITHMS:
         raise SettingsError(f"Unknown trainer {trainer!r}. {did_you_mean(trainer, ALGORITHMS)}")
     table = ALGORITHMS[trainer]
     if algorithm not in table:
-        others = [name for name, theirs in ALGORITHMS.items() if algorithm in theirs]
+        others = [name for name, algorithms in ALGORITHMS.items() if algorithm in algorithms]
         if others:
             hint = f"It is one of {others[0]}'s; those of {trainer} are: {', '.join(sorted(table))}."
         else:

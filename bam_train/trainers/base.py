@@ -1,4 +1,4 @@
-"""The interface of every trainer: train in steps, save, resume, freeze the policy; and its checkpoints' manifest."""
+"""The interface of trainers: train in steps, save, resume, freeze the policy; and the manifest of their checkpoints."""
 
 import contextlib
 import datetime
@@ -23,34 +23,34 @@ from bam_train.settings import TrainSettings
 
 @dataclass(frozen=True)
 class Statistics:
-    """How training goes, over the last hundred or so training episodes; None before the first one ended."""
+    """Means over the last training episodes, about a hundred; None before the first one has ended."""
 
     episodes: int
-    """Training episodes behind the means."""
+    """Number of training episodes in the means."""
     return_mean: float | None
     """Undiscounted sum of rewards of an episode."""
     length_mean: float | None
     """Steps of an episode."""
     success_rate: float | None
-    """Share of successful episodes; None too if the environment does not say."""
+    """Share of successful episodes; None too if the environment does not report success."""
     metrics: dict[str, float]
-    """The trainer's own numbers, such as train/loss; finite ones only."""
+    """Finite numbers of the trainer, such as train/loss."""
 
 
 @dataclass(frozen=True)
 class Progress:
-    """Where training is, between two updates; cheap to make."""
+    """The progress of training, between two updates."""
 
     steps: int
-    """Steps trained since the first of the run."""
+    """Steps trained since the start of the run."""
     total: int
     """Steps to train."""
     statistics: Callable[[], Statistics]
-    """Computes how training goes."""
+    """Computes the statistics, which takes longer than the rest."""
 
 
 OnProgress = Callable[[Progress], bool]
-"""Called between updates, when the trainer may be saved, frozen or evaluated; False ends training there."""
+"""Called between updates, when the trainer may be saved, frozen or evaluated; returns False to end training."""
 
 
 class Trainer(Protocol):
@@ -62,7 +62,7 @@ class Trainer(Protocol):
 
     @classmethod
     def complete(cls, settings: TrainSettings) -> TrainSettings:
-        """Check the algorithm's own settings and fill in its defaults; no training is set up."""
+        """Check the algorithm's settings and add its defaults, without setting up training."""
 
     @classmethod
     def create(cls, settings: TrainSettings) -> "Trainer":
@@ -70,14 +70,14 @@ class Trainer(Protocol):
 
     @classmethod
     def load(cls, checkpoint: Checkpoint, settings: TrainSettings | None = None) -> "Trainer":
-        """Set up a run that continues from a checkpoint, with its settings or with these."""
+        """Set up a run that continues from a checkpoint, with the checkpoint's settings or with `settings`."""
 
     def log_to(self, folder: Path) -> None:
         """Write TensorBoard files into a folder from now on."""
 
     @property
     def steps(self) -> int:
-        """Steps trained since the first of the run."""
+        """Steps trained since the start of the run."""
 
     def train(self, steps: int, on_progress: OnProgress) -> None:
         """Train until the run has at least `steps` steps, or `on_progress` returns False.
@@ -86,22 +86,22 @@ class Trainer(Protocol):
         """
 
     def save(self, path: Path, scores: Mapping[str, Any], notes: Mapping[str, Any]) -> Checkpoint:
-        """Write a checkpoint that can be resumed and deployed; training is not disturbed, not even its random numbers.
+        """Write a checkpoint that can be resumed and deployed; does not change the random numbers of training.
 
         The scores go into the manifest, the notes (JSON values) into ``bam/resume/notes.json``.
         """
 
     def freeze(self) -> FrozenPolicy:
-        """The policy as it is now, raw observation in, deterministic action out; training is not disturbed."""
+        """Freeze the current policy: raw observation in, deterministic action out. Does not change training."""
 
     def undisturbed(self) -> AbstractContextManager[None]:
-        """Do something between two updates, an evaluation say, that leaves training's random numbers as they were."""
+        """Restore the random number generators of training after the ``with`` block, between two updates."""
 
     def evaluation_envs(self) -> AbstractContextManager[VectorEnv[Any, Any, Any] | None]:
-        """The environments to evaluate on between two updates, if no others can be made; else None."""
+        """Environments for an evaluation between two updates, where no others can be made; else None."""
 
     def log(self, metrics: Mapping[str, float]) -> None:
-        """Put numbers next to the trainer's own in TensorBoard."""
+        """Add numbers to the trainer's in TensorBoard."""
 
     def close(self) -> None:
         """Close environments and log files."""
@@ -110,7 +110,7 @@ class Trainer(Protocol):
 def manifest(
     settings: TrainSettings, spaces: tuple[Space[Any], Space[Any]], known: Mapping[str, Any]
 ) -> dict[str, Any]:
-    """The manifest's fields; `known` has those that only the trainer knows: signals, period, steps and scores."""
+    """The manifest's fields; `known` has those of the trainer: signals, period, steps and scores."""
     return {
         "env": settings.env,
         "env_kwargs": settings.env_kwargs,
@@ -137,7 +137,7 @@ def origin() -> dict[str, Any]:
 
 @functools.cache
 def _software() -> tuple[dict[str, str], str | None]:
-    """Versions of Python and packages; the commit of a source tree that bam_train is imported from, if git tells."""
+    """Versions of Python and packages, and the git commit if bam_train is imported from a source tree."""
     versions, commit, root = {"python": platform.python_version()}, None, Path(__file__).resolve().parents[2]
     for package in _PACKAGES:
         with contextlib.suppress(metadata.PackageNotFoundError):

@@ -1,11 +1,11 @@
-"""Recorded episodes for bc, marwil, cql and iql: Parquet files, one row a step.
+"""Recorded episodes for bc, marwil, cql and iql: Parquet files with one row per step.
 
-Columns: ``eps_id`` (text), ``obs``, ``actions`` (the environment's own), ``rewards``, ``new_obs``, ``terminateds``,
-``truncateds``; others are left alone. The rows of an episode follow one another.
+Columns: ``eps_id`` (text), ``obs``, ``actions`` (in the environment's action space), ``rewards``, ``new_obs``,
+``terminateds``, ``truncateds``; others are ignored. The rows of an episode are consecutive.
 
-RLlib would send every row of every update through Ray Data as an episode of its own, at a few thousand rows a second.
-Here a learner reads the files into its memory once and draws its rows from there, a hundred times as fast. One update
-learns from ``train_batch_size_per_learner`` rows, and each of these is a step of the run.
+RLlib sends every row of every update through Ray Data as a separate episode, at a few thousand rows a second. Here a
+learner reads the files into its memory once and draws rows from it, a hundred times as fast. One update learns from
+``train_batch_size_per_learner`` rows, each of which counts as a step of the run.
 """
 
 from __future__ import annotations
@@ -34,16 +34,16 @@ from bam_train.trainers.zero_based_spaces import less_start
 Array = NDArray[Any]
 
 COLUMNS = ("eps_id", "obs", "actions", "rewards", "new_obs", "terminateds", "truncateds")
-"""What every file must have."""
+"""Columns that every file must have."""
 
 _MOST_UPDATES = 100  # of an iteration
 
 
 def add_data(config: Any, settings: TrainSettings, observation_space: Space[Any], action_space: Space[Any]) -> Any:
-    """Let a configuration learn from recorded episodes; returns it.
+    """Configure learning from recorded episodes; returns the configuration.
 
     Raises:
-        SettingsError: There are none, or they do not fit the environment.
+        SettingsError: There are no episodes, or they do not fit the environment.
     """
     _require_columns(settings.data or "", observation_space, action_space)
     batch = int(settings.hyperparameters["train_batch_size_per_learner"])
@@ -51,7 +51,7 @@ def add_data(config: Any, settings: TrainSettings, observation_space: Space[Any]
     config.environment(
         observation_space=observation_space, action_space=action_space, env_config=dict(settings.env_kwargs)
     )
-    if config.is_online:  # CQL, as a kind of SAC, makes an environment that it then does not step
+    if config.is_online:  # CQL, a subclass of SAC, makes an environment without stepping it
         config.environment(register_foreign(settings.env), disable_env_checking=True)
         config.env_runners(num_env_runners=0)
     config.offline_data(
@@ -63,7 +63,7 @@ def add_data(config: Any, settings: TrainSettings, observation_space: Space[Any]
 
 
 class RecordedData(OfflineData):  # type: ignore[misc]
-    """RLlib's `OfflineData` over files that fit into memory: what `AlgorithmConfig.offline_data` takes."""
+    """RLlib's `OfflineData` for files that fit into memory, for `AlgorithmConfig.offline_data`."""
 
     def __init__(self, config: Any) -> None:  # not RLlib's, which opens the files with Ray Data
         self._config = config
@@ -71,13 +71,13 @@ class RecordedData(OfflineData):  # type: ignore[misc]
         self.spaces = self.module_spec = self.learner_handles = self.locality_hints = None  # RLlib sets them
 
     def sample(self, num_samples: int, return_iterator: bool = True, num_shards: int = 1) -> list[Draws]:
-        """One endless iterator for each learner; they draw apart from each other."""
+        """One endless iterator for each learner, with its own random numbers."""
         seed = self._config.seed or 0
         return [Draws(self._config.input_[0], self._config, seed + shard) for shard in range(max(1, num_shards))]
 
 
 class Draws:
-    """Rows of files drawn at random, batch after batch; travels to its learner without the rows."""
+    """Batches of random rows of files; pickled without the rows."""
 
     def __init__(self, data: str, config: Any, seed: int) -> None:
         self._data, self._seed = data, seed
@@ -85,7 +85,7 @@ class Draws:
         self._gamma = float(config.gamma)
 
     def iter_torch_batches(self, *, batch_size: int, device: Any = None, **_: Any) -> Iterator[dict[str, Any]]:
-        """Batches of tensors by the module's name and the column's."""
+        """Yield batches of tensors (batch_size, ...) by module and column, as ``default_policy/obs``."""
         table = load(self._data, *self._spaces, self._gamma)
         columns = {name: torch.from_numpy(values).to(device or "cpu") for name, values in table.items()}
         rng = np.random.default_rng(self._seed)
@@ -95,14 +95,14 @@ class Draws:
 
 
 def load(data: str, observation_space: Space[Any], action_space: Space[Any], gamma: float) -> dict[str, Array]:
-    """All rows, as RLlib's learners take them.
+    """Read all rows in the form that RLlib's learners take.
 
     Returns:
-        Columns (rows, ...): obs, new_obs, actions, rewards, terminateds, truncateds, value_targets (the rewards from a
-        row to the end of what was recorded of its episode, discounted by `gamma`), weights, n_step.
+        Columns (rows, ...): obs, new_obs, actions, rewards, terminateds, truncateds, value_targets (the sum of the
+        rewards from a row to the last recorded one of its episode, discounted by `gamma`), weights, n_step.
 
     Raises:
-        SettingsError: There are no rows, or one has a value that is missing, not finite or not in its space.
+        SettingsError: There are no rows, or a value is missing, not finite or not in its space.
     """
     path, filesystem = _open(data)
     table = pyarrow.parquet.ParquetDataset(path, filesystem=filesystem).read(list(COLUMNS))
@@ -133,7 +133,7 @@ def load(data: str, observation_space: Space[Any], action_space: Space[Any], gam
 
 
 def _column(name: str, column: Any, shape: tuple[int, ...]) -> Array:
-    """A column of numbers, or of (nested) lists of them, as one array (rows, *shape), if all of its rows are whole."""
+    """A column of numbers, or of (nested) lists of them, as one array (rows, *shape); SettingsError for others."""
     found: list[int] | None = []
     values = column.combine_chunks()
     while found is not None and (pyarrow.types.is_list(values.type) or pyarrow.types.is_fixed_size_list(values.type)):
@@ -153,7 +153,7 @@ def _column(name: str, column: Any, shape: tuple[int, ...]) -> Array:
 
 
 def _for_module(name: str, actions: Array, space: Space[Any]) -> Array:
-    """The environment's actions (n, ...) as a module of RLlib gives them: from -1 to 1, or counted from 0."""
+    """Convert the environment's actions (n, ...) to those of an RLlib module: from -1 to 1, or counted from 0."""
     if not isinstance(space, (spaces.Discrete, spaces.MultiDiscrete)):
         return np.asarray(normalize_action(actions.astype(space.dtype), space), space.dtype)
     choices = space.n if isinstance(space, spaces.Discrete) else space.nvec
@@ -165,7 +165,7 @@ def _for_module(name: str, actions: Array, space: Space[Any]) -> Array:
 
 
 def _open(data: str) -> tuple[str, Any]:
-    """Path and filesystem of a folder of Parquet files, here or anywhere that fsspec knows."""
+    """Path and filesystem of a folder of Parquet files, local or at any fsspec address."""
     try:
         known, path = fsspec.core.url_to_fs(os.path.expanduser(data))
         files = [path] if known.isfile(path) else sorted(known.glob(f"{path.rstrip('/')}/**/*.parquet"))
@@ -180,7 +180,7 @@ def _open(data: str) -> tuple[str, Any]:
 
 
 def _require_columns(data: str, observation_space: Space[Any], action_space: Space[Any]) -> None:
-    """Refuse files that lack a column, or whose observations or actions are of another size."""
+    """Refuse files that lack a column, or have observations or actions of another shape."""
     path, filesystem = _open(data)
     try:
         dataset = pyarrow.parquet.ParquetDataset(path, filesystem=filesystem)

@@ -1,7 +1,7 @@
 """One policy of RLlib as one ONNX graph: raw observation in, deterministic action out; and RLlib's own actions.
 
-The graph holds what RLlib does with ``explore=False``: its connectors (one-hot codes, flattening, `MeanStdFilter`), the
-module's forward pass, which is traced, the distribution's deterministic action, and the scaling or clipping to the
+The graph computes RLlib's actions with ``explore=False``: its connectors (one-hot codes, flattening, `MeanStdFilter`),
+the module's forward pass, which is traced, the distribution's deterministic action, and the scaling or clipping to the
 action space. `RLlibPolicy` computes the same with RLlib's own code.
 """
 
@@ -28,7 +28,7 @@ Array = NDArray[Any]
 AnySpace = spaces.Space[Any]
 
 POLICY_ID = "default_policy"
-"""RLlib's name of the one policy of a run that did not name any."""
+"""RLlib's default name of a single policy."""
 
 _SMALL_NUMBER = 1e-6  # ray.rllib.utils.numpy.SMALL_NUMBER, which MeanStdFilter adds to the deviation
 LAYOUT_CONNECTORS = frozenset(
@@ -38,17 +38,17 @@ LAYOUT_CONNECTORS = frozenset(
         *("RemoveSingleTsTimeRankFromBatch", "TensorToNumpy", "UnBatchToIndividualItems"),
     }
 )
-"""What RLlib adds to every pipeline: these change the layout of observations and actions, not their values."""
+"""Connectors of every RLlib pipeline, which change the layout of observations and actions, but not their values."""
 
 
-# What a policy is made of
+# The parts of a policy
 
 
 @dataclass(frozen=True)
 class Filter:
-    """A `MeanStdFilter` that has stopped learning: clip((x - offset) / divisor, -limit, limit), in float64.
+    """A fixed `MeanStdFilter`: clip((x - offset) / divisor, -limit, limit), in float64.
 
-    Its arrays have the observation's shape.
+    The arrays have the observation's shape.
     """
 
     offset: Array
@@ -64,7 +64,7 @@ class Filter:
 
     @classmethod
     def of(cls, stats: Mapping[str, Any], limit: float | None, center: bool, scale: bool) -> Filter:
-        """The filter of a state of RLlib's `RunningStat`, which computes the deviation in float32."""
+        """Make the filter from a state of RLlib's `RunningStat`, which computes the deviation in float32."""
         count = int(stats["num_pushes"])
         mean, squares = (unpacked_array(stats[name]).astype(np.float64) for name in ("mean_array", "sum_sq_diff_array"))
         variance = squares / (count - 1.0) if count > 1 else np.zeros(squares.shape)
@@ -76,26 +76,26 @@ class Filter:
 
 @dataclass(frozen=True)
 class PolicyParts:
-    """One policy of RLlib, with everything that its deterministic action depends on."""
+    """Everything on which the deterministic action of a policy of RLlib depends."""
 
     algorithm: str
     """Name of the algorithm, such as ppo; "" if unknown."""
     observation_space: AnySpace
-    """The environment's own, before any connector."""
+    """The environment's observation space, before any connector."""
     action_space: AnySpace
-    """The environment's own."""
+    """The environment's action space."""
     network: Any
     """Torch module from encoded observations (n, ...) float32 to means, logits or values (n, k)."""
     filter: Filter | None = None
-    """What normalises observations."""
+    """The filter that normalises observations."""
     flatten: bool = False
-    """Observations become one vector: keys in alphabetical order, whole numbers one-hot."""
+    """Whether observations become one vector: keys in alphabetical order, whole numbers one-hot."""
     filter_first: bool = False
-    """The filter comes before the flattening."""
+    """Whether the filter comes before the flattening."""
     normalize_actions: bool = True
-    """Actions from -1 to 1 are scaled to the bounds of the action space."""
+    """Whether actions from -1 to 1 are scaled to the bounds of the action space."""
     clip_actions: bool = False
-    """Actions that are not scaled are clipped to the bounds."""
+    """Whether actions that are not scaled are clipped to the bounds."""
 
 
 def parts_of(module: Any, env_to_module: Any, config: Any, env_spaces: tuple[AnySpace, AnySpace]) -> PolicyParts:
@@ -119,10 +119,10 @@ def parts_of(module: Any, env_to_module: Any, config: Any, env_spaces: tuple[Any
 
 
 def _preprocessing(connectors: list[Any]) -> dict[str, Any]:
-    """The fields of `PolicyParts` about what comes before the network."""
+    """The fields of `PolicyParts` for the connectors before the network."""
     found: dict[str, Any] = {}
     for piece in connectors:
-        kinds = [base.__name__ for base in type(piece).__mro__]  # ours is a subclass of RLlib's filter
+        kinds = [base.__name__ for base in type(piece).__mro__]  # bam_train's filter is a subclass of RLlib's
         name, field = ("MeanStdFilter", "filter") if "MeanStdFilter" in kinds else ("FlattenObservations", "flatten")
         if name not in kinds:
             require_layout_only(piece)
@@ -139,7 +139,7 @@ def _preprocessing(connectors: list[Any]) -> dict[str, Any]:
 
 
 def require_layout_only(piece: Any, known: Sequence[str] = ()) -> None:
-    """Refuse a connector that changes values, except the `known` ones."""
+    """Raise PolicyError for a connector that changes values, except the `known` ones."""
     name = type(piece).__name__
     if name not in LAYOUT_CONNECTORS and name not in known:
         raise PolicyError(f"connector {name} cannot be frozen; expected FlattenObservations or MeanStdFilter")
@@ -149,17 +149,17 @@ def _filter_of(connector: Any) -> Filter:
     agents = list(connector.get_state().values())
     if len(agents) != 1:
         raise PolicyError(f"MeanStdFilter: expected one agent, found {len(agents)}")
-    own, stats = agents[0], agents[0]["running_stats"]
+    state, stats = agents[0], agents[0]["running_stats"]
     if len(stats) != 1:
         raise PolicyError(f"MeanStdFilter: expected one array, found {len(stats)}; put FlattenObservations before it")
-    return Filter.of(stats[0], own["clip_by_value"], own["de_mean_to_zero"], own["de_std_to_one"])
+    return Filter.of(stats[0], state["clip_by_value"], state["de_mean_to_zero"], state["de_std_to_one"])
 
 
 # The graph
 
 
 class FrozenModule(FrozenNetwork):
-    """A policy of RLlib; shares nothing with the live one.
+    """A copy of a policy of RLlib, from raw observations to actions.
 
     Raises:
         PolicyError: The network or a space is of a kind that cannot be frozen.
@@ -201,7 +201,7 @@ class FrozenModule(FrozenNetwork):
                 self.moments[key] = mean.reshape(leaf.shape), spread.reshape(leaf.shape)
 
     def _require_fit(self) -> None:
-        """Weights, observation and action space must belong together."""
+        """Raise PolicyError unless the weights fit the observation and action space."""
         try:
             with torch.no_grad():
                 found = self.scores(*self.example()).shape[1]
@@ -215,9 +215,9 @@ class FrozenModule(FrozenNetwork):
             raise PolicyError(f"the network has {found} outputs, expected {self.outputs} or more for the action space")
 
     def scores(self, *observation: torch.Tensor) -> torch.Tensor:
-        """What the action is made of, (n, k) float32: means, logits or values.
+        """The scores that the action is computed from, (n, k) float32: means, logits or values.
 
-        The network of a Gaussian gives log deviations after the means: these are left out.
+        The log deviations that follow the means of a Gaussian are left out.
         """
         encoded = [encoder(tensor) for encoder, tensor in zip(self.encoders, observation, strict=True)]
         joined = encoded[0] if len(encoded) == 1 else torch.cat(encoded, 1)
@@ -243,7 +243,7 @@ class _Network(Layer):
         module = copy.deepcopy(self.module, memo)
         for name in ("pi", "_pi_head"):
             if isinstance(head := getattr(module, name, None), (TorchMLPHead, TorchFreeLogStdMLPHead)):
-                setattr(module, name, head.net)  # without what it does to log deviations, which are not needed
+                setattr(module, name, head.net)  # without its treatment of log deviations, which are not needed
         return _Network(module)
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
@@ -254,12 +254,12 @@ class _Network(Layer):
                 raise PolicyError(f"{type(module).__name__} gives no action_dist_inputs and cannot be frozen")
             found = outputs["action_dist_inputs"]
             return torch.tanh(found) if self.squash else found
-        # DQN: the value of each choice, up to what a dueling network adds to all of them alike.
+        # DQN: the value of each choice, without the term that a dueling network adds to all values.
         advantages = module.af(module.encoder({"obs": x})["encoder_out"])
         if module.num_atoms == 1:
             return advantages
-        # A distributional one gives logits of each choice over equally spaced values; the mean of these counts, and
-        # what a dueling network adds to all logits of a choice changes nothing about it.
+        # A distributional DQN returns logits of each choice over equally spaced values, whose mean is the value; the
+        # term that a dueling network adds to all logits of a choice does not change this mean.
         steps = torch.arange(0.0, module.num_atoms, dtype=torch.float32)
         support = module.v_min + steps * (module.v_max - module.v_min) / float(module.num_atoms - 1)
         logits = advantages.reshape(-1, int(module.action_space.n), module.num_atoms)
@@ -285,14 +285,14 @@ class _Flat(Layer):
 
 
 class RLlibPolicy:
-    """What RLlib's own code does on raw observations; copies, so that the trainer may go on or be closed.
+    """RLlib's own actions for raw observations; holds copies, independent of the trainer.
 
     Args:
         module: The RLModule.
         env_to_module: The env runner's pipeline, or None; its statistics do not change.
-        config: The AlgorithmConfig; says what is done with actions.
+        config: The AlgorithmConfig, which determines the treatment of actions.
         env_spaces: Observation and action space of the environment.
-        explore: Actions are drawn as in training; else they are the deterministic ones.
+        explore: Whether actions are drawn as in training, or deterministic.
 
     Raises:
         SettingsError: The policy is recurrent.
@@ -320,7 +320,7 @@ class RLlibPolicy:
         self._after = config.build_module_to_env_connector(env=None, spaces=given)
 
     def reset(self, rows: Any = None) -> None:
-        """Nothing: it has no memory."""
+        """Do nothing: the policy is not recurrent."""
 
     def act(self, observation: Any) -> Any:
         """The action for one observation, in the environment's action space."""
@@ -332,20 +332,20 @@ class RLlibPolicy:
 
         space, action_space = self._spaces
         episodes = [
-            SingleAgentEpisode(observations=[one], observation_space=space, action_space=action_space)
-            for one in (less_start(space, observation) for observation in observations)  # RLlib counts from 0
+            SingleAgentEpisode(observations=[value], observation_space=space, action_space=action_space)
+            for value in (less_start(space, observation) for observation in observations)  # RLlib counts from 0
         ]
         given = {"rl_module": self._module, "episodes": episodes, "explore": self._explore, "shared_data": {}}
         forward = self._module.forward_exploration if self._explore else self._module.forward_inference
         with torch.no_grad():
             batch = self._after(batch=forward(self._before(batch={}, **given)), **given)
-        actions = np.stack([np.asarray(one) for one in batch.get("actions_for_env", batch["actions"])])
+        actions = np.stack([np.asarray(action) for action in batch.get("actions_for_env", batch["actions"])])
         dtype = np.int64 if isinstance(action_space, spaces.Discrete) else action_space.dtype
         return np.asarray(plus_start(action_space, actions), dtype)
 
 
 def golden(frozen: FrozenModule, policy: RLlibPolicy, n: int = 256) -> bytes:
-    """Draw n observations, fewer if they are large, and record RLlib's deterministic actions for them.
+    """Draw n observations, or fewer if they are large, and record RLlib's deterministic actions for them.
 
     Returns:
         A safetensors file with ``observation`` (or ``observation.<key>``), (n, ...), and ``action``, (n, ...).
@@ -355,7 +355,7 @@ def golden(frozen: FrozenModule, policy: RLlibPolicy, n: int = 256) -> bytes:
 
 
 def one_by_one(observations: Mapping[str, Array]) -> list[Any]:
-    """The observations of a batch, as an environment gives them."""
+    """Split a batch, (n, ...) by key, into the n observations of an environment."""
     if "" in observations:
         return list(observations[""])
-    return [dict(zip(observations, one, strict=True)) for one in zip(*observations.values(), strict=True)]
+    return [dict(zip(observations, values, strict=True)) for values in zip(*observations.values(), strict=True)]

@@ -1,7 +1,7 @@
-"""Hyperparameters, checked against RLlib's own ``training()`` arguments and completed; the `AlgorithmConfig` of a run.
+"""Hyperparameters, checked against the arguments of RLlib's ``training()`` and completed; a run's `AlgorithmConfig`.
 
-Beside these there are ``model_config`` (RLlib's `DefaultModelConfig`; initialisers by their name in ``torch.nn.init``),
-``rollout_fragment_length``, the steps of each environment before a runner hands over what it has, ``log_std_init`` of a
+Additional ones are ``model_config`` (RLlib's `DefaultModelConfig`; initialisers by their name in ``torch.nn.init``),
+``rollout_fragment_length``, the steps of each environment before a runner delivers its samples, ``log_std_init`` of a
 free standard deviation (``model_config.free_log_std``), and ``action_init_scale``, which multiplies the weights of the
 last layer: with 0.01 the first actions are about 0. A schedule is a list: ``lr=[[0, 3e-4], [1000000, 0.0]]``.
 """
@@ -79,10 +79,10 @@ ELSEWHERE = {
         "it belongs to RLlib's old API stack, or bam-train takes care of it",
     ),
 }
-"""Arguments of RLlib that are no hyperparameters here, many of its old API stack, and what to do instead."""
+"""Arguments of RLlib that are not hyperparameters here, many of its old API stack, and the replacement or reason."""
 
 _OLD_HERE = {"impala": {"epsilon"}, "appo": {"epsilon", "use_critic"}}
-"""Names that are old in one algorithm and current in another."""
+"""Arguments by algorithm that belong to its old API stack, and are current in other algorithms."""
 
 _OF_CONNECTORS = frozenset({"self", "kwargs", "multi_agent", "update_stats"})
 
@@ -91,7 +91,7 @@ _OURS = ("model_config", "rollout_fragment_length", "log_std_init", "action_init
 
 
 def complete(algorithm: Algorithm, given: Mapping[str, Any]) -> dict[str, Any]:
-    """Check hyperparameters by name and type and add the defaults of those that are not given.
+    """Check hyperparameters by name, type and range, and add defaults for missing ones.
 
     Raises:
         SettingsError: An unknown name (with the closest match), a wrong type or a number out of range.
@@ -125,7 +125,7 @@ def complete_normalize(given: bool | Mapping[str, Any]) -> bool | dict[str, Any]
 
 
 def _defaults(algorithm: Algorithm, config: Any) -> dict[str, tuple[Any, Any]]:
-    """Name of every hyperparameter to its annotation and its default."""
+    """Annotation and default of every hyperparameter, by name."""
     left_out = ELSEWHERE.keys() | _OLD_HERE.get(algorithm.name, set())
     found: dict[str, tuple[Any, Any]] = {}
     for owner in type(config).__mro__:
@@ -133,9 +133,9 @@ def _defaults(algorithm: Algorithm, config: Any) -> dict[str, tuple[Any, Any]]:
         for name, row in inspect.signature(method).parameters.items() if method else ():
             if name not in left_out | {"self", "kwargs"} and not name.startswith("_") and name not in found:
                 found[name] = row.annotation, getattr(config, name, None)
-    if "entropy_coeff" in found:  # PPO takes a schedule too, and is annotated otherwise
+    if "entropy_coeff" in found:  # PPO takes a schedule too, unlike its annotation
         found["entropy_coeff"] = found["lr"][0], found["entropy_coeff"][1]
-    if "actor_lr" in found:  # RLlib refuses any other, and its own CQL has one
+    if "actor_lr" in found:  # RLlib refuses any other value, although its CQL has one
         found["lr"] = found["lr"][0], None
     found["rollout_fragment_length"] = typing.Union[int, str], config.rollout_fragment_length  # noqa: UP007
     found["log_std_init"] = typing.Optional[float], None  # noqa: UP045
@@ -144,7 +144,7 @@ def _defaults(algorithm: Algorithm, config: Any) -> dict[str, tuple[Any, Any]]:
 
 
 def _fit(name: str, value: Any, hint: Any) -> Any:
-    """`fit`; RLlib's annotation of a schedule is not for the user to read."""
+    """`fit`, with a readable message for a schedule instead of RLlib's annotation."""
     if hint is Any or not fits(_SCHEDULE, hint) or fits(value, hint):
         return fit(name, value, hint)
     raise SettingsError(f"{name}: expected a number or a schedule [[step, value], ...], found {brief(value)}")
@@ -156,13 +156,13 @@ _MAY_BE_NONE = frozenset(
     {"grad_clip", "vf_clip_param", "minibatch_size", "target_entropy"}
     | {"vtrace_clip_rho_threshold", "vtrace_clip_pg_rho_threshold"}
 )
-"""Hyperparameters with a number for a default that mean something without one."""
+"""Hyperparameters whose default is a number, and for which None has a meaning."""
 
 
 def _hint(name: str, hint: Any, default: Any) -> Any:
-    """The annotation, unless RLlib's own default does not fit it (``grad_clip: Optional[int] = 40.0``).
+    """The annotation, unless RLlib's default does not fit it (``grad_clip: Optional[int] = 40.0``).
 
-    RLlib writes Optional where it means "not given"; where there is a default, None is a number that is missing.
+    RLlib's Optional means "not given"; if there is a default, None is refused.
     """
     if hint is inspect.Parameter.empty:
         return Any
@@ -170,22 +170,22 @@ def _hint(name: str, hint: Any, default: Any) -> Any:
     hint = hint if fits(plain, hint) else typing.Optional[type(plain)]  # noqa: UP045
     if plain is None or name in _MAY_BE_NONE or typing.get_origin(hint) is not typing.Union:
         return hint
-    return typing.Union[tuple(one for one in typing.get_args(hint) if one is not type(None))]  # noqa: UP007
+    return typing.Union[tuple(kind for kind in typing.get_args(hint) if kind is not type(None))]  # noqa: UP007
 
 
 def _plain(value: Any) -> Any:
-    """As it is in JSON: tuples are lists."""
+    """The value in JSON, with lists for tuples."""
     return json.loads(json.dumps(value, default=str))
 
 
-_BUFFERS = {one.__name__: one for one in (EpisodeReplayBuffer, PrioritizedEpisodeReplayBuffer)}
+_BUFFERS = {buffer.__name__: buffer for buffer in (EpisodeReplayBuffer, PrioritizedEpisodeReplayBuffer)}
 
 
 def _complete_buffer(config: Any, given: Mapping[str, Any]) -> dict[str, Any]:
-    """Check the names in ``replay_buffer_config``, which RLlib does not, and add the defaults."""
+    """Check the names in ``replay_buffer_config``, as RLlib does not, and add the defaults."""
     default = _plain(config.replay_buffer_config)
     values = {**default, **given}
-    if default["type"] not in _BUFFERS:  # of CQL, which has no use for it
+    if default["type"] not in _BUFFERS:  # CQL does not use it
         return values
     buffer = _BUFFERS.get(values["type"])
     if buffer is None:
@@ -201,17 +201,17 @@ def _complete_model(config: Any, given: Any) -> dict[str, Any]:
     given = fit("model_config", given, dict)
     hints = typing.get_type_hints(DefaultModelConfig)
     hints |= {name: typing.Optional[str] for name in hints if name.endswith("_initializer")}  # noqa: UP045 - no function
-    own = dataclasses.asdict(DefaultModelConfig()) | config._model_config_auto_includes
+    defaults = dataclasses.asdict(DefaultModelConfig()) | config._model_config_auto_includes
     require_known(given, hints, "model_config argument", ELSEWHERE)
     return {
-        name: fit(f"model_config.{name}", given[name], _hint(name, hints[name], own[name]))
+        name: fit(f"model_config.{name}", given[name], _hint(name, hints[name], defaults[name]))
         if name in given
-        else _plain(own[name])
+        else _plain(defaults[name])
         for name in hints
     }
 
 
-# Numbers, schedules and layers that no algorithm can learn with; some of them RLlib takes, and then hangs
+# Ranges of numbers, schedules and layers with which an algorithm can learn; with some others RLlib hangs
 
 _RATES = (
     *("lr", "actor_lr", "critic_lr", "alpha_lr", "value_lr", "adam_epsilon"),
@@ -230,12 +230,12 @@ _LAST: dict[str, Any] = {
     **dict.fromkeys(("gamma", "lambda_", "tau", "expectile", "epsilon"), Fraction),
     **dict.fromkeys((*_RATES, *_WEIGHTS), NonNegative),
 }
-"""What a schedule may come to: a rate of 0 ends learning, and does no harm at its end."""
+"""Ranges of later values of a schedule, where a rate may be 0."""
 _RANGES = _LAST | dict.fromkeys(_RATES, Positive) | dict.fromkeys(_COUNTS, PositiveInt)
 
 
 def _require_ranges(values: Mapping[str, Any]) -> None:
-    """Refuse what no algorithm can learn with among complete hyperparameters."""
+    """Refuse complete hyperparameters with which no algorithm can learn."""
     for name, value in values.items():
         if isinstance(value, bool):
             continue
@@ -267,11 +267,11 @@ def _require_ranges(values: Mapping[str, Any]) -> None:
 # The configuration of a run
 
 STEPS_AT_LEAST = 200
-"""Steps of an iteration of an algorithm that updates after every few: its overhead is then small."""
+"""Minimum steps of an iteration of an algorithm that updates after a few steps, for a small overhead."""
 
 
 def make_config(settings: TrainSettings, observation_space: Space[Any], action_space: Space[Any], seed: int) -> Any:
-    """The configuration of a run of complete settings; the spaces are the environment's own."""
+    """The configuration of a run with complete settings; the spaces are the environment's."""
     algorithm, values = RLLIB_ALGORITHMS[settings.algo], settings.hyperparameters
     number, gpus_each = learners(settings)
     config = algorithm.load()()
@@ -318,7 +318,7 @@ def envs_each(settings: TrainSettings) -> int:
 def connectors(
     observation_space: Space[Any], normalize: bool | Mapping[str, Any], env: Any, spaces: Any, device: Any
 ) -> list[Any]:
-    """What lies between environment and module: several inputs become one vector, normalised if asked for."""
+    """Connectors between environment and module: several inputs become one vector, normalised if `normalize` is set."""
     pieces: list[Any] = [] if is_plain(observation_space) else [FlattenObservations()]
     if normalize:
         pieces.append(MeanStdFilter(**({} if normalize is True else normalize)))
@@ -326,7 +326,7 @@ def connectors(
 
 
 def is_plain(space: Space[Any]) -> bool:
-    """Whether RLlib's networks take it as it is: a vector or an image, of floats."""
+    """Whether RLlib's networks take the space without a connector: a vector or an image of floats."""
     floats = isinstance(space, spaces.Box) and np.issubdtype(space.dtype, np.floating)
     return floats and len(space.shape or ()) in (1, 3)
 
@@ -339,25 +339,25 @@ _REFUSALS = (
 
 @contextlib.contextmanager
 def refusals(settings: TrainSettings) -> Iterator[None]:
-    """RLlib's errors about settings that cannot work, as our own."""
+    """Turn RLlib's errors about settings that cannot work into SettingsError."""
     try:
         yield
     except BamTrainError:
         raise
     except _REFUSALS as error:
-        said = " ".join(str(error).partition("To suppress all validation errors")[0].split()) or type(error).__name__
-        text = first_cause_of_death(settings.num_env_runners) or said  # RLlib's is about runners that are not there
+        why = " ".join(str(error).partition("To suppress all validation errors")[0].split()) or type(error).__name__
+        text = first_cause_of_death(settings.num_env_runners) or why  # RLlib's message is only that runners are missing
         raise SettingsError(f"{settings.algo} on {settings.env} cannot be set up: {text:.400}") from error
 
 
 class NotesEnds(RLlibCallback):  # type: ignore[misc]
-    """Notes how each episode of RLlib's own runner went, which keeps means alone and no success."""
+    """Logs the end of each episode of RLlib's own runner, which keeps only means, without success."""
 
     def on_episode_end(
         self, *, episode: Any, prev_episode_chunks: Any = (), metrics_logger: Any, **kwargs: Any
     ) -> None:
-        """Note one."""
+        """Log one episode."""
         success = episode.get_infos(-1).get("is_success")
         total = sum(piece.get_return() for piece in (*prev_episode_chunks, episode))
-        # PPO's learner has lengthened the earlier pieces by a step without a reward: `t` counts the real ones.
+        # PPO's learner adds a step without a reward to earlier pieces; `t` does not count it.
         log_end(metrics_logger, episode.t, float(total), None if success is None else bool(success))

@@ -1,9 +1,9 @@
-"""A whole algorithm in a checkpoint: RLlib's own tree of files, and how a run goes on from it without unpickling them.
+"""The state of an algorithm in a checkpoint: RLlib's own tree of files, from which a run resumes without unpickling.
 
-``bam/resume/rllib/…`` is what ``Algorithm.save_to_path`` writes, so that ``Algorithm.from_checkpoint`` of the unpacked
-folder works for those who trust it. Ours builds the algorithm from its settings and sets the states in those files,
-read as arrays and plain values; ``class_and_ctor_args.pkl``, which says how objects are made, is never read.
-``bam/resume/learner.json`` has what the tree leaves out: numbers of the learners that adapt themselves.
+``bam/resume/rllib/…`` is written by ``Algorithm.save_to_path``, so that ``Algorithm.from_checkpoint`` of the unpacked
+folder works for those who trust it. Here a resumed run builds the algorithm from its settings and sets the states in
+these files, read as arrays and plain values; ``class_and_ctor_args.pkl``, which describes objects to make, is never
+read. ``bam/resume/learner.json`` has adaptive numbers of the learners that the tree lacks.
 """
 
 import functools
@@ -26,9 +26,9 @@ STATES = ("state.pkl", "algorithm_state.pkl", "module_state.pkl", "policy_state.
 
 
 def members(algorithm: Any, notes: Mapping[str, Any]) -> dict[str, bytes]:
-    """Everything that the run needs to go on, between two iterations; notes are JSON values."""
+    """The members from which the run resumes, taken between two iterations; notes are JSON values."""
     with tempfile.TemporaryDirectory(prefix="bam-rllib-") as name:
-        root = Path(name).resolve()  # RLlib takes absolute paths alone
+        root = Path(name).resolve()  # RLlib takes absolute paths only
         algorithm.save_to_path(str(root))
         files = sorted(path for path in root.rglob("*") if path.is_file())
         tree = {FOLDER + path.relative_to(root).as_posix(): path.read_bytes() for path in files}
@@ -36,7 +36,7 @@ def members(algorithm: Any, notes: Mapping[str, Any]) -> dict[str, bytes]:
 
 
 def load(checkpoint: Checkpoint, algorithm: Any) -> None:
-    """Put a checkpoint's states into a new algorithm of the same settings.
+    """Restore a checkpoint's states into a new algorithm with the same settings.
 
     Raises:
         CheckpointMismatch: It was made by another version of Ray.
@@ -56,14 +56,14 @@ def load(checkpoint: Checkpoint, algorithm: Any) -> None:
         with checkpoint.fitting(EXTRAS):
             give = functools.partial(_give, extras=json.loads(checkpoint.read(EXTRAS)))
             for result in algorithm.learner_group.foreach_learner(give):
-                result.get()  # raises what went wrong there
+                result.get()  # raises the learner's exception
 
 
 def read(checkpoint: Checkpoint) -> dict[str, Any]:
     """The nested state of the whole algorithm: arrays and plain values.
 
     Raises:
-        AlteredCheckpoint: A state cannot be read, or holds something else; names it.
+        AlteredCheckpoint: A state cannot be read, or holds other objects; the message names it.
     """
     tree: dict[str, Any] = {}
     for name in sorted(checkpoint.manifest.sha256):
@@ -86,23 +86,23 @@ def read(checkpoint: Checkpoint) -> dict[str, Any]:
 
 
 def hand_out(algorithm: Any) -> None:
-    """Give the learner's weights and the observations' statistics to every runner, and wait until it has them.
+    """Send the learner's weights and the observations' statistics to every runner, and wait for their arrival.
 
-    RLlib's `sync_weights` leaves out a runner that has not answered the call before: after `set_state`, which makes
-    two, runners would take their first samples with random weights.
+    RLlib's `sync_weights` skips a runner that has not answered the call before: after `set_state`, which makes two
+    calls, runners would take their first samples with random weights.
     """
     group = algorithm.env_runner_group
     if group is None:
         return
     weights = algorithm.learner_group.get_state(components="learner/rl_module", inference_only=True)["learner"]
     state = algorithm.env_runner.get_state(not_components="rl_module")
-    state["rl_module"] = weights["rl_module"]  # without a number, so that it is not taken for an old one
+    state["rl_module"] = weights["rl_module"]  # without a sequence number, so that they are not discarded as old
     algorithm.env_runner.set_state(state)
     group.foreach_env_runner("set_state", kwargs={"state": state}, local_env_runner=False)
 
 
 def start_actions(algorithm: Any, log_std: float | None, scale: float) -> None:
-    """Set the free standard deviation of a new algorithm's actions, and multiply the policy's last layer by `scale`."""
+    """Set the free standard deviation of a new algorithm's actions, and multiply its policy's last layer by `scale`."""
     if log_std is None and scale == 1.0:
         return
     group = algorithm.learner_group
@@ -119,19 +119,19 @@ def start_actions(algorithm: Any, log_std: float | None, scale: float) -> None:
 
 
 def require_version(checkpoint: Checkpoint) -> None:
-    """Refuse to go on from the state of another Ray than this one, major or minor.
+    """Refuse to resume from the state of another major or minor version of Ray.
 
     Raises:
-        CheckpointMismatch: Names both versions.
+        CheckpointMismatch: The message names both versions.
     """
     import ray
 
-    theirs = str(checkpoint.manifest.versions.get("ray", ""))
-    if theirs and theirs.split(".")[:2] != ray.__version__.split(".")[:2]:
+    saved = str(checkpoint.manifest.versions.get("ray", ""))
+    if saved and saved.split(".")[:2] != ray.__version__.split(".")[:2]:
         raise CheckpointMismatch(
             checkpoint.path,
-            f"was trained with Ray {theirs}, and this is Ray {ray.__version__}, whose states differ. "
-            f'Run: pip install "ray[rllib]=={theirs}" to go on; bam-eval and bam-deploy need no Ray',
+            f"was trained with Ray {saved}, and this is Ray {ray.__version__}, whose states differ. "
+            f'Run: pip install "ray[rllib]=={saved}" to go on; bam-eval and bam-deploy need no Ray',
         )
 
 
@@ -143,13 +143,13 @@ _NAMES = (
     "_last_update_ts_by_mid",
     "entropy_coeff_schedulers_per_module",
 )
-"""PPO's and APPO's KL coefficient, SAC's, TQC's and CQL's temperature, MARWIL's running mean of squared advantages,
-when target networks were updated last, and where a schedule of the entropy's weight is. ``Learner.get_state`` of
-Ray 2.60 has none of them."""
+"""The KL coefficient of PPO and APPO, the temperature of SAC, TQC and CQL, MARWIL's running mean of squared advantages,
+the steps of the last updates of target networks, and the current value of a schedule of the entropy's weight.
+``Learner.get_state`` of Ray 2.60 lacks them."""
 
 
 def extras_of(algorithm: Any) -> dict[str, dict[str, float]]:
-    """What all learners alike keep beside their state: attribute of the learner to module to number."""
+    """Numbers that ``Learner.get_state`` lacks, equal for all learners, by the learner's attribute and module."""
     results = list(algorithm.learner_group.foreach_learner(_take))
     return dict(results[0].get()) if results else {}
 
@@ -161,7 +161,7 @@ def _take(learner: Any) -> dict[str, dict[str, float]]:
 
 
 def _number(value: Any) -> Any:
-    """Of a tensor of one number, or of what a schedule is at: a number that JSON keeps exactly."""
+    """The number of a tensor, or the current value of a schedule, which JSON stores exactly."""
     value = value.get_current_value() if isinstance(value, Scheduler) else value
     return value.item() if isinstance(value, torch.Tensor) else value
 
@@ -171,7 +171,7 @@ def _give(learner: Any, extras: Mapping[str, Mapping[str, float]]) -> None:
         table = getattr(learner, name)
         for key, number in numbers.items():
             value = table[key]
-            if isinstance(value, Scheduler):  # where it is until the first update's end; a fixed number stays
+            if isinstance(value, Scheduler):  # its value until the first update has ended; a fixed number stays
                 value = value.get_current_value() if value.use_schedule else None
             if isinstance(value, torch.Tensor):
                 value.data.fill_(number)  # in place: an optimiser may hold it

@@ -59,7 +59,7 @@ class RLlibTrainer:
             self._signals, self._period = describe() if describe else {}, control_period(env)
         self._ends = {name: deque[float](maxlen=_EPISODES) for name in ("return", "length", "success")}
         self._learnt: dict[str, Any] = {}
-        """What RLlib's learner said of the last iteration."""
+        """Metrics of RLlib's learner for the last iteration."""
         self._steps = 0
         self._tensorboard: TensorBoardFiles | None = None
         self._spare: Any = None
@@ -85,20 +85,20 @@ class RLlibTrainer:
 
     @classmethod
     def complete(cls, settings: TrainSettings) -> TrainSettings:
-        """Check the algorithm's own settings and fill in its defaults."""
+        """Check the algorithm's settings and add its defaults."""
         algorithm = RLLIB_ALGORITHMS[settings.algo]
         _require_fitting(settings)
         with contextlib.closing(make_env(settings.env, settings.env_kwargs)) as env:
             space, action_space = env.observation_space, env.action_space
         algorithm.require_actions(settings.env, type(action_space).__name__)
         if isinstance(space, spaces.Box) and len(space.shape) == 3 and not np.issubdtype(space.dtype, np.floating):
-            raise SettingsError(  # RLlib's networks fail on these in the first update
+            raise SettingsError(  # RLlib's networks fail in the first update
                 f"{settings.env}: the rllib trainer takes images of floats, found {space.dtype} of shape {space.shape}."
                 " Scale them in the environment (gymnasium.wrappers.TransformObservation), or use --trainer sb3"
             )
         values = complete(algorithm, settings.hyperparameters)
         if isinstance(action_space, spaces.Discrete) and values.get("twin_q") is False:
-            # RLlib 2.60's SAC fails on one critic of choices in the first update
+            # The SAC of RLlib 2.60 fails in the first update with one critic and discrete actions
             raise SettingsError("twin_q: expected true, as actions are choices, found false. Leave it out")
         return dataclasses.replace(
             settings,
@@ -115,17 +115,17 @@ class RLlibTrainer:
         with trainer._or_close():
             rllib_state.start_actions(trainer.algorithm, values["log_std_init"], values["action_init_scale"])
             rllib_state.hand_out(trainer.algorithm)
-            trainer.freeze()  # what cannot be frozen is refused before it is trained
+            trainer.freeze()  # refuses a policy that cannot be frozen before it is trained
         return trainer
 
     @classmethod
     def load(cls, checkpoint: Checkpoint, settings: TrainSettings | None = None) -> RLlibTrainer:
-        """Set up a run that goes on from a checkpoint, with its settings or with these."""
+        """Set up a run that continues from a checkpoint, with the checkpoint's settings or with `settings`."""
         settings = settings or TrainSettings.from_mapping(own_settings(checkpoint), str(checkpoint.path))
         with contextlib.closing(make_env(settings.env, settings.env_kwargs)) as env:
             require_fit(checkpoint, env)
         steps = checkpoint.manifest.steps
-        trainer = cls(settings, settings.seed + steps)  # other episodes than the first ones again
+        trainer = cls(settings, settings.seed + steps)  # does not repeat the first episodes
         with trainer._or_close():
             rllib_state.load(checkpoint, trainer.algorithm)
         trainer._steps = steps
@@ -137,7 +137,7 @@ class RLlibTrainer:
 
     @contextlib.contextmanager
     def _or_close(self) -> Iterator[None]:
-        """Whatever goes wrong within leaves nothing open."""
+        """Close the trainer if the ``with`` block raises an exception."""
         try:
             yield
         except BaseException:
@@ -150,7 +150,7 @@ class RLlibTrainer:
 
     @property
     def steps(self) -> int:
-        """Steps trained since the first of the run; of an offline algorithm: recorded steps learnt from."""
+        """Steps trained since the start of the run; for an offline algorithm, recorded steps learnt from."""
         return self._steps
 
     def train(self, steps: int, on_progress: OnProgress) -> None:
@@ -161,7 +161,7 @@ class RLlibTrainer:
                 return
 
     def _iterate(self) -> None:
-        with warnings.catch_warnings():  # TQC compares every quantile with every other, which torch takes for a mistake
+        with warnings.catch_warnings():  # torch warns of TQC's comparison of all pairs
             warnings.filterwarnings("ignore", "Using a target size", UserWarning)
             result, news = self._watch.train()
         self.notices += news
@@ -171,13 +171,15 @@ class RLlibTrainer:
             self._steps = int(self._learnt.get("num_module_steps_trained_lifetime", before))
         else:
             self._steps = int(sampled.get("num_env_steps_sampled_lifetime", before))
-        if self._steps == before:  # every runner was gone
+        if self._steps == before:  # all runners were dead
             return
         for name, values in self._ends.items():
-            ended = np.atleast_1d(np.asarray(sampled.get(ENDS, {}).get(name, ()), np.float64))  # of one, RLlib's number
-            values.extend(ended[~np.isnan(ended)].tolist())  # where no episode ended, RLlib may give NaN
-        # A loss that is NaN makes the weights so, and RLlib reports NaN for no update too.
-        if not all(bool(torch.isfinite(one).all()) for one in self._module().parameters()):
+            ended = np.atleast_1d(
+                np.asarray(sampled.get(ENDS, {}).get(name, ()), np.float64)
+            )  # one episode is a number
+            values.extend(ended[~np.isnan(ended)].tolist())  # RLlib may report NaN if no episode ended
+        # A NaN loss makes the weights NaN; the loss itself is NaN in RLlib's result also if there was no update.
+        if not all(bool(torch.isfinite(weights).all()) for weights in self._module().parameters()):
             raise TrainingFailed(
                 f"the policy's weights are NaN or infinite at step {self.steps}; expected finite numbers: try a "
                 "smaller lr"
@@ -186,9 +188,9 @@ class RLlibTrainer:
         self.log(self._metrics() | means)
 
     def _metrics(self) -> dict[str, float]:
-        """The learner's own numbers, finite ones only."""
+        """The learner's metrics that are finite numbers."""
         arrays = {f"train/{name}": np.asarray(value) for name, value in self._learnt.items()}
-        numbers = {name: float(one) for name, one in arrays.items() if one.ndim == 0 and one.dtype.kind in "fiu"}
+        numbers = {name: float(value) for name, value in arrays.items() if not value.ndim and value.dtype.kind in "fiu"}
         return {name: number for name, number in numbers.items() if math.isfinite(number)}
 
     def _statistics(self) -> Statistics:
@@ -202,13 +204,13 @@ class RLlibTrainer:
         )
 
     def _module(self) -> Any:
-        """The module of this process that has the newest weights."""
+        """A module in this process, with the newest weights."""
         group, runner = self.algorithm.learner_group, self.algorithm.env_runner
         if group.is_local:
             return group._learner.module[DEFAULT_MODULE_ID].unwrapped()
         if runner is not None:
             module = runner.module
-        else:  # one that is there for nothing else
+        else:  # a module kept for this purpose
             if self._spare is None:
                 spec = self._config.get_rl_module_spec(spaces={DEFAULT_MODULE_ID: self._spaces}, inference_only=True)
                 self._spare = spec.build()
@@ -217,15 +219,15 @@ class RLlibTrainer:
         module.set_state(weights["learner"]["rl_module"][DEFAULT_MODULE_ID])
         return module
 
-    def _of(self, kind: Any, module: Any, **given: Any) -> Any:
-        """The module as `parts_of` or as an `RLlibPolicy`."""
+    def _of(self, kind: Any, module: Any, **options: Any) -> Any:
+        """Call `kind`, which is `parts_of` or `RLlibPolicy`, for the module."""
         runner = self.algorithm.env_runner
-        return kind(module, None if runner is None else runner._env_to_module, self._config, self._spaces, **given)
+        return kind(module, None if runner is None else runner._env_to_module, self._config, self._spaces, **options)
 
     def save(self, path: Path, scores: Mapping[str, Any], notes: Mapping[str, Any]) -> Checkpoint:
         """Write a checkpoint that can be resumed and deployed."""
         with self.undisturbed():
-            module = copy.deepcopy(self._module())  # of appo and impala, a thread goes on learning
+            module = copy.deepcopy(self._module())  # appo and impala continue to learn in a thread
             frozen = FrozenModule(self._of(parts_of, module))
             members = {
                 "bam/policy.onnx": frozen.onnx_file(),
@@ -236,19 +238,19 @@ class RLlibTrainer:
         return write_checkpoint(path, manifest(self.settings, self._spaces, known), members)
 
     def freeze(self) -> FrozenPolicy:
-        """The policy as it is now."""
+        """Freeze the current policy."""
         with self.undisturbed():
             graph = FrozenModule(self._of(parts_of, self._module())).onnx_file()
         return FrozenPolicy.from_graph(graph, *map(space_to_json, self._spaces))
 
     def exploring(self) -> RLlibPolicy:
-        """The policy as it is now, drawing its actions as in training."""
+        """The current policy, drawing its actions as in training."""
         with self.undisturbed():
             return cast(RLlibPolicy, self._of(RLlibPolicy, self._module(), explore=True))
 
     @contextlib.contextmanager
     def undisturbed(self) -> Iterator[None]:
-        """Do something between two iterations that leaves training's random numbers as they were."""
+        """Restore the random number generators of training after the ``with`` block, between two iterations."""
         before = random.getstate(), np.random.get_state(), torch.get_rng_state()
         try:
             yield
@@ -259,23 +261,23 @@ class RLlibTrainer:
 
     @contextlib.contextmanager
     def evaluation_envs(self) -> Iterator[VectorEnv[Any, Any, Any] | None]:
-        """None: evaluation makes its own."""
+        """None: evaluation makes its own environments."""
         yield None
 
     def log(self, metrics: Mapping[str, float]) -> None:
-        """Put numbers next to the trainer's own in TensorBoard."""
+        """Add numbers to the trainer's in TensorBoard."""
         if self._tensorboard is not None:
             self._tensorboard.write(metrics, self.steps)
 
     def close(self) -> None:
-        """Let go of environments, log files and Ray."""
+        """Close environments, log files and Ray."""
         if self._tensorboard is not None:
             self._tensorboard.close()
         self._open.close()
 
 
 def _require_fitting(settings: TrainSettings) -> None:
-    """Refuse settings that RLlib's trainer has no use for."""
+    """Refuse settings that the rllib trainer does not support."""
     if settings.transport:
         raise SettingsError(
             "transport: the rllib trainer makes its environments in its own runners. Leave --transport out and put "
