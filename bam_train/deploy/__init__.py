@@ -1,1 +1,1 @@
-"""Running a frozen policy on a robot at its own rate: the loop, its deadlines, its display and its report. No torch."""
+"""Running a frozen policy on a robot at its rate: the loop, deadlines and the report; without torch."""

@@ -1,8 +1,8 @@
-"""The deployment: a chain of agents that moves a robot at absolute deadlines, and what ends it.
+"""The deployment: a chain of agents that moves a robot at absolute deadlines.
 
 Robot, journal and policy are agents of one `TemporalAgent`, which waits for each deadline before the policy acts; your
-own agents join the same chain. However it ends (all episodes done, Ctrl-C, SIGTERM, a fault), the robot is halted and
-closed before anything is reported.
+own agents join the same chain. At the end, for any reason (all episodes done, Ctrl-C, SIGTERM, a fault), the robot is
+halted and closed before anything is reported.
 """
 
 import signal
@@ -22,33 +22,33 @@ from bam_train.loop.workspace import Sink
 from bam_train.signals import handled
 
 WINDOW = 1000
-"""Ticks that the workspace of a deployment keeps at least: 50 s at 20 Hz."""
+"""Minimum number of ticks that the workspace of a deployment keeps: 50 s at 20 Hz."""
 _ENDS = ("terminated", "truncated")
 
 
 class Watcher(Protocol):
-    """Shows the loop to a person; called between ticks, so it has to be quick."""
+    """Displays the loop; called between ticks, so it must be fast."""
 
     def ticked(self, record: EpisodeRecord, action: Any, pacer: Pacer) -> None:
-        """A step was taken."""
+        """Called after every step."""
 
     def ended(self, record: EpisodeRecord) -> None:
-        """An episode ended."""
+        """Called after every episode."""
 
 
 class Stopped(BaseException):
-    """A signal asked for the end."""
+    """A signal that ends the deployment."""
 
 
 class StopSwitch:
-    """Handles signals: while armed, one raises `Stopped`; otherwise it waits, as the robot may be being halted.
+    """Handles signals: while armed, a signal raises `Stopped`; otherwise it is only recorded, as a halt may be running.
 
-    The third one raises KeyboardInterrupt, for a halt that hangs.
+    The third signal raises KeyboardInterrupt, in case the halt hangs.
     """
 
     def __init__(self) -> None:
         self.armed = False
-        """Whether a signal may interrupt what runs now."""
+        """Whether a signal may interrupt the main thread now."""
         self.came: list[int] = []
         """The signals so far."""
 
@@ -58,7 +58,7 @@ class StopSwitch:
             raise Stopped
 
     def __call__(self, number: int) -> None:
-        """Handle a signal, in the main thread, between two of its instructions."""
+        """Handle a signal, in the main thread."""
         self.came.append(number)
         if len(self.came) > 2:
             raise KeyboardInterrupt
@@ -68,20 +68,20 @@ class StopSwitch:
 
 
 class Deployment:
-    """A frozen policy and a robot in one loop, which runs once; memory stays flat however long.
+    """A frozen policy and a robot in one loop, which runs once, with bounded memory.
 
     Args:
         env: The environment, already checked to fit the policy.
         policy: Has ``reset()`` and ``act(observation)``.
         pacer: The deadlines.
-        journal: Filled in tick by tick.
-        agents: Further agents, run after the policy; they declare what they read and write.
-        window: Ticks that the workspace keeps at least.
+        journal: Updated at every tick.
+        agents: Further agents, run after the policy; they declare the variables that they read and write.
+        window: Minimum number of ticks that the workspace keeps.
         sink: ``sink(first_time, {variable: array (n, 1, ...)})`` gets every tick once, in order, episode by episode.
-            It is called between two ticks, so it has to be quick; if it fails, the deployment ends.
+            It is called between two ticks, so it must be fast; if it fails, the deployment ends.
 
     Raises:
-        WiringError: An agent reads what no agent writes; nothing has been connected.
+        WiringError: An agent reads a variable that no agent writes; the robot has not been connected.
     """
 
     def __init__(
@@ -97,27 +97,27 @@ class Deployment:
     ) -> None:
         self.env, self.pacer, self.journal = env, pacer, journal
         self.switch = StopSwitch()
-        """What SIGINT and SIGTERM do."""
+        """Handler of SIGINT and SIGTERM."""
         self._robot = _DeployedRobot(env, self.switch)
         self._workspace = Workspace(window=window, sink=None if sink is None else _silent_once_broken(sink))
-        own = (
+        chain = (
             _StopAgent(self.switch),
             self._robot,
             _JournalAgent(journal, pacer),
             PolicyAgent(policy, self._robot.observation_names, single=True),
         )
-        self._loop = TemporalAgent(Agents(*own, *agents))
+        self._loop = TemporalAgent(Agents(*chain, *agents))
 
     def connect(self) -> None:
-        """Open the link to the robot, if there is one, without moving it: a missing robot shows before the loop."""
+        """Open the link to the robot, if there is one, without moving it; fails before the loop if it is missing."""
         self._robot.connect()
 
     def handles_signals(self) -> AbstractContextManager[None]:
-        """Within this, SIGINT and SIGTERM go to the switch, also where they are ignored; `run` handles them itself."""
+        """Within the ``with`` block, SIGINT and SIGTERM go to the switch, even if ignored; `run` uses this itself."""
         return handled(self.switch, (signal.SIGINT, signal.SIGTERM), ignored_too=True)
 
     def run(self, watcher: Watcher, *, seed: int) -> Ending:
-        """Run ``journal.wanted`` episodes; episode k gets ``seed + k``. Never raises for what happens in them."""
+        """Run ``journal.wanted`` episodes; episode k gets ``seed + k``. Their exceptions become the `Ending`."""
         with self.handles_signals():
             return self._run(watcher, seed)
 
@@ -125,17 +125,17 @@ class Deployment:
         try:
             try:
                 self.switch.armed = True
-                self.switch.raise_again()  # one that came before
+                self.switch.raise_again()  # for an earlier signal
                 for k in range(self.journal.wanted):
                     self._loop(self._workspace, t=0, stop_variable="env/done", seed=seed + k, watcher=watcher)
-                    self._robot.halt()  # a sink may take its time, and so may the next reset
+                    self._robot.halt()  # the sink and the next reset may be slow
                     self._workspace.flush()
             finally:  # inside the outer try: a signal that comes before this line is still caught
                 self.switch.armed = False
             ending = Ending("episodes done", 0)
         except Stopped:
             ending = Ending("interrupted", 128 + self.switch.came[0])
-        except Exception as error:  # whatever went wrong: the robot has to be halted and the report made
+        except Exception as error:  # after any fault, the robot must be halted and the report made
             ending = _ending_of(error)
         except BaseException:
             if not self._robot.closing:
@@ -146,7 +146,7 @@ class Deployment:
 
 
 def _ending_of(error: Exception) -> Ending:
-    """Tells the operator what to look at first: the network, the robot, or the program."""
+    """The ending for an exception: it points the operator to the network, the robot, or the program."""
     text = fault_text(error).replace("call resume()", "run it again")  # the program ends here and cannot be resumed
     if isinstance(error, LinkLost):
         return Ending(f"link lost: {text}", 4)
@@ -156,23 +156,23 @@ def _ending_of(error: Exception) -> Ending:
 
 
 def _unless_it_fails(ending: Ending, what: str, end: Callable[[], None]) -> Ending:
-    """Call `end`; a failure of it is a fault, unless there was one before."""
+    """Call `end`; its failure is a fault, unless there was one before."""
     try:
         end()
-    except Exception as error:  # of the environment or the sink; the report comes all the same
+    except Exception as error:  # of the environment or the sink; the report is made in any case
         if ending.reason in ("episodes done", "interrupted"):
             return Ending(f"fault: {what} failed: {fault_text(error)}", 1)
     return ending
 
 
 def _silent_once_broken(sink: Sink) -> Sink:
-    """The sink, not called any more after it has failed."""
+    """The sink, which is not called again after it has failed."""
     broken = False
 
     def guarded(first_time: int, piece: dict[str, Any]) -> None:
         nonlocal broken
         if not broken:
-            broken = True  # while it runs: whatever leaves it
+            broken = True  # until it returns without an exception
             sink(first_time, piece)
             broken = False
 
@@ -180,17 +180,17 @@ def _silent_once_broken(sink: Sink) -> Sink:
 
 
 def fault_text(error: Exception) -> str:
-    """One line; with the exception's type unless it is one of ours, whose text says enough."""
+    """The exception in one line, with its type unless it belongs to `bam_envs` or `bam_train`."""
     text = " ".join(str(error).split())
-    own = isinstance(error, (BamEnvsError, BamTrainError)) and text
-    return text if own else f"{type(error).__name__}: {text}".removesuffix(": ")
+    is_clear = isinstance(error, (BamEnvsError, BamTrainError)) and text
+    return text if is_clear else f"{type(error).__name__}: {text}".removesuffix(": ")
 
 
 # ---- the agents beside robot and policy
 
 
 class _StopAgent(Agent):
-    """Stands before the robot, which is sent nothing more after a signal whose exception was lost."""
+    """Runs before the robot's agent, so that the robot gets no command after a signal whose exception was lost."""
 
     reads = ()
     writes = ()
@@ -204,7 +204,7 @@ class _StopAgent(Agent):
 
 
 class _DeployedRobot(RobotAgent):
-    """The robot; once the loop begins to close it, no signal interrupts that."""
+    """The robot's agent, whose closing no signal interrupts."""
 
     closing = False
 
@@ -218,7 +218,7 @@ class _DeployedRobot(RobotAgent):
 
 
 class _JournalAgent(Agent):
-    """Keeps the journal, tells the watcher, then waits for the deadline of the next action."""
+    """Updates the journal, calls the watcher, then waits for the deadline of the next action."""
 
     reads = tuple(f"env/{name}" for name in ("reward", "done", *_ENDS, SUCCESS, SAYS_SUCCESS))
     reads_previous = ("action",)

@@ -1,4 +1,4 @@
-"""What has happened so far, kept up to date tick by tick, and the report that can be made of it at any moment."""
+"""The journal of a deployment, updated at every tick, and the report made from it."""
 
 import math
 import time
@@ -19,20 +19,20 @@ class EpisodeRecord:
     total: float = 0.0
     """Undiscounted sum of its rewards so far."""
     length: int = 0
-    """Its steps so far."""
+    """Number of steps so far."""
     success: bool | None = None
-    """`is_success` of the last info; None if the environment has no such thing."""
+    """`is_success` of the last info; None if the environment does not report it."""
     end: str = "stopped"
     """``"terminated"`` (the task's end), ``"truncated"`` (the time limit) or ``"stopped"`` (cut short)."""
 
     def to_json(self) -> dict[str, Any]:
-        """Plain values; a return that is not finite is None."""
+        """The record as JSON values; a return that is not finite is None."""
         total = self.total if math.isfinite(self.total) else None
         return {"seed": self.seed, "length": self.length, "return": total, "success": self.success, "end": self.end}
 
 
 KEPT = 1000
-"""Episodes whose records are kept; older ones are only counted, so that memory stays flat."""
+"""Maximum number of records kept; older episodes are only counted, so that memory is bounded."""
 
 
 @dataclass
@@ -40,7 +40,7 @@ class Journal:
     """The episodes of one deployment."""
 
     wanted: int
-    """Episodes asked for."""
+    """Number of episodes to run."""
     records: deque[EpisodeRecord] = field(default_factory=lambda: deque(maxlen=KEPT))
     """The last `KEPT` episodes."""
     begun: int = 0
@@ -48,12 +48,12 @@ class Journal:
     completed: int = 0
     """Episodes that the environment ended."""
     successes: int | None = 0
-    """How many of those succeeded; None if the environment does not say."""
+    """Successful episodes among these; None if the environment does not report success."""
     startup: float | None = None
     """CPU time of this process from its start to the first observation [s]; None before it."""
 
     def begin(self, seed: int) -> EpisodeRecord:
-        """A new episode, appended and returned."""
+        """Append the record of a new episode, and return it."""
         if self.startup is None:
             self.startup = time.process_time()
         self.records.append(EpisodeRecord(seed))
@@ -61,7 +61,7 @@ class Journal:
         return self.records[-1]
 
     def step(self, reward: float, success: bool | None, end: str = "stopped") -> EpisodeRecord:
-        """Count a step of the newest episode, which is returned; it is the last one unless `end` is ``"stopped"``."""
+        """Add a step to the newest record and return it; the step ends the episode unless `end` is ``"stopped"``."""
         record = self.records[-1]
         record.total += float(reward)
         record.length += 1
@@ -78,7 +78,7 @@ class Journal:
 
 @dataclass(frozen=True)
 class Ending:
-    """Why a deployment ended."""
+    """The reason for the end of a deployment."""
 
     reason: str
     """``"episodes done"``, ``"interrupted"``, ``"link lost: ..."``, ``"safety stop: ..."`` or ``"fault: ..."``."""
@@ -87,7 +87,7 @@ class Ending:
 
 
 MISSED_SHARE = 0.05
-"""More missed ticks than this share are worth a warning."""
+"""Share of missed ticks above which the report has a warning."""
 
 
 @dataclass(frozen=True)
@@ -96,17 +96,17 @@ class DeployReport:
 
     checkpoint: Checkpoint
     seed: int
-    """Of the first episode."""
+    """Seed of the first episode."""
     ending: Ending
     journal: Journal
     pacer: Pacer
     robot: str = "simulated here"
-    """What was driven: an address, or the simulation."""
+    """Address of the robot, or the simulation."""
     guards: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
-    """What the guards of a live robot did, by name; see `SafeRobot.report`."""
+    """Counts of the guards of a live robot, by name; see `SafeRobot.report`."""
 
     def to_json(self) -> dict[str, Any]:
-        """Plain values; times in the unit that their name says."""
+        """The report as JSON values; times in the unit of their name."""
         journal, manifest = self.journal, self.checkpoint.manifest
         return {
             "stop_reason": self.ending.reason,
@@ -124,7 +124,7 @@ class DeployReport:
             "algorithm": manifest.algorithm,
             "checkpoint": str(self.checkpoint.path),
             "robot": self.robot,
-            # A limit that is off is infinite, which JSON does not have.
+            # A disabled limit is infinite, which JSON cannot represent.
             "guards": {
                 name: {**guard, "limit": None} if guard.get("limit") == math.inf else dict(guard)
                 for name, guard in self.guards.items()
@@ -133,7 +133,7 @@ class DeployReport:
         }
 
     def warnings(self) -> list[str]:
-        """What a person should know of a deployment that ended well, too."""
+        """Warnings for the user, also about a deployment that ended well."""
         missed, period = self.pacer.missed, self.pacer.period
         planned = self.pacer.ticks + missed
         if period is None or missed <= MISSED_SHARE * planned:
@@ -144,7 +144,7 @@ class DeployReport:
         ]
 
     def lines(self) -> list[str]:
-        """The same for people, a few lines; the details of a fault have been shown when it happened."""
+        """The report for people, in a few lines, without details of a fault, which were shown when it occurred."""
         journal, reason = self.journal, self.ending.reason.partition(":")[0]
         successes = journal.successes
         succeeded = "" if successes is None else f", {successes} success{'' if successes == 1 else 'es'}"
@@ -157,22 +157,22 @@ class DeployReport:
 
 
 def rate_text(pacer: Pacer) -> str:
-    """Such as ``20.00 Hz of 20``."""
+    """The measured and the wanted rate, such as ``20.00 Hz of 20``."""
     measured = "no rate yet" if pacer.rate is None else f"{pacer.rate:.2f} Hz"
     return f"{measured}, no waiting" if pacer.period is None else f"{measured} of {1 / pacer.period:g}"
 
 
 def lateness_text(pacer: Pacer) -> str:
-    """Such as ``p50 0.08 ms, p99 0.30 ms, max 1.20 ms, no deadline missed``."""
+    """The lateness, such as ``p50 0.08 ms, p99 0.30 ms, max 1.20 ms, no deadline missed``."""
     late = _milliseconds(pacer.lateness)
     figures = [f"{name} {value:.2f} ms" for name, value in late.items()] if late else ["none yet"]
     return ", ".join([*figures, f"{pacer.missed or 'no'} deadline{'s' if pacer.missed > 1 else ''} missed"])
 
 
 def guards_text(guards: Mapping[str, Mapping[str, Any]]) -> str:
-    """Such as ``guards changed the command: joint speed (G8) in 3 ticks``."""
+    """Counts of the guards, such as ``guards changed the command: joint speed (G8) in 3 ticks``."""
     altered, held = (
-        ", ".join(f"{name} ({one['number']}) in {one[what]} ticks" for name, one in guards.items() if one.get(what))
+        ", ".join(f"{name} ({row['number']}) in {row[what]} ticks" for name, row in guards.items() if row.get(what))
         for what in ("altered", "held")
     )
     changed = f"guards changed the command: {altered}" if altered else "no guard changed a command"

@@ -1,4 +1,4 @@
-"""The place of a run's best checkpoint: it overwrites no other run's, and can be written before training begins."""
+"""The path of a run's best checkpoint, which overwrites no other run's and is known to be writable before training."""
 
 import itertools
 import os
@@ -24,23 +24,23 @@ FOLDER = Path("checkpoints")
 
 @dataclass(frozen=True)
 class Output:
-    """Where the best checkpoint goes."""
+    """The destination of the best checkpoint."""
 
     path: Path
     best: Scores | None
-    """The evaluation of the file that is there already, if it is of the same run and will be improved."""
+    """The evaluation of the existing file, if it is the best of the same run so far."""
     notices: tuple[str, ...] = ()
     """Messages for the user."""
 
 
 def choose_output(settings: TrainSettings, out: Path | None, force: bool, resumed: Checkpoint | None) -> Output:
-    """Choose where the best checkpoint goes: to `out` if it is given, and over what is there if `force` says so.
+    """Choose the path of the best checkpoint: `out` if it is given; an existing file is overwritten only with `force`.
 
-    The best of the run that `resumed` continues keeps its place. What killed runs left half written is removed.
+    A run that continues from `resumed` keeps its path. Temporary files of killed runs are removed.
     """
-    own = None if resumed is None else _own_best(resumed)
+    earlier = None if resumed is None else _earlier_best(resumed)
     usual = FOLDER / f"{file_stem(settings.env, settings.algo, settings.trainer)}.zip"
-    wanted = (out or (own.path if own else usual)).expanduser()
+    wanted = (out or (earlier.path if earlier else usual)).expanduser()
     if wanted.is_dir():
         raise OutputError(
             f"{wanted}: is a folder; give the name of a file in it, such as --out {wanted / 'policy.zip'}"
@@ -49,8 +49,8 @@ def choose_output(settings: TrainSettings, out: Path | None, force: bool, resume
         raise OutputError(f"{wanted}: expected a file name that ends in .zip. Choose another one with --out")
     require_room(wanted, "--out", wanted.parent)
     remove_orphans(wanted.resolve())
-    if own is not None and wanted.resolve() == own.path:
-        return Output(wanted, own.best)
+    if earlier is not None and wanted.resolve() == earlier.path:
+        return Output(wanted, earlier.best)
     if force or not wanted.exists():
         return Output(wanted, None)
     numbered = (wanted.with_name(f"{wanted.stem}-{number}.zip") for number in itertools.count(2))
@@ -67,28 +67,28 @@ class _Notes(Struct):
     best: _Noted | None = None
 
 
-def _own_best(resumed: Checkpoint) -> Output | None:
-    """The best checkpoint of the same run, if it is still there and this computer made it."""
+def _earlier_best(resumed: Checkpoint) -> Output | None:
+    """The best checkpoint of the same run, if it still exists and was made on this computer."""
     try:
         noted = msgspec.convert(resumed.json(NOTES), _Notes).best if resumed.has(NOTES) else None
     except msgspec.ValidationError as error:
         raise AlteredCheckpoint(resumed.path, NOTES, f"{NOTES}: {error}. {AGAIN}") from error
     if noted is None:
         return None
-    path, learnt = Path(noted.path), _what(resumed.manifest.settings)
+    path, learnt = Path(noted.path), _learnt(resumed.manifest.settings)
     try:
-        # An untrusted file may note any path: it counts only in a folder where a run of the same settings made it.
+        # An untrusted file may note any path: it counts only in the folder of a run with the same settings.
         config = resumed.path.parent / "config.json"
-        if noted.path != str(resumed.path.resolve()) and _what(read_config(config)) != learnt:
+        if noted.path != str(resumed.path.resolve()) and _learnt(read_config(config)) != learnt:
             return None
-        there = Checkpoint.open(path).manifest
-    except (CheckpointError, ValueError):  # no settings there; a path that is none, such as one with a null byte
+        best = Checkpoint.open(path).manifest
+    except (CheckpointError, ValueError):  # no settings there, or an invalid path, such as one with a null byte
         return None
-    if there.steps != noted.steps or _what(there.settings) != learnt:
+    if best.steps != noted.steps or _learnt(best.settings) != learnt:
         return None
-    return Output(path.resolve(), {**there.scores, "steps": there.steps})
+    return Output(path.resolve(), {**best.scores, "steps": best.steps})
 
 
-def _what(settings: dict[str, Any]) -> dict[str, Any]:
-    """The settings that say what is learnt."""
+def _learnt(settings: dict[str, Any]) -> dict[str, Any]:
+    """The settings that determine what is learnt."""
     return {name: value for name, value in settings.items() if name not in CHANGEABLE}

@@ -1,8 +1,8 @@
-"""Freezing a policy of any library: the layers and the file that all have in common, and golden observations.
+"""Freezing a policy of any library: the common layers and ONNX export, and golden observations.
 
-A frozen policy has the inputs ``observation`` (``observation.<key>`` of a Dict) in the environment's own dtype and
-layout, and ``state.<name>`` if it is recurrent; its outputs are ``action`` and ``next_state.<name>``. The first axis is
-the batch. Golden actions are what the trainer itself does on some observations; the graph is checked against them.
+A frozen policy has the inputs ``observation`` (``observation.<key>`` for a Dict) in the environment's dtype and layout,
+and ``state.<name>`` if it is recurrent; its outputs are ``action`` and ``next_state.<name>``. The first axis is the
+batch. Golden actions are the trainer's own for some observations; the graph is checked against them.
 """
 
 import io
@@ -23,10 +23,10 @@ from bam_train.errors import PolicyError
 Array = NDArray[Any]
 
 KINDS = (spaces.Box, spaces.Discrete, spaces.MultiDiscrete, spaces.MultiBinary)
-_BUDGET = 200_000  # bytes of golden observations; images are random and do not pack
-_FAR = 1e6  # a bound beyond this says nothing about the values that occur
+_BUDGET = 200_000  # bytes of golden observations; images are random and cannot be compressed
+_FAR = 1e6  # bounds beyond this are far from the values that occur
 _HARMLESS_WARNINGS = {
-    # The TorchScript exporter says that it will go; it is 20 times as fast as its successor and needs no onnxscript.
+    # The TorchScript exporter is deprecated, but 20 times as fast as its successor, and works without onnxscript.
     "You are using the legacy TorchScript-based ONNX export": DeprecationWarning,
     "The feature will be removed": DeprecationWarning,
     "Constant folding - Only steps=1 can be constant folded": UserWarning,  # about the padding of images
@@ -35,21 +35,21 @@ _HARMLESS_WARNINGS = {
 
 
 def leaves(space: spaces.Space[Any]) -> dict[str, Any]:
-    """The spaces in a Dict by key, in alphabetical order; any other space just by ``""``."""
+    """The spaces of a Dict by key, in alphabetical order; any other space by ``""``."""
     return {key: space[key] for key in sorted(space.spaces)} if isinstance(space, spaces.Dict) else {"": space}
 
 
 def to(x: torch.Tensor, dtype: torch.dtype) -> torch.Tensor:
-    """Cast, without leaving a node in the graph where there is nothing to do."""
+    """Cast to a dtype, without a node in the graph if the tensor has it already."""
     return x if x.dtype == dtype else x.to(dtype)
 
 
 class Layer(nn.Module):  # type: ignore[misc]
-    """A torch module; torch has no types here."""
+    """Base class of layers, for the type checker, which has no types of torch."""
 
 
 class OneHot(Layer):
-    """A Discrete, (n,), or MultiDiscrete, (n, k): a one-hot code of each number, side by side."""
+    """One-hot codes of a Discrete, (n,), or MultiDiscrete, (n, k), concatenated for each observation."""
 
     def __init__(self, space: spaces.Discrete[Any] | spaces.MultiDiscrete) -> None:
         super().__init__()
@@ -60,14 +60,14 @@ class OneHot(Layer):
         self.columns, self.values = torch.as_tensor(columns), torch.as_tensor(values)
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
-        """Encode whole numbers."""
+        """Encode whole numbers; returns (n, number of choices) float32."""
         x = x.long()
         x = x.unsqueeze(1) if x.ndim == 1 else x.flatten(1)
         return (x.index_select(1, self.columns) == self.values).float()
 
 
 class Normalised(Layer):
-    """clip((x - mean) / deviation, -limit, limit) in float64; without a limit nothing is clipped."""
+    """clip((x - mean) / deviation, -limit, limit) in float64, or without clipping if there is no limit."""
 
     def __init__(self, mean: Array, deviation: Array, limit: float | None) -> None:
         super().__init__()
@@ -80,7 +80,7 @@ class Normalised(Layer):
 
 
 def action_head(space: spaces.Space[Any], *, tanh: bool, scale: bool, clip: bool) -> nn.Module:
-    """What turns scores, (n, k), into actions of a space; tanh, scale and clip are for a Box.
+    """The layer that turns scores, (n, k), into actions of a space; `tanh`, `scale` and `clip` apply to a Box.
 
     Raises:
         PolicyError: The space is of another kind.
@@ -95,7 +95,7 @@ def action_head(space: spaces.Space[Any], *, tanh: bool, scale: bool, clip: bool
 
 
 class _Continuous(Layer):
-    """A Box: the tanh, then from [-1, 1] to the bounds, then clipped to them; float64 where the space is."""
+    """Actions of a Box: tanh, scaling from [-1, 1] to the bounds, clipping; float64 if the space is."""
 
     def __init__(self, space: spaces.Box, tanh: bool, scale: bool, clip: bool) -> None:
         super().__init__()
@@ -111,7 +111,7 @@ class _Continuous(Layer):
 
 
 class _Choice(Layer):
-    """The best of each group of scores, counted from ``start``: Discrete gives (n,), MultiDiscrete (n, k)."""
+    """The index of the best of each group of scores plus ``start``: (n,) for Discrete, (n, k) for MultiDiscrete."""
 
     def __init__(self, space: spaces.Discrete[Any] | spaces.MultiDiscrete) -> None:
         super().__init__()
@@ -128,13 +128,13 @@ class _Choice(Layer):
         return to(best + self.starts if self.shifted else best, self.dtype)
 
     def margin(self, scores: torch.Tensor) -> torch.Tensor:
-        """The least distance of a best score from the second."""
+        """The smallest difference between a best and a second score, (n,)."""
         gaps = [group.topk(2)[0] for group in scores.split(self.counts, dim=1) if group.shape[1] > 1]
         return torch.stack([gap[:, 0] - gap[:, 1] for gap in gaps]).amin(0) if gaps else torch.ones(len(scores))
 
 
 class _Switches(Layer):
-    """A MultiBinary: on where the logit is positive, which is where the probability rounds to 1."""
+    """Actions of a MultiBinary: 1 where the logit is positive, that is where the probability rounds to 1."""
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
         return (x > 0).to(torch.int8)
@@ -146,7 +146,7 @@ class _Switches(Layer):
 class FrozenNetwork(Layer):
     """A copy of a policy, on the CPU and in evaluation mode, from raw observations to actions.
 
-    A subclass gives `head` and `scores`, and for inputs that the policy normalises their `moments`.
+    A subclass defines `head` and `scores`, and the `moments` of inputs that the policy normalises.
     """
 
     head: nn.Module
@@ -157,14 +157,14 @@ class FrozenNetwork(Layer):
         self.moments: dict[str, tuple[Array, Array]] = {}
         """Mean and deviation of the values of an observation, by key."""
         self.state: dict[str, torch.Tensor] = {}
-        """Of a recurrent policy: a batch of two zeros for every array of its state, by name."""
+        """Zeros (2, ...) for every array of a recurrent policy's state, by name."""
         for key, leaf in self.leaves.items():
             if not isinstance(leaf, KINDS):
                 found = type(leaf).__name__
                 raise PolicyError(f"observation {key!r}: a {found} cannot be frozen; expected {_KINDS_TEXT}")
 
     def scores(self, *observation: torch.Tensor) -> torch.Tensor:
-        """What the action is made of, (n, k) float32: means, logits or values."""
+        """The scores that the action is computed from, (n, k) float32: means, logits or values."""
         raise NotImplementedError
 
     def forward(self, *inputs: torch.Tensor) -> Any:
@@ -200,9 +200,9 @@ class FrozenNetwork(Layer):
         return {key: draw_array(leaf, n, rng, self.moments.get(key)) for key, leaf in self.leaves.items()}
 
     def golden_observations(self, n: int = 256) -> dict[str, Array]:
-        """Draw n observations by key, always the same; fewer if they are large.
+        """Draw n observations by key, (n, ...) each, with a fixed seed; fewer if they are large.
 
-        They are those whose choice is clearest: where two choices tie, rounding decides, and that proves nothing.
+        For discrete actions, those with the clearest choice are taken, as rounding would decide a tie.
         """
         size = sum(math.prod(leaf.shape) * leaf.dtype.itemsize for leaf in self.leaves.values())
         n, rng = min(n, max(4, _BUDGET // (size or 1))), np.random.default_rng(0)
@@ -219,9 +219,9 @@ _KINDS_TEXT = "Box, Discrete, MultiDiscrete or MultiBinary"
 
 
 def draw_array(space: Any, n: int, rng: np.random.Generator, moments: tuple[Array, Array] | None) -> Array:
-    """Draw n values of a space that is no Dict, (n, ...).
+    """Draw n values of a space other than a Dict, (n, ...).
 
-    Numbers that the policy normalises have `moments`, mean and deviation, so that few of them end at its limits.
+    `moments` are the mean and deviation of numbers that the policy normalises; few values then exceed its limits.
     """
     shape = (n, *space.shape)
     if isinstance(space, spaces.MultiBinary):

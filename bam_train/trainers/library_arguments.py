@@ -1,6 +1,6 @@
-"""Hyperparameters as JSON values, checked against the annotations of a learning library's own functions.
+"""Hyperparameters as JSON values, checked against the annotations of a learning library's functions.
 
-Everything stays within JSON: settings can be written and read back. A schedule is ``"lin_3e-4"``, linear to 0.
+All values are JSON, so that settings can be written and read. A schedule is ``"lin_3e-4"``, linear to 0.
 """
 
 import types
@@ -17,7 +17,7 @@ from bam_train.errors import SettingsError
 Schedule = Annotated[
     str, msgspec.Meta(pattern=r"^lin_\d+\.?\d*([eE][-+]?\d+)?$", description='a schedule such as "lin_3e-4"')
 ]
-"""A linear schedule as it is written; the annotation of the library is a ``Callable``."""
+"""The text of a linear schedule; the library's annotation is a ``Callable``."""
 
 _UNIONS = (typing.Union, types.UnionType)
 
@@ -28,7 +28,7 @@ def linear_start(text: str) -> float | None:
 
 
 def fit(name: str, value: Any, hint: Any) -> Any:
-    """Return the JSON `value` if the library's annotation takes it; a whole float (``1e6``) becomes an int for it."""
+    """Return the JSON `value` if it fits the library's annotation; a whole float (``1e6``) becomes an int if needed."""
     if fits(value, hint):
         return value
     if isinstance(value, float) and value.is_integer() and fits(int(value), hint):
@@ -37,9 +37,9 @@ def fit(name: str, value: Any, hint: Any) -> Any:
 
 
 def fits(value: Any, hint: Any) -> bool:
-    """Whether a library's annotation takes a JSON value."""
+    """Whether a JSON value fits a library's annotation."""
     if typing.get_origin(hint) in _UNIONS:  # msgspec refuses unions of several kinds of lists
-        return any(fits(value, one) for one in typing.get_args(hint))
+        return any(fits(value, kind) for kind in typing.get_args(hint))
     try:
         msgspec.convert(value, as_written(hint))
     except (msgspec.ValidationError, TypeError):  # TypeError: a class that is not written as JSON
@@ -48,7 +48,7 @@ def fits(value: Any, hint: Any) -> bool:
 
 
 def as_written(hint: Any) -> Any:
-    """The annotation of a value as it is written in settings: a schedule and a class are text."""
+    """The annotation of a value in settings, where a schedule and a class are text."""
     origin = typing.get_origin(hint)
     if origin in _UNIONS:
         return typing.Union[tuple(map(as_written, typing.get_args(hint)))]  # noqa: UP007 - built at run time
@@ -66,7 +66,7 @@ def require_known(
 ) -> None:
     """Refuse names that are not known, with the closest match among `known` and `others`.
 
-    `elsewhere` has names of the library that are none here, and why or what to do instead; `what` is the kind of name.
+    `elsewhere` has the library's names that are not used here, with the reason; `what` is the kind of name.
     """
     for name in given:
         if name in known:

@@ -1,4 +1,4 @@
-"""From what was asked for to complete settings: presets for new runs, the checkpoint's own for resumed ones."""
+"""Complete settings from those that a user gives: with presets for new runs, and a checkpoint's for resumed ones."""
 
 from collections.abc import Mapping
 from dataclasses import fields
@@ -22,31 +22,31 @@ CHANGEABLE = frozenset(
     {"steps", "until_success", "eval_every", "eval_episodes", "device", "threads", "transport", "ca_file", "token_file"}
     | {"num_env_runners", "num_learners", "num_gpus", "address"}
 )
-"""Settings that a resumed run may have otherwise: when to stop, how to measure, where to compute and where the
-environment runs; not what to learn."""
+"""Settings that may change in a resumed run: when to stop, how to evaluate, where to compute and where the environment
+runs; not what to learn."""
 
 OF_RLLIB = ("num_env_runners", "num_learners", "num_gpus", "address", "data")
-"""Settings that the rllib trainer alone has a use for."""
+"""Settings of the rllib trainer only."""
 
 NOWHERE: dict[str, Any] = {"transport": [], "ca_file": None, "token_file": None, "address": None}
-"""Settings that say where a run computes, as they are where it computes here."""
+"""Settings of the place of a run, with their values for this computer."""
 
 
 def read_preset(env: str, algo: str, trainer: str = "sb3") -> dict[str, Any]:
-    """The tuned settings of an environment and an algorithm of a trainer; {} if there are none."""
+    """Read the preset of an environment and an algorithm; {} if there is none."""
     path = PRESETS / f"{file_stem(env, algo, trainer)}.toml"
     return parse_config(path.name, path.read_text(encoding="utf-8")) if path.is_file() else {}
 
 
 def resolve(given: Mapping[str, Any]) -> TrainSettings:
-    """Complete settings of a new run: the trainer's defaults, below the preset, below what was given.
+    """Complete settings of a new run: the trainer's defaults, overridden by the preset, overridden by `given`.
 
-    Raises UnknownName for an environment, SettingsError for any other setting that is unknown or does not fit.
+    Raises UnknownName for an unknown environment, SettingsError for any other setting that is unknown or does not fit.
     """
     asked = TrainSettings.from_mapping(given)
     env = _resolve_env(asked.env, elsewhere=bool(asked.transport))
     require_algorithm(asked.trainer, asked.algo)
-    entry = entry_of(env)  # robo-gym's ids are names of ours
+    entry = entry_of(env)  # also by an id of robo-gym
     preset = read_preset(env if entry is None else entry.id, asked.algo, asked.trainer)
     settings = TrainSettings.from_mapping(merge(preset, given, {"env": env}))
     _require_of_trainer(settings)
@@ -77,23 +77,23 @@ def _require_of_trainer(settings: TrainSettings) -> None:
 
 
 def own_settings(checkpoint: Checkpoint, env: str | None = None, *, elsewhere: bool = False) -> dict[str, Any]:
-    """Settings that a checkpoint's run had, but for where it computed, which no file says: it may be untrusted.
+    """Settings of a checkpoint's run without its place, which is never read from a file, as it may be untrusted.
 
-    The environment is `env` if somebody named it; if it runs `elsewhere`, it need not be installed here.
+    The environment is `env` if the user named it; if it runs `elsewhere`, it need not be installed here.
     """
     manifest = checkpoint.manifest
     module = manifest.env.rpartition(":")[0]
     env_id, env_kwargs = environment_of(checkpoint, env if module and not elsewhere else None, elsewhere=elsewhere)
     what = {"env": env_id, "env_kwargs": env_kwargs, "algo": manifest.algorithm, "trainer": manifest.trainer}
-    own = {**manifest.settings, **NOWHERE, **what}
-    own.pop("exported", None)  # of a checkpoint out of a directory of RLlib
-    return own
+    settings = {**manifest.settings, **NOWHERE, **what}
+    settings.pop("exported", None)  # in checkpoints of bam-export
+    return settings
 
 
 def resolve_resumed(given: Mapping[str, Any], checkpoint: Checkpoint) -> TrainSettings:
-    """Complete settings of a run that continues from a checkpoint: its own, but for what may change.
+    """Complete settings of a run that continues from a checkpoint, of which `given` changes some.
 
-    Raises CheckpointMismatch where another is asked for, SettingsError if the run has all its steps already.
+    Raises CheckpointMismatch for a setting that may not change, SettingsError if the run has all its steps already.
     """
     check_names(given, "settings")
     saved = checkpoint.manifest.settings
@@ -133,7 +133,7 @@ def resolve_resumed(given: Mapping[str, Any], checkpoint: Checkpoint) -> TrainSe
 
 
 def _require_same(differing: list[tuple[str, Any, Any]], checkpoint: Checkpoint) -> None:
-    """Refuse the first setting that is asked for otherwise than the checkpoint has it."""
+    """Refuse the first setting that differs from the checkpoint's."""
     for name, wanted, found in differing[:1]:
         text = f"was trained with {name} {found!r}, not {wanted!r}. Leave {name} out to go on with it, or train anew"
         raise CheckpointMismatch(checkpoint.path, text)
@@ -145,5 +145,5 @@ def _resolve_env(name: str, *, elsewhere: bool = False) -> str:
         return resolve_id(name)
     except UnknownName:
         if elsewhere:
-            return name  # the server says whether it has it
+            return name  # the server checks the name
         raise

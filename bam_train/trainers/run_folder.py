@@ -2,13 +2,13 @@
 
 ::
 
-    config.json         every setting; `--config` reads it back
-    progress.jsonl      a JSON object a line: how training goes ("kind": "training"), evaluations ("kind": "evaluation")
+    config.json         all settings; `--config` reads it
+    progress.jsonl      a JSON object per line: training statistics ("kind": "training") or an evaluation ("evaluation")
     tensorboard/        event files
-    last.zip            the newest checkpoint; `--resume` goes on from it
+    last.zip            the newest checkpoint; `--resume` continues from it
     learning-curve.png  return and success over steps
 
-And copies of its best checkpoint at an fsspec address, such as a bucket, which outlive the computer.
+`Copies` stores the best checkpoint at an fsspec address too, such as a bucket, in case the computer is lost.
 """
 
 import contextlib
@@ -26,14 +26,14 @@ from bam_train.atomic_file import remove_orphans
 from bam_train.errors import OutputError
 
 LEAST_FREE = 20_000_000
-"""Bytes that a disk must have free before training."""
+"""Minimum free bytes of the disk before training."""
 
 
 class RunFolder:
     """The folder ``root/name`` of one run, or ``root/name-2``, ``-3``, … while the name is taken.
 
-    It is made new, and what killed runs of the same name left half written is removed. The constructor and every
-    method raise OutputError where they cannot write.
+    The folder is new; temporary files of killed runs with the same name are removed. The constructor and every method
+    raise OutputError if they cannot write.
     """
 
     def __init__(self, root: Path, name: str) -> None:
@@ -58,12 +58,12 @@ class RunFolder:
             (self.path / "config.json").write_text(json.dumps(settings, indent=2) + "\n", encoding="utf-8")
 
     def add(self, record: Mapping[str, Any]) -> None:
-        """Append one line to ``progress.jsonl``; whole when this returns."""
+        """Append one line to ``progress.jsonl``, and close the file."""
         with _writing(self._progress), self._progress.open("a", encoding="utf-8") as file:
             file.write(json.dumps(record, allow_nan=False) + "\n")
 
     def records(self) -> list[dict[str, Any]]:
-        """All records so far, but for lines that a full disk cut off."""
+        """All records so far, without lines that a full disk cut off."""
         records = []
         for line in self._progress.read_text(encoding="utf-8").splitlines() if self._progress.exists() else ():
             with contextlib.suppress(ValueError):
@@ -78,7 +78,7 @@ class RunFolder:
 
 @contextlib.contextmanager
 def _writing(path: Path) -> Iterator[None]:
-    """Maps failures to write `path` to `OutputError`."""
+    """Map failures to write `path` to `OutputError`."""
     try:
         yield
     except OSError as error:
@@ -86,22 +86,22 @@ def _writing(path: Path) -> Iterator[None]:
 
 
 def unwritable(path: Path, error: Exception, flag: str) -> OutputError:
-    """The error of `path`, which `flag` chose and which cannot be written because of `error`."""
+    """The OutputError for `path`, chosen by `flag`, after the exception `error`."""
     cause = error.__cause__ if isinstance(error.__cause__, OSError) else error
     why = getattr(cause, "strerror", None) or cause
     if isinstance(cause, (NotADirectoryError, FileExistsError)):
-        in_the_way = next((one for one in (path, *path.parents) if one.is_file()), None)
+        in_the_way = next((place for place in (path, *path.parents) if place.is_file()), None)
         why = f"{in_the_way or path} is a file, expected a folder"
     return OutputError(f"{path}: cannot be written: {why}. Choose another place with {flag}")
 
 
 def require_room(path: Path, flag: str = "--runs", folder: Path | None = None) -> None:
-    """Refuse a place that cannot be written, or a full disk, before training; nothing is left there."""
+    """Refuse, before training, a place that cannot be written or a full disk; leaves no file there."""
     folder = path if folder is None else folder
-    there = next(one for one in (folder, *folder.absolute().parents) if one.exists())
+    existing = next(place for place in (folder, *folder.absolute().parents) if place.exists())
     try:
-        with tempfile.TemporaryFile(dir=there):
-            free = shutil.disk_usage(there).free
+        with tempfile.TemporaryFile(dir=existing):
+            free = shutil.disk_usage(existing).free
     except OSError as error:
         raise unwritable(path, error, flag) from error
     if free < LEAST_FREE:
@@ -130,7 +130,7 @@ def draw_curve(records: Sequence[dict[str, Any]], title: str, path: Path) -> Non
         for kind, style in styles.items():
             known = [record for record in records if record["kind"] == kind and record.get(name) is not None]
             if known:
-                axes.plot([one["steps"] for one in known], [one[name] for one in known], label=kind, **style)
+                axes.plot([row["steps"] for row in known], [row[name] for row in known], label=kind, **style)
         axes.set_ylabel({"return_mean": "mean return", "success_rate": "success rate"}[name])
         if name == "success_rate":
             axes.set_ylim(-0.03, 1.03)
@@ -146,11 +146,11 @@ def draw_curve(records: Sequence[dict[str, Any]], title: str, path: Path) -> Non
 
 
 class Copies:
-    """Where checkpoints are copied to.
+    """A place to which checkpoints are copied.
 
     Args:
-        url: An fsspec address, such as ``s3://bucket/runs/`` or ``file:///mnt/share/pick.zip``. One that ends in
-            ``.zip`` is the copy's own; any other is a folder. Raises OutputError if it cannot be one.
+        url: An fsspec address, such as ``s3://bucket/runs/`` or ``file:///mnt/share/pick.zip``: a file if it ends in
+            ``.zip``, else a folder. Raises OutputError if it is malformed.
     """
 
     def __init__(self, url: str) -> None:
@@ -167,16 +167,16 @@ class Copies:
             raise OutputError(f"{url}: cannot be copied to: {' '.join(str(error).split())}") from error
 
     def copy(self, checkpoint: Path) -> None:
-        """Copy a checkpoint there, over an earlier copy; raises OutputError if that fails."""
+        """Copy a checkpoint there and overwrite an earlier copy; raises OutputError if that fails."""
         target = self._path if self._path.endswith(".zip") else posixpath.join(self._path, checkpoint.name)
         try:
             if "file" not in self._files.protocol:
                 self._files.put_file(str(checkpoint), target)
                 return
-            # A bucket shows a file when all of it is there; a folder shows it from its first byte on.
+            # A file appears in a bucket when it is complete, in a folder as soon as it is opened.
             self._files.makedirs(posixpath.dirname(target), exist_ok=True)
             self._files.put_file(str(checkpoint), f"{target}.tmp")
             self._files.mv(f"{target}.tmp", target)
-        except Exception as error:  # every kind of storage has errors of its own
+        except Exception as error:  # each kind of storage has its own exceptions
             why = f"{type(error).__name__}: {' '.join(str(error).split())}"
             raise OutputError(f"{self.url}: {checkpoint} could not be copied there: {why}") from error

@@ -1,4 +1,4 @@
-"""TensorBoard's event files, of which a full disk loses some and ends no run."""
+"""TensorBoard's event files; a full disk loses some of them, but does not end a run."""
 
 import contextlib
 import threading
@@ -8,7 +8,7 @@ from typing import Any
 
 
 class TensorBoardFiles:
-    """Writes numbers into a folder until it cannot."""
+    """Writes numbers into a folder until writing fails."""
 
     def __init__(self, folder: Path) -> None:
         from torch.utils.tensorboard import SummaryWriter
@@ -28,7 +28,7 @@ class TensorBoardFiles:
             self.close()
 
     def close(self) -> None:
-        """Let go of the files."""
+        """Close the files."""
         writer, self._writer = self._writer, None
         if writer is not None:
             with contextlib.suppress(OSError):
@@ -36,6 +36,6 @@ class TensorBoardFiles:
             threading.excepthook = self._hook
 
     def _thread_failed(self, failed: threading.ExceptHookArgs) -> None:
-        """TensorBoard's own thread says on standard error what `write` is told too: leave that out."""
+        """Hide the errors of TensorBoard's thread, which `write` gets too, from standard error."""
         if not (isinstance(failed.exc_value, OSError) and type(failed.thread).__module__.startswith("tensorboard.")):
             self._hook(failed)

@@ -1,9 +1,9 @@
-"""One training run from its first step to its checkpoint, whatever trains it: evaluate, keep the best, save, stop.
+"""One training run of any trainer, from its first step to its checkpoint: evaluate, keep the best, save, stop.
 
-    train ─▶ between two updates: stop asked for? ─ evaluation due? ─ save due? ─ record ─▶ train …
+    train ─▶ between two updates: stop requested? ─ evaluation due? ─ save due? ─ record ─▶ train …
 
-The best policy by evaluation (success, ties by return) goes to ``out``, the newest state to ``last.zip``. What cannot
-be written does not end the run.
+The best policy by evaluation (success, ties by return) goes to ``out``, the newest state to ``last.zip``. A file that
+cannot be written does not end the run.
 """
 
 import math
@@ -25,11 +25,11 @@ from bam_train.trainers.run_folder import Copies, RunFolder, unwritable
 FIRST_SAVE = 2.0
 """Seconds until the first save, so that a run that is killed early can be resumed."""
 SAVE_EVERY = 30.0
-"""Seconds between two saves at least, unless an evaluation comes first."""
+"""Minimum seconds between two saves, unless an evaluation comes first."""
 SAVE_SHARE = 0.02
-"""Share of the time that saving may take: a large replay buffer is saved less often."""
+"""Maximum share of the time for saving: a large replay buffer is saved less often."""
 RECORD_EVERY = 0.1
-"""Seconds between two training records at least."""
+"""Minimum seconds between two training records."""
 
 
 class Watcher(Protocol):
@@ -38,13 +38,13 @@ class Watcher(Protocol):
     def training(
         self, progress: Progress, statistics: Statistics, steps_per_second: float, seconds_left: float | None
     ) -> None:
-        """An update is done."""
+        """Called after an update."""
 
     def evaluated(self, steps: int, report: EvaluationReport, best: bool) -> None:
-        """The policy is evaluated, and is the best so far or not."""
+        """Called after an evaluation; `best` tells whether the policy is the best so far."""
 
     def note(self, text: str) -> None:
-        """A message for the user."""
+        """Called with a message for the user."""
 
 
 Scores = dict[str, Any]
@@ -52,9 +52,9 @@ Scores = dict[str, Any]
 
 
 def _rank(scores: Scores) -> tuple[float, float]:
-    """Larger is better: success first, then return; what is unknown ranks last.
+    """Sort key of evaluations, larger is better: success first, then return; unknown values rank last.
 
-    Success is the low end of its interval: 1 of 5 is less than 4 of 20.
+    Success counts as the low end of its interval: 1 of 5 is less than 4 of 20.
     """
     sure, mean = (scores.get("success_interval") or [scores.get("success_rate")])[0], scores.get("return_mean")
     return (-math.inf if sure is None else sure), (-math.inf if mean is None else mean)
@@ -62,29 +62,29 @@ def _rank(scores: Scores) -> tuple[float, float]:
 
 @dataclass(frozen=True)
 class Outcome:
-    """How a run ended."""
+    """The outcome of a run."""
 
     reason: str
-    """``steps`` (all done), ``success`` (``until_success`` reached) or ``stopped`` (asked to)."""
+    """``steps`` (all done), ``success`` (``until_success`` reached) or ``stopped`` (by the user)."""
     steps: int
-    """Steps trained since the first of the run."""
+    """Steps trained since the start of the run."""
     best: Scores | None
     """The best evaluation."""
     checkpoint: Path | None
-    """Where the best policy is."""
+    """Path of the best policy."""
     last: Path | None
-    """Where the newest state is that could be saved in the run's folder."""
+    """Path of the newest state that was saved in the run's folder."""
     last_steps: int
     """Steps of that state."""
     failure: OutputError | None
-    """Why something is not where it should be; None if all is."""
+    """The first failure to write a file; None if all were written."""
 
 
 class TrainingRun:
-    """Trains, evaluates and saves until it is done.
+    """Trains, evaluates and saves until the run is done.
 
-    The best checkpoint goes to `out`, and from there to `copies`; `best` is the evaluation of the one that an earlier
-    part of the run left there. The `clock` is monotonic [s].
+    The best checkpoint goes to `out`, and from there to `copies`; `best` is the evaluation of the checkpoint that an
+    earlier part of the run saved there. The `clock` is monotonic [s].
     """
 
     def __init__(
@@ -113,26 +113,26 @@ class TrainingRun:
         self._noted = len(trainer.notices)
 
     def stop(self) -> None:
-        """Ask for an end after the update in progress; may be called from a signal handler."""
+        """Stop after the update in progress; may be called from a signal handler."""
         self._stop = True
 
     @property
     def last(self) -> Path | None:
-        """The newest checkpoint on the disk that can be resumed."""
+        """The newest checkpoint on the disk from which the run can be resumed."""
         return next((path for path in (self.folder.last, self._kept) if path is not None and path.exists()), None)
 
     def run(self) -> Outcome:
-        """Train to the end; raises TrainingFailed, whose text names the last good checkpoint."""
+        """Train to the end; raises TrainingFailed, whose message names the last good checkpoint."""
         try:
             self.trainer.train(self.settings.steps, self._between)
             if not self._stop and self._evaluated_at < self.trainer.steps:
                 self._evaluate()
-        except (ProcessesLost, RobotFault) as error:  # what was learnt so far is good
+        except (ProcessesLost, RobotFault) as error:  # the state after the last update is good
             self._save_last()
             kept = f"go on with --resume {self.folder.last}" if self._last_steps else "nothing had been learnt yet"
             text = f"at step {self.trainer.steps}: {str(error).rstrip('.')}. What was learnt is kept: {kept}"
             raise TrainingFailed(text) from error
-        except (TrainingFailed, EnvironmentFailed) as error:  # in the middle of an update, which is not saved
+        except (TrainingFailed, EnvironmentFailed) as error:  # during an update, which is not saved
             where = "" if isinstance(error, TrainingFailed) else f"at step {self.trainer.steps}: "
             good = f"the last good checkpoint is {self.last}" if self.last else "no checkpoint had been saved yet"
             raise TrainingFailed(f"{where}{error}; {good}") from error
@@ -169,7 +169,7 @@ class TrainingRun:
         return not (self._stop or self._reached)
 
     def _due(self, progress: Progress) -> bool:
-        """Whether to evaluate: every so many steps, and early once training itself succeeds as often as wanted."""
+        """Whether to evaluate: every `eval_every` steps, and earlier once training episodes reach `until_success`."""
         every, wanted = self.settings.eval_every or self.settings.steps, self.settings.until_success
         if progress.steps // every > self._evaluated_at // every:
             return True
@@ -191,7 +191,7 @@ class TrainingRun:
         self.watcher.training(progress, statistics, rate, left)
 
     def _evaluate(self) -> None:
-        """Evaluate the frozen policy; the best is kept."""
+        """Evaluate the frozen policy, and keep it if it is the best."""
         steps = self._evaluated_at = self.trainer.steps
         with self.trainer.undisturbed(), self.trainer.evaluation_envs() as envs:
             last = steps >= self.settings.steps
@@ -208,7 +208,7 @@ class TrainingRun:
             self._keep()
 
     def _add(self, kind: str, steps: int, figures: Scores) -> None:
-        """Add a record; training does not depend on it."""
+        """Add a record; a failure does not end training."""
         try:
             seconds = round(self._clock() - self._start, 3)
             self.folder.add({"kind": kind, "steps": steps, "seconds": seconds, **figures})
@@ -218,7 +218,7 @@ class TrainingRun:
             self._failures["progress"] = error
 
     def _keep(self) -> None:
-        """Save the policy as the best so far; if `out` cannot be written, in the run's folder."""
+        """Save the best policy, in the run's folder if `out` cannot be written."""
         before, self.best = self.best, self._scores
         if self._write(self.out, self.out, "--out"):
             self._kept = self.out
@@ -235,7 +235,7 @@ class TrainingRun:
         self.watcher.note(f"the best policy could not be saved; {kept}")
 
     def _copy(self) -> None:
-        """Copy what is at `out`; training does not depend on it."""
+        """Copy the checkpoint at `out`; a failure does not end training."""
         if self._copies is None or self._kept != self.out:
             return
         try:
@@ -248,7 +248,7 @@ class TrainingRun:
             self._failures.pop("copy", None)
 
     def _save_last(self) -> None:
-        """Save the newest state; the next save is put off while saving is slow."""
+        """Save the newest state; slow saves delay the next one."""
         before = self._clock()
         if self._write(self.folder.last, self._kept, "--runs"):
             self._last_steps = self.trainer.steps
@@ -259,8 +259,8 @@ class TrainingRun:
         self._save_pause = max(SAVE_EVERY, (self._saved - before) / SAVE_SHARE)
 
     def _write(self, path: Path, kept: Path | None, flag: str) -> bool:
-        """Write a checkpoint, which notes that the best one is at `kept`; whether it could be."""
-        notes: dict[str, Any] = {"best": None}  # with these a resumed run keeps the best in the same file
+        """Write a checkpoint that notes the best one at `kept`; returns whether it was written."""
+        notes: dict[str, Any] = {"best": None}  # a resumed run continues to save its best policy there
         if (best := self.best) is not None and kept is not None:
             noted = {name: best.get(name) for name in ("steps", "success_rate", "return_mean")}
             notes = {"best": {**noted, "path": str(kept.resolve())}}
@@ -279,7 +279,7 @@ class TrainingRun:
 
 
 EVALUATION_SEED = 2_000_000
-"""First of these seeds, far from training's small ones and from bam-eval's."""
+"""First seed of evaluations, far from the small seeds of training and from bam-eval's."""
 
 
 def evaluate_for_success(
@@ -287,9 +287,9 @@ def evaluate_for_success(
 ) -> tuple[EvaluationReport, bool]:
     """Evaluate a policy; returns the report (the worse of two), and whether ``until_success`` was reached.
 
-    First a quarter of the episodes, which spares early, hopeless policies a long evaluation; then all, if that may
-    reach it; then, if it did, as many fresh ones, which must reach it too. The last evaluation of a run is never cut
-    short. Episode k has EVALUATION_SEED + seed + k; environments that are given stay open.
+    First a quarter of the episodes is played; then all, if the quarter leaves ``until_success`` possible; then, if it
+    was reached, as many other episodes, which must reach it too. The last evaluation of a run always plays all. Episode
+    k has the seed EVALUATION_SEED + seed + k; `envs` are left open.
     """
 
     def play(first: int, count: int) -> EvaluationReport:
@@ -307,5 +307,5 @@ def evaluate_for_success(
     if report.success_rate is None or report.success_rate < wanted:
         return report, False
     again = play(episodes, episodes)
-    worse = min(report, again, key=lambda one: one.success_rate or 0.0)
+    worse = min(report, again, key=lambda report: report.success_rate or 0.0)
     return worse, again.success_rate is not None and again.success_rate >= wanted

@@ -1,4 +1,4 @@
-"""Spaces that count from another number than 0, as learning libraries take them: these ignore ``start``."""
+"""Conversion of spaces with a ``start`` other than 0, which learning libraries ignore, to spaces that count from 0."""
 
 import functools
 from typing import Any
@@ -12,7 +12,7 @@ _Counted = (spaces.Discrete, spaces.MultiDiscrete)
 
 
 def from_zero(env: gym.Env[Any, Any]) -> gym.Env[Any, Any]:
-    """The environment with every Discrete and MultiDiscrete counted from 0; itself if they all are already."""
+    """Wrap the environment so that every Discrete and MultiDiscrete counts from 0; unchanged if they do already."""
     seen, acted = env.observation_space, env.action_space
     if (zero := space_from_zero(acted)) != acted:
         env = TransformAction(env, functools.partial(plus_start, acted), zero)
@@ -22,21 +22,21 @@ def from_zero(env: gym.Env[Any, Any]) -> gym.Env[Any, Any]:
 
 
 def plus_start(space: spaces.Space[Any], value: Any) -> Any:
-    """A value counted from 0 as the space has it, in the space's dtype; other kinds as they are."""
+    """Convert a value that counts from 0 to one of the space, in its dtype; values of other kinds are unchanged."""
     if not isinstance(space, _Counted):
         return value
     return np.asarray(np.asarray(value) + space.start).astype(space.dtype)[()]
 
 
 def less_start(space: spaces.Space[Any], value: Any) -> Any:
-    """A value of the space, or a batch of them, counted from 0; other kinds as they are."""
+    """Convert a value of the space, or a batch of them, to count from 0; values of other kinds are unchanged."""
     if isinstance(space, spaces.Dict):
-        return {key: less_start(space.spaces[key], one) for key, one in value.items()}
+        return {key: less_start(space.spaces[key], part) for key, part in value.items()}
     return value - space.start if isinstance(space, _Counted) else value
 
 
 def space_from_zero(space: spaces.Space[Any]) -> spaces.Space[Any]:
-    """The space with every Discrete and MultiDiscrete counted from 0; leaves of a Dict too."""
+    """The space with every Discrete and MultiDiscrete counting from 0, also in a Dict."""
     if isinstance(space, spaces.Dict):
         return spaces.Dict({key: space_from_zero(leaf) for key, leaf in space.spaces.items()})
     if not isinstance(space, _Counted):

@@ -1,9 +1,9 @@
 """The state of an algorithm in a checkpoint: RLlib's own tree of files, from which a run resumes without unpickling.
 
 ``bam/resume/rllib/…`` is written by ``Algorithm.save_to_path``, so that ``Algorithm.from_checkpoint`` of the unpacked
-folder works for those who trust it. Here a resumed run builds the algorithm from its settings and sets the states in
-these files, read as arrays and plain values; ``class_and_ctor_args.pkl``, which describes objects to make, is never
-read. ``bam/resume/learner.json`` has adaptive numbers of the learners that the tree lacks.
+folder works for those who trust it. A resumed run here builds the algorithm from its settings and sets the states of
+these files, read as arrays and plain values, without ``class_and_ctor_args.pkl``, which describes objects to make.
+``bam/resume/learner.json`` has adaptive numbers of the learners that the tree lacks.
 """
 
 import functools

@@ -1,4 +1,4 @@
-"""Zips that stable-baselines3 wrote without us: loading one runs whatever is pickled in it, so it must be asked for."""
+"""Zips written by stable-baselines3 itself: loading one runs any code pickled in it, so it needs the user's consent."""
 
 import pickle
 import textwrap
@@ -23,27 +23,27 @@ _DAMAGE = (zipfile.BadZipFile, zlib.error, EOFError, pickle.UnpicklingError)
 
 
 def is_plain_sb3(path: Path) -> bool:
-    """Whether the file is a zip as stable-baselines3 writes it, without our manifest; opens nothing in it."""
+    """Whether the file is a zip of stable-baselines3 without our manifest; reads only the list of members."""
     try:
         with open_zip(path) as archive:
             names = set(archive.namelist())
     except NotACheckpoint:
-        return False  # missing or damaged; `Checkpoint.open` says how
+        return False  # missing or damaged; `Checkpoint.open` raises the error
     return "data" in names and MANIFEST not in names
 
 
 def load_trusted(
     path: Path, algo: str, env_id: str, env_kwargs: Mapping[str, Any] | None = None
 ) -> tuple[FrozenPolicy, int]:
-    """Load with stable-baselines3, UNPICKLING what the file holds; only for files whose maker is trusted.
+    """Load with stable-baselines3, which UNPICKLES the file; only for files whose maker is trusted.
 
-    The statistics of a VecNormalize are not in such a file.
+    Such a file lacks the statistics of a VecNormalize.
 
     Returns:
-        The frozen policy, and the steps it was trained for.
+        The frozen policy, and its number of training steps.
 
     Raises:
-        CheckpointMismatch: It is not of this algorithm, or not for this environment.
+        CheckpointMismatch: The file is of another algorithm, or for another environment.
     """
     from bam_train.trainers.sb3.sb3_freezing import freeze
 

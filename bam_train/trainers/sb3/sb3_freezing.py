@@ -1,8 +1,8 @@
 """Turn a trained stable-baselines3 model into one ONNX graph: raw observation in, deterministic action out.
 
-The graph holds the whole path of ``model.predict(..., deterministic=True)``, with what lies around it: `VecNormalize`,
+The graph computes all of ``model.predict(..., deterministic=True)`` and of the wrappers around it: `VecNormalize`,
 `VecTransposeImage`, one-hot codes, the network, squashing, and the action space's bounds. It is traced from a copy on
-the CPU: the model is not touched and no random number is drawn.
+the CPU: the model is not changed and no random number is drawn.
 """
 
 import copy
@@ -47,9 +47,9 @@ class _Numbers(Layer):
 
 
 def _encoder(key: str, raw: Any, seen: AnySpace, normalise: nn.Module, scale: bool) -> nn.Module:
-    """What turns an array of the environment's space `raw` into what the policy's feature extractor takes.
+    """The layer that turns an array of the environment's space `raw` into the input of the policy's feature extractor.
 
-    The policy was built for the space `seen`: channels of an image may have been moved to the front.
+    The policy was built for the space `seen`, in which an image's channels may come first.
     """
     if isinstance(raw, (spaces.Discrete, spaces.MultiDiscrete)):
         return OneHot(raw)
@@ -80,7 +80,7 @@ class _Lstm(Layer):
         if lstm.bidirectional or lstm.proj_size or not lstm.bias:
             raise PolicyError("an LSTM that is bidirectional, projects or has no bias cannot be frozen")
         self.sizes = [lstm.hidden_size] * lstm.num_layers
-        self.gates = nn.ModuleList()  # of each layer, one linear layer from (input, hidden) to the four gates
+        self.gates = nn.ModuleList()  # for each layer, a linear layer from (input, hidden) to the four gates
         for weights in lstm.all_weights:
             w_input, w_hidden, b_input, b_hidden = (weight.detach() for weight in weights)
             weight = torch.cat([w_input, w_hidden], 1)
@@ -100,7 +100,7 @@ class _Lstm(Layer):
 
 
 def _network(policy: BasePolicy) -> tuple[Any, nn.Module, nn.Module, nn.Module | None]:
-    """The module that owns the network, and copies of its feature extractor, its layers and its LSTM if any."""
+    """The module that owns the network, and copies of its feature extractor, layers and LSTM (or None)."""
     lstm = None
     if isinstance(policy, ActorCriticPolicy):
         owner, extractor = policy, policy.pi_features_extractor
@@ -116,7 +116,7 @@ def _network(policy: BasePolicy) -> tuple[Any, nn.Module, nn.Module, nn.Module |
         layers = nn.Sequential(getattr(owner, "latent_pi", nn.Identity()), owner.mu)
     else:
         raise PolicyError(f"policy {type(policy).__name__} cannot be frozen; expected one of stable-baselines3's own")
-    extractor, layers = (copy.deepcopy(one).cpu().eval().requires_grad_(False) for one in (extractor, layers))
+    extractor, layers = (copy.deepcopy(part).cpu().eval().requires_grad_(False) for part in (extractor, layers))
     return owner, extractor, layers, None if lstm is None else _Lstm(copy.deepcopy(lstm).cpu())
 
 
@@ -131,25 +131,25 @@ def _mean_of_quantiles(layers: nn.Sequential, quantiles: int) -> nn.Sequential:
 
 
 def _head(space: AnySpace, policy: BasePolicy) -> nn.Module:
-    """What turns the network's output into an action of the environment's space."""
+    """The layer that turns the network's output into an action of the environment's space."""
     if not isinstance(space, spaces.Box):
         return action_head(space, tanh=False, scale=False, clip=False)
     if isinstance(policy, ActorCriticPolicy):
         distribution = policy.action_dist
         tanh = isinstance(distribution, StateDependentNoiseDistribution) and distribution.bijector is not None
-    else:  # TD3 and DDPG have theirs among the layers of `_network`
+    else:  # TD3 and DDPG have a tanh among the layers of `_network`
         tanh = hasattr(policy.actor, "latent_pi")
-    return action_head(space, tanh=tanh, scale=policy.squash_output, clip=True)  # scaled ones can round past a bound
+    return action_head(space, tanh=tanh, scale=policy.squash_output, clip=True)  # scaled actions can round past a bound
 
 
 class FrozenModel(FrozenNetwork):
-    """The policy of a model of any algorithm of stable-baselines3 or sb3-contrib but ARS.
+    """The policy of a model of any algorithm of stable-baselines3 or sb3-contrib, except ARS.
 
     Args:
         model: The model.
         normaliser: Normaliser of the observations, if any.
-        observation_space: The environment's own, before any wrapper of SB3.
-        action_space: The environment's own; its ``start`` is added to what SB3 counts from 0.
+        observation_space: The environment's observation space, before any wrapper of SB3.
+        action_space: The environment's action space; its ``start`` is added to SB3's actions, which count from 0.
 
     Raises:
         PolicyError: The policy or a space is of a kind that cannot be frozen.
@@ -183,11 +183,11 @@ class FrozenModel(FrozenNetwork):
         self.eval()
 
     def scores(self, *observation: torch.Tensor) -> torch.Tensor:
-        """What the action is made of, (n, outputs) float32: means, logits or values; not if recurrent."""
+        """The scores of a policy that is not recurrent, (n, outputs) float32: means, logits or values."""
         return self.layers(self._features(observation))
 
     def forward(self, *inputs: torch.Tensor) -> Any:
-        """The action, and of a recurrent policy the next state."""
+        """The action, and the next state of a recurrent policy."""
         if self.lstm is None:
             return self.head(self.scores(*inputs))
         count = len(self.leaves)
@@ -208,8 +208,8 @@ def golden(model: BaseAlgorithm, normaliser: VecNormalize | None, observed: AnyS
     """Draw observations and record ``model.predict(..., deterministic=True)``; arguments as of `FrozenModel`.
 
     Returns:
-        A safetensors file with ``observation`` (or ``observation.<key>``), (n, ...), and ``action``, (n, ...); of a
-        recurrent policy the steps of one episode.
+        A safetensors file with ``observation`` (or ``observation.<key>``), (n, ...), and ``action``, (n, ...); for a
+        recurrent policy, the steps of one episode.
     """
     observations = FrozenModel(model, normaliser, observed, acted).golden_observations()
     return pack(observations, trainer_actions(model, normaliser, observed, acted, observations))
@@ -222,7 +222,7 @@ def trainer_actions(
     action_space: AnySpace,
     observations: dict[str, np.ndarray],
 ) -> np.ndarray:
-    """The trainer's own actions for raw observations, in the environment's action space."""
+    """The trainer's actions, (n, ...), for raw observations by key, (n, ...), in the environment's action space."""
     is_dict = isinstance(observation_space, spaces.Dict)
     seen = less_start(observation_space, observations if is_dict else observations[""])
     if normaliser is not None:
@@ -233,8 +233,8 @@ def trainer_actions(
         if hasattr(model.policy, "lstm_actor"):  # one episode, an observation a step
             state, each = None, []
             for t in range(len(next(iter(observations.values())))):
-                one = {key: array[t : t + 1] for key, array in seen.items()} if is_dict else seen[t : t + 1]
-                action, state = model.predict(one, state, episode_start=np.array([t == 0]), deterministic=True)
+                now = {key: array[t : t + 1] for key, array in seen.items()} if is_dict else seen[t : t + 1]
+                action, state = model.predict(now, state, episode_start=np.array([t == 0]), deterministic=True)
                 each.append(action[0])
             actions = np.stack(each)
         else:

@@ -1,4 +1,4 @@
-"""Hyperparameters: checked against the constructors of stable-baselines3, completed, turned into its objects and model.
+"""Hyperparameters, checked against the constructors of stable-baselines3 and completed; the model of a run.
 
 In settings they are JSON: a schedule is ``"lin_3e-4"`` (linear to 0), action noise ``"normal_0.1"`` or
 ``"ornstein-uhlenbeck_0.1"``, a class its name (``activation_fn="tanh"``), ``train_freq`` ``1`` or ``[1, "episode"]``.
@@ -38,7 +38,7 @@ ELSEWHERE = {
         "bam-train takes care of it",
     ),
 }
-"""Constructor arguments that are not hyperparameters, and why or what to do instead."""
+"""Constructor arguments that are not hyperparameters, and the replacement or reason."""
 
 _POLICY_ELSEWHERE = frozenset({"self", "observation_space", "action_space", "lr_schedule", "use_sde"})
 
@@ -69,11 +69,11 @@ _RANGES = {
     **dict.fromkeys(_COUNTS, PositiveInt),
     **dict.fromkeys(("learning_starts", "ent_coef", "vf_coef"), NonNegative),
 }
-"""Numbers that no algorithm can learn with, but the library takes without a word, are out of these."""
+"""Ranges of numbers outside which no algorithm can learn, although the library accepts them."""
 
 
 def complete(algorithm: Algorithm, given: Mapping[str, Any], observation_space: spaces.Space[Any]) -> dict[str, Any]:
-    """Check hyperparameters by name, type and range, and add the defaults of those that are not given."""
+    """Check hyperparameters by name, type and range, and add defaults for missing ones."""
     parameters = _parameters(algorithm.load(), ELSEWHERE)
     require_known(given, parameters, f"{algorithm.name} hyperparameter", ELSEWHERE, NAMES)
     values: dict[str, Any] = {"policy": default_policy(algorithm, observation_space)}
@@ -92,7 +92,7 @@ def complete(algorithm: Algorithm, given: Mapping[str, Any], observation_space: 
 
 
 def default_policy(algorithm: Algorithm, observation_space: spaces.Space[Any]) -> str:
-    """Name of the policy that fits what is observed: several inputs, images, or numbers."""
+    """Name of the policy for an observation space of several inputs, images, or numbers."""
     several = isinstance(observation_space, spaces.Dict)
     kind = "MultiInput" if several else "Cnn" if is_image_space(observation_space) else "Mlp"
     return f"{kind}{'Lstm' if algorithm.recurrent else ''}Policy"
@@ -110,13 +110,13 @@ def complete_normalize(given: bool | Mapping[str, Any], gamma: float) -> bool | 
 
 
 def over_the_whole_run(values: Mapping[str, Any]) -> list[str]:
-    """Names of complete hyperparameters whose course depends on how many steps the run has in all."""
+    """Names of complete hyperparameters that change over the run, and depend on its total of steps."""
     schedules = [name for name, value in values.items() if isinstance(value, str) and linear_start(value) is not None]
     return sorted([*schedules, *({"exploration_fraction"} & values.keys())])
 
 
 def build(values: Mapping[str, Any], action_space: spaces.Space[Any]) -> dict[str, Any]:
-    """Turn complete hyperparameters into the arguments that the constructor takes; `values` is left as it is."""
+    """Turn complete hyperparameters into arguments of the constructor; `values` does not change."""
     arguments = copy.deepcopy(dict(values))
     for name, value in arguments.items():
         if isinstance(value, str) and (start := linear_start(value)) is not None:  # to 0 over the run
@@ -136,13 +136,13 @@ def build(values: Mapping[str, Any], action_space: spaces.Space[Any]) -> dict[st
 
 
 def _parameters(kind: Any, but: Container[str]) -> dict[str, inspect.Parameter]:
-    """Parameters of a class's constructor by name, other than some."""
+    """Parameters of a class's constructor by name, without those in `but`."""
     parameters = inspect.signature(kind.__init__).parameters
     return {name: parameter for name, parameter in parameters.items() if name not in but}
 
 
 def _check_ranges(values: Mapping[str, Any]) -> None:
-    """Refuse a number out of its range; text such as ``auto`` is none, a schedule is its first value."""
+    """Refuse a number out of its range; of a schedule, the first value is checked, and text such as ``auto`` is not."""
     for name, value in values.items():
         first = value[0] if isinstance(value, list) and value else value
         number = linear_start(first) if isinstance(first, str) else first
@@ -166,9 +166,9 @@ _REFUSALS = (AssertionError, ValueError, TypeError, RuntimeError, ZeroDivisionEr
 
 
 def make_model(settings: TrainSettings, venv: VecEnv) -> tuple[Any, list[str]]:
-    """The algorithm's model, whose constructor seeds everything, and what it warns of, a line each.
+    """Make the algorithm's model, whose constructor sets all seeds; returns it with its warnings, one line each.
 
-    Raises SettingsError if the library refuses the settings, or there is no such device.
+    Raises SettingsError if the library refuses the settings, or the device does not exist.
     """
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", UserWarning)
@@ -183,8 +183,8 @@ def make_model(settings: TrainSettings, venv: VecEnv) -> tuple[Any, list[str]]:
         except _REFUSALS as error:
             why = " ".join(str(error).split())
             raise SettingsError(f"{settings.algo} on {settings.env} cannot be set up: {why}") from error
-    notices = [" ".join(str(one.message).split()) for one in caught]
-    if any(text.startswith("You have specified a mini-batch size") for text in notices):  # in words of settings
+    notices = [" ".join(str(warning.message).split()) for warning in caught]
+    if any(text.startswith("You have specified a mini-batch size") for text in notices):  # in terms of the settings
         steps, batch = model.n_steps * model.n_envs, model.batch_size
         notices = [
             f"batch_size {batch} does not divide a rollout of n_steps {model.n_steps} x num_envs {model.n_envs} = "
@@ -194,9 +194,9 @@ def make_model(settings: TrainSettings, venv: VecEnv) -> tuple[Any, list[str]]:
 
 
 def _normalised(venv: VecEnv, given: bool | dict[str, Any]) -> VecNormalize:
-    """The normaliser over `venv`, and below it what brings an image's channels to the front, if one stays an image.
+    """Normalise `venv`, below which a wrapper moves the channels of images, if any, to the front.
 
-    Above it, where stable-baselines3 would put that, the replay buffer is given the images of below: channels last.
+    With this wrapper on top, as in stable-baselines3, the replay buffer would get images with channels last.
     """
     arguments = given if isinstance(given, dict) else {}
     venv.observation_space = copy.deepcopy(venv.observation_space)  # VecNormalize writes into a Dict
@@ -208,9 +208,9 @@ def _normalised(venv: VecEnv, given: bool | dict[str, Any]) -> VecNormalize:
 
 
 def _device(name: str, policy: str) -> str:
-    """Where to compute: what was asked for, if it is there."""
+    """The device to compute on: `name` if it exists, or the choice of ``auto``."""
     if name == "auto":
-        # Copies to a GPU cost more than a small network computes.
+        # Copies to a GPU take longer than the computations of a small network.
         return "cuda" if torch.cuda.is_available() and not policy.startswith("Mlp") else "cpu"
     there = ["cpu", *(f"cuda:{i}" for i in range(torch.cuda.device_count()))]
     if name in there or (name == "cuda" and len(there) > 1):

@@ -1,6 +1,6 @@
-"""The state from which a run of stable-baselines3 continues exactly: ``bam/resume/…`` in its checkpoints.
+"""The state from which a run of stable-baselines3 resumes exactly: ``bam/resume/…`` in its checkpoints.
 
-It is taken between two updates: no rollout is half collected, no gradient half applied.
+It is taken between two updates, without a partial rollout or a partial gradient step.
 """
 
 import json
@@ -30,29 +30,29 @@ _COUNTERS = {
     **dict.fromkeys(("num_timesteps", "_episode_num", "_n_updates", "_n_calls"), _Count),
     **dict.fromkeys(("_current_progress_remaining", "exploration_rate"), _Share),
 }
-"""Numbers that a model counts with, where it has them."""
+"""Counters of a model, each of which some algorithms have."""
 _LAST = ("_last_obs", "_last_original_obs", "_last_episode_starts")
-"""The last observations, with which the next rollout begins."""
+"""Attributes with the last observations, from which the next rollout starts."""
 _DEQUES = ("ep_info_buffer", "ep_success_buffer")
 _REPLAY = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts")
 
 
 @dataclass(frozen=True)
 class Waiting:
-    """State to restore only before the next step of training: setting up draws random numbers and resets noise."""
+    """State that is restored just before the next training step: setting up draws random numbers and resets noise."""
 
     checkpoint: Checkpoint
-    """Where it comes from."""
+    """The checkpoint of this state."""
     random: dict[str, Any]
     noise: list[Any]
     same_episodes: bool
     """Whether the episodes that ran when the checkpoint was saved continue."""
 
     def restore(self, model: Any) -> None:
-        """Restore it into a model."""
+        """Restore the state into a model."""
         with self.checkpoint.fitting(STATE):
-            for one, previous in zip(_correlated_noises(model), self.noise, strict=True):
-                one.noise_prev = previous
+            for process, previous in zip(_correlated_noises(model), self.noise, strict=True):
+                process.noise_prev = previous
             load_random_states(model, self.random)
 
 
@@ -61,7 +61,7 @@ def members(
 ) -> dict[str, bytes]:
     """The members of a checkpoint from which a run of `model` on `venv` continues.
 
-    A loaded run has not restored the `waiting` state yet; the `notes` are JSON values.
+    `waiting` is the state that a loaded run has not restored yet; `notes` are JSON values.
     """
     _, loose = model._get_torch_save_params()  # such as SAC's entropy coefficient
     weights = {"states": model.get_parameters(), "loose": {name: recursive_getattr(model, name) for name in loose}}
@@ -78,16 +78,16 @@ def members(
         # + 1: a buffer with optimize_memory_usage keeps the newest next observation at `pos`.
         filled = buffer.buffer_size if buffer.full else min(buffer.pos + 1, buffer.buffer_size)
         arrays: dict[str, Any] = {name: getattr(buffer, name, None) for name in _REPLAY}
-        for name, own in arrays.items():
-            if own is not None:
-                keyed = isinstance(own, dict)
-                arrays[name] = {key: one[:filled] for key, one in own.items()} if keyed else own[:filled]
+        for name, stored in arrays.items():
+            if stored is not None:
+                keyed = isinstance(stored, dict)
+                arrays[name] = {key: array[:filled] for key, array in stored.items()} if keyed else stored[:filled]
         written |= pack(REPLAY, {"pos": buffer.pos, "full": buffer.full, "filled": filled, "arrays": arrays})
     return written
 
 
 def load(checkpoint: Checkpoint, model: Any, venv: Any, normaliser: VecNormalize | None) -> Waiting:
-    """Restore a checkpoint's state into a new model of the same settings; returns the rest, to be restored later."""
+    """Restore a checkpoint's state into a new model of the same settings; returns the part to be restored later."""
     with checkpoint.fitting(MODEL):
         weights = checkpoint.state(MODEL, torch.from_numpy)
         model.set_parameters(weights["states"], exact_match=True, device=model.device)
@@ -102,7 +102,7 @@ def load(checkpoint: Checkpoint, model: Any, venv: Any, normaliser: VecNormalize
         same = getattr(venv, "can_be_saved", False) and tree["env"] is not None
         if same:
             venv.load_state_dict(tree["env"])
-        else:  # `learn` begins new episodes, seeded by how far the run is
+        else:  # `learn` begins new episodes, with a seed that depends on the steps trained
             model._last_obs = None
             venv.seed(model.seed + model.num_timesteps)
         waiting = Waiting(checkpoint, tree["random"], tree["noise"], same)
@@ -111,12 +111,12 @@ def load(checkpoint: Checkpoint, model: Any, venv: Any, normaliser: VecNormalize
             saved = checkpoint.state(REPLAY, torch.from_numpy)
             buffer, filled = model.replay_buffer, saved["filled"]
             for name, arrays in saved["arrays"].items():
-                own = getattr(buffer, name, None)
-                if isinstance(own, dict):
-                    for key, array in own.items():
+                stored = getattr(buffer, name, None)
+                if isinstance(stored, dict):
+                    for key, array in stored.items():
                         array[:filled] = arrays[key]
-                elif own is not None:
-                    own[:filled] = arrays
+                elif stored is not None:
+                    stored[:filled] = arrays
             buffer.pos, buffer.full = saved["pos"], saved["full"]
     return waiting
 
@@ -132,17 +132,17 @@ def _counters(model: Any) -> dict[str, Any]:
 
 
 def _load_counters(model: Any, tree: Mapping[str, Any]) -> None:
-    """Restore `_counters`, checked: kinds, ranges and shapes."""
+    """Check the kinds, ranges and shapes of `_counters`, and restore them."""
     for name, kind in _COUNTERS.items():
         if name in tree:
             setattr(model, name, check(tree[name], kind, name))
     for name in _LAST:
         value = tree["last"][name]
-        if value is not None:  # as it is before the first step
-            wanted = {key: (model.n_envs, *(one.shape or ())) for key, one in leaves(model.observation_space).items()}
+        if value is not None:  # None before the first step
+            wanted = {key: (model.n_envs, *(leaf.shape or ())) for key, leaf in leaves(model.observation_space).items()}
             if name == "_last_episode_starts":
                 wanted = {"": (model.n_envs,)}
-            found = {key: np.shape(one) for key, one in (value if isinstance(value, dict) else {"": value}).items()}
+            found = {key: np.shape(part) for key, part in (value if isinstance(value, dict) else {"": value}).items()}
             if found != wanted:
                 raise ValueError(f"{name}: expected arrays of shape {wanted}, found {found!s:.80}")
         setattr(model, name, value)
@@ -161,7 +161,7 @@ def _statistics(env: VecNormalize | None) -> dict[str, Any] | None:
     if env is None:
         return None
     observed, returns = _running(env)
-    moments = {key: {"mean": one.mean, "var": one.var, "count": one.count} for key, one in observed.items()}
+    moments = {key: {"mean": rms.mean, "var": rms.var, "count": rms.count} for key, rms in observed.items()}
     rewards = {"mean": returns.mean, "var": returns.var, "count": returns.count}
     return {"observations": moments, "returns": rewards, "running": np.array(env.returns)}
 
@@ -169,28 +169,28 @@ def _statistics(env: VecNormalize | None) -> dict[str, Any] | None:
 def _load_statistics(env: VecNormalize, tree: Mapping[str, Any]) -> None:
     """Restore `_statistics`."""
     observed, returns = _running(env)
-    both = [(observed[key], moments) for key, moments in tree["observations"].items()]
-    for one, moments in [*both, (returns, tree["returns"])]:
-        one.mean, one.var, one.count = moments["mean"], moments["var"], moments["count"]
+    pairs = [(observed[key], moments) for key, moments in tree["observations"].items()]
+    for rms, moments in [*pairs, (returns, tree["returns"])]:
+        rms.mean, rms.var, rms.count = moments["mean"], moments["var"], moments["count"]
     env.returns = np.array(tree["running"])
 
 
 def _running(env: VecNormalize) -> tuple[dict[str, Any], Any]:
-    """The means and variances of what is observed, by key of a Dict or just ``""``, and of returns."""
+    """The running moments of observations, by key of a Dict or ``""``, and of returns."""
     observed = getattr(env, "obs_rms", None)
     keyed = observed if isinstance(observed, dict) else {"": observed}
-    return {key: one for key, one in keyed.items() if one is not None}, env.ret_rms
+    return {key: rms for key, rms in keyed.items() if rms is not None}, env.ret_rms
 
 
 def _correlated_noises(model: Any) -> list[Any]:
-    """Action noise that remembers its last value, of each environment; `learn` spreads it over the environments."""
-    one = model.action_noise
-    noises = one.noises if isinstance(one, VectorizedActionNoise) else [one]
+    """The action noises with a state, one for each environment; `learn` makes these of a single one."""
+    shared = model.action_noise
+    noises = shared.noises if isinstance(shared, VectorizedActionNoise) else [shared]
     return [noise for noise in noises if hasattr(noise, "noise_prev")]
 
 
 def random_states(model: Any) -> dict[str, Any]:
-    """Every generator that training draws from, but for those inside environments."""
+    """The states of all random number generators of training, without those inside environments."""
     kind, keys, position, has_gauss, gauss = np.random.get_state(legacy=True)
     return {
         "python": random.getstate(),
@@ -202,7 +202,7 @@ def random_states(model: Any) -> dict[str, Any]:
 
 
 def load_random_states(model: Any, tree: Mapping[str, Any]) -> None:
-    """Restore `random_states`; the last thing to do before training continues."""
+    """Restore `random_states`, as the last step before training continues."""
     random.setstate(tree["python"])
     saved = tree["numpy"]
     np.random.set_state((saved["kind"], saved["keys"], saved["position"], saved["has_gauss"], saved["gauss"]))

@@ -1,6 +1,6 @@
 """`SB3Trainer`: a run of a stable-baselines3 algorithm that can be stopped, saved and resumed between two updates.
 
-Everything happens where the algorithm asks for its next rollout: the last update is done, the next step not yet taken.
+Progress is reported where the algorithm starts a rollout: the last update is done, and the next step not yet taken.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ from bam_train.trainers.tensorboard_files import TensorBoardFiles
 
 _FINITE = "expected finite numbers: try a smaller learning_rate"
 _REFUSED = ("Expected parameter", "expects all elements of std", "probability tensor")
-"""What torch says of a distribution: weights that are finite can still overflow on their way to it."""
+"""Parts of torch's errors about a distribution: finite weights can still overflow in the network."""
 
 
 class _Stop(Exception):  # noqa: N818 - never leaves this module
@@ -54,9 +54,9 @@ class SB3Trainer:
         env = one_env(venv)
         describe = getattr(env.unwrapped, "describe", None)
         self._signals, self._period = describe() if describe else {}, control_period(env)
-        # The environment's own, before normalisation, image transposition and counting from 0.
-        own = "single_" if isinstance(venv, BatchVecEnv) else ""
-        self._spaces: tuple[Any, Any] = getattr(env, f"{own}observation_space"), getattr(env, f"{own}action_space")
+        # The environment's spaces, before normalisation, image transposition and counting from 0.
+        name = "single_{}_space" if isinstance(venv, BatchVecEnv) else "{}_space"
+        self._spaces: tuple[Any, Any] = getattr(env, name.format("observation")), getattr(env, name.format("action"))
         self._normaliser: VecNormalize | None = model.get_vec_normalize_env()
         self._waiting: resume.Waiting | None = None
         self._on_progress: OnProgress = lambda progress: True
@@ -65,7 +65,7 @@ class SB3Trainer:
 
     @classmethod
     def complete(cls, settings: TrainSettings) -> TrainSettings:
-        """Fill in the algorithm's defaults; where servers run the environments, count them."""
+        """Add the algorithm's defaults, and the number of environments that servers run."""
         if settings.transport:
             with contextlib.closing(make_vector_env(settings.env, {}, 1, settings.place)) as envs:
                 num_envs, seen, acted = envs.num_envs, envs.single_observation_space, envs.single_action_space
@@ -94,7 +94,7 @@ class SB3Trainer:
 
     @classmethod
     def load(cls, checkpoint: Checkpoint, settings: TrainSettings | None = None) -> SB3Trainer:
-        """Set up a run that continues from a checkpoint, with its settings or with these."""
+        """Set up a run that continues from a checkpoint, with the checkpoint's settings or with `settings`."""
         settings = settings or TrainSettings.from_mapping(own_settings(checkpoint), str(checkpoint.path))
         trainer = cls.create(settings)
         require_fit(checkpoint, one_env(trainer.venv), settings.place)
@@ -117,7 +117,7 @@ class SB3Trainer:
 
     @property
     def steps(self) -> int:
-        """Steps trained since the first of the run."""
+        """Steps trained since the start of the run."""
         return int(self.model.num_timesteps)
 
     def train(self, steps: int, on_progress: OnProgress) -> None:
@@ -129,14 +129,14 @@ class SB3Trainer:
         if SB3_ALGORITHMS[self.settings.algo].on_policy:
             log_interval = int(max(1, 2048 // (self.model.n_steps * self.settings.num_envs)))
         with contextlib.suppress(_Stop), self._finite_distributions():
-            # reset_num_timesteps=False: the total is what is left, and a restored episode continues.
-            with np.errstate(over="ignore", invalid="ignore"):  # NaN is looked for, and said once
+            # reset_num_timesteps=False: the total counts the remaining steps, and a restored episode continues.
+            with np.errstate(over="ignore", invalid="ignore"):  # NaN raises TrainingFailed instead of warnings
                 self.model.learn(steps - self.steps, log_interval=log_interval, reset_num_timesteps=False)
             self._between()
 
     @contextlib.contextmanager
     def _finite_distributions(self) -> Iterator[None]:
-        """Torch refuses a distribution of NaN, in the middle of an update too: as our own error."""
+        """Turn torch's errors about a distribution of NaN, also during an update, into TrainingFailed."""
         try:
             yield
         except (ValueError, RuntimeError) as error:
@@ -145,14 +145,14 @@ class SB3Trainer:
             text = f"the policy's weights or actions are NaN or infinite after step {self.steps}; {_FINITE}"
             raise TrainingFailed(text) from error
 
-    def _roll_out(self, collect: Any, *arguments: Any, **named: Any) -> Any:
-        """In place of the algorithm's own `collect_rollouts`: between two updates."""
+    def _roll_out(self, collect: Any, *args: Any, **kwargs: Any) -> Any:
+        """Replacement of the algorithm's `collect_rollouts`, which it calls between two updates."""
         if self._waiting is not None:
             waiting, self._waiting = self._waiting, None
             waiting.restore(self.model)
         if self.steps > self._reported:
             self._between()
-        return collect(*arguments, **named)
+        return collect(*args, **kwargs)
 
     def _between(self) -> None:
         self._reported = self.steps
@@ -165,10 +165,10 @@ class SB3Trainer:
             raise _Stop
 
     def _is_finite(self) -> bool:
-        """Whether every parameter of the policy is a finite number, and the standard deviation of its actions too."""
+        """Whether all parameters of the policy, and the standard deviation of its actions, are finite numbers."""
         log_std = getattr(self.model.policy, "log_std", None)
         numbers = [*self.model.policy.parameters(), *([] if log_std is None else [log_std.exp()])]
-        return all(bool(torch.isfinite(one).all()) for one in numbers)
+        return all(bool(torch.isfinite(tensor).all()) for tensor in numbers)
 
     def _require_finite_weights(self) -> None:
         if not self._is_finite():
@@ -180,8 +180,8 @@ class SB3Trainer:
         numbers = {name: float(value) for name, value in logged if name.startswith("train/")}
         return Statistics(
             episodes=len(episodes),
-            return_mean=float(np.mean([one["r"] for one in episodes])) if episodes else None,
-            length_mean=float(np.mean([one["l"] for one in episodes])) if episodes else None,
+            return_mean=float(np.mean([episode["r"] for episode in episodes])) if episodes else None,
+            length_mean=float(np.mean([episode["l"] for episode in episodes])) if episodes else None,
             success_rate=float(np.mean(successes)) if successes else None,
             metrics={name: value for name, value in numbers.items() if math.isfinite(value)},
         )
@@ -190,9 +190,9 @@ class SB3Trainer:
         """Write a checkpoint that can be resumed and deployed."""
         self._require_finite_weights()
         with self.undisturbed(), self._finite_distributions():
-            theirs = io.BytesIO()  # what stable-baselines3 writes, so that its own `load` opens the checkpoint
-            self.model.save(theirs, exclude=["collect_rollouts"])
-            with zipfile.ZipFile(theirs) as archive:
+            file = io.BytesIO()  # with the members of stable-baselines3, whose `load` can then open the checkpoint
+            self.model.save(file, exclude=["collect_rollouts"])
+            with zipfile.ZipFile(file) as archive:
                 members = {name: archive.read(name) for name in archive.namelist()}
             members["bam/policy.onnx"] = freeze(self.model, self._normaliser, *self._spaces)
             members["bam/golden.safetensors"] = golden(self.model, self._normaliser, *self._spaces)
@@ -201,7 +201,7 @@ class SB3Trainer:
         return write_checkpoint(path, manifest(self.settings, self._spaces, known), members)
 
     def freeze(self) -> FrozenPolicy:
-        """The policy as it is now."""
+        """Freeze the current policy."""
         self._require_finite_weights()
         with self.undisturbed():
             graph = freeze(self.model, self._normaliser, *self._spaces)
@@ -209,7 +209,7 @@ class SB3Trainer:
 
     @contextlib.contextmanager
     def undisturbed(self) -> Iterator[None]:
-        """Do something between two updates that leaves training's random numbers as they were."""
+        """Restore the random number generators of training after the ``with`` block, between two updates."""
         before = resume.random_states(self.model)
         try:
             yield
@@ -218,20 +218,20 @@ class SB3Trainer:
 
     @contextlib.contextmanager
     def evaluation_envs(self) -> Iterator[VectorEnv[Any, Any, Any] | None]:
-        """The environments that training uses, where there can be no others; its running episodes end there."""
+        """The training environments, if no others can be made; their running episodes are then truncated."""
         if not self.settings.transport:
             yield None
             return
         try:
             yield one_env(self.venv)
-        finally:  # with what training observed last, before normalisation; None before its first step
+        finally:  # with training's last observations, before normalisation; None before its first step
             last, normaliser = self.model._last_obs, self._normaliser
             if last is not None and normaliser is not None:
                 last = normaliser.get_original_obs()
             self.venv.interrupt(last)
 
     def log(self, metrics: Mapping[str, float]) -> None:
-        """Put numbers next to the trainer's own in TensorBoard."""
+        """Add numbers to the trainer's in TensorBoard."""
         for name, value in metrics.items():
             self.model.logger.record(name, value)
 

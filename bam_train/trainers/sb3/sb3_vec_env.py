@@ -1,4 +1,4 @@
-"""Environments as stable-baselines3 takes them: `BatchVecEnv` over our batched ones, `DummyVecEnv` over all others."""
+"""Environments for stable-baselines3: `BatchVecEnv` over a batched simulation, `DummyVecEnv` over all others."""
 
 import functools
 from collections.abc import Mapping
@@ -22,7 +22,7 @@ Observations = Any
 
 
 def make_training_env(env_id: str, env_kwargs: Mapping[str, Any], num_envs: int, place: Place = HERE) -> VecEnv:
-    """`num_envs` environments to train on; our own can save and restore their state."""
+    """Make `num_envs` environments to train on; those of `bam_envs` can save and restore their state."""
     if is_batched(env_id) or place.transport:
         return BatchVecEnv(make_vector_env(env_id, env_kwargs, num_envs, place), env_id)
     envs = (FiniteEnv(make_env(env_id, env_kwargs), env_id, index) for index in range(num_envs))
@@ -30,7 +30,7 @@ def make_training_env(env_id: str, env_kwargs: Mapping[str, Any], num_envs: int,
 
 
 def one_env(venv: VecEnv) -> Any:
-    """Our vector environment behind `venv`, or the first of the others."""
+    """The vector environment of a `BatchVecEnv`, or the first environment of a `DummyVecEnv`."""
     if isinstance(venv, BatchVecEnv):
         return venv.batch
     env = venv.envs[0]
@@ -64,7 +64,7 @@ class BatchVecEnv(VecEnv):  # type: ignore[misc]
         return hasattr(self.batch, "state_dict")
 
     def reset(self) -> Observations:
-        """Begin an episode on every environment, with the seeds that `seed` left."""
+        """Begin an episode on every environment, with the seeds of `seed`."""
         seeds: Any = None if all(seed is None for seed in self._seeds) else list(self._seeds)
         observations, _ = self.batch.reset(seed=seeds)
         self._reset_seeds()
@@ -73,7 +73,7 @@ class BatchVecEnv(VecEnv):  # type: ignore[misc]
         return self._copy(observations)
 
     def interrupt(self, last: Observations) -> None:
-        """Truncate the running episodes, which observed `last`, at the next step: an evaluation used them."""
+        """Truncate the running episodes at the next step, with `last` observations, after an evaluation in between."""
         self._interrupted = last
 
     def step_async(self, actions: NDArray[Any]) -> None:
@@ -92,7 +92,7 @@ class BatchVecEnv(VecEnv):  # type: ignore[misc]
         observations, rewards, terminated, truncated, extra = self.batch.step(self._actions)
         done = terminated | truncated
         self._returns += rewards
-        for index in np.flatnonzero(done).tolist():  # in the words of stable-baselines3
+        for index in np.flatnonzero(done).tolist():  # with stable-baselines3's keys
             infos[index] = {
                 "terminal_observation": self._copy(extra["final_obs"], index),
                 "TimeLimit.truncated": not terminated[index],
@@ -104,20 +104,20 @@ class BatchVecEnv(VecEnv):  # type: ignore[misc]
         return self._copy(observations), np.asarray(rewards, dtype=np.float32), done, infos
 
     def _copy(self, observations: Observations, index: Any = ...) -> Any:
-        """A copy, of one environment or all: the environment may write its next observation into the same array."""
+        """Copy the observations of one environment or all, because environments may reuse their arrays."""
         if isinstance(self.observation_space, spaces.Dict):
             return {key: np.array(value[index]) for key, value in observations.items()}
         return np.array(observations[index])
 
     def state_dict(self) -> dict[str, Any]:
-        """Everything their future depends on, as arrays and plain values."""
+        """The complete state of the environments, as arrays and plain values."""
         batch: Any = self.batch
         return {"rows": batch.state_dict(), "returns": self._returns.copy(), "lengths": self.batch.episode_steps.copy()}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Go to what `state_dict` returned."""
+        """Restore a state that `state_dict` returned."""
         batch: Any = self.batch
-        batch.reset()  # builds what a first episode needs before it is overwritten
+        batch.reset()  # allocates the arrays that are then overwritten
         batch.load_state_dict(state["rows"])
         self._returns, self.batch.episode_steps = np.array(state["returns"]), np.array(state["lengths"])
 
@@ -126,19 +126,19 @@ class BatchVecEnv(VecEnv):  # type: ignore[misc]
         self.batch.close()
 
     def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
-        """The vector environment's attribute, for each environment asked for."""
+        """The vector environment's attribute, repeated for each of `indices`."""
         value = getattr(self.batch, attr_name)
         return [value for _ in self._get_indices(indices)]
 
     def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
-        """Set the vector environment's attribute, whichever environments are asked for."""
+        """Set the vector environment's attribute, for all environments."""
         setattr(self.batch, attr_name, value)
 
     def env_method(self, method_name: str, *method_args: Any, indices: Any = None, **method_kwargs: Any) -> list[Any]:
-        """Call the vector environment's method once; its result for each environment asked for."""
+        """Call the vector environment's method once; returns its result for each of `indices`."""
         value = getattr(self.batch, method_name)(*method_args, **method_kwargs)
         return [value for _ in self._get_indices(indices)]
 
     def env_is_wrapped(self, wrapper_class: Any, indices: Any = None) -> list[bool]:
-        """No environment has a wrapper of its own."""
+        """False for each: environments have no wrappers."""
         return [False for _ in self._get_indices(indices)]
