@@ -1,1 +1,1 @@
-"""What only programs written for BBRL or RLlib need."""
+"""Compatibility with programs and files of BBRL and RLlib."""

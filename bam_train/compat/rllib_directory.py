@@ -1,4 +1,4 @@
-"""The folders that RLlib writes checkpoints into: which layout one has, which policies, and where."""
+"""The checkpoint directories of RLlib: their layouts, and the policies in them."""
 
 import json
 import os
@@ -22,17 +22,17 @@ class Directory:
     """One policy in a checkpoint directory."""
 
     given: Path
-    """As the user named it."""
+    """The path that the user gave."""
     root: Path | None
-    """Of the whole algorithm; None if only the policy is there."""
+    """The folder of the whole algorithm; None if only the policy exists."""
     policy: Path
     """The folder with the policy's weights."""
     name: str
-    """Of the policy."""
+    """Name of the policy."""
     old_layout: bool
-    """Whether it has ``policies/<name>/policy_state.pkl``, as RLlib's old API stack writes it."""
+    """Whether it has the ``policies/<name>/policy_state.pkl`` of RLlib's old API stack."""
     ray_version: str
-    """That wrote it; "" if it does not say."""
+    """Version of Ray that wrote it; "" if unknown."""
 
     def altered(self, path: Path, text: str) -> AlteredCheckpoint:
         """The error for a file that cannot be used."""
@@ -42,10 +42,10 @@ class Directory:
         return AlteredCheckpoint(self.given, member, f"{member} {text}")
 
     def read_bytes(self, path: Path) -> bytes:
-        """A file's content.
+        """Read a file.
 
         Raises:
-            AlteredCheckpoint: It is missing, no file, or too large.
+            AlteredCheckpoint: It is missing, not a regular file, or too large.
         """
         try:
             return _content(path, 2**31)
@@ -60,11 +60,11 @@ def find_policy(given: Path, name: str | None = None) -> Directory:
 
     Args:
         given: The directory.
-        name: Of the policy, where there are several.
+        name: Name of the policy, if there are several.
 
     Raises:
-        NotACheckpoint: No such directory, or none of RLlib's.
-        CheckpointMismatch: Several policies and no name, or none of this name, or of a version that is not known.
+        NotACheckpoint: The directory is missing, or not of RLlib.
+        CheckpointMismatch: There are several policies and no name, no policy of this name, or an unknown version.
     """
     given = given.expanduser()
     try:
@@ -85,8 +85,8 @@ def find_policy(given: Path, name: str | None = None) -> Directory:
         raise CheckpointMismatch(given, f"has {len(policies)} policies; choose one with --policy: {names}")
     name = name or next(iter(policies))
     facts = (_facts(root) if root else {}) or _facts(policies[name])
-    words = [str(facts.get(key, "")) for key in ("checkpoint_version", "ray_version")]  # which may be anything
-    version, by = ("".join(one for one in word if one.isprintable() and one != " ")[:40] for word in words)
+    words = [str(facts.get(key, "")) for key in ("checkpoint_version", "ray_version")]  # any text
+    version, by = ("".join(c for c in word if c.isprintable() and c != " ")[:40] for word in words)
     if version and version not in _VERSIONS:
         by = f" by Ray {by}" if by else ""
         text = f"was written{by} in checkpoint version {version}; expected one of {', '.join(_VERSIONS)}"
@@ -100,7 +100,7 @@ def _policies(given: Path) -> tuple[Path | None, dict[str, Path], bool]:
         root = given.parent.parent if given.parent.name == "policies" else None
         return root if root and (root / "algorithm_state.pkl").is_file() else None, {given.name: given}, True
     if (given / "policies").is_dir():
-        return given, {one.name: one for one in sorted((given / "policies").iterdir()) if one.is_dir()}, True
+        return given, {path.name: path for path in sorted((given / "policies").iterdir()) if path.is_dir()}, True
     for below in _MODULES:
         if (given / below).is_dir():
             return _root_of(given / below), _modules(given / below), False
@@ -111,13 +111,13 @@ def _policies(given: Path) -> tuple[Path | None, dict[str, Path], bool]:
 
 
 def _modules(folder: Path) -> dict[str, Path]:
-    """The folders of modules in the folder of a MultiRLModule; one folder of a module alone is its own."""
-    found = {one.name: one for one in sorted(folder.iterdir()) if (one / MODULE).is_file()}
-    return found or ({folder.name: folder} if (folder / MODULE).is_file() else {})
+    """The folders of modules by name: those in the folder of a MultiRLModule, or the folder of a single module."""
+    inner = {path.name: path for path in sorted(folder.iterdir()) if (path / MODULE).is_file()}
+    return inner or ({folder.name: folder} if (folder / MODULE).is_file() else {})
 
 
 def _root_of(modules: Path) -> Path | None:
-    """The algorithm's folder above the folder of all modules, if it is there."""
+    """The algorithm's folder above the folder of all modules, if it exists."""
     for below in _MODULES:
         if modules.as_posix().endswith(f"/{below}"):
             root = modules.parents[below.count("/")]
@@ -126,7 +126,7 @@ def _root_of(modules: Path) -> Path | None:
 
 
 def _facts(folder: Path) -> dict[str, Any]:
-    """What ``rllib_checkpoint.json`` or ``metadata.json`` says; {} if there is none."""
+    """The content of ``rllib_checkpoint.json`` or ``metadata.json``; {} if there is none."""
     for name in ("rllib_checkpoint.json", "metadata.json"):
         try:
             facts = json.loads(_content(folder / name, 2**20))
@@ -145,7 +145,7 @@ def _facts(folder: Path) -> dict[str, Any]:
 
 
 def _content(path: Path, most: int) -> bytes:
-    """Read a file; a pipe or a device, which may never end, is refused unopened."""
+    """Read a regular file; others, such as endless pipes and devices, are refused without opening them."""
     found = path.stat()
     if not stat.S_ISREG(found.st_mode):
         raise OSError(None, "it is not a file")
@@ -155,8 +155,8 @@ def _content(path: Path, most: int) -> bytes:
 
 
 def _not_rllib(given: Path) -> str:
-    """What is wrong with a directory without policies."""
-    inside = sorted(one.name for one in given.glob("checkpoint_*") if one.is_dir())
+    """The error message for a directory without policies."""
+    inside = sorted(path.name for path in given.glob("checkpoint_*") if path.is_dir())
     if inside:
         return f"is a folder of {len(inside)} checkpoints; give one of them, such as {given / inside[-1]}"
     below = [given, *(given / name for name in ("learner_group", *_MODULES, "policies", "env_runner"))]

@@ -1,7 +1,7 @@
-"""From a checkpoint directory of RLlib to a checkpoint.zip that can be evaluated and deployed, and resumed if whole.
+"""Export a checkpoint directory of RLlib as a checkpoint.zip that can be evaluated and deployed, and resumed if whole.
 
-A directory of RLlib's present API is restored by the installed RLlib, which runs what is in it, so only with ``trust``;
-one of the old layout is read without running anything.
+A directory of RLlib's current API is restored by the installed RLlib, which runs the code in it, so only with
+``trust``; a directory of the old layout is read without running code.
 """
 
 import contextlib
@@ -45,16 +45,16 @@ from bam_train.trainers.rllib.rllib_freezing import AnySpace, FrozenModule, Poli
 from bam_train.trainers.zero_based_spaces import space_from_zero
 
 EXPORTED = "exported"
-"""Setting of the manifest that says where an exported checkpoint comes from; a run's own has none of this name."""
+"""Setting of the manifest with the source of an exported checkpoint; runs have no setting of this name."""
 
 
 @dataclass(frozen=True)
 class Exported:
-    """A policy out of a directory, frozen and checked."""
+    """A policy of a directory, frozen and checked."""
 
     directory: Directory
     parts: PolicyParts
-    """Its spaces are the environment's own."""
+    """The parts, with the environment's spaces."""
     env: str
     """Versioned id."""
     env_kwargs: dict[str, Any]
@@ -62,14 +62,14 @@ class Exported:
     signals: dict[str, Any]
     period: float | None
     members: dict[str, bytes]
-    """The graph, and the observations and actions that it was checked against."""
+    """The graph, and the golden observations and actions."""
     checked_by: str
-    """What computed those actions: RLlib with its version, or PyTorch."""
+    """The software that computed the golden actions: RLlib with its version, or PyTorch."""
     difference: float
-    """The largest difference from them."""
+    """The largest difference from the golden actions."""
     policy: FrozenPolicy
     training: TrainSettings | str
-    """Settings of a run that goes on from it, or why there is none."""
+    """Settings of a run that continues from it, or the reason why none can."""
 
     def write(self, path: Path) -> Checkpoint:
         """Write the checkpoint.zip; raises OutputError if it cannot be written there."""
@@ -84,10 +84,10 @@ class Exported:
         if isinstance(self.training, TrainSettings):
             settings |= self.training.to_mapping()
             members = {**members, **states(self.directory)}
-            made_by["versions"] = {**made_by["versions"], "ray": self.directory.ray_version}  # whose states they are
-        own = {name: getattr(self, name) for name in ("env", "env_kwargs", "signals", "period", "steps")}
+            made_by["versions"] = {**made_by["versions"], "ray": self.directory.ray_version}  # of these states
+        facts = {name: getattr(self, name) for name in ("env", "env_kwargs", "signals", "period", "steps")}
         fields = {
-            **own,
+            **facts,
             "observation_space": self.policy.observation_space,
             "action_space": self.policy.action_space,
             "algorithm": self.parts.algorithm,
@@ -115,13 +115,13 @@ def export(
 
     Args:
         given: The directory, of an algorithm or of a policy.
-        env: Its environment, where the directory does not say it or means another.
-        env_kwargs: Arguments of the environment; they win over the directory's.
-        algo: Its algorithm, where the directory does not say it.
-        policy: Its name, where there are several.
-        otherwise: Its environment, where neither `env` nor the directory says it.
-        trust: Files that only their own code can read are unpickled, which runs it.
-        warn: Told before that is done, and what else the user should know.
+        env: The environment, if the directory does not name it or names another.
+        env_kwargs: Arguments of the environment, which override the directory's.
+        algo: The algorithm, if the directory does not name it.
+        policy: The policy's name, if there are several.
+        otherwise: The environment, if neither `env` nor the directory names it.
+        trust: Whether to unpickle a directory of the current API, which runs the code in it.
+        warn: Called with messages for the user, and before anything is unpickled.
 
     Raises:
         CheckpointError: The directory cannot be used.
@@ -174,42 +174,42 @@ def _read(directory: Directory, trust: bool, warn: Callable[[str], None]) -> Sav
 
 
 def _algorithm(saved: SavedPolicy, asked: str | None) -> str:
-    """Name of the algorithm; the directory of a policy alone only says whose network it has."""
-    own = saved.parts.algorithm if re.fullmatch(r"\w{1,40}", saved.parts.algorithm, re.ASCII) else ""
-    asked = None if asked is None else asked.lower()  # PPO, as RLlib says it
+    """Name of the algorithm; the directory of a policy alone has only the algorithm of the network's class."""
+    known = saved.parts.algorithm if re.fullmatch(r"\w{1,40}", saved.parts.algorithm, re.ASCII) else ""
+    asked = None if asked is None else asked.lower()  # such as RLlib's name PPO
     if asked is not None and asked not in RLLIB_ALGORITHMS:
         raise UnknownName("algorithm", asked, RLLIB_ALGORITHMS)
-    if asked is None and not own:
+    if asked is None and not known:
         raise CheckpointMismatch(saved.directory.given, "does not say which algorithm trained it; give --algo NAME")
-    if asked is not None and own and asked != own and saved.configured:
-        raise CheckpointMismatch(saved.directory.given, f"was trained by {own}, not by {asked}; leave --algo out")
-    return asked or own
+    if asked is not None and known and asked != known and saved.configured:
+        raise CheckpointMismatch(saved.directory.given, f"was trained by {known}, not by {asked}; leave --algo out")
+    return asked or known
 
 
 def _environment(
     saved: SavedPolicy, asked: str | None, trust: bool, warn: Callable[[str], None]
 ) -> tuple[str, dict[str, Any]]:
-    """Id and keyword arguments of the environment that was asked for, else of the directory's."""
-    own, given = _own_environment(saved, asked, trust), saved.directory.given
-    if asked is None and own is None:
+    """Id and keyword arguments of the environment `asked`, or else of the directory's."""
+    trained, given = _trained_environment(saved, asked, trust), saved.directory.given
+    if asked is None and trained is None:
         raise CheckpointMismatch(given, "does not say on which environment it was trained; give --env ID")
-    env = resolve_id(asked) if asked is not None else str(own)
+    env = resolve_id(asked) if asked is not None else str(trained)
     names = ", ".join(map(str, saved.env_kwargs))
-    if own is None or not are_same(env, own):
+    if trained is None or not are_same(env, trained):
         if names:
             warn(f"the env_config of its own environment ({names:.200}) is not given to {env}")
         return env, {}
     try:
-        own_kwargs = json.dumps(dict(saved.env_kwargs), allow_nan=False, default=lambda array: array.tolist())
+        text = json.dumps(dict(saved.env_kwargs), allow_nan=False, default=lambda array: array.tolist())
     except (TypeError, ValueError, RecursionError, AttributeError) as error:
         text = f"its env_config holds more than plain values ({names}), which cannot be kept; train with plain ones"
         raise CheckpointMismatch(given, text) from error
-    kept = json.loads(own_kwargs).items()
+    kept = json.loads(text).items()
     return env, {name: value for name, value in kept if entry_of(env) is None or name not in PLACES}
 
 
-def _own_environment(saved: SavedPolicy, asked: str | None, trust: bool) -> str | None:
-    """The environment that the directory names, if it is known here; its module is imported if the user says so."""
+def _trained_environment(saved: SavedPolicy, asked: str | None, trust: bool) -> str | None:
+    """The environment that the directory names, if it is known here; its module is imported only with consent."""
     name, given = saved.env, saved.directory.given
     module = (name or "").rpartition(":")[0]
     if name is None or (asked is not None and module and asked != name):
@@ -229,7 +229,7 @@ def _own_environment(saved: SavedPolicy, asked: str | None, trust: bool) -> str 
 def _in_environment(
     saved: SavedPolicy, env_id: str, warn: Callable[[str], None], env_kwargs: dict[str, Any]
 ) -> tuple[PolicyParts, dict[str, Any], float | None]:
-    """The parts with the environment's own spaces, if the policy was trained with these, its signals and its period."""
+    """The parts with the environment's spaces, its signals and its period; raises CheckpointMismatch if they differ."""
     with contextlib.closing(make_env(env_id, env_kwargs)) as env:
         describe = getattr(env.unwrapped, "describe", None)
         signals, period = describe() if describe else {}, control_period(env)
@@ -238,8 +238,8 @@ def _in_environment(
     pairs = [("action_space", parts.action_space, ours[1])]
     if saved.whole:
         pairs.append(("observation_space", parts.observation_space, ours[0]))
-    for name, theirs, own in pairs:  # the trainer may have seen whole numbers counted from 0
-        there, here = (space_to_json(space_from_zero(space)) for space in (theirs, own))
+    for name, *both in pairs:  # the trainer may have used whole numbers that count from 0
+        there, here = (space_to_json(space_from_zero(space)) for space in both)
         differing = first_difference(there, here, name)
         if differing is not None:
             text = f"{differing[0]} is {_short(differing[1])} in the directory and {_short(differing[2])} in {env_id}"
@@ -254,7 +254,7 @@ _GIVE_ENV = "give the environment it was trained on with --env"
 
 
 def _guessed(saved: SavedPolicy, env_id: str, ours: AnySpace, warn: Callable[[str], None]) -> PolicyParts:
-    """Parts of a policy alone: its directory does not say what came before and after the network."""
+    """The parts of a policy whose directory lacks the connectors before and after the network."""
     parts, given = saved.parts, saved.directory.given
     theirs = parts.observation_space
     if space_to_json(theirs) == space_to_json(ours):
@@ -271,7 +271,7 @@ def _guessed(saved: SavedPolicy, env_id: str, ours: AnySpace, warn: Callable[[st
 
 
 def _space(space: AnySpace) -> str:
-    """A space in short."""
+    """A short text for a space."""
     return f"{type(space).__name__}{space.shape}" if isinstance(space, spaces.Box) else _short(space_to_json(space))
 
 

@@ -1,8 +1,8 @@
-"""One policy in a checkpoint directory of RLlib, of its present API or of its old API stack.
+"""One policy in a checkpoint directory of RLlib, of its current API or of its old API stack.
 
-A directory of the present API is restored by the installed RLlib itself, which runs what is in it. Today's Ray cannot
-read what the old API stack wrote (robo-gym's own scripts used Ray 2.10), so ``policy_state.pkl`` is read here, without
-running what is in it, and its network is built from the names of its weights: dense layers, of SAC and CQL the actor's.
+A directory of the current API is restored by the installed RLlib itself, which runs the code in it. Today's Ray cannot
+read directories of the old API stack (robo-gym's scripts used Ray 2.10), so ``policy_state.pkl`` is read here, without
+running its code, and the network is built from the names of its weights: dense layers, for SAC and CQL the actor's.
 """
 
 import json
@@ -35,22 +35,22 @@ from bam_train.trainers.rllib.state_pickles import read_state, unpacked_array
 
 @dataclass(frozen=True)
 class SavedPolicy:
-    """What a directory holds of one policy."""
+    """One policy in a directory."""
 
     directory: Directory
     parts: PolicyParts
-    """Its spaces are the environment's own if the directory has them, else the network's."""
+    """The parts, with the environment's spaces if the directory has them, else the network's."""
     env: str | None
-    """Name of the environment; None if the directory does not say it."""
+    """Name of the environment; None if the directory does not have it."""
     env_kwargs: Mapping[str, Any]
     steps: int
     """Environment steps trained; 0 if unknown."""
     whole: bool
-    """Whether the directory says what RLlib's connectors do before and after the network."""
+    """Whether the directory has RLlib's connectors before and after the network."""
     configured: bool = True
     """Whether the directory has the configuration of its algorithm."""
     module: Any = field(default=None, repr=False)
-    """The RLModule; None of the old layout."""
+    """The RLModule; None for the old layout."""
     env_to_module: Any = field(default=None, repr=False)
     """The env runner's pipeline; None if the directory has none."""
     config: Any = field(default=None, repr=False)
@@ -58,19 +58,19 @@ class SavedPolicy:
 
 
 def _named(env: Any, env_kwargs: Any) -> tuple[str | None, dict[str, Any]]:
-    """Environment and arguments of a configuration, which may also hold a class and a function's result."""
+    """Environment and arguments of a configuration, if they are a name and a mapping."""
     return env if isinstance(env, str) else None, dict(env_kwargs) if isinstance(env_kwargs, Mapping) else {}
 
 
-# The present API
+# The current API
 
 
 def restore(directory: Directory) -> SavedPolicy:
-    """Let RLlib read the directory, which runs what is in it.
+    """Restore a directory with RLlib, which runs the code in it.
 
     Raises:
-        AlteredCheckpoint: RLlib cannot.
-        PolicyError: It has a connector or network that cannot be frozen.
+        AlteredCheckpoint: RLlib cannot read the directory.
+        PolicyError: A connector or the network cannot be frozen.
     """
     from ray.rllib.algorithms.algorithm_config import AlgorithmConfig
     from ray.rllib.connectors.env_to_module import EnvToModulePipeline
@@ -98,7 +98,7 @@ def restore(directory: Directory) -> SavedPolicy:
     if before is not None:
         env_spaces = before.input_observation_space, before.input_action_space
     parts = parts_of(module, before, config, env_spaces)
-    if not parts.algorithm:  # whose module it is; some have that of another, such as IMPALA PPO's
+    if not parts.algorithm:  # that of the module's class, although IMPALA, for example, uses PPO's
         match = re.match(r"ray\.rllib\.algorithms\.(\w+)\.", type(module).__module__)
         parts = replace(parts, algorithm=match[1] if match else "")
     env, env_kwargs = _named(config.env, config.env_config)
@@ -107,7 +107,7 @@ def restore(directory: Directory) -> SavedPolicy:
 
 
 def _restored(directory: Directory, folder: Path, kind: Any) -> Any:
-    """The object that RLlib restores of a folder; None if there is no such folder."""
+    """The object that RLlib restores from a folder; None if there is no such folder."""
     path = folder / ARGUMENTS
     return _ran(directory, path, lambda: kind.from_checkpoint(str(folder))) if path.is_file() else None
 
@@ -118,7 +118,7 @@ def _unpickled(directory: Directory, path: Path) -> Any:
 
 
 def _ran(directory: Directory, path: Path, read: Callable[[], Any]) -> Any:
-    """What reading a file gives, which is a program that may raise anything."""
+    """The result of reading a file, a program that may raise any exception."""
     try:
         return read()
     except Exception as error:
@@ -128,20 +128,20 @@ def _ran(directory: Directory, path: Path, read: Callable[[], Any]) -> Any:
 
 
 def training_settings(saved: SavedPolicy, parts: PolicyParts, env: str, env_kwargs: Mapping[str, Any]) -> TrainSettings:
-    """The settings of a run that goes on where the directory's algorithm stopped.
+    """The settings of a run that continues the directory's algorithm.
 
-    `parts` are those of `saved` with the environment's own spaces; `env` is a versioned id.
+    `parts` are those of `saved` with the environment's spaces; `env` is a versioned id.
 
     Raises:
-        SettingsError: There is no such run here; says why.
+        SettingsError: No run of bam-train corresponds to it; the message has the reason.
     """
     if saved.module is None:
         raise SettingsError("it is not of RLlib's present API")
     from bam_train.trainers.rllib.rllib_hyperparameters import complete, is_plain
 
     algorithm, name = RLLIB_ALGORITHMS.get(parts.algorithm), saved.directory.name
-    own_module = type(saved.module).__module__.startswith("ray.rllib.algorithms.")
-    if not saved.configured or algorithm is None or algorithm.offline or name != POLICY_ID or not own_module:
+    is_rllibs = type(saved.module).__module__.startswith("ray.rllib.algorithms.")
+    if not saved.configured or algorithm is None or algorithm.offline or name != POLICY_ID or not is_rllibs:
         raise SettingsError("it is no whole algorithm with one policy of RLlib's own that learns in an environment")
     as_here = parts.flatten != is_plain(parts.observation_space) and not (parts.flatten and parts.filter_first)
     if not as_here or not parts.normalize_actions:
@@ -149,10 +149,10 @@ def training_settings(saved: SavedPolicy, parts: PolicyParts, env: str, env_kwar
     config, model = saved.config, saved.module.model_config
     model = model if isinstance(model, Mapping) else vars(model)
     names = complete(algorithm, {})
-    own = {name: getattr(config, name) for name in names if _is_json(getattr(config, name, object()))}
-    own["train_batch_size_per_learner"] = config.train_batch_size_per_learner
-    own["model_config"] = {name: model[name] for name in names["model_config"] if name in model}
-    given = parts.filter
+    values = {name: getattr(config, name) for name in names if _is_json(getattr(config, name, object()))}
+    values["train_batch_size_per_learner"] = config.train_batch_size_per_learner
+    values["model_config"] = {name: model[name] for name in names["model_config"] if name in model}
+    filter_ = parts.filter
     return TrainSettings.from_mapping(
         {
             "env": env,
@@ -164,9 +164,9 @@ def training_settings(saved: SavedPolicy, parts: PolicyParts, env: str, env_kwar
             "num_envs": config.num_envs_per_env_runner * max(1, config.num_env_runners),
             "num_env_runners": config.num_env_runners,
             "num_learners": config.num_learners,
-            "normalize": given is not None
-            and {"clip_by_value": given.limit, "de_mean_to_zero": given.center, "de_std_to_one": given.scale},
-            "hyperparameters": complete(algorithm, json.loads(json.dumps(own))),
+            "normalize": filter_ is not None
+            and {"clip_by_value": filter_.limit, "de_mean_to_zero": filter_.center, "de_std_to_one": filter_.scale},
+            "hyperparameters": complete(algorithm, json.loads(json.dumps(values))),
         }
     )
 
@@ -180,10 +180,10 @@ def _is_json(value: Any) -> bool:
 
 
 def states(directory: Directory) -> dict[str, bytes]:
-    """The states of a whole algorithm as members of a checkpoint; how objects are made is left out.
+    """The states of a whole algorithm as members of a checkpoint, without the pickles that construct objects.
 
     Raises:
-        CheckpointError: One cannot be read.
+        CheckpointError: A state cannot be read.
     """
     from bam_train.trainers.rllib.rllib_state import FOLDER, NOTES, STATES
 
@@ -203,11 +203,11 @@ _MALFORMED = (AttributeError, LookupError, TypeError, ValueError, AssertionError
 
 
 def read_old_policy(directory: Directory) -> SavedPolicy:
-    """Read the policy without running anything.
+    """Read a policy of the old API stack, without running code.
 
     Raises:
         CheckpointError: Its file is missing or damaged.
-        PolicyError: Something in it cannot be frozen.
+        PolicyError: A part of it cannot be frozen.
     """
     path = directory.policy / OLD_STATE
     try:
@@ -235,17 +235,17 @@ def _old_policy(directory: Directory, state: Mapping[str, Any]) -> SavedPolicy:
         raise PolicyError("SAC of the old API stack without normalize_actions has a Beta distribution: not frozen")
     connectors = state.get("connector_configs") or {}
     before, after = (connectors.get(kind, ("", []))[1] for kind in ("agent", "action"))
-    after_names = [one for one, _ in after]
-    strange = [one for one, _ in before if one not in (*_BEFORE, *_FILTERS, "ClipRewardAgentConnector")]
-    for one in strange + [one for one in after_names if one not in _AFTER]:
-        raise PolicyError(f"connector {one} cannot be frozen; expected those that RLlib adds itself")
-    does = config
+    after_names = [kind for kind, _ in after]
+    strange = [kind for kind, _ in before if kind not in (*_BEFORE, *_FILTERS, "ClipRewardAgentConnector")]
+    for kind in strange + [kind for kind in after_names if kind not in _AFTER]:
+        raise PolicyError(f"connector {kind} cannot be frozen; expected those that RLlib adds itself")
+    actions = config
     if after_names:
-        does = {f"{one}_actions": f"{one.title()}ActionsConnector" in after_names for one in ("normalize", "clip")}
+        actions = {f"{do}_actions": f"{do.title()}ActionsConnector" in after_names for do in ("normalize", "clip")}
     filters = [
-        Filter.of(one["running_stats"][0], one["clip"], one["demean"], one["destd"])
-        for name, one in before
-        if name in _FILTERS
+        Filter.of(state["running_stats"][0], state["clip"], state["demean"], state["destd"])
+        for kind, state in before
+        if kind in _FILTERS
     ]
     model = {**config["model"], **(config.get("policy_model_config") or {})}
     parts = PolicyParts(
@@ -255,21 +255,21 @@ def _old_policy(directory: Directory, state: Mapping[str, Any]) -> SavedPolicy:
         network=_network(state["weights"], model, squashed),
         filter=filters[0] if filters else None,
         flatten=not (isinstance(space, spaces.Box) and len(space.shape) == 1),
-        normalize_actions=bool(does.get("normalize_actions")),
-        clip_actions=bool(does.get("clip_actions")),
+        normalize_actions=bool(actions.get("normalize_actions")),
+        clip_actions=bool(actions.get("clip_actions")),
     )
     env, env_kwargs = _named(config.get("env"), config.get("env_config"))
     return SavedPolicy(directory, parts, env, env_kwargs, int(state.get("global_timestep") or 0), whole=True)
 
 
 def _space(value: Mapping[str, Any]) -> AnySpace:
-    """The space that `space_to_dict` of the old stack describes, before any preprocessor."""
+    """The space before any preprocessor, from `space_to_dict` of the old stack."""
     value = value.get("original_space", value)
     fields = value["space"] if isinstance(value["space"], Mapping) else value
     kind = fields["space"]
     if kind == "box":
         low, high, shape = unpacked_array(fields["low"]), unpacked_array(fields["high"]), tuple(fields["shape"])
-        if not low.shape == high.shape == shape:  # a number would be spread over a shape of any size
+        if not low.shape == high.shape == shape:  # a number would be broadcast to a shape of any size
             raise FormatError(f"has bounds of shapes {low.shape} and {high.shape} for shape {shape}")
         return spaces.Box(low, high, shape=shape, dtype=np.dtype(fields["dtype"]).type)
     if kind == "discrete":
@@ -283,7 +283,7 @@ def _space(value: Mapping[str, Any]) -> AnySpace:
 
 
 def _network(weights: Mapping[str, Any], model: Mapping[str, Any], squashed: bool) -> nn.Module:
-    """`FullyConnectedNetwork`: every layer is a `SlimFC`, a linear layer and its activation."""
+    """Build RLlib's `FullyConnectedNetwork`, whose layers are `SlimFC`, a linear layer and its activation."""
     for name in ("custom_model", "custom_action_dist", "use_lstm", "use_attention"):
         if model.get(name):
             raise PolicyError(f"a network of the old API stack with {name} cannot be frozen")

@@ -1,1 +1,1 @@
-"""What only programs written for BBRL need; they import it from `bam_train.loop`."""
+"""Compatibility with programs written for BBRL, which import these names from `bam_train.loop`."""

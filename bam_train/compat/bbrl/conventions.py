@@ -1,7 +1,7 @@
-"""Conventions of BBRL: agents that take a time, a seed, or can be saved, and objects from configurations.
+"""Conventions of BBRL: agents with a time, a seed, or a file, and objects from configurations.
 
-A configuration names a class, ``{"classname": "package.module.Class", "size": 3}``. It is a mapping, or an object with
-attributes such as OmegaConf's, and is never changed.
+A configuration names a class, as ``{"classname": "package.module.Class", "size": 3}``. It is a mapping, or an object
+with attributes such as OmegaConf's, and is never changed.
 """
 
 import importlib
@@ -20,38 +20,38 @@ class TimeAgent(Agent):
 
 
 class SeedableAgentLast(SeedableAgent):
-    """An agent that has the last seed it was given."""
+    """An agent that uses the last of its seeds."""
 
     _combined: Any = staticmethod(lambda seeds: seeds[-1])
 
     def seed(self, seed: int) -> Any:
-        """Take the seed; the agent itself is returned."""
+        """Add a seed; returns the agent."""
         self._seeds = [*getattr(self, "_seeds", ()), seed]
         self._seed = self._combined(self._seeds)
         return self
 
 
 class SeedableAgentSum(SeedableAgentLast):
-    """An agent that has the sum of the seeds it was given."""
+    """An agent that uses the sum of its seeds."""
 
     _combined = staticmethod(sum)
 
 
 class SeedableAgentMean(SeedableAgentLast):
-    """An agent that has the mean of the seeds it was given, rounded down to a whole number."""
+    """An agent that uses the mean of its seeds, rounded down to a whole number."""
 
     _combined = staticmethod(lambda seeds: sum(seeds) // len(seeds))
 
 
 class SerializableAgent(Agent):
-    """An agent that can be saved; override `serialize` to leave out what cannot."""
+    """An agent that can be saved; override `serialize` to leave out attributes that cannot be pickled."""
 
     def serialize(self) -> Any:
-        """What is saved: the agent without what cannot be pickled."""
+        """The object to save: the agent without attributes that cannot be pickled."""
         return self
 
     def save(self, filename: str | Path) -> None:
-        """Pickle `serialize` into a file: `LoopError` if it cannot be pickled, `OutputError` if not written."""
+        """Pickle `serialize` into a file; raises LoopError if it cannot be pickled, OutputError if not written."""
         try:
             data = pickle.dumps(self.serialize())
         except (pickle.PicklingError, TypeError, AttributeError) as error:
@@ -63,7 +63,7 @@ class SerializableAgent(Agent):
 
 
 def load(filename: str | Path) -> Any:
-    """The agent in a file of `SerializableAgent.save`. It is a pickle and runs what is in it: trust its maker."""
+    """Load an agent of `SerializableAgent.save`, from a pickle, which can run any code: load only files you trust."""
     try:
         return pickle.loads(Path(filename).expanduser().read_bytes())
     except (OSError, pickle.UnpicklingError, EOFError) as error:
@@ -71,7 +71,7 @@ def load(filename: str | Path) -> Any:
 
 
 def get_class(arguments: Any) -> Any:
-    """The class (or function) that a configuration's `classname` names.
+    """Import the class (or function) that the `classname` of a configuration names.
 
     Raises:
         SettingsError: There is no `classname`, or it cannot be imported.
@@ -87,7 +87,7 @@ def get_class(arguments: Any) -> Any:
     except ModuleNotFoundError as error:
         raise SettingsError(f"classname {path!r}: {error}; install it or correct the name.") from error
     if not hasattr(module, name):
-        names = [one for one in dir(module) if not one.startswith("_")]
+        names = [public for public in dir(module) if not public.startswith("_")]
         raise SettingsError(
             f"classname {path!r}: module {module.__name__!r} has no {name!r}. {did_you_mean(name, names)}"
         )
@@ -95,7 +95,7 @@ def get_class(arguments: Any) -> Any:
 
 
 def get_arguments(arguments: Any) -> dict[str, Any]:
-    """Every entry of a configuration but its `classname`, in a new dict."""
+    """The entries of a configuration without its `classname`, in a new dict."""
     return {name: value for name, value in _entries(arguments).items() if name != "classname"}
 
 

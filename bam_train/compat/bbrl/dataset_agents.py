@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 
 class _DatasetAgent(Agent):
-    """Writes batches, on the device where the agent is (`to`); refuses those with fewer values than it has names."""
+    """Writes batches, on the device of the agent (`to`); refuses batches with fewer values than names."""
 
     reads = ()
 
@@ -35,7 +35,7 @@ class _DatasetAgent(Agent):
             self.set((name, 0), torch.as_tensor(value).to(self.ghost_params.device))
 
     def _values(self, batch: Any) -> list[Any]:
-        """The values that the names stand for, of a tuple, a mapping or one tensor."""
+        """The values of a tuple, a mapping or one tensor for the names."""
         names = self.output_names
         if isinstance(batch, Mapping):
             missing = [name for name in names if name not in batch]
@@ -53,7 +53,7 @@ class _DatasetAgent(Agent):
 
 
 class DataLoaderAgent(_DatasetAgent):
-    """Writes the next batch of a data loader at each call; after the last one nothing, and `finished` is True.
+    """Writes the next batch of a data loader at each call; after the last one, `finished` is True.
 
     ::
 
@@ -63,8 +63,8 @@ class DataLoaderAgent(_DatasetAgent):
             agent(workspace)
 
     Args:
-        dataloader: A ``torch.utils.data.DataLoader``, or anything that can be iterated over again and again.
-        output_names: Variables for the values of a batch, B x ... each; further values are left out.
+        dataloader: A ``torch.utils.data.DataLoader``, or another iterable that can be iterated repeatedly.
+        output_names: Variables for the values of a batch, B x ... each; further values are ignored.
     """
 
     def __init__(self, dataloader: Any, output_names: Sequence[str] = ("x", "y")) -> None:
@@ -73,12 +73,12 @@ class DataLoaderAgent(_DatasetAgent):
         self.reset()
 
     def reset(self) -> None:
-        """Begin again with the first batch."""
+        """Restart with the first batch."""
         self.iter = iter(self.dataloader)
         self._finished = False
 
     def finished(self) -> bool:
-        """Whether the last call found no batch, and wrote nothing."""
+        """Whether there was no batch for the last call, which wrote nothing."""
         return self._finished
 
     def forward(self, **kwargs: Any) -> None:
@@ -92,12 +92,12 @@ class DataLoaderAgent(_DatasetAgent):
 
 
 class ShuffledDatasetAgent(_DatasetAgent):
-    """Writes items of a dataset at each call, drawn uniformly with replacement, for ever.
+    """Writes items of a dataset at each call, drawn uniformly with replacement.
 
     Args:
         dataset: A ``torch.utils.data.Dataset`` with a length, whose items are tuples of tensors or numbers.
         batch_size: The number of items of each batch.
-        output_names: Variables for the values of an item, batch_size x ... each; further values are left out.
+        output_names: Variables for the values of an item, batch_size x ... each; further values are ignored.
     """
 
     def __init__(self, dataset: Any, batch_size: int, output_names: Sequence[str] = ("x", "y")) -> None:
@@ -107,7 +107,7 @@ class ShuffledDatasetAgent(_DatasetAgent):
         self._rng: np.random.Generator | None = None
 
     def seed(self, seed: int | None = None) -> Self:
-        """Draw from a generator of its own from now on, not from torch's; None gives other batches every time."""
+        """Draw from the agent's own generator from now on, instead of torch's; None seeds it at random."""
         self._rng = np.random.default_rng(check(seed, NonNegativeInt | None, "seed", WorkspaceError))
         return self
 

@@ -1,8 +1,8 @@
 """The gym agents of BBRL up to 0.3 (``bbrl.agents.gyma``), with their arguments and variables.
 
-Differences from bbrl 0.3: the environments are Gymnasium's, whose time limit is a flag of its own; ``truncated`` is
-what ``info["TimeLimit.truncated"]`` was: the time limit, unless the task ended in the same step. ``env/rendering`` is a
-uint8 tensor B x height x width x 3. An action must be there and fit at every t > 0.
+Differences from bbrl 0.3: the environments are Gymnasium's, whose time limit is a separate flag; ``truncated`` is the
+former ``info["TimeLimit.truncated"]``: the time limit, unless the task ended in the same step. ``env/rendering`` is a
+uint8 tensor B x height x width x 3. At every t > 0 an action is required that fits the action space.
 """
 
 from collections.abc import Callable, Mapping
@@ -19,8 +19,8 @@ from bam_train.loop.gym.parallel_gym_agent import Env, ParallelGymAgent, has_aut
 class _OldGymAgent(ParallelGymAgent):
     """Writes env_obs, done, truncated, reward, timestep and cumulated_reward as `ParallelGymAgent` does.
 
-    Environment k is seeded with ``seed + k`` when it is made; no reset seeds it again. `seed` and `n_envs` are
-    required, in spite of their defaults.
+    Environment k is seeded with ``seed + k`` at its first reset only. `seed` and `n_envs` are required, in spite of
+    their defaults.
     """
 
     _autoreset: bool
@@ -50,7 +50,7 @@ class _OldGymAgent(ParallelGymAgent):
         return self.num_envs
 
     def seed(self, seed: int) -> None:
-        """Nothing, as in bbrl 0.3: the environments were seeded when they were made."""
+        """Do nothing, as in bbrl 0.3: the seed is an argument of the constructor."""
 
     def get_obs_and_actions_sizes(self) -> tuple[Any, Any]:
         """Length of observation and action, or number of choices of the action; 1 for a Discrete observation."""
@@ -72,7 +72,7 @@ class _OldGymAgent(ParallelGymAgent):
         return [None if self._seeded else int(self._seed or 0) + k for k in range(self.num_envs)]
 
     def forward(self, t: int = 0, save_render: bool = False, render: bool = False, **kwargs: Any) -> None:
-        """See `GymAgent`; then render all environments, and write their pictures with `save_render`."""
+        """As `GymAgent`; then render all environments, and write the pictures if `save_render` is true."""
         super().forward(t, **kwargs)
         self._seeded = True
         if save_render or render:
@@ -91,12 +91,12 @@ class _OldGymAgent(ParallelGymAgent):
 
 
 class AutoResetGymAgent(_OldGymAgent):
-    """Environments that begin the next episode at the time after the last of one."""
+    """Environments that begin the next episode at the time after the end of an episode."""
 
     _autoreset = True
 
 
 class NoAutoResetGymAgent(_OldGymAgent):
-    """Environments whose last frame is repeated, with reward 0, once an episode has ended."""
+    """Environments whose last values are repeated, with reward 0, once an episode has ended."""
 
     _autoreset = False

@@ -1,16 +1,16 @@
 """Agents that run in other processes: `RemoteAgent`, `NRemoteAgent` and `AsynchronousAgent`.
 
-Differences from BBRL, where the processes of the first two die as they start while the parent waits for ever, and a
-failure in an `AsynchronousAgent` seems to run for ever:
+Differences from BBRL, where the processes of the first two die at their start while the parent waits without end, and
+an `AsynchronousAgent` that failed seems to run without end:
 
-- They work, with every start method. "spawn" is the default, because torch's threads and CUDA do not survive a fork; in
+- They work, with every start method. The default is "spawn", because torch's threads and CUDA do not survive a fork; in
   a notebook, or with agents that cannot be pickled, give ``start_method="fork"``.
-- A failure there is a `RemoteAgentError` here. The processes are closed then; the next call starts new ones.
-- Weights are in shared memory: ``load_state_dict`` on what `get_by_name` finds is seen in the process at once.
-- `seed` seeds the process's global generators as well, before and after the start. Unseeded, process k has seed k; the
-  generators of a lone agent have one from torch's.
+- A failure in a process raises a `RemoteAgentError` in the parent, and ends the processes; the next call restarts them.
+- Weights are in shared memory: ``load_state_dict`` on an agent of `get_by_name` applies to the process at once.
+- `seed` seeds the process's global generators too, before and after the start. By default process k has seed k; the
+  generators of a single agent have a seed drawn from torch's.
 - `close` is idempotent; processes also end with the agent's last reference and with the parent.
-- A process is a daemon, which cannot start processes of its own, with one torch thread.
+- A process is a daemon, which cannot start processes itself, with one torch thread.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ class _ProcessAgent(Agent):
     """Runs an agent in a process, which starts at the first call, without gradients.
 
     Args:
-        agent: What to run there; its weights move into shared memory.
+        agent: The agent to run; its weights move into shared memory.
         start_method: "spawn", "forkserver" or "fork".
     """
 
@@ -54,7 +54,7 @@ class _ProcessAgent(Agent):
         """Seed the agent, and the process's global generators (torch, NumPy, random), now or when it starts.
 
         Raises:
-            RemoteAgentError: The agent refuses, for instance because it is seeded already.
+            RemoteAgentError: The agent refuses the seed, for example because it has one already.
         """
         self._tell("seed", seed)
         self._seed = seed
@@ -67,7 +67,7 @@ class _ProcessAgent(Agent):
         return self
 
     def close(self) -> None:
-        """End the process; at any time, and idempotent. The next call starts a new one."""
+        """End the process; may be called at any time, and is idempotent. The next call starts a new process."""
         if self._worker is not None:
             self._worker.close()
 
@@ -75,7 +75,7 @@ class _ProcessAgent(Agent):
         return (self.agent,)
 
     def _idle_worker(self) -> Worker:
-        """The process, started if there is none."""
+        """The idle process, which is started if there is none."""
         if self._worker is None or self._worker.closed:
             self._worker = Worker(self.agent, self.start_method, self._seed)
             weakref.finalize(self, self._worker.close)
@@ -84,7 +84,7 @@ class _ProcessAgent(Agent):
         return self._worker
 
     def _tell(self, command: str, argument: Any) -> None:
-        """Give a command to the process if there is one."""
+        """Send a command to the process if there is one, and wait for its end."""
         if self._worker is not None and not self._worker.closed:
             worker = self._idle_worker()
             worker.send(command, argument)
@@ -98,7 +98,7 @@ class RemoteAgent(_ProcessAgent):
     """Runs an agent in another process, on a shared workspace."""
 
     def forward(self, **kwargs: Any) -> None:
-        """Run the agent with these keywords, and wait for it.
+        """Run the agent with these keywords, and wait for its end.
 
         Raises:
             WorkspaceError: The workspace is not shared.
@@ -112,7 +112,7 @@ class RemoteAgent(_ProcessAgent):
         wait_for([self.begin(self.workspace, kwargs)])
 
     def begin(self, workspace: Workspace, kwargs: dict[str, Any]) -> Worker:
-        """Begin a run in the process, which is returned; a workspace is sent there once."""
+        """Start a run in the process and return its worker; a workspace is sent only once."""
         worker = self._idle_worker()
         worker.send("run", None if workspace is worker.workspace else workspace, kwargs)
         worker.workspace = workspace
@@ -123,8 +123,8 @@ class NRemoteAgent(Agents):
     """Runs copies of an agent in several processes, each on its own batch columns; see `create`.
 
     Args:
-        agents: One for each process.
-        batch_dims: First column of each, and one after its last.
+        agents: One agent for each process.
+        batch_dims: The first column of each agent, and one after its last.
     """
 
     def __init__(self, agents: Sequence[RemoteAgent], batch_dims: Sequence[tuple[int, int]]) -> None:
@@ -143,19 +143,19 @@ class NRemoteAgent(Agents):
     ) -> tuple[Agent, SharedWorkspace]:
         """Make an agent of `num_processes` processes, and the shared workspace to call it with.
 
-        A copy of `agent` runs here once, with seed 0 and `extra_kwargs`, to see what it writes. Process k writes the
-        batch columns k * B to (k + 1) * B - 1, where B is the batch size of `agent`, and has seed k until ``seed(s)``
-        gives it s + k. Seed what is returned, not `agent`.
+        A copy of `agent` runs once in this process, with seed 0 and `extra_kwargs`, to find the variables that it
+        writes. Process k writes the batch columns k * B to (k + 1) * B - 1, where B is the batch size of `agent`, and
+        has seed k until ``seed(s)`` sets s + k. Seed the returned agent, not `agent`.
 
         Args:
-            agent: What to run; it is copied.
-            num_processes: Processes; 0 returns a copy of `agent` that runs here, to find errors with.
-            time_size: Times of the workspace; None for as many as the run here wrote.
+            agent: The agent to run; it is copied.
+            num_processes: Number of processes; 0 returns a copy of `agent` for this process, for debugging.
+            time_size: Number of times of the workspace; None for that of the first run.
             start_method: "spawn", "forkserver" or "fork".
-            extra_kwargs: Keywords of the run here, such as ``t=0, n_steps=10``.
+            extra_kwargs: Keywords of the first run, such as ``t=0, n_steps=10``.
 
         Raises:
-            WorkspaceError: The agent writes nothing, or variables of different batch sizes; or a negative number.
+            WorkspaceError: The agent writes no variable, or variables of different batch sizes; or `num_processes` < 0.
         """
         if num_processes < 0:
             raise WorkspaceError(f"num_processes: expected at least 0, found {num_processes}.")
@@ -179,10 +179,10 @@ class NRemoteAgent(Agents):
         return NRemoteAgent(remotes, columns).seed(0), shared
 
     def forward(self, **kwargs: Any) -> None:
-        """Run all copies at once, each on its columns of the workspace, and wait for them.
+        """Run all copies in parallel, each on its columns of the workspace, and wait for their end.
 
         Raises:
-            WorkspaceError: The workspace is not shared, or not as wide as all copies together.
+            WorkspaceError: The workspace is not shared, or has another batch size than all copies together.
             RemoteAgentError: A copy failed, or its process ended; all are closed.
         """
         parts = self._columns()
@@ -193,17 +193,17 @@ class NRemoteAgent(Agents):
             raise
 
     def seed(self, seed: int, inc: int = 1) -> Self:
-        """Seed copy k with seed + k * inc; itself is returned."""
+        """Seed copy k with seed + k * inc; returns the agent."""
         for k, agent in enumerate(self):
             agent.seed(seed + k * inc)
         return self
 
     def close(self) -> None:
-        """End all processes; at any time, and idempotent. The next call starts new ones."""
+        """End all processes; may be called at any time, and is idempotent. The next call starts new processes."""
         close_all([agent._worker for agent in self if agent._worker is not None])
 
     def _columns(self) -> list[SharedWorkspace]:
-        """Each copy's part of the workspace; the same objects as long as the workspace is."""
+        """Each copy's part of the workspace; cached for the last workspace."""
         workspace = self.workspace
         if not isinstance(workspace, SharedWorkspace):
             raise WorkspaceError(f"{agent_name(self)} needs the shared workspace that NRemoteAgent.create made for it.")
@@ -219,7 +219,7 @@ class NRemoteAgent(Agents):
 
 
 class AsynchronousAgent(_ProcessAgent):
-    """Starts an agent in another process and gives its workspace when it has ended.
+    """Starts an agent in another process, and returns its workspace after the end.
 
     ::
 
@@ -234,13 +234,13 @@ class AsynchronousAgent(_ProcessAgent):
         self._last: Workspace | None = None
 
     def __call__(self, **kwargs: Any) -> None:  # type: ignore[override]  # it has its own workspace
-        """Start the agent on a new workspace with these keywords, without waiting; refused while one is running."""
+        """Start the agent on a new workspace with these keywords, without waiting; raises LoopError while it runs."""
         worker = self._idle_worker()
         worker.result = self._last = None
         worker.send("run", Workspace(), kwargs)
 
     def is_running(self) -> bool:
-        """Whether the last call is still under way; a failure is raised here, and the process is closed."""
+        """Whether the last call is still running; raises its failure, after which the process is closed."""
         if self._worker is None or self._worker.poll():
             return self._worker is not None
         if self._worker.result is not None:
@@ -248,5 +248,5 @@ class AsynchronousAgent(_ProcessAgent):
         return False
 
     def get_workspace(self) -> Workspace | None:
-        """The workspace of the last call; None while it is under way, and before the first."""
+        """The workspace of the last call; None while it is running, and before the first call."""
         return None if self.is_running() else self._last

@@ -1,8 +1,8 @@
-"""A workspace whose memory several processes see.
+"""A workspace in the shared memory of several processes.
 
-Its variables and its length are fixed. Values are copied in, without their graph; what is read is a view of the memory,
-which changes when another process writes. Unlike BBRL's, `set_full` writes into the shared memory, a split workspace
-has all members of a workspace, and NumPy variables can be shared, too.
+Its variables and its length are fixed. Values are copied when they are written, without their graph; a read returns a
+view of the memory, which changes when another process writes. Unlike in BBRL, `set_full` writes into the shared memory,
+a split workspace has all members of a workspace, and NumPy variables can be shared too.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ class _SharedVariable(Variable):
         self._whole[t] = value
 
     def set_full(self, value: Any) -> None:
-        """Copy T x B x ... onto the first T times; later ones stay."""
+        """Copy T x B x ... to the first T times; later ones do not change."""
         self._check_full(value)
         self._require_length(len(value) - 1)
         if len(value):
@@ -51,7 +51,7 @@ class _SharedVariable(Variable):
         self._whole[: len(value)] = value.detach() if isinstance(value, torch.Tensor) else value
 
     def detach(self) -> None:
-        """Nothing: shared memory keeps no graph."""
+        """Do nothing: shared memory has no graph."""
 
     def _require_length(self, t: int) -> None:
         if t >= len(self.memory):
@@ -62,7 +62,7 @@ class _SharedVariable(Variable):
 
 
 class _SharedTensorVariable(_SharedVariable, TensorVariable):
-    """The same of tensors."""
+    """The same for tensors."""
 
 
 class SharedWorkspace(Workspace):
@@ -80,14 +80,14 @@ class SharedWorkspace(Workspace):
     def columns(self, begin: int, end: int) -> SharedWorkspace:
         """The batch columns [begin, end), in the same memory."""
         variables: Mapping[str, Any] = self.variables
-        return SharedWorkspace({name: type(one)(name, one.memory[:, begin:end]) for name, one in variables.items()})
+        return SharedWorkspace({name: type(v)(name, v.memory[:, begin:end]) for name, v in variables.items()})
 
     def remove_variable(self, name: str) -> None:
-        """Refused: other processes use it."""
+        """Raise WorkspaceError: other processes use the variable."""
         raise WorkspaceError(f"{name!r} cannot be removed from a shared workspace.")
 
     def clear(self, name: str | None = None) -> None:
-        """Refused: other processes use it."""
+        """Raise WorkspaceError: other processes use the workspace."""
         raise WorkspaceError("A shared workspace cannot be cleared: its variables and its length are fixed.")
 
     def _new(self, name: str, value: Any, where: str) -> Any:
@@ -97,11 +97,11 @@ class SharedWorkspace(Workspace):
 
 
 def shared_workspace(workspace: Workspace, n_repeat: int = 1, time_size: int | None = None) -> SharedWorkspace:
-    """A copy of a workspace in shared memory, without graph.
+    """Copy a workspace into shared memory, without its graph.
 
     Args:
-        workspace: What to copy: one variable at least, of dtypes that torch has.
-        n_repeat: How often to repeat it over the batch.
+        workspace: The workspace to copy, with at least one variable, of dtypes that torch has.
+        n_repeat: The number of copies side by side over the batch.
         time_size: The number of times of the copy, which then holds zeros; None for the times and values of
             `workspace`.
     """

@@ -1,7 +1,7 @@
-"""A process that runs one agent for another process, and never outlives it.
+"""A process that runs one agent for its parent process, and never outlives it.
 
-The two ends talk through one pipe, a command there and an answer back, one at a time. What goes wrong there is raised
-here, with the traceback. Weights (parameters and buffers) are in shared memory; everything else of an agent is a copy.
+The processes communicate through a pipe: one command, then one answer. An exception in the worker process is raised in
+the parent, with the traceback. Weights (parameters and buffers) are in shared memory; the rest of an agent is a copy.
 """
 
 import multiprocessing
@@ -40,14 +40,14 @@ class Worker:
     """The parent's end: starts the process. Its methods raise `RemoteAgentError`.
 
     Args:
-        agent: What it runs.
+        agent: The agent to run.
         start_method: "spawn", "forkserver" or "fork".
-        seed: For the agent and for the global generators; None seeds the generators only, from torch's here.
+        seed: Seed of the agent and of the global generators; None seeds only the generators, from torch's here.
 
     Attributes:
-        busy: Whether a command is under way, as far as `poll` has seen.
-        result: What the last command that had a result gave.
-        workspace: The one that the process runs on.
+        busy: Whether a command was running at the last `poll`.
+        result: The last result of a command that had one.
+        workspace: The workspace that the process runs on.
     """
 
     def __init__(self, agent: Agent, start_method: str, seed: int | None) -> None:
@@ -69,14 +69,14 @@ class Worker:
         there.close()
 
     def send(self, command: str, *arguments: Any) -> None:
-        """Begin a command, a method of `_Runner`; `poll` or `wait_for` its end."""
+        """Start a command, a method of `_Runner`; `poll` and `wait_for` detect its end."""
         data = self._pickled((command, *arguments))
         self.busy = True
-        with suppress(OSError):  # it has ended: the answer says so
+        with suppress(OSError):  # the process has ended, which `poll` raises
             self._connection.send_bytes(data)
 
     def poll(self) -> bool:
-        """Whether a command is still under way. If it failed, or the process ended, that is raised and it is closed."""
+        """Whether a command is running. If it failed, or the process ended, close the worker and raise the error."""
         if not self.busy or not wait(self.ends(), 0):
             return self.busy
         try:
@@ -92,17 +92,17 @@ class Worker:
         return False
 
     def ends(self) -> list[Any]:
-        """What becomes ready when it answers or ends."""
+        """Objects for `multiprocessing.connection.wait`, ready when the process answers or ends."""
         return [self._connection, self._process.sentinel]
 
     def ask_to_end(self) -> None:
         """Ask an idle process to close its agent and end, without waiting; only `close` may follow."""
         if not (self.busy or self.closed) and self._owner == os.getpid():
-            with suppress(OSError):  # it has ended, or was asked before
+            with suppress(OSError):  # the process has ended, or was asked before
                 self._connection.send_bytes(b"")
 
     def close(self) -> None:
-        """End the process, at once if it is busy; in any state, and idempotent."""
+        """End the process, at once if it is busy; may be called in any state, and is idempotent."""
         if self.closed or self._owner != os.getpid():  # a forked process has copies of its siblings' ends
             return
         self.ask_to_end()
@@ -116,7 +116,7 @@ class Worker:
         self._connection.close()
 
     def _receive(self) -> tuple[bool, Any]:
-        """Its answer; the error of a process that is no more."""
+        """Receive the answer; raises RemoteAgentError if the process has ended."""
         with suppress(EOFError, OSError):
             if self._connection.poll():
                 answer: tuple[bool, Any] = self._connection.recv()
@@ -142,7 +142,7 @@ class Worker:
 
 
 def wait_for(workers: Sequence[Worker]) -> None:
-    """Wait for the end of all commands; when one fails, a process ends, or Ctrl-C comes, all are closed."""
+    """Wait for the end of all commands; a failure, the end of a process, or Ctrl-C closes all workers."""
     try:
         while running := [worker for worker in workers if worker.poll()]:
             wait([end for worker in running for end in worker.ends()])
@@ -152,7 +152,7 @@ def wait_for(workers: Sequence[Worker]) -> None:
 
 
 def close_all(workers: Sequence[Worker]) -> None:
-    """End the processes, all at the same time."""
+    """End all processes at the same time."""
     for worker in workers:
         worker.ask_to_end()
     for worker in workers:
@@ -161,10 +161,10 @@ def close_all(workers: Sequence[Worker]) -> None:
 
 @contextmanager
 def _signals_blocked(blocked: bool) -> Iterator[None]:
-    """Keep signals from a forked process until it has handlers of its own.
+    """Block signals in a forked process until it has removed the handlers of this one.
 
-    A handler of this process that raises, such as Ray's for SIGTERM, would leave ``os.fork()`` there and go on with
-    this process's own code a second time. The forked process inherits the mask until `drop_handlers` unblocks.
+    A handler that raises, such as Ray's for SIGTERM, would leave ``os.fork()`` in the forked process, which would then
+    run this process's code a second time. The forked process inherits the mask until `drop_handlers` unblocks signals.
     """
     before = signal.pthread_sigmask(signal.SIG_BLOCK, signal.valid_signals() if blocked else ())
     try:
@@ -173,23 +173,23 @@ def _signals_blocked(blocked: bool) -> Iterator[None]:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
-# -- the other end: what runs in the process ---------------------------------------------------------------------------
+# -- in the worker process ---------------------------------------------------------------------------------------------
 
 
 def _serve(connection: Connection, payload: Any, seed: int | None, noise: int) -> None:
-    """Answer commands with (False, result) or (True, (error, traceback)), until told to end or the parent is gone."""
+    """Answer commands with (False, result) or (True, (error, traceback)) until asked to end, or the parent ends."""
     drop_handlers()
     threading.Thread(target=_end_with_parent, args=(os.getppid(),), daemon=True).start()
-    torch.set_num_threads(1)  # as many processes as cores; and OpenMP's threads do not survive a fork
+    torch.set_num_threads(1)  # one process per core; OpenMP's threads do not survive a fork
     runner: _Runner | None = None
-    with suppress(EOFError, OSError):  # the parent is gone
+    with suppress(EOFError, OSError):  # the parent has ended
         while data := connection.recv_bytes():
             answer: tuple[bool, Any]
             try:
                 runner = runner or _Runner(payload, seed, noise)
                 command, *arguments = pickle.loads(data)
                 answer = False, getattr(runner, command)(*arguments)
-            except Exception as error:  # whatever the agent raises is the parent's to handle
+            except Exception as error:  # the parent handles the agent's exceptions
                 answer = True, (f"{type(error).__name__}: {error}", traceback.format_exc())
             connection.send(answer)
     if runner is not None:
@@ -203,7 +203,7 @@ class _Runner:
         self.workspace: Any = None
         try:
             self.agent: Any = pickle.loads(payload) if isinstance(payload, bytes) else payload
-        except (AttributeError, ImportError) as error:  # its class is not where this process can import it
+        except (AttributeError, ImportError) as error:  # this process cannot import its class
             raise LoopError(
                 f"{error}; define what the agent is made of in a module that can be imported, or give "
                 'start_method="fork"'
@@ -213,7 +213,7 @@ class _Runner:
             self.agent.seed(seed)
 
     def run(self, workspace: Any, kwargs: dict[str, Any]) -> bytes | None:
-        """Run on `workspace`, None for that of the last time; gives the values of one that is not shared."""
+        """Run on `workspace`, or the last one for None; returns the pickled values of one that is not shared."""
         self.workspace = self.workspace if workspace is None else workspace
         with torch.no_grad():
             self.agent(self.workspace, **kwargs)
@@ -235,7 +235,7 @@ def _seed_generators(seed: int) -> None:
 
 
 def _end_with_parent(parent: int) -> None:
-    """End this process, whatever it is doing, when its parent is gone."""
+    """End this process at once when its parent has ended."""
     source = multiprocessing.parent_process()
     while source is not None and os.getppid() == parent and not wait([source.sentinel], 1.0):
         pass
