@@ -174,9 +174,7 @@ class RLlibTrainer:
         if self._steps == before:  # all runners were dead
             return
         for name, values in self._ends.items():
-            ended = np.atleast_1d(
-                np.asarray(sampled.get(ENDS, {}).get(name, ()), np.float64)
-            )  # one episode is a number
+            ended = np.atleast_1d(np.asarray(sampled.get(ENDS, {}).get(name, ()), np.float64))  # one is a number
             values.extend(ended[~np.isnan(ended)].tolist())  # RLlib may report NaN if no episode ended
         # A NaN loss makes the weights NaN; the loss itself is NaN in RLlib's result also if there was no update.
         if not all(bool(torch.isfinite(weights).all()) for weights in self._module().parameters()):
