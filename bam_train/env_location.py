@@ -51,7 +51,7 @@ class Place:
         if self.ca_file is not None and without:
             raise SettingsError(f"--ca-file is for wss:// only, and {without[0]} is without TLS; leave it out")
         if self.timeout is not None and not self.transport:
-            raise SettingsError("--timeout is how long an answer of --transport is waited for; leave it out")
+            raise SettingsError("--timeout limits the wait for an answer of --transport; leave it out")
         check(self.timeout, Positive | None, "--timeout", SettingsError)
 
     @property

@@ -1,6 +1,6 @@
-"""What `gymnasium.make` and `gymnasium.make_vec` call: a robot and its task, simulated, live, or on another computer.
+"""The entry points of `gymnasium.make` and `gymnasium.make_vec`: a robot and its task, simulated, live or remote.
 
-Live robots, remote environments and Gymnasium's vector environments are imported where they are asked for.
+Live robots, remote environments and Gymnasium's vector environments are imported on use.
 """
 
 from __future__ import annotations
@@ -32,20 +32,20 @@ def make_env(
     timeout: float | None = None,
     **task_options: Any,
 ) -> gym.Env[Any, Any]:
-    """One robot and its task; what `gymnasium.make` calls.
+    """One robot and its task; the entry point of `gymnasium.make`.
 
     Args:
         env_id: Key of `ENVIRONMENTS`.
-        render_mode: Of the simulated robot.
-        randomize: Of the simulated robot.
+        render_mode: Render mode of the simulated robot.
+        randomize: Whether the physics of the simulated robot is randomized.
         robot: Address of a live robot behind rosbridge, such as ``"ws://10.0.0.5:9090"``, instead of the simulated one.
-            The task runs here. A path puts a namespace before the robot's topics.
+            The task runs in this process. A path in the address is the namespace of the robot's topics.
         transport: Address of a whole environment that runs elsewhere, such as ``"ws://10.0.0.5:9090/bam_001"`` or
-            ``"tcp://10.0.0.5:9091"``; there is no robot and no task here.
-        profile: What the live robot's topics are: a shipped name or a file; by default that of the simulated robot.
+            ``"tcp://10.0.0.5:9091"``; then this process has no robot and no task.
+        profile: Profile of the live robot: a shipped name or a file; by default that of the simulated robot.
         ca_file: Certificates that ``wss://`` trusts instead of the system's.
-        token_file: File with the token that the server asks for.
-        timeout: Longest that an answer of `transport` is waited for [s]; 30 by default.
+        token_file: File with the server's token.
+        timeout: Longest wait for an answer of `transport` [s]; 30 by default.
         task_options: Arguments of the task.
 
     Raises:
@@ -84,16 +84,18 @@ def _check_place(
     randomize: bool,
     task_options: Mapping[str, Any],
 ) -> None:
-    """Refuse options of another place than the one where the environment runs."""
+    """Refuse options that do not apply where the environment runs."""
     if transport is None and timeout is not None:
-        raise InvalidValue(f"timeout={timeout!r} is how long an answer of transport= is waited for; leave it out.")
+        raise InvalidValue(f"timeout={timeout!r} limits the wait for an answer of transport=; leave it out.")
     if transport is not None and task_options:
         names = ", ".join(task_options)
         raise InvalidValue(f"{names}: the task runs at {transport}; give its options to bam-serve there.")
     elsewhere = robot if transport is None else transport
-    asked = [name for name, given in (("render_mode", render_mode is not None), ("randomize", randomize)) if given]
-    if elsewhere is not None and asked:
-        raise InvalidValue(f"{', '.join(asked)}: only the simulation here has that, and not {elsewhere}; leave it out.")
+    chosen = [name for name, used in (("render_mode", render_mode is not None), ("randomize", randomize)) if used]
+    if elsewhere is not None and chosen:
+        raise InvalidValue(
+            f"{', '.join(chosen)}: only the simulation here has that, and not {elsewhere}; leave it out."
+        )
 
 
 def make_vector_env(
@@ -110,9 +112,9 @@ def make_vector_env(
     timeout: float | None = None,
     **task_options: Any,
 ) -> RobotVectorEnv | RemoteVectorEnv:
-    """Simulated robots and their task, stepped together; what `gymnasium.make_vec` calls.
+    """Simulated robots and their task, stepped together; the entry point of `gymnasium.make_vec`.
 
-    With `transport`, one address or several, they run elsewhere: the environments of one server are one request.
+    With `transport`, one address or several, they run elsewhere; each server steps its environments in one request.
 
     Raises:
         InvalidValue: Arguments that exclude each other, or environments that are not there.

@@ -42,7 +42,7 @@ def test_addresses(text, found):
             Place(transport=("tcp://a:1", "tcp://b:2", "tcp://a:1/")),
             "--transport: tcp://a:1 comes twice, and an address is one environment; give it once",
         ),
-        (Place(timeout=5.0), "--timeout is how long an answer of --transport is waited for; leave it out"),
+        (Place(timeout=5.0), "--timeout limits the wait for an answer of --transport; leave it out"),
         (Place(transport=("tcp://a:1",), timeout=0.0), "--timeout: expected a number above 0, found 0.0"),
     ],
 )

@@ -1,4 +1,4 @@
-"""Closing what is still open when Python ends."""
+"""Close open robots and environments when Python ends."""
 
 import atexit
 import logging
@@ -19,13 +19,13 @@ class Closable(Protocol):
 
 
 def close_at_exit(thing: Closable) -> None:
-    """Close `thing` when Python ends, if it is still there.
+    """Close `thing` when Python ends, if it still exists.
 
-    Network threads still run at that time; a ``__del__`` would come later, when they and some modules are gone.
+    Network threads still run at that time; a ``__del__`` would run later, after they and some modules have ended.
     """
     if not _open:
         atexit.unregister(_close_all)
-        atexit.register(_close_all)  # run in reverse order of registration: before the network is taken down
+        atexit.register(_close_all)  # run in reverse order of registration: before the network ends
     _open.add(thing)
 
 
@@ -33,5 +33,5 @@ def _close_all() -> None:
     for thing in list(_open):
         try:
             thing.close()
-        except BamEnvsError as error:  # noqa: PERF203 - the others are closed all the same
+        except BamEnvsError as error:  # noqa: PERF203 - close the remaining ones
             _log.warning("%s", error)

@@ -1,7 +1,7 @@
 """The options of an environment, checked before it is made: names with the closest match, and kinds of values.
 
-They are the arguments of its task's constructor. Any text in place of a flag would count as True, even
-``parity="false"``.
+They are the arguments of its task's constructor. Kinds are checked because any text in place of a flag, even
+``parity="false"``, would count as True.
 """
 
 import inspect
@@ -16,25 +16,25 @@ from bam_envs.core.errors import InvalidValue, UnknownName
 
 
 def constructor_options(task: type) -> dict[str, Any]:
-    """The options of a task's class with their defaults; those of its base classes where it passes them on."""
+    """The options of a task's class with their defaults, including those that it passes on to its base classes."""
     options: dict[str, Any] = {}
     for kind in task.__mro__:
         if "__init__" in vars(kind):
             parameters = inspect.signature(vars(kind)["__init__"]).parameters
-            given = {name: one.default for name, one in parameters.items() if one.kind is one.KEYWORD_ONLY}
-            options = {**given, **options}
+            defaults = {name: one.default for name, one in parameters.items() if one.kind is one.KEYWORD_ONLY}
+            options = {**defaults, **options}
             if not any(one.kind is one.VAR_KEYWORD for one in parameters.values()):
                 break
     return options
 
 
 def in_our_words(name: str) -> str:
-    """The name of an option with robo-gym's name of a joint for ROS's: ``fix_shoulder_pan`` is ``fix_base``."""
+    """The name of an option with robo-gym's name of a joint instead of ROS's: ``fix_shoulder_pan`` is ``fix_base``."""
     return name.replace("shoulder_pan", "base").replace("shoulder_lift", "shoulder")
 
 
 def require_known(env_id: str, options: Mapping[str, Any], given: Iterable[str], others: Iterable[str]) -> None:
-    """Refuse an option that is none of `options`; `others` exist too, and may be the closest match.
+    """Refuse an option that is not in `options`; `others` may be the closest match too.
 
     Raises:
         UnknownName: It carries the closest match.
@@ -45,10 +45,10 @@ def require_known(env_id: str, options: Mapping[str, Any], given: Iterable[str],
 
 
 def require_kinds(env_id: str, options: Mapping[str, Any], given: Mapping[str, Any]) -> None:
-    """Refuse a value of another kind than its default in `options`; what is none of them is left alone.
+    """Refuse a value of another kind than its default in `options`; unknown names are ignored.
 
     Raises:
-        InvalidValue: A flag is neither True nor False, or a number is none.
+        InvalidValue: A flag is neither True nor False, or a number is expected.
     """
     for name, value in given.items():
         default = options.get(name)

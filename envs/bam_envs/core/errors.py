@@ -4,22 +4,22 @@
 
     BamEnvsError
     ├── UnknownName            a name that is not in a table; carries the closest match
-    ├── InvalidValue           a value outside what is allowed: which, expected, found
+    ├── InvalidValue           a value that is not allowed; names it, and what was expected
     ├── MissingExtra           an optional dependency is not installed; carries the pip command
     ├── ResetNeeded            `step` before `reset`, or after the episode ended
-    └── RobotFault             the robot or the link to it went wrong; never an episode's end
-        ├── PhysicsDiverged    the simulation left the finite numbers
-        ├── LinkLost           the link is down: nothing was sent, nothing is kept to be sent later
-        │   ├── NoServer       nobody there, or not what was expected: refused, silent, certificate, token
-        │   └── StaleState     the link is there, and no fresh state came in time
+    └── RobotFault             the robot or the link to it failed; never an episode's end
+        ├── PhysicsDiverged    the simulated state is not finite
+        ├── LinkLost           the link is down: nothing was sent, and nothing is queued
+        │   ├── NoServer       no usable server: refused, silent, certificate, token
+        │   └── StaleState     the link is up, and no fresh state came in time
         ├── ProtocolError      the other end broke the protocol: which field, expected, found
-        ├── RemoteError        the other end refused or failed; carries its own text
-        │   └── NotInCommand   another client is in command there
+        ├── RemoteError        the other end refused or failed; carries its text
+        │   └── NotInCommand   another client is in command
         ├── NotReady           the robot reports that it cannot move now: a protective stop, a paused program
         ├── StartNotReached    the start pose was not reached in time; carries the joints
         └── SafetyStop         a guard stopped the robot; latched until a person resumes; carries the guard
 
-Third-party errors are mapped to these at the border, with the cause kept by ``from``.
+Third-party errors are converted to these, with the cause kept by ``from``.
 """
 
 from collections.abc import Iterable
@@ -31,22 +31,22 @@ class BamEnvsError(Exception):
     """Base class. Its text is one line: what went wrong, why, and what to do."""
 
 
-class UnknownName(BamEnvsError, ValueError):  # noqa: N818 - reads as what happened
-    """A name that no table holds.
+class UnknownName(BamEnvsError, ValueError):  # noqa: N818 - named for the cause
+    """A name that is not in its table.
 
     Attributes:
-        kind: What was looked up, e.g. ``"environment"``.
-        name: The name that was given.
-        choices: Every name the table has, sorted.
+        kind: Kind of the name, e.g. ``"environment"``.
+        name: The unknown name.
+        choices: All names in the table, sorted.
         closest: The most similar choice, or None.
 
     Args:
         kind: See above.
         name: See above.
         choices: See above.
-        examples: What to suggest when nothing is similar; every choice by default.
-        similar: How similar a choice must be to be suggested, from 0 to 1.
-        meant: The name in the table's own words, for the most similar choice; by default as it was given.
+        examples: Names to suggest if none is similar; every choice by default.
+        similar: Least similarity of a suggested choice, from 0 to 1.
+        meant: The name in the spelling of the table, to find the most similar choice; by default `name`.
     """
 
     def __init__(
@@ -65,7 +65,7 @@ class UnknownName(BamEnvsError, ValueError):  # noqa: N818 - reads as what happe
 
 
 class InvalidValue(BamEnvsError, ValueError):  # noqa: N818
-    """A value that does not fit: the message names the thing, the expected and the found."""
+    """A value that is not allowed: the text names it, what was expected and what was found."""
 
 
 class MissingExtra(BamEnvsError, ImportError):  # noqa: N818
@@ -73,7 +73,7 @@ class MissingExtra(BamEnvsError, ImportError):  # noqa: N818
 
     Attributes:
         package: The import that failed.
-        extra: The extra of `bam-train` that brings it.
+        extra: The extra of `bam-train` that installs it.
     """
 
     def __init__(self, package: str, extra: str, purpose: str) -> None:
@@ -86,19 +86,19 @@ class ResetNeeded(BamEnvsError, RuntimeError):  # noqa: N818
 
 
 class RobotFault(BamEnvsError, RuntimeError):  # noqa: N818
-    """The robot, or the link to it, went wrong."""
+    """The robot, or the link to it, failed."""
 
 
 class PhysicsDiverged(RobotFault):
-    """The simulated state is no longer finite; names the environments."""
+    """The simulated state is no longer finite; the text names the environments."""
 
 
 class LinkLost(RobotFault):
-    """The link is down. Nothing was sent, and nothing is kept to be sent later."""
+    """The link is down. Nothing was sent, and nothing is queued."""
 
 
 class NoServer(LinkLost):
-    """No usable server at an address: the text names what was tried, what came back, and how to start one.
+    """No usable server at an address: the text gives the reason, and how to start one.
 
     Attributes:
         url: The address.
@@ -114,7 +114,7 @@ class StaleState(LinkLost):
 
     Attributes:
         age: Age of the newest state [s]; infinite if there was none.
-        limit: Oldest that is allowed [s].
+        limit: Maximum age [s].
     """
 
     def __init__(self, message: str, age: float = float("inf"), limit: float = 0.0) -> None:
@@ -127,11 +127,11 @@ class ProtocolError(RobotFault):
 
 
 class RemoteError(RobotFault):
-    """The other end refused a request, or failed at it; the text is its own."""
+    """The other end refused a request or failed; the text is that of the other end."""
 
 
 class NotInCommand(RemoteError):  # noqa: N818
-    """Another client is in command of what was asked for."""
+    """Another client is in command of the robot or environment."""
 
 
 class NotReady(RobotFault):
@@ -142,7 +142,7 @@ class StartNotReached(RobotFault):
     """The start pose was not reached in time.
 
     Attributes:
-        joints: The joints that are not there, with how far they are from it [rad].
+        joints: The joints that are not at the start pose, with their remaining distance [rad].
     """
 
     def __init__(self, message: str, joints: dict[str, float]) -> None:

@@ -1,4 +1,4 @@
-"""Names of a package that are imported when they are used (PEP 562), so that nobody pays for the others."""
+"""Names of a package that are imported on use (PEP 562)."""
 
 import importlib
 from collections.abc import Callable, Mapping
@@ -10,7 +10,7 @@ def lazy_imports(package: str, modules: Mapping[str, str]) -> tuple[Callable[[st
 
     Args:
         package: Its name.
-        modules: Each name to the module that has it.
+        modules: Name -> module that defines it.
     """
 
     def get(name: str) -> Any:

@@ -43,14 +43,14 @@ class EnvEntry:
     robot_options: tuple[str, ...] = ()
     """Arguments of the task that its robot takes too."""
     variants: dict[str, str] = field(default_factory=dict)
-    """Flags that plug-ins add, such as ``parity``, and ``"module:Class"`` of the task that each of them makes."""
+    """Flags that plug-ins add, such as ``parity`` -> ``"module:Class"`` of the task with that flag."""
 
     def options(self) -> dict[str, Any]:
         """The options of the task, flags of variants among them, with their defaults."""
         return constructor_options(resolve(self.task)) | dict.fromkeys(self.variants, False)
 
     def make_task(self, num_envs: int, given: Mapping[str, Any]) -> Task:
-        """The task of so many environments.
+        """The task of `num_envs` environments, with the options `given`.
 
         Raises:
             UnknownName: It has no such option.
@@ -83,7 +83,7 @@ class Alias:
     env_id: str
     """Key of `ENVIRONMENTS`."""
     variant: str = ""
-    """How the environment of the other id differs; "" if it does not."""
+    """Variant of the environment that the other id names; "" for the environment itself."""
 
 
 _ENTRIES = (
@@ -173,7 +173,7 @@ ALIASES: dict[str, Alias] = {}
 
 
 def register() -> None:
-    """Register every environment with Gymnasium; idempotent. Plug-ins add their variants before."""
+    """Register every environment with Gymnasium; idempotent. Plug-ins must add their variants before."""
     for entry in ENVIRONMENTS.values():
         register_id(entry.id, "bam_envs.make_env", entry.max_episode_steps)
 
@@ -185,7 +185,7 @@ def register_alias(env_id: str, alias: Alias, module: str) -> None:
 
 
 def register_id(env_id: str, module: str, max_episode_steps: int | None) -> None:
-    """Register an id with Gymnasium; `module` has the two functions that make it."""
+    """Register an id with Gymnasium; `module` has the two functions that make its environments."""
     if env_id not in gym.registry:
         gym.register(
             env_id,
@@ -197,13 +197,13 @@ def register_id(env_id: str, module: str, max_episode_steps: int | None) -> None
 
 
 def entry_of(env_id: str) -> EnvEntry | None:
-    """The entry that `env_id` names, ours or a plug-in's, with or without ``module:``; None of anything else."""
-    own = env_id.rpartition(":")[2]
-    return ENVIRONMENTS.get(ALIASES[own].env_id if own in ALIASES else own)
+    """The entry of `env_id`, an id of the table or of a plug-in, with or without ``module:``; None if there is none."""
+    bare = env_id.rpartition(":")[2]
+    return ENVIRONMENTS.get(ALIASES[bare].env_id if bare in ALIASES else bare)
 
 
 def are_same(one: str, other: str) -> bool:
-    """Whether two ids name one environment, as ours and a plug-in's do, but for the plug-in's variants of ours."""
+    """Whether two ids name the same environment in the same variant, such as an id of the table and a plug-in's."""
     entry = entry_of(one)
     return one == other or (entry is not None and entry is entry_of(other) and _variant(one) == _variant(other))
 
@@ -214,10 +214,10 @@ def _variant(env_id: str) -> str:
 
 
 def resolve_id(name: str) -> str:
-    """The id that `name` means: with its version added, ours or Gymnasium's, ``module:Env-v0`` as it is.
+    """The registered id of `name`, with its version added if missing; ``module:Env-v0`` keeps its module.
 
     Raises:
-        UnknownName: Nothing of that name is registered; it carries the closest match.
+        UnknownName: No such environment is registered; the error carries the closest match.
         InvalidValue: The module of ``module:Env-v0`` is not installed.
     """
     module, _, bare = name.rpartition(":")
@@ -231,12 +231,12 @@ def resolve_id(name: str) -> str:
 
 
 def _import_for(module: str, name: str) -> None:
-    """Import `module`, which is to register the environment `name`."""
+    """Import `module`, which should register the environment `name`."""
     try:
         importlib.import_module(module)
     except ModuleNotFoundError as error:
         if error.name is None or not f"{module}.".startswith(f"{error.name}."):
-            raise  # the module is there, and one that it imports is not
+            raise  # the module exists, but one of its imports does not
         raise InvalidValue(
             f"Environment {name!r} needs the module {module!r}, which is neither installed nor in this folder."
         ) from error

@@ -13,12 +13,12 @@ from bam_envs.core.errors import InvalidValue
 
 Array = NDArray[np.float64]
 EnvIds = NDArray[np.int64]
-"""Which of the n environments that are stepped together. Shape: (k,)."""
+"""Indices of some of the n environments that are stepped together. Shape: (k,)."""
 
 
 @dataclass(frozen=True)
 class SignalSpec:
-    """One named signal: what its numbers are called, their unit and their limits."""
+    """One named signal: names, units and limits of its numbers."""
 
     name: str
     """Key in `RobotState.signals`, or ``"command"``."""
@@ -31,10 +31,10 @@ class SignalSpec:
     high: tuple[float, ...]
     """Highest value of each number."""
     max_rate: tuple[float, ...] | None = None
-    """Fastest change of each number [unit/s]; None for what is only measured."""
+    """Fastest change of each number [unit/s]; None for a measured signal."""
 
     def part(self, labels: tuple[str, ...]) -> SignalSpec:
-        """The numbers called `labels`, each of which it has, in their order."""
+        """The numbers called `labels`, in that order; the signal must have all of them."""
         places = [self.labels.index(label) for label in labels]
         low, high = tuple(self.low[one] for one in places), tuple(self.high[one] for one in places)
         rate = None if self.max_rate is None else tuple(self.max_rate[one] for one in places)
@@ -43,17 +43,17 @@ class SignalSpec:
 
 @dataclass(frozen=True)
 class RobotSpec:
-    """What is known of a robot before it is connected."""
+    """The description of a robot, known before it is connected."""
 
     name: str
     signals: tuple[SignalSpec, ...]
-    """What it measures."""
+    """The measured signals."""
     command: SignalSpec
-    """What it is sent."""
+    """The command."""
     period: float
     """Time between two commands [s]."""
     lag: float = field(default=0.0, compare=False)
-    """How far a joint that moves steadily is behind its commands, at the end of a period [s]."""
+    """Delay of a steadily moving joint behind its commands, at the end of a period [s]."""
 
     def describe(self) -> dict[str, list[dict[str, Any]]]:
         """Labels, units and limits of state and command, as plain values."""
@@ -69,34 +69,34 @@ def describe_signal(signal: SignalSpec) -> list[dict[str, Any]]:
 
 @dataclass
 class RobotState:
-    """What n robots measured at one time."""
+    """The measurements of n robots at one time."""
 
     signals: dict[str, Array]
     """Each signal in the order of its labels. Shape: (n, k)."""
     stamp: Array
-    """When it was measured [s]: the robot's monotonic clock, or simulated time. Shape: (n,)."""
+    """Time of the measurement [s]: the robot's monotonic clock, or simulated time. Shape: (n,)."""
     command: Array
-    """The command that was really sent before this was measured. Shape: (n, m)."""
+    """The command that was actually sent before the measurement. Shape: (n, m)."""
     truth: dict[str, Array] = field(default_factory=dict)
-    """What only a simulation knows, such as contacts; {} of a live robot. Shape: (n, ...) each."""
+    """Quantities that only a simulation knows, such as contacts; {} of a live robot. Shape: (n, ...) each."""
 
 
 @dataclass(frozen=True)
 class Initial:
-    """Where an episode starts, in k environments.
+    """The start of an episode in k environments.
 
-    A simulated robot is set to it; a live one goes to ``signals["joint_position"]`` slowly, and its object is
-    where it is.
+    A simulated robot is set to it; a live one goes to ``signals["joint_position"]`` slowly, and its object stays in
+    place.
     """
 
     signals: Mapping[str, Array]
     """Start values of signals. Shape: (k, ...)."""
     seeds: NDArray[np.int64]
-    """Seeds for what the robot itself draws (noise, masses), one for each environment. Shape: (k,)."""
+    """Seeds of the robots' own random numbers (noise, masses), one for each environment. Shape: (k,)."""
 
 
 def checked_command(command: Array, shape: tuple[int, int]) -> Array:
-    """A copy of `command`, which must have `shape` and be finite; which every robot requires.
+    """A copy of `command`, which must have `shape` and be finite, as for every robot.
 
     Raises:
         InvalidValue: It has another shape, or is not finite.
@@ -117,11 +117,11 @@ class Robot(Protocol):
 
     @property
     def spec(self) -> RobotSpec:
-        """What is known of it."""
+        """The description of the robot."""
 
     @property
     def num_robots(self) -> int:
-        """How many are stepped together."""
+        """Number of robots that are stepped together."""
 
     def connect(self) -> None:
         """Make the robot ready for `reset`. Moves nothing; idempotent."""
@@ -133,7 +133,7 @@ class Robot(Protocol):
         """Send `command` (n, m), SI units, and return the state one period later."""
 
     def halt(self) -> None:
-        """Stop moving and keep the link. Callable from any thread; idempotent; never raises."""
+        """Stop moving and keep the link. Thread-safe; idempotent; never raises."""
 
     def close(self) -> None:
         """Halt, then drop the link. Idempotent."""

@@ -49,7 +49,7 @@ def describe(robot: Robot, task: Task) -> dict[str, list[dict[str, Any]]]:
 
 
 class _RobotAndTask:
-    """What both environments share.
+    """Base class of both environments.
 
     Args:
         robot: A robot with as many robots as the task has environments.
@@ -75,7 +75,7 @@ class _RobotAndTask:
         return describe(self.robot, self.task)
 
     def _begin(self, env_ids: EnvIds, rngs: Sequence[np.random.Generator], options: Mapping[str, Any]) -> RobotState:
-        """Begin a new episode in the environments `env_ids`; the state of all."""
+        """Begin a new episode in the environments `env_ids`; returns the state of all environments."""
         sample: Any = self.task.sample_initial
         initial = sample(env_ids, rngs, options) if options else sample(env_ids, rngs)
         self.robot.connect()
@@ -83,15 +83,15 @@ class _RobotAndTask:
         self.task.on_reset(env_ids, state)
         return state
 
-    def _reset_options(self, options: object, own: str | None = None) -> dict[str, Any]:
-        """A copy of the options of `reset`, all of which the task must know but for the environment's `own`."""
+    def _reset_options(self, options: object, extra: str | None = None) -> dict[str, Any]:
+        """A copy of the options of `reset`; the task must know all of them except `extra`, the environment's option."""
         if options is not None and not isinstance(options, Mapping):
             raise InvalidValue(f"options= of reset must be a dict of names and values, not {brief(options)}.")
-        given, known = dict(options or {}), getattr(self.task, "reset_options", ())
-        for name in given:
-            if name not in known and name != own:
+        checked, known = dict(options or {}), getattr(self.task, "reset_options", ())
+        for name in checked:
+            if name not in known and name != extra:
                 raise UnknownName("reset option", name, known)
-        return given
+        return checked
 
     def _running(self) -> RobotState:
         if self.state is None:
@@ -125,7 +125,7 @@ class RobotEnv(_RobotAndTask, gym.Env[NDArray[np.float32], NDArray[np.float32]])
         super().__init__(robot, task, render_mode)
         self.observation_space, self.action_space = task.observation_space, task.action_space
         self.last_state: RobotState | None = None
-        """The newest state there was, also when the episode that it ended is over."""
+        """The newest state, kept after the end of an episode."""
         self._first = np.zeros(1, dtype=np.int64)
 
     def reset(
@@ -133,14 +133,14 @@ class RobotEnv(_RobotAndTask, gym.Env[NDArray[np.float32], NDArray[np.float32]])
     ) -> tuple[NDArray[np.float32], dict[str, Any]]:
         """Begin an episode; a live robot goes to its start pose slowly."""
         gym.Env.reset(self, seed=seed)
-        given = self._reset_options(options)
-        self.state = self.last_state = self._begin(self._first, [self.np_random], given)
+        task_options = self._reset_options(options)
+        self.state = self.last_state = self._begin(self._first, [self.np_random], task_options)
         if self.render_mode == "human":
             self.render()
         return self.task.observe(self.state)[0], {"is_success": False}
 
     def step(self, action: NDArray[np.float32]) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]:
-        """Send the command of `action`; one period later, observe and score."""
+        """Send the command of `action` (a,); observe and score one period later."""
         before = self._running()
         batch = self._checked(action)[None]
         state = self.robot.step(self.task.command(batch, before))
@@ -177,7 +177,7 @@ def plain_info(score: Score) -> dict[str, Any]:
 
 
 def _present(value: NDArray[Any]) -> NDArray[np.bool_]:
-    """Which environments have this info; an empty text stands for none. Shape: (n,)."""
+    """Mask of the environments that have this info; an empty text means none. Shape: (n,)."""
     if value.dtype.kind in "US":
         return np.asarray(value != "")
     if value.dtype.kind == "O":
@@ -186,7 +186,7 @@ def _present(value: NDArray[Any]) -> NDArray[np.bool_]:
 
 
 def _plain(value: Any) -> Any:
-    """Text as str, one number as float, several as an array of their own, objects as they are."""
+    """Text as str, one number as float, several as a new array, objects unchanged."""
     if isinstance(value, str):
         return str(value)
     if isinstance(value, np.ndarray):
@@ -229,16 +229,16 @@ class RobotVectorEnv(_RobotAndTask, gym.vector.VectorEnv[NDArray[np.float32], ND
 
         Args:
             seed: Environment i is seeded with ``seed + i``, or with ``seed[i]``.
-            options: ``reset_mask``, and what the task's ``reset_options`` names, for every environment alike.
+            options: ``reset_mask``, and the task's ``reset_options``, equal for every environment.
         """
-        given = self._reset_options(options, "reset_mask")
-        mask = np.asarray(given.pop("reset_mask", self._all), dtype=bool)
+        task_options = self._reset_options(options, "reset_mask")
+        mask = np.asarray(task_options.pop("reset_mask", self._all), dtype=bool)
         if mask.shape != self._all.shape:
             raise InvalidValue(f"reset_mask must have shape {self._all.shape}, not {mask.shape}.")
         for i, one in enumerate(self._seeds(seed)):
             if one is not None and mask[i]:
                 self._rngs[i] = seeding.np_random(one)[0]
-        observation = self._reset(np.flatnonzero(mask), given)
+        observation = self._reset(np.flatnonzero(mask), task_options)
         return observation, {"is_success": np.zeros(self.num_envs, dtype=bool), "_is_success": self._all.copy()}
 
     def _seeds(self, seed: int | list[int | None] | None) -> Sequence[int | None]:
@@ -257,7 +257,7 @@ class RobotVectorEnv(_RobotAndTask, gym.vector.VectorEnv[NDArray[np.float32], ND
     def step(
         self, actions: NDArray[np.float32]
     ) -> tuple[NDArray[np.float32], NDArray[np.float64], NDArray[np.bool_], NDArray[np.bool_], dict[str, Any]]:
-        """Step every environment; those whose episode ended begin the next one."""
+        """Step every environment with `actions` (n, a); those whose episode ended begin the next one."""
         before = self._running()
         actions = self._checked(actions)
         self.state = self.robot.step(self.task.command(actions, before))
@@ -277,7 +277,7 @@ class RobotVectorEnv(_RobotAndTask, gym.vector.VectorEnv[NDArray[np.float32], ND
     def _next_episodes(
         self, ended: NDArray[np.bool_], observation: NDArray[np.float32], infos: dict[str, Any]
     ) -> NDArray[np.float32]:
-        """Move the last observation and info of ended episodes aside and begin the next ones."""
+        """Save the last observation and info of ended episodes in `infos`, and begin the next episodes."""
         values = {key: value for key, value in infos.items() if not key.startswith("_")}
         masks = {"_" + key: infos["_" + key] for key in values}
         infos |= {name: mask & ~ended for name, mask in masks.items()}  # `reset` gives no such info
@@ -302,7 +302,7 @@ class RobotVectorEnv(_RobotAndTask, gym.vector.VectorEnv[NDArray[np.float32], ND
         return None if image is None else (image,)
 
     def close_extras(self, **kwargs: Any) -> None:
-        """Halt the robots and drop the physics."""
+        """Halt and close the robots."""
         self.state = None
         self.robot.close()
 
@@ -317,12 +317,12 @@ class RobotVectorEnv(_RobotAndTask, gym.vector.VectorEnv[NDArray[np.float32], ND
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> NDArray[np.float32]:
-        """Go to what `state_dict` returned; the observation there."""
+        """Restore the result of `state_dict`; returns the observation."""
         robot: Any = self.robot
-        now: RobotState = robot.load_state_dict(state["robot"])
-        self.state = now
+        restored: RobotState = robot.load_state_dict(state["robot"])
+        self.state = restored
         self.task.load_state_dict(state["task"])
         self.elapsed = np.array(state["elapsed"])
         for rng, rng_state in zip(self._rngs, state["rngs"], strict=True):
             rng.bit_generator.state = rng_state
-        return self.task.observe(now)
+        return self.task.observe(restored)

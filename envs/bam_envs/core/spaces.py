@@ -1,4 +1,4 @@
-"""Gymnasium spaces as plain JSON values and back, as a checkpoint's manifest has them.
+"""Gymnasium spaces as plain JSON values and back, for the manifest of a checkpoint.
 
 =============  ==========================================================================
 type           fields
@@ -13,8 +13,8 @@ Tuple          spaces: a list
 Sequence       space, stack
 =============  ==========================================================================
 
-Infinities are the strings ``"inf"`` and ``"-inf"``: JSON has none. Floats keep every bit. A space comes back equal to
-what it was, except that ``MultiBinary([n])`` comes back as ``MultiBinary(n)``, which holds the same arrays.
+Infinities are the strings ``"inf"`` and ``"-inf"``: JSON has none. Floats keep every bit. A decoded space equals the
+encoded one, except that ``MultiBinary([n])`` becomes ``MultiBinary(n)``, which holds the same arrays.
 """
 
 import math
@@ -33,11 +33,11 @@ from bam_envs.core.wording import brief
 Json = dict[str, Any]
 _KINDS = ("Box", "Discrete", "MultiDiscrete", "MultiBinary", "Text", "Dict", "Tuple", "Sequence")
 _REFUSED = (AssertionError, AttributeError, OverflowError, TypeError, ValueError)
-"""What Gymnasium and NumPy raise for fields that do not fit."""
+"""Errors of Gymnasium and NumPy for fields that do not fit."""
 
 
 def space_to_json(space: Space[Any]) -> Json:
-    """Plain values that `space_from_json` makes the same space of.
+    """Encode a space as plain values for `space_from_json`.
 
     Raises:
         UnknownName: Graph, OneOf, or a kind of space that is not Gymnasium's.
@@ -69,7 +69,7 @@ def space_to_json(space: Space[Any]) -> Json:
 
 
 def space_from_json(value: Mapping[str, Any]) -> Space[Any]:
-    """The space that `space_to_json` was given.
+    """Decode a space that `space_to_json` encoded.
 
     Raises:
         UnknownName: ``value["type"]`` is not in the table.
@@ -96,7 +96,7 @@ def _make(kind: str, value: Mapping[str, Any]) -> Space[Any]:
         low, high = (_bounds(value[side], shape, dtype, side) for side in ("low", "high"))
         return spaces.Box(low, high, shape=shape, dtype=dtype.type)
     if kind == "Discrete":
-        # Gymnasium 1.1 knows no other dtype than int64, and no argument for it.
+        # Gymnasium 1.1 supports only int64, and has no argument for it.
         other = {} if value["dtype"] == "int64" else {"dtype": np.dtype(value["dtype"])}
         return spaces.Discrete(_integer(value, "n"), start=_integer(value, "start"), **other)
     if kind == "MultiDiscrete":

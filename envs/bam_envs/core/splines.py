@@ -20,7 +20,7 @@ class Splines:
     knots: Array
     """Parameter at each point, from 0 to 1. Shape: (k, p)."""
     coefficients: Array
-    """Of the cubic in (u - knot) of each interval, constant first. Shape: (k, p - 1, 4, d)."""
+    """Coefficients of the cubic in (u - knot) of each interval, constant first. Shape: (k, p - 1, 4, d)."""
 
     def at(self, u: Array) -> Array:
         """Points at the parameters `u` of each spline. Shape: (k, m) -> (k, m, d)."""

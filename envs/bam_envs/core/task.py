@@ -1,4 +1,4 @@
-"""The Task protocol: what a robot is asked to do. A task is pure: no I/O and no clock; its memory is arrays it owns."""
+"""The Task protocol: the problem that a robot solves. A task is pure: no I/O and no clock; its memory is arrays."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -22,9 +22,9 @@ class Label:
     name: str
     meaning: str
     unit: str
-    """Of the quantity before scaling."""
+    """Unit of the quantity before scaling."""
     scale: str = "1"
-    """How the quantity is scaled."""
+    """Scaling of the quantity."""
     low: float = -1.0
     high: float = 1.0
 
@@ -40,7 +40,7 @@ class Score:
     success: Flags
     """The task is done. Shape: (n,)."""
     info: dict[str, NDArray[Any]] = field(default_factory=dict)
-    """Named distances and the like, numbers, text ("" for none) or objects. Shape: (n, ...) each."""
+    """Named infos, such as distances: numbers, text ("" for none) or objects. Shape: (n, ...) each."""
 
 
 @runtime_checkable
@@ -48,14 +48,14 @@ class Task(Protocol):
     """Observation, command, reward and end of `num_envs` environments: one live robot, or many simulated ones.
 
     A task may have one more attribute, ``reset_options``: the names of the options that `reset` of its environment
-    takes. Its `sample_initial` has a third argument then, ``options``, a mapping of those that were given.
+    takes. Its `sample_initial` then has a third argument, ``options``, a mapping of the options in use.
     """
 
     num_envs: int
     observation_space: spaces.Box
-    """Of a single environment."""
+    """Observation space of a single environment."""
     action_space: spaces.Box
-    """Of a single environment."""
+    """Action space of a single environment."""
     observation_labels: tuple[Label, ...]
     action_labels: tuple[Label, ...]
 
@@ -63,28 +63,28 @@ class Task(Protocol):
         """Sample targets and start states of these environments, each from its own generator."""
 
     def on_reset(self, env_ids: EnvIds, state: RobotState) -> None:
-        """The robots of these environments are at their start: begin the memory of the episode with what was measured.
+        """Begin the memory of an episode in these environments, whose robots are at their start.
 
         `state` has all n environments.
         """
 
     def observe(self, state: RobotState) -> Floats:
-        """What the policy sees. Shape: (n, ...)."""
+        """The observation for the policy. Shape: (n, ...)."""
 
     def command(self, action: Floats, state: RobotState) -> Array:
-        """What the robot is sent, SI units. Shapes: (n, a) -> (n, m)."""
+        """The command to the robot, SI units. Shapes: (n, a) -> (n, m)."""
 
     def score(self, state: RobotState, action: Floats) -> Score:
         """The outcome of the step that led to `state`."""
 
     def marks(self) -> list[tuple[Array, tuple[float, float, float, float]]]:
-        """Spheres that a picture of environment 0 shows: position (3,) [m] and colour."""
+        """Spheres to draw in an image of environment 0: position (3,) [m] and RGBA colour."""
 
     def state_dict(self) -> dict[str, Any]:
         """The memory, as plain arrays."""
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Go to what `state_dict` returned."""
+        """Restore the result of `state_dict`."""
 
 
 def labelled_box(labels: Sequence[Label]) -> spaces.Box:
@@ -94,7 +94,7 @@ def labelled_box(labels: Sequence[Label]) -> spaces.Box:
 
 
 class Memory:
-    """The memory of a task or of simulated robots, as `Task.state_dict` has it: the arrays that `memory` names."""
+    """The memory of a task or of simulated robots, for `Task.state_dict`: the arrays that `memory` names."""
 
     memory: Mapping[str, str] = {}
     """Key in the saved memory -> attribute."""
@@ -104,23 +104,23 @@ class Memory:
         return {key: getattr(self, attribute).copy() for key, attribute in self.memory.items()}
 
     def load_state_dict(self, state: dict[str, Any]) -> Any:
-        """Go to what `state_dict` returned."""
+        """Restore the result of `state_dict`."""
         for key, attribute in self.memory.items():
             setattr(self, attribute, np.array(state[key], dtype=getattr(self, attribute).dtype))
 
     def own_memory(self) -> None:
-        """Go on with copies: what was handed out of the arrays keeps its numbers."""
+        """Continue with copies, so that views of the arrays that a caller holds keep their numbers."""
         for attribute in self.memory.values():
             setattr(self, attribute, getattr(self, attribute).copy())
 
 
 def draw_seeds(rngs: Sequence[np.random.Generator]) -> NDArray[np.int64]:
-    """A seed for what the robot itself draws, one from each generator; for `Initial.seeds`. Shape: (k,)."""
+    """Seeds of the robots' own random numbers, one from each generator; for `Initial.seeds`. Shape: (k,)."""
     return np.array([rng.integers(2**63) for rng in rngs], dtype=np.int64)
 
 
 def as_objects(values: Sequence[Any]) -> NDArray[Any]:
-    """`values` as an info: an array of objects, one for each environment. Shape: (n,)."""
+    """`values`, one for each environment, as an info: an array of objects. Shape: (n,)."""
     objects = np.empty(len(values), dtype=object)
     objects[:] = values
     return objects

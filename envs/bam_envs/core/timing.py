@@ -10,14 +10,14 @@ from dataclasses import dataclass
 import numpy as np
 
 KEPT = 65536
-"""Ticks whose lateness is kept, so that memory stays flat: 55 minutes at 20 Hz."""
+"""Ticks whose lateness is kept, to limit the memory: 55 minutes at 20 Hz."""
 
 
 class Deadline:
-    """A moment by which something must have happened.
+    """A time limit.
 
     Args:
-        timeout: How far away it is [s].
+        timeout: Time until it passes [s].
         now: The clock [s]; monotonic.
     """
 
@@ -37,7 +37,7 @@ class Deadline:
 
 @dataclass(frozen=True)
 class Lateness:
-    """How long after their deadlines the ticks started [s]."""
+    """Delays of the ticks after their deadlines [s]."""
 
     p50: float
     p99: float
@@ -45,16 +45,16 @@ class Lateness:
 
 
 class Pacer:
-    """Deadlines one period apart, so that lateness does not add up; keeps statistics of how they were kept.
+    """Deadlines one period apart, so that lateness does not add up, with statistics of the lateness.
 
-    A tick that is late starts at once, and the deadlines after it stay where they are. A tick that is late by more
-    than half a period begins a new grid: the deadlines that passed are counted as missed and are not caught up. Two
-    deadlines are therefore never less than half a period apart.
+    A late tick starts at once, and later deadlines do not move. A tick that is late by more than half a period begins
+    a new grid: the deadlines that passed are counted as missed and are not caught up. Two deadlines are therefore never
+    less than half a period apart.
 
     Args:
-        period: Time between two ticks [s]; None runs as fast as possible, with nothing to be late for.
+        period: Time between two ticks [s]; None runs as fast as possible, without deadlines.
         now: The clock [s]; monotonic.
-        sleep: Waits for so many seconds.
+        sleep: Waits for a time [s].
     """
 
     def __init__(
@@ -80,13 +80,13 @@ class Pacer:
         self._due, self._previous = self._now(), None
 
     def wait(self) -> float:
-        """Wait until the next tick is due and start it; how late it is [s], 0 without a period."""
+        """Wait until the next tick is due and start it; returns its lateness [s], 0 without a period."""
         while self.period is not None and self.slack > 0:
             self._sleep(self.slack)
         return self.tick()
 
     def tick(self) -> float:
-        """Start the next tick now, and plan the deadline after it; how late it is [s], 0 without a period."""
+        """Start the next tick now, and set the deadline after it; returns its lateness [s], 0 without a period."""
         now = self._now()
         if self._previous is not None:
             self._seconds += now - self._previous
@@ -133,7 +133,7 @@ class Ticker:
     """A thread that calls `tick` every `period`, and whenever it is woken, until it is stopped.
 
     Args:
-        tick: What to do. An exception ends the thread, and goes to `threading.excepthook` as of any thread.
+        tick: The function to call. An exception in it ends the thread, and goes to `threading.excepthook`.
         period: Time between two calls [s].
     """
 
@@ -148,11 +148,11 @@ class Ticker:
         return self._thread.is_alive()
 
     def start(self) -> None:
-        """Start the thread; the first call comes at once."""
+        """Start the thread; the first call is immediate."""
         self._thread.start()
 
     def wake(self) -> None:
-        """Call `tick` now, out of turn."""
+        """Call `tick` now, before its next time."""
         self._wake.set()
 
     def _run(self) -> None:
@@ -168,7 +168,7 @@ class Ticker:
             self._tick()
 
     def stop(self) -> None:
-        """Start no call any more, and wait for the end of the one that runs. Idempotent."""
+        """End the thread; waits for a running call. Idempotent."""
         self._stopped = True
         self._wake.set()
         if self.running and self._thread is not threading.current_thread():

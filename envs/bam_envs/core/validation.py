@@ -1,4 +1,4 @@
-"""The check of all values that people give: an annotated type describes what fits, and msgspec compares.
+"""The check of all values that users give, by annotated types and msgspec.
 
 ::
 
@@ -11,7 +11,7 @@
             check_fields(self)      # rate: expected a number above 0, found -1
 
 A range is ``Annotated[float, msgspec.Meta(gt=0, le=2)]``; the names below are the frequent ones, and every one of them
-refuses NaN and infinity. ``Meta(description=...)`` replaces the words that an error makes of the type and its range.
+refuses NaN and infinity. ``Meta(description=...)`` replaces an error's description of the type and its range.
 """
 
 import re
@@ -41,12 +41,12 @@ NonEmpty = Annotated[str, Meta(min_length=1, description="non-empty text")]
 
 
 def check(value: object, kind: Any, name: str, error: type[Exception] = InvalidValue) -> Any:
-    """`value` as a `kind`: an int where a float is wanted becomes one, a whole float (1e6) an int, a list a tuple.
+    """`value` as a `kind`: an int becomes a float if one is expected, a whole float (1e6) an int, a list a tuple.
 
     Args:
         value: A number, text, list, table, a dataclass or an instance of any other class.
         kind: A type or annotation, such as ``Positive`` or ``list[int] | None``.
-        name: What the value is for, as the error begins.
+        name: Name of the value, with which the error begins.
         error: Exception to raise.
 
     Raises:
@@ -67,27 +67,27 @@ def check_fields(instance: Any, name: Callable[[str], str] = str, error: type[Ex
 
     Args:
         instance: The dataclass instance.
-        name: Makes of a field's name the one that errors show, such as `bam_envs.core.wording.as_flag`.
+        name: Converts a field's name for errors, such as `bam_envs.core.wording.as_flag`.
         error: Exception to raise.
 
     Raises:
-        error: As of `check`, for the first field that does not fit.
+        error: As in `check`, for the first field that does not fit.
     """
     for field, hint in type_hints(type(instance)).items():
         check(getattr(instance, field), hint, name(field), error)
 
 
 def read_table(kind: type[T], data: object, where: str, error: type[Exception] = InvalidValue) -> T:
-    """The dataclass `kind` with the values of the table `data`, as it comes out of TOML, YAML or JSON.
+    """The dataclass `kind` with the values of the table `data` from TOML, YAML or JSON.
 
     Args:
         kind: A dataclass; its fields are the keys.
-        data: What was read.
-        where: File and table, as the error begins.
+        data: The table.
+        where: File and table, with which the error begins.
         error: Exception to raise.
 
     Raises:
-        error: It is no table, a key is unknown (with the closest match) or missing, or a value does not fit.
+        error: `data` is not a table, a key is unknown (with the closest match) or missing, or a value does not fit.
     """
     table, hints = check(data, dict[str, Any], where, error), type_hints(kind)
     check_keys(table, hints, where, error)
@@ -172,7 +172,7 @@ def _plural(text: str) -> str:
 
 
 def _plain(value: Any) -> Any:
-    """A number of NumPy as Python's own."""
+    """A NumPy number as a Python number."""
     is_number = type(value).__module__ == "numpy" and getattr(value, "ndim", None) == 0
     return value.item() if is_number else value
 
@@ -198,7 +198,7 @@ def _parts(value: Any, kind: Any, name: str) -> list[tuple[str, Any, Any]]:
     origin, arguments = get_origin(kind), get_args(kind)
     if origin is Annotated:
         return _parts(value, arguments[0], name)
-    if origin in (Union, types.UnionType):  # an optional list is looked into, a choice of several types is not
+    if origin in (Union, types.UnionType):  # check the items of an optional list only
         rest = [one for one in arguments if one is not type(None)]
         return _parts(value, rest[0], name) if len(rest) == 1 else []
     if isinstance(value, Mapping) and origin in (dict, Mapping):

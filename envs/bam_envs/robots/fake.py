@@ -1,4 +1,4 @@
-"""A robot without physics, for tests: the joints go exactly where they are sent, at most at the arm's maximum speed."""
+"""A robot without physics, for tests: the joints follow commands exactly, at most at the arm's maximum speed."""
 
 from collections.abc import Iterator
 from typing import Any
@@ -16,23 +16,23 @@ OBJECT_HEIGHT = 0.02
 
 
 class FakeRobot:
-    """Arms with the signals of a UR5e, moved exactly; the object, if there is one, stays where it is.
+    """Arms with the signals of a UR5e that follow commands exactly; the object, if there is one, does not move.
 
-    A command is cut to the limits and the `max_rate` of the spec, and reached within the period.
+    A command is clipped to the limits and the `max_rate` of the spec, and reached within the period.
     """
 
     def __init__(self, num_robots: int = 1, *, with_object: bool = True) -> None:
         self.num_robots = num_robots
         self.spec = arm_spec("fake", with_object=with_object)
         self.sent: list[Array] = []
-        """Every command since the robot was made, as it was given. Shape: (n, 7) each."""
+        """Every command since the robot was made, before clipping. Shape: (n, 7) each."""
         self.halts = 0
-        """How often `halt` was called."""
+        """Number of calls of `halt`."""
         self._connected = False
         self._low, self._high = np.array(self.spec.command.low), np.array(self.spec.command.high)
         self._reach = np.array(self.spec.command.max_rate) * self.spec.period
         position = np.tile([0.0] * 6 + [GRIPPER_OPEN], (num_robots, 1))
-        # Every array is replaced, never changed: states that were handed out keep theirs.
+        # Every array is replaced, never changed, so that returned states keep their numbers.
         self._now = {
             "position": position,
             "velocity": np.zeros((num_robots, 6)),
@@ -42,7 +42,7 @@ class FakeRobot:
         }
 
     def connect(self) -> None:
-        """Take commands from now on."""
+        """Accept commands from now on."""
         self._connected = True
 
     def reset(self, env_ids: EnvIds, initial: Initial) -> RobotState:
@@ -57,7 +57,7 @@ class FakeRobot:
     def place_object(
         self, pose: Array | None, seeds: NDArray[np.int64], env_ids: EnvIds | slice = slice(None)
     ) -> RobotState:
-        """Put the objects at x, y [m] and yaw [rad] of `pose` (k, 3), or leave them; nothing is drawn from `seeds`."""
+        """Put the objects at x, y [m] and yaw [rad] of `pose` (k, 3), or leave them; `seeds` are not used."""
         self._require_link()
         if pose is not None:
             self._now["object"] = placed = self._now["object"].copy()
@@ -70,7 +70,7 @@ class FakeRobot:
         return next(self.slices(command, 1))
 
     def slices(self, command: Array, parts: int) -> Iterator[RobotState]:
-        """Send `command` (n, 7), and give the state after each of `parts` equal parts of the period."""
+        """Send `command` (n, 7), and yield the state after each of `parts` equal parts of the period."""
         self._require_link()
         self._now["command"] = checked_command(command, (self.num_robots, 7))
         self.sent.append(self._now["command"].copy())
@@ -90,7 +90,7 @@ class FakeRobot:
             yield self.measure()
 
     def measure(self) -> RobotState:
-        """The state now."""
+        """The current state."""
         self._require_link()
         position, place = self._now["position"], self._now["object"]
         values = [position[:, :6], self._now["velocity"], position[:, 6:], place[:, :3], place[:, 3:]]
@@ -111,11 +111,11 @@ class FakeRobot:
         self._connected = False
 
     def state_dict(self) -> dict[str, Any]:
-        """Everything the future of the robots depends on."""
+        """The complete state of the robots."""
         return {name: array.copy() for name, array in self._now.items()}
 
     def load_state_dict(self, state: dict[str, Any]) -> RobotState:
-        """Go to what `state_dict` returned; the state there."""
+        """Restore the result of `state_dict`; returns the state."""
         self.connect()
         self._now = {name: np.array(state[name]) for name in self._now}
         return self.measure()

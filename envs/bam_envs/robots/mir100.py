@@ -12,27 +12,27 @@ from bam_envs.core.robot import RobotSpec, SignalSpec
 PERIOD = 0.1
 """Time between two commands [s]."""
 MAX_SPEED = (1.0, 1.5)
-"""Fastest the drive goes: forwards [m/s], turning [rad/s]."""
+"""Maximum speed of the drive: forwards [m/s], turning [rad/s]."""
 MAX_ACCELERATION = (2.0, 2.5)
-"""Fastest the drive changes its speed: forwards [m/s^2], turning [rad/s^2]."""
+"""Maximum acceleration of the drive: forwards [m/s^2], turning [rad/s^2]."""
 FOOTPRINT = (0.90, 0.58)
 """Length and width [m]."""
 FOOTPRINT_AHEAD = 0.0376
-"""How far the middle of the footprint is ahead of the base's frame [m]."""
+"""Distance of the middle of the footprint ahead of the base's frame [m]."""
 SCAN_RAYS = 541
 """Rays of one scanner, half a degree apart."""
 SCAN_SPAN = (math.radians(-135.0), math.radians(135.0))
 """Bearing of the first and of the last ray, in the scanner's frame [rad]."""
 SCAN_RANGE = (0.05, 29.0)
-"""Nearest and farthest that is measured [m]."""
+"""Least and greatest range that is measured [m]."""
 FRONT_MASKED, BACK_MASKED = (30, 10), (10, 20)
-"""Rays that the robot's own body hides, at the beginning and at the end of a scan; always 0 on the robot."""
+"""Number of rays that the robot's body hides at the beginning and at the end of a scan; the robot sends 0 for them."""
 FRONT_RAYS = SCAN_RAYS - sum(FRONT_MASKED)
-"""Rays of the front scanner that see something: 501."""
+"""Unmasked rays of the front scanner: 501."""
 BACK_RAYS = SCAN_RAYS - sum(BACK_MASKED)
-"""Rays of the back scanner that see something: 511."""
+"""Unmasked rays of the back scanner: 511."""
 FRONT_MOUNT, BACK_MOUNT = (0.4288, 0.2358, math.radians(45.0)), (-0.3548, -0.2352, math.radians(-135.0))
-"""Where the scanners are in the base's frame: x, y [m], yaw [rad]."""
+"""Poses of the scanners in the base's frame: x, y [m], yaw [rad]."""
 
 
 def _scan(name: str, rays: int) -> SignalSpec:
@@ -48,6 +48,6 @@ COMMAND = replace(_VELOCITY, name="command", max_rate=MAX_ACCELERATION)
 
 
 def base_spec(name: str = "mir100", *, with_scans: bool = True) -> RobotSpec:
-    """The signals of a MiR100: pose in the map, speeds, and what its two scanners see."""
+    """The signals of a MiR100: pose in the map, speeds, and the ranges of its two scanners."""
     scans = (_scan("f_scan", FRONT_RAYS), _scan("b_scan", BACK_RAYS)) if with_scans else ()
     return RobotSpec(name, (_POSE, _VELOCITY, *scans), COMMAND, PERIOD)

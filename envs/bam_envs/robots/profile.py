@@ -1,4 +1,4 @@
-"""Reads robot profiles: which topics a live robot has, in which order and unit its numbers come, how old they may be.
+"""Reads robot profiles: the topics of a live robot, the order and unit of its numbers, and their maximum age.
 
 A profile is one TOML or YAML file; those in the folder ``profiles`` are shipped, and show every table. A file may start
 from a shipped one (``extends = "ur5e"``), replace whole tables of it, rename topics (``[rename]``) and frames
@@ -33,7 +33,7 @@ tomllib: Any = importlib.import_module("tomllib" if sys.version_info >= (3, 11) 
 
 Table = dict[str, Any]
 Age = Annotated[float, Meta(gt=0, le=BOUNDS["max_age"][1])]
-"""States that are older than this mean nothing any more [s], nor do commands."""
+"""Maximum age of states and commands [s]."""
 T = TypeVar("T")
 Topical = TypeVar("Topical", Source, Sink, CameraSource, Readiness)
 Converted = TypeVar("Converted", Source, Sink)
@@ -140,7 +140,7 @@ def _parsed(where: str, text: str) -> Table:
     except (ValueError, RecursionError, yaml.YAMLError) as error:  # YAML's dates and numbers are left to Python's
         raise InvalidValue(f"{where} is not {language}: {' '.join(str(error).split())}.") from error
     table: Table = check(data, Table, where)
-    if "dead_man" in table:  # what command_timeout was called before
+    if "dead_man" in table:  # the former name of command_timeout
         if "command_timeout" in table:
             raise InvalidValue(f"{where}: command_timeout comes twice: dead_man is its former name. Give one of them.")
         table["command_timeout"] = table.pop("dead_man")
@@ -174,7 +174,7 @@ def _profile(where: str, table: Table) -> RobotProfile:
     def renamed(entry: Topical) -> Topical:
         if entry.topic not in file.rename:
             return entry
-        # Who takes commands on a topic of another name is another controller.
+        # A topic of another name belongs to another controller.
         other: dict[str, Any] = {"controller": ""} if isinstance(entry, Sink) else {}
         return replace(entry, topic=file.rename[entry.topic], **other)
 
@@ -302,7 +302,7 @@ def _topical(kind: type[Topical], row: Table, where: str) -> Topical:
 
 
 def _rows(where: str, tables: Iterable[Table]) -> list[tuple[Table, str]]:
-    """The tables of a list, and how errors call each."""
+    """The tables of a list, each with its place for errors."""
     return [(table, f"{where}[{number}]") for number, table in enumerate(tables)]
 
 

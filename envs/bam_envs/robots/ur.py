@@ -1,6 +1,6 @@
 """Universal Robots arms of seven sizes: limits, speeds, workspaces, outlines; the signals of one, simulated or live.
 
-The command is six joints. The shipped profile ``ur5e`` has them; its gripper, if there is one, is left alone.
+The command is six joints. The shipped profile ``ur5e`` has them; its gripper, if any, is not commanded.
 
 Sources: user manuals of the UR3, UR5 and UR10 (CB3) and of the e-Series (+-360 degrees on all joints; speeds;
 recommended workspaces); ROS-Industrial's ur_description (the elbow cannot fold by more than 180 degrees; offsets and
@@ -22,19 +22,19 @@ from bam_envs.robots.ur5e import JOINTS as JOINTS
 
 Array = NDArray[np.float64]
 DEFAULT_MODEL = "ur5"
-"""The model if none is named: robo-gym's, so that its policies fit."""
+"""The default model: that of robo-gym, so that its policies fit."""
 START = (0.0, -2.5, 1.5, 0.0, -1.4, 0.0)
 """Joint positions [rad] with every model's flange in the air before it, clear of itself and of the table."""
 
 
 @dataclass(frozen=True)
 class ArmOutline:
-    """Where the tubes of an arm are, beside its kinematics [m]."""
+    """Offsets and radii of the tubes of an arm [m]."""
 
     upper_arm_offset: float
-    """Of the upper arm's tube from the arm's middle plane, along the shoulder axis."""
+    """Offset of the upper arm's tube from the arm's middle plane, along the shoulder axis."""
     forearm_offset: float
-    """Of the forearm's tube, likewise."""
+    """Offset of the forearm's tube, along the same axis."""
     base: float
     """Radius of base and shoulder."""
     upper_arm: float
@@ -86,18 +86,18 @@ _MODELS = [
     _model("ur16e", kinematics.UR16E, (120, 180), (0.8, 0.3), ArmOutline(0.1760, 0.0390, *_LARGE)),
 ]
 UR_MODELS = {model.name: model for model in _MODELS}
-"""Name to model."""
+"""Models by name."""
 
 
 def ur_model(name: str) -> UrModel:
-    """The model called `name`; `UnknownName` carries the closest match if there is none."""
+    """The model called `name`; `UnknownName`, with the closest match, if there is none."""
     if name not in UR_MODELS:
         raise UnknownName("ur_model", str(name), UR_MODELS, examples=UR_MODELS, similar=0.85)  # ur7 is not ur5
     return UR_MODELS[name]
 
 
 def ur_spec(model: UrModel, period: float, with_object: bool) -> RobotSpec:
-    """The signals of an arm, and of a tracked object where there is one."""
+    """The signals of an arm, and those of a tracked object if there is one."""
     position, velocity, _, *tracked = arm_spec(model.name, with_object=with_object).signals  # no gripper
     speeds = tuple(model.max_velocity.tolist())
     velocity = replace(velocity, low=tuple(-speed for speed in speeds), high=speeds)

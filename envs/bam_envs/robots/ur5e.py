@@ -43,7 +43,7 @@ COMMAND = SignalSpec(
 
 
 def arm_spec(name: str, *, with_object: bool) -> RobotSpec:
-    """The signals of a UR5e with a gripper, and of a tracked object where there is one."""
+    """The signals of a UR5e with a gripper, and those of a tracked object if there is one."""
     signals = (_POSITION, _VELOCITY, _WIDTH)
     tracked = (_OBJECT_POSITION, _OBJECT_QUATERNION) if with_object else ()
     return RobotSpec(name, (*signals, *tracked), COMMAND, period=0.05)

@@ -1,6 +1,6 @@
-"""States and commands as ROS messages and back, as a profile says: pure functions on dicts and arrays.
+"""States and commands as ROS messages and back, according to a profile: pure functions on dicts and arrays.
 
-Command types that hold a list of numbers have their own lines here; all others go field by field.
+Command types that hold a list of numbers are encoded here one by one; all others go field by field.
 """
 
 import json
@@ -35,10 +35,10 @@ Array = NDArray[np.float64]
 Message = Mapping[str, Any]
 Envelope = tuple[str, str, dict[str, Any]]  # topic, type, message
 Sign = Callable[[Tag, str, bytes], str]  # the text of a tag on a topic with that content; `Tagger.sign` is one
-INFO_SERVICE = "/bam/robot"  # where a served robot says what it is (std_srvs/Trigger; `RobotInfo` in its message)
-HALT_TOPIC = "/bam/halt"  # where a served robot is told to stop (std_msgs/Empty)
+INFO_SERVICE = "/bam/robot"  # describes a served robot (std_srvs/Trigger; `RobotInfo` in its message)
+HALT_TOPIC = "/bam/halt"  # stops a served robot (std_msgs/Empty)
 SCENE_TOPIC = "/bam/scene"
-"""Where a simulated robot is told how an episode begins, by requests on ``request`` and replies on ``reply`` below."""
+"""Sets the scene of a simulated robot for an episode, by requests on ``…/request`` and replies on ``…/reply``."""
 _ARRAYS = ("std_msgs/Float64MultiArray", "std_msgs/Float32MultiArray")
 _JOINTS = "sensor_msgs/JointState"
 LISTED_TYPES = frozenset({*_ARRAYS, _JOINTS, "trajectory_msgs/JointTrajectory"})
@@ -52,27 +52,27 @@ def has_room(kind: str) -> bool:
 
 @dataclass(frozen=True)
 class RobotInfo:
-    """What a robot says of itself."""
+    """A robot's description of itself."""
 
     name: str
-    simulated: bool = False  # whether nothing real moves
-    lockstep: bool = False  # whether its time goes on only with commands, one period each
-    period: Positive | None = None  # time between two commands [s], if it says
+    simulated: bool = False  # whether no real robot moves
+    lockstep: bool = False  # whether its time advances only with commands, one period each
+    period: Positive | None = None  # time between two commands [s], if reported
     text: str = ""  # one line for people
 
     def to_json(self) -> str:
-        """As it travels."""
+        """The text for the answer of `INFO_SERVICE`."""
         return json.dumps(asdict(self))
 
 
 def read_info(text: object, where: str) -> RobotInfo:
-    """The `RobotInfo` that `text` is, without keys of a newer version; `ProtocolError` for anything else."""
+    """The `RobotInfo` in `text`, without keys of a newer version; `ProtocolError` for anything else."""
     try:
         data = json.loads(text) if isinstance(text, str) else None
     except ValueError:
         data = None
     if not isinstance(data, dict) or not isinstance(data.get("name"), str):
-        raise ProtocolError(f"{where}: it must say what robot it is, and says {brief(text)}.")
+        raise ProtocolError(f"{where}: the answer must describe the robot, not {brief(text)}.")
     known = {key: data[key] for key in RobotInfo.__dataclass_fields__ if key in data}
     return read_table(RobotInfo, known, where, ProtocolError)
 
@@ -84,8 +84,8 @@ def decode_source(source: Source, message: object, size: int) -> Array:
     if source.fields:
         raw = np.array([number_at(content, path, where) for path in source.fields])
     elif source.names:
-        found = names_of(content, "name", where)
-        raw = numbers_of(source.names, content, source.field, found, where, source.ignore, source.missing)
+        names = names_of(content, "name", where)
+        raw = numbers_of(source.names, content, source.field, names, where, source.ignore, source.missing)
     else:
         raw = numbers(value_at(content, source.field, where), f"{where}: {source.field}", missing=source.missing)
         first, last = source.skip
@@ -108,10 +108,10 @@ def _from_si(entry: Content, values: Array) -> list[float]:
 def encode_state(
     profile: RobotProfile, state: RobotState, env_id: int, stamp: Mapping[str, int], tag: str = ""
 ) -> list[Envelope]:
-    """The messages that a served robot publishes of one environment of `state`; signals it has not are left out.
+    """The messages that a served robot publishes for one environment of `state`; missing signals are left out.
 
-    `stamp` is as ROS 1 or ROS 2 writes it. `tag`, the `Tag.echo` of the command that this state is the answer to, goes
-    into ``frame_id`` of the last message, so that with it everything has arrived.
+    `stamp` has the spelling of ROS 1 or ROS 2. `tag`, the `Tag.echo` of the command that this state answers, goes into
+    ``frame_id`` of the last message, which shows that all messages have arrived.
     """
     messages: dict[tuple[str, tuple[str, ...]], Envelope] = {}
     for source in profile.state:
@@ -140,7 +140,7 @@ def encode_state(
 def encode_sink(
     sink: Sink, spec: RobotSpec, command: Array, tag: Tag | None, *, sign: Sign | None = None, ros1: bool = False
 ) -> Envelope:
-    """The message that sends the part of `command` (m,) [SI] that goes to `sink`, with `tag` as `sign` signs it."""
+    """The message with the part of `command` (m,) [SI] for `sink`, with `tag`, which `sign` signs."""
     raw, text = _from_si(sink, command[_places(sink, spec)]), ""
     if tag is not None and sink.tag:
         content: list[float] | Array = raw
@@ -157,7 +157,7 @@ def _write_command(sink: Sink, values: list[float], text: str, period: float, *,
     if sink.fields:
         stamped = has_header(sink.type)
         message: dict[str, Any] = {"header": header} if stamped else {}
-        if sink.type in ("geometry_msgs/Twist", "geometry_msgs/TwistStamped"):  # all six, whichever are commanded
+        if sink.type in ("geometry_msgs/Twist", "geometry_msgs/TwistStamped"):  # all six fields, commanded or not
             twist = {part: dict.fromkeys("xyz", 0.0) for part in ("linear", "angular")}
             message.update({"twist": twist} if stamped else twist)
         for path, value in zip(sink.fields, values, strict=True):
@@ -178,25 +178,25 @@ def _places(sink: Sink, spec: RobotSpec) -> list[int]:
 
 
 def _signed(raw: list[float] | Array) -> bytes:
-    """What is signed of a command: its raw numbers (k,) in 32 bits, since some types have no more."""
+    """The signed content of a command: its raw numbers (k,) in 32 bits, since some types have no more."""
     with np.errstate(over="ignore"):
         return np.asarray(raw, dtype="<f4").tobytes()
 
 
 class Decoded(NamedTuple):
-    """A message that commands."""
+    """A decoded command message."""
 
-    places: list[int]  # where its numbers are in the command
-    values: Array  # its numbers [SI]
+    places: list[int]  # indices of its numbers in the command
+    values: Array  # its numbers (k,) [SI]
     tag: Tag | None  # its tag, if it has one
-    content: bytes  # what a signature in the tag is for; empty without one
+    content: bytes  # the signed content; empty without a signature
 
 
 def decode_command(profile: RobotProfile, spec: RobotSpec, topic: str, message: object) -> Decoded:
-    """What a message on `topic` commands; `ProtocolError` if it is not what the profile says."""
+    """The command in a message on `topic`; `ProtocolError` if it differs from the profile."""
     sink = profile.sinks_by_topic.get(topic)
     if sink is None:
-        raise ProtocolError(f"{topic}: no command of {profile.name} comes here.")
+        raise ProtocolError(f"{topic}: {profile.name} takes no command on this topic.")
     content = require_message(message, topic)
     raw, tag = _read_command(sink, content), read_tag(tag_text(content))
     signed = _signed(raw) if tag is not None and tag.mac else b""

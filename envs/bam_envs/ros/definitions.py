@@ -1,4 +1,4 @@
-"""The message and service types that are known by their fields, one a line.
+"""The known message and service types with their fields, one per line.
 
 ``pkg/Type: type field; type field`` for a message, ``pkg/Type: request -> response`` for a service. A ``|`` separates
 spellings of one type, of ROS 1 and ROS 2 or of versions. A type without a package is in the package of its line;

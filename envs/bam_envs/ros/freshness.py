@@ -1,8 +1,8 @@
-"""Old messages are refused: tags that say who sent what when, their check on the robot's side, and clock offsets.
+"""Refuse old messages: tags with sender, number and time, their check on the robot's side, and clock offsets.
 
-A tag travels as text in a field that the message type has anyway: ``header.frame_id``, or the label of the first
-dimension of a multi-array. It looks like ``bam1 s=4f1c e=2 q=17 t=1700000000.250000 d=1700000000.350000``, followed by
-a signature, ``m=`` and 32 hexadecimal digits, where its session was opened (`bam_envs.rosbridge.sessions`).
+A tag is sent as text in an existing field of the message type: ``header.frame_id``, or the label of the first dimension
+of a multi-array. It looks like ``bam1 s=4f1c e=2 q=17 t=1700000000.250000 d=1700000000.350000``. In an open session
+(`bam_envs.rosbridge.sessions`) a signature follows, ``m=`` and 32 hexadecimal digits.
 """
 
 import hmac
@@ -19,29 +19,29 @@ from bam_envs.core.errors import RemoteError
 
 _MARK = "bam1"
 _MOST_SESSIONS = 1024
-_LONGEST = 256  # characters of a tag: what is read is kept for a while
+_LONGEST = 256  # most characters of a tag, parts of which are kept
 
 
 @dataclass(frozen=True)
 class Tag:
-    """Who sent a message, and until when it is valid."""
+    """Sender, number, time and deadline of a message."""
 
-    session: str  # one client, from its start to its end; without blanks
-    epoch: int  # counts the connections of the session
-    sequence: int  # counts its messages over all epochs
-    sent: float  # when it was sent [s], on the sender's steady clock; the receiver estimates the offset
+    session: str  # identifies one client from its start to its end; without blanks
+    epoch: int  # number of the session's connection
+    sequence: int  # number of the message, over all epochs
+    sent: float  # time of sending [s], on the sender's steady clock; the receiver estimates the offset
     deadline: float  # time after which it must not be executed [s], same clock
-    mac: str = ""  # the signature that came with it; empty without one
-    received: str = field(default="", compare=False)  # the text it was read from, without `mac`: that text is signed
+    mac: str = ""  # the received signature; empty without one
+    received: str = field(default="", compare=False)  # the received text without `mac`, which is signed
 
     def to_text(self) -> str:
-        """The tag as it travels, without a signature."""
+        """The text of the tag, without a signature."""
         new = f"{_MARK} s={self.session} e={self.epoch} q={self.sequence} t={self.sent:.6f} d={self.deadline:.6f}"
         return self.received or new
 
     @property
     def echo(self) -> str:
-        """What the state that answers the message repeats of it; see `read_echo`."""
+        """The part of the tag that the answering state repeats; see `read_echo`."""
         return f"{_MARK} s={self.session} q={self.sequence}"
 
 
@@ -73,7 +73,7 @@ def signature(key: bytes, tag: Tag, channel: str, content: bytes) -> str:
 
 
 def new_session() -> str:
-    """A name that no other session has."""
+    """A unique name for a session."""
     return uuid.uuid4().hex[:12]
 
 
@@ -88,7 +88,7 @@ class Tagger:
         self._key, self._clock, self._sequence, self._lock = key, clock, 0, threading.Lock()
 
     def sign(self, tag: Tag, channel: str, content: bytes) -> str:
-        """The text of `tag` as it travels with `content` on `channel`."""
+        """The text of `tag`, signed for `content` on `channel`."""
         return f"{tag.to_text()} m={signature(self._key, tag, channel, content)}" if self._key else tag.to_text()
 
     def next(self, epoch: int, lifetime: float) -> Tag:
@@ -100,17 +100,17 @@ class Tagger:
 
 
 class ClockOffset:
-    """Estimates the offset to the clock of a sender, as if the quickest of its messages had taken no time.
+    """Estimates the offset to the clock of a sender, as if its fastest message had taken no time.
 
-    It grows by `drift` [s/s], which follows clocks that drift apart.
+    The offset grows by `drift` [s/s], to follow clocks that drift apart.
     """
 
     def __init__(self, drift: float = 1e-4) -> None:
-        self.offset: float | None = None  # our clock minus theirs [s]; None before the first message
+        self.offset: float | None = None  # local clock minus the sender's [s]; None before the first message
         self._drift, self._at = drift, 0.0
 
     def age(self, sent: float, arrived: float) -> float:
-        """Age [s] of a message at its arrival; `sent` on their clock, `arrived` on ours."""
+        """Age [s] of a message at its arrival; `sent` on the sender's clock, `arrived` on the local one."""
         difference = arrived - sent
         if self.offset is not None:
             self.offset += self._drift * max(0.0, arrived - self._at)
@@ -121,14 +121,14 @@ class ClockOffset:
 
 
 class Freshness:
-    """Decides which messages of one session are fresh, whatever a bridge kept. Thread-safe; steady clock [s]."""
+    """Checks the freshness of the messages of one session, which a bridge may delay. Thread-safe; steady clock [s]."""
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self._clock, self._offset, self._lock = clock, ClockOffset(), threading.Lock()
         self._latest: dict[str, tuple[int, int]] = {}
 
     def require(self, tag: Tag, channel: str = "") -> None:
-        """Take note of a message of `channel`; `RemoteError` if its connection or number is old, or it is too late."""
+        """Record a message of `channel`; `RemoteError` if its connection or number is old, or it is too late."""
         with self._lock:
             epoch, sequence = self._latest.get(channel, (0, 0))
             late = self._offset.age(tag.sent, self._clock()) - (tag.deadline - tag.sent)
@@ -150,7 +150,7 @@ class FreshnessCheck:
         self._sessions: OrderedDict[str, Freshness] = OrderedDict()
 
     def require(self, tag: Tag, channel: str = "") -> None:
-        """As `Freshness.require`, of the session of `tag`."""
+        """As `Freshness.require`, for the session of `tag`."""
         with self._lock:
             fresh = self._sessions.setdefault(tag.session, Freshness(self._clock))
             self._sessions.move_to_end(tag.session)

@@ -1,6 +1,6 @@
 """Camera images in ROS messages, as PNG or JPEG; depth as a PNG of uint16 millimetres, or raw.
 
-Arrays are RGB. Message data are `bytes`, or base64 text as a JSON bridge sends them.
+Arrays are RGB. Message data are `bytes`, or base64 text from a JSON bridge.
 """
 
 import base64
@@ -23,8 +23,8 @@ _PIXEL_DTYPES = {"16UC1": "u2", "mono16": "u2", "32FC1": "f4"}
 def encode_image(image: NDArray[np.uint8], kind: str = "png") -> bytes:
     """`image` as a file: ``"png"``, which keeps every bit, or ``"jpeg"``, which is smaller and has no alpha.
 
-    Its shape is (height, width), (height, width, 1), (height, width, 3) RGB or (height, width, 4) RGBA; another one, or
-    another dtype or kind, is an `InvalidValue`. Without Pillow all here raise `MissingExtra`.
+    Its shape is (height, width), (height, width, 1), (height, width, 3) RGB or (height, width, 4) RGBA. `InvalidValue`
+    for another shape, dtype or kind. Without Pillow all functions of this module raise `MissingExtra`.
     """
     if kind not in FORMATS:
         raise InvalidValue(f"The image format must be png or jpeg, not {kind!r}.")
@@ -61,16 +61,16 @@ def color_message(
 
 
 def read_color_message(message: Mapping[str, Any]) -> NDArray[np.uint8] | None:
-    """The image in a CompressedImage, or None if it is empty. Raises as `decode_image` does."""
+    """The image in a CompressedImage, or None if it is empty. Raises the errors of `decode_image`."""
     data = message_bytes(message)
     return decode_image(data) if data else None
 
 
 def read_depth_message(message: Mapping[str, Any]) -> NDArray[np.float32] | None:
-    """Metres in an Image or CompressedImage, or None if it is empty: float32, (height, width).
+    """The depth [m] in an Image or CompressedImage, or None if it is empty: float32, (height, width).
 
-    Its data are a grey PNG of 16 bits in mm, or raw, 16UC1 in mm, 32FC1 in m, else `ProtocolError`. 0 is where nothing
-    was measured.
+    Its data are a grey PNG of 16 bits in mm, or raw, 16UC1 in mm, 32FC1 in m, else `ProtocolError`. Pixels without a
+    measurement are 0.
     """
     data = message_bytes(message)
     if not data:
@@ -95,7 +95,7 @@ def read_depth_message(message: Mapping[str, Any]) -> NDArray[np.float32] | None
 
 
 def message_bytes(message: Mapping[str, Any]) -> bytes:
-    """The data of an image message, which a JSON bridge makes base64 text; `ProtocolError` if it is neither."""
+    """The data of an image message, `bytes` or base64 text; `ProtocolError` for anything else."""
     data = message.get("data", b"")
     if isinstance(data, (bytes, bytearray, memoryview)):
         return bytes(data)

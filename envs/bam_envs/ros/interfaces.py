@@ -1,7 +1,7 @@
-"""Messages are checked against their types before anything else sees them: fields, types, ranges, finite numbers.
+"""Check messages against their types before use: fields, types, ranges, finite numbers.
 
-A message of a known type (`definitions`) comes out complete: what it leaves out gets the type's default. Of an unknown
-type only plain values are taken. Values that are not finite and nulls are refused in both cases.
+A message of a known type (`definitions`) is completed: missing fields get the type's defaults. A message of an unknown
+type may hold only plain values. Values that are not finite and nulls are refused in both cases.
 """
 
 import base64
@@ -26,7 +26,7 @@ INTEGERS = {
 }  # least and largest value of each integer type
 FLOATS = {"float32": 3.4028234663852886e38, "float64": sys.float_info.max}  # largest value of each floating-point type
 _BYTES = ("uint8", "byte", "char")  # the types whose arrays are `bytes`
-_OBJECT = (dict, Mapping)  # dict first: asking whether something is a Mapping takes ten times as long
+_OBJECT = (dict, Mapping)  # dict first: a check for Mapping takes ten times as long
 _MISSING: Any = object()  # stands for a field that a message leaves out
 _SHORT = {"time": "builtin_interfaces/Time", "duration": "builtin_interfaces/Duration"}
 _PLAIN_NAME = re.compile(r"[A-Za-z]\w*/(?:msg/|srv/)?[A-Za-z]\w*", re.ASCII)
@@ -36,10 +36,10 @@ Check = Callable[[Any, int], Any]
 
 
 class _Misfit(Exception):  # noqa: N818 - becomes an InvalidValue
-    """A value that does not fit, or what is `said` of it; collects the path to it on the way out."""
+    """A value that does not fit, described by `text` if given; collects the path to it while it is raised."""
 
-    def __init__(self, expected: str, found: object, said: str = "") -> None:
-        self.expected, self.found, self.path = expected, said or brief(found), ""
+    def __init__(self, expected: str, found: object, text: str = "") -> None:
+        self.expected, self.found, self.path = expected, text or brief(found), ""
 
     def under(self, step: str) -> "_Misfit":
         self.path = step + self.path
@@ -61,19 +61,19 @@ class Field:
 
 
 def normal_name(kind: str) -> str:
-    """``pkg/Type`` of ``pkg/Type``, ``pkg/msg/Type`` or ``pkg/srv/Type``; `InvalidValue` for what is no such name."""
+    """``pkg/Type`` of ``pkg/Type``, ``pkg/msg/Type`` or ``pkg/srv/Type``; `InvalidValue` for any other name."""
     if not isinstance(kind, str) or len(kind) > 256 or not _PLAIN_NAME.fullmatch(kind):
         raise InvalidValue(f"Type: expected a name such as 'std_msgs/String', found {brief(kind)}.")
     return kind.replace("/msg/", "/").replace("/srv/", "/")
 
 
 def request_type(kind: str) -> str:
-    """Name of the message that a service of type `kind` is asked with."""
+    """Name of the request message of a service of type `kind`."""
     return normal_name(kind) + "Request"
 
 
 def response_type(kind: str) -> str:
-    """Name of the message that a service of type `kind` answers with."""
+    """Name of the response message of a service of type `kind`."""
     return normal_name(kind) + "Response"
 
 
@@ -83,14 +83,14 @@ def variants(kind: str) -> tuple[tuple[Field, ...], ...]:
 
 
 def complete(kind: str, message: object, *, lenient: bool = False) -> dict[str, Any]:
-    """A message of type `kind` with every field there: a new dict, byte arrays as `bytes`. Read it, do not change it.
+    """A message of type `kind` with every field: a new dict, byte arrays as `bytes`. It must not be changed.
 
-    Byte arrays of `message` may be base64, as JSON has them, `bytes`, or lists of integers. A `lenient` check ignores
-    fields that the type does not have: they may be of a newer version of it. What does not fit is an `InvalidValue`.
+    Byte arrays of `message` may be base64, as in JSON, `bytes`, or lists of integers. A `lenient` check ignores unknown
+    fields, which may be of a newer version. `InvalidValue` if the message does not fit.
     """
     name = kind if kind in _table() else normal_name(kind)
     try:
-        # Unknown types are not kept: a client could name any number of them.
+        # Unknown types are not cached: a client could name any number of them.
         check = _check(name, None, 0, lenient) if name in _table() else _any
         checked: dict[str, Any] = check(_object(message), 0)
     except _Misfit as misfit:
@@ -168,7 +168,7 @@ def _message(kind: str, lenient: bool) -> Check:
             extra = next(name for name in given if name not in usual)
             raise _Misfit(f"only the fields {', '.join(usual)}" if usual else "no fields", extra)
         checked, name = {}, ""
-        try:  # one for all fields, and no function for each: this runs for every part of every message
+        try:  # one for all fields, without a function for each: this runs for every part of every message
             for name, one in plan.items():
                 checked[name] = one(given.get(name, _MISSING), depth + 1)
         except _Misfit as misfit:
@@ -188,7 +188,7 @@ def _number(kind: str, first: float) -> Check:
     first = make(first)
 
     def check(value: Any, depth: int) -> float:
-        if type(value) is make and low <= value <= high:  # what it is nearly always
+        if type(value) is make and low <= value <= high:  # the usual case
             return value
         if value is _MISSING:
             return first

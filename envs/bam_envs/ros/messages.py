@@ -1,6 +1,6 @@
-"""Plain finite numbers out of ROS messages, and into them: message dicts only, no profile, no socket.
+"""Read plain finite numbers from ROS messages, and write them: message dicts only, no profile, no socket.
 
-Every error names what was looked at, what was expected and what was found.
+Every error names the field, what was expected and what was found.
 """
 
 import math
@@ -20,7 +20,7 @@ Array = NDArray[np.float64]
 Message = Mapping[str, Any]
 _YAW = re.compile(r"yaw\((.+)\)")
 _NANO = 1_000_000_000
-_OBJECT = (dict, Mapping)  # dict first: asking whether something is a Mapping takes ten times as long
+_OBJECT = (dict, Mapping)  # dict first: a check for Mapping takes ten times as long
 
 
 @cache
@@ -31,12 +31,12 @@ def has_header(kind: str) -> bool:
 
 
 def same_type(one: str, other: str) -> bool:
-    """Whether two types are alike here: ``pkg/Type`` is ``pkg/msg/Type``, and stamped or not is the same."""
+    """Whether two types are equal, ignoring ``/msg/`` and ``Stamped``."""
     return bare_type(one).removesuffix("Stamped") == bare_type(other).removesuffix("Stamped")
 
 
 def bare_type(kind: str) -> str:
-    """``pkg/Type`` for ``pkg/msg/Type`` too."""
+    """The type without ``/msg/``: ``pkg/Type``."""
     return kind.replace("/msg/", "/")
 
 
@@ -48,7 +48,7 @@ def require_message(message: object, where: str) -> Message:
 
 
 def value_at(message: Message, path: str, where: str) -> Any:
-    """What is at `path`, e.g. ``pose.position.x``; inside of what is stamped where the message is."""
+    """The value at `path`, e.g. ``pose.position.x``; in a stamped message, `path` is that of the unstamped type."""
     steps = path.split(".")
     value: Any = message
     if steps[0] not in message and len(message) == 2 and "header" in message:  # a PoseStamped: a header and a Pose
@@ -64,7 +64,7 @@ def value_at(message: Message, path: str, where: str) -> Any:
 
 @cache
 def _quaternion(path: str) -> tuple[str, ...]:
-    """For ``yaw(path)`` the places of x, y, z, w; for any other path nothing."""
+    """For ``yaw(path)`` the paths of x, y, z, w; empty for any other path."""
     angle = _YAW.fullmatch(path)
     return () if angle is None else tuple(f"{angle.group(1)}.{axis}" for axis in "xyzw")
 
@@ -84,16 +84,16 @@ def number(value: object, where: str, *, missing: float | None = None) -> float:
         return missing
     if isinstance(value, (float, int, np.integer, np.floating)) and not isinstance(value, bool):
         try:
-            found = float(value)
+            result = float(value)
         except OverflowError:
-            found = math.inf
-        if math.isfinite(found):
-            return found
+            result = math.inf
+        if math.isfinite(result):
+            return result
     raise ProtocolError(f"{where} must be a finite number, not {brief(value)}.")
 
 
 def numbers(value: object, where: str, *, names: Sequence[str] = (), missing: float | None = None) -> Array:
-    """The list `value` of plain finite numbers, which may have `names`; shape (k,). `missing` as of `number`."""
+    """The list `value` of plain finite numbers, which may have `names`; shape (k,). For `missing` see `number`."""
     if isinstance(value, np.ndarray) and value.ndim == 1:
         value = value.tolist()
     if not isinstance(value, Sequence) or isinstance(value, (str, bytes, bytearray)):
@@ -101,8 +101,8 @@ def numbers(value: object, where: str, *, names: Sequence[str] = (), missing: fl
     if set(map(type, value)) == {float} and math.isfinite(sum(value)):  # nearly always; a finite sum has finite terms
         return np.array(value)
     places = [f"{where} of {name}" for name in names] or [f"{where}[{place}]" for place in range(len(value))]
-    found = [number(one, place, missing=missing) for one, place in zip(value, places, strict=True)]
-    return np.array(found, dtype=np.float64)
+    checked = [number(one, place, missing=missing) for one, place in zip(value, places, strict=True)]
+    return np.array(checked, dtype=np.float64)
 
 
 def names_of(message: Message, field: str, where: str) -> list[str]:
@@ -125,16 +125,16 @@ def numbers_of(
     ignore: Sequence[str] = (),
     missing: float | None = None,
 ) -> Array:
-    """The numbers of `names` in the list `field`, which has one for each name that was `found`; shape (k,).
+    """The numbers of `names` in the list `field`, which has one for each of the names `found`; shape (k,).
 
-    There may be others only for the names to `ignore`. `missing` is as of `number`.
+    Other names are allowed only if they are in `ignore`. For `missing` see `number`.
     """
     if absent := [name for name in names if name not in found]:
         raise ProtocolError(f"{where}: {', '.join(absent)} missing; found: {', '.join(found) or 'no name'}.")
     if extra := [name for name in found if name not in names and name not in ignore]:
         raise ProtocolError(
             f"{where}: {', '.join(extra)} not expected; expected: {', '.join(names)}. "
-            f"List what is not ours in ignore of the profile."
+            f"List the names of others in ignore of the profile."
         )
     values = value_at(message, field, where)
     if not isinstance(values, (list, tuple, np.ndarray)) or len(values) != len(found):
@@ -171,7 +171,7 @@ def put_at(message: dict[str, Any], path: str, value: float) -> None:
 
 
 def read_stamp(message: Message, where: str) -> float | None:
-    """When the message says it was measured [s], in the spelling of ROS 1 or ROS 2; None if it says nothing, or 0."""
+    """The stamp of a message [s], in the spelling of ROS 1 or ROS 2; None without one, or if it is 0."""
     header = message.get("header")
     stamp = header.get("stamp") if isinstance(header, _OBJECT) else None
     if stamp is None:
@@ -187,7 +187,7 @@ def read_stamp(message: Message, where: str) -> float | None:
 
 
 def write_stamp(seconds: float, *, ros1: bool = False) -> dict[str, int]:
-    """A stamp as ROS 2 spells it, or ROS 1."""
+    """A stamp [s] in the spelling of ROS 2, or ROS 1."""
     whole = math.floor(seconds)
     nano = min(round((seconds - whole) * _NANO), _NANO - 1)
     return {"secs": whole, "nsecs": nano} if ros1 else {"sec": whole, "nanosec": nano}

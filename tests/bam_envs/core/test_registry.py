@@ -222,10 +222,10 @@ def test_the_time_limit_of_robo_gym_cannot_be_put_off(make, env_id, parity, step
             "tolerance: the task runs at ws://b:2; give its options to bam-serve there.",
         ),
         ({"profile": "ur5e"}, "profile='ur5e' describes a live robot; give its address with robot= too."),
-        ({"timeout": 5.0}, "timeout=5.0 is how long an answer of transport= is waited for; leave it out."),
+        ({"timeout": 5.0}, "timeout=5.0 limits the wait for an answer of transport=; leave it out."),
         (
             {"robot": "ws://a:1", "timeout": 5.0},
-            "timeout=5.0 is how long an answer of transport= is waited for; leave it out.",
+            "timeout=5.0 limits the wait for an answer of transport=; leave it out.",
         ),
     ],
 )

@@ -119,7 +119,7 @@ LENGTH = "position must have 6 numbers, one for each name, not"
         (
             {"name": [*JOINTS, "finger_joint"], "position": [0.0] * 7},
             f"finger_joint not expected; expected: {', '.join(JOINTS)}. "
-            "List what is not ours in ignore of the profile.",
+            "List the names of others in ignore of the profile.",
         ),
         ({"name": [*JOINTS, "elbow_joint"]}, "elbow_joint comes twice in name."),
         ({"position": [0.0] * 5}, f"{LENGTH} 5 numbers."),
@@ -323,7 +323,7 @@ def test_trajectories_that_are_refused(names, points, text):
     topic = "/scaled_joint_trajectory_controller/joint_trajectory"
     message = {"joint_names": list(names), "points": [{"positions": one} for one in points]}
     assert refused_command(topic, message) == f"{topic}: {text}"
-    assert refused_command("/elsewhere", {}) == "/elsewhere: no command of ur5e comes here."
+    assert refused_command("/elsewhere", {}) == "/elsewhere: ur5e takes no command on this topic."
 
 
 def test_trajectories_are_ordered_by_name():
@@ -370,7 +370,7 @@ def test_info():
     for text in (None, "", "[]", "{}", '{"name": 3}'):
         with pytest.raises(ProtocolError) as caught:
             read_info(text, "/bam/robot")
-        assert str(caught.value).startswith("/bam/robot: it must say what robot it is, and says ")
+        assert str(caught.value).startswith("/bam/robot: the answer must describe the robot, not ")
 
 
 @pytest.mark.parametrize(

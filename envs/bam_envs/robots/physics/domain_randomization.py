@@ -1,7 +1,7 @@
-"""What differs between a simulated robot and a real one, drawn anew for each episode: domain randomisation.
+"""Domain randomisation: differences between a simulated robot and a real one, drawn for each episode.
 
-Everything that an environment draws follows from one seed. The noise of a whole episode is drawn at its start (a tape
-of `TAPE` steps, read in a circle): one call of the generator for each episode, not for each step.
+All random numbers of an environment follow from one seed. The noise of an episode is drawn at its start, for `TAPE`
+steps that repeat, so that the generator is called once per episode instead of once per step.
 """
 
 from collections.abc import Mapping
@@ -16,13 +16,13 @@ from bam_envs.core.task import Memory
 from bam_envs.robots.physics.mujoco_batch import Physics
 
 Array = NDArray[np.float64]
-ARM_COORDINATES = 8  # six joints and two fingers; what comes after is the object
+ARM_COORDINATES = 8  # six joints and two fingers; the object follows
 TAPE = 256  # steps of noise drawn at once
 
 
 @dataclass(frozen=True)
 class Ranges:
-    """How far a randomised robot differs from the nominal one; a span is the least and the most."""
+    """Ranges of the differences between a randomised robot and the nominal one; a span is (least, greatest)."""
 
     mass: tuple[float, float] = (0.5, 2.0)
     """Factor on the object's mass."""
@@ -39,7 +39,7 @@ class Ranges:
     max_delay: int = 2
     """Commands arrive 0 to this many periods late; drawn once an episode."""
     drop: float = 0.05
-    """Probability that the tracker gives no new object pose in a step; the last one is seen again."""
+    """Probability that the tracker has no new object pose in a step, and repeats the last one."""
 
 
 class Imperfection(Memory):
@@ -58,11 +58,11 @@ class Imperfection(Memory):
         self._dropped = np.zeros((num_envs, TAPE), dtype=bool)
         self._sent = np.zeros((num_envs, self.ranges.max_delay + 1, nu))
         self.seen = np.zeros((num_envs, 7))
-        """Object poses as the tracker says. Shape: (n, 7)."""
+        """Object poses measured by the tracker: position [m], quaternion w, x, y, z. Shape: (n, 7)."""
         self._has_object = physics.model.nq > ARM_COORDINATES
 
     def reset(self, env: int, seed: int, command: Array) -> None:
-        """Draw the differences of a new episode; `command` (m,) is what the robot holds at its start."""
+        """Draw the differences of a new episode; `command` (m,) is the robot's command at its start."""
         rng = np.random.default_rng(seed)
         self.seeds[env], self.step_count[env] = seed, 0
         self.delay[env] = rng.integers(self.ranges.max_delay + 1)
@@ -91,17 +91,17 @@ class Imperfection(Memory):
         self._physics.recompute(env)
 
     def delayed(self, command: Array) -> Array:
-        """What reaches the robot now when `command` (n, m) is sent."""
+        """The command that reaches the robot now, if `command` (n, m) is sent. Shape: (n, m)."""
         self._sent = np.roll(self._sent, 1, axis=1)
         self._sent[:, 0] = command
         return self._sent[np.arange(len(command)), self.delay]
 
     def forget(self, command: Array) -> None:
-        """Drop the commands that are on their way; `command` (n, m) is what the robots hold."""
+        """Drop the delayed commands; `command` (n, m) replaces them."""
         self._sent = np.repeat(command[:, None], self._sent.shape[1], axis=1)
 
     def look(self, env_ids: EnvIds, pose: Array) -> None:
-        """Let the tracker see these environments' objects at `pose` (k, 7): position [m] and quaternion, w first."""
+        """Let the tracker measure these environments' objects at `pose` (k, 7): position [m], quaternion w, x, y, z."""
         now = self.step_count[env_ids] % TAPE
         noise = self._noise[env_ids, now]
         half = 0.5 * self.ranges.angle_noise * noise[:, 3]
@@ -113,7 +113,7 @@ class Imperfection(Memory):
         self.step_count[env_ids] += 1
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Draw each environment again from its seed, then go to where it was."""
+        """Draw each environment again from its seed, then restore its state."""
         for env, seed in enumerate(state["seeds"]):
             self.reset(env, int(seed), self._sent[env, 0])
         super().load_state_dict(state)

@@ -1,7 +1,7 @@
-"""Universal Robots arms without dynamics: in a period the joints reach their set points, no faster than they can.
+"""Universal Robots arms without dynamics: in a period the joints reach their set points, within their speed limits.
 
-What makes an arm slow is in its commands (`bam_envs.tasks.ur_arm`), so that a live arm is as slow. Contacts are
-looked for, and nothing stops at them: they are told in ``state.truth["collision"]``, until the next reset.
+The commands of a task (`bam_envs.tasks.ur_arm`) slow an arm down, so that a live arm is as slow. Contacts are detected
+but do not stop the arm; ``state.truth["collision"]`` reports them until the next reset.
 """
 
 from collections.abc import Iterator, Mapping
@@ -33,9 +33,9 @@ _PAIRS = (
     *((_UPPER, other) for other in (_WRIST_1, _WRIST_2, _WRIST_3)),
     (_FOREARM, _WRIST_3),
 )
-_LOW_LINKS = [_UPPER, _FOREARM, _WRIST_1, _WRIST_2, _WRIST_3, _ELBOW]  # links that can get at the table
+_LOW_LINKS = [_UPPER, _FOREARM, _WRIST_1, _WRIST_2, _WRIST_3, _ELBOW]  # links that can reach the table
 _HALVINGS = 20
-LEAST_SHARE = 0.7  # where arms differ: the least share of the way to its set point that one goes in a period
+LEAST_SHARE = 0.7  # of randomised arms: the least share of the way to its set point that one moves in a period
 
 
 class Capsules(NamedTuple):
@@ -47,7 +47,7 @@ class Capsules(NamedTuple):
 
 
 class ArmContacts:
-    """What arms of one model touch: themselves, the table they stand on, the ground, a ball.
+    """Contacts of arms of one model with themselves, the table they stand on, the ground, a ball.
 
     Each link is a tube, a segment with a radius. Links that share a joint cannot collide; of the others, pairs that are
     always apart are left out. Distances are exact: of two segments in closed form, of a segment and the table by
@@ -76,7 +76,7 @@ class ArmContacts:
         return Capsules(np.stack(start, axis=1), np.stack(end, axis=1), self._radius)
 
     def touching(self, q: Array, obstacle: Array | None = None) -> Flags:
-        """Whether arms at `q` [rad] touch anything, a ball at `obstacle` [m] too. Shapes: (n, 6), (n, 3) -> (n,)."""
+        """Whether arms at `q` [rad] touch anything, or a ball at `obstacle` [m]. Shapes: (n, 6), (n, 3) -> (n,)."""
         arms = self.capsules(q)
         touching = self.touching_itself(arms) | self.touching_table(arms)
         return touching if obstacle is None else touching | self.touching_ball(arms, obstacle)
@@ -117,7 +117,7 @@ def segment_distance2(start: Array, end: Array, other_start: Array, other_end: A
     way, other_way, gap = end - start, other_end - other_start, start - other_start
     a, e = np.maximum(_dot(way, way), 1e-12), np.maximum(_dot(other_way, other_way), 1e-12)
     b, c, f = _dot(way, other_way), _dot(way, gap), _dot(other_way, gap)
-    slant = a * e - b * b  # 0 where they are parallel: then any point will do to begin with
+    slant = a * e - b * b  # 0 if they are parallel: then any first point will do
     share = np.where(slant > 1e-9 * a * e, np.clip((b * f - c * e) / np.maximum(slant, 1e-18), 0.0, 1.0), 0.0)
     other_share = np.clip((b * share + f) / e, 0.0, 1.0)
     share = np.clip((b * other_share - c) / a, 0.0, 1.0)
@@ -138,25 +138,25 @@ def box_distance2(start: Array, end: Array) -> Array:
 
 
 def _outside(point: Array) -> Array:
-    """How far points (n, 3) are outside the table, along each axis."""
+    """Distances of points (n, 3) outside the table along each axis [m]. Shape: (n, 3)."""
     outside: Array = np.maximum(point - TABLE[1], 0.0) + np.minimum(point - TABLE[0], 0.0)
     return outside
 
 
 def _dot(one: Array, other: Array) -> Array:
-    """Dot products along the last axis, written out: each is the same in a batch of any size."""
+    """Dot products along the last axis, written out so that each is the same in a batch of any size."""
     return one[..., 0] * other[..., 0] + one[..., 1] * other[..., 1] + one[..., 2] * other[..., 2]
 
 
 class KinematicArm(Memory, Drawn):
-    """n arms of one model on a table, which move exactly.
+    """n arms of one model on a table, which follow commands exactly.
 
     Args:
-        num_robots: How many are stepped together.
+        num_robots: Number of arms stepped together.
         ur_model: ur3, ur3e, ur5, ur5e, ur10, ur10e or ur16e.
         period: Time between two commands [s].
-        obstacle: Whether a ball flies about, seen by a tracker.
-        randomize: Each episode the arm lags behind its set points by another share, 0 to 0.3 of the way.
+        obstacle: Whether there is a moving ball, measured by a tracker.
+        randomize: Whether the arm lags behind its set points, by a share of the way from 0 to 0.3, drawn each episode.
     """
 
     floor, mark_radius = GROUND, 0.025
@@ -191,16 +191,16 @@ class KinematicArm(Memory, Drawn):
 
     @property
     def setpoint(self) -> Array:
-        """Where the joints are told to be now [rad]. Shape: (n, 6)."""
+        """Current set points of the joints [rad]. Shape: (n, 6)."""
         setpoint: Array = self._position.copy()
         return setpoint
 
     def tool_position(self, q: Array) -> Array:
-        """Position of the pads of a gripper [m], were there one. Shape: (n, 6) [rad] -> (n, 3)."""
+        """Position of the pads of an assumed gripper [m]. Shape: (n, 6) [rad] -> (n, 3)."""
         return self._tool.tool_position(q)
 
     def reset(self, env_ids: EnvIds, initial: Initial) -> RobotState:
-        """Set these environments to the initial joint positions, at rest, and begin the way of their obstacles."""
+        """Set these environments to the initial joint positions, at rest, and restart their obstacles."""
         self._require_link()
         self.own_memory()
         self._position[env_ids] = initial.signals["joint_position"]
@@ -215,7 +215,7 @@ class KinematicArm(Memory, Drawn):
         return self._measure()
 
     def slices(self, command: Array, parts: int) -> Iterator[RobotState]:
-        """As for every `Drawn`: joint positions [rad]; a halt between two parts holds for the rest of the period."""
+        """See `Drawn`: `command` (n, 6) [rad]; a halt between two parts holds for the rest of the period."""
         self._require_link()
         self._command = checked_command(command, (self.num_robots, 6))
         return self._slices(np.clip(self._command, self._low, self._high), parts)
@@ -223,7 +223,7 @@ class KinematicArm(Memory, Drawn):
     def _slices(self, target: Array, parts: int) -> Iterator[RobotState]:
         start, began, halts, period = self._position, self._stamp, self._halts, self.spec.period
         travel = np.clip(target - start, -self._reach, self._reach)
-        goal = np.where(np.abs(target - start) <= self._reach, target, start + travel)  # exact where it is in reach
+        goal = np.where(np.abs(target - start) <= self._reach, target, start + travel)  # exact if it is in reach
         if self.randomize:
             travel = travel * self._share
             goal = start + travel
@@ -249,11 +249,11 @@ class KinematicArm(Memory, Drawn):
         return RobotState(signals, self._stamp, self._command, {"collision": self._collided})
 
     def halt(self) -> None:
-        """Hold where it is."""
+        """Hold the current position."""
         self._halts += 1
 
     def picture(self) -> tuple[list[Shape], View]:
-        """The arm of environment 0, its table and its ball, from so far away that the arm fits."""
+        """The arm of environment 0, its table and its ball, from far enough to show the whole arm."""
         x, y, z = (TABLE[1] - TABLE[0]).tolist()
         shapes = [Shape("box", TABLE.mean(axis=0), (x, y, z), WOOD)]
         arms = self._contacts.capsules(self._position[:1])
@@ -266,11 +266,11 @@ class KinematicArm(Memory, Drawn):
         return shapes, View((0.0, 0.1 * reach, 0.35 * reach), max(1.6, 2.6 * reach), 140.0, -25.0)
 
     def state_dict(self) -> dict[str, Any]:
-        """Everything the future of the simulated robots depends on."""
+        """The complete state of the simulated robots."""
         return super().state_dict() | ({} if self._obstacles is None else {"obstacles": self._obstacles.state_dict()})
 
     def load_state_dict(self, state: dict[str, Any]) -> RobotState:
-        """Go to what `state_dict` returned; the state there."""
+        """Restore the result of `state_dict`; returns the state."""
         self.connect()
         super().load_state_dict(state)
         if self._obstacles is not None:

@@ -75,14 +75,14 @@ class SimulatedArm:
 
     @property
     def setpoint(self) -> Array:
-        """Where the controllers pull now: joint positions [rad] and the gripper's width [m]. Shape: (n, 7)."""
+        """Current set points: joint positions [rad] and the gripper's width [m]. Shape: (n, 7)."""
         setpoint: Array = self._setpoint.copy()
         return setpoint
 
     def reset(self, env_ids: EnvIds, initial: Initial) -> RobotState:
         """Set these environments to the initial joint positions and object pose, at rest, the gripper open."""
         physics, joints = self.physics, initial.signals["joint_position"]
-        physics.state = physics.state.copy()  # states handed out earlier are views of the old array
+        physics.state = physics.state.copy()  # states returned earlier are views of the old array
         physics.time[env_ids], physics.qvel[env_ids] = 0.0, 0.0
         physics.qpos[env_ids, :6], physics.qpos[env_ids, 6:8] = joints, GRIPPER_OPEN / 2
         self._setpoint[env_ids, :6], self._setpoint[env_ids, 6] = joints, GRIPPER_OPEN
@@ -93,7 +93,7 @@ class SimulatedArm:
     def place_object(self, pose: Array | None, seeds: NDArray[np.int64]) -> RobotState:
         """Put the object at `pose` (n, 3), x, y [m] and yaw [rad], or leave it; `seeds` (n,) are of the new episode.
 
-        The arms stay where they are, at rest: a drive whose force saturates can swing about its set point for good.
+        The arms keep their positions, at rest: a drive whose force saturates could otherwise oscillate forever.
 
         Raises:
             InvalidValue: There is no object.
@@ -101,7 +101,7 @@ class SimulatedArm:
         physics = self.physics
         if pose is not None and not self._with_object:
             raise InvalidValue(f"The robot {self.spec.name!r} has no object that could be placed.")
-        physics.state = physics.state.copy()  # states handed out earlier are views of the old array
+        physics.state = physics.state.copy()  # states returned earlier are views of the old array
         physics.qvel[:, : 8 if pose is None else None] = 0.0
         return self._begin(self._all, pose, seeds)
 
@@ -123,11 +123,11 @@ class SimulatedArm:
         return next(self.slices(command, 1))
 
     def slices(self, command: Array, parts: int) -> Iterator[RobotState]:
-        """Send `command` (n, 7), and give the state after each of `parts` equal parts of the period.
+        """Send `command` (n, 7), and yield the state after each of `parts` equal parts of the period.
 
-        Set points are those of `step`, and so is the last state, but for the last bits: where bodies touch, the solver
-        of the physics starts anew with each part. A halt between two parts holds for the rest of the period; whoever
-        stops asking leaves the robots in the middle of the period, where the next command begins.
+        Set points and the last state are those of `step`, except for the last bits: in a contact, the solver of the
+        physics restarts with each part. A halt between two parts holds for the rest of the period. If the iteration is
+        abandoned, the next command begins in the middle of the period.
 
         Raises:
             InvalidValue: `parts` is not 1, 2, 5 or 10.
@@ -137,7 +137,7 @@ class SimulatedArm:
         return self._slices(self._travel(checked_command(command, (self.num_robots, 7))), parts)
 
     def _travel(self, command: Array) -> Array:
-        """How far the set points go in this period, if `command` is sent now. Shape: (n, 7)."""
+        """Change of the set points in this period, if `command` is sent now. Shape: (n, 7)."""
         reach = MAX_RATE * self.spec.period
         within = np.clip(command, self._command - reach, self._command + reach)  # no faster than the arm can
         within[:, 6] = command[:, 6]  # the gripper takes a width and goes there at its own speed
@@ -161,7 +161,7 @@ class SimulatedArm:
             yield self._measure(self._all if last else self._all[:0])
 
     def _measure(self, fresh: EnvIds) -> RobotState:
-        """The state of all environments; a noisy tracker looks again at the `fresh` ones only."""
+        """The state of all environments; a noisy tracker measures only the `fresh` ones again."""
         physics = self.physics
         qpos, qvel = physics.qpos, physics.qvel
         if not np.isfinite(physics.state.sum()):
@@ -178,7 +178,7 @@ class SimulatedArm:
         return RobotState(signals, physics.time, self._command)
 
     def halt(self) -> None:
-        """Hold the measured joint positions; commands that are on their way do not arrive."""
+        """Hold the measured joint positions; delayed commands are dropped."""
         physics, imperfection = self._physics, self._imperfection  # `close` may come from another thread
         if physics is None:
             return
@@ -207,13 +207,13 @@ class SimulatedArm:
         return self._view.show(self.physics.data_of(0), marked(marks))
 
     def state_dict(self) -> dict[str, Any]:
-        """Everything the future of the simulated robots depends on."""
+        """The complete state of the simulated robots."""
         arrays = {"physics": self.physics.state, "setpoint": self._setpoint, "command": self._command}
         extra = {} if self._imperfection is None else {"imperfection": self._imperfection.state_dict()}
         return {name: array.copy() for name, array in arrays.items()} | extra
 
     def load_state_dict(self, state: dict[str, Any]) -> RobotState:
-        """Go to what `state_dict` returned; the state there."""
+        """Restore the result of `state_dict`; returns the state."""
         self.connect()
         if self._imperfection is not None:
             self._imperfection.load_state_dict(state["imperfection"])

@@ -1,8 +1,8 @@
 """Batched MuJoCo physics: n environments of one model, or of n varied copies of it, stepped on all cores.
 
 The whole physical state is one array of shape (n, nstate), which can be set, saved and restored in parts. The future of
-an environment depends on its own state and controls only (`mujoco.rollout` starts the solver from zero at each call):
-one of many equals one alone, bit for bit.
+an environment depends only on its own state and controls (`mujoco.rollout` starts the solver from zero at each call):
+an environment in a batch equals the same one alone, bit for bit.
 """
 
 import copy
@@ -31,7 +31,7 @@ MODELS = Path(__file__).parent / "models"
 
 
 class Physics:
-    """Environments of one MJCF model in ``models/``; `varied`: each has a model of its own, to be changed."""
+    """Environments of one MJCF model in ``models/``; `varied`: each has its own copy of the model, to be changed."""
 
     def __init__(self, scene: str, num_envs: int, *, varied: bool = False) -> None:
         self.model: Any = mujoco.MjModel.from_xml_path(str(MODELS / scene))
@@ -47,7 +47,7 @@ class Physics:
         """Time, joint positions, joint velocities. Shape: (n, 1 + nq + nv)."""
 
     def _start(self) -> None:
-        """Make what belongs to this process: the threads and their working memory."""
+        """Create the threads and their working memory, which belong to this process."""
         self._data = [mujoco.MjData(self.model) for _ in range(self._threads)]
         self._scratch = mujoco.MjData(self.model)
         self._rollout: Any = rollout.Rollout(nthread=self._threads if self._threads > 1 else 0)
@@ -68,11 +68,11 @@ class Physics:
         return self.state[:, 1 + self.model.nq :]
 
     def model_of(self, env: int) -> Any:
-        """The model of `env`; its own where models are varied."""
+        """The model of `env`, a copy if models are varied."""
         return self._models[env]
 
     def recompute(self, env: int) -> None:
-        """Bring what MuJoCo derives from masses and sizes up to date after `model_of(env)` was changed."""
+        """Update the quantities that MuJoCo derives from masses and sizes, after a change of `model_of(env)`."""
         mujoco.mj_setConst(self.model_of(env), self._scratch)
 
     def step(self, control: Array) -> None:
@@ -82,23 +82,23 @@ class Physics:
         options = {"nstep": steps, "state": states, "skip_checks": True, "chunk_size": self._chunk}
         self._rollout.rollout(self._models, self._data, self.state, control, **options)
         after = states[:, -1].copy()
-        # MuJoCo puts a diverged state back to its default, so its time is not what it should be, or NaN.
+        # MuJoCo resets a diverged state to its default, so that its time is wrong, or NaN.
         diverged = ~(np.abs(after[:, 0] - (self.time + steps * self.model.opt.timestep)) < 1e-6)
         after[diverged] = np.nan
         self.state = after
 
     def data_of(self, env: int) -> Any:
-        """An `MjData` with the state of `env` and all that follows from it; overwritten by the next call."""
+        """An `MjData` with the state of `env` and all derived quantities; overwritten by the next call."""
         mujoco.mj_setState(self.model_of(env), self._scratch, np.ascontiguousarray(self.state[env]), FULL)
         mujoco.mj_forward(self.model_of(env), self._scratch)
         return self._scratch
 
     def __getstate__(self) -> dict[str, Any]:
-        """All but what belongs to this process."""
+        """The state without the objects that belong to this process."""
         return {name: value for name, value in self.__dict__.items() if name not in ("_rollout", "_data", "_scratch")}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        """Go to what `__getstate__` returned."""
+        """Restore the result of `__getstate__`."""
         self.__dict__.update(state)
         self._start()
 

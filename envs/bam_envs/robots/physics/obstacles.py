@@ -1,4 +1,4 @@
-"""Where a moving obstacle is: still, up and down, or along a closed path; one in each environment.
+"""The motion of obstacles, one in each environment: at rest, up and down, or along a closed path.
 
 An obstacle jumps from sample to sample 100 times a second, as robo-gym's does. Positions are in ``base_link`` [m].
 """
@@ -14,11 +14,11 @@ from bam_envs.core.splines import Splines, splines_through
 from bam_envs.core.task import Memory
 
 Array = NDArray[np.float64]
-UPDATE_RATE = 100.0  # how often an obstacle moves on [Hz]
+UPDATE_RATE = 100.0  # of an obstacle's position [Hz]
 PATH_POINTS = 10
-"""Points of a closed path, the last of which is the first."""
+"""Points of a closed path; the last equals the first."""
 RADIUS = 0.025
-"""Of the obstacle, a sphere [m]."""
+"""Radius of the obstacle, a sphere [m]."""
 
 
 def wave_signals(draws: Array) -> dict[str, Array]:
@@ -37,12 +37,12 @@ def wave_signals(draws: Array) -> dict[str, Array]:
 class Obstacles(Memory):
     """One obstacle in each environment.
 
-    The start signals of k environments say how theirs move:
+    The start signals of k environments define the motion:
 
-    - ``obstacle_position`` (k, 3): where it stays, or the middle of its wave [m].
-    - ``obstacle_wave`` (k, 2): how far up and down from there [m], and how often [Hz]; it starts at the bottom.
+    - ``obstacle_position`` (k, 3): a fixed position, or the middle of the wave [m].
+    - ``obstacle_wave`` (k, 2): amplitude up and down [m], and frequency [Hz]; the wave starts at the bottom.
     - ``obstacle_path`` (k, 10, 3) and ``obstacle_samples`` (k,): a closed path along a cubic spline through these
-      points [m], and how many hundredths of a second it takes once around.
+      points [m], and its duration [1/100 s].
 
     Without any of them the wave is drawn from the environment's seed.
     """
@@ -59,25 +59,25 @@ class Obstacles(Memory):
         self._samples = np.zeros(num_envs, dtype=np.int64)
 
     def begin(self, env_ids: EnvIds, signals: Mapping[str, Array], seeds: NDArray[np.int64]) -> None:
-        """The obstacles of these environments start anew, as the ``obstacle_*`` of `signals` say."""
-        given = {name: value for name, value in signals.items() if name.startswith("obstacle_")}
-        if not given:
-            given = wave_signals(np.stack([np.random.default_rng(seed).random(2) for seed in seeds]))
+        """Restart the obstacles of these environments, with the motions in the ``obstacle_*`` of `signals`."""
+        motion = {name: value for name, value in signals.items() if name.startswith("obstacle_")}
+        if not motion:
+            motion = wave_signals(np.stack([np.random.default_rng(seed).random(2) for seed in seeds]))
         self._samples[env_ids] = 0
-        self._wave[env_ids] = given.get("obstacle_wave", np.zeros(2))
-        if "obstacle_path" in given:
-            self._points[env_ids], self._samples[env_ids] = given["obstacle_path"], given["obstacle_samples"]
+        self._wave[env_ids] = motion.get("obstacle_wave", np.zeros(2))
+        if "obstacle_path" in motion:
+            self._points[env_ids], self._samples[env_ids] = motion["obstacle_path"], motion["obstacle_samples"]
             self._follow(env_ids)
         else:
-            self._place[env_ids] = given["obstacle_position"]
+            self._place[env_ids] = motion["obstacle_position"]
 
     def _follow(self, env_ids: EnvIds) -> None:
-        """Work out the paths through the points of these environments."""
+        """Compute the paths through the points of these environments."""
         path = splines_through(self._points[env_ids])
         self._knots[env_ids], self._coefficients[env_ids] = path.knots, path.coefficients
 
     def position(self, time: Array) -> Array:
-        """Where the obstacles are `time` seconds after their episode began. Shape: (n,) -> (n, 3)."""
+        """Positions of the obstacles [m] at a `time` [s] after the start of their episodes. Shape: (n,) -> (n, 3)."""
         sample = np.floor(time * UPDATE_RATE + 1e-6)
         place: Array = self._place.copy()
         # A triangle from -1 to 1; both ends of its period are samples: it stays at the bottom for two of them.
@@ -94,7 +94,7 @@ class Obstacles(Memory):
         return place
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Go to what `state_dict` returned."""
+        """Restore the result of `state_dict`."""
         super().load_state_dict(state)
         env_ids = np.flatnonzero(self._samples)
         if len(env_ids):

@@ -1,8 +1,8 @@
-"""Pictures of simulated robots: off screen through EGL or OSMesa, or in a window; of a MuJoCo model, or of shapes.
+"""Images of simulated robots: off screen through EGL or OSMesa, or in a window; of a MuJoCo model, or of shapes.
 
-MuJoCo picks its OpenGL backend when it is imported, from the variable ``MUJOCO_GL``, and without it takes one that
-needs a display. Here the first backend that works is found when the first picture is asked for; ``MUJOCO_GL`` still
-wins where it is set.
+MuJoCo chooses its OpenGL backend on import, from the variable ``MUJOCO_GL``; its default needs a display. This module
+instead uses the first backend that works, found when the first image is drawn; ``MUJOCO_GL`` takes precedence if it is
+set.
 """
 
 from __future__ import annotations
@@ -33,8 +33,8 @@ BACKENDS = ("egl", "osmesa")
 _PROBE = "import sys, importlib; importlib.import_module('mujoco.' + sys.argv[1]).GLContext(16, 16).make_current()"
 
 
-class RenderingUnavailable(BamEnvsError, RuntimeError):  # noqa: N818 - reads as what happened
-    """No OpenGL backend works here; the text says what to install."""
+class RenderingUnavailable(BamEnvsError, RuntimeError):  # noqa: N818 - named for the cause
+    """No OpenGL backend works; the text names the package to install."""
 
 
 class OffScreen:
@@ -58,7 +58,7 @@ class OffScreen:
         atexit.register(self.close)  # while OpenGL is still there
 
     def show(self, data: Any, shapes: Sequence[Shape]) -> NDArray[np.uint8]:
-        """Draw the model as `data` says and `shapes`; read back an image (480, 640, 3)."""
+        """Draw the model in the state `data`, and `shapes`; returns an image (480, 640, 3)."""
         self._gl.make_current()
         everything = mujoco.mjtCatBit.mjCAT_ALL.value
         mujoco.mjv_updateScene(self._model, data, self._option, None, self.camera, everything, self._scene)
@@ -80,7 +80,7 @@ class OffScreen:
 
 
 class Window:
-    """Draws into a window of MuJoCo's own viewer."""
+    """Draws into a window of MuJoCo's viewer."""
 
     def __init__(self, model: Any) -> None:
         require_display()
@@ -92,7 +92,7 @@ class Window:
         self.camera: Any = self._viewer.cam  # the mouse moves it too
 
     def show(self, data: Any, shapes: Sequence[Shape]) -> None:
-        """Bring the window up to date."""
+        """Update the window."""
         with self._viewer.lock():
             self._data.qpos[:], self._data.qvel[:], self._data.time = data.qpos, data.qvel, data.time
             mujoco.mj_forward(self._model, self._data)
@@ -163,7 +163,7 @@ def require_display() -> None:
 
 
 def _add_shapes(scene: Any, shapes: Sequence[Shape]) -> None:
-    """Append bodies that are in no model to an ``MjvScene``, as far as it has room."""
+    """Append bodies that are in no model to an ``MjvScene``, as many as it has room for."""
     for shape in shapes[: scene.maxgeom - scene.ngeom]:
         edges = np.resize(np.asarray(shape.size, np.float64), 3)
         geom = scene.geoms[scene.ngeom]
@@ -199,7 +199,7 @@ def find_backend() -> str:
 
 
 def works(backend: str) -> bool:
-    """Try `backend` in a process of its own: PyOpenGL keeps the first platform that it was given."""
+    """Try `backend` in a separate process, because PyOpenGL keeps its first platform."""
     environment = {**os.environ, "MUJOCO_GL": backend, "PYOPENGL_PLATFORM": backend}
     command = [sys.executable, "-c", _PROBE, backend]
     try:

@@ -29,7 +29,7 @@ _ONE, _HALF_EDGE = np.float32(1.0), np.float32(BOX_EDGE / 2)
 
 @dataclass(frozen=True)
 class Room:
-    """Four walls, from the lowest x and y [m] to the highest; what is inside them is free."""
+    """Four walls, from the lowest x and y [m] to the highest; the space between them is free."""
 
     low: tuple[float, float]
     high: tuple[float, float]
@@ -73,9 +73,9 @@ def _overlaps(x: Array, y: Array, cos: Array, sin: Array, box_x: Array, box_y: A
 
 
 class LaserScanner:
-    """One scanner at the place `mount` of every base: x, y [m], yaw [rad] in its frame.
+    """One scanner at the pose `mount` on every base: x, y [m], yaw [rad] in its frame.
 
-    The `masked` rays, which the base's own body hides at the beginning and at the end, are left out.
+    The `masked` rays, which the base's body hides at the beginning and at the end, are left out.
     """
 
     def __init__(self, mount: tuple[float, float, float], masked: tuple[int, int]) -> None:
@@ -86,7 +86,7 @@ class LaserScanner:
         self._hits = np.empty((_CHUNK, len(bearing)), bool)
 
     def cast(self, pose: Array, room: Room | None, boxes: Array) -> Floats:
-        """How far each ray goes before it meets something [m]; infinite if it never does.
+        """Range of each ray to a wall or a box [m]; infinite if it meets none.
 
         Poses of bases and boxes as in `touches`. Shapes: (n, 3), (n, b, 3) -> (n, rays).
         """
@@ -143,7 +143,7 @@ class LaserScanner:
         for slope, middle, first, last in zip(
             slopes, (dx * cos + dy * sin, dy * cos - dx * sin), nears, fars, strict=True
         ):
-            # `slope` is used up: it becomes the range to the farther side
+            # `slope` is overwritten with the range to the farther side
             np.multiply(slope, _column(middle) - _HALF_EDGE, out=first)
             np.multiply(slope, _column(middle) + _HALF_EDGE, out=slope)
             np.maximum(first, slope, out=last)
@@ -161,9 +161,9 @@ def _column(values: Array) -> Floats:
 
 
 def measured(ranges: Floats, deviates: Floats) -> Array:
-    """What a scanner says of true `ranges` (n, rays) [m], with `deviates` (n, rays) on them: inside `SCAN_RANGE`."""
+    """Measured ranges inside `SCAN_RANGE`, from true `ranges` (n, rays) [m] and `deviates` (n, rays) [m]."""
     ranges = ranges + deviates
-    np.fmax(ranges, np.float32(SCAN_RANGE[0]), out=ranges)  # what is not a number is as near as can be
+    np.fmax(ranges, np.float32(SCAN_RANGE[0]), out=ranges)  # NaN becomes the least range
     clipped: Array = np.minimum(ranges, np.float32(SCAN_RANGE[1]), out=ranges).astype(np.float64)
     return clipped
 
@@ -171,8 +171,8 @@ def measured(ranges: Floats, deviates: Floats) -> Array:
 def noise(seeds: Seeds, count: Seeds, rays: int) -> Floats:
     """Normal deviates of mean 0 and standard deviation `NOISE` [m]; `rays` are at most the 1012 of both scanners.
 
-    Each scan is a stretch of one long tape that begins where the seed of its base and its number `count` in the episode
-    say: so no environment has a generator of its own to keep, and a scan costs a copy. Shapes: (n,), (n,) -> (n, rays).
+    Each scan is a section of one long tape, at a position given by the seed of its base and its number `count` in the
+    episode: no environment needs a generator, and a scan costs one copy. Shapes: (n,), (n,) -> (n, rays).
     """
     starts = mixed(seeds + mixed(count)) % np.uint64(_TAPE)
     deviates: Floats = np.lib.stride_tricks.sliding_window_view(_tape(), rays)[starts.astype(np.int64)]
@@ -187,7 +187,7 @@ def _tape() -> Floats:
 
 
 def mixed(values: Seeds) -> Seeds:
-    """Numbers that look drawn at random, one of each value: splitmix64 (Steele, Lea and Flood, OOPSLA 2014)."""
+    """One pseudo-random number for each value: splitmix64 (Steele, Lea and Flood, OOPSLA 2014)."""
     z = values + np.uint64(0x9E3779B97F4A7C15)
     z = (z ^ (z >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
     z = (z ^ (z >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)

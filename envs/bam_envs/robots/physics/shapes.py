@@ -1,4 +1,4 @@
-"""Bodies of a picture that are in no MuJoCo model: boxes, capsules and spheres. The first picture imports MuJoCo."""
+"""Bodies of an image that are in no MuJoCo model: boxes, capsules and spheres. The first image imports MuJoCo."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -22,13 +22,13 @@ RED: Colour = (0.85, 0.30, 0.25, 1.0)
 
 @dataclass(frozen=True)
 class Shape:
-    """One body of a picture, in the world's frame [m]."""
+    """One body of an image, in the world's frame [m]."""
 
     kind: Literal["box", "capsule", "sphere"]
     position: Array
-    """The middle; of a capsule the middle of one end's half sphere. Shape: (3,)."""
+    """Its middle, or the middle of a capsule's first end. Shape: (3,)."""
     size: tuple[float, ...]
-    """Edges of a box; radius of a capsule or sphere, alone."""
+    """Edges of a box, or only the radius of a capsule or sphere."""
     colour: Colour = GREY
     rotation: Array | None = None
     """From a box's frame to the world's; None for upright. Shape: (3, 3)."""
