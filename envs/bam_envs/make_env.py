@@ -91,11 +91,9 @@ def _check_place(
         names = ", ".join(task_options)
         raise InvalidValue(f"{names}: the task runs at {transport}; give its options to bam-serve there.")
     elsewhere = robot if transport is None else transport
-    chosen = [name for name, used in (("render_mode", render_mode is not None), ("randomize", randomize)) if used]
-    if elsewhere is not None and chosen:
-        raise InvalidValue(
-            f"{', '.join(chosen)}: only the simulation here has that, and not {elsewhere}; leave it out."
-        )
+    flags = [name for name, used in (("render_mode", render_mode is not None), ("randomize", randomize)) if used]
+    if elsewhere is not None and flags:
+        raise InvalidValue(f"{', '.join(flags)}: only the simulation here has that, and not {elsewhere}; leave it out.")
 
 
 def make_vector_env(

@@ -240,7 +240,7 @@ def test_how_long_an_environment_elsewhere_is_waited_for():
     assert env.unwrapped.transport.timeout == 2.5
     rows = make_vector_env("bam/reach-v0", 2, transport=["tcp://a:1", "ws://b:2"], timeout=2.5)
     assert [transport.timeout for transport in rows.transports] == [2.5, 2.5]
-    with pytest.raises(InvalidValue, match=r"^timeout=2.5 is how long an answer of transport= is waited for"):
+    with pytest.raises(InvalidValue, match=r"^timeout=2.5 limits the wait for an answer of transport="):
         make_vector_env("bam/reach-v0", 2, timeout=2.5)
 
 
