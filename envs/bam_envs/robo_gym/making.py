@@ -1,6 +1,6 @@
-"""robo-gym's environments: what `gymnasium.make` and `gymnasium.make_vec` call for its ids, with its options.
+"""robo-gym's environments: the entry points of `gymnasium.make` and `gymnasium.make_vec` for its ids and options.
 
-Where an option means something else here, that is logged, once in a process.
+An option with another meaning than in robo-gym is logged, once per process.
 """
 
 import logging
@@ -19,11 +19,11 @@ from bam_envs.robo_gym.table import ROBO_GYM, RoboGymId
 
 _LOG = logging.getLogger(__name__)
 _MANAGER = ("ip", "lower_bound_port", "upper_bound_port", "server_manager_port")
-"""Where robo-gym finds the Server Manager that starts Gazebo."""
+"""Address of robo-gym's Server Manager, which starts Gazebo."""
 _WINDOWS = ("gui", "gazebo_gui", "rviz_gui")
 _SIMULATED = (*_MANAGER, *_WINDOWS)
 PLACES = frozenset({*_SIMULATED, "rs_address"})
-"""Options that say where an environment of robo-gym's ran, and nothing of what it is."""
+"""Options for the place where an environment of robo-gym ran, not for the environment itself."""
 _RANGES = [f"ee_rotation_{one}_range" for one in ("pos_x", "pos_y", "pos_z", "roll", "pitch", "yaw")]
 _NOT_HERE = {
     "max_velocity_scale_factor": "the arm's speed belongs to the environment, which would be another one",
@@ -42,11 +42,11 @@ _NOT_HERE = {
         "give reset the start itself: options={'joint_positions': [...]}",
     ),
 }
-"""Options of robo-gym's modular environments that are none of ours, and what to do instead."""
+"""Options of robo-gym's modular environments that do not exist here -> alternative."""
 
 
 def make_env(env_id: str, **options: Any) -> gym.Env[Any, Any]:
-    """One robot and its task; `options` are robo-gym's for its class of that id, and our own. Raises as `translate`."""
+    """One robot and its task, with robo-gym's `options` for that id and those of `bam_envs`. See `translate`."""
     entry = ROBO_GYM[env_id]
     arguments = translate(entry, options)
     if arguments.get("transport") is not None:
@@ -59,7 +59,7 @@ def make_env(env_id: str, **options: Any) -> gym.Env[Any, Any]:
 
 
 def make_vector_env(env_id: str, num_envs: int = 1, **options: Any) -> gym.vector.VectorEnv[Any, Any, Any]:
-    """Simulated robots and their task, stepped together; of ``rs_state`` in the infos only where it is asked for."""
+    """Simulated robots and their task, stepped together; infos have ``rs_state`` only with ``rs_state_to_info``."""
     entry = ROBO_GYM[env_id]
     if entry.is_live and options.get("transport") is None:
         raise InvalidValue(
@@ -79,7 +79,7 @@ class RoboGymEnv(RobotEnv):
     """A `RobotEnv` under one of robo-gym's ids, with the methods that robo-gym's environments add."""
 
     is_live = False
-    """Whether there is a robot, and no simulation."""
+    """Whether the robot is live, not simulated."""
 
     def get_rs_state(self) -> dict[str, float] | list[float] | None:
         """The newest wire state: of an arm by key, of a base a list of 1030 numbers; None before the first `reset`."""
@@ -87,7 +87,7 @@ class RoboGymEnv(RobotEnv):
         return None if self.last_state is None else task.rs_state(self.last_state)[0]
 
     def kill_sim(self) -> None:
-        """End the simulation: its memory is free, and no step is taken until the next `reset`, which begins it anew.
+        """End the simulation and free its memory; the next `reset` starts it again.
 
         Raises:
             InvalidValue: The robot is live.
@@ -99,20 +99,20 @@ class RoboGymEnv(RobotEnv):
         self.close()
 
     def restart_sim(self) -> None:
-        """`kill_sim`, and begin the simulation anew; `reset` comes next."""
+        """`kill_sim`, then start the simulation again; call `reset` next."""
         self.kill_sim()
         self.robot.connect()
 
 
 def translate(entry: RoboGymId, given: Mapping[str, Any]) -> dict[str, Any]:
-    """Arguments of `bam_envs.make_env.make_env` for `entry`; says once in a process what an option means here.
+    """Arguments of `bam_envs.make_env.make_env` for `entry`; logs once per process how an option is interpreted.
 
-    A ``Sim-v0`` takes ``robot=`` too: a policy that was trained in it is deployed in it.
+    A ``Sim-v0`` takes ``robot=`` too, to deploy a policy in the environment in which it was trained.
 
     Raises:
-        UnknownName: Neither robo-gym nor we have such an option; it carries the closest match.
-        InvalidValue: An option that is there and cannot be had, or is of the wrong kind; a live robot without an
-            address, or a simulated one with one.
+        UnknownName: Neither robo-gym nor `bam_envs` has such an option; the error carries the closest match.
+        InvalidValue: An option of robo-gym that is not supported, or of the wrong kind; a live robot without an
+            address, or a simulated one with an address.
     """
     taken, refused = constructor_options(entry)
     known = {*_task_options(entry), *MAKE_OPTIONS, "max_episode_steps", *taken}
@@ -133,9 +133,9 @@ def translate(entry: RoboGymId, given: Mapping[str, Any]) -> dict[str, Any]:
             "started first."
         )
     without_effect = (*_MANAGER, "rviz_gui") if robot is None else _SIMULATED
-    said = ", ".join(f"{name}={given[name]!r}" for name in without_effect if given.get(name))
-    if said:
-        say_once(f"{said}: accepted, and without effect. {why}")
+    ignored = ", ".join(f"{name}={given[name]!r}" for name in without_effect if given.get(name))
+    if ignored:
+        say_once(f"{ignored}: accepted, and without effect. {why}")
     if transport is not None:
         return options
     if given.get("parity") and "trajectory" in _task_options(entry) and given.get("trajectory") is None:
@@ -175,15 +175,15 @@ def _robot(entry: RoboGymId, given: Mapping[str, Any]) -> Any:
 
 
 def constructor_options(entry: RoboGymId) -> tuple[frozenset[str], frozenset[str]]:
-    """What robo-gym's constructors take and our tasks do not: what is taken here, and what is refused with a reason."""
+    """Options of robo-gym's constructors that the tasks lack: those accepted, and those refused with a reason."""
     taken = frozenset({*_SIMULATED, "rs_address"} if entry.is_live else _SIMULATED)
     return taken, frozenset({"rs_address", *_NOT_HERE}) - taken - _task_options(entry).keys()
 
 
 def require_values(entry: RoboGymId, given: Mapping[str, Any]) -> None:
     """`require_kinds` for robo-gym's options; windows may be None."""
-    said = {name: value for name, value in given.items() if value is not None or name not in _WINDOWS}
-    require_kinds(entry.id, _task_options(entry) | dict.fromkeys(("randomize", *_WINDOWS), False), said)
+    values = {name: value for name, value in given.items() if value is not None or name not in _WINDOWS}
+    require_kinds(entry.id, _task_options(entry) | dict.fromkeys(("randomize", *_WINDOWS), False), values)
 
 
 def _task_options(entry: RoboGymId) -> dict[str, Any]:
@@ -191,7 +191,7 @@ def _task_options(entry: RoboGymId) -> dict[str, Any]:
 
 
 def _window(given: Mapping[str, Any]) -> dict[str, Any]:
-    """``gui=True`` is a window of the simulated robot's, where there is a display."""
+    """The render mode of ``gui=True``: a window with the simulated robot, if there is a display."""
     names = [name for name in ("gui", "gazebo_gui") if given.get(name)]
     if not names or given.get("render_mode") is not None:
         return {}
@@ -204,5 +204,5 @@ def _window(given: Mapping[str, Any]) -> dict[str, Any]:
 
 @cache
 def say_once(text: str) -> None:
-    """Log `text` as a warning, once in a process."""
+    """Log `text` as a warning, once per process."""
     _LOG.warning("%s", text)

@@ -1,4 +1,4 @@
-"""robo-gym's arithmetic (2.1.0), to the last constant, oddities included: what ``parity=True`` makes of our tasks."""
+"""robo-gym's arithmetic (2.1.0), to the last constant, oddities included: the tasks of ``parity=True``."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -31,10 +31,10 @@ _CORNERS = np.array([[1, -1], [1, 1], [-1, 1], [-1, -1]]) * np.array(FOOTPRINT) 
 
 
 class UrParity(UrTask):
-    """The last step of an episode terminates it, whatever else happened then but a collision."""
+    """The last step of an episode terminates it as "max_steps_exceeded", unless there is a collision."""
 
     def observe(self, state: RobotState) -> Floats:
-        """See `observation_labels`; nothing is cut to the space. Shape: (n, k) float32."""
+        """See `observation_labels`; nothing is clipped to the space. Shape: (n, k) float32."""
         return np.concatenate(self._columns(state), axis=1).astype(np.float32)
 
     def ends(self, collision: Flags, success: Flags, late: Flags) -> tuple[Flags, Any]:
@@ -179,7 +179,7 @@ class UrAvoidanceParity(UrObstacleParity, UrAvoidanceTask):
     pose, collision_reward = START, None
 
     def spread(self, state: RobotState) -> tuple[Array, Array]:
-        """The second is a wrong slice: the last three offsets and the obstacle seen from the elbow."""
+        """The second is robo-gym's wrong slice: the last three offsets and the obstacle seen from the elbow."""
         seen = np.abs(self.observe(state).astype(np.float64))
         return seen[:, 9:15].sum(axis=1), seen[:, 12:18].sum(axis=1)
 
@@ -207,11 +207,11 @@ class UrTrackParity(UrObstacleParity, UrTrackTask):
         return Initial({**initial.signals, "joint_position": self.reference[env_ids]}, initial.seeds)
 
     def _path_numbers(self, env_ids: EnvIds, rngs: Sequence[np.random.Generator]) -> list[int]:
-        """One after the other."""
+        """The paths in order."""
         return [int(number) % FIXED_PATHS for number in self._episodes[env_ids]]
 
     def score(self, state: RobotState, action: Floats) -> Score:
-        """Following closely, acting little and smoothly, away from the obstacle."""
+        """Reward close following, small and smooth actions, and distance from the obstacle."""
         offset = self.offset(state).astype(np.float32).astype(np.float64)  # robo-gym reads it from its observation
         reward, counted = self._following(state, offset, action), self.targets_reached
         self._advance(state)
@@ -219,7 +219,7 @@ class UrTrackParity(UrObstacleParity, UrTrackTask):
 
 
 class DriveParity(DriveTask):
-    """Metres and radians; the way, but none for the first step; 500 steps terminate."""
+    """Observations in metres and radians; no reward for the first step's progress; 500 steps terminate."""
 
     success_reward: float
     observation_labels: tuple[Label, ...] = (
@@ -230,7 +230,7 @@ class DriveParity(DriveTask):
     )
 
     def on_reset(self, env_ids: EnvIds, state: RobotState) -> None:
-        """There is no distance of before."""
+        """Forget the previous distance."""
         super().on_reset(env_ids, state)
         self._previous[env_ids] = np.nan
 
@@ -241,7 +241,7 @@ class DriveParity(DriveTask):
         return require_inside(observation, self.observation_space, self.observation_labels)
 
     def score(self, state: RobotState, action: Floats) -> Score:
-        """Arriving wins over failing, and the last step over both."""
+        """Success takes precedence over failure, and the last step over both."""
         distance, failed = self.distance(state), self.failed(state)
         success = distance < ARRIVED
         # The first step has no shaping but its power, which is float32 as the action.
@@ -272,7 +272,7 @@ class Mir100NavigationParity(DriveParity, Mir100NavigationTask):
     success_reward = 200.0
 
     def failed(self, state: RobotState) -> Flags:
-        """Whether the base left the floor; a misplaced parenthesis lets it go where y is low. Shape: (n,)."""
+        """Whether the base left the floor; robo-gym's misplaced parenthesis ignores a low y. Shape: (n,)."""
         x, y = state.signals["base_pose"][:, 0], state.signals["base_pose"][:, 1]
         return (np.abs(x) > BOUNDARY) | (y > BOUNDARY)
 
@@ -304,14 +304,14 @@ class Mir100AvoidanceParity(DriveParity, Mir100AvoidanceTask):
             return np.zeros(self.num_envs, dtype=bool)
         front, back = state.signals["f_scan"], state.signals["b_scan"]
         near: Flags = np.fmin(np.fmin.reduce(front, axis=1), np.fmin.reduce(back, axis=1)) < NEAREST
-        near &= ~np.isnan(front[:, 0])  # Python's min() never leaves a first number that is none
+        near &= ~np.isnan(front[:, 0])  # Python's min() returns a NaN that comes first
         near |= self._corner_near_box(state.signals["base_pose"])
         touching: Any = state.truth.get("collision", False)
         failed: Flags = near | touching
         return failed
 
     def _corner_near_box(self, pose: Array) -> Flags:
-        """Whether a corner is within `SAFETY_RADIUS` of the middle of a box; as if the base's frame were its middle."""
+        """Whether a corner is within `SAFETY_RADIUS` of the middle of a box; takes the base's frame as its middle."""
         cos, sin = np.cos(pose[:, 2].copy())[:, None], np.sin(pose[:, 2].copy())[:, None]
         x = pose[:, :1] + _CORNERS[:, 0] * cos - _CORNERS[:, 1] * sin
         y = pose[:, 1:2] + _CORNERS[:, 0] * sin + _CORNERS[:, 1] * cos
@@ -326,7 +326,7 @@ def require_inside(observation: Floats, space: spaces.Box, labels: Sequence[Labe
     Raises:
         ProtocolError: Names the first number that is not; robo-gym raises ``InvalidStateError``.
     """
-    outside = ~((observation >= space.low) & (observation <= space.high))  # also what is not a number
+    outside = ~((observation >= space.low) & (observation <= space.high))  # NaN included
     if outside.any():
         env, column = np.argwhere(outside)[0]
         label, value = labels[column], observation[env, column]

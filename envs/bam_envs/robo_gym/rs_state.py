@@ -1,6 +1,6 @@
-"""Wire states of robo-gym's robot servers, read: one state of theirs to a `RobotState` of one robot.
+"""Read wire states of robo-gym's robot servers: one wire state as a `RobotState` of one robot.
 
-The other way is ``task.rs_state(state)``. `read_mir_target` and `read_object` give a target, which no robot measures.
+The inverse is ``task.rs_state(state)``. `read_mir_target` and `read_object` read a target, which no robot measures.
 """
 
 from collections.abc import Mapping, Sequence
@@ -34,11 +34,11 @@ def read_mir(wire: Sequence[float]) -> RobotState:
 
     Args:
         wire: Target x, y, yaw; robot x, y, yaw (m, rad, map); forward and turning speed [m/s, rad/s]; 501 ranges of the
-            front scanner and 511 of the back one [m]; contact (0 or 1); three obstacles x, y, yaw. What is not a
-            number is 0, as in robo-gym, but for ranges: they stay, and the task says what they mean.
+            front scanner and 511 of the back one [m]; contact (0 or 1); three obstacles x, y, yaw. NaN
+            becomes 0, as in robo-gym, except in ranges, which the task handles.
 
     Raises:
-        InvalidValue: It has not 1030 numbers, or one that is infinite.
+        InvalidValue: It does not have 1030 numbers, or one is infinite.
     """
     row = _numbers(wire)
     signals = {"base_pose": np.nan_to_num(row[_POSE]), "base_velocity": np.nan_to_num(row[_TWIST])}
@@ -72,7 +72,7 @@ def read_ur(wire: Mapping[str, float]) -> RobotState:
             (0 or 1).
 
     Raises:
-        InvalidValue: A key is missing or is none of robo-gym's, or its value is not finite; it names the key.
+        InvalidValue: A key is missing or unknown, or its value is not finite; the error names the key.
     """
     mode = (
         "1moving2points" if wire.keys() & set(_FOREARM) else "1object" if wire.keys() & set(_OBJECT) else "only_robot"

@@ -1,6 +1,6 @@
-"""The one table of robo-gym's ids: which environment of ours each is, and what robo-gym has otherwise by default.
+"""The table of robo-gym's ids: the environment of each id in `bam_envs`, and robo-gym's other defaults.
 
-`register` adds them, and robo-gym's arithmetic as the flag ``parity`` of our environments; importing this is cheap.
+`register` adds them, and robo-gym's arithmetic as the flag ``parity`` of the environments; importing this is cheap.
 """
 
 from collections.abc import Mapping
@@ -15,13 +15,13 @@ _UR_MODULAR = {"ur_model": "ur5", "rs_state_to_info": False}
 
 @dataclass(frozen=True)
 class RoboGymId:
-    """One id of robo-gym's."""
+    """One id of robo-gym."""
 
     stem: str  # the id without ``Sim-v0`` or ``Rob-v0``
     env_id: str  # key of `bam_envs.ENVIRONMENTS`
     is_live: bool  # whether it is the ``Rob-v0`` of the two: the same environment, with a robot
     defaults: Mapping[str, Any] = field(default_factory=dict)
-    """Task options that have other defaults there than here."""
+    """Task options with other defaults in robo-gym."""
 
     @property
     def id(self) -> str:
@@ -35,7 +35,7 @@ class RoboGymId:
 
     @property
     def variant(self) -> str:
-        """`stem`, if it differs from `env_id` by more than the arm and what is in the info; else empty."""
+        """`stem`, if it differs from `env_id` by more than the arm and the infos; else empty."""
         return self.stem if self.defaults.keys() - {"ur_model", "rs_state_to_info"} else ""
 
 
@@ -67,11 +67,11 @@ PARITY = {
     "bam/ur-track-v0": "bam_envs.robo_gym.parity:UrTrackParity",
     "bam/isaac-reach-v0": "bam_envs.robo_gym.parity:IsaacReachParity",
 }
-"""The task that ``parity=True`` makes of each environment of ours."""
+"""The task of each environment with ``parity=True``."""
 
 
 def register() -> None:
-    """Add robo-gym's ids, and ``parity`` to the environments that they are; idempotent."""
+    """Add robo-gym's ids, and the flag ``parity`` to their environments; idempotent."""
     for env_id, task in PARITY.items():
         ENVIRONMENTS[env_id].variants["parity"] = task
     for entry in ROBO_GYM.values():

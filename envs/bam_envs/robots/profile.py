@@ -5,7 +5,7 @@ from a shipped one (``extends = "ur5e"``), replace whole tables of it, rename to
 (``[frames]``); ``ignore`` at its top lists names that may come with every source of names.
 
 The types of the keys are those of the dataclasses here and in `bam_envs.ros.profile_tables`; the functions below check
-what one key says against another.
+the keys against each other.
 """
 
 import importlib
@@ -72,7 +72,7 @@ class _File:
 
 @dataclass(frozen=True)
 class _Signal:
-    """A signal as a file writes it: one unit and one limit may stand for all of its numbers."""
+    """A signal in a file; one unit and one limit may stand for all of its numbers."""
 
     labels: tuple[NonEmpty, ...]
     units: tuple[NonEmpty, ...]
@@ -85,7 +85,7 @@ class _Signal:
 def load_profile(name_or_path: str | Path) -> RobotProfile:
     """The shipped profile of that name, or the one in a TOML or YAML file, checked.
 
-    `UnknownName` carries the closest match to a name, `InvalidValue` names what is wrong in a file.
+    `UnknownName` carries the closest match to a name, `InvalidValue` names the error in a file.
     """
     return _profile(*_read_file(str(name_or_path)))
 
@@ -105,7 +105,7 @@ def shipped_profiles() -> list[str]:
 
 
 def _read_file(name: str) -> tuple[str, Table]:
-    """How errors call the file, and what is in it, with what it extends."""
+    """The name of the file for errors, and its table, merged with the profile that it extends."""
     path = Path(name)
     if path.suffix not in _SUFFIXES and len(path.parts) == 1:
         if name not in shipped_profiles():

@@ -17,7 +17,7 @@ from bam_envs.tasks.ur_arm import AboveZero, UrTask, collisions, frame_keys, joi
 DEFAULT = (0.0, -1.712, 1.712, 0.0, 0.0, 0.0)
 """Joint positions [rad] that actions and observations are measured from."""
 TARGETS = np.array([[0.35, -0.2, 0.15], [0.65, 0.2, 0.5]])
-"""Where targets are: lowest and highest x, y, z [m]."""
+"""Range of the targets: lowest and highest x, y, z [m]."""
 PITCH = np.pi / 2  # of targets [rad]: the x axis of the frame at the flange points down
 CLOSE, ALIGNED = 0.02, 0.05
 """The flange has arrived within this distance [m] and this angle [rad]."""
@@ -35,17 +35,17 @@ class IsaacReachTask(UrTask):
     Start:
         The joints are at the default pose, [0, -1.712, 1.712, 0, 0, 0] rad, or at the reset option ``joint_positions``
         (6) [rad]; after an episode that ended without a collision they stay where it ended, unless a seed is given. The
-        target is between x 0.35 and 0.65 m, y -0.2 and 0.2 m, z 0.15 and 0.5 m, the flange pointing down, turned
-        anyhow; or it is the reset option ``ee_target_pose``: x, y, z [m] and roll, pitch, yaw [rad], or x, y, z and a
+        target is between x 0.35 and 0.65 m, y -0.2 and 0.2 m, z 0.15 and 0.5 m, the flange pointing down, with any
+        yaw; or it is the reset option ``ee_target_pose``: x, y, z [m] and roll, pitch, yaw [rad], or x, y, z and a
         quaternion x, y, z, w.
 
     Action:
-        Where the six joints are to be, from the default pose, in units of pi. They go there at a fifth of their fastest
-        speed, and slower when they are near.
+        Target positions of the six joints, from the default pose, in units of pi. The joints move there at a fifth of
+        their maximum speed, and slower when they are near.
 
     Reward:
-        Each step -0.005 d - 0.05 a, where d is the distance from the target [m] and a the angle [rad]; instead of it 2
-        at success and -1 at a collision.
+        Each step -0.005 d - 0.05 a, where d is the distance from the target [m] and a the angle [rad]; instead 2 at
+        success and -1 at a collision.
 
     Success:
         The flange is within 0.02 m and 0.05 rad of the target.
@@ -55,7 +55,7 @@ class IsaacReachTask(UrTask):
 
     Info:
         `dist_coord` [m] (also as `distance`), `dist_rot` [rad], `target_coord` [m], `target_rot` as x, y, z, w,
-        `rs_state` where it is asked for, and at the end `final_status`: "success", "collision"
+        `rs_state` with `rs_state_to_info`, and at the end `final_status`: "success", "collision"
         or "max_steps_exceeded".
 
     Args:
@@ -64,7 +64,7 @@ class IsaacReachTask(UrTask):
         continue_except_collision: Whether episodes begin where the last one ended.
         ee_distance_threshold: Distance that counts as success [m].
         ee_rotation_threshold: Angle that counts as success, if it is less [rad].
-        ee_target_pose: What the reset option of that name is where a reset does not give it.
+        ee_target_pose: Default of the reset option of that name.
         rs_state_to_info: Whether infos have robo-gym's wire state.
     """
 
@@ -103,7 +103,7 @@ class IsaacReachTask(UrTask):
         self._default = np.array(DEFAULT)
         super().__init__(num_envs, ur_model=ur_model, fix_wrist_3=False, rs_state_to_info=rs_state_to_info)
         self.target, self.quaternion = np.zeros((num_envs, 3)), np.tile([0.0, 0.0, 0.0, 1.0], (num_envs, 1))
-        """Where to [m], shape (n, 3), and how turned, x, y, z, w, shape (n, 4)."""
+        """Targets: position [m], shape (n, 3), and quaternion x, y, z, w, shape (n, 4)."""
         self._last_action = np.zeros((num_envs, 6))
         self._ended = np.full((num_envs, 6), np.nan)  # joints where the last episode ended, if the next begins there
         self._rngs: list[np.random.Generator | None] = [None] * num_envs
@@ -144,7 +144,7 @@ class IsaacReachTask(UrTask):
             self.target[env_ids], self.quaternion[env_ids] = pose[:3], pose[3:]
         joints = self._ended[env_ids]
         for k, (env, rng) in enumerate(zip(env_ids, rngs, strict=True)):
-            # A generator that the environment did not have before was seeded: what follows depends on the seed alone.
+            # A new generator means that a seed was given: the episode then depends on the seed alone.
             if np.isnan(joints[k, 0]) or self._rngs[env] not in (None, rng):
                 joints[k] = self._default
             self._rngs[env] = rng
@@ -171,7 +171,7 @@ class IsaacReachTask(UrTask):
         return self.toward(np.clip(self._default + self.scale * self._last_action, *self.model.joint_limits), state)
 
     def score(self, state: RobotState, action: Floats) -> Score:
-        """Nearer and straighter is better."""
+        """Reward proximity and alignment."""
         self.elapsed = self.elapsed + 1
         position, rotation = self._tool(state, self.frame)
         way = self.target - position
@@ -180,12 +180,12 @@ class IsaacReachTask(UrTask):
         collision, late = collisions(state), self.elapsed >= self.max_steps
         success: Flags = (distance <= self._close) & (angle < self._aligned) & ~collision
         reward = np.where(collision, -1.0, np.where(success, 2.0, -0.005 * distance - 0.05 * angle))
-        goes_on = ((success | late) & ~collision)[:, None] & self.continue_except_collision
-        self._ended = np.where(goes_on, state.signals["joint_position"], np.nan)
+        continues = ((success | late) & ~collision)[:, None] & self.continue_except_collision
+        self._ended = np.where(continues, state.signals["joint_position"], np.nan)
         terminated, status = self.ends(collision, success, late)
-        told = {"final_status": status, "distance": distance, "dist_coord": distance.copy(), "dist_rot": angle}
-        told |= {"target_coord": self.target.copy(), "target_rot": self.quaternion.copy()}
-        return Score(reward, terminated, success, self.info(state, **told))
+        values = {"final_status": status, "distance": distance, "dist_coord": distance.copy(), "dist_rot": angle}
+        values |= {"target_coord": self.target.copy(), "target_rot": self.quaternion.copy()}
+        return Score(reward, terminated, success, self.info(state, **values))
 
     def _tool(self, state: RobotState, frame: Array) -> tuple[Array, Array]:
         """Pose of a `frame` at the flange. Shapes: (n, 3), (n, 3, 3)."""
@@ -199,13 +199,13 @@ class IsaacReachTask(UrTask):
         return [one | dict(zip(frame_keys("ee")[3:], q, strict=True)) for one, q in zip(wire, turned, strict=True)]
 
     def marks(self) -> list[tuple[Array, tuple[float, float, float, float]]]:
-        """The target, and a point 5 cm before it where the flange points."""
+        """The target, and a point 5 cm before it in the direction of the flange."""
         x, y, z, w = self.quaternion[0]
         ahead = np.array([1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)])
         return [(self.target[0], (0.1, 0.7, 0.3, 0.6)), (self.target[0] + 0.05 * ahead, (0.1, 0.4, 0.8, 0.6))]
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Go to what `state_dict` returned; the generators are taken for those of the time."""
+        """Restore the result of `state_dict`; the current generators count as known."""
         super().load_state_dict(state)
         self._rngs = [None] * self.num_envs
 

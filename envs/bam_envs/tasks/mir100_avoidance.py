@@ -1,4 +1,4 @@
-"""Drive a MiR100 to the other side of a room, round three boxes that only its lasers see."""
+"""Drive a MiR100 to the other side of a room, around three boxes that only its lasers detect."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -13,18 +13,18 @@ from bam_envs.robots.physics.room import touches
 from bam_envs.tasks.mir100_navigation import DriveTask, spread
 
 SIDE = (2.1, 3.1)
-"""Starts are drawn so far from the middle of the room along y, targets as far on the other side [m]."""
+"""Range of starts along y from the middle of the room, and of targets on the other side [m]."""
 WIDTH = 2.0  # they are drawn at most this far from the middle along x [m]
 BOXES = np.array([[-2.4, -1.5], [-0.5, 0.5], [1.5, 2.4]])
 """Lowest and highest x of the middle of each box [m]."""
 BOX_DEPTH = 1.0  # boxes are drawn at most this far from the middle along y [m]
 NEAREST = 0.15
 """A ray shorter than this is a collision [m]."""
-SECTORS = 8  # the shortest ray is observed of so many sectors of each scanner
-SIGHT = 3.0  # what is farther than this is observed as if it were there [m]
+SECTORS = 8  # number of sectors of each scanner whose shortest ray is observed
+SIGHT = 3.0  # greatest range in observations [m]
 _FRONT_STARTS = np.linspace(0, FRONT_RAYS, SECTORS + 1).astype(np.int64)[:-1]
 _BACK_STARTS = np.linspace(0, BACK_RAYS, SECTORS + 1).astype(np.int64)[:-1]
-_OF_BOXES = slice(6, 15)  # which of the numbers that are drawn the boxes are made of
+_OF_BOXES = slice(6, 15)  # the drawn numbers for the boxes
 _TRIES = 1000
 _RANGES = [
     Label(
@@ -46,7 +46,7 @@ class Mir100AvoidanceTask(DriveTask):
         The base is at rest at x -2 to 2 m, 2.1 to 3.1 m from the middle of the room to either side along y, with any
         yaw; a live one where it is. The target is as far on the other side, at x -2 to 2 m. The boxes, cubes of 0.5 m,
         are about x -2, 0 and 2 m, y -1 to 1 m, with any yaw. The reset options ``start_pose`` and ``target_pose``
-        (x, y [m], yaw [rad]) choose the former two; no box is where the base is told to start.
+        (x, y [m], yaw [rad]) choose the former two; no box is at a chosen start.
 
     Reward:
         Each step 0.5 for each metre nearer, less 0.005 for the time, 0.003 |forward| and 0.0003 |turn|. At success 2
@@ -74,13 +74,13 @@ class Mir100AvoidanceTask(DriveTask):
         """Boxes of a simulated room: x, y [m] and yaw [rad]. Shape: (n, 3, 3)."""
 
     def starts(self, draws: Array) -> Array:
-        """On either side. Shape: (k, 3)."""
+        """Start poses on either side. Shape: (k, 3)."""
         side = np.where(draws[:, 3] < 0.5, -1.0, 1.0)
         x, y = spread(draws[:, 0], -WIDTH, WIDTH), side * spread(draws[:, 1], *SIDE)
         return np.stack([x, y, spread(draws[:, 2], -math.pi, math.pi)], axis=1)
 
     def targets(self, draws: Array, start: Array) -> Array:
-        """On the other side, which is always far enough. Shape: (k, 3)."""
+        """Targets on the other side, which are always far enough. Shape: (k, 3)."""
         side = np.where(start[:, 1] > 0, -1.0, 1.0)
         x, y = spread(draws[:, 4], -WIDTH, WIDTH), side * spread(draws[:, 5], *SIDE)
         return np.stack([x, y, np.zeros(len(start))], axis=1)
@@ -88,7 +88,7 @@ class Mir100AvoidanceTask(DriveTask):
     def scene(
         self, env_ids: EnvIds, draws: Array, start: Array, rngs: Sequence[np.random.Generator]
     ) -> dict[str, Array]:
-        """The boxes, drawn until none is where the base is told to start; the robot refuses a start in a wall."""
+        """The boxes, drawn until none is at a chosen start; the robot refuses a start in a wall."""
         for k, rng in enumerate(rngs):
             for _ in range(0 if np.isnan(start[k, 0]) else _TRIES):
                 if not touches(start[k : k + 1], None, _boxes(draws[k : k + 1]))[0]:
@@ -98,7 +98,7 @@ class Mir100AvoidanceTask(DriveTask):
         return {"obstacle_pose": self.obstacles[env_ids]}
 
     def sectors(self, state: RobotState) -> Array:
-        """The shortest ray of each sector [m]; one that is not a number is 0, the shortest there can be. (n, 16)."""
+        """The shortest ray of each sector [m]; NaN counts as 0. Shape: (n, 16)."""
         front = np.minimum.reduceat(state.signals["f_scan"], _FRONT_STARTS, axis=1)
         back = np.minimum.reduceat(state.signals["b_scan"], _BACK_STARTS, axis=1)
         sectors: Array = np.nan_to_num(np.concatenate([front, back], axis=1), nan=0.0)
@@ -116,7 +116,7 @@ class Mir100AvoidanceTask(DriveTask):
 
 
 def _boxes(draws: Array) -> Array:
-    """Where the boxes are: x, y [m] and yaw [rad]. Shape: (k, draws) -> (k, 3, 3)."""
+    """Poses of the boxes: x, y [m] and yaw [rad]. Shape: (k, draws) -> (k, 3, 3)."""
     of_x, of_y, of_yaw = np.moveaxis(draws[:, _OF_BOXES].reshape(-1, 3, len(BOXES)), 1, 0)
     x = BOXES[:, 0] + of_x * (BOXES[:, 1] - BOXES[:, 0])
     return np.stack([x, spread(of_y, -BOX_DEPTH, BOX_DEPTH), spread(of_yaw, -math.pi, math.pi)], axis=2)

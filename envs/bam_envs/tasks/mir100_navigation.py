@@ -1,4 +1,4 @@
-"""Drive a MiR100 to a place on an open floor; `DriveTask` is what the MiR100's tasks share: driving to a target.
+"""Drive a MiR100 to a target on an open floor; `DriveTask` is the base class of the MiR100's tasks.
 
 Poses are x, y [m] and yaw [rad].
 """
@@ -22,22 +22,22 @@ ARRIVED = 0.2
 MAX_STEPS = 500
 """Steps of an episode."""
 BOUNDARY = 10.0
-"""The floor goes this far from the origin, along x and along y [m]."""
+"""Extent of the floor from the origin, along x and along y [m]."""
 NEARER, ARRIVING, FAILING, TIME, POWER = 0.5, 2.0, -2.0, 0.005, (0.003, 0.0003)
 """Rewards of a metre nearer, of success and of failure; costs of a step and of full speed, forward and turning."""
 DISTANCE_SCALE = 4.0  # of the distance that is observed [m]
 START, TARGET = 2.0, 1.0
 """Starts and targets are drawn at most this far from the origin, along x and along y [m]."""
 MIN_DISTANCE = 1.0  # a target that is drawn is at least this far from the start [m]
-CANDIDATES = 64  # targets that are drawn; the first is taken that is far enough from the start
-START_TOLERANCE = 0.2  # a base that is nearer than this to where it is to start is there [m], [rad]
+CANDIDATES = 64  # targets that are drawn; the first one that is far enough from the start is used
+START_TOLERANCE = 0.2  # a base nearer than this to its start pose is there [m], [rad]
 
 
 class DriveTask(Memory):
     """Drive to within `ARRIVED` of a target; the heading there does not matter.
 
     Args:
-        rs_state_to_info: ``info["rs_state"]`` is the state as robo-gym's robot server would send it.
+        rs_state_to_info: Add the state of robo-gym's robot server to the info as ``rs_state``.
     """
 
     reset_options = ("start_pose", "target_pose")
@@ -52,8 +52,8 @@ class DriveTask(Memory):
         Label("angular_velocity", "speed of turning anticlockwise", "rad/s", f"/ {FASTEST[1]:g}", -2.5, 2.5),
     )
     memory: Mapping[str, str] = {"target": "target", "elapsed": "elapsed", "previous": "_previous"}
-    failure: str  # what ``final_status`` says when something went wrong
-    draws: int  # how many numbers `starts` and `targets` take for each environment
+    failure: str  # ``final_status`` of a failure
+    draws: int  # number of random numbers that `starts` and `targets` take for each environment
 
     def __init__(self, num_envs: int = 1, *, rs_state_to_info: bool = False) -> None:
         self.num_envs, self.rs_state_to_info = num_envs, rs_state_to_info
@@ -76,24 +76,24 @@ class DriveTask(Memory):
     def scene(
         self, env_ids: EnvIds, draws: Array, start: Array, rngs: Sequence[np.random.Generator]
     ) -> dict[str, Array]:
-        """Hook: start values of other signals than the pose, of the environments that begin.
+        """Hook: start values of signals other than the pose, for the environments that begin.
 
-        `draws` may be drawn anew where something is at a pose of `start` (k, 3) that was asked for; NaN where none was.
+        `start` (k, 3) has the chosen start poses, NaN without one; `draws` may be replaced if something is there.
         """
         return {}
 
     def seen(self, state: RobotState) -> list[Floats]:
-        """Hook: what is observed besides. Shape: (n, ...) each."""
+        """Hook: further observations. Shape: (n, ...) each."""
         return []
 
     def failed(self, state: RobotState) -> Flags:
-        """Hook: which episodes are over because something went wrong. Shape: (n,)."""
+        """Hook: mask of the episodes that have failed. Shape: (n,)."""
         raise NotImplementedError
 
     def sample_initial(
         self, env_ids: EnvIds, rngs: Sequence[np.random.Generator], options: Mapping[str, Any] | None = None
     ) -> Initial:
-        """A start pose; the target is chosen when it is known where the base really is."""
+        """A start pose; the target is chosen when the real pose of the base is known."""
         draws = np.stack([rng.random(self.draws) for rng in rngs])
         seeds = draw_seeds(rngs)
         for which, name in enumerate(self.reset_options):
@@ -106,10 +106,10 @@ class DriveTask(Memory):
         return Initial({"base_pose": start, **scene}, seeds)
 
     def on_reset(self, env_ids: EnvIds, state: RobotState) -> None:
-        """Choose the target from where the base is.
+        """Choose the target for the measured pose of the base.
 
         Raises:
-            InvalidValue: A robot that stays where it is was asked to start elsewhere.
+            InvalidValue: The start pose is that of another place, and the robot does not move at a reset.
         """
         pose = state.signals["base_pose"][env_ids]
         off = self._asked[env_ids, 0] - pose
@@ -127,7 +127,7 @@ class DriveTask(Memory):
         self._previous[env_ids] = self.distance(state)[env_ids]
 
     def distance(self, state: RobotState) -> Array:
-        """How far the target is [m]. Shape: (n,)."""
+        """Distance of the target [m]. Shape: (n,)."""
         pose = state.signals["base_pose"]
         dx, dy = self.target[:, 0] - pose[:, 0], self.target[:, 1] - pose[:, 1]
         return np.sqrt(dx * dx + dy * dy)
@@ -156,7 +156,7 @@ class DriveTask(Memory):
         return command
 
     def score(self, state: RobotState, action: Floats) -> Score:
-        """Getting nearer is good, time and power cost, arriving or failing has its own reward instead."""
+        """Reward approaching the target, less time and power; success and failure have their own rewards instead."""
         distance, failed = self.distance(state), self.failed(state)
         success = (distance < ARRIVED) & ~failed
         forward, turn = np.abs(np.clip(action, -1.0, 1.0)).astype(np.float64).T
@@ -171,7 +171,7 @@ class DriveTask(Memory):
     def _scored(
         self, state: RobotState, distance: Array, reward: Array, terminated: Flags, success: Flags, status: Any
     ) -> Score:
-        self._previous = distance.copy()  # the info keeps its own
+        self._previous = distance.copy()  # the info keeps the other array
         info: dict[str, Any] = {"distance": distance, "final_status": status, "target_coord": self.target.copy()}
         if self.rs_state_to_info:
             info["rs_state"] = as_objects(self.rs_state(state))
@@ -227,7 +227,7 @@ class Mir100NavigationTask(DriveTask):
     draws = 3 + 2 * CANDIDATES
 
     def starts(self, draws: Array) -> Array:
-        """Anywhere near the origin. Shape: (k, 3)."""
+        """Start poses near the origin. Shape: (k, 3)."""
         return np.concatenate([spread(draws[:, :2], -START, START), spread(draws[:, 2:3], -math.pi, math.pi)], axis=1)
 
     def targets(self, draws: Array, start: Array) -> Array:

@@ -13,16 +13,16 @@ from bam_envs.robots.ur5e import GEOMETRY
 from bam_envs.tasks.tool_control import ACTION_LABELS, HAND_LABELS, WORKSPACE, ToolControl, hand_state
 
 CUBE_AREA = np.array([[0.35, -0.20], [0.65, 0.20]])
-"""Where the cube starts: lowest and highest x, y [m]."""
+"""Range of the cube at the start: lowest and highest x, y [m]."""
 CUBE_EDGE = 0.04
 """Edge of the cube [m]."""
 START_AREA = np.array([[0.45, -0.05, 0.17], [0.55, 0.05, 0.23]])
-"""Where the tool starts: lowest and highest x, y, z [m]."""
+"""Range of the tool at the start: lowest and highest x, y, z [m]."""
 NEAR = 0.03
 """The object is within the gripper's reach at this distance from the tool [m]."""
-LIFT = 0.10  # how high the cube must be lifted [m]
+LIFT = 0.10  # height to which the cube must be lifted [m]
 HOLD_STEPS = 5
-"""How long it must be held there: 0.25 s at 20 Hz."""
+"""Steps for which it must be held there: 0.25 s at 20 Hz."""
 TABLE_EDGE = -0.03
 """An object below this height has left the table [m]."""
 
@@ -39,7 +39,7 @@ OBJECT_LABELS = (
 
 
 class CubeSense:
-    """What the last state says of tool and cube, worked out once for `observe`, `command` and `score`."""
+    """Tool and cube in the last state, computed once for `observe`, `command` and `score`."""
 
     def __init__(self, state: RobotState) -> None:
         self.state = state
@@ -58,10 +58,9 @@ class PickTask(Memory):
 
     Reward:
         Each step 0.1 (1 - tanh(5 d)), where d is the distance of the tool from the cube [m]; -0.05 while the
-        gripper is told to close 3 cm or more from the cube; while the cube is squeezed between the pads, 0.1
-        more, and 0.5 times the share of 10 cm that it is lifted. At success 30, which is about what holding the
-        cube up for the rest of the episode would bring, so that ending early never costs; -5 when the cube
-        leaves the table.
+        gripper is commanded to close 3 cm or more from the cube; while the cube is squeezed between the pads, 0.1
+        more, and 0.5 times the share of 10 cm that it is lifted. At success 30, about the reward of holding the
+        cube up for the rest of the episode, so that ending early never costs; -5 when the cube leaves the table.
 
     Success:
         The cube is at least 10 cm above where it lay for 5 steps in a row (0.25 s).
@@ -85,7 +84,7 @@ class PickTask(Memory):
         self.rest_height = np.zeros(num_envs)
         """Height of the object where it lay [m]. Shape: (n,)."""
         self.held = np.zeros(num_envs, dtype=np.int64)
-        """For how many steps the object has been high enough. Shape: (n,)."""
+        """Number of steps in a row with the object high enough. Shape: (n,)."""
         self._sense: CubeSense | None = None
 
     def sample_initial(self, env_ids: EnvIds, rngs: Sequence[np.random.Generator]) -> Initial:
@@ -100,19 +99,19 @@ class PickTask(Memory):
         return Initial({"joint_position": joints, "object_pose": cube}, seeds)
 
     def on_reset(self, env_ids: EnvIds, state: RobotState) -> None:
-        """Note the measured joints and how high the object lies."""
+        """Record the measured joints and the height of the object."""
         self.control.start(env_ids, state.signals["joint_position"][env_ids])
         self.rest_height[env_ids] = state.signals["object_position"][env_ids, 2]
         self.held[env_ids] = 0
 
     def sense(self, state: RobotState) -> CubeSense:
-        """Tool and cube of `state`, worked out once."""
+        """Tool and cube of `state`, computed once."""
         if self._sense is None or self._sense.state is not state:
             self._sense = CubeSense(state)
         return self._sense
 
     def lift(self, sense: CubeSense) -> Array:
-        """How high the object is above where it lay [m]. Shape: (n,)."""
+        """Height of the object above its start [m]. Shape: (n,)."""
         return sense.object[:, 2] - self.rest_height
 
     def observe(self, state: RobotState) -> Floats:
@@ -145,7 +144,7 @@ class PickTask(Memory):
         return self.control.closed & (width > 0.6 * CUBE_EDGE) & (width < 1.6 * CUBE_EDGE) & (sense.distance < NEAR)
 
     def score(self, state: RobotState, action: Floats) -> Score:
-        """Near the cube, squeezing it, lifting it; at success the worth of staying there."""
+        """Reward proximity to the cube, squeezing it and lifting it; success pays as much as holding it."""
         sense = self.sense(state)
         lift, grasped = self.lift(sense), self.grasped(sense)
         self.held = np.where(lift >= LIFT, self.held + 1, 0)
@@ -161,7 +160,7 @@ class PickTask(Memory):
         return Score(reward, success | fallen, success, {"distance": sense.distance, "lift": lift})
 
     def marks(self) -> list[tuple[Array, tuple[float, float, float, float]]]:
-        """Nothing to draw beyond the scene."""
+        """None beyond the scene."""
         return []
 
     def state_dict(self) -> dict[str, Any]:
@@ -169,6 +168,6 @@ class PickTask(Memory):
         return {"control": self.control.state_dict(), **super().state_dict()}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Go to what `state_dict` returned."""
+        """Restore the result of `state_dict`."""
         super().load_state_dict(state)
         self.control.load_state_dict(state["control"])

@@ -11,10 +11,10 @@ from bam_envs.robots.ur5e import GRIPPER_OPEN
 from bam_envs.tasks.pick import CUBE_AREA, CUBE_EDGE, NEAR, TABLE_EDGE, CubeSense, PickTask
 
 GOAL_RADIUS = 0.02  # the object lies at the goal within this distance [m]
-GOAL_DISTANCE = 0.10  # a goal is at least this far from where the cube starts [m]
-REST_STEPS = 5  # how long the object must lie there, let go: 0.25 s at 20 Hz
+GOAL_DISTANCE = 0.10  # least distance of a goal from the start of the cube [m]
+REST_STEPS = 5  # steps for which the object must lie there, released: 0.25 s at 20 Hz
 CARRY = 0.05
-"""How high the object is carried [m]."""
+"""Height at which the object is carried [m]."""
 PICKED = 0.03  # an object that was this high has been picked up, not pushed [m]
 FUNNEL = 0.08  # distance from the goal at which it comes down [m]
 
@@ -35,16 +35,16 @@ class PickPlaceTask(PickTask):
 
     Reward:
         Each step 0.04 (1 - tanh(5 d)), where d is the distance of the tool from the cube [m]; -0.02 while the
-        gripper is told to close 3 cm or more from the cube. While the cube is squeezed, 0.04 more; up to 0.1
+        gripper is commanded to close 3 cm or more from the cube. While the cube is squeezed, 0.04 more; up to 0.1
         for carrying it at the right height, which is 5 cm far from the goal and comes down to the table over
         the last 9 cm; and, once it has been lifted 3 cm, up to 0.25 for being near the goal too. 0.04 for a
-        cube that was lifted and is at the goal, still squeezed; once the gripper is told to open there, 0.9 to
-        1.5 by how far it is open, instead of all that. At success 75, about the worth of staying there; -2 when
-        the cube leaves the table.
+        cube that was lifted and is at the goal, still squeezed; once the gripper is commanded to open there, 0.9
+        to 1.5 by its opening, instead of all other terms. At success 75, about the reward of staying there; -2
+        when the cube leaves the table.
 
     Success:
         The cube has been lifted 3 cm in this episode, is within 2 cm of where it would lie at the goal, and the
-        gripper has been told to open and is open by more than 60 % of its width, for 5 steps in a row (0.25 s).
+        gripper has been commanded to open and is open by more than 60 % of its width, for 5 steps in a row (0.25 s).
 
     End:
         Terminated at success, and when the cube is lower than 3 cm below the table top: it has left the table.
@@ -90,7 +90,7 @@ class PickPlaceTask(PickTask):
         return distance
 
     def score(self, state: RobotState, action: Floats) -> Score:
-        """Near the cube, squeezing it, carrying it to the goal, letting go there; at success the worth of staying."""
+        """Reward reaching, squeezing and carrying the cube, and releasing it at the goal; success pays for staying."""
         sense = self.sense(state)
         lift, grasped, distance = self.lift(sense), self.grasped(sense), self.goal_distance(sense)
         opening, width = ~self.control.closed, state.signals["gripper_width"][:, 0]
@@ -106,7 +106,7 @@ class PickPlaceTask(PickTask):
         return Score(reward, success | fallen, success, info)
 
     def _shaping(self, sense: CubeSense, lift: Array, grasped: Any) -> Array:
-        """Reach, squeeze, carry along a funnel: `CARRY` high far from the goal, down to the table there. (n,)."""
+        """Reward reaching, squeezing and carrying: `CARRY` high far from the goal, down to the table there. (n,)."""
         offset = sense.object[:, :2] - self.goal
         across = np.sqrt(np.einsum("ij,ij->i", offset, offset))
         height = CARRY * np.clip((across - 0.01) / FUNNEL, 0.0, 1.0)

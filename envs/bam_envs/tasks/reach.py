@@ -15,12 +15,12 @@ HOME = np.array([-0.27, -1.54, 1.89, -1.93, -1.57, -1.84])
 START_NOISE = 0.1
 """The start differs from `HOME` by at most this much in each joint [rad]."""
 GOAL_AREA = np.array([[0.30, -0.30, 0.10], [0.65, 0.30, 0.45]])
-"""Where goals are: lowest and highest x, y, z [m]."""
+"""Range of the goals: lowest and highest x, y, z [m]."""
 GOAL_RADIUS = 0.02  # the tool has arrived within this distance of the goal [m]
 LOWEST_TOOL = 0.04  # commands that would bring the tool lower than this are not followed [m]
 JOINT_MARGIN = 0.1  # commands stay this far from the joint limits [rad]
 LEASH = 0.15
-"""Farthest the commanded joints are from the measured ones [rad]."""
+"""Farthest distance of the commanded joints from the measured ones [rad]."""
 
 _LOW = np.array([-2 * np.pi, -2 * np.pi, -np.pi, -2 * np.pi, -2 * np.pi, -2 * np.pi]) + JOINT_MARGIN
 
@@ -71,7 +71,7 @@ class ReachTask(Memory):
         return Initial({"joint_position": HOME + START_NOISE * (2 * draws[:, :6] - 1)}, seeds)
 
     def on_reset(self, env_ids: EnvIds, state: RobotState) -> None:
-        """Nothing is kept: commands go on from the one that was really sent last."""
+        """Do nothing: commands continue from the one that was actually sent last."""
 
     def observe(self, state: RobotState) -> Floats:
         """See `observation_labels`. Shape: (n, 21) float32."""
@@ -89,7 +89,7 @@ class ReachTask(Memory):
         return np.clip(observation, self.observation_space.low, self.observation_space.high)
 
     def command(self, action: Floats, state: RobotState) -> Array:
-        """Joint positions [rad], at most `TOOL_STEP` and `JOINT_STEP` on, and the open gripper. Shape: (n, 7)."""
+        """Joint positions [rad] within `TOOL_STEP` and `JOINT_STEP`, and the open gripper [m]. Shape: (n, 7)."""
         measured, sent = state.signals["joint_position"], state.command[:, :6]
         wanted = sent + np.clip(action, -1.0, 1.0).astype(np.float64) * JOINT_STEP
         wanted = np.clip(np.clip(wanted, measured - LEASH, measured + LEASH), _LOW, -_LOW)
@@ -107,7 +107,7 @@ class ReachTask(Memory):
         return np.concatenate([joints, np.full((self.num_envs, 1), GRIPPER_OPEN)], axis=1)
 
     def score(self, state: RobotState, action: Floats) -> Score:
-        """Nearer is better; arriving is worth staying there."""
+        """Reward proximity; success pays as much as staying at the goal."""
         offset = self.goal - GEOMETRY.tool_position(state.signals["joint_position"])
         distance = np.sqrt(np.einsum("ij,ij->i", offset, offset))
         success = distance < GOAL_RADIUS

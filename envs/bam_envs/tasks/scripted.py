@@ -1,6 +1,6 @@
-"""Hand-written policies that solve MuJoCo's tasks from their observations alone: they can be done, and here is how.
+"""Hand-written policies that solve the MuJoCo tasks from their observations alone, as a reference.
 
-They keep no memory, so they act on any number of observations in any order, like a frozen policy.
+They have no memory, so they act on any number of observations in any order, like a frozen policy.
 """
 
 from collections.abc import Callable, Sequence
@@ -16,15 +16,15 @@ from bam_envs.tasks.pick_place import CARRY, PickPlaceTask
 from bam_envs.tasks.reach import HOME, ReachTask
 from bam_envs.tasks.tool_control import JOINT_STEP, LEASH, TOOL_STEP, YAW_STEP
 
-HOVER = 0.08  # how far above the object the tool comes in [m]
-DAMPING = 0.05  # keeps the joints slow where the arm is nearly stretched [m/rad]
-PUT_DOWN = 0.004  # an object lower than this is let go of [m]
+HOVER = 0.08  # height above the object from which the tool approaches [m]
+DAMPING = 0.05  # keeps the joints slow when the arm is nearly stretched [m/rad]
+PUT_DOWN = 0.004  # an object lower than this is released [m]
 Take = Callable[..., Array]
-"""Gives the numbers of the observations with these names, side by side. Shape: (n, names)."""
+"""Returns the numbers of the observations with these names, side by side. Shape: (n, names)."""
 
 
 class ScriptedPolicy:
-    """The part of a frozen policy that evaluation uses: `act` makes the actions (n, a) of an observation's `labels`."""
+    """The part of a frozen policy that evaluation uses; `act` computes the actions (n, a) from named observations."""
 
     def __init__(self, labels: Sequence[Label], act: Callable[[Take], Floats]) -> None:
         self._columns, self._act = {label.name: column for column, label in enumerate(labels)}, act
@@ -34,7 +34,7 @@ class ScriptedPolicy:
         return self._act(lambda *names: observations[:, [self._columns[name] for name in names]].astype(np.float64))
 
     def reset(self, env_ids: Sequence[int] | None = None) -> None:
-        """Nothing to forget."""
+        """Do nothing: there is no memory."""
 
 
 def reach(take: Take) -> Floats:
@@ -43,7 +43,7 @@ def reach(take: Take) -> Floats:
     offset = 0.3 * take("goal_dx", "goal_dy", "goal_dz")
     step = 1e-6 * np.eye(joints.shape[1])
     ahead = [GEOMETRY.tool_position(joints + one) - GEOMETRY.tool_position(joints - one) for one in step]
-    jacobian = np.stack(ahead, axis=2) / 2e-6  # how the tool moves when each joint turns [m/rad]; shape (n, 3, 6)
+    jacobian = np.stack(ahead, axis=2) / 2e-6  # of the tool position [m/rad]; shape (n, 3, 6)
     square = jacobian @ jacobian.transpose(0, 2, 1) + DAMPING**2 * np.eye(3)
     turn = (jacobian.transpose(0, 2, 1) @ np.linalg.solve(square, offset[:, :, None]))[:, :, 0]
     actions: Floats = (turn / np.maximum(np.abs(turn).max(axis=1, keepdims=True), JOINT_STEP)).astype(np.float32)
@@ -51,7 +51,7 @@ def reach(take: Take) -> Floats:
 
 
 class Sight:
-    """What an observation says of hand and object, in SI units, in n environments."""
+    """Hand and object in the observations of n environments, in SI units."""
 
     def __init__(self, take: Take) -> None:
         self.offset = 0.1 * take("object_dx", "object_dy", "object_dz")  # object from the tool [m] (n, 3)
@@ -60,15 +60,15 @@ class Sight:
         cosine, sine = take("object_yaw_cos", "object_yaw_sin").T
         self.turn: Array = np.arctan2(sine, cosine) / 4  # object's yaw from the gripper's, the nearest of four [rad]
         grip, width = take("grip", "gripper_width").T
-        # Whether the gripper was told to close on the object, and whether it has stopped at the object's width. (n,)
+        # Whether the gripper was commanded to close on the object, and whether it stopped at the object's width. (n,)
         self.closed: Flags = (grip > 0) & (np.linalg.norm(self.offset, axis=1) < 0.03)
         self.holding: Flags = self.closed & (width < 0.1)
 
 
 def grasp(sight: Sight) -> tuple[Array, Array, Array]:
-    """Come down on the object through a funnel, the gripper turned to it, and close.
+    """Approach the object from above through a funnel, with the gripper aligned, and close.
 
-    The way of the tool target [m] (n, 3), its turn [rad] (n,), and 1 to close or -1 to open (n,).
+    Returns the motion of the tool target [m] (n, 3), its turn [rad] (n,), and 1 to close or -1 to open (n,).
     """
     across = np.hypot(sight.offset[:, 0], sight.offset[:, 1])
     astray = np.maximum((across - 0.007) / 0.015, (np.abs(sight.turn) - 0.08) / 0.15)
@@ -81,7 +81,7 @@ def grasp(sight: Sight) -> tuple[Array, Array, Array]:
 
 
 def tool_actions(travel: Array, turn: Array, grip: Array) -> Floats:
-    """Actions (n, 5) that move the tool target by `travel` [m] and `turn` [rad], as far as a step goes."""
+    """Actions (n, 5) that move the tool target by `travel` [m] and `turn` [rad], at most one step."""
     actions = np.concatenate([travel / TOOL_STEP, turn[:, None] / YAW_STEP, grip[:, None]], axis=1)
     clipped: Floats = np.clip(actions, -1.0, 1.0).astype(np.float32)
     return clipped
@@ -108,7 +108,7 @@ def pick_place(take: Take) -> Floats:
 
 
 def carry(sight: Sight, goal: Array, over: Flags) -> Array:
-    """Way of the tool target with the object in hand: up, across to `goal` (n, 2) [m], down. Shape: (n, 3) [m]."""
+    """Motion of the tool target with the object grasped: up, across to `goal` (n, 2) [m], down. Shape: (n, 3) [m]."""
     height = np.where(over, 0.0, CARRY)
     travel = np.concatenate([goal - sight.lead[:, :2], (height - sight.lift)[:, None]], axis=1)
     travel[:, :2] *= (over | (sight.lift > 0.6 * CARRY))[:, None]
@@ -121,11 +121,11 @@ SCRIPTED: dict[str, tuple[type[ReachTask | PickTask], Callable[[Take], Floats]]]
     "bam/pick-v0": (PickTask, pick),
     "bam/pick-place-v0": (PickPlaceTask, pick_place),
 }
-"""The task, and what makes its actions, of each environment that has a scripted policy."""
+"""Task and action function of each environment that has a scripted policy."""
 
 
 def scripted_policy(env_id: str) -> ScriptedPolicy:
-    """The scripted policy for `env_id`; `InvalidValue` if the environment has none, `UnknownName` if there is none."""
+    """The scripted policy for `env_id`; `InvalidValue` if it has none, `UnknownName` if it is no environment."""
     if env_id in ENVIRONMENTS and env_id not in SCRIPTED:
         raise InvalidValue(f"{env_id} has no scripted policy. These have one: {', '.join(SCRIPTED)}.")
     if env_id not in SCRIPTED:

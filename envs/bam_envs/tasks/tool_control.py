@@ -1,7 +1,7 @@
 """From tool actions (dx, dy, dz, dyaw, grip) to joint commands, slow enough for a robot near people.
 
 The actions move a tool *target*, not the measured tool, which sags and lags; the target stays within `LEASH` of the
-measured tool and inside the workspace, and begins at what was really sent where guards made another command of it.
+measured tool and inside the workspace, and continues from the command that was actually sent if guards changed it.
 The tool always points straight down, so the joints follow in closed form. From one command to the next the tool target
 moves at most `TOOL_STEP` and no joint more than `JOINT_STEP`.
 """
@@ -15,13 +15,13 @@ from bam_envs.core.task import Array, Floats, Label, Memory
 from bam_envs.robots.ur5e import GEOMETRY, GRIPPER_OPEN
 
 TOOL_STEP = 0.0124
-"""Farthest the tool target goes in 0.05 s [m]; the measured tool stays below 0.25 m/s, as in a UR's recovery mode."""
+"""Maximum motion of the tool target in 0.05 s [m]; the tool stays below 0.25 m/s, as in a UR's recovery mode."""
 JOINT_STEP = 0.05
-"""Farthest a joint goes in a period of 0.05 s [rad]: 1.0 rad/s."""
+"""Maximum motion of a joint in a period of 0.05 s [rad]: 1.0 rad/s."""
 YAW_STEP = 0.05
-"""Farthest the gripper turns in a period [rad]."""
+"""Maximum turn of the gripper in a period [rad]."""
 LEASH = 0.03
-"""Farthest the tool target is from the measured tool, along each axis [m]."""
+"""Maximum distance of the tool target from the measured tool, along each axis [m]."""
 WORKSPACE = np.array([[0.30, -0.25, 0.016], [0.70, 0.25, 0.35]])
 """Box for the tool target: lowest and highest x, y, z [m]."""
 YAW_LIMIT = 1.2  # farthest the gripper turns from straight ahead [rad]; a cube needs pi/4
@@ -48,7 +48,7 @@ HAND_LABELS = (
 
 
 class ToolControl(Memory):
-    """The commanded tool of n environments: its target, its yaw, the joints that were commanded, the gripper."""
+    """The commanded tool of n environments: target, yaw, commanded joints, gripper."""
 
     memory: Mapping[str, str] = {"target": "target", "yaw": "yaw", "closed": "closed", "joints": "_joints"}
 
@@ -58,15 +58,15 @@ class ToolControl(Memory):
         self.yaw = np.zeros(num_envs)
         """Commanded yaw [rad]. Shape: (n,)."""
         self.closed = np.zeros(num_envs, dtype=bool)
-        """Whether the gripper was told to close. Shape: (n,)."""
+        """Whether the gripper was commanded to close. Shape: (n,)."""
         self._joints = np.zeros((num_envs, 6))
 
     def start(self, env_ids: EnvIds, joints: Array) -> None:
         """Begin at the measured `joints` (k, 6) [rad] of these environments."""
-        self._go_on(env_ids, joints)
+        self._continue_from(env_ids, joints)
         self.closed[env_ids] = False
 
-    def _go_on(self, env_ids: EnvIds, joints: Array) -> None:
+    def _continue_from(self, env_ids: EnvIds, joints: Array) -> None:
         position, x_axis = GEOMETRY.tool_pose(joints)
         self.target, self.yaw, self._joints = self.target.copy(), self.yaw.copy(), self._joints.copy()
         self.target[env_ids], self.yaw[env_ids] = position, np.arctan2(x_axis[:, 1], x_axis[:, 0])
@@ -78,11 +78,11 @@ class ToolControl(Memory):
         Args:
             action: In [-1, 1].
             tool: Measured tool position [m]. Shape: (n, 3).
-            sent: Joints that were really sent last [rad]; where guards changed them, the target begins there (n, 6).
+            sent: Joints that were actually sent last [rad]; if guards changed them, the target begins there. (n, 6).
         """
         held = np.flatnonzero((sent != self._joints).any(axis=1))
         if len(held):
-            self._go_on(held, sent[held])
+            self._continue_from(held, sent[held])
         moves: Array = np.clip(action, -1.0, 1.0).astype(np.float64)
         target = np.clip(self.target + moves[:, :3] * TOOL_STEP, tool - LEASH, tool + LEASH)
         travel = np.clip(target, WORKSPACE[0], WORKSPACE[1]) - self.target

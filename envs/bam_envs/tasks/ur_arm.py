@@ -25,7 +25,7 @@ from bam_envs.robots.ur import ur_model as model_called
 AboveZero = Annotated[float, Meta(gt=0)]
 SHORTEST = 0.5  # shortest time that a trajectory takes [s]
 LEASH = 0.2
-"""An arm that is measured farther than this from what it was told last [rad] was halted or held: it begins there."""
+"""An arm measured farther than this from its last command [rad] was halted or held; motion begins at its position."""
 FOREARM = LINKS.index("forearm_link")
 WIRE_JOINTS = ("base", "shoulder", "elbow", "wrist_1", "wrist_2", "wrist_3")  # robo-gym's names of the joints
 POSITIONS = tuple(f"{joint}_joint_position" for joint in WIRE_JOINTS)
@@ -33,17 +33,17 @@ VELOCITIES = tuple(f"{joint}_joint_velocity" for joint in WIRE_JOINTS)
 
 
 class UrTask(Memory):
-    """A task of UR arms: it has the arm's options, steps it counts, and infos.
+    """Base class of the tasks of UR arms: the arm's options, the count of steps, and infos.
 
     Args:
         ur_model: ur3, ur3e, ur5, ur5e, ur10, ur10e or ur16e.
-        fix_base: Take the joint out of the action: it stays where the task wants it. So do the next five.
+        fix_base: Exclude the joint from the action; the task sets its position. The next five do the same.
         fix_shoulder: See above.
         fix_elbow: See above.
         fix_wrist_1: See above.
         fix_wrist_2: See above.
         fix_wrist_3: See above; it turns the flange about its own axis.
-        rs_state_to_info: Put robo-gym's robot server state into info["rs_state"], a dict of floats.
+        rs_state_to_info: Add robo-gym's robot server state to the info as ``rs_state``, a dict of floats.
 
     Raises:
         InvalidValue: All joints are fixed.
@@ -76,9 +76,9 @@ class UrTask(Memory):
             )
         self.num_envs, self.model, self.rs_state_to_info = num_envs, model_called(ur_model), rs_state_to_info
         self.speed: Array = self.velocity_scale * self.model.max_velocity
-        """How fast the joints go [rad/s]. Shape: (6,)."""
+        """Speeds of the joints [rad/s]. Shape: (6,)."""
         self.free = np.flatnonzero(~np.array(fixed, dtype=bool))
-        """Places of the joints that are in the action."""
+        """Indices of the joints that are in the action. Shape: (a,)."""
         self.action_labels = self._action_labels()
         self.observation_labels = self._observation_labels()
         self.action_space: spaces.Box = labelled_box(self.action_labels)
@@ -94,7 +94,7 @@ class UrTask(Memory):
         raise NotImplementedError
 
     def _columns(self, state: RobotState) -> list[Array]:
-        """The numbers of an observation, before they are cut to their space. Shape: (n, k) each."""
+        """The numbers of an observation, before they are clipped to their space. Shape: (n, k) each."""
         raise NotImplementedError
 
     def observe(self, state: RobotState) -> Floats:
@@ -103,14 +103,14 @@ class UrTask(Memory):
         return np.clip(observation, self.observation_space.low, self.observation_space.high)
 
     def full_action(self, action: Floats, held: Array | float = 0.0) -> Array:
-        """Of all joints, cut to [-1, 1]: `action` of the free ones, `held` of the fixed ones. Shape: (n, 6)."""
+        """The action of all joints in [-1, 1]: clipped `action` for free ones, `held` for fixed ones. Shape: (n, 6)."""
         full: Array = np.empty((self.num_envs, 6))
         full[:] = held
         full[:, self.free] = np.clip(action, -1.0, 1.0)
         return full
 
     def toward(self, target: Array, state: RobotState) -> Array:
-        """The set points one period on the way from the last ones in `state` to `target`. Shape: (n, 6) [rad] both."""
+        """The set points after one period on the way from those in `state` to `target`. Shape: (n, 6) [rad] both."""
         measured, sent = state.signals["joint_position"], state.command
         joints = np.where(np.abs(sent - measured).max(axis=1, keepdims=True) <= LEASH, sent, measured)
         way = target - joints
@@ -133,23 +133,23 @@ class UrTask(Memory):
         status = np.where(success, "success", np.where(late, "max_steps_exceeded", ""))
         return collision | success, np.where(collision, "collision", status)
 
-    def info(self, state: RobotState, **told: Any) -> dict[str, Any]:
-        """Infos: what is `told`, and robo-gym's wire state where it is asked for."""
-        return told | ({"rs_state": as_objects(self.rs_state(state))} if self.rs_state_to_info else {})
+    def info(self, state: RobotState, **values: Any) -> dict[str, Any]:
+        """The infos `values`, and robo-gym's wire state with `rs_state_to_info`."""
+        return values | ({"rs_state": as_objects(self.rs_state(state))} if self.rs_state_to_info else {})
 
     def rs_state(self, state: RobotState) -> list[dict[str, float]]:
         """robo-gym's wire state of each environment."""
         return wire_states(self.model, state)
 
     def marks(self) -> list[tuple[Array, tuple[float, float, float, float]]]:
-        """Nothing to draw beyond the scene."""
+        """None beyond the scene."""
         return []
 
 
 def collisions(state: RobotState) -> Flags:
-    """Which arms have touched something; none where nobody knows, as of a live robot. Shape: (n,)."""
-    told: Any = state.truth.get("collision")
-    return np.zeros(len(state.stamp), dtype=bool) if told is None else told
+    """Mask of the arms that have touched something; False if it is not known, as of a live robot. Shape: (n,)."""
+    touched: Any = state.truth.get("collision")
+    return np.zeros(len(state.stamp), dtype=bool) if touched is None else touched
 
 
 def normalised(model: UrModel, joints: Array) -> Array:
@@ -167,7 +167,7 @@ def spherical(vector: Array) -> Array:
 
 
 def in_frame(point: Array, position: Array, rotation: Array) -> Array:
-    """`point` as a frame at `position` with the axes `rotation` sees it. Shapes: (n, 3), (n, 3), (n, 3, 3)."""
+    """`point` in the frame at `position` with the axes `rotation`. Shapes: (n, 3), (n, 3), (n, 3, 3) -> (n, 3)."""
     offset = (point - position)[:, :, None]
     # Written out: the sum for one environment does not depend on how many there are.
     return rotation[:, 0] * offset[:, 0] + rotation[:, 1] * offset[:, 1] + rotation[:, 2] * offset[:, 2]
@@ -180,8 +180,8 @@ def joint_labels(prefix: str, meaning: str, unit: str, scale: str, bound: float 
 
 def joint_option(options: Mapping[str, Any], default: Sequence[float], model: UrModel) -> Array:
     """Joint positions [rad] inside their limits: those of the option ``joint_positions``, or `default`. Shape: (6,)."""
-    given = options.get("joint_positions")
-    joints = finite_numbers(default if given is None else given, 6, "The reset option joint_positions")
+    chosen = options.get("joint_positions")
+    joints = finite_numbers(default if chosen is None else chosen, 6, "The reset option joint_positions")
     for label, value, least, most in zip(JOINTS, joints, *model.joint_limits, strict=True):
         if not least <= value <= most:
             raise InvalidValue(
@@ -201,7 +201,7 @@ def wire_states(
 ) -> list[dict[str, float]]:
     """The states under robo-gym's names, a dict for each: 20 keys, 7 more with an object, 7 more with the forearm.
 
-    `object_position` (n, 3) is where the target or obstacle is [m]; its orientation is that of ``base_link``.
+    `object_position` (n, 3) is that of the target or obstacle [m]; its orientation is that of ``base_link``.
     """
     joints = state.signals["joint_position"]
     keys, columns = [*POSITIONS, *VELOCITIES], [joints, state.signals["joint_velocity"]]

@@ -1,7 +1,7 @@
-"""Avoidance: stay at a pose, and out of the way of an obstacle that goes up and down beside it.
+"""Avoidance: stay at a pose, and avoid an obstacle that moves up and down beside it.
 
-`UrObstacleTask` is what `bam_envs.tasks.ur_track` shares. Frames are robo-gym's: ``tool0`` is the end effector,
-``forearm_link`` the elbow, places are in ``base_link``.
+`UrObstacleTask` is shared with `bam_envs.tasks.ur_track`. Frames are robo-gym's: ``tool0`` is the end effector,
+``forearm_link`` the elbow; positions are in ``base_link``.
 """
 
 from __future__ import annotations
@@ -32,10 +32,10 @@ OFFSET = 0.1  # share of the joint limits off the reference that is 1 in observa
 COLLISION = -0.1
 """Reward of a collision."""
 POSE = (-1.57, -1.31, -1.31, -2.18, 1.57, 0.0)
-"""Joint positions to stay at [rad]; the obstacle's way goes past the flange."""
+"""Joint positions to stay at [rad]; the obstacle moves past the flange."""
 NEAREST = 0.30  # distance of the obstacle from flange and elbow that costs [m]
 RAPID = 0.5  # change of an action that costs, in a joint [rad]
-SPREAD = 0.6  # sum of the shares of their limits that the joints may be off while it is worth something
+SPREAD = 0.6  # sum of the joints' offsets, as shares of their limits, below which they are rewarded
 
 
 def obstacle_labels(
@@ -44,7 +44,7 @@ def obstacle_labels(
     lows: tuple[float, float, float] = (0.0, 0.0, -1.0),
     high: float = 1.0,
 ) -> tuple[Label, ...]:
-    """Of the obstacle's spherical coordinates in `frame`."""
+    """Labels of the obstacle's spherical coordinates in `frame`."""
     names = ("distance", "polar", "azimuth")
     meanings = ("obstacle's distance", "obstacle's angle from z", "obstacle's angle from x about z")
     lines = zip(names, meanings, ("m", "rad", "rad"), scales, lows, strict=True)
@@ -55,7 +55,7 @@ def obstacle_labels(
 
 
 class ObstacleSense:
-    """Where the obstacle is, seen from the arm in one state; worked out once for `observe` and `score`."""
+    """The obstacle relative to the arm in one state, computed once for `observe` and `score`."""
 
     def __init__(self, task: UrObstacleTask, state: RobotState) -> None:
         self.state = state
@@ -71,11 +71,11 @@ class ObstacleSense:
 
 
 class UrObstacleTask(UrTask):
-    """An arm that keeps to a reference and away from an obstacle; what it is and what is rewarded is a task's own.
+    """Base class of tasks with a reference to follow and an obstacle to avoid.
 
     Args:
         include_polar_to_elbow: Whether the observation has the obstacle seen from the elbow, or zeros.
-        fixed_object_position: Where the obstacle stays in every episode [m].
+        fixed_object_position: Position of an obstacle that stays at rest in every episode (3) [m].
     """
 
     rate, velocity_scale, max_steps = 20.0, 0.2, 1000
@@ -95,7 +95,7 @@ class UrObstacleTask(UrTask):
         super().__init__(num_envs, **options)
         self._place = _place(fixed_object_position)
         self.reference = np.zeros((num_envs, 6))
-        """Joint positions to keep to [rad]. Shape: (n, 6)."""
+        """Reference joint positions [rad]. Shape: (n, 6)."""
         self._last_action = np.zeros((num_envs, 6))
         self._sense: ObstacleSense | None = None
 
@@ -110,7 +110,7 @@ class UrObstacleTask(UrTask):
         )
 
     def begin(self, env_ids: EnvIds, options: Mapping[str, Any], joints: Array) -> tuple[Array, Array | None]:
-        """Where arms begin, at `joints` (6,) or as the options say (k, 6) [rad]; where obstacles stay, if so (k, 3)."""
+        """Start of the arms (k, 6) [rad], `joints` (6,) or that of the options, and of obstacles at rest (k, 3) [m]."""
         start = joint_option(options, joints.tolist(), self.model)
         place = _place(options.get("fixed_object_position"))
         place = self._place if place is None else place
@@ -119,7 +119,7 @@ class UrObstacleTask(UrTask):
         return np.tile(start, (len(env_ids), 1)), stays
 
     def sense(self, state: RobotState) -> ObstacleSense:
-        """The obstacle in `state`, worked out once."""
+        """The obstacle in `state`, computed once."""
         if self._sense is None or self._sense.state is not state:
             self._sense = ObstacleSense(self, state)
         return self._sense
@@ -138,7 +138,7 @@ class UrObstacleTask(UrTask):
         return self.toward(self.reference + self.full_action(action), state)
 
     def effort(self, action: Floats, weight: float, rapid: float) -> Array:
-        """Worth of acting little, less for each joint whose action jumps by more than `rapid`; notes the action."""
+        """Reward for small actions (n,), less for each joint whose action jumps by more than `rapid`."""
         full = self.full_action(action)
         jumps = (np.abs(full - self._last_action) > rapid).sum(axis=1)
         self._last_action = full
@@ -146,11 +146,11 @@ class UrObstacleTask(UrTask):
         return effort
 
     def ends(self, collision: Flags, success: Flags, late: Flags) -> tuple[Flags, Any]:
-        """A collision ends an episode; a success is that its time went by without one."""
+        """A collision ends an episode; success is the time limit without a collision."""
         return collision, np.where(collision, "collision", np.where(success, "success", ""))
 
-    def scored(self, state: RobotState, reward: Array, collision_reward: float | None, **told: Any) -> Score:
-        """Count the step: `reward`, but `collision_reward` at a collision, and the infos of both tasks."""
+    def scored(self, state: RobotState, reward: Array, collision_reward: float | None, **values: Any) -> Score:
+        """Count the step: `reward`, or `collision_reward` at a collision, and the infos of both tasks."""
         self.elapsed = self.elapsed + 1
         collision = collisions(state)
         success = (self.elapsed >= self.max_steps) & ~collision
@@ -158,8 +158,8 @@ class UrObstacleTask(UrTask):
         if collision_reward is not None:
             reward = np.where(collision, collision_reward, reward)
         sense = self.sense(state)
-        told |= {"final_status": status, "target_coord": sense.obstacle.copy(), "distance": sense.nearest.copy()}
-        return Score(reward, terminated, success, self.info(state, **told))
+        values |= {"final_status": status, "target_coord": sense.obstacle.copy(), "distance": sense.nearest.copy()}
+        return Score(reward, terminated, success, self.info(state, **values))
 
     def rs_state(self, state: RobotState) -> list[dict[str, float]]:
         """robo-gym's wire state of each environment: 34 named numbers."""
@@ -184,19 +184,19 @@ class UrAvoidanceTask(UrObstacleTask):
         stays at the reset option ``fixed_object_position`` (3) [m].
 
     Action:
-        Where the joints are to be, beside the pose [rad]. They go there at a fifth of their fastest speed, and slower
-        when they are near.
+        Target joint positions, relative to the pose [rad]. The joints move there at a fifth of their maximum speed, and
+        slower when they are near.
 
     Reward:
         Each step, in thousandths: 1 - s / 0.6 while the sum s of the joints' offsets from the pose, in shares of their
         limits, is below 0.6; 1 - the mean square of the action; -0.2 for each joint whose action changed by more than
-        0.5; -2 while the obstacle is within 0.30 m of flange or elbow. At a collision -0.1 and nothing else.
+        0.5; -2 while the obstacle is within 0.30 m of flange or elbow. At a collision -0.1 only.
 
     Success:
         No collision in 1000 steps.
 
     End:
-        Terminated at a collision, of the arm with itself, the table or the obstacle; a live arm does not notice any.
+        Terminated at a collision of the arm with itself, the table or the obstacle, which a live arm does not detect.
 
     Info:
         `target_coord` of the obstacle [m], its `distance` from flange or elbow, the nearer one [m], `rs_state` where it
@@ -216,7 +216,7 @@ class UrAvoidanceTask(UrObstacleTask):
         return self.initial(joints, rngs, **(wave_signals(draws) if place is None else {"obstacle_position": place}))
 
     def score(self, state: RobotState, action: Floats) -> Score:
-        """Staying at the pose, acting little and smoothly, away from the obstacle."""
+        """Reward staying at the pose, small and smooth actions, and distance from the obstacle."""
         off, gate = self.spread(state)
         reward = np.where(gate < SPREAD, (1 - off / SPREAD) / 1000, 0.0)
         reward = reward + self.effort(action, weight=1.0, rapid=RAPID)
@@ -224,6 +224,6 @@ class UrAvoidanceTask(UrObstacleTask):
         return self.scored(state, reward, self.collision_reward)
 
     def spread(self, state: RobotState) -> tuple[Array, Array]:
-        """How far the joints are off the pose, and what must be below `SPREAD` to be worth it. Shape: (n,) each."""
+        """Offset of the joints from the pose, and the number that must be below `SPREAD`. Shape: (n,) each."""
         off = np.abs(self.offset(state)).sum(axis=1)
         return off, off

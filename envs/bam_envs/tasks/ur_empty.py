@@ -1,4 +1,4 @@
-"""UR empty: a UR arm and nothing to do; robo-gym's EmptyEnvironmentUR."""
+"""UR empty: a UR arm without a goal; robo-gym's EmptyEnvironmentUR."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -18,8 +18,8 @@ class UrEmptyTask(UrTask):
         The arm is at the start pose, or at the reset option ``joint_positions`` (6) [rad].
 
     Action:
-        Where the joints are to be, from one end of their range at -1 to the other at 1. They go there at a fifth of
-        their fastest speed, and slower when they are near. A fixed joint stays at its start.
+        Target joint positions, from one end of their range at -1 to the other at 1. The joints move there at a fifth of
+        their maximum speed, and slower when they are near. A fixed joint stays at its start.
 
     Reward:
         0.
@@ -47,7 +47,7 @@ class UrEmptyTask(UrTask):
     def sample_initial(
         self, env_ids: EnvIds, rngs: Sequence[np.random.Generator], options: Mapping[str, Any] | None = None
     ) -> Initial:
-        """The start pose, or what the options say."""
+        """The start pose, or that of the options."""
         joints = joint_option(options or {}, START, self.model)
         return self.initial(np.tile(joints, (len(env_ids), 1)), rngs)
 
@@ -59,7 +59,7 @@ class UrEmptyTask(UrTask):
         return self.toward(self.full_action(action, self._held) * self.model.joint_limits[1], state)
 
     def score(self, state: RobotState, action: Floats) -> Score:
-        """Nothing is better than anything else; a collision ends the episode."""
+        """No reward; a collision ends the episode."""
         self.elapsed = self.elapsed + 1
         success = np.zeros(self.num_envs, dtype=bool)
         terminated, status = self.ends(collisions(state), success, self.elapsed >= self.max_steps)

@@ -23,13 +23,13 @@ from bam_envs.tasks.ur_arm import (
 )
 
 START = (0.0, -2.5, 1.5, -1.5, -1.4, 0.0)
-"""Where an episode starts [rad]."""
+"""Joint positions at the start of an episode [rad]."""
 START_OFFSET = np.array([1.5, 0.25, 0.5, 1.0, 0.4, 3.14])
-"""With `randomize_start` each joint is at most so far from there [rad]."""
+"""With `randomize_start`, maximum distance of each joint from `START` [rad]."""
 WRIST_1_RANGE = (-3.48, 0.31)
-"""With `restrict_wrist_1` the whole range of its action [rad]: where it does not fold back onto the forearm."""
+"""With `restrict_wrist_1`, the range of its action [rad], in which it does not fold back onto the forearm."""
 NEAR = 0.1  # the flange has arrived within this distance of the target [m]
-FAR = 3.0  # farthest that lengths are told, in workspace radii
+FAR = 3.0  # greatest length in observations, in workspace radii
 _WRIST_1 = 3
 
 
@@ -44,12 +44,12 @@ class UrReachTask(UrTask):
         ``ee_target_pose`` (6) [m].
 
     Action:
-        Where the joints are to be, from one end of their range at -1 to the other at 1; wrist 1 from -3.48 to 0.31 rad.
-        They go there at a tenth of their fastest speed, and slower when they are near.
+        Target joint positions, from one end of their range at -1 to the other at 1; wrist 1 from -3.48 to 0.31 rad.
+        The joints move there at a tenth of their maximum speed, and slower when they are near.
 
     Reward:
-        Each step -0.005 d, where d is the distance of the flange from the target [m]; instead of it 2 at success and -1
-        at a collision.
+        Each step -0.005 d, where d is the distance of the flange from the target [m]; instead 2 at success and -1 at a
+        collision.
 
     Success:
         The flange is within 10 cm of the target.
@@ -63,12 +63,12 @@ class UrReachTask(UrTask):
     Args:
         restrict_wrist_1: The action of wrist 1 means -3.48 to 0.31 rad.
         ee_distance_threshold: Distance that counts as success [m].
-        ee_target_pose: What the reset option of that name is where a reset does not give it. So are the next two.
+        ee_target_pose: Default of the reset option of that name. The next two likewise.
         randomize_start: See above.
         continue_on_success: See above.
-        modular: Observations and infos of robo-gym's EndEffectorPositioning2UR: the last action is that of the joints
-            that move; the distance is `dist_coord` too. With `parity`, wrist 1 starts at 0 rad and its action means its
-            whole range, and targets that are not given are the origin.
+        modular: Observations and infos of robo-gym's EndEffectorPositioning2UR: the last action is that of the free
+            joints; the distance is also `dist_coord`. With `parity`, wrist 1 starts at 0 rad and its action has its
+            whole range, and the default target is the origin.
     """
 
     rate, velocity_scale, max_steps = 10.0, 0.1, 300
@@ -97,7 +97,7 @@ class UrReachTask(UrTask):
         super().__init__(num_envs, **options)
         self._restrict = restrict_wrist_1 and _WRIST_1 in self.free
         self.target = np.zeros((num_envs, 3))
-        """Where the flange is to be [m]. Shape: (n, 3)."""
+        """Targets of the flange [m]. Shape: (n, 3)."""
         self._actions = np.zeros((2, num_envs, 6))  # the last one and the one before, of all joints
         self._defaults = {"ee_target_pose": ee_target_pose, "randomize_start": randomize_start}
         self._defaults["continue_on_success"] = continue_on_success
@@ -123,24 +123,24 @@ class UrReachTask(UrTask):
     def sample_initial(
         self, env_ids: EnvIds, rngs: Sequence[np.random.Generator], options: Mapping[str, Any] | None = None
     ) -> Initial:
-        """The start pose, or what the options say; a target in the workspace."""
+        """The start pose, or that of the options; a target in the workspace."""
         options = self._defaults | {name: value for name, value in (options or {}).items() if value is not None}
         randomize = check(options["randomize_start"], bool, "reset option randomize_start")
-        goes_on = check(options["continue_on_success"], bool, "reset option continue_on_success")
+        continues = check(options["continue_on_success"], bool, "reset option continue_on_success")
         joints = np.tile(joint_option(options, self.start, self.model), (len(env_ids), 1))
         target = self._given_target(options)
         for k, (env, rng) in enumerate(zip(env_ids, rngs, strict=True)):
             if randomize:
                 joints[k] = np.clip(joints[k] + rng.uniform(-1.0, 1.0, 6) * START_OFFSET, *self.model.joint_limits)
             self.target[env] = workspace_point(self.model, rng) if target is None else target
-        if goes_on:
+        if continues:
             joints = np.where(self._continues[env_ids, None], self._last_end[env_ids], joints)
         if self.forgets_success:
             self._continues[env_ids] = False
         return self.initial(joints, rngs)
 
     def _given_target(self, options: Mapping[str, Any]) -> Array | None:
-        """The place that ``ee_target_pose`` gives [m]; None where a place is drawn. Shape: (3,)."""
+        """The position in ``ee_target_pose`` [m]; None if a target is to be drawn. Shape: (3,)."""
         if options.get("ee_target_pose") is None:
             return None
         target = finite_numbers(options["ee_target_pose"], 6, "ee_target_pose")[:3]
@@ -154,7 +154,7 @@ class UrReachTask(UrTask):
         return target
 
     def on_reset(self, env_ids: EnvIds, state: RobotState) -> None:
-        """No action has been yet."""
+        """Reset the last actions to 0."""
         super().on_reset(env_ids, state)
         self._actions[:, env_ids] = 0.0
 
@@ -182,7 +182,7 @@ class UrReachTask(UrTask):
         return self.toward(goal, state)
 
     def score(self, state: RobotState, action: Floats) -> Score:
-        """Nearer is better; arriving ends the episode, and so does a collision."""
+        """Reward proximity; success and a collision end the episode."""
         self.elapsed = self.elapsed + 1
         joints, collision = state.signals["joint_position"], collisions(state)
         x, y, z = (self.target - self.model.geometry.tool_position(joints)).T
@@ -208,7 +208,7 @@ class UrReachTask(UrTask):
 
 
 def workspace_point(model: UrModel, rng: np.random.Generator) -> Array:
-    """A point of the recommended workspace, all of it alike [m]. Shape: (3,)."""
+    """A uniformly random point of the recommended workspace [m]. Shape: (3,)."""
     while True:
         share, up, turn = rng.random(3)
         radius, height = model.workspace_radius * np.cbrt(share), up

@@ -1,4 +1,4 @@
-"""Track: follow a recorded joint trajectory and make way for an obstacle that flies about.
+"""Track: follow a recorded joint trajectory and avoid a moving obstacle.
 
 The trajectory is segments of waypoints 1/20 s apart, in a JSON file of robo-gym's form:
 ``{"trajectory": [[[base, shoulder, elbow, wrist 1, wrist 2, wrist 3], ...], ...]}``: segments, waypoints, joints [rad].
@@ -24,23 +24,23 @@ from bam_envs.tasks.ur_arm import joint_labels, normalised
 from bam_envs.tasks.ur_avoidance import COLLISION, UrObstacleTask
 
 RECORDED = "ur_track.json"
-"""The trajectory that is shipped; ``scripts/make_ur_track.py`` makes it."""
-_MOST_BYTES = 2**24  # which file it is may come from a stranger's checkpoint
+"""The shipped trajectory; ``scripts/make_ur_track.py`` makes it."""
+_MOST_BYTES = 2**24  # of a trajectory, whose file may be named by an untrusted checkpoint
 _Waypoint = Annotated[tuple[Finite, Finite, Finite, Finite, Finite, Finite], Meta(description="six joint positions")]
 _Segment = Annotated[list[_Waypoint], Meta(min_length=1, description="a list of waypoints")]
 _Segments = Annotated[list[_Segment], Meta(min_length=1, description="a list of segments")]
 NEAREST = 0.45  # distance of the obstacle from flange or elbow that costs [m]
 RAPID = 0.4  # change of an action that costs, in a joint [rad]
-CLOSE = 0.1  # share of its limit that a joint may be off the reference while it is worth something
+CLOSE = 0.1  # offset of a joint from the reference, as a share of its limit, below which it is rewarded
 ARRIVED = 0.1  # a waypoint at the end of a segment is reached with every joint within this [rad]
 BONUS = 0.05  # reward of reaching it
 AREA = np.array([[-1.0, -1.0, 0.1], [1.0, 1.0, 1.0]])
-"""Where the points of the obstacle's paths are: lowest and highest x, y, z [m]."""
+"""Range of the points of the obstacle's paths: lowest and highest x, y, z [m]."""
 AXIS, BASE = 0.2, 0.35
-"""How far paths keep from the z axis and from the base [m]."""
-AROUND = (8000, 12000)  # how long a path takes once around: least and most hundredths of a second
+"""Least distances of paths from the z axis and from the base [m]."""
+AROUND = (8000, 12000)  # least and greatest duration of a path [1/100 s]
 FIXED_PATHS, FIXED_AROUND = 50, 4000
-"""How many paths `fixed_paths` has, and how long they take once around [1/100 s]."""
+"""Number of paths of `fixed_paths`, and their duration [1/100 s]."""
 
 
 def draw_path(rng: np.random.Generator, samples: int) -> Array:
@@ -49,7 +49,7 @@ def draw_path(rng: np.random.Generator, samples: int) -> Array:
         points = AREA[0] + rng.random((1, PATH_POINTS, 3)) * (AREA[1] - AREA[0])
         points[0, 0, :2] = rng.uniform(0.5, 1.0, 2) * rng.choice((-1.0, 1.0), 2)  # also the last point
         points[0, -1] = points[0, 0]
-        # A coarse look first: about one path in seven is good.
+        # A coarse check first: about one path in seven passes.
         if _keeps_away(points, 200) and _keeps_away(points, samples):
             path: Array = points[0]
             return path
@@ -57,7 +57,7 @@ def draw_path(rng: np.random.Generator, samples: int) -> Array:
 
 @lru_cache(maxsize=FIXED_PATHS)
 def fixed_path(number: int) -> Array:
-    """One of the paths that are always the same. Shape: (10, 3)."""
+    """The fixed path of that number. Shape: (10, 3)."""
     return draw_path(np.random.default_rng([number, FIXED_PATHS]), FIXED_AROUND)
 
 
@@ -77,33 +77,33 @@ class UrTrackTask(UrObstacleTask):
         it stays at the reset option ``fixed_object_position`` (3) [m].
 
     Action:
-        Where the joints are to be, beside the waypoint of the step [rad]. They go there at a fifth of their fastest
-        speed, and slower when they are near. At the end of a segment its last waypoint waits until every joint is
-        within 0.1 rad of it; then the next segment begins, after the last the first.
+        Target joint positions, relative to the waypoint of the step [rad]. The joints move there at a fifth of their
+        maximum speed, and slower when they are near. At the end of a segment its last waypoint waits until every joint
+        is within 0.1 rad of it; then the next segment begins, after the last one the first.
 
     Reward:
         Each step, in thousandths: the mean over the joints of 1 - s / 0.1 where its offset s from the waypoint, in
         shares of its limit, is below 0.1; 1.5 (1 - the mean square of the action); -0.2 for each joint whose action
         changed by more than 0.4; -2 while the obstacle is within 0.45 m of flange or elbow. At the end of a segment
-        0.05. At a collision -0.1 and nothing else.
+        0.05. At a collision -0.1 only.
 
     Success:
         No collision in 1000 steps.
 
     End:
-        Terminated at a collision, of the arm with itself, the table or the obstacle; a live arm does not notice any.
+        Terminated at a collision of the arm with itself, the table or the obstacle, which a live arm does not detect.
 
     Info:
         `targets_reached`, the ends of segments; `target_coord` of the obstacle [m], its `distance` from flange or
-        elbow, the nearer one [m], `rs_state` where it is asked for, and at the end `final_status`: "success" or
+        elbow, the nearer one [m], `rs_state` with `rs_state_to_info`, and at the end `final_status`: "success" or
         "collision".
 
     Args:
         include_polar_to_elbow: Whether the observation has the obstacle seen from the elbow, or zeros.
         trajectory: A JSON file with another trajectory, in robo-gym's form.
             robo-gym's own, up to 0.67 rad from the default, is ``trajectory_raad_2022.json`` in its package.
-        fixed_paths: For tests of policies: the obstacle is on one of 50 paths that are always the same, and faster
-            (40 s once around). Which one is drawn; with ``parity=True`` they come one after the other.
+        fixed_paths: For tests of policies: the obstacle follows one of 50 fixed paths, which are faster (40 s). The
+            path is drawn; with ``parity=True`` they follow in order.
     """
 
     memory: Mapping[str, str] = {
@@ -125,7 +125,7 @@ class UrTrackTask(UrObstacleTask):
         self._waypoints, self._lengths = load_trajectory(trajectory, self.model.joint_limits)
         self.fixed_paths = fixed_paths
         self.segment, self.step_in_segment, self.targets_reached, self._episodes = np.zeros((4, num_envs), np.int64)
-        """Which segment is followed, how many steps of it have been, how many ends were reached. Shape: (n,) each."""
+        """The current segment, the steps in it, and the number of ends reached. Shape: (n,) each."""
         self.waits = np.zeros(num_envs, dtype=bool)
         """Whether the reference is a segment's last waypoint, waiting for the arm. Shape: (n,)."""
 
@@ -139,7 +139,7 @@ class UrTrackTask(UrObstacleTask):
     def sample_initial(
         self, env_ids: EnvIds, rngs: Sequence[np.random.Generator], options: Mapping[str, Any] | None = None
     ) -> Initial:
-        """The first waypoint, and an obstacle on a path or staying."""
+        """The first waypoint, and an obstacle on a path or at rest."""
         self._episodes[env_ids] += 1
         self.segment[env_ids] = self.step_in_segment[env_ids] = self.targets_reached[env_ids] = 0
         self.reference[env_ids], self.waits[env_ids] = self._waypoints[0, 0], False
@@ -171,12 +171,12 @@ class UrTrackTask(UrObstacleTask):
         return super().command(action, state)
 
     def score(self, state: RobotState, action: Floats) -> Score:
-        """Following closely, acting little and smoothly, away from the obstacle."""
+        """Reward close following, small and smooth actions, and distance from the obstacle."""
         reward = self._following(state, self.offset(state), action) + BONUS * self._advance(state)
         return self.scored(state, reward, COLLISION, targets_reached=self.targets_reached.copy())
 
     def _following(self, state: RobotState, offset: Array, action: Floats) -> Array:
-        """Reward without that of the end of a segment. Shape: (n,)."""
+        """Reward without the bonus at the end of a segment. Shape: (n,)."""
         off = np.abs(offset)
         reward = np.where(off < CLOSE, 1 - off / CLOSE, 0.0).sum(axis=1) / 6000
         reward = reward - 0.002 * (self.sense(state).nearest < NEAREST)
@@ -184,7 +184,7 @@ class UrTrackTask(UrObstacleTask):
         return following
 
     def _advance(self, state: RobotState) -> Flags:
-        """Go on to the next segment where the arm is at the end of one; which environments. Shape: (n,)."""
+        """Begin the next segment if the arm is at the end of one; returns the mask of these arms. Shape: (n,)."""
         joints = state.signals["joint_position"]
         near = np.abs(self.reference - joints) <= ARRIVED + 1e-5 * np.abs(joints)  # as NumPy's isclose has it
         reached: Flags = self.waits & near.all(axis=1)
@@ -198,8 +198,8 @@ def load_trajectory(file: str | Path | None, limits: Array) -> tuple[Array, EnvI
     """The trajectory in a JSON file of robo-gym's form, or the shipped one; `limits` (2, 6) are of the joints [rad].
 
     Returns:
-        Joint positions [rad], short segments filled up with their last waypoint, shape (segments, longest, 6), and how
-        many waypoints each segment has, shape (segments,).
+        Joint positions [rad], short segments padded with their last waypoint, shape (segments, longest, 6), and the
+        number of waypoints of each segment, shape (segments,).
 
     Raises:
         InvalidValue: There is no such file, or no trajectory of six joints inside their limits in it.

@@ -1,4 +1,4 @@
-"""Contract tests for robots, tasks and transports of one's own: inherit, say how to make one, run pytest.
+"""Contract tests for your own robots, tasks and transports: inherit, override `make`, run pytest.
 
 ::
 
@@ -12,8 +12,8 @@
         def make(self, env):
             return MyTransport(address_of_a_server_of(env))
 
-They need nothing but NumPy and Gymnasium, and hold for arms with the signals of `bam_envs.robots.ur5e`; for another
-robot, override the hooks that name an arm. `DrivenRobot` is a simulated robot as a live one whose driver misbehaves.
+They need only NumPy and Gymnasium, and are for arms with the signals of `bam_envs.robots.ur5e`; for another robot,
+override the hooks that name an arm. `DrivenRobot` simulates a live robot whose driver misbehaves.
 """
 
 from bam_envs.testing.drivers import DrivenRobot

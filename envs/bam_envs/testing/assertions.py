@@ -1,4 +1,4 @@
-"""What the contract tests assert with."""
+"""Assertions of the contract tests."""
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
@@ -12,7 +12,7 @@ from bam_envs.core.robot import RobotState
 
 @contextmanager
 def no_io() -> Iterator[None]:
-    """Files, sockets, processes and threads are refused inside."""
+    """A context that refuses files, sockets, processes and threads."""
     names = ("builtins.open", "socket.socket.connect", "threading.Thread.start", "subprocess.Popen")
     with ExitStack() as stack:
         for name in names:

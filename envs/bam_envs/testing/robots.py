@@ -1,4 +1,4 @@
-"""The contract test for robots of one's own: one list of promises."""
+"""The contract test for your own robots."""
 
 import copy
 import math
@@ -20,12 +20,12 @@ ARM_HOME = np.array([-0.27, -1.54, 1.89, -1.93, -1.57, -1.84])
 
 
 class RobotContract:
-    """What every robot promises; each test makes a robot of its own and closes it."""
+    """The contract of every robot; each test makes a new robot and closes it."""
 
     sizes: tuple[int, ...] = (1, 3)
-    """How many robots are stepped together in the tests, in rising order; (1,) for a live one."""
+    """Numbers of robots that are stepped together in the tests, in rising order; (1,) for a live one."""
     still = 0.01
-    """Farthest a joint that was told to stay may move in a period [rad]."""
+    """Maximum motion in a period of a joint that is commanded to stay [rad]."""
     holds_what_is_not_finite = False
     """Whether a command that is not finite makes the robot hold for a tick, rather than raise an error."""
 
@@ -34,21 +34,21 @@ class RobotContract:
         raise NotImplementedError("Override make(num_robots) to return the robot under test.")
 
     def initial(self, robot: Robot, env_ids: EnvIds) -> Initial:
-        """Hook: where an episode may start."""
+        """Hook: a possible start of an episode."""
         seeds = np.arange(len(env_ids), dtype=np.int64)
         pose = np.tile([0.5, 0.1, 0.3], (len(env_ids), 1))
         return Initial({"joint_position": np.tile(ARM_HOME, (len(env_ids), 1)), "object_pose": pose}, seeds)
 
     def measured(self, state: RobotState) -> Array:
-        """Hook: what was measured of the first k numbers of the command. Shape: (n, k)."""
+        """Hook: the measured values of the first k numbers of the command. Shape: (n, k)."""
         return state.signals["joint_position"]
 
     def stay(self, state: RobotState) -> Array:
-        """Hook: the command that keeps every joint where it is. Shape: (n, m)."""
+        """Hook: the command that keeps every joint in place. Shape: (n, m)."""
         return np.array(state.command)
 
     def move(self, robot: Robot, state: RobotState) -> Array:
-        """Hook: a command a little away from where the robot is. Shape: (n, m)."""
+        """Hook: a command close to the robot's position. Shape: (n, m)."""
         rate = np.array(robot.spec.command.max_rate or [1.0] * len(robot.spec.command.labels))
         return self.stay(state) - 0.1 * rate * robot.spec.period
 
@@ -88,13 +88,13 @@ class RobotContract:
         assert spec.command.max_rate is not None, "the command needs a max_rate"
 
     def test_step_before_connect_is_refused(self) -> None:
-        """An error of ours, not an AttributeError."""
+        """The error is a `BamEnvsError`, not an AttributeError."""
         robot = self.make(1)
         error = raised(BamEnvsError, lambda: robot.step(np.zeros((1, len(robot.spec.command.labels)))))
         assert str(error), "the error has no text"
 
     def test_connect_is_idempotent_and_moves_nothing(self) -> None:
-        """A robot that was connected again is where it was."""
+        """A second `connect` does not move the robot."""
         with self.running() as (robot, before):
             robot.connect()
             after = robot.step(self.stay(before))
@@ -109,19 +109,19 @@ class RobotContract:
                 _check_state(robot, robot.step(self.move(robot, state)))
 
     def test_stamps_go_on(self) -> None:
-        """Time never stands still."""
+        """The stamp increases with every step."""
         with self.running() as (robot, first):
             second = robot.step(self.stay(first))
             assert (second.stamp > first.stamp).all()
 
     def test_state_has_the_command_that_was_sent(self) -> None:
-        """So that it can be recorded."""
+        """The command can be recorded with the state."""
         with self.running(self.sizes[-1]) as (robot, state):
             command = self.move(robot, state)
             np.testing.assert_array_equal(robot.step(command).command, command)
 
     def test_it_goes_where_it_is_told(self) -> None:
-        """Half a second after a small step, it is closer to there than it was."""
+        """Half a second after a small step, the robot is closer to its command."""
         with self.running() as (robot, state):
             command, start = self.move(robot, state), self.measured(state)
             for _ in range(math.ceil(0.5 / robot.spec.period)):
@@ -131,7 +131,7 @@ class RobotContract:
             assert (after < before).all(), f"left to go: {after}, at first {before}"
 
     def test_command_of_another_shape_is_refused(self) -> None:
-        """By name, with what was expected and found; the robot goes on."""
+        """The error names the expected and the actual shape; the robot continues."""
         with self.running() as (robot, state):
             m = len(robot.spec.command.labels)
             for shape in ((m,), (1, m + 1), (2, m)):
@@ -154,7 +154,7 @@ class RobotContract:
                 robot.step(self.stay(state))
 
     def test_states_and_commands_are_left_alone(self) -> None:
-        """Later steps, halts and resets do not change a state that was handed out, nor a command that was given."""
+        """Later steps, halts and resets do not change a returned state or a sent command."""
         with self.running(self.sizes[-1]) as (robot, first):
             command = self.move(robot, first)
             second = robot.step(command)

@@ -1,4 +1,4 @@
-"""The contract test for tasks of one's own: one list of promises."""
+"""The contract test for your own tasks."""
 
 import copy
 from collections.abc import Iterator
@@ -19,14 +19,14 @@ Array = NDArray[np.float64]
 
 
 class TaskContract:
-    """What every task promises, on robots that `make_robot` makes."""
+    """The contract of every task, on robots that `make_robot` makes."""
 
     joint_step = 0.05
-    """Farthest a commanded joint may go in a period [rad]."""
+    """Maximum motion of a commanded joint in a period [rad]."""
     tool_step = 0.0125
-    """Farthest the commanded tool may go in a period [m]."""
+    """Maximum motion of the commanded tool in a period [m]."""
     steps = 60
-    """How long each test runs."""
+    """Number of steps of each test."""
 
     def make(self, num_envs: int) -> Task:
         """Hook: a task for `num_envs` robots."""
@@ -51,9 +51,9 @@ class TaskContract:
             robot.close()
 
     def actions(self, task: Task, first: int = 0) -> Iterator[NDArray[np.float32]]:
-        """Random actions, to the limit or inside, each kept for ten steps to get somewhere. Shape: (n, a) each.
+        """Random actions, at the limits or inside, each kept for ten steps. Shape: (n, a) each.
 
-        Environment k draws from a generator of its own, that of ``first + k``.
+        Environment k draws from its own generator, seeded ``first + k``.
         """
         rngs = [np.random.default_rng(first + env) for env in range(task.num_envs)]
         for step in range(self.steps):
@@ -105,11 +105,11 @@ class TaskContract:
                 state, last = robot.step(command), command
 
     def first_command(self, state: RobotState) -> Array:
-        """Hook: what `check_pace` compares the first command with. Shape: (n, m), or of its first numbers."""
+        """Hook: the command before the first one, for `check_pace`. Shape: (n, m), or of its first numbers."""
         return state.signals["joint_position"]
 
     def check_pace(self, last: Array, command: Array) -> None:
-        """Hook: from the command `last` to `command`, both (n, m), is no farther than allowed in a period."""
+        """Hook: assert that the step from `last` to `command`, both (n, m), is allowed in a period."""
         last = last[:, :6]
         turn = np.abs(command[:, :6] - last).max()
         assert turn <= self.joint_step * (1 + 1e-9), f"a joint turned {turn} rad in a period"
@@ -117,7 +117,7 @@ class TaskContract:
         assert tool <= self.tool_step * (1 + 1e-9), f"the tool went {tool} m in a period"
 
     def test_actions_beyond_the_space_are_cut(self) -> None:
-        """An action of 100 does what 1 does."""
+        """An action of 100 has the effect of 1."""
         with self.running() as (task, _, state), self.running() as (other, _, same):
             action = np.ones((1, *task.action_space.shape), np.float32)
             np.testing.assert_array_equal(task.command(100 * action, state), other.command(action, same))
@@ -138,17 +138,17 @@ class TaskContract:
                     assert not name.startswith("_"), f"info {name} looks like a mask"
 
     def test_nothing_given_is_changed(self) -> None:
-        """States and actions are the caller's; observing twice is seeing the same."""
+        """States and actions are not changed; observing twice returns the same."""
         with self.running(2) as (task, robot, state):
             for action in self.actions(task):
-                kept, given = copy.deepcopy(state), action.copy()
+                kept, copied = copy.deepcopy(state), action.copy()
                 np.testing.assert_array_equal(task.observe(state), task.observe(state))
                 command = task.command(action, state)
                 sent = command.copy()
                 after = robot.step(command)
                 task.score(after, action)
                 assert_same_state(state, kept)
-                np.testing.assert_array_equal(action, given)
+                np.testing.assert_array_equal(action, copied)
                 np.testing.assert_array_equal(command, sent)
                 state = after
 
@@ -160,18 +160,18 @@ class TaskContract:
                 np.testing.assert_array_equal(together[env], alone[0])
 
     def _record(self, num_envs: int, first: int) -> list[NDArray[Any]]:
-        """Everything said in an episode; environment k has the seed and the actions of ``first + k``."""
-        said: list[NDArray[Any]] = []
+        """All results of an episode; environment k has the seed and the actions of ``first + k``."""
+        results: list[NDArray[Any]] = []
         with self.running(num_envs, seed=first) as (task, robot, state):
             for action in self.actions(task, first):
                 command = task.command(action, state)
                 state = robot.step(command)
                 score = task.score(state, action)
-                said += [command, task.observe(state), score.reward, score.terminated, score.success]
-        return said
+                results += [command, task.observe(state), score.reward, score.terminated, score.success]
+        return results
 
     def test_resetting_one_leaves_the_others(self) -> None:
-        """A new episode of environment 1 changes nothing of 0 and 2."""
+        """A new episode of environment 1 does not change 0 and 2."""
         with self.running(3) as (task, robot, state):
             for action in self.actions(task):
                 state = robot.step(task.command(action, state))
@@ -186,7 +186,7 @@ class TaskContract:
             assert_same_value(task.state_dict(), other.state_dict())
 
     def test_memory_is_saved_and_restored(self) -> None:
-        """What `state_dict` returned stays as it was, and another task goes on from it exactly."""
+        """The result of `state_dict` does not change, and another task continues from it exactly."""
         with self.running(2) as (task, robot, state):
             actions = list(self.actions(task))
             for action in actions[: self.steps // 2]:
@@ -204,19 +204,19 @@ class TaskContract:
             assert_same_value(saved, kept)
 
     def test_handed_out_is_left_alone(self) -> None:
-        """Beginning other episodes does not reach into observations, scores and memory that were handed out."""
+        """New episodes do not change observations, scores and memory that were returned."""
         for again in ([1], [0, 1]):
             with self.running(2) as (task, robot, state):
                 for action in self.actions(task):
                     state = robot.step(task.command(action, state))
                     score = task.score(state, action)
-                said = {"score": vars(score), "observation": task.observe(state), "memory": task.state_dict()}
-                kept = copy.deepcopy(said)
+                results = {"score": vars(score), "observation": task.observe(state), "memory": task.state_dict()}
+                kept = copy.deepcopy(results)
                 _start(task, robot, np.array(again), seed=9)
-                assert_same_value(said, kept)
+                assert_same_value(results, kept)
 
     def test_marks_are_places_and_colours(self) -> None:
-        """For pictures."""
+        """The marks can be drawn."""
         with self.running() as (task, _, _):
             for position, colour in task.marks():
                 assert np.shape(position) == (3,)

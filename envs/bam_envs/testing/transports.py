@@ -1,4 +1,4 @@
-"""The contract test for transports of one's own: one list of promises, and the environment that it serves."""
+"""The contract test for your own transports, and the environment that it serves."""
 
 import copy
 from collections.abc import Iterator
@@ -22,9 +22,9 @@ _INT64 = np.iinfo(np.int64)
 
 
 class MirrorEnv(gym.Env[Any, Any]):
-    """Returns each action as the next observation, which shows what the link does to it.
+    """Returns each action as the next observation, which shows how the link changes it.
 
-    `space` is of both; an episode is terminated after `episode_steps`.
+    `space` is that of both; an episode is terminated after `episode_steps`.
     """
 
     metadata = {"render_modes": []}  # noqa: RUF012 - as Gymnasium declares it
@@ -33,14 +33,14 @@ class MirrorEnv(gym.Env[Any, Any]):
         self.observation_space, self.action_space = copy.deepcopy(space), space  # a space's generator is one thread's
         self.episode_steps, self.elapsed = episode_steps, 0
         self.seen: list[Any] = []
-        """Every action, as it arrived."""
+        """Every action that arrived."""
         self.given: list[tuple[int | None, Info | None]] = []
         """Seed and options of every reset."""
         self.fault: Exception | None = None
         """Raised by the next step."""
 
     def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[Any, Info]:
-        """A sample of the space, which hangs on the seed alone."""
+        """A sample of the space, which depends only on the seed."""
         super().reset(seed=seed)
         self.given.append((seed, options))
         self.elapsed = 0
@@ -84,18 +84,18 @@ ROUND_TRIPS: dict[str, tuple[Space[Any], list[Any]]] = {
     "Sequence": (spaces.Sequence(_TREE), [()]),
     "stacked Sequence": (spaces.Sequence(_box(-1, 1, (2,), np.float32), stack=True), [np.zeros((0, 2), np.float32)]),
 }
-"""Spaces with values that are easily changed on the way, by name; samples come on top."""
+"""Spaces by name, with values that a transport may easily change; samples are added."""
 
 
 class TransportContract:
-    """What every transport promises; each test serves an environment of its own."""
+    """The contract of every transport; each test serves a new environment."""
 
     def make(self, env: Env) -> Transport:
-        """Hook: a transport that is not connected, and reaches `env`; start what it needs."""
+        """Hook: a transport to `env`, not connected; start the server that it needs."""
         raise NotImplementedError("Override make(env) to return a transport that reaches env.")
 
     def finish(self) -> None:
-        """Hook: stop what `make` started; it is called after each transport was closed."""
+        """Hook: stop the server that `make` started; called after each transport is closed."""
 
     @contextmanager
     def serving(self, env: Env) -> Iterator[Transport]:
@@ -138,7 +138,7 @@ class TransportContract:
                     assert_same_value(env.seen[-1], value, f"action, {name}")
 
     def test_the_rest_of_a_step(self) -> None:
-        """Reward, flags and info as they were given."""
+        """Reward, flags and info arrive unchanged."""
         with self.serving(MirrorEnv(spaces.Discrete(3), episode_steps=2)) as transport:
             transport.connect()
             transport.reset(seed=1)
@@ -151,7 +151,7 @@ class TransportContract:
             assert transport.step(1)[1:4] == (2 / 7, True, False)
 
     def test_seeds_reach_the_environment(self) -> None:
-        """Also 0, and also none."""
+        """Even the seed 0, and None."""
         env = MirrorEnv(_box(-1, 1, (3,), np.float32))
         with self.serving(env) as transport:
             transport.connect()
@@ -162,7 +162,7 @@ class TransportContract:
         assert [seed for seed, _ in env.given] == [0, 0, 1, None]
 
     def test_what_is_no_action_does_not_move_anything(self) -> None:
-        """NaN, infinity beyond a bound and a wrong shape are refused here; the place is named; the episode goes on."""
+        """NaN, infinity beyond a bound and a wrong shape are refused with their place; the episode continues."""
         env = MirrorEnv(_box(-1, 1, (2,), np.float32))
         with self.serving(env) as transport:
             transport.connect()
@@ -174,7 +174,7 @@ class TransportContract:
             transport.step(np.zeros(2, np.float32))
 
     def test_a_step_without_an_episode_is_refused(self) -> None:
-        """Before the first reset and after the end; the text says what to do."""
+        """Before the first reset and after the end; the text names `reset`."""
         env = MirrorEnv(spaces.Discrete(3), episode_steps=1)
         with self.serving(env) as transport:
             transport.connect()
@@ -185,7 +185,7 @@ class TransportContract:
         assert len(env.seen) == 1
 
     def test_an_error_of_the_environment_is_told(self) -> None:
-        """With its type and text; a reset goes on from there."""
+        """The error has its type and text; a reset begins a new episode."""
         env = MirrorEnv(spaces.Discrete(3))
         with self.serving(env) as transport:
             transport.connect()
@@ -196,7 +196,7 @@ class TransportContract:
             transport.step(2)
 
     def test_nan_in_an_observation_is_told(self) -> None:
-        """It is not passed on."""
+        """It is refused, not passed on."""
         env = MirrorEnv(spaces.Dict({"x": _box(-1, 1, (2,), np.float32)}))
         with self.serving(env) as transport:
             transport.connect()
@@ -217,7 +217,7 @@ class TransportContract:
             raised(LinkLost, lambda: transport.step(1))
 
     def test_it_is_the_environment_in_process(self) -> None:
-        """`RemoteEnv` gives what the environment gives, with the same seed and actions."""
+        """`RemoteEnv` returns the results of the environment, with the same seed and actions."""
         space = _box(-1, 1, (3,), np.float32)
         alone = MirrorEnv(space)
         with self.serving(MirrorEnv(space)) as transport:
@@ -229,7 +229,7 @@ class TransportContract:
                 assert one[1:4] == two[1:4]
 
     def test_vectors_are_those_of_gymnasium(self) -> None:
-        """`RemoteVectorEnv` over a vector environment gives what that gives, automatic resets included."""
+        """`RemoteVectorEnv` returns the results of the vector environment, automatic resets included."""
         makers = [lambda: MirrorEnv(_box(-1, 1, (2,), np.float32), episode_steps=2)] * 3
         alone, there = (SyncVectorEnv(makers, autoreset_mode=AutoresetMode.SAME_STEP) for _ in range(2))
         with self.serving(there) as transport:
@@ -238,12 +238,12 @@ class TransportContract:
             for value in np.linspace(-1, 1, 30, dtype=np.float32).reshape(5, 3, 2):
                 one: Any = envs.step(value)
                 two: Any = alone.step(value)
-                for name, mine, theirs in zip(("observation", "reward", "end", "cut"), one, two, strict=False):
-                    assert_same_value(mine, theirs, name)
-                mine, theirs = one[4], two[4]
-                assert ("final_obs" in mine) == ("final_obs" in theirs)
-                if "final_obs" in theirs:
-                    np.testing.assert_array_equal(np.stack(mine["final_obs"]), np.stack(theirs["final_obs"]))
-                    np.testing.assert_array_equal(mine["_final_obs"], theirs["_final_obs"])
-                    np.testing.assert_array_equal(mine["final_info"]["elapsed"], theirs["final_info"]["elapsed"])
+                for name, remote, local in zip(("observation", "reward", "end", "cut"), one, two, strict=False):
+                    assert_same_value(remote, local, name)
+                remote, local = one[4], two[4]
+                assert ("final_obs" in remote) == ("final_obs" in local)
+                if "final_obs" in local:
+                    np.testing.assert_array_equal(np.stack(remote["final_obs"]), np.stack(local["final_obs"]))
+                    np.testing.assert_array_equal(remote["_final_obs"], local["_final_obs"])
+                    np.testing.assert_array_equal(remote["final_info"]["elapsed"], local["final_info"]["elapsed"])
         alone.close()

@@ -36,23 +36,23 @@ _BODY: tuple[tuple[float, tuple[float, float, float], float, Colour], ...] = (
 """Boxes that the base looks like: how far ahead [m], edges [m], height of the top [m], colour."""
 _WALL = (0.15, 0.5)  # thickness and height [m]
 _LASER_HEIGHT = 0.1914
-_EVERY = 6  # one of so many rays is drawn
-_STAYS = 2.5  # how far the base goes before the camera goes with it [m]
-GAIN_SPREAD = 0.05  # a randomised drive goes at most this much faster or slower than it is told
+_EVERY = 6  # every sixth ray is drawn
+_STAYS = 2.5  # distance of the base from which the camera follows it [m]
+GAIN_SPREAD = 0.05  # largest relative error of the speed of a randomised drive
 
 
 class SimulatedBase(Memory, Drawn):
-    """Bases with the signals of a MiR100, each in a room of its own.
+    """Bases with the signals of a MiR100, each in a separate room.
 
-    Speeds change no faster than the `max_rate` of the spec, at the beginning of a period; then the base goes along an
-    arc. One that would touch a wall or a box stands still instead, and ``truth["collision"]`` says so until `reset`.
+    Speeds change no faster than the `max_rate` of the spec, at the beginning of a period; then the base moves along an
+    arc. A base that would touch a wall or a box stops instead, and ``truth["collision"]`` is set until `reset`.
 
     Args:
-        num_robots: How many are stepped together.
+        num_robots: Number of bases stepped together.
         room: The walls; None for none.
-        boxes: How many boxes there are in each room.
+        boxes: Number of boxes in each room.
         with_scans: Whether the laser scanners are on.
-        randomize: Whether the drive of each episode is a little off.
+        randomize: Whether the drive has a speed error, drawn for each episode.
     """
 
     mark_radius = 0.2
@@ -107,7 +107,7 @@ class SimulatedBase(Memory, Drawn):
                 f"The base cannot start at {where} (x, y [m], yaw [rad]): it touches a wall or a box there.{walls}"
             )
         self.own_memory()
-        self._seen = self._seen.copy()  # states that were handed out keep theirs
+        self._seen = self._seen.copy()  # states that were returned keep theirs
         self.pose[env_ids], self.boxes[env_ids] = pose, boxes
         self._velocity[env_ids], self._stamp[env_ids], self._command[env_ids] = 0.0, 0.0, 0.0
         self._collision[env_ids], self._scans[env_ids] = False, 0
@@ -119,7 +119,7 @@ class SimulatedBase(Memory, Drawn):
         return self._state()
 
     def slices(self, command: Array, parts: int) -> Iterator[RobotState]:
-        """As for every `Drawn`: speeds forward [m/s] and of turning [rad/s]."""
+        """See `Drawn`: `command` (n, 2) is the speed forward [m/s] and of turning [rad/s]."""
         self._require_link()
         self._command = checked_command(command, (self.num_robots, 2))
         target = np.clip(self._command, self._low, self._high) * self._gain
@@ -137,7 +137,7 @@ class SimulatedBase(Memory, Drawn):
             yield self._state()
 
     def _drive(self, seconds: float) -> None:
-        """Go along the arc of the present speeds; where that would touch something, stand still."""
+        """Move along the arc of the current speeds; a base that would touch something stops."""
         v, w = np.ascontiguousarray(self._velocity.T)
         x, y, yaw = np.ascontiguousarray(self.pose.T)
         turn = w * seconds
@@ -153,7 +153,7 @@ class SimulatedBase(Memory, Drawn):
         self.pose = pose
 
     def _scan(self, env_ids: EnvIds) -> None:
-        """Measure what the scanners of these environments see."""
+        """Measure the ranges of the scanners of these environments."""
         if not self._seen.shape[1]:
             return
         pose, boxes = self.pose[env_ids], self.boxes[env_ids]
@@ -168,17 +168,17 @@ class SimulatedBase(Memory, Drawn):
         return RobotState(signals, self._stamp, self._command, truth)
 
     def halt(self) -> None:
-        """Stand still."""
+        """Stop at once."""
         self._velocity, self._command = np.zeros_like(self._velocity), np.zeros_like(self._command)
 
     def picture(self) -> tuple[list[Shape], View]:
-        """The base of environment 0, its room and boxes, and what its lasers see.
+        """The base of environment 0, its room and boxes, and its laser ranges.
 
-        From above: the whole room; without one, the camera goes along once the base has gone far.
+        From above: the whole room; without a room, the camera follows the base once it is far from the origin.
         """
         pose, seen, rotation = self.pose[0], self._seen[0], turned(float(self.pose[0, 2]))
         shapes = []
-        for ahead, edges, top, colour in _BODY:  # a dark bar says which end is the front
+        for ahead, edges, top, colour in _BODY:  # a dark bar marks the front
             middle = np.array([pose[0], pose[1], top - edges[2] / 2]) + rotation @ [ahead, 0.0, 0.0]
             shapes.append(Shape("box", middle, edges, colour, rotation))
         shapes += [] if self.room is None else wall_shapes(self.room)
@@ -190,7 +190,7 @@ class SimulatedBase(Memory, Drawn):
         return shapes, View((round(float(x), 3), round(float(y), 3), 0.0), 11.0, 90.0, -65.0)
 
     def load_state_dict(self, state: dict[str, Any]) -> RobotState:
-        """Go to what `state_dict` returned; the state there."""
+        """Restore the result of `state_dict`; returns the state."""
         self.connect()
         super().load_state_dict(state)
         self._seen = np.empty_like(self._seen)
@@ -211,7 +211,7 @@ def wall_shapes(room: Room) -> list[Shape]:
 
 
 def scan_shapes(pose: Array, front: Array, back: Array) -> list[Shape]:
-    """Dots where some of the rays end, of the base at `pose` (3,) whose scanners measure `front` and `back` [m]."""
+    """Dots at the ends of some rays of the base at `pose` (3,), whose scanners measure `front` and `back` [m]."""
     dots = []
     for mount, masked, ranges in ((FRONT_MOUNT, FRONT_MASKED, front), (BACK_MOUNT, BACK_MASKED, back)):
         bearing = np.linspace(*SCAN_SPAN, SCAN_RAYS)[masked[0] : SCAN_RAYS - masked[1]][::_EVERY]

@@ -25,21 +25,21 @@ Array = NDArray[np.float64]
 LOWEST, HIGHEST = np.array(COMMAND.low), np.array(COMMAND.high)
 MAX_RATE = np.array(COMMAND.max_rate)
 GRIPPER_LEASH = 0.011
-"""Farthest the gripper's set point runs ahead of its fingers [m]: what full force needs, so that it opens at once."""
-LAG = 0.05  # how far the joints are behind their set points [s]: damping by stiffness of the actuators
-PHYSICS_STEPS = 10  # in a period
+"""Farthest distance of the gripper's set point ahead of its fingers [m]: enough for full force, and to open at once."""
+LAG = 0.05  # delay of the joints behind their set points [s]: damping by stiffness of the actuators
+PHYSICS_STEPS = 10  # per period
 
 
 class SimulatedArm:
-    """n simulated UR5e arms, each on a table of its own.
+    """n simulated UR5e arms, each on a separate table.
 
     The joint set points move linearly from the last command to the new one within a period, as a UR controller
     interpolates; the gripper's set point moves at `GRIPPER_SPEED`.
 
     Args:
-        num_robots: How many are stepped together.
-        with_object: Whether there is a cube, seen by a tracker.
-        randomize: Masses, friction, sizes and gains that differ each episode, a noisy tracker and late commands.
+        num_robots: Number of arms stepped together.
+        with_object: Whether there is a cube, measured by a tracker.
+        randomize: Masses, friction, sizes and gains that differ each episode, a noisy tracker and delayed commands.
     """
 
     def __init__(self, num_robots: int = 1, *, with_object: bool = True, randomize: bool = False) -> None:

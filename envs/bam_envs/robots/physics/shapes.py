@@ -38,11 +38,11 @@ class Shape:
 
 @dataclass(frozen=True)
 class View:
-    """From where a picture is seen: MuJoCo's free camera."""
+    """The view of an image: MuJoCo's free camera."""
 
-    target: tuple[float, float, float]  # what is in the middle [m]
+    target: tuple[float, float, float]  # point in the middle [m]
     distance: float  # of the camera [m]
-    azimuth: float  # where it looks to, seen from above: 0 along x, 90 along y [deg]
+    azimuth: float  # direction of view, seen from above: 0 along x, 90 along y [deg]
     elevation: float  # -90 looks straight down [deg]
 
 
@@ -52,7 +52,7 @@ def marked(marks: Sequence[tuple[Array, Colour]], radius: float = 0.02) -> list[
 
 
 class Drawn:
-    """A robot simulated in NumPy that has pictures; a subclass defines `slices`, `halt` and `picture`."""
+    """A robot simulated in NumPy that can be rendered; a subclass defines `slices`, `halt` and `picture`."""
 
     floor: float = 0.0  # height of the floor [m]
     mark_radius: float = 0.02  # radius of the task's marks [m]
@@ -60,7 +60,7 @@ class Drawn:
     _connected = False
 
     def connect(self) -> None:
-        """There is nothing to connect to; commands are taken from now on."""
+        """Accept commands from now on."""
         self._connected = True
 
     def _require_link(self) -> None:
@@ -68,7 +68,7 @@ class Drawn:
             raise ResetNeeded("The simulated robot is not connected. Call reset() first.")
 
     def slices(self, command: Array, parts: int) -> Iterator[RobotState]:
-        """Send `command` (n, m), and give the state after each of `parts` equal parts of the period."""
+        """Send `command` (n, m), and yield the state after each of `parts` equal parts of the period."""
         raise NotImplementedError
 
     def step(self, command: Array) -> RobotState:
@@ -76,18 +76,18 @@ class Drawn:
         return next(self.slices(command, 1))
 
     def halt(self) -> None:
-        """Hold where it is."""
+        """Hold the current position."""
         raise NotImplementedError
 
     def close(self) -> None:
-        """Halt, and close the window; no command is taken until `connect`."""
+        """Halt, and close the window; commands are refused until `connect`."""
         self.halt()
         if self._renderer is not None:
             self._renderer.close()
         self._renderer, self._connected = None, False
 
     def picture(self) -> tuple[list[Shape], View]:
-        """What environment 0 looks like, and from where."""
+        """The shapes of environment 0, and the view of them."""
         raise NotImplementedError
 
     def render(self, mode: str, marks: Sequence[tuple[Array, Colour]]) -> NDArray[np.uint8] | None:
