@@ -1,4 +1,4 @@
-"""Before a robot moves: its environment is proved to fit the policy, its limits are shown, and a person is asked."""
+"""Before a robot moves: check that its environment fits the policy, show its limits, and ask a person for consent."""
 
 import os
 import sys
@@ -29,21 +29,21 @@ def connected_env(
     named: str | None = None,
     env_kwargs: Mapping[str, Any] | None = None,
 ) -> gym.Env[Any, Any]:
-    """The environment of a checkpoint; its robot is connected, has not moved, and may now be moved.
+    """Make the environment of a checkpoint; its robot is connected and has not moved, and there is consent to move it.
 
     Args:
-        checkpoint: Of the policy that is going to act.
-        place: Where the environment runs.
-        signals: One whose exception Python discarded is raised again before anything moves.
-        who: What will move the robot, as the question to a person begins.
-        episodes: How many are planned.
+        checkpoint: The checkpoint of the policy that will act.
+        place: The place of the environment.
+        signals: A signal whose exception Python discarded is raised again before the robot moves.
+        who: The program that will move the robot, for the question to a person.
+        episodes: Number of planned episodes.
         yes: Do not ask before a real robot moves.
         render: Show the simulation in a window.
         named: The environment that the user expects.
-        env_kwargs: Arguments of the environment; they win over the checkpoint's.
+        env_kwargs: Arguments of the environment, which override the checkpoint's.
     """
-    env_id, own = environment_of(checkpoint, named, elsewhere=bool(place.transport))
-    env = make_env(env_id, {**own, **(env_kwargs or {})}, render_mode="human" if render else None, place=place)
+    env_id, saved = environment_of(checkpoint, named, elsewhere=bool(place.transport))
+    env = make_env(env_id, {**saved, **(env_kwargs or {})}, render_mode="human" if render else None, place=place)
     try:
         require_fit(checkpoint, env, place)
         signals.raise_again()
@@ -61,13 +61,13 @@ def connected_env(
 
 
 def guards_of(env: Any) -> dict[str, dict[str, Any]]:
-    """What the guards of an environment's live robot did; empty for a simulated one."""
+    """The counts of the guards of an environment's live robot, by name; empty for a simulated one."""
     report = getattr(getattr(env.unwrapped, "robot", None), "report", None)
     return {} if report is None else dict(report())
 
 
 def plan_lines(env: Any, env_id: str, address: str, episodes: int) -> list[str]:
-    """What a person should know of the episodes to come."""
+    """Lines for a person about the planned episodes."""
     spec = getattr(getattr(env.unwrapped, "robot", None), "spec", None)
     planned = "1 episode" if episodes == 1 else f"{episodes} episodes, one after the other without a pause"
     begin = "where the base stands"
@@ -78,16 +78,16 @@ def plan_lines(env: Any, env_id: str, address: str, episodes: int) -> list[str]:
 
 
 def require_consent(env: Any, who: str, *, yes: bool, plan: Sequence[str] = ()) -> None:
-    """Ask once before the real robot of `env`, if it has one, moves; it is connected, and stands still.
+    """Ask a person once before the real robot of `env`, if it has one, moves; it is connected, and stands still.
 
     Args:
         env: The environment, single or vector.
-        who: What will move it, as the first line begins.
+        who: The program that will move the robot, for the first line.
         yes: Show the lines, and do not ask.
-        plan: Lines that say what it will do.
+        plan: Lines about the planned episodes.
 
     Raises:
-        SettingsError: The robot says that it cannot move now, the answer is not yes, or there is nobody to ask.
+        SettingsError: The robot is not ready to move, the answer is not yes, or there is nobody to ask.
     """
     robot: Any = getattr(env.unwrapped, "robot", None)
     info = getattr(robot, "info", None)
@@ -112,7 +112,7 @@ def require_consent(env: Any, who: str, *, yes: bool, plan: Sequence[str] = ()) 
 
 
 def require_screen(*, remote: bool) -> None:
-    """Refuse ``--render`` where there is nothing to show, or no screen to show it on."""
+    """Refuse ``--render`` without a simulation here, or without a screen."""
     if remote:
         raise SettingsError(
             "--render shows the simulation here, and there is none with --robot or --transport; leave it out"

@@ -1,7 +1,6 @@
-"""What the programs print, on standard output, standard error or a rich console.
+"""The output of the programs, on standard output, standard error or a rich console.
 
-What is printed may come from a file or from the network: every text passes `shown`, so that nothing in it acts on a
-terminal.
+Text may come from a file or from the network, so all of it passes `shown`, which makes control characters harmless.
 """
 
 from __future__ import annotations
@@ -38,8 +37,8 @@ def tell(*lines: str) -> None:
 
 
 def drop(stream: TextIO) -> None:
-    """From now on what is written to the stream is dropped, and what its buffer still holds."""
-    with contextlib.suppress(OSError):  # a stream that is no file
+    """Discard the content of the stream's buffer, and all later writes to the stream."""
+    with contextlib.suppress(OSError):  # a stream without a file
         null = os.open(os.devnull, os.O_WRONLY)
         os.dup2(null, stream.fileno())
         os.close(null)
@@ -60,7 +59,7 @@ def rich_text(text: str, style: str = "", **arguments: Any) -> Text:
 
 
 class ShownFormatter(logging.Formatter):
-    """Formats what is logged."""
+    """Formats log records with `shown`."""
 
     def formatMessage(self, record: logging.LogRecord) -> str:  # noqa: D102, N802 - logging's name
         return shown(super().formatMessage(record))
@@ -70,7 +69,7 @@ class ShownFormatter(logging.Formatter):
 
 
 def show_logs_and_tracebacks() -> None:
-    """Pass what Python itself prints through `shown`: unhandled logs, and the traceback of an error in our code."""
+    """Pass the output of Python itself through `shown`: unhandled logs, and tracebacks."""
 
     def say_traceback(*error: Any) -> None:
         for line in "".join(traceback.format_exception(*error)).rstrip("\n").split("\n"):
@@ -81,18 +80,18 @@ def show_logs_and_tracebacks() -> None:
     sys.excepthook = say_traceback
 
 
-# Numbers to read
+# Numbers for people
 
 
 def count(number: float) -> str:
-    """A count in short: 950, 12.3k, 1.25M."""
+    """Format a count: 950, 12.3k, 1.25M."""
     if number < 10_000:
         return f"{number:.0f}"
     return f"{number / 1e3:.4g}k" if number < 1e6 else f"{number / 1e6:.4g}M"
 
 
 def duration(seconds: float | None) -> str:
-    """A duration in short: 4.2 s, 3 min 05 s, 2 h 04 min; a dash if it is not known."""
+    """Format a duration [s]: 4.2 s, 3 min 05 s, 2 h 04 min; a dash if it is not known."""
     if seconds is None or seconds != seconds or seconds == float("inf"):
         return "-"
     if seconds < 60:
@@ -102,10 +101,10 @@ def duration(seconds: float | None) -> str:
 
 
 def percent(share: float | None) -> str:
-    """A share: 98.5 %; a dash if it is not known."""
+    """Format a share: 98.5 %; a dash if it is not known."""
     return "-" if share is None else f"{100 * share:.1f} %".replace(".0 %", " %")
 
 
 def number(value: float | None) -> str:
-    """A measured value to four digits; a dash if it is not known."""
+    """Format a measured value with four digits; a dash if it is not known."""
     return "-" if value is None else f"{value:.4g}"

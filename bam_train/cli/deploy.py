@@ -1,7 +1,7 @@
 """`bam-deploy`: drive a robot with a checkpoint's frozen policy, at the environment's own rate, without torch.
 
-A signal ends it at any moment; one whose exception Python discarded, as it does in the callbacks of an import, is
-raised again before anything moves.
+A signal ends it at any moment; a signal whose exception Python discarded, as in callbacks of an import, is raised again
+before the robot moves.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 
 def deploy_checkpoint(config: DeployConfig, signals: SignalMemory) -> int:
-    """The program, with its arguments read; a signal that came and was lost ends it before the robot moves."""
+    """Run the program with its parsed flags; a signal whose exception was lost ends it before the robot moves."""
     place = _checked_place(config)
     from bam_envs.core.timing import Pacer
     from bam_train.checkpoint import Checkpoint
@@ -60,7 +60,7 @@ def _run(
     env, journal, pacer = deployment.env, deployment.journal, deployment.pacer
     title = f"{checkpoint.path} on {checkpoint.manifest.env}{place.text and f' at {place.text}'}"
     with deployment.handles_signals():  # a second Ctrl-C must not lose the report
-        deployment.switch.came += signals.came  # one that was lost: the deployment ends before it begins
+        deployment.switch.came += signals.came  # after a lost exception, the deployment ends before it begins
         plain = nullcontext(PlainDisplay(journal, say))
         with live_display(make_console(), env, title, journal) if sys.stderr.isatty() else plain as watcher:
             ending = deployment.run(watcher, seed=config.seed)
@@ -75,7 +75,7 @@ def _run(
 
 
 def _checked_place(config: DeployConfig) -> Place:
-    """Where the flags say that the environment runs; invalid flags are refused before anything is loaded."""
+    """The place of the environment by the flags; invalid flags are refused before anything is loaded."""
     from bam_train.env_location import Place, addresses
     from bam_train.errors import SettingsError
 
@@ -98,18 +98,18 @@ def _checked_place(config: DeployConfig) -> Place:
 
 
 def _period(config: DeployConfig, checkpoint: Checkpoint, env: gym.Env[Any, Any]) -> float | None:
-    """Time between two actions [s], by the flags, the environment or the checkpoint; None for as fast as it goes."""
+    """Time between two actions [s], by the flags, the environment or the checkpoint; None for no waiting."""
     from bam_train.environments import control_period
     from bam_train.errors import SettingsError
 
     if config.fast:
         return None
-    own = control_period(env) or checkpoint.manifest.period
-    if config.rate is None and own is None:
+    usual = control_period(env) or checkpoint.manifest.period
+    if config.rate is None and usual is None:
         raise SettingsError(f"{checkpoint.manifest.env} does not say its rate; give --rate HZ, or --fast not to wait")
-    if config.rate is not None and own is not None and not math.isclose(config.rate * own, 1.0, rel_tol=1e-6):
-        say(f"bam-deploy: warning: {config.rate:g} Hz is asked for, and the policy was made for {1 / own:g} Hz")
-    return own if config.rate is None else 1 / config.rate
+    if config.rate is not None and usual is not None and not math.isclose(config.rate * usual, 1.0, rel_tol=1e-6):
+        say(f"bam-deploy: warning: {config.rate:g} Hz is asked for, and the policy was made for {1 / usual:g} Hz")
+    return usual if config.rate is None else 1 / config.rate
 
 
 main = partial(run_program, "bam-deploy", "bam_train.cli.flags:DeployConfig", deploy_checkpoint)

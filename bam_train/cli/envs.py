@@ -1,4 +1,4 @@
-"""`bam-envs`: the environments that come with this package, and what each number of theirs means."""
+"""`bam-envs`: the environments of this package, and the meaning of each number in their spaces."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 
 def show_environments(config: EnvsConfig) -> None:
-    """The program, with its arguments read."""
+    """Run the program with its parsed flags."""
     facts: Any = overview() if config.env is None else details(config.env)
     if config.json:
         tell(*json_module.dumps(facts, indent=2, allow_nan=False).split("\n"))
@@ -24,7 +24,7 @@ def show_environments(config: EnvsConfig) -> None:
 
 
 def overview() -> list[dict[str, Any]]:
-    """Plain values of each of our environments; imports no simulator."""
+    """Facts of each environment of `bam_envs`, as JSON values; imports no simulator."""
     from bam_envs.core.registry import ENVIRONMENTS, resolve
     from bam_envs.robo_gym.table import ROBO_GYM
 
@@ -44,24 +44,24 @@ def overview() -> list[dict[str, Any]]:
 
 
 def overview_lines(facts: list[dict[str, Any]]) -> list[str]:
-    """The environments as a table, then robo-gym's names of them, two ids in a line."""
+    """The environments as a table, then robo-gym's names for them, two ids in a line."""
     keys = ("id", "observation", "action", "episode_steps", "rate_hz", "summary")
-    cells = [[f"{one[key]:g}" if key == "rate_hz" else str(one[key]) for key in keys] for one in facts]
+    cells = [[f"{env[key]:g}" if key == "rate_hz" else str(env[key]) for key in keys] for env in facts]
     table = aligned([["id", "observation", "action", "steps", "Hz", "what to do"], *cells])
-    pairs = {name.replace("Sim-v0", "{Sim,Rob}-v0"): one["id"] for one in facts for name in one["robo_gym"][::2]}
+    pairs = {name.replace("Sim-v0", "{Sim,Rob}-v0"): env["id"] for env in facts for name in env["robo_gym"][::2]}
     more = "Details: bam-envs ID. Training: bam-train --env ID --algo ppo; any Gymnasium id will do."
     theirs = "robo-gym's ids work too, with robo-gym's options; Rob is the one with a live robot:"
     return [*table, "", theirs, *aligned(list(map(list, pairs.items()))), "", more]
 
 
 def aligned(table: list[list[str]]) -> list[str]:
-    """The lines of a table, in columns of one width each."""
+    """The lines of a table, with aligned columns."""
     widths = [max(map(len, column)) for column in zip(*table, strict=True)]
     return ["  ".join(map(str.ljust, cells, widths)).rstrip() for cells in table]
 
 
 def details(name: str) -> dict[str, Any]:
-    """Everything about one environment, as plain values; makes it, so it needs its simulator."""
+    """All facts of one environment, as JSON values; makes it, so it needs its simulator."""
     from bam_envs.core.registry import entry_of, resolve_id
     from bam_envs.core.spaces import space_to_json
     from bam_envs.robo_gym.table import ROBO_GYM
@@ -89,7 +89,7 @@ def details(name: str) -> dict[str, Any]:
 
 
 def detail_lines(facts: dict[str, Any]) -> list[str]:
-    """The same for people."""
+    """The facts of `details` as lines for people."""
     lines = [facts["id"] if facts["summary"] is None else f"{facts['id']}: {facts['summary']}"]
     if facts["same_as"] is not None:
         live = ", with a live robot: rs_address='IP:PORT' or robot='ws://IP:PORT'" if facts["is_live"] else ""
@@ -100,17 +100,17 @@ def detail_lines(facts: dict[str, Any]) -> list[str]:
         lines += [f"{kind}: {json_module.dumps(facts[kind + '_space'])}" for kind in ("observation", "action")]
     for kind, signals in facts["signals"].items():
         columns = ("name", "low", "high", "scale", "unit", "meaning")
-        keys = [key for key in columns if any(key in one for one in signals)]
-        values = [[one.get(key, "") for key in keys] for one in folded(signals)]
-        cells = [[one if isinstance(one, str) else f"{one:.4g}" for one in line] for line in values]
+        keys = [key for key in columns if any(key in signal for signal in signals)]
+        values = [[signal.get(key, "") for key in keys] for signal in folded(signals)]
+        cells = [[value if isinstance(value, str) else f"{value:.4g}" for value in line] for line in values]
         lines += ["", kind, *(f"  {line}" for line in aligned([keys, *cells]))]
     return lines
 
 
 def folded(signals: list[dict[str, Any]], most: int = 16) -> list[dict[str, Any]]:
-    """`signals`, but one for each run of over `most` that differ by their number alone: ``f_scan_0 to f_scan_500``."""
+    """Replace each run of more than `most` signals that differ only by number by one: ``f_scan_0 to f_scan_500``."""
     shown = []
-    for _, group in groupby(signals, lambda one: {**one, "name": one["name"].rstrip("0123456789")}):
+    for _, group in groupby(signals, lambda signal: {**signal, "name": signal["name"].rstrip("0123456789")}):
         run = list(group)
         shown += run if len(run) <= most else [{**run[0], "name": f"{run[0]['name']} to {run[-1]['name']}"}]
     return shown

@@ -1,4 +1,4 @@
-"""`bam-eval`: how well a checkpoint's frozen policy does, over seeded episodes."""
+"""`bam-eval`: evaluate a checkpoint's frozen policy over seeded episodes."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 
 class _Subject(NamedTuple):
-    """What is evaluated, and where."""
+    """A policy to evaluate, and its environment."""
 
     policy: FrozenPolicy
     env: str
@@ -27,13 +27,13 @@ class _Subject(NamedTuple):
     algorithm: str
     steps: int
     asked: dict[str, Any]
-    """Arguments of the environment that are not the checkpoint's own."""
+    """Arguments of the environment that the user gave."""
     checkpoint: Checkpoint | None
     """None for a plain stable-baselines3 zip."""
 
 
 def evaluate_checkpoint(config: EvalConfig) -> None:
-    """The program, with its arguments read."""
+    """Run the program with its parsed flags."""
     from bam_train.environments import make_env, make_vector_env, require_fit
     from bam_train.evaluation import default_num_envs, evaluate
     from bam_train.trainers.sb3.plain_sb3_zip import is_plain_sb3
@@ -42,7 +42,7 @@ def evaluate_checkpoint(config: EvalConfig) -> None:
     video = None if config.video is None else require_video_path(config.video)
     path = config.checkpoint.expanduser()
     subject = (_foreign if is_plain_sb3(path) else _own)(config, path)
-    if video is not None:  # one picture, before the work is done
+    if video is not None:  # try one picture before the evaluation
         with closing(make_env(subject.env, subject.env_kwargs, render_mode="rgb_array")) as env:
             env.reset(seed=0)
             picture(env)
@@ -69,7 +69,7 @@ def evaluate_checkpoint(config: EvalConfig) -> None:
 
 
 def _own(config: EvalConfig, path: Path) -> _Subject:
-    """One of our checkpoints: nothing is unpickled, and torch is not imported."""
+    """Open a checkpoint of bam-train, without unpickling and without torch."""
     from bam_train.checkpoint import Checkpoint
     from bam_train.environments import environment_of, require_env_kwargs
     from bam_train.errors import CheckpointMismatch

@@ -1,4 +1,4 @@
-"""For scripts that run a policy in a loop of their own: a command line, and the environment, here or a live robot's."""
+"""For scripts with their own loop: flags, and the environment of a checkpoint, simulated or with a live robot."""
 
 import contextlib
 import signal
@@ -19,7 +19,7 @@ from bam_train.signals import SignalMemory, handled, interrupt
 
 @dataclass(frozen=True, kw_only=True)
 class RobotFlags:
-    """Where the policy acts, and who watches; a script's own flags come before these."""
+    """Flags of the robot and its display; a script's own flags come before these."""
 
     robot: Url = None
     """Use the policy on a live robot behind rosbridge, such as ws://10.0.0.5:9090."""
@@ -31,7 +31,7 @@ class RobotFlags:
 
 @dataclass(frozen=True, kw_only=True)
 class TrainingFlags(RobotFlags):
-    """What is trained on, and where it goes."""
+    """Flags of the training environment and the checkpoint."""
 
     env: EnvId = None
     """Environment, any that bam-train takes, instead of the script's own."""
@@ -48,7 +48,7 @@ def environment_of(args: TrainingFlags, own: str, own_kwargs: Mapping[str, Any])
 
 
 def require_place(env_id: str, robot: str | None, render: bool) -> None:
-    """Refuse a ``--robot`` that cannot be and a ``--render`` without a screen; nothing is made or connected."""
+    """Refuse an invalid ``--robot`` and a ``--render`` without a screen; makes and connects nothing."""
     if robot is not None:
         require_robot_address(robot)
         Place(robot).robot_kwargs(env_id, {})
@@ -58,9 +58,9 @@ def require_place(env_id: str, robot: str | None, render: bool) -> None:
 
 @contextlib.contextmanager
 def signals_ask() -> Iterator[Callable[[], bool]]:
-    """Within, the first Ctrl-C, SIGTERM or SIGHUP interrupts nothing, and what this gives says that it came.
+    """Within the ``with`` block, the first Ctrl-C, SIGTERM or SIGHUP only makes the yielded function return True.
 
-    A second one interrupts, and leaving raises what the first one asked for.
+    A second signal interrupts the block; at its end, the exception of the first one is raised.
     """
     came: list[int] = []
 
@@ -81,10 +81,11 @@ def signals_ask() -> Iterator[Callable[[], bool]]:
 def open_env(
     checkpoint: Checkpoint, robot: str | None = None, *, render: bool = False, **asked: Any
 ) -> Iterator[gym.Env[Any, Any]]:
-    """The environment that a checkpoint was trained in, fresh; within, a live robot is connected and may be moved.
+    """Make the environment of a checkpoint; within the ``with`` block, a live robot is connected and may be moved.
 
-    However it is left, the robot is halted and the link dropped. Of a live robot, each `step` waits for the end of its
-    period. `robot` is its address; what is `asked` is as of `bam_train.cli.consent.connected_env`.
+    At the end of the block, for any reason, the robot is halted and the link dropped. With a live robot, each `step`
+    waits for the end of its period. `robot` is its address; `asked` has options of
+    `bam_train.cli.consent.connected_env`.
     """
     require_place(checkpoint.manifest.env, robot, render)
     with SignalMemory() as signals:

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 
 def export_directory(config: ExportConfig) -> None:
-    """The program, with its arguments read."""
+    """Run the program with its parsed flags."""
     from bam_train.compat.rllib_export import export
     from bam_train.environments import must_be_named
     from bam_train.settings import TrainSettings, read_env_kwargs

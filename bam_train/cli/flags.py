@@ -1,7 +1,7 @@
-"""The flags of the programs: one frozen dataclass a program, one field a flag, its docstring the line of ``--help``.
+"""The flags of the programs: a frozen dataclass for each program, whose fields are flags and their docstrings the help.
 
-Programs import this after they have begun to handle signals, as tyro takes a while. It imports nothing of `bam_envs`,
-whose import registers the environments with Gymnasium and takes longer than ``--help`` may.
+Programs import this after they have begun to handle signals, because importing tyro takes a while. It does not import
+`bam_envs`, which registers the environments with Gymnasium and would make ``--help`` slow.
 """
 
 import sys
@@ -27,7 +27,7 @@ Url = Annotated[str | None, tyro.conf.arg(metavar="URL")]
 
 
 def _unset(metavar: str) -> object:
-    """A flag that shows what it takes, and no default: what is not given is not set."""
+    """Annotation of a flag whose help shows `metavar` and no default."""
     return tyro.conf.arg(metavar=metavar, help_behavior_hint="")
 
 
@@ -40,13 +40,13 @@ _METAVARS = {
     "ca_file": "FILE",
     "token_file": "FILE",
 }
-"""What a flag shows if it is neither a number nor a name."""
+"""Metavars of flags that are neither numbers nor names."""
 
 
 def _settings_flags() -> Any:
-    """`TrainSettings` with flags for fields: None is not given, and comes from ``--config``, the preset or a default.
+    """`TrainSettings` with flags for fields: None means not given; then ``--config``, the preset or a default applies.
 
-    The tables are no flags: ``--set`` reaches into them.
+    Tables have no flags: ``--set`` changes their entries.
     """
     flags: list[tuple[str, Any, None]] = []
     for name, hint in get_type_hints(TrainSettings, include_extras=True).items():

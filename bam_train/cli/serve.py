@@ -1,4 +1,4 @@
-"""`bam-serve`: an environment and its simulated robot for many clients, over rosbridge, TCP or ROS 2."""
+"""`bam-serve`: serve an environment and its simulated robot to many clients, over rosbridge, TCP or ROS 2."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ if TYPE_CHECKING:
     from bam_train.cli.flags import ServeConfig
 
 _LOOK = 1.0
-"""How often it is seen to that everything still runs [s]."""
+"""Time between two checks that everything still runs [s]."""
 
 
 def serve(config: ServeConfig, signals: SignalMemory) -> None:
-    """The program, with its arguments read; it ends by a signal, or an error."""
+    """Run the program with its parsed flags, until a signal or an error."""
     from bam_envs.remote.serve.serve_options import ServeOptions
     from bam_envs.remote.serve.served_environment import ServedEnvironment
     from bam_train.errors import SettingsError
@@ -48,7 +48,7 @@ def _tell(line: str) -> None:
 
 
 def _consented_env(config: ServeConfig) -> Any:
-    """The environment that is asked for; if its robot is a real one, somebody agreed that clients move it."""
+    """Make the environment; if its robot is real, ask for consent that clients move it."""
     from bam_envs.core.registry import MAKE_OPTIONS, resolve_id
     from bam_train.cli.consent import require_consent
     from bam_train.environments import make_env, make_vector_env, require_env_kwargs
@@ -56,13 +56,13 @@ def _consented_env(config: ServeConfig) -> Any:
 
     given = [parse_assignment(text, "randomize=true") for text in config.set]
     env_id, kwargs = resolve_id(config.env), {".".join(path): value for path, value in given}
-    # What says where it runs, such as robot=, may be given here.
+    # Options of the place, such as robot=, are allowed here.
     require_env_kwargs(env_id, {name: value for name, value in kwargs.items() if name not in MAKE_OPTIONS})
     many = config.num_envs > 1
     env: Any = make_vector_env(env_id, kwargs, config.num_envs) if many else make_env(env_id, kwargs)
     robot: Any = getattr(env.unwrapped, "robot", None)
     try:
-        if hasattr(robot, "report"):  # a live one has guards
+        if hasattr(robot, "report"):  # a live robot, with guards
             robot.connect()
         require_consent(env, "bam-serve: whoever connects", yes=config.yes)
     except BaseException:

@@ -27,7 +27,7 @@ _KEPT: list[contextlib.ExitStack] = []
 
 
 def train(config: TrainConfig) -> int:
-    """Do what the flags say; returns the exit status."""
+    """Run the program with its parsed flags; returns the exit status."""
     from bam_train.checkpoint import Checkpoint
     from bam_train.env_location import addresses
     from bam_train.settings import NAMES, merge, read_assignments, read_config
@@ -47,7 +47,7 @@ def train(config: TrainConfig) -> int:
 
 
 def _train(config: TrainConfig, settings: TrainSettings, checkpoint: Checkpoint | None) -> int:
-    """Train with complete settings, and say how it went; returns the exit status."""
+    """Train with complete settings, and print the outcome; returns the exit status."""
     from bam_train.cli.train_display import LiveDisplay, MayClose, PlainDisplay, summarise
     from bam_train.settings import file_stem
     from bam_train.trainers import load_trainer
@@ -81,23 +81,23 @@ def _train(config: TrainConfig, settings: TrainSettings, checkpoint: Checkpoint 
             trainer.close()
         summarise(settings, outcome, folder, time.monotonic() - _STARTED)
         if came:
-            _KEPT.append(handlers.pop_all())  # the handlers of before return as soon as this is collected
+            _KEPT.append(handlers.pop_all())  # otherwise its collection would restore the earlier handlers
     if outcome.failure is not None:
         raise outcome.failure
     return 128 + came[0] if came else 0
 
 
 def _stop_on_signals(run: TrainingRun, came: list[int]) -> Callable[[int], None]:
-    """What handles signals: the first one asks `run` to stop after its update, the second ends the process."""
+    """Handler of signals: the first one stops `run` after its update, the second ends the process."""
 
     def write(line: str) -> None:
-        """To standard error, not by print: the signal may have come in the middle of one."""
+        """Write to standard error without print, which the signal may have interrupted."""
         show_cursor = b"\x1b[?25h" if sys.stderr.isatty() else b""  # a live panel has hidden it
-        with contextlib.suppress(OSError):  # nobody reads it any more
+        with contextlib.suppress(OSError):  # the reader has closed it
             os.write(2, show_cursor + line.encode())
 
     def stop(number: int) -> None:
-        if came:  # end the process wherever it is: an exception might be caught, or wait for threads
+        if came:  # end the process at once: an exception might be caught, or wait for threads
             kept = f"the last checkpoint on the disk is {run.last}" if run.last else "no checkpoint had been saved yet"
             write(f"bam-train: quit at once; {kept}\n")
             run.folder.remove_unfinished()

@@ -1,4 +1,4 @@
-"""What `bam-train` shows on standard error: a panel on a terminal, plain lines elsewhere, a summary at the end."""
+"""The display of `bam-train` on standard error: a panel on a terminal, plain lines elsewhere, a summary at the end."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ if TYPE_CHECKING:
     from bam_train.trainers.training_run import Outcome, Scores
 
 LINE_EVERY = 1.0
-"""Seconds between two plain lines about training at least."""
+"""Minimum seconds between two plain lines about training."""
 
 
 class MayClose:
-    """A text stream that may go away, as a closed pipe or terminal does: from then on, what is written is dropped."""
+    """A text stream that may be closed by its reader, as a pipe or terminal; later writes are then discarded."""
 
     def __init__(self, stream: TextIO) -> None:
         self._stream = stream
@@ -32,7 +32,7 @@ class MayClose:
         return getattr(self._stream, name)
 
     def write(self, text: str) -> int:
-        """Write through: the buffer stays empty, so that a flush does nothing."""
+        """Write and flush, so that the buffer is always empty."""
         try:
             self._stream.write(text)
             self._stream.flush()
@@ -46,7 +46,7 @@ class PlainDisplay:
 
     def __init__(self, title: str, clock: Callable[[], float] = time.monotonic) -> None:
         self._title, self._clock = title, clock
-        self._said = float("-inf")
+        self._printed = float("-inf")
 
     def __enter__(self) -> PlainDisplay:
         self.note(self._title)
@@ -56,24 +56,24 @@ class PlainDisplay:
         return
 
     def training(self, progress: Progress, statistics: Statistics, speed: float, left: float | None) -> None:
-        """Say how training goes, unless that was said less than a second ago."""
-        if self._clock() - self._said < LINE_EVERY:
+        """Print the statistics of training, unless the last line is less than a second old."""
+        if self._clock() - self._printed < LINE_EVERY:
             return
-        self._said = self._clock()
+        self._printed = self._clock()
         success = "" if statistics.success_rate is None else f"success {percent(statistics.success_rate)}  "
         rest = "" if left is None else f"{duration(max(0.0, left))} left"
         what = f"{success}return {number(statistics.return_mean)}"
         self.note(f"{_steps(progress)}  {speed:,.0f} steps/s  {what}  {rest}")
 
     def evaluated(self, steps: int, report: EvaluationReport, best: bool) -> None:
-        """Say how well the policy does."""
+        """Print the result of an evaluation."""
         success = "" if report.success_rate is None else f"success {percent(report.success_rate)}, "
         rest = f"return {number(report.return_mean)}, {report.length_mean:.0f} steps an episode"
         newest = ", the best so far" if best else ""
         self.note(f"evaluation at {count(steps)} steps: {success}{rest} ({report.episodes} episodes){newest}")
 
     def note(self, text: str) -> None:
-        """Say something."""
+        """Print a message."""
         say(text)
 
 
@@ -95,7 +95,7 @@ class LiveDisplay(PlainDisplay):
         self._live.stop()
 
     def training(self, progress: Progress, statistics: Statistics, speed: float, left: float | None) -> None:
-        """Change the panel."""
+        """Update the panel."""
         from rich.panel import Panel
         from rich.progress_bar import ProgressBar
         from rich.table import Table
@@ -116,7 +116,7 @@ class LiveDisplay(PlainDisplay):
         self._live.update(Panel(outer, title=rich_text(self._title), title_align="left"))
 
     def note(self, text: str) -> None:
-        """Say something above the panel."""
+        """Print a message above the panel."""
         self._console.print(rich_text(text), soft_wrap=True)
 
 
@@ -128,7 +128,7 @@ _REASONS = {"steps": "all steps done", "success": "success reached", "stopped": 
 
 
 def summarise(settings: TrainSettings, outcome: Outcome, folder: RunFolder, seconds: float) -> None:
-    """Draw the learning curve and say how the run went, `seconds` [s] after the program started."""
+    """Draw the learning curve and print the outcome of the run, `seconds` [s] after the program started."""
     from bam_train.trainers.run_folder import draw_curve
 
     try:
@@ -178,6 +178,6 @@ def _next_commands(settings: TrainSettings, outcome: Outcome) -> list[str]:
 
 
 def _short(path: Path) -> str:
-    """As short as it can be typed here."""
+    """The shortest form of the path for a shell in this folder."""
     absolute, here = path.resolve(), Path.cwd()
     return shlex.quote(str(absolute.relative_to(here) if absolute.is_relative_to(here) else absolute))
