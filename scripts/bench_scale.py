@@ -141,9 +141,9 @@ class Clock:
 
 
 def timings(trainer: Any) -> dict[str, float]:
-    """What RLlib says about its last iteration [s]; smoothed, so only their medians are of use."""
-    said = getattr(trainer, "_result", {}).get("timers", {})
-    return {name: float(said[timer]) for name, timer in TIMERS.items() if timer in said}
+    """The parts of RLlib's last iteration [s]; smoothed, so only their medians are of use."""
+    timers = getattr(trainer, "timers", {})
+    return {name: float(timers[timer]) for name, timer in TIMERS.items() if timer in timers}
 
 
 def line(result: Result, reference: Result) -> str:

@@ -58,6 +58,8 @@ class RLlibTrainer:
             describe = getattr(env.unwrapped, "describe", None)
             self._signals, self._period = describe() if describe else {}, control_period(env)
         self._ends = {name: deque[float](maxlen=_EPISODES) for name in ("return", "length", "success")}
+        self.timers: dict[str, Any] = {}
+        """Seconds of each part of the last iteration, smoothed, under RLlib's names."""
         self._learnt: dict[str, Any] = {}
         """Metrics of RLlib's learner for the last iteration."""
         self._steps = 0
@@ -165,6 +167,7 @@ class RLlibTrainer:
             warnings.filterwarnings("ignore", "Using a target size", UserWarning)
             result, news = self._watch.train()
         self.notices += news
+        self.timers = result.get("timers", {})
         before, sampled = self._steps, result.get("env_runners", {})
         self._learnt = result.get("learners", {}).get(DEFAULT_MODULE_ID, {})
         if RLLIB_ALGORITHMS[self.settings.algo].offline:
