@@ -1,5 +1,6 @@
 """The workspace: named variables over time, which agents read and write.
 
+One class and longer than other modules: BBRL's programs call all of its methods on one object.
 A variable is T x B x ...: time first, batch second; at one time it is B x .... Values are torch tensors, which are kept
 as they are, with their graph, or NumPy arrays, which are copied.
 

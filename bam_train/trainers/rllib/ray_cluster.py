@@ -73,8 +73,11 @@ def _private(settings: TrainSettings) -> Iterator[None]:
     root = "/tmp" if os.path.isdir("/tmp") else None  # paths of Ray's sockets must be short
     with (
         tempfile.TemporaryDirectory(prefix="bam-ray-", dir=root, ignore_cleanup_errors=True) as folder,
+        # Called from the last to the first; two of Ray's processes would run for a minute. Once the raylet is gone, Ray
+        # ends this process with status 1.
+        at_quit(lambda: _kill(_started_since(before))),
         at_quit(lambda: shutil.rmtree(folder, ignore_errors=True)),
-        at_quit(lambda: _kill(_started_since(before))),  # called first; two of Ray's processes would run for a minute
+        at_quit(lambda: _kill([one for one in _started_since(before) if one.name() != "raylet"])),
         _private_token(),
     ):
         try:
