@@ -48,7 +48,7 @@ def test_get_by_name_finds_children_first_then_the_container():
 
 def test_everything_has_to_be_an_agent():
     with pytest.raises(LoopError) as error:
-        Agents(Add(1), print)
+        Agents(Add(1), len)
     assert str(error.value) == "Agents: expected agents, found builtin_function_or_method at place 1."
 
 
