@@ -70,9 +70,8 @@ def cluster(settings: TrainSettings) -> Iterator[None]:
 @contextlib.contextmanager
 def _private(settings: TrainSettings) -> Iterator[None]:
     before = set(psutil.Process().children())
-    root = "/tmp" if os.path.isdir("/tmp") else None  # paths of Ray's sockets must be short
     with (
-        tempfile.TemporaryDirectory(prefix="bam-ray-", dir=root, ignore_cleanup_errors=True) as folder,
+        _new_folder() as folder,
         # Called from the last to the first; two of Ray's processes would run for a minute. Once the raylet is gone, Ray
         # ends this process with status 1.
         at_quit(lambda: _kill(_started_since(before))),
@@ -108,6 +107,17 @@ def _private(settings: TrainSettings) -> Iterator[None]:
                 _, alive = psutil.wait_procs(started, timeout=GRACE)
                 _kill(alive)
                 psutil.wait_procs(alive, timeout=GRACE)
+
+
+@contextlib.contextmanager
+def _new_folder() -> Iterator[str]:
+    """A folder for Ray's files; a forked process leaves it alone, which `tempfile.TemporaryDirectory` does not."""
+    root = "/tmp" if os.path.isdir("/tmp") else None  # paths of Ray's sockets must be short
+    folder = tempfile.mkdtemp(prefix="bam-ray-", dir=root)
+    try:
+        yield folder
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
 
 
 def _started_since(before: set[Any]) -> list[Any]:
