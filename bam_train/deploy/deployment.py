@@ -19,7 +19,7 @@ from bam_train.errors import BamTrainError
 from bam_train.loop import Agent, Agents, PolicyAgent, RobotAgent, TemporalAgent, Workspace
 from bam_train.loop.robot_agent import SAYS_SUCCESS, SUCCESS
 from bam_train.loop.workspace import Sink
-from bam_train.signals import handled
+from bam_train.signals import handled, interrupt
 
 WINDOW = 1000
 """Minimum number of ticks that the workspace of a deployment keeps: 50 s at 20 Hz."""
@@ -43,10 +43,15 @@ class Stopped(BaseException):
 class StopSwitch:
     """Handles signals: while armed, a signal raises `Stopped`; otherwise it is only recorded, as a halt may be running.
 
-    The third signal raises KeyboardInterrupt, in case the halt hangs.
+    The second signal halts the robot and raises KeyboardInterrupt, which ends the program at once. The third raises it
+    without the halt, in case that hangs.
+
+    Args:
+        halt: Halts the robot; may be called at any moment.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, halt: Callable[[], None]) -> None:
+        self._halt = halt
         self.armed = False
         """Whether a signal may interrupt the main thread now."""
         self.came: list[int] = []
@@ -60,8 +65,12 @@ class StopSwitch:
     def __call__(self, number: int) -> None:
         """Handle a signal, in the main thread."""
         self.came.append(number)
-        if len(self.came) > 2:
-            raise KeyboardInterrupt
+        if len(self.came) > 1:
+            try:
+                if len(self.came) == 2:
+                    self._halt()
+            finally:
+                interrupt(self.came[0])
         if self.armed:
             self.armed = False
             raise Stopped
@@ -96,7 +105,7 @@ class Deployment:
         sink: Sink | None = None,
     ) -> None:
         self.env, self.pacer, self.journal = env, pacer, journal
-        self.switch = StopSwitch()
+        self.switch = StopSwitch(lambda: self._robot.halt())
         """Handler of SIGINT and SIGTERM."""
         self._robot = _DeployedRobot(env, self.switch)
         self._workspace = Workspace(window=window, sink=None if sink is None else _silent_once_broken(sink))

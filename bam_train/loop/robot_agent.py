@@ -68,7 +68,7 @@ class RobotAgent(Agent):
             return
         try:
             self.halt()
-        except Exception:  # not a third Ctrl-C, which quits while the halt hangs: closing would halt again
+        except Exception:  # not a second Ctrl-C, which quits at once: closing would halt again
             self.env.close()  # type: ignore[no-untyped-call]
             raise
         self.env.close()  # type: ignore[no-untyped-call]

@@ -19,6 +19,7 @@ from bam_envs.safety.gate import SafeRobot
 from bam_envs.tasks.pick import PickTask
 from bam_envs.tasks.reach import ReachTask
 from bam_envs.testing.drivers import DrivenRobot
+from bam_train.cli.program import guarded
 from bam_train.deploy.deployment import Deployment
 from bam_train.deploy.journal import Ending, Journal
 from bam_train.errors import WiringError
@@ -189,16 +190,8 @@ def test_after_a_signal_whose_exception_is_discarded_nothing_more_is_sent(corrid
     assert env.robot.calls == ["halt", "close"]
 
 
-@pytest.mark.parametrize(
-    ("happens", "expected"),
-    [
-        (lambda: os.kill(os.getpid(), signal.SIGINT), Ending("interrupted", 130)),
-        (raises(RobotFault("link lost")), Ending("fault: link lost", 1)),
-    ],
-    ids=["a second signal", "a signal after a fault"],
-)
-def test_a_signal_does_not_stop_the_halt(corridor, happens, expected):
-    env = Driven(gym.make(corridor, slow=True), happens)
+def test_a_signal_after_a_fault_does_not_stop_the_halt(corridor):
+    env = Driven(gym.make(corridor, slow=True), raises(RobotFault("link lost")))
     halted = []
 
     def halt():
@@ -206,16 +199,30 @@ def test_a_signal_does_not_stop_the_halt(corridor, happens, expected):
         halted.append(True)
 
     env.robot.halt = halt
-    assert run(env)[0] == expected
+    assert run(env)[0] == Ending("fault: link lost", 1)
     assert halted == [True]
 
 
-def test_a_third_signal_gives_up(corridor):
+@pytest.mark.parametrize(("number", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_a_second_signal_halts_and_quits_at_once(corridor, number, status):
+    """Here while the environment is being closed, which may take its time."""
+
+    class Slow(gym.Wrapper):
+        def close(self):
+            signal.raise_signal(signal.SIGINT)
+            pytest.fail("it went on")
+
+    env = Driven(Slow(gym.make(corridor, slow=True)), lambda: os.kill(os.getpid(), number))
+    assert guarded(lambda: run(env)[0].status, "bam-deploy") == status
+    assert env.robot.calls == ["halt", "close", "halt"]
+
+
+def test_a_third_signal_quits_although_the_halt_hangs(corridor):
     env = Driven(gym.make(corridor, slow=True), lambda: os.kill(os.getpid(), signal.SIGINT))
 
     def hangs():
-        os.kill(os.getpid(), signal.SIGINT)
-        os.kill(os.getpid(), signal.SIGINT)
+        signal.raise_signal(signal.SIGINT)
+        pytest.fail("it went on")
 
     env.robot.halt = hangs
     with pytest.raises(KeyboardInterrupt):
