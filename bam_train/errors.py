@@ -7,7 +7,9 @@
     │   ├── NotACheckpoint         no such file, not a zip, truncated, or without bam/manifest.json
     │   ├── AlteredCheckpoint      a member differs from the manifest, is missing or is extra
     │   ├── NewerFormat            written by a newer bam-train
-    │   └── CheckpointMismatch     made for another environment, algorithm or setting
+    │   ├── CheckpointMismatch     made for another environment, algorithm or setting
+    │   └── UntrustedCheckpoint    not signed, or not by a key that this computer trusts
+    ├── BadKey                     a key for signing or verifying that cannot be used
     ├── FormatError                bytes that do not follow their file format (safetensors, ONNX)
     ├── PolicyError                a frozen policy that cannot run, or an observation that does not fit it
     ├── SettingsError              a setting or option that does not exist or does not fit
@@ -61,6 +63,18 @@ class NewerFormat(CheckpointError):  # noqa: N818
 
 class CheckpointMismatch(CheckpointError):  # noqa: N818
     """The checkpoint belongs to another environment, algorithm or setting."""
+
+
+class UntrustedCheckpoint(CheckpointError):  # noqa: N818
+    """The checkpoint is not signed, or not by a key that this computer trusts; `why` is the text without the path."""
+
+    def __init__(self, path: str | Path, message: str) -> None:
+        self.why = message
+        super().__init__(path, message)
+
+
+class BadKey(BamTrainError):  # noqa: N818
+    """A key for signing or verifying that cannot be used; the text names its file."""
 
 
 class FormatError(BamTrainError, ValueError):

@@ -71,6 +71,7 @@ def test_console_scripts(wheel):
         "bam-eval = bam_train.cli.eval:main",
         "bam-export = bam_train.cli.export:main",
         "bam-serve = bam_train.cli.serve:main",
+        "bam-sign = bam_train.cli.sign:main",
         "bam-train = bam_train.cli.train:main",
     ]
 
@@ -79,6 +80,7 @@ def test_the_base_install_is_small(metadata):
     names = sorted(re.split("[<>=; ]", one)[0] for one in base_requirements(metadata))
     assert names == [
         "cbor2",
+        "cryptography",
         "gymnasium",
         "msgspec",
         "numpy",

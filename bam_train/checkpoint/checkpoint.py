@@ -7,6 +7,7 @@
     bam/policy.onnx           the frozen policy
     bam/golden.safetensors    observations, and the trainer's actions for them
     bam/resume/...            everything needed to resume exactly
+    bam/signature.json        who vouches for the manifest, if `bam-sign` signed it
 
 The file is complete or absent: written to a temporary file in the same folder, flushed to the disk, then renamed.
 Reading never unpickles.
@@ -34,6 +35,7 @@ from bam_train.checkpoint.manifest import AGAIN, MANIFEST, Manifest, manifest_by
 from bam_train.checkpoint.zip_members import (
     CHUNK,
     RESUME,
+    SIGNATURE,
     chunks,
     list_members,
     most_bytes,
@@ -152,7 +154,7 @@ def write_checkpoint(path: str | Path, manifest_fields: Mapping[str, Any], membe
             found = f"member {name!r} has {len(data)} bytes, expected at most {most_bytes(name)}"
             raise CheckpointError(path, f"cannot be written: {found}")
         # stable-baselines3 reads every member that ends in .pth, at any depth
-        if name == MANIFEST or not name or (name.startswith("bam/") and name.endswith(".pth")):
+        if name in (MANIFEST, SIGNATURE, "") or (name.startswith("bam/") and name.endswith(".pth")):
             raise CheckpointError(path, f"member {name!r} cannot be written: the name is reserved")
     digests = {name: hashlib.sha256(data).hexdigest() for name, data in sorted(members.items())}
     manifest = manifest_bytes(path, {**manifest_fields, "sha256": digests})

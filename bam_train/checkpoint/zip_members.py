@@ -14,11 +14,14 @@ from bam_train.errors import AlteredCheckpoint, NotACheckpoint
 
 CHUNK = 2**20  # bytes read at once
 MOST_MEMBERS = 10_000
+SIGNATURE = "bam/signature.json"
+"""Member with the signature of the manifest, which cannot list it."""
 RESUME = "bam/resume/"
 """Prefix of the members that only resumed training needs."""
 _MOST_DIRECTORY = 4 * 2**20  # bytes of the zip's own list of members
 _MOST_BYTES = {
     MANIFEST: MOST_MANIFEST,
+    SIGNATURE: 2**14,
     "bam/policy.onnx": 2**28,
     "bam/golden.safetensors": 2**26,
     RESUME: 64 * 2**30,  # the largest replay buffers are a tenth of this
@@ -60,12 +63,14 @@ def open_zip(path: Path) -> Iterator[zipfile.ZipFile]:
 
 
 def list_members(path: Path, archive: zipfile.ZipFile) -> dict[str, zipfile.ZipInfo]:
-    """List the members; before any is unpacked, refuse duplicates, other compression and sizes beyond the limits."""
+    """List the members; before any is unpacked, refuse duplicates, bad names, other compression and large sizes."""
     infos: dict[str, zipfile.ZipInfo] = {}
     for info in archive.infolist():
         name = info.filename
         if name in infos:
             raise AlteredCheckpoint(path, name, f"holds {name} twice. {AGAIN}")
+        if name.startswith("/") or "\\" in name or ":" in name.partition("/")[0] or ".." in name.split("/"):
+            raise AlteredCheckpoint(path, name, f"holds {name}, a name that points outside of the zip. {AGAIN}")
         if info.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
             found = info.compress_type
             raise AlteredCheckpoint(path, name, f"{name} is packed by method {found}, expected deflate. {AGAIN}")
@@ -111,8 +116,8 @@ def chunks(path: Path, archive: zipfile.ZipFile, info: zipfile.ZipInfo, expected
 
 
 def require_same_members(path: Path, found: set[str], expected: set[str]) -> None:
-    """Refuse a file that lacks a member of the manifest, or has a member that the manifest does not list."""
-    found = found - {MANIFEST}
+    """Refuse a file that lacks a member of the manifest, or has one that it does not list, other than its signature."""
+    found = found - {MANIFEST, SIGNATURE}
     for name in sorted(expected - found):
         raise AlteredCheckpoint(path, name, f"{name} is missing, although {MANIFEST} lists it. {AGAIN}")
     for name in sorted(found - expected):

@@ -2,7 +2,7 @@
 
 import os
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import gymnasium as gym
@@ -11,6 +11,7 @@ from bam_envs.core.robot import RobotSpec
 from bam_envs.safety.guard import is_base
 from bam_train.checkpoint import Checkpoint
 from bam_train.cli.console import say
+from bam_train.deploy.trust import has_real_robot
 from bam_train.env_location import Place
 from bam_train.environments import environment_of, make_env, require_fit
 from bam_train.errors import SettingsError
@@ -28,6 +29,7 @@ def connected_env(
     render: bool = False,
     named: str | None = None,
     env_kwargs: Mapping[str, Any] | None = None,
+    admit: Callable[[gym.Env[Any, Any]], Sequence[str]] = lambda env: (),
 ) -> gym.Env[Any, Any]:
     """Make the environment of a checkpoint; its robot is connected and has not moved, and there is consent to move it.
 
@@ -41,6 +43,7 @@ def connected_env(
         render: Show the simulation in a window.
         named: The environment that the user expects.
         env_kwargs: Arguments of the environment, which override the checkpoint's.
+        admit: Called with the environment, connected, before anybody is asked; returns lines for a person.
     """
     env_id, saved = environment_of(checkpoint, named, elsewhere=bool(place.transport))
     env = make_env(env_id, {**saved, **(env_kwargs or {})}, render_mode="human" if render else None, place=place)
@@ -51,7 +54,8 @@ def connected_env(
         if robot is not None:
             robot.connect()
             signals.raise_again()
-        plan = plan_lines(env, env_id, place.text, episodes)
+        plan = [*plan_lines(env, env_id, place.text, episodes), *admit(env)]
+        signals.raise_again()
         require_consent(env, f"{who}: {checkpoint.path}", yes=yes, plan=plan)
         signals.raise_again()
     except BaseException:
@@ -89,11 +93,10 @@ def require_consent(env: Any, who: str, *, yes: bool, plan: Sequence[str] = ()) 
     Raises:
         SettingsError: The robot is not ready to move, the answer is not yes, or there is nobody to ask.
     """
-    robot: Any = getattr(env.unwrapped, "robot", None)
-    info = getattr(robot, "info", None)
-    if info is None or info.simulated:
+    if not has_real_robot(env):
         return
-    begin = f"{who} will move {info.text}"
+    robot: Any = env.unwrapped.robot
+    begin = f"{who} will move {robot.info.text}"
     for line in [f"{begin}:", *plan, "within"] if plan else [f"{begin}, within"]:
         say(line)
     for name, guard in guards_of(env).items():

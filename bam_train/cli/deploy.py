@@ -34,18 +34,19 @@ def deploy_checkpoint(config: DeployConfig, signals: SignalMemory) -> int:
     from bam_train.cli.consent import connected_env
     from bam_train.deploy.deployment import Deployment
     from bam_train.deploy.journal import Journal
-    from bam_train.policy import FrozenPolicy
+    from bam_train.deploy.trust import Admission
 
     checkpoint = Checkpoint.open(config.checkpoint)
-    policy = FrozenPolicy.from_checkpoint(checkpoint)
+    admission = Admission(checkpoint, config.keys, config.allow_unsigned)
     asked: Any = {"episodes": config.episodes, "yes": config.yes, "render": config.render, "named": config.env}
-    env = connected_env(checkpoint, place, signals, who="bam-deploy", **asked)
+    env = connected_env(checkpoint, place, signals, who="bam-deploy", admit=admission, **asked)
     try:
         pacer = Pacer(_period(config, checkpoint, env))
     except BaseException:
         env.close()  # type: ignore[no-untyped-call]
         raise
-    deployment = Deployment(env, policy, pacer, Journal(config.episodes))
+    journal = Journal(config.episodes, marks=admission.marks)
+    deployment = Deployment(env, admission.policy, pacer, journal)
     return _run(config, checkpoint, place, deployment, signals)
 
 
@@ -58,7 +59,7 @@ def _run(
     from bam_train.deploy.journal import DeployReport
 
     env, journal, pacer = deployment.env, deployment.journal, deployment.pacer
-    title = f"{checkpoint.path} on {checkpoint.manifest.env}{place.text and f' at {place.text}'}"
+    title = f"{checkpoint.path} on {checkpoint.manifest.env}{place.text and f' at {place.text}'}{journal.marked}"
     with deployment.handles_signals():  # a second Ctrl-C must not lose the report
         deployment.switch.came += signals.came  # after a lost exception, the deployment ends before it begins
         plain = nullcontext(PlainDisplay(journal, say))

@@ -38,7 +38,7 @@ class PlainDisplay:
         how = {True: "success", False: "no success", None: record.end}[record.success]
         steps = f"{record.length} step{'' if record.length == 1 else 's'}"
         which = f"episode {self._journal.begun}/{self._journal.wanted} (seed {record.seed})"
-        self._write(f"{which}: {how} after {steps}, return {record.total:.2f}")
+        self._write(f"{which}: {how} after {steps}, return {record.total:.2f}{self._journal.marked}")
 
 
 class LiveDisplay(PlainDisplay):

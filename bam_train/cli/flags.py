@@ -7,7 +7,7 @@ Programs import this after they have begun to handle signals, because importing 
 import sys
 from dataclasses import dataclass, make_dataclass
 from pathlib import Path
-from typing import Annotated, Any, get_type_hints
+from typing import Annotated, Any, Literal, get_type_hints
 
 import tyro
 from msgspec import Meta
@@ -21,6 +21,7 @@ Positive = Annotated[float, Meta(gt=0, le=sys.float_info.max)]
 Assignments = Annotated[tuple[str, ...], tyro.conf.UseAppendAction, tyro.conf.arg(metavar="NAME=VALUE")]
 CheckpointFile = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="CHECKPOINT")]
 File = Annotated[Path | None, tyro.conf.arg(metavar="FILE")]
+Folder = Annotated[Path | None, tyro.conf.arg(metavar="FOLDER")]
 Name = Annotated[str | None, tyro.conf.arg(metavar="NAME")]
 EnvId = Annotated[str | None, tyro.conf.arg(metavar="ID")]
 Url = Annotated[str | None, tyro.conf.arg(metavar="URL")]
@@ -137,6 +138,10 @@ class DeployConfig:
     """Longest that an answer of --transport is waited for [s]; 30 by default."""
     yes: bool = False
     """Do not ask before a real robot moves."""
+    keys: Folder = None
+    """Public keys that a real robot trusts; $BAM_TRUSTED_KEYS or ~/.config/bam-train/trusted by default."""
+    allow_unsigned: bool = False
+    """Let a checkpoint move a real robot that nobody trusted has signed; every status line says so."""
     rate: Annotated[Positive | None, tyro.conf.arg(metavar="HZ")] = None
     """Actions a second [Hz]; by default the environment's own."""
     fast: bool = False
@@ -227,3 +232,19 @@ class ServeConfig:
     """Images as png, which keeps every bit, or jpeg."""
     gymapi_version: str | None = None
     """Version of bam_msgs/GymAPI, where clients do not show theirs: 2025-05-24, 2025-06-17 or 2025-06-22 (default)."""
+
+
+@dataclass(frozen=True)
+class SignConfig:
+    """Make a key, sign a checkpoint with it, verify one, or trust somebody's public key."""
+
+    action: tyro.conf.Positional[Literal["keygen", "sign", "verify", "trust"]]
+    """What to do."""
+    file: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="FILE")]
+    """keygen: the private key to write; sign, verify: a checkpoint; trust: a public key, NAME.pub."""
+    key: File = None
+    """Private key that signs; needed by sign."""
+    name: Name = None
+    """Your name in signatures; keygen: the file's name by default."""
+    keys: Folder = None
+    """Folder of the public keys that are trusted; $BAM_TRUSTED_KEYS or ~/.config/bam-train/trusted by default."""

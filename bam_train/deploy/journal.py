@@ -51,6 +51,13 @@ class Journal:
     """Successful episodes among these; None if the environment does not report success."""
     startup: float | None = None
     """CPU time of this process from its start to the first observation [s]; None before it."""
+    marks: tuple[str, ...] = ()
+    """What each status line says of this deployment, such as ``"UNSIGNED"``."""
+
+    @property
+    def marked(self) -> str:
+        """The marks as the end of a status line: ``", UNSIGNED"``; empty without any."""
+        return "".join(f", {mark}" for mark in self.marks)
 
     def begin(self, seed: int) -> EpisodeRecord:
         """Append the record of a new episode, and return it."""
@@ -124,6 +131,7 @@ class DeployReport:
             "algorithm": manifest.algorithm,
             "checkpoint": str(self.checkpoint.path),
             "robot": self.robot,
+            "marks": list(journal.marks),
             # A disabled limit is infinite, which JSON cannot represent.
             "guards": {
                 name: {**guard, "limit": None} if guard.get("limit") == math.inf else dict(guard)
@@ -150,7 +158,7 @@ class DeployReport:
         succeeded = "" if successes is None else f", {successes} success{'' if successes == 1 else 'es'}"
         episodes = f"{journal.completed} of {journal.wanted} episodes{succeeded}"
         return [
-            f"{reason}: {episodes}, {self.pacer.ticks} ticks, {rate_text(self.pacer)}",
+            f"{reason}: {episodes}, {self.pacer.ticks} ticks, {rate_text(self.pacer)}{journal.marked}",
             *([f"lateness {lateness_text(self.pacer)}"] if self.pacer.period is not None else []),
             *([guards_text(self.guards)] if self.guards else []),
         ]

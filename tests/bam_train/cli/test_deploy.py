@@ -42,6 +42,7 @@ def test_report_for_programs(corridor_checkpoint, starting_cell, run):
         "algorithm": "ppo",
         "checkpoint": str(path),
         "robot": "simulated here",
+        "marks": [],
         "guards": {},
         "per_episode": [
             {"seed": seed, "length": length, "return": 1 - 0.25 * length, "success": True, "end": "terminated"}

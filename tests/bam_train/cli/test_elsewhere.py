@@ -164,14 +164,18 @@ def test_a_server_that_hangs_is_waited_for_as_long_as_one_wants(corridor, corrid
 def test_a_real_robot_is_shown_and_does_not_move_unasked(serve, run, monkeypatch):
     monkeypatch.setattr(rosbridge_robot, "read_info", lambda *said: replace(read_info(*said), simulated=False))
     served = serve(gym.make("bam/pick-v0", disable_env_checker=True), fast=True)
-    status, out, err = run(deploy, PICK, "--episodes", 2, "--robot", served.bus.url)
+    unsigned = f"{PICK}: is not signed. Sign it with bam-sign sign {PICK} --key FILE"
+    status, out, err = run(deploy, PICK, "--robot", served.bus.url, "--yes")
+    assert (status, out, err) == (1, "", f"bam-deploy: {unsigned}, or give --allow-unsigned\n")
+    status, out, err = run(deploy, PICK, "--episodes", 2, "--robot", served.bus.url, "--allow-unsigned")
     assert (status, out) == (1, "")
     lines = err.splitlines()
     assert lines[0].startswith(f"bam-deploy: {PICK} will move ur5e")
-    assert lines[1:5] == [
+    assert lines[1:6] == [
         f"  address: {served.bus.url}",
         "  bam/pick-v0: 2 episodes, one after the other without a pause",
         "  each begins by opening the gripper and going to the start pose",
+        f"  UNSIGNED: {unsigned}",
         "within",
     ]
     assert "  tool speed (G10): 0.25 m/s" in lines

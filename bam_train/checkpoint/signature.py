@@ -1,0 +1,286 @@
+"""Signatures of checkpoints: Ed25519 over the manifest, which holds the sha256 of every other member.
+
+The signature is a member of its own, ``bam/signature.json``, which the manifest does not list: signing changes no other
+member. What is signed is the text ``bam-train checkpoint signature 1``, the signer's name, the time, and the bytes of
+``bam/manifest.json``, each after its length as 8 bytes. A key is two files: ``NAME.key``, PKCS 8 in PEM, mode 0600; and
+``NAME.pub``, one line ``ed25519 BASE64 NAME``. A computer trusts the public keys in one folder.
+"""
+
+import base64
+import binascii
+import copy
+import os
+import re
+import stat
+import zipfile
+from collections import deque
+from dataclasses import dataclass
+from datetime import datetime, timezone
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import msgspec
+from msgspec import Meta
+
+from bam_train.atomic_file import replacing
+from bam_train.checkpoint.checkpoint import Checkpoint
+from bam_train.checkpoint.manifest import AGAIN, MANIFEST, parse_manifest
+from bam_train.checkpoint.zip_members import RESUME, SIGNATURE, chunks, list_members, open_zip
+from bam_train.errors import AlteredCheckpoint, BadKey, OutputError, UntrustedCheckpoint
+
+_NAME = r"[A-Za-z0-9][A-Za-z0-9_.@-]{0,63}"
+Name = Annotated[str, Meta(pattern=f"^{_NAME}$")]
+_MOST_KEY = 2**14  # bytes of a key file that are read
+
+
+class Signature(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """The member ``bam/signature.json``."""
+
+    format: Literal[1]
+    """Version of what is signed."""
+    algorithm: Literal["ed25519"]
+    signer: Name
+    """Name of the key, as whoever made it gave it."""
+    created: Annotated[str, Meta(max_length=40)]
+    """UTC, ISO 8601."""
+    public_key: Annotated[str, Meta(min_length=44, max_length=44)]
+    """Base64 of its 32 bytes."""
+    signature: Annotated[str, Meta(min_length=88, max_length=88)]
+    """Base64 of its 64 bytes."""
+
+
+@dataclass(frozen=True)
+class PublicKey:
+    """A key that signatures are verified with."""
+
+    name: str
+    """Of whoever signs with it."""
+    text: str
+    """Base64 of its 32 bytes."""
+
+    @property
+    def line(self) -> str:
+        """The content of a ``.pub`` file."""
+        return f"ed25519 {self.text} {self.name}\n"
+
+
+def trusted_folder() -> Path:
+    """Where this computer keeps the public keys that it trusts: ``$BAM_TRUSTED_KEYS``, else below ``~/.config``."""
+    config = os.environ.get("XDG_CONFIG_HOME") or "~/.config"
+    return Path(os.environ.get("BAM_TRUSTED_KEYS") or f"{config}/bam-train/trusted").expanduser()
+
+
+# Keys
+
+
+def public_path(path: Path) -> Path:
+    """Where the public key of the private key at `path` is: beside it."""
+    return path.with_suffix(".pub") if path.suffix == ".key" else path.with_name(f"{path.name}.pub")
+
+
+def make_key(path: Path, name: str) -> PublicKey:
+    """Make a key: the private one at `path`, which only this user can read, and the public one at `public_path`.
+
+    Raises:
+        BadKey: `name` is not a name.
+        OutputError: One of the files exists, or cannot be written.
+    """
+    from cryptography.hazmat.primitives import serialization
+    from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
+
+    _require_name(name)
+    key = Ed25519PrivateKey.generate()
+    public = PublicKey(name, _base64(key.public_key().public_bytes_raw()))
+    form = serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption()
+    _write_new(path, key.private_bytes(*form), 0o600)
+    try:
+        _write_new(public_path(path), public.line.encode(), 0o644)
+    except OutputError:
+        path.unlink()
+        raise
+    return public
+
+
+def _require_name(name: str) -> None:
+    if re.fullmatch(_NAME, name) is None:
+        text = "expected 1 to 64 letters, digits, '.', '_', '@' and '-', beginning with a letter or digit"
+        raise BadKey(f"the signer's name {name!r}: {text}. Give another with --name")
+
+
+def _write_new(path: Path, data: bytes, mode: int) -> None:
+    """Write a file that must not exist yet."""
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode), "wb") as file:
+            file.write(data)
+    except FileExistsError as error:
+        raise OutputError(f"{path}: a key is there already. Choose another name, or move that one away") from error
+    except OSError as error:
+        raise OutputError(f"{path}: cannot be written: {error.strerror or error}. Choose another place") from error
+
+
+def read_private_key(path: Path) -> tuple[Any, PublicKey]:
+    """The private key of `make_key` and its public one.
+
+    Raises:
+        BadKey: There is none, others can read it, or it is no Ed25519 key.
+    """
+    from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
+    from cryptography.hazmat.primitives.serialization import load_pem_private_key
+
+    try:
+        with path.open("rb") as file:
+            mode = stat.S_IMODE(os.fstat(file.fileno()).st_mode)
+            if mode & 0o077 and os.name == "posix":
+                raise BadKey(f"{path}: others can read this private key (mode {mode:04o}). Run: chmod 600 {path}")
+            key = load_pem_private_key(file.read(_MOST_KEY), None)
+    except OSError as error:
+        remedy = "Make one with bam-sign keygen, or give another with --key"
+        raise BadKey(f"{path}: the private key cannot be read: {error.strerror or error}. {remedy}") from error
+    except (ValueError, TypeError) as error:
+        raise BadKey(f"{path}: not a private key without a password. Make one with bam-sign keygen") from error
+    if not isinstance(key, Ed25519PrivateKey):
+        raise BadKey(f"{path}: expected an Ed25519 key, found {type(key).__name__}. Make one with bam-sign keygen")
+    text, public = _base64(key.public_key().public_bytes_raw()), public_path(path)
+    name = read_public_key(public).name if public.exists() else path.stem
+    _require_name(name)
+    return key, PublicKey(name, text)
+
+
+def read_public_key(path: Path) -> PublicKey:
+    """The key in a ``.pub`` file.
+
+    Raises:
+        BadKey: There is none, or it is none.
+    """
+    try:
+        with path.open("rb") as file:
+            text = file.read(_MOST_KEY).decode("ascii", "replace")
+    except OSError as error:
+        raise BadKey(f"{path}: the public key cannot be read: {error.strerror or error}. Check its name") from error
+    found = re.fullmatch(rf"ed25519 ([A-Za-z0-9+/]{{43}}=) ({_NAME})\s*", text)
+    if found is None:
+        raise BadKey(f"{path}: expected one line 'ed25519 KEY NAME', as bam-sign keygen writes it. Copy it again")
+    return PublicKey(found[2], found[1])
+
+
+def trusted_keys(folder: Path) -> list[PublicKey]:
+    """The keys in a folder; none if there is no such folder.
+
+    Raises:
+        BadKey: A file there is no key, or others than its owner can change the folder or a key.
+    """
+    paths = sorted(folder.glob("*.pub"))
+    for path in (folder, *paths) if os.name == "posix" and paths else ():
+        if path.stat().st_mode & 0o022:
+            raise BadKey(f"{path}: others can change whom this computer trusts. Run: chmod go-w {path}")
+    return [read_public_key(path) for path in paths]
+
+
+def trust(path: Path, folder: Path) -> Path:
+    """Copy the public key at `path` into `folder`; where it is now.
+
+    Raises:
+        BadKey: There is no key at `path`, or another one of that name is trusted already.
+    """
+    key = read_public_key(path)
+    place = folder / f"{key.name}.pub"
+    if place.exists():
+        if read_public_key(place).text == key.text:
+            return place
+        raise BadKey(f"{place}: another key of that name is trusted. Remove that file first, if it is to be replaced")
+    _write_new(place, key.line.encode(), 0o644)
+    return place
+
+
+# Signatures
+
+
+def sign(path: Path, key_path: Path) -> Signature:
+    """Sign a checkpoint, every member of which is verified first; a signature that it has is replaced.
+
+    Raises:
+        BadKey: As of `read_private_key`.
+        CheckpointError: The checkpoint is not whole.
+        OutputError: It cannot be written; nothing was changed.
+    """
+    key, public = read_private_key(key_path)
+    checkpoint = Checkpoint.open(path)
+    created = datetime.now(timezone.utc).isoformat(timespec="seconds")
+    signature = key.sign(_signed(public.name, created, _manifest(checkpoint)))
+    made = Signature(1, "ed25519", public.name, created, public.text, _base64(signature))
+    target = Path(os.path.realpath(checkpoint.path))
+    try:
+        with replacing(target) as temporary, open_zip(target) as source, zipfile.ZipFile(temporary, "w") as archive:
+            for name, info in list_members(target, source).items():
+                if name != SIGNATURE:
+                    with archive.open(copy.copy(info), "w", force_zip64=info.file_size > 2**31) as writer:
+                        for chunk in chunks(target, source, info, checkpoint.manifest.sha256.get(name)):
+                            writer.write(chunk)
+            info = zipfile.ZipInfo(SIGNATURE)
+            info.external_attr = 0o644 << 16
+            archive.writestr(info, msgspec.json.encode(made), zipfile.ZIP_DEFLATED)
+    except OSError as error:
+        raise OutputError(f"{path}: cannot be written: {error.strerror or error}") from error
+    return made
+
+
+def verify(checkpoint: Checkpoint, folder: Path) -> Signature:
+    """The signature of a checkpoint by a key that `folder` trusts; every member is compared with what was signed.
+
+    Raises:
+        UntrustedCheckpoint: It is not signed, or by a key that is not trusted.
+        AlteredCheckpoint: The signature is not one of this manifest, or a member is not as signed; names the member.
+        BadKey: A file in `folder` is no key.
+    """
+    from cryptography.exceptions import InvalidSignature
+    from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PublicKey
+
+    path, data = checkpoint.path, _member(checkpoint.path, SIGNATURE)
+    if not data:
+        raise UntrustedCheckpoint(path, f"is not signed. Sign it with bam-sign sign {path} --key FILE")
+    try:
+        found = msgspec.json.decode(data, type=Signature)
+        text, raw = (base64.b64decode(one, validate=True) for one in (found.public_key, found.signature))
+    except (msgspec.MsgspecError, binascii.Error) as error:
+        raise AlteredCheckpoint(path, SIGNATURE, f"{SIGNATURE}: {error}. Sign it again") from error
+    known = next((key for key in trusted_keys(folder) if key.text == found.public_key), None)
+    if known is None:
+        why = f"was signed by {found.signer} with the key {found.public_key[:12]}..., which {folder} does not trust"
+        raise UntrustedCheckpoint(path, f"{why}. If you trust that person, run bam-sign trust with their .pub file")
+    manifest = _manifest(checkpoint)
+    try:
+        Ed25519PublicKey.from_public_bytes(text).verify(raw, _signed(found.signer, found.created, manifest))
+    except InvalidSignature as error:
+        why = f"{MANIFEST} or {SIGNATURE} was altered after {found.signer} signed: the signature does not fit"
+        raise AlteredCheckpoint(path, MANIFEST, f"{why}. {AGAIN}") from error
+    with open_zip(path) as archive:  # the other members were compared when it was opened
+        for name, info in list_members(path, archive).items():
+            if name.startswith(RESUME):
+                deque(chunks(path, archive, info, checkpoint.manifest.sha256.get(name)), maxlen=0)
+    return msgspec.structs.replace(found, signer=known.name)  # a signer may call himself anything
+
+
+def _manifest(checkpoint: Checkpoint) -> bytes:
+    """The bytes of the manifest, which must be the one that the checkpoint was opened with."""
+    data = _member(checkpoint.path, MANIFEST)
+    if parse_manifest(checkpoint.path, data) != checkpoint.manifest:
+        raise AlteredCheckpoint(checkpoint.path, MANIFEST, f"{MANIFEST} was replaced while it was read. Try again")
+    return data
+
+
+def _signed(signer: str, created: str, manifest: bytes) -> bytes:
+    """The bytes that are signed; lengths keep one part from being read as another."""
+    parts = [b"bam-train checkpoint signature 1", signer.encode(), created.encode(), manifest]
+    return b"".join(len(part).to_bytes(8, "big") + part for part in parts)
+
+
+def _member(path: Path, name: str) -> bytes:
+    """A member's bytes; b"" if there is none."""
+    with open_zip(path) as archive:
+        infos = list_members(path, archive)
+        return b"".join(chunks(path, archive, infos[name])) if name in infos else b""
+
+
+def _base64(data: bytes) -> str:
+    return base64.b64encode(data).decode()
