@@ -214,7 +214,7 @@ def read_config(path: str | Path) -> dict[str, Any]:
     except OSError as error:
         raise SettingsError(f"{path}: cannot be read: {error.strerror or error}") from error
     except UnicodeDecodeError as error:
-        raise SettingsError(f"{path}: is not text ({error.reason} at byte {error.start})") from error
+        raise SettingsError(f"{path}: is not text ({error.reason} at byte {error.start}). Save it as UTF-8") from error
     return parse_config(str(path), text)
 
 

@@ -80,7 +80,7 @@ def _own(config: EvalConfig, path: Path) -> _Subject:
     manifest, asked = checkpoint.manifest, read_env_kwargs(config.set)
     env_id, env_kwargs = environment_of(checkpoint, config.env)
     if config.algo not in (None, manifest.algorithm):
-        raise CheckpointMismatch(path, f"was trained by {manifest.algorithm}, not by {config.algo}")
+        raise CheckpointMismatch(path, f"was trained by {manifest.algorithm}, not by {config.algo}; leave --algo out")
     require_env_kwargs(env_id, asked)
     policy = FrozenPolicy.from_checkpoint(checkpoint)
     return _Subject(policy, env_id, {**env_kwargs, **asked}, manifest.algorithm, manifest.steps, asked, checkpoint)

@@ -204,9 +204,9 @@ class ServeConfig:
     """Address to listen on; 127.0.0.1 is this computer alone, 0.0.0.0 every network it is in."""
     namespace: str = ""
     """Name before every topic and service, such as bam_001."""
-    tcp: Port | None = None
+    tcp: Annotated[Port | None, tyro.conf.arg(metavar="PORT")] = None
     """Serve the environment on this TCP port too, which is faster; 0 takes a free one."""
-    via: str | None = None
+    via: Url = None
     """Offer everything through the rosbridge server at this address (ws://10.0.0.5:9090) instead of one here."""
     rclpy: bool = False
     """Be a ROS 2 node instead of a rosbridge server; needs rclpy."""
@@ -216,21 +216,21 @@ class ServeConfig:
     """Time passes only with steps and commands, as fast as they come: the default of other environments."""
     lease: Positive = 2.0
     """A client that gives no sign of life for so long may lose command to another one [s]."""
-    cert: str | None = None
+    cert: Annotated[str | None, tyro.conf.arg(metavar="FILE")] = None
     """Certificate in PEM, for wss:// instead of ws://."""
-    key: str | None = None
+    key: Annotated[str | None, tyro.conf.arg(metavar="FILE")] = None
     """Its key, if it is in another file."""
-    token_file: str | None = None
+    token_file: Annotated[str | None, tyro.conf.arg(metavar="FILE")] = None
     """File with a secret that clients must show; with --via, the one to show there."""
-    operator_token_file: str | None = None
+    operator_token_file: Annotated[str | None, tyro.conf.arg(metavar="FILE")] = None
     """File with another secret: who shows that one may take command from others."""
     no_token: bool = False
     """Listen on a network without a token: anybody who reaches this computer may command what is served."""
-    ca_file: str | None = None
+    ca_file: Annotated[str | None, tyro.conf.arg(metavar="FILE")] = None
     """With --via wss://: certificates to trust instead of the system's."""
     image_format: str = "png"
     """Images as png, which keeps every bit, or jpeg."""
-    gymapi_version: str | None = None
+    gymapi_version: Annotated[str | None, tyro.conf.arg(metavar="VERSION")] = None
     """Version of bam_msgs/GymAPI, where clients do not show theirs: 2025-05-24, 2025-06-17 or 2025-06-22 (default)."""
 
 

@@ -61,7 +61,10 @@ def guarded(main: Callable[[], int | None], prog: str, signals: SignalMemory | N
     try:
         with signals or SignalMemory() as signals:
             try:
-                return main() or 0
+                status = main() or 0
+                if not status:
+                    signals.raise_again()  # of which Python discarded the exception
+                return status
             except KeyboardInterrupt as error:
                 if not isinstance(error, Terminated) and signals.came[:1] != [signal.SIGINT]:
                     signals.raise_again()  # of SIGTERM, of which Ray raises a plain KeyboardInterrupt

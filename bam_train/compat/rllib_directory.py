@@ -69,7 +69,7 @@ def find_policy(given: Path, name: str | None = None) -> Directory:
     given = given.expanduser()
     try:
         if not given.is_dir():
-            wrong = "is a file, expected a checkpoint directory of RLlib"
+            wrong = "is a file, expected a checkpoint directory of RLlib. Give one that algo.save_to_path or algo.save wrote"
             missing = "no such directory. Give one that algo.save_to_path or algo.save wrote"
             raise NotACheckpoint(given, wrong if given.exists() else missing)
         next(given.iterdir(), None)

@@ -97,7 +97,7 @@ def test_config_files_in_both_formats(tmp_path):
         ("a.json", "[1]", "a.json: expected a table of settings, found a list"),
         ("a.toml", "stps = 3", "a.toml: unknown setting 'stps'. Did you mean 'steps'?"),
         ("a.yaml", "", "a.yaml: expected a .toml or .json file, found .yaml"),
-        ("a.json", b"\xff\xfe", "a.json: is not text (invalid start byte at byte 0)"),
+        ("a.json", b"\xff\xfe", "a.json: is not text (invalid start byte at byte 0). Save it as UTF-8"),
         ("a.json", None, "a.json: no such file. Check the name after --config, or make one with --print-config"),
     ],
 )

@@ -238,7 +238,8 @@ def _import_for(module: str, name: str) -> None:
         if error.name is None or not f"{module}.".startswith(f"{error.name}."):
             raise  # the module exists, but one of its imports does not
         raise InvalidValue(
-            f"Environment {name!r} needs the module {module!r}, which is neither installed nor in this folder."
+            f"Environment {name!r} needs the module {module!r}, which is neither installed nor in this folder. "
+            "Install it, or run in the folder that has it."
         ) from error
 
 

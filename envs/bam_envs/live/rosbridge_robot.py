@@ -203,6 +203,7 @@ class RosbridgeRobot:
 
     def _open_session(self, control: RosbridgeLink) -> None:
         """Sign commands for a new session from now on, if the robot's side has sessions."""
+        self._session_over = True  # until one is open: a reset after a failure tries again
         if self._describes_itself:
             self._session.open(control)
         self._session_over = False

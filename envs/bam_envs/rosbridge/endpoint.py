@@ -112,5 +112,5 @@ class Endpoint:
             return ssl.create_default_context(cafile=self.ca_file)
         except OSError as error:
             raise InvalidValue(
-                f"CA file {self.ca_file!r} cannot be used: {error}. Expected certificates in PEM."
+                f"CA file {self.ca_file!r} cannot be used: {error.strerror or error}. Give a file of certificates in PEM."
             ) from error

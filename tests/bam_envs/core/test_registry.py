@@ -97,7 +97,8 @@ def test_a_module_that_is_not_there(module):
     with pytest.raises(InvalidValue) as caught:
         resolve_id(f"{module}:Env-v0")
     assert str(caught.value) == (
-        f"Environment '{module}:Env-v0' needs the module '{module}', which is neither installed nor in this folder."
+        f"Environment '{module}:Env-v0' needs the module '{module}', which is neither installed nor in this folder. "
+        "Install it, or run in the folder that has it."
     )
 
 

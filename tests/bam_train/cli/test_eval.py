@@ -93,7 +93,7 @@ def refused(run, *arguments):
             "Use --env test/Corridor-v0, or train one for CartPole-v1",
         ),
         (("--env", "bam/pik"), "Unknown environment 'bam/pik'. Did you mean 'bam/pick-v0'?"),
-        (("--algo", "sac"), "{}: was trained by ppo, not by sac"),
+        (("--algo", "sac"), "{}: was trained by ppo, not by sac; leave --algo out"),
     ],
 )
 def test_another_environment_or_algorithm(corridor_checkpoint, run, flags, text):
