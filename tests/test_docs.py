@@ -289,6 +289,7 @@ def added(tmp_path_factory):
     return folder
 
 
+@pytest.mark.slow
 def test_added_contracts_hold(added):
     tests = [path.name for path in added.glob("test_*.py")]
     assert sorted(tests) == ["test_hover.py", "test_lagged.py"]

@@ -1,10 +1,15 @@
 """Tasks as `gymnasium.make` makes them, variants of plug-ins among them, without their robot; and states of arms."""
 
 import numpy as np
+import pytest
 
 from bam_envs.core.registry import ENVIRONMENTS
 from bam_envs.core.robot import RobotState
 from bam_envs.ros.codec import encode_sink
+
+QUICK = ("bam/pick-v0", "bam/mir100-avoidance-v0", "bam/ur-track-v0")
+EACH = [one if one in QUICK else pytest.param(one, marks=pytest.mark.slow) for one in ENVIRONMENTS]
+"""Every environment; `make quick` tests an arm with a gripper, a base and an arm alone."""
 
 
 def make_task(env_id, num_envs=1, **options):

@@ -4,7 +4,6 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from bam_envs.core.registry import ENVIRONMENTS
 from bam_train.environments import make_vector_env
 from bam_train.errors import PolicyError, SettingsError
 from bam_train.evaluation import (
@@ -15,6 +14,7 @@ from bam_train.evaluation import (
     summarise,
     wilson_interval,
 )
+from tests.bam_envs.making import EACH
 
 
 class Always:
@@ -154,7 +154,7 @@ class Steady:
         return np.tile(np.tanh(observations[:, :1]), (1, self.size)).astype(np.float32)
 
 
-@pytest.mark.parametrize("env_id", ENVIRONMENTS)
+@pytest.mark.parametrize("env_id", EACH)
 def test_an_episode_depends_on_its_seed_and_on_no_other_episode(env_id):
     options = {"max_episode_steps": 40}
     rows = make_vector_env(env_id, options, 4)

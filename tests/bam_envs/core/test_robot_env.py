@@ -17,6 +17,7 @@ from bam_envs.robots.fake import FakeRobot
 from bam_envs.tasks.pick import PickTask
 from bam_envs.tasks.scripted import SCRIPTED, scripted_policy
 from bam_envs.testing.assertions import assert_same_value
+from tests.bam_envs.making import EACH
 
 ONE_OF_EACH = ("bam/pick-v0", "bam/mir100-avoidance-v0", "bam/ur-empty-v0")
 """An arm with a gripper, a base, an arm alone: for what does not depend on the task."""
@@ -45,7 +46,7 @@ def assert_same(one, two):
         assert_same_value(left[-1], right[-1], "info")
 
 
-@pytest.mark.parametrize("env_id", ENVIRONMENTS)
+@pytest.mark.parametrize("env_id", EACH)
 def test_gymnasiums_checker_has_nothing_to_say(env_id):
     env = gym.make(env_id, randomize=True, render_mode="rgb_array")
     check_env(env.unwrapped)
@@ -69,7 +70,7 @@ def test_wrappers_work_without_a_warning(env_id):
     env.close()
 
 
-@pytest.mark.parametrize("env_id", ENVIRONMENTS)
+@pytest.mark.parametrize("env_id", EACH)
 @pytest.mark.parametrize("randomize", [False, True])
 def test_the_same_seed_is_the_same_trajectory(make, actions_of, env_id, randomize):
     def run(seed):
@@ -90,7 +91,7 @@ def test_the_same_environment_repeats_itself(make, actions_of, env_id):
     assert_same(played(env, actions, seed=1), played(env, actions, seed=1))
 
 
-@pytest.mark.parametrize("env_id", ENVIRONMENTS)
+@pytest.mark.parametrize("env_id", EACH)
 def test_episodes_differ(make, env_id):
     env = make(env_id)
     starts = [env.reset(seed=0)[0], *(env.reset()[0] for _ in range(3))]
@@ -101,7 +102,7 @@ PLACES = {"target_coord": (3,), "target_rot": (4,)}
 """Infos that are no numbers, texts or objects, and their shapes."""
 
 
-@pytest.mark.parametrize("env_id", ENVIRONMENTS)
+@pytest.mark.parametrize("env_id", EACH)
 @pytest.mark.parametrize("wire", [False, True])
 def test_infos_are_plain_and_can_be_pickled(make, env_id, wire):
     env = make(env_id, rs_state_to_info=True) if wire and ENVIRONMENTS[env_id].variants else make(env_id)
@@ -144,7 +145,7 @@ def still(env_id, env):
     return action
 
 
-@pytest.mark.parametrize("env_id", ENVIRONMENTS)
+@pytest.mark.parametrize("env_id", EACH)
 def test_the_time_limit_truncates(make, env_id):
     env, limit = make(env_id), ENVIRONMENTS[env_id].max_episode_steps
     env.reset(seed=0)
@@ -199,7 +200,7 @@ def test_failure_terminates(make, env_id):
     assert (terminated, truncated, info["is_success"], info["final_status"]) == (True, False, False, status)
 
 
-@pytest.mark.parametrize("env_id", ENVIRONMENTS)
+@pytest.mark.parametrize("env_id", EACH)
 def test_no_step_without_an_episode(env_id):
     env = make_env(env_id)
     policy = scripted_policy(env_id) if env_id in SCRIPTED else Kept(ENDED[env_id][1])
@@ -238,7 +239,7 @@ def test_actions_may_be_lists(make, env_id):
     np.testing.assert_array_equal(one.step(action)[0], two.step(np.array(action, np.float32))[0])
 
 
-@pytest.mark.parametrize("env_id", ENVIRONMENTS)
+@pytest.mark.parametrize("env_id", EACH)
 def test_describe_names_every_number(make, env_id):
     env = make(env_id).unwrapped
     said = json.loads(json.dumps(env.describe()))

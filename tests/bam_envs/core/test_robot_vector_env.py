@@ -16,6 +16,7 @@ from bam_envs.robots.fake import FakeRobot
 from bam_envs.tasks.pick import PickTask
 from bam_envs.tasks.scripted import SCRIPTED, scripted_policy
 from bam_envs.testing.assertions import assert_same_value
+from tests.bam_envs.making import EACH, QUICK
 
 ONE_OF_EACH = ("bam/pick-v0", "bam/mir100-avoidance-v0", "bam/ur-empty-v0")
 """An arm with a gripper, a base, an arm alone: for what does not depend on the task."""
@@ -44,8 +45,9 @@ def steps_of(env_id):
 
 PARITY = [(env_id, {"parity": True, "rs_state_to_info": True}) for env_id, one in ENVIRONMENTS.items() if one.variants]
 SAME = [(env_id, {"randomize": False}) for env_id in ONE_OF_EACH]
-KINDS = [*((env_id, {"randomize": True}) for env_id in ENVIRONMENTS), *SAME, *PARITY]
-IDS = [f"{env_id}-{'-'.join(name for name, value in options.items() if value)}" for env_id, options in KINDS]
+ALL = [*((env_id, {"randomize": True}) for env_id in ENVIRONMENTS), *SAME, *PARITY]
+IDS = [f"{env_id}-{'-'.join(name for name, value in options.items() if value)}" for env_id, options in ALL]
+KINDS = [one if one[0] in QUICK else pytest.param(*one, marks=pytest.mark.slow) for one in ALL]
 
 
 @pytest.mark.parametrize(("env_id", "options"), KINDS, ids=IDS)
@@ -212,7 +214,7 @@ def assert_same_steps(one, two, actions):
         assert_same_infos(left[4], right[4])
 
 
-@pytest.mark.parametrize("env_id", ENVIRONMENTS)
+@pytest.mark.parametrize("env_id", EACH)
 def test_another_one_goes_on_exactly(make_rows, actions_of, env_id):
     one, two, three = (make_rows(env_id, 3, randomize=True, max_episode_steps=40) for _ in range(3))
     actions = batch(actions_of, 3, 100, size_of(one))
@@ -230,7 +232,7 @@ def test_another_one_goes_on_exactly(make_rows, actions_of, env_id):
     assert_same_steps(one, three, actions[37:80])
 
 
-@pytest.mark.parametrize("env_id", ENVIRONMENTS)
+@pytest.mark.parametrize("env_id", EACH)
 def test_a_state_is_plain(make_rows, env_id):
     envs = make_rows(env_id, 2, randomize=True)
     envs.reset(seed=0)
@@ -238,7 +240,7 @@ def test_a_state_is_plain(make_rows, env_id):
     json.dumps(envs.unwrapped.state_dict(), default=lambda array: np.asarray(array).tolist())
 
 
-@pytest.mark.parametrize("env_id", ENVIRONMENTS)
+@pytest.mark.parametrize("env_id", EACH)
 def test_saving_right_before_a_new_episode(make_rows, env_id):
     envs, other = make_rows(env_id, 2), make_rows(env_id, 2)
     envs.reset(seed=0)
@@ -258,7 +260,7 @@ def test_without_physics_too(actions_of):
     assert_same_steps(one, two, actions[30:])
 
 
-@pytest.mark.parametrize("env_id", ENVIRONMENTS)
+@pytest.mark.parametrize("env_id", EACH)
 def test_no_number_is_ever_nan(make_rows, env_id):
     envs = make_rows(env_id, 64, randomize=True)
     envs.reset(seed=0)
@@ -287,7 +289,7 @@ def test_limits_of_steps_are_those_of_the_table(make_rows):
         assert make_rows(env_id, 1).unwrapped.max_episode_steps == entry.max_episode_steps
 
 
-@pytest.mark.parametrize("env_id", ENVIRONMENTS)
+@pytest.mark.parametrize("env_id", EACH)
 def test_a_pickled_environment_goes_on_as_the_first(make_rows, actions_of, env_id):
     first = make_rows(env_id, 3, randomize=True, max_episode_steps=40)
     first.reset(seed=0)

@@ -103,6 +103,7 @@ def test_trajectories_for_the_joints_alone(server, robot_on):
     assert scripted.on(topic)[-1]["points"][0]["positions"] == scripted.signals["joint_position"].tolist()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("realtime", [False, True])
 def test_a_served_arm_with_a_gripper_keeps_its_width(serve, make, realtime):
     url, served = serve(FakeRobot(1), realtime, EMPTY_START)

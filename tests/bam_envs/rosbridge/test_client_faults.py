@@ -132,6 +132,7 @@ def test_a_pending_call_fails_at_once_when_the_link_is_closed(scripted, link, lo
     assert lost.reasons == []
 
 
+@pytest.mark.slow
 def test_a_server_that_does_not_finish_closing_is_left(scripted, link, lost):
     link.advertise("/cmd", STRING)
     scripted.freeze()

@@ -57,25 +57,34 @@ class Simulated(TaskContract):
 @pytest.mark.parametrize(
     ("env_id", "options", "randomize"),
     [
-        ("bam/reach-v0", {}, False),
-        ("bam/pick-v0", {}, False),
-        ("bam/pick-place-v0", {}, False),
         ("bam/pick-v0", {}, True),
-        ("bam/ur-reach-v0", {}, False),
-        ("bam/ur-reach-v0", PARITY, False),
-        ("bam/ur-reach-v0", {"ur_model": "ur3"}, True),
-        ("bam/ur-empty-v0", {**PARITY, "ur_model": "ur16e"}, False),
-        ("bam/ur-avoidance-v0", PARITY, False),
         ("bam/ur-avoidance-v0", {"ur_model": "ur10e", "include_polar_to_elbow": True, "fix_base": True}, False),
-        ("bam/ur-avoidance-v0", {"fixed_object_position": (0.12, 0.34, 0.5)}, False),
-        ("bam/ur-track-v0", {}, False),
         ("bam/ur-track-v0", {**PARITY, "fixed_paths": True}, False),
-        ("bam/ur-track-v0", {"fixed_paths": True, "include_polar_to_elbow": False, "fix_wrist_3": False}, False),
         ("bam/isaac-reach-v0", {}, False),
         ("bam/mir100-navigation-v0", {}, False),
-        ("bam/mir100-navigation-v0", PARITY, False),
-        ("bam/mir100-avoidance-v0", {}, False),
         ("bam/mir100-avoidance-v0", PARITY, False),
+        *(
+            pytest.param(*one, marks=pytest.mark.slow)
+            for one in (
+                ("bam/reach-v0", {}, False),
+                ("bam/pick-v0", {}, False),
+                ("bam/pick-place-v0", {}, False),
+                ("bam/ur-reach-v0", {}, False),
+                ("bam/ur-reach-v0", PARITY, False),
+                ("bam/ur-reach-v0", {"ur_model": "ur3"}, True),
+                ("bam/ur-empty-v0", {**PARITY, "ur_model": "ur16e"}, False),
+                ("bam/ur-avoidance-v0", PARITY, False),
+                ("bam/ur-avoidance-v0", {"fixed_object_position": (0.12, 0.34, 0.5)}, False),
+                ("bam/ur-track-v0", {}, False),
+                (
+                    "bam/ur-track-v0",
+                    {"fixed_paths": True, "include_polar_to_elbow": False, "fix_wrist_3": False},
+                    False,
+                ),
+                ("bam/mir100-navigation-v0", PARITY, False),
+                ("bam/mir100-avoidance-v0", {}, False),
+            )
+        ),
     ],
 )
 class TestSimulated(Simulated):

@@ -402,6 +402,7 @@ def test_an_agent_that_reads_what_nobody_writes_is_refused_before_the_robot_is_c
         robot.step(np.zeros((1, 7)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("limit", [None, 2], ids=["one endless episode", "many short ones"])
 def test_memory_stays_flat(limit):
     """Policy, watcher and sink keep nothing; 1,000 ticks fill the window and all records, 1,000 more add nothing."""

@@ -90,7 +90,7 @@ def test_the_table_of_trainers():
     assert load_trainer("sb3").__name__ == "SB3Trainer"
 
 
-@pytest.mark.parametrize("name", sorted(path.name for path in PRESETS.iterdir()))
+@pytest.mark.parametrize("name", sorted(path.name for path in PRESETS.iterdir() if path.name != "__pycache__"))
 def test_every_preset_is_complete_and_of_an_environment_of_ours(name):
     runs = [(trainer, algo) for trainer, table in ALGORITHMS.items() for algo in table]
     found = [(env, *run) for env in ENVIRONMENTS for run in runs if f"{file_stem(env, run[1], run[0])}.toml" == name]

@@ -16,7 +16,7 @@ from bam_envs.rosbridge.client import RosbridgeLink
 from bam_envs.rosbridge.endpoint import Endpoint
 from bam_envs.rosbridge.server import BridgeServer
 from bam_envs.testing.transports import assert_same_value
-from tests.bam_envs.making import encode_command
+from tests.bam_envs.making import EACH, encode_command
 
 UR5E = load_profile("ur5e")
 ARM = arm_spec("ur5e", with_object=True)
@@ -92,7 +92,7 @@ def test_an_environment_without_a_robot_has_no_topics(serve_env, transport):
 
 
 @pytest.mark.parametrize("kind", [RosbridgeTransport, TcpTransport])
-@pytest.mark.parametrize("env_id", ENVIRONMENTS)
+@pytest.mark.parametrize("env_id", EACH)
 def test_the_environment_is_the_one_in_process_bit_for_bit(serve_env, transport, make, actions_of, env_id, kind):
     options = {"rs_state_to_info": True} if ENVIRONMENTS[env_id].variants else {}
     local = make(env_id, **options)

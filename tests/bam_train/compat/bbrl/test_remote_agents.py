@@ -81,6 +81,7 @@ def created():
 # -- results -----------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", ["spawn", "fork"])
 def test_processes_give_the_results_of_this_one(created, method):
     agent = loop(Walker())
@@ -303,6 +304,7 @@ def test_agents_that_cannot_be_sent(started):
     assert multiprocessing.active_children() == []
 
 
+@pytest.mark.slow
 def test_agents_of_modules_that_only_this_process_has(started, monkeypatch):
     notebook = types.ModuleType("notebook")
     exec("from remote_test_agents import Walker\nclass Own(Walker):\n    pass", notebook.__dict__)
