@@ -69,9 +69,8 @@ def find_policy(given: Path, name: str | None = None) -> Directory:
     given = given.expanduser()
     try:
         if not given.is_dir():
-            wrong = "is a file, expected a checkpoint directory of RLlib. Give one that algo.save_to_path or algo.save wrote"
-            missing = "no such directory. Give one that algo.save_to_path or algo.save wrote"
-            raise NotACheckpoint(given, wrong if given.exists() else missing)
+            wrong = "is a file, expected a checkpoint directory of RLlib" if given.exists() else "no such directory"
+            raise NotACheckpoint(given, f"{wrong}. Give one that algo.save_to_path or algo.save wrote")
         next(given.iterdir(), None)
     except OSError as error:
         raise NotACheckpoint(given, f"cannot be read: {error.strerror or error}") from error

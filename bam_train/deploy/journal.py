@@ -179,12 +179,16 @@ def lateness_text(pacer: Pacer) -> str:
 
 def guards_text(guards: Mapping[str, Mapping[str, Any]]) -> str:
     """Counts of the guards, such as ``guards changed the command: joint speed (G8) in 3 ticks``."""
-    altered, held = (
-        ", ".join(f"{name} ({row['number']}) in {row[what]} tick{'s' if row[what] > 1 else ''}" for name, row in guards.items() if row.get(what))
+    counts = {
+        what: ", ".join(
+            f"{name} ({row['number']}) in {row[what]} tick{'s' if row[what] > 1 else ''}"
+            for name, row in guards.items()
+            if row.get(what)
+        )
         for what in ("altered", "held")
-    )
-    changed = f"guards changed the command: {altered}" if altered else "no guard changed a command"
-    return f"{changed}; held the robot: {held}" if held else changed
+    }
+    changed = f"guards changed the command: {counts['altered']}" if counts["altered"] else "no guard changed a command"
+    return f"{changed}; held the robot: {counts['held']}" if counts["held"] else changed
 
 
 def _milliseconds(lateness: Lateness | None) -> dict[str, float] | None:

@@ -111,6 +111,7 @@ class Endpoint:
         try:
             return ssl.create_default_context(cafile=self.ca_file)
         except OSError as error:
+            reason = error.strerror or error
             raise InvalidValue(
-                f"CA file {self.ca_file!r} cannot be used: {error.strerror or error}. Give a file of certificates in PEM."
+                f"CA file {self.ca_file!r} cannot be used: {reason}. Give a file of certificates in PEM."
             ) from error

@@ -28,7 +28,9 @@ def read_token(path: str | Path, *, private: bool = False) -> str:
         token = Path(path).read_text(encoding="utf-8").strip()
     except (OSError, UnicodeDecodeError) as error:
         reason = error.strerror if isinstance(error, OSError) else "it is not text"
-        raise InvalidValue(f"The token file {path} cannot be read: {reason}. Write a secret into a file that only you can read.") from error
+        raise InvalidValue(
+            f"The token file {path} cannot be read: {reason}. Write a secret into a file that only you can read."
+        ) from error
     if not token:
         raise InvalidValue(f"The token file {path} is empty; put a secret into it.")
     return token

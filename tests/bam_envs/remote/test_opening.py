@@ -71,4 +71,7 @@ def test_a_token_file(tmp_path):
     assert open_transport("tcp://x:1", token_file=str(path)).endpoint.token == "geheim"
     with pytest.raises(InvalidValue) as caught:
         open_transport("tcp://x:1", token_file=str(tmp_path / "none"))
-    assert str(caught.value) == f"The token file {tmp_path / 'none'} cannot be read: No such file or directory."
+    assert str(caught.value) == (
+        f"The token file {tmp_path / 'none'} cannot be read: No such file or directory. "
+        "Write a secret into a file that only you can read."
+    )

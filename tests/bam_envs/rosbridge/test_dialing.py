@@ -158,9 +158,7 @@ def test_tls_that_fails(new_scripted, scripted, certificates):
     assert text.endswith(". If the server has no TLS, use ws://.")
 
 
-@pytest.mark.parametrize(
-    ("content", "reason"), [(None, "[Errno 2] No such file or directory"), ("no certificate", "[X509")]
-)
+@pytest.mark.parametrize(("content", "reason"), [(None, "No such file or directory"), ("no certificate", "[X509")])
 def test_a_ca_file_that_is_none(scripted, tmp_path, content, reason):
     path = tmp_path / "ca.pem"
     if content is not None:
@@ -169,7 +167,7 @@ def test_a_ca_file_that_is_none(scripted, tmp_path, content, reason):
     with pytest.raises(InvalidValue) as raised:
         link.connect()
     assert str(raised.value).startswith(f"CA file {str(path)!r} cannot be used: {reason}")
-    assert str(raised.value).endswith(" Expected certificates in PEM.")
+    assert str(raised.value).endswith(" Give a file of certificates in PEM.")
     assert isinstance(raised.value.__cause__, ssl.SSLError | OSError)
     link.close()
 

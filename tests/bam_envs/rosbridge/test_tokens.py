@@ -9,9 +9,9 @@ from bam_envs.rosbridge.tokens import Guesses, Tokens, read_token
 @pytest.mark.parametrize(
     ("content", "text"),
     [
-        (None, "cannot be read: No such file or directory."),
+        (None, "cannot be read: No such file or directory. Write a secret into a file that only you can read."),
         (b" \n", "is empty; put a secret into it."),
-        (b"\xff\xfe", "cannot be read: it is not text."),
+        (b"\xff\xfe", "cannot be read: it is not text. Write a secret into a file that only you can read."),
     ],
 )
 def test_a_token_file_that_is_none(tmp_path, content, text):
