@@ -6,15 +6,23 @@ its direction.
 """
 
 import math
-from typing import Any
-
-import numpy as np
-from numpy.typing import NDArray
+from collections.abc import Sequence
 
 from bam_envs.core.robot import RobotSpec
-from bam_envs.safety.guard import Guard, Limits, Tick, ToolPosition, clip, columns_in, max_rate, position_range
+from bam_envs.safety.guard import (
+    Guard,
+    Limits,
+    Numbers,
+    Tick,
+    ToolPoint,
+    ToolPosition,
+    clip,
+    columns_in,
+    max_rate,
+    position_range,
+    tool_point_of,
+)
 
-Array = NDArray[np.float64]
 ROUNDING = 1 + 1e-9
 """A step that is exactly as long as its limit must not exceed it by floating point rounding."""
 _ROUNDS = 8
@@ -23,10 +31,11 @@ JUMP = 0.05
 """Tolerance of the measured change of a joint beyond its fastest turn [rad]."""
 
 
-def fastest_joints(spec: RobotSpec, limits: Limits, unlimited: float = math.inf) -> Array:
+def fastest_joints(spec: RobotSpec, limits: Limits, unlimited: float = math.inf) -> Numbers:
     """Maximum speed of each joint (k,) [rad/s], the lower of limit and data sheet; `unlimited` without either."""
-    fastest: Array = np.minimum(limits.joint_speed, max_rate(spec.command)[columns_in(spec.command, "rad")])
-    return np.where(np.isfinite(fastest), fastest, unlimited)
+    rates = max_rate(spec.command)
+    fastest = [min(limits.joint_speed, rates[column]) for column in columns_in(spec.command, "rad")]
+    return [one if math.isfinite(one) else unlimited for one in fastest]
 
 
 class PositionLimits(Guard):
@@ -35,7 +44,7 @@ class PositionLimits(Guard):
     A joint that is inside the margin may stay or go back, and must not come nearer to the end.
     """
 
-    number, name, unit = "G7", "position margin", "rad"
+    number, name, unit, setting = "G7", "position margin", "rad", "position_margin"
 
     def __init__(self, spec: RobotSpec, limits: Limits) -> None:
         self.limit_value = limits.position_margin
@@ -43,8 +52,9 @@ class PositionLimits(Guard):
 
     def limit(self, tick: Tick) -> bool:
         """Clip the goal, joint by joint."""
-        goal = np.clip(tick.goal, np.minimum(self.low, tick.last), np.maximum(self.high, tick.last))
-        changed = bool((goal != tick.goal).any())
+        rows = zip(tick.goal, tick.last, self.low, self.high, strict=True)
+        goal = [min(max(value, min(low, last)), max(high, last)) for value, last, low, high in rows]
+        changed = goal != tick.goal
         tick.goal, tick.command = goal, goal.copy()
         return changed
 
@@ -52,26 +62,27 @@ class PositionLimits(Guard):
 class JointSpeed(Guard):
     """No joint is faster than the limit or its data sheet; the other joints slow down with it."""
 
-    number, name, unit = "G8", "joint speed", "rad/s"
+    number, name, unit, setting = "G8", "joint speed", "rad/s", "joint_speed"
 
     def __init__(self, spec: RobotSpec, limits: Limits) -> None:
         self._joints, self._fastest = columns_in(spec.command, "rad"), fastest_joints(spec, limits)
-        self.limit_value = float(self._fastest.max())
+        self.limit_value = max(self._fastest)
 
     def limit(self, tick: Tick) -> bool:
         """Shorten the step of all joints."""
-        return _shorten(tick, self._joints, self._fastest * tick.period)
+        return shorten(tick, self._joints, [fastest * tick.period for fastest in self._fastest])
 
 
 class RampIn(Guard):
     """A first command that is farther than one step from the arm is approached slowly, for a limited time."""
 
-    number, name, unit = "G14", "ramp-in speed", "rad/s"
+    number, name, unit, setting = "G14", "ramp-in speed", "rad/s", "reset_speed"
 
     def __init__(self, spec: RobotSpec, limits: Limits) -> None:
         self.limit_value, self._joints = limits.reset_speed, columns_in(spec.command, "rad")
         # If nothing limited a joint's speed, a first step of any length would count as near.
-        self._one_step = fastest_joints(spec, limits, limits.reset_speed) * spec.period * ROUNDING
+        fastest = fastest_joints(spec, limits, limits.reset_speed)
+        self._one_step = [one * spec.period * ROUNDING for one in fastest]
         self._longest = math.ceil(limits.ramp_time / spec.period)
         self._left: int | None = None
 
@@ -81,30 +92,35 @@ class RampIn(Guard):
 
     def limit(self, tick: Tick) -> bool:
         """Shorten the steps until the command is reached."""
-        reach = self.limit_value * tick.period
-        if tick.approach:
-            return _shorten(tick, self._joints, reach)
-        if self._left == 0:
+        if self._left == 0 and not tick.approach:
             return False
-        far = bool((np.abs(tick.goal - tick.last)[self._joints] > self._one_step).any())
+        reach = [self.limit_value * tick.period] * len(self._joints)
+        if tick.approach:
+            return shorten(tick, self._joints, reach)
+        goal, last = tick.goal, tick.last
+        far = any(abs(goal[at] - last[at]) > one for at, one in zip(self._joints, self._one_step, strict=True))
         self._left = 0 if not far else self._longest - 1 if self._left is None else self._left - 1
-        return far and _shorten(tick, self._joints, reach)
+        return far and shorten(tick, self._joints, reach)
 
 
 class ToolSpeed(Guard):
     """The tool is never faster than the limit, along a straight line from command to command."""
 
-    number, name, unit = "G10", "tool speed", "m/s"
+    number, name, unit, setting = "G10", "tool speed", "m/s", "tool_speed"
 
     def __init__(self, spec: RobotSpec, limits: Limits, tool_position: ToolPosition) -> None:
-        self.limit_value, self._tool = limits.tool_speed, tool_position
+        self.limit_value, self._tool = limits.tool_speed, tool_point_of(tool_position)
         self._joints = columns_in(spec.command, "rad")
 
     def limit(self, tick: Tick) -> bool:
         """Shorten the step of all joints."""
-        last, wanted = tick.last[self._joints], tick.command[self._joints]
-        tick.command[self._joints] = slowed = within_reach(self._tool, last, wanted, self.limit_value * tick.period)
-        return slowed is not wanted
+        last, wanted = [tick.last[at] for at in self._joints], [tick.command[at] for at in self._joints]
+        slowed = within_reach(self._tool, last, wanted, self.limit_value * tick.period)
+        if slowed is wanted:
+            return False
+        for at, value in zip(self._joints, slowed, strict=True):
+            tick.command[at] = value
+        return True
 
 
 class JointAcceleration(Guard):
@@ -115,7 +131,7 @@ class JointAcceleration(Guard):
     joint goes as far towards it as it may.
     """
 
-    number, name, unit = "G9", "joint acceleration", "rad/s^2"
+    number, name, unit, setting = "G9", "joint acceleration", "rad/s^2", "joint_acceleration"
 
     def __init__(self, spec: RobotSpec, limits: Limits) -> None:
         self.limit_value = limits.joint_acceleration
@@ -124,29 +140,45 @@ class JointAcceleration(Guard):
 
     def limit(self, tick: Tick) -> bool:
         """Bring the step near to the last one."""
-        last = tick.last[self._joints]
-        wanted, before = tick.command[self._joints] - last, tick.last_step[self._joints]
-        distance = np.abs(tick.goal[self._joints] - last)
-        change = self.limit_value * tick.period**2
-        longest = longest_step(distance, self.limit_value * self._period**2) * (tick.period / self._period)
-        slowed = wanted * _least_share(np.where(distance <= change, distance, longest), np.abs(wanted))
-        step = self._near(slowed, before, change * ROUNDING)
-        if (step == wanted).all():
+        goal, command, last, last_step = tick.goal, tick.command, tick.last, tick.last_step
+        wanted = [command[at] - last[at] for at in self._joints]
+        change, braking = self.limit_value * tick.period**2, self.limit_value * self._period**2
+        shortened, share = tick.period / self._period, 1.0
+        for at, way in zip(self._joints, wanted, strict=True):
+            distance, way = abs(goal[at] - last[at]), abs(way)
+            longest = distance if distance <= change else longest_step(distance, braking) * shortened
+            if way > longest * ROUNDING:
+                share = min(share, longest / way)
+        slowed = wanted if share == 1.0 else [way * share for way in wanted]
+        step = self._near(slowed, [last_step[at] for at in self._joints], change * ROUNDING)
+        if step == wanted:
             return False
-        tick.command[self._joints] = last + step
+        for at, way in zip(self._joints, step, strict=True):
+            command[at] = last[at] + way
         return True
 
     @staticmethod
-    def _near(wanted: Array, before: Array, change: float) -> Array:
+    def _near(wanted: Numbers, before: Numbers, change: float) -> Numbers:
         """The longest part of `wanted` within reach of the step `before`; if there is none, each joint by itself."""
-        low, high = before - change, before + change
-        if (wanted >= low).all() and (wanted <= high).all():
+        least, most, inside = 0.0, 1.0, True
+        for way, about in zip(wanted, before, strict=True):
+            low, high = about - change, about + change
+            if low <= way <= high:
+                if low > 0.0 or high < 0.0:  # a shorter part may be outside
+                    least = max(least, (low if low > 0.0 else high) / way)
+                continue
+            inside = False
+            if way == 0.0:
+                least, most = 2.0, -1.0
+            else:
+                ends = low / way, high / way
+                least, most = max(least, min(ends)), min(most, max(ends))
+        if inside:
             return wanted
-        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-            ends = np.sort(np.stack([low / wanted, high / wanted]), axis=0)
-        ends = np.where(wanted == 0, np.where((low <= 0) & (high >= 0), [[0.0], [1.0]], [[2.0], [-1.0]]), ends)
-        least, most = max(0.0, float(ends[0].max())), min(1.0, float(ends[1].min()))
-        return wanted * most if least <= most else np.clip(wanted, low, high)
+        if least <= most:
+            return [way * most for way in wanted]
+        rows = zip(wanted, before, strict=True)
+        return [min(max(way, about - change), about + change) for way, about in rows]
 
 
 class GripperSpeed(Guard):
@@ -156,14 +188,19 @@ class GripperSpeed(Guard):
 
     def __init__(self, spec: RobotSpec) -> None:
         self._columns = columns_in(spec.command, "m")
-        self._rate = max_rate(spec.command)[self._columns]
-        self.limit_value = float(self._rate.min())
+        rates = max_rate(spec.command)
+        self._rates = [rates[column] for column in self._columns]
+        self.limit_value = min(self._rates)
 
     def limit(self, tick: Tick) -> bool:
         """Clip the width."""
-        reach, last, measured = self._rate * tick.period, tick.last[self._columns], tick.measured[self._columns]
-        # Around a held object the last width is far below the fingers: opening begins at the fingers.
-        return clip(tick, self._columns, np.fmin(last, measured) - reach, np.fmax(last, measured) + reach)
+        low, high = [], []
+        for column, rate in zip(self._columns, self._rates, strict=True):
+            reach, last, measured = rate * tick.period, tick.last[column], tick.measured[column]
+            # Around a held object the last width is far below the fingers: opening begins at the fingers.
+            low.append((measured if measured < last else last) - reach)  # NaN: it is not measured
+            high.append((measured if measured > last else last) + reach)
+        return clip(tick, self._columns, low, high)
 
 
 class MeasuredJump(Guard):
@@ -172,67 +209,59 @@ class MeasuredJump(Guard):
     number, name, unit = "G7", "measured jump", "rad"
 
     def __init__(self, spec: RobotSpec) -> None:
-        self.limit_value, self._joints = JUMP, columns_in(spec.command, "rad")
-        self._fastest = max_rate(spec.command)[self._joints]
-        self._labels = np.array(spec.command.labels)[self._joints]
+        self.limit_value, rates = JUMP, max_rate(spec.command)
+        self._joints = [(at, rates[at], spec.command.labels[at]) for at in columns_in(spec.command, "rad")]
 
     def fault(self, tick: Tick) -> str | None:
         """Report the joint with the largest jump."""
-        turned = np.abs(tick.measured - tick.before)[self._joints]
-        most = self._fastest * (max(tick.period, tick.pause) + tick.age) + self.limit_value
-        over = turned > most  # NaN: there was no tick before
-        if not over.any():
-            return None
-        at = int(np.argmax(turned - most))
-        return (
-            f"{self._labels[at]} was measured {turned[at]:.3f} rad from where it was a tick before, and it turns "
-            f"{most[at]:.3f} rad at most in that time: look at what publishes its position"
-        )
+        measured, before, seconds = tick.measured, tick.before, max(tick.period, tick.pause) + tick.age
+        worst, text = 0.0, None
+        for at, fastest, label in self._joints:
+            turned, most = abs(measured[at] - before[at]), fastest * seconds + self.limit_value
+            if turned - most > worst:  # NaN: there was no tick before
+                worst = turned - most
+                text = (
+                    f"{label} was measured {turned:.3f} rad from where it was a tick before, and it turns "
+                    f"{most:.3f} rad at most in that time: look at what publishes its position"
+                )
+        return text
 
 
-def tool_travel(tool_position: ToolPosition, here: Array, there: Array) -> float:
-    """Distance between the tool positions at the joints `here` and `there`, both (k,) [rad]; in m."""
-    return math.dist(*tool_position(np.stack([here, there])))
-
-
-def within_reach(tool_position: ToolPosition, here: Array, there: Array, reach: float) -> Array:
+def within_reach(tool: ToolPoint, here: Numbers, there: Numbers, reach: float) -> Numbers:
     """The joints `there` (k,), moved so near to `here` that the tool travels `reach` [m] at most."""
-    near = there
+    start, near = tool(here), there
     for _ in range(_ROUNDS):
-        travel = tool_travel(tool_position, here, near)
+        travel = math.dist(start, tool(near))
         if travel <= reach * ROUNDING:
             return near
-        near = here + (near - here) * (0.999 * reach / travel)
+        share = 0.999 * reach / travel
+        near = [begin + (end - begin) * share for begin, end in zip(here, near, strict=True)]
     return here
 
 
-def longest_step(distance: Array, change: float) -> Array:
+def longest_step(distance: float, change: float) -> float:
     """The longest next step after which a joint can still stop within `distance`.
 
     Each step may be shorter than the one before by `change`. If the first of n steps has length s and the last one is
     at most `change`, together they cover ``n s - change n (n - 1) / 2``.
 
     Args:
-        distance: Not negative. Shape: (k,).
+        distance: Not negative.
         change: Above 0, in the unit of `distance`.
     """
-    steps = np.maximum(1.0, np.ceil((np.sqrt(1.0 + 8.0 * distance / change) - 1.0) / 2.0))
-    longest: Array = distance / steps + change * (steps - 1.0) / 2.0
-    return longest
+    steps = max(1.0, math.ceil((math.sqrt(1.0 + 8.0 * distance / change) - 1.0) / 2.0))
+    return distance / steps + change * (steps - 1.0) / 2.0
 
 
-def _shorten(tick: Tick, joints: Any, reach: Any) -> bool:
-    """Shorten the step of all `joints` until none is longer than its `reach`; True if one was."""
-    last = tick.last[joints]
-    step = tick.command[joints] - last
-    share = _least_share(reach, np.abs(step))
+def shorten(tick: Tick, joints: Sequence[int], reach: Numbers) -> bool:
+    """Shorten the step of all `joints` until none is longer than its `reach` (k,); True if one was."""
+    last, command, share = tick.last, tick.command, 1.0
+    for at, most in zip(joints, reach, strict=True):
+        way = abs(command[at] - last[at])
+        if way > most * ROUNDING:
+            share = min(share, most / way)
     if share == 1.0:
         return False
-    tick.command[joints] = last + share * step
+    for at in joints:
+        command[at] = last[at] + share * (command[at] - last[at])
     return True
-
-
-def _least_share(allowed: Any, wanted: Array) -> float:
-    """The largest factor, at most 1, that makes all of `wanted` as small as `allowed`."""
-    over = wanted > allowed * ROUNDING
-    return float((allowed / np.where(over, wanted, 1.0))[over].min()) if over.any() else 1.0

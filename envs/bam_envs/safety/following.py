@@ -8,14 +8,21 @@ faster than its limit.
 import math
 from collections import deque
 
-import numpy as np
-from numpy.typing import NDArray
-
 from bam_envs.core.robot import RobotSpec
-from bam_envs.safety.arm_guards import fastest_joints, tool_travel, within_reach
-from bam_envs.safety.guard import Guard, Limits, Tick, ToolPosition, clip, columns_in, max_rate, ticks_of
+from bam_envs.safety.arm_guards import fastest_joints, within_reach
+from bam_envs.safety.guard import (
+    Guard,
+    Limits,
+    Numbers,
+    Tick,
+    ToolPosition,
+    clip,
+    columns_in,
+    max_rate,
+    ticks_of,
+    tool_point_of,
+)
 
-Array = NDArray[np.float64]
 SHARE = 0.75
 """The allowed gap, as a share of the limit for one period."""
 STRIKES = 3
@@ -35,7 +42,7 @@ class Following(Guard):
     def __init__(self, spec: RobotSpec, limits: Limits) -> None:
         self._lag = spec.lag if limits.lag is None else limits.lag
         # A command lasts for a period after it is sent, and the robot is behind it by its lag.
-        self._sent: deque[Array] = deque(maxlen=2 + ticks_of(self._lag, spec))
+        self._sent: deque[Numbers] = deque(maxlen=2 + ticks_of(self._lag, spec))
         self._strikes, self._good, self._forgiven = 0, 0, ticks_of(FORGIVEN, spec)
 
     def restart(self) -> None:
@@ -46,11 +53,13 @@ class Following(Guard):
         """Reset the count, when an episode begins or a person resumes the robot."""
         self._strikes = self._good = 0
 
-    def off(self, sent: Array, measured: Array) -> Array:
+    def off(self, sent: Numbers, measured: Numbers) -> Numbers:
         """Distance of the measured values from the range of the recent commands, 0 inside it. Shape: (k,)."""
         self._sent.append(sent)
-        commands = np.stack(self._sent)
-        off: Array = np.clip(measured, commands.min(axis=0), commands.max(axis=0)) - measured
+        off = []
+        for value, *commands in zip(measured, *self._sent, strict=True):
+            low, high = min(commands), max(commands)
+            off.append(low - value if value < low else high - value if value > high else 0.0)  # NaN: not measured
         return off
 
     def is_struck(self, over: bool) -> bool:
@@ -68,67 +77,80 @@ class Following(Guard):
 class JointFollowing(Following):
     """A command is no farther from the measured joint than its lag explains; a joint that does not follow is held."""
 
-    name, unit = "following", "rad"
+    name, unit, setting = "following", "rad", "lag"
 
     def __init__(self, spec: RobotSpec, limits: Limits, tool_position: ToolPosition | None) -> None:
         super().__init__(spec, limits)
         self._joints, self._period = columns_in(spec.command, "rad"), spec.period
-        self._tool, self._tool_reach = tool_position, limits.tool_speed * spec.period
-        self._labels = np.array(spec.command.labels)[self._joints]
-        self._fastest = fastest_joints(spec, limits, limits.reset_speed)
-        self._slowest = np.minimum(self._fastest, limits.reset_speed)
-        self._tolerance = limits.follow_tolerance
-        self.limit_value = float(self._fastest.max()) * (self._lag + self._period)
-
-    def _reach(self, tick: Tick) -> Array:
-        """Farthest that a command may be from a joint at rest [rad]. Shape: (k,)."""
-        fastest = self._slowest if tick.approach else self._fastest
-        reach: Array = np.maximum(fastest * self._period, self._tolerance)
-        return reach
+        self._tool = None if tool_position is None else tool_point_of(tool_position)
+        self._tool_reach = limits.tool_speed * spec.period
+        self._labels = [spec.command.labels[at] for at in self._joints]
+        fastest, self._tolerance = fastest_joints(spec, limits, limits.reset_speed), limits.follow_tolerance
+        self._fastest = fastest
+        self._step = [one * spec.period for one in fastest]
+        self._slow_step = [min(one, limits.reset_speed) * spec.period for one in fastest]
+        self._reach = [max(step, self._tolerance) for step in self._step]
+        self._slow_reach = [max(step, self._tolerance) for step in self._slow_step]
+        self.limit_value = max(fastest) * (self._lag + self._period)
 
     def fault(self, tick: Tick) -> str | None:
         """Report the joint, the gap, and likely causes."""
-        sent, measured = tick.last[self._joints], tick.measured[self._joints]
-        off, allowed = self.off(sent, measured), SHARE * self._reach(tick)
-        over = bool((np.abs(off) > allowed).any())  # NaN: it is not measured
-        if not over and self._tool is not None and (np.abs(off) > self._tolerance).any():
-            over = tool_travel(self._tool, measured, measured + off) > SHARE * self._tool_reach
+        sent, measured = [tick.last[at] for at in self._joints], [tick.measured[at] for at in self._joints]
+        # The farthest that a command may be from a joint at rest.
+        allowed = [SHARE * reach for reach in (self._slow_reach if tick.approach else self._reach)]
+        off = self.off(sent, measured)
+        over = any(abs(gap) > most for gap, most in zip(off, allowed, strict=True))
+        if not over and self._tool is not None and max(map(abs, off)) > self._tolerance:
+            explained = [value + gap for value, gap in zip(measured, off, strict=True)]
+            over = math.dist(self._tool(measured), self._tool(explained)) > SHARE * self._tool_reach
         if not self.is_struck(over):
             return None
-        at = int(np.argmax(np.abs(off) / allowed))
+        at = max(range(len(off)), key=lambda one: abs(off[one]) / allowed[one])
         return (
             f"{self._labels[at]} does not follow its commands: it is {measured[at] - sent[at]:+.3f} rad from the last "
             f"one, and beyond a lag of {self._lag:g} s it may be {allowed[at]:.3f} rad, and the tool "
             f"{SHARE * self._tool_reach:.3f} m: {LIKELY}"
         )
 
-    def hold(self, tick: Tick) -> Array:
+    def hold(self, tick: Tick) -> Numbers:
         """The measured joints, approached no faster than the joints' limits. Shape: (m,)."""
-        held: Array = tick.last.copy()
-        held[self._joints] = self._near(tick, tick.measured[self._joints])
+        held = tick.last.copy()
+        self._go_near(tick, [tick.measured[at] for at in self._joints], held)
         return held
 
     def limit(self, tick: Tick) -> bool:
         """Bring the command within one step of the explained position, so that a released joint cannot jump."""
-        wanted, measured = tick.command[self._joints], tick.measured[self._joints]
-        ahead = np.clip(np.nan_to_num(tick.velocity[self._joints]), -self._fastest, self._fastest) * self._lag
-        explained = measured + np.clip(wanted - measured, np.minimum(ahead, 0.0), np.maximum(ahead, 0.0))
-        jump = np.abs(wanted - explained)
-        reach = self._reach(tick)
-        near = np.clip(wanted, explained - reach, explained + reach)
-        farther = (jump > np.abs(wanted - tick.last[self._joints]) + self._tolerance).any()
+        command, last = tick.command, tick.last
+        reaches = self._slow_reach if tick.approach else self._reach
+        explained, near, farther, changed = [], [], False, False
+        for at, fastest, reach in zip(self._joints, self._fastest, reaches, strict=True):
+            wanted, measured, speed = command[at], tick.measured[at], tick.velocity[at]
+            ahead = 0.0 if math.isnan(speed) else min(max(speed, -fastest), fastest) * self._lag
+            place = measured + min(max(wanted - measured, min(ahead, 0.0)), max(ahead, 0.0))
+            allowed = min(max(wanted, place - reach), place + reach)
+            farther = farther or abs(wanted - place) > abs(wanted - last[at]) + self._tolerance
+            changed = changed or allowed != wanted
+            explained.append(place)
+            near.append(allowed)
         if farther and self._tool is not None:  # at most the tool's limit for one period from there
-            near = within_reach(self._tool, explained, near, self._tool_reach)
-        if (near == wanted).all():
+            reached = within_reach(self._tool, explained, near, self._tool_reach)
+            changed, near = changed or reached is not near, reached
+        if not changed:
             return False
-        tick.command[self._joints] = self._near(tick, near)
+        self._go_near(tick, near, command)
         return True
 
-    def _near(self, tick: Tick, wanted: Array) -> Array:
-        """`wanted`, at most one step from the last command: the measurement may be wrong."""
-        last, step = tick.last[self._joints], (self._slowest if tick.approach else self._fastest) * self._period
-        near: Array = np.clip(wanted, last - step, last + step)
-        return near
+    def _go_near(self, tick: Tick, wanted: Numbers, command: Numbers) -> None:
+        """Set the joints of `command` to `wanted`, at most one step from the last command: a measurement may be wrong.
+
+        Args:
+            tick: The tick.
+            wanted: Joints [rad]. Shape: (k,).
+            command: The command to change. Shape: (m,).
+        """
+        steps = self._slow_step if tick.approach else self._step
+        for at, value, step in zip(self._joints, wanted, steps, strict=True):
+            command[at] = min(max(value, tick.last[at] - step), tick.last[at] + step)
 
 
 class BaseFollowing(Following):
@@ -136,14 +158,14 @@ class BaseFollowing(Following):
 
     def __init__(self, name: str, unit: str, acceleration: float, spec: RobotSpec, limits: Limits) -> None:
         super().__init__(spec, limits)
-        self.name, self.unit = name, unit
+        self.name, self.unit, rates = name, unit, max_rate(spec.command)
         self._columns = columns_in(spec.command, unit)
-        self._fastest = np.minimum(acceleration, max_rate(spec.command)[self._columns])
-        self._ahead = self._fastest * (self._lag + spec.period)
-        self.limit_value = float(self._ahead.max())
-        self._change = self._fastest * spec.period
-        self._allowed = SHARE * self._change
-        self._reached: Array | None = None  # speed of a base that follows as well as its acceleration allows
+        fastest = [min(acceleration, rates[at]) for at in self._columns]
+        self._ahead = [one * (self._lag + spec.period) for one in fastest]
+        self.limit_value = max(self._ahead)
+        self._change = [one * spec.period for one in fastest]
+        self._allowed = [SHARE * one for one in self._change]
+        self._reached: Numbers | None = None  # speed of a base that follows as well as its acceleration allows
 
     def restart(self) -> None:
         """Forget the reached speed as well: the base may still be moving."""
@@ -152,13 +174,13 @@ class BaseFollowing(Following):
 
     def fault(self, tick: Tick) -> str | None:
         """Report the measured speed and the commanded one."""
-        sent, measured = tick.last[self._columns], tick.measured[self._columns]
-        before = measured if self._reached is None else self._reached
-        self._reached = np.clip(sent, before - self._change, before + self._change)
-        off = np.abs(self.off(self._reached, measured))
-        if not self.is_struck(bool((off > self._allowed).any())):
+        sent, measured = [tick.last[at] for at in self._columns], [tick.measured[at] for at in self._columns]
+        rows = zip(sent, self._reached or measured, self._change, strict=True)
+        self._reached = [min(max(value, before - change), before + change) for value, before, change in rows]
+        off = [abs(one) for one in self.off(self._reached, measured)]
+        if not self.is_struck(any(one > most for one, most in zip(off, self._allowed, strict=True))):
             return None
-        at = int(np.argmax(off))
+        at = off.index(max(off))
         return (
             f"the base does not follow its commands: it goes at {measured[at]:.3f} {self.unit}, and was sent "
             f"{sent[at]:.3f} {self.unit}; beyond a lag of {self._lag:g} s it may be off by {self._allowed[at]:.3f} "
@@ -167,6 +189,10 @@ class BaseFollowing(Following):
 
     def limit(self, tick: Tick) -> bool:
         """Clip the speed around the measured one; slower is always allowed."""
-        measured = tick.measured[self._columns]
-        low, high = np.minimum(0.0, measured - self._ahead), np.maximum(0.0, measured + self._ahead)
+        low, high = [], []
+        for at, ahead in zip(self._columns, self._ahead, strict=True):
+            measured = tick.measured[at]
+            unknown = math.isnan(measured)
+            low.append(-math.inf if unknown else min(0.0, measured - ahead))
+            high.append(math.inf if unknown else max(0.0, measured + ahead))
         return clip(tick, self._columns, low, high)

@@ -10,7 +10,7 @@ import math
 import time
 import weakref
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import fields
 from typing import Any, NoReturn, final
 
 import numpy as np
@@ -22,6 +22,7 @@ from bam_envs.safety.following import Following
 from bam_envs.safety.guard import (
     Guard,
     Limits,
+    Numbers,
     Sealed,
     Tick,
     ToolPosition,
@@ -106,12 +107,15 @@ class SafeRobot(metaclass=Sealed):
         "__weakref__",
         "_bad",
         "_before",
+        "_checks",
         "_clock",
+        "_code",
         "_further",
         "_guards",
         "_halts",
         "_is_base",
         "_last",
+        "_limiters",
         "_limits",
         "_live",
         "_places",
@@ -126,6 +130,7 @@ class SafeRobot(metaclass=Sealed):
         "_state",
         "_status",
         "_stopped",
+        "_tell",
     )
 
     def __init__(
@@ -143,14 +148,17 @@ class SafeRobot(metaclass=Sealed):
         self._live: Any = robot if getattr(robot, "needs_clearance", False) else None
         if self._live is not None:
             require_bounded(self._limits, robot.spec)
+        self._tell: Any = getattr(self._live, "tell_status", None)
         self._shape = Shape(robot.spec)
         self._further = tuple(guards)
         self._guards = tuple(default_guards(robot.spec, self._limits, tool_position=tool_position))
+        self._checks = tuple(one for one in self._guards if type(one).fault is not Guard.fault)
+        self._limiters = tuple(one for one in self._guards if type(one).limit is not Guard.limit)
         self._robot: Any = robot
         self._clock, self._is_base, command = clock, is_base(robot.spec), robot.spec.command
         self._places = measured_places(robot.spec, command.units)
         self._speeds = measured_places(robot.spec, [f"{unit}/s" for unit in command.units])
-        unmeasured = {*columns_in(command, "rad").tolist()} - {place for place, _, _ in self._places}
+        unmeasured = {*columns_in(command, "rad")} - {place for place, _, _ in self._places}
         if unmeasured:  # the guards need the position of the arm
             names = ", ".join(command.labels[at] for at in sorted(unmeasured))
             raise InvalidValue(f"The guards need {names} of {robot.spec.name} measured in rad; no signal has it.")
@@ -159,7 +167,7 @@ class SafeRobot(metaclass=Sealed):
             facts = {"number": one.number, "limit": one.limit_value, "unit": one.unit}
             self._report[one.name] = {**facts, "altered": 0, "held": 0, "stopped": 0}
         self._stopped: tuple[str, str] | None = None
-        self._bad, self._halts, self._status = 0, 0, ""
+        self._bad, self._halts, self._status, self._code = 0, 0, "", 0
         self._sent_at: float | None = None
         self._forget()
         if self._live is not None:  # two gates would each allow a whole step
@@ -180,10 +188,10 @@ class SafeRobot(metaclass=Sealed):
     def _forget(self) -> None:
         """Forget all states and commands."""
         self._state: RobotState | None = None
-        self._before: Array | None = None  # measured values of the tick before
-        self._sent: Array | None = None  # the last command that the robot was sent
-        self._last: Array | None = None  # the same; None if the next command begins at the measured position
-        self._speed = np.zeros(len(self.spec.command.labels))  # of the last command [unit/s]
+        self._before: Numbers | None = None  # measured values of the tick before
+        self._sent: Numbers | None = None  # the last command that the robot was sent
+        self._last: Numbers | None = None  # the same; None if the next command begins at the measured position
+        self._speed = [0.0] * len(self.spec.command.labels)  # of the last command [unit/s]
 
     @property
     def spec(self) -> RobotSpec:
@@ -202,8 +210,18 @@ class SafeRobot(metaclass=Sealed):
 
     @property
     def status(self) -> str:
-        """The last guard that changed the last command, or held the robot: ``"joint speed (G8)"``; empty for none."""
+        """The last guard that changed the last command, held or stopped the robot: ``"joint speed (G8)"``; or empty."""
         return self._status
+
+    @property
+    def code(self) -> int:
+        """`status` as the number of that guard: 8 for G8, 0 for none, -1 for a further guard without a number."""
+        return self._code
+
+    @property
+    def stopped(self) -> str | None:
+        """The guard that stopped the robot and its reason, until a person calls `resume`; None if it may move."""
+        return None if self._stopped is None else self._stopped[1]
 
     @property
     def info(self) -> Any:
@@ -242,7 +260,7 @@ class SafeRobot(metaclass=Sealed):
         self._require_free()
         return self._advance(self._shape.numbers(command))
 
-    def _advance(self, goal: Array, *, approach: bool = False) -> RobotState:
+    def _advance(self, goal: Numbers, *, approach: bool = False) -> RobotState:
         """One tick towards `goal` (m,)."""
         halts = self._halts
         try:
@@ -257,21 +275,22 @@ class SafeRobot(metaclass=Sealed):
             self._hold(tick, *fault)
         return self._send(tick, halts)
 
-    def _tick(self, goal: Array, approach: bool) -> Tick:
+    def _tick(self, goal: Numbers, approach: bool) -> Tick:
         pause = self._pause()
         last = self._begin_at(pause)
         measured, speeds, period = self._measured(self._places), self._measured(self._speeds), self.spec.period
-        before = np.full_like(measured, np.nan) if self._before is None else self._before
+        before = [math.nan] * len(measured) if self._before is None else self._before
         self._before = measured
         time_passed = min(period, pause or period)
+        rows = zip(speeds, measured, before, strict=True)
         return Tick(
             goal=goal,
             command=goal.copy(),
             last=last,
-            last_step=self._speed * time_passed,
+            last_step=[speed * time_passed for speed in self._speed],
             measured=measured,
             before=before,
-            velocity=np.where(np.isnan(speeds), (measured - before) / period, speeds),
+            velocity=[(now - old) / period if math.isnan(speed) else speed for speed, now, old in rows],
             age=self.age(),
             period=time_passed,
             pause=pause,
@@ -289,7 +308,7 @@ class SafeRobot(metaclass=Sealed):
             return 0.0
         return self._clock() - sent_at
 
-    def _begin_at(self, pause: float) -> Array:
+    def _begin_at(self, pause: float) -> Numbers:
         """The last command if the robot still follows it, else its measured position, at rest. Shape: (m,)."""
         in_motion = self._sent_at is not None or self._live is None or self._in_lockstep()
         last = self._last  # read once: a halt in another thread clears it
@@ -299,24 +318,26 @@ class SafeRobot(metaclass=Sealed):
             self._state = self._fresh_state()
         measured, command = self._measured(self._places), self.spec.command
         if self._is_base:
-            last = np.zeros_like(measured)
+            last = [0.0] * len(measured)
         elif self._sent is None:
             # A gripper that is not measured is taken as open; fingers may be measured a little beyond their range.
-            last = np.clip(np.where(np.isfinite(measured), measured, command.high), command.low, command.high)
+            rows = zip(measured, command.low, command.high, strict=True)
+            last = [min(max(value, low), high) if math.isfinite(value) else high for value, low, high in rows]
         else:  # the gripper keeps its grip
-            last, joints = self._sent.copy(), columns_in(command, "rad")
-            last[joints] = measured[joints]
-        self._last, self._speed, self._before = last, np.zeros_like(last), None
+            last = self._sent.copy()
+            for joint in columns_in(command, "rad"):
+                last[joint] = measured[joint]
+        self._last, self._speed, self._before = last, [0.0] * len(last), None
         self._restart()
         return last
 
-    def _measured(self, places: list[tuple[int, str, int]]) -> Array:
+    def _measured(self, places: list[tuple[int, str, int]]) -> Numbers:
         """The measured value of each number of the command, from `places`; NaN if not measured. Shape: (m,)."""
         if self._state is None:
             raise ResetNeeded("Nothing is known of the robot yet. Call reset() first.")
-        measured = np.full(len(self.spec.command.labels), np.nan)
+        measured, signals = [math.nan] * len(self.spec.command.labels), self._state.signals
         for place, name, column in places:
-            measured[place] = self._state.signals[name][0, column]
+            measured[place] = float(signals[name].item(0, column))
         return measured
 
     def _fresh_state(self) -> RobotState:
@@ -345,7 +366,7 @@ class SafeRobot(metaclass=Sealed):
                 guard.forgive()
 
     def _fault(self, tick: Tick) -> tuple[Guard, str] | None:
-        for guard in self._guards:
+        for guard in self._checks:
             if (reason := guard.fault(tick)) is not None:
                 return guard, reason
         for guard in self._further:
@@ -354,19 +375,19 @@ class SafeRobot(metaclass=Sealed):
         return None
 
     def _limit(self, tick: Tick) -> None:
-        self._bad, self._status = 0, ""
+        self._bad, self._status, self._code = 0, "", 0
         for guard in self._further:
             asked = _copy(tick)
             if guard.limit(asked):
-                tick.goal = self._shape.numbers(asked.command[None])
+                tick.goal = self._shape.numbers(np.asarray(asked.command)[None])
                 tick.command = tick.goal.copy()
                 self._note(guard, "altered")
-        for guard in self._guards:
+        for guard in self._limiters:
             if guard.limit(tick) and not tick.approach:
                 self._note(guard, "altered")
 
     def _note(self, guard: Guard, effect: str) -> None:
-        self._status = guard.title
+        self._status, self._code = guard.title, guard.code
         self._report[guard.name][effect] += 1
 
     def _hold(self, tick: Tick, guard: Guard, reason: str) -> None:
@@ -375,13 +396,21 @@ class SafeRobot(metaclass=Sealed):
         self._bad += 1
         if self._bad >= guard.patience:
             self._stop(guard, reason if self._bad == 1 else f"{reason}, {self._bad} ticks in a row")
-        tick.command = np.zeros_like(tick.last) if self._is_base else guard.hold(tick)
+        if self._is_base:
+            tick.command = [0.0] * len(tick.last)
+        elif guard in self._further:
+            tick.command = self._shape.numbers(np.asarray(guard.hold(_copy(tick)))[None])
+        else:
+            tick.command = guard.hold(tick)
         tick.last = tick.command  # at rest: the next command begins there
 
     def _send(self, tick: Tick, halts: int) -> RobotState:
         """Send the command; halt the robot if that fails."""
-        cleared = _clear(self._robot, tick.command[None])
-        handed: Any = tick.command[None].copy() if self._live is None else cleared
+        command = np.array([tick.command])
+        cleared = _clear(self._robot, command)
+        handed: Any = command if self._live is None else cleared
+        if self._tell is not None:
+            self._tell(self._code, self._status, stopped=False)
         done, self._sent_at = False, self._clock()
         try:
             self._state = self._robot.step(handed)
@@ -392,7 +421,8 @@ class SafeRobot(metaclass=Sealed):
                 self.halt()
         self._sent = tick.command
         if self._halts == halts:
-            self._last, self._speed = tick.command, (tick.command - tick.last) / tick.period
+            rows = zip(tick.command, tick.last, strict=True)
+            self._last, self._speed = tick.command, [(now - before) / tick.period for now, before in rows]
         self._require_in_range(self._state)
         return _copied(self._state)  # changes by the caller must not reach the guards
 
@@ -404,7 +434,9 @@ class SafeRobot(metaclass=Sealed):
     def _stop(self, guard: Guard, reason: str) -> NoReturn:
         """Halt, and refuse commands until a person resumes."""
         self.halt()
-        self._report[guard.name]["stopped"] += 1
+        self._note(guard, "stopped")
+        if self._tell is not None:
+            self._tell(self._code, self._status, stopped=True)
         why = self.not_ready()
         readiness = "" if why is None else f"not ready: {why}: "
         self._stopped = guard.name, f"{guard.title}: {readiness}{reason}"
@@ -421,6 +453,7 @@ class SafeRobot(metaclass=Sealed):
     def resume(self) -> None:
         """Let a stopped robot move again, from its position. A person decides this, never a program."""
         self._stopped, self._bad, self._last, self._sent_at, self._before = None, 0, None, None, None
+        self._status, self._code = "", 0
         self._restart(forgive=True)
 
     def reset(self, env_ids: EnvIds, initial: Initial) -> RobotState:
@@ -445,56 +478,58 @@ class SafeRobot(metaclass=Sealed):
         self._restart(forgive=True)
         begin = self._begin_at(self._pause())
         self._sent_at = None  # the first command may come at any time
-        return replace(_copied(state), command=begin[None].copy())
+        return RobotState(_copied(state).signals, state.stamp, np.array([begin]), state.truth)
 
     def _take(self, state: RobotState) -> RobotState:
         """Restart from `state`."""
-        self._state, self._before, self._bad, self._status = state, None, 0, ""
+        self._state, self._before, self._bad, self._status, self._code = state, None, 0, "", 0
         self._require_in_range(state)
         return state
 
-    def _start_pose(self, initial: Initial) -> Array:
+    def _start_pose(self, initial: Initial) -> Numbers:
         """The joints of `initial` as a command, the gripper open. Shape: (m,)."""
-        start: Array = np.array(self.spec.command.high)
-        start[columns_in(self.spec.command, "rad")] = initial.signals["joint_position"][0]
+        start, labels = list(self.spec.command.high), self.spec.command.labels
+        joints = np.asarray(initial.signals["joint_position"])[0].tolist()
+        for column, value in zip(columns_in(self.spec.command, "rad"), joints, strict=True):
+            start[column] = value
         low, high = position_range(self.spec, self.limits)
-        inside = (low <= start) & (start <= high)  # NaN is not
-        if not inside.all():
-            column = int(np.argmin(inside))
-            raise InvalidValue(
-                f"The start pose has {self.spec.command.labels[column]} at {start[column]:.3f} rad, outside the "
-                f"{low[column]:.3f} to {high[column]:.3f} rad that the guards allow. Choose another start, or a "
-                "smaller position_margin."
-            )
+        for column, value in enumerate(start):
+            if not low[column] <= value <= high[column]:  # NaN is not
+                raise InvalidValue(
+                    f"The start pose has {labels[column]} at {value:.3f} rad, outside the "
+                    f"{low[column]:.3f} to {high[column]:.3f} rad that the guards allow. Choose another start, or a "
+                    "smaller position_margin."
+                )
         return start
 
-    def _joints_off(self, start: Array) -> dict[str, float]:
+    def _joints_off(self, start: Numbers) -> dict[str, float]:
         """The joints that are not measured at `start` (m,), with their remaining distance [rad]."""
-        far, near = start - self._measured(self._places), self.limits.reset_tolerance
-        columns = columns_in(self.spec.command, "rad")
-        return {self.spec.command.labels[at]: float(far[at]) for at in columns if not abs(far[at]) <= near}
+        measured, near = self._measured(self._places), self.limits.reset_tolerance
+        far = {at: start[at] - measured[at] for at in columns_in(self.spec.command, "rad")}
+        return {self.spec.command.labels[at]: gap for at, gap in far.items() if not abs(gap) <= near}
 
     def _is_open(self) -> bool:
         """Whether the gripper is measured open; one that is not measured (NaN) counts as open."""
-        far = np.array(self.spec.command.high) - self._measured(self._places)
-        return not (np.abs(far)[columns_in(self.spec.command, "m")] > GRIPPER_NEAR).any()
+        measured, widest = self._measured(self._places), self.spec.command.high
+        return not any(abs(widest[at] - measured[at]) > GRIPPER_NEAR for at in columns_in(self.spec.command, "m"))
 
-    def _approach(self, start: Array) -> None:
+    def _approach(self, start: Numbers) -> None:
         """Open the gripper with the arm in place, then go to `start` (m,)."""
         joints, grippers = columns_in(self.spec.command, "rad"), columns_in(self.spec.command, "m")
 
         def is_reached() -> bool:  # all joints are measured there, and were sent there
             sent = self._begin_at(0.0)
-            return bool((sent == start)[joints].all()) and not self._joints_off(start)
+            return all(sent[at] == start[at] for at in joints) and not self._joints_off(start)
 
         opened = self._begin_at(0.0).copy()
-        opened[grippers] = start[grippers]
+        for at in grippers:
+            opened[at] = start[at]
         goals = (opened, GRIPPER_TIME, self._is_open), (start, self.limits.reset_timeout, is_reached)
         for goal, longest, done in goals:
             for _ in range(math.ceil(longest / self.spec.period)):
                 if done():
                     break
-                self._advance(goal, approach=True)
+                self._advance(goal.copy(), approach=True)
         if not is_reached():
             self.halt()
             off, why = self._joints_off(start), self.not_ready()
@@ -524,9 +559,10 @@ _GUARDED: weakref.WeakKeyDictionary[Any, weakref.ref[SafeRobot]] = weakref.WeakK
 def _copied(state: RobotState) -> RobotState:
     """The state with copies of its arrays."""
     signals = {name: values.copy() for name, values in state.signals.items()}
-    return replace(state, signals=signals, command=state.command.copy())
+    return RobotState(signals, state.stamp, state.command.copy(), state.truth)
 
 
 def _copy(tick: Tick) -> Tick:
-    """A copy of the tick for a user's guard, which may change the command only."""
-    return replace(tick, **{name: value.copy() for name, value in vars(tick).items() if isinstance(value, np.ndarray)})
+    """The tick with arrays (m,) for a user's guard, which may change the command only."""
+    values = (getattr(tick, one.name) for one in fields(tick))
+    return Tick(*(np.array(value) if isinstance(value, list) else value for value in values))  # type: ignore[arg-type]

@@ -14,12 +14,17 @@ from msgspec import Meta
 from numpy.typing import NDArray
 
 from bam_envs.core.errors import InvalidValue, UnknownName
+from bam_envs.core.kinematics import ArmGeometry
 from bam_envs.core.robot import RobotSpec, SignalSpec
 from bam_envs.core.validation import check
 
 Array = NDArray[np.float64]
+Numbers = list[float]
+"""One number for each number of the command, or for some of them: lists are several times as quick as short arrays."""
 ToolPosition = Callable[[Array], Array]
 """Forward kinematics: joints (n, k) [rad] to tool positions (n, 3) [m]."""
+ToolPoint = Callable[[Sequence[float]], tuple[float, float, float]]
+"""The same for one pose: joints (k,) [rad] to the tool's x, y, z [m]."""
 LONGEST_PERIOD = 1.0
 """Longest time between two commands to a live robot [s]: a robot may move for that long before the next check."""
 
@@ -84,19 +89,38 @@ class Limits:
             if isinstance(value, (np.ndarray, np.generic)):  # an array could be changed after it was checked
                 object.__setattr__(self, one.name, number)
 
+        for less, more in ORDERED:
+            self._require_order(less, more)
+
+    def _require_order(self, less: str, more: str) -> None:
+        """`InvalidValue` if the limit `less` is above the limit `more`."""
+        low, high = getattr(self, less), getattr(self, more)
+        if low is not None and high is not None and low > high:
+            raise InvalidValue(
+                f"The limits {less} of {low:g} and {more} of {high:g} contradict each other: {less} is at most {more}."
+            )
+
     @classmethod
     def of(cls, values: Mapping[str, float]) -> Limits:
         """The defaults, updated with the `values` of a profile.
 
         Raises:
             UnknownName: There is no such limit.
-            InvalidValue: One is not above 0, or outside `BOUNDS`.
+            InvalidValue: One is not above 0, or outside `BOUNDS`, or two contradict each other.
         """
         for name in values:
             if name not in BOUNDS:
                 raise UnknownName("limit", name, BOUNDS)
         limits = cls(**values)
         limits.require_bounded()
+        return limits
+
+    def changed(self, values: Mapping[str, float]) -> Limits:
+        """These limits with other `values`, as an operator gives them. Raises the errors of `of`."""
+        current = {one.name: getattr(self, one.name) for one in fields(self)}
+        limits = Limits.of({**current, **values})
+        if "reset_speed" in values:  # in a profile it may be above the speed that a person lowered
+            limits._require_order("reset_speed", "joint_speed")
         return limits
 
     def require_bounded(self) -> None:
@@ -113,6 +137,8 @@ BOUNDS: Mapping[str, tuple[float, float, str]] = MappingProxyType(
     {one.name: one.metadata["bounds"] for one in fields(Limits)}
 )
 """Minimum, maximum and unit of each limit of a live robot: no typing error can disable a guard."""
+ORDERED: tuple[tuple[str, str], ...] = ()
+"""Pairs of limits, the first of which is at most the second."""
 
 
 def require_bounded(limits: Limits, spec: RobotSpec) -> None:
@@ -137,23 +163,23 @@ def require_bounded(limits: Limits, spec: RobotSpec) -> None:
         )
 
 
-@dataclass
+@dataclass(slots=True)
 class Tick:
-    """One command on its way through the guards. Arrays have shape (m,)."""
+    """One command on its way through the guards, m numbers in each list; a guard of a user gets arrays (m,)."""
 
-    goal: Array
+    goal: Numbers
     """Goal of the command; inside the position limits from `PositionLimits` on."""
-    command: Array
+    command: Numbers
     """Command to send, as changed by the guards so far."""
-    last: Array
+    last: Numbers
     """Command that was sent last, or the measured values if none was sent."""
-    last_step: Array
+    last_step: Numbers
     """Change of the last command in a time of `period`."""
-    measured: Array
+    measured: Numbers
     """The measured value of each number of the command; NaN where nothing is measured."""
-    before: Array
+    before: Numbers
     """`measured` one tick before."""
-    velocity: Array
+    velocity: Numbers
     """Measured rate of change of each number of the command [unit/s]; NaN where nothing is measured."""
     age: float
     """Age of the newest state [s]."""
@@ -188,11 +214,19 @@ class Guard(metaclass=Sealed):
     """The limit, in `unit`."""
     patience: float = 1
     """Number of faults in a row that stop the robot; fewer hold it."""
+    setting: str = ""
+    """Name of the limit in `Limits` that sets `limit_value`; empty for a fixed one."""
 
     @property
     def title(self) -> str:
         """Name and number for messages: ``joint speed (G8)``."""
         return f"{self.name} ({self.number})"
+
+    @property
+    def code(self) -> int:
+        """The number of `number`: 8 for ``"G8"``; -1 if it has none."""
+        digits = self.number.removeprefix("G")
+        return int(digits) if digits.isdecimal() else -1
 
     def restart(self) -> None:
         """Forget the motion: after a connection, reset or halt the next command begins at the robot's position."""
@@ -201,26 +235,28 @@ class Guard(metaclass=Sealed):
         """Why `tick` must not be executed at all, or None."""
         return None
 
-    def hold(self, tick: Tick) -> Array:
+    def hold(self, tick: Tick) -> Numbers:
         """The command to an arm if `tick` is not executed: by default the last command again. Shape: (m,)."""
-        held: Array = tick.last.copy()
-        return held
+        return tick.last.copy()
 
     def limit(self, tick: Tick) -> bool:
         """Bring ``tick.command`` inside the limit; True if that changed it."""
         return False
 
 
-def clip(tick: Tick, columns: Any, low: Array, high: Array) -> bool:
-    """Clip `columns` of the command to `low` and `high`; True if that changed it."""
-    wanted = tick.command[columns]
-    tick.command[columns] = clipped = np.clip(wanted, low, high)
-    return bool((clipped != wanted).any())
+def clip(tick: Tick, columns: Sequence[int], low: Numbers, high: Numbers) -> bool:
+    """Clip `columns` of the command to `low` and `high`, a number for each column; True if that changed it."""
+    changed = False
+    for column, least, most in zip(columns, low, high, strict=True):
+        wanted = tick.command[column]
+        if wanted < least or wanted > most:
+            tick.command[column], changed = (least if wanted < least else most), True
+    return changed
 
 
-def columns_in(signal: SignalSpec, unit: str) -> NDArray[np.int64]:
+def columns_in(signal: SignalSpec, unit: str) -> list[int]:
     """Indices of the numbers of `signal` that are in `unit`."""
-    return np.flatnonzero([one == unit for one in signal.units])
+    return [column for column, one in enumerate(signal.units) if one == unit]
 
 
 def is_base(spec: RobotSpec) -> bool:
@@ -228,23 +264,38 @@ def is_base(spec: RobotSpec) -> bool:
     return "m/s" in spec.command.units
 
 
+def tool_point_of(tool_position: ToolPosition) -> ToolPoint:
+    """`tool_position` for one pose in plain numbers, which is quicker; quickest for that of an `ArmGeometry`."""
+    owner = getattr(tool_position, "__self__", None)
+    if type(owner) is ArmGeometry and tool_position == owner.tool_position:
+        return owner.tool_point
+
+    def tool_point(q: Sequence[float]) -> tuple[float, float, float]:
+        x, y, z = tool_position(np.array([q]))[0].tolist()
+        return x, y, z
+
+    return tool_point
+
+
 def ticks_of(seconds: float, spec: RobotSpec) -> int:
     """Number of periods in a time [s], rounded up."""
     return math.ceil(seconds / spec.period - 1e-9)
 
 
-def max_rate(command: SignalSpec) -> Array:
+def max_rate(command: SignalSpec) -> Numbers:
     """Maximum rate of change of each number [unit/s]; infinite where the data sheet gives none."""
-    return np.array(command.max_rate or (math.inf,) * len(command.labels))
+    return list(command.max_rate or (math.inf,) * len(command.labels))
 
 
-def position_range(spec: RobotSpec, limits: Limits) -> tuple[Array, Array]:
+def position_range(spec: RobotSpec, limits: Limits) -> tuple[Numbers, Numbers]:
     """Lowest and highest command (m,), less the margin of the joints; `InvalidValue` if that leaves no room."""
-    margin = np.where([unit == "rad" for unit in spec.command.units], limits.position_margin, 0.0)
-    low, high = np.array(spec.command.low) + margin, np.array(spec.command.high) - margin
-    if (low > high).any():
-        label = spec.command.labels[int(np.flatnonzero(low > high)[0])]
-        raise InvalidValue(f"The limit position_margin of {limits.position_margin:g} rad leaves {label} no room.")
+    command = spec.command
+    margins = [limits.position_margin if unit == "rad" else 0.0 for unit in command.units]
+    low = [value + margin for value, margin in zip(command.low, margins, strict=True)]
+    high = [value - margin for value, margin in zip(command.high, margins, strict=True)]
+    for label, least, most in zip(command.labels, low, high, strict=True):
+        if least > most:
+            raise InvalidValue(f"The limit position_margin of {limits.position_margin:g} rad leaves {label} no room.")
     return low, high
 
 

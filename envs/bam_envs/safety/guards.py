@@ -15,7 +15,19 @@ from bam_envs.core.kinematics import UR5E_GRIPPER, UR_JOINTS
 from bam_envs.core.robot import RobotSpec, RobotState
 from bam_envs.safety import arm_guards as arm
 from bam_envs.safety.following import BaseFollowing, JointFollowing
-from bam_envs.safety.guard import Guard, Limits, Tick, ToolPosition, clip, columns_in, is_base, max_rate, ticks_of
+from bam_envs.safety.guard import (
+    Guard,
+    Limits,
+    Numbers,
+    Tick,
+    ToolPosition,
+    clip,
+    columns_in,
+    is_base,
+    max_rate,
+    ticks_of,
+    tool_point_of,
+)
 
 Array = NDArray[np.float64]
 LATE = 2.0
@@ -37,23 +49,23 @@ class Shape(Guard):
     def __init__(self, spec: RobotSpec) -> None:
         self.limit_value = len(spec.command.labels)
 
-    def numbers(self, command: Array) -> Array:
-        """A copy of `command` (1, m) as numbers (m,); `InvalidValue` if it has another shape or is not numeric."""
+    def numbers(self, command: Array) -> Numbers:
+        """`command` (1, m) as m numbers; `InvalidValue` if it has another shape or is not numeric."""
         try:
-            array = np.array(command, dtype=np.float64)
+            array = np.asarray(command, dtype=np.float64)
         except (TypeError, ValueError) as error:
             raise InvalidValue(f"The command must be numbers: {error}.") from error
         expected = (1, int(self.limit_value))
         if array.shape != expected:
             raise InvalidValue(f"The command must have shape {expected}, not {array.shape}.")
-        numbers: Array = array[0]
+        numbers: Numbers = array[0].tolist()
         return numbers
 
 
 class Finite(Guard):
     """A command with NaN or infinity is not executed."""
 
-    number, name, unit = "G2", "finite", "bad ticks in a row"
+    number, name, unit, setting = "G2", "finite", "bad ticks in a row", "bad_ticks"
 
     def __init__(self, spec: RobotSpec, limits: Limits) -> None:
         self.limit_value = self.patience = limits.bad_ticks
@@ -61,17 +73,16 @@ class Finite(Guard):
 
     def fault(self, tick: Tick) -> str | None:
         """Report the numbers that are not finite."""
-        finite = np.isfinite(tick.goal)
-        if finite.all():
+        if all(map(math.isfinite, tick.goal)):
             return None
-        bad = [label for label, good in zip(self._labels, finite, strict=True) if not good]
+        bad = [label for label, value in zip(self._labels, tick.goal, strict=True) if not math.isfinite(value)]
         return f"the command for {', '.join(bad)} is not a finite number"
 
 
 class Freshness(Guard):
     """While the newest state is too old, the robot's position is unknown, and no new command is sent."""
 
-    number, name, unit = "G3", "state age", "s"
+    number, name, unit, setting = "G3", "state age", "s", "max_age"
 
     def __init__(self, spec: RobotSpec, limits: Limits) -> None:
         self.limit_value = limits.max_age or (0.5 if is_base(spec) else 0.1)
@@ -87,7 +98,7 @@ class Freshness(Guard):
 class Pace(Guard):
     """Commands come one period apart: a late one is not executed, and a pause or many late ones stop the robot."""
 
-    number, name, unit = "G15", "command pace", "s"
+    number, name, unit, setting = "G15", "command pace", "s", "max_pause"
 
     def __init__(self, spec: RobotSpec, limits: Limits) -> None:
         self.limit_value, self._period = limits.max_pause, spec.period
@@ -106,7 +117,7 @@ class Pace(Guard):
 class Answers(Guard):
     """A robot that answers commands does so in time; otherwise commands arrive too late or not at all."""
 
-    number, name, unit = "G4", "answer to a command", "s"
+    number, name, unit, setting = "G4", "answer to a command", "s", "answer_time"
 
     def __init__(self, spec: RobotSpec, limits: Limits) -> None:
         self.limit_value, self.patience = limits.answer_time, ticks_of(limits.hold_time, spec)
@@ -127,11 +138,11 @@ class BaseSpeed(Guard):
     number = "G11"
 
     def __init__(self, name: str, unit: str, limit: float, spec: RobotSpec) -> None:
-        self.name, self.unit = name, unit
-        self._columns = columns_in(spec.command, unit)
-        self._low = np.maximum(-limit, np.array(spec.command.low)[self._columns])
-        self._high = np.minimum(limit, np.array(spec.command.high)[self._columns])
-        self.limit_value = float(self._high.max())
+        self.name, self.unit, self.setting = name, unit, name.replace(" ", "_")
+        self._columns, command = columns_in(spec.command, unit), spec.command
+        self._low = [max(-limit, command.low[at]) for at in self._columns]
+        self._high = [min(limit, command.high[at]) for at in self._columns]
+        self.limit_value = max(self._high)
 
     def limit(self, tick: Tick) -> bool:
         """Clip this speed; the other one is unchanged."""
@@ -144,16 +155,18 @@ class BaseAcceleration(Guard):
     number = "G11"
 
     def __init__(self, name: str, unit: str, limit: float, spec: RobotSpec) -> None:
-        self.name, self.unit = name, f"{unit}^2"
-        self._columns = columns_in(spec.command, unit)
-        fastest = np.minimum(limit, max_rate(spec.command)[self._columns])
-        self.limit_value, self._fastest = float(fastest.max()), fastest
+        self.name, self.unit, self.setting = name, f"{unit}^2", name.replace(" ", "_")
+        self._columns, rates = columns_in(spec.command, unit), max_rate(spec.command)
+        self._fastest = [min(limit, rates[at]) for at in self._columns]
+        self.limit_value = max(self._fastest)
 
     def limit(self, tick: Tick) -> bool:
         """Clip the speed to the range around the last one."""
-        last, change = tick.last[self._columns], self._fastest * tick.period
-        low = np.where(last > 0, np.minimum(0.0, last - change), last - change)
-        high = np.where(last < 0, np.maximum(0.0, last + change), last + change)
+        low, high = [], []
+        for at, fastest in zip(self._columns, self._fastest, strict=True):
+            last, change = tick.last[at], fastest * tick.period
+            low.append(min(0.0, last - change) if last > 0 else last - change)
+            high.append(max(0.0, last + change) if last < 0 else last + change)
         return clip(tick, self._columns, low, high)
 
 
@@ -162,10 +175,11 @@ class MeasuredSpeed(Guard):
 
     patience = MEASURED_PATIENCE
 
-    def __init__(self, number: str, name: str, unit: str, limit: float, speeds: Callable[[Tick], Array]) -> None:
+    def __init__(self, number: str, name: str, unit: str, limit: float, speeds: Callable[[Tick], Numbers]) -> None:
         self.number, self.name, self.unit = number, f"measured {name}", unit
+        self.setting = name.replace(" ", "_")
         self.limit_value, self._speeds = MEASURED_MARGIN * limit, speeds
-        self._before: Array | None = None
+        self._before: Numbers | None = None
 
     def restart(self) -> None:
         """Forget the last tick: the mean needs two."""
@@ -173,12 +187,15 @@ class MeasuredSpeed(Guard):
 
     def fault(self, tick: Tick) -> str | None:
         """Report the measured speed."""
-        now = np.abs(self._speeds(tick))
+        now = [abs(speed) for speed in self._speeds(tick)]
         before, self._before = self._before, now
         if before is None:
             return None
-        fastest = float(((before + now) / 2).max())
-        if not fastest > self.limit_value:  # NaN: it is not measured
+        fastest = 0.0
+        for first, second in zip(before, now, strict=True):
+            if (first + second) / 2 > fastest:  # NaN: it is not measured
+                fastest = (first + second) / 2
+        if not fastest > self.limit_value:
             return None
         return f"{fastest:.3f} {self.unit} were measured, and at most {self.limit_value:.3f} {self.unit} are allowed"
 
@@ -191,20 +208,17 @@ class MeasuredLimits(Guard):
 
     def __init__(self, spec: RobotSpec) -> None:
         self._watched = [signal for signal in spec.signals if signal.name in self.SIGNALS]
-        self._ranges = {one.name: (np.array(one.low), np.array(one.high)) for one in self._watched}
 
     def trip(self, state: RobotState) -> str | None:
         """The first number of `state` that is outside its range, as the reason for a stop; or None."""
         for signal in self._watched:
-            low, high = self._ranges[signal.name]
-            values = state.signals[signal.name][0]
-            inside = (values >= low) & (values <= high)  # NaN is not
-            if not inside.all():
-                at = int(np.flatnonzero(~inside)[0])
-                return (
-                    f"{signal.name} of {signal.labels[at]} was measured at {values[at]:.3f} {signal.units[at]}, "
-                    f"outside {low[at]:.3f} to {high[at]:.3f}"
-                )
+            values = state.signals[signal.name][0].tolist()
+            for at, (value, low, high) in enumerate(zip(values, signal.low, signal.high, strict=True)):
+                if not low <= value <= high:  # NaN is not
+                    return (
+                        f"{signal.name} of {signal.labels[at]} was measured at {value:.3f} {signal.units[at]}, "
+                        f"outside {low:.3f} to {high:.3f}"
+                    )
         return None
 
 
@@ -239,13 +253,16 @@ def _arm_guards(spec: RobotSpec, limits: Limits, tool_position: ToolPosition | N
     joints = columns_in(spec.command, "rad")
     measured: list[Guard] = [arm.MeasuredJump(spec)]
     if math.isfinite(limits.joint_speed):
-        measured.append(MeasuredSpeed("G8", "joint speed", "rad/s", limits.joint_speed, lambda t: t.velocity[joints]))
+        limit = limits.joint_speed
+        measured.append(MeasuredSpeed("G8", "joint speed", "rad/s", limit, lambda t: [t.velocity[at] for at in joints]))
     tool: list[Guard] = []
     if position is not None:
+        tool_point = tool_point_of(position)
 
-        def tool_speed(tick: Tick) -> Array:
-            here, moment = tick.measured[joints], 1e-3
-            return np.array([arm.tool_travel(position, here, here + tick.velocity[joints] * moment) / moment])
+        def tool_speed(tick: Tick) -> Numbers:
+            here, moment = [tick.measured[at] for at in joints], 1e-3
+            there = [tick.measured[at] + tick.velocity[at] * moment for at in joints]
+            return [math.dist(tool_point(here), tool_point(there)) / moment]
 
         measured.append(MeasuredSpeed("G10", "tool speed", "m/s", limits.tool_speed, tool_speed))
         tool.append(arm.ToolSpeed(spec, limits, position))
@@ -261,7 +278,7 @@ def _kinematics(spec: RobotSpec, tool_position: ToolPosition | None) -> ToolPosi
     """Forward kinematics; `InvalidValue` if they are not known, or the tool stays in place when the joints turn."""
     joints = columns_in(spec.command, "rad")
     if tool_position is None:
-        if tuple(np.array(spec.command.labels)[joints]) == UR_JOINTS:
+        if tuple(spec.command.labels[at] for at in joints) == UR_JOINTS:
             return UR5E_GRIPPER.tool_position
         raise InvalidValue(
             f"The tool speed of {spec.name} cannot be limited: its kinematics are not known. "
@@ -280,8 +297,8 @@ def _kinematics(spec: RobotSpec, tool_position: ToolPosition | None) -> ToolPosi
 def _base_guards(spec: RobotSpec, limits: Limits) -> list[Guard]:
     drive, turn = columns_in(spec.command, "m/s"), columns_in(spec.command, "rad/s")
     return [
-        MeasuredSpeed("G11", "base speed", "m/s", limits.base_speed, lambda tick: tick.measured[drive]),
-        MeasuredSpeed("G11", "turn speed", "rad/s", limits.turn_speed, lambda tick: tick.measured[turn]),
+        MeasuredSpeed("G11", "base speed", "m/s", limits.base_speed, lambda tick: [tick.measured[at] for at in drive]),
+        MeasuredSpeed("G11", "turn speed", "rad/s", limits.turn_speed, lambda tick: [tick.measured[at] for at in turn]),
         BaseSpeed("base speed", "m/s", limits.base_speed, spec),
         BaseSpeed("turn speed", "rad/s", limits.turn_speed, spec),
         BaseAcceleration("base acceleration", "m/s", limits.base_acceleration, spec),

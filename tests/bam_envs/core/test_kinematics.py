@@ -33,6 +33,8 @@ def test_forward_kinematics_are_those_of_the_model(model):
 def test_tool_position_is_the_position_of_tool_pose():
     joints = random_joints(10)
     np.testing.assert_array_equal(GEOMETRY.tool_position(joints), GEOMETRY.tool_pose(joints)[0])
+    one_by_one = [GEOMETRY.tool_point(pose) for pose in joints.tolist()]
+    np.testing.assert_allclose(one_by_one, GEOMETRY.tool_position(joints), rtol=0, atol=1e-14)
 
 
 def test_the_tool_is_farther_out_than_the_flange_by_its_length():

@@ -84,4 +84,4 @@ def test_the_guards_know_the_kinematics_of_the_model(make):
     guard = next(guard for guard in live.unwrapped.robot._guards if isinstance(guard, ToolSpeed))
     joints = np.array([[0.1, -1.0, 1.0, 0.3, 0.2, 0.0]])
     position, axes = UR_MODELS["ur10e"].geometry.flange_pose(joints)
-    np.testing.assert_allclose(guard._tool(joints), position + 0.15 * axes[:, :, 2], atol=1e-12)
+    np.testing.assert_allclose([guard._tool(joints[0])], position + 0.15 * axes[:, :, 2], atol=1e-12)

@@ -4,7 +4,7 @@ The commands of a task (`bam_envs.tasks.ur_arm`) slow an arm down, so that a liv
 but do not stop the arm; ``state.truth["collision"]`` reports them until the next reset.
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple
@@ -195,9 +195,10 @@ class KinematicArm(Memory, Drawn):
         setpoint: Array = self._position.copy()
         return setpoint
 
-    def tool_position(self, q: Array) -> Array:
-        """Position of the pads of an assumed gripper [m]. Shape: (n, 6) [rad] -> (n, 3)."""
-        return self._tool.tool_position(q)
+    @property
+    def tool_position(self) -> Callable[[Array], Array]:
+        """Forward kinematics of the pads of an assumed gripper: (n, 6) [rad] to (n, 3) [m]."""
+        return self._tool.tool_position
 
     def reset(self, env_ids: EnvIds, initial: Initial) -> RobotState:
         """Set these environments to the initial joint positions, at rest, and restart their obstacles."""
