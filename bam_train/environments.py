@@ -192,8 +192,27 @@ def require_fit(checkpoint: Checkpoint, env: AnyEnv, place: Place = HERE) -> Non
     Raises:
         CheckpointMismatch: Names the first thing that differs, and both values.
     """
-    manifest = checkpoint.manifest
-    single = "single_" if isinstance(env, VectorEnv) else ""
+    pairs = fit_pairs(checkpoint, env)
+    differences = (first_difference(theirs, ours, name) for name, theirs, ours in pairs)
+    difference = next(filter(None, differences), None)
+    if difference is None:
+        return
+    name, theirs, ours = difference
+    place_text = f"at {place.text}" if place.transport else f"in {checkpoint.manifest.env} as installed"
+    remedy = "serve the version" if place.transport else "install the version"
+    raise CheckpointMismatch(
+        checkpoint.path,
+        f"{name} is {short_json(theirs)} in the checkpoint and {short_json(ours)} {place_text}; "
+        f"train it anew, or {remedy} it was trained with",
+    )
+
+
+def fit_pairs(checkpoint: Checkpoint, env: AnyEnv) -> list[tuple[str, Any, Any]]:
+    """What must be equal for the policy of a checkpoint to fit `env`: name, the checkpoint's value, the environment's.
+
+    The values are plain JSON; those that one of the two does not give are left out.
+    """
+    manifest, single = checkpoint.manifest, "single_" if isinstance(env, VectorEnv) else ""
     pairs = [
         (name, getattr(manifest, name), space_to_json(getattr(env, single + name)))
         for name in ("observation_space", "action_space")
@@ -202,23 +221,12 @@ def require_fit(checkpoint: Checkpoint, env: AnyEnv, place: Place = HERE) -> Non
     signals = {} if describe is None else describe()
     if signals and manifest.signals:
         pairs.append(("signals", _names_and_units(manifest.signals), _names_and_units(signals)))
-    difference = None
-    for name, *values in pairs:
-        theirs, ours = json.loads(json.dumps(values))  # tuples as lists
-        difference = difference or first_difference(theirs, ours, name)
+    plain = [(name, *json.loads(json.dumps(values))) for name, *values in pairs]  # tuples as lists
     period = getattr(env.unwrapped, "period", None)
-    if difference is None:
-        if period is None or manifest.period is None or math.isclose(period, manifest.period, rel_tol=1e-9):
-            return
-        difference = ("period [s]", manifest.period, float(period))
-    name, theirs, ours = difference
-    place_text = f"at {place.text}" if place.transport else f"in {manifest.env} as installed"
-    remedy = "serve the version" if place.transport else "install the version"
-    raise CheckpointMismatch(
-        checkpoint.path,
-        f"{name} is {_short(theirs)} in the checkpoint and {_short(ours)} {place_text}; "
-        f"train it anew, or {remedy} it was trained with",
-    )
+    if period is not None and manifest.period is not None:
+        same = math.isclose(period, manifest.period, rel_tol=1e-9)
+        plain.append(("period [s]", manifest.period, manifest.period if same else float(period)))
+    return plain
 
 
 def first_difference(theirs: Any, ours: Any, name: str) -> tuple[str, Any, Any] | None:
@@ -238,7 +246,8 @@ def _names_and_units(signals: Mapping[str, Any]) -> dict[str, Any]:
     return {kind: [{key: entry.get(key) for key in ("name", "unit")} for entry in signals[kind]] for kind in signals}
 
 
-def _short(value: Any, most: int = 60) -> str:
+def short_json(value: Any, most: int = 60) -> str:
+    """`value` as JSON, at most `most` characters of it."""
     text = json.dumps(value)
     return text if len(text) <= most else text[: most - 3] + "..."
 

@@ -21,6 +21,7 @@
     │   ├── WiringError            an agent reads what no agent writes
     │   ├── RemoteAgentError       an agent in another process failed, or its process ended
     │   └── AgentInUse             an agent is called by two threads at once
+    ├── ContractRefused            a robot that does not fit the checkpoint; nothing has moved
     ├── EnvironmentFailed          an environment gave NaN or infinity
     ├── TrainingFailed             training cannot continue (a NaN loss); the last good checkpoint is kept
     │   └── ProcessesLost          processes that training needs have ended; earlier checkpoints are good
@@ -35,6 +36,9 @@ from pathlib import Path
 
 class BamTrainError(Exception):
     """Root of the tree; its message is one line: what failed, why, and what to do."""
+
+    exit_status = 1
+    """Exit status of a program that ends with it."""
 
 
 class CheckpointError(BamTrainError):
@@ -133,6 +137,16 @@ class RemoteAgentError(LoopError):
 
 class AgentInUse(LoopError):  # noqa: N818
     """An agent is called by two threads at once."""
+
+
+class ContractRefused(BamTrainError):  # noqa: N818
+    """A robot does not fit the checkpoint; `what` is the first line of the contract that does not."""
+
+    exit_status = 3
+
+    def __init__(self, what: str, message: str) -> None:
+        self.what = what
+        super().__init__(message)
 
 
 class EnvironmentFailed(BamTrainError):  # noqa: N818

@@ -8,9 +8,11 @@ from typing import Any
 import gymnasium as gym
 
 from bam_envs.core.robot import RobotSpec
+from bam_envs.live.evidence import Evidence
 from bam_envs.safety.guard import is_base
 from bam_train.checkpoint import Checkpoint
 from bam_train.cli.console import say
+from bam_train.deploy.contract_table import Contract
 from bam_train.deploy.trust import has_real_robot
 from bam_train.env_location import Place
 from bam_train.environments import environment_of, make_env, require_fit
@@ -30,6 +32,7 @@ def connected_env(
     named: str | None = None,
     env_kwargs: Mapping[str, Any] | None = None,
     admit: Callable[[gym.Env[Any, Any]], Sequence[str]] = lambda env: (),
+    wiggle: bool = False,
 ) -> gym.Env[Any, Any]:
     """Make the environment of a checkpoint; its robot is connected and has not moved, and there is consent to move it.
 
@@ -44,24 +47,66 @@ def connected_env(
         named: The environment that the user expects.
         env_kwargs: Arguments of the environment, which override the checkpoint's.
         admit: Called with the environment, connected, before anybody is asked; returns lines for a person.
+        wiggle: Move each axis of a live robot a little first, to see whether it moves as commanded.
+
+    Raises:
+        ContractRefused: The live robot does not fit the checkpoint.
+        CheckpointMismatch: Another environment does not.
     """
     env_id, saved = environment_of(checkpoint, named, elsewhere=bool(place.transport))
     env = make_env(env_id, {**saved, **(env_kwargs or {})}, render_mode="human" if render else None, place=place)
     try:
-        require_fit(checkpoint, env, place)
+        contract = None
+        if place.robot is None:
+            require_fit(checkpoint, env, place)
+        else:
+            contract = required_contract(checkpoint, env, place)
         signals.raise_again()
         robot: Any = getattr(env.unwrapped, "robot", None)
         if robot is not None:
             robot.connect()
             signals.raise_again()
-        plan = [*plan_lines(env, env_id, place.text, episodes), *admit(env)]
+        plan = [*plan_lines(env, env_id, place.text, episodes, wiggle=wiggle), *admit(env)]
         signals.raise_again()
         require_consent(env, f"{who}: {checkpoint.path}", yes=yes, plan=plan)
         signals.raise_again()
+        if wiggle and contract is not None and contract.evidence is not None:
+            require_motion(env, f"{checkpoint.path} and the robot at {place.text}", contract.evidence)
+            signals.raise_again()
     except BaseException:
         env.close()  # type: ignore[no-untyped-call]
         raise
     return env
+
+
+def required_contract(checkpoint: Checkpoint, env: Any, place: Place) -> Contract:
+    """The contract of a checkpoint with a live robot, shown to a person if the robot is real; moves nothing.
+
+    Raises:
+        ContractRefused: They do not fit; the table is shown.
+    """
+    from bam_train.deploy.contract import check_contract  # only for live robots
+
+    contract = check_contract(checkpoint, env, place)
+    info = None if contract.evidence is None else contract.evidence.info
+    if contract.refused or info is None or not info.simulated:
+        for line in contract.lines():
+            say(line)
+    contract.require(f"{checkpoint.path} and the robot at {place.text}")
+    return contract
+
+
+def require_motion(env: Any, who: str, evidence: Evidence) -> None:
+    """Move each axis a little, and refuse a robot of which one does not move as commanded: `ContractRefused`."""
+    from bam_train.deploy.arm_checks import measured_joints
+    from bam_train.deploy.wiggle import wiggle
+
+    robot = env.unwrapped.robot
+    joints = None if is_base(robot.spec) else measured_joints(evidence, robot.spec)
+    moved = Contract(tuple(wiggle(robot, None if joints is None else joints[-1])))
+    for line in moved.lines():
+        say(line)
+    moved.require(who, "the robot has moved a little, and was halted")
 
 
 def guards_of(env: Any) -> dict[str, dict[str, Any]]:
@@ -70,7 +115,7 @@ def guards_of(env: Any) -> dict[str, dict[str, Any]]:
     return {} if report is None else dict(report())
 
 
-def plan_lines(env: Any, env_id: str, address: str, episodes: int) -> list[str]:
+def plan_lines(env: Any, env_id: str, address: str, episodes: int, *, wiggle: bool = False) -> list[str]:
     """Lines for a person about the planned episodes."""
     spec = getattr(getattr(env.unwrapped, "robot", None), "spec", None)
     planned = "1 episode" if episodes == 1 else f"{episodes} episodes, one after the other without a pause"
@@ -78,7 +123,8 @@ def plan_lines(env: Any, env_id: str, address: str, episodes: int) -> list[str]:
     if isinstance(spec, RobotSpec) and not is_base(spec):
         gripper = "opening the gripper and " if "m" in spec.command.units else ""
         begin = f"by {gripper}going to the start pose"
-    return [f"  address: {address}", f"  {env_id}: {planned}", f"  each begins {begin}"]
+    first = ["  first each axis moves a little and back, to see whether it moves as commanded"] if wiggle else []
+    return [f"  address: {address}", *first, f"  {env_id}: {planned}", f"  each begins {begin}"]
 
 
 def require_consent(env: Any, who: str, *, yes: bool, plan: Sequence[str] = ()) -> None:

@@ -39,6 +39,7 @@ def deploy_checkpoint(config: DeployConfig, signals: SignalMemory) -> int:
     checkpoint = Checkpoint.open(config.checkpoint)
     admission = Admission(checkpoint, config.keys, config.allow_unsigned)
     asked: Any = {"episodes": config.episodes, "yes": config.yes, "render": config.render, "named": config.env}
+    asked["wiggle"] = config.wiggle
     env = connected_env(checkpoint, place, signals, who="bam-deploy", admit=admission, **asked)
     try:
         pacer = Pacer(_period(config, checkpoint, env))
@@ -91,6 +92,8 @@ def _checked_place(config: DeployConfig) -> Place:
         raise SettingsError(
             "a live robot is driven at the rate that its policy was made for; leave out --rate and --fast"
         )
+    if config.wiggle and config.robot is None:
+        raise SettingsError("--wiggle moves the axes of a live robot; give its address with --robot too")
     if config.render:
         from bam_train.cli.consent import require_screen
 

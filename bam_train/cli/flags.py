@@ -142,6 +142,8 @@ class DeployConfig:
     """Public keys that a real robot trusts; $BAM_TRUSTED_KEYS or ~/.config/bam-train/trusted by default."""
     allow_unsigned: bool = False
     """Let a checkpoint move a real robot that nobody trusted has signed; every status line says so."""
+    wiggle: bool = False
+    """Move each axis of a live robot a little and back first, to see whether it moves as commanded."""
     rate: Annotated[Positive | None, tyro.conf.arg(metavar="HZ")] = None
     """Actions a second [Hz]; by default the environment's own."""
     fast: bool = False

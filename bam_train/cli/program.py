@@ -95,7 +95,8 @@ def guarded(main: Callable[[], int | None], prog: str, signals: SignalMemory | N
 
         if isinstance(error, (BamTrainError, BamEnvsError)):
             _complain(prog, str(error))
-        elif isinstance(error, BrokenPipeError) or (isinstance(error, OSError) and error.errno == errno.ENOSPC):
+            return getattr(error, "exit_status", 1)
+        if isinstance(error, BrokenPipeError) or (isinstance(error, OSError) and error.errno == errno.ENOSPC):
             # Standard output is closed, as by head, or full; Python would complain about what its buffer still holds.
             drop(sys.stdout)
             if error.errno == errno.ENOSPC:

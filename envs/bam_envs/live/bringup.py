@@ -69,24 +69,26 @@ class TopicTypes:
     """Asks a server for the types of its topics, if it offers rosapi; waits at most `timeout` [s] for each."""
 
     def __init__(self, link: RosbridgeLink, profile: RobotProfile, timeout: float) -> None:
-        self._link, self._profile, self._timeout, self._answers = link, profile, timeout, True
+        self._link, self._profile, self._timeout = link, profile, timeout
+        self.answers = True
+        """Whether the server offers rosapi, as far as is known."""
 
     def check(self, topic: str, expected: str) -> str:
         """The type of `topic` on the server, `expected` if it is unknown; `ProtocolError` for a different one."""
-        kind = self._type_of(topic) or expected
+        kind = self.type_of(topic) or expected
         if not same_type(kind, expected):
             raise self._wrong_type(topic, expected, kind)
         return kind
 
     def may_be(self, topic: str, kind: str) -> bool:
         """Whether `topic` is of type `kind` on the server, or its type is unknown."""
-        actual = self._type_of(topic)
-        return same_type(actual, kind) if actual else not self._answers
+        actual = self.type_of(topic)
+        return same_type(actual, kind) if actual else not self.answers
 
     def check_listened(self, topic: str, sink: Sink) -> str:
         """As `check`, for the `topic` of `sink`: it needs a subscriber, and the expected type, stamped or not."""
         deadline, expected = Deadline(self._timeout), sink.type
-        while not self._type_of(topic) and self._answers:
+        while not self.type_of(topic) and self.answers:
             if deadline.passed:
                 raise ProtocolError(
                     f"Nobody listens to {topic} ({expected}), which takes {', '.join(sink.labels)}. Is the controller "
@@ -94,7 +96,7 @@ class TopicTypes:
                     f"this may be another robot than it describes.{namespaces_with(self._link, 'topics', sink.topic)}"
                 )
             time.sleep(_TRY_AGAIN)  # nodes of a ROS graph take a while to discover each other
-        kind = self._type_of(topic) or expected
+        kind = self.type_of(topic) or expected
         if bare_type(kind) != bare_type(expected):  # reading ignores a stamp, writing does not
             raise self._wrong_type(topic, expected, kind)
         return kind
@@ -105,14 +107,14 @@ class TopicTypes:
             f"Correct the topic or its type in the profile of {self._profile.name}."
         )
 
-    def _type_of(self, topic: str) -> str:
+    def type_of(self, topic: str) -> str:
         """The type of `topic` on the server; empty if it is unknown."""
-        if not self._answers:
+        if not self.answers:
             return ""
         try:
             answer = self._link.call("/rosapi/topic_type", "rosapi/TopicType", {"topic": topic}, self._timeout)
         except RemoteError:  # the rosapi node does not run
-            self._answers = False
+            self.answers = False
             return ""
         kind = answer.get("type")
         return kind if isinstance(kind, str) else ""

@@ -121,6 +121,15 @@ class SourceAge:
         return now - self._measured
 
 
+def concerns(source: Source, message: Any) -> bool:
+    """Whether a message of the topic of `source` is about it.
+
+    On a shared topic the names identify the source of a message; a malformed one counts for every source.
+    """
+    names: Any = message.get("name") if isinstance(message, Mapping) else None
+    return not (source.partial and isinstance(names, Sequence)) or any(name in source.names for name in names)
+
+
 class LiveState:
     """Listens to the sources of the signals in `spec`, and decodes in the calling thread."""
 
@@ -157,11 +166,7 @@ class LiveState:
         sources = [source for source in self.sources if source.topic == topic]
 
         def listen(message: Message, caller: Caller) -> None:
-            names: Any = message.get("name") if isinstance(message, Mapping) else None
-            # On a shared topic the names identify the source of a message; a malformed one counts for every source.
-            named = isinstance(names, Sequence)
-            fits = [one for one in sources if not (one.partial and named) or any(name in one.names for name in names)]
-            self.mailbox.put([source.signal for source in fits], message)
+            self.mailbox.put([source.signal for source in sources if concerns(source, message)], message)
 
         return listen
 

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from bam_envs.core.errors import LinkLost
+from bam_envs.core.kinematics import UR_JOINTS
 from bam_envs.live import rosbridge_robot
 from bam_envs.remote.serve.env_server import EnvServer
 from bam_envs.remote.serve.serve_options import ServeOptions
@@ -181,6 +182,85 @@ def test_a_real_robot_is_shown_and_does_not_move_unasked(serve, run, monkeypatch
     assert "  tool speed (G10): 0.25 m/s" in lines
     assert lines[-1] == (
         "bam-deploy: a real robot would move, and there is nobody to ask; give --yes to go on without asking"
+    )
+
+
+@pytest.fixture
+def commands_to():
+    """Counts what a served robot is sent: ``commands_to(served)`` is a list that grows."""
+
+    def count(served):
+        sent = []
+        for topic in ("/gripper/commands", "/forward_position_controller/commands"):
+            served.bus.subscribe(topic, "std_msgs/Float64MultiArray", lambda message, caller: sent.append(message))
+        return sent
+
+    return count
+
+
+def test_a_robot_that_does_not_fit_is_refused_by_its_line_and_gets_no_command(serve, run, commands_to):
+    served = serve(gym.make("bam/reach-v0", disable_env_checker=True), fast=True)  # an arm without a cube to pick
+    sent = commands_to(served)
+    status, out, err = run(deploy, PICK, "--robot", served.bus.url)
+    *table, last = err.splitlines()
+    assert (status, out, sent) == (3, "", [])
+    assert table[0].split() == ["what", "expected", "found", "verdict"]
+    assert [line.split()[:2] for line in table if line.endswith("refused")] == [["topic", "/object_pose"]]
+    assert last == (
+        f"bam-deploy: {PICK} and the robot at {served.bus.url} do not fit: topic /object_pose: expected "
+        "geometry_msgs/PoseStamped, found nobody publishes it; correct the robot or its profile; nothing has moved"
+    )
+
+
+def test_each_axis_is_wiggled_first(serve, run, commands_to):
+    served = serve(gym.make("bam/pick-v0", disable_env_checker=True), fast=True)
+    sent = commands_to(served)
+    status, _, err = run(deploy, PICK, "--episodes", 1, "--robot", served.bus.url, "--wiggle", "--json")
+    lines = err.splitlines()
+    assert status == 0, err
+    assert [line.split()[2] for line in lines[1:8]] == [*UR_JOINTS, "gripper_width"]
+    assert all(line.endswith("  ok") for line in lines[1:8])
+    assert len(sent) > 2 * 7 * 60  # of seven axes, each for 3 s at 20 Hz, on two topics
+
+
+GRIPPER_REVERSED = """
+extends = "ur5e"
+name = "cell 7"
+
+[[commands.position]]
+topic = "/gripper/commands"
+type = "std_msgs/Float64MultiArray"
+labels = ["gripper_width"]
+scale = -1.0
+offset = 0.085
+
+[[commands.position]]
+topic = "/forward_position_controller/commands"
+type = "std_msgs/Float64MultiArray"
+labels = ["shoulder_pan_joint", "shoulder_lift_joint", "elbow_joint", "wrist_1_joint", "wrist_2_joint", "wrist_3_joint"]
+"""
+
+
+def test_an_axis_that_does_not_move_as_commanded_is_refused(serve, run, tmp_path):
+    profile = tmp_path / "cell_7.toml"
+    profile.write_text(GRIPPER_REVERSED)
+    served = serve(gym.make("bam/pick-v0", disable_env_checker=True), fast=True)
+    status, out, err = run(deploy, PICK, "--robot", served.bus.url, "--profile", profile, "--wiggle")
+    assert (status, out) == (3, "")
+    *table, last = err.splitlines()
+    assert [line.split()[2] for line in table if line.endswith("refused")] == ["gripper_width"]
+    assert last.startswith(
+        f"bam-deploy: {PICK} and the robot at {served.bus.url} do not fit: motion of gripper_width: expected as "
+        "commanded, found it moved "
+    )
+    assert last.endswith("the robot has moved a little, and was halted")
+
+
+def test_wiggling_needs_a_live_robot(run):
+    assert run(deploy, PICK, "--wiggle") == (
+        1,
+        "",
+        "bam-deploy: --wiggle moves the axes of a live robot; give its address with --robot too\n",
     )
 
 

@@ -1,0 +1,227 @@
+"""Is a live arm the one that the policy was made for? Its kinematics, the sense of its joints, and their limits.
+
+The pose of the tool, as the arm's own controller measures it, is compared with the one computed from the joints. It
+shows swapped and mirrored joints, other units, and another arm.
+"""
+
+import itertools
+import math
+from collections.abc import Iterator, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bam_envs.core.errors import ProtocolError
+from bam_envs.core.kinematics import UR5E_GRIPPER, UR_JOINTS, ArmGeometry, angle_between, quaternions
+from bam_envs.core.robot import RobotSpec
+from bam_envs.live.evidence import DESCRIPTION, Evidence
+from bam_envs.robots.ur import UR_MODELS
+from bam_train.deploy.contract_table import Check, check
+from bam_train.deploy.robot_checks import FACTORS, readings
+from bam_train.deploy.urdf import Urdf, read_urdf
+from bam_train.errors import FormatError
+
+Array = NDArray[np.float64]
+BESIDE, TURNED = 0.015, 0.06
+"""Tolerance of the tool's pose: beside the flange's axis [m], and turned [rad]; a factory's calibration is less."""
+LONGEST_TOOL = 0.4
+"""Longest tool of a robot whose policy moves the flange [m]."""
+_STILL = 0.05  # most that a joint may move while it is observed [rad]
+
+
+class Pose(NamedTuple):
+    """A measured pose of a tool in ``base_link``."""
+
+    position: Array  # (3,) [m]
+    quaternion: Array | None  # x, y, z, w, or None if it is not measured
+
+
+def geometry_of(env: Any) -> ArmGeometry | None:
+    """The lengths of the arm that the task of `env` is made for; None for other robots."""
+    spec, model = env.unwrapped.robot.spec, getattr(env.unwrapped.task, "model", None)
+    if model is not None:
+        geometry: ArmGeometry = model.geometry
+        return geometry
+    return UR5E_GRIPPER if spec.command.labels[:6] == UR_JOINTS else None
+
+
+def arm_checks(spec: RobotSpec, geometry: ArmGeometry, margin: float, evidence: Evidence) -> Iterator[Check]:
+    """The lines about the limits, the kinematics and the sense of the joints of an arm.
+
+    Args:
+        spec: Signals and commands of the task.
+        geometry: The arm that the task is made for.
+        margin: Distance that the guards keep from the end of a joint's travel [rad].
+        evidence: Its messages.
+    """
+    urdf, why = _description(evidence)
+    yield from _limits(spec, margin, urdf, why)
+    joints = measured_joints(evidence, spec)
+    if joints is None:  # refused in other lines
+        return
+    if urdf is not None:
+        yield from _described_kinematics(geometry, joints, urdf)
+    pose, why = _tool_pose(evidence)
+    expected = f"within {BESIDE:g} m and {math.degrees(TURNED):.0f} degrees of the joints'"
+    if np.ptp(joints, axis=0).max() > _STILL:
+        pose, why = None, "the arm moves"
+    if pose is None:
+        yield check("tool pose", expected, why, fits=None)
+        yield check("sense of the joints", "as commanded", "not shown without the tool's pose", fits=None)
+        return
+    q = np.median(joints, axis=0)
+    beside, along, turned = _gap(geometry, q, pose)
+    if not _near(beside, turned):
+        yield check("tool pose", expected, _explained(geometry, q, pose), fits=False)
+        return
+    text = f"{beside:.3f} m, {math.degrees(turned):.1f} degrees" if pose.quaternion is not None else f"{beside:.3f} m"
+    yield check("tool pose", expected, text, fits=True)
+    yield _tool_length(geometry, along)
+    yield _senses(geometry, q, pose)
+
+
+def measured_joints(evidence: Evidence, spec: RobotSpec) -> Array | None:
+    """The measured joints (k, 6) [rad], or None if they are outside their range or unreadable."""
+    signal = next(one for one in spec.signals if one.name == "joint_position")
+    source = next(one for one in evidence.sources if one.signal == "joint_position")
+    try:
+        values = readings(evidence, source, len(signal.labels))[1]
+    except ProtocolError:
+        return None
+    inside = (values >= np.array(signal.low)).all() and (values <= np.array(signal.high)).all()
+    return values if len(values) and inside else None
+
+
+def _tool_pose(evidence: Evidence) -> tuple[Pose | None, str]:
+    """The measured pose of the tool; or None, and why it is not known."""
+    found: dict[str, Array] = {}
+    for name, size in (("tool_position", 3), ("tool_quaternion", 4)):
+        source = next((one for one in evidence.sources if one.signal == name), None)
+        if source is None:
+            continue
+        try:
+            values = readings(evidence, source, size)[1]
+        except ProtocolError as error:
+            return None, str(error).removesuffix(".")
+        if len(values):
+            found[name] = np.median(values, axis=0)
+    if "tool_position" not in found:
+        return None, "the robot does not report the pose of its tool"
+    quaternion = found.get("tool_quaternion")
+    if quaternion is None or not 0.9 < np.linalg.norm(quaternion) < 1.1:
+        return Pose(found["tool_position"], None), ""
+    return Pose(found["tool_position"], np.roll(quaternion, -1) / np.linalg.norm(quaternion)), ""  # w comes last
+
+
+def _gap(geometry: ArmGeometry, q: Array, pose: Pose) -> tuple[float, float, float]:
+    """Where a tool is from the flange that the joints (6,) put there: beside its axis, along it [m], turned [rad]."""
+    flange, axes = geometry.flange_pose(q[None])
+    x, y, along = axes[0].T @ (pose.position - flange[0])
+    turned = 0.0 if pose.quaternion is None else float(angle_between(quaternions(axes), pose.quaternion[None])[0])
+    return math.hypot(x, y), float(along), turned
+
+
+def _near(beside: float, turned: float) -> bool:
+    return beside <= BESIDE and turned <= TURNED
+
+
+def _fits(geometry: ArmGeometry, q: Array, pose: Pose) -> bool:
+    beside, along, turned = _gap(geometry, q, pose)
+    return _near(beside, turned) and -BESIDE <= along <= LONGEST_TOOL
+
+
+def _tool_length(geometry: ArmGeometry, along: float) -> Check:
+    """The tool is as long as the policy's, or the robot gives the pose of its flange."""
+    if geometry.tool == 0.0:
+        fits, expected = -BESIDE <= along <= LONGEST_TOOL, f"0 to {LONGEST_TOOL:g} m before the flange"
+    else:
+        fits = min(abs(along - geometry.tool), abs(along)) <= BESIDE
+        expected = f"{geometry.tool:g} m, or 0 for the flange"
+    hint = "" if fits else ": set the tool centre point (TCP) of the robot so"
+    return check("tool length", expected, f"{along:.3f} m{hint}", fits=fits)
+
+
+def _senses(geometry: ArmGeometry, q: Array, pose: Pose) -> Check:
+    """A joint's sense is shown if the tool would be elsewhere with the joint at the opposite angle."""
+    hidden = [name for i, name in enumerate(UR_JOINTS) if _fits(geometry, np.where(np.arange(6) == i, -q, q), pose)]
+    found = "shown by the tool's pose" if not hidden else f"not shown near 0 rad: {', '.join(hidden)}; give --wiggle"
+    return check("sense of the joints", "as commanded", found, fits=None if hidden else True)
+
+
+def _explained(geometry: ArmGeometry, q: Array, pose: Pose) -> str:
+    """What is wrong with a pose that does not fit: the one change with which it would."""
+    for text, arm, joints, measured in _changes(geometry, q, pose):
+        if _fits(arm, joints, measured):
+            return text
+    beside, along, turned = _gap(geometry, q, pose)
+    return f"{math.hypot(beside, along - geometry.tool):.3f} m and {math.degrees(turned):.0f} degrees away"
+
+
+def _changes(geometry: ArmGeometry, q: Array, pose: Pose) -> Iterator[tuple[str, ArmGeometry, Array, Pose]]:
+    """Common mistakes: text, arm, joints, and pose without the mistake."""
+    for i, name in enumerate(UR_JOINTS):
+        yield f"{name} has the opposite sign", geometry, np.where(np.arange(6) == i, -q, q), pose
+    for i, j in itertools.combinations(range(6), 2):
+        swapped = q.copy()
+        swapped[[i, j]] = q[[j, i]]
+        yield f"{UR_JOINTS[i]} and {UR_JOINTS[j]} are swapped", geometry, swapped, pose
+    yield "the joints are in degrees", geometry, np.radians(q), pose
+    for unit, factor in FACTORS["m"].items():
+        yield f"the tool's position is in {unit}", geometry, q, Pose(pose.position / factor, pose.quaternion)
+    for name, model in UR_MODELS.items():
+        yield f"the kinematics of a {name}", model.geometry, q, pose
+    half_turn = Pose(pose.position * (-1, -1, 1), None)
+    yield "the tool's pose is turned by 180 degrees about z: base instead of base_link", geometry, q, half_turn
+
+
+def _description(evidence: Evidence) -> tuple[Urdf | None, str]:
+    """The robot's URDF; or None, and why it is not known."""
+    letters = evidence.letters.get(DESCRIPTION, ())
+    if not letters:
+        return None, f"nobody publishes {DESCRIPTION}"
+    message: Any = letters[-1].message
+    try:
+        return read_urdf(message.get("data") if isinstance(message, dict) else None), ""
+    except FormatError as error:
+        return None, str(error)
+
+
+def _limits(spec: RobotSpec, margin: float, urdf: Urdf | None, why: str) -> Iterator[Check]:
+    """The joints can go wherever the guards let commands go."""
+    command = spec.command
+    joints = [(i, urdf[name]) for i, name in enumerate(command.labels) if urdf is not None and name in urdf]
+    if not joints:
+        yield check("joint limits", "as in the profile", why or f"{DESCRIPTION} has none of the joints", fits=None)
+    for i, joint in joints:
+        low, high = command.low[i], command.high[i]
+        enough = joint.low <= low + margin + 1e-6 and joint.high >= high - margin - 1e-6
+        sane = joint.kind == "continuous" or joint.high - joint.low < 10 * (high - low)
+        kinds = ("revolute", "continuous") if command.units[i] == "rad" else ("prismatic",)
+        what, expected = f"limits of {command.labels[i]}", f"{low:.4g} to {high:.4g} {command.units[i]}"
+        found = f"{joint.low:.4g} to {joint.high:.4g}" if joint.kind in kinds else f"a {joint.kind} joint"
+        hint = "" if sane else " (degrees?)" if command.units[i] == "rad" else " (millimetres?)"
+        yield check(what, expected, found + hint, fits=joint.kind in kinds and enough and sane)
+
+
+def _described_kinematics(geometry: ArmGeometry, joints: Array, urdf: Urdf) -> Iterator[Check]:
+    """The arm of the URDF is the task's, at the measured joints."""
+    q = joints[-1]
+    described = urdf.pose("base_link", "tool0", dict(zip(UR_JOINTS, q, strict=True)))
+    if described is None:
+        return
+    pose = Pose(described[0], quaternions(described[1][None])[0])
+    beside, along, turned = _gap(geometry, q, pose)
+    fits = _near(beside, turned) and abs(along) <= BESIDE
+    found = f"{math.hypot(beside, along):.3f} m" if fits else _explained_model(geometry, q, pose)
+    yield check(f"kinematics in {DESCRIPTION}", f"flange within {BESIDE:g} m", found, fits=fits)
+
+
+def _explained_model(geometry: ArmGeometry, q: Array, pose: Pose) -> str:
+    names: Sequence[str] = [
+        name
+        for name, model in UR_MODELS.items()
+        if (gap := _gap(model.geometry, q, pose)) and _near(gap[0], gap[2]) and abs(gap[1]) <= BESIDE
+    ]
+    beside, along, _ = _gap(geometry, q, pose)
+    return f"those of a {names[0]}" if names else f"{math.hypot(beside, along):.3f} m away"

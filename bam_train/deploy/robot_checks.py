@@ -1,0 +1,212 @@
+"""Does what a live robot publishes and listens to fit the task? Pure functions of collected messages.
+
+A topic whose messages cannot be read is refused in the topic's own line, and its signals have no further lines.
+"""
+
+import math
+import statistics
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from bam_envs.core.errors import ProtocolError
+from bam_envs.core.robot import RobotSpec, SignalSpec
+from bam_envs.live.evidence import Evidence
+from bam_envs.live.state import Letter, SourceAge, concerns
+from bam_envs.ros.codec import decode_source
+from bam_envs.ros.messages import bare_type, same_type
+from bam_envs.ros.profile_tables import RobotProfile, Source
+from bam_train.deploy.contract_table import Check, check
+
+Array = NDArray[np.float64]
+SLOWER = 0.8
+"""Least number of states per command."""
+BEYOND = 0.05
+"""How far a measured number may be beyond its range, as a share of the range: fingers and noise."""
+FACTORS = {"rad": {"degrees": math.degrees(1)}, "m": {"millimetres": 1000.0, "centimetres": 100.0}}
+"""Other units of a number, and how much greater a number is in them."""
+RATE_OFF = 0.1
+"""Tolerance of a measured speed against the change of the measured position [unit/s], and as a share of it."""
+SPEED_OF = {"joint_velocity": "joint_position", "base_velocity": "base_pose"}
+_SCAN_OFF, _RANGE_OFF = 0.02, 10.0  # tolerated share of an angle, tolerated factor of a scanner's range
+_SHORTEST = 0.05  # least time over which a speed is compared [s]
+
+
+def readings(evidence: Evidence, source: Source, size: int) -> tuple[Array, Array]:
+    """Arrival times (k,) [s] and values (k, size) [SI] of a signal; `ProtocolError` for an unreadable message."""
+    letters = [one for one in evidence.letters.get(source.topic, ()) if concerns(source, one.message)]
+    values = [decode_source(source, one.message, size) for one in letters]
+    return np.array([one.arrived for one in letters]), np.array(values).reshape(-1, size)
+
+
+def robot_checks(profile: RobotProfile, spec: RobotSpec, evidence: Evidence) -> Iterator[Check]:
+    """The lines about topics, rates, ages, units, ranges and commands of a live robot."""
+    sizes = {signal.name: len(signal.labels) for signal in spec.signals}
+    required = [source for source in evidence.sources if source.signal in sizes]
+    lockstep = evidence.info is not None and evidence.info.lockstep
+    readable: dict[str, tuple[Array, Array]] = {}
+    for topic in dict.fromkeys(source.topic for source in required):
+        sources = [source for source in required if source.topic == topic]
+        trouble, found = _topic_trouble(evidence, sources, sizes)
+        yield check(f"topic {topic}", sources[0].type, trouble or sources[0].type, fits=not trouble)
+        if trouble:
+            continue
+        readable |= found
+        if not lockstep:
+            yield from _timing(profile, spec, evidence, sources[0])
+        yield from _scan_geometry(sources[0], evidence.letters[topic][-1].message)
+    for signal in spec.signals:
+        if signal.name in readable:
+            lines = list(_range(signal, readable[signal.name][1]))
+            yield from lines
+            if lines[0].verdict == "refused":
+                del readable[signal.name]
+    for speed, position in SPEED_OF.items():
+        if speed in readable and position in readable and not lockstep:
+            yield _speed(speed, position, *readable[speed], *readable[position])
+    yield from _commands(evidence)
+    if evidence.info is not None and evidence.info.lockstep and evidence.info.period is not None:
+        period = evidence.info.period
+        yield check("robot's period", f"{spec.period:g} s", f"{period:g} s", fits=period == spec.period)
+
+
+def _topic_trouble(
+    evidence: Evidence, sources: Sequence[Source], sizes: dict[str, int]
+) -> tuple[str, dict[str, tuple[Array, Array]]]:
+    """Why the messages of a topic cannot be used, or nothing; and the readings of its signals."""
+    topic, expected = sources[0].topic, sources[0].type
+    if evidence.types is not None:
+        kind = evidence.types[topic]
+        if not kind:
+            return "nobody publishes it", {}
+        if not same_type(kind, expected):
+            return bare_type(kind), {}
+    found: dict[str, tuple[Array, Array]] = {}
+    for source in sources:
+        try:
+            times, values = readings(evidence, source, sizes[source.signal])
+        except ProtocolError as error:
+            return str(error).removeprefix(f"{topic}: ").removesuffix("."), {}
+        if not len(times):
+            return f"no message in {evidence.seconds:.1f} s", {}
+        found[source.signal] = times, values
+    return "", found
+
+
+def _timing(profile: RobotProfile, spec: RobotSpec, evidence: Evidence, source: Source) -> Iterator[Check]:
+    """Rate and age of the messages of a topic."""
+    letters = [one for one in evidence.letters[source.topic] if concerns(source, one.message)]
+    allowed = source.max_age or profile.max_age
+    least = 1 / allowed if source.max_age else max(1 / allowed, SLOWER / spec.period)
+    try:
+        new, ages = _new_and_ages(evidence, source, letters)
+    except ProtocolError as error:
+        yield check(f"rate of {source.topic}", f"at least {least:.3g} Hz", str(error), fits=False)
+        return
+    rate = (len(new) - 1) / (new[-1] - new[0]) if len(new) > 1 and new[-1] > new[0] else 0.0
+    what = f"{rate:.3g} Hz" if rate else f"{len(new)} new in {evidence.seconds:.1f} s"
+    yield check(f"rate of {source.topic}", f"at least {least:.3g} Hz", what, fits=rate >= least)
+    if rate >= least:
+        age = statistics.median(ages)
+        yield check(f"age of {source.topic}", f"at most {allowed:g} s", f"{age:.3f} s", fits=age <= allowed)
+
+
+def _new_and_ages(evidence: Evidence, source: Source, letters: Sequence[Letter]) -> tuple[list[float], list[float]]:
+    """Arrivals of the new measurements [s], and the age of each message at its arrival [s]."""
+    watch, new, ages, before = SourceAge(evidence.wall_ahead), [], [], math.nan
+    for letter in letters:
+        watch.look(letter, source.topic, evidence.server_offset)
+        ages.append(max(0.0, watch.at(letter.arrived)))
+        if watch.stamp is None or watch.stamp != before:
+            new.append(letter.arrived)
+        before = math.nan if watch.stamp is None else watch.stamp
+    return new, ages
+
+
+def _scan_geometry(source: Source, message: object) -> Iterator[Check]:
+    """The angles and the range of a scanner, where the profile and the message have them."""
+    told = message if isinstance(message, dict) else {}
+    for name, expected in source.constants.items():
+        value = told.get(name)
+        if name.startswith("angle_") and isinstance(value, (int, float)):
+            fits = math.isclose(value, expected, rel_tol=_SCAN_OFF)
+            unit = FACTORS["rad"]["degrees"]
+            hint = " (degrees?)" if not fits and math.isclose(value / unit, expected, rel_tol=_SCAN_OFF) else ""
+            yield check(f"{name} of {source.topic}", f"{expected:.4g} rad", f"{value:.4g}{hint}", fits=fits)
+        if name == "range_max" and isinstance(value, (int, float)):
+            fits = expected / _RANGE_OFF < value < expected * _RANGE_OFF
+            hint = "" if fits else " (millimetres?)"
+            yield check(f"{name} of {source.topic}", f"about {expected:g} m", f"{value:g}{hint}", fits=fits)
+
+
+def _range(signal: SignalSpec, values: Array) -> Iterator[Check]:
+    """The measured numbers of a signal are inside their range, and a quaternion has the length 1."""
+    low, high = np.array(signal.low), np.array(signal.high)
+    room = BEYOND * (high - low)
+    outside = ((values < low - room) | (values > high + room)).any(axis=0)
+    unit = signal.units[0] if len(set(signal.units)) == 1 else ", ".join(signal.units)
+    expected = f"{_span(low, high)} {unit}".removesuffix(" 1")
+    if outside.any():
+        at = int(np.flatnonzero(outside)[0])
+        worst = float(values[np.abs(values[:, at]).argmax(), at])
+        found = f"{signal.labels[at]} at {worst:.4g}{_other_unit(signal, values)}"
+        expected = f"{signal.labels[at]} in {_span(low[at], high[at])} {signal.units[at]}".removesuffix(" 1")
+    else:
+        found = _span(values.min(axis=0), values.max(axis=0))
+    yield check(signal.name, expected, found, fits=not outside.any())
+    if signal.name.endswith("quaternion"):
+        lengths = np.linalg.norm(values, axis=1)
+        worst = float(lengths[np.abs(lengths - 1.0).argmax()])
+        yield check(f"length of {signal.name}", "1", f"{worst:.3f}", fits=abs(worst - 1.0) <= BEYOND)
+
+
+def _span(low: ArrayLike, high: ArrayLike) -> str:
+    least, most = round(float(np.min(low)), 6), round(float(np.max(high)), 6)
+    return f"{least + 0.0:.4g} to {most + 0.0:.4g}"
+
+
+def _other_unit(signal: SignalSpec, values: Array) -> str:
+    """``" (degrees?)"`` if the values would be inside their range in that unit, and not all near 0; else nothing."""
+    low, high = np.array(signal.low), np.array(signal.high)
+    for name, factor in FACTORS.get(signal.units[0], {}).items():
+        si = values / factor
+        if ((si >= low) & (si <= high)).all() and (np.abs(si) > BEYOND * (high - low)).any():
+            return f" ({name}?)"
+    return ""
+
+
+def _speed(speed: str, position: str, times: Array, speeds: Array, at: Array, positions: Array) -> Check:
+    """The measured speeds are those at which the measured position changes."""
+    what, expected = f"{speed} against {position}", f"equal within {RATE_OFF:g}"
+    if len(at) < 2 or at[-1] - at[0] < _SHORTEST:
+        return check(what, expected, "too few messages", fits=None)
+    change = positions[-1] - positions[0]
+    if position == "base_pose":
+        change = driven(positions)[-1]
+    changed = change / (at[-1] - at[0])
+    inside = (times >= at[0]) & (times <= at[-1])
+    measured = speeds[inside].mean(axis=0) if inside.any() else speeds.mean(axis=0)
+    off = np.abs(measured - changed) - RATE_OFF * np.abs(changed)
+    worst = int(off.argmax())
+    still = np.abs(changed).max() < RATE_OFF and off[worst] <= RATE_OFF
+    found = "at rest" if still else f"{measured[worst]:.3g} told, {changed[worst]:.3g} by {position}"
+    return check(what, expected, found, fits=bool(off[worst] <= RATE_OFF))
+
+
+def driven(poses: Array) -> Array:
+    """How far a base has driven forwards [m] and turned [rad] since the first of `poses` (k, 3). Shape: (k, 2)."""
+    steps = np.diff(poses, axis=0)
+    turned = np.angle(np.exp(1j * steps[:, 2]))
+    heading = poses[:-1, 2] + turned / 2
+    forwards = steps[:, 0] * np.cos(heading) + steps[:, 1] * np.sin(heading)
+    return np.concatenate([np.zeros((1, 2)), np.cumsum(np.stack([forwards, turned], axis=1), axis=0)])
+
+
+def _commands(evidence: Evidence) -> Iterator[Check]:
+    """Somebody takes each part of a command, with its type."""
+    for sink in evidence.sinks:
+        kind = None if evidence.types is None else evidence.types[sink.topic]
+        found = "not told" if kind is None else bare_type(kind) or "nobody listens"
+        fits = None if kind is None else bare_type(kind) == bare_type(sink.type)
+        yield check(f"command {sink.topic}", sink.type, found, fits=fits)

@@ -1,0 +1,140 @@
+"""What a live robot shows to a client that only listens: its description, types, messages. Nothing is sent to it."""
+
+import threading
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+from bam_envs.core.errors import LinkLost
+from bam_envs.core.robot import RobotSpec
+from bam_envs.core.timing import Deadline
+from bam_envs.live.bringup import TIMEOUT, TopicTypes, ask, tagged_sinks
+from bam_envs.live.state import Letter
+from bam_envs.ros.codec import INFO_SERVICE, RobotInfo, read_info
+from bam_envs.ros.messages import same_type
+from bam_envs.ros.profile_tables import RobotProfile, Sink, Source
+from bam_envs.rosbridge.bus import Caller, Listener, Message
+from bam_envs.rosbridge.client import RosbridgeLink
+from bam_envs.rosbridge.endpoint import Endpoint
+
+LISTEN = 0.5
+"""Shortest time for which messages are collected [s]."""
+DESCRIPTION, DESCRIPTION_TYPE = "/robot_description", "std_msgs/String"
+"""The topic on which a robot publishes its URDF, latched."""
+TOOL_POSE = ("tool_position", "tool_quaternion")
+"""Optional signals of an arm: the pose of its tool, as its controller measures it."""
+_AGAIN = 0.1
+_AGES = 3
+"""Number of the longest allowed ages for which messages are collected."""
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """The collected messages of a robot, and what its server says of them; topics are without the namespace."""
+
+    info: RobotInfo | None
+    """The robot's description of itself; None if it has none."""
+    sources: tuple[Source, ...]
+    """Where the signals of the task come from, and the pose of the tool if the profile has it."""
+    sinks: tuple[Sink, ...]
+    """Where the commands of the task go."""
+    types: Mapping[str, str] | None
+    """Type of each topic on the server, empty if it does not know it; None if the server does not answer."""
+    letters: Mapping[str, tuple[Letter, ...]]
+    """Messages of each topic, in order."""
+    seconds: float
+    """Time for which messages were collected [s]."""
+    wall_ahead: float = 0.0
+    """The local wall clock minus the local monotonic clock [s]."""
+    server_offset: float | None = None
+    """The local wall clock minus the server's [s]; None if the server does not report its time."""
+
+
+@dataclass
+class _Inbox:
+    """Collects messages by topic; its listeners run on the network thread."""
+
+    letters: dict[str, list[Letter]] = field(default_factory=dict)
+    changed: threading.Condition = field(default_factory=threading.Condition)
+
+    def listener(self, topic: str) -> Listener:
+        letters = self.letters.setdefault(topic, [])
+
+        def listen(message: Message, caller: Caller) -> None:
+            with self.changed:
+                letters.append(Letter(message, time.monotonic(), len(letters) + 1))
+                self.changed.notify_all()
+
+        return listen
+
+
+def gather(
+    endpoint: Endpoint, profile: RobotProfile, spec: RobotSpec, *, listen: float | None = None, timeout: float = TIMEOUT
+) -> Evidence:
+    """Listen to a robot over a connection of its own, which is closed afterwards; moves nothing.
+
+    Args:
+        endpoint: Its address.
+        profile: Its topics.
+        spec: Signals and commands of the task.
+        listen: Time for which messages are collected after the first of each topic [s]; None: three times the longest
+            allowed age of a state, at least `LISTEN`.
+        timeout: Longest wait for the first message of each topic, and for a topic that nobody offers [s].
+
+    Raises:
+        NoServer: There is no usable server.
+        LinkLost: The link dropped.
+        ProtocolError: The robot's description of itself cannot be read.
+    """
+    narrowed = profile.narrowed(spec.command.labels)
+    required = tuple(profile.source(signal.name) for signal in spec.signals)
+    have = {source.signal for source in required}
+    extra = tuple(one for one in profile.state if one.signal in TOOL_POSE and one.signal not in have)
+    if listen is None:
+        listen = max(LISTEN, _AGES * max((one.max_age or profile.max_age) for one in required))
+    link = RosbridgeLink(endpoint, name="contract")
+    try:
+        link.connect()
+        service = link.namespace + INFO_SERVICE
+        answer = ask(link, service)
+        info = None if answer is None else read_info(answer.get("message"), service)
+        sinks = (tagged_sinks(narrowed, None) if info is not None else None) or narrowed.sinks()
+        needed = {one.topic: one.type for one in (*required, *sinks)}
+        wanted = {**needed, **{one.topic: one.type for one in extra}, DESCRIPTION: DESCRIPTION_TYPE}
+        types = _types(link, TopicTypes(link, profile, timeout), wanted, needed, timeout)
+        inbox = _Inbox()
+        begun = _listen(link, inbox, wanted, {one.topic for one in sinks}, types)
+        first = {source.topic for source in required} & inbox.letters.keys()
+        with inbox.changed:
+            inbox.changed.wait_for(lambda: all(inbox.letters[one] for one in first) or not link.is_up, timeout)
+            inbox.changed.wait_for(lambda: not link.is_up, listen)
+            letters = {topic: tuple(found) for topic, found in inbox.letters.items()}
+        if not link.is_up:
+            raise LinkLost(f"{link.url}: the link dropped while the robot's topics were checked.")
+        seconds = time.monotonic() - begun
+        ahead = time.time() - time.monotonic()
+        return Evidence(info, (*required, *extra), sinks, types, letters, seconds, ahead, link.clock_offset)
+    finally:
+        link.close()
+
+
+def _types(
+    link: RosbridgeLink, types: TopicTypes, wanted: Mapping[str, str], needed: Mapping[str, str], timeout: float
+) -> Mapping[str, str] | None:
+    """The type of each of the `wanted` topics; waits for the `needed` ones: nodes take a while to be discovered."""
+    deadline, found = Deadline(timeout), {topic: types.type_of(link.namespace + topic) for topic in wanted}
+    while types.answers and not all(found[topic] for topic in needed) and not deadline.passed:
+        time.sleep(_AGAIN)
+        found |= {topic: types.type_of(link.namespace + topic) for topic in needed if not found[topic]}
+    return found if types.answers else None
+
+
+def _listen(
+    link: RosbridgeLink, inbox: _Inbox, wanted: Mapping[str, str], sinks: set[str], types: Mapping[str, str] | None
+) -> float:
+    """Subscribe to every topic that can be read, other than commands; returns the time [s], local monotonic clock."""
+    for topic, expected in wanted.items():
+        kind = expected if types is None else types[topic]
+        if topic not in sinks and kind and same_type(kind, expected):
+            link.subscribe(link.namespace + topic, kind, inbox.listener(topic))
+    return time.monotonic()

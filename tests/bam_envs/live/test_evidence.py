@@ -1,0 +1,97 @@
+"""Listening to a robot: what it publishes is collected, and nothing is sent to it."""
+
+import socket
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from bam_envs.core.errors import NoServer
+from bam_envs.live.evidence import DESCRIPTION, gather
+from bam_envs.robots.profile import load_profile
+from bam_envs.robots.ur5e import arm_spec
+from bam_envs.rosbridge.endpoint import Endpoint
+
+SPEC, PROFILE = arm_spec("ur5e", with_object=True), load_profile("ur5e")
+STATES = ["/joint_states", "/gripper/joint_states", "/object_pose"]
+COMMANDS = ["/gripper/commands", "/forward_position_controller/commands"]
+TOOL = "/tcp_pose_broadcaster/pose"
+
+
+def listened(url, **options):
+    return gather(Endpoint(url), PROFILE, SPEC, **{"listen": 0.1, "timeout": 5.0, **options})
+
+
+def test_what_a_robot_publishes_is_collected(server, robot_on, simulation):
+    scripted = robot_on(server, info=simulation)
+    server.advertise(DESCRIPTION, "std_msgs/String", latch=True)
+    server.publish(DESCRIPTION, {"data": "<robot/>"})
+    evidence = listened(server.url)
+    assert evidence.info == simulation
+    assert [source.topic for source in evidence.sources if source.topic == TOOL] == [TOOL, TOOL]
+    assert [sink.topic for sink in evidence.sinks] == COMMANDS
+    kinds = {**{one.topic: one.type for one in (*evidence.sources, *evidence.sinks)}, DESCRIPTION: "std_msgs/String"}
+    assert evidence.types == {**kinds, TOOL: ""}  # the simulated robot does not measure its tool
+    assert sorted(evidence.letters) == sorted([*STATES, DESCRIPTION])
+    assert all(evidence.letters[topic][0].message["header"] for topic in STATES)
+    assert [letter.number for letter in evidence.letters["/joint_states"]][:2] == [1, 2]
+    assert evidence.letters[DESCRIPTION][0].message == {"data": "<robot/>"}
+    assert abs(evidence.server_offset) < 5.0
+    assert scripted.commands == []
+    assert scripted.halts == 0
+
+
+def test_the_pose_of_the_tool_is_collected_where_it_is_measured(server, robot_on):
+    robot_on(server, spec=replace(SPEC, signals=PROFILE.signals))
+    assert listened(server.url).letters[TOOL][0].message["header"]["frame_id"] == "base"
+
+
+def test_a_topic_that_nobody_publishes_is_waited_for_and_left_out(server, robot_on):
+    robot_on(server, spec=arm_spec("ur5e", with_object=False))
+    evidence = listened(server.url, timeout=0.2)
+    assert evidence.types["/object_pose"] == ""
+    assert "/object_pose" not in evidence.letters
+    assert evidence.letters["/joint_states"]
+    assert evidence.info is None
+
+
+def test_a_silent_topic_has_no_letters(server, robot_on):
+    scripted = robot_on(server)
+    scripted.mangle = lambda topic, message: None if topic == "/object_pose" else message
+    evidence = listened(server.url, timeout=0.2)
+    assert evidence.letters["/object_pose"] == ()
+    assert evidence.letters["/joint_states"]
+
+
+def test_a_server_without_rosapi_tells_no_types(lax, robot_on):
+    running = lax()
+    robot_on(running)
+    evidence = listened(running.url)
+    assert evidence.types is None
+    assert all(evidence.letters[topic] for topic in STATES)
+    assert evidence.letters[TOOL] == ()
+    kinds = {message["op"] for _, message in running.frames}
+    assert kinds == {"call_service", "subscribe"}
+
+
+def test_the_longest_allowed_age_says_how_long_to_listen(server, robot_on):
+    robot_on(server)
+    assert listened(server.url, listen=None).seconds >= 0.5
+
+
+def test_nobody_there(unused_port):
+    with pytest.raises(NoServer, match=r"^ws://127\.0\.0\.1"):
+        listened(f"ws://127.0.0.1:{unused_port}")
+
+
+@pytest.fixture
+def unused_port():
+    with socket.create_server(("127.0.0.1", 0)) as probe:
+        return probe.getsockname()[1]
+
+
+def test_joints_at_another_namespace(server, robot_on):
+    robot_on(server, namespace="/cell")
+    evidence = listened(f"{server.url}/cell")
+    joints = evidence.letters["/joint_states"][-1].message["position"]
+    assert np.isfinite(joints).all()

@@ -1,0 +1,145 @@
+"""A small motion of each axis shows whether it moves as commanded."""
+
+import math
+
+import numpy as np
+import pytest
+
+from bam_envs.core.robot import Initial
+from bam_envs.robots.fake import FakeRobot
+from bam_envs.robots.mir100 import base_spec
+from bam_envs.robots.physics.kinematic_base import open_floor
+from bam_envs.robots.ur5e import arm_spec
+from bam_envs.safety.gate import SafeRobot
+from bam_envs.testing.drivers import DrivenRobot
+from bam_train.deploy.wiggle import FAR, motion_checks, wiggle
+
+HOME = np.array([-0.27, -1.54, 1.89, -1.93, -1.57, -1.84])
+ARM = arm_spec("ur5e", with_object=False).command
+
+
+class Wrong(DrivenRobot):
+    """Its driver alters commands, relative to where the robot was placed."""
+
+    def __init__(self, robot, alter):
+        super().__init__(robot)
+        self.alter = alter
+
+    def _driven(self, command):
+        start = self._followed if not hasattr(self, "start") else self.start
+        self.start = start
+        return start + self.alter(command - start)
+
+
+def wiggled(alter=lambda change: change):
+    driven = Wrong(FakeRobot(with_object=False), alter)
+    driven.connect()
+    driven.place(Initial({"joint_position": HOME[None]}, np.zeros(1, np.int64)))
+    robot = SafeRobot(driven, clock=driven.clock)
+    robot.connect()
+    lines = list(wiggle(robot, HOME))
+    state = driven.measure()
+    return {one.what: (one.found, one.verdict) for one in lines}, state, driven
+
+
+def test_a_correct_arm_moves_a_little_and_comes_back():
+    found, state, driven = wiggled()
+    assert found == {f"motion of {label}": ("1.00 of what was commanded", "ok") for label in ARM.labels}
+    np.testing.assert_allclose(state.signals["joint_position"][0], HOME, atol=1e-9)
+    np.testing.assert_allclose(state.signals["gripper_width"][0], 0.085, atol=1e-9)
+    assert driven.fastest < 0.06
+
+
+def mirror(change):
+    return change * (1, -1, 1, 1, 1, 1, 1)
+
+
+def swap(change):
+    return change[:, [0, 1, 2, 4, 3, 5, 6]]
+
+
+@pytest.mark.parametrize(
+    ("alter", "axis", "found"),
+    [
+        (mirror, "shoulder_lift_joint", "(G23)"),
+        (swap, "wrist_1_joint", "wrist_1_joint does not follow its commands"),
+        (lambda change: change * (1, 1, 1, 1, 1, 0, 1), "wrist_3_joint", "it did not move"),
+        (lambda change: change * (1, 1, 1, 1, 1, 1, -1), "gripper_width", "it did not move"),
+    ],
+)
+def test_a_wrong_arm_is_refused_by_its_axis(alter, axis, found):
+    """The guards stop the arm on the way where its position would be wrong; then nothing else is moved."""
+    lines, state, _ = wiggled(alter)
+    refused = {what: text for what, (text, verdict) in lines.items() if verdict != "ok"}
+    assert list(refused) == [f"motion of {axis}"]
+    assert found in refused[f"motion of {axis}"]
+    np.testing.assert_allclose(state.signals["joint_position"][0], HOME, atol=0.04)
+
+
+def test_a_base_drives_and_turns_a_little():
+    floor = open_floor(1, randomize=False)
+    driven = DrivenRobot(floor)
+    driven.connect()
+    driven.place(Initial({"base_pose": np.zeros((1, 3))}, np.zeros(1, np.int64)))
+    robot = SafeRobot(driven, clock=driven.clock)
+    lines = list(wiggle(robot, None))
+    assert [(one.what, one.verdict) for one in lines] == [
+        ("motion of linear_velocity", "ok"),
+        ("motion of angular_velocity", "ok"),
+    ]
+
+
+# ---- a recording of any motion
+
+PERIOD = 0.05
+
+
+def motion(rng, lag=2):
+    """Commands of 10 s that move every axis, and the positions measured `lag` periods later."""
+    t = np.arange(200) * PERIOD
+    rates = rng.uniform(0.5, 3.0, 7)
+    commanded = np.sin(t[:, None] * rates) * np.array([0.2] * 6 + [0.02]) + np.array([*HOME, 0.05])
+    measured = np.concatenate([np.repeat(commanded[:1], lag, axis=0), commanded])[: len(t)]
+    return commanded, measured + rng.normal(0.0, 1e-4, measured.shape)
+
+
+@pytest.mark.parametrize("lag", [0, 1, 4])
+def test_a_recording_of_a_correct_arm(lag):
+    lines = list(motion_checks(ARM, *motion(np.random.default_rng(lag), lag), PERIOD))
+    assert [one.verdict for one in lines] == ["ok"] * 7
+
+
+@pytest.mark.parametrize(
+    ("change", "found"),
+    [
+        (lambda x: x * (-1, 1, 1, 1, 1, 1, 1), {"shoulder_pan_joint": "it moved the other way"}),
+        (
+            lambda x: x * (math.degrees(1), 1, 1, 1, 1, 1, 1),
+            {"shoulder_pan_joint": "it moved 57 times as far (degrees?)"},
+        ),
+        (lambda x: x * (1, 1, 1, 1, 1, 1, 1000), {"gripper_width": "it moved 1e+03 times as far (millimetres?)"}),
+        (
+            lambda x: x[:, [2, 1, 0, 3, 4, 5, 6]],
+            {"shoulder_pan_joint": "elbow_joint moved instead", "elbow_joint": "shoulder_pan_joint moved instead"},
+        ),
+    ],
+)
+def test_a_recording_of_a_wrong_arm(change, found):
+    commanded, measured = motion(np.random.default_rng(3))
+    lines = motion_checks(ARM, commanded, change(measured), PERIOD)
+    assert {one.what.removeprefix("motion of "): one.found for one in lines if one.verdict == "refused"} == found
+
+
+def test_an_axis_that_did_not_move_or_is_not_measured_is_not_told():
+    commanded, measured = motion(np.random.default_rng(0))
+    commanded[:, 0], measured[:, 6] = commanded[0, 0], np.nan
+    lines = {one.what: one for one in motion_checks(ARM, commanded, measured, PERIOD)}
+    assert "motion of shoulder_pan_joint" not in lines
+    assert (lines["motion of gripper_width"].found, lines["motion of gripper_width"].verdict) == (
+        "it is not measured",
+        "not told",
+    )
+
+
+def test_every_unit_of_a_command_has_its_distance():
+    assert {*ARM.units, *base_spec().command.units} == FAR.keys()
