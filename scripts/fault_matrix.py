@@ -1,0 +1,319 @@
+"""What happens when something fails while a policy moves a robot: one fault after the other, in a simulated robot cell.
+
+Robot, driver, rosbridge server and bam-deploy are processes of their own. Each row strikes while the arm moves, and
+shows how long commands for motion still arrive and the robot still moves, what the operator sees, the exit status, and
+what the recording holds.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import json
+import os
+import runpy
+import signal
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from bam_envs.testing.robot_cell import CellLog, Network, RobotCell, StateFault
+from bam_train.checkpoint import Checkpoint
+
+ROOT = Path(__file__).parents[1]
+CHECKPOINT = ROOT / "checkpoints" / "reach-ppo.zip"
+FLAGS: tuple[str, ...] = ()
+"""Further flags of each bam-deploy."""
+FAST, AT_REST = 0.15, 0.02
+"""A fault strikes above the first speed; below the second one the robot is at rest [rad/s or m/s]."""
+BRAKING = 0.3
+"""Time in which a robot that rests comes to a stand [s]."""
+FREEZE, RESTART = 5.0, 10.0
+"""How long the network is frozen, and after what time a bridge is restarted [s]."""
+LONGEST = 120.0
+"""Longest time that a deployment may take [s]."""
+WATCHED = 1.0
+"""How long the robot is watched after the end of everything [s]."""
+
+
+class Deployment:
+    """A bam-deploy in a process of its own.
+
+    Args:
+        command: Its program and arguments.
+        recording: The file into which it records.
+    """
+
+    def __init__(self, command: list[str], recording: Path) -> None:
+        environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), str(ROOT / "envs")])}
+        pipes: Any = {"stdout": subprocess.DEVNULL, "stderr": subprocess.PIPE, "text": True}
+        self.process: subprocess.Popen[str] = subprocess.Popen(command, env=environment, **pipes)
+        self.recording, self.lines, self.ended = recording, list[tuple[float, str]](), 0.0
+        self._reading = threading.Thread(target=self._read)
+        self._reading.start()
+
+    def _read(self) -> None:
+        with self.process:
+            for line in self.process.stderr or ():
+                self.lines.append((time.monotonic(), line.rstrip()))
+        self.ended = time.monotonic()
+
+    def finish(self) -> int:
+        """Wait for its end; the exit status."""
+        self._reading.join(LONGEST)
+        self.process.kill()  # what has not ended by now never will
+        self._reading.join()
+        return self.process.returncode
+
+    def said(self, start: float = 0.0) -> tuple[str, ...]:
+        """What the operator saw since `start`, other than ends of episodes."""
+        return tuple(line for at, line in self.lines if at >= start and not line.startswith("episode "))
+
+
+@dataclass
+class Scene:
+    """A cell in which a deployment moves the robot."""
+
+    cell: RobotCell
+    network: Network
+    folder: Path
+    checkpoint: Path
+    deployment: Deployment = field(init=False)
+    back: float | None = None
+    """When the link came back [s], monotonic clock."""
+    others: list[str] = field(default_factory=list)
+    """What others than the operator of the deployment saw."""
+
+    def deploy(self, name: str = "first", *before: str, program: tuple[str, ...] = ()) -> Deployment:
+        """Start a bam-deploy; `before` stands before its command, and `program` instead of its name."""
+        recording = self.folder / f"{name}.mcap"
+        command = [*before, sys.executable, *(program or ("-m", "bam_train.cli.deploy")), str(self.checkpoint)]
+        flags = ["--robot", self.network.url, "--yes", "--episodes", "4", *FLAGS]
+        return Deployment([*command, *flags], recording)
+
+    @property
+    def clock(self) -> Path:
+        """While this file exists, the clock of a deployment by `with_clock` is an hour ahead."""
+        return self.folder / "clock"
+
+
+# ---- the faults
+
+
+def kill_policy(scene: Scene) -> None:
+    scene.deployment.process.kill()
+
+
+def restart_bridge(scene: Scene) -> None:
+    scene.cell.kill("bridge")
+    time.sleep(RESTART)
+    scene.cell.restart_bridge()
+    scene.back = time.monotonic()
+
+
+def freeze_network(scene: Scene) -> None:
+    scene.network.freeze()
+    time.sleep(FREEZE)
+    scene.back = time.monotonic()
+    scene.network.thaw()
+
+
+def jump(scene: Scene) -> None:
+    scene.clock.touch()
+
+
+def hog(scene: Scene) -> None:
+    burners = [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(2 * (os.cpu_count() or 1))]
+    time.sleep(FREEZE)
+    for burner in burners:
+        burner.kill()
+        burner.wait()
+
+
+def deploy_twice(scene: Scene) -> None:
+    second = scene.deploy("second")
+    scene.others.append(f"the second one, status {second.finish()}: {second.said()[-1]}")
+
+
+def interrupt(times: int) -> Callable[[Scene], None]:
+    def act(scene: Scene) -> None:
+        for _ in range(times):
+            scene.deployment.process.send_signal(signal.SIGINT)
+            time.sleep(0.02)
+
+    return act
+
+
+def send_nulls(scene: Scene) -> None:
+    scene.network.nulls = True
+
+
+def wrong_states(fault: StateFault) -> Callable[[Scene], None]:
+    return lambda scene: scene.cell.publish_wrongly(fault)
+
+
+@dataclass(frozen=True)
+class Fault:
+    """One row of the matrix."""
+
+    name: str
+    act: Callable[[Scene], None]
+    statuses: tuple[int, ...]
+    """Exit statuses with which the deployment may end."""
+    deploy: Callable[[Scene], Deployment] = Scene.deploy
+
+
+def with_clock(scene: Scene) -> Deployment:
+    """A deployment whose wall clock can jump."""
+    return scene.deploy("first", program=(__file__, "--jumping-clock", str(scene.clock)))
+
+
+FAULTS = (
+    Fault("policy process killed", kill_policy, (-signal.SIGKILL,)),
+    Fault("bridge killed", lambda scene: scene.cell.kill("bridge"), (4,)),
+    Fault("bridge restarted after 10 s", restart_bridge, (4,)),
+    Fault("network frozen for 5 s", freeze_network, (4,)),
+    Fault("robot driver killed", lambda scene: scene.cell.kill("driver"), (4,)),
+    Fault("state topic stops", wrong_states(StateFault.SILENT), (4,)),
+    Fault("joint vanishes from the message", wrong_states(StateFault.SHORT), (1,)),
+    Fault("NaN in the state", send_nulls, (1,)),
+    Fault("robot's clock jumps by an hour", wrong_states(StateFault.CLOCK), (0, 3, 4)),
+    Fault("this computer's clock jumps by an hour", jump, (0,), with_clock),
+    Fault("all cores hogged for 5 s", hog, (0, 3, 4)),
+    Fault("two deployments to one robot", deploy_twice, (0,)),
+    Fault("Ctrl-C", interrupt(1), (130,)),
+    Fault("Ctrl-C twice", interrupt(2), (130,)),
+)
+
+
+# ---- what came of them
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What a fault did."""
+
+    name: str
+    motion: float | None
+    """From the fault to the last command for motion [s]; None: none came any more."""
+    rest: float | None
+    """From the fault until the robot stood still [s]; None: it stood still at once."""
+    ended: float
+    """From the fault to the end of the deployment [s]."""
+    status: int
+    saw: tuple[str, ...]
+    """What was on the operator's screen."""
+    recorded: str
+    problems: tuple[str, ...]
+
+    def lines(self) -> Iterator[str]:
+        """The row as text."""
+        motion, rest = (("-" if one is None else f"{one:.2f} s") for one in (self.motion, self.rest))
+        verdict = "ok" if not self.problems else f"WRONG: {'; '.join(self.problems)}"
+        yield f"{self.name:40}{motion:>10}{rest:>10}{self.ended:>9.2f} s{self.status:>6}  {verdict}"
+        yield from (f"    {line}" for line in self.saw)
+        if self.recorded:
+            yield f"    recording: {self.recorded}"
+
+
+def strike(fault: Fault, cell: RobotCell, checkpoint: Path) -> Outcome:
+    """Let a deployment move the robot of `cell`, let the fault happen, and watch."""
+    with contextlib.ExitStack() as stack:
+        network = stack.enter_context(Network(cell.port))
+        scene = Scene(cell, network, Path(stack.enter_context(tempfile.TemporaryDirectory())), checkpoint)
+        deployment = scene.deployment = fault.deploy(scene)
+        stack.callback(deployment.finish)
+        stack.callback(deployment.process.kill)
+        try:
+            cell.await_motion(FAST)
+        except RuntimeError as error:
+            deployment.process.kill()
+            raise RuntimeError(f"{error} bam-deploy: {deployment.finish()}, {deployment.said()}") from error
+        start = time.monotonic()
+        fault.act(scene)
+        status = deployment.finish()
+        time.sleep(WATCHED)
+        log = cell.log().since(start)
+    saw = (*deployment.said(start), *scene.others)
+    return outcome(fault, log, start, deployment.ended, status, saw, scene.back, cell.command_timeout)
+
+
+def outcome(
+    fault: Fault,
+    log: CellLog,
+    start: float,
+    ended: float,
+    status: int,
+    saw: tuple[str, ...],
+    back: float | None,
+    watchdog: float,
+) -> Outcome:
+    """Judge what the robot did since `start`."""
+    motions, moving = log.motions(), log.times[log.speeds > AT_REST]
+    last_motion = float(motions[-1]) if len(motions) else start
+    rest = float(moving[-1]) if len(moving) else start
+    problems = []
+    if status not in fault.statuses:
+        problems.append(f"exit status {status}")
+    if rest > max(last_motion, start) + watchdog + BRAKING:
+        problems.append(f"it moved {rest - last_motion:.2f} s after the last command")
+    if log.speeds[-1] > AT_REST:
+        problems.append(f"it still moves {log.times[-1] - last_motion:.2f} s after the last command")
+    if last_motion > ended:
+        problems.append("a command came after the end")
+    late = 0 if back is None else int((motions > back).sum())
+    if late:
+        problems.append(f"{late} commands from before the cut arrived after it")
+    return Outcome(
+        fault.name,
+        last_motion - start if len(motions) else None,
+        rest - start if len(moving) else None,
+        ended - start,
+        status,
+        saw,
+        "",
+        tuple(problems),
+    )
+
+
+def run_with_jumping_clock(file: Path, arguments: list[str]) -> None:
+    """Run bam-deploy in this process with a wall clock that is an hour ahead while `file` exists."""
+    wall, wall_ns = time.time, time.time_ns
+    time.time = lambda: wall() + 3600 * file.exists()
+    time.time_ns = lambda: wall_ns() + 3600 * 10**9 * file.exists()
+    sys.argv = ["bam-deploy", *arguments]
+    runpy.run_module("bam_train.cli.deploy", run_name="__main__")
+
+
+def main() -> None:
+    """Print the matrix; exit status 1 if something is wrong."""
+    if sys.argv[1:2] == ["--jumping-clock"]:
+        run_with_jumping_clock(Path(sys.argv[2]), sys.argv[3:])
+        return
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--only", action="append", help="faults whose name has this text; may be given several times")
+    parser.add_argument("--checkpoint", type=Path, default=CHECKPOINT, help="the policy; its environment has a robot")
+    parser.add_argument("--plain", action="store_true", help="a robot without sessions, halt topic and description")
+    parser.add_argument("--json", action="store_true", help="print one JSON object a fault instead of a table")
+    options = parser.parse_args()
+    chosen = [one for one in FAULTS if not options.only or any(text in one.name for text in options.only)]
+    if not options.json:
+        print(f"{'fault':40}{'motion':>10}{'at rest':>10}{'ended':>11}{'exit':>6}")
+    env_id, wrong = Checkpoint.open(options.checkpoint).manifest.env, 0
+    for fault in chosen:
+        with RobotCell(env_id, describes_itself=not options.plain) as cell:
+            result = strike(fault, cell, options.checkpoint)
+        wrong += bool(result.problems)
+        for line in [json.dumps(vars(result))] if options.json else result.lines():
+            print(line, flush=True)
+    sys.exit(min(1, wrong))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,40 @@
+"""A few rows of the fault matrix, in one robot cell; the script has all of them."""
+
+import pytest
+
+from bam_envs.testing.robot_cell import RobotCell, StateFault
+
+
+@pytest.fixture(scope="module")
+def matrix(load_script):
+    return load_script("fault_matrix")
+
+
+@pytest.fixture(scope="module")
+def whole_cell():
+    with RobotCell("bam/reach-v0") as cell:
+        yield cell
+
+
+@pytest.fixture
+def cell(whole_cell):
+    yield whole_cell
+    whole_cell.publish_wrongly(StateFault.NONE)
+
+
+@pytest.mark.parametrize(
+    ("name", "status", "said"),
+    [
+        ("policy process killed", -9, ()),
+        ("Ctrl-C twice", 130, ("bam-deploy: interrupted",)),
+        ("joint vanishes from the message", 1, ("bam-deploy: fault: /joint_states: wrist_3_joint missing; found: ",)),
+        ("bridge killed", 4, ("bam-deploy: link lost: ws://127.0.0.1:",)),
+    ],
+)
+def test_the_robot_rests_and_the_operator_knows_why(matrix, cell, monkeypatch, name, status, said):
+    monkeypatch.setattr(matrix, "BRAKING", 5.0)  # on a busy computer
+    fault = next(one for one in matrix.FAULTS if one.name == name)
+    outcome = matrix.strike(fault, cell, matrix.CHECKPOINT)
+    assert (outcome.problems, outcome.status) == ((), status)
+    assert len(outcome.saw) == len(said)
+    assert all(line.startswith(text) for line, text in zip(outcome.saw, said, strict=True))
