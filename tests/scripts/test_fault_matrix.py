@@ -36,5 +36,6 @@ def test_the_robot_rests_and_the_operator_knows_why(matrix, cell, monkeypatch, n
     fault = next(one for one in matrix.FAULTS if one.name == name)
     outcome = matrix.strike(fault, cell, matrix.CHECKPOINT)
     assert (outcome.problems, outcome.status) == ((), status)
-    assert len(outcome.saw) == len(said)
-    assert all(line.startswith(text) for line, text in zip(outcome.saw, said, strict=True))
+    seen = [line for line in outcome.saw if "warning" not in line]  # of missed ticks, on a busy computer
+    assert len(seen) == len(said)
+    assert all(line.startswith(text) for line, text in zip(seen, said, strict=True))
