@@ -9,6 +9,8 @@
     │   ├── NewerFormat            written by a newer bam-train
     │   ├── CheckpointMismatch     made for another environment, algorithm or setting
     │   └── UntrustedCheckpoint    not signed, or not by a key that this computer trusts
+    ├── BadTrials                  a record of trials that was edited, or cannot be read or written
+    ├── TrialsNeeded               full speed before trials have shown that the policy succeeds
     ├── BadKey                     a key for signing or verifying that cannot be used
     ├── FormatError                bytes that do not follow their file format (safetensors, ONNX)
     ├── PolicyError                a frozen policy that cannot run, or an observation that does not fit it
@@ -75,6 +77,14 @@ class UntrustedCheckpoint(CheckpointError):  # noqa: N818
     def __init__(self, path: str | Path, message: str) -> None:
         self.why = message
         super().__init__(path, message)
+
+
+class BadTrials(BamTrainError):  # noqa: N818
+    """A record of trials that was edited, or cannot be read or written; the text names its file."""
+
+
+class TrialsNeeded(BamTrainError):  # noqa: N818
+    """Full speed before trials on this robot have shown that the policy succeeds."""
 
 
 class BadKey(BamTrainError):  # noqa: N818

@@ -1,0 +1,286 @@
+"""Trials of a checkpoint on a robot: their record, and the test that says when they are enough.
+
+The record is a file of JSON lines. A line is written, and is on the disk, before a trial begins, and another one at its
+end: a trial that has only the first one, because the program or the computer was stopped, has failed. Each line carries
+an HMAC of itself and of the line before it; its key, the number of lines and the last HMAC are in a folder that only
+this user can read. So a line that was edited, removed, added or moved is found, at the end of the file too. Part of a
+line at the end, which a crash leaves, is ignored. Whoever can read that folder can write any record.
+
+The test may be looked at after every trial, and ended at any time, because it is a test martingale (J. Ville, 1939;
+I. Waudby-Smith and A. Ramdas, "Estimating means of bounded random variables by betting", 2023). For a success rate of
+at most the threshold t, each factor
+
+    success: q / t,    failure: (1 - q) / (1 - t),    for any q > t,
+
+has an expectation of at most 1. So the product of the factors ever reaches 1 / alpha with a probability of at most
+alpha. The mean of the products for a few q finds both policies far above the threshold and those just above it.
+"""
+
+import contextlib
+import hashlib
+import hmac
+import json
+import math
+import os
+import secrets
+import tempfile
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from datetime import datetime, timezone
+from pathlib import Path
+from typing import IO, Any
+
+from bam_train.errors import BadTrials
+
+try:
+    import fcntl
+except ImportError:  # Windows: two programs must not write to one record at once
+    fcntl = None  # type: ignore[assignment]
+
+ALPHA = 0.05
+"""Maximum probability that a policy passes whose success rate is not above the threshold."""
+_MIXTURE = {0.1: 0.8, 0.3: 0.1, 0.6: 0.1}
+"""Failure rate 1 - q of an alternative, as a share of that at the threshold, to its weight."""
+_MOST = 2**28  # bytes of a record
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """What trials say for a success rate above a threshold."""
+
+    successes: int
+    trials: int
+    threshold: float
+    """Success rate that is to be exceeded; from 0 to 1, exclusive."""
+
+    @property
+    def value(self) -> float:
+        """The test martingale: 1 without trials, enough at 1 / `ALPHA`."""
+        failures, logs = self.trials - self.successes, []
+        for share, weight in _MIXTURE.items():
+            success = math.log((1 - share * (1 - self.threshold)) / self.threshold)
+            logs.append(math.log(weight) + self.successes * success + failures * math.log(share))
+        most = max(logs)
+        return math.exp(min(most, 600.0)) * sum(math.exp(one - most) for one in logs)
+
+    @property
+    def is_enough(self) -> bool:
+        """Whether the success rate is above the threshold, with an error probability of at most `ALPHA`."""
+        return self.value >= 1 / ALPHA
+
+    @property
+    def missing(self) -> int:
+        """Number of further trials that would be enough if all of them succeeded."""
+        further = 0
+        while not Evidence(self.successes + further, self.trials + further, self.threshold).is_enough:
+            further += 1
+        return further
+
+    @property
+    def text(self) -> str:
+        """For people: ``18 of 19 trials succeeded; 30 more without a failure would show more than 90 %``."""
+        done = f"{self.successes} of {self.trials} trial{'' if self.trials == 1 else 's'} succeeded"
+        above = f"more than {100 * self.threshold:g} %"
+        if self.is_enough:
+            return f"{done}, which shows {above} (error probability at most {100 * ALPHA:g} %)"
+        return f"{done}; {self.missing} more without a failure would show {above}"
+
+
+@dataclass(frozen=True)
+class Subject:
+    """What is tried, and where."""
+
+    checkpoint: str
+    """`Checkpoint.digest`."""
+    robot: str
+    """Address of the robot."""
+
+
+class TrialRecord:
+    """The trials in one file of JSON lines; several programs may write to it.
+
+    Args:
+        path: The file, made by the first trial.
+        private: Folder for the keys of records, which only this user can read; made by the first trial.
+    """
+
+    def __init__(self, path: Path, private: Path) -> None:
+        self.path, self._private = path, private
+
+    def evidence(self, subject: Subject, threshold: float) -> Evidence:
+        """The evidence of the trials of `subject` so far.
+
+        Raises:
+            BadTrials: A line was edited, removed, added or moved; the file or its key cannot be read.
+        """
+        lines = self._read().lines if self.path.exists() else []
+        begun = {row["begun"] for row in lines if "begun" in row and _subject_of(row) == subject}
+        succeeded = {row.get("ended") for row in lines if row.get("success") is True}
+        return Evidence(len(begun & succeeded), len(begun), threshold)
+
+    def begin(self, subject: Subject, **facts: Any) -> str:
+        """Write that a trial begins, with further `facts` (JSON); the name of the trial."""
+        name = f"{_now()} {secrets.token_hex(4)}"
+        self._append({"begun": name, **vars(subject), **facts})
+        return name
+
+    def end(self, name: str, success: bool, reason: str) -> None:
+        """Write how the trial `name` ended."""
+        self._append({"ended": name, "success": success, "reason": reason, "time": _now()})
+
+    def _append(self, row: dict[str, Any]) -> None:
+        try:
+            self.path.parent.mkdir(parents=True, exist_ok=True)
+            self._private.mkdir(parents=True, exist_ok=True, mode=0o700)
+            with _locked(self.path) as file:
+                book = self._read() if os.fstat(file.fileno()).st_size else _Book.new()
+                file.truncate(book.size)  # without the part of a line that a crash left
+                file.seek(book.size)
+                rows = [row] if book.lines else [{"format": 1, "record": book.name, "created": _now()}, row]
+                if not book.lines:
+                    self._save(book)  # its key, before the first line
+                for one in rows:
+                    file.write(book.add(one))
+                file.flush()
+                os.fsync(file.fileno())
+                self._save(book)
+        except OSError as error:
+            why = error.strerror or error
+            raise BadTrials(
+                f"{self.path}: the trial cannot be recorded: {why}. Give another file with --trials"
+            ) from error
+
+    def _read(self) -> "_Book":
+        """Every line, checked."""
+        try:
+            with self.path.open("rb") as file:
+                whole, newline, _ = file.read(_MOST).rpartition(b"\n")
+            if not newline:
+                return _Book.new()
+            name = _json(whole.split(b"\n", 1)[0]).get("record")
+            if not (isinstance(name, str) and name.isalnum()):
+                raise self._bad("line 1 was edited")
+            key, number_saved, last = self._state(name)
+        except OSError as error:
+            what = error.filename or self.path
+            text = f"{what} cannot be read: {error.strerror or error}"
+            raise BadTrials(
+                f"{self.path}: {text}. A record is of use only to the user who made it. {_AGAIN}"
+            ) from error
+        book = _Book(name, key)
+        for number, line in enumerate(whole.split(b"\n"), 1):
+            row = _json(line)
+            if not hmac.compare_digest(str(row.pop("hmac", "")), book.mac(row)):
+                raise self._bad(f"line {number} was edited, or lines before it were removed, added or moved")
+            book.add(row)
+            if number == number_saved and book.last != last:
+                raise self._bad(f"line {number} was edited")
+        if len(book.lines) < number_saved:
+            raise self._bad(f"lines at its end were removed: it had {number_saved}, found {len(book.lines)}")
+        book.size = len(whole) + 1
+        return book
+
+    def _state(self, name: str) -> tuple[bytes, int, str]:
+        """Key, number of lines and last HMAC of the record `name`."""
+        path = self._private / f"{name}.json"
+        state = _json(path.read_bytes())
+        try:
+            return bytes.fromhex(state["key"]), int(state["lines"]), str(state["last"])
+        except (LookupError, TypeError, ValueError) as error:
+            raise self._bad(f"{path} is damaged") from error
+
+    def _bad(self, why: str) -> BadTrials:
+        return BadTrials(f"{self.path}: {why}. {_AGAIN}")
+
+    def _save(self, book: "_Book") -> None:
+        """Replace the key, the number of lines and the last HMAC in one step."""
+        state = {"key": book.key.hex(), "lines": len(book.lines), "last": book.last}
+        descriptor, temporary = tempfile.mkstemp(dir=self._private)  # with mode 0600
+        with os.fdopen(descriptor, "w") as file:
+            json.dump(state, file)
+            file.flush()
+            os.fsync(descriptor)
+        os.replace(temporary, self._private / f"{book.name}.json")
+
+
+_AGAIN = "Restore it from a copy, or move it away and begin the trials again"
+
+
+@dataclass
+class _Book:
+    """The lines of a record, and what the next one needs."""
+
+    name: str
+    key: bytes
+
+    def __post_init__(self) -> None:
+        self.lines: list[dict[str, Any]] = []
+        self.last, self.size = "", 0
+
+    @classmethod
+    def new(cls) -> "_Book":
+        return cls(secrets.token_hex(8), secrets.token_bytes(32))
+
+    def mac(self, row: dict[str, Any]) -> str:
+        """The HMAC of a row after the last one."""
+        text = json.dumps([self.last, row], sort_keys=True).encode()
+        return hmac.new(self.key, text, hashlib.sha256).hexdigest()
+
+    def add(self, row: dict[str, Any]) -> bytes:
+        """Take a row, and return its line."""
+        self.last = self.mac(row)
+        line = json.dumps({**row, "hmac": self.last}).encode() + b"\n"
+        self.lines.append(row)
+        self.size += len(line)
+        return line
+
+
+def _json(line: bytes) -> dict[str, Any]:
+    """The table in a line; an empty one if it has none."""
+    with contextlib.suppress(ValueError, RecursionError):
+        row = json.loads(line)
+        if isinstance(row, dict):
+            return row
+    return {}
+
+
+@contextlib.contextmanager
+def _locked(path: Path) -> Iterator[IO[bytes]]:
+    """The file at `path`, made if need be, locked against other programs."""
+    with os.fdopen(os.open(path, os.O_RDWR | os.O_CREAT, 0o644), "r+b") as file:
+        if fcntl is not None:
+            with contextlib.suppress(OSError):  # a file system without locks
+                fcntl.flock(file, fcntl.LOCK_EX)
+        yield file
+
+
+def _subject_of(row: dict[str, Any]) -> Subject:
+    return Subject(str(row.get("checkpoint")), str(row.get("robot")))
+
+
+class Trials:
+    """The trials of one deployment: one an episode, from its first command on.
+
+    Args:
+        record: Where they are recorded.
+        subject: What is tried, and where.
+        facts: For people: what else each first line holds (JSON), such as the environment and the recording.
+    """
+
+    def __init__(self, record: TrialRecord, subject: Subject, facts: Mapping[str, Any]) -> None:
+        self.record, self.subject, self._facts = record, subject, dict(facts)
+        self._running: str | None = None
+
+    def begin(self, seed: int) -> None:
+        """Record that a trial begins; raises BadTrials if that is impossible, and then nothing may move."""
+        self._running = self.record.begin(self.subject, **self._facts, seed=seed)
+
+    def end(self, success: bool, reason: str) -> None:
+        """Record the end of the running trial, if there is one."""
+        if self._running is not None:
+            running, self._running = self._running, None
+            self.record.end(running, success, reason)
+
+
+def _now() -> str:
+    return datetime.now(timezone.utc).isoformat(timespec="milliseconds")
