@@ -4,8 +4,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from bam_envs.core.errors import BamEnvsError
 from bam_envs.core.registry import entry_of
 from bam_envs.core.validation import Positive, check
+from bam_envs.safety.guard import Limits
 from bam_train.errors import SettingsError
 
 
@@ -25,6 +27,8 @@ class Place:
     """File with the token that the server asks for."""
     timeout: float | None = None
     """Longest wait for an answer of `transport` [s]; None for its default."""
+    guards: tuple[tuple[str, float], ...] = ()
+    """Names and values of limits of the live robot's guards that differ from the profile's."""
 
     def require_sane(self) -> None:
         """Refuse addresses and options that exclude each other.
@@ -38,6 +42,8 @@ class Place:
             )
         if self.profile is not None and self.robot is None:
             raise SettingsError("--profile describes a live robot; give its address with --robot too")
+        if self.guards and self.robot is None:
+            raise SettingsError("--guard changes a limit of a live robot; give its address with --robot too")
         for flag, value in (("--ca-file", self.ca_file), ("--token-file", self.token_file)):
             if value is not None and not self.is_remote:
                 raise SettingsError(
@@ -82,11 +88,36 @@ class Place:
             )
         kwargs = {name: value for name, value in env_kwargs.items() if name != "randomize"}  # for simulations only
         link = {"ca_file": self.ca_file, "token_file": self.token_file}
-        return {**kwargs, "robot": self.robot, "profile": self.profile, **link}
+        guards = {"guards": dict(self.guards)} if self.guards else {}
+        return {**kwargs, "robot": self.robot, "profile": self.profile, **guards, **link}
 
 
 HERE = Place()
 """The simulation here."""
+
+
+def read_guards(texts: Sequence[str]) -> tuple[tuple[str, float], ...]:
+    """Parse the texts of ``--guard NAME=VALUE``.
+
+    Raises:
+        SettingsError: There is no such limit, one comes twice or is outside its bounds, or two contradict each other.
+    """
+    values: dict[str, float] = {}
+    for text in texts:
+        name, _, typed = (part.strip() for part in text.partition("="))
+        try:
+            value = float(typed)
+        except ValueError as error:
+            example = "joint_speed=0.3"
+            raise SettingsError(f"--guard {text}: expected NAME=NUMBER, such as --guard {example}") from error
+        if name in values:
+            raise SettingsError(f"--guard: {name} comes twice ({values[name]:g} and {value:g}); give it once")
+        values[name] = value
+    try:
+        Limits().changed(values)
+    except BamEnvsError as error:
+        raise SettingsError(f"--guard: {error}") from error
+    return tuple(values.items())
 
 
 def addresses(text: str | Sequence[str] | None) -> tuple[str, ...]:

@@ -10,6 +10,7 @@ import json as json_module
 import math
 import sys
 from contextlib import nullcontext
+from dataclasses import asdict
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -26,6 +27,10 @@ if TYPE_CHECKING:
     from bam_train.env_location import Place
 
 
+ANY_ROBOT = "ws://127.0.0.1:9090"
+"""Address for showing the guards of a robot whose address is not given; nothing is connected."""
+
+
 def deploy_checkpoint(config: DeployConfig, signals: SignalMemory) -> int:
     """Run the program with its parsed flags; a signal whose exception was lost ends it before the robot moves."""
     place = _checked_place(config)
@@ -37,6 +42,8 @@ def deploy_checkpoint(config: DeployConfig, signals: SignalMemory) -> int:
     from bam_train.deploy.trust import Admission
 
     checkpoint = Checkpoint.open(config.checkpoint)
+    if config.print_guards:
+        return print_guards(config, checkpoint, place)
     admission = Admission(checkpoint, config.keys, config.allow_unsigned)
     asked: Any = {"episodes": config.episodes, "yes": config.yes, "render": config.render, "named": config.env}
     asked["wiggle"] = config.wiggle
@@ -49,6 +56,24 @@ def deploy_checkpoint(config: DeployConfig, signals: SignalMemory) -> int:
     journal = Journal(config.episodes, marks=admission.marks)
     deployment = Deployment(env, admission.policy, pacer, journal)
     return _run(config, checkpoint, place, deployment, signals)
+
+
+def print_guards(config: DeployConfig, checkpoint: Checkpoint, place: Place) -> int:
+    """Print the guards between a live robot and the policy of `checkpoint`; nothing is connected."""
+    from bam_envs.core.registry import entry_of
+    from bam_train.deploy.guard_table import guard_lines
+    from bam_train.environments import environment_of, make_env
+    from bam_train.errors import SettingsError
+
+    env_id, env_kwargs = environment_of(checkpoint, config.env)
+    if entry_of(env_id) is None:
+        raise SettingsError(f"--print-guards: {env_id} has no robot, and so no guards")
+    env = make_env(env_id, env_kwargs, place=place)
+    robot: Any = env.unwrapped.robot  # type: ignore[attr-defined]
+    table = {"guards": robot.guards(), "limits": asdict(robot.limits)}
+    tell(*([json_module.dumps(table)] if config.json else guard_lines(robot.guards(), robot.limits)))
+    env.close()  # type: ignore[no-untyped-call]
+    return 0
 
 
 def _run(
@@ -78,11 +103,22 @@ def _run(
 
 def _checked_place(config: DeployConfig) -> Place:
     """The place of the environment by the flags; invalid flags are refused before anything is loaded."""
-    from bam_train.env_location import Place, addresses
+    from bam_train.env_location import Place, addresses, read_guards
     from bam_train.errors import SettingsError
 
     ca_file, token_file = (None if path is None else str(path) for path in (config.ca_file, config.token_file))
-    place = Place(config.robot, addresses(config.transport), config.profile, ca_file, token_file, config.timeout)
+    if config.print_guards and config.transport is not None:
+        raise SettingsError("--print-guards shows the guards of a live robot, and --transport has none; leave it out")
+    robot = ANY_ROBOT if config.print_guards and config.robot is None else config.robot
+    place = Place(
+        robot,
+        addresses(config.transport),
+        config.profile,
+        ca_file,
+        token_file,
+        config.timeout,
+        read_guards(config.guard),
+    )
     if config.rate is not None and config.fast:
         raise SettingsError("--fast does not wait for deadlines, so --rate has no meaning with it; give one of the two")
     if config.transport is not None and not place.transport:

@@ -130,6 +130,10 @@ class DeployConfig:
     """Whole environment that runs elsewhere: ws://10.0.0.5:9090/bam_001 (GymAPI), tcp://10.0.0.5:9091."""
     profile: Name = None
     """What the live robot's topics are: a shipped name, or a .toml or .yaml file."""
+    guard: Assignments = ()
+    """One limit of the live robot's guards, any number of times: joint_speed=0.3; --print-guards has their names."""
+    print_guards: bool = False
+    """Print the guards that a live robot would have, with their limits and what they do; connect and move nothing."""
     ca_file: File = None
     """Certificates that wss:// trusts instead of the system's."""
     token_file: File = None

@@ -27,6 +27,7 @@ def make_env(
     robot: str | None = None,
     transport: str | None = None,
     profile: str | None = None,
+    guards: Mapping[str, float] | None = None,
     ca_file: str | None = None,
     token_file: str | None = None,
     timeout: float | None = None,
@@ -43,6 +44,7 @@ def make_env(
         transport: Address of a whole environment that runs elsewhere, such as ``"ws://10.0.0.5:9090/bam_001"`` or
             ``"tcp://10.0.0.5:9091"``; then this process has no robot and no task.
         profile: Profile of the live robot: a shipped name or a file; by default that of the simulated robot.
+        guards: Limits of the live robot's guards that differ from its profile's, such as ``{"joint_speed": 0.3}``.
         ca_file: Certificates that ``wss://`` trusts instead of the system's.
         token_file: File with the server's token.
         timeout: Longest wait for an answer of `transport` [s]; 30 by default.
@@ -55,6 +57,8 @@ def make_env(
         raise InvalidValue("robot= and transport= exclude each other: the task runs here, or with the robot elsewhere.")
     if robot is None and profile is not None:
         raise InvalidValue(f"profile={profile!r} describes a live robot; give its address with robot= too.")
+    if robot is None and guards is not None:
+        raise InvalidValue("guards= changes the limits of a live robot; give its address with robot= too.")
     _check_place(robot, transport, timeout, render_mode, randomize, task_options)
     if transport is not None:
         from bam_envs.remote.remote_env import make_remote_env
@@ -71,7 +75,13 @@ def make_env(
 
     tool = getattr(simulated, "tool_position", None)  # forward kinematics of an arm that is no UR5e
     live = live_robot(
-        robot, simulated.spec, profile=profile, tool_position=tool, ca_file=ca_file, token_file=token_file
+        robot,
+        simulated.spec,
+        profile=profile,
+        guards=guards,
+        tool_position=tool,
+        ca_file=ca_file,
+        token_file=token_file,
     )
     return RobotEnv(live, task, render_mode=render_mode)
 

@@ -2,7 +2,7 @@
 
 import pytest
 
-from bam_train.env_location import HERE, Place, addresses
+from bam_train.env_location import HERE, Place, addresses, read_guards
 from bam_train.errors import SettingsError
 
 
@@ -42,6 +42,10 @@ def test_addresses(text, found):
             Place(transport=("tcp://a:1", "tcp://b:2", "tcp://a:1/")),
             "--transport: tcp://a:1 comes twice, and an address is one environment; give it once",
         ),
+        (
+            Place(guards=(("joint_speed", 0.3),)),
+            "--guard changes a limit of a live robot; give its address with --robot too",
+        ),
         (Place(timeout=5.0), "--timeout limits the wait for an answer of --transport; leave it out"),
         (Place(transport=("tcp://a:1",), timeout=0.0), "--timeout: expected a number above 0, found 0.0"),
     ],
@@ -68,6 +72,37 @@ def test_a_live_robot_is_as_it_is():
         "ca_file": "ca.pem",
         "token_file": None,
     }
+
+
+def test_the_limits_of_its_guards():
+    place = Place(robot="ws://a:1", guards=read_guards([" joint_speed = 0.3", "tool_speed=1e-1"]))
+    assert place.robot_kwargs("bam/pick-v0", {})["guards"] == {"joint_speed": 0.3, "tool_speed": 0.1}
+
+
+@pytest.mark.parametrize(
+    ("texts", "message"),
+    [
+        (["joint_speed"], "--guard joint_speed: expected NAME=NUMBER, such as --guard joint_speed=0.3"),
+        (["joint_speed=fast"], "--guard joint_speed=fast: expected NAME=NUMBER, such as --guard joint_speed=0.3"),
+        (["joint_sped=0.3"], "--guard: Unknown limit 'joint_sped'. Did you mean 'joint_speed'?"),
+        (
+            ["joint_speed=9"],
+            "--guard: The limit joint_speed of a live robot must be 0.01 to 3.14159 rad/s, not 9.",
+        ),
+        (["tool_speed=inf"], "--guard: The limit tool_speed of a live robot must be 0.005 to 1 m/s, not inf."),
+        (["tool_speed=nan"], "--guard: The limit tool_speed: expected a number above 0, found nan"),
+        (["joint_speed=1", "joint_speed=2"], "--guard: joint_speed comes twice (1 and 2); give it once"),
+        (
+            ["joint_speed=0.3", "reset_speed=0.5"],
+            "--guard: The limits reset_speed of 0.5 and joint_speed of 0.3 contradict each other: reset_speed is at "
+            "most joint_speed.",
+        ),
+    ],
+)
+def test_a_guard_that_is_refused(texts, message):
+    with pytest.raises(SettingsError) as caught:
+        read_guards(texts)
+    assert str(caught.value) == message
 
 
 def test_an_environment_without_a_robot_says_so():

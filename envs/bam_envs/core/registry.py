@@ -20,7 +20,17 @@ if TYPE_CHECKING:
     from bam_envs.core.robot import Robot
     from bam_envs.core.task import Task
 
-MAKE_OPTIONS = ("render_mode", "randomize", "robot", "transport", "profile", "ca_file", "token_file", "timeout")
+MAKE_OPTIONS = (
+    "render_mode",
+    "randomize",
+    "robot",
+    "transport",
+    "profile",
+    "guards",
+    "ca_file",
+    "token_file",
+    "timeout",
+)
 """Arguments of `gymnasium.make` for every environment here, besides the options of its task."""
 
 

@@ -1,5 +1,6 @@
 """The one function that builds a live robot: a `RosbridgeRobot` behind the guards of a `SafeRobot`."""
 
+from collections.abc import Mapping
 from pathlib import Path
 
 from bam_envs.core.errors import InvalidValue
@@ -18,6 +19,7 @@ def live_robot(
     *,
     profile: RobotProfile | str | Path | None = None,
     limits: Limits | None = None,
+    guards: Mapping[str, float] | None = None,
     tool_position: ToolPosition | None = None,
     command: str | None = None,
     ca_file: str | None = None,
@@ -30,6 +32,7 @@ def live_robot(
         spec: Signals and commands that the task needs; None: all of the profile that are not optional.
         profile: The profile of its topics: a shipped name or a file. None: the shipped one with the commands of `spec`.
         limits: The limits of the guards; None: those of the profile.
+        guards: Some of them by name, which override the others, such as ``{"joint_speed": 0.3}``.
         tool_position: Forward kinematics of an arm other than a UR5e, (n, k) [rad] to (n, 3) [m].
         command: Command mode, such as ``"trajectory"``; None: the profile's default.
         ca_file: PEM file of the authorities to trust instead of the system's.
@@ -37,8 +40,8 @@ def live_robot(
 
     Raises:
         InvalidValue: The address is not that of a robot, a file cannot be read, or the profile lacks a signal or
-            command of `spec`.
-        UnknownName: There is no such profile, or no such command mode.
+            command of `spec`; or a limit is outside its bounds, or contradicts another one.
+        UnknownName: There is no such profile, command mode or limit.
     """
     require_robot_address(url)
     endpoint = Endpoint.with_token_file(url, ca_file=ca_file, token_file=token_file)
@@ -47,7 +50,8 @@ def live_robot(
     else:
         chosen = profile if isinstance(profile, RobotProfile) else load_profile("ur5e" if profile is None else profile)
     robot = RosbridgeRobot(endpoint, chosen, spec=spec, command=command)
-    return SafeRobot(robot, limits=limits or profile_limits(chosen), tool_position=tool_position)
+    base = limits or profile_limits(chosen)
+    return SafeRobot(robot, limits=base.changed(guards) if guards else base, tool_position=tool_position)
 
 
 def profile_limits(profile: RobotProfile) -> Limits:

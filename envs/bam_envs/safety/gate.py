@@ -6,6 +6,7 @@ Several such ticks in a row, or a measurement beyond the data sheet, stop the ro
 Longer than most files: `SafeRobot` and `ClearedCommand` share a file so that no other module can clear a command.
 """
 
+import inspect
 import math
 import time
 import weakref
@@ -236,6 +237,21 @@ class SafeRobot(metaclass=Sealed):
     def age(self) -> float:
         """Age of the newest state of a live robot [s]; 0 for any other."""
         return 0.0 if self._live is None else float(self._live.age())
+
+    def guards(self) -> list[dict[str, Any]]:
+        """The guards in their order: number, name, limit, unit, name of the setting in `Limits`, and what it does."""
+        every = dict.fromkeys((*self._further, *self._guards))  # the tool's speed is limited twice
+        return [
+            {
+                "number": one.number,
+                "name": one.name,
+                "limit": one.limit_value if math.isfinite(one.limit_value) else None,
+                "unit": one.unit,
+                "setting": one.setting,
+                "does": inspect.cleandoc(type(one).__doc__ or "").partition("\n\n")[0].replace("\n", " "),
+            }
+            for one in every
+        ]
 
     def report(self) -> dict[str, dict[str, Any]]:
         """For each guard: number, limit, unit, commands altered, ticks held, and stops of the robot.

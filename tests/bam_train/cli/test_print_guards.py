@@ -1,0 +1,59 @@
+"""``bam-deploy --print-guards`` and ``--guard``: every guard that a live robot would have; nothing is connected."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from bam_envs.safety.guard import BOUNDS
+from bam_train.cli.deploy import main
+
+CHECKPOINTS = Path(__file__).parents[3] / "checkpoints"
+
+
+@pytest.mark.parametrize("name", ["reach-ppo.zip", "mir100-navigation-ppo.zip"])
+def test_every_guard_has_a_number_a_name_a_limit_and_says_what_it_does(run, name):
+    status, out, err = run(main, CHECKPOINTS / name, "--print-guards", "--json")
+    table = json.loads(out)
+    assert (status, err) == (0, "")
+    for guard in table["guards"]:
+        assert guard["number"].startswith("G")
+        assert guard["name"]
+        assert guard["unit"]
+        assert guard["does"].endswith(".")
+        assert all(one in BOUNDS for one in guard["setting"].split(", ") if one)
+    assert set(table["limits"]) == set(BOUNDS)
+
+
+def test_a_guard_that_is_changed_is_shown_so(run):
+    given = ("--robot", "ws://10.0.0.5:9090", "--guard", "joint_speed=0.3")
+    status, out, err = run(main, CHECKPOINTS / "reach-ppo.zip", "--print-guards", *given)
+    lines = [" ".join(line.split()) for line in out.splitlines()]
+    assert (status, err) == (0, "")
+    does = "No joint is faster than the limit or its data sheet; the other joints slow down with it."
+    assert f"G8 joint speed 0.3 rad/s joint_speed {does}" in lines
+    assert "joint_speed 0.3 0.01 3.14159 rad/s" in lines
+
+
+@pytest.mark.parametrize(
+    ("flags", "message"),
+    [
+        (("--print-guards", "--guard", "joint_speed=9"), "must be 0.01 to 3.14159 rad/s, not 9."),
+        (("--guard", "joint_speed=0.3"), "--guard changes a limit of a live robot; give its address with --robot too"),
+        (
+            ("--print-guards", "--transport", "tcp://127.0.0.1:9"),
+            "--print-guards shows the guards of a live robot, and --transport has none; leave it out",
+        ),
+    ],
+)
+def test_what_is_refused_in_one_line(run, flags, message):
+    status, out, err = run(main, CHECKPOINTS / "reach-ppo.zip", *flags)
+    assert (status, out) == (1, "")
+    assert err.count("\n") == 1
+    assert err.strip().endswith(message)
+
+
+def test_an_environment_without_a_robot_has_no_guards(run, corridor_checkpoint):
+    status, out, err = run(main, corridor_checkpoint(), "--print-guards")
+    assert (status, out) == (1, "")
+    assert err == "bam-deploy: --print-guards: test/Corridor-v0 has no robot, and so no guards\n"
