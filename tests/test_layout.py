@@ -24,7 +24,19 @@ ORDER = {
     ],
     "bam_train": [
         *("errors", "signals", "atomic_file", "env_location", "settings", "finite_envs"),
-        *("checkpoint", "policy", "environments", "video", "loop", "evaluation", "deploy", "trainers", "compat", "cli"),
+        *(
+            "checkpoint",
+            "policy",
+            "environments",
+            "video",
+            "recording",
+            "loop",
+            "evaluation",
+            "deploy",
+            "trainers",
+            "compat",
+            "cli",
+        ),
     ],
 }
 """Each package or module imports what stands before it, and nothing behind it."""

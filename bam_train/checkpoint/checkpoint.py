@@ -55,6 +55,8 @@ class Checkpoint:
 
     path: Path
     manifest: Manifest
+    digest: str = ""
+    """Hex sha256 of the manifest, which has that of every other member."""
 
     @classmethod
     def open(cls, path: str | Path) -> Checkpoint:
@@ -68,12 +70,13 @@ class Checkpoint:
         path = Path(path).expanduser()
         with open_zip(path) as archive:
             infos = list_members(path, archive)
-            manifest = parse_manifest(path, b"".join(chunks(path, archive, infos[MANIFEST])))
+            data = b"".join(chunks(path, archive, infos[MANIFEST]))
+            manifest = parse_manifest(path, data)
             require_same_members(path, set(infos), set(manifest.sha256))
             for name, expected in manifest.sha256.items():
                 if not name.startswith(RESUME):  # may have gigabytes; `read` verifies it
                     deque(chunks(path, archive, infos[name], expected), maxlen=0)
-        return cls(path, manifest)
+        return cls(path, manifest, hashlib.sha256(data).hexdigest())
 
     def has(self, member: str) -> bool:
         """Whether a member is in the file."""
@@ -175,4 +178,4 @@ def write_checkpoint(path: str | Path, manifest_fields: Mapping[str, Any], membe
     except OSError as error:
         why = error.strerror or error
         raise OutputError(f"{path}: cannot be written: {why}. Choose another place with --out") from error
-    return Checkpoint(path, parse_manifest(path, manifest))
+    return Checkpoint(path, parse_manifest(path, manifest), hashlib.sha256(manifest).hexdigest())

@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from bam_train.cli.flags import DeployConfig
     from bam_train.deploy.deployment import Deployment
     from bam_train.env_location import Place
+    from bam_train.recording.recorder import Recorder
 
 
 ANY_ROBOT = "ws://127.0.0.1:9090"
@@ -50,11 +51,12 @@ def deploy_checkpoint(config: DeployConfig, signals: SignalMemory) -> int:
     env = connected_env(checkpoint, place, signals, who="bam-deploy", admit=admission, **asked)
     try:
         pacer = Pacer(_period(config, checkpoint, env))
+        recorder = _recorder(config, checkpoint, place, env, admission.marks)
     except BaseException:
         env.close()  # type: ignore[no-untyped-call]
         raise
     journal = Journal(config.episodes, marks=admission.marks)
-    deployment = Deployment(env, admission.policy, pacer, journal)
+    deployment = Deployment(env, admission.policy, pacer, journal, recorder=recorder)
     return _run(config, checkpoint, place, deployment, signals)
 
 
@@ -94,7 +96,9 @@ def _run(
         if ending.status:
             say(f"bam-deploy: {ending.reason}")
         where = place.text or "simulated here"
-        report = DeployReport(checkpoint, config.seed, ending, journal, pacer, where, guards_of(env))
+        report = DeployReport(
+            checkpoint, config.seed, ending, journal, pacer, where, guards_of(env), deployment.recorder
+        )
         for warning in report.warnings():
             say(f"bam-deploy: warning: {warning}")
         tell(*([json_module.dumps(report.to_json(), allow_nan=False)] if config.json else report.lines()))
@@ -119,6 +123,8 @@ def _checked_place(config: DeployConfig) -> Place:
         config.timeout,
         read_guards(config.guard),
     )
+    if config.record is not None and config.no_record:
+        raise SettingsError("--record and --no-record exclude each other; give one of the two")
     if config.rate is not None and config.fast:
         raise SettingsError("--fast does not wait for deadlines, so --rate has no meaning with it; give one of the two")
     if config.transport is not None and not place.transport:
@@ -135,6 +141,21 @@ def _checked_place(config: DeployConfig) -> Place:
 
         require_screen(remote=place.is_remote)
     return place
+
+
+def _recorder(
+    config: DeployConfig, checkpoint: Checkpoint, place: Place, env: gym.Env[Any, Any], marks: tuple[str, ...]
+) -> Recorder | None:
+    """The recorder that the flags ask for, started; None for none."""
+    if config.record is None and (config.no_record or place.robot is None):
+        return None
+    from bam_train.deploy.flight import deployment_facts, flight_recorder, new_recording
+
+    path = config.record or new_recording(checkpoint.manifest.env)
+    facts = {**deployment_facts(checkpoint, env), "seed": config.seed, "address": place.text, "marks": ", ".join(marks)}
+    recorder = flight_recorder(path.expanduser(), env, facts)
+    recorder.start()
+    return recorder
 
 
 def _period(config: DeployConfig, checkpoint: Checkpoint, env: gym.Env[Any, Any]) -> float | None:

@@ -154,6 +154,10 @@ class DeployConfig:
     """Do not wait for deadlines: as fast as it goes."""
     render: bool = False
     """Show the robot in a window."""
+    record: File = None
+    """Record every tick into this .mcap file; by default a live robot's go to a new file in recordings/."""
+    no_record: bool = False
+    """Do not record a live robot."""
     json: bool = False
     """Print one JSON report on standard output instead of a few lines."""
 

@@ -6,6 +6,7 @@ halted and closed before anything is reported.
 """
 
 import signal
+import time
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 from typing import Any, Protocol
@@ -14,11 +15,13 @@ import gymnasium as gym
 
 from bam_envs.core.errors import BamEnvsError, LinkLost, SafetyStop
 from bam_envs.core.timing import Pacer
+from bam_train.deploy.flight import RecorderAgent, Stopwatch
 from bam_train.deploy.journal import Ending, EpisodeRecord, Journal
 from bam_train.errors import BamTrainError
 from bam_train.loop import Agent, Agents, PolicyAgent, RobotAgent, TemporalAgent, Workspace
 from bam_train.loop.robot_agent import SAYS_SUCCESS, SUCCESS
 from bam_train.loop.workspace import Sink
+from bam_train.recording.recorder import ERROR, INFO, Recorder
 from bam_train.signals import handled, interrupt
 
 WINDOW = 1000
@@ -88,6 +91,8 @@ class Deployment:
         window: Minimum number of ticks that the workspace keeps.
         sink: ``sink(first_time, {variable: array (n, 1, ...)})`` gets every tick once, in order, episode by episode.
             It is called between two ticks, so it must be fast; if it fails, the deployment ends.
+        recorder: Records every tick, if given; it has started, and is closed at the end. If it fails, the deployment
+            goes on.
 
     Raises:
         WiringError: An agent reads a variable that no agent writes; the robot has not been connected.
@@ -103,19 +108,24 @@ class Deployment:
         agents: Sequence[Agent] = (),
         window: int = WINDOW,
         sink: Sink | None = None,
+        recorder: Recorder | None = None,
     ) -> None:
-        self.env, self.pacer, self.journal = env, pacer, journal
+        self.env, self.pacer, self.journal, self.recorder = env, pacer, journal, recorder
         self.switch = StopSwitch(lambda: self._robot.halt())
         """Handler of SIGINT and SIGTERM."""
         self._robot = _DeployedRobot(env, self.switch)
         self._workspace = Workspace(window=window, sink=None if sink is None else _silent_once_broken(sink))
-        chain = (
-            _StopAgent(self.switch),
+        watch, names = Stopwatch(), self._robot.observation_names
+        chain: list[Agent] = [
+            _StopAgent(self.switch, watch),
             self._robot,
-            _JournalAgent(journal, pacer),
-            PolicyAgent(policy, self._robot.observation_names, single=True),
-        )
-        self._loop = TemporalAgent(Agents(*chain, *agents))
+            _JournalAgent(journal, pacer, watch),
+            PolicyAgent(policy, names, single=True),
+            *agents,
+        ]
+        if recorder is not None:
+            chain.append(RecorderAgent(recorder, env, names, journal, watch))
+        self._loop = TemporalAgent(Agents(*chain))
 
     def connect(self) -> None:
         """Open the link to the robot, if there is one, without moving it; fails before the loop if it is missing."""
@@ -128,7 +138,11 @@ class Deployment:
     def run(self, watcher: Watcher, *, seed: int) -> Ending:
         """Run ``journal.wanted`` episodes; episode k gets ``seed + k``. Their exceptions become the `Ending`."""
         with self.handles_signals():
-            return self._run(watcher, seed)
+            ending = self._run(watcher, seed)
+            if self.recorder is not None:
+                self.recorder.event(ending.reason, ERROR if ending.status in (1, 3, 4) else INFO)
+                self.recorder.close()
+            return ending
 
     def _run(self, watcher: Watcher, seed: int) -> Ending:
         try:
@@ -204,11 +218,12 @@ class _StopAgent(Agent):
     reads = ()
     writes = ()
 
-    def __init__(self, switch: StopSwitch) -> None:
+    def __init__(self, switch: StopSwitch, watch: Stopwatch) -> None:
         super().__init__()
-        self._switch = switch
+        self._switch, self._watch = switch, watch
 
     def forward(self, **kwargs: Any) -> None:
+        self._watch.begun = time.perf_counter()
         self._switch.raise_again()
 
 
@@ -233,11 +248,12 @@ class _JournalAgent(Agent):
     reads_previous = ("action",)
     writes = ()
 
-    def __init__(self, journal: Journal, pacer: Pacer) -> None:
+    def __init__(self, journal: Journal, pacer: Pacer, watch: Stopwatch) -> None:
         super().__init__()
-        self._journal, self._pacer = journal, pacer
+        self._journal, self._pacer, self._watch = journal, pacer, watch
 
     def forward(self, t: int, seed: int, watcher: Watcher, **kwargs: Any) -> None:
+        self._watch.stepped = time.perf_counter()
         if t == 0:
             self._journal.begin(seed)
             self._pacer.start()
@@ -248,5 +264,5 @@ class _JournalAgent(Agent):
             watcher.ticked(record, self.get(("action", t - 1))[0], self._pacer)
             if end != "stopped":
                 watcher.ended(record)
-        if not self.get(("env/done", t))[0]:
-            self._pacer.wait()
+        self._watch.late = 0.0 if self.get(("env/done", t))[0] else self._pacer.wait()
+        self._watch.waited = time.perf_counter()

@@ -9,6 +9,7 @@ from typing import Any
 
 from bam_envs.core.timing import Lateness, Pacer
 from bam_train.checkpoint import Checkpoint
+from bam_train.recording.recorder import Recorder
 
 
 @dataclass
@@ -111,6 +112,8 @@ class DeployReport:
     """Address of the robot, or the simulation."""
     guards: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
     """Counts of the guards of a live robot, by name; see `SafeRobot.report`."""
+    recorder: Recorder | None = None
+    """What recorded it, if anything."""
 
     def to_json(self) -> dict[str, Any]:
         """The report as JSON values; times in the unit of their name."""
@@ -138,17 +141,20 @@ class DeployReport:
                 for name, guard in self.guards.items()
             },
             "per_episode": [record.to_json() for record in journal.records],
+            **({} if self.recorder is None else {"recording": str(self.recorder.path)}),
         }
 
     def warnings(self) -> list[str]:
         """Warnings for the user, also about a deployment that ended well."""
         missed, period = self.pacer.missed, self.pacer.period
         planned = self.pacer.ticks + missed
+        faults = [] if self.recorder is None or not self.recorder.fault else [f"recording: {self.recorder.fault}"]
         if period is None or missed <= MISSED_SHARE * planned:
-            return []
+            return faults
         return [
+            *faults,
             f"{missed} of {planned} ticks were missed: policy and robot take longer than the {1e3 * period:g} ms that "
-            "the policy was made for; use a faster computer, or stop what else runs on it"
+            "the policy was made for; use a faster computer, or stop what else runs on it",
         ]
 
     def lines(self) -> list[str]:
@@ -161,6 +167,7 @@ class DeployReport:
             f"{reason}: {episodes}, {self.pacer.ticks} ticks, {rate_text(self.pacer)}{journal.marked}",
             *([f"lateness {lateness_text(self.pacer)}"] if self.pacer.period is not None else []),
             *([guards_text(self.guards)] if self.guards else []),
+            *([f"recorded in {self.recorder.path}"] if self.recorder is not None else []),
         ]
 
 

@@ -106,9 +106,11 @@ def test_a_policy_does_elsewhere_what_it_does_here(serve, run):
         assert json.loads(there)["robot"] == url
 
 
-def test_a_policy_drives_a_robot_over_its_topics(serve, run):
+def test_a_policy_drives_a_robot_over_its_topics(serve, run, tmp_path, monkeypatch):
     served = serve(gym.make("bam/pick-v0", disable_env_checker=True), fast=True)
-    status, out, err = run(deploy, PICK, "--json", "--episodes", 1, "--robot", served.bus.url)
+    policy = str(Path(PICK).resolve())
+    monkeypatch.chdir(tmp_path)
+    status, out, err = run(deploy, policy, "--json", "--episodes", 1, "--robot", served.bus.url)
     report = json.loads(out)
     assert (status, report["stop_reason"], report["successes"]) == (0, "episodes done", 1), err
     assert report["robot"] == served.bus.url
@@ -116,6 +118,8 @@ def test_a_policy_drives_a_robot_over_its_topics(serve, run):
     assert {row["number"] for row in report["guards"].values()} == numbers
     assert all(row["stopped"] == 0 for row in report["guards"].values())
     assert "will move" not in err  # it said that it is simulated
+    [recording] = tmp_path.glob("recordings/*-pick.mcap")
+    assert report["recording"] == str(recording.relative_to(tmp_path))
 
 
 class Cut(gym.Env):

@@ -1,0 +1,184 @@
+"""The flight recorder's agent: it hands the numbers of every tick of a deployment to a `Recorder`."""
+
+import itertools
+import json
+import math
+import platform
+import time
+from collections.abc import Iterable, Mapping
+from importlib.metadata import version
+from pathlib import Path
+from time import perf_counter
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from numpy.typing import NDArray
+
+from bam_train.checkpoint import Checkpoint
+from bam_train.deploy.journal import Journal
+from bam_train.environments import control_period
+from bam_train.loop import Agent
+from bam_train.loop.gym.gym_spaces import NAME
+from bam_train.recording.recorder import Recorder
+
+STAGES = ("step", "wait", "late", "policy", "age", "record")
+"""What /latency has; see `RecorderAgent`."""
+_SCALARS = {
+    "/status": ("code", "guard"),
+    "/latency": STAGES,
+    "/episode": ("episode", "step", "reward", "terminated", "truncated", "success"),
+}
+
+
+class Stopwatch:
+    """The times of a tick on the clock of `perf_counter` [s], which the agents of the loop fill in."""
+
+    begun = stepped = waited = 0.0
+    late = 0.0
+    """Delay of the tick after its deadline [s]."""
+
+
+def flight_recorder(path: Path, env: gym.Env[Any, Any], metadata: Mapping[str, Any]) -> Recorder:
+    """A recorder for a deployment in `env`, which has not started.
+
+    Args:
+        path: The file.
+        env: The environment.
+        metadata: What is deployed: text, or values that are kept as JSON.
+    """
+    report: Mapping[str, Any] = getattr(getattr(env.unwrapped, "robot", None), "report", dict)()
+    texts = {key: value if isinstance(value, str) else json.dumps(value) for key, value in metadata.items()}
+    return Recorder(path, texts, [f"{name} ({row['number']})" for name, row in report.items()])
+
+
+def new_recording(env_id: str, folder: Path = Path("recordings")) -> Path:
+    """A file that does not exist yet, named by the time (UTC) and the environment."""
+    name = env_id.rpartition(":")[2].rpartition("/")[2].rpartition("-v")[0]
+    stem = f"{time.strftime('%Y-%m-%dT%H%M%SZ', time.gmtime())}-{name}"
+    paths = (folder / f"{stem}{'' if k == 1 else f'-{k}'}.mcap" for k in itertools.count(1))
+    return next(path for path in paths if not path.exists())
+
+
+def deployment_facts(checkpoint: Checkpoint, env: gym.Env[Any, Any]) -> dict[str, Any]:
+    """What a recording says of a deployment, by name."""
+    manifest, robot = checkpoint.manifest, getattr(env.unwrapped, "robot", None)
+    info = getattr(robot, "info", None)
+    return {
+        "checkpoint": str(checkpoint.path.resolve()),
+        "checkpoint_sha256": checkpoint.digest,
+        "env": manifest.env,
+        "env_kwargs": manifest.env_kwargs,
+        "period_s": control_period(env) or manifest.period,
+        "robot": "" if info is None else info.text,
+        "guards": getattr(robot, "report", dict)(),
+        "versions": {"bam-train": version("bam-train"), "python": platform.python_version()},
+    }
+
+
+class RecorderAgent(Agent):
+    """Records each tick: last in the chain, so that the action is the one that the environment gets.
+
+    The latencies are ``step``, from an action to the observation that it led to; ``wait``, until the next deadline;
+    ``late``, the delay of the tick after that; ``policy``, from then to the next action; ``age`` of a live robot's
+    newest state at that time; and ``record``, what recording the tick before took.
+
+    Args:
+        recorder: The recorder, which has started.
+        env: The environment.
+        names: The variables of the observation.
+        journal: The journal.
+        watch: The times of the tick.
+    """
+
+    writes = ()
+
+    def __init__(
+        self, recorder: Recorder, env: gym.Env[Any, Any], names: tuple[str, ...], journal: Journal, watch: Stopwatch
+    ) -> None:
+        super().__init__()
+        self._recorder, self._env, self._journal, self._watch = recorder, env.unwrapped, journal, watch
+        self._robot: Any = getattr(self._env, "robot", None)
+        self._names, self.reads = names, (*names, "action", "env/reward")
+        self._numbers: list[str] = []
+        self._decided, self._took = 0.0, math.nan
+
+    def forward(self, t: int, seed: int, **kwargs: Any) -> None:
+        """Record the tick."""
+        begun, watch, record = perf_counter(), self._watch, self._journal.records[-1]
+        state: Any = getattr(self._env, "last_state", None)
+        action = self.get(("action", t))
+        if t == 0:
+            self._recorder.event(f"episode {self._journal.begun} begins, seed {seed}")
+            self._describe(state, {name: self.get((name, t)) for name in self._names}, action)
+        scalars = [
+            *self._status(),
+            *(watch.stepped - watch.begun, watch.waited - watch.stepped, watch.late, begun - watch.waited),
+            *(self._age(), self._took, self._journal.begun - 1, t, self.get(("env/reward", t))[0]),
+            *(record.end == "terminated", record.end == "truncated"),
+            math.nan if record.success is None else record.success,
+        ]
+        arrays = [*(self.get((name, t)) for name in self._numbers), action]
+        if state is not None:
+            arrays = [state.stamp, *state.signals.values(), *_numeric(state.truth).values(), state.command, *arrays]
+        self._recorder.tick(arrays, scalars, begun - self._decided if t else 0.0)
+        for name in self._names:
+            if name not in self._numbers:
+                self._recorder.pixels(name.removeprefix("env/"), self.get((name, t))[0])
+        self._decided = perf_counter()
+        self._took = self._decided - begun
+
+    def _describe(self, state: Any, observed: Mapping[str, NDArray[Any]], action: NDArray[Any]) -> None:
+        """Name the numbers of a tick, in the order of `forward`."""
+        labels = {
+            kind: [str(row["name"]) for row in rows] for kind, rows in getattr(self._env, "describe", dict)().items()
+        }
+        self._numbers = [name for name, array in observed.items() if not _is_picture(array)]
+        arrays = {name.removeprefix(f"env/{NAME}").lstrip("/"): observed[name] for name in self._numbers}
+        layout, truth = {}, {} if state is None else _numeric(state.truth)
+        if state is not None:
+            spec = self._robot.spec
+            signals = [
+                f"{one.name}.{label}" for one in spec.signals if one.name in state.signals for label in one.labels
+            ]
+            layout = {"/state": ["stamp", *signals], "/truth": _named(truth), "/command": list(spec.command.labels)}
+        layout["/observation"] = _named(arrays, labels.get("observation"))
+        layout["/action"] = _named({"": action}, labels.get("action"))
+        layout |= {topic: list(names) for topic, names in _SCALARS.items()}
+        kinds = {"truth": truth, "observation": arrays, "action": {"": action}}
+        extra = {kind: json.dumps({name: _kind(array) for name, array in of.items()}) for kind, of in kinds.items()}
+        self._recorder.declare({topic: names for topic, names in layout.items() if names}, extra)
+
+    def _status(self) -> tuple[int, int]:
+        """Number, and place in the recorder's list, of the guard that changed the last command."""
+        guard: str = getattr(self._robot, "status", "")
+        if not guard:
+            return 0, 0
+        number = guard.rpartition("(G")[2].rstrip(")")
+        return int(getattr(self._robot, "code", number)), self._recorder.place(guard)
+
+    def _age(self) -> float:
+        age = getattr(self._robot, "age", None)
+        return math.nan if age is None else float(age())
+
+
+def _is_picture(array: NDArray[Any]) -> bool:
+    """Whether an observation (1, height, width, 1, 3 or 4) is recorded as a picture."""
+    return array.dtype == np.uint8 and array.ndim == 4 and array.shape[3] in (1, 3, 4)
+
+
+def _numeric(truth: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
+    """The parts of a state's truth that are numbers."""
+    return {name: array for name, array in truth.items() if array.dtype.kind in "fiub" and array.size}
+
+
+def _named(arrays: Mapping[str, NDArray[Any]], labels: Iterable[str] | None = None) -> list[str]:
+    """A name for each number of `arrays`: the labels where there are as many, else such as ``name.0`` or ``0``."""
+    names = [f"{name}.{i}".lstrip(".") for name, array in arrays.items() for i in range(array.size)]
+    given = list(labels or ())
+    return given if len(given) == len(names) else names
+
+
+def _kind(array: NDArray[Any]) -> list[Any]:
+    """Dtype and shape of an array (1, ...), without the batch."""
+    return [array.dtype.str, *array.shape[1:]]

@@ -1,0 +1,197 @@
+"""The recorder of a deployment: a tick hands its numbers to another process, which encodes them and writes the file.
+
+Topics of the file, as JSON with a schema:
+
+=============  ======================================================================================
+topic          content
+=============  ======================================================================================
+/state         each signal of the robot by label, SI units; ``stamp`` is the robot's own time [s]
+/truth         what only a simulation knows, such as contacts
+/observation   each number of the observation by name
+/action        each number of the policy's action by name
+/command       each number of the command that was sent, after the guards, by label, SI units
+/status        ``code`` (0 is fine, else the guard's number) and the ``guard`` that changed the command
+/latency       time of each stage of the tick, by name [s]
+/episode       episode, step, reward, terminated, truncated and success
+/events        foxglove.Log: what the operator did and was told
+/camera/NAME   foxglove.CompressedImage
+/pixels/NAME   foxglove.RawImage: an observation that is a picture
+=============  ======================================================================================
+
+The log time of a message is the wall clock; ``t`` in it is the monotonic clock [s]. All messages of a tick have the
+same sequence number. /command and /status have the time at which the command was sent, a step before the state that it
+led to. A number that is not finite is null. The metadata record ``deployment`` says what was deployed.
+"""
+
+import json
+import logging
+import os
+import struct
+import subprocess
+import sys
+import time
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bam_train.errors import OutputError
+from bam_train.recording.ring import EVENT, IMAGE, LAYOUT, PIXELS, TICK, TIMES, Ring, make_shared_file
+
+INFO, WARNING, ERROR = 2, 3, 4
+"""Levels of events, as of foxglove.Log."""
+_LOG = logging.getLogger(__name__)
+_RING = 16 * 2**20
+_START, _END = 20.0, 10.0  # seconds that the process may take to start and to end
+_LOOK = 64
+"""Records between two looks at whether the process is alive."""
+
+
+class Recorder:
+    """Writes one MCAP file from another process; after `start`, only `close` waits for the disk.
+
+    Once something fails, nothing more is recorded: `fault` says why, and a warning is logged.
+
+    Args:
+        path: The file; an existing one is refused, missing folders are made.
+        metadata: Text by name, for whoever opens the file; may be changed until `start`.
+        guards: Titles of the guards, such as ``"joint speed (G8)"``, for `/status`.
+        size: Bytes of memory for what is not on the disk yet.
+    """
+
+    def __init__(
+        self, path: Path, metadata: Mapping[str, str] | None = None, guards: Sequence[str] = (), size: int = _RING
+    ) -> None:
+        self.path, self.metadata, self.guards = path, dict(metadata or {}), ("", *guards)
+        self._places = {title: place for place, title in enumerate(self.guards)}
+        self._ring_size, self._numbers, self._writes = size, 0, 0
+        self._fault = ""
+        self._ring: Ring | None = None
+        self._process: subprocess.Popen[bytes] | None = None
+
+    def start(self) -> None:
+        """Start the process and make the file.
+
+        Raises:
+            OutputError: The file cannot be made.
+        """
+        descriptor = make_shared_file(self._ring_size)
+        self._ring = ring = Ring(descriptor)
+        head = {"path": str(self.path), "metadata": self.metadata, "guards": self.guards}
+        ring.write(json.dumps(head).encode())
+        program = [sys.executable, "-m", "bam_train.recording.recorder_process", str(descriptor), str(os.getpid())]
+        try:
+            self._process = subprocess.Popen(
+                program,
+                pass_fds=[descriptor],
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.DEVNULL,
+                env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},
+                start_new_session=True,  # Ctrl-C at the terminal is for the deployment alone
+            )
+        finally:
+            os.close(descriptor)
+        started = time.monotonic()
+        while not ring.ready:
+            if self._process.poll() is not None or ring.failure or time.monotonic() - started > _START:
+                self._process.kill()
+                self._process.wait()
+                self._process = None
+                raise OutputError(ring.failure or f"{self.path}: the recorder's process did not start")
+            time.sleep(0.002)
+
+    @property
+    def pid(self) -> int:
+        """Number of the process that writes the file; 0 before `start`."""
+        return 0 if self._process is None else self._process.pid
+
+    @property
+    def fault(self) -> str:
+        """Why nothing is recorded any more; "" while all is well."""
+        return self._fault or ("" if self._ring is None else self._ring.failure)
+
+    def place(self, guard: str) -> int:
+        """The number by which a tick names the guard with this title; 0 for none."""
+        return self._places.get(guard, 0)
+
+    def declare(self, layout: Mapping[str, Sequence[str]], extra: Mapping[str, str] | None = None) -> None:
+        """Say which numbers a tick has from now on.
+
+        Args:
+            layout: Topic to the names of its numbers, in the order of a tick; ``group.name`` is shown as a table.
+            extra: Text by name that readers of the numbers need, kept as the metadata record ``layout``.
+        """
+        self._numbers = sum(map(len, layout.values()))
+        content = {"layout": {topic: list(names) for topic, names in layout.items()}, "extra": dict(extra or {})}
+        self._write(LAYOUT, json.dumps(content).encode())
+
+    def tick(self, arrays: Iterable[NDArray[Any]], numbers: Sequence[float] = (), sent_ago: float = 0.0) -> None:
+        """Record one tick, whose numbers, one after the other, are those of the layout.
+
+        Args:
+            arrays: Arrays of any shape; bool and whole numbers are recorded as numbers.
+            numbers: The numbers after those of the arrays.
+            sent_ago: How long ago the command of this tick was sent [s].
+        """
+        if self._fault:
+            return
+        data = [
+            array.tobytes() if array.dtype == np.float64 else array.astype(np.float64).tobytes() for array in arrays
+        ]
+        content = b"".join((*data, struct.pack(f"={len(numbers)}d", *numbers)))
+        if len(content) != 8 * self._numbers:
+            self._fail(f"{self.path}: a tick has {len(content) // 8} numbers, and {self._numbers} were declared")
+        self._write(TICK, content, sent_ago)
+
+    def event(self, text: str, level: int = INFO) -> None:
+        """Record what the operator did or was told."""
+        self._write(EVENT, bytes([level]) + text.encode(errors="replace"))
+
+    def image(self, camera: str, form: str, data: bytes) -> None:
+        """Record one encoded image of a camera; `form` is its format: jpeg, png or webp."""
+        self._write(IMAGE, json.dumps([camera, form]).encode() + b"\n" + data)
+
+    def pixels(self, name: str, pixels: NDArray[np.uint8]) -> None:
+        """Record a picture without loss. Shape: (height, width, 1, 3 or 4), grey, RGB or RGBA."""
+        self._write(PIXELS, json.dumps([name, *pixels.shape]).encode() + b"\n" + pixels.tobytes())
+
+    def _write(self, kind: bytes, data: bytes, ago: float = 0.0) -> None:
+        if self._fault or self._ring is None:
+            return
+        self._writes += 1
+        if not self._ring.write(b"".join((kind, TIMES.pack(time.time_ns(), time.monotonic(), ago), data))):
+            self._fail(self._ring.failure or f"{self.path}: the disk is too slow; nothing is recorded from now on")
+        elif self._writes % _LOOK == 0 and (fault := self._status()):
+            self._fail(fault)
+
+    def _status(self) -> str:
+        """What ended the process early; "" if nothing did."""
+        status = None if self._process is None else self._process.poll()
+        if status is None or self.fault:
+            return self.fault
+        return f"{self.path}: the recorder's process ended with status {status}; nothing is recorded from now on"
+
+    def _fail(self, fault: str) -> None:
+        if not self._fault:
+            self._fault = fault
+            _LOG.warning("%s", fault)
+            if self._ring is not None:
+                self._ring.close()
+
+    def close(self) -> str:
+        """End the file, wait for it, and return `fault`; idempotent."""
+        if self._process is None or self._ring is None:
+            return self.fault
+        early = "" if self._ring.closed else self._status()
+        self._ring.close()
+        try:
+            self._process.wait(_END)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
+            early = f"{self.path}: the recorder did not end within {_END:g} s; the end of the recording is missing"
+        if early or self.fault:
+            self._fail(self._ring.failure or early)
+        return self.fault

@@ -1,0 +1,177 @@
+"""The process that writes a recording: it takes records out of the ring, encodes them and flushes them to the disk.
+
+It ends the file properly when the deployment closes the ring, and also when the deployment's process is gone.
+"""
+
+import base64
+import json
+import os
+import signal
+import struct
+import sys
+import time
+from contextlib import suppress
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import msgspec
+from mcap.writer import CompressionType, Writer
+
+from bam_train.recording.ring import EVENT, IMAGE, LAYOUT, PIXELS, TICK, TIMES, Ring
+
+_POLL = 0.02
+"""Time between two looks into the ring [s]."""
+_SYNC = 0.5
+"""Time between two flushes to the disk itself [s]: what a power cut may cost."""
+_CHUNK = 1024
+"""Bytes of a chunk, less than most ticks: what is in an open chunk is lost when this process is killed."""
+_SENT = ("/command", "/status")
+"""Topics with the time at which the command was sent."""
+_NUMBER, _TEXT, _WHOLE = {"type": "number"}, {"type": "string"}, {"type": "integer"}
+_STAMP = {"type": "object", "properties": {"sec": _WHOLE, "nsec": _WHOLE}}
+_IMAGE = {"timestamp": _STAMP, "frame_id": _TEXT, "data": {"type": "string", "contentEncoding": "base64"}}
+_SIZE = {"width": _WHOLE, "height": _WHOLE, "step": _WHOLE}
+_KNOWN = {
+    "foxglove.Log": dict.fromkeys(("message", "name", "file"), _TEXT)
+    | {"timestamp": _STAMP, "level": _WHOLE, "line": _WHOLE},
+    "foxglove.CompressedImage": {**_IMAGE, "format": _TEXT},
+    "foxglove.RawImage": {**_IMAGE, **_SIZE, "encoding": _TEXT},
+}
+"""Properties of Foxglove's own schemas."""
+_encode = msgspec.json.Encoder().encode  # what is not finite becomes null
+
+
+class _File:
+    """The MCAP file, and what was registered in it."""
+
+    def __init__(self, head: dict[str, Any]) -> None:
+        self.file: BinaryIO = open(head["path"], "xb")  # noqa: SIM115 - closed by `close`
+        self._writer = Writer(self.file, chunk_size=_CHUNK, compression=CompressionType.ZSTD)
+        self._writer.start(profile="", library="bam-train")
+        self._writer.add_metadata("deployment", {key: str(value) for key, value in head["metadata"].items()})
+        self._guards: list[str] = head["guards"]
+        self._layout: dict[str, list[list[str]]] = {}  # topic -> [group, name] or [name] of each number
+        self._channels: dict[str, int] = {}
+        self._numbers = struct.Struct("=0d")
+        self._sequence = 0
+
+    def add(self, record: bytes) -> None:
+        kind, (wall, monotonic, ago), data = record[:1], TIMES.unpack_from(record, 1), record[1 + TIMES.size :]
+        stamp = {"sec": wall // 10**9, "nsec": wall % 10**9}
+        if kind == TICK:
+            self._tick(wall, monotonic, ago, data)
+        elif kind == LAYOUT:
+            self._declare(json.loads(data))
+        elif kind == EVENT:
+            message = {"timestamp": stamp, "level": data[0], "message": data[1:].decode(), "name": "bam-deploy"}
+            self._known("/events", "foxglove.Log", wall, {**message, "file": "", "line": 0})
+        else:
+            head, _, image = data.partition(b"\n")
+            name, *facts = json.loads(head)
+            content = {"timestamp": stamp, "frame_id": name, "data": base64.b64encode(image).decode()}
+            if kind == IMAGE:
+                content["format"] = facts[0]
+                self._known(f"/camera/{name}", "foxglove.CompressedImage", wall, content)
+            elif kind == PIXELS:
+                height, width, channels = facts
+                content |= {"width": width, "height": height, "step": width * channels}
+                content["encoding"] = {1: "mono8", 3: "rgb8", 4: "rgba8"}[channels]
+                self._known(f"/pixels/{name}", "foxglove.RawImage", wall, content)
+
+    def _declare(self, content: dict[str, Any]) -> None:
+        if content["extra"]:
+            self._writer.add_metadata("layout", content["extra"])
+        self._layout = {topic: [name.split(".", 1) for name in names] for topic, names in content["layout"].items()}
+        self._numbers = struct.Struct(f"={sum(map(len, self._layout.values()))}d")
+        for topic, names in self._layout.items():
+            if topic not in self._channels:
+                properties: dict[str, Any] = nested([(["t"], _NUMBER), *((name, _NUMBER) for name in names)])
+                if topic == "/status":
+                    properties["guard"] = _TEXT
+                for name, part in properties.items():
+                    if "type" not in part:
+                        properties[name] = {"type": "object", "properties": part}
+                self._register(topic, f"bam{topic.replace('/', '.')}", properties)
+
+    def _register(self, topic: str, schema: str, properties: dict[str, Any]) -> None:
+        content = json.dumps({"title": schema, "type": "object", "properties": properties}).encode()
+        schema_id = self._writer.register_schema(schema, "jsonschema", content)
+        self._channels[topic] = self._writer.register_channel(topic, "json", schema_id)
+
+    def _tick(self, wall: int, monotonic: float, ago: float, data: bytes) -> None:
+        numbers = iter(self._numbers.unpack(data))
+        for topic, names in self._layout.items():
+            late = ago if topic in _SENT else 0.0
+            message = nested([(["t"], monotonic - late), *((name, next(numbers)) for name in names)])
+            if topic == "/status":
+                message["guard"] = self._guards[int(message["guard"])]
+            self._message(topic, wall - int(1e9 * late), message)
+        self._sequence += 1
+
+    def _known(self, topic: str, schema: str, wall: int, content: dict[str, Any]) -> None:
+        if topic not in self._channels:
+            self._register(topic, schema, _KNOWN[schema])
+        self._message(topic, wall, content)
+
+    def _message(self, topic: str, wall: int, content: dict[str, Any]) -> None:
+        self._writer.add_message(self._channels[topic], wall, _encode(content), wall, self._sequence)
+
+    def flush(self, sync: bool) -> None:
+        self.file.flush()
+        if sync:
+            os.fsync(self.file.fileno())
+
+    def close(self) -> None:
+        self._writer.finish()  # type: ignore[no-untyped-call]
+        self.flush(sync=True)
+        self.file.close()
+
+
+def nested(values: list[tuple[list[str], Any]]) -> dict[str, Any]:
+    """``[(["a"], 1), (["b", "c"], 2)]`` as ``{"a": 1, "b": {"c": 2}}``."""
+    table: dict[str, Any] = {}
+    for name, value in values:
+        (table if len(name) == 1 else table.setdefault(name[0], {}))[name[-1]] = value
+    return table
+
+
+def _drain(ring: Ring, file: _File, parent: int) -> None:
+    synced = time.monotonic()
+    while True:
+        over = ring.closed or os.getppid() != parent  # looked at first: what was written before is still read
+        while (record := ring.read()) is not None:
+            file.add(record)
+        now = time.monotonic()
+        file.flush(sync=now - synced > _SYNC)
+        synced = now if now - synced > _SYNC else synced
+        if over:
+            return
+        time.sleep(_POLL)
+
+
+def main() -> None:
+    """Take the descriptor of the ring and the deployment's process number from the command line."""
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        signal.signal(number, signal.SIG_IGN)  # the deployment ends this process by closing the ring
+    with suppress(OSError):
+        os.nice(5)
+    ring, parent = Ring(int(sys.argv[1])), int(sys.argv[2])
+    head = json.loads(ring.read() or b"{}")
+    try:
+        Path(head["path"]).parent.mkdir(parents=True, exist_ok=True)
+        file = _File(head)
+        ring.begin()
+        _drain(ring, file, parent)
+        file.close()
+        return
+    except OSError as error:
+        remedy = "; nothing is recorded from now on" if ring.ready else ". Choose another file"
+        why = f"cannot be written: {error.strerror or error}{remedy}"
+        if isinstance(error, FileExistsError) and error.filename == head["path"]:
+            why = "a recording is there already. Choose another file"
+        ring.fail(f"{head['path']}: {why}")
+    os._exit(1)  # Python would try to write again what its buffer still holds
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,117 @@
+"""A ring of records in memory that two processes share: one writes and never waits, the other reads.
+
+The memory begins with a head of 512 bytes (`_Head`); the rest is the ring. Each record is its size, a CRC-32 and its
+bytes, padded to 8. The writer stores the bytes first and the new end afterwards; where the processor swaps the two, the
+checksum shows it, and the reader looks again later.
+"""
+
+import ctypes
+import mmap
+import os
+import struct
+import tempfile
+import zlib
+from typing import Any
+
+TICK, LAYOUT, EVENT, IMAGE, PIXELS = b"T", b"L", b"E", b"I", b"P"
+"""Kinds of records, as their first byte."""
+TIMES = struct.Struct("=qdd")
+"""Then: wall clock [ns], monotonic clock [s], and how long before that the command was sent [s]."""
+_RECORD = struct.Struct("=II")
+_HEAD = 512
+_TEXT = 256
+
+
+class _Head(ctypes.Structure):
+    _fields_ = (
+        ("written", ctypes.c_uint64),  # bytes since the start
+        ("read", ctypes.c_uint64),
+        ("ready", ctypes.c_uint64),  # the reader has begun
+        ("closed", ctypes.c_uint64),  # the writer writes nothing more
+        ("failed", ctypes.c_uint64),  # the reader reads nothing more
+        ("reason", ctypes.c_char * _TEXT),
+    )
+
+
+def make_shared_file(size: int) -> int:
+    """A file descriptor of memory for a ring of `size` bytes; it vanishes with the processes that have it."""
+    if hasattr(os, "memfd_create"):
+        descriptor = os.memfd_create("bam-recorder")
+    else:
+        with tempfile.TemporaryFile() as file:
+            descriptor = os.dup(file.fileno())
+    os.ftruncate(descriptor, _HEAD + size)
+    os.set_inheritable(descriptor, True)
+    return descriptor
+
+
+class Ring:
+    """One end of the ring in a file of `make_shared_file`."""
+
+    def __init__(self, descriptor: int) -> None:
+        self._map = mmap.mmap(descriptor, 0)
+        self._head: Any = _Head.from_buffer(self._map)
+        self._bytes = memoryview(self._map)[_HEAD:]
+        self._size = len(self._bytes)
+
+    def write(self, data: bytes) -> bool:
+        """Append a record; False if there is no room for it, or the reader has failed."""
+        size = (_RECORD.size + len(data) + 7) & ~7
+        start = self._head.written
+        if start + size - self._head.read > self._size or self._head.failed:
+            return False
+        self._put(start, _RECORD.pack(len(data), zlib.crc32(data)) + data)
+        self._head.written = start + size
+        return True
+
+    def read(self) -> bytes | None:
+        """The next record; None if there is none yet."""
+        start = self._head.read
+        if start == self._head.written:
+            return None
+        size, checksum = _RECORD.unpack(self._get(start, _RECORD.size))
+        data = self._get(start + _RECORD.size, size) if size < self._size else b""
+        if zlib.crc32(data) != checksum or len(data) != size:
+            return None
+        self._head.read = start + ((_RECORD.size + size + 7) & ~7)
+        return data
+
+    def begin(self) -> None:
+        """The reader's first act, once it can take records."""
+        self._head.ready = 1
+
+    def close(self) -> None:
+        """The writer's last act."""
+        self._head.closed = 1
+
+    @property
+    def ready(self) -> bool:
+        """Whether the reader has begun."""
+        return bool(self._head.ready)
+
+    @property
+    def closed(self) -> bool:
+        """Whether the writer has closed it."""
+        return bool(self._head.closed)
+
+    def fail(self, reason: str) -> None:
+        """The reader's last act, if it cannot go on."""
+        self._head.reason = reason.encode()[: _TEXT - 1]
+        self._head.failed = 1
+
+    @property
+    def failure(self) -> str:
+        """Why the reader cannot go on; "" if it can."""
+        return self._head.reason.decode(errors="replace") if self._head.failed else ""
+
+    def _put(self, position: int, data: bytes) -> None:
+        start = position % self._size
+        first = min(len(data), self._size - start)
+        self._bytes[start : start + first] = data[:first]
+        if first < len(data):
+            self._bytes[: len(data) - first] = data[first:]
+
+    def _get(self, position: int, size: int) -> bytes:
+        start = position % self._size
+        first = min(size, self._size - start)
+        return bytes(self._bytes[start : start + first]) + bytes(self._bytes[: size - first])
