@@ -82,6 +82,7 @@ def test_the_base_install_is_small(metadata):
         "cbor2",
         "cryptography",
         "gymnasium",
+        "mcap",
         "msgspec",
         "numpy",
         "onnxruntime",

@@ -138,11 +138,22 @@ class Deployment:
     def run(self, watcher: Watcher, *, seed: int) -> Ending:
         """Run ``journal.wanted`` episodes; episode k gets ``seed + k``. Their exceptions become the `Ending`."""
         with self.handles_signals():
-            ending = self._run(watcher, seed)
-            if self.recorder is not None:
-                self.recorder.event(ending.reason, ERROR if ending.status in (1, 3, 4) else INFO)
-                self.recorder.close()
-            return ending
+            ending = None
+            try:
+                ending = self._run(watcher, seed)
+                return ending
+            finally:
+                self._end_recording(ending)
+
+    def _end_recording(self, ending: Ending | None) -> None:
+        """Record how it ended; without an ending, leave the rest to the recorder's process, which outlives this one."""
+        if self.recorder is None:
+            return
+        if ending is None:
+            self.recorder.event("ended at once, by a second signal", ERROR)
+        else:
+            self.recorder.event(ending.reason, ERROR if ending.status in (1, 3, 4) else INFO)
+            self.recorder.close()
 
     def _run(self, watcher: Watcher, seed: int) -> Ending:
         try:
