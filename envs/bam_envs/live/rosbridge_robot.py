@@ -5,6 +5,7 @@ message behind a running service call. While a connection is down, nothing is se
 Longer than other modules because it is one object with one lifecycle: connect, reset, step, halt, close.
 """
 
+import json
 import logging
 import math
 import threading
@@ -30,7 +31,15 @@ from bam_envs.core.robot import EnvIds, Initial, RobotSpec, RobotState
 from bam_envs.core.timing import Pacer
 from bam_envs.live import bringup
 from bam_envs.live.state import Letter, LiveState
-from bam_envs.ros.codec import HALT_TOPIC, INFO_SERVICE, SCENE_TOPIC, RobotInfo, encode_sink, read_info
+from bam_envs.ros.codec import (
+    HALT_TOPIC,
+    INFO_SERVICE,
+    SCENE_TOPIC,
+    STATUS_TOPIC,
+    RobotInfo,
+    encode_sink,
+    read_info,
+)
 from bam_envs.ros.freshness import Tag
 from bam_envs.ros.profile_tables import RobotProfile, Sink
 from bam_envs.rosbridge.client import RosbridgeLink
@@ -100,6 +109,7 @@ class RosbridgeRobot:
         self._commanded = False  # since `connect`
         self._session_over = False  # as the robot's side reported
         self._refusals: list[BamEnvsError] = []
+        self._status = ""  # of this tick, as JSON
         self._sent: Array | None = None
         self._sent_at = -math.inf
         self._answers = False  # whether it reports the commands it has executed, in real time
@@ -186,6 +196,7 @@ class RosbridgeRobot:
             control.advertise(name, kind)
             halting.advertise(name, kind)
         halting.advertise(self.namespace + HALT_TOPIC, "std_msgs/Empty")
+        control.advertise(self.namespace + STATUS_TOPIC, "std_msgs/String")
 
     def _begin(self, control: RosbridgeLink) -> None:
         """Use this connection from now on, and ignore messages of an older one."""
@@ -217,6 +228,8 @@ class RosbridgeRobot:
     def _on_status(self, status: Mapping[str, Any]) -> None:
         """Take a status of the server, or of the robot's side behind it; `step` raises the first error."""
         if self._readiness is not None and self._readiness.owns(status, self.namespace):
+            return
+        if STATUS_TOPIC in str(status.get("id")) + str(status.get("msg")):  # a server may refuse the report
             return
         if status.get("level") == "error":
             text = str(status.get("msg"))
@@ -295,6 +308,7 @@ class RosbridgeRobot:
         tag = self._session.tagger.next(self._epoch, self._answer_timeout if lockstep else self._command_life)
         self._pacer.tick()
         self._send(control, values, tag, halts)
+        self._publish_status(control)
         if not lockstep:
             self._cut.wait(max(0.0, self._pacer.slack))
         elif not self._state.await_answer(
@@ -321,6 +335,16 @@ class RosbridgeRobot:
                 self._sent, self._sent_at = command.copy(), self._clock()
                 if self._answers:
                     self._owed[tag.sequence] = self._sent_at
+
+    def tell_status(self, code: int, guard: str, *, stopped: bool) -> None:
+        """Publish `SafeRobot.code` and `SafeRobot.status` on `STATUS_TOPIC`: a stop at once, else after the command."""
+        self._status = json.dumps({"code": code, "guard": guard, "stopped": stopped})
+        if stopped and self._control is not None:
+            self._publish_status(self._control)
+
+    def _publish_status(self, control: RosbridgeLink) -> None:
+        if self._status:
+            control.publish_soon(self.namespace + STATUS_TOPIC, {"data": self._status})
 
     def measure(self) -> RobotState:
         """The newest state, with the command that was sent last. Raises the errors of `step`."""

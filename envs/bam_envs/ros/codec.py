@@ -37,6 +37,7 @@ Envelope = tuple[str, str, dict[str, Any]]  # topic, type, message
 Sign = Callable[[Tag, str, bytes], str]  # the text of a tag on a topic with that content; `Tagger.sign` is one
 INFO_SERVICE = "/bam/robot"  # describes a served robot (std_srvs/Trigger; `RobotInfo` in its message)
 HALT_TOPIC = "/bam/halt"  # stops a served robot (std_msgs/Empty)
+STATUS_TOPIC = "/bam/status"  # what the guards did in each tick (std_msgs/String of JSON), sent by the client
 SCENE_TOPIC = "/bam/scene"
 """Sets the scene of a simulated robot for an episode, by requests on ``…/request`` and replies on ``…/reply``."""
 _ARRAYS = ("std_msgs/Float64MultiArray", "std_msgs/Float32MultiArray")

@@ -15,6 +15,7 @@ from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future
 from concurrent.futures import TimeoutError as NoResultYet
+from contextlib import suppress
 from functools import partial
 from typing import Any
 
@@ -151,6 +152,17 @@ class RosbridgeLink(Declarations):
                 raise InvalidValue(f"Topic {topic!r} was not advertised: call advertise(topic, type) before publish.")
         frames = [dump_json({"op": "publish", "topic": one, "msg": msg}) for one, msg in messages]
         self._thread.do(lambda: connection.send(*frames), _SEND_WITHIN)
+
+    def publish_soon(self, topic: str, message: Message) -> None:
+        """Hand a report to the network thread without waiting for it; dropped if it cannot be sent at once."""
+        connection, frame = self._up, dump_json({"op": "publish", "topic": topic, "msg": message})
+
+        def send() -> None:
+            with suppress(LinkLost):
+                if connection is not None:
+                    connection.send(frame)
+
+        self._thread.post(send)
 
     def on_status(self, callback: Callable[[Mapping[str, Any]], None]) -> None:
         """Call `callback` with each `status` message; on the network thread."""

@@ -1,10 +1,14 @@
 """Live robots behind their guards: served robots, through a server, as any robot."""
 
+import json
+import time
+
 import numpy as np
 import pytest
 
-from bam_envs.core.errors import InvalidValue, LinkLost, ProtocolError, UnknownName
+from bam_envs.core.errors import InvalidValue, LinkLost, ProtocolError, SafetyStop, UnknownName
 from bam_envs.core.robot import EnvIds, Initial, Robot, RobotState
+from bam_envs.core.timing import Deadline
 from bam_envs.live.building import live_robot, profile_limits
 from bam_envs.live.rosbridge_robot import RosbridgeRobot
 from bam_envs.remote.serve.command_lease import CommandLease
@@ -148,6 +152,45 @@ def test_its_limits(tmp_path):
     assert live_robot("ws://robot", profile=path).limits == expected
     assert live_robot("ws://robot", profile=path, limits=Limits()).limits == Limits()
     assert live_robot("ws://robot", profile="mir100").limits == Limits(max_age=0.5)
+
+
+def test_some_limits_of_its_guards():
+    slow = live_robot("ws://robot", profile="mir100", guards={"base_speed": 0.2}).limits
+    assert slow == Limits(max_age=0.5, base_speed=0.2)
+    with pytest.raises(InvalidValue) as caught:
+        live_robot("ws://robot", guards={"tool_speed": 2.0})
+    assert str(caught.value) == "The limit tool_speed of a live robot must be 0.005 to 1 m/s, not 2."
+
+
+def test_what_its_guards_did_is_published_in_every_tick(server, robot_on, start_pose):
+    robot_on(server, namespace="/arm_1")
+    heard = []
+    server.subscribe("/arm_1/bam/status", "std_msgs/String", lambda message, caller: heard.append(message["data"]))
+    robot = live_robot(f"{server.url}/arm_1")
+    robot.connect()
+    try:
+        state = robot.reset(np.zeros(1, np.int64), start_pose)
+        assert heard == []
+        state = robot.step(state.command)
+        far = state.command + np.array([0, 0, 0, 0, 0, 0.04, 0])
+        robot.step(far)
+        for _ in range(2):
+            robot.step(np.full_like(far, np.nan))
+        with pytest.raises(SafetyStop):
+            robot.step(np.full_like(far, np.nan))
+    finally:
+        robot.close()
+    deadline = Deadline(10.0)
+    while len(heard) < 5 and not deadline.passed:
+        time.sleep(0.005)
+    expected = [
+        (0, "", False),
+        (9, "joint acceleration (G9)", False),
+        *[(2, "finite (G2)", stop) for stop in (0, 0, 1)],
+    ]
+    assert [tuple(json.loads(one).values()) for one in heard] == expected
+    assert (robot.code, robot.status) == (2, "finite (G2)")
+    assert robot.stopped.startswith("finite (G2): the command for shoulder_pan_joint")
 
 
 def test_its_token(tmp_path, robot_on, start_pose):
