@@ -86,12 +86,14 @@ class Place:
                 f"{env_id} has no robot that --robot could exchange; serve it next to the robot with "
                 f"bam-serve --env {env_id}, and give --transport"
             )
-        kwargs = {name: value for name, value in env_kwargs.items() if name != "randomize"}  # for simulations only
+        kwargs = {name: value for name, value in env_kwargs.items() if name not in SIMULATED}
         link = {"ca_file": self.ca_file, "token_file": self.token_file}
         guards = {"guards": dict(self.guards)} if self.guards else {}
         return {**kwargs, "robot": self.robot, "profile": self.profile, **guards, **link}
 
 
+SIMULATED = ("randomize", "link")
+"""Arguments of an environment that only a simulated robot has."""
 HERE = Place()
 """The simulation here."""
 

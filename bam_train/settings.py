@@ -182,12 +182,14 @@ def read_assignments(texts: Sequence[str]) -> dict[str, Any]:
 
 
 def read_env_kwargs(texts: Sequence[str]) -> dict[str, Any]:
-    """Parse the texts of ``--set env_kwargs.NAME=VALUE``, for a program that has no other settings."""
+    """Parse the texts of ``--set NAME=VALUE`` or ``env_kwargs.NAME=VALUE``, for a program without other settings."""
+    given: list[str] = []
     for text in texts:
-        path, _ = parse_assignment(text, "env_kwargs.NAME=VALUE")
-        if path[0] != "env_kwargs" or len(path) == 1:
-            raise SettingsError(f"--set {text}: expected env_kwargs.NAME=VALUE, such as env_kwargs.parity=true")
-    env_kwargs: dict[str, Any] = read_assignments(texts).get("env_kwargs", {})
+        path, _ = parse_assignment(text, "randomize=true")
+        if path == ["env_kwargs"]:
+            raise SettingsError(f"--set {text}: expected NAME=VALUE, such as randomize=true or parity=true")
+        given.append(text if path[0] == "env_kwargs" else f"env_kwargs.{text.strip()}")
+    env_kwargs: dict[str, Any] = read_assignments(given).get("env_kwargs", {})
     return env_kwargs
 
 

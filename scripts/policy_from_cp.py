@@ -28,7 +28,7 @@ class Flags(RobotFlags):
     env: EnvId = None
     """Of a directory that does not say where it was trained."""
     set: Assignments = ()
-    """env_kwargs.NAME=VALUE: an argument of the environment, any number of times; it wins over the checkpoint's."""
+    """An argument of the environment, any number of times: parity=true. It wins over the checkpoint's."""
     num_episodes: Count = 5
     """How many."""
     seed: Seed = FIRST_SEED

@@ -9,7 +9,7 @@ from __future__ import annotations
 import json as json_module
 import math
 import sys
-from contextlib import nullcontext
+from contextlib import closing, nullcontext
 from dataclasses import asdict
 from functools import partial
 from typing import TYPE_CHECKING, Any
@@ -34,6 +34,8 @@ ANY_ROBOT = "ws://127.0.0.1:9090"
 
 def deploy_checkpoint(config: DeployConfig, signals: SignalMemory) -> int:
     """Run the program with its parsed flags; a signal whose exception was lost ends it before the robot moves."""
+    if config.rehearse is not None:
+        return _rehearse(config, config.rehearse)
     place = _checked_place(config)
     from bam_envs.core.timing import Pacer
     from bam_train.checkpoint import Checkpoint
@@ -75,6 +77,28 @@ def print_guards(config: DeployConfig, checkpoint: Checkpoint, place: Place) -> 
     table = {"guards": robot.guards(), "limits": asdict(robot.limits)}
     tell(*([json_module.dumps(table)] if config.json else guard_lines(robot.guards(), robot.limits)))
     env.close()  # type: ignore[no-untyped-call]
+    return 0
+
+
+def _rehearse(config: DeployConfig, link: str) -> int:
+    """Rehearse the deployment in simulation, and report it."""
+    from bam_train.checkpoint import Checkpoint
+    from bam_train.deploy.rehearsal import Rehearsal
+    from bam_train.env_location import read_guards
+    from bam_train.errors import SettingsError
+    from bam_train.policy import FrozenPolicy
+
+    for name in ("robot", "transport", "rate", "fast", "render"):
+        if getattr(config, name):
+            raise SettingsError(f"--rehearse simulates the robot, its link and its time; leave out --{name}")
+    checkpoint = Checkpoint.open(config.checkpoint)
+    policy = FrozenPolicy.from_checkpoint(checkpoint)
+    limits: Any = {"profile": config.profile, "guards": dict(read_guards(config.guard))}
+    with closing(Rehearsal(checkpoint, link, named=config.env, **limits)) as rehearsal:
+        report = rehearsal.run(
+            policy, episodes=config.episodes, seed=config.seed, tell=lambda line: say(f"bam-deploy: {line}")
+        )
+    tell(*([json_module.dumps(report.to_json(), allow_nan=False)] if config.json else report.lines()))
     return 0
 
 

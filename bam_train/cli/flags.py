@@ -99,7 +99,7 @@ class EvalConfig:
     algo: Name = None
     """Refuse the checkpoint unless it was trained by this algorithm; needed for a plain stable-baselines3 zip."""
     set: Assignments = ()
-    """env_kwargs.NAME=VALUE: an argument of the environment, any number of times; it wins over the checkpoint's."""
+    """An argument of the environment, any number of times: randomize=true, link=wifi. It wins over the checkpoint's."""
     num_envs: Annotated[Count | None, tyro.conf.arg(metavar="N")] = None
     """Environments stepped side by side; by default as many as is quick."""
     json: bool = False
@@ -140,6 +140,9 @@ class DeployConfig:
     """File with the token that the server asks for."""
     timeout: Annotated[Positive | None, tyro.conf.arg(metavar="S")] = None
     """Longest that an answer of --transport is waited for [s]; 30 by default."""
+    rehearse: Annotated[str | None, tyro.conf.arg(metavar="LINK")] = None
+    """Rehearse in simulated time: the simulated robot behind wifi, lte, bad or a .json file of bam-doctor, and
+    behind the guards of a live robot."""
     yes: bool = False
     """Do not ask before a real robot moves."""
     keys: Folder = None
@@ -177,7 +180,7 @@ class ExportConfig:
     policy: Name = None
     """Which policy, where the directory has several."""
     set: Assignments = ()
-    """env_kwargs.NAME=VALUE: an argument of the environment, any number of times; it wins over the directory's."""
+    """An argument of the environment, any number of times: parity=true. It wins over the directory's."""
     trust_pickle: bool = False
     """Let RLlib read a directory of its present API, which runs whatever code is in it."""
     force: bool = False

@@ -1,12 +1,13 @@
 """Complete settings from those that a user gives: with presets for new runs, and a checkpoint's for resumed ones."""
 
 from collections.abc import Mapping
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
 from bam_envs.core.errors import UnknownName
 from bam_envs.core.registry import entry_of, resolve_id
+from bam_envs.robots.linked import portable
 from bam_train.checkpoint import Checkpoint
 from bam_train.checkpoint.manifest import require_no_place
 from bam_train.environments import environment_of, require_env_kwargs
@@ -51,6 +52,8 @@ def resolve(given: Mapping[str, Any]) -> TrainSettings:
     settings = TrainSettings.from_mapping(merge(preset, given, {"env": env}))
     _require_of_trainer(settings)
     require_env_kwargs(env, settings.env_kwargs)
+    if "link" in settings.env_kwargs and entry is not None:
+        settings = replace(settings, env_kwargs={**settings.env_kwargs, "link": portable(settings.env_kwargs["link"])})
     try:
         require_no_place(settings.env_kwargs)
     except ValueError as error:

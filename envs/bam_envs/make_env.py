@@ -15,6 +15,7 @@ from bam_envs.core.registry import ENVIRONMENTS
 from bam_envs.core.validation import PositiveInt, check
 
 if TYPE_CHECKING:
+    from bam_envs.core.robot import Robot
     from bam_envs.core.robot_env import RobotVectorEnv
     from bam_envs.remote.remote_env import RemoteVectorEnv
 
@@ -24,6 +25,7 @@ def make_env(
     *,
     render_mode: str | None = None,
     randomize: bool = False,
+    link: Any = None,
     robot: str | None = None,
     transport: str | None = None,
     profile: str | None = None,
@@ -39,6 +41,8 @@ def make_env(
         env_id: Key of `ENVIRONMENTS`.
         render_mode: Render mode of the simulated robot.
         randomize: Whether the physics of the simulated robot is randomized.
+        link: The link that the simulated robot is behind: ``"wifi"``, ``"lte"``, ``"bad"``, a JSON file or a table of
+            `LinkProfile`; None for no link.
         robot: Address of a live robot behind rosbridge, such as ``"ws://10.0.0.5:9090"``, instead of the simulated one.
             The task runs in this process. A path in the address is the namespace of the robot's topics.
         transport: Address of a whole environment that runs elsewhere, such as ``"ws://10.0.0.5:9090/bam_001"`` or
@@ -59,7 +63,7 @@ def make_env(
         raise InvalidValue(f"profile={profile!r} describes a live robot; give its address with robot= too.")
     if robot is None and guards is not None:
         raise InvalidValue("guards= changes the limits of a live robot; give its address with robot= too.")
-    _check_place(robot, transport, timeout, render_mode, randomize, task_options)
+    _check_place(robot, transport, timeout, render_mode, randomize, link, task_options)
     if transport is not None:
         from bam_envs.remote.remote_env import make_remote_env
 
@@ -70,7 +74,7 @@ def make_env(
     task = entry.make_task(1, task_options)
     simulated = entry.make_robot(1, randomize, task_options)
     if robot is None:
-        return RobotEnv(simulated, task, render_mode=render_mode)
+        return RobotEnv(_behind(link, simulated), task, render_mode=render_mode)
     from bam_envs.live.building import live_robot
 
     tool = getattr(simulated, "tool_position", None)  # forward kinematics of an arm that is no UR5e
@@ -86,12 +90,22 @@ def make_env(
     return RobotEnv(live, task, render_mode=render_mode)
 
 
+def _behind(link: Any, robot: Robot) -> Robot:
+    """The simulated robots behind `link`, or as they are."""
+    if link is None:
+        return robot
+    from bam_envs.robots.linked import LinkedRobot, link_profile
+
+    return LinkedRobot(robot, link_profile(link))
+
+
 def _check_place(
     robot: str | None,
     transport: object,
     timeout: float | None,
     render_mode: str | None,
     randomize: bool,
+    link: object,
     task_options: Mapping[str, Any],
 ) -> None:
     """Refuse options that do not apply where the environment runs."""
@@ -101,7 +115,8 @@ def _check_place(
         names = ", ".join(task_options)
         raise InvalidValue(f"{names}: the task runs at {transport}; give its options to bam-serve there.")
     elsewhere = robot if transport is None else transport
-    flags = [name for name, used in (("render_mode", render_mode is not None), ("randomize", randomize)) if used]
+    given = {"render_mode": render_mode is not None, "randomize": randomize, "link": link is not None}
+    flags = [name for name, used in given.items() if used]
     if elsewhere is not None and flags:
         raise InvalidValue(f"{', '.join(flags)}: only the simulation here has that, and not {elsewhere}; leave it out.")
 
@@ -113,6 +128,7 @@ def make_vector_env(
     max_episode_steps: int | None = None,
     render_mode: str | None = None,
     randomize: bool = False,
+    link: Any = None,
     robot: str | None = None,
     transport: str | Sequence[str] | None = None,
     ca_file: str | None = None,
@@ -130,7 +146,7 @@ def make_vector_env(
     check(num_envs, PositiveInt, "num_envs")
     if robot is not None:
         raise InvalidValue("A live robot is one environment, which nothing may reset unasked; use gymnasium.make.")
-    _check_place(None, transport, timeout, render_mode, randomize, task_options)
+    _check_place(None, transport, timeout, render_mode, randomize, link, task_options)
     if transport is not None:
         from bam_envs.remote.remote_env import make_remote_vector_env
 
@@ -141,7 +157,7 @@ def make_vector_env(
 
     entry = ENVIRONMENTS[env_id]
     return RobotVectorEnv(
-        entry.make_robot(num_envs, randomize, task_options),
+        _behind(link, entry.make_robot(num_envs, randomize, task_options)),
         entry.make_task(num_envs, task_options),
         max_episode_steps=max_episode_steps,
         render_mode=render_mode,

@@ -208,7 +208,11 @@ def test_the_module_that_is_imported_is_the_one_that_was_named(strange, corridor
         ({"render_mode": "human"}, "env_kwargs: unknown setting 'render_mode' of bam/pick-v0."),
         (
             {"timeout": 5.0},
-            "env_kwargs: unknown setting 'timeout' of bam/pick-v0. Choose from: max_episode_steps, randomize.",
+            "env_kwargs: unknown setting 'timeout' of bam/pick-v0. Choose from: link, max_episode_steps, randomize.",
+        ),
+        (
+            {"link": "wify"},
+            "env_kwargs: link: 'wify' is neither a shipped profile nor a .json file. Did you mean 'wifi'?",
         ),
         ({"max_episode_steps": 0}, "env_kwargs.max_episode_steps: expected a whole number from 1 on, found 0"),
     ],

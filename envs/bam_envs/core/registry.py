@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 MAKE_OPTIONS = (
     "render_mode",
     "randomize",
+    "link",
     "robot",
     "transport",
     "profile",

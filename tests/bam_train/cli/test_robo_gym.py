@@ -55,9 +55,10 @@ def test_the_examples_of_the_help(run):
 
 
 def test_arguments_that_are_given_win(run):
-    status, _, err = run(main, THEIRS / BASE, "--set", "env_kwargs.parity=true", "--out", "policy.zip")
-    assert (status, err) == (0, "")
-    assert Checkpoint.open("policy.zip").manifest.env_kwargs == {"parity": True}
+    for name in ("env_kwargs.parity", "parity"):
+        status, _, err = run(main, THEIRS / BASE, "--set", f"{name}=true", "--out", "policy.zip", "--force")
+        assert (status, err) == (0, "")
+        assert Checkpoint.open("policy.zip").manifest.env_kwargs == {"parity": True}
     exported = export(THEIRS / ARM, env_kwargs={"ur_model": "ur10e"})
     assert exported.env_kwargs == {"ur_model": "ur10e", "rs_state_to_info": False, "parity": True}
     remedy = "give the environment it was trained on with --env"
@@ -69,7 +70,8 @@ def test_arguments_that_are_given_win(run):
 @pytest.mark.parametrize(
     ("assignment", "text"),
     [
-        ("parity=true", "--set parity=true: expected env_kwargs.NAME=VALUE, such as env_kwargs.parity=true"),
+        ("env_kwargs=1", "--set env_kwargs=1: expected NAME=VALUE, such as randomize=true or parity=true"),
+        ("party=true", f"env_kwargs: unknown setting 'party' of {BASE}. Did you mean 'parity'?"),
         (
             "env_kwargs.party=true",
             f"env_kwargs: unknown setting 'party' of {BASE}. Did you mean 'parity'?",

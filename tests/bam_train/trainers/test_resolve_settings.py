@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import gymnasium as gym
@@ -13,6 +13,7 @@ from bam_envs.core.errors import InvalidValue, UnknownName
 from bam_envs.core.registry import ENVIRONMENTS
 from bam_envs.remote.serve.env_server import EnvServer
 from bam_envs.remote.serve.tcp_server import TcpServer
+from bam_envs.robots.linked import link_profile
 from bam_train.checkpoint import write_checkpoint
 from bam_train.errors import AlteredCheckpoint, CheckpointMismatch, OutputError, SettingsError
 from bam_train.settings import file_stem
@@ -81,6 +82,19 @@ def test_what_cannot_be_is_one_line(given, text):
         resolve({**PPO, **given})
     assert text in str(caught.value)
     assert "\n" not in str(caught.value)
+
+
+def test_a_link_is_kept_without_its_file(tmp_path):
+    """A checkpoint may be used where the file is not."""
+    path = tmp_path / "link.json"
+    path.write_text('{"command_delay": [0, 0.1], "state_delay": [0, 0.1]}')
+    given = {"randomize": True, "link": str(path)}
+    kept = resolve({**PPO, "env_kwargs": given}).env_kwargs
+    assert kept == {"randomize": True, "link": asdict(link_profile(path))}
+    assert given["link"] == str(path)
+    assert resolve({**PPO, "env_kwargs": {"link": "wifi"}}).env_kwargs == {"link": "wifi"}
+    with pytest.raises(SettingsError, match=r"^env_kwargs: link: 'wify' is neither a shipped profile nor"):
+        resolve({**PPO, "env_kwargs": {"link": "wify"}})
 
 
 def test_the_table_of_trainers():

@@ -1,0 +1,164 @@
+"""A rehearsal: a frozen policy drives a simulated robot behind a link and a live robot's guards, in simulated time."""
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from bam_envs.core.errors import SafetyStop, StaleState
+from bam_envs.core.registry import entry_of
+from bam_envs.live.rehearsed import rehearsed_robot, time_to_stop
+from bam_envs.robots.linked import LinkedRobot
+from bam_train.checkpoint import Checkpoint
+from bam_train.deploy.journal import EpisodeRecord
+from bam_train.environments import environment_of, make_env, require_fit
+from bam_train.errors import SettingsError
+from bam_train.evaluation import wilson_interval
+
+HALTS_WITHIN = 1.0
+"""The halt of an episode is tried in this time after its start [s], when the robot is on its way."""
+
+
+@dataclass
+class RehearsalReport:
+    """The outcome of a rehearsal."""
+
+    checkpoint: Path
+    env: str
+    link: str
+    """Name or file of the link."""
+    seed: int
+    """Seed of the first episode; episode k has seed + k."""
+    records: list[EpisodeRecord] = field(default_factory=list)
+    halts: list[float] = field(default_factory=list)
+    """Time from a halt until the robot rested, once an episode [s]; infinite if it did not rest."""
+    guards: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    """Counts of the guards, by name; see `SafeRobot.report`."""
+
+    def to_json(self) -> dict[str, Any]:
+        """The report as JSON values."""
+        episodes, successes = len(self.records), sum(bool(record.success) for record in self.records)
+        rested = [seconds for seconds in self.halts if math.isfinite(seconds)]
+        return {
+            "checkpoint": str(self.checkpoint),
+            "env": self.env,
+            "link": self.link,
+            "seed": self.seed,
+            "episodes": episodes,
+            "successes": successes,
+            "success_rate": successes / episodes,
+            "success_interval": list(wilson_interval(successes, episodes)),
+            "stopped_by": {name: row["stopped"] for name, row in self.guards.items() if row["stopped"]},
+            "time_to_stop_s": {"p50": float(np.median(rested)), "max": max(rested)} if rested else None,
+            "halts_without_rest": len(self.halts) - len(rested),
+            "guards": {
+                name: dict(row) if math.isfinite(row["limit"]) else {**row, "limit": None}
+                for name, row in self.guards.items()
+            },
+            "per_episode": [record.to_json() for record in self.records],
+        }
+
+    def lines(self) -> list[str]:
+        """The report for people."""
+        facts, times = self.to_json(), "no halt was tried"
+        counts = "{successes} of {episodes}".format(**facts)
+        low, high = facts["success_interval"]
+        if facts["time_to_stop_s"] is not None:
+            times = "p50 {p50:.2f} s, max {max:.2f} s from a halt to rest".format(**facts["time_to_stop_s"])
+        if facts["halts_without_rest"]:
+            times += f"; after {facts['halts_without_rest']} of {len(self.halts)} halts it did not rest"
+        ticks = sum(record.length for record in self.records)
+        rows = [
+            ("stopped", "stopped", f"{facts['episodes']} episodes"),
+            ("held", "held", f"{ticks} ticks"),
+            ("limited", "altered", f"{ticks} ticks"),
+        ]
+        return [
+            f"{self.checkpoint} on {self.env} behind {self.link}, with the guards of a live robot",
+            f"  success   {facts['success_rate']:.1%} ({counts}; 95 % interval {low:.1%} to {high:.1%})",
+            *(f"  {title:<8}  {self._by_guard(effect, of)}" for title, effect, of in rows),
+            f"  stopping  {times}",
+            f"  episodes  {facts['episodes']}, seeds {self.seed} to {self.seed + facts['episodes'] - 1}",
+        ]
+
+    def _by_guard(self, effect: str, of: str) -> str:
+        """Which guards had an `effect`, and in how many `of` all episodes or ticks."""
+        counts = {f"{name} ({row['number']})": row[effect] for name, row in self.guards.items()}
+        return ", ".join(f"by {title} in {count} of {of}" for title, count in counts.items() if count) or "never"
+
+
+class Rehearsal:
+    """The environment of a checkpoint, whose simulated robot is behind a link and the guards of a live one.
+
+    Args:
+        checkpoint: The checkpoint of the policy that will act.
+        link: See `bam_envs.robots.linked.link_profile`.
+        named: The environment that the user expects.
+        profile: The robot profile with the limits of the guards; by default the shipped one for the robot.
+        guards: Limits that differ from the profile's.
+
+    Raises:
+        SettingsError: The environment is not one of `bam_envs`, and has no robot that could be put behind a link.
+    """
+
+    def __init__(
+        self,
+        checkpoint: Checkpoint,
+        link: str,
+        *,
+        named: str | None = None,
+        profile: str | None = None,
+        guards: Mapping[str, float] | None = None,
+    ) -> None:
+        env_id, saved = environment_of(checkpoint, named)
+        if entry_of(env_id) is None:
+            raise SettingsError(f"{env_id} has no robot that --rehearse could put behind a link; leave it out")
+        self.checkpoint, self.link = checkpoint, link
+        self.env = make_env(env_id, {**saved, "link": link})
+        require_fit(checkpoint, self.env)
+        inner: Any = self.env.unwrapped
+        self._linked: LinkedRobot = inner.robot
+        self._gate = inner.robot = rehearsed_robot(self._linked, profile=profile, guards=guards)
+
+    def run(self, policy: Any, *, episodes: int, seed: int, tell: Callable[[str], None]) -> RehearsalReport:
+        """Play `episodes`, at least 1; a stop by a guard ends its episode only.
+
+        Args:
+            policy: Has ``reset()`` and ``act(observation)``: a `FrozenPolicy`.
+            episodes: Number of episodes.
+            seed: Seed of the first one.
+            tell: Called with a line about each stop by a guard: the first one by a guard has its reason.
+        """
+        report, told = RehearsalReport(self.checkpoint.path, self.checkpoint.manifest.env, self.link, seed), set[str]()
+        for k in range(episodes):
+            report.records.append(EpisodeRecord(seed + k))
+            try:
+                self._play(policy, report)
+            except (SafetyStop, StaleState) as stop:
+                short = str(stop).partition(":")[0]
+                tell(f"episode with seed {seed + k}: {short if short in told else stop}")
+                told.add(short)
+                self._gate.resume()
+        report.guards = self._gate.report()
+        return report
+
+    def _play(self, policy: Any, report: RehearsalReport) -> None:
+        """Play one episode; at a moment drawn from its seed a halt is tried, and the robot then goes on as it was."""
+        record = report.records[-1]
+        halt_at = 1 + np.random.default_rng(record.seed).integers(round(HALTS_WITHIN / self._linked.spec.period))
+        observation, _ = self.env.reset(seed=record.seed)
+        policy.reset()
+        while record.end == "stopped":
+            observation, reward, terminated, truncated, info = self.env.step(policy.act(observation))
+            record.total, record.length = record.total + float(reward), record.length + 1
+            record.success = bool(info["is_success"])
+            record.end = "terminated" if terminated else "truncated" if truncated else "stopped"
+            if record.length == halt_at:
+                report.halts.append(time_to_stop(self._linked))
+
+    def close(self) -> None:
+        """Close the environment."""
+        self.env.close()  # type: ignore[no-untyped-call]

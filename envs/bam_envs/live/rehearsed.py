@@ -1,0 +1,116 @@
+"""A simulated robot behind a simulated link, guarded as a live one is: what an operator rehearses a deployment with.
+
+Time is the simulation's: it advances by a period with each command, and the ages of states are counted in it.
+"""
+
+import math
+from collections.abc import Mapping
+
+from bam_envs.core.errors import InvalidValue
+from bam_envs.core.robot import EnvIds, Initial, RobotState
+from bam_envs.live.building import profile_limits
+from bam_envs.robots.linked import Array, LinkedRobot
+from bam_envs.robots.profile import load_profile, profile_for
+from bam_envs.ros.codec import RobotInfo
+from bam_envs.safety.gate import ClearedCommand, SafeRobot
+from bam_envs.safety.guard import is_base, measured_places
+
+RESTS = 0.02
+"""A robot rests when its joints are slower than this [rad/s], or its drive [m/s] and its turning [rad/s]."""
+LONGEST_STOP = 5.0
+"""Longest time for which a robot is watched until it rests [s]."""
+
+
+class RehearsedRobot:
+    """One simulated robot behind a link, which takes cleared commands only, as a live one does.
+
+    Args:
+        robot: The robot behind the link.
+    """
+
+    needs_clearance = True
+
+    def __init__(self, robot: LinkedRobot) -> None:
+        self.robot, self.spec, self.num_robots = robot, robot.spec, robot.num_robots
+        text = f"{robot.spec.name}, simulated behind a link; its time advances with commands"
+        self.info = RobotInfo(robot.spec.name, simulated=True, lockstep=True, period=robot.spec.period, text=text)
+
+    def connect(self) -> None:
+        """Make the robot ready."""
+        self.robot.connect()
+
+    def not_ready(self) -> None:
+        """Nothing: it is always ready."""
+
+    def reset(self, env_ids: EnvIds, initial: Initial) -> RobotState:
+        """Set the robot to `initial`, at rest."""
+        return self.robot.reset(env_ids, initial)
+
+    def step(self, command: Array | ClearedCommand) -> RobotState:
+        """Send a cleared command; one period later, the newest state that has arrived.
+
+        Raises:
+            InvalidValue: No `SafeRobot` cleared it.
+        """
+        if not isinstance(command, ClearedCommand):
+            raise InvalidValue(
+                f"Commands to {self.spec.name} must be cleared by a SafeRobot: use rehearsed_robot(...)."
+            )
+        return self.robot.step(command.for_robot(self))
+
+    def measure(self) -> RobotState:
+        """The newest state that has arrived."""
+        return self.robot.newest
+
+    def age(self) -> float:
+        """Age of that state [s]."""
+        return float(self.robot.age[0])
+
+    def halt(self) -> None:
+        """Stop moving."""
+        self.robot.halt()
+
+    def close(self) -> None:
+        """Halt, and drop the link."""
+        self.robot.close()
+
+
+def rehearsed_robot(
+    robot: LinkedRobot, *, profile: str | None = None, guards: Mapping[str, float] | None = None
+) -> SafeRobot:
+    """`robot` behind the guards of a live one.
+
+    Args:
+        robot: One simulated robot behind a link.
+        profile: The robot profile with the limits of the guards; by default the shipped one for the robot.
+        guards: Limits that differ from the profile's, such as ``{"lag": 0.15}``.
+
+    Raises:
+        InvalidValue: There are several robots, no profile has such commands, or a limit is outside its bounds.
+    """
+    chosen = profile_for(robot.spec) if profile is None else load_profile(profile)
+    tool = getattr(robot.robot, "tool_position", None)  # forward kinematics of an arm that is no UR5e
+    limits = profile_limits(chosen).changed(guards or {})
+    return SafeRobot(RehearsedRobot(robot), limits=limits, tool_position=tool)
+
+
+def time_to_stop(robot: LinkedRobot) -> float:
+    """The time from sending a halt to one robot until it rests [s]; infinite if that takes longer than `LONGEST_STOP`.
+
+    The halt goes through the link, once, as any command, and nothing follows it. Afterwards the robot is as it was.
+    """
+    before, spec = robot.state_dict(), robot.spec
+    speeds = spec.command.units if is_base(spec) else [f"{unit}/s" for unit in spec.command.units]
+    places = measured_places(spec, speeds)
+
+    def moves() -> bool:
+        return any(abs(robot.there.signals[name][0, column]) > RESTS for _, name, column in places)
+
+    robot.step(robot.rest(robot.newest))
+    periods = 1
+    while moves() and periods * spec.period < LONGEST_STOP:
+        robot.wait()
+        periods += 1
+    seconds = math.inf if moves() else periods * spec.period
+    robot.load_state_dict(before)
+    return seconds

@@ -1,0 +1,72 @@
+"""How well checkpoints do behind imperfect links: plain, randomised, with late commands, and under each link profile.
+
+Prints a table in Markdown. Of each checkpoint the same episodes are played in every column; the share of its plain
+success that is left stands in brackets.
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+from bam_envs.core.errors import BamEnvsError
+from bam_envs.core.registry import entry_of
+from bam_envs.robots.linked import PROFILES
+from bam_train.checkpoint import Checkpoint
+from bam_train.errors import BamTrainError
+from bam_train.evaluation import evaluate
+from bam_train.policy import FrozenPolicy
+
+FOLDER = Path(__file__).resolve().parents[1] / "checkpoints"
+SEED = 3_000_000
+"""Seed of the first episode: neither training nor `bam-eval` has played it."""
+
+
+def columns(period: float) -> dict[str, dict[str, Any]]:
+    """Arguments of the environment for each column of the table; `period` is the robot's [s]."""
+    plain = {"randomize": False, "link": None}
+    late = {"command_delay": [2 * period, 2 * period], "state_delay": [0.0, 0.0]}
+    links = {name: {**plain, "link": name} for name in PROFILES}
+    return {
+        "plain": plain,
+        "randomised": {**plain, "randomize": True},
+        "commands 2 steps late": {**plain, "link": late},
+        **links,
+        "randomised, wifi": {"randomize": True, "link": "wifi"},
+    }
+
+
+def row(path: Path, episodes: int) -> list[str]:
+    """The success of one checkpoint in each column."""
+    checkpoint = Checkpoint.open(path)
+    manifest = checkpoint.manifest
+    entry = entry_of(manifest.env)
+    if entry is None:
+        raise BamTrainError(f"{path}: {manifest.env} has no robot that a link could be put before; leave it out")
+    policy, cells, plain = FrozenPolicy.from_checkpoint(checkpoint), [path.name], 0.0
+    for name, given in columns(entry.period).items():
+        report = evaluate(policy, manifest.env, {**manifest.env_kwargs, **given}, episodes=episodes, seed=SEED)
+        rate = report.success_rate or 0.0
+        plain = rate if name == "plain" else plain
+        cells.append(f"{rate:.1%}" + (f" ({rate / plain:.3f})" if plain and name != "plain" else ""))
+    return cells
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("checkpoints", nargs="*", type=Path, help="default: every .zip in checkpoints/")
+    parser.add_argument("--episodes", type=int, default=300, help="episodes in each column (default 300)")
+    arguments = parser.parse_args()
+    header = ["checkpoint", *columns(1.0)]
+    print(f"| {' | '.join(header)} |\n| {' | '.join(['---'] * len(header))} |", flush=True)
+    try:
+        for path in arguments.checkpoints or sorted(FOLDER.glob("*.zip")):
+            print(f"| {' | '.join(row(path, arguments.episodes))} |", flush=True)
+    except (BamTrainError, BamEnvsError) as error:
+        parser.error(str(error))
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
