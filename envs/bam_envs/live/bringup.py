@@ -4,20 +4,22 @@ A rosbridge server does not report a wrong topic or type. Each topic is therefor
 offers rosapi, and each source by its first message.
 """
 
+import math
 import threading
 import time
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
+from functools import partial
 from typing import Any
 
 from bam_envs.core.errors import BamEnvsError, LinkLost, ProtocolError, RemoteError, StaleState
 from bam_envs.core.timing import Deadline
 from bam_envs.live.state import LiveState, Mailbox
 from bam_envs.ros.codec import RobotInfo, has_room
-from bam_envs.ros.freshness import Tagger
-from bam_envs.ros.messages import bare_type, same_type
+from bam_envs.ros.freshness import Tagger, read_tag
+from bam_envs.ros.messages import bare_type, same_type, tag_text
 from bam_envs.ros.profile_tables import Readiness, RobotProfile, Sink
-from bam_envs.rosbridge.bus import Listener, namespaces_with
+from bam_envs.rosbridge.bus import Caller, Listener, Message, namespaces_with
 from bam_envs.rosbridge.client import RosbridgeLink
 from bam_envs.rosbridge.sessions import LEASE_TOPIC, LEAVE, RENEW, SESSION_SERVICE, read_session
 
@@ -28,6 +30,8 @@ _TRIES, _TRY_AGAIN = 3, 0.1
 FIRST_WITHIN = 0.3
 """Longest wait for the latched topics that report whether the robot is ready [s]."""
 _ANSWER_WITHIN = 2.0
+_RIVAL_TIME = 1.0
+"""How long after a command of somebody else a robot counts as driven by it [s]."""
 _RENEW_EVERY, _RENEWAL_LIFE = 0.5, 1.0
 """Time between two renewals of the lease, and how long each is valid [s]; the robot's side waits for several of them
 (`CommandLease`)."""
@@ -140,11 +144,14 @@ def await_first(link: RosbridgeLink, state: LiveState, profile: RobotProfile, ti
 class LiveReadiness:
     """Whether a robot is ready to move, by the topics in `profile.readiness` and the controllers of `sinks`.
 
-    All of them are optional: a robot is driven without those that it does not report, which `unknown` names.
+    All of them are optional: a robot is driven without those that it does not report, which `unknown` names. A robot
+    that somebody else commands is not ready; that is seen where commands have room for the tag of `session`.
     """
 
-    def __init__(self, profile: RobotProfile, sinks: tuple[Sink, ...], types: TopicTypes) -> None:
-        self._profile, self._types = profile, types
+    def __init__(self, profile: RobotProfile, sinks: tuple[Sink, ...], types: TopicTypes, session: str) -> None:
+        self._profile, self._types, self._sinks, self._session = profile, types, sinks, session
+        self._begun = False
+        self._rival, self._rival_at = "", -math.inf  # topic and time of the last command of somebody else
         self.mailbox = Mailbox()
         """Messages by topic; to be cleared when the link is down."""
         self._subscribed: tuple[Readiness, ...] = ()
@@ -155,14 +162,30 @@ class LiveReadiness:
 
     def begin(self, link: RosbridgeLink) -> None:
         """Subscribe to the topics, wait briefly for their latched messages, and query the controllers."""
-        if not self._subscribed:  # on a later connection the link subscribes again by itself
+        if not self._begun:  # on a later connection the link subscribes again by itself
+            self._begun = True
             every = self._profile.readiness
             self._subscribed = tuple(one for one in every if self._types.may_be(link.namespace + one.topic, one.type))
             for one in self._subscribed:
                 link.subscribe(link.namespace + one.topic, one.type, self._listener(one.topic))
+            for sink in self._sinks:
+                kind = self._types.type_of(link.namespace + sink.topic) or sink.type
+                if has_room(kind):
+                    link.subscribe(link.namespace + sink.topic, kind, partial(self._on_command, sink.topic))
         topics = {one.topic for one in self._subscribed}
         self.mailbox.wait_for(lambda slots: topics <= slots.keys() or not link.is_up, FIRST_WITHIN)
+        self._rival_at = -math.inf  # a ROS 2 bridge repeats commands of the last second to who subscribes
         self._query(link)
+
+    def _on_command(self, topic: str, message: Message, caller: Caller) -> None:
+        tag = read_tag(tag_text(message))
+        if tag is None or tag.session != self._session:
+            self._rival, self._rival_at = topic, time.monotonic()
+
+    @property
+    def has_rival(self) -> bool:
+        """Whether somebody else has just commanded the robot."""
+        return time.monotonic() - self._rival_at < _RIVAL_TIME
 
     def _listener(self, topic: str) -> Listener:
         return lambda message, caller: self.mailbox.put([topic], message)
@@ -176,6 +199,8 @@ class LiveReadiness:
 
         While it is `moving`, measured numbers (`at_least`) are ignored, because they may dip.
         """
+        if self.has_rival:
+            return f"somebody else commands the robot on {self._rival}; end the other program first"
         letters = self.mailbox.newest()
         for one in self._subscribed:
             if one.topic in letters and not (moving and one.at_least is not None):

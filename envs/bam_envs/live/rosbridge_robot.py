@@ -176,7 +176,10 @@ class RosbridgeRobot:
         self._state.server_offset = lambda: control.clock_offset
         types = bringup.TopicTypes(control, self.profile, self._timeout)
         self._declare(control, halting, types)
-        self._readiness = bringup.LiveReadiness(self.profile, self._sinks, types) if info is None else None
+        self._readiness = None
+        if info is None:
+            session = self._session.tagger.session
+            self._readiness = bringup.LiveReadiness(self.profile, self._sinks, types, session)
 
     def _declare(self, control: RosbridgeLink, halting: RosbridgeLink, types: bringup.TopicTypes) -> None:
         """Subscribe states and advertise commands, with their types on the server."""
@@ -378,7 +381,9 @@ class RosbridgeRobot:
         first = self._sending.acquire(timeout=_HALT_WAITS)
         try:
             halting.publish(self.namespace + HALT_TOPIC, {})
-            if not self._describes_itself:
+            # Whoever only looks must not hold a robot that somebody else moves.
+            others = not self._commanded and self._readiness is not None and self._readiness.has_rival
+            if not self._describes_itself and not others:
                 self._publish_hold(halting)
             self._halt_failed = False
         except BamEnvsError as error:  # reported once: several threads and `close` try it too

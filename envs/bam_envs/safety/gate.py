@@ -456,8 +456,9 @@ class SafeRobot(metaclass=Sealed):
         why = self.not_ready()
         readiness = "" if why is None else f"not ready: {why}: "
         self._stopped = guard.name, f"{guard.title}: {readiness}{reason}"
-        message = f"The robot was stopped by {self._stopped[1]}. When it is safe, call resume()."
-        if isinstance(guard, Freshness):
+        unseen = " Whether it stands is not known: stop it by hand if it moves." if isinstance(guard, Freshness) else ""
+        message = f"The robot was stopped by {self._stopped[1]}.{unseen} When it is safe, call resume()."
+        if unseen:
             raise StaleState(message, self.age(), guard.limit_value)
         raise SafetyStop(guard.name, message)
 

@@ -124,6 +124,35 @@ def test_an_arm_that_is_not_ready_does_not_begin(driver, connected, start_pose, 
     )
 
 
+def test_two_programs_do_not_drive_one_robot(server, robot_on, connected, start_pose):
+    """The second one neither moves nor holds the robot; the first one goes on."""
+    first, second = connected(), live_robot(server.url)
+    second.connect()
+    command = first.reset(ROW, start_pose).command
+    first.step(command)
+    until(lambda: second.not_ready() is not None)
+    assert second.not_ready() == (
+        "somebody else commands the robot on /forward_position_controller/commands; end the other program first"
+    )
+    with pytest.raises(NotReady, match="somebody else commands the robot"):
+        second.reset(ROW, start_pose)
+    second.halt()
+    second.close()
+    assert first.not_ready() is None
+    first.step(command)
+
+
+def test_a_command_of_somebody_else_stops_a_robot_in_motion(server, connected, start_pose):
+    robot = connected()
+    command = robot.reset(ROW, start_pose).command
+    robot.step(command)
+    server.advertise("/forward_position_controller/commands", "std_msgs/Float64MultiArray")
+    server.publish("/forward_position_controller/commands", {"data": command[0, :6].tolist()})
+    until(lambda: robot.not_ready() is not None)
+    with pytest.raises(NotReady, match="somebody else commands the robot on /forward_position_controller/commands"):
+        robot.step(command)
+
+
 def test_a_stop_in_mid_episode_is_named_at_once(driver, connected, start_pose):
     driver.say_ready()
     robot = connected()

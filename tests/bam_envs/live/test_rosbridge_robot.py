@@ -535,7 +535,7 @@ def drive(url, results):
 @pytest.mark.filterwarnings("ignore:.*fork.*:DeprecationWarning")
 def test_in_a_forked_worker(server, robot_on, connect):
     scripted = robot_on(server)
-    _, gate = connect(server.url)
+    robot, gate = connect(server.url)
     context = multiprocessing.get_context("fork")
     results = context.Queue()
     worker = context.Process(target=drive, args=(server.url, results))
@@ -543,6 +543,8 @@ def test_in_a_forked_worker(server, robot_on, connect):
     assert results.get(timeout=60) == [[0.085]]
     worker.join(DEADLINE)
     assert worker.exitcode == 0
+    while robot.not_ready() is not None:  # for a second, somebody else has just commanded it
+        time.sleep(0.05)
     before = len(scripted.on(JOINT_COMMANDS))
     gate.step(gate.state.command)  # this process goes on
     scripted.wait_for(lambda: len(scripted.on(JOINT_COMMANDS)) > before)
@@ -570,6 +572,8 @@ def test_states_are_asked_for_throttled_and_the_newest_alone(lax, robot_on, conn
         "/joint_states": expected,
         "/object_pose": expected,
         "/gripper/joint_states": (0, 0),  # shared by several publishers, it comes whole
+        "/forward_position_controller/commands": (0, 0),  # to see whether somebody else commands the robot
+        "/gripper/commands": (0, 0),
     }
     assert all(type(number) is int for pair in subscriptions(server).values() for number in pair)
 
