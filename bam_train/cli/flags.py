@@ -184,7 +184,7 @@ class DoctorConfig:
     seconds: Annotated[Positive, tyro.conf.arg(metavar="S")] = 5.0
     """Duration of the measurement of states and link [s]."""
     measure: File = None
-    """Write the measured link to this .json file, for bam-deploy --rehearse."""
+    """Write the measured link to this .json file, with which bam-deploy rehearses."""
     json: bool = False
     """Print one JSON object on standard output instead of a table."""
 
