@@ -34,6 +34,7 @@ PROGRAMS = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["scri
 FLAGS_OF = {
     "bam-train": "training.md",
     "bam-doctor": "doctor.md",
+    "bam-replay": "recording.md",
     "bam-serve": "remote.md",
     "bam-sign": "signing.md",
 }

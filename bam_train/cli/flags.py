@@ -190,6 +190,24 @@ class DoctorConfig:
 
 
 @dataclass(frozen=True)
+class ReplayConfig:
+    """Sum up a recording of bam-deploy, play it through its environment with a policy, and draw it."""
+
+    recording: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RECORDING")]
+    """The .mcap file that bam-deploy wrote."""
+    checkpoint: File = None
+    """Checkpoint whose policy acts on the recorded states; by default the recorded one, if it is where it was."""
+    env: EnvId = None
+    """Environment that the checkpoint belongs to; needed for some_module:Env-v0."""
+    plot: File = None
+    """Draw states, commands, actions, status and latencies into this .png file."""
+    video: File = None
+    """Make a .gif or .mp4 of the recorded pictures; without any, of the simulated robot in the recorded states."""
+    json: bool = False
+    """Print one JSON object on standard output instead of a few lines."""
+
+
+@dataclass(frozen=True)
 class ExportConfig:
     """Turn a checkpoint directory of RLlib into a checkpoint.zip that can be evaluated and deployed."""
 
