@@ -149,7 +149,7 @@ class Recording:
         return [range(start, end) for start, end in zip(starts, [*starts[1:], self.ticks], strict=True)]
 
     def arrays(self, kind: str) -> dict[str, NDArray[Any]]:
-        """The arrays of ``"observation"``, ``"action"`` or ``"truth"``, (ticks, ...) each, by name; "" for the only one."""
+        """The arrays of ``"observation"``, ``"action"`` or ``"truth"``, (ticks, ...) each; an only one is called ""."""
         table = self.tables.get(f"/{kind}")
         try:
             return {} if table is None else _split(table.numbers[:, 1:], self.kinds.get(kind, {}))
