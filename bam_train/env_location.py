@@ -7,7 +7,7 @@ from typing import Any
 from bam_envs.core.errors import BamEnvsError
 from bam_envs.core.registry import entry_of
 from bam_envs.core.validation import Positive, check
-from bam_envs.safety.guard import Limits
+from bam_envs.safety.guard import TRIAL_SPEED, Limits
 from bam_train.errors import SettingsError
 
 
@@ -29,6 +29,8 @@ class Place:
     """Longest wait for an answer of `transport` [s]; None for its default."""
     guards: tuple[tuple[str, float], ...] = ()
     """Names and values of limits of the live robot's guards that differ from the profile's."""
+    trial: bool | None = False
+    """Whether a live robot is on trial: slow, and in a box around its start; None: if it is real."""
 
     def require_sane(self) -> None:
         """Refuse addresses and options that exclude each other.
@@ -81,7 +83,8 @@ class Place:
         Raises:
             SettingsError: The environment is not one of `bam_envs`, and has no robot to exchange.
         """
-        if entry_of(env_id) is None:
+        entry = entry_of(env_id)
+        if entry is None:
             raise SettingsError(
                 f"{env_id} has no robot that --robot could exchange; serve it next to the robot with "
                 f"bam-serve --env {env_id}, and give --transport"
@@ -89,7 +92,11 @@ class Place:
         kwargs = {name: value for name, value in env_kwargs.items() if name not in SIMULATED}
         link = {"ca_file": self.ca_file, "token_file": self.token_file}
         guards = {"guards": dict(self.guards)} if self.guards else {}
-        return {**kwargs, "robot": self.robot, "profile": self.profile, **guards, **link}
+        trial: dict[str, Any] = {}
+        if self.trial:  # with as much more time as it is slower
+            steps = kwargs.get("max_episode_steps") or entry.max_episode_steps
+            trial = {"trial": True, "max_episode_steps": -1 if steps == -1 else round(steps / TRIAL_SPEED)}
+        return {**kwargs, "robot": self.robot, "profile": self.profile, **guards, **link, **trial}
 
 
 SIMULATED = ("randomize", "link")

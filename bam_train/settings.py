@@ -59,6 +59,8 @@ class TrainSettings:
     """Library that trains: sb3 (default) or rllib."""
     until_success: _Share | None = None
     """Stop once this share of evaluation episodes succeeds, such as 0.99."""
+    trial_threshold: Annotated[float, Meta(gt=0, lt=1, description="a share above 0 and below 1, such as 0.9")] = 0.9
+    """Success rate that trials on a real robot must exceed before bam-deploy runs at full speed."""
     eval_every: _Steps | None = None
     """Steps between two evaluations (default a twentieth of the run, and at least 1000)."""
     eval_episodes: Annotated[int, Meta(ge=1, le=1_000_000)] = 20

@@ -9,6 +9,7 @@ member. What is signed is the text ``bam-train checkpoint signature 1``, the sig
 import base64
 import binascii
 import copy
+import hashlib
 import os
 import re
 import stat
@@ -24,7 +25,7 @@ from msgspec import Meta
 
 from bam_train.atomic_file import replacing
 from bam_train.checkpoint.checkpoint import Checkpoint
-from bam_train.checkpoint.manifest import AGAIN, MANIFEST, parse_manifest
+from bam_train.checkpoint.manifest import AGAIN, MANIFEST
 from bam_train.checkpoint.zip_members import RESUME, SIGNATURE, chunks, list_members, open_zip
 from bam_train.errors import AlteredCheckpoint, BadKey, OutputError, UntrustedCheckpoint
 
@@ -64,10 +65,15 @@ class PublicKey:
         return f"ed25519 {self.text} {self.name}\n"
 
 
+def config_folder() -> Path:
+    """This user's own folder: ``bam-train`` below ``$XDG_CONFIG_HOME`` or ``~/.config``."""
+    return Path(os.environ.get("XDG_CONFIG_HOME") or "~/.config").expanduser() / "bam-train"
+
+
 def trusted_folder() -> Path:
-    """Where this computer keeps the public keys that it trusts: ``$BAM_TRUSTED_KEYS``, else below ``~/.config``."""
-    config = os.environ.get("XDG_CONFIG_HOME") or "~/.config"
-    return Path(os.environ.get("BAM_TRUSTED_KEYS") or f"{config}/bam-train/trusted").expanduser()
+    """Where this user keeps the public keys that are trusted: ``$BAM_TRUSTED_KEYS``, else in `config_folder`."""
+    named = os.environ.get("BAM_TRUSTED_KEYS")
+    return Path(named).expanduser() if named else config_folder() / "trusted"
 
 
 # Keys
@@ -264,7 +270,7 @@ def verify(checkpoint: Checkpoint, folder: Path) -> Signature:
 def _manifest(checkpoint: Checkpoint) -> bytes:
     """The bytes of the manifest, which must be the one that the checkpoint was opened with."""
     data = _member(checkpoint.path, MANIFEST)
-    if parse_manifest(checkpoint.path, data) != checkpoint.manifest:
+    if hashlib.sha256(data).hexdigest() != checkpoint.digest:
         raise AlteredCheckpoint(checkpoint.path, MANIFEST, f"{MANIFEST} was replaced while it was read. Try again")
     return data
 

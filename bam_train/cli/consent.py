@@ -3,6 +3,7 @@
 import os
 import sys
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import gymnasium as gym
@@ -31,7 +32,7 @@ def connected_env(
     render: bool = False,
     named: str | None = None,
     env_kwargs: Mapping[str, Any] | None = None,
-    admit: Callable[[gym.Env[Any, Any]], Sequence[str]] = lambda env: (),
+    admit: Callable[[gym.Env[Any, Any], Place], Sequence[str]] = lambda env, place: (),
     wiggle: bool = False,
 ) -> gym.Env[Any, Any]:
     """Make the environment of a checkpoint; its robot is connected and has not moved, and there is consent to move it.
@@ -46,7 +47,8 @@ def connected_env(
         render: Show the simulation in a window.
         named: The environment that the user expects.
         env_kwargs: Arguments of the environment, which override the checkpoint's.
-        admit: Called with the environment, connected, before anybody is asked; returns lines for a person.
+        admit: Called with the environment, connected, and its place, before anybody is asked; returns lines for a
+            person.
         wiggle: Move each axis of a live robot a little first, to see whether it moves as commanded.
 
     Raises:
@@ -54,7 +56,8 @@ def connected_env(
         CheckpointMismatch: Another environment does not.
     """
     env_id, saved = environment_of(checkpoint, named, elsewhere=bool(place.transport))
-    env = make_env(env_id, {**saved, **(env_kwargs or {})}, render_mode="human" if render else None, place=place)
+    kwargs, mode = {**saved, **(env_kwargs or {})}, "human" if render else None
+    env = make_env(env_id, kwargs, render_mode=mode, place=place)
     try:
         contract = None
         if place.robot is None:
@@ -66,7 +69,13 @@ def connected_env(
         if robot is not None:
             robot.connect()
             signals.raise_again()
-        plan = [*plan_lines(env, env_id, place.text, episodes, wiggle=wiggle), *admit(env)]
+        if place.robot is not None and place.trial is None and has_real_robot(env):
+            env.close()  # type: ignore[no-untyped-call]
+            place = replace(place, trial=True)  # a robot's limits are fixed when it is made
+            env = make_env(env_id, kwargs, render_mode=mode, place=place)
+            env.unwrapped.robot.connect()  # type: ignore[attr-defined]
+            signals.raise_again()
+        plan = [*plan_lines(env, env_id, place.text, episodes, wiggle=wiggle), *admit(env, place)]
         signals.raise_again()
         require_consent(env, f"{who}: {checkpoint.path}", yes=yes, plan=plan)
         signals.raise_again()

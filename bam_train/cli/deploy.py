@@ -47,7 +47,7 @@ def deploy_checkpoint(config: DeployConfig, signals: SignalMemory) -> int:
     checkpoint = Checkpoint.open(config.checkpoint)
     if config.print_guards:
         return print_guards(config, checkpoint, place)
-    admission = Admission(checkpoint, config.keys, config.allow_unsigned)
+    admission = Admission(checkpoint, config.keys, config.allow_unsigned, config.trials, config.i_know)
     asked: Any = {"episodes": config.episodes, "yes": config.yes, "render": config.render, "named": config.env}
     asked["wiggle"] = config.wiggle
     env = connected_env(checkpoint, place, signals, who="bam-deploy", admit=admission, **asked)
@@ -57,8 +57,10 @@ def deploy_checkpoint(config: DeployConfig, signals: SignalMemory) -> int:
     except BaseException:
         env.close()  # type: ignore[no-untyped-call]
         raise
+    if admission.trials is not None and recorder is not None:
+        admission.trials.facts["recording"] = recorder.path.name
     journal = Journal(config.episodes, marks=admission.marks)
-    deployment = Deployment(env, admission.policy, pacer, journal, recorder=recorder)
+    deployment = Deployment(env, admission.policy, pacer, journal, recorder=recorder, trials=admission.trials)
     return _run(config, checkpoint, place, deployment, signals)
 
 
@@ -120,9 +122,8 @@ def _run(
         if ending.status:
             say(f"bam-deploy: {ending.reason}")
         where = place.text or "simulated here"
-        report = DeployReport(
-            checkpoint, config.seed, ending, journal, pacer, where, guards_of(env), deployment.recorder
-        )
+        facts: Any = {"guards": guards_of(env), "trials": deployment.trials, "recorder": deployment.recorder}
+        report = DeployReport(checkpoint, config.seed, ending, journal, pacer, where, **facts)
         for warning in report.warnings():
             say(f"bam-deploy: warning: {warning}")
         tell(*([json_module.dumps(report.to_json(), allow_nan=False)] if config.json else report.lines()))
@@ -146,6 +147,7 @@ def _checked_place(config: DeployConfig) -> Place:
         token_file,
         config.timeout,
         read_guards(config.guard),
+        trial=None if config.stage is None else config.stage == "trial",
     )
     if config.record is not None and config.no_record:
         raise SettingsError("--record and --no-record exclude each other; give one of the two")
@@ -158,6 +160,10 @@ def _checked_place(config: DeployConfig) -> Place:
         raise SettingsError(
             "a live robot is driven at the rate that its policy was made for; leave out --rate and --fast"
         )
+    if robot is None and (config.stage or config.trials):
+        raise SettingsError("--stage and --trials are for a live robot; give its address with --robot too")
+    if config.i_know and config.stage != "full":
+        raise SettingsError("--i-know is for --stage full alone; leave it out")
     if config.wiggle and config.robot is None:
         raise SettingsError("--wiggle moves the axes of a live robot; give its address with --robot too")
     if config.render:

@@ -35,6 +35,7 @@ def _unset(metavar: str) -> object:
 _File = Annotated[Path | None, _unset("FILE")]
 _METAVARS = {
     "until_success": "SHARE",
+    "trial_threshold": "SHARE",
     "address": "auto|HOST:PORT",
     "data": "FOLDER",
     "transport": "URL,...",
@@ -151,6 +152,12 @@ class DeployConfig:
     """Let a checkpoint move a real robot that nobody trusted has signed; every status line says so."""
     wiggle: bool = False
     """Move each axis of a live robot a little and back first, to see whether it moves as commanded."""
+    stage: Annotated[Literal["trial", "full"] | None, tyro.conf.arg(metavar="trial|full")] = None
+    """trial (default on a real robot): a quarter of the speed, in a box around the start; full: as its limits say."""
+    i_know: bool = False
+    """Let --stage full run before trials on this robot have shown that the policy succeeds."""
+    trials: File = None
+    """Record of the trials; recordings/trials.jsonl by default."""
     rate: Annotated[Positive | None, tyro.conf.arg(metavar="HZ")] = None
     """Actions a second [Hz]; by default the environment's own."""
     fast: bool = False
@@ -163,48 +170,6 @@ class DeployConfig:
     """Do not record a live robot."""
     json: bool = False
     """Print one JSON report on standard output instead of a few lines."""
-
-
-@dataclass(frozen=True)
-class DoctorConfig:
-    """Check a live robot step by step without moving it, name the first step that fails, and measure its link."""
-
-    url: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="URL")]
-    """Address of the robot behind rosbridge, such as ws://10.0.0.5:9090."""
-    checkpoint: File = None
-    """Check what the task of this checkpoint needs, and its contract with the robot."""
-    env: EnvId = None
-    """Refuse the checkpoint unless it was trained on this environment; needed for some_module:Env-v0."""
-    profile: Name = None
-    """What the robot's topics are: a shipped name, or a .toml or .yaml file; by default the one that fits best."""
-    ca_file: File = None
-    """Certificates that wss:// trusts instead of the system's."""
-    token_file: File = None
-    """File with the token that the server asks for."""
-    seconds: Annotated[Positive, tyro.conf.arg(metavar="S")] = 5.0
-    """Duration of the measurement of states and link [s]."""
-    measure: File = None
-    """Write the measured link to this .json file, with which bam-deploy rehearses."""
-    json: bool = False
-    """Print one JSON object on standard output instead of a table."""
-
-
-@dataclass(frozen=True)
-class ReplayConfig:
-    """Sum up a recording of bam-deploy, play it through its environment with a policy, and draw it."""
-
-    recording: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RECORDING")]
-    """The .mcap file that bam-deploy wrote."""
-    checkpoint: File = None
-    """Checkpoint whose policy acts on the recorded states; by default the recorded one, if it is where it was."""
-    env: EnvId = None
-    """Environment that the checkpoint belongs to; needed for some_module:Env-v0."""
-    plot: File = None
-    """Draw states, commands, actions, status and latencies into this .png file."""
-    video: File = None
-    """Make a .gif or .mp4 of the recorded pictures; without any, of the simulated robot in the recorded states."""
-    json: bool = False
-    """Print one JSON object on standard output instead of a few lines."""
 
 
 @dataclass(frozen=True)

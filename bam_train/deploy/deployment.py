@@ -9,6 +9,7 @@ import signal
 import time
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
+from functools import partial
 from typing import Any, Protocol
 
 import gymnasium as gym
@@ -17,6 +18,7 @@ from bam_envs.core.errors import BamEnvsError, LinkLost, SafetyStop
 from bam_envs.core.timing import Pacer
 from bam_train.deploy.flight import RecorderAgent, Stopwatch
 from bam_train.deploy.journal import Ending, EpisodeRecord, Journal
+from bam_train.deploy.trials import Trials
 from bam_train.errors import BamTrainError
 from bam_train.loop import Agent, Agents, PolicyAgent, RobotAgent, TemporalAgent, Workspace
 from bam_train.loop.robot_agent import SAYS_SUCCESS, SUCCESS
@@ -93,6 +95,7 @@ class Deployment:
             It is called between two ticks, so it must be fast; if it fails, the deployment ends.
         recorder: Records every tick, if given; it has started, and is closed at the end. If it fails, the deployment
             goes on.
+        trials: Where each episode is recorded as a trial, if given.
 
     Raises:
         WiringError: An agent reads a variable that no agent writes; the robot has not been connected.
@@ -109,8 +112,9 @@ class Deployment:
         window: int = WINDOW,
         sink: Sink | None = None,
         recorder: Recorder | None = None,
+        trials: Trials | None = None,
     ) -> None:
-        self.env, self.pacer, self.journal, self.recorder = env, pacer, journal, recorder
+        self.env, self.pacer, self.journal, self.recorder, self.trials = env, pacer, journal, recorder, trials
         self.switch = StopSwitch(lambda: self._robot.halt())
         """Handler of SIGINT and SIGTERM."""
         self._robot = _DeployedRobot(env, self.switch)
@@ -119,7 +123,7 @@ class Deployment:
         chain: list[Agent] = [
             _StopAgent(self.switch, watch),
             self._robot,
-            _JournalAgent(journal, pacer, watch),
+            _JournalAgent(journal, pacer, watch, trials),
             PolicyAgent(policy, names, single=True),
             *agents,
         ]
@@ -163,6 +167,8 @@ class Deployment:
                 for k in range(self.journal.wanted):
                     self._loop(self._workspace, t=0, stop_variable="env/done", seed=seed + k, watcher=watcher)
                     self._robot.halt()  # the sink and the next reset may be slow
+                    if self.trials is not None:
+                        self.trials.end(self.journal.records[-1].success is True, self.journal.records[-1].end)
                     self._workspace.flush()
             finally:  # inside the outer try: a signal that comes before this line is still caught
                 self.switch.armed = False
@@ -176,6 +182,9 @@ class Deployment:
                 self._robot.halt()
             raise
         ending = _unless_it_fails(ending, "closing", self._robot.close)
+        if self.trials is not None:
+            ended = partial(self.trials.end, False, ending.reason)  # of an episode that was cut short
+            ending = _unless_it_fails(ending, "recording the trial", ended)
         return _unless_it_fails(ending, "recording", self._workspace.flush)  # of an episode that was cut short
 
 
@@ -259,14 +268,16 @@ class _JournalAgent(Agent):
     reads_previous = ("action",)
     writes = ()
 
-    def __init__(self, journal: Journal, pacer: Pacer, watch: Stopwatch) -> None:
+    def __init__(self, journal: Journal, pacer: Pacer, watch: Stopwatch, trials: Trials | None) -> None:
         super().__init__()
-        self._journal, self._pacer, self._watch = journal, pacer, watch
+        self._journal, self._pacer, self._watch, self._trials = journal, pacer, watch, trials
 
     def forward(self, t: int, seed: int, watcher: Watcher, **kwargs: Any) -> None:
         self._watch.stepped = time.perf_counter()
         if t == 0:
             self._journal.begin(seed)
+            if self._trials is not None:
+                self._trials.begin(seed)  # before the first command
             self._pacer.start()
         else:  # the step that led to time t
             success = self.get((f"env/{SUCCESS}", t))[0] if self.get((f"env/{SAYS_SUCCESS}", t))[0] else None

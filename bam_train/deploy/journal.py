@@ -9,6 +9,7 @@ from typing import Any
 
 from bam_envs.core.timing import Lateness, Pacer
 from bam_train.checkpoint import Checkpoint
+from bam_train.deploy.trials import Trials
 from bam_train.recording.recorder import Recorder
 
 
@@ -112,6 +113,8 @@ class DeployReport:
     """Address of the robot, or the simulation."""
     guards: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
     """Counts of the guards of a live robot, by name; see `SafeRobot.report`."""
+    trials: Trials | None = None
+    """The trials of this deployment."""
     recorder: Recorder | None = None
     """What recorded it, if anything."""
 
@@ -135,6 +138,7 @@ class DeployReport:
             "checkpoint": str(self.checkpoint.path),
             "robot": self.robot,
             "marks": list(journal.marks),
+            "trials": None if self.trials is None else self.trials.evidence.to_json(),
             # A disabled limit is infinite, which JSON cannot represent.
             "guards": {
                 name: {**guard, "limit": None} if guard.get("limit") == math.inf else dict(guard)
@@ -167,6 +171,7 @@ class DeployReport:
             f"{reason}: {episodes}, {self.pacer.ticks} ticks, {rate_text(self.pacer)}{journal.marked}",
             *([f"lateness {lateness_text(self.pacer)}"] if self.pacer.period is not None else []),
             *([guards_text(self.guards)] if self.guards else []),
+            *([self.trials.evidence.text] if self.trials else []),
             *([f"recorded in {self.recorder.path}"] if self.recorder is not None else []),
         ]
 

@@ -76,6 +76,10 @@ class Evidence:
             further += 1
         return further
 
+    def to_json(self) -> dict[str, Any]:
+        """The evidence as JSON values."""
+        return {**vars(self), "is_enough": self.is_enough}
+
     @property
     def text(self) -> str:
         """For people: ``18 of 19 trials succeeded; 30 more without a failure would show more than 90 %``."""
@@ -264,16 +268,22 @@ class Trials:
     Args:
         record: Where they are recorded.
         subject: What is tried, and where.
+        threshold: Success rate that is to be exceeded.
         facts: For people: what else each first line holds (JSON), such as the environment and the recording.
     """
 
-    def __init__(self, record: TrialRecord, subject: Subject, facts: Mapping[str, Any]) -> None:
-        self.record, self.subject, self._facts = record, subject, dict(facts)
+    def __init__(self, record: TrialRecord, subject: Subject, threshold: float, facts: Mapping[str, Any]) -> None:
+        self.record, self.subject, self.threshold, self.facts = record, subject, threshold, dict(facts)
         self._running: str | None = None
+
+    @property
+    def evidence(self) -> Evidence:
+        """The evidence of all trials so far, of earlier deployments too. Raises BadTrials as `TrialRecord.evidence`."""
+        return self.record.evidence(self.subject, self.threshold)
 
     def begin(self, seed: int) -> None:
         """Record that a trial begins; raises BadTrials if that is impossible, and then nothing may move."""
-        self._running = self.record.begin(self.subject, **self._facts, seed=seed)
+        self._running = self.record.begin(self.subject, **self.facts, seed=seed)
 
     def end(self, success: bool, reason: str) -> None:
         """Record the end of the running trial, if there is one."""

@@ -1,4 +1,4 @@
-"""What a real robot asks of a checkpoint before it moves: a signature that this computer trusts."""
+"""What a real robot asks of a checkpoint before it moves: a signature that this computer trusts, and trials."""
 
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -6,12 +6,17 @@ from typing import Any
 
 import gymnasium as gym
 
+from bam_envs.safety.guard import TRIAL_SPEED
 from bam_train.checkpoint import Checkpoint
-from bam_train.errors import UntrustedCheckpoint
+from bam_train.deploy.trials import Subject, TrialRecord, Trials
+from bam_train.env_location import Place
+from bam_train.errors import TrialsNeeded, UntrustedCheckpoint
 from bam_train.policy import FrozenPolicy
 
-UNSIGNED = "UNSIGNED"
-"""Mark of a deployment whose checkpoint nobody trusted has signed."""
+UNSIGNED, UNPROVEN, TRIAL = "UNSIGNED", "UNPROVEN", "trial"
+"""Marks of a deployment: nobody trusted has signed its checkpoint; full speed without enough trials; on trial."""
+TRIALS = Path("recordings") / "trials.jsonl"
+"""The record of trials."""
 
 
 def has_real_robot(env: Any) -> bool:
@@ -28,19 +33,31 @@ class Admission:
     keys: Path | None = None
     """Folder of the trusted public keys; None: that of this user."""
     allow_unsigned: bool = False
+    record: Path | None = None
+    """The record of trials; None: `TRIALS`."""
+    i_know: bool = False
+    """Whether full speed is allowed without enough trials."""
     marks: tuple[str, ...] = ()
     """For `Journal.marks`."""
+    trials: Trials | None = None
+    """For `Deployment`: the trials of a robot on trial."""
     policy: FrozenPolicy = field(init=False)
     """The frozen policy, once it is admitted."""
 
-    def __call__(self, env: gym.Env[Any, Any]) -> list[str]:
-        """Check the signature if the robot is real, and load the policy; returns lines for a person.
+    def __call__(self, env: gym.Env[Any, Any], place: Place) -> list[str]:
+        """Check signature and trials if the robot is real, and load the policy; returns lines for a person.
+
+        A simulated robot needs no signature, and trials only if its place says whether it is on trial.
 
         Raises:
             UntrustedCheckpoint: The robot is real, and nobody trusted has signed the checkpoint.
             AlteredCheckpoint: It is not as it was signed.
+            TrialsNeeded: Full speed is asked for, and there are not enough trials.
+            BadTrials: The record of trials was edited, or cannot be read.
         """
         lines = self._signature() if has_real_robot(env) else []
+        if place.robot is not None and place.trial is not None:
+            lines += self._stage(place.robot, is_trial=place.trial)
         self.policy = FrozenPolicy.from_checkpoint(self.checkpoint)
         return lines
 
@@ -55,3 +72,24 @@ class Admission:
             self.marks = (*self.marks, UNSIGNED)
             return [f"  {UNSIGNED}: {error}"]
         return [f"  signed by {found.signer}, {found.created}"]
+
+    def _stage(self, address: str, *, is_trial: bool) -> list[str]:
+        from bam_train.checkpoint.signature import config_folder
+
+        manifest = self.checkpoint.manifest
+        record = TrialRecord((self.record or TRIALS).expanduser(), config_folder() / "trials")
+        subject = Subject(self.checkpoint.digest, address.rstrip("/"))
+        threshold = manifest.settings.get("trial_threshold")
+        threshold = threshold if type(threshold) is float and 0 < threshold < 1 else 0.9
+        trials = Trials(record, subject, threshold, {"env": manifest.env, "file": str(self.checkpoint.path)})
+        evidence = trials.evidence
+        if is_trial:
+            self.marks, self.trials = (*self.marks, TRIAL), trials
+            return [f"  stage trial, at {100 * TRIAL_SPEED:g} % of the speed limits: {evidence.text}"]
+        if evidence.is_enough:
+            return [f"  stage full: {evidence.text}"]
+        if not self.i_know:
+            remedy = "Run more with --stage trial, or give --i-know"
+            raise TrialsNeeded(f"--stage full: {self.checkpoint.path} at {address}: {evidence.text}. {remedy}")
+        self.marks = (*self.marks, UNPROVEN)
+        return [f"  {UNPROVEN}: {evidence.text}"]

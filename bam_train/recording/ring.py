@@ -49,8 +49,7 @@ class Ring:
     """One end of the ring in a file of `make_shared_file`."""
 
     def __init__(self, descriptor: int) -> None:
-        now = {"flags": mmap.MAP_SHARED | mmap.MAP_POPULATE} if hasattr(mmap, "MAP_POPULATE") else {}
-        self._map = mmap.mmap(descriptor, 0, **now)  # its pages exist from now on, not from their first use in a tick
+        self._map = mmap.mmap(descriptor, 0)
         self._head: Any = _Head.from_buffer(self._map)
         self._bytes = memoryview(self._map)[_HEAD:]
         self._size = len(self._bytes)

@@ -30,6 +30,7 @@ def make_env(
     transport: str | None = None,
     profile: str | None = None,
     guards: Mapping[str, float] | None = None,
+    trial: bool = False,
     ca_file: str | None = None,
     token_file: str | None = None,
     timeout: float | None = None,
@@ -49,6 +50,7 @@ def make_env(
             ``"tcp://10.0.0.5:9091"``; then this process has no robot and no task.
         profile: Profile of the live robot: a shipped name or a file; by default that of the simulated robot.
         guards: Limits of the live robot's guards that differ from its profile's, such as ``{"joint_speed": 0.3}``.
+        trial: Whether the live robot is on trial: slow, and in a box around its start.
         ca_file: Certificates that ``wss://`` trusts instead of the system's.
         token_file: File with the server's token.
         timeout: Longest wait for an answer of `transport` [s]; 30 by default.
@@ -63,6 +65,8 @@ def make_env(
         raise InvalidValue(f"profile={profile!r} describes a live robot; give its address with robot= too.")
     if robot is None and guards is not None:
         raise InvalidValue("guards= changes the limits of a live robot; give its address with robot= too.")
+    if robot is None and trial:
+        raise InvalidValue("trial=True is for a live robot; give its address with robot= too.")
     _check_place(robot, transport, timeout, render_mode, randomize, link, task_options)
     if transport is not None:
         from bam_envs.remote.remote_env import make_remote_env
@@ -83,6 +87,7 @@ def make_env(
         simulated.spec,
         profile=profile,
         guards=guards,
+        trial=trial,
         tool_position=tool,
         ca_file=ca_file,
         token_file=token_file,

@@ -28,6 +28,7 @@ MAKE_OPTIONS = (
     "transport",
     "profile",
     "guards",
+    "trial",
     "ca_file",
     "token_file",
     "timeout",

@@ -20,6 +20,7 @@ def live_robot(
     profile: RobotProfile | str | Path | None = None,
     limits: Limits | None = None,
     guards: Mapping[str, float] | None = None,
+    trial: bool = False,
     tool_position: ToolPosition | None = None,
     command: str | None = None,
     ca_file: str | None = None,
@@ -33,6 +34,7 @@ def live_robot(
         profile: The profile of its topics: a shipped name or a file. None: the shipped one with the commands of `spec`.
         limits: The limits of the guards; None: those of the profile.
         guards: Some of them by name, which override the others, such as ``{"joint_speed": 0.3}``.
+        trial: Whether it is on trial: slow, and in a box around its start; see `Limits.on_trial`.
         tool_position: Forward kinematics of an arm other than a UR5e, (n, k) [rad] to (n, 3) [m].
         command: Command mode, such as ``"trajectory"``; None: the profile's default.
         ca_file: PEM file of the authorities to trust instead of the system's.
@@ -50,8 +52,12 @@ def live_robot(
     else:
         chosen = profile if isinstance(profile, RobotProfile) else load_profile("ur5e" if profile is None else profile)
     robot = RosbridgeRobot(endpoint, chosen, spec=spec, command=command)
-    base = limits or profile_limits(chosen)
-    return SafeRobot(robot, limits=base.changed(guards) if guards else base, tool_position=tool_position)
+    chosen_limits = limits or profile_limits(chosen)
+    if guards:
+        chosen_limits = chosen_limits.changed(guards)
+    if trial:
+        chosen_limits = chosen_limits.on_trial(base=chosen.kind == "base")
+    return SafeRobot(robot, limits=chosen_limits, tool_position=tool_position)
 
 
 def profile_limits(profile: RobotProfile) -> Limits:

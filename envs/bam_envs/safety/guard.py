@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import sys
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from types import MappingProxyType
 from typing import Annotated, Any
 
@@ -29,6 +29,10 @@ LONGEST_PERIOD = 1.0
 """Longest time between two commands to a live robot [s]: a robot may move for that long before the next check."""
 
 
+TRIAL_SPEED = 0.25
+"""Share of the speed limits of a robot on trial."""
+TRIAL_BOX = {"arm": 0.35, "base": 3.0}
+"""How far it may go from where it starts, along each axis [m]."""
 _ABOVE_ZERO = Annotated[float, Meta(gt=0, description="a number above 0")]
 _FINITE = Annotated[float, Meta(gt=0, le=sys.float_info.max, description="a finite number above 0")]
 
@@ -81,6 +85,9 @@ class Limits:
     """How far a joint may be from the start pose [rad]."""
     reset_timeout: float = _limit(30.0, 0.1, 300.0, "s", finite=True)
     """Longest time to reach the start pose [s]."""
+    trial_box: float | None = _limit(None, 0.05, 20.0, "m", finite=True)
+    """How far a robot on trial may go from where it starts, along each axis [m]; None: no limit, or on trial 0.35 for
+    an arm, 3 for a base."""
 
     def __post_init__(self) -> None:
         for one in fields(self):
@@ -122,6 +129,23 @@ class Limits:
         if "reset_speed" in values:  # in a profile it may be above the speed that a person lowered
             limits._require_order("reset_speed", "joint_speed")
         return limits
+
+    def scaled(self, share: float) -> Limits:
+        """These limits with `share` of the speeds, as far as `BOUNDS` allow."""
+        speeds = ("joint_speed", "tool_speed", "base_speed", "turn_speed")
+        return replace(self, **{name: max(BOUNDS[name][0], share * getattr(self, name)) for name in speeds})
+
+    def on_trial(self, *, base: bool) -> Limits:
+        """These limits for a policy on trial on an arm or a base: `TRIAL_SPEED` of the speeds, and a `trial_box`.
+
+        A slow arm that presses on an object is as far from its commands as a fast one, so `follow_tolerance` is wider.
+        """
+        return replace(
+            self.scaled(TRIAL_SPEED),
+            trial_box=self.trial_box or TRIAL_BOX["base" if base else "arm"],
+            follow_tolerance=max(0.01, self.follow_tolerance),
+            reset_timeout=min(BOUNDS["reset_timeout"][1], self.reset_timeout / TRIAL_SPEED),
+        )
 
     def require_bounded(self) -> None:
         """`InvalidValue` if a limit is outside `BOUNDS`, as no limit of a live robot may be."""

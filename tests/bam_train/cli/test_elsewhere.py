@@ -176,14 +176,16 @@ def test_a_real_robot_is_shown_and_does_not_move_unasked(serve, run, monkeypatch
     assert (status, out) == (1, "")
     lines = err.splitlines()
     assert lines[0].startswith(f"bam-deploy: {PICK} will move ur5e")
-    assert lines[1:6] == [
+    assert lines[1:7] == [
         f"  address: {served.bus.url}",
         "  bam/pick-v0: 2 episodes, one after the other without a pause",
         "  each begins by opening the gripper and going to the start pose",
         f"  UNSIGNED: {unsigned}",
+        "  stage trial, at 25 % of the speed limits: 0 of 0 trials succeeded; 33 more without a failure would show "
+        "more than 90 %",
         "within",
     ]
-    assert "  tool speed (G10): 0.25 m/s" in lines
+    assert "  tool speed (G10): 0.0625 m/s" in lines
     assert lines[-1] == (
         "bam-deploy: a real robot would move, and there is nobody to ask; give --yes to go on without asking"
     )

@@ -14,6 +14,7 @@ from bam_train.checkpoint import MANIFEST, POLICY, Checkpoint, safetensors_file,
 from bam_train.checkpoint.signature import make_key, public_path, sign, trust, verify
 from bam_train.cli.sign import main
 from bam_train.deploy.trust import Admission
+from bam_train.env_location import HERE
 from bam_train.errors import AlteredCheckpoint, BadKey, CheckpointError, OutputError, UntrustedCheckpoint
 from bam_train.policy import onnx_session
 
@@ -51,7 +52,7 @@ def signed(corridor_checkpoint, key):
 def admit(path, keys, **options):
     """What bam-deploy does before a real robot moves."""
     admission = Admission(Checkpoint.open(path), keys, **options)
-    return admission(REAL), admission
+    return admission(REAL, HERE), admission
 
 
 def members_of(path):
@@ -187,7 +188,7 @@ def test_a_simulated_robot_needs_no_signature(corridor_checkpoint):
     admission = Admission(Checkpoint.open(corridor_checkpoint()))
     simulated = SimpleNamespace(robot=SimpleNamespace(info=SimpleNamespace(simulated=True)))
     for env in (SimpleNamespace(unwrapped=simulated), SimpleNamespace(unwrapped=object())):
-        assert admission(env) == []
+        assert admission(env, HERE) == []
     assert admission.marks == ()
 
 

@@ -77,7 +77,7 @@ def record(tmp_path):
 
 
 def try_it(record, *outcomes, subject=PICK):
-    trials = Trials(record, subject, {"env": "bam/pick-v0"})
+    trials = Trials(record, subject, 0.9, {"env": "bam/pick-v0"})
     for seed, outcome in enumerate(outcomes):
         trials.begin(seed)
         trials.end(outcome, "terminated")
@@ -107,9 +107,9 @@ def test_trials_count_for_one_checkpoint_on_one_robot(record):
 
 def test_a_trial_without_an_end_has_failed(record):
     try_it(record, True)
-    Trials(record, PICK, {}).begin(7)
+    Trials(record, PICK, 0.9, {}).begin(7)
     assert counts(record) == (1, 2)
-    Trials(record, PICK, {}).end(True, "never begun")
+    Trials(record, PICK, 0.9, {}).end(True, "never begun")
     assert counts(record) == (1, 2)
 
 
@@ -185,7 +185,7 @@ def test_killed_between_two_lines(record):
     code = (
         "import os, sys; from pathlib import Path; from bam_train.deploy.trials import *\n"
         "record = TrialRecord(Path(sys.argv[1]), Path(sys.argv[2]))\n"
-        "trials = Trials(record, Subject('ab12', 'ws://10.0.0.5:9090'), {})\n"
+        "trials = Trials(record, Subject('ab12', 'ws://10.0.0.5:9090'), 0.9, {})\n"
         "trials.begin(1); trials.end(True, 'done'); trials.begin(2); os.kill(os.getpid(), 9)"
     )
     private = record.path.parents[1] / "private"
@@ -210,6 +210,6 @@ def test_a_place_where_nothing_can_be_written_is_named(tmp_path):
     (tmp_path / "file").write_text("")
     record = TrialRecord(tmp_path / "file" / "trials.jsonl", tmp_path / "private")
     with pytest.raises(BadTrials, match=r"the trial cannot be recorded: .*\. Give another file with --trials"):
-        Trials(record, PICK, {}).begin(0)
+        Trials(record, PICK, 0.9, {}).begin(0)
     with pytest.raises(BadTrials, match=r"cannot be read: Not a directory"):
         record._read()

@@ -1,1 +1,0 @@
-"""Programs for a live robot besides bam-deploy."""

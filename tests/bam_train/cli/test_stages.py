@@ -1,0 +1,242 @@
+"""Stages of a roll-out: on trial, slow and in a box, until trials have shown enough for full speed."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+
+import gymnasium as gym
+import pytest
+
+from bam_envs.core.errors import InvalidValue, LinkLost
+from bam_envs.live import rosbridge_robot
+from bam_envs.remote.serve.serve_options import ServeOptions
+from bam_envs.remote.serve.served_environment import ServedEnvironment
+from bam_envs.ros.codec import read_info
+from bam_envs.safety.guard import BOUNDS, Limits
+from bam_train.checkpoint import Checkpoint
+from bam_train.cli.deploy import main as deploy
+from bam_train.deploy.trials import Subject, TrialRecord, Trials
+from bam_train.deploy.trust import Admission
+from bam_train.env_location import HERE, Place
+from bam_train.errors import BadTrials, TrialsNeeded
+from tests.bam_train.deploy.test_deployment import Driven, raises
+from tests.bam_train.deploy.test_deployment import run as run_deployment
+
+REACH = Path(__file__).parents[3] / "checkpoints" / "reach-ppo.zip"
+URL = "ws://10.0.0.5:9090"
+SIMULATED = SimpleNamespace(unwrapped=SimpleNamespace(robot=SimpleNamespace(info=SimpleNamespace(simulated=True))))
+ON_TRIAL, FULL = Place(robot=URL, trial=True), Place(robot=f"{URL}/", trial=False)
+
+
+@pytest.fixture(autouse=True)
+def config(tmp_path, monkeypatch):
+    """The user's own folder."""
+    monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path / "config"))
+    return tmp_path / "config" / "bam-train"
+
+
+@pytest.fixture
+def admission(corridor_checkpoint, tmp_path):
+    """Makes the admission of one checkpoint, whose record is in `tmp_path`."""
+
+    def make(*, i_know=False, **settings):
+        checkpoint = Checkpoint.open(corridor_checkpoint(settings=settings))
+        return Admission(checkpoint, record=tmp_path / "trials.jsonl", i_know=i_know)
+
+    return make
+
+
+def try_it(trials, *outcomes):
+    for seed, outcome in enumerate(outcomes):
+        trials.begin(seed)
+        trials.end(outcome, "terminated")
+
+
+def test_on_trial_until_trials_show_enough_for_full_speed(admission):
+    one = admission()
+    assert one(SIMULATED, ON_TRIAL) == [
+        "  stage trial, at 25 % of the speed limits: 0 of 0 trials succeeded; 33 more without a failure would show "
+        "more than 90 %"
+    ]
+    assert one.marks == ("trial",)
+    try_it(one.trials, *[True] * 32)
+    early = admission()
+    with pytest.raises(TrialsNeeded) as caught:
+        early(SIMULATED, FULL)
+    assert str(caught.value) == (
+        f"--stage full: {early.checkpoint.path} at {URL}/: 32 of 32 trials succeeded; 1 more without a failure would "
+        "show more than 90 %. Run more with --stage trial, or give --i-know"
+    )
+    assert not hasattr(early, "policy")
+    try_it(one.trials, True)
+    full = admission()
+    assert full(SIMULATED, FULL) == [
+        "  stage full: 33 of 33 trials succeeded, which shows more than 90 % (error probability at most 5 %)"
+    ]
+    assert (full.marks, full.trials) == ((), None)
+
+
+def test_another_checkpoint_or_robot_begins_anew(admission):
+    one = admission()
+    one(SIMULATED, ON_TRIAL)
+    try_it(one.trials, *[True] * 33)
+    with pytest.raises(TrialsNeeded, match="0 of 0 trials succeeded"):
+        admission()(SIMULATED, replace(FULL, robot="ws://10.0.0.6:9090"))
+    with pytest.raises(
+        TrialsNeeded, match="0 of 0 trials succeeded; 7 more without a failure would show more than 60 %"
+    ):
+        admission(trial_threshold=0.6)(SIMULATED, FULL)
+
+
+def test_who_knows_may_go_at_full_speed_and_every_line_says_so(admission):
+    one = admission(i_know=True)
+    assert one(SIMULATED, FULL) == [
+        "  UNPROVEN: 0 of 0 trials succeeded; 33 more without a failure would show more than 90 %"
+    ]
+    assert one.marks == ("UNPROVEN",)
+
+
+@pytest.mark.parametrize("threshold", [None, 7, "0.5", 0.0, True])
+def test_a_threshold_that_is_none_is_the_usual_one(admission, threshold):
+    assert "33 more" in admission(trial_threshold=threshold)(SIMULATED, ON_TRIAL)[0]
+
+
+def test_an_edited_record_is_refused_at_every_stage(admission, tmp_path):
+    one = admission()
+    one(SIMULATED, ON_TRIAL)
+    try_it(one.trials, False)
+    path = tmp_path / "trials.jsonl"
+    path.write_text(path.read_text().replace("false", "true"))
+    for place in (ON_TRIAL, FULL):
+        with pytest.raises(BadTrials, match="line 3 was edited"):
+            admission(i_know=True)(SIMULATED, place)
+
+
+def test_a_simulated_robot_has_no_stage_unless_one_is_asked_for(admission):
+    for place in (HERE, Place(robot=URL, trial=None)):
+        one = admission()
+        assert one(SIMULATED, place) == []
+        assert (one.marks, one.trials) == ((), None)
+
+
+# Limits
+
+
+def test_the_limits_of_a_robot_on_trial():
+    limits = Limits.of({"tool_speed": 0.01, "reset_timeout": 100.0})
+    arm, base = limits.on_trial(base=False), limits.on_trial(base=True)
+    assert (arm.joint_speed, arm.base_speed, arm.turn_speed) == (0.25, 0.125, 0.175)
+    assert arm.tool_speed == BOUNDS["tool_speed"][0]
+    assert (arm.trial_box, base.trial_box, arm.follow_tolerance, arm.reset_timeout) == (0.35, 3.0, 0.01, 300.0)
+    assert Limits(trial_box=0.5, follow_tolerance=0.02).on_trial(base=False).trial_box == 0.5
+    assert Limits().scaled(0.5).joint_speed == 0.5
+    arm.require_bounded()
+
+
+def test_an_episode_on_trial_may_take_four_times_as_long():
+    assert ON_TRIAL.robot_kwargs("bam/pick-v0", {})["max_episode_steps"] == 400
+    assert ON_TRIAL.robot_kwargs("bam/pick-v0", {"max_episode_steps": 7})["max_episode_steps"] == 28
+    assert ON_TRIAL.robot_kwargs("bam/pick-v0", {"max_episode_steps": -1})["max_episode_steps"] == -1
+    assert "max_episode_steps" not in FULL.robot_kwargs("bam/pick-v0", {})
+    with pytest.raises(InvalidValue, match=r"^trial=True is for a live robot; give its address with robot= too\.$"):
+        gym.make("bam/pick-v0", trial=True)
+
+
+# A deployment
+
+
+@pytest.fixture
+def trials(tmp_path):
+    record = TrialRecord(tmp_path / "trials.jsonl", tmp_path / "private")
+    return Trials(record, Subject("ab12", URL), 0.9, {})
+
+
+def reasons(trials):
+    rows = [json.loads(line) for line in trials.record.path.read_text().splitlines()]
+    return [row["reason"] for row in rows if "reason" in row]
+
+
+def test_every_episode_is_a_trial(corridor, trials):
+    env = Driven(gym.make(corridor, disable_env_checker=True))
+    run_deployment(env, trials=trials)
+    assert (trials.evidence.successes, trials.evidence.trials) == (3, 3)
+    assert reasons(trials) == ["terminated"] * 3
+
+
+def test_an_episode_that_is_cut_short_has_failed(corridor, trials):
+    env = Driven(gym.make(corridor, disable_env_checker=True), raises(LinkLost("the link dropped")), at=2)
+    ending, _, _ = run_deployment(env, trials=trials)
+    assert ending.status == 4
+    assert (trials.evidence.successes, trials.evidence.trials) == (trials.evidence.trials - 1, trials.evidence.trials)
+    assert reasons(trials)[-1] == "link lost: the link dropped"
+
+
+def test_nothing_moves_if_a_trial_cannot_be_recorded(corridor, tmp_path):
+    (tmp_path / "file").write_text("")
+    trials = Trials(TrialRecord(tmp_path / "file" / "trials.jsonl", tmp_path), Subject("ab12", URL), 0.9, {})
+    env = Driven(gym.make(corridor, disable_env_checker=True))
+    ending, _, _ = run_deployment(env, trials=trials)
+    assert env.count == 0
+    assert ending.status == 1
+    assert "the trial cannot be recorded: " in ending.reason
+
+
+# The program
+
+
+@pytest.mark.parametrize(
+    ("flags", "text"),
+    [
+        (("--stage", "trial"), "--stage and --trials are for a live robot; give its address with --robot too"),
+        (("--i-know",), "--i-know is for --stage full alone; leave it out"),
+    ],
+)
+def test_flags_that_do_not_fit(run, flags, text):
+    assert run(deploy, REACH, *flags) == (1, "", f"bam-deploy: {text}\n")
+
+
+@pytest.fixture
+def served():
+    options = ServeOptions(port=0, fast=True)
+    with ServedEnvironment(gym.make("bam/reach-v0", disable_env_checker=True), options) as served:
+        yield served
+
+
+def test_a_real_robot_is_on_trial_unless_something_else_is_asked_for(served, run, monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(rosbridge_robot, "read_info", lambda *said: replace(read_info(*said), simulated=False))
+    flags = ("--robot", served.bus.url, "--allow-unsigned", "--no-record")
+    status, _, err = run(deploy, REACH, *flags)
+    assert status == 1  # there is nobody to ask
+    assert "  stage trial, at 25 % of the speed limits: 0 of 0 trials succeeded; " in err
+    assert "  joint speed (G8): 0.25 rad/s\n" in err
+    status, _, err = run(deploy, REACH, *flags, "--stage", "full")
+    assert status == 1
+    assert err.endswith("more than 90 %. Run more with --stage trial, or give --i-know\n")
+    status, _, err = run(deploy, REACH, *flags, "--stage", "full", "--i-know")
+    assert "  UNPROVEN: 0 of 0 trials" in err
+    assert "  joint speed (G8): 1 rad/s\n" in err
+
+
+def test_trials_are_run_recorded_and_reported(served, run, tmp_path):
+    record = tmp_path / "trials.jsonl"
+    flags = (
+        "--robot",
+        served.bus.url,
+        "--stage",
+        "trial",
+        "--trials",
+        record,
+        "--episodes",
+        1,
+        "--no-record",
+        "--json",
+    )
+    status, out, err = run(deploy, REACH, *flags)
+    report = json.loads(out)
+    assert (status, report["marks"]) == (0, ["trial"]), err
+    assert report["trials"] == {"successes": 1, "trials": 1, "threshold": 0.9, "is_enough": False}
+    assert err.endswith(", trial\n")
+    assert report["guards"]["joint speed"]["limit"] == 0.25
+    assert json.loads(record.read_text().splitlines()[1])["robot"] == served.bus.url
