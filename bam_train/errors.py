@@ -12,6 +12,7 @@
     ├── BadTrials                  a record of trials that was edited, or cannot be read or written
     ├── TrialsNeeded               full speed before trials have shown that the policy succeeds
     ├── BadKey                     a key for signing or verifying that cannot be used
+    ├── BadRecording               a file that is no recording, or does not fit what it is played with
     ├── FormatError                bytes that do not follow their file format (safetensors, ONNX)
     ├── PolicyError                a frozen policy that cannot run, or an observation that does not fit it
     ├── SettingsError              a setting or option that does not exist or does not fit
@@ -89,6 +90,10 @@ class TrialsNeeded(BamTrainError):  # noqa: N818
 
 class BadKey(BamTrainError):  # noqa: N818
     """A key for signing or verifying that cannot be used; the text names its file."""
+
+
+class BadRecording(BamTrainError, ValueError):  # noqa: N818
+    """A file that is no recording of a deployment, or one that does not fit what it is played with."""
 
 
 class FormatError(BamTrainError, ValueError):

@@ -71,8 +71,11 @@ def serve_echo() -> None:
     asyncio.run(main())
 
 
-def serve_robot() -> None:
-    """The embedded server with a robot that moves at once, and a camera of 640 x 480 at 30 Hz."""
+def serve_robot(*, realtime: bool = False) -> None:
+    """The embedded server with a robot that moves at once, and a camera of 640 x 480 at 30 Hz.
+
+    In real time it publishes 100 states a second; otherwise its time advances with commands.
+    """
     from bam_envs.core.robot import Initial
     from bam_envs.remote.serve.command_lease import CommandLease
     from bam_envs.remote.serve.robot_service import RobotService
@@ -81,7 +84,7 @@ def serve_robot() -> None:
     from bam_envs.robots.profile import load_profile
     from bam_envs.rosbridge.server import BridgeServer
 
-    robot = ServedRobot(FakeRobot(1), command_timeout=0.1)
+    robot = ServedRobot(FakeRobot(1), command_timeout=0.1, realtime=realtime)
     robot.connect()
     robot.reset(np.arange(1), Initial({"joint_position": np.array([HOME])}, np.zeros(1, np.int64)))
     with BridgeServer(port=0) as server:
@@ -172,6 +175,7 @@ def until_the_end(*ports: int) -> None:
 SERVERS: dict[str, Callable[[], None]] = {
     "echo": serve_echo,
     "robot": serve_robot,
+    "realtime robot": lambda: serve_robot(realtime=True),
     "state": lambda: serve_environment((18,)),
     "image": lambda: serve_environment(IMAGE),
     "joints": serve_joint_states,

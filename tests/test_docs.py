@@ -31,7 +31,13 @@ ROOT = Path(__file__).parents[1]
 DOCS = sorted((ROOT / "docs").rglob("*.md"))
 PAGES = [ROOT / "README.md", ROOT / "CHANGELOG.md", ROOT / "checkpoints" / "README.md", *DOCS]
 PROGRAMS = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["scripts"]
-FLAGS_OF = {"bam-train": "training.md", "bam-serve": "remote.md", "bam-sign": "signing.md"}
+FLAGS_OF = {
+    "bam-train": "training.md",
+    "bam-doctor": "doctor.md",
+    "bam-replay": "recording.md",
+    "bam-serve": "remote.md",
+    "bam-sign": "signing.md",
+}
 EXAMPLES = {"PYTHONPATH": os.pathsep.join([str(ROOT), str(ROOT / "envs")]), "OMP_NUM_THREADS": "1"}
 
 

@@ -67,9 +67,11 @@ def test_console_scripts(wheel):
     lines = sorted(line for line in wheel.read(name).decode().splitlines() if " = " in line)
     assert lines == [
         "bam-deploy = bam_train.cli.deploy:main",
+        "bam-doctor = bam_train.cli.live.doctor:main",
         "bam-envs = bam_train.cli.envs:main",
         "bam-eval = bam_train.cli.eval:main",
         "bam-export = bam_train.cli.export:main",
+        "bam-replay = bam_train.cli.live.replay:main",
         "bam-serve = bam_train.cli.serve:main",
         "bam-sign = bam_train.cli.sign:main",
         "bam-train = bam_train.cli.train:main",

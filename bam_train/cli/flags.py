@@ -173,6 +173,48 @@ class DeployConfig:
 
 
 @dataclass(frozen=True)
+class DoctorConfig:
+    """Check a live robot step by step without moving it, name the first step that fails, and measure its link."""
+
+    url: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="URL")]
+    """Address of the robot behind rosbridge, such as ws://10.0.0.5:9090."""
+    checkpoint: File = None
+    """Check what the task of this checkpoint needs, and its contract with the robot."""
+    env: EnvId = None
+    """Refuse the checkpoint unless it was trained on this environment; needed for some_module:Env-v0."""
+    profile: Name = None
+    """What the robot's topics are: a shipped name, or a .toml or .yaml file; by default the one that fits best."""
+    ca_file: File = None
+    """Certificates that wss:// trusts instead of the system's."""
+    token_file: File = None
+    """File with the token that the server asks for."""
+    seconds: Annotated[Positive, tyro.conf.arg(metavar="S")] = 5.0
+    """Duration of the measurement of states and link [s]."""
+    measure: File = None
+    """Write the measured link to this .json file, with which bam-deploy rehearses."""
+    json: bool = False
+    """Print one JSON object on standard output instead of a table."""
+
+
+@dataclass(frozen=True)
+class ReplayConfig:
+    """Sum up a recording of bam-deploy, play it through its environment with a policy, and draw it."""
+
+    recording: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RECORDING")]
+    """The .mcap file that bam-deploy wrote."""
+    checkpoint: File = None
+    """Checkpoint whose policy acts on the recorded states; by default the recorded one, if it is where it was."""
+    env: EnvId = None
+    """Environment that the checkpoint belongs to; needed for some_module:Env-v0."""
+    plot: File = None
+    """Draw states, commands, actions, status and latencies into this .png file."""
+    video: File = None
+    """Make a .gif or .mp4 of the recorded pictures; without any, of the simulated robot in the recorded states."""
+    json: bool = False
+    """Print one JSON object on standard output instead of a few lines."""
+
+
+@dataclass(frozen=True)
 class ExportConfig:
     """Turn a checkpoint directory of RLlib into a checkpoint.zip that can be evaluated and deployed."""
 

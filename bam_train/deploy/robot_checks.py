@@ -15,7 +15,7 @@ from bam_envs.core.robot import RobotSpec, SignalSpec
 from bam_envs.live.evidence import Evidence
 from bam_envs.live.state import Letter, SourceAge, concerns
 from bam_envs.ros.codec import decode_source
-from bam_envs.ros.messages import bare_type, same_type
+from bam_envs.ros.messages import Message, bare_type, number_at, same_type
 from bam_envs.ros.profile_tables import RobotProfile, Source
 from bam_train.deploy.contract_table import Check, check
 
@@ -124,20 +124,25 @@ def _new_and_ages(evidence: Evidence, source: Source, letters: Sequence[Letter])
     return new, ages
 
 
-def _scan_geometry(source: Source, message: object) -> Iterator[Check]:
-    """The angles and the range of a scanner, where the profile and the message have them."""
-    told = message if isinstance(message, dict) else {}
+def _scan_geometry(source: Source, message: Message) -> Iterator[Check]:
+    """The angles and the range of a scanner, where the profile has them."""
     for name, expected in source.constants.items():
-        value = told.get(name)
-        if name.startswith("angle_") and isinstance(value, (int, float)):
-            fits = math.isclose(value, expected, rel_tol=_SCAN_OFF)
-            unit = FACTORS["rad"]["degrees"]
-            hint = " (degrees?)" if not fits and math.isclose(value / unit, expected, rel_tol=_SCAN_OFF) else ""
-            yield check(f"{name} of {source.topic}", f"{expected:.4g} rad", f"{value:.4g}{hint}", fits=fits)
-        if name == "range_max" and isinstance(value, (int, float)):
-            fits = expected / _RANGE_OFF < value < expected * _RANGE_OFF
-            hint = "" if fits else " (millimetres?)"
-            yield check(f"{name} of {source.topic}", f"about {expected:g} m", f"{value:g}{hint}", fits=fits)
+        angle = name.startswith("angle_")
+        if not angle and name != "range_max":
+            continue
+        what, wanted = f"{name} of {source.topic}", f"{expected:.4g} rad" if angle else f"about {expected:g} m"
+        try:
+            value = number_at(message, name, source.topic)
+        except ProtocolError as error:
+            yield check(what, wanted, str(error).removeprefix(f"{source.topic}: ").removesuffix("."), fits=None)
+            continue
+        if angle:
+            fits, hint = math.isclose(value, expected, rel_tol=_SCAN_OFF), " (degrees?)"
+            other = math.isclose(math.radians(value), expected, rel_tol=_SCAN_OFF)
+        else:
+            fits, hint = expected / _RANGE_OFF < value < expected * _RANGE_OFF, " (millimetres?)"
+            other = math.isclose(value / FACTORS["m"]["millimetres"], expected, rel_tol=_SCAN_OFF)
+        yield check(what, wanted, f"{value:.4g}{hint if other and not fits else ''}", fits=fits)
 
 
 def _range(signal: SignalSpec, values: Array) -> Iterator[Check]:
@@ -155,7 +160,7 @@ def _range(signal: SignalSpec, values: Array) -> Iterator[Check]:
     else:
         found = _span(values.min(axis=0), values.max(axis=0))
     yield check(signal.name, expected, found, fits=not outside.any())
-    if signal.name.endswith("quaternion"):
+    if signal.name.endswith("quaternion") and not outside.any():
         lengths = np.linalg.norm(values, axis=1)
         worst = float(lengths[np.abs(lengths - 1.0).argmax()])
         yield check(f"length of {signal.name}", "1", f"{worst:.3f}", fits=abs(worst - 1.0) <= BEYOND)
@@ -190,7 +195,9 @@ def _speed(speed: str, position: str, times: Array, speeds: Array, at: Array, po
     off = np.abs(measured - changed) - RATE_OFF * np.abs(changed)
     worst = int(off.argmax())
     still = np.abs(changed).max() < RATE_OFF and off[worst] <= RATE_OFF
-    found = "at rest" if still else f"{measured[worst]:.3g} told, {changed[worst]:.3g} by {position}"
+    if still:
+        return check(what, expected, "not shown at rest", fits=None)
+    found = f"{measured[worst]:.3g} told, {changed[worst]:.3g} by {position}"
     return check(what, expected, found, fits=bool(off[worst] <= RATE_OFF))
 
 

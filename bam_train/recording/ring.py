@@ -49,7 +49,8 @@ class Ring:
     """One end of the ring in a file of `make_shared_file`."""
 
     def __init__(self, descriptor: int) -> None:
-        self._map = mmap.mmap(descriptor, 0)
+        now = {"flags": mmap.MAP_SHARED | mmap.MAP_POPULATE} if hasattr(mmap, "MAP_POPULATE") else {}
+        self._map = mmap.mmap(descriptor, 0, **now)  # its pages exist from now on, not from their first use in a tick
         self._head: Any = _Head.from_buffer(self._map)
         self._bytes = memoryview(self._map)[_HEAD:]
         self._size = len(self._bytes)

@@ -35,6 +35,8 @@ _RIVAL_TIME = 1.0
 _RENEW_EVERY, _RENEWAL_LIFE = 0.5, 1.0
 """Time between two renewals of the lease, and how long each is valid [s]; the robot's side waits for several of them
 (`CommandLease`)."""
+_STATES = 5
+"""Number of states of a topic that should arrive per period, and within the age at which a state is too old."""
 _ACTIVE = ("active", "running")
 """The states of a controller that takes commands, in ROS 2 and in ROS 1."""
 
@@ -61,6 +63,17 @@ def info_by_profile(url: str, profile: RobotProfile, unknown: Iterable[str] = ()
     rest = f"; it does not report {silent}" if silent else ""
     known = f"profile {profile.name}: {', '.join(profile.command.labels)}"
     return RobotInfo(profile.name, text=f"the robot at {url}, which does not describe itself ({known}{rest})")
+
+
+def least_interval(profile: RobotProfile, period: float, topic: str, *, describes_itself: bool) -> int:
+    """Least time between two messages of a state topic to ask the server for [ms]; 0: each message.
+
+    A driver may send 500 states a second, and the queues of a busy bridge delay them all. Where several publish on a
+    topic, the bridge might always drop those of the same publisher. A robot that describes itself sends no more than is
+    needed.
+    """
+    is_shared = any(source.partial for source in profile.state if source.topic == topic)
+    return 0 if describes_itself or is_shared else int(1000 * min(period, profile.max_age) / _STATES)
 
 
 def tagged_sinks(profile: RobotProfile, mode: str | None) -> tuple[Sink, ...] | None:

@@ -53,8 +53,6 @@ from bam_envs.safety.guard import measured_places
 Array = NDArray[np.float64]
 _LOG = logging.getLogger(__name__)
 _LOST_AFTER = 1.0
-_STATES = 5
-"""Number of states of a topic that should arrive per period, and within the age at which a state is too old."""
 _ANSWER_TIMEOUT = 5.0
 """Longest time that a robot in lockstep takes for a period, unless the endpoint has a timeout [s]."""
 _RESET_TIMEOUT = 3.0
@@ -183,14 +181,10 @@ class RosbridgeRobot:
 
     def _declare(self, control: RosbridgeLink, halting: RosbridgeLink, types: bringup.TopicTypes) -> None:
         """Subscribe states and advertise commands, with their types on the server."""
-        shared = {source.topic for source in self.profile.state if source.partial}
-        fewest = int(1000 * min(self.spec.period, self.profile.max_age) / _STATES)
+        itself = self._describes_itself
         for topic, kind in {source.topic: source.type for source in self._state.sources}.items():
             name = self.namespace + topic
-            # A driver may send 500 states a second, and the queues of a busy bridge delay them all. Where several
-            # publish on a topic, the bridge might always drop those of the same publisher. A robot that describes
-            # itself sends no more than is needed.
-            least = 0 if self._describes_itself or topic in shared else fewest
+            least = bringup.least_interval(self.profile, self.spec.period, topic, describes_itself=itself)
             listener, kind = self._state.listener(topic), types.check(name, kind)
             control.subscribe(name, kind, listener, throttle_ms=least, queue_length=1 if least else 0)
         for sink in self._sinks:

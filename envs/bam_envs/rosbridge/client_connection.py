@@ -82,7 +82,7 @@ class Connection:
         `NoServer` gives the reason; its cause is a `ConnectionRefusedError` if the server may still be starting.
         """
         deadline = time.monotonic() + timeout
-        self._socket = await _open_socket(self._endpoint, timeout, self._max_message)
+        self._socket = await open_socket(self._endpoint, timeout, self._max_message)
         self._heard_at = time.monotonic()
         loop = asyncio.get_running_loop()
         self._tasks = [loop.create_task(work(self._socket)) for work in (self._read, self._watch)]
@@ -289,16 +289,24 @@ class Connection:
 # ---- the socket, and the reasons why it could not be opened
 
 
-async def _open_socket(endpoint: Endpoint, timeout: float, max_message: int) -> ClientConnection:
-    """Connect and do the WebSocket handshake in `timeout` [s]; `max_message` limits received messages [bytes]."""
-    address, context = endpoint.address, endpoint.tls_context()
-    deadline = time.monotonic() + timeout
+async def open_port(address: Address, timeout: float) -> socket.socket:
+    """A TCP connection to a server; `NoServer` gives the reason why there is none within `timeout` [s]."""
     try:
-        # TCP first, to tell apart a closed port, one behind a firewall and a silent one; and so that websockets uses
-        # no proxy, behind which there is no robot.
-        plain = await asyncio.wait_for(_open_tcp(address), timeout)
+        return await asyncio.wait_for(_open_tcp(address), timeout)
     except (OSError, asyncio.TimeoutError) as error:
         raise NoServer(address.url, _no_connection(address, error, timeout)) from error
+
+
+async def open_socket(endpoint: Endpoint, timeout: float, max_message: int) -> ClientConnection:
+    """Connect and do the WebSocket handshake in `timeout` [s]; `max_message` limits received messages [bytes].
+
+    `NoServer` gives the reason why that failed.
+    """
+    address, context = endpoint.address, endpoint.tls_context()
+    deadline = time.monotonic() + timeout
+    # TCP first, to tell apart a closed port, one behind a firewall and a silent one; and so that websockets uses
+    # no proxy, behind which there is no robot.
+    plain = await open_port(address, timeout)
     try:
         return await connect(
             f"{address.url}/",

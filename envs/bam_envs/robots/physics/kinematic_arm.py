@@ -253,6 +253,10 @@ class KinematicArm(Memory, Drawn):
         """Hold the current position."""
         self._halts += 1
 
+    def show(self, state: RobotState) -> None:
+        """Put the arm of the one environment where `state` measured it, to draw it."""
+        self._position, self._stamp = state.signals["joint_position"], state.stamp
+
     def picture(self) -> tuple[list[Shape], View]:
         """The arm of environment 0, its table and its ball, from far enough to show the whole arm."""
         x, y, z = (TABLE[1] - TABLE[0]).tolist()

@@ -171,6 +171,12 @@ class SimulatedBase(Memory, Drawn):
         """Stop at once."""
         self._velocity, self._command = np.zeros_like(self._velocity), np.zeros_like(self._command)
 
+    def show(self, state: RobotState) -> None:
+        """Put the base of the one environment where `state` measured it, with what its scanners saw, to draw it."""
+        self.pose = state.signals["base_pose"]
+        if self._seen.shape[1]:
+            self._seen = np.concatenate([state.signals["f_scan"], state.signals["b_scan"]], axis=1)
+
     def picture(self) -> tuple[list[Shape], View]:
         """The base of environment 0, its room and boxes, and its laser ranges.
 

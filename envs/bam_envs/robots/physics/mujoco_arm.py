@@ -206,6 +206,13 @@ class SimulatedArm:
             self._view = open_view(self.physics.model_of(0), mode, camera="front")
         return self._view.show(self.physics.data_of(0), marked(marks))
 
+    def show(self, state: RobotState) -> None:
+        """Put the arm and object of the one environment where `state` measured them, to draw it."""
+        physics, signals = self.physics, state.signals
+        physics.qpos[:, :6], physics.qpos[:, 6:8] = signals["joint_position"], signals["gripper_width"] / 2
+        if self._with_object:
+            physics.qpos[:, 8:11], physics.qpos[:, 11:15] = signals["object_position"], signals["object_quaternion"]
+
     def state_dict(self) -> dict[str, Any]:
         """The complete state of the simulated robots."""
         arrays = {"physics": self.physics.state, "setpoint": self._setpoint, "command": self._command}

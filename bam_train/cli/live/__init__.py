@@ -1,0 +1,1 @@
+"""Programs for a live robot besides bam-deploy."""

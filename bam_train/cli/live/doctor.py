@@ -1,0 +1,175 @@
+"""`bam-doctor`: check a live robot step by step without moving it, and measure the link to it."""
+
+from __future__ import annotations
+
+import json as json_module
+from dataclasses import asdict, dataclass
+from functools import partial
+from typing import TYPE_CHECKING, Any
+
+from bam_train.cli.console import say, tell
+from bam_train.cli.program import run_program
+from bam_train.errors import ContractRefused
+from bam_train.signals import SignalMemory
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from bam_envs.live.diagnosis import Diagnosis, Step
+    from bam_train.checkpoint import Checkpoint
+    from bam_train.cli.flags import DoctorConfig
+    from bam_train.deploy.contract_table import Contract
+    from bam_train.env_location import Place
+
+CONTRACT = "contract"
+"""Name of the last step, with a checkpoint."""
+
+
+def examine(config: DoctorConfig, signals: SignalMemory) -> int:
+    """Run the program with its parsed flags; returns the exit status: 1 if a step failed, 3 if it is the contract."""
+    _require_sane(config)
+    from bam_envs.live.diagnosis import STEPS, Diagnosis
+
+    paths = {"ca_file": config.ca_file, "token_file": config.token_file}
+    files: dict[str, Any] = {name: None if path is None else str(path) for name, path in paths.items()}
+    subject = _Subject.of(config, files)
+    steps: list[Step] = []
+    try:
+        robot = None if subject is None else subject.env.unwrapped.robot
+        diagnosis = Diagnosis(config.url, robot, profile=config.profile, seconds=config.seconds, **files)
+        try:
+            for step in _shown(_all_steps(diagnosis, subject), config):
+                steps.append(step)
+                signals.raise_again()
+            if subject is not None and subject.contract is not None and not config.json:
+                tell(*(f"  {line}" for line in subject.contract.lines()))
+        finally:
+            diagnosis.close()
+    finally:
+        if subject is not None:
+            subject.env.close()
+    names = [*STEPS, *([] if subject is None else [CONTRACT])]
+    failed = next((step for step in steps if step.verdict == "failed"), None)
+    measured = _write_measured(config, diagnosis)
+    if config.json:
+        report = {
+            "address": config.url,
+            "profile": None if diagnosis.profile is None else diagnosis.profile.name,
+            "steps": [asdict(step) for step in steps],
+            "not_tried": names[len(steps) :],
+            "failed": None if failed is None else failed.name,
+            "contract": None if subject is None or subject.contract is None else subject.contract.to_json(),
+            "measured": measured,
+        }
+        tell(json_module.dumps(report, allow_nan=False))
+    if failed is None:
+        return 0
+    say(f"bam-doctor: {failed.name} failed: {failed.found}")
+    refused = subject is not None and subject.contract is not None and subject.contract.refused
+    return ContractRefused.exit_status if refused else 1
+
+
+@dataclass
+class _Subject:
+    """The checkpoint, with its environment for the robot, which is not connected yet."""
+
+    checkpoint: Checkpoint
+    env: Any
+    place: Place
+    contract: Contract | None = None
+    """The table, once it was checked."""
+
+    @classmethod
+    def of(cls, config: DoctorConfig, files: dict[str, Any]) -> _Subject | None:
+        """Open the checkpoint of the flags and make its environment; None without a checkpoint."""
+        if config.checkpoint is None:
+            return None
+        from bam_train.checkpoint import Checkpoint
+        from bam_train.env_location import Place
+        from bam_train.environments import environment_of, make_env
+
+        checkpoint = Checkpoint.open(config.checkpoint)
+        env_id, env_kwargs = environment_of(checkpoint, config.env)
+        place = Place(config.url, profile=config.profile, **files)
+        return cls(checkpoint, make_env(env_id, env_kwargs, place=place), place)
+
+
+def _all_steps(diagnosis: Diagnosis, subject: _Subject | None) -> Iterator[Step]:
+    """The steps of the diagnosis; then, if none failed, the contract of the checkpoint."""
+    from bam_envs.core.errors import BamEnvsError
+    from bam_envs.core.wording import listed
+    from bam_envs.live.diagnosis import Step
+
+    passed = True
+    for step in diagnosis.steps():
+        yield step
+        passed = step.verdict != "failed"
+    if not passed or subject is None:
+        return
+    from bam_train.deploy.contract import check_contract
+
+    try:
+        subject.contract = contract = check_contract(subject.checkpoint, subject.env, subject.place)
+        contract.require(f"{subject.checkpoint.path} and the robot")
+    except (BamEnvsError, ContractRefused) as error:
+        yield Step(CONTRACT, "failed", str(error))
+        return
+    untold = [line.what for line in contract.checks if line.verdict == "not told"]
+    warnings = [f"the robot does not tell its {listed(untold)}"] if untold else []
+    yield Step(CONTRACT, "warning" if warnings else "ok", f"{len(contract.checks)} lines", tuple(warnings))
+
+
+def _shown(steps: Iterator[Step], config: DoctorConfig) -> Iterator[Step]:
+    """The steps, each printed as soon as it is made unless JSON was asked for."""
+    for step in steps:
+        if not config.json:
+            text = "" if step.verdict == "failed" else step.found  # why it failed comes last, on standard error
+            lines = [f"{step.name:<16}{step.verdict:<9}{text}".rstrip()]
+            tell(*lines, *(f"{'':<25}warning: {warning}" for warning in step.warnings))
+        yield step
+
+
+def _require_sane(config: DoctorConfig) -> None:
+    from bam_train.errors import OutputError, SettingsError
+
+    if config.env is not None and config.checkpoint is None:
+        raise SettingsError("--env says what a checkpoint was trained on; give --checkpoint too, or leave it out")
+    if config.measure is None:
+        return
+    if config.measure.suffix != ".json":
+        raise SettingsError(f"--measure: expected a .json file, found {str(config.measure)!r}")
+    if not config.measure.expanduser().parent.is_dir():
+        raise OutputError(f"--measure: there is no folder {config.measure.parent}; make it first")
+
+
+def _write_measured(config: DoctorConfig, diagnosis: Diagnosis) -> dict[str, Any] | None:
+    """Write the link as `LinkProfile`, and return it as JSON values; None if it was not measured, or not asked for."""
+    if config.measure is None:
+        return None
+    from bam_envs.core.errors import InvalidValue
+    from bam_train.atomic_file import replacing
+    from bam_train.errors import OutputError
+
+    measurement, path = diagnosis.measurement, config.measure.expanduser()
+    if measurement is None:
+        say(f"bam-doctor: {path} was not written: the link was not measured")
+        return None
+    about = f"{config.url}, {len(measurement.trips)} pings in {measurement.seconds:.1f} s"
+    try:
+        link = measurement.profile(about)
+        with replacing(path) as temporary:
+            temporary.write_text(link.to_json() + "\n")
+    except InvalidValue as error:
+        say(f"bam-doctor: {path} was not written: {error}")
+        return None
+    except OSError as error:
+        raise OutputError(f"{path} cannot be written: {error.strerror or error}") from error
+    if not config.json:
+        tell(f"{path}: the measured link; try it with bam-deploy CHECKPOINT --rehearse {path}")
+    return asdict(link)
+
+
+main = partial(run_program, "bam-doctor", "bam_train.cli.flags:DoctorConfig", examine)
+
+if __name__ == "__main__":
+    main()

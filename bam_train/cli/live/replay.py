@@ -1,0 +1,196 @@
+"""`bam-replay`: sum up a recording of `bam-deploy`, play it through its environment, and draw it."""
+
+from __future__ import annotations
+
+import json as json_module
+from contextlib import closing
+from functools import partial
+from itertools import islice
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from bam_train.cli.console import duration, say, tell
+from bam_train.cli.program import run_program
+
+if TYPE_CHECKING:
+    from bam_train.checkpoint import Checkpoint
+    from bam_train.cli.flags import ReplayConfig
+    from bam_train.recording.playback import Played
+    from bam_train.recording.recording import Recording
+
+LEVELS = {3: "warning: ", 4: "error: "}
+MOST_EVENTS = 20
+"""Events that are shown; of more, the first and the last half of so many."""
+
+
+def replay(config: ReplayConfig) -> None:
+    """Run the program with its parsed flags."""
+    from bam_train.recording.recording import Recording
+    from bam_train.video import require_video_path
+
+    video = None if config.video is None else require_video_path(config.video)
+    recording = Recording.open(config.recording)
+    found = _checkpoint(config, recording)
+    played, why = (None, found) if isinstance(found, str) else (_played(config, recording, found), "")
+    if config.json:
+        facts = {**facts_of(recording), "played": None if played is None else played.to_json(), "not_played": why}
+        tell(json_module.dumps(facts, allow_nan=False))
+    else:
+        tell(*lines_of(recording), *_played_lines(played, why))
+    if config.plot is not None:
+        from bam_train.recording.drawing import plot
+
+        plot(recording, config.plot.expanduser())
+        say(f"bam-replay: {config.plot}: drawn")
+    if video is not None:
+        _film(recording, found, config.env, video)
+
+
+def _checkpoint(config: ReplayConfig, recording: Recording) -> Checkpoint | str:
+    """The checkpoint to play with; else why there is none."""
+    from bam_train.checkpoint import Checkpoint
+
+    if config.checkpoint is not None:
+        return Checkpoint.open(config.checkpoint)
+    if not recording.ticks:
+        return "no whole tick is in it"
+    path = Path(recording.metadata.get("checkpoint", ""))
+    if not path.is_file():
+        return f"its checkpoint {path} is not here; give it with --checkpoint"
+    checkpoint = Checkpoint.open(path)
+    if checkpoint.digest != recording.metadata.get("checkpoint_sha256"):
+        return f"{path} is another checkpoint than then; give --checkpoint {path} to play it with that one"
+    return checkpoint
+
+
+def _played(config: ReplayConfig, recording: Recording, checkpoint: Checkpoint) -> Played:
+    from bam_train.policy import FrozenPolicy
+    from bam_train.recording.playback import play, play_observations, replay_env
+
+    policy = FrozenPolicy.from_checkpoint(checkpoint)
+    if "/state" not in recording.tables:
+        return play_observations(recording, policy)
+    with closing(replay_env(recording, checkpoint, config.env)) as env:
+        return play(recording, env, policy)
+
+
+def _played_lines(played: Played | None, why: str) -> list[str]:
+    if played is None:
+        return [f"not played: {why}"]
+    lines = [f"played: the same observation in {played.observations} of {played.ticks} ticks, "]
+    lines[0] += f"the same action in {played.actions}" + ("" if played.same else f", at most {played.worst:.3g} apart")
+    return lines
+
+
+def facts_of(recording: Recording) -> dict[str, Any]:
+    """The summary as JSON values; times in the unit of their name."""
+    import numpy as np
+
+    from bam_train.deploy.flight import STAGES
+
+    counts = {guard: recording.guards.count(guard) for guard in sorted(set(recording.guards) - {""})}
+    stages = {}
+    for name in STAGES if recording.ticks else ():
+        numbers = recording.tables["/latency"].column(name)
+        if len(known := numbers[np.isfinite(numbers)]):
+            p50, p99, most = (round(1e3 * float(x), 3) for x in (*np.percentile(known, [50, 99]), known.max()))
+            stages[name] = {"p50": p50, "p99": p99, "max": most}
+    return {
+        "recording": str(recording.path),
+        "complete": recording.complete,
+        "deployment": recording.metadata,
+        "ticks": recording.ticks,
+        "seconds": _seconds(recording),
+        "per_episode": _episodes(recording),
+        "guards": counts,
+        "latency_ms": stages,
+        "events": [
+            {"time_s": event.time / 1e9, "level": event.level, "text": event.text} for event in recording.events
+        ],
+    }
+
+
+def _seconds(recording: Recording) -> float:
+    if not recording.ticks:
+        return 0.0
+    times = recording.tables["/episode"].times
+    return (int(times[-1]) - int(times[0])) / 1e9
+
+
+def _episodes(recording: Recording) -> list[dict[str, Any]]:
+    """Length, return, end and success of each episode; without an end, it was cut short."""
+    rows, seed = [], int(recording.metadata.get("seed", 0))
+    for number, ticks in enumerate(recording.episodes()):
+        table, last = recording.tables["/episode"], ticks[-1]
+        ends = [end for end in ("terminated", "truncated") if table.column(end)[last]]
+        success = table.column("success")[last]
+        rows.append(
+            {
+                "seed": seed + number,
+                "length": len(ticks) - 1,
+                "return": float(table.column("reward")[ticks.start : ticks.stop].sum()),
+                "success": None if success != success else bool(success),
+                "end": ends[0] if ends else "stopped",
+            }
+        )
+    return rows
+
+
+def lines_of(recording: Recording) -> list[str]:
+    """The summary for people."""
+    facts, told = facts_of(recording), recording.metadata
+    end = "complete" if recording.complete else "its end is missing: it was cut off or damaged"
+    policy = Path(told.get("checkpoint", "")).name or "no checkpoint"
+    on = " ".join(filter(None, [told.get("env"), told.get("address") and f"at {told['address']}", told.get("robot")]))
+    marks = f", {told['marks']}" if told.get("marks") else ""
+    lines = [
+        f"{recording.path}: {policy} ({told.get('checkpoint_sha256', '')[:12]}) on {on}{marks}",
+        f"{recording.ticks} ticks in {duration(facts['seconds'])}, {end}",
+    ]
+    for number, row in enumerate(facts["per_episode"], 1):
+        how = {True: "success", False: "no success", None: row["end"]}[row["success"]]
+        lines.append(
+            f"episode {number} (seed {row['seed']}): {how} after {row['length']} steps, return {row['return']:.2f}"
+        )
+    changed = ", ".join(f"{guard} in {count} ticks" for guard, count in facts["guards"].items())
+    lines.append(f"guards changed the command: {changed}" if changed else "no guard changed a command")
+    for stage, row in facts["latency_ms"].items():
+        lines.append(f"{stage}: p50 {row['p50']:.2f} ms, p99 {row['p99']:.2f} ms, max {row['max']:.2f} ms")
+    return [*lines, *_event_lines(recording)]
+
+
+def _event_lines(recording: Recording) -> list[str]:
+    events = recording.events
+    begin = events[0].time if events else 0
+    texts = [f"{(one.time - begin) / 1e9:.2f} s: {LEVELS.get(one.level, '')}{one.text}" for one in events]
+    half = MOST_EVENTS // 2
+    return texts if len(texts) <= MOST_EVENTS else [*texts[:half], f"... {len(texts) - 2 * half} more", *texts[-half:]]
+
+
+def _film(recording: Recording, checkpoint: Checkpoint | str, named: str | None, path: Path) -> None:
+    """A video of the recorded pictures, else of the simulated robot where the recorded one was."""
+    from bam_train.errors import SettingsError
+    from bam_train.recording.drawing import frames
+    from bam_train.video import open_video, picture
+
+    period = float(recording.metadata.get("period_s", "0.05"))
+    recorded = list(islice(frames(recording), 1))
+    if not recorded and isinstance(checkpoint, str):
+        raise SettingsError(f"no video: {recording.path} has no pictures, and {checkpoint}")
+    with open_video(path, 1 / period) as add:
+        if recorded or isinstance(checkpoint, str):
+            for frame in frames(recording):
+                add(frame)
+        else:
+            from bam_train.policy import FrozenPolicy
+            from bam_train.recording.playback import play, replay_env
+
+            with closing(replay_env(recording, checkpoint, named, "rgb_array")) as env:
+                play(recording, env, FrozenPolicy.from_checkpoint(checkpoint), lambda: add(picture(env)))
+    say(f"bam-replay: {path}: {recording.ticks} ticks")
+
+
+main = partial(run_program, "bam-replay", "bam_train.cli.flags:ReplayConfig", lambda config, _: replay(config))
+
+if __name__ == "__main__":
+    main()

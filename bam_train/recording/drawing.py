@@ -1,0 +1,131 @@
+"""A recording as a figure and as a video."""
+
+from __future__ import annotations
+
+import base64
+import binascii
+from collections.abc import Callable, Iterator
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bam_envs.core.errors import MissingExtra, ProtocolError
+from bam_envs.ros.images import decode_image
+from bam_train.errors import BadRecording, OutputError
+from bam_train.recording.recording import Recording
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+MOST_LINES = 16
+"""Numbers of a signal that are drawn; those of a longer one, such as a laser's, are left out."""
+_CHANNELS = {"mono8": 1, "rgb8": 3, "rgba8": 4}
+
+
+def plot(recording: Recording, path: Path) -> None:
+    """Draw states, commands, actions, status and latencies over time into an image file.
+
+    Raises:
+        BadRecording: There is no tick in it.
+        MissingExtra: matplotlib is not installed.
+        OutputError: The file cannot be written.
+    """
+    try:
+        from matplotlib.figure import Figure
+    except ImportError as error:
+        raise MissingExtra("matplotlib", "notebook", "--plot") from error
+    rows = _rows(recording)
+    if not recording.ticks:
+        raise BadRecording(f"{recording.path}: no whole tick is in it; there is nothing to draw")
+    figure = Figure(figsize=(10, 0.8 + 1.7 * len(rows)), layout="constrained")
+    axes = figure.subplots(len(rows), 1, sharex=True, squeeze=False)[:, 0]
+    for one, (name, draw) in zip(axes, rows, strict=True):
+        draw(one)
+        one.set_ylabel(name, fontsize="small")
+        one.grid(alpha=0.3)
+        for ticks in recording.episodes()[1:]:
+            one.axvline(_seconds(recording, "/episode")[ticks[0]], color="grey", linewidth=0.8, linestyle=":")
+        if one.get_legend_handles_labels()[1]:
+            one.legend(loc="center left", bbox_to_anchor=(1, 0.5), fontsize="x-small")
+    axes[0].set_title(f"{recording.path.name}: {recording.metadata.get('env', '')}", fontsize="medium")
+    axes[-1].set_xlabel("time [s]")
+    try:
+        figure.savefig(path, dpi=100)
+    except (OSError, ValueError) as error:
+        raise OutputError(f"{path}: cannot be written: {error}. Choose another .png") from error
+
+
+def _rows(recording: Recording) -> list[tuple[str, Callable[[Axes], None]]]:
+    """Name and drawing function of each plot, from top to bottom."""
+    rows: list[tuple[str, Callable[[Axes], None]]] = []
+    groups: dict[str, list[str]] = {}
+    for name in recording.tables["/state"].names if "/state" in recording.tables else ():
+        if "." in name:
+            groups.setdefault(name.split(".", 1)[0], []).append(name)
+    for group, names in groups.items():
+        if len(names) <= MOST_LINES:
+            rows.append((group, partial(_lines, recording, "/state", names)))
+    for topic in ("/command", "/action"):
+        names = list(recording.tables[topic].names[1:]) if topic in recording.tables else []
+        if 0 < len(names) <= MOST_LINES:
+            rows.append((topic[1:], partial(_lines, recording, topic, names)))
+    return [*rows, ("status", partial(_status, recording)), ("latency [ms]", partial(_latency, recording))]
+
+
+def _seconds(recording: Recording, topic: str) -> NDArray[np.float64]:
+    """Times of the messages since the first tick [s]."""
+    seconds: NDArray[np.float64] = (recording.tables[topic].times - recording.tables["/episode"].times[0]) / 1e9
+    return seconds
+
+
+def _lines(recording: Recording, topic: str, names: list[str], axes: Axes) -> None:
+    for name in names:
+        values = recording.tables[topic].column(name)
+        axes.plot(_seconds(recording, topic), values, label=name.split(".", 1)[-1], linewidth=1)
+
+
+def _status(recording: Recording, axes: Axes) -> None:
+    titles = ["fine", *sorted(set(recording.guards) - {""})]
+    places = [titles.index(guard or "fine") for guard in recording.guards]
+    axes.plot(_seconds(recording, "/status"), places, drawstyle="steps-post", linewidth=1)
+    axes.set_yticks(range(len(titles)), titles, fontsize="x-small")
+
+
+def _latency(recording: Recording, axes: Axes) -> None:
+    for name in recording.tables["/latency"].names[1:]:
+        values = 1e3 * recording.tables["/latency"].column(name)
+        if np.isfinite(values).any():
+            axes.plot(_seconds(recording, "/latency"), values, label=name, linewidth=1)
+    axes.set_yscale("symlog", linthresh=0.1)
+
+
+def frames(recording: Recording, topic: str | None = None) -> Iterator[NDArray[np.uint8]]:
+    """The recorded pictures of one topic, by default the first one that has any. Shape: (height, width, 3).
+
+    Raises:
+        BadRecording: A picture cannot be decoded.
+    """
+    for name, _, message in recording.pictures(topic):
+        topic = topic or name
+        if name == topic:
+            try:
+                yield _colours(_pixels(message))
+            except (ProtocolError, KeyError, ValueError, binascii.Error) as error:
+                raise BadRecording(f"{recording.path}: a picture of {name} cannot be decoded: {error}") from error
+
+
+def _pixels(message: dict[str, Any]) -> NDArray[np.uint8]:
+    data = base64.b64decode(message["data"])
+    if "encoding" not in message:
+        return decode_image(data)
+    shape = (message["height"], message["width"], _CHANNELS[message["encoding"]])
+    return np.frombuffer(data, np.uint8).reshape(shape)
+
+
+def _colours(pixels: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Grey or RGBA pixels as RGB."""
+    grey = pixels[..., None] if pixels.ndim == 2 else pixels
+    return np.repeat(grey, 3, axis=2) if grey.shape[2] == 1 else grey[:, :, :3]

@@ -1,0 +1,129 @@
+"""Playing a recording: the same states through the same environment, and what a policy does in them."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+
+from bam_envs.core.errors import RobotFault
+from bam_envs.core.robot_env import RobotEnv
+from bam_envs.robots.replay_robot import ReplayRobot
+from bam_train.checkpoint import Checkpoint
+from bam_train.environments import environment_of, make_env
+from bam_train.errors import BadRecording
+from bam_train.recording.recording import Recording
+
+ELSEWHERE = ("randomize", "link", "guards", "trial")
+"""Arguments of an environment that concern its robot, which is replaced."""
+
+
+@dataclass
+class Played:
+    """How far a policy agrees with a recording."""
+
+    ticks: int = 0
+    """Ticks played."""
+    observations: int = 0
+    """Of these, those with the same observation, bit for bit."""
+    actions: int = 0
+    """Those with the same action, bit for bit."""
+    worst: float = 0.0
+    """Largest difference between a number of an action and the recorded one."""
+
+    @property
+    def same(self) -> bool:
+        """Whether everything was the same, bit for bit."""
+        return self.observations == self.actions == self.ticks
+
+    def to_json(self) -> dict[str, Any]:
+        """As JSON values."""
+        return asdict(self) | {"same": self.same}
+
+    def compare(self, observation: bool, action: Any, recorded: Any) -> None:
+        """Count one tick."""
+        action, recorded = np.asarray(action, np.float64), np.asarray(recorded, np.float64)
+        self.ticks += 1
+        self.observations += observation
+        self.actions += bool(np.array_equal(action, recorded))
+        self.worst = max(self.worst, float(np.abs(action - recorded).max()))
+
+
+def replay_env(
+    recording: Recording, checkpoint: Checkpoint, named: str | None = None, render_mode: str | None = None
+) -> gym.Env[Any, Any]:
+    """The environment of a checkpoint, with the recorded robot in it; see `ReplayRobot`.
+
+    Args:
+        recording: The recording of a robot.
+        checkpoint: Names the environment.
+        named: The environment that the user expects.
+        render_mode: ``"rgb_array"`` draws the simulated robot where the recorded one was.
+
+    Raises:
+        BadRecording: No robot was recorded, or another one.
+        CheckpointError: It belongs to another environment, or to one that must be named.
+    """
+    if recording.metadata.get("env"):
+        checkpoint.requires_env(recording.metadata["env"])
+    env_id, kwargs = environment_of(checkpoint, named)
+    kwargs = {name: value for name, value in kwargs.items() if name not in ELSEWHERE}
+    env = make_env(env_id, kwargs, render_mode=render_mode)
+    inner = env.unwrapped
+    if not isinstance(inner, RobotEnv):
+        raise BadRecording(f"{recording.path}: {env_id} has no robot, whose states could be played")
+    states, simulated = recording.states(inner.robot.spec), inner.robot
+    episodes = [[states[k] for k in ticks] for ticks in recording.episodes()]
+    if not episodes:
+        raise BadRecording(f"{recording.path}: no whole tick is in it; there is nothing to play")
+    inner.robot = ReplayRobot(simulated.spec, episodes, simulated if render_mode else None)
+    return env
+
+
+def play(recording: Recording, env: gym.Env[Any, Any], policy: Any, shown: Callable[[], None] = lambda: None) -> Played:
+    """Let `policy` act on every recorded tick; the environment goes on with the recorded action.
+
+    Args:
+        recording: The recording.
+        env: The environment from `replay_env`.
+        policy: Has ``reset()`` and ``act(observation)``.
+        shown: Called at each tick, to take a picture.
+    """
+    played, seed = Played(), int(recording.metadata.get("seed", 0))
+    observed, [acted] = recording.arrays("observation"), recording.arrays("action").values()
+    for number, ticks in enumerate(recording.episodes()):
+        policy.reset()
+        observation, _ = env.reset(seed=seed + number)
+        for k in ticks:
+            shown()
+            played.compare(_same(observation, observed, k), policy.act(observation), acted[k])
+            if k == ticks[-1]:
+                break
+            try:
+                observation, _, terminated, truncated, _ = env.step(acted[k])
+            except RobotFault:
+                break
+            if (terminated or truncated) and k + 1 != ticks[-1]:
+                raise BadRecording(
+                    f"{recording.path}: episode {number + 1} ends after {k + 1 - ticks[0]} steps here, and it had "
+                    f"{ticks[-1] - ticks[0]}; play it with the versions in its metadata"
+                )
+    return played
+
+
+def play_observations(recording: Recording, policy: Any) -> Played:
+    """Let `policy` act on every recorded observation, of an environment without a robot; not on pictures."""
+    played, [acted] = Played(), recording.arrays("action").values()
+    observed = recording.arrays("observation")
+    for ticks in recording.episodes():
+        policy.reset()
+        for k in ticks:
+            parts = {name: array[k] for name, array in observed.items()}
+            played.compare(True, policy.act(parts.get("", parts)), acted[k])
+    return played
+
+
+def _same(observation: Any, recorded: Mapping[str, Any], k: int) -> bool:
+    parts = observation if isinstance(observation, Mapping) else {"": observation}
+    return all(np.array_equal(parts[name], array[k]) for name, array in recorded.items())

@@ -1,0 +1,214 @@
+"""Reading a recording, also one that was cut off or damaged: everything before that place is there."""
+
+import json
+import struct
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+from mcap.exceptions import McapError
+from mcap.records import Channel, Chunk, Footer, McapRecord, Message, Metadata
+from mcap.stream_reader import StreamReader, breakup_chunk
+from numpy.typing import NDArray
+from zstandard import ZstdError
+
+from bam_envs.core.robot import RobotSpec, RobotState
+from bam_train.errors import BadRecording
+
+Array = NDArray[np.float64]
+TICKS = ("/state", "/truth", "/command", "/observation", "/action", "/status", "/latency", "/episode")
+"""Topics with one message for each tick; robots alone have the first three."""
+_MOST_CHUNK = 2**28  # bytes of a chunk, unpacked: a camera's largest picture is far smaller
+_DAMAGE = (McapError, ZstdError, msgspec.MsgspecError, struct.error, ValueError, LookupError, OverflowError, EOFError)
+_decode = msgspec.json.Decoder().decode
+
+
+@dataclass
+class Table:
+    """The messages of one topic, one for each tick."""
+
+    names: tuple[str, ...]
+    """Name of each number, such as ``joint_position.elbow_joint``."""
+    numbers: Array
+    """NaN for a number that was not finite. Shape: (ticks, k)."""
+    times: NDArray[np.int64]
+    """Wall clock [ns]. Shape: (ticks,)."""
+
+    def column(self, name: str) -> Array:
+        """The numbers called `name`. Shape: (ticks,)."""
+        return self.numbers[:, self.names.index(name)]
+
+
+@dataclass(frozen=True)
+class Event:
+    """What the operator did or was told."""
+
+    time: int
+    """Wall clock [ns]."""
+    level: int
+    text: str
+
+
+@dataclass
+class Recording:
+    """A recording of `bam-deploy`; `open` reads it."""
+
+    path: Path
+    metadata: dict[str, str] = field(default_factory=dict)
+    """What was deployed; see `bam_train.deploy.flight.deployment_facts`."""
+    kinds: dict[str, dict[str, list[Any]]] = field(default_factory=dict)
+    """Dtype and shape of each array of ``truth``, ``observation`` and ``action``."""
+    tables: dict[str, Table] = field(default_factory=dict)
+    """Topic to its numbers; all have the same number of ticks."""
+    guards: list[str] = field(default_factory=list)
+    """The guard that changed the command that led to each tick; "" for none."""
+    events: list[Event] = field(default_factory=list)
+    complete: bool = False
+    """Whether the recorder ended the file; else it was cut off or damaged, and its end is missing."""
+
+    @classmethod
+    def open(cls, path: str | Path) -> "Recording":
+        """Read a recording up to its end, or to the place where it is cut off or damaged; without its pictures.
+
+        Raises:
+            BadRecording: There is no such file, or it is no recording of `bam-deploy`.
+        """
+        recording = cls(Path(path).expanduser())
+        rows: dict[str, list[tuple[int, dict[str, Any]]]] = {topic: [] for topic in TICKS}
+        for record in recording._records():
+            if isinstance(record, Metadata) and record.name == "deployment":
+                recording.metadata = dict(record.metadata)
+            elif isinstance(record, Metadata) and record.name == "layout":
+                recording.kinds = {kind: json.loads(text) for kind, text in record.metadata.items()}
+            elif isinstance(record, Footer):
+                recording.complete = True
+            elif isinstance(record, tuple):
+                recording._take(rows, *record)
+        if not recording.metadata and not rows["/episode"]:
+            raise BadRecording(f"{path}: not a recording of bam-deploy. Give a .mcap file that it wrote")
+        try:
+            recording._fill({topic: messages for topic, messages in rows.items() if messages})
+        except (TypeError, ValueError, AttributeError) as error:
+            raise BadRecording(f"{path}: its numbers cannot be read: {error}. Get the file again") from error
+        return recording
+
+    def pictures(self, topic: str | None = None) -> Iterator[tuple[str, int, dict[str, Any]]]:
+        """Topic, time [ns] and message of each picture, of cameras and of observations; or only those of `topic`."""
+        for record in self._records():
+            if isinstance(record, tuple):
+                channel, message = record
+                if channel.startswith(("/camera/", "/pixels/")) and topic in (None, channel):
+                    yield channel, message.log_time, _decode(message.data)
+
+    def _records(self) -> Iterator[McapRecord | tuple[str, Message]]:
+        """The records up to the end or the damage, with each message beside its topic."""
+        topics: dict[int, str] = {}
+        try:
+            with self.path.open("rb") as file:
+                limit = max(1, self.path.stat().st_size)
+                for record in StreamReader(file, emit_chunks=True, record_size_limit=limit).records:
+                    for one in _unpacked(record):
+                        if isinstance(one, Channel):
+                            topics[one.id] = one.topic
+                        yield (topics[one.channel_id], one) if isinstance(one, Message) else one
+        except OSError as error:
+            raise BadRecording(f"{self.path}: cannot be read: {error.strerror or error}") from error
+        except _DAMAGE:
+            return  # what was read so far is the recording
+
+    def _take(self, rows: dict[str, list[tuple[int, dict[str, Any]]]], topic: str, message: Message) -> None:
+        if topic in rows:
+            rows[topic].append((message.log_time, _decode(message.data)))
+        elif topic == "/events":
+            content = _decode(message.data)
+            self.events.append(Event(message.log_time, int(content["level"]), str(content["message"])))
+
+    def _fill(self, rows: dict[str, list[tuple[int, dict[str, Any]]]]) -> None:
+        ticks = min(map(len, rows.values()), default=0)  # of the last tick, some messages may be missing
+        self.guards = [str(content.pop("guard", "")) for _, content in rows.get("/status", [])[:ticks]]
+        for topic, messages in rows.items():
+            flat = [_flat(content) for _, content in messages[:ticks]]
+            names = tuple(flat[0]) if flat else ()
+            table = [[np.nan if (x := row.get(name)) is None else x for name in names] for row in flat]
+            times = np.array([time for time, _ in messages[:ticks]], dtype=np.int64)
+            self.tables[topic] = Table(names, np.array(table, dtype=np.float64).reshape(ticks, len(names)), times)
+
+    @property
+    def ticks(self) -> int:
+        """Number of whole ticks."""
+        return len(self.guards)
+
+    def episodes(self) -> list[range]:
+        """The ticks of each episode; the first one of each is the reset."""
+        if not self.ticks:
+            return []
+        starts = np.flatnonzero(self.tables["/episode"].column("step") == 0).tolist()
+        return [range(start, end) for start, end in zip(starts, [*starts[1:], self.ticks], strict=True)]
+
+    def arrays(self, kind: str) -> dict[str, NDArray[Any]]:
+        """The arrays of ``"observation"``, ``"action"`` or ``"truth"``, (ticks, ...) each; an only one is called ""."""
+        table = self.tables.get(f"/{kind}")
+        try:
+            return {} if table is None else _split(table.numbers[:, 1:], self.kinds.get(kind, {}))
+        except (TypeError, ValueError) as error:
+            raise BadRecording(f"{self.path}: its arrays cannot be read: {error}. Get the file again") from error
+
+    def states(self, spec: RobotSpec) -> list[RobotState]:
+        """The state at each tick, of a robot with this spec.
+
+        Raises:
+            BadRecording: The recording lacks a signal of the spec.
+        """
+        state, command, known = self._table("/state"), self._table("/command"), self.arrays("truth")
+        try:
+            signals = {
+                one.name: np.stack([state.column(f"{one.name}.{label}") for label in one.labels], axis=1)
+                for one in spec.signals
+            }
+            commands = np.stack([command.column(label) for label in spec.command.labels], axis=1)
+        except ValueError as error:
+            raise BadRecording(f"{self.path}: another robot than {spec.name} was recorded: {error}") from error
+        stamps = state.column("stamp")
+        return [
+            RobotState(
+                {name: values[k : k + 1] for name, values in signals.items()},
+                stamps[k : k + 1],
+                commands[k : k + 1],
+                {name: values[k : k + 1] for name, values in known.items()},
+            )
+            for k in range(self.ticks)
+        ]
+
+    def _table(self, topic: str) -> Table:
+        if topic not in self.tables:
+            raise BadRecording(f"{self.path}: no robot was recorded: there is no {topic} in it")
+        return self.tables[topic]
+
+
+def _unpacked(record: McapRecord) -> list[McapRecord]:
+    if not isinstance(record, Chunk):
+        return [record]
+    if record.uncompressed_size > _MOST_CHUNK:
+        raise ValueError("a chunk that no recorder writes")
+    return breakup_chunk(record, validate_crc=True)
+
+
+def _flat(content: dict[str, Any]) -> dict[str, Any]:
+    """``{"a": 1, "b": {"c": 2}}`` as ``{"a": 1, "b.c": 2}``."""
+    flat: dict[str, Any] = {}
+    for name, value in content.items():
+        flat |= {f"{name}.{key}": part for key, part in value.items()} if isinstance(value, dict) else {name: value}
+    return flat
+
+
+def _split(numbers: Array, kinds: dict[str, list[Any]]) -> dict[str, NDArray[Any]]:
+    """Numbers (ticks, k), one array after the other, as the arrays that they were."""
+    arrays, at = {}, 0
+    for name, (dtype, *shape) in kinds.items():
+        size = int(np.prod(shape))
+        arrays[name] = numbers[:, at : at + size].astype(np.dtype(dtype)).reshape(len(numbers), *shape)
+        at += size
+    return arrays

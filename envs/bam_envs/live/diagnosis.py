@@ -1,0 +1,332 @@
+"""Check a live robot step by step, from its port to its guards, without moving it.
+
+Each step relies on those before it, so the first that fails ends the diagnosis: it is the cause of all that follows.
+"""
+
+import asyncio
+import math
+import time
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+import numpy as np
+
+from bam_envs.core.errors import BamEnvsError, LinkLost, NotReady, ProtocolError, StaleState
+from bam_envs.live import bringup
+from bam_envs.live.building import live_robot, require_robot_address
+from bam_envs.live.link_measurement import PING_TOPIC, Array, LinkMeasurement, Reading, measure_link
+from bam_envs.live.state import LiveState
+from bam_envs.robots.profile import load_profile, profile_for, shipped_profiles
+from bam_envs.ros.codec import INFO_SERVICE, RobotInfo, read_info
+from bam_envs.ros.profile_tables import RobotProfile
+from bam_envs.rosbridge.bus import namespaces_with
+from bam_envs.rosbridge.client import RosbridgeLink
+from bam_envs.rosbridge.client_connection import open_port, open_socket
+from bam_envs.rosbridge.endpoint import Endpoint
+from bam_envs.safety.gate import SafeRobot
+from bam_envs.safety.guard import measured_places, position_range
+
+STEPS = (
+    *("port", "websocket", "rosbridge", "topics", "rates and ages", "clock", "round trip", "command path", "guards"),
+)
+"""Names of the steps, in their order."""
+CLOCK_APART = 1.0
+"""Offset of the server's clock above which a step warns [s]."""
+LOST_WARNS, LOST_FAILS = 0.05, 0.10
+"""Share of lost pings above which a step warns, and fails."""
+_HANDSHAKE = 2**20
+"""Largest message of the connection that is opened for the handshake alone [bytes]."""
+Verdict = Literal["ok", "warning", "failed"]
+
+
+@dataclass(frozen=True)
+class Step:
+    """The outcome of one step."""
+
+    name: str
+    verdict: Verdict
+    found: str
+    """What was found; of a step that failed: why, and what to do."""
+    warnings: tuple[str, ...] = ()
+    """What to look at although the step passed."""
+
+
+@dataclass
+class _Findings:
+    """What a step that passed has found."""
+
+    text: list[str] = field(default_factory=list)
+    warnings: list[str] = field(default_factory=list)
+
+
+class Diagnosis:
+    """The checks of one robot. `close` it at the end.
+
+    Args:
+        url: Its address, ``ws://host:port`` or ``wss://host:port``, and the namespace of its topics.
+        robot: The robot of a task at that address, not connected; None: that of `profile`.
+        profile: Its profile, a shipped name or a file; None: the one of the robot's task, or the shipped one most of
+            whose topics are there.
+        ca_file: PEM file of the authorities to trust instead of the system's.
+        token_file: File with the server's shared secret.
+        seconds: Duration of the measurement [s].
+
+    Raises:
+        InvalidValue: The address is not that of a robot, or a file cannot be read.
+        UnknownName: There is no such profile.
+    """
+
+    def __init__(
+        self,
+        url: str,
+        robot: SafeRobot | None = None,
+        *,
+        profile: str | None = None,
+        ca_file: str | None = None,
+        token_file: str | None = None,
+        seconds: float = 5.0,
+    ) -> None:
+        require_robot_address(url)
+        self.endpoint = endpoint = Endpoint.with_token_file(url, ca_file=ca_file, token_file=token_file)
+        self._credentials: dict[str, Any] = {"ca_file": ca_file, "token_file": token_file}
+        self.robot, self.seconds = robot, seconds
+        self.measurement: LinkMeasurement | None = None
+        """What was measured; None before the step ``"rates and ages"``."""
+        self.profile: RobotProfile | None = None if profile is None else load_profile(profile)
+        if profile is None and robot is not None:
+            self.profile = profile_for(robot.spec)
+        self._info: RobotInfo | None = None
+        self._link = RosbridgeLink(endpoint, name="doctor")
+        self._timeout = endpoint.timeout or bringup.TIMEOUT
+
+    def steps(self) -> Iterator[Step]:
+        """Make one step after the other, up to the first that fails."""
+        for name in STEPS:
+            check: Callable[[_Findings], None] = getattr(self, f"_{name.replace(' ', '_')}")
+            findings = _Findings()
+            try:
+                check(findings)
+            except BamEnvsError as error:
+                yield Step(name, "failed", str(error))
+                return
+            verdict: Verdict = "warning" if findings.warnings else "ok"
+            yield Step(name, verdict, "; ".join(findings.text), tuple(findings.warnings))
+
+    def close(self) -> None:
+        """Close all links; the robot was not moved, and is not halted."""
+        self._link.close()
+        if self.robot is not None:
+            self.robot.close()
+
+    # ---- the server
+
+    def _port(self, findings: _Findings) -> None:
+        address, begun = self.endpoint.address, time.monotonic()
+        asyncio.run(open_port(address, self._timeout)).close()
+        findings.text.append(f"{address.host}:{address.port} is open, connected in {_ms(time.monotonic() - begun)}")
+
+    def _websocket(self, findings: _Findings) -> None:
+        begun = time.monotonic()
+
+        async def shake_hands() -> float:
+            socket = await open_socket(self.endpoint, self._timeout, _HANDSHAKE)
+            taken = time.monotonic() - begun
+            with suppress(asyncio.TimeoutError):
+                await asyncio.wait_for(socket.close(), self._timeout)
+            return taken
+
+        kind = "with TLS, " if self.endpoint.address.secure else ""
+        findings.text.append(f"a WebSocket server, {kind}opened in {_ms(asyncio.run(shake_hands()))}")
+
+    def _rosbridge(self, findings: _Findings) -> None:
+        self._link.connect()
+        service, ros = self._link.namespace + INFO_SERVICE, self._link.ros
+        findings.text.append("answers" + ("" if ros is None else f" as ROS {ros[-1]}"))
+        answer = bringup.ask(self._link, service)
+        if answer is not None:
+            self._info = read_info(answer.get("message"), service)
+            findings.text.append(f"the robot describes itself: {self._info.text or self._info.name}")
+
+    # ---- states
+
+    def _topics(self, findings: _Findings) -> None:
+        profile, link = self._chosen_profile(), self._link
+        if self.robot is None:
+            self.robot = live_robot(self.endpoint.url, profile=profile, **self._credentials)
+        types = bringup.TopicTypes(link, profile, self._timeout)
+        sources = LiveState(profile, self.robot.spec).sources
+        topics = {source.topic: source.type for source in sources}
+        for topic, kind in topics.items():
+            types.check(link.namespace + topic, kind)
+            if types.answers and not types.type_of(link.namespace + topic):
+                signals = ", ".join(source.signal for source in sources if source.topic == topic)
+                raise ProtocolError(
+                    f"there is no topic {link.namespace}{topic} ({kind}), which has {signals}. Does its driver "
+                    f"run, and is the topic called so? Topics are in the profile of {profile.name} "
+                    "(--profile); with --checkpoint only those of its task are needed."
+                    f"{namespaces_with(link, 'topics', topic)}"
+                )
+        findings.text.append(f"profile {profile.name}: {', '.join(topics)}")
+        if types.answers:
+            findings.text.append("all of the expected types")
+        else:
+            findings.warnings.append("the server has no rosapi node, so that types of topics cannot be checked")
+
+    def _chosen_profile(self) -> RobotProfile:
+        if self.profile is None:
+            answer: dict[str, Any] = {}
+            with suppress(BamEnvsError):  # a server without rosapi
+                answer = self._link.call("/rosapi/topics", "rosapi/Topics", {}, self._timeout)
+            there = {str(topic).removeprefix(self._link.namespace) for topic in answer.get("topics") or ()}
+
+            def share(profile: RobotProfile) -> float:
+                topics = {source.topic for source in profile.state if not source.optional}
+                return len(topics & there) / len(topics)
+
+            self.profile = max((load_profile(name) for name in ("ur5e", *shipped_profiles())), key=share)
+        return self.profile
+
+    def _rates_and_ages(self, findings: _Findings) -> None:
+        robot, profile = self._known()
+        period, info = robot.spec.period, self._info
+        state = LiveState(profile, robot.spec)
+        self.measurement = measure_link(
+            self._link,
+            profile,
+            state,
+            period=period,
+            seconds=self.seconds,
+            timeout=self._timeout,
+            describes_itself=info is not None,
+        )
+        if info is not None and info.lockstep:
+            findings.text.append("its time advances with commands only, so that states have neither rate nor age")
+            return
+        seen = set()
+        for reading in self.measurement.readings:
+            key = (reading.source.topic, reading.source.names)
+            limit = max(reading.source.max_age or 0.0, profile.max_age)
+            _require_states(reading, limit, self.measurement.seconds, profile)
+            if key not in seen:
+                findings.text.append(f"{reading.source.topic} {reading.rate:.4g} Hz, age {_p50_p99(reading.ages)}")
+                _warn_of_states(reading, limit, period, findings.warnings)
+            seen.add(key)
+
+    # ---- the link
+
+    def _clock(self, findings: _Findings) -> None:
+        offset = self._link.clock_offset
+        if offset is None:
+            findings.text.append("the server does not report its time")
+            findings.warnings.append("ages of states are relative to the quickest message")
+            return
+        side = "behind" if offset > 0 else "ahead of"
+        findings.text.append(f"the server's clock is {_ms(abs(offset))} {side} this computer's")
+        if abs(offset) > CLOCK_APART:
+            findings.warnings.append("set both clocks by the same NTP server, or recordings of both cannot be compared")
+
+    def _round_trip(self, findings: _Findings) -> None:
+        robot, profile = self._known()
+        measured, life = self._measured(), profile.command_life(robot.spec.period)
+        if not len(measured.trips):
+            raise ProtocolError(
+                f"what is published on {self._link.namespace}{PING_TOPIC} does not come back in {self._timeout:g} s, "
+                "so that commands may not arrive either. Does the server let clients use this topic (topics_glob)?"
+            )
+        findings.text.append(
+            f"{_p50_p99(measured.back)} of {len(measured.trips)} pings, one every {_ms(robot.spec.period)}; "
+            f"{measured.lost:.2%} lost, {measured.copies} doubled"
+        )
+        if measured.lost > LOST_FAILS:
+            raise LinkLost(
+                f"{measured.lost:.1%} of {len(measured.trips)} pings did not come back, and {LOST_FAILS:.0%} may. "
+                "Use a cable, or a network that is less busy."
+            )
+        p50, p99 = np.percentile(measured.back, [50, 99])
+        if p50 / 2 > life:
+            raise LinkLost(
+                f"one way takes {_ms(p50 / 2)} (half of p50 of the round trip), and a command means something for "
+                f"{_ms(life)}: none would be executed. Use a cable, or run the policy nearer to the robot."
+            )
+        if measured.lost > LOST_WARNS:
+            findings.warnings.append(f"{measured.lost:.1%} of the pings were lost; a cable loses none")
+        if p99 - p50 / 2 > life:
+            findings.warnings.append(f"more than 1 % of the commands come later than {_ms(life)}, and are dropped")
+
+    # ---- commands, without sending one
+
+    def _command_path(self, findings: _Findings) -> None:
+        robot, _ = self._known()
+        robot.connect()  # checks types and listeners of all command topics and opens the connection that halts
+        why = robot.not_ready()
+        if why is not None:
+            raise NotReady(f"{why}; bring the robot into the state in which it takes commands, then run this again")
+        findings.text.append("the topics of commands have listeners, and the connection that halts is open")
+        findings.text.append("ready; nothing was sent")
+
+    def _guards(self, findings: _Findings) -> None:
+        robot, _ = self._known()
+        findings.text.append(f"{len(robot.report())} guards; bam-deploy --print-guards shows them")
+        spec, newest = robot.spec, {one.source.signal: one.values for one in self._measured().readings}
+        low, high = (np.asarray(one, float) for one in position_range(spec, robot.limits))
+        for place, name, column in measured_places(spec, spec.command.units):
+            value, label = float(newest[name][column]), spec.command.labels[place]
+            if spec.command.units[place] == "rad" and not low[place] <= value <= high[place]:
+                findings.warnings.append(
+                    f"{label} is at {value:.3f} rad, beyond {low[place]:.3f} to {high[place]:.3f} rad: jog it back, or "
+                    "the first command brings it to that limit"
+                )
+
+    # ---- what earlier steps have made
+
+    def _known(self) -> tuple[SafeRobot, RobotProfile]:
+        if self.robot is None or self.profile is None:
+            raise StaleState("the robot is not known before its topics are checked")
+        return self.robot, self.profile
+
+    def _measured(self) -> LinkMeasurement:
+        if self.measurement is None:
+            raise StaleState("nothing was measured yet")
+        return self.measurement
+
+
+def _require_states(reading: Reading, limit: float, seconds: float, profile: RobotProfile) -> None:
+    """Raise an error unless a deployment could use these states; `limit` is their maximum age [s]."""
+    topic, kind = reading.source.topic, reading.source.type
+    if not reading.count:
+        raise StaleState(
+            f"{topic} ({kind}): no message in {seconds:.1f} s. Does its driver run? Topics are in the profile of "
+            f"{profile.name} (--profile); with --checkpoint only those of its task are needed."
+        )
+    if reading.unread == reading.count:
+        raise ProtocolError(reading.error)
+    p99 = float(np.percentile(reading.ages, 99)) if len(reading.ages) else math.inf
+    if p99 > limit:
+        raise StaleState(
+            f"{topic}: the newest state is up to {_ms(p99)} old (p99), and {_ms(limit)} is the limit, at "
+            f"{reading.rate:.3g} Hz. Raise the rate of its driver, or mend the network; max_age is in the profile.",
+            p99,
+            limit,
+        )
+
+
+def _warn_of_states(reading: Reading, limit: float, period: float, warnings: list[str]) -> None:
+    topic, worst = reading.source.topic, float(reading.ages.max())
+    if reading.unread:
+        warnings.append(f"{topic}: {reading.unread} of {reading.count} messages cannot be read: {reading.error}")
+    if worst > limit:
+        warnings.append(f"{topic}: once {_ms(worst)} old, and {_ms(limit)} is the limit; the robot would be held")
+    if reading.rate < 0.95 / period:
+        warnings.append(f"{topic}: fewer than one state in each period of {_ms(period)}")
+
+
+def _ms(seconds: float) -> str:
+    """A time for people: ``0.42 ms``, ``12.3 ms``, ``3.2 s``."""
+    return f"{seconds:.1f} s" if seconds >= 1.0 else f"{1e3 * seconds:.3g} ms"
+
+
+def _p50_p99(seconds: Array) -> str:
+    p50, p99 = np.percentile(seconds, [50, 99])
+    return f"p50 {_ms(p50)}, p99 {_ms(p99)}"

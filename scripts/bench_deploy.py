@@ -1,0 +1,347 @@
+"""What a deployment costs: guards, one tick without the network, 100 Hz over loopback, the recorder, and its memory.
+
+Each figure stands next to something bare that is measured in the same run and in turns, so that a busy machine slows
+both alike. The robot of all figures but the third is a stand-in in this process: it takes and gives the frames of a
+rosbridge server, and is where it was told to be.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")  # before NumPy reads it
+
+import numpy as np
+from bench_link import Samples, Server, lateness, live_arm, verdict
+
+GUARDS_P50, GUARDS_P99, TICK_P50, RECORDER_P50 = 60.0, 250.0, 200.0, 30.0  # microseconds
+LATE_SHARE, LATE = 1.0, 0.001  # percent of ticks, seconds
+GROWTH, WARM = 5.0, 10_000  # megabytes, ticks
+HOME = (-0.27, -1.54, 1.89, -1.93, -1.57, -1.84, 0.085)
+"""A command: joints [rad] with the tool above the table, gripper [m]."""
+CHECKPOINT = Path(__file__).resolve().parents[1] / "checkpoints" / "pick-ppo.zip"
+
+clock = time.perf_counter
+"""Measures durations [s]; with ``--cpu`` the processor time of this thread."""
+
+
+class StandIn:
+    """A live robot without its network: commands become frames, states come from frames."""
+
+    needs_clearance = True
+    num_robots = 1
+
+    def __init__(self, spec: Any) -> None:
+        from bam_envs.live.state import LiveState
+        from bam_envs.robots.profile import profile_for
+        from bam_envs.ros.codec import RobotInfo
+        from bam_envs.ros.freshness import Tagger
+
+        self.spec, self.profile = spec, profile_for(spec)
+        self.info = RobotInfo(spec.name, simulated=True, period=spec.period, text="a stand-in")
+        self.now, self.inside = 0.0, 0.0  # time of the robot; duration of the last step [s]
+        self.came, self.left = 0.0, 0.0  # when the last state came in, and the last command went out [s]
+        self._tagger, self._command = Tagger(key=b"0" * 32), np.array([HOME])
+        self._live = LiveState(self.profile, spec)
+        self._ears = {source.topic: self._live.listener(source.topic) for source in self._live.sources}
+        self._signals = {signal.name: np.zeros((1, len(signal.labels))) for signal in spec.signals}
+        self._signals["object_quaternion"] = np.array([[1.0, 0.0, 0.0, 0.0]])
+        self._signals["object_position"] = np.array([[0.5, 0.0, 0.02]])
+
+    def steps(self) -> float:
+        """Time that passes with steps only [s]."""
+        return self.now
+
+    def connect(self) -> None:
+        """It is there."""
+
+    def reset(self, env_ids: Any, initial: Any) -> Any:
+        """It stays where it is."""
+        return self._state()
+
+    def step(self, cleared: Any) -> Any:
+        """Encode the command, let a period pass, decode the state."""
+        from bam_envs.ros.codec import encode_sink
+        from bam_envs.rosbridge.encoding import dump_json
+
+        begun, values = clock(), cleared.for_robot(self)[0]
+        tag = self._tagger.next(1, 0.1)
+        for sink in self.profile.sinks():
+            topic, _, message = encode_sink(sink, self.spec, values, tag, sign=self._tagger.sign)
+            dump_json({"op": "publish", "topic": topic, "msg": message})
+        self.left = clock()
+        self.now += self.spec.period
+        self._command = values[None].copy()
+        state = self._state()
+        self.inside = clock() - begun
+        return state
+
+    def _state(self) -> Any:
+        from bam_envs.core.robot import RobotState
+        from bam_envs.ros.codec import encode_state
+        from bam_envs.ros.messages import write_stamp
+        from bam_envs.rosbridge.bus import UNKNOWN_CALLER
+        from bam_envs.rosbridge.encoding import decode_server_frame
+
+        self._signals |= {"joint_position": self._command[:, :6], "gripper_width": self._command[:, 6:]}
+        state = RobotState(self._signals, np.zeros(1), self._command)
+        messages = encode_state(self.profile, state, 0, write_stamp(time.time()))
+        frames = [json.dumps({"op": "publish", "topic": topic, "msg": message}) for topic, _, message in messages]
+        self.came = clock()
+        for frame in frames:
+            message = decode_server_frame(frame.encode())
+            self._ears[message["topic"]](message["msg"], UNKNOWN_CALLER)
+        return self.measure()
+
+    def measure(self) -> Any:
+        """The newest state."""
+        from bam_envs.core.robot import RobotState
+
+        signals, stamp = self._live.read()
+        return RobotState(signals, np.array([stamp]), self._command.copy())
+
+    def age(self) -> float:
+        """Age of the state [s]."""
+        return min(self._live.age(), 0.01)  # as if a busy computer did not pause between a frame and its use
+
+    def halt(self) -> None:
+        """It does not move between steps."""
+
+    def close(self) -> None:
+        """Nothing is open."""
+
+
+def microseconds(times: Samples) -> tuple[float, float]:
+    """p50 and p99."""
+    p50, p99 = 1e6 * np.percentile(times, [50, 99])
+    return float(p50), float(p99)
+
+
+def row(name: str, value: str, target: str, met: str) -> str:
+    """One line of the table."""
+    return f"{name:<46} {value:<28} {target:<22} {met}"
+
+
+def at_most(value: float, target: float) -> str:
+    """``met`` or ``missed``."""
+    return verdict(value, target, at_most=True)
+
+
+def guarded(standin: StandIn) -> Any:
+    """The stand-in behind all guards, as `make_env` builds a robot for a task that moves the tool in straight lines."""
+    from bam_envs.safety.gate import SafeRobot
+
+    return SafeRobot(standin, clock=standin.steps)
+
+
+def measure_guards(count: int) -> Iterator[str]:
+    """All guards together, around a smooth random motion of six joints and a gripper at 20 Hz."""
+    from bam_envs.core.robot import Initial
+    from bam_envs.robots.ur5e import arm_spec
+
+    standin, rng = StandIn(arm_spec("ur5e", with_object=True)), np.random.default_rng(0)
+    robot = guarded(standin)
+    robot.connect()
+    robot.reset(np.arange(1), Initial({"joint_position": np.array([HOME[:6]])}, np.zeros(1, np.int64)))
+    times, bare, speed = np.empty(count), np.empty(count), np.zeros(7)
+    command = robot.step(np.array([HOME])).command.copy()
+    for k in range(count):
+        if k % 20 == 0:  # a new direction each second, back towards the middle
+            speed[:6] = rng.uniform(-0.8, 0.8, 6) - 0.5 * (command[0, :6] - HOME[:6])
+        command = command + speed * standin.spec.period
+        begun = clock()
+        command = robot.step(command).command
+        ended = clock()
+        times[k], bare[k] = ended - begun - standin.inside, standin.inside
+    (p50, p99), (alone, _) = microseconds(times), microseconds(bare)
+    names = len(robot.report())
+    text = f"p50 {p50:.0f}, p99 {p99:.0f} us"
+    target = f"<= {GUARDS_P50:g} / <= {GUARDS_P99:g} us"
+    yield row(f"{names} guards together, 6-joint arm, a tick", text, target, at_most(max(p50 / 60, p99 / 250), 1.0))
+    yield f"  p50 is {p50 / alone:.2f} of the stand-in's own step, which encodes and decodes frames ({alone:.0f} us)"
+
+
+class Clocked:
+    """A policy that notes when a state came in and when it was asked for an action."""
+
+    def __init__(self, policy: Any, standin: StandIn) -> None:
+        self.policy, self.standin = policy, standin
+        self.pending, self.inside = 0.0, 0.0
+        self.ticks: list[float] = []
+        self.alone: list[float] = []
+
+    def reset(self, *arguments: Any) -> None:
+        """A new episode: what the arm does on the way to its start is no tick."""
+        self.note()
+        self.policy.reset(*arguments)
+
+    def act(self, observation: Any) -> Any:
+        """The action."""
+        self.note()
+        self.pending = self.standin.came
+        begun = clock()
+        action = self.policy.act(observation)
+        self.inside = clock() - begun
+        return action
+
+    def note(self) -> None:
+        """Count the tick before, whose command has gone out by now."""
+        if self.pending and len(self.ticks) < 100_000:
+            self.ticks.append(self.standin.left - self.pending)
+            self.alone.append(self.inside)
+        self.pending = 0.0
+
+
+class Quiet:
+    """Watches a deployment for its memory: after `WARM` ticks and at the end."""
+
+    def __init__(self) -> None:
+        self.ticks, self.warm = 0, 0.0
+
+    def ticked(self, record: Any, action: Any, pacer: Any) -> None:
+        """Count."""
+        self.ticks += 1
+        if self.ticks == WARM:
+            self.warm = resident()
+
+    def ended(self, record: Any) -> None:
+        """Nothing is shown."""
+
+
+def deploy(ticks: int, recording: Path | None = None) -> tuple[Clocked, Quiet]:
+    """A deployment of so many ticks of bam/pick without waiting, on the stand-in, recorded in a file if given."""
+    import gymnasium as gym
+
+    from bam_envs.core.registry import ENVIRONMENTS
+    from bam_envs.core.robot_env import RobotEnv
+    from bam_envs.core.timing import Pacer
+    from bam_train.checkpoint import Checkpoint
+    from bam_train.deploy.deployment import Deployment
+    from bam_train.deploy.flight import flight_recorder
+    from bam_train.deploy.journal import Journal
+    from bam_train.policy import FrozenPolicy
+
+    entry = ENVIRONMENTS["bam/pick-v0"]
+    standin, steps = StandIn(entry.make_robot(1, False, {}).spec), entry.max_episode_steps
+    env: gym.Env[Any, Any] = gym.wrappers.TimeLimit(RobotEnv(guarded(standin), entry.make_task(1, {})), steps)
+    policy = Clocked(FrozenPolicy.from_checkpoint(Checkpoint.open(CHECKPOINT)), standin)
+    recorder, watcher = None if recording is None else flight_recorder(recording, env, {}), Quiet()
+    if recorder is not None:
+        recorder.start()
+    deployment = Deployment(env, policy, Pacer(None), Journal(-(-ticks // steps)), recorder=recorder)
+    deployment.connect()
+    ending = deployment.run(watcher, seed=1)
+    if ending.status or (recorder is not None and recorder.fault):
+        raise SystemExit(f"bench_deploy: the deployment ended: {ending.reason} {recorder and recorder.fault}")
+    return policy, watcher
+
+
+def measure_tick(count: int) -> Iterator[str]:
+    """From the frames of a state to the frames of the command: codec, task, policy, guards, loop, and the recorder."""
+    from bam_train.deploy.flight import RecorderAgent
+
+    forward, shares = RecorderAgent.forward, []
+
+    def clocked(agent: Any, **arguments: Any) -> None:
+        begun = clock()
+        forward(agent, **arguments)
+        shares.append(clock() - begun)
+
+    with tempfile.TemporaryDirectory() as folder:
+        RecorderAgent.forward = clocked  # type: ignore[assignment]
+        try:
+            policy, _ = deploy(count, Path(folder) / "bench.mcap")
+        finally:
+            RecorderAgent.forward = forward  # type: ignore[method-assign]
+    (p50, p99), (alone, _) = microseconds(np.array(policy.ticks)), microseconds(np.array(policy.alone))
+    text, target = f"p50 {p50:.0f}, p99 {p99:.0f} us", f"<= {TICK_P50:g} us (p50)"
+    yield row("observation in to command out, recorded", text, target, at_most(p50, TICK_P50))
+    yield f"  p50 is {p50 / alone:.1f} times the frozen policy's own ({alone:.0f} us)"
+    share, worst = microseconds(np.array(shares))
+    text, target = f"p50 {share:.0f}, p99 {worst:.0f} us", f"<= {RECORDER_P50:g} us (p50)"
+    yield row("  of it the recorder's share", text, target, at_most(share, RECORDER_P50))
+    yield f"  p50 is {share / p50:.0%} of a tick"
+
+
+def measure_rate(seconds: float, rounds: int) -> Iterator[str]:
+    """100 Hz against the embedded server, and a loop that only sleeps, in turns."""
+    ours, bare = [], []
+    with Server("realtime robot") as server:
+        robot, state = live_arm(f"ws://127.0.0.1:{server.ports[0]}", period=0.01)
+        for _ in range(rounds):
+            ends = np.empty(int(100 * seconds / rounds))
+            for k in range(len(ends)):
+                robot.step(state.command)
+                ends[k] = time.monotonic()
+            ours.append(lateness(ends, 0.01))
+            bare.append(asleep(len(ends)))
+            robot.halt()  # the next round begins a new motion
+        robot.close()
+    late, alone = (100 * float((np.concatenate(one) > LATE).mean()) for one in (ours, bare))
+    p50, p99 = 1e3 * np.percentile(np.concatenate(ours), [50, 99])
+    text = f"{late:.2f} % late by > 1 ms"
+    yield row("100 Hz against the embedded server", text, f"< {LATE_SHARE:g} %", at_most(late, LATE_SHARE))
+    yield f"  lateness p50 {p50:.2f}, p99 {p99:.2f} ms; a loop that only sleeps has {alone:.2f} % such ticks"
+
+
+def asleep(count: int) -> Samples:
+    """Lateness of a loop at 100 Hz that does nothing [s]."""
+    begun, ends = time.monotonic(), np.empty(count)
+    for k in range(count):
+        time.sleep(max(0.0, begun + 0.01 * k - time.monotonic()))
+        ends[k] = time.monotonic()
+    return lateness(ends, 0.01)
+
+
+def measure_memory(ticks: int) -> Iterator[str]:
+    """Growth of a deployment in accelerated time."""
+    if ticks <= WARM:
+        raise SystemExit(f"bench_deploy: --ticks must be above {WARM}")
+    _, watcher = deploy(ticks)
+    growth = (resident() - watcher.warm) / 1e6
+    text = f"{growth:+.2f} MB after {watcher.ticks:,}"
+    yield row("memory of a deployment", text, f"< {GROWTH:g} MB", at_most(growth, GROWTH))
+
+
+def resident() -> float:
+    """Memory of this process [bytes]; on Linux."""
+    with open("/proc/self/statm", encoding="ascii") as file:
+        return float(file.read().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+
+
+def main() -> None:
+    """Measure what was asked for."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    names = ("guards", "tick", "rate", "memory")
+    parser.add_argument("--only", choices=names, action="append", help="measure this alone; may be given several times")
+    parser.add_argument("--count", type=int, default=20_000, help="timed ticks of guards, tick and recorder")
+    parser.add_argument("--seconds", type=float, default=60.0, help="length of the measurement at 100 Hz")
+    parser.add_argument("--rounds", type=int, default=6, help="turns of 100 Hz and of the loop that only sleeps")
+    parser.add_argument("--cpu", action="store_true", help="count processor time in microseconds; for a busy machine")
+    parser.add_argument("--ticks", type=int, default=1_000_000, help="ticks of the deployment for its memory")
+    options = parser.parse_args()
+    if options.cpu:
+        global clock
+        clock = time.thread_time
+    measurements: dict[str, Callable[[], Iterator[str]]] = {
+        "guards": lambda: measure_guards(options.count),
+        "tick": lambda: measure_tick(options.count),
+        "rate": lambda: measure_rate(options.seconds, options.rounds),
+        "memory": lambda: measure_memory(options.ticks),
+    }
+    print(row("figure", "measured", "target", ""))
+    for name, measure in measurements.items():
+        if options.only is None or name in options.only:
+            for line in measure():
+                print(line, flush=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,277 @@
+"""A diagnosis names the first thing that is wrong, and moves nothing."""
+
+import asyncio
+import contextlib
+import socket
+import threading
+import time
+
+import numpy as np
+import pytest
+from websockets.asyncio.server import serve
+
+from bam_envs.core.errors import InvalidValue
+from bam_envs.live import bringup
+from bam_envs.live.diagnosis import STEPS, Diagnosis
+from bam_envs.live.link_measurement import LinkMeasurement, Reading
+from bam_envs.robots.profile import load_profile
+from bam_envs.ros.codec import RobotInfo
+from bam_envs.ros.messages import write_stamp
+
+PATIENT = 'extends = "ur5e"\nname = "patient"\nkind = "arm"\nmax_age = 1.0\ncommand_timeout = 1.0\n'
+
+
+@pytest.fixture(autouse=True)
+def impatient(monkeypatch):
+    monkeypatch.setattr(bringup, "TIMEOUT", 1.0)
+
+
+@pytest.fixture
+def patient(tmp_path):
+    """A profile that a busy computer satisfies too; `more` is added to the file."""
+
+    def write(more=""):
+        (tmp_path / "patient.toml").write_text(PATIENT + more)
+        return str(tmp_path / "patient.toml")
+
+    return write
+
+
+def diagnose(url, robot=None, **options):
+    """The diagnosis, which is closed, and its steps by name."""
+    diagnosis = Diagnosis(url, robot, seconds=0.6, **options)
+    try:
+        return diagnosis, {step.name: step for step in diagnosis.steps()}
+    finally:
+        diagnosis.close()
+
+
+def failure(steps):
+    """The last step, which must have failed, and why."""
+    assert list(steps) == list(STEPS[: len(steps)])
+    *before, last = steps.values()
+    assert all(step.verdict != "failed" for step in before)
+    assert last.verdict == "failed", steps
+    return last.name, last.found
+
+
+def test_a_healthy_robot_passes_every_step_and_is_not_moved(server, robot_on, patient):
+    robot = robot_on(server, info=RobotInfo("ur5e", text="a scripted robot"))
+    diagnosis, steps = diagnose(server.url, profile=patient())
+    assert list(steps) == list(STEPS)
+    assert {step.verdict for step in steps.values()} <= {"ok", "warning"}, steps
+    assert steps["rosbridge"].found == "answers as ROS 2; the robot describes itself: a scripted robot"
+    topics = "/joint_states, /gripper/joint_states, /object_pose"
+    assert steps["topics"].found == f"profile patient: {topics}; all of the expected types"
+    assert steps["command path"].found.endswith("nothing was sent")
+    assert robot.commands == []
+    assert robot.halts == 0
+    link = diagnosis.measurement.profile("here")
+    assert link.about == "here"
+    assert link.command_loss == link.state_loss == link.nulls == 0.0
+    assert link.command_delay == sorted(link.command_delay)
+
+
+def test_the_profile_that_fits_best_is_taken(server, robot_on):
+    robot_on(server, "mir100")
+    diagnosis, steps = diagnose(server.url)
+    assert diagnosis.profile.name == "mir100"
+    assert steps["topics"].verdict == "ok"
+
+
+def test_a_closed_port():
+    with socket.create_server(("127.0.0.1", 0)) as probe:
+        port = probe.getsockname()[1]
+    name, why = failure(diagnose(f"ws://127.0.0.1:{port}")[1])
+    assert name == "port"
+    assert why.startswith(f"ws://127.0.0.1:{port}: refused: nothing listens there. Is the port open?")
+
+
+@contextlib.contextmanager
+def listening(start):
+    """The address of the server that the coroutine `start` opens."""
+    loop, started, ports, stop = asyncio.new_event_loop(), threading.Event(), [], asyncio.Event()
+
+    async def main():
+        async with await start() as server:
+            ports.append(next(iter(server.sockets)).getsockname()[1])
+            started.set()
+            await stop.wait()
+
+    thread = threading.Thread(target=lambda: loop.run_until_complete(main()))
+    thread.start()
+    assert started.wait(10.0)
+    try:
+        yield f"ws://127.0.0.1:{ports[0]}"
+    finally:
+        loop.call_soon_threadsafe(stop.set)
+        thread.join(10.0)
+        loop.close()
+
+
+def test_a_port_of_another_service():
+    async def say_hello(reader, writer):
+        writer.write(b"SSH-2.0-OpenSSH_9.2\r\n")
+        with contextlib.suppress(ConnectionError):
+            await writer.drain()
+        writer.close()
+
+    with listening(lambda: asyncio.start_server(say_hello, "127.0.0.1", 0)) as url:
+        name, why = failure(diagnose(url)[1])
+    assert name == "websocket"
+    assert "something listens there that is no WebSocket server" in why
+
+
+def test_a_websocket_server_that_is_no_rosbridge():
+    async def echo(connection):
+        async for frame in connection:
+            await connection.send(frame)
+
+    async def start():
+        return await serve(echo, "127.0.0.1", 0)
+
+    with listening(start) as url:
+        name, why = failure(diagnose(url)[1])
+    assert name == "rosbridge"
+    assert "an echo server" in why
+
+
+def test_another_robot_than_the_profile_says(server, robot_on):
+    robot_on(server, "mir100")
+    name, why = failure(diagnose(server.url, profile="ur5e")[1])
+    assert name == "topics"
+    assert why.startswith(
+        "there is no topic /joint_states (sensor_msgs/JointState), which has joint_position, joint_velocity."
+    )
+
+
+def test_a_topic_of_another_type(server, robot_on):
+    server.advertise("/object_pose", "std_msgs/Float64MultiArray")
+    server.advertise("/joint_states", "sensor_msgs/JointState")
+    server.advertise("/gripper/joint_states", "sensor_msgs/JointState")
+    name, why = failure(diagnose(server.url)[1])
+    assert name == "topics"
+    assert why.startswith("/object_pose is a std_msgs/Float64MultiArray there, and geometry_msgs/PoseStamped was")
+
+
+def test_a_robot_in_another_namespace(server, robot_on):
+    robot_on(server, namespace="/cell_1")
+    name, why = failure(diagnose(server.url, profile="ur5e")[1])
+    assert name == "topics"
+    assert " It is there at another address: ws://HOST:PORT/cell_1, " in why
+
+
+def test_a_silent_topic(server, robot_on):
+    robot = robot_on(server)
+    robot.mangle = lambda topic, message: None if topic == "/object_pose" else message
+    name, why = failure(diagnose(server.url)[1])
+    assert name == "rates and ages"
+    assert why.startswith("/object_pose (geometry_msgs/PoseStamped): no message in 0.6 s. Does its driver run?")
+
+
+def test_states_that_stay_the_same(server, robot_on):
+    robot = robot_on(server)
+    frozen = write_stamp(time.time() - 5.0)
+    robot.stamp = lambda: frozen
+    name, why = failure(diagnose(server.url)[1])
+    assert name == "rates and ages"
+    assert why.startswith("/joint_states: the newest state is up to ")
+    assert "and 100 ms is the limit" in why
+
+
+def without_elbow(message):
+    keep = [index for index, name in enumerate(message["name"]) if name != "elbow_joint"]
+    return {**message, **{key: [message[key][one] for one in keep] for key in ("name", "position", "velocity")}}
+
+
+def test_a_joint_that_vanishes(server, robot_on):
+    robot = robot_on(server)
+    robot.mangle = lambda topic, message: without_elbow(message) if topic == "/joint_states" else message
+    name, why = failure(diagnose(server.url)[1])
+    assert name == "rates and ages"
+    assert "elbow_joint" in why
+
+
+def test_some_unreadable_states_are_a_warning_and_measured(server, robot_on, patient):
+    robot, numbers = robot_on(server), iter(range(10**6))
+    robot.mangle = lambda topic, message: (
+        without_elbow(message) if topic == "/joint_states" and next(numbers) % 4 == 0 else message
+    )
+    diagnosis, steps = diagnose(server.url, profile=patient())
+    assert "messages cannot be read: /joint_states" in steps["rates and ages"].warnings[0]
+    assert 0.0 < diagnosis.measurement.profile().nulls < 1.0
+
+
+def test_a_server_that_passes_no_message_on(lax, robot_on, patient):
+    server = lax()
+    robot_on(server)
+    steps = diagnose(server.url, profile=patient())[1]
+    assert steps["topics"].warnings == ("the server has no rosapi node, so that types of topics cannot be checked",)
+    name, why = failure(steps)
+    assert name == "round trip"
+    assert why.startswith("what is published on /bam/ping does not come back in 1 s")
+
+
+def test_nobody_takes_commands(server, robot_on, patient):
+    robot_on(server)
+    profile = patient('\n[rename]\n"/forward_position_controller/commands" = "/other/commands"\n')
+    name, why = failure(diagnose(server.url, profile=profile)[1])
+    assert name == "command path"
+    assert why.startswith("Nobody listens to /other/commands (std_msgs/Float64MultiArray), which takes shoulder_pan")
+
+
+def test_a_robot_in_a_protective_stop(server, robot_on, patient):
+    robot = robot_on(server)
+    server.advertise("/io_and_status_controller/safety_mode", "ur_dashboard_msgs/SafetyMode", latch=True)
+    server.publish("/io_and_status_controller/safety_mode", {"mode": 3})
+    name, why = failure(diagnose(server.url, profile=patient())[1])
+    assert name == "command path"
+    assert why.startswith("protective stop (/io_and_status_controller/safety_mode); bring the robot into the state")
+    assert robot.commands == []
+
+
+def test_a_joint_beyond_its_limits_is_a_warning(server, robot_on, patient):
+    robot_on(server).signals["joint_position"][2] = 3.1
+    warnings = diagnose(server.url, profile=patient())[1]["guards"].warnings
+    assert len(warnings) == 1
+    assert warnings[0].startswith("elbow_joint is at 3.100 rad, beyond -3.042 to 3.042 rad: jog it back")
+
+
+def test_a_clock_that_is_apart_is_a_warning(lax, robot_on, patient, monkeypatch):
+    server = lax()
+    robot_on(server)
+    monkeypatch.setattr("bam_envs.live.diagnosis.CLOCK_APART", 0.0)
+    warnings = diagnose(server.url, profile=patient())[1]["clock"].warnings
+    assert warnings == ("set both clocks by the same NTP server, or recordings of both cannot be compared",)
+
+
+# What is measured
+
+
+def measured(trips, arrival=(0.0,), copies=0, count=1, unread=0):
+    source = load_profile("ur5e").state[0]
+    reading = Reading(source, count, 100.0, np.array(arrival), np.zeros(1), np.zeros(6), unread, "")
+    return LinkMeasurement(1.0, np.array(trips, float), copies, (reading,))
+
+
+def test_a_way_is_a_round_trip_less_half_the_median():
+    link = measured([0.02] * 100 + [0.05]).profile()
+    assert link.command_delay == [0.01] * 100 + [0.04]
+    assert link.state_delay == link.command_delay  # without stamps
+
+
+def test_a_state_is_as_old_as_its_stamp_says():
+    link = measured([0.02] * 11, arrival=np.linspace(0.0, 0.1, 101)).profile()
+    assert link.state_delay == pytest.approx(np.maximum(np.linspace(0.0, 0.1, 101), 0.01))
+
+
+def test_losses_copies_and_nulls():
+    lost = float("nan")
+    link = measured([0.02, lost, lost, lost, 0.02, lost] + [0.02] * 14, copies=2, count=10, unread=1).profile()
+    assert (1 - link.command_loss) * (1 - link.state_loss) == pytest.approx(0.8)
+    assert (link.burst, link.duplicates, link.nulls) == (2.0, 0.1, 0.1)
+
+
+def test_too_few_pings_make_no_profile():
+    with pytest.raises(InvalidValue, match=r"3 pings came back, and quantiles need 10\. Measure for longer\."):
+        measured([0.02] * 3).profile()

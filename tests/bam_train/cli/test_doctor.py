@@ -1,0 +1,109 @@
+"""bam-doctor: a table of steps, the first that fails with its remedy, and the measured link in a file."""
+
+import json
+import socket
+from pathlib import Path
+
+import gymnasium as gym
+import pytest
+
+from bam_envs.live.diagnosis import STEPS
+from bam_envs.remote.serve.serve_options import ServeOptions
+from bam_envs.remote.serve.served_environment import ServedEnvironment
+from bam_envs.robots.linked import link_profile
+from bam_train.cli.live.doctor import main as doctor
+
+PICK = Path(__file__).parents[3] / "checkpoints" / "pick-ppo.zip"
+
+
+@pytest.fixture(scope="module")
+def served():
+    """The address of a served bam/pick; in lockstep, where no state is too old on a busy computer."""
+    with ServedEnvironment(gym.make("bam/pick-v0", disable_env_checker=True), ServeOptions(port=0, fast=True)) as one:
+        yield one.bus.url
+
+
+@pytest.fixture
+def nobody():
+    with socket.create_server(("127.0.0.1", 0)) as probe:
+        return f"ws://127.0.0.1:{probe.getsockname()[1]}"
+
+
+def test_a_healthy_robot(run, served, tmp_path):
+    path = tmp_path / "link.json"
+    status, out, err = run(doctor, served, "--seconds", 0.8, "--measure", path)
+    assert (status, err) == (0, "")
+    lines = out.splitlines()
+    assert [line.split("  ")[0] for line in lines if not line.startswith(" ")][:-1] == list(STEPS)
+    assert lines[-1] == f"{path}: the measured link; try it with bam-deploy CHECKPOINT --rehearse {path}"
+    link = link_profile(str(path))
+    assert link.about.startswith(f"{served}, ")
+    assert link.command_loss == 0.0
+
+
+def test_json(run, served, tmp_path):
+    path = tmp_path / "link.json"
+    status, out, _ = run(doctor, served, "--seconds", 0.8, "--measure", path, "--json", "--checkpoint", PICK)
+    report = json.loads(out)
+    assert status == 0
+    assert [step["name"] for step in report["steps"]] == [*STEPS, "contract"]
+    assert {line["verdict"] for line in report["contract"]} <= {"ok", "not told"}
+    assert (report["address"], report["failed"], report["not_tried"]) == (served, None, [])
+    assert report["measured"] == json.loads(path.read_text())
+
+
+def test_the_first_failing_step_is_named(run, nobody, tmp_path):
+    path = tmp_path / "link.json"
+    status, out, err = run(doctor, nobody, "--measure", path)
+    assert status == 1
+    assert out == "port            failed\n"
+    unwritten, why = err.splitlines()
+    assert unwritten == f"bam-doctor: {path} was not written: the link was not measured"
+    assert why.startswith(f"bam-doctor: port failed: {nobody}: refused: nothing listens there. Is the port open?")
+    assert not path.exists()
+
+
+def test_a_refused_contract(run, served, forge, tmp_path):
+    path = tmp_path / "pick.zip"
+    path.write_bytes(PICK.read_bytes())
+    status, out, err = run(doctor, served, "--seconds", 0.3, "--checkpoint", forge(path, period=0.1))
+    assert status == 3
+    assert err == (
+        f"bam-doctor: contract failed: {path} and the robot do not fit: period [s]: expected 0.1, found 0.05; "
+        "correct the robot or its profile; nothing has moved\n"
+    )
+    assert any(line.split() == ["period", "[s]", "0.1", "0.05", "refused"] for line in out.splitlines())
+
+
+def test_json_of_a_failure(run, nobody):
+    status, out, _ = run(doctor, nobody, "--json")
+    report = json.loads(out)
+    assert status == 1
+    assert (report["failed"], report["not_tried"], report["measured"]) == ("port", list(STEPS[1:]), None)
+    assert report["steps"][0]["verdict"] == "failed"
+
+
+def test_too_short_a_measurement_writes_no_file(run, served, tmp_path):
+    path = tmp_path / "link.json"
+    _, _, err = run(doctor, served, "--seconds", 0.05, "--measure", path)
+    assert err.endswith("pings came back, and quantiles need 10. Measure for longer.\n")
+    assert not path.exists()
+
+
+@pytest.mark.parametrize(
+    ("flags", "text"),
+    [
+        (["ws://127.0.0.1:1", "--env", "bam/pick"], "--env says what a checkpoint was trained on; give --checkpoint"),
+        (["ws://127.0.0.1:1", "--measure", "link.txt"], "--measure: expected a .json file, found 'link.txt'"),
+        (["ws://127.0.0.1:1", "--measure", "nowhere/a.json"], "--measure: there is no folder nowhere; make it first"),
+        (["tcp://127.0.0.1:1"], "A live robot's address is ws://host:port or wss://host:port; 'tcp://127.0.0.1:1' is"),
+        (["127.0.0.1:1"], "A live robot's address is ws://host:port or wss://host:port, not '127.0.0.1:1'. Did you"),
+        (["ws://127.0.0.1:1", "--profile", "ur5"], "Unknown robot profile 'ur5'. Did you mean 'ur5e'?"),
+        (["ws://127.0.0.1:1", "--ca-file", "ca.pem"], "ws://127.0.0.1:1: ca_file is for wss:// only, and this address"),
+    ],
+)
+def test_flags_that_are_refused(run, flags, text):
+    status, out, err = run(doctor, *flags)
+    assert (status, out) == (1, "")
+    assert err.startswith(f"bam-doctor: {text}")
+    assert len(err.splitlines()) == 1

@@ -1,0 +1,241 @@
+"""A recording read again, played through its environment with a policy, and summed up by `bam-replay`."""
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from mcap.writer import Writer
+
+from bam_train.checkpoint import Checkpoint
+from bam_train.cli.deploy import main as deploy
+from bam_train.cli.live.replay import main as replay
+from bam_train.environments import make_env
+from bam_train.errors import BadRecording
+from bam_train.policy import FrozenPolicy
+from bam_train.recording.drawing import frames
+from bam_train.recording.playback import play, replay_env
+from bam_train.recording.recorder import Recorder
+from bam_train.recording.recording import Recording
+
+CHECKPOINTS = Path(__file__).parents[3] / "checkpoints"
+PICK = CHECKPOINTS / "pick-ppo.zip"
+
+
+def call(main, *arguments):
+    """Runs a program; its exit status."""
+    with pytest.raises(SystemExit) as done:
+        main([str(argument) for argument in arguments])
+    return done.value.code or 0
+
+
+@pytest.fixture(scope="module")
+def pick(tmp_path_factory):
+    """A recording of two episodes of pick."""
+    path = tmp_path_factory.mktemp("recordings") / "pick.mcap"
+    assert call(deploy, PICK, "--fast", "--episodes", 2, "--record", path) == 0
+    return path
+
+
+def test_the_numbers_are_there_again(pick):
+    recording = Recording.open(pick)
+    assert recording.complete
+    assert recording.ticks == 70
+    assert recording.episodes() == [range(36), range(36, 70)]
+    assert recording.metadata["env"] == "bam/pick-v0"
+    assert recording.metadata["checkpoint_sha256"] == Checkpoint.open(PICK).digest
+    assert [event.text for event in recording.events] == [
+        "episode 1 begins, seed 1000000",
+        "episode 2 begins, seed 1000001",
+        "episodes done",
+    ]
+    env = make_env("bam/pick-v0")
+    observation, _ = env.reset(seed=1_000_000)
+    states, [action] = recording.states(env.unwrapped.robot.spec), recording.arrays("action").values()
+    for k in range(36):
+        [observed] = recording.arrays("observation").values()
+        np.testing.assert_array_equal(observed[k], observation)
+        for name, values in env.unwrapped.last_state.signals.items():
+            np.testing.assert_array_equal(states[k].signals[name], values)
+        if k < 35:
+            observation, *_ = env.step(action[k])
+    env.close()
+
+
+@pytest.mark.parametrize("name", ["pick-ppo", "mir100-avoidance-ppo", "ur-reach-ppo"])
+def test_the_same_policy_acts_the_same_bit_for_bit(name, tmp_path):
+    path, checkpoint = tmp_path / "a.mcap", Checkpoint.open(CHECKPOINTS / f"{name}.zip")
+    assert call(deploy, checkpoint.path, "--fast", "--episodes", 1, "--record", path) == 0
+    recording = Recording.open(path)
+    env = replay_env(recording, checkpoint)
+    played = play(recording, env, FrozenPolicy.from_checkpoint(checkpoint))
+    env.close()
+    assert played.ticks == recording.ticks > 30
+    assert (played.observations, played.actions, played.worst, played.same) == (played.ticks, played.ticks, 0.0, True)
+
+
+def test_another_policy_is_compared(pick):
+    class Still:
+        def reset(self):
+            pass
+
+        def act(self, observation):
+            return np.zeros(5, np.float32)
+
+    recording, checkpoint = Recording.open(pick), Checkpoint.open(PICK)
+    env = replay_env(recording, checkpoint)
+    played = play(recording, env, Still())
+    env.close()
+    [action] = recording.arrays("action").values()
+    assert (played.ticks, played.observations, played.actions) == (70, 70, 0)
+    assert played.worst == np.abs(action).max()
+
+
+def test_summary_for_people_and_programs(pick, capsys):
+    assert call(replay, pick) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0] == f"{pick}: pick-ppo.zip ({Checkpoint.open(PICK).digest[:12]}) on bam/pick-v0"
+    assert lines[1].startswith("70 ticks in ")
+    assert lines[1].endswith(" s, complete")
+    assert lines[2:5] == [
+        "episode 1 (seed 1000000): success after 35 steps, return 38.48",
+        "episode 2 (seed 1000001): success after 33 steps, return 39.01",
+        "no guard changed a command",
+    ]
+    assert [line.partition(":")[0] for line in lines[5:10]] == ["step", "wait", "late", "policy", "record"]
+    assert lines[-2].endswith(" s: episodes done")
+    assert lines[-1] == "played: the same observation in 70 of 70 ticks, the same action in 70"
+    assert call(replay, pick, "--json") == 0
+    report = json.loads(capsys.readouterr().out)
+    assert report["played"] == {"ticks": 70, "observations": 70, "actions": 70, "worst": 0.0, "same": True}
+    assert [row["length"] for row in report["per_episode"]] == [35, 33]
+    assert report["complete"] is True
+
+
+def test_an_environment_without_a_robot(corridor_checkpoint, tmp_path, capsys):
+    path = tmp_path / "a.mcap"
+    assert call(deploy, corridor_checkpoint(), "--fast", "--episodes", 3, "--record", path) == 0
+    capsys.readouterr()
+    assert call(replay, path) == 0
+    lines = capsys.readouterr().out.splitlines()
+    ticks = Recording.open(path).ticks
+    assert lines[-1] == f"played: the same observation in {ticks} of {ticks} ticks, the same action in {ticks}"
+
+
+def test_a_checkpoint_that_is_gone_or_changed(pick, corridor_checkpoint, tmp_path, capsys):
+    path, checkpoint = tmp_path / "a.mcap", corridor_checkpoint()
+    assert call(deploy, checkpoint, "--fast", "--episodes", 1, "--record", path) == 0
+    shutil.move(checkpoint, tmp_path / "moved.zip")
+    capsys.readouterr()
+    assert call(replay, path) == 0
+    last = capsys.readouterr().out.splitlines()[-1]
+    assert last == f"not played: its checkpoint {checkpoint} is not here; give it with --checkpoint"
+    corridor_checkpoint(steps=4096)
+    assert call(replay, path) == 0
+    last = capsys.readouterr().out.splitlines()[-1]
+    assert last == (
+        f"not played: {checkpoint} is another checkpoint than then; give --checkpoint {checkpoint} to play it with "
+        "that one"
+    )
+    assert call(replay, path, "--checkpoint", tmp_path / "moved.zip") == 0
+    assert capsys.readouterr().out.splitlines()[-1].startswith("played: the same observation in ")
+    assert call(replay, pick, "--checkpoint", checkpoint) == 1
+    assert "was trained on test/Corridor-v0, not on bam/pick-v0" in capsys.readouterr().err
+
+
+def test_a_recording_cut_anywhere_is_readable(pick, tmp_path, capsys):
+    data, path = pick.read_bytes(), tmp_path / "cut.mcap"
+    ticks = []
+    rng = np.random.default_rng(0)
+    for size in sorted({*rng.integers(0, len(data), 40).tolist(), 7, 8, 30, len(data) - 1}):
+        path.write_bytes(data[:size])
+        try:
+            recording = Recording.open(path)
+        except BadRecording as error:
+            assert "not a recording of bam-deploy" in str(error)  # noqa: PT017 - its beginning is missing
+            assert size < 2000
+            continue
+        assert not recording.complete or size == len(data) - 1
+        ticks.append(recording.ticks)
+        assert len(recording.states(make_spec())) == recording.ticks if recording.ticks else True
+    assert ticks == sorted(ticks)
+    assert ticks[-1] == 70
+    path.write_bytes(data[: len(data) // 2])
+    assert call(replay, path) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[1].endswith(" s, its end is missing: it was cut off or damaged")
+    played = Recording.open(path).ticks
+    assert 20 < played < 70
+    assert lines[-1] == f"played: the same observation in {played} of {played} ticks, the same action in {played}"
+
+
+def make_spec():
+    return make_env("bam/pick-v0").unwrapped.robot.spec
+
+
+def test_a_damaged_recording_is_read_up_to_the_damage(pick, tmp_path):
+    rng, path, data = np.random.default_rng(1), tmp_path / "damaged.mcap", pick.read_bytes()
+    for place in rng.integers(0, len(data), 60):
+        path.write_bytes(data[:place] + bytes([data[place] ^ 0xFF]) + data[place + 1 :])
+        try:
+            assert 0 <= Recording.open(path).ticks <= 70
+        except BadRecording as error:
+            assert str(error).startswith(f"{path}: ")  # noqa: PT017 - either is right
+
+
+@pytest.mark.parametrize(
+    ("content", "why"),
+    [
+        (None, "cannot be read: No such file or directory"),
+        (b"", "not a recording of bam-deploy. Give a .mcap file that it wrote"),
+        (b"PK\x03\x04 a zip", "not a recording of bam-deploy. Give a .mcap file that it wrote"),
+    ],
+)
+def test_what_is_no_recording_is_one_line(tmp_path, capsys, content, why):
+    path = tmp_path / "a.mcap"
+    if content is not None:
+        path.write_bytes(content)
+    assert call(replay, path) == 1
+    assert capsys.readouterr().err == f"bam-replay: {path}: {why}\n"
+
+
+def test_somebody_elses_mcap_file_is_refused(tmp_path):
+    path = tmp_path / "a.mcap"
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        channel = writer.register_channel("/state", "json", 0)
+        writer.add_message(channel, 1, b'{"t": "x"}', 1)
+        writer.finish()
+    with pytest.raises(BadRecording, match=r"not a recording of bam-deploy"):
+        Recording.open(path)
+
+
+def test_a_recording_is_drawn(pick, tmp_path, capsys):
+    plot, video, cut = tmp_path / "a.png", tmp_path / "a.gif", tmp_path / "cut.mcap"
+    cut.write_bytes(pick.read_bytes()[:20_000])
+    ticks = Recording.open(cut).ticks
+    assert 3 < ticks < 15
+    assert call(replay, cut, "--plot", plot, "--video", video) == 0
+    assert capsys.readouterr().err.splitlines() == [
+        f"bam-replay: {plot}: drawn",
+        f"bam-replay: {video}: {ticks} ticks",
+    ]
+    assert plot.read_bytes().startswith(b"\x89PNG")
+    assert video.read_bytes().startswith(b"GIF8")
+    assert call(replay, pick, "--plot", tmp_path / "nowhere" / "a.png") == 1
+    assert f"bam-replay: {tmp_path / 'nowhere' / 'a.png'}: cannot be written: " in capsys.readouterr().err
+
+
+def test_recorded_pictures_are_there_again(tmp_path):
+    recorder = Recorder(tmp_path / "a.mcap", {"env": "test"})
+    recorder.start()
+    first = np.arange(12, dtype=np.uint8).reshape(2, 2, 3)
+    recorder.pixels("front", first)
+    recorder.pixels("grey", first[:, :, :1])
+    recorder.pixels("front", first + 1)
+    assert recorder.close() == ""
+    recording = Recording.open(recorder.path)
+    np.testing.assert_array_equal(list(frames(recording)), [first, first + 1])
+    np.testing.assert_array_equal(list(frames(recording, "/pixels/grey")), [np.repeat(first[:, :, :1], 3, axis=2)])
