@@ -13,6 +13,7 @@ import json
 import os
 import runpy
 import signal
+import struct
 import subprocess
 import sys
 import tempfile
@@ -23,14 +24,16 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from mcap.exceptions import McapError
+from mcap.records import Channel, Message
+from mcap.stream_reader import StreamReader
+
 from bam_envs.testing.robot_cell import CellLog, Network, RobotCell, StateFault
 from bam_train.checkpoint import Checkpoint
 
 ROOT = Path(__file__).parents[1]
 CHECKPOINT = ROOT / "checkpoints" / "reach-ppo.zip"
-FLAGS: tuple[str, ...] = ()
-"""Further flags of each bam-deploy."""
-FAST, AT_REST = 0.15, 0.02
+FAST, AT_REST = 0.1, 0.02
 """A fault strikes above the first speed; below the second one the robot is at rest [rad/s or m/s]."""
 BRAKING = 0.3
 """Time in which a robot that rests comes to a stand [s]."""
@@ -38,6 +41,8 @@ FREEZE, RESTART = 5.0, 10.0
 """How long the network is frozen, and after what time a bridge is restarted [s]."""
 LONGEST = 120.0
 """Longest time that a deployment may take [s]."""
+LOST = 1.0
+"""What a recording may lack before a fault [s]."""
 WATCHED = 1.0
 """How long the robot is watched after the end of everything [s]."""
 
@@ -84,18 +89,30 @@ class Scene:
     network: Network
     folder: Path
     checkpoint: Path
+    flags: tuple[str, ...]
+    """Further flags of each bam-deploy."""
     deployment: Deployment = field(init=False)
     back: float | None = None
     """When the link came back [s], monotonic clock."""
     others: list[str] = field(default_factory=list)
     """What others than the operator of the deployment saw."""
 
-    def deploy(self, name: str = "first", *before: str, program: tuple[str, ...] = ()) -> Deployment:
-        """Start a bam-deploy; `before` stands before its command, and `program` instead of its name."""
-        recording = self.folder / f"{name}.mcap"
-        command = [*before, sys.executable, *(program or ("-m", "bam_train.cli.deploy")), str(self.checkpoint)]
-        flags = ["--robot", self.network.url, "--yes", "--episodes", "4", *FLAGS]
-        return Deployment([*command, *flags], recording)
+    def deploy(
+        self, name: str, *before: str, program: tuple[str, ...] = ("-m", "bam_train.cli.deploy"), disk: str = ""
+    ) -> Deployment:
+        """Start a bam-deploy.
+
+        Args:
+            name: Of its recording.
+            before: What stands before its command.
+            program: What Python runs.
+            disk: The subfolder for its recording.
+        """
+        recording = f"{name}.mcap"
+        flags = ["--robot", self.network.url, "--yes", "--episodes", "4", *self.flags]
+        flags += ["--record", str(self.folder / disk / recording)]
+        command = [*before, sys.executable, *program, str(self.checkpoint), *flags]
+        return Deployment(command, self.folder / recording)
 
     @property
     def clock(self) -> Path:
@@ -166,12 +183,23 @@ class Fault:
     act: Callable[[Scene], None]
     statuses: tuple[int, ...]
     """Exit statuses with which the deployment may end."""
-    deploy: Callable[[Scene], Deployment] = Scene.deploy
+    deploy: Callable[[Scene], Deployment] = lambda scene: scene.deploy("first")
+    is_recorded: bool = True
+    """Whether the recording goes on until the fault."""
 
 
 def with_clock(scene: Scene) -> Deployment:
     """A deployment whose wall clock can jump."""
     return scene.deploy("first", program=(__file__, "--jumping-clock", str(scene.clock)))
+
+
+def with_full_disk(scene: Scene) -> Deployment:
+    """A deployment whose recording fills its disk: a small one of its own, which ends with it."""
+    disk = scene.folder / "disk"
+    disk.mkdir()
+    script = 'mount -t tmpfs -o size=64k none "$0" && "$@"; status=$?; cp "$0"/*.mcap "$0"/..; exit $status'
+    own = ("unshare", "--user", "--map-root-user", "--mount", "sh", "-c", script, str(disk))
+    return scene.deploy("first", *own, disk=disk.name)
 
 
 FAULTS = (
@@ -186,6 +214,7 @@ FAULTS = (
     Fault("robot's clock jumps by an hour", wrong_states(StateFault.CLOCK), (0, 3, 4)),
     Fault("this computer's clock jumps by an hour", jump, (0,), with_clock),
     Fault("all cores hogged for 5 s", hog, (0, 3, 4)),
+    Fault("disk full", lambda scene: None, (0,), with_full_disk, is_recorded=False),
     Fault("two deployments to one robot", deploy_twice, (0,)),
     Fault("Ctrl-C", interrupt(1), (130,)),
     Fault("Ctrl-C twice", interrupt(2), (130,)),
@@ -196,16 +225,26 @@ FAULTS = (
 
 
 @dataclass(frozen=True)
+class Recorded:
+    """What a recording holds."""
+
+    ticks: int
+    last: float
+    """Time of the last tick [s], monotonic clock."""
+    events: tuple[str, ...]
+
+
+@dataclass(frozen=True)
 class Outcome:
-    """What a fault did."""
+    """What a fault did; times from the fault [s]."""
 
     name: str
-    motion: float | None
-    """From the fault to the last command for motion [s]; None: none came any more."""
-    rest: float | None
-    """From the fault until the robot stood still [s]; None: it stood still at once."""
+    motion: float
+    """When the last command for motion arrived; 0: before."""
+    rest: float
+    """From when on the robot stood still."""
     ended: float
-    """From the fault to the end of the deployment [s]."""
+    """When the deployment ended."""
     status: int
     saw: tuple[str, ...]
     """What was on the operator's screen."""
@@ -214,72 +253,86 @@ class Outcome:
 
     def lines(self) -> Iterator[str]:
         """The row as text."""
-        motion, rest = (("-" if one is None else f"{one:.2f} s") for one in (self.motion, self.rest))
         verdict = "ok" if not self.problems else f"WRONG: {'; '.join(self.problems)}"
-        yield f"{self.name:40}{motion:>10}{rest:>10}{self.ended:>9.2f} s{self.status:>6}  {verdict}"
-        yield from (f"    {line}" for line in self.saw)
-        if self.recorded:
-            yield f"    recording: {self.recorded}"
+        yield f"{self.name:40}{self.motion:>9.2f}{self.rest:>9.2f}{self.ended:>9.2f}{self.status:>6}  {verdict}"
+        yield from (f"    {line}" for line in (*self.saw, f"recording: {self.recorded}"))
 
 
-def strike(fault: Fault, cell: RobotCell, checkpoint: Path) -> Outcome:
+def strike(fault: Fault, cell: RobotCell, checkpoint: Path, flags: tuple[str, ...] = ()) -> Outcome:
     """Let a deployment move the robot of `cell`, let the fault happen, and watch."""
     with contextlib.ExitStack() as stack:
         network = stack.enter_context(Network(cell.port))
-        scene = Scene(cell, network, Path(stack.enter_context(tempfile.TemporaryDirectory())), checkpoint)
+        folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
+        scene = Scene(cell, network, folder, checkpoint, flags)
         deployment = scene.deployment = fault.deploy(scene)
         stack.callback(deployment.finish)
         stack.callback(deployment.process.kill)
-        try:
-            cell.await_motion(FAST)
-        except RuntimeError as error:
-            deployment.process.kill()
-            raise RuntimeError(f"{error} bam-deploy: {deployment.finish()}, {deployment.said()}") from error
-        start = time.monotonic()
+        start = await_policy(scene, fault)
         fault.act(scene)
         status = deployment.finish()
         time.sleep(WATCHED)
-        log = cell.log().since(start)
+        log, recorded = cell.log().since(start), read_recording(deployment.recording)
     saw = (*deployment.said(start), *scene.others)
-    return outcome(fault, log, start, deployment.ended, status, saw, scene.back, cell.command_timeout)
+    problems = [*([] if status in fault.statuses else [f"exit status {status}"])]
+    problems += judge(log, start, deployment.ended, scene.back, cell.command_timeout)
+    if fault.is_recorded and recorded.last < start - LOST:
+        problems.append("the recording ends before the fault")
+    after = f"{recorded.last - start:+.2f} s" if recorded.ticks else "never"
+    said = f"{recorded.ticks} ticks, the last {after}; {'; '.join(recorded.events) or 'no events'}"
+    times = (last_motion(log, start) - start, last_moving(log, start) - start, deployment.ended - start)
+    return Outcome(fault.name, *times, status, saw, said, tuple(problems))
 
 
-def outcome(
-    fault: Fault,
-    log: CellLog,
-    start: float,
-    ended: float,
-    status: int,
-    saw: tuple[str, ...],
-    back: float | None,
-    watchdog: float,
-) -> Outcome:
-    """Judge what the robot did since `start`."""
-    motions, moving = log.motions(), log.times[log.speeds > AT_REST]
-    last_motion = float(motions[-1]) if len(motions) else start
-    rest = float(moving[-1]) if len(moving) else start
-    problems = []
-    if status not in fault.statuses:
-        problems.append(f"exit status {status}")
-    if rest > max(last_motion, start) + watchdog + BRAKING:
-        problems.append(f"it moved {rest - last_motion:.2f} s after the last command")
+def await_policy(scene: Scene, fault: Fault) -> float:
+    """Wait until the policy moves the robot, no longer the way to the start pose; the time now [s]."""
+    deadline, begun = time.monotonic() + LONGEST, not fault.is_recorded
+    while not begun or not (scene.cell.log().speeds[-3:] > FAST).any():
+        begun = begun or read_recording(scene.deployment.recording).ticks > 5
+        if time.monotonic() > deadline or scene.deployment.process.poll() is not None:
+            scene.deployment.process.kill()
+            raise RuntimeError(f"bam-deploy: {scene.deployment.finish()}, {scene.deployment.said()}")
+        time.sleep(0.01)
+    return time.monotonic()
+
+
+def last_motion(log: CellLog, start: float) -> float:
+    """When the last command for motion arrived [s]; `start` if none did after it."""
+    motions = log.motions()
+    return max(start, float(motions[-1])) if len(motions) else start
+
+
+def last_moving(log: CellLog, start: float) -> float:
+    """When the robot moved last [s]; `start` if it did not after it."""
+    moving = log.times[log.speeds > AT_REST]
+    return max(start, float(moving[-1])) if len(moving) else start
+
+
+def judge(log: CellLog, start: float, ended: float, back: float | None, watchdog: float) -> Iterator[str]:
+    """What is wrong with what the robot did since `start`."""
+    commanded, moving = last_motion(log, start), last_moving(log, start)
+    if moving > commanded + watchdog + BRAKING:
+        yield f"it moved {moving - commanded:.2f} s after the last command"
     if log.speeds[-1] > AT_REST:
-        problems.append(f"it still moves {log.times[-1] - last_motion:.2f} s after the last command")
-    if last_motion > ended:
-        problems.append("a command came after the end")
-    late = 0 if back is None else int((motions > back).sum())
+        yield f"it still moves {log.times[-1] - commanded:.2f} s after the last command"
+    if commanded > ended:
+        yield "a command came after the end"
+    late = 0 if back is None else int((log.motions() > back).sum())
     if late:
-        problems.append(f"{late} commands from before the cut arrived after it")
-    return Outcome(
-        fault.name,
-        last_motion - start if len(motions) else None,
-        rest - start if len(moving) else None,
-        ended - start,
-        status,
-        saw,
-        "",
-        tuple(problems),
-    )
+        yield f"{late} commands from before the cut arrived after it"
+
+
+def read_recording(path: Path) -> Recorded:
+    """What is readable of a recording, also of one that was cut."""
+    topics, ticks, events = dict[int, str](), list[float](), list[str]()
+    with contextlib.suppress(FileNotFoundError, McapError, struct.error), path.open("rb") as file:
+        for record in StreamReader(file).records:
+            if isinstance(record, Channel):
+                topics[record.id] = record.topic
+            elif isinstance(record, Message) and topics[record.channel_id] == "/status":
+                ticks.append(json.loads(record.data)["t"])
+            elif isinstance(record, Message) and topics[record.channel_id] == "/events":
+                events.append(json.loads(record.data)["message"])
+    return Recorded(len(ticks), max(ticks, default=0.0), tuple(events))
 
 
 def run_with_jumping_clock(file: Path, arguments: list[str]) -> None:
@@ -304,11 +357,11 @@ def main() -> None:
     options = parser.parse_args()
     chosen = [one for one in FAULTS if not options.only or any(text in one.name for text in options.only)]
     if not options.json:
-        print(f"{'fault':40}{'motion':>10}{'at rest':>10}{'ended':>11}{'exit':>6}")
+        print(f"{'fault':40}{'motion':>9}{'rest':>9}{'end':>9}{'exit':>6}")
     env_id, wrong = Checkpoint.open(options.checkpoint).manifest.env, 0
     for fault in chosen:
         with RobotCell(env_id, describes_itself=not options.plain) as cell:
-            result = strike(fault, cell, options.checkpoint)
+            result = strike(fault, cell, options.checkpoint, ("--allow-unsigned",) if options.plain else ())
         wrong += bool(result.problems)
         for line in [json.dumps(vars(result))] if options.json else result.lines():
             print(line, flush=True)

@@ -164,14 +164,6 @@ class RobotCell:
         is_base = "m/s" in self.spec.command.units
         return CellLog(rows[:, 0], rows[:, 1], rows[:, 2], rows[:, 4:], rows[:, 3], is_base)
 
-    def await_motion(self, speed: float, timeout: float = 60.0) -> None:
-        """Wait until the robot moves faster than `speed` [rad/s or m/s]; RuntimeError after `timeout` [s]."""
-        deadline = time.monotonic() + timeout
-        while not (self.log().speeds[-5:] > speed).any():
-            if time.monotonic() > deadline:
-                raise RuntimeError(f"The robot did not move faster than {speed:g} within {timeout:g} s.")
-            time.sleep(0.01)
-
     def _start(self, name: str, main: Callable[..., None], *arguments: Any) -> Any:
         ready = _PROCESSES.Event()
         self.processes[name] = _PROCESSES.Process(target=main, args=(*arguments, ready), name=name, daemon=True)

@@ -415,7 +415,8 @@ def test_stale_states_hold_for_half_a_second_and_then_stop():
         robot.step(away(state, 0.02))
     assert str(caught.value) == (
         "The robot was stopped by state age (G3): the newest state is 0.110 s old, and at most 0.1 s are allowed, "
-        "10 ticks in a row. Whether it stands is not known: stop it by hand if it moves. When it is safe, call resume()."
+        "10 ticks in a row. Whether it stands is not known: stop it by hand if it moves. "
+        "When it is safe, call resume()."
     )
     assert (caught.value.age, caught.value.limit) == (0.11, 0.1)
     assert robot.report()["state age"]["held"] == 10
