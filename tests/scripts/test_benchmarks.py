@@ -93,3 +93,17 @@ def test_loop_without_torch(bench):
         "what the loop adds to a tick",
     ]
     assert all(line.endswith("< 5 MB  met") for line in deployment[::2])
+
+
+def test_deployment(bench):
+    names = [word for name in ("guards", "tick", "rate") for word in ("--only", name)]  # test_loop has the memory
+    lines = bench("bench_deploy", "--count", 100, "--seconds", 0.6, "--rounds", 1, "--cpu", *names)
+    firsts = (
+        "guards together, 6-joint arm, a tick",
+        "observation in to command out",
+        "recorder's share of a tick",
+        "100 Hz against the embedded server",
+    )
+    found = [next(line for line in lines if first in line) for first in firsts]
+    assert all(line.endswith(("met", "missed")) for line in found)
+    assert lines[0].split() == ["figure", "measured", "target"]
