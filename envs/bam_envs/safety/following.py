@@ -141,7 +141,9 @@ class JointFollowing(Following):
         return True
 
     def _go_near(self, tick: Tick, wanted: Numbers, command: Numbers) -> None:
-        """Set the joints of `command` to `wanted`, at most one step from the last command: a measurement may be wrong.
+        """Set the joints of `command` as near to `wanted` as the limits of joints and tool allow from the last command.
+
+        The measurement may be wrong.
 
         Args:
             tick: The tick.
@@ -149,8 +151,13 @@ class JointFollowing(Following):
             command: The command to change. Shape: (m,).
         """
         steps = self._slow_step if tick.approach else self._step
-        for at, value, step in zip(self._joints, wanted, steps, strict=True):
-            command[at] = min(max(value, tick.last[at] - step), tick.last[at] + step)
+        last = [tick.last[at] for at in self._joints]
+        rows = zip(wanted, last, steps, strict=True)
+        near = [min(max(value, begin - step), begin + step) for value, begin, step in rows]
+        if self._tool is not None:
+            near = within_reach(self._tool, last, near, self._tool_reach)
+        for at, value in zip(self._joints, near, strict=True):
+            command[at] = value
 
 
 class BaseFollowing(Following):

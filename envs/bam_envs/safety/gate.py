@@ -332,6 +332,7 @@ class SafeRobot(metaclass=Sealed):
             return last
         if self._live is not None and self._state is not None:
             self._state = self._fresh_state()
+            self._require_in_range(self._state)  # a motion does not begin at a wrong measurement
         measured, command = self._measured(self._places), self.spec.command
         if self._is_base:
             last = [0.0] * len(measured)
