@@ -57,6 +57,8 @@ class TrainSettings:
     """Threads that torch computes with (default 1: more is slower on small networks)."""
     trainer: str = "sb3"
     """Library that trains: sb3 (default) or rllib."""
+    start: str | None = None
+    """Checkpoint whose weights a new run of sb3 begins with: to harden a policy with env_kwargs.randomize, say."""
     until_success: _Share | None = None
     """Stop once this share of evaluation episodes succeeds, such as 0.99."""
     trial_threshold: Annotated[float, Meta(gt=0, lt=1, description="a share above 0 and below 1, such as 0.9")] = 0.9

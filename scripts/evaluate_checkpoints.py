@@ -27,7 +27,7 @@ from bam_train.trainers.resolve_settings import resolve
 FOLDER = Path(__file__).resolve().parents[1] / "checkpoints"
 HEADER = ("checkpoint", "command", "seed", "steps", "wall time", "success", "size")
 FLAGS = (
-    *("steps", "seed", "num_envs", "device", "threads", "until_success", "eval_every", "eval_episodes"),
+    *("steps", "seed", "num_envs", "device", "threads", "start", "until_success", "eval_every", "eval_episodes"),
     *("num_env_runners", "num_learners", "num_gpus", "address", "data"),
 )
 """Settings that have a flag of their own."""

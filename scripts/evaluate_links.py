@@ -1,7 +1,8 @@
-"""How well checkpoints do behind imperfect links: plain, randomised, with late commands, and under each link profile.
+"""How well checkpoints do when robot, link or computer are worse than in training; prints a table in Markdown.
 
-Prints a table in Markdown. Of each checkpoint the same episodes are played in every column; the share of its plain
-success that is left stands in brackets.
+Each column plays the same episodes: plain; with domain randomisation; with actions that reach the task two steps late,
+as those of a slow policy; with commands that reach the robot two steps late; and under each link profile. The share of
+the plain success that is left stands in brackets.
 """
 
 from __future__ import annotations
@@ -9,6 +10,8 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from bam_envs.core.errors import BamEnvsError
 from bam_envs.core.registry import entry_of
@@ -19,20 +22,42 @@ from bam_train.evaluation import evaluate
 from bam_train.policy import FrozenPolicy
 
 FOLDER = Path(__file__).resolve().parents[1] / "checkpoints"
+LATE_ACTIONS = "late actions"
 SEED = 3_000_000
 """Seed of the first episode: neither training nor `bam-eval` has played it."""
+
+
+STEPS = 2
+"""Delay of late actions and commands [steps]."""
+
+
+class Late:
+    """A policy whose actions come `STEPS` steps late; until then they are zero."""
+
+    def __init__(self, policy: FrozenPolicy) -> None:
+        self.policy, self.actions = policy, list[Any]()
+
+    def reset(self, env_ids: Any = None) -> None:
+        """Begin an episode in every environment."""
+        self.policy.reset()
+        self.actions = []
+
+    def act_batch(self, observations: Any) -> Any:
+        """The actions for the observations `STEPS` steps ago. Shapes: (n, ...) -> (n, a)."""
+        self.actions.append(self.policy.act_batch(observations))
+        return self.actions[-1 - STEPS] if len(self.actions) > STEPS else np.zeros_like(self.actions[0])
 
 
 def columns(period: float) -> dict[str, dict[str, Any]]:
     """Arguments of the environment for each column of the table; `period` is the robot's [s]."""
     plain = {"randomize": False, "link": None}
-    late = {"command_delay": [2 * period, 2 * period], "state_delay": [0.0, 0.0]}
-    links = {name: {**plain, "link": name} for name in PROFILES}
+    late = {"command_delay": [STEPS * period] * 2, "state_delay": [0.0, 0.0]}
     return {
         "plain": plain,
         "randomised": {**plain, "randomize": True},
-        "commands 2 steps late": {**plain, "link": late},
-        **links,
+        LATE_ACTIONS: plain,
+        "late commands": {**plain, "link": late},
+        **{name: {**plain, "link": name} for name in PROFILES},
         "randomised, wifi": {"randomize": True, "link": "wifi"},
     }
 
@@ -46,7 +71,8 @@ def row(path: Path, episodes: int) -> list[str]:
         raise BamTrainError(f"{path}: {manifest.env} has no robot that a link could be put before; leave it out")
     policy, cells, plain = FrozenPolicy.from_checkpoint(checkpoint), [path.name], 0.0
     for name, given in columns(entry.period).items():
-        report = evaluate(policy, manifest.env, {**manifest.env_kwargs, **given}, episodes=episodes, seed=SEED)
+        acting = Late(policy) if name == LATE_ACTIONS else policy
+        report = evaluate(acting, manifest.env, {**manifest.env_kwargs, **given}, episodes=episodes, seed=SEED)
         rate = report.success_rate or 0.0
         plain = rate if name == "plain" else plain
         cells.append(f"{rate:.1%}" + (f" ({rate / plain:.3f})" if plain and name != "plain" else ""))

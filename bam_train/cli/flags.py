@@ -38,6 +38,7 @@ _METAVARS = {
     "trial_threshold": "SHARE",
     "address": "auto|HOST:PORT",
     "data": "FOLDER",
+    "start": "CHECKPOINT",
     "transport": "URL,...",
     "ca_file": "FILE",
     "token_file": "FILE",

@@ -77,6 +77,8 @@ def _require_of_trainer(settings: TrainSettings) -> None:
             if field.name in OF_RLLIB and getattr(settings, field.name) != field.default:
                 text = "the sb3 trainer has no use for it; leave it out, or add --trainer rllib"
                 raise SettingsError(f"{field.name}: {text}")
+    elif settings.start is not None:
+        raise SettingsError(f"start: the {settings.trainer} trainer has no use for it; leave it out")
 
 
 def own_settings(checkpoint: Checkpoint, env: str | None = None, *, elsewhere: bool = False) -> dict[str, Any]:

@@ -86,14 +86,27 @@ def members(
     return written
 
 
-def load(checkpoint: Checkpoint, model: Any, venv: Any, normaliser: VecNormalize | None) -> Waiting:
-    """Restore a checkpoint's state into a new model of the same settings; returns the part to be restored later."""
+def load_weights(checkpoint: Checkpoint, model: Any) -> None:
+    """Restore the weights of a checkpoint, and the state of its optimisers, into a new model of the same networks."""
     with checkpoint.fitting(MODEL):
         weights = checkpoint.state(MODEL, torch.from_numpy)
         model.set_parameters(weights["states"], exact_match=True, device=model.device)
         for name, value in weights["loose"].items():
             if value is not None:
                 recursive_getattr(model, name).data.copy_(value)
+
+
+def begin_with(checkpoint: Checkpoint, model: Any, normaliser: VecNormalize | None) -> None:
+    """Give a new run the weights of a checkpoint, and what its observations and rewards are normalised by."""
+    load_weights(checkpoint, model)
+    if normaliser is not None:
+        with checkpoint.fitting(STATE):
+            _load_statistics(normaliser, checkpoint.state(STATE, torch.from_numpy)["normaliser"])
+
+
+def load(checkpoint: Checkpoint, model: Any, venv: Any, normaliser: VecNormalize | None) -> Waiting:
+    """Restore a checkpoint's state into a new model of the same settings; returns the part to be restored later."""
+    load_weights(checkpoint, model)
     tree = checkpoint.state(STATE, torch.from_numpy)
     with checkpoint.fitting(STATE):
         _load_counters(model, tree["counters"])

@@ -24,7 +24,7 @@ from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 from bam_envs.core.spaces import space_to_json
 from bam_train.checkpoint import Checkpoint, write_checkpoint
 from bam_train.environments import control_period, make_env, make_vector_env, require_fit
-from bam_train.errors import TrainingFailed
+from bam_train.errors import CheckpointMismatch, TrainingFailed
 from bam_train.policy import FrozenPolicy
 from bam_train.settings import TrainSettings
 from bam_train.trainers.algorithms import SB3_ALGORITHMS
@@ -84,6 +84,19 @@ class SB3Trainer:
     @classmethod
     def create(cls, settings: TrainSettings) -> SB3Trainer:
         """Set up a new run of complete settings."""
+        trainer = cls._made(settings)
+        if settings.start is not None:
+            checkpoint = Checkpoint.open(settings.start)
+            require_fit(checkpoint, one_env(trainer.venv), settings.place)
+            made = checkpoint.manifest
+            if (made.trainer, made.algorithm) != (settings.trainer, settings.algo):
+                text = f"was trained by {made.algorithm} of {made.trainer}: {settings.algo} of sb3 cannot begin with it"
+                raise CheckpointMismatch(checkpoint.path, f"{text}; leave start out, or give --algo {made.algorithm}")
+            resume.begin_with(checkpoint, trainer.model, trainer._normaliser)
+        return trainer
+
+    @classmethod
+    def _made(cls, settings: TrainSettings) -> SB3Trainer:
         torch.set_num_threads(settings.threads)
         venv = make_training_env(settings.env, settings.env_kwargs, settings.num_envs, settings.place)
         model, notices = hyperparameters.make_model(settings, venv)
@@ -96,7 +109,7 @@ class SB3Trainer:
     def load(cls, checkpoint: Checkpoint, settings: TrainSettings | None = None) -> SB3Trainer:
         """Set up a run that continues from a checkpoint, with the checkpoint's settings or with `settings`."""
         settings = settings or TrainSettings.from_mapping(own_settings(checkpoint), str(checkpoint.path))
-        trainer = cls.create(settings)
+        trainer = cls._made(settings)
         require_fit(checkpoint, one_env(trainer.venv), settings.place)
         trainer._waiting = resume.load(checkpoint, trainer.model, trainer.venv, trainer._normaliser)
         if not trainer._waiting.same_episodes:

@@ -62,6 +62,7 @@ ROBO_GYM = {"env": "NoObstacleNavigationMir100Sim", "algo": "ppo"}
             "sac does not fit CartPole-v1: it takes Box actions, found Discrete. Use one of: ",
         ),
         ({"trainer": "sb"}, "Unknown trainer 'sb'. Did you mean 'sb3'?"),
+        ({"start": "a.zip", "trainer": "rllib"}, "start: the rllib trainer has no use for it; leave it out"),
         ({"data": "a.parquet"}, "data: the sb3 trainer has no use for it; leave it out, or add --trainer rllib"),
         (
             {"transport": ["tcp://a:1"], "env_kwargs": {"randomize": True}},

@@ -14,7 +14,7 @@ from bam_envs.core.errors import LinkLost
 from bam_envs.remote.serve.env_server import EnvServer
 from bam_envs.remote.serve.tcp_server import TcpServer
 from bam_train.checkpoint import Checkpoint
-from bam_train.errors import EnvironmentFailed, SettingsError, TrainingFailed
+from bam_train.errors import CheckpointError, EnvironmentFailed, SettingsError, TrainingFailed
 from bam_train.policy import FrozenPolicy
 from bam_train.settings import TrainSettings
 from bam_train.trainers.sb3.sb3_trainer import SB3Trainer
@@ -46,6 +46,37 @@ def test_a_checkpoint_says_where_it_comes_from_and_holds_the_policy(walk, tmp_pa
     wanted = trainer.model.predict(observations, deterministic=True)[0]
     for policy in (trainer.freeze(), FrozenPolicy.load(tmp_path / "a.zip")):
         assert np.abs(policy.act_batch(observations) - wanted).max() <= 1e-5
+
+
+@pytest.mark.parametrize("normalize", [False, True])
+def test_a_new_run_begins_with_the_weights_of_another(walk, tmp_path, normalize):
+    path = tmp_path / "plain.zip"
+    plain = SB3Trainer.create(completed(walk, hyperparameters=FIRST, seed=4, normalize=normalize))
+    plain.train(96, lambda progress: True)
+    plain.save(path, {}, {"best": None})
+    hardened = SB3Trainer.create(completed(walk, hyperparameters=FIRST, seed=5, normalize=normalize, start=str(path)))
+    assert hardened.steps == 0
+    observations = np.random.default_rng(0).uniform(-1, 1, (50, 2)).astype(np.float32)
+    np.testing.assert_array_equal(hardened.freeze().act_batch(observations), plain.freeze().act_batch(observations))
+    hardened.train(96, lambda progress: True)
+    hardened.save(tmp_path / "hard.zip", {}, {"best": None})
+    path.unlink()  # a resumed run needs its own checkpoint only
+    again = SB3Trainer.load(Checkpoint.open(tmp_path / "hard.zip"))
+    assert (again.steps, again.settings.start) == (hardened.steps, str(path))
+
+
+def test_weights_that_a_run_cannot_begin_with(walk, tmp_path):
+    path = tmp_path / "a.zip"
+    trainer = SB3Trainer.create(completed(walk, hyperparameters=FIRST))
+    trainer.train(64, lambda progress: True)
+    trainer.save(path, {}, {"best": None})
+    for given, text in (
+        ({"algo": "a2c"}, "was trained by ppo of sb3: a2c of sb3 cannot begin with it; leave start out, or give "),
+        ({"hyperparameters": {"policy_kwargs": {"net_arch": [8]}}}, "bam/resume/model does not fit these settings: "),
+    ):
+        with pytest.raises(CheckpointError, match=text) as caught:
+            SB3Trainer.create(completed(walk, start=str(path), **given))
+        assert str(caught.value).startswith(f"{path}: ")
 
 
 def test_it_trains_on_as_many_environments_as_the_servers_have(walk, rows, tmp_path):
