@@ -193,8 +193,8 @@ class ClockedEnv(gym.Wrapper[Any, Any, Any, Any]):
         self.policy, self.standin, self.shares = policy, standin, shares
         self.made = self.came = 0.0
         self.times: dict[str, list[float]] = {"policy": [], "command": [], "frames": [], "recorder": []}
-        """Durations [s]: of the policy, from an observation to its command, from a state's frames to the command's, and of
-        the recorder, which is the last of `shares`."""
+        """Durations [s]: of the policy, from an observation to its command, from a state's frames to the command's, and
+        of the recorder, the last of `shares`."""
 
     def reset(self, **arguments: Any) -> Any:
         """Begin an episode."""

@@ -9,6 +9,7 @@ import pytest
 from bam_envs.core.errors import LinkLost, NoServer, NotReady, SafetyStop, StaleState
 from bam_envs.core.robot import Initial
 from bam_envs.live.building import live_robot, profile_limits
+from bam_envs.live.diagnosis import STEPS, Diagnosis
 from bam_envs.robots.profile import load_profile
 from bam_envs.robots.ur5e import arm_spec
 
@@ -181,3 +182,19 @@ def test_a_topic_that_is_not_what_the_profile_says(changes, text, rosbridge, rob
     with pytest.raises(StaleState, match=text):
         robot.connect()
     robot.close()
+
+
+def test_a_diagnosis_finds_it_well_and_moves_nothing(rosbridge, robot_node):
+    robot_node.ask("forget")
+    diagnosis = Diagnosis(rosbridge.url, seconds=2.0)
+    try:
+        steps = list(diagnosis.steps())
+    finally:
+        diagnosis.close()
+    assert [step.name for step in steps] == list(STEPS)
+    assert all(step.verdict != "failed" for step in steps), steps
+    assert diagnosis.profile.name == "ur5e"
+    assert robot_node.ask("report")["received"] == []
+    link = diagnosis.measurement.profile()
+    assert link.command_loss < 0.1
+    assert 0.0 < link.command_delay[50] < 0.1

@@ -98,6 +98,7 @@ class Diagnosis:
         if profile is None and robot is not None:
             self.profile = profile_for(robot.spec)
         self._info: RobotInfo | None = None
+        self._has_rosapi = False
         self._link = RosbridgeLink(endpoint, name="doctor")
         self._timeout = endpoint.timeout or bringup.TIMEOUT
 
@@ -169,6 +170,7 @@ class Diagnosis:
                     f"{namespaces_with(link, 'topics', topic)}"
                 )
         findings.text.append(f"profile {profile.name}: {', '.join(topics)}")
+        self._has_rosapi = types.answers
         if types.answers:
             findings.text.append("all of the expected types")
         else:
@@ -263,8 +265,11 @@ class Diagnosis:
         why = robot.not_ready()
         if why is not None:
             raise NotReady(f"{why}; bring the robot into the state in which it takes commands, then run this again")
-        findings.text.append("the topics of commands have listeners, and the connection that halts is open")
-        findings.text.append("ready; nothing was sent")
+        if self._has_rosapi:
+            findings.text.append("the topics of commands have listeners")
+        else:
+            findings.warnings.append("without a rosapi node the server does not say whether anybody listens to commands")
+        findings.text.append("the connection that halts is open; ready; nothing was sent")
 
     def _guards(self, findings: _Findings) -> None:
         robot, _ = self._known()
