@@ -268,7 +268,7 @@ class Diagnosis:
         if self._has_rosapi:
             findings.text.append("the topics of commands have listeners")
         else:
-            findings.warnings.append("without a rosapi node the server does not say whether anybody listens to commands")
+            findings.warnings.append("without a rosapi node the server cannot say whether anybody listens")
         findings.text.append("the connection that halts is open; ready; nothing was sent")
 
     def _guards(self, findings: _Findings) -> None:
