@@ -24,8 +24,26 @@ LINKS = ("shoulder_link", "upper_arm_link", "forearm_link", "wrist_1_link", "wri
 
 
 @dataclass(frozen=True)
+class ArmOutline:
+    """Offsets and radii of the tubes of an arm [m]."""
+
+    upper_arm_offset: float
+    """Offset of the upper arm's tube from the arm's middle plane, along the shoulder axis."""
+    forearm_offset: float
+    """Offset of the forearm's tube, along the same axis."""
+    base: float
+    """Radius of base and shoulder."""
+    upper_arm: float
+    """Radius of the upper arm."""
+    forearm: float
+    """Radius of the forearm."""
+    wrist: float
+    """Radius of the wrists and of the flange."""
+
+
+@dataclass(frozen=True)
 class ArmGeometry:
-    """The six lengths of a Universal Robots arm and its tool [m]."""
+    """The six lengths of a Universal Robots arm and its tool [m], and the tubes around them."""
 
     d1: float
     """Height of the shoulder axis above the base."""
@@ -41,6 +59,8 @@ class ArmGeometry:
     """Wrist 2 to the flange."""
     tool: float = 0.0
     """Flange to the tool's centre point along the flange axis."""
+    outline: ArmOutline | None = None
+    """The arm's tubes; None if they are not known."""
 
     def tool_pose(self, q: Array) -> tuple[Array, Array]:
         """Position of the tool and the direction of its x axis.
@@ -172,13 +192,22 @@ class ArmGeometry:
         return q
 
 
-UR3 = ArmGeometry(d1=0.1519, a2=-0.24365, a3=-0.21325, d4=0.11235, d5=0.08535, d6=0.0819)
-UR3E = ArmGeometry(d1=0.15185, a2=-0.24355, a3=-0.2132, d4=0.13105, d5=0.08535, d6=0.0921)
-UR5 = ArmGeometry(d1=0.089159, a2=-0.425, a3=-0.39225, d4=0.10915, d5=0.09465, d6=0.0823)
-UR5E = ArmGeometry(d1=0.1625, a2=-0.425, a3=-0.3922, d4=0.1333, d5=0.0997, d6=0.0996)
-UR10 = ArmGeometry(d1=0.1273, a2=-0.612, a3=-0.5723, d4=0.163941, d5=0.1157, d6=0.0922)
-UR10E = ArmGeometry(d1=0.1807, a2=-0.6127, a3=-0.57155, d4=0.17415, d5=0.11985, d6=0.11655)
-UR16E = ArmGeometry(d1=0.1807, a2=-0.4784, a3=-0.36, d4=0.17415, d5=0.11985, d6=0.11655)
+_SMALL, _MIDDLE, _LARGE = (0.060, 0.048, 0.040, 0.0315), (0.070, 0.054, 0.042, 0.0375), (0.085, 0.075, 0.055, 0.045)
+"""Radii of base, upper arm, forearm and wrists [m]: ROS-Industrial's ur_description, measured from models."""
+
+
+def _arm(lengths: tuple[float, ...], offsets: tuple[float, float], radii: tuple[float, ...]) -> ArmGeometry:
+    """An arm of the lengths d1, a2, a3, d4, d5 and d6 [m]; the offsets are of upper arm and forearm."""
+    return ArmGeometry(*lengths, outline=ArmOutline(*offsets, *radii))
+
+
+UR3 = _arm((0.1519, -0.24365, -0.21325, 0.11235, 0.08535, 0.0819), (0.1198, 0.0273), _SMALL)
+UR3E = _arm((0.15185, -0.24355, -0.2132, 0.13105, 0.08535, 0.0921), (0.1200, 0.0270), _SMALL)
+UR5 = _arm((0.089159, -0.425, -0.39225, 0.10915, 0.09465, 0.0823), (0.13585, 0.0165), _MIDDLE)
+UR5E = _arm((0.1625, -0.425, -0.3922, 0.1333, 0.0997, 0.0996), (0.1380, 0.0070), _MIDDLE)
+UR10 = _arm((0.1273, -0.612, -0.5723, 0.163941, 0.1157, 0.0922), (0.220941, 0.049041), _LARGE)
+UR10E = _arm((0.1807, -0.6127, -0.57155, 0.17415, 0.11985, 0.11655), (0.1762, 0.0393), _LARGE)
+UR16E = _arm((0.1807, -0.4784, -0.36, 0.17415, 0.11985, 0.11655), (0.1760, 0.0390), _LARGE)
 UR5E_GRIPPER = replace(UR5E, tool=0.15)
 """A UR5e with a parallel gripper; the tool is the middle of the gripper's pads."""
 UR_JOINTS = (

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from bam_envs.core import kinematics
 from bam_envs.core.errors import UnknownName
-from bam_envs.core.kinematics import ArmGeometry
+from bam_envs.core.kinematics import ArmGeometry, ArmOutline
 from bam_envs.core.robot import RobotSpec
 from bam_envs.robots.ur5e import COMMAND, arm_spec
 from bam_envs.robots.ur5e import JOINTS as JOINTS
@@ -25,24 +25,6 @@ DEFAULT_MODEL = "ur5"
 """The default model: that of robo-gym, so that its policies fit."""
 START = (0.0, -2.5, 1.5, 0.0, -1.4, 0.0)
 """Joint positions [rad] with every model's flange in the air before it, clear of itself and of the table."""
-
-
-@dataclass(frozen=True)
-class ArmOutline:
-    """Offsets and radii of the tubes of an arm [m]."""
-
-    upper_arm_offset: float
-    """Offset of the upper arm's tube from the arm's middle plane, along the shoulder axis."""
-    forearm_offset: float
-    """Offset of the forearm's tube, along the same axis."""
-    base: float
-    """Radius of base and shoulder."""
-    upper_arm: float
-    """Radius of the upper arm."""
-    forearm: float
-    """Radius of the forearm."""
-    wrist: float
-    """Radius of the wrists and of the flange."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,28 +44,24 @@ class UrModel:
     outline: ArmOutline
 
 
-def _model(
-    name: str, geometry: ArmGeometry, degrees: tuple[int, int], workspace: tuple[float, float], outline: ArmOutline
-) -> UrModel:
+def _model(name: str, geometry: ArmGeometry, degrees: tuple[int, int], workspace: tuple[float, float]) -> UrModel:
     """A model; `degrees` are the speeds of shoulder and wrists [degrees/s], an elbow does 180."""
     turn, elbow = 2 * math.pi, math.pi
     high = np.array([turn, turn, elbow, turn, turn, turn])
     speeds = np.radians([degrees[0], degrees[0], 180, degrees[1], degrees[1], degrees[1]])
     for array in (limits := np.stack([-high, high]), speeds):
         array.setflags(write=False)
-    return UrModel(name, geometry, limits, speeds, *workspace, outline)
+    return UrModel(name, geometry, limits, speeds, *workspace, geometry.outline)  # type: ignore[arg-type]
 
 
-_SMALL, _MIDDLE, _LARGE = (0.060, 0.048, 0.040, 0.0315), (0.070, 0.054, 0.042, 0.0375), (0.085, 0.075, 0.055, 0.045)
-"""Radii of base, upper arm, forearm and wrists [m]."""
 _MODELS = [
-    _model("ur3", kinematics.UR3, (180, 360), (0.45, 0.2), ArmOutline(0.1198, 0.0273, *_SMALL)),
-    _model("ur3e", kinematics.UR3E, (180, 360), (0.45, 0.2), ArmOutline(0.1200, 0.0270, *_SMALL)),
-    _model("ur5", kinematics.UR5, (180, 180), (0.75, 0.2), ArmOutline(0.13585, 0.0165, *_MIDDLE)),
-    _model("ur5e", kinematics.UR5E, (180, 180), (0.75, 0.2), ArmOutline(0.1380, 0.0070, *_MIDDLE)),
-    _model("ur10", kinematics.UR10, (120, 180), (1.3, 0.3), ArmOutline(0.220941, 0.049041, *_LARGE)),
-    _model("ur10e", kinematics.UR10E, (120, 180), (1.3, 0.3), ArmOutline(0.1762, 0.0393, *_LARGE)),
-    _model("ur16e", kinematics.UR16E, (120, 180), (0.8, 0.3), ArmOutline(0.1760, 0.0390, *_LARGE)),
+    _model("ur3", kinematics.UR3, (180, 360), (0.45, 0.2)),
+    _model("ur3e", kinematics.UR3E, (180, 360), (0.45, 0.2)),
+    _model("ur5", kinematics.UR5, (180, 180), (0.75, 0.2)),
+    _model("ur5e", kinematics.UR5E, (180, 180), (0.75, 0.2)),
+    _model("ur10", kinematics.UR10, (120, 180), (1.3, 0.3)),
+    _model("ur10e", kinematics.UR10E, (120, 180), (1.3, 0.3)),
+    _model("ur16e", kinematics.UR16E, (120, 180), (0.8, 0.3)),
 ]
 UR_MODELS = {model.name: model for model in _MODELS}
 """Models by name."""

@@ -55,8 +55,7 @@ class ArmContacts:
     """
 
     def __init__(self, model: UrModel) -> None:
-        self._geometry, self._outline = model.geometry, model.outline
-        shape = model.outline
+        self._geometry, self._outline = model.geometry, (shape := model.outline)
         self._radius = np.array(
             [shape.base, shape.upper_arm, shape.upper_arm, shape.forearm, *[shape.wrist] * 3, shape.forearm]
         )

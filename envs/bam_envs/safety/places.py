@@ -1,0 +1,180 @@
+"""The guards that keep a robot out of a place: a box around its tool, its own links, the table, and singularities.
+
+Each looks where the robot would come to rest if it braked after the command, and shortens the step until that is
+outside the place, if necessary by braking harder than the limit on acceleration. A robot that is in such a place
+already may stay or leave, and must not go farther in.
+"""
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+from bam_envs.core.kinematics import ArmGeometry
+from bam_envs.core.errors import InvalidValue
+from bam_envs.core.robot import RobotSpec
+from bam_envs.safety.guard import Guard, Limits, Numbers, Tick, ToolPoint, columns_in, max_rate
+from bam_envs.safety.tubes import ArmTubes
+
+_HALVINGS = 6
+"""The allowed share of a step is found to 1/64."""
+_TOUCH = 1e-9
+"""A robot this little in a place [m] is outside."""
+_REGULAR = 0.45
+"""An arm none of whose three factors of the Jacobian's determinant is below this is far from a singularity."""
+
+
+class Place(Guard):
+    """Base class of the guards of an arm: `depth` says how far in a forbidden place it is at some joints."""
+
+    keeps_out = True
+
+    def __init__(self, spec: RobotSpec, limits: Limits) -> None:
+        self._joints, self._change = columns_in(spec.command, "rad"), limits.joint_acceleration * spec.period**2
+
+    def depth(self, joints: Sequence[float]) -> float:
+        """How far in a forbidden place the arm is at `joints` (k,) [rad]; 0 outside."""
+        raise NotImplementedError
+
+    def is_outside(self, joints: Sequence[float]) -> bool:
+        """Whether the arm at `joints` (k,) [rad] is outside; called once in each tick, and may be quicker."""
+        return self.depth(joints) <= _TOUCH
+
+    def rest(self, last: Numbers, step: Numbers, share: float = 1.0) -> Numbers:
+        """Where the joints come to rest after `share` of `step` from `last`, if they brake together. Shape: (k,)."""
+        # Braking takes n steps, each shorter by the same part: together they are (n - 1) / 2 times as long as the first.
+        braking = math.ceil(share * max(map(abs, step)) / self._change - 1e-6)
+        share *= 1.0 + max(0, braking - 1) / 2.0
+        return [one + share * way for one, way in zip(last, step, strict=True)]
+
+    def limit(self, tick: Tick) -> bool:
+        """Shorten the step of all joints."""
+        last = [tick.last[at] for at in self._joints]
+        step = [tick.command[at] - one for at, one in zip(self._joints, last, strict=True)]
+        if self.is_outside(self.rest(last, step)):
+            return False
+        here = max(self.depth(last), _TOUCH)
+        if self.depth(self.rest(last, step)) <= here:  # it comes out
+            return False
+        least, most = 0.0, 1.0
+        for _ in range(_HALVINGS):
+            middle = (least + most) / 2.0
+            if self.depth(self.rest(last, step, middle)) <= here:
+                least = middle
+            else:
+                most = middle
+        for at, one, way in zip(self._joints, last, step, strict=True):
+            tick.command[at] = one + least * way
+        return True
+
+
+class WorkspaceBox(Place):
+    """The tool stays in a box. Zero is a limit like any other number.
+
+    Args:
+        spec: The arm.
+        limits: Its limits, of which the acceleration counts.
+        low: Lowest x, y and z [m], in ``base_link``; minus infinity for none.
+        high: Highest x, y and z [m].
+        tool: Forward kinematics of one pose.
+
+    Raises:
+        InvalidValue: `low` is not below `high`.
+    """
+
+    number, name, unit = "G10", "workspace box", "m"
+
+    def __init__(
+        self, spec: RobotSpec, limits: Limits, low: Sequence[float], high: Sequence[float], tool: ToolPoint
+    ) -> None:
+        super().__init__(spec, limits)
+        self._low, self._high = (*map(float, low),), (*map(float, high),)
+        _require_room(self._low, self._high)
+        self._tool = tool
+        self.limit_value = max(most - least for least, most in zip(self._low, self._high, strict=True))
+
+    def depth(self, joints: Sequence[float]) -> float:
+        """Distance of the tool outside the box, along the axis where it is farthest [m]."""
+        x, y, z = self._tool(joints)
+        low, high = self._low, self._high
+        return max(low[0] - x, x - high[0], low[1] - y, y - high[1], low[2] - z, z - high[2], 0.0)
+
+    def start_fault(self, start: Numbers) -> str | None:
+        """Why the arm must not go to `start` (m,)."""
+        joints = [start[at] for at in self._joints]
+        if self.depth(joints) <= _TOUCH:
+            return None
+        at, low, high = (", ".join(f"{one:.3f}" for one in point) for point in (self._tool(joints), self._low, self._high))
+        return f"the tool would be at {at} m, outside the box from {low} to {high} m: widen the box, or choose another start"
+
+
+class BaseBox(Guard):
+    """A base stays in a rectangle of its map: it brakes before the edge, and may turn there and drive back.
+
+    Args:
+        spec: The base, whose ``base_pose`` is measured.
+        limits: Its limits, of which acceleration and lag count.
+        low: Lowest x and y of its frame [m].
+        high: Highest x and y [m].
+
+    Raises:
+        InvalidValue: `low` is not below `high`.
+    """
+
+    number, name, unit, keeps_out = "G10", "workspace box", "m", True
+
+    def __init__(self, spec: RobotSpec, limits: Limits, low: Sequence[float], high: Sequence[float]) -> None:
+        self._low, self._high = (*map(float, low),), (*map(float, high),)
+        _require_room(self._low, self._high)
+        self.limit_value = max(most - least for least, most in zip(self._low, self._high, strict=True))
+        (self._drive,) = columns_in(spec.command, "m/s")
+        self._brakes = min(limits.base_acceleration, max_rate(spec.command)[self._drive])
+        self._delay = spec.period + (spec.lag if limits.lag is None else limits.lag)
+
+    def limit(self, tick: Tick) -> bool:
+        """Limit the speed to what leaves room to brake."""
+        if "base_pose" not in tick.signals:
+            return False
+        x, y, yaw = tick.signals["base_pose"][0].tolist()
+        speed = tick.command[self._drive]
+        way = math.copysign(1.0, speed) * math.cos(yaw), math.copysign(1.0, speed) * math.sin(yaw)
+        room = math.inf
+        for place, along, least, most in zip((x, y), way, self._low, self._high, strict=True):
+            if along:
+                room = min(room, max(0.0, (most - place if along > 0.0 else place - least) / abs(along)))
+        # v delay + v^2 / 2a = room
+        delay = self._brakes * self._delay
+        fastest = math.sqrt(delay * delay + 2.0 * self._brakes * room) - delay if room < math.inf else math.inf
+        if not abs(speed) > fastest:
+            return False
+        tick.command[self._drive] = math.copysign(fastest, speed)
+        return True
+
+
+class Collision(Place):
+    """Tubes of the arm that share no joint stay apart, and all stay above the table."""
+
+    number, name, unit, setting = "G24", "collision", "m", "clearance"
+
+    def __init__(self, spec: RobotSpec, limits: Limits, tubes: ArmTubes) -> None:
+        super().__init__(spec, limits)
+        self.limit_value, self._tubes, self._table = limits.clearance, tubes, limits.table_height
+
+    def depth(self, joints: Sequence[float]) -> float:
+        """By how much the least distance is below the limit [m]."""
+        distance = min(self._tubes.nearest(joints), self._tubes.lowest(joints) - self._table)
+        return max(0.0, self.limit_value - distance)
+
+    def is_outside(self, joints: Sequence[float]) -> bool:
+        """As `depth`, with pairs of tubes that cannot be near left out."""
+        low = self._tubes.lowest(joints) - self._table < self.limit_value
+        return not low and not self._tubes.nearer_than(self.limit_value, joints)
+
+    def start_fault(self, start: Numbers) -> str | None:
+        """Why the arm must not go to `start` (m,)."""
+        if (depth := self.depth([start[at] for at in self._joints])) <= _TOUCH:
+            return None
+        return (
+            f"the arm would be {self.limit_value - depth:.3f} m from itself or from the table at "
+            f"{self._table:g} m, and {self.limit_value:g} m are kept: choose another start, or correct table_height"
+        )

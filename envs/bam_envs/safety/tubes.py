@@ -1,0 +1,107 @@
+"""The tubes of a Universal Robots arm in plain numbers: how near they come to each other and to the table.
+
+All points are in the arm's vertical plane (radial, sideways, height), which turns with joint 1: neither that joint nor
+the last one changes a distance. The tubes and pairs are those of the simulation (`ArmContacts`); the last tube reaches
+to the end of the tool where there is one.
+"""
+
+import math
+from collections.abc import Sequence
+
+from bam_envs.core.kinematics import ArmGeometry, ArmOutline
+
+Point = tuple[float, float, float]
+Tube = tuple[Point, Point, float]
+"""Two ends and the radius [m]."""
+_BASE, _SHOULDER, _UPPER, _FOREARM, _WRIST_1, _WRIST_2, _WRIST_3, _ELBOW = range(8)
+_PAIRS = (
+    *((one, other, 0) for one in (_BASE, _SHOULDER) for other in (_FOREARM, _WRIST_1, _WRIST_2, _WRIST_3)),
+    *((_UPPER, other, 1) for other in (_WRIST_1, _WRIST_2, _WRIST_3)),
+    (_FOREARM, _WRIST_3, 2),
+)
+"""Tubes that share no joint and can touch; the joints from 2, 3 or 4 on, counted from 0 here, change their distance."""
+
+
+class ArmTubes:
+    """Distances of an arm's tubes; `tool` is whether the geometry's tool is really there."""
+
+    def __init__(self, geometry: ArmGeometry, outline: ArmOutline, *, tool: bool) -> None:
+        self._arm, self._outline, self._tool = geometry, outline, geometry.tool if tool else 0.0
+        self._radii = [outline.base, *[outline.upper_arm] * 2, outline.forearm, *[outline.wrist] * 3, outline.forearm]
+        end = geometry.d6 + self._tool
+        wrist = geometry.d5 + end
+        self._levers = abs(geometry.a2) + abs(geometry.a3) + wrist, abs(geometry.a3) + wrist, wrist, end
+        self._near = [0.0] * len(_PAIRS)
+        self._at: Sequence[float] = [math.inf] * 6
+
+    def lowest(self, q: Sequence[float]) -> float:
+        """Height of the lowest point of the arm at the joints `q` (6,) [rad], up to its flange [m]."""
+        arm, shape, low = self._arm, self._outline, q[1] + q[2] + q[3]
+        elbow = arm.d1 + arm.a2 * math.sin(q[1])
+        wrist_1 = elbow + arm.a3 * math.sin(q[1] + q[2])
+        wrist_2 = wrist_1 - arm.d5 * math.cos(low)
+        flange = wrist_2 - arm.d6 * math.sin(q[4]) * math.sin(low)
+        thick = max(shape.upper_arm, shape.forearm)
+        return min(elbow - thick, wrist_1 - shape.forearm, min(wrist_2, flange) - shape.wrist)
+
+    def nearest(self, q: Sequence[float]) -> float:
+        """Least distance of two tubes at the joints `q` (6,) [rad]; below 0 if they overlap; in m."""
+        tubes = self.tubes(q)
+        return min(self._distance(tubes, one, other) for one, other, _ in _PAIRS)
+
+    def nearer_than(self, margin: float, q: Sequence[float]) -> bool:
+        """Whether two tubes are nearer than `margin` [m] at the joints `q` (6,) [rad].
+
+        A pair is computed anew only after the joints between its tubes have turned far enough, since it was computed
+        last, to bring it within the margin: each turn moves a tube by at most its angle times the arm's length beyond.
+        """
+        moved, at, levers = [0.0] * 3, self._at, self._levers
+        beyond = levers[3] * abs(q[4] - at[4])
+        for group, joint in ((2, 3), (1, 2), (0, 1)):
+            beyond += levers[joint - 1] * abs(q[joint] - at[joint])
+            moved[group] = beyond
+        self._at = list(q)
+        tubes: list[Tube] = []
+        for place, (one, other, group) in enumerate(_PAIRS):
+            self._near[place] -= moved[group]
+            if not self._near[place] >= margin:
+                tubes = tubes or self.tubes(q)
+                self._near[place] = self._distance(tubes, one, other)
+        return min(self._near) < margin
+
+    @staticmethod
+    def _distance(tubes: list[Tube], one: int, other: int) -> float:
+        (start, end, radius), (other_start, other_end, other_radius) = tubes[one], tubes[other]
+        return math.sqrt(segment_distance2(start, end, other_start, other_end)) - radius - other_radius
+
+    def tubes(self, q: Sequence[float]) -> list[Tube]:
+        """Base, shoulder, upper arm, forearm, wrists 1 to 3 (up to the end of the tool), elbow, at `q` (6,) [rad]."""
+        arm, shape, low = self._arm, self._outline, q[1] + q[2] + q[3]
+        sine, cosine, s5, reach = math.sin(low), math.cos(low), math.sin(q[4]), arm.d6 + self._tool
+        upper, fore, d1 = shape.upper_arm_offset, shape.forearm_offset, arm.d1
+        elbow_x, elbow_z = arm.a2 * math.cos(q[1]), d1 + arm.a2 * math.sin(q[1])
+        x, z = elbow_x + arm.a3 * math.cos(q[1] + q[2]), elbow_z + arm.a3 * math.sin(q[1] + q[2])
+        wrist, wrist_1 = (x, fore, z), (x, arm.d4, z)
+        x, z = x + arm.d5 * sine, z - arm.d5 * cosine
+        wrist_2 = x, arm.d4, z
+        tool = x - reach * s5 * cosine, arm.d4 + reach * math.cos(q[4]), z - reach * s5 * sine
+        shoulder, beside = (0.0, 0.0, d1), (0.0, upper, d1)
+        elbow, inside = (elbow_x, upper, elbow_z), (elbow_x, fore, elbow_z)
+        starts = (0.0, 0.0, 0.0), shoulder, beside, inside, wrist, wrist_1, wrist_2, elbow
+        ends = shoulder, beside, elbow, wrist, wrist_1, wrist_2, tool, inside
+        return list(zip(starts, ends, self._radii, strict=True))
+
+
+def segment_distance2(start: Point, end: Point, other_start: Point, other_end: Point) -> float:
+    """Squared distance of two segments [m^2]; Ericson, "Real-Time Collision Detection", 5.1.9."""
+    wx, wy, wz = end[0] - start[0], end[1] - start[1], end[2] - start[2]
+    ox, oy, oz = other_end[0] - other_start[0], other_end[1] - other_start[1], other_end[2] - other_start[2]
+    gx, gy, gz = start[0] - other_start[0], start[1] - other_start[1], start[2] - other_start[2]
+    a, e = max(wx * wx + wy * wy + wz * wz, 1e-12), max(ox * ox + oy * oy + oz * oz, 1e-12)
+    b, c, f = wx * ox + wy * oy + wz * oz, wx * gx + wy * gy + wz * gz, ox * gx + oy * gy + oz * gz
+    slant = a * e - b * b  # 0 if they are parallel: then any first point will do
+    share = min(max((b * f - c * e) / slant, 0.0), 1.0) if slant > 1e-9 * a * e else 0.0
+    other = min(max((b * share + f) / e, 0.0), 1.0)
+    share = min(max((b * other - c) / a, 0.0), 1.0)
+    x, y, z = gx + share * wx - other * ox, gy + share * wy - other * oy, gz + share * wz - other * oz
+    return x * x + y * y + z * z
