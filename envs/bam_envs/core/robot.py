@@ -42,6 +42,31 @@ class SignalSpec:
 
 
 @dataclass(frozen=True)
+class Scanner:
+    """A laser scanner of a base, in a plane above the floor."""
+
+    signal: str
+    """Name of the signal of its ranges [m]."""
+    pose: tuple[float, float, float]
+    """x, y [m] and yaw [rad] in the base's frame."""
+    bearings: tuple[float, ...]
+    """Direction of each ray in the scanner's frame [rad]."""
+
+
+@dataclass(frozen=True)
+class BaseBody:
+    """Shape of a base, a rectangle in its own frame, and its scanners."""
+
+    front: float
+    """Distance of its front ahead of its frame [m]."""
+    back: float
+    """Distance of its back behind its frame [m]."""
+    side: float
+    """Half its width [m]."""
+    scanners: tuple[Scanner, ...]
+
+
+@dataclass(frozen=True)
 class RobotSpec:
     """The description of a robot, known before it is connected."""
 
@@ -54,6 +79,8 @@ class RobotSpec:
     """Time between two commands [s]."""
     lag: float = field(default=0.0, compare=False)
     """Delay of a steadily moving joint behind its commands, at the end of a period [s]."""
+    body: BaseBody | None = field(default=None, compare=False)
+    """Shape and laser scanners of a base, if they are known."""
 
     def describe(self) -> dict[str, list[dict[str, Any]]]:
         """Labels, units and limits of state and command, as plain values."""

@@ -7,7 +7,7 @@ scanners at opposite corners); SICK S300 data sheet (541 rays, 270 degrees, 0.05
 import math
 from dataclasses import replace
 
-from bam_envs.core.robot import RobotSpec, SignalSpec
+from bam_envs.core.robot import BaseBody, RobotSpec, Scanner, SignalSpec
 
 PERIOD = 0.1
 """Time between two commands [s]."""
@@ -35,6 +35,23 @@ FRONT_MOUNT, BACK_MOUNT = (0.4288, 0.2358, math.radians(45.0)), (-0.3548, -0.235
 """Poses of the scanners in the base's frame: x, y [m], yaw [rad]."""
 
 
+def _bearings(masked: tuple[int, int]) -> tuple[float, ...]:
+    """The unmasked rays of a scanner, in its frame [rad]."""
+    step = (SCAN_SPAN[1] - SCAN_SPAN[0]) / (SCAN_RAYS - 1)
+    return tuple(SCAN_SPAN[0] + ray * step for ray in range(masked[0], SCAN_RAYS - masked[1]))
+
+
+BODY = BaseBody(
+    FOOTPRINT_AHEAD + FOOTPRINT[0] / 2,
+    FOOTPRINT[0] / 2 - FOOTPRINT_AHEAD,
+    FOOTPRINT[1] / 2,
+    (
+        Scanner("f_scan", FRONT_MOUNT, _bearings(FRONT_MASKED)),
+        Scanner("b_scan", BACK_MOUNT, _bearings(BACK_MASKED)),
+    ),
+)
+
+
 def _scan(name: str, rays: int) -> SignalSpec:
     labels = tuple(f"{name}_{ray}" for ray in range(rays))
     return SignalSpec(name, labels, ("m",) * rays, (0.0,) * rays, (SCAN_RANGE[1],) * rays)
@@ -50,4 +67,4 @@ COMMAND = replace(_VELOCITY, name="command", max_rate=MAX_ACCELERATION)
 def base_spec(name: str = "mir100", *, with_scans: bool = True) -> RobotSpec:
     """The signals of a MiR100: pose in the map, speeds, and the ranges of its two scanners."""
     scans = (_scan("f_scan", FRONT_RAYS), _scan("b_scan", BACK_RAYS)) if with_scans else ()
-    return RobotSpec(name, (_POSE, _VELOCITY, *scans), COMMAND, PERIOD)
+    return RobotSpec(name, (_POSE, _VELOCITY, *scans), COMMAND, PERIOD, body=BODY)

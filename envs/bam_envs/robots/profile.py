@@ -57,6 +57,7 @@ class _File:
     period: Positive | None = None
     max_age: Age | None = None
     command_timeout: Age | None = None
+    watchdog: NonNegative | None = None
     controllers: NonEmpty = ""
     ignore: tuple[NonEmpty, ...] = ()
     limits: Mapping[str, Finite] = field(default_factory=dict)
@@ -154,6 +155,11 @@ def _profile(where: str, table: Table) -> RobotProfile:
         Limits.of(file.limits)
     except (UnknownName, InvalidValue) as error:
         raise InvalidValue(f"{where}: limits: {error}") from error
+    if file.kind == "base" and file.watchdog == 0.0:
+        raise InvalidValue(
+            f"{where}: watchdog = 0 says that the base drives on when it hears nothing, and such a base is not driven: "
+            "give its drive a time-out, of 0.5 s or less, and say it here."
+        )
     spec = _robot(where, file)
     state = _state(where, file, spec)
     commands = {mode: _sinks(where, mode, rows, spec.command) for mode, rows in file.commands.items()}
@@ -192,6 +198,8 @@ def _profile(where: str, table: Table) -> RobotProfile:
         cameras=tuple(map(renamed, cameras)),
         readiness=tuple(map(renamed, readiness)),
         controllers=file.controllers,
+        watchdog=file.watchdog,
+        body=spec.body,
     )
 
 
@@ -208,7 +216,8 @@ def _robot(where: str, file: _File) -> RobotSpec:
     every = [*(base.signals if base else ()), *signals]
     _require_once(where, "signal", [signal.name for signal in every])
     final = command or base.command  # type: ignore[union-attr]
-    return RobotSpec(file.name, tuple(every), final, file.period or base.period)  # type: ignore[union-attr]
+    period = file.period or base.period  # type: ignore[union-attr]
+    return RobotSpec(file.name, tuple(every), final, period, body=base.body if base else None)
 
 
 def _signal(row: Table, where: str) -> SignalSpec:

@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal, get_args
 from msgspec import Meta
 
 from bam_envs.core.errors import InvalidValue, UnknownName
-from bam_envs.core.robot import RobotSpec, SignalSpec
+from bam_envs.core.robot import BaseBody, RobotSpec, SignalSpec
 from bam_envs.core.validation import Finite, NonEmpty, NonNegativeInt, Positive
 
 Topic = Annotated[str, Meta(pattern=r"^(/[A-Za-z]\w*)+\Z", description="an absolute name such as /joint_states")]
@@ -167,6 +167,10 @@ class RobotProfile:
     readiness: tuple[Readiness, ...] = ()  # topics that report whether it can move
     controllers: str = ""
     """The service that lists its controllers and their states (``list_controllers``); empty: there is none."""
+    watchdog: float | None = None
+    """Time after which it stops by itself without a command [s]; 0: it does not; None: that is not known."""
+    body: BaseBody | None = None
+    """Shape and laser scanners of a base, if they are known."""
 
     @cached_property
     def sinks_by_topic(self) -> Mapping[str, Sink]:
@@ -238,7 +242,7 @@ class RobotProfile:
         lag = _LAGS[self.kind] + max(0.0, max(reached, default=0.0) - period)
         if wanted is None:
             signals = tuple(signal for signal in self.signals if not self.source(signal.name).optional)
-            return RobotSpec(self.name, signals, self.command, period, lag)
+            return RobotSpec(self.name, signals, self.command, period, lag, self.body)
         known = {signal.name: signal for signal in self.signals}
         for signal in wanted.signals:
             if signal.name not in known:
@@ -251,7 +255,7 @@ class RobotProfile:
                 raise InvalidValue(f"{signal.name} must be {', '.join(signal.labels)}; that of {self.name} is {found}.")
         signals = tuple(known[signal.name] for signal in wanted.signals)
         command = self.narrowed(wanted.command.labels, mode).command
-        return RobotSpec(self.name, signals, command, period, lag)
+        return RobotSpec(self.name, signals, command, period, lag, self.body)
 
 
 def _missing(sink: Sink, labels: tuple[str, ...]) -> list[str]:

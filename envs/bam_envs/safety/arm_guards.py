@@ -181,6 +181,37 @@ class JointAcceleration(Guard):
         return [min(max(way, about - change), about + change) for way, about in rows]
 
 
+class JointJerk(Guard):
+    """Joints that speed up do so gradually: their acceleration grows slowly. Braking is never held back."""
+
+    number, name, unit, setting = "G9", "joint jerk", "rad/s^3", "joint_jerk"
+
+    def __init__(self, spec: RobotSpec, limits: Limits) -> None:
+        self.limit_value, self._acceleration = limits.joint_jerk, limits.joint_acceleration
+        self._joints = columns_in(spec.command, "rad")
+        self._before = [0.0] * len(self._joints)  # speeds one command before the last one [rad/s]
+
+    def restart(self) -> None:
+        """The robot is at rest."""
+        self._before = [0.0] * len(self._joints)
+
+    def limit(self, tick: Tick) -> bool:
+        """Bring the steps of joints that speed up near to the last ones."""
+        period, jerk = tick.period, self.limit_value * tick.period
+        speeds = [tick.last_step[at] / period for at in self._joints]
+        before, self._before, changed = self._before, speeds, False
+        if jerk >= self._acceleration:  # any acceleration is reached in one step
+            return False
+        for at, speed, earlier in zip(self._joints, speeds, before, strict=True):
+            last, step = tick.last[at], tick.command[at] - tick.last[at]
+            way = math.copysign(1.0, step)
+            gained = max(0.0, way * (speed - earlier) / period) if way * speed > 0.0 else 0.0
+            most = max(0.0, way * speed) * period + (gained + jerk) * period**2
+            if way * step > most * ROUNDING:
+                tick.command[at], changed = last + way * most, True
+        return changed
+
+
 class GripperSpeed(Guard):
     """The gripper's width changes no faster than its data sheet allows, from the last command or the measured width."""
 

@@ -19,7 +19,6 @@ from numpy.typing import NDArray
 
 from bam_envs.core.errors import InvalidValue, ResetNeeded, RobotFault, SafetyStop, StaleState, StartNotReached
 from bam_envs.core.robot import EnvIds, Initial, Robot, RobotSpec, RobotState
-from bam_envs.safety.following import Following
 from bam_envs.safety.guard import (
     Guard,
     Limits,
@@ -33,6 +32,7 @@ from bam_envs.safety.guard import (
     position_range,
     require_bounded,
 )
+from bam_envs.safety.link_guards import Watchdog
 from bam_envs.safety.guards import LATE, Freshness, MeasuredLimits, Shape, default_guards
 
 __all__ = ["ClearedCommand", "Limits", "SafeRobot"]
@@ -97,6 +97,7 @@ class SafeRobot(metaclass=Sealed):
         guards: Further guards, applied before the default ones.
         limits: The limits of the guards; those of a live robot are inside `guard.BOUNDS`.
         tool_position: Forward kinematics of an arm other than a UR5e, (n, k) [rad] to (n, 3) [m].
+        straight: Whether the commands move the tool of an arm along straight lines, so that singularities count.
         clock: Monotonic clock [s].
 
     Raises:
@@ -115,12 +116,14 @@ class SafeRobot(metaclass=Sealed):
         "_guards",
         "_halts",
         "_is_base",
+        "_kept_out",
         "_last",
         "_limiters",
         "_limits",
         "_live",
         "_places",
         "_report",
+        "_returned_at",
         "_robot",
         "_sent",
         "_sent_at",
@@ -141,6 +144,7 @@ class SafeRobot(metaclass=Sealed):
         *,
         limits: Limits | None = None,
         tool_position: ToolPosition | None = None,
+        straight: bool = False,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         if robot.num_robots != 1:
@@ -152,7 +156,7 @@ class SafeRobot(metaclass=Sealed):
         self._tell: Any = getattr(self._live, "tell_status", None)
         self._shape = Shape(robot.spec)
         self._further = tuple(guards)
-        self._guards = tuple(default_guards(robot.spec, self._limits, tool_position=tool_position))
+        self._guards = tuple(default_guards(robot.spec, self._limits, tool_position=tool_position, straight=straight))
         self._checks = tuple(one for one in self._guards if type(one).fault is not Guard.fault)
         self._limiters = tuple(one for one in self._guards if type(one).limit is not Guard.limit)
         self._robot: Any = robot
@@ -170,6 +174,7 @@ class SafeRobot(metaclass=Sealed):
         self._stopped: tuple[str, str] | None = None
         self._bad, self._halts, self._status, self._code = 0, 0, "", 0
         self._sent_at: float | None = None
+        self._returned_at, self._kept_out = 0.0, False
         self._forget()
         if self._live is not None:  # two gates would each allow a whole step
             other = _GUARDED.get(robot)
@@ -225,6 +230,11 @@ class SafeRobot(metaclass=Sealed):
         return None if self._stopped is None else self._stopped[1]
 
     @property
+    def warnings(self) -> tuple[str, ...]:
+        """What the guards warn of now: ``"link quality (G16): only 93 of the last 100 ticks ..."``."""
+        return tuple(f"{one.title}: {one.warning}" for one in (*self._further, *self._guards) if one.warning)
+
+    @property
     def info(self) -> Any:
         """The robot's description of itself, or None."""
         return getattr(self._robot, "info", None)
@@ -263,6 +273,10 @@ class SafeRobot(metaclass=Sealed):
     def connect(self) -> None:
         """Connect the robot. Moves nothing."""
         self._robot.connect()
+        if self._live is not None:
+            for guard in self._guards:
+                if isinstance(guard, Watchdog):
+                    guard.connected(getattr(self.info, "watchdog", None))
 
     def step(self, command: Array) -> RobotState:
         """Send `command` (1, m), as limited by the guards; returns the state one period later, with the sent command.
@@ -312,6 +326,9 @@ class SafeRobot(metaclass=Sealed):
             pause=pause,
             waiting=getattr(self._live, "waiting", lambda: 0.0)(),
             approach=approach,
+            action_age=self._clock() - self._returned_at if pause else 0.0,
+            kept_out=self._kept_out,
+            signals=self._state.signals if self._state is not None else {},
         )
 
     def _in_lockstep(self) -> bool:
@@ -379,7 +396,7 @@ class SafeRobot(metaclass=Sealed):
     def _restart(self, *, forgive: bool = False) -> None:
         for guard in (*self._further, *self._guards):
             guard.restart()
-            if forgive and isinstance(guard, Following):
+            if forgive:
                 guard.forgive()
 
     def _fault(self, tick: Tick) -> tuple[Guard, str] | None:
@@ -392,7 +409,7 @@ class SafeRobot(metaclass=Sealed):
         return None
 
     def _limit(self, tick: Tick) -> None:
-        self._bad, self._status, self._code = 0, "", 0
+        self._bad, self._status, self._code, self._kept_out = 0, "", 0, False
         for guard in self._further:
             asked = _copy(tick)
             if guard.limit(asked):
@@ -406,6 +423,7 @@ class SafeRobot(metaclass=Sealed):
     def _note(self, guard: Guard, effect: str) -> None:
         self._status, self._code = guard.title, guard.code
         self._report[guard.name][effect] += 1
+        self._kept_out |= guard.keeps_out
 
     def _hold(self, tick: Tick, guard: Guard, reason: str) -> None:
         """Send a command that holds the robot in place; stop the robot after too many ticks in a row."""
@@ -431,7 +449,7 @@ class SafeRobot(metaclass=Sealed):
         done, self._sent_at = False, self._clock()
         try:
             self._state = self._robot.step(handed)
-            done = True
+            done, self._returned_at = True, self._clock()
         finally:
             _CLEARED.pop(cleared, None)
             if not done or self._halts != halts:  # a halt of another thread may have come just before the command
@@ -470,15 +488,18 @@ class SafeRobot(metaclass=Sealed):
 
     def resume(self) -> None:
         """Let a stopped robot move again, from its position. A person decides this, never a program."""
+        if self._stopped is not None:
+            for guard in (*self._further, *self._guards):
+                guard.resumed()
         self._stopped, self._bad, self._last, self._sent_at, self._before = None, 0, None, None, None
-        self._status, self._code = "", 0
+        self._status, self._code, self._kept_out = "", 0, False
         self._restart(forgive=True)
 
     def reset(self, env_ids: EnvIds, initial: Initial) -> RobotState:
         """Bring the robot to `initial`; a live arm opens its gripper and goes to its start pose slowly.
 
         Raises:
-            InvalidValue: The start pose is outside the position limits; nothing moved.
+            InvalidValue: The start pose is outside the position limits, or in a place that is kept out of; nothing moved.
             StartNotReached: The arm was not there in time; the error holds the joints.
             SafetyStop: A guard stopped the robot, now or earlier.
         """
@@ -518,6 +539,9 @@ class SafeRobot(metaclass=Sealed):
                     f"{low[column]:.3f} to {high[column]:.3f} rad that the guards allow. Choose another start, or a "
                     "smaller position_margin."
                 )
+        for guard in (*self._further, *self._guards):
+            if (reason := guard.start_fault(start)) is not None:
+                raise InvalidValue(f"{guard.title} does not allow the start pose: {reason}.")
         return start
 
     def _joints_off(self, start: Numbers) -> dict[str, float]:
@@ -582,5 +606,6 @@ def _copied(state: RobotState) -> RobotState:
 
 def _copy(tick: Tick) -> Tick:
     """The tick with arrays (m,) for a user's guard, which may change the command only."""
-    values = (getattr(tick, one.name) for one in fields(tick))
-    return Tick(*(np.array(value) if isinstance(value, list) else value for value in values))  # type: ignore[arg-type]
+    values = (getattr(tick, one.name) for one in fields(tick) if one.name != "signals")
+    signals = {name: array.copy() for name, array in tick.signals.items()}
+    return Tick(*(np.array(value) if isinstance(value, list) else value for value in values), signals=signals)  # type: ignore[arg-type]

@@ -34,6 +34,7 @@ TRIAL_SPEED = 0.25
 TRIAL_BOX = {"arm": 0.35, "base": 3.0}
 """How far it may go from where it starts, along each axis [m]."""
 _ABOVE_ZERO = Annotated[float, Meta(gt=0, description="a number above 0")]
+_ANY = Annotated[float, Meta(ge=-sys.float_info.max, le=sys.float_info.max, description="a finite number")]
 _FINITE = Annotated[float, Meta(gt=0, le=sys.float_info.max, description="a finite number above 0")]
 
 
@@ -41,6 +42,12 @@ def _limit(default: float | None, least: float, most: float, unit: str, *, finit
     """A limit, with its minimum and maximum for a live robot; `finite` if it cannot be disabled."""
     kind: Any = _FINITE if finite else _ABOVE_ZERO
     return field(default=default, metadata={"bounds": (least, most, unit), "type": kind if default else kind | None})
+
+
+def _place(default: float | None, least: float, most: float) -> Any:
+    """A limit that is a place [m], of any sign; 0 is a limit like any other."""
+    kind: Any = _ANY
+    return field(default=default, metadata={"bounds": (least, most, "m"), "type": kind | None})
 
 
 @dataclass(frozen=True)
@@ -88,6 +95,48 @@ class Limits:
     trial_box: float | None = _limit(None, 0.05, 20.0, "m", finite=True)
     """How far a robot on trial may go from where it starts, along each axis [m]; None: no limit, or on trial 0.35 for
     an arm, 3 for a base."""
+    joint_jerk: float = _limit(500.0, 10.0, 5000.0, "rad/s^3")
+    """Maximum jerk of a joint that speeds up [rad/s^3]; at 20 Hz `joint_acceleration` is the lower limit."""
+    action_age: float = _limit(0.1, 0.01, 1.0, "s")
+    """Maximum time from a state to the command that rests on it [s]."""
+    watchdog: float | None = _limit(None, 0.02, 1.0, "s")
+    """Time within which a robot should stop by itself [s], for a warning; None: 0.1 for an arm, 0.5 for a base."""
+    late_share: float = _limit(0.05, 0.01, 1.0, "share")
+    """Share of late commands above which there is a warning."""
+    link_warn: float = _limit(0.95, 0.5, 1.0, "share")
+    """Share of ticks with a state and an answer in time below which there is a warning."""
+    link_stop: float = _limit(0.9, 0.5, 1.0, "share")
+    """The same share, below which the robot is stopped."""
+    clamp_warn: float = _limit(0.05, 0.01, 1.0, "share")
+    """Share of commands that are changed to keep the robot out of a place above which there is a warning."""
+    clamp_stop: float = _limit(0.2, 0.01, 1.0, "share")
+    """The same share, above which the robot is stopped."""
+    singularity_slow: float = _limit(17.0, 5.0, 100.0, "condition number", finite=True)
+    """Condition number above which an arm slows down, if its task moves the tool along straight lines."""
+    singularity_stop: float = _limit(30.0, 6.0, 200.0, "condition number", finite=True)
+    """Condition number that it does not exceed."""
+    clearance: float = _limit(0.01, 0.002, 0.1, "m", finite=True)
+    """Distance that the links of an arm keep from each other and from the table [m]."""
+    table_height: float = _place(0.0, -2.0, 1.0)
+    """Height of the table in ``base_link`` [m], below which no part of an arm goes."""
+    box_x_min: float = _place(-1.5, -2.0, 1.5)
+    """Lowest x of the tool [m]."""
+    box_x_max: float = _place(1.5, -1.5, 2.0)
+    """Highest x of the tool [m]."""
+    box_y_min: float = _place(-1.5, -2.0, 1.5)
+    """Lowest y of the tool [m]."""
+    box_y_max: float = _place(1.5, -1.5, 2.0)
+    """Highest y of the tool [m]."""
+    box_z_min: float | None = _place(None, -2.0, 2.0)
+    """Lowest z of the tool [m]; None: `table_height` if the task commands a gripper, else unlimited."""
+    box_z_max: float = _place(2.0, -1.0, 2.0)
+    """Highest z of the tool [m]."""
+    laser_stop: float = _limit(0.3, 0.05, 2.0, "m", finite=True)
+    """Distance from the base, in the direction in which it drives, at which it stops for what its lasers see [m]."""
+    laser_slow: float = _limit(0.4, 0.05, 3.0, "m", finite=True)
+    """Distance at which it drives at 30 % of its speed limit [m]."""
+    collision_time: float = _limit(2.0, 0.2, 10.0, "s", finite=True)
+    """Time to a collision with what its lasers see below which a base slows down [s]."""
 
     def __post_init__(self) -> None:
         for one in fields(self):
@@ -161,7 +210,15 @@ BOUNDS: Mapping[str, tuple[float, float, str]] = MappingProxyType(
     {one.name: one.metadata["bounds"] for one in fields(Limits)}
 )
 """Minimum, maximum and unit of each limit of a live robot: no typing error can disable a guard."""
-ORDERED: tuple[tuple[str, str], ...] = ()
+ORDERED: tuple[tuple[str, str], ...] = (
+    ("singularity_slow", "singularity_stop"),
+    ("link_stop", "link_warn"),
+    ("clamp_warn", "clamp_stop"),
+    ("laser_stop", "laser_slow"),
+    ("box_x_min", "box_x_max"),
+    ("box_y_min", "box_y_max"),
+    ("box_z_min", "box_z_max"),
+)
 """Pairs of limits, the first of which is at most the second."""
 
 
@@ -215,6 +272,12 @@ class Tick:
     """Time since the oldest unanswered command was sent [s]; 0 if there is none, or the robot never answers."""
     approach: bool = False
     """Whether the robot is on its way to a start pose."""
+    action_age: float = 0.0
+    """Time from the state that the command rests on to the command [s]; 0 for a first command, and in lockstep."""
+    kept_out: bool = False
+    """Whether the command before was changed to keep the robot out of a place."""
+    signals: Mapping[str, Array] = field(default_factory=dict)
+    """The newest measured signals, with shape (1, k) each; to be read only."""
 
 
 class Sealed(type):
@@ -240,6 +303,10 @@ class Guard(metaclass=Sealed):
     """Number of faults in a row that stop the robot; fewer hold it."""
     setting: str = ""
     """Name of the limit in `Limits` that sets `limit_value`; empty for a fixed one."""
+    keeps_out: bool = False
+    """Whether it changes commands to keep the robot out of a place, which `KeptOut` counts."""
+    warning: str = ""
+    """What a person should know before the guard has to act; empty for nothing."""
 
     @property
     def title(self) -> str:
@@ -254,6 +321,16 @@ class Guard(metaclass=Sealed):
 
     def restart(self) -> None:
         """Forget the motion: after a connection, reset or halt the next command begins at the robot's position."""
+
+    def forgive(self) -> None:
+        """Forget faults, when an episode begins or a person resumes the robot."""
+
+    def resumed(self) -> None:
+        """A person has ended a stop."""
+
+    def start_fault(self, start: Numbers) -> str | None:
+        """Why an arm must not go to the start pose `start` (m,), or None."""
+        return None
 
     def fault(self, tick: Tick) -> str | None:
         """Why `tick` must not be executed at all, or None."""
@@ -288,11 +365,17 @@ def is_base(spec: RobotSpec) -> bool:
     return "m/s" in spec.command.units
 
 
+def geometry_of(tool_position: ToolPosition) -> ArmGeometry | None:
+    """The arm whose `ArmGeometry.tool_position` this is; None for any other function."""
+    owner = getattr(tool_position, "__self__", None)
+    return owner if type(owner) is ArmGeometry and tool_position == owner.tool_position else None
+
+
 def tool_point_of(tool_position: ToolPosition) -> ToolPoint:
     """`tool_position` for one pose in plain numbers, which is quicker; quickest for that of an `ArmGeometry`."""
-    owner = getattr(tool_position, "__self__", None)
-    if type(owner) is ArmGeometry and tool_position == owner.tool_position:
-        return owner.tool_point
+    geometry = geometry_of(tool_position)
+    if geometry is not None:
+        return geometry.tool_point
 
     def tool_point(q: Sequence[float]) -> tuple[float, float, float]:
         x, y, z = tool_position(np.array([q]))[0].tolist()

@@ -14,6 +14,7 @@ from bam_envs.core.errors import InvalidValue
 from bam_envs.core.kinematics import UR5E_GRIPPER, UR_JOINTS
 from bam_envs.core.robot import RobotSpec, RobotState
 from bam_envs.safety import arm_guards as arm
+from bam_envs.safety.base_guards import LaserZones
 from bam_envs.safety.following import BaseFollowing, JointFollowing
 from bam_envs.safety.guard import (
     Guard,
@@ -23,18 +24,29 @@ from bam_envs.safety.guard import (
     ToolPosition,
     clip,
     columns_in,
+    geometry_of,
     is_base,
     max_rate,
     ticks_of,
     tool_point_of,
 )
+from bam_envs.safety.link_guards import (
+    LATE_TICKS,
+    ActionAge,
+    KeptOut,
+    LateTicks,
+    LinkQuality,
+    RampAfterStop,
+    Watchdog,
+)
+from bam_envs.safety.places import Collision, WorkspaceBox
+from bam_envs.safety.singularity import Singularity
+from bam_envs.safety.tubes import ArmTubes
 
 Array = NDArray[np.float64]
 LATE = 2.0
 """After this many periods without a command a live robot may be short of its last command: its watchdog may have
 stopped it."""
-LATE_TICKS = 10
-"""This many late commands in a row stop the robot."""
 MEASURED_MARGIN = 1.3
 """A measured speed may be this many times its limit: controllers overshoot commands slightly."""
 MEASURED_PATIENCE = 3
@@ -223,14 +235,20 @@ class MeasuredLimits(Guard):
 
 
 def default_guards(
-    spec: RobotSpec, limits: Limits | None = None, *, tool_position: ToolPosition | None = None
+    spec: RobotSpec,
+    limits: Limits | None = None,
+    *,
+    tool_position: ToolPosition | None = None,
+    straight: bool = False,
 ) -> list[Guard]:
     """The guards of a robot of `spec`, in the order in which they are applied.
 
     Args:
         spec: An arm is commanded in rad, a base in m/s and rad/s.
         limits: The limits of the guards.
-        tool_position: Forward kinematics, (n, k) [rad] to (n, 3) [m]; None only for a UR5e.
+        tool_position: Forward kinematics, (n, k) [rad] to (n, 3) [m]; None only for a UR5e. If it is that of an
+            `ArmGeometry` with an outline, collisions are guarded too.
+        straight: Whether the commands move the tool along straight lines; then singularities are guarded too.
 
     Raises:
         InvalidValue: The command has numbers that no guard limits, or the tool of an arm would have no speed limit.
@@ -243,12 +261,17 @@ def default_guards(
             f"The command of {spec.name} cannot be guarded: a base takes m/s and rad/s only, an arm takes rad and no "
             f"speeds; found {found}."
         )
-    moving = _base_guards(spec, limits) if is_base(spec) else _arm_guards(spec, limits, tool_position)
-    first = [Finite(spec, limits), Freshness(spec, limits), Pace(spec, limits), Answers(spec, limits)]
-    return [Shape(spec), *first, *moving, MeasuredLimits(spec)]
+    moving = _base_guards(spec, limits) if is_base(spec) else _arm_guards(spec, limits, tool_position, straight)
+    # Those that count ticks look at every tick, also at one that another guard does not execute.
+    counting = [LateTicks(spec, limits), LinkQuality(spec, limits), KeptOut(limits)]
+    first = [Finite(spec, limits), Freshness(spec, limits), Pace(spec, limits), ActionAge(limits)]
+    watched = [Answers(spec, limits), Watchdog(spec, limits)]
+    return [Shape(spec), *counting, *first, *watched, *moving, MeasuredLimits(spec)]
 
 
-def _arm_guards(spec: RobotSpec, limits: Limits, tool_position: ToolPosition | None) -> list[Guard]:
+def _arm_guards(
+    spec: RobotSpec, limits: Limits, tool_position: ToolPosition | None, straight: bool
+) -> list[Guard]:
     position = None if math.isinf(limits.tool_speed) else _kinematics(spec, tool_position)
     joints = columns_in(spec.command, "rad")
     measured: list[Guard] = [arm.MeasuredJump(spec)]
@@ -267,11 +290,31 @@ def _arm_guards(spec: RobotSpec, limits: Limits, tool_position: ToolPosition | N
         measured.append(MeasuredSpeed("G10", "tool speed", "m/s", limits.tool_speed, tool_speed))
         tool.append(arm.ToolSpeed(spec, limits, position))
     gripper = [arm.GripperSpeed(spec)] if "m" in spec.command.units else []
-    smooth = [arm.JointAcceleration(spec, limits)] if math.isfinite(limits.joint_acceleration) else []
-    speed = [arm.JointSpeed(spec, limits), arm.RampIn(spec, limits), *tool]
+    smooth: list[Guard] = []
+    if math.isfinite(limits.joint_acceleration):
+        smooth = [arm.JointAcceleration(spec, limits), arm.JointJerk(spec, limits)]
+    speed = [arm.JointSpeed(spec, limits), arm.RampIn(spec, limits), RampAfterStop(spec, limits), *tool]
+    singular, kept_out = _place_guards(spec, limits, position, straight)
     # The tool's speed is limited twice: joints that change their speed one by one can speed the tool up.
-    last = [*smooth, *tool, JointFollowing(spec, limits, position)]
+    last = [*singular, *smooth, *tool, JointFollowing(spec, limits, position), *kept_out]
     return [*measured, arm.PositionLimits(spec, limits), *gripper, *speed, *last]
+
+
+def _place_guards(
+    spec: RobotSpec, limits: Limits, position: ToolPosition | None, straight: bool
+) -> tuple[list[Guard], list[Guard]]:
+    """The guards that keep an arm out of singularities, and out of places: none whose geometry is not known."""
+    if position is None:
+        return [], []
+    has_gripper, least = "m" in spec.command.units, limits.box_z_min
+    if least is None:  # without a gripper the tool is only assumed
+        least = limits.table_height if has_gripper else -math.inf
+    low, high = (limits.box_x_min, limits.box_y_min, least), (limits.box_x_max, limits.box_y_max, limits.box_z_max)
+    kept_out: list[Guard] = [WorkspaceBox(spec, limits, low, high, tool_point_of(position))]
+    geometry = geometry_of(position)
+    if geometry is not None and geometry.outline is not None:
+        kept_out.append(Collision(spec, limits, ArmTubes(geometry, geometry.outline, tool=has_gripper)))
+    return [Singularity(spec, limits, geometry)] if straight and geometry is not None else [], kept_out
 
 
 def _kinematics(spec: RobotSpec, tool_position: ToolPosition | None) -> ToolPosition:
@@ -303,6 +346,8 @@ def _base_guards(spec: RobotSpec, limits: Limits) -> list[Guard]:
         BaseSpeed("turn speed", "rad/s", limits.turn_speed, spec),
         BaseAcceleration("base acceleration", "m/s", limits.base_acceleration, spec),
         BaseAcceleration("turn acceleration", "rad/s", limits.turn_acceleration, spec),
+        RampAfterStop(spec, limits),
         BaseFollowing("base following", "m/s", limits.base_acceleration, spec, limits),
         BaseFollowing("turn following", "rad/s", limits.turn_acceleration, spec, limits),
+        *([] if spec.body is None else [LaserZones(spec, limits, spec.body)]),
     ]

@@ -1,27 +1,22 @@
-"""The guards that keep a robot out of a place: a box around its tool, its own links, the table, and singularities.
+"""The guards that keep an arm out of a place: a box around its tool, its own links, and the table.
 
 Each looks where the robot would come to rest if it braked after the command, and shortens the step until that is
-outside the place, if necessary by braking harder than the limit on acceleration. A robot that is in such a place
+outside the place, if necessary by braking harder than the limit on acceleration. An arm that is in such a place
 already may stay or leave, and must not go farther in.
 """
 
 import math
 from collections.abc import Sequence
 
-import numpy as np
-
-from bam_envs.core.kinematics import ArmGeometry
 from bam_envs.core.errors import InvalidValue
 from bam_envs.core.robot import RobotSpec
-from bam_envs.safety.guard import Guard, Limits, Numbers, Tick, ToolPoint, columns_in, max_rate
+from bam_envs.safety.guard import Guard, Limits, Numbers, Tick, ToolPoint, columns_in
 from bam_envs.safety.tubes import ArmTubes
 
 _HALVINGS = 6
 """The allowed share of a step is found to 1/64."""
 _TOUCH = 1e-9
 """A robot this little in a place [m] is outside."""
-_REGULAR = 0.45
-"""An arm none of whose three factors of the Jacobian's determinant is below this is far from a singularity."""
 
 
 class Place(Guard):
@@ -89,7 +84,7 @@ class WorkspaceBox(Place):
     ) -> None:
         super().__init__(spec, limits)
         self._low, self._high = (*map(float, low),), (*map(float, high),)
-        _require_room(self._low, self._high)
+        require_room(self._low, self._high)
         self._tool = tool
         self.limit_value = max(most - least for least, most in zip(self._low, self._high, strict=True))
 
@@ -106,49 +101,6 @@ class WorkspaceBox(Place):
             return None
         at, low, high = (", ".join(f"{one:.3f}" for one in point) for point in (self._tool(joints), self._low, self._high))
         return f"the tool would be at {at} m, outside the box from {low} to {high} m: widen the box, or choose another start"
-
-
-class BaseBox(Guard):
-    """A base stays in a rectangle of its map: it brakes before the edge, and may turn there and drive back.
-
-    Args:
-        spec: The base, whose ``base_pose`` is measured.
-        limits: Its limits, of which acceleration and lag count.
-        low: Lowest x and y of its frame [m].
-        high: Highest x and y [m].
-
-    Raises:
-        InvalidValue: `low` is not below `high`.
-    """
-
-    number, name, unit, keeps_out = "G10", "workspace box", "m", True
-
-    def __init__(self, spec: RobotSpec, limits: Limits, low: Sequence[float], high: Sequence[float]) -> None:
-        self._low, self._high = (*map(float, low),), (*map(float, high),)
-        _require_room(self._low, self._high)
-        self.limit_value = max(most - least for least, most in zip(self._low, self._high, strict=True))
-        (self._drive,) = columns_in(spec.command, "m/s")
-        self._brakes = min(limits.base_acceleration, max_rate(spec.command)[self._drive])
-        self._delay = spec.period + (spec.lag if limits.lag is None else limits.lag)
-
-    def limit(self, tick: Tick) -> bool:
-        """Limit the speed to what leaves room to brake."""
-        if "base_pose" not in tick.signals:
-            return False
-        x, y, yaw = tick.signals["base_pose"][0].tolist()
-        speed = tick.command[self._drive]
-        way = math.copysign(1.0, speed) * math.cos(yaw), math.copysign(1.0, speed) * math.sin(yaw)
-        room = math.inf
-        for place, along, least, most in zip((x, y), way, self._low, self._high, strict=True):
-            if along:
-                room = min(room, max(0.0, (most - place if along > 0.0 else place - least) / abs(along)))
-        # v delay + v^2 / 2a = room
-        delay = self._brakes * self._delay
-        fastest = math.sqrt(delay * delay + 2.0 * self._brakes * room) - delay if room < math.inf else math.inf
-        if not abs(speed) > fastest:
-            return False
-        tick.command[self._drive] = math.copysign(fastest, speed)
-        return True
 
 
 class Collision(Place):
@@ -178,3 +130,9 @@ class Collision(Place):
             f"the arm would be {self.limit_value - depth:.3f} m from itself or from the table at "
             f"{self._table:g} m, and {self.limit_value:g} m are kept: choose another start, or correct table_height"
         )
+
+
+def require_room(low: Sequence[float], high: Sequence[float]) -> None:
+    """`InvalidValue` if a box from `low` to `high` [m] is empty."""
+    if not all(least < most for least, most in zip(low, high, strict=True)):
+        raise InvalidValue(f"A workspace box needs room: low {low} must be below high {high} on every axis.")

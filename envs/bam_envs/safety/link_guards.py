@@ -1,0 +1,200 @@
+"""The guards of the link and of the rhythm: late actions, late ticks, a bad link, a robot kept out of places, stops.
+
+Some of them warn before they stop the robot: their `warning` stands until its cause is gone.
+"""
+
+import math
+from collections import deque
+
+from bam_envs.core.robot import RobotSpec
+from bam_envs.safety.arm_guards import fastest_joints, shorten
+from bam_envs.safety.guard import Guard, Limits, Tick, clip, columns_in, is_base
+
+TICKS = 100
+"""Shares of ticks are of the last 100."""
+LATE_TICKS = 10
+"""This many late commands in a row stop the robot."""
+_LATE_BY = 0.1
+"""A tick is late if it comes more than this share of a period after its time; at least `_JITTER`."""
+_JITTER = 0.005
+"""Lateness of a sleeping process on an idle computer [s]."""
+
+
+class ActionAge(Guard):
+    """A command is sent while the state that it rests on is new; a later one is not executed."""
+
+    number, name, unit, setting, patience = "G4", "action age", "s", "action_age", LATE_TICKS
+
+    def __init__(self, limits: Limits) -> None:
+        self.limit_value = limits.action_age
+
+    def fault(self, tick: Tick) -> str | None:
+        """Report the age of the action."""
+        if tick.action_age <= self.limit_value:
+            return None
+        return (
+            f"the command came {tick.action_age:.3f} s after the state that it rests on, and at most "
+            f"{self.limit_value:g} s are allowed: the policy takes too long, or the computer is busy"
+        )
+
+
+class Share(Guard):
+    """Base class: counts the ticks among the last 100 for which `is_counted` is true."""
+
+    unit = "share of 100 ticks"
+
+    def __init__(self) -> None:
+        self._ticks: deque[bool] = deque(maxlen=TICKS)
+        self._counted = 0
+
+    def is_counted(self, tick: Tick) -> bool:
+        """Whether `tick` is one of those to count."""
+        raise NotImplementedError
+
+    def forgive(self) -> None:
+        """Forget the ticks before."""
+        self._ticks.clear()
+        self._counted, self.warning = 0, ""
+
+    def count(self, tick: Tick) -> int:
+        """Number of counted ticks among the last 100, this one included."""
+        if len(self._ticks) == TICKS:
+            self._counted -= self._ticks[0]
+        self._ticks.append(counted := self.is_counted(tick))
+        self._counted += counted
+        return self._counted
+
+
+class LateTicks(Share):
+    """Commands that come late are counted; too many are a warning, and `Pace` stops the robot after ten in a row."""
+
+    number, name, setting = "G15", "late ticks", "late_share"
+
+    def __init__(self, spec: RobotSpec, limits: Limits) -> None:
+        super().__init__()
+        self.limit_value, self._period = limits.late_share, spec.period
+        self._by = max(_LATE_BY * spec.period, _JITTER)
+
+    def is_counted(self, tick: Tick) -> bool:
+        """Whether the command is late."""
+        return tick.pause > self._period + self._by
+
+    def fault(self, tick: Tick) -> str | None:
+        """Never: it only warns."""
+        late = self.count(tick)
+        if late > TICKS * self.limit_value or tick.pause > 2.0 * self._period:
+            self.warning = (
+                f"{late} of the last {TICKS} commands were more than {1000 * self._by:.0f} ms late: the policy takes too "
+                "long, or the computer is busy"
+            )
+        elif not late:
+            self.warning = ""
+        return None
+
+
+class LinkQuality(Share):
+    """A link on which too many states are too old, or too many commands are not answered in time, is not driven on."""
+
+    number, name, setting = "G16", "link quality", "link_stop"
+
+    def __init__(self, spec: RobotSpec, limits: Limits) -> None:
+        super().__init__()
+        self.limit_value, self._warn = limits.link_stop, limits.link_warn
+        self._max_age, self._answer = limits.max_age or (0.5 if is_base(spec) else 0.1), limits.answer_time
+
+    def is_counted(self, tick: Tick) -> bool:
+        """Whether a state or an answer did not come in time."""
+        return not tick.age <= self._max_age or tick.waiting > self._answer
+
+    def fault(self, tick: Tick) -> str | None:
+        """Report the share of good ticks, when the link is back: while it is down, others hold the robot."""
+        bad = self.count(tick)
+        good = f"only {TICKS - bad} of the last {TICKS} ticks had a state and an answer in time"
+        self.warning = good if bad > TICKS * (1.0 - self._warn) + 1e-9 else ""
+        if self._ticks[-1] or bad <= TICKS * (1.0 - self.limit_value) + 1e-9:
+            return None
+        return (
+            f"{good}, and {TICKS * self.limit_value:.0f} are needed: look at the network and at the load of the "
+            "robot's computer, or come nearer to its access point"
+        )
+
+
+class KeptOut(Share):
+    """A policy that is kept out of a place again and again does not know where it is, and is stopped."""
+
+    number, name, setting = "G18", "changed commands", "clamp_stop"
+
+    def __init__(self, limits: Limits) -> None:
+        super().__init__()
+        self.limit_value, self._warn = limits.clamp_stop, limits.clamp_warn
+
+    def is_counted(self, tick: Tick) -> bool:
+        """Whether the command before was changed to keep the robot out of a place."""
+        return tick.kept_out
+
+    def fault(self, tick: Tick) -> str | None:
+        """Report the number of changed commands."""
+        changed = self.count(tick)
+        text = f"{changed} of the last {TICKS} commands were changed to keep the robot out of a place"
+        self.warning = text if changed > TICKS * self._warn + 1e-9 else ""
+        if changed <= TICKS * self.limit_value + 1e-9:
+            return None
+        self.forgive()  # a person who resumes the robot has seen it
+        return f"{text}, and {TICKS * self.limit_value:.0f} are allowed: the report names the guards that changed them"
+
+
+class Watchdog(Guard):
+    """The robot itself stops when it hears nothing; this guard only says whether it is known to do so in time."""
+
+    number, name, unit, setting = "G5", "robot's watchdog", "s", "watchdog"
+
+    def __init__(self, spec: RobotSpec, limits: Limits) -> None:
+        self.limit_value = limits.watchdog or (0.5 if is_base(spec) else 0.1)
+        self._rest = "drives on" if is_base(spec) else "goes on to its last command"
+
+    def connected(self, watchdog: float | None) -> None:
+        """Take the time after which the robot stops by itself [s]; 0: it never does; None: that is not known."""
+        if watchdog is None or watchdog == 0.0:
+            known = "is not known to stop" if watchdog is None else "does not stop"
+            self.warning = (
+                f"the robot {known} by itself: when this computer or the link fails it {self._rest}; keep a hand on its "
+                "emergency stop, and say in its profile after what time it stops (watchdog = 0.1)"
+            )
+        elif not watchdog <= self.limit_value:
+            self.warning = (
+                f"the robot stops by itself only {watchdog:g} s after the last command, and {self.limit_value:g} s "
+                "are expected: shorten its time-out"
+            )
+        else:
+            self.warning = ""
+
+
+
+
+class RampAfterStop(Guard):
+    """After a stop that a person has ended, the robot's speed limits grow from 0 to their values."""
+
+    number, name, unit, setting = "G14", "ramp-in after a stop", "s", "ramp_time"
+
+    def __init__(self, spec: RobotSpec, limits: Limits) -> None:
+        self.limit_value, self._left = limits.ramp_time, 0.0
+        self._joints = columns_in(spec.command, "rad")
+        self._fastest = fastest_joints(spec, limits, limits.reset_speed)
+        speeds = {"m/s": limits.base_speed, "rad/s": limits.turn_speed}
+        rows = zip(spec.command.units, spec.command.high, strict=True)
+        self._speeds = [min(speeds[unit], high) for unit, high in rows if unit in speeds]
+
+    def resumed(self) -> None:
+        """Begin the ramp."""
+        self._left = self.limit_value
+
+    def limit(self, tick: Tick) -> bool:
+        """Shorten the step of all joints, or clip the speeds of a base."""
+        if self._left <= 0.0:
+            return False
+        self._left -= tick.period
+        share = 1.0 - max(0.0, self._left) / self.limit_value
+        if self._joints:
+            return shorten(tick, self._joints, [fastest * share * tick.period for fastest in self._fastest])
+        speeds = [speed * share for speed in self._speeds]
+        return clip(tick, range(len(speeds)), [-speed for speed in speeds], speeds)

@@ -1,0 +1,72 @@
+"""Singularity (G13): an arm that moves its tool along straight lines slows down where its joints cannot follow them."""
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+from bam_envs.core.kinematics import ArmGeometry
+from bam_envs.core.robot import RobotSpec
+from bam_envs.safety.guard import Guard, Limits, Tick, columns_in
+
+_RATE = 4.0
+"""Joints 2 to 5 change no singular value by more than this [1/rad]; measured: 3.9 at most, of all seven arms."""
+
+
+class Singularity(Guard):
+    """Towards a singularity the arm slows down, and stops before it; away from it, it is free.
+
+    The limit is the condition number of the Jacobian, whose lengths are measured in halves of the arm's length. It is
+    computed anew only after the joints have turned far enough, since it was computed last, to reach the limit.
+    """
+
+    number, name, unit, setting, keeps_out = "G13", "singularity", "condition number", "singularity_stop", True
+
+    def __init__(self, spec: RobotSpec, limits: Limits, geometry: ArmGeometry) -> None:
+        self._slow, self.limit_value = limits.singularity_slow, limits.singularity_stop
+        self._arm, self._joints = geometry, columns_in(spec.command, "rad")
+        self._at: Sequence[float] = [math.inf] * 6
+        self._room = 0.0  # the joints may turn so far [rad] before the next computation
+
+    def limit(self, tick: Tick) -> bool:
+        """Shorten the step of all joints, except on the way to a start pose, which is no straight line."""
+        wanted = [tick.command[at] for at in self._joints]
+        self._room -= sum(abs(wanted[joint] - self._at[joint]) for joint in (1, 2, 3, 4))
+        self._at = wanted
+        if self._room > 0.0 or tick.approach:
+            return False
+        condition = self.condition(wanted)
+        last = [tick.last[at] for at in self._joints]
+        if condition <= self._slow or condition <= self.condition(last):
+            return False
+        span = self.limit_value - self._slow
+        share = max(0.0, self.limit_value - condition) / span if span else 0.0
+        for at, one, way in zip(self._joints, last, wanted, strict=True):
+            tick.command[at] = one + min(share, 1.0) * (way - one)
+        self._room = 0.0
+        return True
+
+    def condition(self, q: Sequence[float]) -> float:
+        """Condition number of the Jacobian at the joints `q` (6,) [rad]."""
+        values = np.linalg.svd(np.array(self._jacobian(q)), compute_uv=False).tolist()
+        self._room = (values[-1] - values[0] / self._slow) / (_RATE * (1.0 + 1.0 / self._slow))
+        return float(values[0] / max(values[-1], 1e-12))
+
+    def _jacobian(self, q: Sequence[float]) -> list[list[float]]:
+        """Velocity of the tool and turning speed for each joint, in the arm's vertical plane. Shape: (6, 6)."""
+        arm, low = self._arm, q[1] + q[2] + q[3]
+        unit = (abs(arm.a2) + abs(arm.a3)) / 2.0
+        sine, cosine, s5, c5 = math.sin(low), math.cos(low), math.sin(q[4]), math.cos(q[4])
+        end = arm.d6 + arm.tool
+        out = -s5 * cosine, c5, -s5 * sine
+        # From each joint to the tool: radial and height; all beyond joint 1 are `arm.d4` beside the plane.
+        x5, z5 = end * out[0], end * out[2]
+        x4, z4 = x5 + arm.d5 * sine, z5 - arm.d5 * cosine
+        x3, z3 = x4 + arm.a3 * math.cos(q[1] + q[2]), z4 + arm.a3 * math.sin(q[1] + q[2])
+        x2, z2 = x3 + arm.a2 * math.cos(q[1]), z3 + arm.a2 * math.sin(q[1])
+        beside = end * c5
+        rows = [[-(arm.d4 + beside), x2, 0.0, 0.0, 0.0, 1.0]]
+        rows += [[z, 0.0, -x, 0.0, 1.0, 0.0] for x, z in ((x2, z2), (x3, z3), (x4, z4))]
+        axis = sine, 0.0, -cosine
+        rows += [[cosine * beside, -cosine * x5 - sine * z5, sine * beside, *axis], [0.0, 0.0, 0.0, *out]]
+        return [[value / unit for value in row[:3]] + row[3:] for row in rows]
