@@ -196,7 +196,9 @@ _SMALL, _MIDDLE, _LARGE = (0.060, 0.048, 0.040, 0.0315), (0.070, 0.054, 0.042, 0
 """Radii of base, upper arm, forearm and wrists [m]: ROS-Industrial's ur_description, measured from models."""
 
 
-def _arm(lengths: tuple[float, ...], offsets: tuple[float, float], radii: tuple[float, ...]) -> ArmGeometry:
+def _arm(
+    lengths: tuple[float, float, float, float, float, float], offsets: tuple[float, float], radii: tuple[float, ...]
+) -> ArmGeometry:
     """An arm of the lengths d1, a2, a3, d4, d5 and d6 [m]; the offsets are of upper arm and forearm."""
     return ArmGeometry(*lengths, outline=ArmOutline(*offsets, *radii))
 

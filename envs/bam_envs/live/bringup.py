@@ -62,7 +62,11 @@ def info_by_profile(url: str, profile: RobotProfile, unknown: Iterable[str] = ()
     silent = ", ".join(name.rpartition("/")[2] for name in unknown)
     rest = f"; it does not report {silent}" if silent else ""
     known = f"profile {profile.name}: {', '.join(profile.command.labels)}"
-    return RobotInfo(profile.name, text=f"the robot at {url}, which does not describe itself ({known}{rest})")
+    return RobotInfo(
+        profile.name,
+        text=f"the robot at {url}, which does not describe itself ({known}{rest})",
+        watchdog=profile.watchdog,
+    )
 
 
 def least_interval(profile: RobotProfile, period: float, topic: str, *, describes_itself: bool) -> int:

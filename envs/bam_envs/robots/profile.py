@@ -21,7 +21,7 @@ from msgspec import Meta
 
 from bam_envs.core.errors import InvalidValue, UnknownName
 from bam_envs.core.robot import RobotSpec, SignalSpec
-from bam_envs.core.validation import Finite, NonEmpty, Positive, check, read_table, type_hints
+from bam_envs.core.validation import Finite, NonEmpty, NonNegative, Positive, check, read_table, type_hints
 from bam_envs.robots.mir100 import base_spec
 from bam_envs.robots.ur5e import arm_spec
 from bam_envs.ros.codec import LISTED_TYPES

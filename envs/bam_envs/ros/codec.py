@@ -60,6 +60,7 @@ class RobotInfo:
     lockstep: bool = False  # whether its time advances only with commands, one period each
     period: Positive | None = None  # time between two commands [s], if reported
     text: str = ""  # one line for people
+    watchdog: float | None = None  # time after which it stops by itself without a command [s], if known
 
     def to_json(self) -> str:
         """The text for the answer of `INFO_SERVICE`."""

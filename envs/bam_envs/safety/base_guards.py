@@ -25,7 +25,7 @@ class LaserZones(Guard):
     an obstacle at its scanner.
     """
 
-    number, name, unit, setting, keeps_out = "G12", "laser zones", "m", "laser_stop", True
+    number, name, unit, setting = "G12", "laser zones", "m", "laser_stop"
 
     def __init__(self, spec: RobotSpec, limits: Limits, body: BaseBody) -> None:
         self.limit_value, self._slow, self._time = limits.laser_stop, limits.laser_slow, limits.collision_time

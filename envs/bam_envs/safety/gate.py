@@ -32,8 +32,8 @@ from bam_envs.safety.guard import (
     position_range,
     require_bounded,
 )
-from bam_envs.safety.link_guards import Watchdog
 from bam_envs.safety.guards import LATE, Freshness, MeasuredLimits, Shape, default_guards
+from bam_envs.safety.link_guards import Share, Watchdog
 
 __all__ = ["ClearedCommand", "Limits", "SafeRobot"]
 
@@ -430,7 +430,8 @@ class SafeRobot(metaclass=Sealed):
         self._note(guard, "held")
         self._bad += 1
         if self._bad >= guard.patience:
-            self._stop(guard, reason if self._bad == 1 else f"{reason}, {self._bad} ticks in a row")
+            once = self._bad == 1 or isinstance(guard, Share)
+            self._stop(guard, reason if once else f"{reason}, {self._bad} ticks in a row")
         if self._is_base:
             tick.command = [0.0] * len(tick.last)
         elif guard in self._further:
@@ -499,7 +500,7 @@ class SafeRobot(metaclass=Sealed):
         """Bring the robot to `initial`; a live arm opens its gripper and goes to its start pose slowly.
 
         Raises:
-            InvalidValue: The start pose is outside the position limits, or in a place that is kept out of; nothing moved.
+            InvalidValue: The start pose is not one that the guards allow; nothing moved.
             StartNotReached: The arm was not there in time; the error holds the joints.
             SafetyStop: A guard stopped the robot, now or earlier.
         """
@@ -608,4 +609,4 @@ def _copy(tick: Tick) -> Tick:
     """The tick with arrays (m,) for a user's guard, which may change the command only."""
     values = (getattr(tick, one.name) for one in fields(tick) if one.name != "signals")
     signals = {name: array.copy() for name, array in tick.signals.items()}
-    return Tick(*(np.array(value) if isinstance(value, list) else value for value in values), signals=signals)  # type: ignore[arg-type]
+    return Tick(*(np.array(value) if isinstance(value, list) else value for value in values), signals=signals)  # type: ignore[arg-type, misc]

@@ -115,7 +115,7 @@ class Limits:
     """Condition number above which an arm slows down, if its task moves the tool along straight lines."""
     singularity_stop: float = _limit(30.0, 6.0, 200.0, "condition number", finite=True)
     """Condition number that it does not exceed."""
-    clearance: float = _limit(0.01, 0.002, 0.1, "m", finite=True)
+    clearance: float = _limit(0.005, 0.002, 0.1, "m", finite=True)
     """Distance that the links of an arm keep from each other and from the table [m]."""
     table_height: float = _place(0.0, -2.0, 1.0)
     """Height of the table in ``base_link`` [m], below which no part of an arm goes."""

@@ -269,9 +269,7 @@ def default_guards(
     return [Shape(spec), *counting, *first, *watched, *moving, MeasuredLimits(spec)]
 
 
-def _arm_guards(
-    spec: RobotSpec, limits: Limits, tool_position: ToolPosition | None, straight: bool
-) -> list[Guard]:
+def _arm_guards(spec: RobotSpec, limits: Limits, tool_position: ToolPosition | None, straight: bool) -> list[Guard]:
     position = None if math.isinf(limits.tool_speed) else _kinematics(spec, tool_position)
     joints = columns_in(spec.command, "rad")
     measured: list[Guard] = [arm.MeasuredJump(spec)]

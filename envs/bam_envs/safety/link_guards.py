@@ -3,7 +3,6 @@
 Some of them warn before they stop the robot: their `warning` stands until its cause is gone.
 """
 
-import math
 from collections import deque
 
 from bam_envs.core.robot import RobotSpec
@@ -84,8 +83,8 @@ class LateTicks(Share):
         late = self.count(tick)
         if late > TICKS * self.limit_value or tick.pause > 2.0 * self._period:
             self.warning = (
-                f"{late} of the last {TICKS} commands were more than {1000 * self._by:.0f} ms late: the policy takes too "
-                "long, or the computer is busy"
+                f"{late} of the last {TICKS} commands were more than {1000 * self._by:.0f} ms late: the policy takes "
+                "too long, or the computer is busy"
             )
         elif not late:
             self.warning = ""
@@ -157,8 +156,8 @@ class Watchdog(Guard):
         if watchdog is None or watchdog == 0.0:
             known = "is not known to stop" if watchdog is None else "does not stop"
             self.warning = (
-                f"the robot {known} by itself: when this computer or the link fails it {self._rest}; keep a hand on its "
-                "emergency stop, and say in its profile after what time it stops (watchdog = 0.1)"
+                f"the robot {known} by itself: when this computer or the link fails it {self._rest}; keep a hand on "
+                "its emergency stop, and say in its profile after what time it stops (watchdog = 0.1)"
             )
         elif not watchdog <= self.limit_value:
             self.warning = (
@@ -167,8 +166,6 @@ class Watchdog(Guard):
             )
         else:
             self.warning = ""
-
-
 
 
 class RampAfterStop(Guard):

@@ -37,7 +37,7 @@ class Place(Guard):
 
     def rest(self, last: Numbers, step: Numbers, share: float = 1.0) -> Numbers:
         """Where the joints come to rest after `share` of `step` from `last`, if they brake together. Shape: (k,)."""
-        # Braking takes n steps, each shorter by the same part: together they are (n - 1) / 2 times as long as the first.
+        # Braking takes n steps, each shorter by the same part: together they are (n - 1) / 2 first ones long.
         braking = math.ceil(share * max(map(abs, step)) / self._change - 1e-6)
         share *= 1.0 + max(0, braking - 1) / 2.0
         return [one + share * way for one, way in zip(last, step, strict=True)]
@@ -99,8 +99,13 @@ class WorkspaceBox(Place):
         joints = [start[at] for at in self._joints]
         if self.depth(joints) <= _TOUCH:
             return None
-        at, low, high = (", ".join(f"{one:.3f}" for one in point) for point in (self._tool(joints), self._low, self._high))
-        return f"the tool would be at {at} m, outside the box from {low} to {high} m: widen the box, or choose another start"
+        at, low, high = (
+            ", ".join(f"{one:.3f}" for one in point) for point in (self._tool(joints), self._low, self._high)
+        )
+        return (
+            f"the tool would be at {at} m, outside the box from {low} to {high} m: widen the box, or choose another "
+            "start"
+        )
 
 
 class Collision(Place):

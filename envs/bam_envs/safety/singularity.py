@@ -20,7 +20,7 @@ class Singularity(Guard):
     computed anew only after the joints have turned far enough, since it was computed last, to reach the limit.
     """
 
-    number, name, unit, setting, keeps_out = "G13", "singularity", "condition number", "singularity_stop", True
+    number, name, unit, setting = "G13", "singularity", "condition number", "singularity_stop"
 
     def __init__(self, spec: RobotSpec, limits: Limits, geometry: ArmGeometry) -> None:
         self._slow, self.limit_value = limits.singularity_slow, limits.singularity_stop

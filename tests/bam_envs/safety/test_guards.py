@@ -15,7 +15,7 @@ from bam_envs.robots.mir100 import base_spec
 from bam_envs.robots.ur5e import GEOMETRY, JOINTS, arm_spec
 from bam_envs.safety import arm_guards, guards
 from bam_envs.safety.arm_guards import longest_step
-from bam_envs.safety.guard import BOUNDS, Limits, Tick
+from bam_envs.safety.guard import BOUNDS, ORDERED, Limits, Tick
 from bam_envs.safety.guards import default_guards
 from bam_envs.testing import ARM_HOME
 
@@ -68,10 +68,15 @@ def test_the_list_of_an_arm():
     table = [(one.number, one.name, round(one.limit_value, 9), one.unit) for one in default_guards(ARM)]
     assert table == [
         ("G2", "shape", 7, "numbers"),
+        ("G15", "late ticks", 0.05, "share of 100 ticks"),
+        ("G16", "link quality", 0.9, "share of 100 ticks"),
+        ("G18", "changed commands", 0.2, "share of 100 ticks"),
         ("G2", "finite", 3, "bad ticks in a row"),
         ("G3", "state age", 0.1, "s"),
         ("G15", "command pace", 1.0, "s"),
+        ("G4", "action age", 0.1, "s"),
         ("G4", "answer to a command", 0.3, "s"),
+        ("G5", "robot's watchdog", 0.1, "s"),
         ("G7", "measured jump", 0.05, "rad"),
         ("G8", "measured joint speed", 1.3, "rad/s"),
         ("G10", "measured tool speed", 0.325, "m/s"),
@@ -79,10 +84,14 @@ def test_the_list_of_an_arm():
         ("G8", "gripper speed", 0.15, "m/s"),
         ("G8", "joint speed", 1.0, "rad/s"),
         ("G14", "ramp-in speed", 0.25, "rad/s"),
+        ("G14", "ramp-in after a stop", 3.0, "s"),
         ("G10", "tool speed", 0.25, "m/s"),
         ("G9", "joint acceleration", 10.0, "rad/s^2"),
+        ("G9", "joint jerk", 500.0, "rad/s^3"),
         ("G10", "tool speed", 0.25, "m/s"),
         ("G23", "following", 0.05, "rad"),
+        ("G10", "workspace box", 3.0, "m"),
+        ("G24", "collision", 0.005, "m"),
         ("G7", "measured limits", 0.0, "beyond the data sheet"),
     ]
 
@@ -91,18 +100,25 @@ def test_the_list_of_a_base():
     table = [(one.number, one.name, round(one.limit_value, 9), one.unit) for one in default_guards(BASE)]
     assert table == [
         ("G2", "shape", 2, "numbers"),
+        ("G15", "late ticks", 0.05, "share of 100 ticks"),
+        ("G16", "link quality", 0.9, "share of 100 ticks"),
+        ("G18", "changed commands", 0.2, "share of 100 ticks"),
         ("G2", "finite", 3, "bad ticks in a row"),
         ("G3", "state age", 0.5, "s"),
         ("G15", "command pace", 1.0, "s"),
+        ("G4", "action age", 0.1, "s"),
         ("G4", "answer to a command", 0.3, "s"),
+        ("G5", "robot's watchdog", 0.5, "s"),
         ("G11", "measured base speed", 0.65, "m/s"),
         ("G11", "measured turn speed", 0.91, "rad/s"),
         ("G11", "base speed", 0.5, "m/s"),
         ("G11", "turn speed", 0.7, "rad/s"),
         ("G11", "base acceleration", 2.0, "m/s^2"),  # the data sheet's, which is below the limit
         ("G11", "turn acceleration", 2.5, "rad/s^2"),
+        ("G14", "ramp-in after a stop", 3.0, "s"),
         ("G23", "base following", 0.2, "m/s"),
         ("G23", "turn following", 0.25, "rad/s"),
+        ("G12", "laser zones", 0.3, "m"),
         ("G7", "measured limits", 0.0, "beyond the data sheet"),
     ]
 
@@ -110,7 +126,8 @@ def test_the_list_of_a_base():
 def test_what_is_not_there_or_off_has_no_guard():
     names = [one.name for one in default_guards(ARM)]
     off = Limits(joint_acceleration=math.inf, tool_speed=math.inf, joint_speed=math.inf)
-    gone = {name for name in names if "acceleration" in name or "tool speed" in name or name == "measured joint speed"}
+    gone = {name for name in names if "acceleration" in name or "tool speed" in name}
+    gone |= {"measured joint speed", "joint jerk", "workspace box", "collision"}
     assert [one.name for one in default_guards(ARM, off)] == [name for name in names if name not in gone]
     joints_only = replace(ARM, command=ARM.command.part(JOINTS))
     assert [one.name for one in default_guards(joints_only)] == [name for name in names if name != "gripper speed"]
@@ -151,12 +168,14 @@ def test_limits_by_name():
 @pytest.mark.parametrize("name", sorted(BOUNDS))
 def test_a_profile_cannot_open_a_guard(name):
     least, most, unit = BOUNDS[name]
-    assert Limits.of({name: least}) != Limits.of({name: most})
-    for value in (1000.5, least / 2):
+    wide = {less: BOUNDS[less][0] for less, more in ORDERED if more == name}  # limits that are ordered go together
+    wide |= {more: BOUNDS[more][1] for less, more in ORDERED if less == name}
+    assert Limits.of({**wide, name: least}) != Limits.of({**wide, name: most})
+    for value in (1000.5 * most, least / 2 if least > 0 else least - 1):
         with pytest.raises(InvalidValue) as caught:
-            Limits.of({name: value})
+            Limits(**{**wide, name: value}).require_bounded()
         text = f"The limit {name} of a live robot must be {least:g} to {most:g} {unit}, not {value:g}."
-        assert str(caught.value) == text
+        assert str(caught.value) == text or (wide and "contradict each other" in str(caught.value))
 
 
 def other_arm():
@@ -175,7 +194,7 @@ def test_an_arm_without_kinematics_has_no_tool_speed_that_could_be_limited():
     blind = [one.name for one in default_guards(other_arm(), Limits(tool_speed=math.inf))]
     assert not [name for name in blind if "tool" in name]
     seeing = default_guards(other_arm(), tool_position=lambda q: np.pad(q, ((0, 0), (0, 1))))
-    assert len(seeing) == len(blind) + 3
+    assert len(seeing) == len(blind) + 4
     with pytest.raises(InvalidValue) as caught:
         default_guards(other_arm(), tool_position=lambda q: np.zeros((len(q), 3)))
     assert str(caught.value) == (

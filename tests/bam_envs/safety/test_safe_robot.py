@@ -8,7 +8,7 @@ import threading
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given, reject, settings
 from hypothesis import strategies as st
 
 from bam_envs.core.errors import (
@@ -27,6 +27,7 @@ from bam_envs.robots.ur5e import GEOMETRY
 from bam_envs.safety.arm_guards import JointSpeed
 from bam_envs.safety.gate import ClearedCommand, SafeRobot
 from bam_envs.safety.guard import Guard, Limits
+from bam_envs.safety.tubes import ArmTubes
 from bam_envs.testing import ARM_HOME, RobotContract
 
 FIRST = np.zeros(1, np.int64)
@@ -169,6 +170,7 @@ class Watcher:
 
     def __init__(self, inner, state, limits):
         self.inner, self.limits = inner, limits
+        self.tubes = ArmTubes(GEOMETRY, GEOMETRY.outline, tool=True)
         low, high = np.array(inner.spec.command.low), np.array(inner.spec.command.high)
         margin = np.array([limits.position_margin] * 6 + [0.0])
         self.low, self.high = low + margin, high - margin
@@ -201,6 +203,8 @@ class Watcher:
         change = np.abs(step - self.step)[:6]
         slower = (np.abs(step) <= np.abs(self.step) + 1e-12) & (step * self.step >= -1e-12)
         assert ((change <= limits.joint_acceleration * period**2 + 1e-8) | slower[:6]).all()
+        assert GEOMETRY.tool_point(sent[:6])[2] >= -1e-6, "the tool is in the table"
+        assert min(self.tubes.nearest(sent), self.tubes.lowest(sent)) >= limits.clearance - 1e-6
         assert (sent >= self.least - 1e-9).all(), "it passed the farthest place that it was told"
         assert (sent <= self.most + 1e-9).all(), "it passed the farthest place that it was told"
         self.last, self.step = sent, step
@@ -214,8 +218,11 @@ class Watcher:
     st.sampled_from([0.02, 0.25, 1.0]),
 )
 def test_whatever_it_is_told_what_is_sent_keeps_every_limit_at_every_tick(orders, joints, acceleration, tool_speed):
-    limits = Limits(joint_acceleration=acceleration, tool_speed=tool_speed)
-    inner, robot, state = fake(joints, limits=limits)
+    limits = Limits(joint_acceleration=acceleration, tool_speed=tool_speed, joint_jerk=5000.0)
+    try:
+        inner, robot, state = fake(joints, limits=limits)
+    except InvalidValue:  # the arm would begin in itself or in the table
+        reject()
     watcher = Watcher(inner, state, limits)
     for kind, numbers, times in orders:
         for _ in range(times):
@@ -428,7 +435,7 @@ def test_stale_states_hold_for_half_a_second_and_then_stop():
 def test_after_stale_states_it_goes_on_from_rest():
     arm, robot, state = live()
     state = robot.step(state.command)
-    for _ in range(20):
+    for _ in range(2):  # more of them are a bad link
         arm.old = 0.3
         for _ in range(5):
             state = robot.step(turned(state, 0.05))
@@ -436,7 +443,7 @@ def test_after_stale_states_it_goes_on_from_rest():
         after = robot.step(turned(state, 0.05))
         np.testing.assert_allclose((after.command - state.command)[0, 5], 0.025)
         state = after
-    assert (robot.report()["state age"]["held"], robot.report()["state age"]["stopped"]) == (100, 0)
+    assert (robot.report()["state age"]["held"], robot.report()["state age"]["stopped"]) == (10, 0)
 
 
 @pytest.mark.parametrize("paused", [False, True])
