@@ -1,6 +1,8 @@
 """The process that writes a recording: it takes records out of the ring, encodes them and flushes them to the disk.
 
-It ends the file properly when the deployment closes the ring, and also when the deployment's process is gone.
+It ends the file properly when the deployment closes the ring, and also when the deployment's process is gone. What a
+kill of this process may cost is one look into the ring: the messages of each look are appended as a small chunk of
+their own, and `_SETTLE` later one compressed chunk with an index takes the place of these.
 """
 
 import base64
@@ -10,21 +12,22 @@ import signal
 import struct
 import sys
 import time
+import zlib
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, BinaryIO
 
 import msgspec
+from mcap.data_stream import RecordBuilder
+from mcap.records import Channel, Chunk, Message, Schema
 from mcap.writer import CompressionType, Writer
 
 from bam_train.recording.ring import EVENT, IMAGE, LAYOUT, PIXELS, TICK, TIMES, Ring
 
 _POLL = 0.02
 """Time between two looks into the ring [s]."""
-_SYNC = 0.5
-"""Time between two flushes to the disk itself [s]: what a power cut may cost."""
-_CHUNK = 1024
-"""Bytes of a chunk, less than most ticks: what is in an open chunk is lost when this process is killed."""
+_SETTLE = 0.5
+"""Time between two chunks with an index, which are flushed to the disk itself [s]: twice that may a power cut cost."""
 _SENT = ("/command", "/status")
 """Topics with the time at which the command was sent."""
 _NUMBER, _TEXT, _WHOLE = {"type": "number"}, {"type": "string"}, {"type": "integer"}
@@ -46,14 +49,17 @@ class _File:
 
     def __init__(self, head: dict[str, Any]) -> None:
         self.file: BinaryIO = open(head["path"], "xb")  # noqa: SIM115 - closed by `close`
-        self._writer = Writer(self.file, chunk_size=_CHUNK, compression=CompressionType.ZSTD)
+        self._writer = Writer(self.file, chunk_size=2**62, compression=CompressionType.ZSTD)  # `settle` ends chunks
         self._writer.start(profile="", library="bam-train")
-        self._writer.add_metadata("deployment", {key: str(value) for key, value in head["metadata"].items()})
         self._guards: list[str] = head["guards"]
         self._layout: dict[str, list[list[str]]] = {}  # topic -> [group, name] or [name] of each number
         self._channels: dict[str, int] = {}
         self._numbers = struct.Struct("=0d")
         self._sequence = 0
+        self._new = RecordBuilder()
+        """Messages since the last look into the ring."""
+        self._begin = self._end = self.file.tell()  # of the small chunks
+        self._metadata("deployment", {key: str(value) for key, value in head["metadata"].items()})
 
     def add(self, record: bytes) -> None:
         kind, (wall, monotonic, ago), data = record[:1], TIMES.unpack_from(record, 1), record[1 + TIMES.size :]
@@ -80,7 +86,7 @@ class _File:
 
     def _declare(self, content: dict[str, Any]) -> None:
         if content["extra"]:
-            self._writer.add_metadata("layout", content["extra"])
+            self._metadata("layout", content["extra"])
         self._layout = {topic: [name.split(".", 1) for name in names] for topic, names in content["layout"].items()}
         self._numbers = struct.Struct(f"={sum(map(len, self._layout.values()))}d")
         for topic, names in self._layout.items():
@@ -93,10 +99,17 @@ class _File:
                         properties[name] = {"type": "object", "properties": part}
                 self._register(topic, f"bam{topic.replace('/', '.')}", properties)
 
-    def _register(self, topic: str, schema: str, properties: dict[str, Any]) -> None:
-        content = json.dumps({"title": schema, "type": "object", "properties": properties}).encode()
-        schema_id = self._writer.register_schema(schema, "jsonschema", content)
-        self._channels[topic] = self._writer.register_channel(topic, "json", schema_id)
+    def _metadata(self, name: str, content: dict[str, str]) -> None:
+        self.settle()
+        self._writer.add_metadata(name, content)
+        self._begin = self._end = self.file.tell()
+
+    def _register(self, topic: str, name: str, properties: dict[str, Any]) -> None:
+        content = json.dumps({"title": name, "type": "object", "properties": properties}).encode()
+        schema = self._writer.register_schema(name, "jsonschema", content)
+        self._channels[topic] = channel = self._writer.register_channel(topic, "json", schema)
+        Schema(id=schema, data=content, encoding="jsonschema", name=name).write(self._new)
+        Channel(id=channel, topic=topic, message_encoding="json", metadata={}, schema_id=schema).write(self._new)
 
     def _tick(self, wall: int, monotonic: float, ago: float, data: bytes) -> None:
         numbers = iter(self._numbers.unpack(data))
@@ -114,16 +127,37 @@ class _File:
         self._message(topic, wall, content)
 
     def _message(self, topic: str, wall: int, content: dict[str, Any]) -> None:
-        self._writer.add_message(self._channels[topic], wall, _encode(content), wall, self._sequence)
+        data, channel = _encode(content), self._channels[topic]
+        self._writer.add_message(channel, wall, data, wall, self._sequence)
+        Message(channel, wall, data, wall, self._sequence).write(self._new)
 
-    def flush(self, sync: bool) -> None:
+    def save(self) -> None:
+        """Append the new messages as a small chunk, where this process's end cannot harm them any more."""
+        if not self._new.count:
+            return
+        data: bytes = self._new.end()  # type: ignore[no-untyped-call]
+        record = RecordBuilder()
+        Chunk("", data, 0, 0, zlib.crc32(data), len(data)).write(record)
+        self.file.seek(self._end)
+        self.file.write(record.end())  # type: ignore[no-untyped-call]
         self.file.flush()
-        if sync:
-            os.fsync(self.file.fileno())
+        self._end = self.file.tell()
+        self.file.seek(self._begin)
+
+    def settle(self) -> None:
+        """Put one chunk in the place of the small ones, and flush it to the disk itself."""
+        self._new.end()  # type: ignore[no-untyped-call]
+        self.file.seek(self._begin)
+        self._writer.flush()  # type: ignore[no-untyped-call]
+        self.file.truncate()
+        os.fsync(self.file.fileno())
+        self._begin = self._end = self.file.tell()
 
     def close(self) -> None:
+        self.settle()
         self._writer.finish()  # type: ignore[no-untyped-call]
-        self.flush(sync=True)
+        self.file.flush()
+        os.fsync(self.file.fileno())
         self.file.close()
 
 
@@ -136,16 +170,17 @@ def nested(values: list[tuple[list[str], Any]]) -> dict[str, Any]:
 
 
 def _drain(ring: Ring, file: _File, parent: int) -> None:
-    synced = time.monotonic()
+    settled = time.monotonic()
     while True:
         over = ring.closed or os.getppid() != parent  # looked at first: what was written before is still read
         while (record := ring.read()) is not None:
             file.add(record)
-        now = time.monotonic()
-        file.flush(sync=now - synced > _SYNC)
-        synced = now if now - synced > _SYNC else synced
         if over:
             return
+        file.save()
+        if time.monotonic() - settled > _SETTLE:
+            settled = time.monotonic()
+            file.settle()
         time.sleep(_POLL)
 
 
