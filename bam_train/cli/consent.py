@@ -4,6 +4,7 @@ import os
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
@@ -33,6 +34,7 @@ def connected_env(
     named: str | None = None,
     env_kwargs: Mapping[str, Any] | None = None,
     admit: Callable[[gym.Env[Any, Any], Place], Sequence[str]] = lambda env, place: (),
+    motion: Path | None = None,
     wiggle: bool = False,
 ) -> gym.Env[Any, Any]:
     """Make the environment of a checkpoint; its robot is connected and has not moved, and there is consent to move it.
@@ -49,6 +51,7 @@ def connected_env(
         env_kwargs: Arguments of the environment, which override the checkpoint's.
         admit: Called with the environment, connected, and its place, before anybody is asked; returns lines for a
             person.
+        motion: Recording of the live robot in which each axis must have moved as it was commanded.
         wiggle: Move each axis of a live robot a little first, to see whether it moves as commanded.
 
     Raises:
@@ -63,7 +66,7 @@ def connected_env(
         if place.robot is None:
             require_fit(checkpoint, env, place)
         else:
-            contract = required_contract(checkpoint, env, place)
+            contract = required_contract(checkpoint, env, place, motion)
         signals.raise_again()
         robot: Any = getattr(env.unwrapped, "robot", None)
         if robot is not None:
@@ -88,7 +91,7 @@ def connected_env(
     return env
 
 
-def required_contract(checkpoint: Checkpoint, env: Any, place: Place) -> Contract:
+def required_contract(checkpoint: Checkpoint, env: Any, place: Place, motion: Path | None = None) -> Contract:
     """The contract of a checkpoint with a live robot, shown to a person if the robot is real; moves nothing.
 
     Raises:
@@ -97,8 +100,12 @@ def required_contract(checkpoint: Checkpoint, env: Any, place: Place) -> Contrac
     from bam_train.deploy.contract import check_contract  # only for live robots
 
     contract = check_contract(checkpoint, env, place)
+    if motion is not None:
+        from bam_train.deploy.wiggle import recorded_motion
+
+        contract = replace(contract, checks=(*contract.checks, *recorded_motion(motion, env.unwrapped.robot.spec)))
     info = None if contract.evidence is None else contract.evidence.info
-    if contract.refused or info is None or not info.simulated:
+    if contract.refused or info is None or not info.simulated or motion is not None:
         for line in contract.lines():
             say(line)
     contract.require(f"{checkpoint.path} and the robot at {place.text}")

@@ -49,7 +49,7 @@ def deploy_checkpoint(config: DeployConfig, signals: SignalMemory) -> int:
         return print_guards(config, checkpoint, place)
     admission = Admission(checkpoint, config.keys, config.allow_unsigned, config.trials, config.i_know)
     asked: Any = {"episodes": config.episodes, "yes": config.yes, "render": config.render, "named": config.env}
-    asked["wiggle"] = config.wiggle
+    asked |= {"wiggle": config.wiggle, "motion": config.motion}
     env = connected_env(checkpoint, place, signals, who="bam-deploy", admit=admission, **asked)
     try:
         pacer = Pacer(_period(config, checkpoint, env))
@@ -164,8 +164,9 @@ def _checked_place(config: DeployConfig) -> Place:
         raise SettingsError("--stage and --trials are for a live robot; give its address with --robot too")
     if config.i_know and config.stage != "full":
         raise SettingsError("--i-know is for --stage full alone; leave it out")
-    if config.wiggle and config.robot is None:
-        raise SettingsError("--wiggle moves the axes of a live robot; give its address with --robot too")
+    if config.robot is None and (config.wiggle or config.motion is not None):
+        flag = "--wiggle" if config.wiggle else "--motion"
+        raise SettingsError(f"{flag} is about the axes of a live robot; give its address with --robot too")
     if config.render:
         from bam_train.cli.consent import require_screen
 

@@ -151,6 +151,8 @@ class DeployConfig:
     """Public keys that a real robot trusts; $BAM_TRUSTED_KEYS or ~/.config/bam-train/trusted by default."""
     allow_unsigned: bool = False
     """Let a checkpoint move a real robot that nobody trusted has signed; every status line says so."""
+    motion: File = None
+    """Recording (.mcap) of this robot in which each axis must have moved as it was commanded."""
     wiggle: bool = False
     """Move each axis of a live robot a little and back first, to see whether it moves as commanded."""
     stage: Annotated[Literal["trial", "full"] | None, tyro.conf.arg(metavar="trial|full")] = None

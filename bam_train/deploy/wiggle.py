@@ -1,21 +1,22 @@
-"""Does each axis of a live robot move as it is commanded? By a small, slow motion of one axis after the other.
+"""Does each axis of a live robot move as it is commanded? By a recording, or by a small, slow motion of each axis.
 
-The motion passes the guards like any other. The same comparison takes a recording of any motion.
+That motion passes the guards like any other.
 """
 
 import math
-from collections.abc import Iterator
-from typing import Any
+from collections.abc import Iterator, Sequence
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from bam_envs.core.errors import SafetyStop
-from bam_envs.core.robot import Initial, RobotState, SignalSpec
+from bam_envs.core.robot import Initial, RobotSpec, RobotState, SignalSpec
 from bam_envs.safety.gate import SafeRobot
 from bam_envs.safety.guard import is_base, measured_places
 from bam_train.deploy.contract_table import Check, check
 from bam_train.deploy.robot_checks import FACTORS, driven
+from bam_train.recording.recording import Recording
 
 Array = NDArray[np.float64]
 FAR = {"rad": 0.03, "m": 0.01, "m/s": 0.05, "rad/s": 0.1}
@@ -25,6 +26,10 @@ THERE, STAY = 1.0, 0.5
 _MOST_LAG = 0.5  # longest delay of the measured motion behind the commands [s]
 _MOVED, _LEAST, _MOST = 0.3, 0.6, 1.6
 """Share of the commanded motion that counts as motion at all, and the least and most that is right."""
+_HELD = 0.2
+"""The same least share of a gripper, which closes no further than what it holds."""
+_FIT, _ENOUGH = 0.8, 0.2
+"""Share of a motion that its commands must explain, and share of `FAR` that shows anything."""
 
 
 def wiggle(robot: SafeRobot, joints: Array | None) -> Iterator[Check]:
@@ -49,14 +54,36 @@ def wiggle(robot: SafeRobot, joints: Array | None) -> Iterator[Check]:
         return
     finally:
         robot.halt()
-    sent, seen = np.array(commanded), np.array(measured)
+    yield from _compared(spec, commanded, measured)
+
+
+def recorded_motion(path: Path, spec: RobotSpec) -> Iterator[Check]:
+    """The lines about the motion of each axis in the longest episode of a recording of a live robot of `spec`.
+
+    Raises:
+        BadRecording: There is no such recording, or it is of another robot.
+    """
+    recording = Recording.open(path)
+    robot = recording.metadata.get("robot", "")
+    yield check(f"recording {path.name}", "of a live robot", robot or "of a simulation", fits=bool(robot))
+    states, episodes = recording.states(spec), recording.episodes()
+    if not robot or not episodes:
+        return
+    longest = max(episodes, key=len)
+    episode = states[longest.start : longest.stop]
+    yield from _compared(spec, [one.command[0] for one in episode], [_measured(spec, one) for one in episode])
+
+
+def _compared(spec: RobotSpec, commands: Sequence[Array], measured: Sequence[Array]) -> Iterator[Check]:
+    """`motion_checks` of the commands, and of what was measured after each."""
+    sent, seen = np.array(commands), np.array(measured)
     if is_base(spec):
         sent, seen = np.cumsum(sent * spec.period, axis=0), driven(seen)
-    yield from motion_checks(command, sent, seen, spec.period)
+    yield from motion_checks(spec.command, sent, seen, spec.period)
 
 
 def motion_checks(command: SignalSpec, commanded: Array, measured: Array, period: float) -> Iterator[Check]:
-    """One line for each axis that was commanded to move: whether it was that axis that moved, as far, and that way.
+    """One line for each axis: whether its motion was the commanded one, as far, that way, and not another axis's.
 
     Args:
         command: Labels and units of the axes.
@@ -64,46 +91,57 @@ def motion_checks(command: SignalSpec, commanded: Array, measured: Array, period
         measured: Measured positions (k, m); NaN where nothing is measured.
         period: Time between two rows [s].
     """
-    known = np.isfinite(measured.sum(axis=0))
-    moved = [i for i in range(len(command.labels)) if np.ptp(commanded[:, i]) >= 0.2 * FAR[command.units[i]]]
-    gains = _gains(commanded[:, moved], np.where(known, measured, 0.0), round(_MOST_LAG / period))
-    for row, i in zip(gains, moved, strict=True):
-        what, expected = f"motion of {command.labels[i]}", "as commanded"
-        if not known[i]:
-            yield check(what, expected, "it is not measured", fits=None)
-            continue
-        found = _wrong(command, i, row)
-        yield check(what, expected, found or f"{row[i]:.2f} of what was commanded", fits=not found)
+    moved = np.ptp(commanded, axis=0) >= [_ENOUGH * FAR[unit] for unit in command.units]
+    for i, label in enumerate(command.labels):
+        found: tuple[str, bool | None] = ("it was not commanded to move", None)
+        if not np.isfinite(measured[:, i]).all():
+            found = "it is not measured", None
+        elif moved[i]:
+            found = _motion(command, i, commanded, measured[:, i], moved, round(_MOST_LAG / period))
+        yield check(f"motion of {label}", "as commanded", found[0], fits=found[1])
 
 
-def _gains(commanded: Array, measured: Array, most_lag: int) -> Array:
-    """Least squares: how far each measured axis moves for each commanded one, at the delay that fits best."""
-    best, gains = math.inf, np.zeros((commanded.shape[1], measured.shape[1]))
+def _motion(
+    command: SignalSpec, i: int, commanded: Array, measured: Array, moved: NDArray[np.bool_], most_lag: int
+) -> tuple[str, bool | None]:
+    """How the measured axis `i` (k,) moved, for the commands to all axes (k, m); and whether that is right."""
+    gain, fit = _best_fit(commanded[:, i], measured, most_lag)
+    unit = command.units[i].removesuffix("/s")
+    others = {
+        label: _best_fit(commanded[:, j], measured, most_lag)
+        for j, label in enumerate(command.labels)
+        if j != i and moved[j] and command.units[j] == command.units[i]
+    }
+    like = [label for label, (other, how_well) in others.items() if how_well >= max(_FIT, fit) and _right(other, unit)]
+    if np.ptp(measured) < _MOVED * np.ptp(commanded[:, i]) and not like:
+        return "it did not move", False
+    if fit < _FIT:
+        return f"it moved as {like[0]} was commanded" if like else "it did not follow its commands", False
+    if gain < 0:
+        return "it moved the other way", False
+    if _right(gain, unit):
+        return (f"{gain:.2f} of what was commanded", True) if not like else (f"as {like[0]} was commanded, too", None)
+    units = FACTORS.get(unit, {}).items()
+    hint = next((f" ({name}?)" for name, much in units if _right(gain / much, unit) or _right(gain * much, unit)), "")
+    return f"it moved {gain:.2g} times as far{hint}", False
+
+
+def _right(gain: float, unit: str) -> bool:
+    return (_HELD if unit == "m" else _LEAST) <= gain <= _MOST
+
+
+def _best_fit(commanded: Array, measured: Array, most_lag: int) -> tuple[float, float]:
+    """Least squares, at the delay that fits best: the measured motion per commanded one, and the share it explains."""
+    best = 0.0, -math.inf
     for lag in range(min(most_lag, len(commanded) - 2) + 1):
         sent, seen = commanded[: len(commanded) - lag], measured[lag:]
-        sent, seen = sent - sent.mean(axis=0), seen - seen.mean(axis=0)
-        solution = np.linalg.lstsq(sent, seen, rcond=None)[0]
-        error = float(np.square(seen - sent @ solution).mean())
-        if error < best:
-            best, gains = error, solution
-    return gains
-
-
-def _wrong(command: SignalSpec, i: int, gains: Array) -> str:
-    """What is wrong with the motion of axis `i`, for the gains (m,) of every axis; empty if nothing is."""
-    unit, far = command.units[i].removesuffix("/s"), int(np.abs(gains).argmax())
-    if abs(gains[far]) < _MOVED:
-        return "it did not move"
-    if far != i and abs(gains[i]) < _MOVED:
-        return f"{command.labels[far]} moved instead"
-    if gains[i] < 0:
-        return "it moved the other way"
-    if _LEAST <= gains[i] <= _MOST:
-        return ""
-    units = FACTORS.get(unit, {}).items()
-    fits = (name for name, much in units if any(_LEAST <= one <= _MOST for one in (gains[i] / much, gains[i] * much)))
-    hint = next((f" ({name}?)" for name in fits), "")
-    return f"it moved {gains[i]:.2g} times as far{hint}"
+        sent, seen = sent - sent.mean(), seen - seen.mean()
+        gain = float(sent @ seen) / max(float(sent @ sent), 1e-12)
+        left = seen - gain * sent
+        explained = 1.0 - float(left @ left) / max(float(seen @ seen), 1e-12)
+        if explained > best[1]:
+            best = gain, explained
+    return best
 
 
 def _goals(command: SignalSpec, start: Array, period: float) -> Iterator[tuple[str, Array]]:
@@ -121,7 +159,7 @@ def _goals(command: SignalSpec, start: Array, period: float) -> Iterator[tuple[s
             yield command.labels[i], goal
 
 
-def _measured(spec: Any, state: RobotState) -> Array:
+def _measured(spec: RobotSpec, state: RobotState) -> Array:
     """The measured position of each axis (m,), NaN if not measured; of a base its pose (3,)."""
     if is_base(spec):
         pose: Array = state.signals["base_pose"][0]

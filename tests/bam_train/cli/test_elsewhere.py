@@ -218,15 +218,31 @@ def test_a_robot_that_does_not_fit_is_refused_by_its_line_and_gets_no_command(se
     )
 
 
-def test_each_axis_is_wiggled_first(serve, run, commands_to):
+def test_each_axis_is_wiggled_first_or_shown_by_a_recording(serve, run, commands_to, tmp_path):
     served = serve(gym.make("bam/pick-v0", disable_env_checker=True), fast=True)
+    live, file = ("--robot", served.bus.url), tmp_path / "flight.mcap"
     sent = commands_to(served)
-    status, _, err = run(deploy, PICK, "--episodes", 1, "--robot", served.bus.url, "--wiggle", "--json")
+    status, _, err = run(deploy, PICK, "--episodes", 1, *live, "--wiggle", "--json", "--record", file)
     lines = err.splitlines()
     assert status == 0, err
     assert [line.split()[2] for line in lines[1:8]] == [*UR_JOINTS, "gripper_width"]
     assert all(line.endswith("  ok") for line in lines[1:8])
     assert len(sent) > 2 * 7 * 60  # of seven axes, each for 3 s at 20 Hz, on two topics
+    status, _, err = run(deploy, PICK, "--episodes", 1, *live, "--motion", file, "--no-record")
+    lines = [line.split("  ") for line in err.splitlines()]
+    assert status == 0, err
+    assert ["recording flight.mcap", "ok"] in [[line[0], line[-1]] for line in lines]
+    moved = {line[0].removeprefix("motion of "): line[-1] for line in lines if line[0].startswith("motion of ")}
+    assert moved == dict.fromkeys([*UR_JOINTS, "gripper_width"], "ok") | {"wrist_2_joint": "not told"}
+
+
+def test_a_recording_of_a_simulation_shows_nothing(serve, run, tmp_path):
+    file = tmp_path / "flight.mcap"
+    assert run(deploy, PICK, "--episodes", 1, "--fast", "--record", file)[0] == 0
+    served = serve(gym.make("bam/pick-v0", disable_env_checker=True), fast=True)
+    status, _, err = run(deploy, PICK, "--robot", served.bus.url, "--motion", file)
+    assert status == 3
+    assert "do not fit: recording flight.mcap: expected of a live robot, found of a simulation;" in err
 
 
 GRIPPER_REVERSED = """
@@ -257,7 +273,7 @@ def test_an_axis_that_does_not_move_as_commanded_is_refused(serve, run, tmp_path
     assert [line.split()[2] for line in table if line.endswith("refused")] == ["gripper_width"]
     assert last.startswith(
         f"bam-deploy: {PICK} and the robot at {served.bus.url} do not fit: motion of gripper_width: expected as "
-        "commanded, found it moved "
+        "commanded, found it did not follow its commands; "
     )
     assert last.endswith("the robot has moved a little, and was halted")
 
@@ -266,7 +282,7 @@ def test_wiggling_needs_a_live_robot(run):
     assert run(deploy, PICK, "--wiggle") == (
         1,
         "",
-        "bam-deploy: --wiggle moves the axes of a live robot; give its address with --robot too\n",
+        "bam-deploy: --wiggle is about the axes of a live robot; give its address with --robot too\n",
     )
 
 

@@ -120,7 +120,10 @@ def test_a_recording_of_a_correct_arm(lag):
         (lambda x: x * (1, 1, 1, 1, 1, 1, 1000), {"gripper_width": "it moved 1e+03 times as far (millimetres?)"}),
         (
             lambda x: x[:, [2, 1, 0, 3, 4, 5, 6]],
-            {"shoulder_pan_joint": "elbow_joint moved instead", "elbow_joint": "shoulder_pan_joint moved instead"},
+            {
+                "shoulder_pan_joint": "it moved as elbow_joint was commanded",
+                "elbow_joint": "it moved as shoulder_pan_joint was commanded",
+            },
         ),
     ],
 )
@@ -134,11 +137,29 @@ def test_an_axis_that_did_not_move_or_is_not_measured_is_not_told():
     commanded, measured = motion(np.random.default_rng(0))
     commanded[:, 0], measured[:, 6] = commanded[0, 0], np.nan
     lines = {one.what: one for one in motion_checks(ARM, commanded, measured, PERIOD)}
-    assert "motion of shoulder_pan_joint" not in lines
-    assert (lines["motion of gripper_width"].found, lines["motion of gripper_width"].verdict) == (
-        "it is not measured",
-        "not told",
-    )
+    assert [(one.what, one.found) for one in lines.values() if one.verdict == "not told"] == [
+        ("motion of shoulder_pan_joint", "it was not commanded to move"),
+        ("motion of gripper_width", "it is not measured"),
+    ]
+
+
+def test_two_axes_that_were_commanded_alike_are_not_told_apart():
+    commanded, measured = motion(np.random.default_rng(0))
+    commanded[:, 1], measured[:, 1] = commanded[:, 0], measured[:, 0]
+    lines = {one.what: (one.found, one.verdict) for one in motion_checks(ARM, commanded, measured, PERIOD)}
+    assert lines["motion of shoulder_pan_joint"] == ("as shoulder_lift_joint was commanded, too", "not told")
+
+
+def test_a_gripper_that_holds_something_closes_no_further():
+    commanded, measured = motion(np.random.default_rng(0))
+    measured[:, 6] = np.maximum(measured[:, 6], 0.045)
+    assert list(motion_checks(ARM, commanded, measured, PERIOD))[6].verdict == "ok"
+
+
+def test_an_axis_that_goes_elsewhere_does_not_follow():
+    commanded, measured = motion(np.random.default_rng(0))
+    measured[:, 3] = np.random.default_rng(1).normal(0.0, 0.2, len(measured))
+    assert list(motion_checks(ARM, commanded, measured, PERIOD))[3].found == "it did not follow its commands"
 
 
 def test_every_unit_of_a_command_has_its_distance():
