@@ -63,7 +63,7 @@ def arm_checks(spec: RobotSpec, geometry: ArmGeometry, margin: float, evidence: 
     if urdf is not None:
         yield from _described_kinematics(geometry, joints, urdf)
     pose, why = _tool_pose(evidence)
-    expected = f"within {BESIDE:g} m and {math.degrees(TURNED):.0f} degrees of the joints'"
+    expected = f"as computed, within {BESIDE:g} m and {math.degrees(TURNED):.0f} degrees"
     if np.ptp(joints, axis=0).max() > _STILL:
         pose, why = None, "the arm moves"
     if pose is None:

@@ -182,7 +182,7 @@ def test_the_table_of_a_correct_arm():
     assert lines[-1].split("  ")[-1] == "ok"
     assert contract.to_json()[-3] == {
         "what": "tool pose",
-        "expected": "within 0.015 m and 3 degrees of the joints'",
+        "expected": "as computed, within 0.015 m and 3 degrees",
         "found": "0.000 m, 0.0 degrees",
         "verdict": "ok",
     }
