@@ -180,12 +180,14 @@ def _recorder(
     """The recorder that the flags ask for, started; None for none."""
     if config.record is None and (config.no_record or place.robot is None):
         return None
-    from bam_train.deploy.flight import deployment_facts, flight_recorder, new_recording
+    from bam_train.deploy.flight import deployment_facts, flight_recorder, new_recording, watch_cameras
 
     path = config.record or new_recording(checkpoint.manifest.env)
     facts = {**deployment_facts(checkpoint, env), "seed": config.seed, "address": place.text, "marks": ", ".join(marks)}
     recorder = flight_recorder(path.expanduser(), env, facts)
     recorder.start()
+    for warning in watch_cameras(recorder, place):
+        say(f"bam-deploy: warning: {warning}")
     return recorder
 
 

@@ -15,8 +15,13 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
+from bam_envs.core.errors import BamEnvsError
+from bam_envs.live.camera import LiveCamera
+from bam_envs.robots.profile import load_profile
+from bam_envs.rosbridge.endpoint import Endpoint
 from bam_train.checkpoint import Checkpoint
 from bam_train.deploy.journal import Journal
+from bam_train.env_location import Place
 from bam_train.environments import control_period
 from bam_train.loop import Agent
 from bam_train.loop.gym.gym_spaces import NAME
@@ -76,6 +81,23 @@ def deployment_facts(checkpoint: Checkpoint, env: gym.Env[Any, Any]) -> dict[str
     }
 
 
+def watch_cameras(recorder: Recorder, place: Place) -> list[str]:
+    """Connect the cameras in the live robot's profile, and record them; returns a line for each one that is not."""
+    left_out = []
+    for source in load_profile(place.profile).cameras if place.robot and place.profile else ():
+        endpoint = Endpoint.with_token_file(place.robot or "", ca_file=place.ca_file, token_file=place.token_file)
+        camera = LiveCamera(endpoint, source)
+        try:
+            camera.connect()
+        except BamEnvsError as error:
+            left_out.append(f"camera {source.name} is not recorded: {error}")
+            continue
+        recorder.watch(camera)
+        if camera.file() is None:
+            left_out.append(f"camera {source.name} sends no PNG or JPEG, and is not recorded")
+    return left_out
+
+
 class RecorderAgent(Agent):
     """Records each tick: last in the chain, so that the action is the one that the environment gets.
 
@@ -125,6 +147,7 @@ class RecorderAgent(Agent):
         for name in self._names:
             if name not in self._numbers:
                 self._recorder.pixels(name.removeprefix("env/"), self.get((name, t))[0])
+        self._recorder.look()
         self._decided = perf_counter()
         self._took = self._decided - begun
 

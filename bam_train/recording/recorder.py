@@ -32,7 +32,7 @@ import sys
 import time
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -47,6 +47,19 @@ _RING = 16 * 2**20
 _START, _END = 20.0, 10.0  # seconds that the process may take to start and to end
 _LOOK = 64
 """Records between two looks at whether the process is alive."""
+
+
+class Camera(Protocol):
+    """A camera whose images are recorded, such as `bam_envs.live.camera.LiveCamera`."""
+
+    source: Any
+    """Has its ``name``."""
+
+    def file(self) -> tuple[int, str, bytes] | None:
+        """Number, format and bytes of the newest image, or None."""
+
+    def close(self) -> None:
+        """Drop its connection."""
 
 
 class Recorder:
@@ -68,6 +81,8 @@ class Recorder:
         self._places = {title: place for place, title in enumerate(self.guards)}
         self._ring_size, self._numbers, self._writes = size, 0, 0
         self._fault = ""
+        self._cameras: list[Camera] = []
+        self._seen: list[int] = []
         self._ring: Ring | None = None
         self._process: subprocess.Popen[bytes] | None = None
 
@@ -150,12 +165,32 @@ class Recorder:
         self._write(EVENT, bytes([level]) + text.encode(errors="replace"))
 
     def image(self, camera: str, form: str, data: bytes) -> None:
-        """Record one encoded image of a camera; `form` is its format: jpeg, png or webp."""
-        self._write(IMAGE, json.dumps([camera, form]).encode() + b"\n" + data)
+        """Record one encoded image of a camera; `form` is its format: jpeg, png or webp.
+
+        Where the disk is behind, images are left out first: half of the memory is kept for the ticks.
+        """
+        self._write_picture(IMAGE, [camera, form], data)
+
+    def watch(self, camera: Camera) -> None:
+        """Record each new image of `camera` that `look` finds; `close` closes it."""
+        self._cameras.append(camera)
+        self._seen.append(0)
+
+    def look(self) -> None:
+        """Record the new images of the watched cameras."""
+        for place, camera in enumerate(self._cameras):
+            number, form, data = camera.file() or (self._seen[place], "", b"")
+            if number != self._seen[place]:
+                self._seen[place] = number
+                self.image(camera.source.name, form, data)
 
     def pixels(self, name: str, pixels: NDArray[np.uint8]) -> None:
         """Record a picture without loss. Shape: (height, width, 1, 3 or 4), grey, RGB or RGBA."""
-        self._write(PIXELS, json.dumps([name, *pixels.shape]).encode() + b"\n" + pixels.tobytes())
+        self._write_picture(PIXELS, [name, *pixels.shape], pixels.tobytes())
+
+    def _write_picture(self, kind: bytes, head: list[Any], data: bytes) -> None:
+        if self._ring is not None and self._ring.room - len(data) > self._ring_size / 2:
+            self._write(kind, json.dumps(head).encode() + b"\n" + data)
 
     def _write(self, kind: bytes, data: bytes, ago: float = 0.0) -> None:
         if self._fault or self._ring is None:
@@ -182,6 +217,8 @@ class Recorder:
 
     def close(self) -> str:
         """End the file, wait for it, and return `fault`; idempotent."""
+        for camera in self._cameras:
+            camera.close()
         if self._process is None or self._ring is None:
             return self.fault
         early = "" if self._ring.closed else self._status()

@@ -65,6 +65,11 @@ class Ring:
         self._head.written = start + size
         return True
 
+    @property
+    def room(self) -> int:
+        """Bytes that are free."""
+        return self._size - int(self._head.written - self._head.read)
+
     def read(self) -> bytes | None:
         """The next record; None if there is none yet."""
         start = self._head.read

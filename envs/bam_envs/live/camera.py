@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from bam_envs.core.errors import ProtocolError, ResetNeeded, StaleState
 from bam_envs.live.state import Mailbox, SourceAge
-from bam_envs.ros.images import message_bytes, read_color_message, read_depth_message
+from bam_envs.ros.images import SIGNATURES, message_bytes, read_color_message, read_depth_message
 from bam_envs.ros.profile_tables import CameraSource
 from bam_envs.rosbridge.client import RosbridgeLink
 from bam_envs.rosbridge.endpoint import Endpoint
@@ -105,6 +105,18 @@ class LiveCamera:
             pixels = decode_pixels(letter.message, self._topic)
             self._decoded = CameraImage(pixels, self._age.stamp, letter.number)
         return self._decoded
+
+    def file(self) -> tuple[int, str, bytes] | None:
+        """Number, ``"png"`` or ``"jpeg"``, and bytes of the newest image, as they arrived; None for anything else."""
+        letter = None if self._link is None else self._mailbox.newest().get(_SLOT)
+        if letter is None or "data" not in letter.message or "encoding" in letter.message:
+            return None
+        try:
+            data = message_bytes(letter.message)
+        except ProtocolError:
+            return None
+        form = next((name for name, start in SIGNATURES.items() if data.startswith(start)), None)
+        return None if form is None else (letter.number, form, data)
 
     def close(self) -> None:
         """Drop the connection. Idempotent."""

@@ -17,6 +17,8 @@ from bam_envs.core.errors import InvalidValue, MissingExtra, ProtocolError
 FORMATS = ("png", "jpeg")
 _PNG = b"\x89PNG\r\n\x1a\n"
 _JPEG = b"\xff\xd8\xff"
+SIGNATURES = {"png": _PNG, "jpeg": _JPEG}
+"""First bytes of an image file of each format."""
 _PIXEL_DTYPES = {"16UC1": "u2", "mono16": "u2", "32FC1": "f4"}
 
 

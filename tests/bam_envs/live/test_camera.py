@@ -10,7 +10,7 @@ import pytest
 from bam_envs.core.errors import MissingExtra, ProtocolError, ResetNeeded, StaleState, UnknownName
 from bam_envs.live.camera import LiveCamera, decode_pixels
 from bam_envs.robots.profile import load_profile
-from bam_envs.ros.images import color_message
+from bam_envs.ros.images import color_message, decode_image
 from bam_envs.ros.profile_tables import CameraSource
 from bam_envs.rosbridge.endpoint import Endpoint
 
@@ -78,6 +78,9 @@ def test_a_compressed_image(show, connect):
     image = one.latest()
     np.testing.assert_array_equal(image.pixels, PIXELS)
     assert image.pixels.dtype == np.uint8
+    number, form, data = one.file()
+    assert (form, number >= image.number) == ("png", True)
+    np.testing.assert_array_equal(decode_image(data), PIXELS)
     assert image.stamp == 7.5
     assert image.number >= 1
     one.connect()

@@ -20,11 +20,14 @@ from bam_envs.remote.serve.serve_options import ServeOptions
 from bam_envs.remote.serve.served_environment import ServedEnvironment
 from bam_envs.remote.serve.tcp_server import TcpServer
 from bam_envs.ros.codec import read_info
+from bam_envs.ros.images import color_message
 from bam_train.checkpoint import Checkpoint
 from bam_train.cli.deploy import main as deploy
 from bam_train.cli.flags import TrainConfig
 from bam_train.cli.program import guarded
 from bam_train.cli.train import train
+from bam_train.recording.drawing import frames
+from bam_train.recording.recording import Recording
 
 PICK = Path(__file__).parents[3] / "checkpoints" / "pick-ppo.zip"
 
@@ -120,6 +123,26 @@ def test_a_policy_drives_a_robot_over_its_topics(serve, run, tmp_path, monkeypat
     assert "will move" not in err  # it said that it is simulated
     [recording] = tmp_path.glob("recordings/*-pick.mcap")
     assert report["recording"] == str(recording.relative_to(tmp_path))
+
+
+def test_the_cameras_of_a_profile_are_recorded(serve, run, tmp_path):
+    served = serve(gym.make("bam/pick-v0", disable_env_checker=True), fast=True)
+    picture = np.arange(48, dtype=np.uint8).reshape(4, 4, 3)
+    served.bus.advertise("/hand/compressed", "sensor_msgs/CompressedImage", latch=True)
+    served.bus.publish("/hand/compressed", color_message(picture, "png"))
+    profile, recording = tmp_path / "cell.toml", tmp_path / "a.mcap"
+    profile.write_text(
+        'extends = "ur5e"\n[[cameras]]\nname = "hand"\ntopic = "/hand/compressed"\n'
+        '[[cameras]]\nname = "gone"\ntopic = "/gone/compressed"\n'
+    )
+    flags = ("--episodes", 1, "--robot", served.bus.url, "--profile", profile, "--record", recording)
+    status, _, err = run(deploy, PICK, *flags)
+    assert status == 0, err
+    assert (
+        "bam-deploy: warning: camera gone is not recorded: /gone/compressed (sensor_msgs/CompressedImage): no image"
+        in err
+    )
+    np.testing.assert_array_equal(list(frames(Recording.open(recording))), [picture])
 
 
 class Cut(gym.Env):
