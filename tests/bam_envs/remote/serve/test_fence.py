@@ -59,7 +59,7 @@ def watcher():
 @pytest.mark.parametrize("pace", ["fast", "realtime"])
 def test_a_watcher_takes_no_robot_over_from_a_running_policy(serve_env, watcher, make, pace):
     url = serve_env(**{pace: True}).bus.url
-    live = make("bam/pick-v0", robot=url)
+    live = make("bam/pick-v0", robot=url, guards={"lag": 0.5, "max_pause": 5.0})  # on a busy computer, too
     live.reset(seed=1)
     live.step(ACTION)
     thief = watcher(url)
