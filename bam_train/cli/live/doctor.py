@@ -115,7 +115,7 @@ def _all_steps(diagnosis: Diagnosis, subject: _Subject | None) -> Iterator[Step]
         yield Step(CONTRACT, "failed", str(error))
         return
     untold = [line.what for line in contract.checks if line.verdict == "not told"]
-    warnings = [f"the robot does not tell its {listed(untold)}"] if untold else []
+    warnings = [f"not told by the robot: {listed(untold)}"] if untold else []
     yield Step(CONTRACT, "warning" if warnings else "ok", f"{len(contract.checks)} lines", tuple(warnings))
 
 

@@ -181,11 +181,12 @@ class Diagnosis:
             answer: dict[str, Any] = {}
             with suppress(BamEnvsError):  # a server without rosapi
                 answer = self._link.call("/rosapi/topics", "rosapi/Topics", {}, self._timeout)
-            there = {str(topic).removeprefix(self._link.namespace) for topic in answer.get("topics") or ()}
+            there, namespace = {str(topic) for topic in answer.get("topics") or ()}, self._link.namespace
 
             def share(profile: RobotProfile) -> float:
                 topics = {source.topic for source in profile.state if not source.optional}
-                return len(topics & there) / len(topics)
+                elsewhere = sum(any(one.endswith(topic) for one in there) for topic in topics)  # in any namespace
+                return (len({namespace + topic for topic in topics} & there) + elsewhere) / len(topics)
 
             self.profile = max((load_profile(name) for name in ("ur5e", *shipped_profiles())), key=share)
         return self.profile

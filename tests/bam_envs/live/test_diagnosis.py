@@ -161,6 +161,13 @@ def test_a_robot_in_another_namespace(server, robot_on):
     assert " It is there at another address: ws://HOST:PORT/cell_1, " in why
 
 
+def test_the_profile_is_found_in_another_namespace(server, robot_on):
+    robot_on(server, "mir100", namespace="/cell_1")
+    diagnosis, steps = diagnose(server.url)
+    assert diagnosis.profile.name == "mir100"
+    assert failure(steps)[1].endswith(" It is there at another address: ws://HOST:PORT/cell_1.")
+
+
 def test_a_silent_topic(server, robot_on):
     robot = robot_on(server)
     robot.mangle = lambda topic, message: None if topic == "/object_pose" else message
