@@ -211,7 +211,7 @@ class Diagnosis:
         for reading in self.measurement.readings:
             key = (reading.source.topic, reading.source.names)
             limit = max(reading.source.max_age or 0.0, profile.max_age)
-            _require_states(reading, limit, self.measurement.seconds, profile)
+            _require_states(reading, limit, self.seconds, profile)
             if key not in seen:
                 findings.text.append(f"{reading.source.topic} {reading.rate:.4g} Hz, age {_p50_p99(reading.ages)}")
                 _warn_of_states(reading, limit, period, findings.warnings)
@@ -275,6 +275,7 @@ class Diagnosis:
     def _guards(self, findings: _Findings) -> None:
         robot, _ = self._known()
         findings.text.append(f"{len(robot.report())} guards; bam-deploy --print-guards shows them")
+        findings.warnings.extend(robot.warnings)
         spec, newest = robot.spec, {one.source.signal: one.values for one in self._measured().readings}
         low, high = (np.asarray(one, float) for one in position_range(spec, robot.limits))
         for place, name, column in measured_places(spec, spec.command.units):
@@ -303,7 +304,7 @@ def _require_states(reading: Reading, limit: float, seconds: float, profile: Rob
     topic, kind = reading.source.topic, reading.source.type
     if not reading.count:
         raise StaleState(
-            f"{topic} ({kind}): no message in {seconds:.1f} s. Does its driver run? Topics are in the profile of "
+            f"{topic} ({kind}): no message in {seconds:g} s. Does its driver run? Topics are in the profile of "
             f"{profile.name} (--profile); with --checkpoint only those of its task are needed."
         )
     if reading.unread == reading.count:

@@ -168,10 +168,10 @@ def test_the_profile_is_found_in_another_namespace(server, robot_on):
     assert failure(steps)[1].endswith(" It is there at another address: ws://HOST:PORT/cell_1.")
 
 
-def test_a_silent_topic(server, robot_on):
+def test_a_silent_topic(server, robot_on, patient):
     robot = robot_on(server)
     robot.mangle = lambda topic, message: None if topic == "/object_pose" else message
-    name, why = failure(diagnose(server.url)[1])
+    name, why = failure(diagnose(server.url, profile=patient())[1])
     assert name == "rates and ages"
     assert why.startswith("/object_pose (geometry_msgs/PoseStamped): no message in 0.6 s. Does its driver run?")
 
@@ -191,10 +191,10 @@ def without_elbow(message):
     return {**message, **{key: [message[key][one] for one in keep] for key in ("name", "position", "velocity")}}
 
 
-def test_a_joint_that_vanishes(server, robot_on):
+def test_a_joint_that_vanishes(server, robot_on, patient):
     robot = robot_on(server)
     robot.mangle = lambda topic, message: without_elbow(message) if topic == "/joint_states" else message
-    name, why = failure(diagnose(server.url)[1])
+    name, why = failure(diagnose(server.url, profile=patient())[1])
     assert name == "rates and ages"
     assert "elbow_joint" in why
 
@@ -240,8 +240,14 @@ def test_a_robot_in_a_protective_stop(server, robot_on, patient):
 def test_a_joint_beyond_its_limits_is_a_warning(server, robot_on, patient):
     robot_on(server).signals["joint_position"][2] = 3.1
     warnings = diagnose(server.url, profile=patient())[1]["guards"].warnings
+    assert warnings[-1].startswith("elbow_joint is at 3.100 rad, beyond -3.042 to 3.042 rad: jog it back")
+
+
+def test_a_robot_without_a_watchdog_is_a_warning(server, robot_on, patient):
+    robot_on(server)
+    warnings = diagnose(server.url, profile=patient("watchdog = 0\n"))[1]["guards"].warnings
     assert len(warnings) == 1
-    assert warnings[0].startswith("elbow_joint is at 3.100 rad, beyond -3.042 to 3.042 rad: jog it back")
+    assert warnings[0].startswith("robot's watchdog (G5): the robot does not stop ")
 
 
 def test_a_clock_that_is_apart_is_a_warning(lax, robot_on, patient, monkeypatch):
