@@ -146,7 +146,8 @@ def test_no_directories_of_rllib(tmp_path):
     (tmp_path / "packed" / "learner_group" / "state.msgpack").touch()
     says = {
         "nowhere": "no such directory. Give one that algo.save_to_path or algo.save wrote",
-        "file": "is a file, expected a checkpoint directory of RLlib. Give one that algo.save_to_path or algo.save wrote",
+        "file": "is a file, expected a checkpoint directory of RLlib. Give one that algo.save_to_path or algo.save "
+        "wrote",
         "empty": "is no checkpoint directory of RLlib: it has neither learner_group nor policies, nor a policy's "
         "weights",
         "trial": f"is a folder of 1 checkpoints; give one of them, such as {tmp_path}/trial/checkpoint_000003",
