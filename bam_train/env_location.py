@@ -31,6 +31,8 @@ class Place:
     """Names and values of limits of the live robot's guards that differ from the profile's."""
     trial: bool | None = False
     """Whether a live robot is on trial: slow, and in a box around its start; None: if it is real."""
+    shadow: bool = False
+    """Whether somebody else drives the live robot, and nothing is sent."""
 
     def require_sane(self) -> None:
         """Refuse addresses and options that exclude each other.
@@ -96,7 +98,8 @@ class Place:
         if self.trial:  # with as much more time as it is slower
             steps = kwargs.get("max_episode_steps") or entry.max_episode_steps
             trial = {"trial": True, "max_episode_steps": -1 if steps == -1 else round(steps / TRIAL_SPEED)}
-        return {**kwargs, "robot": self.robot, "profile": self.profile, **guards, **link, **trial}
+        shadow = {"shadow": True} if self.shadow else {}
+        return {**kwargs, "robot": self.robot, "profile": self.profile, **guards, **link, **trial, **shadow}
 
 
 SIMULATED = ("randomize", "link")

@@ -72,7 +72,7 @@ def connected_env(
         if robot is not None:
             robot.connect()
             signals.raise_again()
-        if place.robot is not None and place.trial is None and has_real_robot(env):
+        if place.robot is not None and place.trial is None and not place.shadow and has_real_robot(env):
             env.close()  # type: ignore[no-untyped-call]
             place = replace(place, trial=True)  # a robot's limits are fixed when it is made
             env = make_env(env_id, kwargs, render_mode=mode, place=place)
@@ -80,7 +80,8 @@ def connected_env(
             signals.raise_again()
         plan = [*plan_lines(env, env_id, place.text, episodes, wiggle=wiggle), *admit(env, place)]
         signals.raise_again()
-        require_consent(env, f"{who}: {checkpoint.path}", yes=yes, plan=plan)
+        if not place.shadow:
+            require_consent(env, f"{who}: {checkpoint.path}", yes=yes, plan=plan)
         signals.raise_again()
         if wiggle and contract is not None and contract.evidence is not None:
             require_motion(env, f"{checkpoint.path} and the robot at {place.text}", contract.evidence)

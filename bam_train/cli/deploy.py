@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from bam_train.checkpoint import Checkpoint
     from bam_train.cli.flags import DeployConfig
     from bam_train.deploy.deployment import Deployment
+    from bam_train.deploy.shadow import Shadow
     from bam_train.env_location import Place
     from bam_train.recording.recorder import Recorder
 
@@ -61,7 +62,7 @@ def deploy_checkpoint(config: DeployConfig, signals: SignalMemory) -> int:
         admission.trials.facts["recording"] = recorder.path.name
     journal = Journal(config.episodes, marks=admission.marks)
     deployment = Deployment(env, admission.policy, pacer, journal, recorder=recorder, trials=admission.trials)
-    return _run(config, checkpoint, place, deployment, signals)
+    return _run(config, checkpoint, place, deployment, signals, admission.shadow)
 
 
 def print_guards(config: DeployConfig, checkpoint: Checkpoint, place: Place) -> int:
@@ -105,7 +106,12 @@ def _rehearse(config: DeployConfig, link: str) -> int:
 
 
 def _run(
-    config: DeployConfig, checkpoint: Checkpoint, place: Place, deployment: Deployment, signals: SignalMemory
+    config: DeployConfig,
+    checkpoint: Checkpoint,
+    place: Place,
+    deployment: Deployment,
+    signals: SignalMemory,
+    shadow: Shadow | None,
 ) -> int:
     """Run the deployment and report it, also after a signal; returns the exit status."""
     from bam_train.cli.consent import guards_of
@@ -123,6 +129,7 @@ def _run(
             say(f"bam-deploy: {ending.reason}")
         where = place.text or "simulated here"
         facts: Any = {"guards": guards_of(env), "trials": deployment.trials, "recorder": deployment.recorder}
+        facts["shadow"] = shadow
         report = DeployReport(checkpoint, config.seed, ending, journal, pacer, where, **facts)
         for warning in report.warnings():
             say(f"bam-deploy: warning: {warning}")
@@ -148,6 +155,7 @@ def _checked_place(config: DeployConfig) -> Place:
         config.timeout,
         read_guards(config.guard),
         trial=None if config.stage is None else config.stage == "trial",
+        shadow=config.shadow,
     )
     if config.record is not None and config.no_record:
         raise SettingsError("--record and --no-record exclude each other; give one of the two")
@@ -162,6 +170,8 @@ def _checked_place(config: DeployConfig) -> Place:
         )
     if robot is None and (config.stage or config.trials):
         raise SettingsError("--stage and --trials are for a live robot; give its address with --robot too")
+    if config.shadow and (robot is None or config.stage or config.wiggle):
+        raise SettingsError("--shadow needs --robot, and moves nothing; leave out --stage and --wiggle")
     if config.i_know and config.stage != "full":
         raise SettingsError("--i-know is for --stage full alone; leave it out")
     if config.robot is None and (config.wiggle or config.motion is not None):

@@ -159,6 +159,8 @@ class DeployConfig:
     """trial (default on a real robot): a quarter of the speed, in a box around the start; full: as its limits say."""
     i_know: bool = False
     """Let --stage full run before trials on this robot have shown that the policy succeeds."""
+    shadow: bool = False
+    """Send nothing: compute what the policy would do while somebody else drives the live robot, and compare both."""
     trials: File = None
     """Record of the trials; recordings/trials.jsonl by default."""
     rate: Annotated[Positive | None, tyro.conf.arg(metavar="HZ")] = None

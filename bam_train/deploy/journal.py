@@ -9,6 +9,7 @@ from typing import Any
 
 from bam_envs.core.timing import Lateness, Pacer
 from bam_train.checkpoint import Checkpoint
+from bam_train.deploy.shadow import Shadow
 from bam_train.deploy.trials import Trials
 from bam_train.recording.recorder import Recorder
 
@@ -115,6 +116,8 @@ class DeployReport:
     """Counts of the guards of a live robot, by name; see `SafeRobot.report`."""
     trials: Trials | None = None
     """The trials of this deployment."""
+    shadow: Shadow | None = None
+    """The comparison with whoever drove the robot."""
     recorder: Recorder | None = None
     """What recorded it, if anything."""
 
@@ -139,6 +142,7 @@ class DeployReport:
             "robot": self.robot,
             "marks": list(journal.marks),
             "trials": None if self.trials is None else self.trials.evidence.to_json(),
+            "shadow": None if self.shadow is None else self.shadow.agreement.to_json(),
             # A disabled limit is infinite, which JSON cannot represent.
             "guards": {
                 name: {**guard, "limit": None} if guard.get("limit") == math.inf else dict(guard)
@@ -172,6 +176,7 @@ class DeployReport:
             *([f"lateness {lateness_text(self.pacer)}"] if self.pacer.period is not None else []),
             *([guards_text(self.guards)] if self.guards else []),
             *([self.trials.evidence.text] if self.trials else []),
+            *([self.shadow.agreement.text] if self.shadow else []),
             *([f"recorded in {self.recorder.path}"] if self.recorder is not None else []),
         ]
 

@@ -8,13 +8,15 @@ import gymnasium as gym
 
 from bam_envs.safety.guard import TRIAL_SPEED
 from bam_train.checkpoint import Checkpoint
+from bam_train.deploy.shadow import Shadow
 from bam_train.deploy.trials import Subject, TrialRecord, Trials
 from bam_train.env_location import Place
 from bam_train.errors import TrialsNeeded, UntrustedCheckpoint
 from bam_train.policy import FrozenPolicy
 
-UNSIGNED, UNPROVEN, TRIAL = "UNSIGNED", "UNPROVEN", "trial"
-"""Marks of a deployment: nobody trusted has signed its checkpoint; full speed without enough trials; on trial."""
+UNSIGNED, UNPROVEN, TRIAL, SHADOW = "UNSIGNED", "UNPROVEN", "trial", "shadow: nothing is sent"
+"""Marks of a deployment: nobody trusted has signed its checkpoint; full speed without enough trials; on trial; somebody
+else drives."""
 TRIALS = Path("recordings") / "trials.jsonl"
 """The record of trials."""
 
@@ -41,6 +43,8 @@ class Admission:
     """For `Journal.marks`."""
     trials: Trials | None = None
     """For `Deployment`: the trials of a robot on trial."""
+    shadow: Shadow | None = None
+    """The comparison with whoever drives the robot."""
     policy: FrozenPolicy = field(init=False)
     """The frozen policy, once it is admitted."""
 
@@ -56,7 +60,11 @@ class Admission:
             BadTrials: The record of trials was edited, or cannot be read.
         """
         lines = self._signature() if has_real_robot(env) else []
-        if place.robot is not None and place.trial is not None:
+        if place.shadow:
+            robot: Any = env.unwrapped.robot  # type: ignore[attr-defined]
+            robot.watch = self.shadow = Shadow(robot.spec, robot.limits)
+            self.marks = (*self.marks, SHADOW)
+        elif place.robot is not None and place.trial is not None:
             lines += self._stage(place.robot, is_trial=place.trial)
         self.policy = FrozenPolicy.from_checkpoint(self.checkpoint)
         return lines

@@ -31,6 +31,7 @@ def make_env(
     profile: str | None = None,
     guards: Mapping[str, float] | None = None,
     trial: bool = False,
+    shadow: bool = False,
     ca_file: str | None = None,
     token_file: str | None = None,
     timeout: float | None = None,
@@ -51,6 +52,7 @@ def make_env(
         profile: Profile of the live robot: a shipped name or a file; by default that of the simulated robot.
         guards: Limits of the live robot's guards that differ from its profile's, such as ``{"joint_speed": 0.3}``.
         trial: Whether the live robot is on trial: slow, and in a box around its start.
+        shadow: Whether somebody else drives the live robot: its states are read, and nothing is sent.
         ca_file: Certificates that ``wss://`` trusts instead of the system's.
         token_file: File with the server's token.
         timeout: Longest wait for an answer of `transport` [s]; 30 by default.
@@ -65,8 +67,11 @@ def make_env(
         raise InvalidValue(f"profile={profile!r} describes a live robot; give its address with robot= too.")
     if robot is None and guards is not None:
         raise InvalidValue("guards= changes the limits of a live robot; give its address with robot= too.")
-    if robot is None and trial:
-        raise InvalidValue("trial=True is for a live robot; give its address with robot= too.")
+    for name in ("trial",) * trial + ("shadow",) * shadow:
+        if robot is None:
+            raise InvalidValue(f"{name}=True is for a live robot; give its address with robot= too.")
+    if trial and shadow:
+        raise InvalidValue("trial=True and shadow=True exclude each other: a shadow sends nothing. Give one of them.")
     _check_place(robot, transport, timeout, render_mode, randomize, link, task_options)
     if transport is not None:
         from bam_envs.remote.remote_env import make_remote_env
@@ -79,19 +84,13 @@ def make_env(
     simulated = entry.make_robot(1, randomize, task_options)
     if robot is None:
         return RobotEnv(_behind(link, simulated), task, render_mode=render_mode)
-    from bam_envs.live.building import live_robot
+    from bam_envs.live.building import live_robot, shadow_robot
 
+    where: dict[str, Any] = {"profile": profile, "guards": guards, "ca_file": ca_file, "token_file": token_file}
+    if shadow:
+        return RobotEnv(shadow_robot(robot, simulated.spec, **where), task, render_mode=render_mode)
     tool = getattr(simulated, "tool_position", None)  # forward kinematics of an arm that is no UR5e
-    live = live_robot(
-        robot,
-        simulated.spec,
-        profile=profile,
-        guards=guards,
-        trial=trial,
-        tool_position=tool,
-        ca_file=ca_file,
-        token_file=token_file,
-    )
+    live = live_robot(robot, simulated.spec, trial=trial, tool_position=tool, **where)
     return RobotEnv(live, task, render_mode=render_mode)
 
 

@@ -29,6 +29,7 @@ MAKE_OPTIONS = (
     "profile",
     "guards",
     "trial",
+    "shadow",
     "ca_file",
     "token_file",
     "timeout",

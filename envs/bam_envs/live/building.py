@@ -6,6 +6,7 @@ from pathlib import Path
 from bam_envs.core.errors import InvalidValue
 from bam_envs.core.robot import RobotSpec
 from bam_envs.live.rosbridge_robot import RosbridgeRobot
+from bam_envs.live.shadow import ShadowRobot
 from bam_envs.robots.profile import load_profile, profile_for
 from bam_envs.ros.profile_tables import RobotProfile
 from bam_envs.rosbridge.endpoint import Endpoint
@@ -47,10 +48,7 @@ def live_robot(
     """
     require_robot_address(url)
     endpoint = Endpoint.with_token_file(url, ca_file=ca_file, token_file=token_file)
-    if profile is None and spec is not None:
-        chosen = profile_for(spec)
-    else:
-        chosen = profile if isinstance(profile, RobotProfile) else load_profile("ur5e" if profile is None else profile)
+    chosen = _chosen(profile, spec)
     robot = RosbridgeRobot(endpoint, chosen, spec=spec, command=command)
     chosen_limits = limits or profile_limits(chosen)
     if guards:
@@ -58,6 +56,28 @@ def live_robot(
     if trial:
         chosen_limits = chosen_limits.on_trial(base=chosen.kind == "base")
     return SafeRobot(robot, limits=chosen_limits, tool_position=tool_position)
+
+
+def shadow_robot(
+    url: str,
+    spec: RobotSpec | None = None,
+    *,
+    profile: RobotProfile | str | Path | None = None,
+    guards: Mapping[str, float] | None = None,
+    ca_file: str | None = None,
+    token_file: str | None = None,
+) -> ShadowRobot:
+    """A live robot that somebody else drives: its states are read, and nothing is sent. Arguments: see `live_robot`."""
+    require_robot_address(url)
+    endpoint, chosen = Endpoint.with_token_file(url, ca_file=ca_file, token_file=token_file), _chosen(profile, spec)
+    return ShadowRobot(endpoint, chosen, spec=spec, limits=profile_limits(chosen).changed(guards or {}))
+
+
+def _chosen(profile: RobotProfile | str | Path | None, spec: RobotSpec | None) -> RobotProfile:
+    """The profile that is named, or the one for `spec`."""
+    if profile is None and spec is not None:
+        return profile_for(spec)
+    return profile if isinstance(profile, RobotProfile) else load_profile("ur5e" if profile is None else profile)
 
 
 def profile_limits(profile: RobotProfile) -> Limits:

@@ -173,20 +173,24 @@ class RosbridgeRobot:
                 )
         self._state.server_offset = lambda: control.clock_offset
         types = bringup.TopicTypes(control, self.profile, self._timeout)
-        self._declare(control, halting, types)
+        self._subscribe(control, types)
+        self._advertise(control, halting, types)
         self._readiness = None
         if info is None:
             session = self._session.tagger.session
             self._readiness = bringup.LiveReadiness(self.profile, self._sinks, types, session)
 
-    def _declare(self, control: RosbridgeLink, halting: RosbridgeLink, types: bringup.TopicTypes) -> None:
-        """Subscribe states and advertise commands, with their types on the server."""
+    def _subscribe(self, control: RosbridgeLink, types: bringup.TopicTypes) -> None:
+        """Subscribe states, with their types on the server."""
         itself = self._describes_itself
         for topic, kind in {source.topic: source.type for source in self._state.sources}.items():
             name = self.namespace + topic
             least = bringup.least_interval(self.profile, self.spec.period, topic, describes_itself=itself)
             listener, kind = self._state.listener(topic), types.check(name, kind)
             control.subscribe(name, kind, listener, throttle_ms=least, queue_length=1 if least else 0)
+
+    def _advertise(self, control: RosbridgeLink, halting: RosbridgeLink, types: bringup.TopicTypes) -> None:
+        """Advertise commands, with their types on the server."""
         for sink in self._sinks:
             name = self.namespace + sink.topic
             kind = types.check_listened(name, sink)

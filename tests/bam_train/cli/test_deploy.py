@@ -44,6 +44,7 @@ def test_report_for_programs(corridor_checkpoint, starting_cell, run):
         "robot": "simulated here",
         "marks": [],
         "trials": None,
+        "shadow": None,
         "guards": {},
         "per_episode": [
             {"seed": seed, "length": length, "return": 1 - 0.25 * length, "success": True, "end": "terminated"}
