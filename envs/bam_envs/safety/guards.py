@@ -41,6 +41,7 @@ from bam_envs.safety.link_guards import (
 )
 from bam_envs.safety.places import Collision, WorkspaceBox
 from bam_envs.safety.singularity import Singularity
+from bam_envs.safety.trial_box import TrialBox
 from bam_envs.safety.tubes import ArmTubes
 
 Array = NDArray[np.float64]
@@ -309,6 +310,8 @@ def _place_guards(
         least = limits.table_height if has_gripper else -math.inf
     low, high = (limits.box_x_min, limits.box_y_min, least), (limits.box_x_max, limits.box_y_max, limits.box_z_max)
     kept_out: list[Guard] = [WorkspaceBox(spec, limits, low, high, tool_point_of(position))]
+    if limits.trial_box is not None:
+        kept_out.append(TrialBox(spec, limits, limits.trial_box, tool_point_of(position)))
     geometry = geometry_of(position)
     if geometry is not None and geometry.outline is not None:
         kept_out.append(Collision(spec, limits, ArmTubes(geometry, geometry.outline, tool=has_gripper)))
@@ -348,4 +351,5 @@ def _base_guards(spec: RobotSpec, limits: Limits) -> list[Guard]:
         BaseFollowing("base following", "m/s", limits.base_acceleration, spec, limits),
         BaseFollowing("turn following", "rad/s", limits.turn_acceleration, spec, limits),
         *([] if spec.body is None else [LaserZones(spec, limits, spec.body)]),
+        *([] if limits.trial_box is None else [TrialBox(spec, limits, limits.trial_box, None)]),
     ]

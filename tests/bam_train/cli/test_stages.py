@@ -239,4 +239,5 @@ def test_trials_are_run_recorded_and_reported(served, run, tmp_path):
     assert report["trials"] == {"successes": 1, "trials": 1, "threshold": 0.9, "is_enough": False}
     assert err.endswith(", trial\n")
     assert report["guards"]["joint speed"]["limit"] == 0.25
+    assert report["guards"]["trial box"]["limit"] == 0.35
     assert json.loads(record.read_text().splitlines()[1])["robot"] == served.bus.url

@@ -1,0 +1,47 @@
+"""The guard that keeps a robot on trial near its start."""
+
+from bam_envs.core.robot import RobotSpec
+from bam_envs.safety.base_guards import BaseBox
+from bam_envs.safety.guard import Guard, Limits, Tick, ToolPoint, columns_in
+from bam_envs.safety.places import WorkspaceBox
+
+
+class TrialBox(Guard):
+    """A robot on trial stays near the place where its first command begins: the tool of an arm, or a base.
+
+    The way to a start pose does not count. The pose of a base must be measured.
+
+    Args:
+        spec: The robot.
+        limits: Its limits.
+        half: How far it may go along each axis [m].
+        tool: Forward kinematics of one pose of an arm; None for a base.
+    """
+
+    number, name, unit, setting, keeps_out = "G10", "trial box", "m", "trial_box", True
+
+    def __init__(self, spec: RobotSpec, limits: Limits, half: float, tool: ToolPoint | None) -> None:
+        self._spec, self._limits, self.limit_value, self._tool = spec, limits, half, tool
+        self._joints = columns_in(spec.command, "rad")
+        self._box: Guard | None = None
+
+    def limit(self, tick: Tick) -> bool:
+        """Shorten the step as `WorkspaceBox` and `BaseBox` do."""
+        if tick.approach:
+            return False
+        if self._box is None:
+            self._box = self._around(tick)
+        return self._box is not None and self._box.limit(tick)
+
+    def _around(self, tick: Tick) -> Guard | None:
+        """The box around where the robot is."""
+        if self._tool is not None:
+            here = self._tool([tick.last[at] for at in self._joints])
+        elif "base_pose" in tick.signals:
+            here = tick.signals["base_pose"][0, :2].tolist()
+        else:
+            return None
+        low, high = [one - self.limit_value for one in here], [one + self.limit_value for one in here]
+        if self._tool is None:
+            return BaseBox(self._spec, self._limits, low, high)
+        return WorkspaceBox(self._spec, self._limits, low, high, self._tool)
