@@ -23,8 +23,8 @@ if TYPE_CHECKING:
 
     from bam_train.checkpoint import Checkpoint
     from bam_train.cli.flags import DeployConfig
+    from bam_train.deploy.agreement import Shadow
     from bam_train.deploy.deployment import Deployment
-    from bam_train.deploy.shadow import Shadow
     from bam_train.env_location import Place
     from bam_train.recording.recorder import Recorder
 

@@ -9,7 +9,7 @@ from typing import Any
 
 from bam_envs.core.timing import Lateness, Pacer
 from bam_train.checkpoint import Checkpoint
-from bam_train.deploy.shadow import Shadow
+from bam_train.deploy.agreement import Shadow
 from bam_train.deploy.trials import Trials
 from bam_train.recording.recorder import Recorder
 

@@ -8,7 +8,7 @@ import gymnasium as gym
 
 from bam_envs.safety.guard import TRIAL_SPEED
 from bam_train.checkpoint import Checkpoint
-from bam_train.deploy.shadow import Shadow
+from bam_train.deploy.agreement import Shadow
 from bam_train.deploy.trials import Subject, TrialRecord, Trials
 from bam_train.env_location import Place
 from bam_train.errors import TrialsNeeded, UntrustedCheckpoint

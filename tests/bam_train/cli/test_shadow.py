@@ -12,7 +12,7 @@ from bam_envs.core.robot import RobotState
 from bam_envs.robots.mir100 import base_spec
 from bam_envs.robots.ur5e import arm_spec
 from bam_envs.safety.guard import Limits
-from bam_train.deploy.shadow import Agreement, Shadow
+from bam_train.deploy.agreement import Agreement, Shadow
 from bam_train.policy import FrozenPolicy
 
 ARM = replace(arm_spec("ur5e", with_object=False), lag=0.0)
