@@ -127,8 +127,8 @@ class Deployment:
             PolicyAgent(policy, names, single=True),
             *agents,
         ]
-        if recorder is not None:
-            chain.append(RecorderAgent(recorder, env, names, journal, watch))
+        self._flight = None if recorder is None else RecorderAgent(recorder, env, names, journal, watch)
+        chain += [] if self._flight is None else [self._flight]
         self._loop = TemporalAgent(Agents(*chain))
 
     def connect(self) -> None:
@@ -151,8 +151,9 @@ class Deployment:
 
     def _end_recording(self, ending: Ending | None) -> None:
         """Record how it ended; without an ending, leave the rest to the recorder's process, which outlives this one."""
-        if self.recorder is None:
+        if self.recorder is None or self._flight is None:
             return
+        self._flight.record_last_command()
         if ending is None:
             self.recorder.event("ended at once, by a second signal", ERROR)
         else:

@@ -5,7 +5,7 @@ import json
 import math
 import platform
 import time
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from importlib.metadata import version
 from pathlib import Path
 from time import perf_counter
@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bam_envs.core.errors import BamEnvsError
+from bam_envs.core.robot import RobotState
 from bam_envs.live.camera import LiveCamera
 from bam_envs.robots.profile import load_profile
 from bam_envs.rosbridge.endpoint import Endpoint
@@ -34,6 +35,12 @@ _SCALARS = {
     "/latency": STAGES,
     "/episode": ("episode", "step", "reward", "terminated", "truncated", "success"),
 }
+
+
+MOST_BESIDE = 32
+"""Most numbers of a signal that is recorded with a command outside the ticks; those of a laser are more."""
+Sent = tuple[Sequence[float], RobotState, int, str]
+"""A command, the state that it led to, and the number and title of the guard that changed it."""
 
 
 class Stopwatch:
@@ -123,11 +130,36 @@ class RecorderAgent(Agent):
         self._robot: Any = getattr(self._env, "robot", None)
         self._names, self.reads = names, (*names, "action", "env/reward")
         self._numbers: list[str] = []
+        self._declared = False  # what /sent has
         self._decided, self._took = 0.0, math.nan
+        self._sent: Sent | None = None
+        """The last command that no tick has yet."""
+        observe = getattr(self._robot, "observe", None)
+        if observe is not None:
+            observe(self._was_sent)
+
+    def _was_sent(self, command: Sequence[float], state: RobotState, code: int, status: str, approach: bool) -> None:
+        self._sent = command, state, code, status
+        if approach:
+            self.record_last_command()
+
+    def record_last_command(self) -> None:
+        """Record the last command on its own, if no tick has it."""
+        if self._sent is None:
+            return
+        (command, state, code, status), self._sent = self._sent, None
+        signals = [one for one in self._robot.spec.signals if len(one.labels) <= MOST_BESIDE]
+        if not self._declared:
+            names = [f"{one.name}.{label}" for one in signals for label in one.labels]
+            commands = [f"command.{label}" for label in self._robot.spec.command.labels]
+            self._recorder.declare({"/sent": [*names, *commands, "code", "guard"]}, series=1)
+            self._declared = True
+        numbers = [*command, code, self._recorder.place(status)]
+        self._recorder.tick([state.signals[one.name] for one in signals], numbers, series=1)
 
     def forward(self, t: int, seed: int, **kwargs: Any) -> None:
         """Record the tick."""
-        begun, watch, record = perf_counter(), self._watch, self._journal.records[-1]
+        begun, watch, record, self._sent = perf_counter(), self._watch, self._journal.records[-1], None
         state: Any = getattr(self._env, "last_state", None)
         action = self.get(("action", t))
         if t == 0:

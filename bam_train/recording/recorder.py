@@ -14,6 +14,8 @@ topic          content
 /latency       time of each stage of the tick, by name [s]
 /episode       episode, step, reward, terminated, truncated and success
 /events        foxglove.Log: what the operator did and was told
+/sent          commands outside the ticks, with the state that each led to: on the way to the start pose of a
+               live robot, and the last one before a fault
 /camera/NAME   foxglove.CompressedImage
 /pixels/NAME   foxglove.RawImage: an observation that is a picture
 =============  ======================================================================================
@@ -79,7 +81,8 @@ class Recorder:
     ) -> None:
         self.path, self.metadata, self.guards = path, dict(metadata or {}), ("", *guards)
         self._places = {title: place for place, title in enumerate(self.guards)}
-        self._ring_size, self._numbers, self._writes = size, 0, 0
+        self._ring_size, self._writes = size, 0
+        self._numbers: dict[int, int] = {}  # of a tick, by series
         self._fault = ""
         self._cameras: list[Camera] = []
         self._seen: list[int] = []
@@ -131,24 +134,30 @@ class Recorder:
         """The number by which a tick names the guard with this title; 0 for none."""
         return self._places.get(guard, 0)
 
-    def declare(self, layout: Mapping[str, Sequence[str]], extra: Mapping[str, str] | None = None) -> None:
+    def declare(
+        self, layout: Mapping[str, Sequence[str]], extra: Mapping[str, str] | None = None, series: int = 0
+    ) -> None:
         """Say which numbers a tick has from now on.
 
         Args:
             layout: Topic to the names of its numbers, in the order of a tick; ``group.name`` is shown as a table.
             extra: Text by name that readers of the numbers need, kept as the metadata record ``layout``.
+            series: Which ticks: 0 for those of the loop.
         """
-        self._numbers = sum(map(len, layout.values()))
+        self._numbers[series] = sum(map(len, layout.values()))
         content = {"layout": {topic: list(names) for topic, names in layout.items()}, "extra": dict(extra or {})}
-        self._write(LAYOUT, json.dumps(content).encode())
+        self._write(LAYOUT, json.dumps(content).encode(), series=series)
 
-    def tick(self, arrays: Iterable[NDArray[Any]], numbers: Sequence[float] = (), sent_ago: float = 0.0) -> None:
+    def tick(
+        self, arrays: Iterable[NDArray[Any]], numbers: Sequence[float] = (), sent_ago: float = 0.0, series: int = 0
+    ) -> None:
         """Record one tick, whose numbers, one after the other, are those of the layout.
 
         Args:
             arrays: Arrays of any shape; bool and whole numbers are recorded as numbers.
             numbers: The numbers after those of the arrays.
             sent_ago: How long ago the command of this tick was sent [s].
+            series: As in `declare`.
         """
         if self._fault:
             return
@@ -156,9 +165,10 @@ class Recorder:
             array.tobytes() if array.dtype == np.float64 else array.astype(np.float64).tobytes() for array in arrays
         ]
         content = b"".join((*data, struct.pack(f"={len(numbers)}d", *numbers)))
-        if len(content) != 8 * self._numbers:
-            self._fail(f"{self.path}: a tick has {len(content) // 8} numbers, and {self._numbers} were declared")
-        self._write(TICK, content, sent_ago)
+        if len(content) != 8 * self._numbers[series]:
+            declared = self._numbers[series]
+            self._fail(f"{self.path}: a tick has {len(content) // 8} numbers, and {declared} were declared")
+        self._write(TICK, content, sent_ago, series)
 
     def event(self, text: str, level: int = INFO) -> None:
         """Record what the operator did or was told."""
@@ -192,11 +202,11 @@ class Recorder:
         if self._ring is not None and self._ring.room - len(data) > self._ring_size / 2:
             self._write(kind, json.dumps(head).encode() + b"\n" + data)
 
-    def _write(self, kind: bytes, data: bytes, ago: float = 0.0) -> None:
+    def _write(self, kind: bytes, data: bytes, ago: float = 0.0, series: int = 0) -> None:
         if self._fault or self._ring is None:
             return
         self._writes += 1
-        if not self._ring.write(b"".join((kind, TIMES.pack(time.time_ns(), time.monotonic(), ago), data))):
+        if not self._ring.write(b"".join((kind, TIMES.pack(time.time_ns(), time.monotonic(), ago, series), data))):
             self._fail(self._ring.failure or f"{self.path}: the disk is too slow; nothing is recorded from now on")
         elif self._writes % _LOOK == 0 and (fault := self._status()):
             self._fail(fault)

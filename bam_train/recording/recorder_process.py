@@ -13,6 +13,7 @@ import struct
 import sys
 import time
 import zlib
+from collections import Counter
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -30,6 +31,8 @@ _SETTLE = 0.5
 """Time between two chunks with an index, which are flushed to the disk itself [s]: twice that may a power cut cost."""
 _SENT = ("/command", "/status")
 """Topics with the time at which the command was sent."""
+_GUARDED = ("/status", "/sent")
+"""Topics that name a guard, whose place in the list the tick has."""
 _NUMBER, _TEXT, _WHOLE = {"type": "number"}, {"type": "string"}, {"type": "integer"}
 _STAMP = {"type": "object", "properties": {"sec": _WHOLE, "nsec": _WHOLE}}
 _IMAGE = {"timestamp": _STAMP, "frame_id": _TEXT, "data": {"type": "string", "contentEncoding": "base64"}}
@@ -52,22 +55,23 @@ class _File:
         self._writer = Writer(self.file, chunk_size=2**62, compression=CompressionType.ZSTD)  # `settle` ends chunks
         self._writer.start(profile="", library="bam-train")
         self._guards: list[str] = head["guards"]
-        self._layout: dict[str, list[list[str]]] = {}  # topic -> [group, name] or [name] of each number
+        self._layouts: dict[int, dict[str, list[list[str]]]] = {}
+        """For each series: topic -> [group, name] or [name] of each number."""
         self._channels: dict[str, int] = {}
-        self._numbers = struct.Struct("=0d")
-        self._sequence = 0
+        self._sequences: Counter[int] = Counter()
         self._new = RecordBuilder()
         """Messages since the last look into the ring."""
         self._begin = self._end = self.file.tell()  # of the small chunks
         self._metadata("deployment", {key: str(value) for key, value in head["metadata"].items()})
 
     def add(self, record: bytes) -> None:
-        kind, (wall, monotonic, ago), data = record[:1], TIMES.unpack_from(record, 1), record[1 + TIMES.size :]
+        kind, (wall, monotonic, ago, series) = record[:1], TIMES.unpack_from(record, 1)
+        data = record[1 + TIMES.size :]
         stamp = {"sec": wall // 10**9, "nsec": wall % 10**9}
         if kind == TICK:
-            self._tick(wall, monotonic, ago, data)
+            self._tick(series, wall, monotonic, ago, data)
         elif kind == LAYOUT:
-            self._declare(json.loads(data))
+            self._declare(series, json.loads(data))
         elif kind == EVENT:
             message = {"timestamp": stamp, "level": data[0], "message": data[1:].decode(), "name": "bam-deploy"}
             self._known("/events", "foxglove.Log", wall, {**message, "file": "", "line": 0})
@@ -84,15 +88,15 @@ class _File:
                 content["encoding"] = {1: "mono8", 3: "rgb8", 4: "rgba8"}[channels]
                 self._known(f"/pixels/{name}", "foxglove.RawImage", wall, content)
 
-    def _declare(self, content: dict[str, Any]) -> None:
+    def _declare(self, series: int, content: dict[str, Any]) -> None:
         if content["extra"]:
             self._metadata("layout", content["extra"])
-        self._layout = {topic: [name.split(".", 1) for name in names] for topic, names in content["layout"].items()}
-        self._numbers = struct.Struct(f"={sum(map(len, self._layout.values()))}d")
-        for topic, names in self._layout.items():
+        layout = {topic: [name.split(".", 1) for name in names] for topic, names in content["layout"].items()}
+        self._layouts[series] = layout
+        for topic, names in layout.items():
             if topic not in self._channels:
                 properties: dict[str, Any] = nested([(["t"], _NUMBER), *((name, _NUMBER) for name in names)])
-                if topic == "/status":
+                if topic in _GUARDED:
                     properties["guard"] = _TEXT
                 for name, part in properties.items():
                     if "type" not in part:
@@ -111,25 +115,25 @@ class _File:
         Schema(id=schema, data=content, encoding="jsonschema", name=name).write(self._new)
         Channel(id=channel, topic=topic, message_encoding="json", metadata={}, schema_id=schema).write(self._new)
 
-    def _tick(self, wall: int, monotonic: float, ago: float, data: bytes) -> None:
-        numbers = iter(self._numbers.unpack(data))
-        for topic, names in self._layout.items():
+    def _tick(self, series: int, wall: int, monotonic: float, ago: float, data: bytes) -> None:
+        numbers = iter(struct.unpack(f"={len(data) // 8}d", data))
+        for topic, names in self._layouts[series].items():
             late = ago if topic in _SENT else 0.0
             message = nested([(["t"], monotonic - late), *((name, next(numbers)) for name in names)])
-            if topic == "/status":
+            if topic in _GUARDED:
                 message["guard"] = self._guards[int(message["guard"])]
-            self._message(topic, wall - int(1e9 * late), message)
-        self._sequence += 1
+            self._message(topic, wall - int(1e9 * late), message, self._sequences[series])
+        self._sequences[series] += 1
 
     def _known(self, topic: str, schema: str, wall: int, content: dict[str, Any]) -> None:
         if topic not in self._channels:
             self._register(topic, schema, _KNOWN[schema])
         self._message(topic, wall, content)
 
-    def _message(self, topic: str, wall: int, content: dict[str, Any]) -> None:
+    def _message(self, topic: str, wall: int, content: dict[str, Any], sequence: int = 0) -> None:
         data, channel = _encode(content), self._channels[topic]
-        self._writer.add_message(channel, wall, data, wall, self._sequence)
-        Message(channel, wall, data, wall, self._sequence).write(self._new)
+        self._writer.add_message(channel, wall, data, wall, sequence)
+        Message(channel, wall, data, wall, sequence).write(self._new)
 
     def save(self) -> None:
         """Append the new messages as a small chunk, where this process's end cannot harm them any more."""

@@ -15,8 +15,8 @@ from typing import Any
 
 TICK, LAYOUT, EVENT, IMAGE, PIXELS = b"T", b"L", b"E", b"I", b"P"
 """Kinds of records, as their first byte."""
-TIMES = struct.Struct("=qdd")
-"""Then: wall clock [ns], monotonic clock [s], and how long before that the command was sent [s]."""
+TIMES = struct.Struct("=qddB")
+"""Then: wall clock [ns], monotonic clock [s], how long before that the command was sent [s], and the series."""
 _RECORD = struct.Struct("=II")
 _HEAD = 512
 _TEXT = 256

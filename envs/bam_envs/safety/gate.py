@@ -38,6 +38,8 @@ from bam_envs.safety.link_guards import Share, Watchdog
 __all__ = ["ClearedCommand", "Limits", "SafeRobot"]
 
 Array = NDArray[np.float64]
+Observer = Callable[[Sequence[float], RobotState, int, str, bool], None]
+"""See `SafeRobot.observe`."""
 GRIPPER_TIME = 1.0
 """Longest wait for the gripper to open before an arm goes to its start pose [s]."""
 GRIPPER_NEAR = 0.002
@@ -121,6 +123,7 @@ class SafeRobot(metaclass=Sealed):
         "_limiters",
         "_limits",
         "_live",
+        "_observer",
         "_places",
         "_report",
         "_returned_at",
@@ -153,6 +156,7 @@ class SafeRobot(metaclass=Sealed):
         self._live: Any = robot if getattr(robot, "needs_clearance", False) else None
         if self._live is not None:
             require_bounded(self._limits, robot.spec)
+        self._observer: Observer | None = None
         self._tell: Any = getattr(self._live, "tell_status", None)
         self._shape = Shape(robot.spec)
         self._further = tuple(guards)
@@ -269,6 +273,14 @@ class SafeRobot(metaclass=Sealed):
         Commands that were altered on the way to a start pose are not counted.
         """
         return {name: dict(row) for name, row in self._report.items()}
+
+    def observe(self, observer: Observer) -> None:
+        """Call ``observer(command, state, code, status, approach)`` after each command that was sent.
+
+        `command` has the numbers of `spec.command`; `state` is the one that it led to, which must not be changed;
+        `approach` is true on the way to a start pose. It is called between two commands, so it must be fast.
+        """
+        self._observer = observer
 
     def connect(self) -> None:
         """Connect the robot. Moves nothing."""
@@ -459,6 +471,8 @@ class SafeRobot(metaclass=Sealed):
         if self._halts == halts:
             rows = zip(tick.command, tick.last, strict=True)
             self._last, self._speed = tick.command, [(now - before) / tick.period for now, before in rows]
+        if self._observer is not None:
+            self._observer(tick.command, self._state, self._code, self._status, tick.approach)
         self._require_in_range(self._state)
         return _copied(self._state)  # changes by the caller must not reach the guards
 

@@ -11,8 +11,11 @@ from bam_envs.core.errors import SafetyStop
 from bam_envs.core.robot_env import RobotEnv
 from bam_envs.core.timing import Pacer
 from bam_envs.robots.fake import FakeRobot
+from bam_envs.robots.physics.mujoco_arm import SimulatedArm
 from bam_envs.safety.gate import SafeRobot
 from bam_envs.tasks.pick import PickTask
+from bam_envs.tasks.reach import ReachTask
+from bam_envs.testing.drivers import DrivenRobot
 from bam_train.deploy.deployment import Deployment
 from bam_train.deploy.flight import flight_recorder, new_recording
 from bam_train.deploy.journal import Ending, Journal
@@ -116,6 +119,37 @@ def test_the_end_of_a_deployment_that_failed_is_recorded(recorded):
     assert ending.status == 3
     assert len(found["/state"]) == 3
     assert (found["/events"][-1]["level"], found["/events"][-1]["message"]) == (4, ending.reason)
+
+
+def test_the_way_to_the_start_pose_is_recorded(recorded):
+    driven = DrivenRobot(SimulatedArm(with_object=False))
+    env = gym.wrappers.TimeLimit(RobotEnv(SafeRobot(driven, clock=driven.clock), ReachTask()), 3)
+    ending, found = recorded(env, Policy(*[0.0] * 6), episodes=1)
+    assert ending == Ending("episodes done", 0)
+    way, joints = found["/sent"], driven.spec.command.labels[:6]
+    assert len(way) > 20
+    start = found["/state"][0]["joint_position"]
+    for label in joints:
+        assert way[-1]["command"][label] == pytest.approx(start[label], abs=0.03)
+        assert abs(way[0]["joint_position"][label] - way[0]["command"][label]) < 0.1
+    assert len(found["/state"]) == 4
+
+
+def test_the_last_command_before_a_stop_is_recorded(recorded):
+    class Torn(FakeRobot):
+        def step(self, command):
+            state = super().step(command)
+            if len(self.sent) == 3:
+                state.signals["joint_velocity"] = np.full((1, 6), 99.0)
+            return state
+
+    env = RobotEnv(SafeRobot(Torn()), PickTask())
+    ending, found = recorded(env, Policy(*[1.0] * 5))
+    assert ending.status == 3, ending
+    assert len(found["/state"]) == 3
+    [last] = found["/sent"]
+    assert list(last["command"].values()) == env.unwrapped.robot._robot.sent[2][0].tolist()
+    assert last["joint_velocity"]["elbow_joint"] == 99.0
 
 
 class Camera(gym.Env):
