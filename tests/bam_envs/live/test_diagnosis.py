@@ -23,7 +23,7 @@ PATIENT = 'extends = "ur5e"\nname = "patient"\nkind = "arm"\nmax_age = 1.0\ncomm
 
 @pytest.fixture(autouse=True)
 def impatient(monkeypatch):
-    monkeypatch.setattr(bringup, "TIMEOUT", 1.0)
+    monkeypatch.setattr(bringup, "TIMEOUT", 2.0)
 
 
 @pytest.fixture
@@ -216,7 +216,7 @@ def test_a_server_that_passes_no_message_on(lax, robot_on, patient):
     assert steps["topics"].warnings == ("the server has no rosapi node, so that types of topics cannot be checked",)
     name, why = failure(steps)
     assert name == "round trip"
-    assert why.startswith("what is published on /bam/ping does not come back in 1 s")
+    assert why.startswith("what is published on /bam/ping does not come back in 2 s")
 
 
 def test_nobody_takes_commands(server, robot_on, patient):
