@@ -10,7 +10,7 @@ from bam_envs.core.kinematics import cube_yaw_phase
 from bam_envs.core.robot import EnvIds, Initial, RobotState
 from bam_envs.core.task import Array, Floats, Label, Memory, Score, draw_seeds, labelled_box
 from bam_envs.robots.ur5e import GEOMETRY
-from bam_envs.tasks.tool_control import ACTION_LABELS, HAND_LABELS, WORKSPACE, ToolControl, hand_state
+from bam_envs.tasks.tool_control import ACTION_LABELS, HALF, HAND_LABELS, MIDDLE, ToolControl, hand_state
 
 CUBE_AREA = np.array([[0.35, -0.20], [0.65, 0.20]])
 """Range of the cube at the start: lowest and highest x, y [m]."""
@@ -121,13 +121,13 @@ class PickTask(Memory):
 
     def _columns(self, state: RobotState) -> list[Array]:
         """Hand and cube, not clipped. Shape: (n, k) each."""
-        sense, middle, half = self.sense(state), WORKSPACE.mean(axis=0), (WORKSPACE[1] - WORKSPACE[0]) / 2
+        sense = self.sense(state)
         # exp(4 i (yaw of the cube - yaw of the gripper))
         axis: Any = sense.x_axis[:, 0] - 1j * sense.x_axis[:, 1]
         phase = cube_yaw_phase(state.signals["object_quaternion"]) * (axis * axis) ** 2
         return [
             *hand_state(state, self.control, sense.tool, sense.x_axis),
-            (sense.object[:, :2] - middle[:2]) / half[:2],
+            (sense.object[:, :2] - MIDDLE[:2]) / HALF[:2],
             self.lift(sense)[:, None] / LIFT,
             sense.offset / 0.1,
             phase.real[:, None],

@@ -24,6 +24,7 @@ LEASH = 0.03
 """Maximum distance of the tool target from the measured tool, along each axis [m]."""
 WORKSPACE = np.array([[0.30, -0.25, 0.016], [0.70, 0.25, 0.35]])
 """Box for the tool target: lowest and highest x, y, z [m]."""
+MIDDLE, HALF = WORKSPACE.mean(axis=0), (WORKSPACE[1] - WORKSPACE[0]) / 2
 YAW_LIMIT = 1.2  # farthest the gripper turns from straight ahead [rad]; a cube needs pi/4
 
 ACTION_LABELS = (
@@ -80,8 +81,9 @@ class ToolControl(Memory):
             tool: Measured tool position [m]. Shape: (n, 3).
             sent: Joints that were actually sent last [rad]; if guards changed them, the target begins there. (n, 6).
         """
-        held = np.flatnonzero((sent != self._joints).any(axis=1))
-        if len(held):
+        changed = sent != self._joints
+        if changed.any():
+            held = np.flatnonzero(changed.any(axis=1))
             self._continue_from(held, sent[held])
         moves: Array = np.clip(action, -1.0, 1.0).astype(np.float64)
         target = np.clip(self.target + moves[:, :3] * TOOL_STEP, tool - LEASH, tool + LEASH)
@@ -112,10 +114,9 @@ class ToolControl(Memory):
 
 def hand_state(state: RobotState, control: ToolControl, tool: Array, x_axis: Array) -> list[Array]:
     """The first ten numbers of an observation; see `HAND_LABELS`. Shape: (n, k) each."""
-    middle, half = WORKSPACE.mean(axis=0), (WORKSPACE[1] - WORKSPACE[0]) / 2
     yaw = np.arctan2(x_axis[:, 1], x_axis[:, 0])
     return [
-        (tool - middle) / half,
+        (tool - MIDDLE) / HALF,
         (control.target - tool) / LEASH,
         yaw[:, None] / YAW_LIMIT,
         (control.yaw - yaw)[:, None] / YAW_STEP,
