@@ -16,9 +16,9 @@ from bam_envs.safety.guard import (
     Tick,
     ToolPoint,
     ToolPosition,
-    clip,
     columns_in,
     max_rate,
+    picker,
     position_range,
     tool_point_of,
 )
@@ -53,6 +53,13 @@ class PositionLimits(Guard):
 
     def limit(self, tick: Tick) -> bool:
         """Clip the goal, joint by joint."""
+        for value, low, high in zip(tick.goal, self.low, self.high, strict=True):
+            if not low <= value <= high:
+                return self._clip(tick)
+        tick.command = tick.goal.copy()
+        return False
+
+    def _clip(self, tick: Tick) -> bool:
         rows = zip(tick.goal, tick.last, self.low, self.high, strict=True)
         goal = [min(max(value, min(low, last)), max(high, last)) for value, last, low, high in rows]
         changed = goal != tick.goal
@@ -112,11 +119,16 @@ class ToolSpeed(Guard):
     def __init__(self, spec: RobotSpec, limits: Limits, tool_position: ToolPosition) -> None:
         self.limit_value, self._tool = limits.tool_speed, tool_point_of(tool_position)
         self._joints = columns_in(spec.command, "rad")
+        self._pick = picker(self._joints)
+        self._checked: tuple[Numbers, Numbers, float] | None = None
 
     def limit(self, tick: Tick) -> bool:
         """Shorten the step of all joints."""
-        last, wanted = [tick.last[at] for at in self._joints], [tick.command[at] for at in self._joints]
-        slowed = within_reach(self._tool, last, wanted, self.limit_value * tick.period)
+        last, wanted, reach = self._pick(tick.last), self._pick(tick.command), self.limit_value * tick.period
+        if self._checked == (last, wanted, reach):  # it is asked twice in a tick, and few commands change in between
+            return False
+        slowed = within_reach(self._tool, last, wanted, reach)
+        self._checked = last, slowed, reach
         if slowed is wanted:
             return False
         for at, value in zip(self._joints, slowed, strict=True):
@@ -137,22 +149,24 @@ class JointAcceleration(Guard):
     def __init__(self, spec: RobotSpec, limits: Limits) -> None:
         self.limit_value = limits.joint_acceleration
         self._joints = columns_in(spec.command, "rad")
-        self._period = spec.period
+        self._pick, self._period = picker(self._joints), spec.period
 
     def limit(self, tick: Tick) -> bool:
         """Bring the step near to the last one."""
-        goal, command, last, last_step = tick.goal, tick.command, tick.last, tick.last_step
+        goal, command, last = tick.goal, tick.command, tick.last
         wanted = [command[at] - last[at] for at in self._joints]
         change, braking = self.limit_value * tick.period**2, self.limit_value * self._period**2
         shortened, share = tick.period / self._period, 1.0
         for at, way in zip(self._joints, wanted, strict=True):
             distance, way = abs(goal[at] - last[at]), abs(way)
+            if way <= change and way <= distance * shortened:  # it can stop after that
+                continue
             longest = distance if distance <= change else longest_step(distance, braking) * shortened
             if way > longest * ROUNDING:
                 share = min(share, longest / way)
         slowed = wanted if share == 1.0 else [way * share for way in wanted]
-        step = self._near(slowed, [last_step[at] for at in self._joints], change * ROUNDING)
-        if step == wanted:
+        step = self._near(slowed, self._pick(tick.last_step), change * ROUNDING)
+        if step is wanted or step == wanted:
             return False
         for at, way in zip(self._joints, step, strict=True):
             command[at] = last[at] + way
@@ -161,21 +175,22 @@ class JointAcceleration(Guard):
     @staticmethod
     def _near(wanted: Numbers, before: Numbers, change: float) -> Numbers:
         """The longest part of `wanted` within reach of the step `before`; if there is none, each joint by itself."""
-        least, most, inside = 0.0, 1.0, True
+        for way, about in zip(wanted, before, strict=True):
+            if not -change <= way - about <= change:
+                break
+        else:
+            return wanted
+        least, most = 0.0, 1.0
         for way, about in zip(wanted, before, strict=True):
             low, high = about - change, about + change
             if low <= way <= high:
                 if low > 0.0 or high < 0.0:  # a shorter part may be outside
                     least = max(least, (low if low > 0.0 else high) / way)
-                continue
-            inside = False
-            if way == 0.0:
+            elif way == 0.0:
                 least, most = 2.0, -1.0
             else:
                 ends = low / way, high / way
                 least, most = max(least, min(ends)), min(most, max(ends))
-        if inside:
-            return wanted
         if least <= most:
             return [way * most for way in wanted]
         rows = zip(wanted, before, strict=True)
@@ -226,13 +241,20 @@ class GripperSpeed(Guard):
 
     def limit(self, tick: Tick) -> bool:
         """Clip the width."""
-        low, high = [], []
+        changed = False
         for column, rate in zip(self._columns, self._rates, strict=True):
-            reach, last, measured = rate * tick.period, tick.last[column], tick.measured[column]
+            reach, last, measured, wanted = (
+                rate * tick.period,
+                tick.last[column],
+                tick.measured[column],
+                tick.command[column],
+            )
             # Around a held object the last width is far below the fingers: opening begins at the fingers.
-            low.append((measured if measured < last else last) - reach)  # NaN: it is not measured
-            high.append((measured if measured > last else last) + reach)
-        return clip(tick, self._columns, low, high)
+            low = (measured if measured < last else last) - reach  # NaN: it is not measured
+            high = (measured if measured > last else last) + reach
+            if not low <= wanted <= high:
+                tick.command[column], changed = (low if wanted < low else high), True
+        return changed
 
 
 class MeasuredJump(Guard):

@@ -19,6 +19,7 @@ from bam_envs.safety.guard import (
     clip,
     columns_in,
     max_rate,
+    picker,
     ticks_of,
     tool_point_of,
 )
@@ -56,11 +57,10 @@ class Following(Guard):
     def off(self, sent: Numbers, measured: Numbers) -> Numbers:
         """Distance of the measured values from the range of the recent commands, 0 inside it. Shape: (k,)."""
         self._sent.append(sent)
-        off = []
-        for value, *commands in zip(measured, *self._sent, strict=True):
-            low, high = min(commands), max(commands)
-            off.append(low - value if value < low else high - value if value > high else 0.0)  # NaN: not measured
-        return off
+        rows = zip(measured, map(min, *self._sent), map(max, *self._sent), strict=True) if len(self._sent) > 1 else ()
+        rows = rows or zip(measured, sent, sent, strict=True)
+        # NaN: it is not measured.
+        return [low - value if value < low else high - value if value > high else 0.0 for value, low, high in rows]
 
     def is_struck(self, over: bool) -> bool:
         """Count a tick whose gap is `over` the limit; after `STRIKES` of them the robot is stopped."""
@@ -82,6 +82,7 @@ class JointFollowing(Following):
     def __init__(self, spec: RobotSpec, limits: Limits, tool_position: ToolPosition | None) -> None:
         super().__init__(spec, limits)
         self._joints, self._period = columns_in(spec.command, "rad"), spec.period
+        self._pick = picker(self._joints)
         self._tool = None if tool_position is None else tool_point_of(tool_position)
         self._tool_reach = limits.tool_speed * spec.period
         self._labels = [spec.command.labels[at] for at in self._joints]
@@ -91,16 +92,20 @@ class JointFollowing(Following):
         self._slow_step = [min(one, limits.reset_speed) * spec.period for one in fastest]
         self._reach = [max(step, self._tolerance) for step in self._step]
         self._slow_reach = [max(step, self._tolerance) for step in self._slow_step]
+        self._allowed = [SHARE * reach for reach in self._reach]
+        self._slow_allowed = [SHARE * reach for reach in self._slow_reach]
         self.limit_value = max(fastest) * (self._lag + self._period)
 
     def fault(self, tick: Tick) -> str | None:
         """Report the joint, the gap, and likely causes."""
-        sent, measured = [tick.last[at] for at in self._joints], [tick.measured[at] for at in self._joints]
-        # The farthest that a command may be from a joint at rest.
-        allowed = [SHARE * reach for reach in (self._slow_reach if tick.approach else self._reach)]
+        sent, measured = self._pick(tick.last), self._pick(tick.measured)
         off = self.off(sent, measured)
-        over = any(abs(gap) > most for gap, most in zip(off, allowed, strict=True))
-        if not over and self._tool is not None and max(map(abs, off)) > self._tolerance:
+        # The farthest that a command may be from a joint at rest.
+        allowed, farthest, over = self._slow_allowed if tick.approach else self._allowed, 0.0, False
+        for gap, most in zip(off, allowed, strict=True):
+            size = abs(gap)
+            farthest, over = max(farthest, size), over or size > most
+        if not over and self._tool is not None and farthest > self._tolerance:
             explained = [value + gap for value, gap in zip(measured, off, strict=True)]
             over = math.dist(self._tool(measured), self._tool(explained)) > SHARE * self._tool_reach
         if not self.is_struck(over):
@@ -115,21 +120,23 @@ class JointFollowing(Following):
     def hold(self, tick: Tick) -> Numbers:
         """The measured joints, approached no faster than the joints' limits. Shape: (m,)."""
         held = tick.last.copy()
-        self._go_near(tick, [tick.measured[at] for at in self._joints], held)
+        self._go_near(tick, self._pick(tick.measured), held)
         return held
 
     def limit(self, tick: Tick) -> bool:
         """Bring the command within one step of the explained position, so that a released joint cannot jump."""
-        command, last = tick.command, tick.last
-        reaches = self._slow_reach if tick.approach else self._reach
+        command, pick, reaches = tick.command, self._pick, self._slow_reach if tick.approach else self._reach
         explained, near, farther, changed = [], [], False, False
-        for at, fastest, reach in zip(self._joints, self._fastest, reaches, strict=True):
-            wanted, measured, speed = command[at], tick.measured[at], tick.velocity[at]
-            ahead = 0.0 if math.isnan(speed) else min(max(speed, -fastest), fastest) * self._lag
-            place = measured + min(max(wanted - measured, min(ahead, 0.0)), max(ahead, 0.0))
-            allowed = min(max(wanted, place - reach), place + reach)
-            farther = farther or abs(wanted - place) > abs(wanted - last[at]) + self._tolerance
+        rows = pick(command), pick(tick.last), pick(tick.measured), pick(tick.velocity), self._fastest, reaches
+        for wanted, last, measured, speed, fastest, reach in zip(*rows, strict=True):
+            gap = wanted - measured
+            ahead = min(max(speed, -fastest), fastest) * self._lag
+            # The lag explains a gap in the direction of the motion; NaN: the speed is not measured.
+            part = (gap if abs(gap) < abs(ahead) else ahead) if gap * ahead > 0.0 else 0.0
+            place = measured + part
+            allowed = place - reach if wanted < place - reach else place + reach if wanted > place + reach else wanted
             changed = changed or allowed != wanted
+            farther = farther or abs(wanted - place) > abs(wanted - last) + self._tolerance
             explained.append(place)
             near.append(allowed)
         if farther and self._tool is not None:  # at most the tool's limit for one period from there
@@ -151,7 +158,7 @@ class JointFollowing(Following):
             command: The command to change. Shape: (m,).
         """
         steps = self._slow_step if tick.approach else self._step
-        last = [tick.last[at] for at in self._joints]
+        last = self._pick(tick.last)
         rows = zip(wanted, last, steps, strict=True)
         near = [min(max(value, begin - step), begin + step) for value, begin, step in rows]
         if self._tool is not None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import operator
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
@@ -358,6 +359,14 @@ def clip(tick: Tick, columns: Sequence[int], low: Numbers, high: Numbers) -> boo
 def columns_in(signal: SignalSpec, unit: str) -> list[int]:
     """Indices of the numbers of `signal` that are in `unit`."""
     return [column for column, one in enumerate(signal.units) if one == unit]
+
+
+def picker(columns: Sequence[int]) -> Callable[[Numbers], Numbers]:
+    """A function that returns the numbers in `columns` of a list; quick where they stand side by side."""
+    if columns and list(columns) == list(range(columns[0], columns[-1] + 1)):
+        pick: Callable[[Numbers], Numbers] = operator.itemgetter(slice(columns[0], columns[-1] + 1))
+        return pick
+    return lambda values: [values[column] for column in columns]
 
 
 def is_base(spec: RobotSpec) -> bool:

@@ -27,6 +27,7 @@ from bam_envs.safety.guard import (
     geometry_of,
     is_base,
     max_rate,
+    picker,
     ticks_of,
     tool_point_of,
 )
@@ -202,7 +203,7 @@ class MeasuredSpeed(Guard):
         """Report the measured speed."""
         now = [abs(speed) for speed in self._speeds(tick)]
         before, self._before = self._before, now
-        if before is None:
+        if before is None or max(before) + max(now) <= 2 * self.limit_value:
             return None
         fastest = 0.0
         for first, second in zip(before, now, strict=True):
@@ -273,17 +274,18 @@ def default_guards(
 def _arm_guards(spec: RobotSpec, limits: Limits, tool_position: ToolPosition | None, straight: bool) -> list[Guard]:
     position = None if math.isinf(limits.tool_speed) else _kinematics(spec, tool_position)
     joints = columns_in(spec.command, "rad")
+    pick = picker(joints)
     measured: list[Guard] = [arm.MeasuredJump(spec)]
     if math.isfinite(limits.joint_speed):
         limit = limits.joint_speed
-        measured.append(MeasuredSpeed("G8", "joint speed", "rad/s", limit, lambda t: [t.velocity[at] for at in joints]))
+        measured.append(MeasuredSpeed("G8", "joint speed", "rad/s", limit, lambda tick: pick(tick.velocity)))
     tool: list[Guard] = []
     if position is not None:
         tool_point = tool_point_of(position)
 
         def tool_speed(tick: Tick) -> Numbers:
-            here, moment = [tick.measured[at] for at in joints], 1e-3
-            there = [tick.measured[at] + tick.velocity[at] * moment for at in joints]
+            here, moment = pick(tick.measured), 1e-3
+            there = [at + speed * moment for at, speed in zip(here, pick(tick.velocity), strict=True)]
             return [math.dist(tool_point(here), tool_point(there)) / moment]
 
         measured.append(MeasuredSpeed("G10", "tool speed", "m/s", limits.tool_speed, tool_speed))
@@ -339,10 +341,10 @@ def _kinematics(spec: RobotSpec, tool_position: ToolPosition | None) -> ToolPosi
 
 
 def _base_guards(spec: RobotSpec, limits: Limits) -> list[Guard]:
-    drive, turn = columns_in(spec.command, "m/s"), columns_in(spec.command, "rad/s")
+    drive, turn = picker(columns_in(spec.command, "m/s")), picker(columns_in(spec.command, "rad/s"))
     return [
-        MeasuredSpeed("G11", "base speed", "m/s", limits.base_speed, lambda tick: [tick.measured[at] for at in drive]),
-        MeasuredSpeed("G11", "turn speed", "rad/s", limits.turn_speed, lambda tick: [tick.measured[at] for at in turn]),
+        MeasuredSpeed("G11", "base speed", "m/s", limits.base_speed, lambda tick: drive(tick.measured)),
+        MeasuredSpeed("G11", "turn speed", "rad/s", limits.turn_speed, lambda tick: turn(tick.measured)),
         BaseSpeed("base speed", "m/s", limits.base_speed, spec),
         BaseSpeed("turn speed", "rad/s", limits.turn_speed, spec),
         BaseAcceleration("base acceleration", "m/s", limits.base_acceleration, spec),
