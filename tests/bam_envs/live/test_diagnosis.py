@@ -288,3 +288,28 @@ def test_losses_copies_and_nulls():
 def test_too_few_pings_make_no_profile():
     with pytest.raises(InvalidValue, match=r"3 pings came back, and quantiles need 10\. Measure for longer\."):
         measured([0.02] * 3).profile()
+
+
+def test_a_delay_of_the_network_is_in_both_directions(server, robot_on, patient):
+    delay = 0.03
+
+    async def pump(reader, writer):
+        loop = asyncio.get_running_loop()
+        with contextlib.suppress(ConnectionError):
+            while data := await reader.read(65536):
+                loop.call_later(delay, writer.write, data)
+        loop.call_later(delay, writer.close)
+
+    async def pass_on(reader, writer):
+        there, back = await asyncio.open_connection("127.0.0.1", server.port)
+        await asyncio.gather(pump(reader, back), pump(there, writer))
+
+    robot_on(server)
+    with listening(lambda: asyncio.start_server(pass_on, "127.0.0.1", 0)) as url:
+        diagnosis, steps = diagnose(url, profile=patient())
+        time.sleep(2 * delay)  # the last bytes are on their way
+    assert steps["guards"].verdict != "failed"
+    link = diagnosis.measurement.profile()
+    assert diagnosis.measurement.back.min() >= 2 * delay
+    for delays in (link.command_delay, link.state_delay):
+        assert 0.8 * delay <= delays[50] <= 10 * delay
