@@ -85,15 +85,16 @@ def print_guards(config: DeployConfig, checkpoint: Checkpoint, place: Place) -> 
 
 def _rehearse(config: DeployConfig, link: str) -> int:
     """Rehearse the deployment in simulation, and report it."""
+    from bam_envs.core.wording import as_flag
     from bam_train.checkpoint import Checkpoint
     from bam_train.deploy.rehearsal import Rehearsal
     from bam_train.env_location import read_guards
     from bam_train.errors import SettingsError
     from bam_train.policy import FrozenPolicy
 
-    for name in ("robot", "transport", "rate", "fast", "render"):
+    for name in ("robot", "transport", "rate", "fast", "render", "wiggle", "stage", "record", "print_guards"):
         if getattr(config, name):
-            raise SettingsError(f"--rehearse simulates the robot, its link and its time; leave out --{name}")
+            raise SettingsError(f"--rehearse simulates the robot, its link and its time; leave out {as_flag(name)}")
     checkpoint = Checkpoint.open(config.checkpoint)
     policy = FrozenPolicy.from_checkpoint(checkpoint)
     limits: Any = {"profile": config.profile, "guards": dict(read_guards(config.guard))}

@@ -86,6 +86,10 @@ def test_the_report_for_people():
         (("wify",), "link: 'wify' is neither a shipped profile nor a .json file. Did you mean 'wifi'?"),
         (("wifi", "--robot", "ws://a:1"), "--rehearse simulates the robot, its link and its time; leave out --robot"),
         (("wifi", "--fast"), "--rehearse simulates the robot, its link and its time; leave out --fast"),
+        (
+            ("wifi", "--print-guards"),
+            "--rehearse simulates the robot, its link and its time; leave out --print-guards",
+        ),
         (("wifi", "--profile", "ur6e"), "Unknown robot profile 'ur6e'. Did you mean 'ur5e'?"),
     ],
 )
