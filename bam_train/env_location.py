@@ -102,7 +102,7 @@ class Place:
         return {**kwargs, "robot": self.robot, "profile": self.profile, **guards, **link, **trial, **shadow}
 
 
-SIMULATED = ("randomize", "link")
+SIMULATED = ("randomize", "link", "action_delay")
 """Arguments of an environment that only a simulated robot has."""
 HERE = Place()
 """The simulation here."""

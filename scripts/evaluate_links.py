@@ -11,8 +11,6 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from bam_envs.core.errors import BamEnvsError
 from bam_envs.core.registry import entry_of
 from bam_envs.robots.linked import PROFILES
@@ -22,43 +20,23 @@ from bam_train.evaluation import evaluate
 from bam_train.policy import FrozenPolicy
 
 FOLDER = Path(__file__).resolve().parents[1] / "checkpoints"
-LATE_ACTIONS = "late actions"
 SEED = 3_000_000
 """Seed of the first episode: neither training nor `bam-eval` has played it."""
-
-
 STEPS = 2
 """Delay of late actions and commands [steps]."""
 
 
-class Late:
-    """A policy whose actions come `STEPS` steps late; until then they are zero."""
-
-    def __init__(self, policy: FrozenPolicy) -> None:
-        self.policy, self.actions = policy, list[Any]()
-
-    def reset(self, env_ids: Any = None) -> None:
-        """Begin an episode in every environment."""
-        self.policy.reset()
-        self.actions = []
-
-    def act_batch(self, observations: Any) -> Any:
-        """The actions for the observations `STEPS` steps ago. Shapes: (n, ...) -> (n, a)."""
-        self.actions.append(self.policy.act_batch(observations))
-        return self.actions[-1 - STEPS] if len(self.actions) > STEPS else np.zeros_like(self.actions[0])
-
-
 def columns(period: float) -> dict[str, dict[str, Any]]:
     """Arguments of the environment for each column of the table; `period` is the robot's [s]."""
-    plain = {"randomize": False, "link": None}
+    plain = {"randomize": False, "link": None, "action_delay": None}
     late = {"command_delay": [STEPS * period] * 2, "state_delay": [0.0, 0.0]}
     return {
         "plain": plain,
         "randomised": {**plain, "randomize": True},
-        LATE_ACTIONS: plain,
+        "late actions": {**plain, "action_delay": STEPS},
         "late commands": {**plain, "link": late},
         **{name: {**plain, "link": name} for name in PROFILES},
-        "randomised, wifi": {"randomize": True, "link": "wifi"},
+        "randomised, wifi": {**plain, "randomize": True, "link": "wifi"},
     }
 
 
@@ -71,8 +49,7 @@ def row(path: Path, episodes: int) -> list[str]:
         raise BamTrainError(f"{path}: {manifest.env} has no robot that a link could be put before; leave it out")
     policy, cells, plain = FrozenPolicy.from_checkpoint(checkpoint), [path.name], 0.0
     for name, given in columns(entry.period).items():
-        acting = Late(policy) if name == LATE_ACTIONS else policy
-        report = evaluate(acting, manifest.env, {**manifest.env_kwargs, **given}, episodes=episodes, seed=SEED)
+        report = evaluate(policy, manifest.env, {**manifest.env_kwargs, **given}, episodes=episodes, seed=SEED)
         rate = report.success_rate or 0.0
         plain = rate if name == "plain" else plain
         cells.append(f"{rate:.1%}" + (f" ({rate / plain:.3f})" if plain and name != "plain" else ""))

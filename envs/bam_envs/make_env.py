@@ -17,6 +17,7 @@ from bam_envs.core.validation import PositiveInt, check
 if TYPE_CHECKING:
     from bam_envs.core.robot import Robot
     from bam_envs.core.robot_env import RobotVectorEnv
+    from bam_envs.core.task import Task
     from bam_envs.remote.remote_env import RemoteVectorEnv
 
 
@@ -26,6 +27,7 @@ def make_env(
     render_mode: str | None = None,
     randomize: bool = False,
     link: Any = None,
+    action_delay: Any = None,
     robot: str | None = None,
     transport: str | None = None,
     profile: str | None = None,
@@ -45,6 +47,8 @@ def make_env(
         randomize: Whether the physics of the simulated robot is randomized.
         link: The link that the simulated robot is behind: ``"wifi"``, ``"lte"``, ``"bad"``, a JSON file or a table of
             `LinkProfile`; None for no link.
+        action_delay: Steps by which the actions of a simulation are late, or the least and the greatest number of
+            them, drawn for each episode.
         robot: Address of a live robot behind rosbridge, such as ``"ws://10.0.0.5:9090"``, instead of the simulated one.
             The task runs in this process. A path in the address is the namespace of the robot's topics.
         transport: Address of a whole environment that runs elsewhere, such as ``"ws://10.0.0.5:9090/bam_001"`` or
@@ -72,7 +76,7 @@ def make_env(
             raise InvalidValue(f"{name}=True is for a live robot; give its address with robot= too.")
     if trial and shadow:
         raise InvalidValue("trial=True and shadow=True exclude each other: a shadow sends nothing. Give one of them.")
-    _check_place(robot, transport, timeout, render_mode, randomize, link, task_options)
+    _check_place(robot, transport, timeout, render_mode, randomize, link, action_delay, task_options)
     if transport is not None:
         from bam_envs.remote.remote_env import make_remote_env
 
@@ -83,7 +87,7 @@ def make_env(
     task = entry.make_task(1, task_options)
     simulated = entry.make_robot(1, randomize, task_options)
     if robot is None:
-        return RobotEnv(_behind(link, simulated), task, render_mode=render_mode)
+        return RobotEnv(_behind(link, simulated), _late(action_delay, task), render_mode=render_mode)
     from bam_envs.live.building import live_robot, shadow_robot
 
     where: dict[str, Any] = {"profile": profile, "guards": guards, "ca_file": ca_file, "token_file": token_file}
@@ -103,6 +107,16 @@ def _behind(link: Any, robot: Robot) -> Robot:
     return LinkedRobot(robot, link_profile(link))
 
 
+def _late(action_delay: Any, task: Task) -> Task:
+    """The task with late actions, or as it is."""
+    if action_delay is None:
+        return task
+    from bam_envs.tasks.late_actions import LateActions, read_delay
+
+    late: Any = LateActions(task, read_delay(action_delay))  # most members are the task's own
+    return late  # type: ignore[no-any-return]
+
+
 def _check_place(
     robot: str | None,
     transport: object,
@@ -110,6 +124,7 @@ def _check_place(
     render_mode: str | None,
     randomize: bool,
     link: object,
+    action_delay: object,
     task_options: Mapping[str, Any],
 ) -> None:
     """Refuse options that do not apply where the environment runs."""
@@ -119,8 +134,8 @@ def _check_place(
         names = ", ".join(task_options)
         raise InvalidValue(f"{names}: the task runs at {transport}; give its options to bam-serve there.")
     elsewhere = robot if transport is None else transport
-    given = {"render_mode": render_mode is not None, "randomize": randomize, "link": link is not None}
-    flags = [name for name, used in given.items() if used]
+    given = {"render_mode": render_mode, "randomize": randomize or None, "link": link, "action_delay": action_delay}
+    flags = [name for name, value in given.items() if value is not None]
     if elsewhere is not None and flags:
         raise InvalidValue(f"{', '.join(flags)}: only the simulation here has that, and not {elsewhere}; leave it out.")
 
@@ -133,6 +148,7 @@ def make_vector_env(
     render_mode: str | None = None,
     randomize: bool = False,
     link: Any = None,
+    action_delay: Any = None,
     robot: str | None = None,
     transport: str | Sequence[str] | None = None,
     ca_file: str | None = None,
@@ -150,7 +166,7 @@ def make_vector_env(
     check(num_envs, PositiveInt, "num_envs")
     if robot is not None:
         raise InvalidValue("A live robot is one environment, which nothing may reset unasked; use gymnasium.make.")
-    _check_place(None, transport, timeout, render_mode, randomize, link, task_options)
+    _check_place(None, transport, timeout, render_mode, randomize, link, action_delay, task_options)
     if transport is not None:
         from bam_envs.remote.remote_env import make_remote_vector_env
 
@@ -162,7 +178,7 @@ def make_vector_env(
     entry = ENVIRONMENTS[env_id]
     return RobotVectorEnv(
         _behind(link, entry.make_robot(num_envs, randomize, task_options)),
-        entry.make_task(num_envs, task_options),
+        _late(action_delay, entry.make_task(num_envs, task_options)),
         max_episode_steps=max_episode_steps,
         render_mode=render_mode,
     )

@@ -66,7 +66,7 @@ def test_what_a_transport_is_opened_with():
 
 def test_a_live_robot_is_as_it_is():
     place = Place(robot="ws://a:1", profile="mine.toml", ca_file="ca.pem")
-    assert place.robot_kwargs("bam/pick-v0", {"randomize": True, "link": "wifi"}) == {
+    assert place.robot_kwargs("bam/pick-v0", {"randomize": True, "link": "wifi", "action_delay": 2}) == {
         "robot": "ws://a:1",
         "profile": "mine.toml",
         "ca_file": "ca.pem",

@@ -208,7 +208,12 @@ def test_the_module_that_is_imported_is_the_one_that_was_named(strange, corridor
         ({"render_mode": "human"}, "env_kwargs: unknown setting 'render_mode' of bam/pick-v0."),
         (
             {"timeout": 5.0},
-            "env_kwargs: unknown setting 'timeout' of bam/pick-v0. Choose from: link, max_episode_steps, randomize.",
+            "env_kwargs: unknown setting 'timeout' of bam/pick-v0. "
+            "Choose from: action_delay, link, max_episode_steps, randomize.",
+        ),
+        (
+            {"action_delay": -2},
+            "env_kwargs: action_delay: expected a whole number from 0 to 32, or two of them, found -2",
         ),
         (
             {"link": "wify"},

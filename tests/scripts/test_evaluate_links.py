@@ -2,15 +2,7 @@
 
 import json
 
-import numpy as np
-import pytest
-
 from tests.scripts.conftest import ROOT
-
-
-@pytest.fixture
-def script(load_script):
-    return load_script("evaluate_links")
 
 
 def test_the_table_of_one_checkpoint(run_script, tmp_path):
@@ -24,23 +16,6 @@ def test_the_table_of_one_checkpoint(run_script, tmp_path):
     ]
 
 
-def test_actions_are_two_steps_late(script):
-    class Counting:
-        count = 0
-
-        def reset(self):
-            self.count = 0
-
-        def act_batch(self, observations):
-            self.count += 1
-            return np.full((1, 1), self.count)
-
-    late = script.Late(Counting())
-    for _ in range(2):
-        late.reset()
-        assert [int(late.act_batch(None)[0, 0]) for _ in range(5)] == [0, 0, 1, 2, 3]
-
-
-def test_late_commands_are_two_periods_late(script):
-    link = script.columns(0.05)["late commands"]["link"]
+def test_late_commands_are_two_periods_late(load_script):
+    link = load_script("evaluate_links").columns(0.05)["late commands"]["link"]
     assert json.dumps(link) == '{"command_delay": [0.1, 0.1], "state_delay": [0.0, 0.0]}'

@@ -24,6 +24,7 @@ MAKE_OPTIONS = (
     "render_mode",
     "randomize",
     "link",
+    "action_delay",
     "robot",
     "transport",
     "profile",
