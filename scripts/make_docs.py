@@ -177,7 +177,7 @@ def guards() -> str:
     robots: dict[tuple[str, ...], list[str]] = {}
     for name in ("ur5e", "mir100"):
         profile = load_profile(name)
-        for guard in default_guards(profile.spec(), profile_limits(profile)):
+        for guard in default_guards(profile.spec(), profile_limits(profile), straight=True):
             does = code(inspect.cleandoc(type(guard).__doc__ or "").partition("\n\n")[0])
             key = (guard.number, guard.name, f"{guard.limit_value:g} {guard.unit}", does)
             robots.setdefault(key, []).append(profile.kind)

@@ -165,6 +165,8 @@ def require_consent(env: Any, who: str, *, yes: bool, plan: Sequence[str] = ()) 
     for name, guard in guards_of(env).items():
         if guard["limit"] not in (None, ""):
             say(f"  {name} ({guard['number']}): {guard['limit']:.3g} {guard['unit']}".rstrip())
+    for warning in getattr(robot, "warnings", ()):
+        say(f"  warning: {warning}")
     if (why := robot.not_ready()) is not None:
         raise SettingsError(f"not ready: {why}; nothing has moved")
     if yes:

@@ -28,10 +28,13 @@ class PlainDisplay:
     """Writes one line for each episode."""
 
     def __init__(self, journal: Journal, write: Callable[[str], None]) -> None:
-        self._journal, self._write = journal, write
+        self._journal, self._write, self._warned = journal, write, 0
 
     def ticked(self, record: EpisodeRecord, action: Any, pacer: Pacer) -> None:
-        """Nothing: a line for each tick is too many."""
+        """Write the first warning of each guard; a line for each tick is too many."""
+        for title, text in [*self._journal.warnings.items()][self._warned :]:
+            self._write(f"warning: {title}: {text}")
+        self._warned = len(self._journal.warnings)
 
     def ended(self, record: EpisodeRecord) -> None:
         """Write such as ``episode 2/5 (seed 8): success after 47 steps, return 12.31``."""
@@ -64,7 +67,8 @@ class LiveDisplay(PlainDisplay):
         self._live, self._env, self._title, self._now, self._drawn = live, env, title, now, -math.inf
 
     def ticked(self, record: EpisodeRecord, action: Any, pacer: Pacer) -> None:
-        """Redraw if it is time and there is time."""
+        """As there, and redraw if it is time and there is time."""
+        super().ticked(record, action, pacer)
         now = self._now()
         if now - self._drawn < self.EVERY or pacer.slack < self.COST:
             return

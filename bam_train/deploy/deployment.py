@@ -123,7 +123,7 @@ class Deployment:
         chain: list[Agent] = [
             _StopAgent(self.switch, watch),
             self._robot,
-            _JournalAgent(journal, pacer, watch, trials),
+            _JournalAgent(journal, pacer, watch, trials, getattr(env.unwrapped, "robot", None)),
             PolicyAgent(policy, names, single=True),
             *agents,
         ]
@@ -269,9 +269,10 @@ class _JournalAgent(Agent):
     reads_previous = ("action",)
     writes = ()
 
-    def __init__(self, journal: Journal, pacer: Pacer, watch: Stopwatch, trials: Trials | None) -> None:
+    def __init__(self, journal: Journal, pacer: Pacer, watch: Stopwatch, trials: Trials | None, robot: Any) -> None:
         super().__init__()
         self._journal, self._pacer, self._watch, self._trials = journal, pacer, watch, trials
+        self._robot = robot
 
     def forward(self, t: int, seed: int, watcher: Watcher, **kwargs: Any) -> None:
         self._watch.stepped = time.perf_counter()
@@ -283,6 +284,7 @@ class _JournalAgent(Agent):
         else:  # the step that led to time t
             success = self.get((f"env/{SUCCESS}", t))[0] if self.get((f"env/{SAYS_SUCCESS}", t))[0] else None
             end = next((end for end in _ENDS if self.get((f"env/{end}", t))[0]), "stopped")
+            self._journal.warn(getattr(self._robot, "warnings", ()))
             record = self._journal.step(self.get(("env/reward", t))[0], success, end)
             watcher.ticked(record, self.get(("action", t - 1))[0], self._pacer)
             if end != "stopped":

@@ -26,7 +26,7 @@ from bam_train.env_location import Place
 from bam_train.environments import control_period
 from bam_train.loop import Agent
 from bam_train.loop.gym.gym_spaces import NAME
-from bam_train.recording.recorder import Recorder
+from bam_train.recording.recorder import WARNING, Recorder
 
 STAGES = ("step", "wait", "late", "policy", "age", "record")
 """What /latency has; see `RecorderAgent`."""
@@ -131,6 +131,7 @@ class RecorderAgent(Agent):
         self._names, self.reads = names, (*names, "action", "env/reward")
         self._numbers: list[str] = []
         self._declared = False  # what /sent has
+        self._warned = 0
         self._decided, self._took = 0.0, math.nan
         self._sent: Sent | None = None
         """The last command that no tick has yet."""
@@ -165,6 +166,10 @@ class RecorderAgent(Agent):
         if t == 0:
             self._recorder.event(f"episode {self._journal.begun} begins, seed {seed}")
             self._describe(state, {name: self.get((name, t)) for name in self._names}, action)
+        if len(self._journal.warnings) > self._warned:
+            for title, text in [*self._journal.warnings.items()][self._warned :]:
+                self._recorder.event(f"{title}: {text}", WARNING)
+            self._warned = len(self._journal.warnings)
         scalars = [
             *self._status(),
             *(watch.stepped - watch.begun, watch.waited - watch.stepped, watch.late, begun - watch.waited),

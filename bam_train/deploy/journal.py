@@ -3,7 +3,7 @@
 import math
 import time
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -56,11 +56,17 @@ class Journal:
     """CPU time of this process from its start to the first observation [s]; None before it."""
     marks: tuple[str, ...] = ()
     """What each status line says of this deployment, such as ``"UNSIGNED"``."""
+    warnings: dict[str, str] = field(default_factory=dict)
+    """The newest warning of each guard of a live robot, by its title; see `SafeRobot.warnings`."""
 
     @property
     def marked(self) -> str:
         """The marks as the end of a status line: ``", UNSIGNED"``; empty without any."""
         return "".join(f", {mark}" for mark in self.marks)
+
+    def warn(self, warnings: Sequence[str]) -> None:
+        """Keep the warnings of the guards, each of which begins with the guard's title."""
+        self.warnings.update(warning.split(": ", 1) for warning in warnings)  # type: ignore[misc]
 
     def begin(self, seed: int) -> EpisodeRecord:
         """Append the record of a new episode, and return it."""
@@ -156,7 +162,9 @@ class DeployReport:
         """Warnings for the user, also about a deployment that ended well."""
         missed, period = self.pacer.missed, self.pacer.period
         planned = self.pacer.ticks + missed
-        faults = [] if self.recorder is None or not self.recorder.fault else [f"recording: {self.recorder.fault}"]
+        faults = [f"{title}: {text}" for title, text in self.journal.warnings.items()]
+        if self.recorder is not None and self.recorder.fault:
+            faults.append(f"recording: {self.recorder.fault}")
         if period is None or missed <= MISSED_SHARE * planned:
             return faults
         return [

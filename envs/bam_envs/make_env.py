@@ -94,7 +94,8 @@ def make_env(
     if shadow:
         return RobotEnv(shadow_robot(robot, simulated.spec, **where), task, render_mode=render_mode)
     tool = getattr(simulated, "tool_position", None)  # forward kinematics of an arm that is no UR5e
-    live = live_robot(robot, simulated.spec, trial=trial, tool_position=tool, **where)
+    straight = getattr(task, "moves_straight", False)
+    live = live_robot(robot, simulated.spec, trial=trial, tool_position=tool, straight=straight, **where)
     return RobotEnv(live, task, render_mode=render_mode)
 
 

@@ -23,6 +23,7 @@ def live_robot(
     guards: Mapping[str, float] | None = None,
     trial: bool = False,
     tool_position: ToolPosition | None = None,
+    straight: bool = False,
     command: str | None = None,
     ca_file: str | None = None,
     token_file: str | None = None,
@@ -37,6 +38,7 @@ def live_robot(
         guards: Some of them by name, which override the others, such as ``{"joint_speed": 0.3}``.
         trial: Whether it is on trial: slow, and in a box around its start; see `Limits.on_trial`.
         tool_position: Forward kinematics of an arm other than a UR5e, (n, k) [rad] to (n, 3) [m].
+        straight: Whether the commands move the tool along straight lines, so that singularities count.
         command: Command mode, such as ``"trajectory"``; None: the profile's default.
         ca_file: PEM file of the authorities to trust instead of the system's.
         token_file: File with the server's shared secret.
@@ -55,7 +57,7 @@ def live_robot(
         chosen_limits = chosen_limits.changed(guards)
     if trial:
         chosen_limits = chosen_limits.on_trial(base=chosen.kind == "base")
-    return SafeRobot(robot, limits=chosen_limits, tool_position=tool_position)
+    return SafeRobot(robot, limits=chosen_limits, tool_position=tool_position, straight=straight)
 
 
 def shadow_robot(

@@ -306,9 +306,10 @@ class RosbridgeRobot:
         self._require_link()
         self._require_accepted()
         lockstep = self.info.lockstep  # no time passes between commands: a late one is valid until the wait times out
-        tag = self._session.tagger.next(self._epoch, self._answer_timeout if lockstep else self._command_life)
+        life = self._answer_timeout if lockstep else self._command_life
+        tag, until = self._session.tagger.next(self._epoch, life), self._clock() + life
         self._pacer.tick()
-        self._send(control, values, tag, halts)
+        self._send(control, values, tag, halts, until)
         self._publish_status(control)
         if not lockstep:
             self._cut.wait(max(0.0, self._pacer.slack))
@@ -324,12 +325,18 @@ class RosbridgeRobot:
         self._require_accepted()
         return self.measure()
 
-    def _send(self, control: RosbridgeLink, command: Array, tag: Tag, halts: int) -> None:
-        """Send every part of `command` (m,), unless there were more than `halts` halts: one came after `step` began."""
+    def _send(self, control: RosbridgeLink, command: Array, tag: Tag, halts: int, until: float) -> None:
+        """Send every part of `command` (m,), unless there were more than `halts` halts: one came after `step` began.
+
+        Nor is it sent after `until` [s], when this process was stopped meanwhile: a robot of ours would refuse it by
+        its tag, others would execute it. The gate finds the pause with the next command.
+        """
         ros1, sign = control.ros == "ros1", self._session.tagger.sign
         envelopes = [encode_sink(sink, self.spec, command, tag, sign=sign, ros1=ros1) for sink in self._sinks]
         with self._sending:
-            if self._halts == halts:
+            if self._clock() > until:
+                _LOG.warning("%s: a command waited too long in this process, and was not sent.", self.url)
+            elif self._halts == halts:
                 self._commanded = True
                 self._session.drive()
                 control.publish_all([(self.namespace + topic, message) for topic, _, message in envelopes])

@@ -45,7 +45,6 @@ class PositionLimits(Guard):
     """
 
     number, name, unit, setting = "G7", "position margin", "rad", "position_margin"
-    keeps_out = True
 
     def __init__(self, spec: RobotSpec, limits: Limits) -> None:
         self.limit_value = limits.position_margin

@@ -1,7 +1,7 @@
 """The guards of a base that look at where it is: what its lasers see, and the edge of a rectangle."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -49,18 +49,18 @@ class LaserZones(Guard):
         speed, turn = tick.command[self._drive], tick.command[self._turn]
         if not self._scanners or not (speed or turn):
             return False
-        points = np.concatenate([self._points(tick, *scanner) for scanner in self._scanners], axis=1)
+        points = self.points(tick.signals)
         slowed = self._in_zones(speed, points)
         share = self._share(slowed, turn, points)
         tick.command[self._drive], tick.command[self._turn] = slowed * share, turn * share
         return slowed != speed or share < 1.0
 
-    @staticmethod
-    def _points(tick: Tick, signal: str, place: Array, rays: Array) -> Array:
-        """What a scanner sees, in the base's frame [m]. Shape: (2, k)."""
-        ranges = np.nan_to_num(tick.signals[signal][0], nan=0.0, posinf=1e6)
-        points: Array = place + ranges * rays
-        return points
+    def points(self, signals: Mapping[str, Array]) -> Array:
+        """What the scanners see, in the base's frame [m]. Shape: (2, k)."""
+        seen = [
+            place + np.nan_to_num(signals[name][0], nan=0.0, posinf=1e6) * rays for name, place, rays in self._scanners
+        ]
+        return np.concatenate(seen, axis=1)
 
     def _in_zones(self, speed: float, points: Array) -> float:
         """The allowed part of `speed` [m/s], by the nearest of `points` on the side to which it drives."""

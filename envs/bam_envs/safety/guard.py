@@ -101,7 +101,8 @@ class Limits:
     action_age: float = _limit(0.1, 0.01, 1.0, "s")
     """Maximum time from a state to the command that rests on it [s]."""
     watchdog: float | None = _limit(None, 0.02, 1.0, "s")
-    """Time within which a robot should stop by itself [s], for a warning; None: 0.1 for an arm, 0.5 for a base."""
+    """Time within which a robot should stop by itself [s], for a warning; None: 0.1 for an arm, 0.5 for a base, or
+    two periods if that is longer."""
     late_share: float = _limit(0.05, 0.01, 1.0, "share")
     """Share of late commands above which there is a warning."""
     link_warn: float = _limit(0.95, 0.5, 1.0, "share")

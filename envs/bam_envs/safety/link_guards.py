@@ -65,7 +65,7 @@ class Share(Guard):
 
 
 class LateTicks(Share):
-    """Commands that come late are counted; too many are a warning, and `Pace` stops the robot after ten in a row."""
+    """Commands that come late are counted; too many are a warning; ten in a row stop the robot (command pace)."""
 
     number, name, setting = "G15", "late ticks", "late_share"
 
@@ -148,7 +148,7 @@ class Watchdog(Guard):
     number, name, unit, setting = "G5", "robot's watchdog", "s", "watchdog"
 
     def __init__(self, spec: RobotSpec, limits: Limits) -> None:
-        self.limit_value = limits.watchdog or (0.5 if is_base(spec) else 0.1)
+        self.limit_value = limits.watchdog or max(0.5 if is_base(spec) else 0.1, 2.0 * spec.period)
         self._rest = "drives on" if is_base(spec) else "goes on to its last command"
 
     def connected(self, watchdog: float | None) -> None:

@@ -64,7 +64,7 @@ class Place(Guard):
 
 
 class WorkspaceBox(Place):
-    """The tool stays in a box. Zero is a limit like any other number.
+    """The tool stays in a box, whose longest edge this is; zero is a limit like any other number.
 
     Args:
         spec: The arm.

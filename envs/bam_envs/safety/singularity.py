@@ -14,7 +14,7 @@ _RATE = 4.0
 
 
 class Singularity(Guard):
-    """Towards a singularity the arm slows down, and stops before it; away from it, it is free.
+    """In a task with straight lines, an arm slows down towards a singularity, and stops before it; back, it is free.
 
     The limit is the condition number of the Jacobian, whose lengths are measured in halves of the arm's length. It is
     computed anew only after the joints have turned far enough, since it was computed last, to reach the limit.

@@ -74,6 +74,7 @@ class PickTask(Memory):
 
     memory: Mapping[str, str] = {"rest_height": "rest_height", "held": "held"}
     action_labels = ACTION_LABELS
+    moves_straight = True  # the tool, along straight lines: singularities count
     observation_labels: tuple[Label, ...] = HAND_LABELS + OBJECT_LABELS
 
     def __init__(self, num_envs: int = 1) -> None:

@@ -93,7 +93,7 @@ class RobotService:
         text = f"{profile.name}, served in real time; it rests {robot.command_timeout:g} s after the last command"
         if lockstep:
             text = f"{profile.name}, served in lockstep: its time advances with commands, {robot.spec.period:g} s each"
-        self.info = RobotInfo(profile.name, True, lockstep, robot.spec.period, text)
+        self.info = RobotInfo(profile.name, True, lockstep, robot.spec.period, text, robot.command_timeout)
         """Its description for clients."""
         self._slot = CommandSlot()
         self._sessions = Sessions(lambda name: lease.holder == Caller("", session=name).client)

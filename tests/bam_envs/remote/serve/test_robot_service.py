@@ -137,7 +137,7 @@ def test_it_says_what_it_is(serve, bus, realtime, text):
     serve(realtime=realtime)
     answer = bus.services["/bam/robot"][1]({}, None)
     assert answer["success"] is True
-    assert read_info(answer["message"], "/bam/robot") == RobotInfo("ur5e", True, not realtime, 0.05, text)
+    assert read_info(answer["message"], "/bam/robot") == RobotInfo("ur5e", True, not realtime, 0.05, text, 0.1)
 
 
 def test_in_lockstep_each_command_is_one_period_and_is_echoed(serve):
