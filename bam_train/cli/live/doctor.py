@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json as json_module
+import os
 from dataclasses import asdict, dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Any
@@ -138,8 +139,11 @@ def _require_sane(config: DoctorConfig) -> None:
         return
     if config.measure.suffix != ".json":
         raise SettingsError(f"--measure: expected a .json file, found {str(config.measure)!r}")
-    if not config.measure.expanduser().parent.is_dir():
+    folder = config.measure.expanduser().parent
+    if not folder.is_dir():
         raise OutputError(f"--measure: there is no folder {config.measure.parent}; make it first")
+    if not os.access(folder, os.W_OK):
+        raise OutputError(f"--measure: the folder {config.measure.parent} cannot be written; choose another one")
 
 
 def _write_measured(config: DoctorConfig, diagnosis: Diagnosis) -> dict[str, Any] | None:
