@@ -125,12 +125,10 @@ class RobotCell:
             stack.callback(self._kill_all)
             self.processes: dict[str, Any] = {}
             """The running processes: ``robot``, ``driver`` and ``bridge``; each has ``kill()``."""
-            ready = [
-                self._start("robot", run_robot, self._env_id, near, self._path),
-                self._start("bridge", run_bridge, self.port),
-                self._start("driver", run_driver, self.spec, far, self.url, self._fault, self._describes_itself),
-            ]
-            _await(ready)
+            robot = self._start("robot", run_robot, self._env_id, near, self._path)
+            bridge = self._start("bridge", run_bridge, self.port)
+            told = self.spec, far, self.url, self._fault, self._describes_itself, bridge
+            _await([robot, bridge, self._start("driver", run_driver, *told)])
             self._stack = stack.pop_all()
         return self
 
@@ -323,11 +321,14 @@ def _shortened(message: Message) -> Message:
     return message
 
 
-def run_driver(spec: RobotSpec, wire: socket.socket, url: str, fault: Any, describes_itself: bool, ready: Any) -> None:
-    """The main function of the driver's process: topics of the robot on the rosbridge server at `url`."""
+def run_driver(
+    spec: RobotSpec, wire: socket.socket, url: str, fault: Any, describes_itself: bool, bridge: Any, ready: Any
+) -> None:
+    """The main function of the driver's process: topics of the robot on the server at `url`, once `bridge` is set."""
     _be_another_computer()
     profile = profile_for(spec)
     link = RosbridgeLink(url, name="driver")
+    bridge.wait(_START)
     link.connect()
     wire.setblocking(False)
     robot: Any = DrivenRobot(spec, profile.command_life(spec.period), wire)
