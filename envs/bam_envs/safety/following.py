@@ -57,10 +57,14 @@ class Following(Guard):
     def off(self, sent: Numbers, measured: Numbers) -> Numbers:
         """Distance of the measured values from the range of the recent commands, 0 inside it. Shape: (k,)."""
         self._sent.append(sent)
-        rows = zip(measured, map(min, *self._sent), map(max, *self._sent), strict=True) if len(self._sent) > 1 else ()
-        rows = rows or zip(measured, sent, sent, strict=True)
-        # NaN: it is not measured.
-        return [low - value if value < low else high - value if value > high else 0.0 for value, low, high in rows]
+        off = [0.0] * len(sent)
+        for at, (value, oldest, newest) in enumerate(zip(measured, self._sent[0], sent, strict=True)):
+            if oldest <= value <= newest or newest <= value <= oldest:
+                continue
+            commands = [one[at] for one in self._sent]
+            low, high = min(commands), max(commands)
+            off[at] = low - value if value < low else high - value if value > high else 0.0  # NaN: it is not measured
+        return off
 
     def is_struck(self, over: bool) -> bool:
         """Count a tick whose gap is `over` the limit; after `STRIKES` of them the robot is stopped."""

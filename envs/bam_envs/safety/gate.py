@@ -138,6 +138,8 @@ class SafeRobot(metaclass=Sealed):
         "_status",
         "_stopped",
         "_tell",
+        "_trips",
+        "_unmeasured",
     )
 
     def __init__(
@@ -162,6 +164,8 @@ class SafeRobot(metaclass=Sealed):
         self._further = tuple(guards)
         self._guards = tuple(default_guards(robot.spec, self._limits, tool_position=tool_position, straight=straight))
         self._checks = tuple(one for one in self._guards if type(one).fault is not Guard.fault)
+        self._trips = tuple(one for one in self._guards if isinstance(one, MeasuredLimits))
+        self._unmeasured = [math.nan] * len(robot.spec.command.labels)
         self._limiters = tuple(one for one in self._guards if type(one).limit is not Guard.limit)
         self._robot: Any = robot
         self._clock, self._is_base, command = clock, is_base(robot.spec), robot.spec.command
@@ -320,8 +324,8 @@ class SafeRobot(metaclass=Sealed):
     def _tick(self, goal: Numbers, approach: bool) -> Tick:
         pause = self._pause()
         last = self._begin_at(pause)
-        measured, speeds, period = self._measured(self._places), self._measured(self._speeds), self.spec.period
-        before = [math.nan] * len(measured) if self._before is None else self._before
+        measured, speeds, period = self._measured(self._places), self._measured(self._speeds), self._spec.period
+        before = self._unmeasured if self._before is None else self._before
         self._before = measured
         time_passed = min(period, pause or period)
         rows = zip(speeds, measured, before, strict=True)
@@ -336,7 +340,7 @@ class SafeRobot(metaclass=Sealed):
             age=self.age(),
             period=time_passed,
             pause=pause,
-            waiting=getattr(self._live, "waiting", lambda: 0.0)(),
+            waiting=getattr(self._live, "waiting", float)(),
             approach=approach,
             action_age=self._clock() - self._returned_at if pause else 0.0,
             kept_out=self._kept_out,
@@ -355,9 +359,12 @@ class SafeRobot(metaclass=Sealed):
 
     def _begin_at(self, pause: float) -> Numbers:
         """The last command if the robot still follows it, else its measured position, at rest. Shape: (m,)."""
-        in_motion = self._sent_at is not None or self._live is None or self._in_lockstep()
-        last = self._last  # read once: a halt in another thread clears it
-        if last is not None and in_motion and pause <= LATE * self.spec.period:
+        last, sent_at = self._last, self._sent_at  # read once: a halt in another thread clears them
+        if (
+            last is not None
+            and pause <= LATE * self._spec.period
+            and (sent_at is not None or self._live is None or self._in_lockstep())
+        ):
             return last
         if self._live is not None and self._state is not None:
             self._state = self._fresh_state()
@@ -381,9 +388,9 @@ class SafeRobot(metaclass=Sealed):
         """The measured value of each number of the command, from `places`; NaN if not measured. Shape: (m,)."""
         if self._state is None:
             raise ResetNeeded("Nothing is known of the robot yet. Call reset() first.")
-        measured, signals = [math.nan] * len(self.spec.command.labels), self._state.signals
+        measured, signals = self._unmeasured.copy(), self._state.signals
         for place, name, column in places:
-            measured[place] = float(signals[name].item(0, column))
+            measured[place] = signals[name].item(0, column)
         return measured
 
     def _fresh_state(self) -> RobotState:
@@ -477,8 +484,8 @@ class SafeRobot(metaclass=Sealed):
         return _copied(self._state)  # changes by the caller must not reach the guards
 
     def _require_in_range(self, state: RobotState) -> None:
-        for guard in self._guards:
-            if isinstance(guard, MeasuredLimits) and (reason := guard.trip(state)) is not None:
+        for guard in self._trips:
+            if (reason := guard.trip(state)) is not None:
                 self._stop(guard, reason)
 
     def _stop(self, guard: Guard, reason: str) -> NoReturn:

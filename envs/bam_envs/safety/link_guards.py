@@ -43,8 +43,7 @@ class Share(Guard):
     unit = "share of 100 ticks"
 
     def __init__(self) -> None:
-        self._ticks: deque[bool] = deque(maxlen=TICKS)
-        self._counted = 0
+        self._tick, self._counted = 0, deque[int]()  # number of this tick, and of those that count
 
     def is_counted(self, tick: Tick) -> bool:
         """Whether `tick` is one of those to count."""
@@ -52,16 +51,17 @@ class Share(Guard):
 
     def forgive(self) -> None:
         """Forget the ticks before."""
-        self._ticks.clear()
-        self._counted, self.warning = 0, ""
+        self._counted.clear()
+        self.warning = ""
 
     def count(self, tick: Tick) -> int:
         """Number of counted ticks among the last 100, this one included."""
-        if len(self._ticks) == TICKS:
-            self._counted -= self._ticks[0]
-        self._ticks.append(counted := self.is_counted(tick))
-        self._counted += counted
-        return self._counted
+        self._tick += 1
+        if self.is_counted(tick):
+            self._counted.append(self._tick)
+        if self._counted and self._counted[0] <= self._tick - TICKS:
+            self._counted.popleft()
+        return len(self._counted)
 
 
 class LateTicks(Share):
@@ -108,9 +108,12 @@ class LinkQuality(Share):
     def fault(self, tick: Tick) -> str | None:
         """Report the share of good ticks, when the link is back: while it is down, others hold the robot."""
         bad = self.count(tick)
+        if not bad:
+            self.warning = ""
+            return None
         good = f"only {TICKS - bad} of the last {TICKS} ticks had a state and an answer in time"
         self.warning = good if bad > TICKS * (1.0 - self._warn) + 1e-9 else ""
-        if self._ticks[-1] or bad <= TICKS * (1.0 - self.limit_value) + 1e-9:
+        if self._counted[-1] == self._tick or bad <= TICKS * (1.0 - self.limit_value) + 1e-9:
             return None
         return (
             f"{good}, and {TICKS * self.limit_value:.0f} are needed: look at the network and at the load of the "
@@ -134,6 +137,9 @@ class KeptOut(Share):
     def fault(self, tick: Tick) -> str | None:
         """Report the number of changed commands."""
         changed = self.count(tick)
+        if not changed:
+            self.warning = ""
+            return None
         text = f"{changed} of the last {TICKS} commands were changed to keep the robot out of a place"
         self.warning = text if changed > TICKS * self._warn + 1e-9 else ""
         if changed <= TICKS * self.limit_value + 1e-9:

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 
 from bam_envs.core.errors import InvalidValue
 from bam_envs.core.robot import RobotSpec
-from bam_envs.safety.guard import Guard, Limits, Numbers, Tick, ToolPoint, columns_in
+from bam_envs.safety.guard import Guard, Limits, Numbers, Tick, ToolPoint, columns_in, picker
 from bam_envs.safety.tubes import ArmTubes
 
 _HALVINGS = 6
@@ -26,6 +26,7 @@ class Place(Guard):
 
     def __init__(self, spec: RobotSpec, limits: Limits) -> None:
         self._joints, self._change = columns_in(spec.command, "rad"), limits.joint_acceleration * spec.period**2
+        self._pick = picker(self._joints)
 
     def depth(self, joints: Sequence[float]) -> float:
         """How far in a forbidden place the arm is at `joints` (k,) [rad]; 0 outside."""
@@ -44,8 +45,8 @@ class Place(Guard):
 
     def limit(self, tick: Tick) -> bool:
         """Shorten the step of all joints."""
-        last = [tick.last[at] for at in self._joints]
-        step = [tick.command[at] - one for at, one in zip(self._joints, last, strict=True)]
+        last = self._pick(tick.last)
+        step = [one - before for one, before in zip(self._pick(tick.command), last, strict=True)]
         if self.is_outside(self.rest(last, step)):
             return False
         here = max(self.depth(last), _TOUCH)
@@ -116,6 +117,8 @@ class Collision(Place):
     def __init__(self, spec: RobotSpec, limits: Limits, tubes: ArmTubes) -> None:
         super().__init__(spec, limits)
         self.limit_value, self._tubes, self._table = limits.clearance, tubes, limits.table_height
+        self._at: Sequence[float] = [math.inf] * 6  # where it was computed last
+        self._room = 0.0  # the distance to anything may shrink by this before the next computation [m]
 
     def depth(self, joints: Sequence[float]) -> float:
         """By how much the least distance is below the limit [m]."""
@@ -123,9 +126,13 @@ class Collision(Place):
         return max(0.0, self.limit_value - distance)
 
     def is_outside(self, joints: Sequence[float]) -> bool:
-        """As `depth`, with pairs of tubes that cannot be near left out."""
-        low = self._tubes.lowest(joints) - self._table < self.limit_value
-        return not low and not self._tubes.nearer_than(self.limit_value, joints)
+        """As `depth`, without what cannot be near."""
+        if self._tubes.change(self._at, joints) < self._room:
+            return True
+        height = self._tubes.lowest(joints) - self._table
+        near = self._tubes.nearer_than(self.limit_value, joints)
+        self._at, self._room = joints, min(height, self._tubes.least) - self.limit_value
+        return not near and height >= self.limit_value
 
     def start_fault(self, start: Numbers) -> str | None:
         """Why the arm must not go to `start` (m,)."""

@@ -49,6 +49,16 @@ class ArmTubes:
         tubes = self.tubes(q)
         return min(self._distance(tubes, one, other) for one, other, _ in _PAIRS)
 
+    def change(self, here: Sequence[float], there: Sequence[float]) -> float:
+        """No height of `lowest` and no distance changes by more from the joints `here` to `there` (6,) [rad]; in m."""
+        levers = self._levers
+        return (
+            levers[0] * abs(there[1] - here[1])
+            + levers[1] * abs(there[2] - here[2])
+            + levers[2] * abs(there[3] - here[3])
+            + levers[3] * abs(there[4] - here[4])
+        )
+
     def nearer_than(self, margin: float, q: Sequence[float]) -> bool:
         """Whether two tubes are nearer than `margin` [m] at the joints `q` (6,) [rad].
 
@@ -67,7 +77,12 @@ class ArmTubes:
             if not self._near[place] >= margin:
                 tubes = tubes or self.tubes(q)
                 self._near[place] = self._distance(tubes, one, other)
-        return min(self._near) < margin
+        return self.least < margin
+
+    @property
+    def least(self) -> float:
+        """The least distance of two tubes that is possible at the joints of `nearer_than` [m]."""
+        return min(self._near)
 
     @staticmethod
     def _distance(tubes: list[Tube], one: int, other: int) -> float:
