@@ -2,6 +2,7 @@
 
 import contextlib
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,10 +13,15 @@ from bam_envs.live.building import live_robot, profile_limits
 from bam_envs.live.diagnosis import STEPS, Diagnosis
 from bam_envs.robots.profile import load_profile
 from bam_envs.robots.ur5e import arm_spec
+from bam_train.checkpoint import Checkpoint
+from bam_train.deploy.contract import check_contract
+from bam_train.env_location import Place
+from bam_train.environments import make_env
 
 ROW = np.zeros(1, np.int64)
 HOME = np.array([[0.0, -1.5708, 1.5708, -1.5708, -1.5708, 0.0]])
 SPEC = arm_spec("ur5e", with_object=True)
+PICK = Path(__file__).parents[2] / "checkpoints" / "pick-ppo.zip"
 POSITIONS, GRIPPER, TRAJECTORY = "positions", "gripper", "trajectory"
 
 
@@ -198,3 +204,19 @@ def test_a_diagnosis_finds_it_well_and_moves_nothing(rosbridge, robot_node):
     link = diagnosis.measurement.profile()
     assert link.command_loss < 0.1
     assert 0.0 < link.command_delay[50] < 0.1
+
+
+STATES = ("/joint_states", "/gripper/joint_states", "/object_pose")
+
+
+def test_the_contract_is_compared_without_a_command(rosbridge, robot_node):
+    env, place = make_env("bam/pick-v0", place=Place(robot=rosbridge.url)), Place(robot=rosbridge.url)
+    robot_node.ask("forget")
+    contract = check_contract(Checkpoint.open(PICK), env, place)
+    assert [(one.what, one.found) for one in contract.refused] == []
+    verdicts = {one.what: one.verdict for one in contract.checks}
+    assert [verdicts[f"rate of {topic}"] for topic in STATES] == ["ok"] * 3
+    assert verdicts["command /forward_position_controller/commands"] == "not told"  # this bridge has no rosapi
+    assert robot_node.ask("report")["received"] == []
+    elsewhere = check_contract(Checkpoint.open(PICK), env, Place(robot=f"{rosbridge.url}/cell"), timeout=0.5)
+    assert [one.what for one in elsewhere.refused] == [f"topic {topic}" for topic in STATES]
