@@ -145,7 +145,11 @@ def _tool_length(geometry: ArmGeometry, along: float) -> Check:
 def _senses(geometry: ArmGeometry, q: Array, pose: Pose) -> Check:
     """A joint's sense is shown if the tool would be elsewhere with the joint at the opposite angle."""
     hidden = [name for i, name in enumerate(UR_JOINTS) if _fits(geometry, np.where(np.arange(6) == i, -q, q), pose)]
-    found = "shown by the tool's pose" if not hidden else f"not shown near 0 rad: {', '.join(hidden)}; give --wiggle"
+    found = (
+        "shown by the tool's pose"
+        if not hidden
+        else f"not shown at 0 or 180 degrees: {', '.join(hidden)}; give --wiggle"
+    )
     return check("sense of the joints", "as commanded", found, fits=None if hidden else True)
 
 

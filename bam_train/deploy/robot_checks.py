@@ -17,6 +17,7 @@ from bam_envs.live.state import Letter, SourceAge, concerns
 from bam_envs.ros.codec import decode_source
 from bam_envs.ros.messages import Message, bare_type, number_at, same_type
 from bam_envs.ros.profile_tables import RobotProfile, Source
+from bam_envs.safety.guards import MeasuredLimits
 from bam_train.deploy.contract_table import Check, check
 
 Array = NDArray[np.float64]
@@ -148,7 +149,8 @@ def _scan_geometry(source: Source, message: Message) -> Iterator[Check]:
 def _range(signal: SignalSpec, values: Array) -> Iterator[Check]:
     """The measured numbers of a signal are inside their range, and a quaternion has the length 1."""
     low, high = np.array(signal.low), np.array(signal.high)
-    room = BEYOND * (high - low)
+    # A guard stops a robot that is beyond its data sheet at all.
+    room = (0.0 if signal.name in MeasuredLimits.SIGNALS else BEYOND) * (high - low)
     outside = ((values < low - room) | (values > high + room)).any(axis=0)
     unit = signal.units[0] if len(set(signal.units)) == 1 else ", ".join(signal.units)
     expected = f"{_span(low, high)} {unit}".removesuffix(" 1")
