@@ -102,8 +102,8 @@ class Place:
         return {**kwargs, "robot": self.robot, "profile": self.profile, **guards, **link, **trial, **shadow}
 
 
-SIMULATED = ("randomize", "link", "action_delay")
-"""Arguments of an environment that only a simulated robot has."""
+SIMULATED: Mapping[str, Any] = {"randomize": False, "link": None, "action_delay": None}
+"""Arguments of an environment that only a simulated robot has, with their values for a perfect one."""
 HERE = Place()
 """The simulation here."""
 

@@ -2,7 +2,8 @@
 
 Command, seed and steps come from each checkpoint's manifest, wall time from the run that made it (`--runs`) or, without
 that, from the table as it is; the success rate is measured here, over episodes that neither training nor its
-evaluations have seen: those of ``bam-eval --episodes 1000``.
+evaluations have seen: those of ``bam-eval --episodes 1000``. A policy that was trained with randomised physics, late
+actions or a link is evaluated without them here; ``scripts/evaluate_links.py`` evaluates all with them.
 """
 
 from __future__ import annotations
@@ -16,8 +17,10 @@ from pathlib import Path
 from typing import Any
 
 from bam_envs.core.errors import BamEnvsError
+from bam_envs.core.registry import entry_of
 from bam_train.checkpoint import Checkpoint, Manifest
 from bam_train.cli.console import duration
+from bam_train.env_location import SIMULATED
 from bam_train.errors import BamTrainError
 from bam_train.evaluation import FIRST_SEED, EvaluationReport, evaluate
 from bam_train.policy import FrozenPolicy
@@ -85,7 +88,8 @@ def row(path: Path, episodes: int, runs: Path, known: dict[tuple[str, ...], str]
     checkpoint = Checkpoint.open(path)
     manifest = checkpoint.manifest
     policy = FrozenPolicy.from_checkpoint(checkpoint)
-    report = evaluate(policy, manifest.env, manifest.env_kwargs, episodes=episodes, seed=FIRST_SEED)
+    plain = SIMULATED if entry_of(manifest.env) is not None else {}
+    report = evaluate(policy, manifest.env, {**manifest.env_kwargs, **plain}, episodes=episodes, seed=FIRST_SEED)
     made = [f"`{command(manifest, path.name)}`", str(manifest.seed), f"{manifest.steps:,}"]
     first = [f"[{path.name}]({path.name})", *made]
     seconds = wall_time(manifest, runs) or known.get(tuple(first), "not recorded")

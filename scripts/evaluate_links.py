@@ -15,6 +15,7 @@ from bam_envs.core.errors import BamEnvsError
 from bam_envs.core.registry import entry_of
 from bam_envs.robots.linked import PROFILES
 from bam_train.checkpoint import Checkpoint
+from bam_train.env_location import SIMULATED
 from bam_train.errors import BamTrainError
 from bam_train.evaluation import evaluate
 from bam_train.policy import FrozenPolicy
@@ -28,7 +29,7 @@ STEPS = 2
 
 def columns(period: float) -> dict[str, dict[str, Any]]:
     """Arguments of the environment for each column of the table; `period` is the robot's [s]."""
-    plain = {"randomize": False, "link": None, "action_delay": None}
+    plain = dict(SIMULATED)
     late = {"command_delay": [STEPS * period] * 2, "state_delay": [0.0, 0.0]}
     return {
         "plain": plain,

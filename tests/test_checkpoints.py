@@ -5,6 +5,7 @@ from pathlib import Path
 import pytest
 
 from bam_train.checkpoint import Checkpoint
+from bam_train.env_location import SIMULATED
 from bam_train.evaluation import evaluate
 from bam_train.policy import FrozenPolicy
 
@@ -30,6 +31,7 @@ def test_a_committed_checkpoint_succeeds_and_is_small(name, least):
     path = FOLDER / f"{name}.zip"
     assert path.stat().st_size < (1_200_000 if name in WIDE else 500_000)
     manifest = Checkpoint.open(path).manifest
-    report = evaluate(FrozenPolicy.load(path), manifest.env, manifest.env_kwargs, episodes=200, seed=7_000_000)
+    env_kwargs = {**manifest.env_kwargs, **SIMULATED}  # a perfect robot, also for a policy that was trained for worse
+    report = evaluate(FrozenPolicy.load(path), manifest.env, env_kwargs, episodes=200, seed=7_000_000)
     assert report.episodes == 200
     assert report.success_rate >= least

@@ -92,7 +92,7 @@ def _rehearse(config: DeployConfig, link: str) -> int:
     from bam_train.errors import SettingsError
     from bam_train.policy import FrozenPolicy
 
-    for name in ("robot", "transport", "rate", "fast", "render", "wiggle", "stage", "record", "print_guards"):
+    for name in ("robot", "transport", "rate", "fast", "render", "wiggle", "stage", "shadow", "record", "print_guards"):
         if getattr(config, name):
             raise SettingsError(f"--rehearse simulates the robot, its link and its time; leave out {as_flag(name)}")
     checkpoint = Checkpoint.open(config.checkpoint)

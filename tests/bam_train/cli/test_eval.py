@@ -1,4 +1,5 @@
 import json
+from pathlib import Path
 
 import pytest
 from PIL import Image
@@ -75,6 +76,16 @@ def test_film(corridor_checkpoint, starting_cell, run, tmp_path):
 def test_its_environment_and_algorithm_may_be_asked_for(corridor_checkpoint, run):
     status, _, _ = run(main, corridor_checkpoint(), "--env", "test/Corridor", "--algo", "ppo", "--episodes", 1)
     assert status == 0
+
+
+def test_the_environment_may_be_worse_than_in_training(run):
+    drive = Path(__file__).parents[3] / "checkpoints" / "mir100-navigation-ppo.zip"
+    worse = ("randomize=true", "link=wifi", "env_kwargs.action_delay=[0,2]")
+    status, out, err = run(main, drive, "--episodes", 3, *(word for one in worse for word in ("--set", one)))
+    lines = out.splitlines()
+    assert (status, err) == (0, "")
+    assert lines[0].endswith("on bam/mir100-navigation-v0 with randomize=True, link='wifi', action_delay=[0, 2]")
+    assert lines[1] == "  success   100.0% (3 of 3; 95 % interval 43.9% to 100.0%)"
 
 
 def refused(run, *arguments):
