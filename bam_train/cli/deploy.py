@@ -192,11 +192,14 @@ def _recorder(
     if config.record is None and (config.no_record or place.robot is None):
         return None
     from bam_train.deploy.flight import deployment_facts, flight_recorder, new_recording, watch_cameras
+    from bam_train.deploy.trust import has_real_robot
 
     path = config.record or new_recording(checkpoint.manifest.env)
     facts = {**deployment_facts(checkpoint, env), "seed": config.seed, "address": place.text, "marks": ", ".join(marks)}
     recorder = flight_recorder(path.expanduser(), env, facts)
     recorder.start()
+    if has_real_robot(env):
+        recorder.event("nobody was asked before the robot moves (--yes)" if config.yes else "the operator lets it move")
     for warning in watch_cameras(recorder, place):
         say(f"bam-deploy: warning: {warning}")
     return recorder

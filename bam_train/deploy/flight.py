@@ -20,6 +20,7 @@ from bam_envs.core.robot import RobotState
 from bam_envs.live.camera import LiveCamera
 from bam_envs.robots.profile import load_profile
 from bam_envs.rosbridge.endpoint import Endpoint
+from bam_envs.safety.guard import Tick
 from bam_train.checkpoint import Checkpoint
 from bam_train.deploy.journal import Journal
 from bam_train.env_location import Place
@@ -39,8 +40,6 @@ _SCALARS = {
 
 MOST_BESIDE = 32
 """Most numbers of a signal that is recorded with a command outside the ticks; those of a laser are more."""
-Sent = tuple[Sequence[float], RobotState, int, str]
-"""A command, the state that it led to, and the number and title of the guard that changed it."""
 
 
 class Stopwatch:
@@ -109,8 +108,8 @@ class RecorderAgent(Agent):
     """Records each tick: last in the chain, so that the action is the one that the environment gets.
 
     The latencies are ``step``, from an action to the observation that it led to; ``wait``, until the next deadline;
-    ``late``, the delay of the tick after that; ``policy``, from then to the next action; ``age`` of a live robot's
-    newest state at that time; and ``record``, what recording the tick before took.
+    ``late``, the delay of the tick after that; ``policy``, from then to the next action; ``age`` of a guarded
+    robot's newest state when the command was sent; and ``record``, what recording the tick before took.
 
     Args:
         recorder: The recorder, which has started.
@@ -130,42 +129,42 @@ class RecorderAgent(Agent):
         self._robot: Any = getattr(self._env, "robot", None)
         self._names, self.reads = names, (*names, "action", "env/reward")
         self._numbers: list[str] = []
+        self._pictures: list[str] = []
         self._declared = False  # what /sent has
         self._warned = 0
-        self._decided, self._took = 0.0, math.nan
-        self._sent: Sent | None = None
+        self._decided, self._took, self._age = 0.0, math.nan, math.nan
+        self._sent: tuple[Sequence[float], RobotState] | None = None
         """The last command that no tick has yet."""
         observe = getattr(self._robot, "observe", None)
         if observe is not None:
             observe(self._was_sent)
 
-    def _was_sent(self, command: Sequence[float], state: RobotState, code: int, status: str, approach: bool) -> None:
-        self._sent = command, state, code, status
-        if approach:
+    def _was_sent(self, tick: Tick, state: RobotState) -> None:
+        self._age, self._sent = tick.age, (tick.command, state)
+        if tick.approach:
             self.record_last_command()
 
     def record_last_command(self) -> None:
         """Record the last command on its own, if no tick has it."""
         if self._sent is None:
             return
-        (command, state, code, status), self._sent = self._sent, None
+        (command, state), self._sent = self._sent, None
         signals = [one for one in self._robot.spec.signals if len(one.labels) <= MOST_BESIDE]
         if not self._declared:
             names = [f"{one.name}.{label}" for one in signals for label in one.labels]
             commands = [f"command.{label}" for label in self._robot.spec.command.labels]
             self._recorder.declare({"/sent": [*names, *commands, "code", "guard"]}, series=1)
             self._declared = True
-        numbers = [*command, code, self._recorder.place(status)]
-        self._recorder.tick([state.signals[one.name] for one in signals], numbers, series=1)
+        self._recorder.tick([state.signals[one.name] for one in signals], [*command, *self._status()], series=1)
 
     def forward(self, t: int, seed: int, **kwargs: Any) -> None:
         """Record the tick."""
         begun, watch, record, self._sent = perf_counter(), self._watch, self._journal.records[-1], None
         state: Any = getattr(self._env, "last_state", None)
-        action = self.get(("action", t))
+        get, action = self.get, self.get(("action", t))
         if t == 0:
             self._recorder.event(f"episode {self._journal.begun} begins, seed {seed}")
-            self._describe(state, {name: self.get((name, t)) for name in self._names}, action)
+            self._describe(state, {name: get((name, t)) for name in self._names}, action)
         if len(self._journal.warnings) > self._warned:
             for title, text in [*self._journal.warnings.items()][self._warned :]:
                 self._recorder.event(f"{title}: {text}", WARNING)
@@ -173,17 +172,17 @@ class RecorderAgent(Agent):
         scalars = [
             *self._status(),
             *(watch.stepped - watch.begun, watch.waited - watch.stepped, watch.late, begun - watch.waited),
-            *(self._age(), self._took, self._journal.begun - 1, t, self.get(("env/reward", t))[0]),
+            *(self._age, self._took, self._journal.begun - 1, t, get(("env/reward", t))[0]),
             *(record.end == "terminated", record.end == "truncated"),
             math.nan if record.success is None else record.success,
         ]
-        arrays = [*(self.get((name, t)) for name in self._numbers), action]
+        arrays = [*[get((name, t)) for name in self._numbers], action]
         if state is not None:
-            arrays = [state.stamp, *state.signals.values(), *_numeric(state.truth).values(), state.command, *arrays]
+            truth = _numeric(state.truth).values() if state.truth else ()
+            arrays = [state.stamp, *state.signals.values(), *truth, state.command, *arrays]
         self._recorder.tick(arrays, scalars, begun - self._decided if t else 0.0)
-        for name in self._names:
-            if name not in self._numbers:
-                self._recorder.pixels(name.removeprefix("env/"), self.get((name, t))[0])
+        for name in self._pictures:
+            self._recorder.pixels(name.removeprefix("env/"), get((name, t))[0])
         self._recorder.look()
         self._decided = perf_counter()
         self._took = self._decided - begun
@@ -193,7 +192,8 @@ class RecorderAgent(Agent):
         labels = {
             kind: [str(row["name"]) for row in rows] for kind, rows in getattr(self._env, "describe", dict)().items()
         }
-        self._numbers = [name for name, array in observed.items() if not _is_picture(array)]
+        self._pictures = [name for name, array in observed.items() if _is_picture(array)]
+        self._numbers = [name for name in observed if name not in self._pictures]
         arrays = {name.removeprefix(f"env/{NAME}").lstrip("/"): observed[name] for name in self._numbers}
         layout, truth = {}, {} if state is None else _numeric(state.truth)
         if state is not None:
@@ -216,10 +216,6 @@ class RecorderAgent(Agent):
             return 0, 0
         number = guard.rpartition("(G")[2].rstrip(")")
         return int(getattr(self._robot, "code", number)), self._recorder.place(guard)
-
-    def _age(self) -> float:
-        age = getattr(self._robot, "age", None)
-        return math.nan if age is None else float(age())
 
 
 def _is_picture(array: NDArray[Any]) -> bool:

@@ -38,7 +38,7 @@ from bam_envs.safety.link_guards import Share, Watchdog
 __all__ = ["ClearedCommand", "Limits", "SafeRobot"]
 
 Array = NDArray[np.float64]
-Observer = Callable[[Sequence[float], RobotState, int, str, bool], None]
+Observer = Callable[[Tick, RobotState], None]
 """See `SafeRobot.observe`."""
 GRIPPER_TIME = 1.0
 """Longest wait for the gripper to open before an arm goes to its start pose [s]."""
@@ -279,10 +279,9 @@ class SafeRobot(metaclass=Sealed):
         return {name: dict(row) for name, row in self._report.items()}
 
     def observe(self, observer: Observer) -> None:
-        """Call ``observer(command, state, code, status, approach)`` after each command that was sent.
+        """Call ``observer(tick, state)`` after each command that was sent, with the state that it led to.
 
-        `command` has the numbers of `spec.command`; `state` is the one that it led to, which must not be changed;
-        `approach` is true on the way to a start pose. It is called between two commands, so it must be fast.
+        It is called between two commands, so it must be fast, and it must change neither of the two.
         """
         self._observer = observer
 
@@ -479,7 +478,7 @@ class SafeRobot(metaclass=Sealed):
             rows = zip(tick.command, tick.last, strict=True)
             self._last, self._speed = tick.command, [(now - before) / tick.period for now, before in rows]
         if self._observer is not None:
-            self._observer(tick.command, self._state, self._code, self._status, tick.approach)
+            self._observer(tick, self._state)
         self._require_in_range(self._state)
         return _copied(self._state)  # changes by the caller must not reach the guards
 

@@ -24,6 +24,7 @@ from bam_envs.ros.images import color_message
 from bam_train.checkpoint import Checkpoint
 from bam_train.cli.deploy import main as deploy
 from bam_train.cli.flags import TrainConfig
+from bam_train.cli.live.replay import main as replay
 from bam_train.cli.program import guarded
 from bam_train.cli.train import train
 from bam_train.recording.drawing import frames
@@ -123,6 +124,9 @@ def test_a_policy_drives_a_robot_over_its_topics(serve, run, tmp_path, monkeypat
     assert "will move" not in err  # it said that it is simulated
     [recording] = tmp_path.glob("recordings/*-pick.mcap")
     assert report["recording"] == str(recording.relative_to(tmp_path))
+    status, out, _ = run(replay, recording, "--json")
+    played = json.loads(out)["played"]
+    assert (status, played["same"], played["ticks"]) == (0, True, report["ticks"] + 1)
 
 
 def test_the_cameras_of_a_profile_are_recorded(serve, run, tmp_path):
