@@ -58,7 +58,7 @@ class StateFault(IntEnum):
     SILENT = 1
     """None is published."""
     SHORT = 2
-    """The last joint, or a field of a pose, is missing."""
+    """The last joint is missing."""
     CLOCK = 3
     """The driver's clock has jumped by an hour."""
 
@@ -313,12 +313,10 @@ def _untagged(message: Message) -> Message:
 
 
 def _shortened(message: Message) -> Message:
-    """A state without its last joint, or without a field of its pose."""
-    if "name" in message:  # sensor_msgs/JointState
-        return {key: value[:-1] if isinstance(value, list) else value for key, value in message.items()}
-    if "position" in message:  # geometry_msgs/Pose
-        return {**message, "position": {"x": 0.0}}
-    return message
+    """A sensor_msgs/JointState without its last joint; any other message as it is."""
+    if "name" not in message:
+        return message
+    return {key: value[:-1] if isinstance(value, list) else value for key, value in message.items()}
 
 
 def run_driver(
