@@ -173,6 +173,12 @@ def test_a_signature_that_is_none_is_named(signed, keys, data):
     assert caught.value.member == SIGNATURE
 
 
+def test_a_signature_of_an_absurd_size_is_not_read(signed, keys):
+    write(signed, members_of(signed) | {SIGNATURE: bytes(2**24)})
+    with pytest.raises(AlteredCheckpoint, match=r"bam/signature\.json has 16777216 bytes, expected at most 16384"):
+        admit(signed, keys)
+
+
 def test_an_unsigned_checkpoint_is_refused_or_marked(corridor_checkpoint, keys, key):
     path = corridor_checkpoint()
     text = f"is not signed. Sign it with bam-sign sign {path} --key FILE"
