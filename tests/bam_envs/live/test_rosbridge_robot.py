@@ -292,6 +292,29 @@ def test_a_command_that_a_halt_overtook_is_not_sent(server, robot_on, connect):
     assert all(message["data"] == state.command[0, :6].tolist() for message in scripted.on(JOINT_COMMANDS))
 
 
+def test_a_command_that_waited_in_this_process_is_not_sent(server, robot_on, connect, caplog):
+    scripted, looks, jump = robot_on(server), [], 0.0
+
+    def clock():
+        nonlocal jump
+        if looks:  # the process is stopped between two looks at the clock
+            looks.append(None)
+            jump = 5.0 if len(looks) == 3 else jump
+        return time.monotonic() + jump
+
+    robot, gate = connect(server.url, clock=clock)
+    state = gate.step(gate.state.command)
+    looks.append(None)
+    late = gate.step(gate.state.command + 0.01)
+    np.testing.assert_array_equal(late.command, state.command)
+    assert [record.getMessage() for record in caplog.records] == [
+        f"{server.url}: a command waited too long in this process, and was not sent."
+    ]
+    state = gate.step(gate.state.command + 0.02)
+    scripted.wait_for(lambda: len(scripted.on(JOINT_COMMANDS)) == 2)
+    assert scripted.on(JOINT_COMMANDS)[1]["data"] == state.command[0, :6].tolist()
+
+
 def test_a_halt_overtakes_a_call_that_runs(lax, robot_on, connect):
     """One by which the robot is asked for its controllers."""
     server, blocks, release = lax(), threading.Event(), threading.Event()
