@@ -121,17 +121,17 @@ class Limits:
     """Distance that the links of an arm keep from each other and from the table [m]."""
     table_height: float = _place(0.0, -2.0, 1.0)
     """Height of the table in ``base_link`` [m], below which no part of an arm goes."""
-    box_x_min: float = _place(-1.5, -2.0, 1.5)
+    box_x_min: float = _place(-2.0, -2.5, 2.0)
     """Lowest x of the tool [m]."""
-    box_x_max: float = _place(1.5, -1.5, 2.0)
+    box_x_max: float = _place(2.0, -2.0, 2.5)
     """Highest x of the tool [m]."""
-    box_y_min: float = _place(-1.5, -2.0, 1.5)
+    box_y_min: float = _place(-2.0, -2.5, 2.0)
     """Lowest y of the tool [m]."""
-    box_y_max: float = _place(1.5, -1.5, 2.0)
+    box_y_max: float = _place(2.0, -2.0, 2.5)
     """Highest y of the tool [m]."""
-    box_z_min: float | None = _place(None, -2.0, 2.0)
+    box_z_min: float | None = _place(None, -2.5, 2.0)
     """Lowest z of the tool [m]; None: `table_height` if the task commands a gripper, else unlimited."""
-    box_z_max: float = _place(2.0, -1.0, 2.0)
+    box_z_max: float = _place(2.0, -1.0, 2.5)
     """Highest z of the tool [m]."""
     laser_stop: float = _limit(0.3, 0.05, 2.0, "m", finite=True)
     """Distance from the base, in the direction in which it drives, at which it stops for what its lasers see [m]."""

@@ -90,7 +90,7 @@ def test_the_list_of_an_arm():
         ("G9", "joint jerk", 500.0, "rad/s^3"),
         ("G10", "tool speed", 0.25, "m/s"),
         ("G23", "following", 0.05, "rad"),
-        ("G10", "workspace box", 3.0, "m"),
+        ("G10", "workspace box", 4.0, "m"),
         ("G24", "collision", 0.005, "m"),
         ("G7", "measured limits", 0.0, "beyond the data sheet"),
     ]

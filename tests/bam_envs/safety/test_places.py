@@ -114,7 +114,7 @@ def test_a_start_pose_outside_the_box_or_in_the_table_is_refused_before_anything
         reset(robot)
     assert str(caught.value) == (
         f"workspace box (G10) does not allow the start pose: the tool would be at {x:.3f}, {y:.3f}, {z:.3f} m, outside "
-        f"the box from -1.500, -1.500, 0.000 to {x - 0.1:.3f}, 1.500, 2.000 m: widen the box, or choose another start."
+        f"the box from -2.000, -2.000, 0.000 to {x - 0.1:.3f}, 2.000, 2.000 m: widen the box, or choose another start."
     )
     lying = (0.0, 0.3, 0.0, -1.0, -1.5, 0.0)
     with pytest.raises(InvalidValue, match=r"^collision \(G24\) does not allow the start pose: the arm would be -0"):
