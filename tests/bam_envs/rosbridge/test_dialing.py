@@ -86,7 +86,7 @@ def test_a_name_that_nobody_knows():
 )
 def test_another_server(answer, text):
     with answering(answer) as url:
-        assert failure(url) == text
+        assert failure(url, connect_timeout=5.0) == text
 
 
 @pytest.mark.parametrize(
