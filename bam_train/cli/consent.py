@@ -62,11 +62,7 @@ def connected_env(
     kwargs, mode = {**saved, **(env_kwargs or {})}, "human" if render else None
     env = make_env(env_id, kwargs, render_mode=mode, place=place)
     try:
-        contract = None
-        if place.robot is None:
-            require_fit(checkpoint, env, place)
-        else:
-            contract = required_contract(checkpoint, env, place, motion)
+        contract = required_contract(checkpoint, env, place, motion)
         signals.raise_again()
         robot: Any = getattr(env.unwrapped, "robot", None)
         if robot is not None:
@@ -83,7 +79,7 @@ def connected_env(
         if not place.shadow:
             require_consent(env, f"{who}: {checkpoint.path}", yes=yes, plan=plan)
         signals.raise_again()
-        if wiggle and contract is not None and contract.evidence is not None:
+        if wiggle and contract.evidence is not None and not place.shadow:
             require_motion(env, f"{checkpoint.path} and the robot at {place.text}", contract.evidence)
             signals.raise_again()
     except BaseException:
@@ -95,9 +91,15 @@ def connected_env(
 def required_contract(checkpoint: Checkpoint, env: Any, place: Place, motion: Path | None = None) -> Contract:
     """The contract of a checkpoint with a live robot, shown to a person if the robot is real; moves nothing.
 
+    Any other environment is compared with the checkpoint only, and the contract is empty.
+
     Raises:
         ContractRefused: They do not fit; the table is shown.
+        CheckpointMismatch: An environment without a live robot does not fit.
     """
+    if place.robot is None:
+        require_fit(checkpoint, env, place)
+        return Contract(())
     from bam_train.deploy.contract import check_contract  # only for live robots
 
     contract = check_contract(checkpoint, env, place)

@@ -88,10 +88,9 @@ def gather(
     """
     narrowed = profile.narrowed(spec.command.labels)
     required = tuple(profile.source(signal.name) for signal in spec.signals)
-    have = {source.signal for source in required}
-    extra = tuple(one for one in profile.state if one.signal in TOOL_POSE and one.signal not in have)
-    if listen is None:
-        listen = max(LISTEN, _AGES * max((one.max_age or profile.max_age) for one in required))
+    extra = tuple(one for one in profile.state if one.signal in TOOL_POSE and one not in required)
+    longest = max((one.max_age or profile.max_age) for one in required)
+    listen = max(LISTEN, _AGES * longest) if listen is None else listen
     link = RosbridgeLink(endpoint, name="contract")
     try:
         link.connect()

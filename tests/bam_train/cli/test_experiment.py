@@ -12,6 +12,7 @@ import pytest
 from bam_envs.core.errors import InvalidValue, LinkLost
 from bam_train.checkpoint import Checkpoint
 from bam_train.cli.experiment import TrainingFlags, environment_of, open_env, require_place, signals_ask
+from bam_train.deploy.contract_table import Contract
 from bam_train.environments import make_env
 from bam_train.errors import SettingsError
 from bam_train.signals import Terminated
@@ -106,7 +107,7 @@ def test_a_real_robot_does_not_move_unasked(monkeypatch, capsys):
     """Nobody is there to ask: it is connected, and closed again."""
     made = make_env("bam/pick-v0")
     monkeypatch.setattr("bam_train.cli.consent.make_env", lambda *arguments, **options: made)
-    monkeypatch.setattr("bam_train.cli.consent.required_contract", lambda *arguments: None)  # it would listen there
+    monkeypatch.setattr("bam_train.cli.consent.required_contract", lambda *arguments: Contract(()))  # it would listen
     robot, closed = made.unwrapped.robot, []
     robot.info, robot.not_ready = SimpleNamespace(simulated=False, text="a real robot"), lambda: None
     monkeypatch.setattr(robot, "close", lambda: closed.append(True))
