@@ -82,6 +82,7 @@ class Recorder:
         self.path, self.metadata, self.guards = path, dict(metadata or {}), ("", *guards)
         self._places = {title: place for place, title in enumerate(self.guards)}
         self._ring_size, self._writes = size, 0
+        self._declared: dict[int, Any] = {}  # by series
         self._numbers: dict[int, int] = {}  # of a tick, by series
         self._fault = ""
         self._cameras: list[Camera] = []
@@ -144,9 +145,10 @@ class Recorder:
             extra: Text by name that readers of the numbers need, kept as the metadata record ``layout``.
             series: Which ticks: 0 for those of the loop.
         """
-        self._numbers[series] = sum(map(len, layout.values()))
         content = {"layout": {topic: list(names) for topic, names in layout.items()}, "extra": dict(extra or {})}
-        self._write(LAYOUT, json.dumps(content).encode(), series=series)
+        if content != self._declared.get(series):
+            self._declared[series], self._numbers[series] = content, sum(map(len, layout.values()))
+            self._write(LAYOUT, json.dumps(content).encode(), series=series)
 
     def tick(
         self, arrays: Iterable[NDArray[Any]], numbers: Sequence[float] = (), sent_ago: float = 0.0, series: int = 0

@@ -47,7 +47,7 @@ _KNOWN = {
 _encode = msgspec.json.Encoder().encode  # what is not finite becomes null
 
 
-class _File:
+class RecordingFile:
     """The MCAP file, and what was registered in it."""
 
     def __init__(self, head: dict[str, Any]) -> None:
@@ -65,6 +65,7 @@ class _File:
         self._metadata("deployment", {key: str(value) for key, value in head["metadata"].items()})
 
     def add(self, record: bytes) -> None:
+        """Encode a record of the ring."""
         kind, (wall, monotonic, ago, series) = record[:1], TIMES.unpack_from(record, 1)
         data = record[1 + TIMES.size :]
         stamp = {"sec": wall // 10**9, "nsec": wall % 10**9}
@@ -158,6 +159,7 @@ class _File:
         self._begin = self._end = self.file.tell()
 
     def close(self) -> None:
+        """End the file with its summary."""
         self.settle()
         self._writer.finish()  # type: ignore[no-untyped-call]
         self.file.flush()
@@ -173,7 +175,8 @@ def nested(values: list[tuple[list[str], Any]]) -> dict[str, Any]:
     return table
 
 
-def _drain(ring: Ring, file: _File, parent: int) -> None:
+def drain(ring: Ring, file: RecordingFile, parent: int) -> None:
+    """Write the records of the ring into the file until it is closed, or the process `parent` is gone."""
     settled = time.monotonic()
     while True:
         over = ring.closed or os.getppid() != parent  # looked at first: what was written before is still read
@@ -198,9 +201,9 @@ def main() -> None:
     head = json.loads(ring.read() or b"{}")
     try:
         Path(head["path"]).parent.mkdir(parents=True, exist_ok=True)
-        file = _File(head)
+        file = RecordingFile(head)
         ring.begin()
-        _drain(ring, file, parent)
+        drain(ring, file, parent)
         file.close()
         return
     except OSError as error:

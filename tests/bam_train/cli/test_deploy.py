@@ -75,6 +75,22 @@ def test_the_rate_and_its_deadlines_are_reported(corridor_checkpoint, run, flags
     assert err.startswith(f"{said}episode 1/1 ")
 
 
+def test_a_recording_that_cannot_be_made_is_one_line_and_nothing_moves(corridor_checkpoint, corridor, run, monkeypatch):
+    moved, path = [], corridor_checkpoint()
+    monkeypatch.setattr(corridor_class(corridor), "reset", lambda *_, **__: moved.append(True))
+    assert run(main, path, "--record", path) == (
+        1,
+        "",
+        f"bam-deploy: {path}: a recording is there already. Choose another file\n",
+    )
+    assert run(main, path, "--record", path, "--no-record") == (
+        1,
+        "",
+        "bam-deploy: --record and --no-record exclude each other; give one of the two\n",
+    )
+    assert moved == []
+
+
 def test_a_rate_is_needed(corridor_checkpoint, corridor, run, monkeypatch):
     monkeypatch.setattr(corridor_class(corridor), "metadata", {"render_modes": []})
     status, out, err = run(main, corridor_checkpoint())

@@ -59,7 +59,9 @@ def recorded(tmp_path):
             reader = make_reader(file)
             for _, channel, message in reader.iter_messages(log_time_order=False):
                 found.setdefault(channel.topic, []).append(json.loads(message.data))
-            found["metadata"] = {one.name: one.metadata for one in reader.iter_metadata()}
+            metadata = [(one.name, one.metadata) for one in reader.iter_metadata()]
+            assert [name for name, _ in metadata] == ["deployment", "layout"]
+            found["metadata"] = dict(metadata)
         return ending, found
 
     return run

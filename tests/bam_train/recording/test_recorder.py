@@ -9,6 +9,7 @@ import signal
 import struct
 import subprocess
 import sys
+import threading
 import time
 
 import numpy as np
@@ -20,6 +21,9 @@ from mcap.stream_reader import StreamReader, breakup_chunk
 
 from bam_train.errors import OutputError
 from bam_train.recording.recorder import Recorder
+from bam_train.recording.recorder_process import RecordingFile, drain
+from bam_train.recording.ring import LAYOUT as LAYOUT_RECORD
+from bam_train.recording.ring import TICK, TIMES, Ring, make_shared_file
 
 LAYOUT = {"/state": ["arm.pan", "arm.lift"], "/action": ["dx"], "/status": ["code", "guard"]}
 
@@ -102,6 +106,9 @@ import sys, time
 import numpy as np
 from pathlib import Path
 from bam_train.recording.recorder import Recorder
+from bam_train.recording.recorder_process import RecordingFile, drain
+from bam_train.recording.ring import LAYOUT as LAYOUT_RECORD
+from bam_train.recording.ring import TICK, TIMES, Ring, make_shared_file
 recorder = Recorder(Path(sys.argv[1]))
 recorder.start()
 recorder.declare({"/state": [f"k{i}" for i in range(20)]})
@@ -156,6 +163,32 @@ def test_at_any_moment_the_file_holds_what_was_recorded_a_second_before(started)
         assert found == list(range(len(found)))
         assert len(found) >= sum(tick < now - 1 for tick in ticks)
     assert len(found) > 50
+
+
+def test_what_is_a_second_old_is_on_the_disk_itself(tmp_path, monkeypatch):
+    """What a power cut leaves is the file as it was at the last `fsync`."""
+    synced, path = [(time.monotonic(), b"")], tmp_path / "a.mcap"
+    monkeypatch.setattr(os, "fsync", lambda _: synced.append((time.monotonic(), path.read_bytes())))
+    descriptor = make_shared_file(2**20)
+    ring, file = Ring(descriptor), RecordingFile({"path": str(path), "metadata": {}, "guards": [""]})
+    thread = threading.Thread(target=drain, args=(Ring(descriptor), file, os.getppid()))
+    thread.start()
+    ring.write(LAYOUT_RECORD + TIMES.pack(0, 0.0, 0.0, 0) + b'{"layout": {"/state": ["k"]}, "extra": {}}')
+    ticks, cuts = [], []
+    for k in range(200):
+        ring.write(TICK + TIMES.pack(k, 0.0, 0.0, 0) + struct.pack("=d", k))
+        ticks.append(time.monotonic())
+        time.sleep(0.01)
+        cuts.append((time.monotonic(), len(ticks)))
+    ring.close()
+    thread.join()
+    file.close()
+    os.close(descriptor)
+    for now, _ in cuts[::10]:
+        left = max(one for one in synced if one[0] <= now)[1]
+        found = [one["k"] for one in messages(left).get("/state", ())]
+        assert found == list(range(len(found)))
+        assert len(found) >= sum(tick < now - 1 for tick in ticks)
 
 
 def test_a_full_disk_ends_the_recording_only(started, caplog):
