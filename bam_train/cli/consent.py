@@ -4,6 +4,7 @@ import os
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -59,21 +60,17 @@ def connected_env(
         CheckpointMismatch: Another environment does not.
     """
     env_id, saved = environment_of(checkpoint, named, elsewhere=bool(place.transport))
-    kwargs, mode = {**saved, **(env_kwargs or {})}, "human" if render else None
-    env = make_env(env_id, kwargs, render_mode=mode, place=place)
+    make = partial(make_env, env_id, {**saved, **(env_kwargs or {})}, render_mode="human" if render else None)
+    env = make(place=place)
     try:
         contract = required_contract(checkpoint, env, place, motion)
         signals.raise_again()
-        robot: Any = getattr(env.unwrapped, "robot", None)
-        if robot is not None:
-            robot.connect()
-            signals.raise_again()
+        _connect(env, signals)
         if place.robot is not None and place.trial is None and not place.shadow and has_real_robot(env):
             env.close()  # type: ignore[no-untyped-call]
             place = replace(place, trial=True)  # a robot's limits are fixed when it is made
-            env = make_env(env_id, kwargs, render_mode=mode, place=place)
-            env.unwrapped.robot.connect()  # type: ignore[attr-defined]
-            signals.raise_again()
+            env = make(place=place)
+            _connect(env, signals)
         plan = [*plan_lines(env, env_id, place.text, episodes, wiggle=wiggle), *admit(env, place)]
         signals.raise_again()
         if not place.shadow:
@@ -86,6 +83,14 @@ def connected_env(
         env.close()  # type: ignore[no-untyped-call]
         raise
     return env
+
+
+def _connect(env: Any, signals: SignalMemory) -> None:
+    """Connect the robot of `env`, if it has one."""
+    robot: Any = getattr(env.unwrapped, "robot", None)
+    if robot is not None:
+        robot.connect()
+        signals.raise_again()
 
 
 def required_contract(checkpoint: Checkpoint, env: Any, place: Place, motion: Path | None = None) -> Contract:

@@ -67,13 +67,8 @@ def make_env(
     """
     if robot is not None and transport is not None:
         raise InvalidValue("robot= and transport= exclude each other: the task runs here, or with the robot elsewhere.")
-    if robot is None and profile is not None:
-        raise InvalidValue(f"profile={profile!r} describes a live robot; give its address with robot= too.")
-    if robot is None and guards is not None:
-        raise InvalidValue("guards= changes the limits of a live robot; give its address with robot= too.")
-    for name in ("trial",) * trial + ("shadow",) * shadow:
-        if robot is None:
-            raise InvalidValue(f"{name}=True is for a live robot; give its address with robot= too.")
+    if robot is None:
+        _refuse_for_simulations(profile, guards, trial, shadow)
     if trial and shadow:
         raise InvalidValue("trial=True and shadow=True exclude each other: a shadow sends nothing. Give one of them.")
     _check_place(robot, transport, timeout, render_mode, randomize, link, action_delay, task_options)
@@ -97,6 +92,17 @@ def make_env(
     straight = getattr(task, "moves_straight", False)
     live = live_robot(robot, simulated.spec, trial=trial, tool_position=tool, straight=straight, **where)
     return RobotEnv(live, task, render_mode=render_mode)
+
+
+def _refuse_for_simulations(profile: object, guards: object, trial: bool, shadow: bool) -> None:
+    """Refuse options that only a live robot has."""
+    if profile is not None:
+        raise InvalidValue(f"profile={profile!r} describes a live robot; give its address with robot= too.")
+    if guards is not None:
+        raise InvalidValue("guards= changes the limits of a live robot; give its address with robot= too.")
+    if trial or shadow:
+        name = "trial" if trial else "shadow"
+        raise InvalidValue(f"{name}=True is for a live robot; give its address with robot= too.")
 
 
 def _behind(link: Any, robot: Robot) -> Robot:

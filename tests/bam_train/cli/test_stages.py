@@ -141,6 +141,8 @@ def test_an_episode_on_trial_may_take_four_times_as_long():
     assert "max_episode_steps" not in FULL.robot_kwargs("bam/pick-v0", {})
     with pytest.raises(InvalidValue, match=r"^trial=True is for a live robot; give its address with robot= too\.$"):
         gym.make("bam/pick-v0", trial=True)
+    with pytest.raises(InvalidValue, match=r"^trial=True and shadow=True exclude each other: a shadow sends nothing"):
+        gym.make("bam/pick-v0", robot=URL, trial=True, shadow=True)
 
 
 # A deployment
