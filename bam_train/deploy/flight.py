@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from bam_envs.core.errors import BamEnvsError
 from bam_envs.core.robot import RobotState
+from bam_envs.core.robot_env import RobotEnv
 from bam_envs.live.camera import LiveCamera
 from bam_envs.robots.profile import load_profile
 from bam_envs.rosbridge.endpoint import Endpoint
@@ -127,6 +128,7 @@ class RecorderAgent(Agent):
         super().__init__()
         self._recorder, self._env, self._journal, self._watch = recorder, env.unwrapped, journal, watch
         self._robot: Any = getattr(self._env, "robot", None)
+        self._has_states = isinstance(self._env, RobotEnv)
         self._names, self.reads = names, (*names, "action", "env/reward")
         self._numbers: list[str] = []
         self._pictures: list[str] = []
@@ -160,7 +162,7 @@ class RecorderAgent(Agent):
     def forward(self, t: int, seed: int, **kwargs: Any) -> None:
         """Record the tick."""
         begun, watch, record, self._sent = perf_counter(), self._watch, self._journal.records[-1], None
-        state: Any = getattr(self._env, "last_state", None)
+        state: Any = self._env.last_state if self._has_states else None  # type: ignore[attr-defined]
         get, action = self.get, self.get(("action", t))
         if t == 0:
             self._recorder.event(f"episode {self._journal.begun} begins, seed {seed}")

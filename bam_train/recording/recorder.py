@@ -167,8 +167,8 @@ class Recorder:
             array.tobytes() if array.dtype == np.float64 else array.astype(np.float64).tobytes() for array in arrays
         ]
         content = b"".join((*data, struct.pack(f"={len(numbers)}d", *numbers)))
-        if len(content) != 8 * self._numbers[series]:
-            declared = self._numbers[series]
+        declared = self._numbers.get(series, 0)
+        if len(content) != 8 * declared:
             self._fail(f"{self.path}: a tick has {len(content) // 8} numbers, and {declared} were declared")
         self._write(TICK, content, sent_ago, series)
 
