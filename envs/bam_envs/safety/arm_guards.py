@@ -157,6 +157,13 @@ class JointAcceleration(Guard):
         change, braking = self.limit_value * tick.period**2, self.limit_value * self._period**2
         shortened, share = tick.period / self._period, 1.0
         for at, way in zip(self._joints, wanted, strict=True):
+            if abs(way) > change or abs(way) > abs(goal[at] - last[at]) * shortened:
+                break  # it may have to brake
+            if not -change <= way - tick.last_step[at] <= change:
+                break
+        else:
+            return False
+        for at, way in zip(self._joints, wanted, strict=True):
             distance, way = abs(goal[at] - last[at]), abs(way)
             if way <= change and way <= distance * shortened:  # it can stop after that
                 continue

@@ -132,6 +132,12 @@ class JointFollowing(Following):
         command, pick, reaches = tick.command, self._pick, self._slow_reach if tick.approach else self._reach
         explained, near, farther, changed = [], [], False, False
         rows = pick(command), pick(tick.last), pick(tick.measured), pick(tick.velocity), self._fastest, reaches
+        for wanted, last, measured, reach in zip(*rows[:3], reaches, strict=True):
+            gap = abs(wanted - measured)
+            if not (gap <= reach and gap <= abs(wanted - last) + self._tolerance):
+                break
+        else:  # however little of its gaps the lag explains
+            return False
         for wanted, last, measured, speed, fastest, reach in zip(*rows, strict=True):
             gap = wanted - measured
             ahead = min(max(speed, -fastest), fastest) * self._lag

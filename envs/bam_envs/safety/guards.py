@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from bam_envs.core.errors import InvalidValue
 from bam_envs.core.kinematics import UR5E_GRIPPER, UR_JOINTS
-from bam_envs.core.robot import RobotSpec, RobotState
+from bam_envs.core.robot import RobotSpec, RobotState, SignalSpec
 from bam_envs.safety import arm_guards as arm
 from bam_envs.safety.base_guards import LaserZones
 from bam_envs.safety.following import BaseFollowing, JointFollowing
@@ -227,13 +227,20 @@ class MeasuredLimits(Guard):
         """The first number of `state` that is outside its range, as the reason for a stop; or None."""
         for signal in self._watched:
             values = state.signals[signal.name][0].tolist()
-            for at, (value, low, high) in enumerate(zip(values, signal.low, signal.high, strict=True)):
+            for value, low, high in zip(values, signal.low, signal.high, strict=True):
                 if not low <= value <= high:  # NaN is not
-                    return (
-                        f"{signal.name} of {signal.labels[at]} was measured at {value:.3f} {signal.units[at]}, "
-                        f"outside {low:.3f} to {high:.3f}"
-                    )
+                    return self._outside(signal, values)
         return None
+
+    @staticmethod
+    def _outside(signal: SignalSpec, values: Numbers) -> str:
+        """The first of `values` that is outside the range of `signal`."""
+        rows = zip(values, signal.low, signal.high, strict=True)
+        at = next(place for place, (value, low, high) in enumerate(rows) if not low <= value <= high)
+        return (
+            f"{signal.name} of {signal.labels[at]} was measured at {values[at]:.3f} {signal.units[at]}, "
+            f"outside {signal.low[at]:.3f} to {signal.high[at]:.3f}"
+        )
 
 
 def default_guards(
