@@ -148,7 +148,7 @@ def test_nothing_is_sent(run, monkeypatch):
     with ServedEnvironment(env, ServeOptions(port=0, fast=True)) as served:
         flags = ("--robot", served.bus.url, "--shadow", "--episodes", 1, "--no-record")
         status, out, err = run(main, checkpoint, *flags)
-    assert (status, err.endswith(", shadow: nothing is sent\n")) == (0, True), err
+    assert (status, ", shadow: nothing is sent\n" in err) == (0, True), err
     assert "agreement with whoever drives: 0." in out
     assert operations == {
         ("subscribe", None),

@@ -20,6 +20,7 @@ from bam_train.deploy.trials import Subject, TrialRecord, Trials
 from bam_train.deploy.trust import Admission
 from bam_train.env_location import HERE, Place
 from bam_train.errors import BadTrials, TrialsNeeded
+from bam_train.recording.recording import Recording
 from tests.bam_train.deploy.test_deployment import Driven, raises
 from tests.bam_train.deploy.test_deployment import run as run_deployment
 
@@ -221,25 +222,17 @@ def test_a_real_robot_is_on_trial_unless_something_else_is_asked_for(served, run
     assert "  joint speed (G8): 1 rad/s\n" in err
 
 
-def test_trials_are_run_recorded_and_reported(served, run, tmp_path):
-    record = tmp_path / "trials.jsonl"
-    flags = (
-        "--robot",
-        served.bus.url,
-        "--stage",
-        "trial",
-        "--trials",
-        record,
-        "--episodes",
-        1,
-        "--no-record",
-        "--json",
-    )
-    status, out, err = run(deploy, REACH, *flags)
+def test_trials_are_run_recorded_and_reported(served, run, monkeypatch, tmp_path):
+    monkeypatch.setattr(rosbridge_robot, "read_info", lambda *said: replace(read_info(*said), simulated=False))
+    record, recording = tmp_path / "trials.jsonl", tmp_path / "one.mcap"
+    flags = ("--robot", served.bus.url, "--trials", record, "--episodes", 1, "--record", recording, "--json")
+    status, out, err = run(deploy, REACH, *flags, "--yes", "--allow-unsigned")
     report = json.loads(out)
-    assert (status, report["marks"]) == (0, ["trial"]), err
+    assert (status, report["marks"]) == (0, ["UNSIGNED", "trial"]), err
+    assert Recording.open(recording).metadata["marks"] == "UNSIGNED, trial"
     assert report["trials"] == {"successes": 1, "trials": 1, "threshold": 0.9, "is_enough": False}
-    assert err.endswith(", trial\n")
+    assert ", UNSIGNED, trial\n" in err
     assert report["guards"]["joint speed"]["limit"] == 0.25
     assert report["guards"]["trial box"]["limit"] == 0.35
-    assert json.loads(record.read_text().splitlines()[1])["robot"] == served.bus.url
+    begun = json.loads(record.read_text().splitlines()[1])
+    assert (begun["robot"], begun["recording"]) == (served.bus.url, "one.mcap")
