@@ -45,6 +45,9 @@ from bam_train.recording.ring import EVENT, IMAGE, LAYOUT, PIXELS, TICK, TIMES, 
 INFO, WARNING, ERROR = 2, 3, 4
 """Levels of events, as of foxglove.Log."""
 _LOG = logging.getLogger(__name__)
+_PROGRAM = (  # without the folder it is started in, whose files could hide ours
+    "import sys; sys.path[:] = filter(None, sys.path); import bam_train.recording.recorder_process as it; it.main()"
+)
 _RING = 16 * 2**20
 _START, _END = 20.0, 10.0  # seconds that the process may take to start and to end
 _LOOK = 64
@@ -100,14 +103,14 @@ class Recorder:
         self._ring = ring = Ring(descriptor)
         head = {"path": str(self.path), "metadata": self.metadata, "guards": self.guards}
         ring.write(json.dumps(head).encode())
-        program = [sys.executable, "-m", "bam_train.recording.recorder_process", str(descriptor), str(os.getpid())]
+        program = [sys.executable, "-c", _PROGRAM, str(descriptor), str(os.getpid())]
         try:
             self._process = subprocess.Popen(
                 program,
                 pass_fds=[descriptor],
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.DEVNULL,
-                env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},
+                env={**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
                 start_new_session=True,  # Ctrl-C at the terminal is for the deployment alone
             )
         finally:

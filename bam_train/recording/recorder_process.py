@@ -213,7 +213,3 @@ def main() -> None:
             why = "a recording is there already. Choose another file"
         ring.fail(f"{head['path']}: {why}")
     os._exit(1)  # Python would try to write again what its buffer still holds
-
-
-if __name__ == "__main__":
-    main()

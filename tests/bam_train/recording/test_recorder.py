@@ -253,6 +253,13 @@ def test_a_file_that_is_there_is_kept(started, tmp_path):
     assert path.read_text() == "mine"
 
 
+def test_files_of_the_folder_it_is_started_in_hide_nothing(started, tmp_path, monkeypatch):
+    for name in ("json", "mcap", "bam_train"):
+        (tmp_path / f"{name}.py").write_text("raise SystemExit('not ours')")
+    monkeypatch.chdir(tmp_path)
+    assert started().close() == ""
+
+
 def test_a_folder_that_cannot_be_made_is_named(started, tmp_path):
     (tmp_path / "flight").write_text("a file")
     with pytest.raises(OutputError) as caught:
