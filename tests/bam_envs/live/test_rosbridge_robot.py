@@ -302,7 +302,7 @@ def test_a_command_that_waited_in_this_process_is_not_sent(server, robot_on, con
             jump = 5.0 if len(looks) == 3 else jump
         return time.monotonic() + jump
 
-    robot, gate = connect(server.url, clock=clock)
+    _, gate = connect(server.url, clock=clock)
     state = gate.step(gate.state.command)
     looks.append(None)
     late = gate.step(gate.state.command + 0.01)
