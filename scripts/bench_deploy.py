@@ -192,6 +192,8 @@ class ClockedEnv(gym.Wrapper[Any, Any, Any, Any]):
     ) -> None:
         super().__init__(env)
         self.policy, self.standin, self.shares = policy, standin, shares
+        self.keeps = True
+        """Whether durations are kept, which takes memory."""
         self.made = self.came = 0.0
         self.times: dict[str, list[float]] = {"policy": [], "command": [], "frames": [], "recorder": []}
         """Durations [s]: of the policy, from an observation to its command, from a state's frames to the command's, and
@@ -206,7 +208,7 @@ class ClockedEnv(gym.Wrapper[Any, Any, Any, Any]):
     def step(self, action: Any) -> Any:
         """One step, which ends the tick."""
         stepped, robot = self.env.step(action), self.standin
-        if len(self.times["policy"]) < 100_000:
+        if self.keeps:
             share = self.shares[-1] if self.shares else 0.0
             durations = (self.policy.took, robot.entered - self.made, robot.left - self.came, share)
             for times, duration in zip(self.times.values(), durations, strict=True):
@@ -250,6 +252,7 @@ def deploy(ticks: int, recording: Path | None = None, shares: Sequence[float] = 
     policy = ClockedPolicy(FrozenPolicy.from_checkpoint(Checkpoint.open(CHECKPOINT)))
     inner: gym.Env[Any, Any] = RobotEnv(guarded(standin), entry.make_task(1, {}))
     env = ClockedEnv(gym.wrappers.TimeLimit(inner, steps), policy, standin, shares)
+    env.keeps = recording is not None
     recorder, watcher = None if recording is None else flight_recorder(recording, env, {}), Quiet()
     if recorder is not None:
         recorder.start()
