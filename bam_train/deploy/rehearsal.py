@@ -14,6 +14,7 @@ from bam_envs.live.rehearsed import rehearsed_robot, time_to_stop
 from bam_envs.robots.linked import LinkedRobot
 from bam_train.checkpoint import Checkpoint
 from bam_train.deploy.journal import EpisodeRecord
+from bam_train.env_location import SIMULATED
 from bam_train.environments import environment_of, make_env, require_fit
 from bam_train.errors import SettingsError
 from bam_train.evaluation import wilson_interval
@@ -117,7 +118,7 @@ class Rehearsal:
         if entry_of(env_id) is None:
             raise SettingsError(f"{env_id} has no robot that --rehearse could put behind a link; leave it out")
         self.checkpoint, self.link = checkpoint, link
-        self.env = make_env(env_id, {**saved, "link": link})
+        self.env = make_env(env_id, {**saved, **SIMULATED, "link": link})
         require_fit(checkpoint, self.env)
         inner: Any = self.env.unwrapped
         self._linked: LinkedRobot = inner.robot

@@ -2,14 +2,16 @@
 
 import json
 import math
+from contextlib import closing
 from pathlib import Path
 
 import pytest
 
 from bam_envs.robots.linked import LinkProfile
+from bam_train.checkpoint import Checkpoint
 from bam_train.cli.deploy import main
 from bam_train.deploy.journal import EpisodeRecord
-from bam_train.deploy.rehearsal import RehearsalReport
+from bam_train.deploy.rehearsal import Rehearsal, RehearsalReport
 
 CHECKPOINTS = Path(__file__).parents[3] / "checkpoints"
 DRIVE = CHECKPOINTS / "mir100-navigation-ppo.zip"
@@ -62,6 +64,19 @@ def test_a_stop_ends_its_episode_only(run, tmp_path):
     begin = "bam-deploy: episode with seed 100000{}: The robot was stopped by state age (G3)"
     assert lines[0].startswith(f"{begin.format(0)}: the newest state is ")
     assert lines[1:] == [begin.format(1)]
+
+
+def test_it_adds_the_link_only():
+    """Randomised physics and late actions are of training; a live robot has none either."""
+    checkpoint = Checkpoint.open(CHECKPOINTS / "pick-place-ppo.zip")
+    assert checkpoint.manifest.env_kwargs == {"randomize": True, "action_delay": [0, 3], "link": "wifi"}
+    with closing(Rehearsal(checkpoint, "lte")) as rehearsal:
+        assert rehearsal.env.spec.kwargs == {
+            "env_id": "bam/pick-place-v0",
+            "randomize": False,
+            "action_delay": None,
+            "link": "lte",
+        }
 
 
 def test_the_report_for_people():
