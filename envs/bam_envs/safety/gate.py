@@ -288,10 +288,13 @@ class SafeRobot(metaclass=Sealed):
     def connect(self) -> None:
         """Connect the robot. Moves nothing."""
         self._robot.connect()
-        if self._live is not None:
-            for guard in self._guards:
-                if isinstance(guard, Watchdog):
-                    guard.connected(getattr(self.info, "watchdog", None))
+        watchdog = getattr(self.info, "watchdog", None)
+        for guard in self._guards:
+            if isinstance(guard, Watchdog) and (watchdog is not None or self._is_real()):
+                guard.connected(watchdog)
+
+    def _is_real(self) -> bool:
+        return self._live is not None and not getattr(self.info, "simulated", False)
 
     def step(self, command: Array) -> RobotState:
         """Send `command` (1, m), as limited by the guards; returns the state one period later, with the sent command.

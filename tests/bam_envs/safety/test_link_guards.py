@@ -13,6 +13,7 @@ from bam_envs.robots.mir100 import base_spec
 from bam_envs.robots.physics.kinematic_base import SimulatedBase
 from bam_envs.robots.profile import load_profile
 from bam_envs.robots.ur5e import arm_spec
+from bam_envs.ros.codec import RobotInfo
 from bam_envs.safety.arm_guards import JointJerk
 from bam_envs.safety.gate import SafeRobot
 from bam_envs.safety.guard import Limits, Tick
@@ -120,6 +121,26 @@ def test_a_robot_should_stop_by_itself(spec, watchdog, text):
     guard.connected(watchdog)
     assert guard.warning.startswith(text)
     assert bool(guard.warning) == bool(text)
+
+
+class Standing(FakeRobot):
+    """An arm behind a link."""
+
+    needs_clearance = True
+
+    def __init__(self, info):
+        super().__init__()
+        self.info = info
+
+
+@pytest.mark.parametrize(
+    ("simulated", "watchdog", "warned"), [(False, None, 1), (True, None, 0), (True, 0.3, 1), (False, 0.1, 0)]
+)
+def test_it_is_asked_after_connecting_whether_a_real_robot_stops_by_itself(simulated, watchdog, warned):
+    robot = SafeRobot(Standing(RobotInfo("ur5e", simulated=simulated, watchdog=watchdog)))
+    assert robot.warnings == ()
+    robot.connect()
+    assert [one.partition(":")[0] for one in robot.warnings] == ["robot's watchdog (G5)"] * warned
 
 
 def test_a_profile_says_after_what_time_the_robot_stops_and_a_base_that_never_does_is_refused(tmp_path):
