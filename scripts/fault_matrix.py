@@ -314,12 +314,12 @@ def last_moving(log: CellLog, start: float) -> float:
 
 def judge(log: CellLog, start: float, ended: float, back: float | None, watchdog: float) -> Iterator[str]:
     """What is wrong with what the robot did since `start`."""
-    commanded, moving = last_motion(log, start), last_moving(log, start)
+    commanded, moving = max([start, *log.arrivals()]), last_moving(log, start)
     if moving > commanded + watchdog + BRAKING:
         yield f"it moved {moving - commanded:.2f} s after the last command"
     if log.speeds[-1] > AT_REST:
         yield f"it still moves {log.times[-1] - commanded:.2f} s after the last command"
-    if commanded > ended:
+    if last_motion(log, start) > ended:
         yield "a command came after the end"
     late = 0 if back is None else int((log.motions() > back).sum())
     if late:

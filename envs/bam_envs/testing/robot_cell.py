@@ -80,8 +80,13 @@ class CellLog:
     is_base: bool
     """Whether commands are speeds."""
 
+    def arrivals(self) -> Array:
+        """Times of all commands [s]."""
+        times: Array = self.times[np.diff(self.commands, prepend=self.commands[:1]) > 0]
+        return times
+
     def motions(self) -> Array:
-        """Times of the commands that ask for motion: a base's that are not 0, an arm's that differ from the last."""
+        """Times of the commands that ask for motion [s]: a base's that are not 0, an arm's that are new."""
         arrived = np.diff(self.commands, prepend=self.commands[:1]) > 0
         moves = self.targets if self.is_base else np.diff(self.targets, axis=0, prepend=self.targets[:1])
         times: Array = self.times[arrived & (np.abs(moves).max(axis=1, initial=0.0) > 1e-6)]
@@ -111,14 +116,13 @@ class RobotCell:
         self.command_timeout = profile_for(self.spec).command_life(self.spec.period)
         """The robot's watchdog [s]."""
         self._fault: Any = _PROCESSES.Value(ctypes.c_int, StateFault.NONE, lock=False)
+        self._port: Any = _PROCESSES.Value(ctypes.c_int, 0, lock=False)  # a free one, which a restarted bridge keeps
         self._stack = contextlib.ExitStack()
 
     def __enter__(self) -> RobotCell:
         with contextlib.ExitStack() as stack:
             folder = stack.enter_context(tempfile.TemporaryDirectory())
             self._path = Path(folder) / "robot.log"
-            with socket.create_server(("127.0.0.1", 0)) as probe:
-                self.port: int = probe.getsockname()[1]
             near, far = socket.socketpair(socket.AF_UNIX, socket.SOCK_DGRAM)
             stack.enter_context(near)
             stack.enter_context(far)
@@ -126,8 +130,8 @@ class RobotCell:
             self.processes: dict[str, Any] = {}
             """The running processes: ``robot``, ``driver`` and ``bridge``; each has ``kill()``."""
             robot = self._start("robot", run_robot, self._env_id, near, self._path)
-            bridge = self._start("bridge", run_bridge, self.port)
-            told = self.spec, far, self.url, self._fault, self._describes_itself, bridge
+            bridge = self._start("bridge", run_bridge, self._port)
+            told = self.spec, far, self._port, self._fault, self._describes_itself, bridge
             _await([robot, bridge, self._start("driver", run_driver, *told)])
             self._stack = stack.pop_all()
         return self
@@ -136,9 +140,9 @@ class RobotCell:
         self._stack.close()
 
     @property
-    def url(self) -> str:
-        """Address of the rosbridge server."""
-        return f"ws://127.0.0.1:{self.port}"
+    def port(self) -> int:
+        """Port of the rosbridge server on 127.0.0.1."""
+        return int(self._port.value)
 
     def kill(self, name: str) -> None:
         """Kill the process `name`, as ``kill -9`` does."""
@@ -148,7 +152,7 @@ class RobotCell:
 
     def restart_bridge(self) -> None:
         """Start a bridge at the address of the one that was killed; returns when it listens."""
-        _await([self._start("bridge", run_bridge, self.port)])
+        _await([self._start("bridge", run_bridge, self._port)])
 
     def publish_wrongly(self, fault: StateFault) -> None:
         """Let the driver publish wrong states from now on."""
@@ -320,13 +324,13 @@ def _shortened(message: Message) -> Message:
 
 
 def run_driver(
-    spec: RobotSpec, wire: socket.socket, url: str, fault: Any, describes_itself: bool, bridge: Any, ready: Any
+    spec: RobotSpec, wire: socket.socket, port: Any, fault: Any, describes_itself: bool, bridge: Any, ready: Any
 ) -> None:
-    """The main function of the driver's process: topics of the robot on the server at `url`, once `bridge` is set."""
+    """The main function of the driver's process: topics of the robot on the server at `port`, once `bridge` is set."""
     _be_another_computer()
     profile = profile_for(spec)
-    link = RosbridgeLink(url, name="driver")
     bridge.wait(_START)
+    link = RosbridgeLink(f"ws://127.0.0.1:{port.value}", name="driver")
     link.connect()
     wire.setblocking(False)
     robot: Any = DrivenRobot(spec, profile.command_life(spec.period), wire)
@@ -335,10 +339,10 @@ def run_driver(
     threading.Event().wait()
 
 
-def run_bridge(port: int, ready: Any) -> None:
-    """The main function of the bridge's process."""
+def run_bridge(port: Any, ready: Any) -> None:
+    """The main function of the bridge's process, on `port`, which it sets if it is 0."""
     _be_another_computer()
-    BridgeServer(port=port).start()
+    port.value = BridgeServer(port=port.value).start().port
     ready.set()
     threading.Event().wait()
 
