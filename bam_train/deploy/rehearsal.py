@@ -122,7 +122,9 @@ class Rehearsal:
         require_fit(checkpoint, self.env)
         inner: Any = self.env.unwrapped
         self._linked: LinkedRobot = inner.robot
-        self._gate = inner.robot = rehearsed_robot(self._linked, profile=profile, guards=guards)
+        straight = getattr(inner.task, "moves_straight", False)
+        self._gate = rehearsed_robot(self._linked, profile=profile, guards=guards, straight=straight)
+        inner.robot = self._gate
 
     def run(self, policy: Any, *, episodes: int, seed: int, tell: Callable[[str], None]) -> RehearsalReport:
         """Play `episodes`, at least 1; a stop by a guard ends its episode only.

@@ -76,7 +76,11 @@ class RehearsedRobot:
 
 
 def rehearsed_robot(
-    robot: LinkedRobot, *, profile: str | None = None, guards: Mapping[str, float] | None = None
+    robot: LinkedRobot,
+    *,
+    profile: str | None = None,
+    guards: Mapping[str, float] | None = None,
+    straight: bool = False,
 ) -> SafeRobot:
     """`robot` behind the guards of a live one.
 
@@ -84,6 +88,7 @@ def rehearsed_robot(
         robot: One simulated robot behind a link.
         profile: The robot profile with the limits of the guards; by default the shipped one for the robot.
         guards: Limits that differ from the profile's, such as ``{"lag": 0.15}``.
+        straight: Whether the task moves the tool in straight lines, see `SafeRobot`.
 
     Raises:
         InvalidValue: There are several robots, no profile has such commands, or a limit is outside its bounds.
@@ -91,7 +96,7 @@ def rehearsed_robot(
     chosen = profile_for(robot.spec) if profile is None else load_profile(profile)
     tool = getattr(robot.robot, "tool_position", None)  # forward kinematics of an arm that is no UR5e
     limits = profile_limits(chosen).changed(guards or {})
-    return SafeRobot(RehearsedRobot(robot), limits=limits, tool_position=tool)
+    return SafeRobot(RehearsedRobot(robot), limits=limits, tool_position=tool, straight=straight)
 
 
 def time_to_stop(robot: LinkedRobot) -> float:

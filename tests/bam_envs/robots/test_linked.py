@@ -267,6 +267,18 @@ def test_every_environment_can_be_behind_a_link(make, make_rows, env_id, actions
     assert differs
 
 
+def test_a_saved_environment_goes_on_with_what_is_on_its_way(make_rows, actions_of):
+    options = {"link": "bad", "action_delay": [0, 3], "randomize": True}
+    rows, again = (make_rows("bam/mir100-avoidance-v0", 2, **options) for _ in range(2))
+    rows.reset(seed=0)
+    actions = np.stack([actions_of(k, 30, 2) for k in range(2)], axis=1)
+    for action in actions[:15]:
+        seen = rows.step(action)[0]
+    np.testing.assert_array_equal(again.unwrapped.load_state_dict(rows.unwrapped.state_dict()), seen)
+    for action in actions[15:]:
+        np.testing.assert_array_equal(rows.step(action)[0], again.step(action)[0])
+
+
 def test_only_a_simulated_robot_is_behind_a_link(make, make_rows):
     for place in ({"robot": "ws://127.0.0.1:1"}, {"transport": "tcp://127.0.0.1:1"}):
         with pytest.raises(InvalidValue, match=r"^link: only the simulation here has that, and not "):

@@ -77,6 +77,8 @@ def test_it_adds_the_link_only():
             "action_delay": None,
             "link": "lte",
         }
+        names = rehearsal.env.unwrapped.robot.report()
+    assert "singularity" in names  # as on a live arm in this task, which moves the tool in straight lines
 
 
 def test_the_report_for_people():
