@@ -20,7 +20,7 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")  # before NumPy reads it
 
 import gymnasium as gym
 import numpy as np
-from bench_link import Samples, Server, lateness, live_arm, verdict
+from bench_link import Samples, Server, live_arm, verdict
 
 GUARDS_P50, GUARDS_P99, TICK_P50, RECORDER_P50 = 60.0, 250.0, 200.0, 30.0  # microseconds
 LATE_SHARE, LATE = 1.0, 0.001  # percent of ticks, seconds
@@ -297,33 +297,31 @@ def measure_tick(count: int) -> Iterator[str]:
 
 
 def measure_rate(seconds: float, rounds: int) -> Iterator[str]:
-    """100 Hz against the embedded server, and a loop that only sleeps, in turns."""
-    ours, bare = [], []
+    """100 Hz against the embedded server, and a loop that only sleeps, in turns: how late commands are sent."""
+    from bam_envs.core.timing import Pacer
+
+    ours: list[float] = []
+    bare: list[float] = []
+    count = int(100 * seconds / rounds)
     with Server("realtime robot") as server:
         robot, state = live_arm(f"ws://127.0.0.1:{server.ports[0]}", period=0.01)
+        pacer = robot._robot._pacer
+        tick = pacer.tick
+        pacer.tick = lambda: ours.append(tick())
         for _ in range(rounds):
-            ends = np.empty(int(100 * seconds / rounds))
-            for k in range(len(ends)):
+            pacer.start()
+            for _ in range(count):
                 robot.step(state.command)
-                ends[k] = time.monotonic()
-            ours.append(lateness(ends, 0.01))
-            bare.append(asleep(len(ends)))
             robot.halt()  # the next round begins a new motion
+            asleep = Pacer(0.01)
+            asleep.start()
+            bare += [asleep.wait() for _ in range(count)]
         robot.close()
-    late, alone = (100 * float((np.concatenate(one) > LATE).mean()) for one in (ours, bare))
-    p50, p99 = 1e3 * np.percentile(np.concatenate(ours), [50, 99])
+    late, alone = (100 * float((np.array(one) > LATE).mean()) for one in (ours, bare))
+    p50, p99 = 1e3 * np.percentile(ours, [50, 99])
     text = f"{late:.2f} % late by > 1 ms"
     yield row("100 Hz against the embedded server", text, f"< {LATE_SHARE:g} %", at_most(late, LATE_SHARE))
     yield f"  lateness p50 {p50:.2f}, p99 {p99:.2f} ms; a loop that only sleeps has {alone:.2f} % such ticks"
-
-
-def asleep(count: int) -> Samples:
-    """Lateness of a loop at 100 Hz that does nothing [s]."""
-    begun, ends = time.monotonic(), np.empty(count)
-    for k in range(count):
-        time.sleep(max(0.0, begun + 0.01 * k - time.monotonic()))
-        ends[k] = time.monotonic()
-    return lateness(ends, 0.01)
 
 
 def measure_memory(ticks: int) -> Iterator[str]:
