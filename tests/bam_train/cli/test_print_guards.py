@@ -33,6 +33,8 @@ def test_a_guard_that_is_changed_is_shown_so(run):
     does = "No joint is faster than the limit or its data sheet; the other joints slow down with it."
     assert f"G8 joint speed 0.3 rad/s joint_speed {does}" in lines
     assert "joint_speed 0.3 0.01 3.14159 rad/s" in lines
+    numbers = {f"G{number}" for number in range(1, 25)}  # G19 is not there; others are of bases, or of straight lines
+    assert numbers - {line.split()[0] for line in lines if line} == {"G11", "G12", "G13", "G19"}
 
 
 @pytest.mark.parametrize(

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from bam_envs.core.errors import InvalidValue, SafetyStop
+from bam_envs.core.errors import InvalidValue
 from bam_envs.remote.serve.served_robot import ServedRobot
 
 NAVIGATION, AVOIDANCE = "bam/mir100-navigation-v0", "bam/mir100-avoidance-v0"
@@ -50,36 +50,29 @@ def test_navigation_drives_to_the_target_from_where_the_base_is(serve, make, opt
         assert served.env.unwrapped.robot.state.signals["base_velocity"].any()
 
 
-def test_a_live_base_in_a_box_like_the_simulated_one(serve, make):
-    """The same commands, here and there; but for the noise of its rays the same is seen."""
+def test_a_live_base_sees_what_the_simulated_one_sees_and_stops_before_it(serve, make):
+    """The same commands, here and there, until the lasers slow the live base down."""
     pose = [0.0, -2.6, math.pi / 2]
     served = serve(AVOIDANCE, pose, fast=True)
     there, here = live(make, served, AVOIDANCE), make(AVOIDANCE)
     here.reset(seed=3, options={"start_pose": pose, "target_pose": [0.0, 2.5, 0.0]})
     there.reset(seed=8, options={"target_pose": [0.0, 2.5, 0.0]})
     assert there.unwrapped.state.truth == {}
+    seen, zones = 0, there.unwrapped.robot.report()["laser zones"]
     for _ in range(100):
         one, two = here.step(FORWARD), there.step(FORWARD)
-        np.testing.assert_allclose(one[0], two[0], atol=0.05)
-        if one[2] or two[2]:
+        zones = there.unwrapped.robot.report()["laser zones"]
+        if zones["altered"] or one[2]:
             break
-    boxes = served.env.unwrapped.task.obstacles
-    np.testing.assert_array_equal(boxes, here.unwrapped.task.obstacles)
-    assert one[4]["final_status"] == "collision"
-
-
-def test_a_live_base_in_parity_has_no_collisions_and_is_stopped_at_the_wall(serve, make):
-    served = serve(AVOIDANCE, [0.0, -2.6, math.pi / 2], fast=True)
-    env = live(make, served, AVOIDANCE, parity=True)
-    env.reset(seed=1)
-
-    def drive():
-        for _ in range(80):
-            assert not env.step(FORWARD)[2]
-
-    with pytest.raises(SafetyStop, match=r"^The robot was stopped by base following \(G23\): "):
-        drive()
-    assert served.env.unwrapped.robot.state.truth["collision"].tolist() == [True]
+        np.testing.assert_allclose(one[0], two[0], atol=0.05)  # but for the noise of its rays
+        seen += 1
+    assert seen > 10
+    np.testing.assert_array_equal(served.env.unwrapped.task.obstacles, here.unwrapped.task.obstacles)
+    assert zones["number"] == "G12"
+    for _ in range(60):
+        assert not there.step(FORWARD)[2]
+    assert served.env.unwrapped.robot.state.truth["collision"].tolist() == [False]
+    assert np.abs(served.env.unwrapped.robot.state.signals["base_velocity"]).max() < 0.01
 
 
 def test_somewhere_else_than_it_is(serve, make):
