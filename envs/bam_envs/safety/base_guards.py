@@ -58,7 +58,7 @@ class LaserZones(Guard):
     def points(self, signals: Mapping[str, Array]) -> Array:
         """What the scanners see, in the base's frame [m]. Shape: (2, k)."""
         seen = [
-            place + np.nan_to_num(signals[name][0], nan=0.0, posinf=1e6) * rays for name, place, rays in self._scanners
+            place + np.clip(np.nan_to_num(signals[name][0]), 0.0, 1e6) * rays for name, place, rays in self._scanners
         ]
         return np.concatenate(seen, axis=1)
 

@@ -167,12 +167,13 @@ class JointFollowing(Following):
             wanted: Joints [rad]. Shape: (k,).
             command: The command to change. Shape: (m,).
         """
-        steps = self._slow_step if tick.approach else self._step
+        share = tick.period / self._period
+        steps = [step * share for step in (self._slow_step if tick.approach else self._step)]
         last = self._pick(tick.last)
         rows = zip(wanted, last, steps, strict=True)
         near = [min(max(value, begin - step), begin + step) for value, begin, step in rows]
         if self._tool is not None:
-            near = within_reach(self._tool, last, near, self._tool_reach)
+            near = within_reach(self._tool, last, near, self._tool_reach * share)
         for at, value in zip(self._joints, near, strict=True):
             command[at] = value
 

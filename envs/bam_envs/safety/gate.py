@@ -17,7 +17,7 @@ from typing import Any, NoReturn, final
 import numpy as np
 from numpy.typing import NDArray
 
-from bam_envs.core.errors import InvalidValue, ResetNeeded, RobotFault, SafetyStop, StaleState, StartNotReached
+from bam_envs.core.errors import InvalidValue, ResetNeeded, SafetyStop, StaleState, StartNotReached
 from bam_envs.core.robot import EnvIds, Initial, Robot, RobotSpec, RobotState
 from bam_envs.safety.guard import (
     Guard,
@@ -313,15 +313,16 @@ class SafeRobot(metaclass=Sealed):
         halts = self._halts
         try:
             tick = self._tick(goal, approach)
-        except RobotFault:  # its position is unknown, and a base would drive on
-            self.halt()
+            fault = self._fault(tick)
+            if fault is None:
+                self._limit(tick)
+            else:
+                self._hold(tick, *fault)
+            return self._send(tick, halts)
+        except BaseException:  # of the robot, of a further guard or of the observer: a base would drive on
+            if self._halts == halts:
+                self.halt()
             raise
-        fault = self._fault(tick)
-        if fault is None:
-            self._limit(tick)
-        else:
-            self._hold(tick, *fault)
-        return self._send(tick, halts)
 
     def _tick(self, goal: Numbers, approach: bool) -> Tick:
         pause = self._pause()
@@ -435,6 +436,8 @@ class SafeRobot(metaclass=Sealed):
             asked = _copy(tick)
             if guard.limit(asked):
                 tick.goal = self._shape.numbers(np.asarray(asked.command)[None])
+                if not all(map(math.isfinite, tick.goal)):
+                    raise InvalidValue(f"The guard {guard.name} commanded {tick.goal}: correct it; nothing was sent.")
                 tick.command = tick.goal.copy()
                 self._note(guard, "altered")
         for guard in self._limiters:
@@ -448,6 +451,7 @@ class SafeRobot(metaclass=Sealed):
 
     def _hold(self, tick: Tick, guard: Guard, reason: str) -> None:
         """Send a command that holds the robot in place; stop the robot after too many ticks in a row."""
+        self._kept_out = False
         self._note(guard, "held")
         self._bad += 1
         if self._bad >= guard.patience:
@@ -455,10 +459,8 @@ class SafeRobot(metaclass=Sealed):
             self._stop(guard, reason if once else f"{reason}, {self._bad} ticks in a row")
         if self._is_base:
             tick.command = [0.0] * len(tick.last)
-        elif guard in self._further:
-            tick.command = self._shape.numbers(np.asarray(guard.hold(_copy(tick)))[None])
         else:
-            tick.command = guard.hold(tick)
+            tick.command = tick.last.copy() if guard in self._further else guard.hold(tick)
         tick.last = tick.command  # at rest: the next command begins there
 
     def _send(self, tick: Tick, halts: int) -> RobotState:
@@ -492,13 +494,13 @@ class SafeRobot(metaclass=Sealed):
 
     def _stop(self, guard: Guard, reason: str) -> NoReturn:
         """Halt, and refuse commands until a person resumes."""
+        self._stopped = guard.name, f"{guard.title}: {reason}"  # first: nothing that fails below ends the stop
         self.halt()
         self._note(guard, "stopped")
         if self._tell is not None:
             self._tell(self._code, self._status, stopped=True)
-        why = self.not_ready()
-        readiness = "" if why is None else f"not ready: {why}: "
-        self._stopped = guard.name, f"{guard.title}: {readiness}{reason}"
+        if (why := self.not_ready()) is not None:
+            self._stopped = guard.name, f"{guard.title}: not ready: {why}: {reason}"
         unseen = " Whether it stands is not known: stop it by hand if it moves." if isinstance(guard, Freshness) else ""
         message = f"The robot was stopped by {self._stopped[1]}.{unseen} When it is safe, call resume()."
         if unseen:

@@ -339,7 +339,7 @@ class Guard(metaclass=Sealed):
         return None
 
     def hold(self, tick: Tick) -> Numbers:
-        """The command to an arm if `tick` is not executed: by default the last command again. Shape: (m,)."""
+        """The command (m,) to an arm if `tick` is not executed: the last one again. Not asked of a guard of a user."""
         return tick.last.copy()
 
     def limit(self, tick: Tick) -> bool:

@@ -304,7 +304,7 @@ def _arm_guards(spec: RobotSpec, limits: Limits, tool_position: ToolPosition | N
     speed = [arm.JointSpeed(spec, limits), arm.RampIn(spec, limits), RampAfterStop(spec, limits), *tool]
     singular, kept_out = _place_guards(spec, limits, position, straight)
     # The tool's speed is limited twice: joints that change their speed one by one can speed the tool up.
-    last = [*singular, *smooth, *tool, JointFollowing(spec, limits, position), *kept_out]
+    last = [*smooth, *tool, JointFollowing(spec, limits, position), *singular, *kept_out]
     return [*measured, arm.PositionLimits(spec, limits), *gripper, *speed, *last]
 
 

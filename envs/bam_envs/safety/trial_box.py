@@ -1,5 +1,6 @@
 """The guard that keeps a robot on trial near its start."""
 
+from bam_envs.core.errors import InvalidValue
 from bam_envs.core.robot import RobotSpec
 from bam_envs.safety.base_guards import BaseBox
 from bam_envs.safety.guard import Guard, Limits, Tick, ToolPoint, columns_in
@@ -9,13 +10,16 @@ from bam_envs.safety.places import WorkspaceBox
 class TrialBox(Guard):
     """A robot on trial stays near the place where its first command begins: the tool of an arm, or a base.
 
-    The way to a start pose does not count. The pose of a base must be measured.
+    The way to a start pose does not count.
 
     Args:
         spec: The robot.
         limits: Its limits.
         half: How far it may go along each axis [m].
         tool: Forward kinematics of one pose of an arm; None for a base.
+
+    Raises:
+        InvalidValue: The pose of a base is not measured.
     """
 
     number, name, unit, setting, keeps_out = "G10", "trial box", "m", "trial_box", True
@@ -23,6 +27,11 @@ class TrialBox(Guard):
     def __init__(self, spec: RobotSpec, limits: Limits, half: float, tool: ToolPoint | None) -> None:
         self._spec, self._limits, self.limit_value, self._tool = spec, limits, half, tool
         self._joints = columns_in(spec.command, "rad")
+        if tool is None and "base_pose" not in [signal.name for signal in spec.signals]:
+            raise InvalidValue(
+                f"The {self.title} of {spec.name} needs base_pose, which the task does not measure. Add the signal to "
+                "the task, or set no trial_box."
+            )
         self._box: Guard | None = None
 
     def limit(self, tick: Tick) -> bool:
@@ -31,16 +40,14 @@ class TrialBox(Guard):
             return False
         if self._box is None:
             self._box = self._around(tick)
-        return self._box is not None and self._box.limit(tick)
+        return self._box.limit(tick)
 
-    def _around(self, tick: Tick) -> Guard | None:
+    def _around(self, tick: Tick) -> Guard:
         """The box around where the robot is."""
         if self._tool is not None:
             here = self._tool([tick.last[at] for at in self._joints])
-        elif "base_pose" in tick.signals:
-            here = tick.signals["base_pose"][0, :2].tolist()
         else:
-            return None
+            here = tick.signals["base_pose"][0, :2].tolist()
         low, high = [one - self.limit_value for one in here], [one + self.limit_value for one in here]
         if self._tool is None:
             return BaseBox(self._spec, self._limits, low, high)

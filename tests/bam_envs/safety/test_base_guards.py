@@ -66,8 +66,10 @@ def test_distances_are_limits():
     assert drive((0.5, 0.0), scans((FRONT + 1.2, 0.0)), collision_time=4.0)[0] < 0.5
 
 
-def test_a_ray_without_a_number_is_an_obstacle():
-    blind = {**FREE, "f_scan": np.full((1, FREE["f_scan"].shape[1]), math.nan)}
+@pytest.mark.parametrize("ray", [math.nan, -math.inf, -1.0])
+def test_a_ray_without_a_distance_is_an_obstacle(ray):
+    """Minus infinity is too near to be measured."""
+    blind = {**FREE, "f_scan": np.full((1, FREE["f_scan"].shape[1]), ray)}
     assert drive((0.5, 0.0), blind) == [0.0, 0.0]
     assert drive((-0.5, 0.0), blind) == [-0.5, 0.0]
 

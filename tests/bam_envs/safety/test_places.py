@@ -211,6 +211,17 @@ def test_a_singularity_that_is_gone_to_step_by_step_is_noticed_in_time():
     assert guard.condition(place[:6]) < 30.5
 
 
+@pytest.mark.parametrize("limits", [{}, {"joint_speed": 3.0, "tool_speed": 1.0}])
+def test_an_arm_that_cannot_brake_in_time_stops_before_a_singularity_all_the_same(limits):
+    robot = SafeRobot(FakeRobot(), limits=Limits(**limits), straight=True)
+    state, conditions = reset(robot, wrist(-1.2)[:6]), []
+    for _ in range(120):  # past the ramp-in, which a far goal would begin
+        state = robot.step(state.command + 0.04 * (np.arange(7) == 4))
+        state = robot.step(state.command + 1.0 * (np.arange(7) == 4))
+        conditions.append(singularity().condition(state.command[0, :6].tolist()))
+    assert 25 < max(conditions) < 30.5
+
+
 def test_only_tasks_that_move_the_tool_straight_have_the_guard_of_singularities():
     names = {straight: [*SafeRobot(FakeRobot(), straight=straight).report()] for straight in (False, True)}
     assert [name for name in names[True] if name not in names[False]] == ["singularity"]

@@ -321,6 +321,85 @@ def test_guards_of_ones_own_are_asked_first_and_never_have_the_last_word(kind):
     assert len(robot.report()) == len(SafeRobot(FakeRobot()).report())
 
 
+class Broken(Guard):
+    """Does what a guard of one's own must not do."""
+
+    number, name, unit, limit_value, patience = "G99", "broken", "", math.inf, 5
+
+    def __init__(self, **does):
+        self.does = does
+
+    def fault(self, tick):
+        return self.does.get("fault", lambda: None)()
+
+    def hold(self, tick):
+        return np.asarray(tick.last) + 2.0
+
+    def limit(self, tick):
+        tick.command = np.asarray(tick.command) * self.does.get("times", 1.0)
+        return "times" in self.does
+
+
+def test_a_guard_of_ones_own_that_holds_the_robot_moves_nothing():
+    _, robot, state = live(guards=[Broken(fault=lambda: "no")])
+    np.testing.assert_array_equal(robot.step(away(state, 0.1)).command, state.command)
+
+
+def test_a_guard_of_ones_own_cannot_command_what_is_not_finite():
+    arm, robot, state = live(guards=[Broken(times=math.nan)])
+    halts, sent = arm.halts, len(arm.sent)
+    with pytest.raises(InvalidValue, match=r"^The guard broken commanded \[nan, .*\]: correct it; nothing was sent\.$"):
+        robot.step(state.command)
+    assert (arm.halts, len(arm.sent)) == (halts + 1, sent)
+
+
+def test_what_fails_in_a_guard_of_ones_own_or_in_an_observer_halts_the_robot():
+    def fail(*anything):
+        raise RuntimeError("a bug")
+
+    for guards, observer in (([Broken(fault=fail)], None), ([], fail)):
+        arm, robot, state = live(guards=guards)
+        robot.observe(observer)
+        halts = arm.halts
+        with pytest.raises(RuntimeError, match="a bug"):
+            robot.step(state.command)
+        assert arm.halts == halts + 1
+
+
+@pytest.mark.parametrize("what", ["not_ready", "tell_status"])
+def test_a_stop_latches_whatever_fails_while_it_is_reported(what):
+    def fail(*anything, stopped=True):
+        if stopped:
+            raise KeyboardInterrupt
+
+    arm = LiveArm()
+    setattr(arm, what, fail)
+    robot = SafeRobot(arm, clock=arm.clock, limits=Limits(bad_ticks=1))
+    robot.connect()
+    arm.place(ARM_HOME)
+    state, halts = robot.reset(np.arange(1), start_at()), arm.halts
+    with pytest.raises(KeyboardInterrupt):
+        robot.step(NAN)
+    assert arm.halts == halts + 1
+    with pytest.raises(SafetyStop, match=r"^The robot is still stopped by finite \(G2\): "):
+        robot.step(state.command)
+
+
+def test_ticks_in_which_the_robot_is_held_are_not_changed_commands():
+    class Once(Broken):
+        keeps_out = True
+
+        def limit(self, tick):
+            return self.does.pop("once", False)
+
+    arm, robot, state = live(guards=[Once(once=True)], limits=Limits(hold_time=2.0))
+    state = robot.step(state.command)
+    arm.old = 0.2
+    for _ in range(25):
+        robot.step(state.command)
+    assert [text for text in robot.warnings if text.startswith("changed commands")] == []
+
+
 def test_no_attribute_opens_the_gate():
     _, robot, _ = live()
     for name in ("guards", "limits", "spec", "status", "num_robots", "step", "report"):
@@ -743,6 +822,20 @@ def test_limits_hold_over_the_real_time_since_the_last_command():
         assert tool_travel(one, other) <= 0.25 * took + 1e-9
         assert np.abs(other - one)[:6].max() <= 1.0 * took + 1e-9
     assert {round(now - before, 3) for (before, _), (now, _) in itertools.pairwise(sent[1:])} == {0.029, 0.071}
+
+
+def test_a_blocked_joint_is_gone_back_to_no_faster_than_its_limit_where_ticks_are_short():
+    arm, robot, state = live(limits=Limits(tool_speed=1.0, joint_acceleration=20.0))
+    sent = [(arm.now, state.command[0])]
+    for tick in range(22):
+        arm.now -= 0.03 * (tick % 2)
+        arm.stuck = [5] if tick >= 6 else None
+        begun = arm.now
+        state = robot.step(turned(state, 0.2))
+        sent.append((begun, state.command[0]))
+    for (before, one), (now, other) in itertools.pairwise(sent[1:]):
+        assert np.abs(other - one)[:6].max() <= 1.0 * min(now - before, 0.05) + 1e-9
+    assert robot.report()["following"]["held"] > 0
 
 
 def test_a_robot_that_does_not_answer_is_held_and_then_stopped():

@@ -1,17 +1,21 @@
 """A robot on trial stays near its start."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from bam_envs.core.errors import InvalidValue
 from bam_envs.core.kinematics import UR5E_GRIPPER
 from bam_envs.core.robot import Initial
 from bam_envs.core.robot_env import RobotEnv
+from bam_envs.robots.mir100 import base_spec
 from bam_envs.robots.physics.kinematic_base import SimulatedBase
 from bam_envs.robots.physics.mujoco_arm import SimulatedArm
 from bam_envs.safety.gate import SafeRobot
 from bam_envs.safety.guard import Limits
+from bam_envs.safety.guards import default_guards
 from bam_envs.tasks.reach import ReachTask
 
 START = np.array([0.5, 0.0, 0.3])
@@ -63,6 +67,14 @@ def test_a_base_brakes_at_the_edge():
     x, y, _ = state.signals["base_pose"][0]
     assert (x, robot.spec.command.units) == (pytest.approx(2.0, abs=0.02), ("m/s", "rad/s"))
     assert -0.2 < y <= 0.02
+
+
+def test_a_base_whose_place_is_not_measured_has_no_box_and_is_refused():
+    spec = replace(base_spec(with_scans=False), signals=base_spec().signals[1:2])
+    with pytest.raises(
+        InvalidValue, match=r"^The trial box \(G10\) of mir100 needs base_pose, which the task does not"
+    ):
+        default_guards(spec, Limits(trial_box=1.0))
 
 
 def test_without_the_limit_there_is_no_such_guard():
