@@ -30,7 +30,7 @@ class TrialBox(Guard):
         if tool is None and "base_pose" not in [signal.name for signal in spec.signals]:
             raise InvalidValue(
                 f"The {self.title} of {spec.name} needs base_pose, which the task does not measure. Add the signal to "
-                "the task, or set no trial_box."
+                "the task, or run without a trial box (--stage full)."
             )
         self._box: Guard | None = None
 
