@@ -98,6 +98,8 @@ class Subject:
     """`Checkpoint.digest`."""
     robot: str
     """Address of the robot."""
+    simulated: bool = False
+    """Whether the robot is simulated: such trials say nothing of a real one at that address."""
 
 
 class TrialRecord:
@@ -158,13 +160,14 @@ class TrialRecord:
         """Every line, checked."""
         try:
             with self.path.open("rb") as file:
-                whole, newline, _ = file.read(_MOST).rpartition(b"\n")
-            if not newline:
-                return _Book.new()
-            name = _json(whole.split(b"\n", 1)[0]).get("record")
-            if not (isinstance(name, str) and name.isalnum()):
-                raise self._bad("line 1 was edited")
-            key, number_saved, last = self._state(name)
+                first = file.readline(_MOST)
+                if not first.endswith(b"\n"):
+                    return _Book.new()
+                name = _json(first).get("record")
+                if not (isinstance(name, str) and name.isalnum()):
+                    raise self._bad("line 1 was edited")
+                key, number_saved, last = self._state(name)  # before the lines, to which others may add meanwhile
+                whole = (first + file.read(_MOST)).rpartition(b"\n")[0]
         except OSError as error:
             what = error.filename or self.path
             text = f"{what} cannot be read: {error.strerror or error}"
@@ -259,7 +262,7 @@ def _locked(path: Path) -> Iterator[IO[bytes]]:
 
 
 def _subject_of(row: dict[str, Any]) -> Subject:
-    return Subject(str(row.get("checkpoint")), str(row.get("robot")))
+    return Subject(str(row.get("checkpoint")), str(row.get("robot")), row.get("simulated") is not False)
 
 
 class Trials:

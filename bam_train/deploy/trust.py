@@ -65,7 +65,7 @@ class Admission:
             robot.watch = self.shadow = Shadow(robot.spec, robot.limits)
             self.marks = (*self.marks, SHADOW)
         elif place.robot is not None and place.trial is not None:
-            lines += self._stage(place.robot, is_trial=place.trial)
+            lines += self._stage(place.robot, is_trial=place.trial, simulated=not has_real_robot(env))
         self.policy = FrozenPolicy.from_checkpoint(self.checkpoint)
         return lines
 
@@ -81,12 +81,12 @@ class Admission:
             return [f"  {UNSIGNED}: {error}"]
         return [f"  signed by {found.signer}, {found.created}"]
 
-    def _stage(self, address: str, *, is_trial: bool) -> list[str]:
+    def _stage(self, address: str, *, is_trial: bool, simulated: bool) -> list[str]:
         from bam_train.checkpoint.signature import config_folder
 
         manifest = self.checkpoint.manifest
         record = TrialRecord((self.record or TRIALS).expanduser(), config_folder() / "trials")
-        subject = Subject(self.checkpoint.digest, address.rstrip("/"))
+        subject = Subject(self.checkpoint.digest, address.rstrip("/"), simulated)
         threshold = manifest.settings.get("trial_threshold")
         threshold = threshold if type(threshold) is float and 0 < threshold < 1 else 0.9
         trials = Trials(record, subject, threshold, {"env": manifest.env, "file": str(self.checkpoint.path)})

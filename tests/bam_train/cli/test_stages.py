@@ -27,6 +27,7 @@ from tests.bam_train.deploy.test_deployment import run as run_deployment
 REACH = Path(__file__).parents[3] / "checkpoints" / "reach-ppo.zip"
 URL = "ws://10.0.0.5:9090"
 SIMULATED = SimpleNamespace(unwrapped=SimpleNamespace(robot=SimpleNamespace(info=SimpleNamespace(simulated=True))))
+REAL = SimpleNamespace(unwrapped=SimpleNamespace(robot=SimpleNamespace(info=SimpleNamespace(simulated=False))))
 ON_TRIAL, FULL = Place(robot=URL, trial=True), Place(robot=f"{URL}/", trial=False)
 
 
@@ -88,6 +89,16 @@ def test_another_checkpoint_or_robot_begins_anew(admission):
         TrialsNeeded, match="0 of 0 trials succeeded; 7 more without a failure would show more than 60 %"
     ):
         admission(trial_threshold=0.6)(SIMULATED, FULL)
+
+
+def test_trials_in_simulation_say_nothing_of_a_real_robot_at_that_address(admission):
+    one = admission()
+    one(SIMULATED, ON_TRIAL)
+    try_it(one.trials, *[True] * 33)
+    real = admission()
+    real.allow_unsigned = True
+    with pytest.raises(TrialsNeeded, match="0 of 0 trials succeeded"):
+        real(REAL, FULL)
 
 
 def test_who_knows_may_go_at_full_speed_and_every_line_says_so(admission):

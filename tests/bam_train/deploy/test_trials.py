@@ -5,6 +5,7 @@ import math
 import os
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -94,15 +95,29 @@ def test_trials_count_for_one_checkpoint_on_one_robot(record):
     try_it(record, True, False, True)
     try_it(record, True, subject=Subject("ab12", "ws://10.0.0.6:9090"))
     try_it(record, True, subject=Subject("cd34", PICK.robot))
+    try_it(record, True, subject=Subject("ab12", PICK.robot, simulated=True))
     assert counts(record) == (2, 3)
     rows = [json.loads(line) for line in record.path.read_text().splitlines()]
     assert [sorted(row) for row in rows[:3]] == [
         ["created", "format", "hmac", "record"],
-        ["begun", "checkpoint", "env", "hmac", "robot", "seed"],
+        ["begun", "checkpoint", "env", "hmac", "robot", "seed", "simulated"],
         ["ended", "hmac", "reason", "success", "time"],
     ]
     (state,) = (record.path.parents[1] / "private").iterdir()
     assert state.stat().st_mode & 0o777 == 0o600
+
+
+def test_another_program_may_add_a_trial_while_the_record_is_read(record, monkeypatch):
+    try_it(record, True)
+    read = Path.read_bytes
+
+    def slow(path):
+        monkeypatch.undo()
+        try_it(record, True)
+        return read(path)
+
+    monkeypatch.setattr(Path, "read_bytes", slow)
+    assert counts(record) == (2, 2)
 
 
 def test_a_trial_without_an_end_has_failed(record):
@@ -121,7 +136,7 @@ def edit(record, change):
 @pytest.mark.parametrize(
     ("change", "text"),
     [
-        (lambda lines: [line.replace(b"false", b"true") for line in lines], "line 5 was edited"),
+        (lambda lines: [line.replace(b's": false', b's": true') for line in lines], "line 5 was edited"),
         (lambda lines: [*lines[:3], *lines[5:]], "line 4 was edited, or lines before it were removed, added or moved"),
         (lambda lines: [*lines[:3], *lines[5:7], *lines[3:5]], "line 4 was edited"),
         (lambda lines: [*lines[:3], *lines[1:]], "line 4 was edited"),
