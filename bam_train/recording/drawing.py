@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from bam_envs.core.errors import MissingExtra, ProtocolError
 from bam_envs.ros.images import decode_image
+from bam_train.atomic_file import replacing
 from bam_train.errors import BadRecording, OutputError
 from bam_train.recording.recording import Recording
 
@@ -53,9 +54,11 @@ def plot(recording: Recording, path: Path) -> None:
     axes[0].set_title(f"{recording.path.name}: {recording.metadata.get('env', '')}", fontsize="medium")
     axes[-1].set_xlabel("time [s]")
     try:
-        figure.savefig(path, dpi=100)
+        with replacing(path) as temporary:
+            figure.savefig(temporary, dpi=100, format=path.suffix[1:] or "png")
     except (OSError, ValueError) as error:
-        raise OutputError(f"{path}: cannot be written: {error}. Choose another .png") from error
+        why = getattr(error, "strerror", None) or error
+        raise OutputError(f"{path}: cannot be written: {why}. Choose another .png") from error
 
 
 def _rows(recording: Recording) -> list[tuple[str, Callable[[Axes], None]]]:

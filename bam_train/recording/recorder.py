@@ -244,6 +244,11 @@ class Recorder:
             self._process.kill()
             self._process.wait()
             early = f"{self.path}: the recorder did not end within {_END:g} s; the end of the recording is missing"
+        if self._process.returncode and not early:
+            status = self._process.returncode
+            early = (
+                f"{self.path}: the recorder's process ended with status {status}; the end of the recording is missing"
+            )
         if early or self.fault:
             self._fail(self._ring.failure or early)
         return self.fault

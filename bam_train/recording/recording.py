@@ -5,7 +5,7 @@ import struct
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import msgspec
 import numpy as np
@@ -21,8 +21,14 @@ from bam_train.errors import BadRecording
 Array = NDArray[np.float64]
 TICKS = ("/state", "/truth", "/command", "/observation", "/action", "/status", "/latency", "/episode")
 """Topics with one message for each tick; robots alone have the first three."""
+_ALWAYS = ("/action", "/status", "/latency", "/episode")
+"""Those that every deployment has."""
+_Rows: TypeAlias = dict[str, list[tuple[int, dict[str, Any]]]]
+"""Topic to the time and the content of its messages."""
 _MOST_CHUNK = 2**28  # bytes of a chunk, unpacked: a camera's largest picture is far smaller
 _DAMAGE = (McapError, ZstdError, msgspec.MsgspecError, struct.error, ValueError, LookupError, OverflowError, EOFError)
+_FOREIGN = (msgspec.MsgspecError, ValueError, LookupError, TypeError, OverflowError, RecursionError)
+"""Exceptions for the content of messages that we did not write."""
 _decode = msgspec.json.Decoder().decode
 
 
@@ -77,17 +83,17 @@ class Recording:
             BadRecording: There is no such file, or it is no recording of `bam-deploy`.
         """
         recording = cls(Path(path).expanduser())
-        rows: dict[str, list[tuple[int, dict[str, Any]]]] = {topic: [] for topic in TICKS}
-        for record in recording._records():
-            if isinstance(record, Metadata) and record.name == "deployment":
-                recording.metadata = dict(record.metadata)
-            elif isinstance(record, Metadata) and record.name == "layout":
-                recording.kinds = {kind: json.loads(text) for kind, text in record.metadata.items()}
-            elif isinstance(record, Footer):
-                recording.complete = True
-            elif isinstance(record, tuple):
-                recording._take(rows, *record)
-        if not recording.metadata and not rows["/episode"]:
+        rows: _Rows = {topic: [] for topic in TICKS}
+        try:
+            for record in recording._records():
+                recording._take(rows, record)
+        except BadRecording:
+            raise
+        except _FOREIGN:
+            pass  # what was read so far is the recording
+        if not all(rows[topic] for topic in _ALWAYS):
+            rows.clear()  # not one whole tick
+        if not recording.metadata and not rows:
             raise BadRecording(f"{path}: not a recording of bam-deploy. Give a .mcap file that it wrote")
         try:
             recording._fill({topic: messages for topic, messages in rows.items() if messages})
@@ -119,14 +125,23 @@ class Recording:
         except _DAMAGE:
             return  # what was read so far is the recording
 
-    def _take(self, rows: dict[str, list[tuple[int, dict[str, Any]]]], topic: str, message: Message) -> None:
+    def _take(self, rows: _Rows, record: McapRecord | tuple[str, Message]) -> None:
+        if isinstance(record, Metadata) and record.name == "deployment":
+            self.metadata = dict(record.metadata)
+        elif isinstance(record, Metadata) and record.name == "layout":
+            self.kinds = {kind: json.loads(text) for kind, text in record.metadata.items()}
+        elif isinstance(record, Footer):
+            self.complete = True
+        if not isinstance(record, tuple):
+            return
+        topic, message = record
         if topic in rows:
             rows[topic].append((message.log_time, _decode(message.data)))
         elif topic == "/events":
             content = _decode(message.data)
             self.events.append(Event(message.log_time, int(content["level"]), str(content["message"])))
 
-    def _fill(self, rows: dict[str, list[tuple[int, dict[str, Any]]]]) -> None:
+    def _fill(self, rows: _Rows) -> None:
         ticks = min(map(len, rows.values()), default=0)  # of the last tick, some messages may be missing
         self.guards = [str(content.pop("guard", "")) for _, content in rows.get("/status", [])[:ticks]]
         for topic, messages in rows.items():

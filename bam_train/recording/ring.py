@@ -1,6 +1,6 @@
 """A ring of records in memory that two processes share: one writes and never waits, the other reads.
 
-The memory begins with a head of 512 bytes (`_Head`); the rest is the ring. Each record is its size, a CRC-32 and its
+The memory begins with a head of 8 KiB (`_Head`); the rest is the ring. Each record is its size, a CRC-32 and its
 bytes, padded to 8. The writer stores the bytes first and the new end afterwards; where the processor swaps the two, the
 checksum shows it, and the reader looks again later.
 """
@@ -18,8 +18,8 @@ TICK, LAYOUT, EVENT, IMAGE, PIXELS = b"T", b"L", b"E", b"I", b"P"
 TIMES = struct.Struct("=qddB")
 """Then: wall clock [ns], monotonic clock [s], how long before that the command was sent [s], and the series."""
 _RECORD = struct.Struct("=II")
-_HEAD = 512
-_TEXT = 256
+_HEAD = 8192
+_TEXT = 8000
 
 
 class _Head(ctypes.Structure):

@@ -50,10 +50,10 @@ def _checkpoint(config: ReplayConfig, recording: Recording) -> Checkpoint | str:
     """The checkpoint to play with; else why there is none."""
     from bam_train.checkpoint import Checkpoint
 
-    if config.checkpoint is not None:
-        return Checkpoint.open(config.checkpoint)
     if not recording.ticks:
         return "no whole tick is in it"
+    if config.checkpoint is not None:
+        return Checkpoint.open(config.checkpoint)
     path = Path(recording.metadata.get("checkpoint", ""))
     if not path.is_file():
         return f"its checkpoint {path} is not here; give it with --checkpoint"

@@ -222,13 +222,14 @@ def test_what_is_no_recording_is_one_line(tmp_path, capsys, content, why):
     assert capsys.readouterr().err == f"bam-replay: {path}: {why}\n"
 
 
-def test_somebody_elses_mcap_file_is_refused(tmp_path):
+@pytest.mark.parametrize("topic", ["/state", "/status", "/episode", "/events"])
+@pytest.mark.parametrize("content", [b'{"t": "x"}', b"[1]", b"\0\1\0\0", b'{"t": 1e999}'])
+def test_somebody_elses_mcap_file_is_refused(tmp_path, topic, content):
     path = tmp_path / "a.mcap"
     with path.open("wb") as file:
         writer = Writer(file)
         writer.start()
-        channel = writer.register_channel("/state", "json", 0)
-        writer.add_message(channel, 1, b'{"t": "x"}', 1)
+        writer.add_message(writer.register_channel(topic, "json", 0), 1, content, 1)
         writer.finish()
     with pytest.raises(BadRecording, match=r"not a recording of bam-deploy"):
         Recording.open(path)
@@ -247,7 +248,29 @@ def test_a_recording_is_drawn(small_chunks, tmp_path, capsys):
     assert plot.read_bytes().startswith(b"\x89PNG")
     assert video.read_bytes().startswith(b"GIF8")
     assert call(replay, cut, "--plot", tmp_path / "nowhere" / "a.png") == 1
-    assert f"bam-replay: {tmp_path / 'nowhere' / 'a.png'}: cannot be written: " in capsys.readouterr().err
+    assert capsys.readouterr().err == (
+        f"bam-replay: {tmp_path / 'nowhere' / 'a.png'}: cannot be written: No such file or directory. "
+        "Choose another .png\n"
+    )
+
+
+def test_a_plot_is_whole_or_absent(small_chunks, tmp_path, capsys):
+    cut, plot, before = tmp_path / "cut.mcap", tmp_path / "plot", tmp_path / "plot.txt"
+    cut.write_bytes(small_chunks[:20_000])
+    before.write_text("mine")
+    assert call(replay, cut, "--plot", before) == 1
+    assert before.read_text() == "mine"
+    assert call(replay, cut, "--plot", plot) == 0
+    assert plot.read_bytes().startswith(b"\x89PNG")
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["cut.mcap", "plot", "plot.txt"]
+
+
+def test_a_recording_without_a_whole_tick_is_not_played(tmp_path, capsys):
+    recorder = Recorder(tmp_path / "a.mcap", {"env": "bam/pick-v0"})
+    recorder.start()
+    assert recorder.close() == ""
+    assert call(replay, recorder.path, "--checkpoint", PICK) == 0
+    assert capsys.readouterr().out.splitlines()[-1] == "not played: no whole tick is in it"
 
 
 def test_recorded_pictures_are_there_again(tmp_path):

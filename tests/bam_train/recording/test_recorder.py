@@ -238,6 +238,16 @@ def test_a_recorder_that_was_killed_is_noticed(started):
     assert recorder.close() == text
 
 
+def test_a_recorder_that_was_killed_at_the_end_is_noticed(started):
+    recorder = started()
+    os.kill(recorder.pid, signal.SIGSTOP)
+    killer = threading.Timer(0.3, os.kill, (recorder.pid, signal.SIGKILL))
+    killer.start()
+    text = f"{recorder.path}: the recorder's process ended with status -9; the end of the recording is missing"
+    assert (recorder.close(), recorder.close()) == (text, text)
+    killer.join()
+
+
 def test_a_tick_that_was_not_declared_ends_the_recording(started):
     recorder = started()
     recorder.tick([np.zeros(3), np.zeros(1)], [0, 0])
@@ -266,3 +276,10 @@ def test_a_folder_that_cannot_be_made_is_named(started, tmp_path):
         started("flight/a.mcap")
     path = tmp_path / "flight" / "a.mcap"
     assert str(caught.value) == f"{path}: cannot be written: File exists. Choose another file"
+
+
+def test_a_long_path_leaves_room_for_the_reason(started, tmp_path):
+    (tmp_path / "flight").write_text("a file")
+    with pytest.raises(OutputError) as caught:
+        started("flight/" + "a" * 250 + "/a.mcap")
+    assert str(caught.value).endswith("/a.mcap: cannot be written: Not a directory. Choose another file")
