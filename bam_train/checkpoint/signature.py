@@ -7,7 +7,6 @@ member. What is signed is the text ``bam-train checkpoint signature 1``, the sig
 """
 
 import base64
-import binascii
 import copy
 import hashlib
 import os
@@ -134,6 +133,8 @@ def read_private_key(path: Path) -> tuple[Any, PublicKey]:
     from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
     from cryptography.hazmat.primitives.serialization import load_pem_private_key
 
+    if path.suffix == ".pub":
+        raise BadKey(f"{path}: a public key signs nothing. Give the private one, which bam-sign keygen made with it")
     try:
         with path.open("rb") as file:
             mode = stat.S_IMODE(os.fstat(file.fileno()).st_mode)
@@ -248,7 +249,7 @@ def verify(checkpoint: Checkpoint, folder: Path) -> Signature:
     try:
         found = msgspec.json.decode(data, type=Signature)
         text, raw = (base64.b64decode(one, validate=True) for one in (found.public_key, found.signature))
-    except (msgspec.MsgspecError, binascii.Error) as error:
+    except (msgspec.MsgspecError, ValueError) as error:
         raise AlteredCheckpoint(path, SIGNATURE, f"{SIGNATURE}: {error}. Sign it again") from error
     known = next((key for key in trusted_keys(folder) if key.text == found.public_key), None)
     if known is None:

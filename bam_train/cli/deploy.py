@@ -29,6 +29,11 @@ if TYPE_CHECKING:
     from bam_train.recording.recorder import Recorder
 
 
+LIVE_ONLY = (
+    *("robot", "transport", "rate", "fast", "render", "wiggle", "motion", "stage", "i_know", "trials", "shadow"),
+    *("record", "print_guards", "ca_file", "token_file", "timeout"),
+)
+"""Flags that a rehearsal has no use for."""
 ANY_ROBOT = "ws://127.0.0.1:9090"
 """Address for showing the guards of a robot whose address is not given; nothing is connected."""
 
@@ -92,7 +97,7 @@ def _rehearse(config: DeployConfig, link: str) -> int:
     from bam_train.errors import SettingsError
     from bam_train.policy import FrozenPolicy
 
-    for name in ("robot", "transport", "rate", "fast", "render", "wiggle", "stage", "shadow", "record", "print_guards"):
+    for name in LIVE_ONLY:
         if getattr(config, name):
             raise SettingsError(f"--rehearse simulates the robot, its link and its time; leave out {as_flag(name)}")
     checkpoint = Checkpoint.open(config.checkpoint)
@@ -146,6 +151,8 @@ def _checked_place(config: DeployConfig) -> Place:
     ca_file, token_file = (None if path is None else str(path) for path in (config.ca_file, config.token_file))
     if config.print_guards and config.transport is not None:
         raise SettingsError("--print-guards shows the guards of a live robot, and --transport has none; leave it out")
+    if config.print_guards and config.shadow:
+        raise SettingsError("--print-guards shows what limits commands, and --shadow sends none; give one of the two")
     robot = ANY_ROBOT if config.print_guards and config.robot is None else config.robot
     place = Place(
         robot,

@@ -11,6 +11,9 @@ from bam_train.cli.program import run_program
 if TYPE_CHECKING:
     from bam_train.cli.flags import SignConfig
 
+FLAGS = {"keygen": "name", "sign": "key", "verify": "keys", "trust": "keys"}
+"""Action to the one flag that it takes."""
+
 
 def sign_checkpoint(config: SignConfig) -> None:
     """Run the program with its parsed flags."""
@@ -18,6 +21,9 @@ def sign_checkpoint(config: SignConfig) -> None:
     from bam_train.checkpoint.signature import make_key, public_path, sign, trust, trusted_folder, verify
     from bam_train.errors import SettingsError
 
+    for name in FLAGS.values():
+        if getattr(config, name) is not None and name != FLAGS[config.action]:
+            raise SettingsError(f"{config.action} has no use for --{name}; leave it out")
     path, folder = config.file.expanduser(), (config.keys or trusted_folder()).expanduser()
     if config.action == "keygen":
         public = make_key(path, config.name or path.stem)

@@ -46,6 +46,10 @@ def test_a_guard_that_is_changed_is_shown_so(run):
             ("--print-guards", "--transport", "tcp://127.0.0.1:9"),
             "--print-guards shows the guards of a live robot, and --transport has none; leave it out",
         ),
+        (
+            ("--print-guards", "--robot", "ws://127.0.0.1:9", "--shadow"),
+            "--print-guards shows what limits commands, and --shadow sends none; give one of the two",
+        ),
     ],
 )
 def test_what_is_refused_in_one_line(run, flags, message):

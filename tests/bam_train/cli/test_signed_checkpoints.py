@@ -173,6 +173,15 @@ def test_a_signature_that_is_none_is_named(signed, keys, data):
     assert caught.value.member == SIGNATURE
 
 
+@pytest.mark.parametrize("field", ["public_key", "signature"])
+def test_a_signature_of_other_letters_is_named(signed, keys, field):
+    members = members_of(signed)
+    signature = json.loads(members[SIGNATURE])
+    write(signed, members | {SIGNATURE: json.dumps(signature | {field: "é" * len(signature[field])}).encode()})
+    with pytest.raises(AlteredCheckpoint, match=r"bam/signature\.json: .*\. Sign it again"):
+        admit(signed, keys)
+
+
 def test_a_signature_of_an_absurd_size_is_not_read(signed, keys):
     write(signed, members_of(signed) | {SIGNATURE: bytes(2**24)})
     with pytest.raises(AlteredCheckpoint, match=r"bam/signature\.json has 16777216 bytes, expected at most 16384"):
@@ -339,6 +348,10 @@ def test_from_a_key_to_a_verified_checkpoint(corridor_checkpoint, run, tmp_path,
     [
         (("sign", "a.zip"), 1, "--key is missing: the private key that signs. Make one with bam-sign keygen"),
         (("sing", "a.zip"), 2, "sing"),
+        (("sign", "a.zip", "--key", "me.pub"), 1, "me.pub: a public key signs nothing. Give the private one"),
+        (("sign", "a.zip", "--key", "me.key", "--name", "bob"), 1, "sign has no use for --name; leave it out"),
+        (("keygen", "me.key", "--keys", "trusted"), 1, "keygen has no use for --keys; leave it out"),
+        (("verify", "a.zip", "--key", "me.key"), 1, "verify has no use for --key; leave it out"),
         (("verify",), 2, "FILE is missing."),
     ],
 )

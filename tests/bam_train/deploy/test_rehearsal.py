@@ -107,6 +107,10 @@ def test_the_report_for_people():
             ("wifi", "--print-guards"),
             "--rehearse simulates the robot, its link and its time; leave out --print-guards",
         ),
+        (
+            ("wifi", "--motion", "a.mcap"),
+            "--rehearse simulates the robot, its link and its time; leave out --motion",
+        ),
         (("wifi", "--profile", "ur6e"), "Unknown robot profile 'ur6e'. Did you mean 'ur5e'?"),
     ],
 )
