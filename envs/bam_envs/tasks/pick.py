@@ -8,7 +8,7 @@ from gymnasium import spaces
 
 from bam_envs.core.kinematics import cube_yaw_phase
 from bam_envs.core.robot import EnvIds, Initial, RobotState
-from bam_envs.core.task import Array, Floats, Label, Memory, Score, draw_seeds, labelled_box
+from bam_envs.core.task import Array, Floats, Label, Memory, Score, draw_seeds, labelled_box, limited
 from bam_envs.robots.ur5e import GEOMETRY
 from bam_envs.tasks.tool_control import ACTION_LABELS, HALF, HAND_LABELS, MIDDLE, ToolControl, hand_state
 
@@ -118,7 +118,7 @@ class PickTask(Memory):
     def observe(self, state: RobotState) -> Floats:
         """See `observation_labels`. Shape: (n, 18) float32."""
         observation = np.concatenate(self._columns(state), axis=1).astype(np.float32)
-        return np.clip(observation, self.observation_space.low, self.observation_space.high)
+        return limited(observation, self.observation_space.low, self.observation_space.high)
 
     def _columns(self, state: RobotState) -> list[Array]:
         """Hand and cube, not clipped. Shape: (n, k) each."""
@@ -155,7 +155,7 @@ class PickTask(Memory):
         reward = (
             0.1 * (1 - np.tanh(5 * sense.distance))
             - 0.05 * early
-            + grasped * (0.1 + 0.5 * np.clip(lift / LIFT, 0.0, 1.0))
+            + grasped * (0.1 + 0.5 * limited(lift / LIFT, 0.0, 1.0))
         )
         reward = reward + 30.0 * success - 5.0 * fallen
         return Score(reward, success | fallen, success, {"distance": sense.distance, "lift": lift})

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from bam_envs.core.robot import EnvIds, Initial, RobotState
-from bam_envs.core.task import Array, Floats, Label, Score
+from bam_envs.core.task import Array, Floats, Label, Score, limited
 from bam_envs.robots.ur5e import GRIPPER_OPEN
 from bam_envs.tasks.pick import CUBE_AREA, CUBE_EDGE, NEAR, TABLE_EDGE, CubeSense, PickTask
 
@@ -99,7 +99,7 @@ class PickPlaceTask(PickTask):
         self.held = np.where(there & opening & (width > 0.6 * GRIPPER_OPEN), self.held + 1, 0)
         success = self.held >= REST_STEPS
         fallen = sense.object[:, 2] < TABLE_EDGE
-        openness = np.clip((width - CUBE_EDGE) / (GRIPPER_OPEN - CUBE_EDGE), 0.0, 1.0)
+        openness = limited((width - CUBE_EDGE) / (GRIPPER_OPEN - CUBE_EDGE), 0.0, 1.0)
         reward = np.where(there & opening, 0.9 + 0.6 * openness, self._shaping(sense, lift, grasped) + 0.04 * there)
         reward = reward + 75.0 * success - 2.0 * fallen
         info = {"distance": sense.distance, "lift": lift, "goal_distance": distance}
@@ -109,7 +109,7 @@ class PickPlaceTask(PickTask):
         """Reward reaching, squeezing and carrying: `CARRY` high far from the goal, down to the table there. (n,)."""
         offset = sense.object[:, :2] - self.goal
         across = np.sqrt(np.einsum("ij,ij->i", offset, offset))
-        height = CARRY * np.clip((across - 0.01) / FUNNEL, 0.0, 1.0)
+        height = CARRY * limited((across - 0.01) / FUNNEL, 0.0, 1.0)
         inside, near = 1 - np.tanh(25 * np.abs(lift - height)), 1 - np.tanh(5 * across)
         reach: Array = 0.04 * (1 - np.tanh(5 * sense.distance))
         early = 0.02 * (self.control.closed & (sense.distance > NEAR))

@@ -6,7 +6,7 @@ import numpy as np
 from gymnasium import spaces
 
 from bam_envs.core.robot import EnvIds, Initial, RobotState
-from bam_envs.core.task import Array, Floats, Label, Memory, Score, draw_seeds, labelled_box
+from bam_envs.core.task import Array, Floats, Label, Memory, Score, draw_seeds, labelled_box, limited
 from bam_envs.robots.ur5e import GEOMETRY, GRIPPER_OPEN, JOINTS
 from bam_envs.tasks.tool_control import JOINT_STEP, TOOL_STEP
 
@@ -86,13 +86,13 @@ class ReachTask(Memory):
             offset / 0.05,
         ]
         observation = np.concatenate(columns, axis=1).astype(np.float32)
-        return np.clip(observation, self.observation_space.low, self.observation_space.high)
+        return limited(observation, self.observation_space.low, self.observation_space.high)
 
     def command(self, action: Floats, state: RobotState) -> Array:
         """Joint positions [rad] within `TOOL_STEP` and `JOINT_STEP`, and the open gripper [m]. Shape: (n, 7)."""
         measured, sent = state.signals["joint_position"], state.command[:, :6]
-        wanted = sent + np.clip(action, -1.0, 1.0).astype(np.float64) * JOINT_STEP
-        wanted = np.clip(np.clip(wanted, measured - LEASH, measured + LEASH), _LOW, -_LOW)
+        wanted = sent + limited(action, -1.0, 1.0).astype(np.float64) * JOINT_STEP
+        wanted = limited(limited(wanted, measured - LEASH, measured + LEASH), _LOW, -_LOW)
         travel = wanted - sent
         travel *= np.minimum(1.0, 0.999 * JOINT_STEP / np.maximum(np.abs(travel).max(axis=1), 1e-9))[:, None]
         tool = GEOMETRY.tool_position(sent)

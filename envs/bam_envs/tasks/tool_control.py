@@ -11,7 +11,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from bam_envs.core.robot import EnvIds, RobotState
-from bam_envs.core.task import Array, Floats, Label, Memory
+from bam_envs.core.task import Array, Floats, Label, Memory, limited
 from bam_envs.robots.ur5e import GEOMETRY, GRIPPER_OPEN
 
 TOOL_STEP = 0.0124
@@ -85,12 +85,12 @@ class ToolControl(Memory):
         if changed.any():
             held = np.flatnonzero(changed.any(axis=1))
             self._continue_from(held, sent[held])
-        moves: Array = np.clip(action, -1.0, 1.0).astype(np.float64)
-        target = np.clip(self.target + moves[:, :3] * TOOL_STEP, tool - LEASH, tool + LEASH)
-        travel = np.clip(target, WORKSPACE[0], WORKSPACE[1]) - self.target
+        moves: Array = limited(action, -1.0, 1.0).astype(np.float64)
+        target = limited(self.target + moves[:, :3] * TOOL_STEP, tool - LEASH, tool + LEASH)
+        travel = limited(target, WORKSPACE[0], WORKSPACE[1]) - self.target
         length = np.sqrt(np.einsum("ij,ij->i", travel, travel))
         travel = travel * np.minimum(1.0, TOOL_STEP / np.maximum(length, 1e-9))[:, None]
-        turn = np.clip(self.yaw + moves[:, 3] * YAW_STEP, -YAW_LIMIT, YAW_LIMIT) - self.yaw
+        turn = limited(self.yaw + moves[:, 3] * YAW_STEP, -YAW_LIMIT, YAW_LIMIT) - self.yaw
         self._move(travel, turn)
         self.closed = action[:, 4] > 0
         width = np.where(self.closed, 0.0, GRIPPER_OPEN)

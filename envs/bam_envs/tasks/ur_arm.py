@@ -18,7 +18,7 @@ from bam_envs.core.env_options import finite_numbers
 from bam_envs.core.errors import InvalidValue
 from bam_envs.core.kinematics import LINKS, quaternions
 from bam_envs.core.robot import EnvIds, Initial, RobotState
-from bam_envs.core.task import Array, Flags, Floats, Label, Memory, as_objects, draw_seeds, labelled_box
+from bam_envs.core.task import Array, Flags, Floats, Label, Memory, as_objects, draw_seeds, labelled_box, limited
 from bam_envs.robots.ur import DEFAULT_MODEL, JOINTS, UrModel
 from bam_envs.robots.ur import ur_model as model_called
 
@@ -100,13 +100,13 @@ class UrTask(Memory):
     def observe(self, state: RobotState) -> Floats:
         """See `observation_labels`. Shape: (n, k) float32."""
         observation = np.concatenate(self._columns(state), axis=1).astype(np.float32)
-        return np.clip(observation, self.observation_space.low, self.observation_space.high)
+        return limited(observation, self.observation_space.low, self.observation_space.high)
 
     def full_action(self, action: Floats, held: Array | float = 0.0) -> Array:
         """The action of all joints in [-1, 1]: clipped `action` for free ones, `held` for fixed ones. Shape: (n, 6)."""
         full: Array = np.empty((self.num_envs, 6))
         full[:] = held
-        full[:, self.free] = np.clip(action, -1.0, 1.0)
+        full[:, self.free] = limited(action, -1.0, 1.0)
         return full
 
     def toward(self, target: Array, state: RobotState) -> Array:
@@ -116,7 +116,7 @@ class UrTask(Memory):
         way = target - joints
         duration = np.maximum((np.abs(way) / self.speed).max(axis=1), SHORTEST)
         step = way * ((1.0 / self.rate) / duration)[:, None]
-        command: Array = np.clip(joints + step, *self.model.joint_limits)
+        command: Array = limited(joints + step, *self.model.joint_limits)
         return command
 
     def initial(self, joints: Array, rngs: Sequence[np.random.Generator], **signals: Array) -> Initial:
