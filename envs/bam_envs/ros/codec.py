@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from bam_envs.core.errors import ProtocolError
 from bam_envs.core.robot import RobotSpec, RobotState
-from bam_envs.core.validation import Positive, read_table
+from bam_envs.core.validation import NonNegative, Positive, read_table
 from bam_envs.core.wording import brief
 from bam_envs.ros.freshness import Tag, read_tag
 from bam_envs.ros.messages import (
@@ -60,7 +60,7 @@ class RobotInfo:
     lockstep: bool = False  # whether its time advances only with commands, one period each
     period: Positive | None = None  # time between two commands [s], if reported
     text: str = ""  # one line for people
-    watchdog: float | None = None  # time after which it stops by itself without a command [s], if known
+    watchdog: NonNegative | None = None  # time after which it stops by itself without a command [s], if known
 
     def to_json(self) -> str:
         """The text for the answer of `INFO_SERVICE`."""

@@ -269,12 +269,12 @@ class MeasuredJump(Guard):
     number, name, unit = "G7", "measured jump", "rad"
 
     def __init__(self, spec: RobotSpec) -> None:
-        self.limit_value, rates = JUMP, max_rate(spec.command)
+        self.limit_value, self._period, rates = JUMP, spec.period, max_rate(spec.command)
         self._joints = [(at, rates[at], spec.command.labels[at]) for at in columns_in(spec.command, "rad")]
 
     def fault(self, tick: Tick) -> str | None:
         """Report the joint with the largest jump."""
-        measured, before, seconds = tick.measured, tick.before, max(tick.period, tick.pause) + tick.age
+        measured, before, seconds = tick.measured, tick.before, max(self._period, tick.pause) + tick.age
         worst, text = 0.0, None
         for at, fastest, label in self._joints:
             turned, most = abs(measured[at] - before[at]), fastest * seconds + self.limit_value

@@ -382,6 +382,7 @@ def test_info():
         ("lockstep", '"no"', "lockstep: expected true or false, found 'no'"),
         ("period", '"0.05"', "period: expected a number above 0, found '0.05'"),
         ("period", "0", "period: expected a number above 0, found 0"),
+        ("watchdog", "-1", "watchdog: expected a number of at least 0, found -1"),
         ("text", "[1]", "text: expected text, found [1]"),
     ],
 )

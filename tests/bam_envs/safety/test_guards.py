@@ -235,6 +235,15 @@ def test_a_measured_speed_is_the_mean_of_two_ticks(name, velocity, text):
     assert guard.fault(arm_tick(joints(), velocity=joints(math.nan))) is None
 
 
+def test_a_joint_turns_for_a_whole_period_between_two_states_also_where_two_commands_are_close_together():
+    guard, close = arm_guards.MeasuredJump(ARM), {"before": np.zeros(7), "period": 0.01, "pause": 0.01}
+    assert guard.fault(tick_from(HOME, measured=np.full(7, 0.15), **close)) is None
+    assert guard.fault(tick_from(HOME, measured=np.full(7, 0.21), **close)) == (
+        "shoulder_pan_joint was measured 0.210 rad from where it was a tick before, and it turns 0.207 rad at most in "
+        "that time: look at what publishes its position"
+    )
+
+
 def test_joints_keep_a_margin_and_the_gripper_its_range():
     guard = arm_guards.PositionLimits(ARM, Limits())
     tick = tick_from(HOME, goal=np.array([7.0, -7.0, 3.1, 0.0, 0.0, 0.0, 0.2]))
