@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 PIP_INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt
 DEMO := build/demo
-WORKERS := -n 2 --no-loadscope-reorder
+WORKERS := -n 3 --no-loadscope-reorder
 
 .PHONY: demo test quick peers lint format docs site clean
 
