@@ -74,7 +74,7 @@ ROBO_GYM = {"env": "NoObstacleNavigationMir100Sim", "algo": "ppo"}
         ),
         (
             {**ROBO_GYM, "env_kwargs": {"ur_model": "ur10e"}},
-            "env_kwargs: unknown setting 'ur_model' of NoObstacleNavigationMir100Sim-v0. Choose from: action_delay, gazebo_gui, ",
+            "env_kwargs: unknown setting 'ur_model' of NoObstacleNavigationMir100Sim-v0. Choose from: action_delay, ",
         ),
     ],
 )
