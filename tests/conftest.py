@@ -1,8 +1,8 @@
 """What the whole suite needs: signals that are heard, and which tests worker processes may run side by side.
 
 `make test` runs ``pytest -n 3``, as tests of Ray and the peers often wait. The tests of one file stay in one worker,
-with what the file sets up once; so do all of Ray, whose processes fill a machine, and all of the ROS 2 peers, which share
-their servers. The longest come first, so that the workers end at about the same time.
+with what the file sets up once; so do all of Ray, whose processes fill a machine, and all of the ROS 2 peers, which
+share their servers. The longest come first, so that the workers end at about the same time.
 """
 
 import os
