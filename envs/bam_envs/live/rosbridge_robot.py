@@ -252,8 +252,7 @@ class RosbridgeRobot:
             RemoteError: The other end refused the scene.
             StaleState: No fresh state came.
         """
-        control = self._connected()
-        control.wait_up(_RESET_TIMEOUT)
+        control = self._wait_up()
         if control.epoch != self._epoch or self._cut.is_set():
             self._begin(control)
         elif self._session_over or (self._session.is_driving and self._state.echo()[0] != self._session.tagger.session):
@@ -453,6 +452,14 @@ class RosbridgeRobot:
         if self._control is None:
             raise ResetNeeded(f"{self.profile.name} at {self.url} is not connected. Call connect() first.")
         return self._control
+
+    def _wait_up(self) -> RosbridgeLink:
+        """The connection of the commands, when both are up; `LinkLost` if they are not after `_RESET_TIMEOUT` [s]."""
+        control, halting = self._connected(), self._halting
+        control.wait_up(_RESET_TIMEOUT)
+        if halting is not None:
+            halting.wait_up(_RESET_TIMEOUT)
+        return control
 
     def _require_link(self) -> None:
         """Raise `LinkLost` unless both connections have been up since `connect` or `reset`."""

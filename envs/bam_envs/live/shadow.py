@@ -46,8 +46,7 @@ class ShadowRobot(RosbridgeRobot):
 
     def reset(self, env_ids: EnvIds, initial: Initial) -> RobotState:
         """A fresh state; the robot goes on with what it does, and `initial` has no effect."""
-        control = self._connected()
-        control.wait_up(bringup.TIMEOUT)
+        control = self._wait_up()
         if control.epoch != self._epoch or self._cut.is_set():
             self._begin(control)
         self._await(lambda slots: self.age() <= self.profile.max_age)
