@@ -119,7 +119,8 @@ def _write_new(path: Path, data: bytes, mode: int) -> None:
         with os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode), "wb") as file:
             file.write(data)
     except FileExistsError as error:
-        raise OutputError(f"{path}: a key is there already. Choose another name, or move that one away") from error
+        what = "a folder" if path.is_dir() else "a key"
+        raise OutputError(f"{path}: {what} is there already. Choose another name, or move that one away") from error
     except OSError as error:
         raise OutputError(f"{path}: cannot be written: {error.strerror or error}. Choose another place") from error
 

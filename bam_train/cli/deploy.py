@@ -178,8 +178,8 @@ def _checked_place(config: DeployConfig) -> Place:
         )
     if robot is None and (config.stage or config.trials):
         raise SettingsError("--stage and --trials are for a live robot; give its address with --robot too")
-    if config.shadow and (robot is None or config.stage or config.wiggle):
-        raise SettingsError("--shadow needs --robot, and moves nothing; leave out --stage and --wiggle")
+    if config.shadow and (robot is None or config.stage or config.wiggle or config.trials):
+        raise SettingsError("--shadow needs --robot, and moves nothing; leave out --stage, --wiggle and --trials")
     if config.i_know and config.stage != "full":
         raise SettingsError("--i-know is for --stage full alone; leave it out")
     if config.robot is None and (config.wiggle or config.motion is not None):

@@ -155,7 +155,7 @@ class Deployment:
             return
         self._flight.record_last_command()
         if ending is None:
-            self.recorder.event("ended at once, by a second signal", ERROR)
+            self.recorder.event("ended at once, by a signal", ERROR)
         else:
             self.recorder.event(ending.reason, ERROR if ending.status in (1, 3, 4) else INFO)
             self.recorder.close()

@@ -11,7 +11,7 @@ from bam_train.checkpoint import Checkpoint
 from bam_train.deploy.agreement import Shadow
 from bam_train.deploy.trials import Subject, TrialRecord, Trials
 from bam_train.env_location import Place
-from bam_train.errors import TrialsNeeded, UntrustedCheckpoint
+from bam_train.errors import SettingsError, TrialsNeeded, UntrustedCheckpoint
 from bam_train.policy import FrozenPolicy
 
 UNSIGNED, UNPROVEN, TRIAL, SHADOW = "UNSIGNED", "UNPROVEN", "trial", "shadow: nothing is sent"
@@ -58,6 +58,7 @@ class Admission:
             AlteredCheckpoint: It is not as it was signed.
             TrialsNeeded: Full speed is asked for, and there are not enough trials.
             BadTrials: The record of trials was edited, or cannot be read.
+            SettingsError: There is a record of trials, and the robot is simulated and not on trial.
         """
         lines = self._signature() if has_real_robot(env) else []
         if place.shadow:
@@ -66,6 +67,8 @@ class Admission:
             self.marks = (*self.marks, SHADOW)
         elif place.robot is not None and place.trial is not None:
             lines += self._stage(place.robot, is_trial=place.trial, simulated=not has_real_robot(env))
+        elif self.record is not None:
+            raise SettingsError("--trials: a simulated robot is on trial only with --stage trial; give that too")
         self.policy = FrozenPolicy.from_checkpoint(self.checkpoint)
         return lines
 

@@ -210,6 +210,7 @@ def main() -> None:
         remedy = "; nothing is recorded from now on" if ring.ready else ". Choose another file"
         why = f"cannot be written: {error.strerror or error}{remedy}"
         if isinstance(error, FileExistsError) and error.filename == head["path"]:
-            why = "a recording is there already. Choose another file"
+            what = "a folder" if Path(head["path"]).is_dir() else "a recording"
+            why = f"{what} is there already. Choose another file"
         ring.fail(f"{head['path']}: {why}")
     os._exit(1)  # Python would try to write again what its buffer still holds

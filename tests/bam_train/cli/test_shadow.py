@@ -157,7 +157,7 @@ def test_nothing_is_sent(run, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    "flags", [(), ("--robot", "ws://a:1", "--stage", "trial"), ("--robot", "ws://a:1", "--wiggle")]
+    "flags", [(), *(("--robot", "ws://a:1", *one) for one in (("--stage", "trial"), ("--wiggle",), ("--trials", "a")))]
 )
 def test_a_shadow_needs_a_robot_and_moves_nothing(run, flags):
     from bam_train.cli.deploy import main
@@ -165,5 +165,5 @@ def test_a_shadow_needs_a_robot_and_moves_nothing(run, flags):
     assert run(main, "a.zip", "--shadow", *flags) == (
         1,
         "",
-        "bam-deploy: --shadow needs --robot, and moves nothing; leave out --stage and --wiggle\n",
+        "bam-deploy: --shadow needs --robot, and moves nothing; leave out --stage, --wiggle and --trials\n",
     )

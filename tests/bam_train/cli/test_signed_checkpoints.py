@@ -244,6 +244,8 @@ def test_a_key_is_secret_and_is_not_overwritten(tmp_path, key):
     with pytest.raises(OutputError, match=r"alice\.key: a key is there already\. Choose another name"):
         make_key(key, "alice")
     (tmp_path / "bob.pub").write_text("")
+    with pytest.raises(OutputError, match=r": a folder is there already\. Choose another name"):
+        make_key(tmp_path, "bob")
     with pytest.raises(OutputError, match=r"bob\.pub: a key is there already"):
         make_key(tmp_path / "bob.key", "bob")
     assert not (tmp_path / "bob.key").exists()

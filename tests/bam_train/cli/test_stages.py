@@ -19,7 +19,7 @@ from bam_train.cli.deploy import main as deploy
 from bam_train.deploy.trials import Subject, TrialRecord, Trials
 from bam_train.deploy.trust import Admission
 from bam_train.env_location import HERE, Place
-from bam_train.errors import BadTrials, TrialsNeeded
+from bam_train.errors import BadTrials, SettingsError, TrialsNeeded
 from bam_train.recording.recording import Recording
 from tests.bam_train.deploy.test_deployment import Driven, raises
 from tests.bam_train.deploy.test_deployment import run as run_deployment
@@ -128,6 +128,9 @@ def test_an_edited_record_is_refused_at_every_stage(admission, tmp_path):
 def test_a_simulated_robot_has_no_stage_unless_one_is_asked_for(admission):
     for place in (HERE, Place(robot=URL, trial=None)):
         one = admission()
+        with pytest.raises(SettingsError, match="a simulated robot is on trial only with --stage trial; give that too"):
+            one(SIMULATED, place)
+        one.record = None
         assert one(SIMULATED, place) == []
         assert (one.marks, one.trials) == ((), None)
 

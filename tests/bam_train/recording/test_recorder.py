@@ -261,6 +261,8 @@ def test_a_file_that_is_there_is_kept(started, tmp_path):
         started()
     assert str(caught.value) == f"{path}: a recording is there already. Choose another file"
     assert path.read_text() == "mine"
+    with pytest.raises(OutputError, match=r": a folder is there already\. Choose another file$"):
+        started(".")
 
 
 def test_files_of_the_folder_it_is_started_in_hide_nothing(started, tmp_path, monkeypatch):
