@@ -117,7 +117,9 @@ def _foreign(config: EvalConfig, path: Path) -> _Subject:
 
 def _table(report: EvaluationReport, subject: _Subject, path: Path) -> list[str]:
     """The report for people, line by line."""
-    given = ", ".join(f"{name}={value!r}" for name, value in subject.asked.items())
+    from bam_envs.core.wording import brief
+
+    given = ", ".join(f"{name}={brief(value)}" for name, value in subject.env_kwargs.items())
     success = "unknown: the environment does not report is_success"
     if report.success_rate is not None and report.success_interval is not None:
         interval = "95 % interval {:.1%} to {:.1%}".format(*report.success_interval)

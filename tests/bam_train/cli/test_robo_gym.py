@@ -106,5 +106,6 @@ def test_an_evaluation_says_what_it_changed(run):
     run(main, THEIRS / ARM, "--out", "policy.zip")
     status, out, err = run(evaluate, "policy.zip", "--episodes", 1, "--set", "env_kwargs.ee_distance_threshold=9")
     assert (status, err) == (0, "")
-    assert out.splitlines()[0] == f"policy.zip (ppo, 0 steps) on {ARM} with ee_distance_threshold=9"
+    kwargs = "ur_model='ur5', rs_state_to_info=False, parity=True, ee_distance_threshold=9"
+    assert out.splitlines()[0] == f"policy.zip (ppo, 0 steps) on {ARM} with {kwargs}"
     assert out.splitlines()[1].startswith("  success   100.0% (1 of 1")
