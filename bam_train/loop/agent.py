@@ -124,12 +124,12 @@ class Agent(_Base):  # type: ignore[misc]
 
     def get(self, index: str | tuple[str, int]) -> Any:
         """All times of a variable, T x B x ..., or with (name, t) its value at t, B x ...."""
-        workspace = self._workspace()
+        workspace = self.workspace if self.workspace is not None else self._workspace()
         return workspace.get_full(index) if isinstance(index, str) else workspace.get(index[0], index[1])
 
     def set(self, index: str | tuple[str, int], value: Any) -> None:
         """Write all times of a variable, T x B x ..., or with (name, t) its value at t, B x ...."""
-        workspace = self._workspace()
+        workspace = self.workspace if self.workspace is not None else self._workspace()
         if isinstance(index, str):
             workspace.set_full(index, value)
         else:

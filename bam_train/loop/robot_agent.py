@@ -16,6 +16,8 @@ SUCCESS = "info/is_success"
 SAYS_SUCCESS = "info/_is_success"
 """Variable with Gymnasium's mask for it: whether the info has ``is_success``."""
 
+_FLAGS = np.array([False]), np.array([True])
+
 
 class RobotAgent(Agent):
     """Resets the environment at t = 0, and steps it at t > 0 with the action of t - 1.
@@ -98,14 +100,15 @@ class RobotAgent(Agent):
             "reward": np.array([float(reward)]),
             "cumulated_reward": np.array([self._total]),
             "timestep": np.array([self._steps]),
-            "terminated": np.array([bool(terminated)]),
-            "truncated": np.array([bool(truncated)]),
-            "done": np.array([not self._running]),
-            SUCCESS: np.array([bool(info.get("is_success", False))]),
-            SAYS_SUCCESS: np.array(["is_success" in info]),
+            "terminated": _FLAGS[bool(terminated)],
+            "truncated": _FLAGS[bool(truncated)],
+            "done": _FLAGS[not self._running],
+            SUCCESS: _FLAGS[bool(info.get("is_success", False))],
+            SAYS_SUCCESS: _FLAGS["is_success" in info],
         }
+        put = self.workspace.set  # copies the arrays
         for name, value in values.items():
-            self.set((self.output + name, t), value)
+            put(self.output + name, t, value)
 
 
 def robot_of(env: gym.Env[Any, Any]) -> Any:

@@ -162,21 +162,21 @@ class ArmGeometry:
         Returns:
             Joint positions [rad], the last of which follows `yaw` without a jump. Shape: (n, 6).
         """
-        x, y, z = _columns(position)
+        return _rows(*self.joints_down(*_columns(position), *_columns(yaw[:, None])))
+
+    def joints_down(self, x: Column, y: Column, z: Column, yaw: Column) -> tuple[Column, ...]:
+        """`reach_down` of columns: of n tool positions (n,) each, or of one in plain numbers."""
         # Seen from above, (radial, d4) turned by q1 is (x, y): the wrist passes beside the base at distance d4.
         radial = np.sqrt(np.maximum(x * x + y * y - self.d4**2, 1e-12))
         q1 = np.arctan2(y, x) - np.arctan2(self.d4, radial)
-        return self._fold(q1, self.d5 - radial, z + self.d6 + self.tool - self.d1, *_columns(yaw[:, None]))
-
-    def _fold(self, q1: Column, radial: Column, height: Column, yaw: Column) -> Array:
-        """Joints 2 to 6 for wrist 1 at (`radial`, `height`) [m] from the shoulder in the plane of `q1`."""
-        reach2 = radial * radial + height * height
-        cosine = (reach2 - self.a2**2 - self.a3**2) / (2 * self.a2 * self.a3)
+        # In that plane: wrist 1 from the shoulder.
+        along, height = self.d5 - radial, z + self.d6 + self.tool - self.d1
+        cosine = (along * along + height * height - self.a2**2 - self.a3**2) / (2 * self.a2 * self.a3)
         q3 = np.arccos(np.minimum(np.maximum(cosine, -1.0), 1.0))
         first = np.arctan2(self.a3 * np.sin(q3), self.a2 + self.a3 * np.cos(q3))
-        q2 = np.arctan2(height, radial) - first
+        q2 = np.arctan2(height, along) - first
         q2 = q2 - 2 * np.pi * np.rint((q2 + np.pi / 2) / (2 * np.pi))  # the branch around -90 degrees
-        return _rows(q1, q2, q3, -np.pi / 2 - q2 - q3, -np.pi / 2, q1 - yaw - np.pi / 2)
+        return q1, q2, q3, -np.pi / 2 - q2 - q3, -np.pi / 2, q1 - yaw - np.pi / 2
 
 
 def _columns(rows: Array) -> Sequence[Column]:
