@@ -39,11 +39,6 @@ class LaserZones(Guard):
                 rays = np.stack([np.cos(bearing), np.sin(bearing)])
                 self._scanners.append((scanner.signal, np.array(scanner.pose[:2])[:, None], rays))
 
-    @property
-    def sees(self) -> bool:
-        """Whether any of its scanners is measured."""
-        return bool(self._scanners)
-
     def limit(self, tick: Tick) -> bool:
         """Reduce the speeds."""
         speed, turn = tick.command[self._drive], tick.command[self._turn]

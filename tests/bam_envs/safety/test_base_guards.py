@@ -76,14 +76,12 @@ def test_a_ray_without_a_distance_is_an_obstacle(ray):
 
 def test_a_base_whose_lasers_are_not_measured_is_not_limited_by_them():
     guard = next(one for one in default_guards(base_spec(with_scans=False)) if one.number == "G12")
-    assert not guard.sees
     assert drive((0.5, 0.0), {}, guard) == [0.5, 0.0]
 
 
 def test_the_lasers_are_where_the_simulated_room_has_them():
     robot = ENVIRONMENTS["bam/mir100-avoidance-v0"].make_robot(1, False, {})
     guard = LaserZones(robot.spec, Limits(), robot.spec.body)
-    assert guard.sees
     robot.connect()
     task = ENVIRONMENTS["bam/mir100-avoidance-v0"].make_task(1, {})
     state = robot.reset(np.arange(1), task.sample_initial(np.arange(1), [np.random.default_rng(0)]))
