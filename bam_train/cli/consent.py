@@ -111,7 +111,8 @@ def required_contract(checkpoint: Checkpoint, env: Any, place: Place, motion: Pa
     if motion is not None:
         from bam_train.deploy.wiggle import recorded_motion
 
-        contract = replace(contract, checks=(*contract.checks, *recorded_motion(motion, env.unwrapped.robot.spec)))
+        lines = recorded_motion(motion, env.unwrapped.robot.spec, place.robot)
+        contract = replace(contract, checks=(*contract.checks, *lines))
     info = None if contract.evidence is None else contract.evidence.info
     if contract.refused or info is None or not info.simulated or motion is not None:
         for line in contract.lines():

@@ -16,6 +16,7 @@ from bam_envs.safety.gate import SafeRobot
 from bam_envs.safety.guard import is_base, measured_places
 from bam_train.deploy.contract_table import Check, check
 from bam_train.deploy.robot_checks import FACTORS, driven
+from bam_train.deploy.trust import SHADOW
 from bam_train.recording.recording import Recording
 
 Array = NDArray[np.float64]
@@ -57,18 +58,25 @@ def wiggle(robot: SafeRobot, joints: Array | None) -> Iterator[Check]:
     yield from _compared(spec, commanded, measured)
 
 
-def recorded_motion(path: Path, spec: RobotSpec) -> Iterator[Check]:
-    """The lines about the motion of each axis in the longest episode of a recording of a live robot of `spec`.
+def recorded_motion(path: Path, spec: RobotSpec, address: str) -> Iterator[Check]:
+    """The lines about the motion of each axis in the longest episode of a recording of the live robot at `address`.
+
+    A recording of another robot, of a simulation, or of a shadow, which sends nothing, is refused.
 
     Raises:
         BadRecording: There is no such recording, or it is of another robot.
     """
     recording = Recording.open(path)
-    robot = recording.metadata.get("robot", "")
-    yield check(f"recording {path.name}", "of a live robot", robot or "of a simulation", fits=bool(robot))
-    states, episodes = recording.states(spec), recording.episodes()
-    if not robot or not episodes:
+    told = recording.metadata
+    found = told.get("address", "") if told.get("robot") else "a simulation"
+    if SHADOW in told.get("marks", ""):
+        found = "a shadow, which sends nothing"
+    fits = found.rstrip("/") == address.rstrip("/")
+    yield check(f"recording {path.name}", address, found, fits=fits)
+    episodes = recording.episodes()
+    if not fits or not episodes:
         return
+    states = recording.states(spec)
     longest = max(episodes, key=len)
     episode = states[longest.start : longest.stop]
     yield from _compared(spec, [one.command[0] for one in episode], [_measured(spec, one) for one in episode])

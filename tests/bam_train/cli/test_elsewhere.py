@@ -269,7 +269,7 @@ def test_a_recording_of_a_simulation_shows_nothing(serve, run, tmp_path):
     served = serve(gym.make("bam/pick-v0", disable_env_checker=True), fast=True)
     status, _, err = run(deploy, PICK, "--robot", served.bus.url, "--motion", file)
     assert status == 3
-    assert "do not fit: recording flight.mcap: expected of a live robot, found of a simulation;" in err
+    assert f"do not fit: recording flight.mcap: expected {served.bus.url}, found a simulation;" in err
 
 
 GRIPPER_REVERSED = """

@@ -12,10 +12,12 @@ from bam_envs.robots.physics.kinematic_base import open_floor
 from bam_envs.robots.ur5e import arm_spec
 from bam_envs.safety.gate import SafeRobot
 from bam_envs.testing.drivers import DrivenRobot
-from bam_train.deploy.wiggle import FAR, motion_checks, wiggle
+from bam_train.deploy.wiggle import FAR, motion_checks, recorded_motion, wiggle
+from bam_train.recording.recorder import Recorder
 
 HOME = np.array([-0.27, -1.54, 1.89, -1.93, -1.57, -1.84])
-ARM = arm_spec("ur5e", with_object=False).command
+SPEC = arm_spec("ur5e", with_object=False)
+ARM = SPEC.command
 
 
 class Wrong(DrivenRobot):
@@ -164,3 +166,19 @@ def test_an_axis_that_goes_elsewhere_does_not_follow():
 
 def test_every_unit_of_a_command_has_its_distance():
     assert {*ARM.units, *base_spec().command.units} == FAR.keys()
+
+
+@pytest.mark.parametrize(
+    ("told", "found"),
+    [
+        ({"robot": ""}, "a simulation"),
+        ({"address": "ws://10.0.0.6:9090"}, "ws://10.0.0.6:9090"),
+        ({"marks": "trial, shadow: nothing is sent"}, "a shadow, which sends nothing"),
+    ],
+)
+def test_a_recording_of_another_robot_or_of_a_shadow_is_refused(tmp_path, told, found):
+    recorder = Recorder(tmp_path / "a.mcap", {"robot": "ur5e", "address": "ws://10.0.0.5:9090", "marks": ""} | told)
+    recorder.start()
+    assert recorder.close() == ""
+    [line] = recorded_motion(recorder.path, SPEC, "ws://10.0.0.5:9090/")
+    assert (line.what, line.found, line.verdict) == ("recording a.mcap", found, "refused")
