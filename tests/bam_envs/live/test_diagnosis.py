@@ -285,6 +285,7 @@ def test_too_few_pings_make_no_profile():
         measured([0.02] * 3).profile()
 
 
+@pytest.mark.slow
 def test_a_delay_of_the_network_is_in_both_directions(server, robot_on, patient):
     delay = 0.03
 

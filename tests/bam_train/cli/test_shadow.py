@@ -81,6 +81,7 @@ def test_a_base_drives_and_turns():
     assert shadow.agreement.mean == pytest.approx((1 + 1 - math.sqrt(0.5)) / 2)
 
 
+@pytest.mark.slow
 def test_the_interval_holds_the_true_mean_in_about_95_of_100_cases():
     """The arm moves at a share d of what is asked for, between -1 and 1: 2d / (1 + d) agree, and none for d < 0."""
     rng, held, true = np.random.default_rng(3), 0, 1 - math.log(2)

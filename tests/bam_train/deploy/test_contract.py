@@ -414,6 +414,7 @@ def places(value, at=()):
         yield from places(one, (*at, key))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(60))
 def test_no_message_stops_the_comparison(seed):
     rng = random.Random(seed)

@@ -37,6 +37,7 @@ def first_promotion(rate, threshold, operators, most):
     return np.where(passed.any(axis=1), passed.argmax(axis=1) + 1.0, math.inf)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("rate", "threshold"), [(0.9, 0.9), (0.85, 0.9), (0.5, 0.5), (0.99, 0.99)])
 def test_at_most_one_in_twenty_is_promoted_wrongly_however_long_operators_go_on(rate, threshold):
     times = first_promotion(rate, threshold, operators=10_000, most=1000)

@@ -199,6 +199,7 @@ except LoopError as error:
 """
 
 
+@pytest.mark.slow
 def test_agents_made_before_torch_was_imported():
     done = subprocess.run([sys.executable, "-c", BEFORE_TORCH], capture_output=True, text=True, check=False)
     text = "Count 'early' was made before torch was imported; import torch first."

@@ -126,6 +126,7 @@ def test_values_without_a_batch(kind):
     assert to_dataframe(ws)["x"].tolist() == [1.0, 2.0]
 
 
+@pytest.mark.slow
 def test_a_picture_for_notebooks_that_does_not_touch_pyplot():
     program = """
 import sys, numpy as np

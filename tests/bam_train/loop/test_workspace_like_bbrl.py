@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from bam_train.loop import Workspace
 
 bbrl_workspace = pytest.importorskip("bbrl.workspace")
+pytestmark = pytest.mark.slow
 
 NAMES = ("a", "b", "env/done")
 SHAPES = {"a": (3,), "b": (3, 2), "env/done": (3,)}

@@ -120,6 +120,7 @@ for k in range(100_000):
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("both", [False, True], ids=["the deployment", "the recorder too"])
 def test_a_kill_loses_almost_nothing(tmp_path, both):
     path = tmp_path / "a.mcap"

@@ -15,7 +15,8 @@ bbrl_gymnasium = pytest.importorskip("bbrl.agents.gymnasium")
 bbrl_workspace = pytest.importorskip("bbrl.workspace")
 
 STEPS = 150
-pytestmark = pytest.mark.filterwarnings("ignore")  # BBRL's, and Gymnasium's checker about the small environments
+# Warnings of BBRL, and of Gymnasium's checker about the small environments.
+pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("ignore")]
 
 
 def play(agent, workspace, act, steps=STEPS, first=0):

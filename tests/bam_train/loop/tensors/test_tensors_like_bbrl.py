@@ -10,6 +10,7 @@ from bam_train.loop.tensors import returns
 
 theirs = pytest.importorskip("bbrl.workspace")
 pytest.importorskip("bbrl.agents")
+pytestmark = pytest.mark.slow
 
 from bbrl import get_arguments, get_class, instantiate_class  # noqa: E402
 from bbrl.agents.dataloader import DataLoaderAgent  # noqa: E402
