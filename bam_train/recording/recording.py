@@ -26,8 +26,8 @@ _ALWAYS = ("/action", "/status", "/latency", "/episode")
 _Rows: TypeAlias = dict[str, list[tuple[int, dict[str, Any]]]]
 """Topic to the time and the content of its messages."""
 _MOST_CHUNK = 2**28  # bytes of a chunk, unpacked: a camera's largest picture is far smaller
-_DAMAGE = (McapError, ZstdError, msgspec.MsgspecError, struct.error, ValueError, LookupError, OverflowError)
-_DAMAGE += (EOFError, MemoryError)  # of a length that makes no sense
+_LENGTH = (LookupError, OverflowError, EOFError, MemoryError)
+_DAMAGE = (McapError, ZstdError, msgspec.MsgspecError, struct.error, ValueError, *_LENGTH)
 _FOREIGN = (msgspec.MsgspecError, ValueError, LookupError, TypeError, OverflowError, RecursionError)
 """Exceptions for the content of messages that we did not write."""
 _decode = msgspec.json.Decoder().decode
