@@ -117,7 +117,12 @@ def _write_new(path: Path, data: bytes, mode: int) -> None:
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         with os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode), "wb") as file:
-            file.write(data)
+            try:
+                file.write(data)
+                file.flush()
+            except OSError:
+                path.unlink()
+                raise
     except FileExistsError as error:
         what = "a folder" if path.is_dir() else "a key"
         raise OutputError(f"{path}: {what} is there already. Choose another name, or move that one away") from error
@@ -218,19 +223,25 @@ def sign(path: Path, key_path: Path) -> Signature:
     signature = key.sign(_signed(public.name, created, _manifest(checkpoint)))
     made = Signature(1, "ed25519", public.name, created, public.text, _base64(signature))
     target = Path(os.path.realpath(checkpoint.path))
-    try:
-        with replacing(target) as temporary, open_zip(target) as source, zipfile.ZipFile(temporary, "w") as archive:
-            for name, info in list_members(target, source).items():
-                if name != SIGNATURE:
-                    with archive.open(copy.copy(info), "w", force_zip64=info.file_size > 2**31) as writer:
-                        for chunk in chunks(target, source, info, checkpoint.manifest.sha256.get(name)):
-                            writer.write(chunk)
-            info = zipfile.ZipInfo(SIGNATURE)
-            info.external_attr = 0o644 << 16
-            archive.writestr(info, msgspec.json.encode(made), zipfile.ZIP_DEFLATED)
-    except OSError as error:
-        raise OutputError(f"{path}: cannot be written: {error.strerror or error}") from error
+    with open_zip(target) as source:
+        try:
+            _copy_signed(target, source, checkpoint, made)
+        except OSError as error:  # inside, as `open_zip` would say that it cannot be read
+            raise OutputError(f"{path}: cannot be written: {error.strerror or error}. Make room beside it") from error
     return made
+
+
+def _copy_signed(target: Path, source: zipfile.ZipFile, checkpoint: Checkpoint, signature: Signature) -> None:
+    """Replace the file by a copy with this signature in the place of the one that it may have."""
+    with replacing(target) as temporary, zipfile.ZipFile(temporary, "w") as archive:
+        for name, info in list_members(target, source).items():
+            if name != SIGNATURE:
+                with archive.open(copy.copy(info), "w", force_zip64=info.file_size > 2**31) as writer:
+                    for chunk in chunks(target, source, info, checkpoint.manifest.sha256.get(name)):
+                        writer.write(chunk)
+        info = zipfile.ZipInfo(SIGNATURE)
+        info.external_attr = 0o644 << 16
+        archive.writestr(info, msgspec.json.encode(signature), zipfile.ZIP_DEFLATED)
 
 
 def verify(checkpoint: Checkpoint, folder: Path) -> Signature:

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from bam_train.checkpoint.manifest import AGAIN, MANIFEST, MOST_MANIFEST
-from bam_train.errors import AlteredCheckpoint, NotACheckpoint
+from bam_train.errors import AlteredCheckpoint, NotACheckpoint, OutputError
 
 CHUNK = 2**20  # bytes read at once
 MOST_MEMBERS = 10_000
@@ -50,6 +50,8 @@ def open_zip(path: Path) -> Iterator[zipfile.ZipFile]:
             raise NotACheckpoint(path, f"lists members in {found} bytes, expected at most {_MOST_DIRECTORY}. {AGAIN}")
         with zipfile.ZipFile(path) as archive:
             yield archive
+    except OutputError:  # an OSError, of whoever writes what is read here
+        raise
     except FileNotFoundError as error:
         raise NotACheckpoint(path, "no such file. Train one with bam-train, or check the name") from error
     except OSError as error:

@@ -62,7 +62,7 @@ class RecordingFile:
         self._new = RecordBuilder()
         """Messages since the last look into the ring."""
         self._begin = self._end = self.file.tell()  # of the small chunks
-        self._metadata("deployment", {key: str(value) for key, value in head["metadata"].items()})
+        self._metadata("deployment", {key: _text(value) for key, value in head["metadata"].items()})
 
     def add(self, record: bytes) -> None:
         """Encode a record of the ring."""
@@ -165,6 +165,11 @@ class RecordingFile:
         self.file.flush()
         os.fsync(self.file.fileno())
         self.file.close()
+
+
+def _text(value: str) -> str:
+    """The text without what UTF-8 cannot have, such as parts of a file name in another encoding."""
+    return value.encode(errors="replace").decode()
 
 
 def nested(values: list[tuple[list[str], Any]]) -> dict[str, Any]:

@@ -3,6 +3,8 @@
 import json
 import os
 import re
+import resource
+import signal
 import time
 import zipfile
 from types import SimpleNamespace
@@ -417,3 +419,21 @@ def test_a_checkpoint_that_is_not_whole_is_not_signed(signed, key):
         sign(signed, key)
     assert signed.read_bytes() == before
     assert [path.name for path in signed.parent.glob("*.zip*")] == [signed.name]
+
+
+def test_a_full_disk_leaves_everything_as_it_was(signed, key, tmp_path):
+    before, names = signed.read_bytes(), sorted(signed.parent.iterdir())
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    handler = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (10, limits[1]))
+    try:
+        with pytest.raises(OutputError) as unsigned:
+            sign(signed, key)
+        with pytest.raises(OutputError, match=r"bob\.key: cannot be written: "):
+            make_key(tmp_path / "bob.key", "bob")
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+        signal.signal(signal.SIGXFSZ, handler)
+    assert str(unsigned.value) == f"{signed}: cannot be written: File too large. Make room beside it"
+    assert (signed.read_bytes(), sorted(signed.parent.iterdir())) == (before, names)
+    assert not (tmp_path / "bob.key").exists()

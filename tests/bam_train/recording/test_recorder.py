@@ -22,6 +22,7 @@ from mcap.stream_reader import StreamReader, breakup_chunk
 from bam_train.errors import OutputError
 from bam_train.recording.recorder import Recorder
 from bam_train.recording.recorder_process import RecordingFile, drain
+from bam_train.recording.recording import Recording
 from bam_train.recording.ring import LAYOUT as LAYOUT_RECORD
 from bam_train.recording.ring import TICK, TIMES, Ring, make_shared_file
 
@@ -264,6 +265,13 @@ def test_a_file_that_is_there_is_kept(started, tmp_path):
     assert path.read_text() == "mine"
     with pytest.raises(OutputError, match=r": a folder is there already\. Choose another file$"):
         started(".")
+
+
+def test_a_file_name_in_another_encoding_is_told(tmp_path):
+    recorder = Recorder(tmp_path / "a.mcap", {"checkpoint": "a\udcff.zip"})
+    recorder.start()
+    assert recorder.close() == ""
+    assert Recording.open(recorder.path).metadata == {"checkpoint": "a?.zip"}
 
 
 def test_files_of_the_folder_it_is_started_in_hide_nothing(started, tmp_path, monkeypatch):
