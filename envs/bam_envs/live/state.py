@@ -93,14 +93,16 @@ class SourceAge:
         self.tag: object = None
         """Tag with the command that it answers; see `bam_envs.ros.freshness.read_echo`."""
         self._quickest, self._wall_ahead = ClockOffset(), wall_ahead
-        self._number, self._newest, self._measured = 0, -math.inf, -math.inf
+        self.number = 0
+        """Number of the newest letter that was read; 0 before the first."""
+        self._newest, self._measured = -math.inf, -math.inf
 
     def look(self, letter: Letter, where: str, server_offset: float | None) -> None:
         """Read stamp and tag of a message of the topic `where`, if it is new; `ProtocolError` for a wrong stamp.
 
         `server_offset` is the local wall clock minus the server's [s]; None if it is not known.
         """
-        if letter.number == self._number:
+        if letter.number == self.number:
             return
         message, arrived = require_message(letter.message, where), letter.arrived
         stamp = read_stamp(message, where)
@@ -114,7 +116,7 @@ class SourceAge:
                 if abs(absolute) < _OTHER_CLOCK:
                     delay = max(delay, absolute)
             self._newest, self._measured = stamp, arrived - delay
-        self.stamp, self.tag, self._number = stamp, tag_text(message), letter.number
+        self.stamp, self.tag, self.number = stamp, tag_text(message), letter.number
 
     def at(self, now: float) -> float:
         """Age [s] at `now`, local monotonic clock; infinite before the first message."""
@@ -221,4 +223,6 @@ class LiveState:
 
     def _look(self, letters: Mapping[str, Letter]) -> None:
         for source in self._heads.values():
-            self._ages[source.signal].look(letters[source.signal], source.topic, self.server_offset())
+            letter, age = letters[source.signal], self._ages[source.signal]
+            if letter.number != age.number:
+                age.look(letter, source.topic, self.server_offset())

@@ -106,9 +106,10 @@ class JointFollowing(Following):
         off = self.off(sent, measured)
         # The farthest that a command may be from a joint at rest.
         allowed, farthest, over = self._slow_allowed if tick.approach else self._allowed, 0.0, False
-        for gap, most in zip(off, allowed, strict=True):
-            size = abs(gap)
-            farthest, over = max(farthest, size), over or size > most
+        if any(off):
+            for gap, most in zip(off, allowed, strict=True):
+                size = abs(gap)
+                farthest, over = max(farthest, size), over or size > most
         if not over and self._tool is not None and farthest > self._tolerance:
             explained = [value + gap for value, gap in zip(measured, off, strict=True)]
             over = math.dist(self._tool(measured), self._tool(explained)) > SHARE * self._tool_reach

@@ -6,6 +6,7 @@ since then.
 
 import math
 from collections.abc import Callable
+from operator import le
 
 import numpy as np
 from numpy.typing import NDArray
@@ -194,6 +195,7 @@ class MeasuredSpeed(Guard):
         self.setting = name.replace(" ", "_")
         self.limit_value, self._speeds = MEASURED_MARGIN * limit, speeds
         self._before: Numbers | None = None
+        self._fastest = 0.0  # of these
 
     def restart(self) -> None:
         """Forget the last tick: the mean needs two."""
@@ -203,7 +205,8 @@ class MeasuredSpeed(Guard):
         """Report the measured speed."""
         now = [abs(speed) for speed in self._speeds(tick)]
         before, self._before = self._before, now
-        if before is None or max(before) + max(now) <= 2 * self.limit_value:
+        fastest_before, self._fastest = self._fastest, max(now)
+        if before is None or fastest_before + self._fastest <= 2 * self.limit_value:
             return None
         fastest = 0.0
         for first, second in zip(before, now, strict=True):
@@ -227,9 +230,8 @@ class MeasuredLimits(Guard):
         """The first number of `state` that is outside its range, as the reason for a stop; or None."""
         for signal in self._watched:
             values = state.signals[signal.name][0].tolist()
-            for value, low, high in zip(values, signal.low, signal.high, strict=True):
-                if not low <= value <= high:  # NaN is not
-                    return self._outside(signal, values)
+            if not (all(map(le, signal.low, values)) and all(map(le, values, signal.high))):  # NaN is not
+                return self._outside(signal, values)
         return None
 
     @staticmethod
