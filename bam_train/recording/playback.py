@@ -8,6 +8,7 @@ import gymnasium as gym
 import numpy as np
 
 from bam_envs.core.errors import RobotFault
+from bam_envs.core.registry import entry_of
 from bam_envs.core.robot_env import RobotEnv
 from bam_envs.robots.replay_robot import ReplayRobot
 from bam_train.checkpoint import Checkpoint
@@ -69,6 +70,9 @@ def replay_env(
         checkpoint.requires_env(recording.metadata["env"])
     env_id, kwargs = environment_of(checkpoint, named)
     kwargs = {name: value for name, value in kwargs.items() if name not in ELSEWHERE}
+    entry, longest = entry_of(env_id), max(map(len, recording.episodes()), default=0) - 1
+    if entry is not None and longest > (kwargs.get("max_episode_steps") or entry.max_episode_steps):
+        kwargs["max_episode_steps"] = -1  # a trial is slow, and its episodes are longer
     env = make_env(env_id, kwargs, render_mode=render_mode)
     inner = env.unwrapped
     if not isinstance(inner, RobotEnv):

@@ -259,6 +259,7 @@ OUT_OF_RANGE = [
     (serve, ["--port", "abc"], "--port: expected a whole number from 0 to 65535, found 'abc'"),
     (train, ["--steps", "0"], "--steps: expected a whole number from 1 to 1000000000000000, found 0"),
     (envs, ["--lst"], "unknown option --lst; there are --json and --help"),
+    (deploy, ["x.zip", "--stage", "trail"], "--stage: expected full or trial, found 'trail'"),
     (envs, ["a", "b"], "unexpected argument b"),
 ]
 

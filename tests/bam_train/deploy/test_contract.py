@@ -388,6 +388,13 @@ def test_what_a_robot_does_not_report_is_not_told():
     }
 
 
+def test_a_simulated_gripper_that_chatters_on_an_object_is_no_wrong_speed():
+    arm = Arm()
+    altered(joint_velocity=lambda x: x + 0.66)(arm)
+    arm.info = RobotInfo("ur5e", simulated=True)
+    assert "joint_velocity against joint_position" not in refused(arm.contract())
+
+
 def test_a_joint_at_zero_does_not_show_its_sense():
     arm = Arm(joints=JOINTS * (1, 1, 1, 1, 1, 0))
     last = arm.contract().checks[-1]

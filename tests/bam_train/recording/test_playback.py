@@ -11,9 +11,14 @@ from mcap.records import Channel, Message, Metadata
 from mcap.stream_reader import StreamReader
 from mcap.writer import Writer
 
+from bam_envs.core.timing import Pacer
 from bam_train.checkpoint import Checkpoint
 from bam_train.cli.deploy import main as deploy
+from bam_train.cli.deploy_display import PlainDisplay
 from bam_train.cli.live.replay import main as replay
+from bam_train.deploy.deployment import Deployment
+from bam_train.deploy.flight import deployment_facts, flight_recorder
+from bam_train.deploy.journal import Journal
 from bam_train.environments import make_env
 from bam_train.errors import BadRecording
 from bam_train.policy import FrozenPolicy
@@ -284,3 +289,22 @@ def test_recorded_pictures_are_there_again(tmp_path):
     recording = Recording.open(recorder.path)
     np.testing.assert_array_equal(list(frames(recording)), [first, first + 1])
     np.testing.assert_array_equal(list(frames(recording, "/pixels/grey")), [np.repeat(first[:, :, :1], 3, axis=2)])
+
+
+def test_an_episode_longer_than_the_environments_is_played_to_its_end(tmp_path):
+    class Still:
+        def reset(self):
+            pass
+
+        def act(self, observation):
+            return np.zeros(5, np.float32)
+
+    path, checkpoint = tmp_path / "slow.mcap", Checkpoint.open(PICK)
+    env = make_env("bam/pick-v0", {"max_episode_steps": 120})  # as on trial, where a robot is slow
+    recorder = flight_recorder(path, env, {**deployment_facts(checkpoint, env), "seed": 0})
+    recorder.start()
+    deployment = Deployment(env, Still(), Pacer(None), Journal(1), recorder=recorder)
+    assert deployment.run(PlainDisplay(deployment.journal, print), seed=0).status == 0
+    recording = Recording.open(path)
+    played = play(recording, replay_env(recording, checkpoint), Still())
+    assert (played.ticks, played.same) == (121, True)
