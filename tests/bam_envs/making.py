@@ -7,7 +7,7 @@ from bam_envs.core.registry import ENVIRONMENTS
 from bam_envs.core.robot import RobotState
 from bam_envs.ros.codec import encode_sink
 
-QUICK = ("bam/pick-v0", "bam/mir100-avoidance-v0", "bam/ur-track-v0")
+QUICK = ("bam/pick-v0", "bam/mir100-avoidance-v0", "bam/ur-empty-v0")
 EACH = [one if one in QUICK else pytest.param(one, marks=pytest.mark.slow) for one in ENVIRONMENTS]
 """Every environment; `make quick` tests an arm with a gripper, a base and an arm alone."""
 

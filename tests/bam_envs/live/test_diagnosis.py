@@ -209,6 +209,7 @@ def test_some_unreadable_states_are_a_warning_and_measured(server, robot_on, pat
     assert 0.0 < diagnosis.measurement.profile().nulls < 1.0
 
 
+@pytest.mark.slow
 def test_a_server_that_passes_no_message_on_and_whose_clock_is_apart(lax, robot_on, patient, monkeypatch):
     monkeypatch.setattr("bam_envs.live.diagnosis.CLOCK_APART", 0.0)
     server = lax()
@@ -222,6 +223,7 @@ def test_a_server_that_passes_no_message_on_and_whose_clock_is_apart(lax, robot_
     assert why.startswith("what is published on /bam/ping does not come back in 2 s")
 
 
+@pytest.mark.slow
 def test_nobody_takes_commands(server, robot_on, patient):
     robot_on(server)
     profile = patient('\n[rename]\n"/forward_position_controller/commands" = "/other/commands"\n')

@@ -69,6 +69,7 @@ def run(env, steps=6, start=START):
     return np.abs(moved).max()
 
 
+@pytest.mark.slow
 def test_an_arm_without_gripper_runs_a_task_that_has_none(server, robot_on, make):
     scripted = robot_on(server, spec=SIX)
     scripted.signals["joint_position"][:] = START

@@ -91,6 +91,7 @@ def test_half_a_period_is_a_whole_one_half_of_the_time():
     assert (numbers(robot.robot.sent)[1] == 2).mean() == pytest.approx(0.5, abs=0.05)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("loss", "burst", "run"), [(0.1, 1.0, 1 / 0.9), (0.1, 4.0, 4.0), (0.4, 1.0, 1 / 0.6)])
 def test_losses_have_their_share_and_come_in_bursts(loss, burst, run):
     robot, _ = started(LinkProfile(AT_ONCE, AT_ONCE, command_loss=loss, burst=burst), 500)

@@ -129,6 +129,7 @@ def test_a_policy_agrees_with_itself_and_not_with_its_opposite(sign, low, high):
 # The program
 
 
+@pytest.mark.slow
 def test_nothing_is_sent(run, monkeypatch):
     """Counted at the bridge: every operation of every client."""
     from bam_envs.remote.serve.serve_options import ServeOptions

@@ -236,6 +236,7 @@ def test_a_real_robot_is_on_trial_unless_something_else_is_asked_for(served, run
     assert "  joint speed (G8): 1 rad/s\n" in err
 
 
+@pytest.mark.slow
 def test_trials_are_run_recorded_and_reported(served, run, monkeypatch, tmp_path):
     monkeypatch.setattr(rosbridge_robot, "read_info", lambda *said: replace(read_info(*said), simulated=False))
     record, recording = tmp_path / "trials.jsonl", tmp_path / "one.mcap"

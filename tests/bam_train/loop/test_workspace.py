@@ -120,6 +120,7 @@ def test_pickled_and_copied(kind, again):
     assert ws.time_size() == 2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("window", [None, 3])
 def test_a_workspace_is_freed_at_once(kind, window):
     """A workspace an epoch is the usual form: they must not wait for the garbage collector."""

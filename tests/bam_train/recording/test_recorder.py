@@ -148,6 +148,7 @@ def test_a_kill_loses_almost_nothing(tmp_path, both):
     assert len(found) > (last - 200 if both else last)  # 1 s; the recorder that lives on loses nothing
 
 
+@pytest.mark.slow
 def test_at_any_moment_the_file_holds_what_was_recorded_a_second_before(started):
     """A copy of the file is what a kill of all processes at that moment leaves."""
     recorder = started()
@@ -167,6 +168,7 @@ def test_at_any_moment_the_file_holds_what_was_recorded_a_second_before(started)
     assert len(found) > 50
 
 
+@pytest.mark.slow
 def test_what_is_a_second_old_is_on_the_disk_itself(tmp_path, monkeypatch):
     """What a power cut leaves is the file as it was at the last `fsync`."""
     synced, path = [(time.monotonic(), b"")], tmp_path / "a.mcap"

@@ -292,6 +292,7 @@ class Large(FakeEnv):
         return np.zeros(12_000_000, np.uint8), {}
 
 
+@pytest.mark.slow
 def test_a_client_that_never_reads_is_dropped_and_holds_up_nobody():
     with TcpServer(EnvServer(Large(), lease=0.0), patience=1.0) as server:
         left = threading.Event()
@@ -362,6 +363,7 @@ def fuzzed(rng, number):
     return [kind, ["s1", 1, number, sent, sent + 10], *[junk(rng) for _ in range(count)]]
 
 
+@pytest.mark.slow
 def test_random_messages_change_nothing(client):
     rng = random.Random(1)
     space = spaces.Dict(

@@ -11,6 +11,8 @@ from bam_envs.robots.physics.rendering import RenderingUnavailable
 from bam_envs.robots.physics.room import LAB
 from bam_envs.robots.physics.shapes import BLUE, RED
 
+pytestmark = pytest.mark.slow
+
 GREEN = (0.0, 1.0, 0.0, 1.0)
 READY = {"joint_position": np.array([[0.0, -2.5, 1.5, 0.0, -1.4, 0.0]])}
 BOXES = np.array([[[-2.0, 0.5, 0.3], [0.0, 0.0, 1.0], [2.0, -0.5, 2.0]]])

@@ -6,6 +6,8 @@ import pytest
 from bam_envs.robots.physics.rendering import MOST_GEOMS, RenderingUnavailable, ShapeRenderer
 from bam_envs.robots.physics.shapes import BLUE, RED, Shape, View, marked, turned
 
+pytestmark = pytest.mark.slow
+
 ABOVE = View((0.0, 0.0, 0.0), 4.0, 90.0, -90.0)
 """Straight from above, x to the right and y up: 45 degrees high, so about 3.3 m over 480 lines at the floor."""
 PIXELS = 480 / (2 * 4.0 * np.tan(np.pi / 8))

@@ -13,6 +13,8 @@ from bam_envs.robots.physics import rendering
 from bam_envs.robots.physics.mujoco_batch import Physics
 from bam_envs.robots.physics.rendering import RenderingUnavailable, find_backend, open_view
 
+pytestmark = pytest.mark.slow
+
 ON_LINUX = pytest.mark.skipif(sys.platform != "linux", reason="elsewhere there is always a display")
 
 

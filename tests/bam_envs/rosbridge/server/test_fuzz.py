@@ -160,6 +160,7 @@ class Fuzzed:
         self.bridge.tick(self.now + 1000)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(3))
 def test_nonsense_is_survived_and_forgotten(seed):
     fuzzed = Fuzzed(seed)
