@@ -87,12 +87,16 @@ def make_key(path: Path, name: str) -> PublicKey:
     """Make a key: the private one at `path`, which only this user can read, and the public one at `public_path`.
 
     Raises:
-        BadKey: `name` is not a name.
+        BadKey: `name` is not a name, or `path` is one for a public key.
         OutputError: One of the files exists, or cannot be written.
     """
     from cryptography.hazmat.primitives import serialization
     from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
+    if path.is_dir():
+        raise OutputError(f"{path}: a folder. Name the private key in it, such as {path / 'alice.key'}")
+    if path.suffix == ".pub":
+        raise BadKey(f"{path}: that is a name for a public key. Give the private one: {path.with_suffix('.key')}")
     _require_name(name)
     key = Ed25519PrivateKey.generate()
     public = PublicKey(name, _base64(key.public_key().public_bytes_raw()))
@@ -124,8 +128,7 @@ def _write_new(path: Path, data: bytes, mode: int) -> None:
                 path.unlink()
                 raise
     except FileExistsError as error:
-        what = "a folder" if path.is_dir() else "a key"
-        raise OutputError(f"{path}: {what} is there already. Choose another name, or move that one away") from error
+        raise OutputError(f"{path}: a key is there already. Choose another name, or move that one away") from error
     except OSError as error:
         raise OutputError(f"{path}: cannot be written: {error.strerror or error}. Choose another place") from error
 
@@ -171,6 +174,8 @@ def read_public_key(path: Path) -> PublicKey:
             text = file.read(_MOST_KEY).decode("ascii", "replace")
     except OSError as error:
         raise BadKey(f"{path}: the public key cannot be read: {error.strerror or error}. Check its name") from error
+    if "PRIVATE KEY-----" in text:
+        raise BadKey(f"{path}: a private key, which stays secret. Give the public one: {public_path(path)}")
     found = re.fullmatch(rf"ed25519 ([A-Za-z0-9+/]{{43}}=) ({_NAME})\s*", text)
     if found is None:
         raise BadKey(f"{path}: expected one line 'ed25519 KEY NAME', as bam-sign keygen writes it. Copy it again")

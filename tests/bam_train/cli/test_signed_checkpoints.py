@@ -246,8 +246,11 @@ def test_a_key_is_secret_and_is_not_overwritten(tmp_path, key):
     with pytest.raises(OutputError, match=r"alice\.key: a key is there already\. Choose another name"):
         make_key(key, "alice")
     (tmp_path / "bob.pub").write_text("")
-    with pytest.raises(OutputError, match=r": a folder is there already\. Choose another name"):
+    with pytest.raises(OutputError, match=r": a folder\. Name the private key in it, such as \S+/alice\.key$"):
         make_key(tmp_path, "bob")
+    with pytest.raises(BadKey, match=r"carl\.pub: that is a name for a public key\. Give the private one: \S+carl\.key$"):
+        make_key(tmp_path / "carl.pub", "carl")
+    assert not list(tmp_path.glob("carl*"))
     with pytest.raises(OutputError, match=r"bob\.pub: a key is there already"):
         make_key(tmp_path / "bob.key", "bob")
     assert not (tmp_path / "bob.key").exists()
@@ -318,6 +321,8 @@ def test_others_must_not_decide_whom_this_computer_trusts(signed, keys):
 
 def test_another_key_of_a_trusted_name_is_refused(tmp_path, keys, key):
     assert trust(public_path(key), keys) == keys / "alice.pub"
+    with pytest.raises(BadKey, match=r"a private key, which stays secret\. Give the public one: \S+alice\.pub$"):
+        trust(key, keys)
     make_key(tmp_path / "other.key", "alice")
     with pytest.raises(BadKey, match=r"another key of that name is trusted\. Remove that file first"):
         trust(tmp_path / "other.pub", keys)
