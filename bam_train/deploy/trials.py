@@ -3,8 +3,9 @@
 The record is a file of JSON lines. A line is written, and is on the disk, before a trial begins, and another one at its
 end: a trial that has only the first one, because the program or the computer was stopped, has failed. Each line carries
 an HMAC of itself and of the line before it; its key, the number of lines and the last HMAC are in a folder that only
-this user can read. So a line that was edited, removed, added or moved is found, at the end of the file too. Part of a
-line at the end, which a crash leaves, is ignored. Whoever can read that folder can write any record.
+this user can read. So a line that was edited, removed, added or moved is found, at the end of the file too; so is an
+emptied file. Part of a line at the end, which a crash leaves, is ignored. Whoever can read that folder can write any
+record.
 
 The test may be looked at after every trial, and ended at any time, because it is a test martingale (J. Ville, 1939;
 I. Waudby-Smith and A. Ramdas, "Estimating means of bounded random variables by betting", 2023). For a success rate of
@@ -138,8 +139,9 @@ class TrialRecord:
         try:
             self.path.parent.mkdir(parents=True, exist_ok=True)
             self._private.mkdir(parents=True, exist_ok=True, mode=0o700)
+            was_there = self.path.exists()
             with _locked(self.path) as file:
-                book = self._read() if os.fstat(file.fileno()).st_size else _Book.new()
+                book = self._read() if was_there or os.fstat(file.fileno()).st_size else _Book.new()
                 file.truncate(book.size)  # without the part of a line that a crash left
                 file.seek(book.size)
                 rows = [row] if book.lines else [{"format": 1, "record": book.name, "created": _now()}, row]
@@ -162,6 +164,7 @@ class TrialRecord:
             with self.path.open("rb") as file:
                 first = file.readline(_MOST)
                 if not first.endswith(b"\n"):
+                    self._require_new()
                     return _Book.new()
                 name = _json(first).get("record")
                 if not (isinstance(name, str) and name.isalnum()):
@@ -169,11 +172,11 @@ class TrialRecord:
                 key, number_saved, last = self._state(name)  # before the lines, to which others may add meanwhile
                 whole = (first + file.read(_MOST)).rpartition(b"\n")[0]
         except OSError as error:
-            what = error.filename or self.path
-            text = f"{what} cannot be read: {error.strerror or error}"
-            raise BadTrials(
-                f"{self.path}: {text}. A record is of use only to the user who made it. {_AGAIN}"
-            ) from error
+            why = f"cannot be read: {error.strerror or error}"
+            if error.filename in (None, self.path, str(self.path)):
+                raise BadTrials(f"{self.path}: {why}. Give another file with --trials") from error
+            text = f"its key {error.filename} {why}. A record is of use only to the user who made it. {_AGAIN}"
+            raise BadTrials(f"{self.path}: {text}") from error
         book = _Book(name, key)
         for number, line in enumerate(whole.split(b"\n"), 1):
             row = _json(line)
@@ -186,6 +189,13 @@ class TrialRecord:
             raise self._bad(f"lines at its end were removed: it had {number_saved}, found {len(book.lines)}")
         book.size = len(whole) + 1
         return book
+
+    def _require_new(self) -> None:
+        """`BadTrials` if there were lines in the file at this path, in which there is none."""
+        for path in self._private.glob("*.json"):
+            state = _json(path.read_bytes())
+            if state.get("path") == str(self.path.resolve()) and state.get("lines"):
+                raise self._bad(f"its lines were removed: it had {state['lines']}")
 
     def _state(self, name: str) -> tuple[bytes, int, str]:
         """Key, number of lines and last HMAC of the record `name`."""
@@ -201,7 +211,8 @@ class TrialRecord:
 
     def _save(self, book: "_Book") -> None:
         """Replace the key, the number of lines and the last HMAC in one step."""
-        state = {"key": book.key.hex(), "lines": len(book.lines), "last": book.last}
+        path, count = str(self.path.resolve()), len(book.lines)
+        state = {"key": book.key.hex(), "lines": count, "last": book.last, "path": path}
         descriptor, temporary = tempfile.mkstemp(dir=self._private)  # with mode 0600
         with os.fdopen(descriptor, "w") as file:
             json.dump(state, file)

@@ -122,7 +122,8 @@ class Recording:
                             topics[one.id] = one.topic
                         yield (topics[one.channel_id], one) if isinstance(one, Message) else one
         except OSError as error:
-            raise BadRecording(f"{self.path}: cannot be read: {error.strerror or error}") from error
+            why = error.strerror or error
+            raise BadRecording(f"{self.path}: cannot be read: {why}. Give a .mcap file of bam-deploy") from error
         except _DAMAGE:
             return  # what was read so far is the recording
 

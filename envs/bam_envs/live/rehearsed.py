@@ -91,9 +91,10 @@ def rehearsed_robot(
         straight: Whether the task moves the tool in straight lines, see `SafeRobot`.
 
     Raises:
-        InvalidValue: There are several robots, no profile has such commands, or a limit is outside its bounds.
+        InvalidValue: There are several robots, the profile has no such commands, or a limit is outside its bounds.
     """
-    chosen = profile_for(robot.spec) if profile is None else load_profile(profile)
+    labels = robot.spec.command.labels
+    chosen = profile_for(robot.spec) if profile is None else load_profile(profile).narrowed(labels)
     tool = getattr(robot.robot, "tool_position", None)  # forward kinematics of an arm that is no UR5e
     limits = profile_limits(chosen).changed(guards or {})
     return SafeRobot(RehearsedRobot(robot), limits=limits, tool_position=tool, straight=straight)

@@ -118,6 +118,8 @@ def link_profile(link: object) -> LinkProfile:
         )
     try:
         return read_table(LinkProfile, msgspec.json.decode(path.read_bytes()), str(link))
+    except InvalidValue as error:
+        raise InvalidValue(str(error).replace("link: ", f"{link}: ", 1)) from error
     except OSError as error:
         raise InvalidValue(
             f"link: {link} cannot be read: {error.strerror or error}. Write it with bam-doctor --measure {link}"

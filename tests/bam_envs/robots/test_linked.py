@@ -214,7 +214,7 @@ def test_a_file_of_a_profile_can_be_read_again(tmp_path):
 @pytest.mark.parametrize(
     ("change", "text"),
     [
-        ({"command_delay": [0.2, 0.1]}, "link: command_delay: expected quantiles in rising order, found [0.2, 0.1]"),
+        ({"command_delay": [0.2, 0.1]}, "{}: command_delay: expected quantiles in rising order, found [0.2, 0.1]"),
         ({"state_delay": [0.1]}, "{}: state_delay: expected a list of 2 to 1001 times from 0 to 60 s, found [0.1]"),
         ({"state_delay": [-1, 0]}, "{}: state_delay[0]: expected a number from 0 to 60, found -1"),
         ({"state_loss": 1.0}, "{}: state_loss: expected a number from 0 to 0.9, found 1.0"),

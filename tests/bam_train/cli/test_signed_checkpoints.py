@@ -248,7 +248,9 @@ def test_a_key_is_secret_and_is_not_overwritten(tmp_path, key):
     (tmp_path / "bob.pub").write_text("")
     with pytest.raises(OutputError, match=r": a folder\. Name the private key in it, such as \S+/alice\.key$"):
         make_key(tmp_path, "bob")
-    with pytest.raises(BadKey, match=r"carl\.pub: that is a name for a public key\. Give the private one: \S+carl\.key$"):
+    with pytest.raises(
+        BadKey, match=r"carl\.pub: that is a name for a public key\. Give the private one: \S+carl\.key$"
+    ):
         make_key(tmp_path / "carl.pub", "carl")
     assert not list(tmp_path.glob("carl*"))
     with pytest.raises(OutputError, match=r"bob\.pub: a key is there already"):

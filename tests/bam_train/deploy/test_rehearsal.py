@@ -112,6 +112,11 @@ def test_the_report_for_people():
             "--rehearse simulates the robot, its link and its time; leave out --motion",
         ),
         (("wifi", "--profile", "ur6e"), "Unknown robot profile 'ur6e'. Did you mean 'ur5e'?"),
+        (
+            ("wifi", "--profile", "ur5e"),
+            "Commands are linear_velocity, angular_velocity, and ur5e takes shoulder_pan_joint, shoulder_lift_joint, "
+            "elbow_joint, wrist_1_joint, wrist_2_joint, wrist_3_joint, gripper_width. Choose another profile.",
+        ),
     ],
 )
 def test_what_cannot_be_rehearsed(run, flags, text):

@@ -197,6 +197,22 @@ def test_a_crash_before_the_first_line(record):
     assert counts(record) == (1, 1)
 
 
+def test_an_emptied_record_is_refused_and_one_that_was_moved_away_begins_again(record):
+    try_it(record, True)
+    moved = record.path.rename(record.path.with_name("old.jsonl"))
+    assert counts(record) == (0, 0)
+    try_it(record, False)
+    record.path.write_bytes(b"")
+    for act in (lambda: counts(record), lambda: try_it(record, True)):
+        with pytest.raises(
+            BadTrials, match=r"its lines were removed: it had 3\. Restore it from a copy"
+        ):
+            act()
+    assert record.path.read_bytes() == b""
+    moved.replace(record.path)
+    assert counts(record) == (1, 1)
+
+
 def test_killed_between_two_lines(record):
     code = (
         "import os, sys; from pathlib import Path; from bam_train.deploy.trials import *\n"
@@ -227,5 +243,7 @@ def test_a_place_where_nothing_can_be_written_is_named(tmp_path):
     record = TrialRecord(tmp_path / "file" / "trials.jsonl", tmp_path / "private")
     with pytest.raises(BadTrials, match=r"the trial cannot be recorded: .*\. Give another file with --trials"):
         Trials(record, PICK, 0.9, {}).begin(0)
-    with pytest.raises(BadTrials, match=r"cannot be read: Not a directory"):
+    with pytest.raises(BadTrials, match=r"cannot be read: Not a directory\. Give another file with --trials$"):
         record._read()
+    with pytest.raises(BadTrials, match=r"cannot be read: Is a directory\. Give another file with --trials$"):
+        counts(TrialRecord(tmp_path, tmp_path / "private"))

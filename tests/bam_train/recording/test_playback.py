@@ -214,7 +214,7 @@ def test_a_damaged_recording_is_read_up_to_the_damage(small_chunks, tmp_path):
 @pytest.mark.parametrize(
     ("content", "why"),
     [
-        (None, "cannot be read: No such file or directory"),
+        (None, "cannot be read: No such file or directory. Give a .mcap file of bam-deploy"),
         (b"", "not a recording of bam-deploy. Give a .mcap file that it wrote"),
         (b"PK\x03\x04 a zip", "not a recording of bam-deploy. Give a .mcap file that it wrote"),
     ],
