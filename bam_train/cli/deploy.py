@@ -10,7 +10,6 @@ import json as json_module
 import math
 import sys
 from contextlib import closing, nullcontext
-from dataclasses import asdict
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -73,7 +72,7 @@ def deploy_checkpoint(config: DeployConfig, signals: SignalMemory) -> int:
 def print_guards(config: DeployConfig, checkpoint: Checkpoint, place: Place) -> int:
     """Print the guards between a live robot and the policy of `checkpoint`; nothing is connected."""
     from bam_envs.core.registry import entry_of
-    from bam_train.deploy.guard_table import guard_lines
+    from bam_train.deploy.guard_table import guard_lines, in_force
     from bam_train.environments import environment_of, make_env
     from bam_train.errors import SettingsError
 
@@ -82,8 +81,10 @@ def print_guards(config: DeployConfig, checkpoint: Checkpoint, place: Place) -> 
         raise SettingsError(f"--print-guards: {env_id} has no robot, and so no guards")
     env = make_env(env_id, env_kwargs, place=place)
     robot: Any = env.unwrapped.robot  # type: ignore[attr-defined]
-    table = {"guards": robot.guards(), "limits": asdict(robot.limits)}
-    tell(*([json_module.dumps(table)] if config.json else guard_lines(robot.guards(), robot.limits)))
+    guards = robot.guards()
+    limits = in_force(guards, robot.limits, robot.spec)
+    table = {"guards": guards, "limits": limits}
+    tell(*([json_module.dumps(table)] if config.json else guard_lines(guards, limits)))
     env.close()  # type: ignore[no-untyped-call]
     return 0
 

@@ -25,7 +25,7 @@ class Agreement:
     """How far a policy agrees with whoever drives: 1 the same motion, 0 the opposite one."""
 
     mean: float | None
-    """Of all ticks in which one of both moves; None without any."""
+    """Of all ticks in which one of both moves; None if the robot moves in none."""
     interval: tuple[float, float] | None
     """95 % interval of the mean; None for less than ten blocks of a second."""
     ticks: int
@@ -42,6 +42,8 @@ class Agreement:
     @property
     def text(self) -> str:
         """For people: ``agreement with whoever drives: 0.83 (0.79 to 0.87) in 412 moving ticks``."""
+        if self.mean is None and self.ticks:
+            return f"agreement with whoever drives: nobody drove; the policy would have moved in {self.ticks} ticks"
         if self.mean is None:
             return f"agreement with whoever drives: nobody moved, nor would the policy, in {self.still} ticks"
         between = "too short for an interval"
@@ -75,7 +77,7 @@ class Shadow:
         self._size = max(1, round(BLOCK / spec.period))
         self._block: list[float] = []
         self._blocks, self._mean, self._squares = 0, 0.0, 0.0  # Welford's, of the means of blocks
-        self._sum, self._ticks, self._still = 0.0, 0, 0
+        self._sum, self._ticks, self._still, self._driven = 0.0, 0, 0, False
 
     def __call__(self, command: Array, before: RobotState, after: RobotState) -> None:
         """Take one tick, as `bam_envs.live.shadow.ShadowRobot.watch`."""
@@ -89,6 +91,7 @@ class Shadow:
         if max(size) < STILL:
             self._still += 1
             return
+        self._driven = self._driven or size[1] >= STILL
         self._take(1.0 - float(np.linalg.norm(p - d)) / sum(size))
 
     def _take(self, agreement: float) -> None:
@@ -108,7 +111,7 @@ class Shadow:
     @property
     def agreement(self) -> Agreement:
         """The agreement so far."""
-        mean = self._sum / self._ticks if self._ticks else None
+        mean = self._sum / self._ticks if self._driven else None
         interval = None
         if mean is not None and self._blocks >= _FEWEST:
             half = _student(self._blocks - 1) * math.sqrt(self._squares / (self._blocks - 1) / self._blocks)

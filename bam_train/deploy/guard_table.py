@@ -1,9 +1,11 @@
 """The table that ``bam-deploy --print-guards`` prints: every guard, and every limit that ``--guard`` changes."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from typing import Any
 
-from bam_envs.safety.guard import BOUNDS, Limits
+from bam_envs.core.robot import RobotSpec
+from bam_envs.safety.guard import BOUNDS, Limits, is_base
 
 BESIDE = (
     "G1   contract, signature  compared and verified before a live robot moves (exit status 3 or 1)",
@@ -16,20 +18,35 @@ BESIDE = (
 """Protection of which the gate is not the place."""
 
 
-def guard_lines(guards: Sequence[Mapping[str, Any]], limits: Limits) -> list[str]:
-    """Lines for people.
+def in_force(guards: Sequence[Mapping[str, Any]], limits: Limits, spec: RobotSpec) -> dict[str, float | None]:
+    """The value of each limit, also where `limits` leave it to the robot; None for a guard that is not there.
 
     Args:
         guards: The guards, from `SafeRobot.guards`.
         limits: The limits of the robot.
+        spec: The robot.
+    """
+    floor = limits.table_height if "m" in spec.command.units and not is_base(spec) else None
+    chosen = {guard["setting"]: guard["limit"] for guard in guards} | {"lag": spec.lag, "box_z_min": floor}
+    return {name: chosen.get(name) if value is None else value for name, value in asdict(limits).items()}
+
+
+def guard_lines(guards: Sequence[Mapping[str, Any]], limits: Mapping[str, float | None]) -> list[str]:
+    """Lines for people.
+
+    Args:
+        guards: The guards, from `SafeRobot.guards`.
+        limits: The value of each limit, from `in_force`.
     """
     rows = [["guard", "", "limit", "set by", "what it does"]]
     for guard in guards:
         limit = "off" if guard["limit"] is None else f"{guard['limit']:.3g} {guard['unit']}"
-        rows.append([guard["number"], guard["name"], limit, guard["setting"] or "-", guard["does"]])
+        names = guard["setting"].split(", ")
+        by = names[0] if len(names) == 1 else f"{names[0].partition('_')[0]}_*"
+        rows.append([guard["number"], guard["name"], limit, by or "-", guard["does"]])
     settings = [["--guard", "now", "least", "most", "unit"]]
     for name, (least, most, unit) in BOUNDS.items():
-        value = getattr(limits, name)
+        value = limits[name]
         settings.append([name, "-" if value is None else f"{value:g}", f"{least:g}", f"{most:g}", unit])
     return [*_aligned(rows), "", "beside the gate", *BESIDE, "", *_aligned(settings)]
 

@@ -147,8 +147,11 @@ def lines_of(recording: Recording) -> list[str]:
         f"{recording.path}: {policy} ({told.get('checkpoint_sha256', '')[:12]}) on {on}{marks}",
         f"{recording.ticks} ticks in {duration(facts['seconds'])}, {end}",
     ]
-    for number, row in enumerate(facts["per_episode"], 1):
+    episodes = facts["per_episode"]
+    for number, row in enumerate(episodes, 1):
         how = {True: "success", False: "no success", None: row["end"]}[row["success"]]
+        if row["end"] == "stopped" and not row["success"]:
+            how = "stopped" if recording.complete or number < len(episodes) else "cut off"
         lines.append(
             f"episode {number} (seed {row['seed']}): {how} after {row['length']} steps, return {row['return']:.2f}"
         )

@@ -79,6 +79,7 @@ class WorkspaceBox(Place):
     """
 
     number, name, unit = "G10", "workspace box", "m"
+    setting = "box_x_min, box_x_max, box_y_min, box_y_max, box_z_min, box_z_max"
 
     def __init__(
         self, spec: RobotSpec, limits: Limits, low: Sequence[float], high: Sequence[float], tool: ToolPoint

@@ -41,7 +41,6 @@ def one(pan, lift=0.0):
         (one(0.5), one(0.25), 2 / 3),
         (one(0.25), one(0.5), 2 / 3),
         (one(0.5), one(0, 0.5), 1 - math.sqrt(0.5)),
-        (one(0.5), one(0), 0.0),
         (one(0.0), one(0.5), 0.0),
     ],
 )
@@ -58,6 +57,16 @@ def test_standing_still_together_says_nothing():
     assert shadow.agreement == Agreement(None, None, 0, 1)
     assert shadow.agreement.text == "agreement with whoever drives: nobody moved, nor would the policy, in 1 ticks"
     assert shadow.agreement.to_json() == {"agreement": None, "interval": None, "ticks": 0, "still": 1}
+
+
+def test_a_robot_that_never_moves_is_driven_by_nobody():
+    shadow = Shadow(ARM, Limits())
+    arm_tick(shadow, one(0.5), one(0))
+    assert shadow.agreement == Agreement(None, None, 1, 0)
+    text = "agreement with whoever drives: nobody drove; the policy would have moved in 1 ticks"
+    assert shadow.agreement.text == text
+    arm_tick(shadow, one(0.5), one(0.5))
+    assert (shadow.agreement.mean, shadow.agreement.ticks) == (0.5, 2)
 
 
 def test_a_motion_is_compared_with_what_was_asked_for_a_lag_before():
@@ -151,7 +160,7 @@ def test_nothing_is_sent(run, monkeypatch):
         flags = ("--robot", served.bus.url, "--shadow", "--episodes", 1, "--no-record")
         status, out, err = run(main, checkpoint, *flags)
     assert (status, ", shadow: nothing is sent\n" in err) == (0, True), err
-    assert "agreement with whoever drives: 0." in out
+    assert "agreement with whoever drives: nobody drove; the policy would have moved in 100 ticks" in out
     assert operations == {
         ("subscribe", None),
         *(("call_service", name) for name in ("/rosapi/get_time", "/rosapi/topic_type", "/bam/robot")),

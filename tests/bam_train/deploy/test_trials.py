@@ -204,9 +204,7 @@ def test_an_emptied_record_is_refused_and_one_that_was_moved_away_begins_again(r
     try_it(record, False)
     record.path.write_bytes(b"")
     for act in (lambda: counts(record), lambda: try_it(record, True)):
-        with pytest.raises(
-            BadTrials, match=r"its lines were removed: it had 3\. Restore it from a copy"
-        ):
+        with pytest.raises(BadTrials, match=r"its lines were removed: it had 3\. Restore it from a copy"):
             act()
     assert record.path.read_bytes() == b""
     moved.replace(record.path)

@@ -192,6 +192,7 @@ def test_a_recording_cut_anywhere_is_readable(small_chunks, tmp_path, capsys):
     assert call(replay, path) == 0
     lines = capsys.readouterr().out.splitlines()
     assert lines[1].endswith(" s, its end is missing: it was cut off or damaged")
+    assert [line for line in lines if " (seed 100000" in line][-1].split(": ")[1].startswith("cut off after ")
     played = Recording.open(path).ticks
     assert 20 < played < 70
     assert lines[-1] == f"played: the same observation in {played} of {played} ticks, the same action in {played}"
