@@ -72,11 +72,7 @@ def _private(settings: TrainSettings) -> Iterator[None]:
     before = set(psutil.Process().children())
     with (
         _new_folder() as folder,
-        # Called from the last to the first; two of Ray's processes would run for a minute. Once the raylet is gone, Ray
-        # ends this process with status 1.
-        at_quit(lambda: _kill(_started_since(before))),
-        at_quit(lambda: shutil.rmtree(folder, ignore_errors=True)),
-        at_quit(lambda: _kill([one for one in _started_since(before) if one.name() != "raylet"])),
+        at_quit(lambda: _kill_at_once(before, folder)),
         _private_token(),
     ):
         try:
@@ -128,6 +124,24 @@ def _started_since(before: set[Any]) -> list[Any]:
         with contextlib.suppress(psutil.Error):
             started.update(child.children(recursive=True))
     return list(started)
+
+
+def _kill_at_once(before: set[Any], folder: str) -> None:
+    """Kill the processes that are not in `before`, some of which would run for a minute, and remove `folder`.
+
+    The raylet is suspended first and killed last: it would end when its agents do, and Ray then ends this process with
+    status 1.
+    """
+    started = _started_since(before)
+    raylets = []
+    for process in started:
+        with contextlib.suppress(psutil.Error):
+            if process.name() == "raylet":
+                process.suspend()
+                raylets.append(process)
+    _kill([process for process in started if process not in raylets])
+    shutil.rmtree(folder, ignore_errors=True)
+    _kill(raylets)
 
 
 def _kill(processes: list[Any]) -> None:

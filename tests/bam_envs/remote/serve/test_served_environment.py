@@ -1,4 +1,5 @@
 import threading
+import time
 
 import gymnasium as gym
 import numpy as np
@@ -198,7 +199,11 @@ def test_through_somebody_elses_server(serve_env, link, transport):
         client = link(theirs.url)
         send(client, served.env.unwrapped.robot.state.signals["joint_position"][0], "/lab")
         wait_for(lambda: served.lease.holder == "a sender without a name", client)
-    assert any("It is tried again until it is back; the robot rests meanwhile." in line for line in served.lines)
+    down = "It is tried again until it is back; the robot rests meanwhile."
+    end = time.monotonic() + 10.0
+    while not any(down in line for line in served.lines):
+        assert time.monotonic() < end, served.lines
+        time.sleep(0.01)
 
 
 def test_a_robot_that_is_there_already_is_not_doubled(serve_env):
