@@ -27,6 +27,7 @@ from typing import Any
 from mcap.exceptions import McapError
 from mcap.records import Channel, Message
 from mcap.stream_reader import StreamReader
+from zstandard import ZstdError
 
 from bam_envs.testing.robot_cell import CellLog, Network, RobotCell, StateFault
 from bam_train.checkpoint import Checkpoint
@@ -327,9 +328,10 @@ def judge(log: CellLog, start: float, ended: float, back: float | None, watchdog
 
 
 def read_recording(path: Path) -> Recorded:
-    """What is readable of a recording, also of one that was cut."""
+    """What is readable of a recording, also of one that was cut, or is written meanwhile."""
     topics, ticks, events = dict[int, str](), list[float](), list[str]()
-    with contextlib.suppress(FileNotFoundError, McapError, struct.error), path.open("rb") as file:
+    damage = (McapError, ZstdError, struct.error, ValueError, EOFError, OverflowError, MemoryError)
+    with contextlib.suppress(FileNotFoundError, *damage), path.open("rb") as file:
         for record in StreamReader(file).records:
             if isinstance(record, Channel):
                 topics[record.id] = record.topic

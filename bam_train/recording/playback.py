@@ -94,7 +94,7 @@ def play(recording: Recording, env: gym.Env[Any, Any], policy: Any, shown: Calla
         policy: Has ``reset()`` and ``act(observation)``.
         shown: Called at each tick, to take a picture.
     """
-    played, seed = Played(), int(recording.metadata.get("seed", 0))
+    played, seed = Played(), _seed(recording)
     observed, [acted] = recording.arrays("observation"), recording.arrays("action").values()
     for number, ticks in enumerate(recording.episodes()):
         policy.reset()
@@ -114,6 +114,13 @@ def play(recording: Recording, env: gym.Env[Any, Any], policy: Any, shown: Calla
                     f"{ticks[-1] - ticks[0]}; play it with the versions in its metadata"
                 )
     return played
+
+
+def _seed(recording: Recording) -> int:
+    text = recording.metadata.get("seed", "0")
+    if not text.isdecimal():
+        raise BadRecording(f"{recording.path}: its metadata says seed {text!r}, which is no number. Get the file again")
+    return int(text)
 
 
 def play_observations(recording: Recording, policy: Any) -> Played:

@@ -59,6 +59,9 @@ _RESET_TIMEOUT = 3.0
 """Longest wait for a fresh state, or for a scene to be set [s]."""
 _HALT_WAITS = 0.05
 """Longest wait of a halt for a command that is being sent, so that the halt arrives after it [s]."""
+_LEAD, _LEAD_DECAY = 0.1, 0.95
+"""A step ends before its deadline by the longest time that a recent command took to compute, at most by this share of a
+period; at each tick the memory of that longest time fades by this factor."""
 _BY_HAND = "stop it by hand if it moves; a robot with a command timeout stops by itself"
 _NOTHING_SENT = ". Nothing was sent, and nothing is kept"
 _FAR, _CANNOT_BE_FAR = 0.3, 1.0
@@ -97,6 +100,7 @@ class RosbridgeRobot:
         self._clock, self._state = clock, LiveState(self.profile, self.spec, clock)
         self._readiness: bringup.LiveReadiness | None = None  # of a robot that is real
         self._pacer, self._session = Pacer(self.spec.period, now=clock), bringup.DrivingSession()
+        self._ended_at, self._lead = clock(), 0.0  # of the last step; how long before its deadline the next one ends
         self._command_life = profile.command_life(self.spec.period)
         self._control: RosbridgeLink | None = None
         self._halting: RosbridgeLink | None = None
@@ -306,12 +310,15 @@ class RosbridgeRobot:
         self._require_accepted()
         lockstep = self.info.lockstep  # no time passes between commands: a late one is valid until the wait times out
         life = self._answer_timeout if lockstep else self._command_life
+        if not lockstep:
+            self._await_deadline()
         tag, until = self._session.tagger.next(self._epoch, life), self._clock() + life
         self._pacer.tick()
         self._send(control, values, tag, halts, until)
         self._publish_status(control)
         if not lockstep:
-            self._cut.wait(max(0.0, self._pacer.slack))
+            self._cut.wait(max(0.0, self._pacer.slack - self._lead))
+            self._ended_at = self._clock()
         elif not self._state.await_answer(
             tag.echo, lambda: self._cut.is_set() or bool(self._refusals), self._answer_timeout
         ):
@@ -323,6 +330,14 @@ class RosbridgeRobot:
         self._require_link()
         self._require_accepted()
         return self.measure()
+
+    def _await_deadline(self) -> None:
+        """Wait until the command is due; the next period ends earlier by the time that its computation took."""
+        worked, period = self._clock() - self._ended_at, self.spec.period
+        if worked < period:  # a longer pause is not spent on one command
+            self._lead = min(max(worked, _LEAD_DECAY * self._lead), _LEAD * period)
+        self._cut.wait(max(0.0, self._pacer.slack))
+        self._require_link()
 
     def _send(self, control: RosbridgeLink, command: Array, tag: Tag, halts: int, until: float) -> None:
         """Send every part of `command` (m,), unless there were more than `halts` halts: one came after `step` began.

@@ -206,6 +206,8 @@ class Limits:
                 raise InvalidValue(
                     f"The limit {name} of a live robot must be {least:g} to {most:g} {unit}, not {value:g}."
                 )
+            if value is not None and unit == "ticks" and value % 1:
+                raise InvalidValue(f"The limit {name} counts ticks and must be a whole number, not {value:g}.")
 
 
 BOUNDS: Mapping[str, tuple[float, float, str]] = MappingProxyType(

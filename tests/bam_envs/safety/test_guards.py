@@ -178,6 +178,13 @@ def test_a_profile_cannot_open_a_guard(name):
         assert str(caught.value) == text or (wide and "contradict each other" in str(caught.value))
 
 
+def test_a_count_of_ticks_is_a_whole_number():
+    with pytest.raises(
+        InvalidValue, match=r"^The limit bad_ticks counts ticks and must be a whole number, not 1\.5\.$"
+    ):
+        Limits.of({"bad_ticks": 1.5})
+
+
 def other_arm():
     command = SignalSpec("command", ("a", "b"), ("rad", "rad"), (-3.0, -3.0), (3.0, 3.0), (2.0, 0.5))
     measured = SignalSpec("joint_position", ("a", "b"), ("rad", "rad"), (-3.0, -3.0), (3.0, 3.0))

@@ -292,6 +292,13 @@ def test_recorded_pictures_are_there_again(tmp_path):
     np.testing.assert_array_equal(list(frames(recording, "/pixels/grey")), [np.repeat(first[:, :, :1], 3, axis=2)])
 
 
+def test_a_seed_that_is_no_number_is_refused(pick):
+    recording = Recording.open(pick)
+    recording.metadata["seed"] = "soon"
+    with pytest.raises(BadRecording, match=r"its metadata says seed 'soon', which is no number\. Get the file again$"):
+        play(recording, replay_env(recording, Checkpoint.open(PICK)), None)
+
+
 def test_an_episode_longer_than_the_environments_is_played_to_its_end(tmp_path):
     class Still:
         def reset(self):
