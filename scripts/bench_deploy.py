@@ -317,7 +317,7 @@ def measure_rate(seconds: float, rounds: int) -> Iterator[str]:
             asleep.start()
             bare += [asleep.wait() for _ in range(count)]
         robot.close()
-    late, alone = (100 * float((np.array(one) > LATE).mean()) for one in (ours, bare))
+    late, alone = (100 * float((np.array(lateness) > LATE).mean()) for lateness in (ours, bare))
     p50, p99 = 1e3 * np.percentile(ours, [50, 99])
     text = f"{late:.2f} % late by > 1 ms"
     yield row("100 Hz against the embedded server", text, f"< {LATE_SHARE:g} %", at_most(late, LATE_SHARE))

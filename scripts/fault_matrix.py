@@ -364,8 +364,8 @@ def main() -> None:
     options = parser.parse_args()
     env_id, wrong = Checkpoint.open(options.checkpoint).manifest.env, 0
     is_base = "m/s" in RobotCell(env_id).spec.command.units
-    rows = [one for one in FAULTS if not (is_base and one.name == JOINT)]
-    chosen = [one for one in rows if not options.only or any(text in one.name for text in options.only)]
+    rows = [fault for fault in FAULTS if not (is_base and fault.name == JOINT)]
+    chosen = [fault for fault in rows if not options.only or any(text in fault.name for text in options.only)]
     if not options.json:
         print(f"{'fault':40}{'motion':>9}{'rest':>9}{'end':>9}{'exit':>6}")
     for fault in chosen:

@@ -265,7 +265,7 @@ def verify(checkpoint: Checkpoint, folder: Path) -> Signature:
         raise UntrustedCheckpoint(path, f"is not signed. Sign it with bam-sign sign {path} --key FILE")
     try:
         found = msgspec.json.decode(data, type=Signature)
-        text, raw = (base64.b64decode(one, validate=True) for one in (found.public_key, found.signature))
+        text, raw = (base64.b64decode(encoded, validate=True) for encoded in (found.public_key, found.signature))
     except (msgspec.MsgspecError, ValueError) as error:
         raise AlteredCheckpoint(path, SIGNATURE, f"{SIGNATURE}: {error}. Sign it again") from error
     known = next((key for key in trusted_keys(folder) if key.text == found.public_key), None)

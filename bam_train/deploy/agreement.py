@@ -36,7 +36,7 @@ class Agreement:
     def to_json(self) -> dict[str, Any]:
         """The agreement as JSON values."""
         rounded = None if self.mean is None else round(self.mean, 4)
-        interval = None if self.interval is None else [round(one, 4) for one in self.interval]
+        interval = None if self.interval is None else [round(bound, 4) for bound in self.interval]
         return {"agreement": rounded, "interval": interval, "ticks": self.ticks, "still": self.still}
 
     @property

@@ -83,8 +83,8 @@ def arm_checks(spec: RobotSpec, geometry: ArmGeometry, margin: float, evidence: 
 
 def measured_joints(evidence: Evidence, spec: RobotSpec) -> Array | None:
     """The measured joints (k, 6) [rad], or None if they are outside their range or unreadable."""
-    signal = next(one for one in spec.signals if one.name == "joint_position")
-    source = next(one for one in evidence.sources if one.signal == "joint_position")
+    signal = next(signal for signal in spec.signals if signal.name == "joint_position")
+    source = next(source for source in evidence.sources if source.signal == "joint_position")
     try:
         values = readings(evidence, source, len(signal.labels))[1]
     except ProtocolError:
@@ -97,7 +97,7 @@ def _tool_pose(evidence: Evidence) -> tuple[Pose | None, str]:
     """The measured pose of the tool; or None, and why it is not known."""
     found: dict[str, Array] = {}
     for name, size in (("tool_position", 3), ("tool_quaternion", 4)):
-        source = next((one for one in evidence.sources if one.signal == name), None)
+        source = next((source for source in evidence.sources if source.signal == name), None)
         if source is None:
             continue
         try:

@@ -39,12 +39,12 @@ class Contract:
     @property
     def refused(self) -> tuple[Check, ...]:
         """The lines that do not fit; a robot moves only if there are none."""
-        return tuple(one for one in self.checks if one.verdict == "refused")
+        return tuple(line for line in self.checks if line.verdict == "refused")
 
     def lines(self) -> list[str]:
         """The table for people, with its head; what was refused comes with the whole text."""
         rows = [("what", "expected", "found", "verdict")]
-        rows += [(one.what, one.expected, one.found, one.verdict) for one in self.checks]
+        rows += [(line.what, line.expected, line.found, line.verdict) for line in self.checks]
         widths = [min(_WIDEST, max(len(row[column]) for row in rows)) for column in range(3)]
 
         def cell(text: str, width: int, *, whole: bool) -> str:
@@ -56,7 +56,7 @@ class Contract:
 
     def to_json(self) -> list[dict[str, Any]]:
         """The lines as plain values."""
-        return [asdict(one) for one in self.checks]
+        return [asdict(line) for line in self.checks]
 
     def require(self, who: str, moved: str = "nothing has moved") -> None:
         """Raise `ContractRefused`, which names the first refused line, if there are any.
@@ -74,4 +74,4 @@ class Contract:
 
 def joined(*groups: Iterable[Check]) -> Contract:
     """The contract with the lines of all groups, in order."""
-    return Contract(tuple(one for group in groups for one in group))
+    return Contract(tuple(line for group in groups for line in group))

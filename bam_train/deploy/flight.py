@@ -151,13 +151,13 @@ class RecorderAgent(Agent):
         if self._sent is None:
             return
         (command, state), self._sent = self._sent, None
-        signals = [one for one in self._robot.spec.signals if len(one.labels) <= MOST_BESIDE]
+        signals = [signal for signal in self._robot.spec.signals if len(signal.labels) <= MOST_BESIDE]
         if not self._declared:
-            names = [f"{one.name}.{label}" for one in signals for label in one.labels]
+            names = [f"{signal.name}.{label}" for signal in signals for label in signal.labels]
             commands = [f"command.{label}" for label in self._robot.spec.command.labels]
             self._recorder.declare({"/sent": [*names, *commands, "code", "guard"]}, series=1)
             self._declared = True
-        self._recorder.tick([state.signals[one.name] for one in signals], [*command, *self._status()], series=1)
+        self._recorder.tick([state.signals[signal.name] for signal in signals], [*command, *self._status()], series=1)
 
     def forward(self, t: int, seed: int, **kwargs: Any) -> None:
         """Record the tick."""
@@ -200,9 +200,8 @@ class RecorderAgent(Agent):
         layout, truth = {}, {} if state is None else _numeric(state.truth)
         if state is not None:
             spec = self._robot.spec
-            signals = [
-                f"{one.name}.{label}" for one in spec.signals if one.name in state.signals for label in one.labels
-            ]
+            present = [signal for signal in spec.signals if signal.name in state.signals]
+            signals = [f"{signal.name}.{label}" for signal in present for label in signal.labels]
             layout = {"/state": ["stamp", *signals], "/truth": _named(truth), "/command": list(spec.command.labels)}
         layout["/observation"] = _named(arrays, labels.get("observation"))
         layout["/action"] = _named({"": action}, labels.get("action"))

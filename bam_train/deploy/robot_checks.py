@@ -36,9 +36,9 @@ _SHORTEST = 0.05  # least time over which a speed is compared [s]
 
 def readings(evidence: Evidence, source: Source, size: int) -> tuple[Array, Array]:
     """Arrival times (k,) [s] and values (k, size) [SI] of a signal; `ProtocolError` for an unreadable message."""
-    letters = [one for one in evidence.letters.get(source.topic, ()) if concerns(source, one.message)]
-    values = [decode_source(source, one.message, size) for one in letters]
-    return np.array([one.arrived for one in letters]), np.array(values).reshape(-1, size)
+    letters = [letter for letter in evidence.letters.get(source.topic, ()) if concerns(source, letter.message)]
+    values = [decode_source(source, letter.message, size) for letter in letters]
+    return np.array([letter.arrived for letter in letters]), np.array(values).reshape(-1, size)
 
 
 def robot_checks(profile: RobotProfile, spec: RobotSpec, evidence: Evidence) -> Iterator[Check]:
@@ -98,7 +98,7 @@ def _topic_trouble(
 
 def _timing(profile: RobotProfile, spec: RobotSpec, evidence: Evidence, source: Source) -> Iterator[Check]:
     """Rate and age of the messages of a topic."""
-    letters = [one for one in evidence.letters[source.topic] if concerns(source, one.message)]
+    letters = [letter for letter in evidence.letters[source.topic] if concerns(source, letter.message)]
     allowed = source.max_age or profile.max_age
     least = 1 / allowed if source.max_age else max(1 / allowed, SLOWER / spec.period)
     try:

@@ -62,7 +62,7 @@ class Evidence:
             success = math.log((1 - share * (1 - self.threshold)) / self.threshold)
             logs.append(math.log(weight) + self.successes * success + failures * math.log(share))
         most = max(logs)
-        return math.exp(min(most, 600.0)) * sum(math.exp(one - most) for one in logs)
+        return math.exp(min(most, 600.0)) * sum(math.exp(log - most) for log in logs)
 
     @property
     def is_enough(self) -> bool:
@@ -147,8 +147,8 @@ class TrialRecord:
                 rows = [row] if book.lines else [{"format": 1, "record": book.name, "created": _now()}, row]
                 if not book.lines:
                     self._save(book)  # its key, before the first line
-                for one in rows:
-                    file.write(book.add(one))
+                for new_row in rows:
+                    file.write(book.add(new_row))
                 file.flush()
                 os.fsync(file.fileno())
                 self._save(book)

@@ -61,7 +61,7 @@ def read_urdf(text: object) -> Urdf:
         raise FormatError("the robot's description is no URDF")
     try:
         root = ElementTree.fromstring(text)  # without declarations there is nothing to expand
-        return Urdf({str(one.get("name")): _joint(one) for one in root.findall("joint")})
+        return Urdf({str(element.get("name")): _joint(element) for element in root.findall("joint")})
     except (ElementTree.ParseError, ValueError, AttributeError) as error:
         raise FormatError(f"the robot's description is no URDF: {error}") from error
 
@@ -84,7 +84,7 @@ def _joint(element: Any) -> UrdfJoint:
 
 
 def _vector(element: Any, name: str) -> Array:
-    values = np.array([float(one) for one in element.get(name, "0 0 0").split()])
+    values = np.array([float(text) for text in element.get(name, "0 0 0").split()])
     if values.shape != (3,):
         raise ValueError(f"{name} has {len(values)} numbers instead of 3")
     return values

@@ -79,7 +79,7 @@ def recorded_motion(path: Path, spec: RobotSpec, address: str) -> Iterator[Check
     states = recording.states(spec)
     longest = max(episodes, key=len)
     episode = states[longest.start : longest.stop]
-    yield from _compared(spec, [one.command[0] for one in episode], [_measured(spec, one) for one in episode])
+    yield from _compared(spec, [state.command[0] for state in episode], [_measured(spec, state) for state in episode])
 
 
 def _compared(spec: RobotSpec, commands: Sequence[Array], measured: Sequence[Array]) -> Iterator[Check]:

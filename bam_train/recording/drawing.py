@@ -43,14 +43,14 @@ def plot(recording: Recording, path: Path) -> None:
         raise BadRecording(f"{recording.path}: no whole tick is in it; there is nothing to draw")
     figure = Figure(figsize=(10, 0.8 + 1.7 * len(rows)), layout="constrained")
     axes = figure.subplots(len(rows), 1, sharex=True, squeeze=False)[:, 0]
-    for one, (name, draw) in zip(axes, rows, strict=True):
-        draw(one)
-        one.set_ylabel(name, fontsize="small")
-        one.grid(alpha=0.3)
+    for panel, (name, draw) in zip(axes, rows, strict=True):
+        draw(panel)
+        panel.set_ylabel(name, fontsize="small")
+        panel.grid(alpha=0.3)
         for ticks in recording.episodes()[1:]:
-            one.axvline(_seconds(recording, "/episode")[ticks[0]], color="grey", linewidth=0.8, linestyle=":")
-        if one.get_legend_handles_labels()[1]:
-            one.legend(loc="center left", bbox_to_anchor=(1, 0.5), fontsize="x-small")
+            panel.axvline(_seconds(recording, "/episode")[ticks[0]], color="grey", linewidth=0.8, linestyle=":")
+        if panel.get_legend_handles_labels()[1]:
+            panel.legend(loc="center left", bbox_to_anchor=(1, 0.5), fontsize="x-small")
     axes[0].set_title(f"{recording.path.name}: {recording.metadata.get('env', '')}", fontsize="medium")
     axes[-1].set_xlabel("time [s]")
     try:

@@ -117,10 +117,10 @@ class Recording:
             with self.path.open("rb") as file:
                 limit = max(1, self.path.stat().st_size)
                 for record in StreamReader(file, emit_chunks=True, record_size_limit=limit).records:
-                    for one in _unpacked(record):
-                        if isinstance(one, Channel):
-                            topics[one.id] = one.topic
-                        yield (topics[one.channel_id], one) if isinstance(one, Message) else one
+                    for part in _unpacked(record):
+                        if isinstance(part, Channel):
+                            topics[part.id] = part.topic
+                        yield (topics[part.channel_id], part) if isinstance(part, Message) else part
         except OSError as error:
             why = error.strerror or error
             raise BadRecording(f"{self.path}: cannot be read: {why}. Give a .mcap file of bam-deploy") from error
@@ -182,8 +182,8 @@ class Recording:
         state, command, known = self._table("/state"), self._table("/command"), self.arrays("truth")
         try:
             signals = {
-                one.name: np.stack([state.column(f"{one.name}.{label}") for label in one.labels], axis=1)
-                for one in spec.signals
+                signal.name: np.stack([state.column(f"{signal.name}.{label}") for label in signal.labels], axis=1)
+                for signal in spec.signals
             }
             commands = np.stack([command.column(label) for label in spec.command.labels], axis=1)
         except ValueError as error:

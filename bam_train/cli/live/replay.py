@@ -165,7 +165,7 @@ def lines_of(recording: Recording) -> list[str]:
 def _event_lines(recording: Recording) -> list[str]:
     events = recording.events
     begin = events[0].time if events else 0
-    texts = [f"{(one.time - begin) / 1e9:.2f} s: {LEVELS.get(one.level, '')}{one.text}" for one in events]
+    texts = [f"{(event.time - begin) / 1e9:.2f} s: {LEVELS.get(event.level, '')}{event.text}" for event in events]
     half = MOST_EVENTS // 2
     return texts if len(texts) <= MOST_EVENTS else [*texts[:half], f"... {len(texts) - 2 * half} more", *texts[-half:]]
 

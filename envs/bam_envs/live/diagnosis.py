@@ -185,7 +185,7 @@ class Diagnosis:
 
             def share(profile: RobotProfile) -> float:
                 topics = {source.topic for source in profile.state if not source.optional}
-                elsewhere = sum(any(one.endswith(topic) for one in there) for topic in topics)  # in any namespace
+                elsewhere = sum(any(name.endswith(topic) for name in there) for topic in topics)  # in any namespace
                 return (len({namespace + topic for topic in topics} & there) + elsewhere) / len(topics)
 
             self.profile = max((load_profile(name) for name in ("ur5e", *shipped_profiles())), key=share)
@@ -276,8 +276,8 @@ class Diagnosis:
         robot, _ = self._known()
         findings.text.append(f"{len(robot.report())} guards; bam-deploy --print-guards shows them")
         findings.warnings.extend(robot.warnings)
-        spec, newest = robot.spec, {one.source.signal: one.values for one in self._measured().readings}
-        low, high = (np.asarray(one, float) for one in position_range(spec, robot.limits))
+        spec, newest = robot.spec, {reading.source.signal: reading.values for reading in self._measured().readings}
+        low, high = (np.asarray(bound, float) for bound in position_range(spec, robot.limits))
         for place, name, column in measured_places(spec, spec.command.units):
             value, label = float(newest[name][column]), spec.command.labels[place]
             if spec.command.units[place] == "rad" and not low[place] <= value <= high[place]:

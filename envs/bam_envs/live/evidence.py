@@ -88,8 +88,8 @@ def gather(
     """
     narrowed = profile.narrowed(spec.command.labels)
     required = tuple(profile.source(signal.name) for signal in spec.signals)
-    extra = tuple(one for one in profile.state if one.signal in TOOL_POSE and one not in required)
-    longest = max((one.max_age or profile.max_age) for one in required)
+    extra = tuple(source for source in profile.state if source.signal in TOOL_POSE and source not in required)
+    longest = max((source.max_age or profile.max_age) for source in required)
     listen = max(LISTEN, _AGES * longest) if listen is None else listen
     link = RosbridgeLink(endpoint, name="contract")
     try:
@@ -98,14 +98,14 @@ def gather(
         answer = ask(link, service)
         info = None if answer is None else read_info(answer.get("message"), service)
         sinks = (tagged_sinks(narrowed, None) if info is not None else None) or narrowed.sinks()
-        needed = {one.topic: one.type for one in (*required, *sinks)}
-        wanted = {**needed, **{one.topic: one.type for one in extra}, DESCRIPTION: DESCRIPTION_TYPE}
+        needed = {entry.topic: entry.type for entry in (*required, *sinks)}
+        wanted = {**needed, **{source.topic: source.type for source in extra}, DESCRIPTION: DESCRIPTION_TYPE}
         types = _types(link, TopicTypes(link, profile, timeout), wanted, needed, timeout)
         inbox = _Inbox()
-        begun = _listen(link, inbox, wanted, {one.topic for one in sinks}, types)
+        begun = _listen(link, inbox, wanted, {sink.topic for sink in sinks}, types)
         first = {source.topic for source in required} & inbox.letters.keys()
         with inbox.changed:
-            inbox.changed.wait_for(lambda: all(inbox.letters[one] for one in first) or not link.is_up, timeout)
+            inbox.changed.wait_for(lambda: all(inbox.letters[topic] for topic in first) or not link.is_up, timeout)
             inbox.changed.wait_for(lambda: not link.is_up, listen)
             letters = {topic: tuple(found) for topic, found in inbox.letters.items()}
         if not link.is_up:

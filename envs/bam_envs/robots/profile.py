@@ -157,8 +157,8 @@ def _profile(where: str, table: Table) -> RobotProfile:
         raise InvalidValue(f"{where}: limits: {error}") from error
     if file.kind == "base" and file.watchdog == 0.0:
         raise InvalidValue(
-            f"{where}: watchdog = 0 says that the base drives on when it hears nothing, and such a base is not driven: "
-            "give its drive a time-out, of 0.5 s or less, and say it here."
+            f"{where}: watchdog = 0 means that the base keeps driving when commands stop, and such a base is not "
+            "driven: give its drive a time-out of 0.5 s or less, and set it here."
         )
     spec = _robot(where, file)
     state = _state(where, file, spec)

@@ -26,7 +26,7 @@ from bam_envs.safety.guard import (
 ROUNDING = 1 + 1e-9
 """A step that is exactly as long as its limit must not exceed it by floating point rounding."""
 _ROUNDS = 8
-"""Most times that a step is shortened until the tool is slow enough."""
+"""Maximum number of times that a step is shortened until the tool is slow enough."""
 JUMP = 0.05
 """Tolerance of the measured change of a joint beyond its fastest turn [rad]."""
 
@@ -35,7 +35,7 @@ def fastest_joints(spec: RobotSpec, limits: Limits, unlimited: float = math.inf)
     """Maximum speed of each joint (k,) [rad/s], the lower of limit and data sheet; `unlimited` without either."""
     rates = max_rate(spec.command)
     fastest = [min(limits.joint_speed, rates[column]) for column in columns_in(spec.command, "rad")]
-    return [one if math.isfinite(one) else unlimited for one in fastest]
+    return [speed if math.isfinite(speed) else unlimited for speed in fastest]
 
 
 class PositionLimits(Guard):
@@ -89,7 +89,7 @@ class RampIn(Guard):
         self.limit_value, self._joints = limits.reset_speed, columns_in(spec.command, "rad")
         # If nothing limited a joint's speed, a first step of any length would count as near.
         fastest = fastest_joints(spec, limits, limits.reset_speed)
-        self._one_step = [one * spec.period * ROUNDING for one in fastest]
+        self._one_step = [speed * spec.period * ROUNDING for speed in fastest]
         self._longest = math.ceil(limits.ramp_time / spec.period)
         self._left: int | None = None
 
@@ -105,7 +105,7 @@ class RampIn(Guard):
         if tick.approach:
             return shorten(tick, self._joints, reach)
         goal, last = tick.goal, tick.last
-        far = any(abs(goal[at] - last[at]) > one for at, one in zip(self._joints, self._one_step, strict=True))
+        far = any(abs(goal[at] - last[at]) > step for at, step in zip(self._joints, self._one_step, strict=True))
         self._left = 0 if not far else self._longest - 1 if self._left is None else self._left - 1
         return far and shorten(tick, self._joints, reach)
 
@@ -124,7 +124,7 @@ class ToolSpeed(Guard):
     def limit(self, tick: Tick) -> bool:
         """Shorten the step of all joints."""
         last, wanted, reach = self._pick(tick.last), self._pick(tick.command), self.limit_value * tick.period
-        if self._checked == (last, wanted, reach):  # it is asked twice in a tick, and few commands change in between
+        if self._checked == (last, wanted, reach):  # called twice in a tick, and few commands change in between
             return False
         slowed = within_reach(self._tool, last, wanted, reach)
         self._checked = last, slowed, reach
@@ -264,7 +264,7 @@ class GripperSpeed(Guard):
 
 
 class MeasuredJump(Guard):
-    """A joint that is measured farther from its last position than it can have turned is wrongly measured."""
+    """The robot is stopped if a joint's measured position changes by more than its maximum speed allows."""
 
     number, name, unit = "G7", "measured jump", "rad"
 

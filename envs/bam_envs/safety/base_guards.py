@@ -1,4 +1,4 @@
-"""The guards of a base that look at where it is: what its lasers see, and the edge of a rectangle."""
+"""The guards of a base that depend on its surroundings: laser zones, and a workspace rectangle."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -8,21 +8,21 @@ from numpy.typing import NDArray
 
 from bam_envs.core.robot import BaseBody, RobotSpec
 from bam_envs.safety.guard import Guard, Limits, Tick, columns_in, max_rate
-from bam_envs.safety.places import require_room
+from bam_envs.safety.region_guards import require_room
 
 Array = NDArray[np.float64]
 SLOW = 0.3
 """Share of the speed limit between the slow zone and the stop zone."""
-_LOOKS = 20
-"""Number of times within the time to a collision at which the way ahead is looked at."""
+_SAMPLES = 20
+"""Number of moments within `collision_time` at which the path ahead is checked."""
 
 
 class LaserZones(Guard):
-    """A base slows down, and stops, before what its lasers see in the direction in which it drives.
+    """A base slows down and stops before obstacles that its lasers see in its direction of travel.
 
-    It may always turn where it hits nothing, and drive away. It also slows down in proportion if it would hit
-    something sooner than `collision_time`, along the arc that it is told to drive. A ray without a number counts as
-    an obstacle at its scanner.
+    It may always turn where it hits nothing, and drive away. It also slows down in proportion if it would hit an
+    obstacle sooner than `collision_time` along the commanded arc. A NaN in a scan counts as an obstacle at the
+    scanner.
     """
 
     number, name, unit, setting = "G12", "laser zones", "m", "laser_stop"
@@ -51,14 +51,14 @@ class LaserZones(Guard):
         return slowed != speed or share < 1.0
 
     def points(self, signals: Mapping[str, Array]) -> Array:
-        """What the scanners see, in the base's frame [m]. Shape: (2, k)."""
-        seen = [
+        """The points that the scanners see, in the base's frame [m]. Shape: (2, k)."""
+        hits = [
             place + np.clip(np.nan_to_num(signals[name][0]), 0.0, 1e6) * rays for name, place, rays in self._scanners
         ]
-        return np.concatenate(seen, axis=1)
+        return np.concatenate(hits, axis=1)
 
     def _in_zones(self, speed: float, points: Array) -> float:
-        """The allowed part of `speed` [m/s], by the nearest of `points` on the side to which it drives."""
+        """The allowed part of `speed` [m/s], by the nearest of `points` in the direction of travel."""
         if not speed:
             return speed
         way, end = (1.0, self._body.front) if speed > 0.0 else (-1.0, self._body.back)
@@ -75,14 +75,14 @@ class LaserZones(Guard):
         x, y = points[:, np.square(points).sum(axis=0) <= (radius + abs(speed) * self._time) ** 2]
         outside = ~self._touches(x, y)
         x, y = x[outside], y[outside]
-        moments = self._time * np.arange(1, _LOOKS + 1)[:, None] / _LOOKS
+        moments = self._time * np.arange(1, _SAMPLES + 1)[:, None] / _SAMPLES
         angle = turn * moments
         # Along the arc the base is at v t sinc(angle / 2) in the direction angle / 2.
         way = speed * moments * np.sinc(angle / (2 * math.pi))
         dx, dy = x - way * np.cos(angle / 2), y - way * np.sin(angle / 2)
         cos, sin = np.cos(angle), np.sin(angle)
         hits = self._touches(cos * dx + sin * dy, cos * dy - sin * dx).any(axis=1)
-        return float(hits.argmax()) / _LOOKS if hits.any() else 1.0
+        return float(hits.argmax()) / _SAMPLES if hits.any() else 1.0
 
     def _touches(self, x: Array, y: Array) -> NDArray[np.bool_]:
         """Whether points in the base's frame are inside its body."""
@@ -95,7 +95,7 @@ class BaseBox(Guard):
 
     Args:
         spec: The base, whose ``base_pose`` is measured.
-        limits: Its limits, of which acceleration and lag count.
+        limits: Its limits; `base_acceleration` and `lag` are used.
         low: Lowest x and y of its frame [m].
         high: Highest x and y [m].
 
@@ -114,7 +114,7 @@ class BaseBox(Guard):
         self._delay = spec.period + (spec.lag if limits.lag is None else limits.lag)
 
     def limit(self, tick: Tick) -> bool:
-        """Limit the speed to what leaves room to brake."""
+        """Limit the speed so that the base can brake before the edge."""
         if "base_pose" not in tick.signals:
             return False
         x, y, yaw = tick.signals["base_pose"][0].tolist()

@@ -1,8 +1,8 @@
 """Following (G23): a robot that does not follow its commands is held in place, and stopped if that continues.
 
 A joint follows if it is behind its commands by no more than its known lag at its measured speed. The rest of the gap is
-its jump if whatever holds it lets go. At rest that is at most the joint's limit for one period, so that it never moves
-faster than its limit.
+the distance that it would jump when released. At rest that is at most the joint's limit for one period, so that a
+released joint never moves faster than its limit.
 """
 
 import math
@@ -29,7 +29,7 @@ SHARE = 0.75
 STRIKES = 3
 """Number of times that a robot does not follow until it is stopped; fewer hold it."""
 FORGIVEN = 2.0
-"""Following for this long [s] sets that count back to 0."""
+"""Time of following after which that count is reset to 0 [s]."""
 LIKELY = (
     "look for a protective stop, a paused program, an inactive controller, a low speed slider, or something in its way"
 )
@@ -61,7 +61,7 @@ class Following(Guard):
         for at, (value, oldest, newest) in enumerate(zip(measured, self._sent[0], sent, strict=True)):
             if oldest <= value <= newest or newest <= value <= oldest:
                 continue
-            commands = [one[at] for one in self._sent]
+            commands = [command[at] for command in self._sent]
             low, high = min(commands), max(commands)
             off[at] = low - value if value < low else high - value if value > high else 0.0  # NaN: it is not measured
         return off
@@ -92,8 +92,8 @@ class JointFollowing(Following):
         self._labels = [spec.command.labels[at] for at in self._joints]
         fastest, self._tolerance = fastest_joints(spec, limits, limits.reset_speed), limits.follow_tolerance
         self._fastest = fastest
-        self._step = [one * spec.period for one in fastest]
-        self._slow_step = [min(one, limits.reset_speed) * spec.period for one in fastest]
+        self._step = [speed * spec.period for speed in fastest]
+        self._slow_step = [min(speed, limits.reset_speed) * spec.period for speed in fastest]
         self._reach = [max(step, self._tolerance) for step in self._step]
         self._slow_reach = [max(step, self._tolerance) for step in self._slow_step]
         self._allowed = [SHARE * reach for reach in self._reach]
@@ -115,7 +115,7 @@ class JointFollowing(Following):
             over = math.dist(self._tool(measured), self._tool(explained)) > SHARE * self._tool_reach
         if not self.is_struck(over):
             return None
-        at = max(range(len(off)), key=lambda one: abs(off[one]) / allowed[one])
+        at = max(range(len(off)), key=lambda column: abs(off[column]) / allowed[column])
         return (
             f"{self._labels[at]} does not follow its commands: it is {measured[at] - sent[at]:+.3f} rad from the last "
             f"one, and beyond a lag of {self._lag:g} s it may be {allowed[at]:.3f} rad, and the tool "
@@ -137,7 +137,7 @@ class JointFollowing(Following):
             gap = abs(wanted - measured)
             if not (gap <= reach and gap <= abs(wanted - last) + self._tolerance):
                 break
-        else:  # however little of its gaps the lag explains
+        else:  # near enough even if the lag explains none of the gap
             return False
         for wanted, last, measured, speed, fastest, reach in zip(*rows, strict=True):
             gap = wanted - measured
@@ -180,17 +180,17 @@ class JointFollowing(Following):
 
 
 class BaseFollowing(Following):
-    """A base that does not follow its commands is sent no more speed than it can gain, and then 0."""
+    """Commands stay within reach of the measured speed; a base that does not follow its commands is held."""
 
     def __init__(self, name: str, unit: str, acceleration: float, spec: RobotSpec, limits: Limits) -> None:
         super().__init__(spec, limits)
         self.name, self.unit, rates = name, unit, max_rate(spec.command)
         self._columns = columns_in(spec.command, unit)
         fastest = [min(acceleration, rates[at]) for at in self._columns]
-        self._ahead = [one * (self._lag + spec.period) for one in fastest]
+        self._ahead = [speed * (self._lag + spec.period) for speed in fastest]
         self.limit_value = max(self._ahead)
-        self._change = [one * spec.period for one in fastest]
-        self._allowed = [SHARE * one for one in self._change]
+        self._change = [speed * spec.period for speed in fastest]
+        self._allowed = [SHARE * change for change in self._change]
         self._reached: Numbers | None = None  # speed of a base that follows as well as its acceleration allows
 
     def restart(self) -> None:
@@ -203,8 +203,8 @@ class BaseFollowing(Following):
         sent, measured = [tick.last[at] for at in self._columns], [tick.measured[at] for at in self._columns]
         rows = zip(sent, self._reached or measured, self._change, strict=True)
         self._reached = [min(max(value, before - change), before + change) for value, before, change in rows]
-        off = [abs(one) for one in self.off(self._reached, measured)]
-        if not self.is_struck(any(one > most for one, most in zip(off, self._allowed, strict=True))):
+        off = [abs(gap) for gap in self.off(self._reached, measured)]
+        if not self.is_struck(any(gap > most for gap, most in zip(off, self._allowed, strict=True))):
             return None
         at = off.index(max(off))
         return (

@@ -43,7 +43,7 @@ Observer = Callable[[Tick, RobotState], None]
 GRIPPER_TIME = 1.0
 """Longest wait for the gripper to open before an arm goes to its start pose [s]."""
 GRIPPER_NEAR = 0.002
-"""The gripper is open when it is this near to its widest [m]."""
+"""Tolerance within which a gripper counts as open [m]."""
 FRESH_LOOKS, FRESH_PAUSE = 50, 0.005
 """Number of checks for a fresh state before a motion begins, and the time between two checks [s]."""
 
@@ -58,7 +58,7 @@ class ClearedCommand(metaclass=Sealed):
         raise InvalidValue("Only a SafeRobot clears commands. Build the robot with live_robot(...).")
 
     def __init_subclass__(cls) -> None:
-        raise InvalidValue("Only a SafeRobot clears commands; there is no other kind of ClearedCommand.")
+        raise InvalidValue("Only a SafeRobot clears commands; ClearedCommand has no subclasses.")
 
     def __reduce_ex__(self, protocol: Any) -> NoReturn:
         raise InvalidValue("A cleared command cannot be copied: it is good for one tick.")
@@ -187,11 +187,11 @@ class SafeRobot(metaclass=Sealed):
         if self._live is not None:  # two gates would each allow a whole step
             other = _GUARDED.get(robot)
             if other is not None and other() is not None:
-                raise InvalidValue(f"{self.spec.name} stands behind a SafeRobot already; command it through that one.")
+                raise InvalidValue(f"{self.spec.name} has a SafeRobot already; command it through that one.")
             _GUARDED[robot] = weakref.ref(self)
 
     def __init_subclass__(cls) -> None:
-        raise InvalidValue("A SafeRobot has no other kind: it keeps a robot safe. Give it further guards with guards=.")
+        raise InvalidValue("A SafeRobot has no subclasses: it keeps a robot safe. Give it further guards with guards=.")
 
     def __reduce_ex__(self, protocol: Any) -> NoReturn:
         raise InvalidValue(
@@ -239,7 +239,7 @@ class SafeRobot(metaclass=Sealed):
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """What the guards warn of now: ``"link quality (G16): only 93 of the last 100 ticks ..."``."""
+        """The current warnings of the guards: ``"link quality (G16): only 93 of the last 100 ticks ..."``."""
         return tuple(f"{one.title}: {one.warning}" for one in (*self._further, *self._guards) if one.warning)
 
     @property
@@ -281,7 +281,7 @@ class SafeRobot(metaclass=Sealed):
     def observe(self, observer: Observer) -> None:
         """Call ``observer(tick, state)`` after each command that was sent, with the state that it led to.
 
-        It is called between two commands, so it must be fast, and it must change neither of the two.
+        It is called between two commands, so it must be fast, and it must change neither argument.
         """
         self._observer = observer
 

@@ -21,11 +21,11 @@ from bam_envs.core.validation import check
 
 Array = NDArray[np.float64]
 Numbers = list[float]
-"""One number for each number of the command, or for some of them: lists are several times as quick as short arrays."""
+"""A value for each entry of a command, or for some of them; lists are several times faster than short arrays."""
 ToolPosition = Callable[[Array], Array]
 """Forward kinematics: joints (n, k) [rad] to tool positions (n, 3) [m]."""
 ToolPoint = Callable[[Sequence[float]], tuple[float, float, float]]
-"""The same for one pose: joints (k,) [rad] to the tool's x, y, z [m]."""
+"""Forward kinematics of one pose: joints (k,) [rad] to the tool's x, y, z [m]."""
 LONGEST_PERIOD = 1.0
 """Longest time between two commands to a live robot [s]: a robot may move for that long before the next check."""
 
@@ -33,7 +33,7 @@ LONGEST_PERIOD = 1.0
 TRIAL_SPEED = 0.25
 """Share of the speed limits of a robot on trial."""
 TRIAL_BOX = {"arm": 0.35, "base": 3.0}
-"""How far it may go from where it starts, along each axis [m]."""
+"""Maximum distance of a robot on trial from its start, along each axis [m]."""
 _ABOVE_ZERO = Annotated[float, Meta(gt=0, description="a number above 0")]
 _ANY = Annotated[float, Meta(ge=-sys.float_info.max, le=sys.float_info.max, description="a finite number")]
 _FINITE = Annotated[float, Meta(gt=0, le=sys.float_info.max, description="a finite number above 0")]
@@ -45,8 +45,8 @@ def _limit(default: float | None, least: float, most: float, unit: str, *, finit
     return field(default=default, metadata={"bounds": (least, most, unit), "type": kind if default else kind | None})
 
 
-def _place(default: float | None, least: float, most: float) -> Any:
-    """A limit that is a place [m], of any sign; 0 is a limit like any other."""
+def _coordinate(default: float | None, least: float, most: float) -> Any:
+    """A limit on a coordinate [m], of any sign; 0 is a limit like any other."""
     kind: Any = _ANY
     return field(default=default, metadata={"bounds": (least, most, "m"), "type": kind | None})
 
@@ -74,7 +74,7 @@ class Limits:
     max_age: float | None = _limit(None, 0.01, 1.0, "s")
     """Maximum age of a state [s]; None: 0.1 for an arm, 0.5 for a base."""
     bad_ticks: float = _limit(3, 1.0, 10.0, "ticks")
-    """Number of commands in a row that are not finite after which the robot is stopped."""
+    """Number of consecutive commands with NaN or infinity that stop the robot."""
     hold_time: float = _limit(0.5, 0.05, 2.0, "s")
     """Time for which the robot is held without a fresh state, or without an answer, before it is stopped [s]."""
     max_pause: float = _limit(1.0, 0.1, 5.0, "s")
@@ -94,58 +94,58 @@ class Limits:
     reset_timeout: float = _limit(30.0, 0.1, 300.0, "s", finite=True)
     """Longest time to reach the start pose [s]."""
     trial_box: float | None = _limit(None, 0.05, 20.0, "m", finite=True)
-    """How far a robot on trial may go from where it starts, along each axis [m]; None: no limit, or on trial 0.35 for
-    an arm, 3 for a base."""
+    """Maximum distance of a robot on trial from its start, along each axis [m]; None: no limit, or on trial 0.35 for an
+    arm, 3 for a base."""
     joint_jerk: float = _limit(500.0, 10.0, 5000.0, "rad/s^3")
     """Maximum jerk of a joint that speeds up [rad/s^3]; at 20 Hz `joint_acceleration` is the lower limit."""
     action_age: float = _limit(0.1, 0.01, 1.0, "s")
-    """Maximum time from a state to the command that rests on it [s]."""
+    """Maximum time from a state to the command computed from it [s]."""
     watchdog: float | None = _limit(None, 0.02, 1.0, "s")
     """Time within which a robot should stop by itself [s], for a warning; None: 0.1 for an arm, 0.5 for a base, or
     two periods if that is longer."""
     late_share: float = _limit(0.05, 0.01, 1.0, "share")
-    """Share of late commands above which there is a warning."""
+    """Share of late commands above which the guard warns."""
     link_warn: float = _limit(0.95, 0.5, 1.0, "share")
-    """Share of ticks with a state and an answer in time below which there is a warning."""
+    """Share of ticks with a state and an answer in time below which the guard warns."""
     link_stop: float = _limit(0.9, 0.5, 1.0, "share")
-    """The same share, below which the robot is stopped."""
+    """Share of ticks with a state and an answer in time below which the robot is stopped."""
     clamp_warn: float = _limit(0.05, 0.01, 1.0, "share")
-    """Share of commands that are changed to keep the robot out of a place above which there is a warning."""
+    """Share of commands changed to keep the robot out of a forbidden region above which the guard warns."""
     clamp_stop: float = _limit(0.2, 0.01, 1.0, "share")
-    """The same share, above which the robot is stopped."""
+    """Share of commands changed to keep the robot out of a forbidden region above which it is stopped."""
     singularity_slow: float = _limit(17.0, 5.0, 100.0, "condition number", finite=True)
     """Condition number above which an arm slows down, if its task moves the tool along straight lines."""
     singularity_stop: float = _limit(30.0, 6.0, 200.0, "condition number", finite=True)
-    """Condition number that it does not exceed."""
+    """Condition number that such an arm does not exceed."""
     clearance: float = _limit(0.005, 0.002, 0.1, "m", finite=True)
     """Distance that the links of an arm keep from each other and from the table [m]."""
-    table_height: float = _place(0.0, -2.0, 1.0)
+    table_height: float = _coordinate(0.0, -2.0, 1.0)
     """Height of the table in ``base_link`` [m], below which no part of an arm goes."""
-    box_x_min: float = _place(-2.0, -2.5, 2.0)
+    box_x_min: float = _coordinate(-2.0, -2.5, 2.0)
     """Lowest x of the tool [m]."""
-    box_x_max: float = _place(2.0, -2.0, 2.5)
+    box_x_max: float = _coordinate(2.0, -2.0, 2.5)
     """Highest x of the tool [m]."""
-    box_y_min: float = _place(-2.0, -2.5, 2.0)
+    box_y_min: float = _coordinate(-2.0, -2.5, 2.0)
     """Lowest y of the tool [m]."""
-    box_y_max: float = _place(2.0, -2.0, 2.5)
+    box_y_max: float = _coordinate(2.0, -2.0, 2.5)
     """Highest y of the tool [m]."""
-    box_z_min: float | None = _place(None, -2.5, 2.0)
+    box_z_min: float | None = _coordinate(None, -2.5, 2.0)
     """Lowest z of the tool [m]; None: `table_height` if the task commands a gripper, else unlimited."""
-    box_z_max: float = _place(2.0, -1.0, 2.5)
+    box_z_max: float = _coordinate(2.0, -1.0, 2.5)
     """Highest z of the tool [m]."""
     laser_stop: float = _limit(0.3, 0.05, 2.0, "m", finite=True)
-    """Distance from the base, in the direction in which it drives, at which it stops for what its lasers see [m]."""
+    """Distance to an obstacle in the direction of travel at which a base stops [m]."""
     laser_slow: float = _limit(0.4, 0.05, 3.0, "m", finite=True)
-    """Distance at which it drives at 30 % of its speed limit [m]."""
+    """Distance to an obstacle in the direction of travel below which a base drives at 30 % of its speed limit [m]."""
     collision_time: float = _limit(2.0, 0.2, 10.0, "s", finite=True)
-    """Time to a collision with what its lasers see below which a base slows down [s]."""
+    """Time to a collision with an obstacle below which a base slows down [s]."""
 
     def __post_init__(self) -> None:
-        for one in fields(self):
-            value = getattr(self, one.name)
-            number = check(value, one.metadata["type"], f"The limit {one.name}")
+        for limit in fields(self):
+            value = getattr(self, limit.name)
+            number = check(value, limit.metadata["type"], f"The limit {limit.name}")
             if isinstance(value, (np.ndarray, np.generic)):  # an array could be changed after it was checked
-                object.__setattr__(self, one.name, number)
+                object.__setattr__(self, limit.name, number)
 
         for less, more in ORDERED:
             self._require_order(less, more)
@@ -164,7 +164,7 @@ class Limits:
 
         Raises:
             UnknownName: There is no such limit.
-            InvalidValue: One is not above 0, or outside `BOUNDS`, or two contradict each other.
+            InvalidValue: A limit is not above 0, or outside `BOUNDS`, or two contradict each other.
         """
         for name in values:
             if name not in BOUNDS:
@@ -175,7 +175,7 @@ class Limits:
 
     def changed(self, values: Mapping[str, float]) -> Limits:
         """These limits with other `values`, as an operator gives them. Raises the errors of `of`."""
-        current = {one.name: getattr(self, one.name) for one in fields(self)}
+        current = {limit.name: getattr(self, limit.name) for limit in fields(self)}
         limits = Limits.of({**current, **values})
         if "reset_speed" in values:  # in a profile it may be above the speed that a person lowered
             limits._require_order("reset_speed", "joint_speed")
@@ -199,7 +199,7 @@ class Limits:
         )
 
     def require_bounded(self) -> None:
-        """`InvalidValue` if a limit is outside `BOUNDS`, as no limit of a live robot may be."""
+        """`InvalidValue` if a limit is outside `BOUNDS`, which hold for every live robot."""
         for name, (least, most, unit) in BOUNDS.items():
             value = getattr(self, name)
             if value is not None and not least <= value <= most:
@@ -211,7 +211,7 @@ class Limits:
 
 
 BOUNDS: Mapping[str, tuple[float, float, str]] = MappingProxyType(
-    {one.name: one.metadata["bounds"] for one in fields(Limits)}
+    {limit.name: limit.metadata["bounds"] for limit in fields(Limits)}
 )
 """Minimum, maximum and unit of each limit of a live robot: no typing error can disable a guard."""
 ORDERED: tuple[tuple[str, str], ...] = (
@@ -243,14 +243,14 @@ def require_bounded(limits: Limits, spec: RobotSpec) -> None:
         )
     if not 0.0 < spec.period <= LONGEST_PERIOD:
         raise InvalidValue(
-            f"The period of {spec.name} must be above 0 and at most {LONGEST_PERIOD:g} s, not {spec.period:g} s: for "
-            "so long a command may go as far as the limits let it. Command it more often."
+            f"The period of {spec.name} must be above 0 and at most {LONGEST_PERIOD:g} s, not {spec.period:g} s: the "
+            "robot moves for that long without a check. Command it more often."
         )
 
 
 @dataclass(slots=True)
 class Tick:
-    """One command on its way through the guards, m numbers in each list; a guard of a user gets arrays (m,)."""
+    """One command on its way through the guards, with lists of m numbers; a user's guard receives arrays (m,)."""
 
     goal: Numbers
     """Goal of the command; inside the position limits from `PositionLimits` on."""
@@ -277,9 +277,9 @@ class Tick:
     approach: bool = False
     """Whether the robot is on its way to a start pose."""
     action_age: float = 0.0
-    """Time from the state that the command rests on to the command [s]; 0 for a first command, and in lockstep."""
+    """Time from the state to the command computed from it [s]; 0 for a first command, and in lockstep."""
     kept_out: bool = False
-    """Whether the command before was changed to keep the robot out of a place."""
+    """Whether the previous command was changed to keep the robot out of a forbidden region."""
     signals: Mapping[str, Array] = field(default_factory=dict)
     """The newest measured signals, with shape (1, k) each; to be read only."""
 
@@ -308,9 +308,9 @@ class Guard(metaclass=Sealed):
     setting: str = ""
     """Name of the limit in `Limits` that sets `limit_value`; empty for a fixed one."""
     keeps_out: bool = False
-    """Whether it changes commands to keep the robot out of a place, which `KeptOut` counts."""
+    """Whether it changes commands to keep the robot out of a forbidden region, which `ChangedCommands` counts."""
     warning: str = ""
-    """What a person should know before the guard has to act; empty for nothing."""
+    """Warning for the operator, given before the guard acts; empty for none."""
 
     @property
     def title(self) -> str:
@@ -319,7 +319,7 @@ class Guard(metaclass=Sealed):
 
     @property
     def code(self) -> int:
-        """The number of `number`: 8 for ``"G8"``; -1 if it has none."""
+        """`number` as an integer: 8 for ``"G8"``; -1 for a guard without such a number."""
         digits = self.number.removeprefix("G")
         return int(digits) if digits.isdecimal() else -1
 
@@ -330,7 +330,7 @@ class Guard(metaclass=Sealed):
         """Forget faults, when an episode begins or a person resumes the robot."""
 
     def resumed(self) -> None:
-        """A person has ended a stop."""
+        """Called when a person has ended a stop."""
 
     def start_fault(self, start: Numbers) -> str | None:
         """Why an arm must not go to the start pose `start` (m,), or None."""
@@ -341,7 +341,7 @@ class Guard(metaclass=Sealed):
         return None
 
     def hold(self, tick: Tick) -> Numbers:
-        """The command (m,) to an arm if `tick` is not executed: the last one again. Not asked of a guard of a user."""
+        """The command (m,) that holds an arm if `tick` is not executed; not called on a user's guard."""
         return tick.last.copy()
 
     def limit(self, tick: Tick) -> bool:
@@ -361,11 +361,11 @@ def clip(tick: Tick, columns: Sequence[int], low: Numbers, high: Numbers) -> boo
 
 def columns_in(signal: SignalSpec, unit: str) -> list[int]:
     """Indices of the numbers of `signal` that are in `unit`."""
-    return [column for column, one in enumerate(signal.units) if one == unit]
+    return [column for column, column_unit in enumerate(signal.units) if column_unit == unit]
 
 
 def picker(columns: Sequence[int]) -> Callable[[Numbers], Numbers]:
-    """A function that returns the numbers in `columns` of a list; quick where they stand side by side."""
+    """A function that returns the numbers in `columns` of a list; faster for adjacent columns."""
     if columns and list(columns) == list(range(columns[0], columns[-1] + 1)):
         pick: Callable[[Numbers], Numbers] = operator.itemgetter(slice(columns[0], columns[-1] + 1))
         return pick
@@ -384,7 +384,7 @@ def geometry_of(tool_position: ToolPosition) -> ArmGeometry | None:
 
 
 def tool_point_of(tool_position: ToolPosition) -> ToolPoint:
-    """`tool_position` for one pose in plain numbers, which is quicker; quickest for that of an `ArmGeometry`."""
+    """`tool_position` for one pose in plain numbers, which is faster; fastest for that of an `ArmGeometry`."""
     geometry = geometry_of(tool_position)
     if geometry is not None:
         return geometry.tool_point

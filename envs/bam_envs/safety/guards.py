@@ -15,6 +15,7 @@ from bam_envs.core.errors import InvalidValue
 from bam_envs.core.kinematics import UR5E_GRIPPER, UR_JOINTS
 from bam_envs.core.robot import RobotSpec, RobotState, SignalSpec
 from bam_envs.safety import arm_guards as arm
+from bam_envs.safety.arm_tubes import ArmTubes
 from bam_envs.safety.base_guards import LaserZones
 from bam_envs.safety.following import BaseFollowing, JointFollowing
 from bam_envs.safety.guard import (
@@ -35,16 +36,15 @@ from bam_envs.safety.guard import (
 from bam_envs.safety.link_guards import (
     LATE_TICKS,
     ActionAge,
-    KeptOut,
+    ChangedCommands,
     LateTicks,
     LinkQuality,
     RampAfterStop,
     Watchdog,
 )
-from bam_envs.safety.places import Collision, WorkspaceBox
+from bam_envs.safety.region_guards import Collision, WorkspaceBox
 from bam_envs.safety.singularity import Singularity
 from bam_envs.safety.trial_box import TrialBox
-from bam_envs.safety.tubes import ArmTubes
 
 Array = NDArray[np.float64]
 LATE = 2.0
@@ -186,7 +186,7 @@ class BaseAcceleration(Guard):
 
 
 class MeasuredSpeed(Guard):
-    """The measured speed, averaged over two ticks, is at most 1.3 times its limit; a robot that is held slows down."""
+    """The measured speed, averaged over two ticks, is at most 1.3 times its limit; above that the robot is held."""
 
     patience = MEASURED_PATIENCE
 
@@ -195,7 +195,7 @@ class MeasuredSpeed(Guard):
         self.setting = name.replace(" ", "_")
         self.limit_value, self._speeds = MEASURED_MARGIN * limit, speeds
         self._before: Numbers | None = None
-        self._fastest = 0.0  # of these
+        self._fastest = 0.0  # highest speed of the last tick
 
     def restart(self) -> None:
         """Forget the last tick: the mean needs two."""
@@ -273,8 +273,8 @@ def default_guards(
             f"speeds; found {found}."
         )
     moving = _base_guards(spec, limits) if is_base(spec) else _arm_guards(spec, limits, tool_position, straight)
-    # Those that count ticks look at every tick, also at one that another guard does not execute.
-    counting = [LateTicks(spec, limits), LinkQuality(spec, limits), KeptOut(limits)]
+    # Guards that count ticks come first: they count every tick, also one that another guard does not execute.
+    counting = [LateTicks(spec, limits), LinkQuality(spec, limits), ChangedCommands(limits)]
     first = [Finite(spec, limits), Freshness(spec, limits), Pace(spec, limits), ActionAge(limits)]
     watched = [Answers(spec, limits), Watchdog(spec, limits)]
     return [Shape(spec), *counting, *first, *watched, *moving, MeasuredLimits(spec)]
@@ -304,20 +304,20 @@ def _arm_guards(spec: RobotSpec, limits: Limits, tool_position: ToolPosition | N
     if math.isfinite(limits.joint_acceleration):
         smooth = [arm.JointAcceleration(spec, limits), arm.JointJerk(spec, limits)]
     speed = [arm.JointSpeed(spec, limits), arm.RampIn(spec, limits), RampAfterStop(spec, limits), *tool]
-    singular, kept_out = _place_guards(spec, limits, position, straight)
+    singular, kept_out = _region_guards(spec, limits, position, straight)
     # The tool's speed is limited twice: joints that change their speed one by one can speed the tool up.
     last = [*smooth, *tool, JointFollowing(spec, limits, position), *singular, *kept_out]
     return [*measured, arm.PositionLimits(spec, limits), *gripper, *speed, *last]
 
 
-def _place_guards(
+def _region_guards(
     spec: RobotSpec, limits: Limits, position: ToolPosition | None, straight: bool
 ) -> tuple[list[Guard], list[Guard]]:
-    """The guards that keep an arm out of singularities, and out of places: none whose geometry is not known."""
+    """The guards of an arm against singularities, and against forbidden regions; none if its geometry is unknown."""
     if position is None:
         return [], []
     has_gripper, least = "m" in spec.command.units, limits.box_z_min
-    if least is None:  # without a gripper the tool is only assumed
+    if least is None:  # without a gripper the length of the tool is an assumption
         least = limits.table_height if has_gripper else -math.inf
     low, high = (limits.box_x_min, limits.box_y_min, least), (limits.box_x_max, limits.box_y_max, limits.box_z_max)
     kept_out: list[Guard] = [WorkspaceBox(spec, limits, low, high, tool_point_of(position))]

@@ -1,6 +1,6 @@
-"""The guards of the link and of the rhythm: late actions, late ticks, a bad link, a robot kept out of places, stops.
+"""The guards of timing and link: late actions, late ticks, link quality, changed commands, watchdog, ramp after a stop.
 
-Some of them warn before they stop the robot: their `warning` stands until its cause is gone.
+Some of them warn before they stop the robot: their `warning` is set until its cause is gone.
 """
 
 from collections import deque
@@ -10,9 +10,9 @@ from bam_envs.safety.arm_guards import fastest_joints, shorten
 from bam_envs.safety.guard import Guard, Limits, Tick, clip, columns_in, is_base
 
 TICKS = 100
-"""Shares of ticks are of the last 100."""
+"""Number of recent ticks of which shares are computed."""
 LATE_TICKS = 10
-"""This many late commands in a row stop the robot."""
+"""Number of consecutive late commands that stop the robot."""
 _LATE_BY = 0.1
 """A tick is late if it comes more than this share of a period after its time; at least `_JITTER`."""
 _JITTER = 0.005
@@ -20,7 +20,7 @@ _JITTER = 0.005
 
 
 class ActionAge(Guard):
-    """A command is sent while the state that it rests on is new; a later one is not executed."""
+    """A command is sent only while the state that it was computed from is recent; a later one is not executed."""
 
     number, name, unit, setting, patience = "G4", "action age", "s", "action_age", LATE_TICKS
 
@@ -32,7 +32,7 @@ class ActionAge(Guard):
         if tick.action_age <= self.limit_value:
             return None
         return (
-            f"the command came {tick.action_age:.3f} s after the state that it rests on, and at most "
+            f"the command came {tick.action_age:.3f} s after the state that it was computed from, and at most "
             f"{self.limit_value:g} s are allowed: the policy takes too long, or the computer is busy"
         )
 
@@ -43,14 +43,14 @@ class Share(Guard):
     unit = "share of 100 ticks"
 
     def __init__(self) -> None:
-        self._tick, self._counted = 0, deque[int]()  # number of this tick, and of those that count
+        self._tick, self._counted = 0, deque[int]()  # numbers of the current tick, and of the counted ones
 
     def is_counted(self, tick: Tick) -> bool:
-        """Whether `tick` is one of those to count."""
+        """Whether `tick` is counted."""
         raise NotImplementedError
 
     def forgive(self) -> None:
-        """Forget the ticks before."""
+        """Forget the counted ticks."""
         self._counted.clear()
         self.warning = ""
 
@@ -65,7 +65,7 @@ class Share(Guard):
 
 
 class LateTicks(Share):
-    """Commands that come late are counted; too many are a warning; ten in a row stop the robot (command pace)."""
+    """Late commands are counted, and too many give a warning; ten in a row stop the robot: command pace (G15)."""
 
     number, name, setting = "G15", "late ticks", "late_share"
 
@@ -79,7 +79,7 @@ class LateTicks(Share):
         return tick.pause > self._period + self._by
 
     def fault(self, tick: Tick) -> str | None:
-        """Never: it only warns."""
+        """Return None: this guard only warns."""
         late = self.count(tick)
         if late > TICKS * self.limit_value or tick.pause > 2.0 * self._period:
             self.warning = (
@@ -92,7 +92,7 @@ class LateTicks(Share):
 
 
 class LinkQuality(Share):
-    """A link on which too many states are too old, or too many commands are not answered in time, is not driven on."""
+    """The robot is stopped if too many states are too old, or too many commands are not answered in time."""
 
     number, name, setting = "G16", "link quality", "link_stop"
 
@@ -106,7 +106,7 @@ class LinkQuality(Share):
         return not tick.age <= self._max_age or tick.waiting > self._answer
 
     def fault(self, tick: Tick) -> str | None:
-        """Report the share of good ticks, when the link is back: while it is down, others hold the robot."""
+        """Report the number of good ticks once the link is back; while it is down, other guards hold the robot."""
         bad = self.count(tick)
         if not bad:
             self.warning = ""
@@ -121,8 +121,8 @@ class LinkQuality(Share):
         )
 
 
-class KeptOut(Share):
-    """A policy that is kept out of a place again and again does not know where it is, and is stopped."""
+class ChangedCommands(Share):
+    """The robot is stopped if too many commands had to be changed to keep it out of forbidden regions."""
 
     number, name, setting = "G18", "changed commands", "clamp_stop"
 
@@ -131,7 +131,7 @@ class KeptOut(Share):
         self.limit_value, self._warn = limits.clamp_stop, limits.clamp_warn
 
     def is_counted(self, tick: Tick) -> bool:
-        """Whether the command before was changed to keep the robot out of a place."""
+        """Whether the previous command was changed to keep the robot out of a forbidden region."""
         return tick.kept_out
 
     def fault(self, tick: Tick) -> str | None:
@@ -140,30 +140,30 @@ class KeptOut(Share):
         if not changed:
             self.warning = ""
             return None
-        text = f"{changed} of the last {TICKS} commands were changed to keep the robot out of a place"
+        text = f"{changed} of the last {TICKS} commands were changed to keep the robot out of a forbidden region"
         self.warning = text if changed > TICKS * self._warn + 1e-9 else ""
         if changed <= TICKS * self.limit_value + 1e-9:
             return None
-        self.forgive()  # a person who resumes the robot has seen it
+        self.forgive()  # after the stop, the count begins again
         return f"{text}, and {TICKS * self.limit_value:.0f} are allowed: the report names the guards that changed them"
 
 
 class Watchdog(Guard):
-    """The robot itself stops when it hears nothing; this guard only says whether it is known to do so in time."""
+    """A robot should stop by itself when commands stop; this guard only warns if it is not known to do so in time."""
 
     number, name, unit, setting = "G5", "robot's watchdog", "s", "watchdog"
 
     def __init__(self, spec: RobotSpec, limits: Limits) -> None:
         self.limit_value = limits.watchdog or max(0.5 if is_base(spec) else 0.1, 2.0 * spec.period)
-        self._rest = "drives on" if is_base(spec) else "goes on to its last command"
+        self._rest = "keeps driving" if is_base(spec) else "continues to its last command"
 
     def connected(self, watchdog: float | None) -> None:
-        """Take the time after which the robot stops by itself [s]; 0: it never does; None: that is not known."""
+        """Set the warning from the time after which the robot stops by itself [s]; 0: never; None: unknown."""
         if watchdog is None or watchdog == 0.0:
             known = "is not known to stop" if watchdog is None else "does not stop"
             self.warning = (
                 f"the robot {known} by itself: when this computer or the link fails it {self._rest}; keep a hand on "
-                "its emergency stop, and say in its profile after what time it stops (watchdog = 0.1)"
+                "its emergency stop, and set the time after which it stops in its profile (watchdog = 0.1)"
             )
         elif not watchdog <= self.limit_value:
             self.warning = (

@@ -1,4 +1,4 @@
-"""Singularity (G13): an arm that moves its tool along straight lines slows down where its joints cannot follow them."""
+"""Singularity (G13): an arm that moves its tool along straight lines slows down near singularities."""
 
 import math
 from collections.abc import Sequence
@@ -15,10 +15,11 @@ poses of all seven arms, with and without a tool: 1.56, 0.87, 0.41, 0.87 and 0.6
 
 
 class Singularity(Guard):
-    """In a task with straight lines, an arm slows down towards a singularity, and stops before it; back, it is free.
+    """In a task with straight lines, an arm slows down towards a singularity and stops before it.
 
-    The limit is the condition number of the Jacobian, whose lengths are measured in halves of the arm's length. It is
-    computed anew only after the joints have turned far enough, since it was computed last, to reach the limit.
+    The limit is the condition number of the Jacobian, with lengths in halves of the arm's length. It is computed again
+    only when the joints have turned far enough since the last time to reach the limit. Away from the singularity the
+    arm moves freely.
     """
 
     number, name, unit, setting = "G13", "singularity", "condition number", "singularity_stop"
@@ -28,10 +29,10 @@ class Singularity(Guard):
         self._arm, self._joints = geometry, columns_in(spec.command, "rad")
         self._at: Sequence[float] = [math.inf] * 6
         self._rates = [least + most / self._slow for least, most in zip(_SMALLEST, _LARGEST, strict=True)]
-        self._room = 0.0  # by which the smallest singular value is above the largest one divided by the limit
+        self._room = 0.0  # smallest singular value minus the largest one divided by `singularity_slow`, at least
 
     def limit(self, tick: Tick) -> bool:
-        """Shorten the step of all joints, except on the way to a start pose, which is no straight line."""
+        """Shorten the step of all joints, except on the way to a start pose, which is not a straight line."""
         wanted = [tick.command[at] for at in self._joints]
         for joint, rate in enumerate(self._rates, 1):
             self._room -= rate * abs(wanted[joint] - self._at[joint])
@@ -44,8 +45,8 @@ class Singularity(Guard):
             return False
         span = self.limit_value - self._slow
         share = max(0.0, self.limit_value - condition) / span if span else 0.0
-        for at, one, way in zip(self._joints, last, wanted, strict=True):
-            tick.command[at] = one + min(share, 1.0) * (way - one)
+        for at, start, way in zip(self._joints, last, wanted, strict=True):
+            tick.command[at] = start + min(share, 1.0) * (way - start)
         self._room = 0.0
         return True
 
@@ -62,7 +63,7 @@ class Singularity(Guard):
         sine, cosine, s5, c5 = math.sin(low), math.cos(low), math.sin(q[4]), math.cos(q[4])
         end = arm.d6 + arm.tool
         out = -s5 * cosine, c5, -s5 * sine
-        # From each joint to the tool: radial and height; all beyond joint 1 are `arm.d4` beside the plane.
+        # From each joint to the tool, radially (x) and in height (z); joints 2 to 6 are `arm.d4` beside the plane.
         x5, z5 = end * out[0], end * out[2]
         x4, z4 = x5 + arm.d5 * sine, z5 - arm.d5 * cosine
         x3, z3 = x4 + arm.a3 * math.cos(q[1] + q[2]), z4 + arm.a3 * math.sin(q[1] + q[2])

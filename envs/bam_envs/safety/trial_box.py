@@ -4,18 +4,18 @@ from bam_envs.core.errors import InvalidValue
 from bam_envs.core.robot import RobotSpec
 from bam_envs.safety.base_guards import BaseBox
 from bam_envs.safety.guard import Guard, Limits, Tick, ToolPoint, columns_in
-from bam_envs.safety.places import WorkspaceBox
+from bam_envs.safety.region_guards import WorkspaceBox
 
 
 class TrialBox(Guard):
     """A robot on trial stays near the place where its first command begins: the tool of an arm, or a base.
 
-    The way to a start pose does not count.
+    The way to a start pose is not limited.
 
     Args:
         spec: The robot.
         limits: Its limits.
-        half: How far it may go along each axis [m].
+        half: Maximum distance from the start along each axis [m].
         tool: Forward kinematics of one pose of an arm; None for a base.
 
     Raises:
@@ -43,12 +43,12 @@ class TrialBox(Guard):
         return self._box.limit(tick)
 
     def _around(self, tick: Tick) -> Guard:
-        """The box around where the robot is."""
+        """The box around the robot's position."""
         if self._tool is not None:
             here = self._tool([tick.last[at] for at in self._joints])
         else:
             here = tick.signals["base_pose"][0, :2].tolist()
-        low, high = [one - self.limit_value for one in here], [one + self.limit_value for one in here]
+        low, high = [value - self.limit_value for value in here], [value + self.limit_value for value in here]
         if self._tool is None:
             return BaseBox(self._spec, self._limits, low, high)
         return WorkspaceBox(self._spec, self._limits, low, high, self._tool)

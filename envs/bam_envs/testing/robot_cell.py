@@ -178,7 +178,7 @@ class RobotCell:
 
 
 def _await(ready: Sequence[Any]) -> None:
-    if not all(one.wait(_START) for one in ready):
+    if not all(event.wait(_START) for event in ready):
         raise RuntimeError(f"A process of the robot cell did not start within {_START:g} s.")
 
 

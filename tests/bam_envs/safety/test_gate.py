@@ -79,7 +79,7 @@ def test_a_live_robot_has_one_way_in_and_it_takes_cleared_commands():
 def test_a_live_robot_has_one_gate():
     robot = RosbridgeRobot(NOBODY, load_profile("ur5e"))
     gate = SafeRobot(robot)
-    with pytest.raises(InvalidValue, match=r"^ur5e stands behind a SafeRobot already; "):
+    with pytest.raises(InvalidValue, match=r"^ur5e has a SafeRobot already; "):
         SafeRobot(robot)
     del gate
     SafeRobot(robot)
@@ -94,7 +94,7 @@ def test_the_gate_has_neither_copies_nor_other_kinds():
         assert str(caught.value) == (
             "The SafeRobot of ur5e cannot be copied: a robot has one gate. Build another SafeRobot for another robot."
         )
-    with pytest.raises(InvalidValue, match=r"^A SafeRobot has no other kind: "):
+    with pytest.raises(InvalidValue, match=r"^A SafeRobot has no subclasses: "):
         type("Open", (SafeRobot,), {"age": lambda self: 0.0})
 
 
@@ -117,8 +117,8 @@ def test_the_limits_of_a_live_robot_are_of_no_other_kind_and_their_bounds_are_fi
         (
             "ur5e",
             "period = 100.0",
-            "The period of ur5e must be above 0 and at most 1 s, not 100 s: for so long a command may go as far as "
-            "the limits let it. Command it more often.",
+            "The period of ur5e must be above 0 and at most 1 s, not 100 s: the robot moves for that "
+            "long without a check. Command it more often.",
         ),
     ],
 )

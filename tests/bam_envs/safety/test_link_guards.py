@@ -17,7 +17,7 @@ from bam_envs.ros.codec import RobotInfo
 from bam_envs.safety.arm_guards import JointJerk
 from bam_envs.safety.gate import SafeRobot
 from bam_envs.safety.guard import Limits, Tick
-from bam_envs.safety.link_guards import ActionAge, KeptOut, LateTicks, LinkQuality, Watchdog
+from bam_envs.safety.link_guards import ActionAge, ChangedCommands, LateTicks, LinkQuality, Watchdog
 from bam_envs.testing import ARM_HOME
 
 ARM, BASE = arm_spec("ur5e", with_object=False), base_spec(with_scans=False)
@@ -29,12 +29,12 @@ def tick_of(command=HOME, last=HOME, step=(0.0,) * 7, **numbers):
     return Tick(goal=[*command], command=[*command], last=[*last], last_step=[*step], velocity=[0.0] * 7, **numbers)
 
 
-def test_a_command_that_rests_on_an_old_state_is_not_executed():
+def test_a_command_computed_from_an_old_state_is_not_executed():
     guard = ActionAge(Limits())
     assert guard.fault(tick_of(action_age=0.1)) is None
     assert guard.fault(tick_of(action_age=0.123)) == (
-        "the command came 0.123 s after the state that it rests on, and at most 0.1 s are allowed: the policy takes "
-        "too long, or the computer is busy"
+        "the command came 0.123 s after the state that it was computed from, and at most 0.1 s are allowed: the policy "
+        "takes too long, or the computer is busy"
     )
     assert guard.patience == 10
 
@@ -79,17 +79,17 @@ def test_a_bad_link_is_a_warning_and_then_a_stop_when_it_is_back(good, bad):
 
 
 def test_a_robot_that_is_kept_out_of_a_place_too_often_is_stopped():
-    guard = KeptOut(Limits())
+    guard = ChangedCommands(Limits())
     for number in range(1, 21):
         assert guard.fault(tick_of(kept_out=True)) is None
         assert guard.fault(tick_of(kept_out=False)) is None
-        changed = f"{number} of the last 100 commands were changed to keep the robot out of a place"
+        changed = f"{number} of the last 100 commands were changed to keep the robot out of a forbidden region"
         assert guard.warning == (changed if number > 5 else "")
     assert guard.fault(tick_of(kept_out=True)) == (
-        "21 of the last 100 commands were changed to keep the robot out of a place, and 20 are allowed: the report "
-        "names the guards that changed them"
+        "21 of the last 100 commands were changed to keep the robot out of a forbidden region, and 20 are allowed: the "
+        "report names the guards that changed them"
     )
-    off = KeptOut(Limits(clamp_stop=1.0))
+    off = ChangedCommands(Limits(clamp_stop=1.0))
     assert not any(off.fault(tick_of(kept_out=True)) for _ in range(300))
 
 
@@ -100,18 +100,18 @@ def test_a_robot_that_is_kept_out_of_a_place_too_often_is_stopped():
         (
             ARM,
             None,
-            "the robot is not known to stop by itself: when this computer or the link fails it goes on to its last",
+            "the robot is not known to stop by itself: when this computer or the link fails it continues to its las",
         ),
         (
             ARM,
             0.0,
-            "the robot does not stop by itself: when this computer or the link fails it goes on to its last comma",
+            "the robot does not stop by itself: when this computer or the link fails it continues to its last comma",
         ),
         (BASE, 0.5, ""),
         (
             BASE,
             None,
-            "the robot is not known to stop by itself: when this computer or the link fails it drives on; keep a",
+            "the robot is not known to stop by itself: when this computer or the link fails it keeps driving; keep a",
         ),
         (BASE, 0.7, "the robot stops by itself only 0.7 s after the last command, and 0.5 s are expected: shorten its"),
     ],
@@ -149,8 +149,8 @@ def test_a_profile_says_after_what_time_the_robot_stops_and_a_base_that_never_do
     with pytest.raises(InvalidValue) as caught:
         load_profile(path)
     assert str(caught.value) == (
-        f"{path}: watchdog = 0 says that the base drives on when it hears nothing, and such a base is not driven: give "
-        "its drive a time-out, of 0.5 s or less, and say it here."
+        f"{path}: watchdog = 0 means that the base keeps driving when commands stop, and such a base is not driven: "
+        "give its drive a time-out of 0.5 s or less, and set it here."
     )
 
 
@@ -209,5 +209,5 @@ def test_a_standing_warning_has_the_title_of_its_guard():
     for _ in range(7):
         assert robot.warnings == ()
         robot.step(up)
-    text = "6 of the last 100 commands were changed to keep the robot out of a place"
+    text = "6 of the last 100 commands were changed to keep the robot out of a forbidden region"
     assert robot.warnings == (f"changed commands (G18): {text}",)

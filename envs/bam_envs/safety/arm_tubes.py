@@ -1,4 +1,4 @@
-"""The tubes of a Universal Robots arm in plain numbers: how near they come to each other and to the table.
+"""The links of a Universal Robots arm as tubes: their distances from each other and from the table.
 
 All points are in the arm's vertical plane (radial, sideways, height), which turns with joint 1: neither that joint nor
 the last one changes a distance. The tubes and pairs are those of the simulation (`ArmContacts`); the last tube reaches
@@ -12,18 +12,18 @@ from bam_envs.core.kinematics import ArmGeometry, ArmOutline
 
 Point = tuple[float, float, float]
 Tube = tuple[Point, Point, float]
-"""Two ends and the radius [m]."""
+"""The two ends and the radius [m]."""
 _BASE, _SHOULDER, _UPPER, _FOREARM, _WRIST_1, _WRIST_2, _WRIST_3, _ELBOW = range(8)
 _PAIRS = (
-    *((one, other, 0) for one in (_BASE, _SHOULDER) for other in (_FOREARM, _WRIST_1, _WRIST_2, _WRIST_3)),
+    *((first, other, 0) for first in (_BASE, _SHOULDER) for other in (_FOREARM, _WRIST_1, _WRIST_2, _WRIST_3)),
     *((_UPPER, other, 1) for other in (_WRIST_1, _WRIST_2, _WRIST_3)),
     (_FOREARM, _WRIST_3, 2),
 )
-"""Tubes that share no joint and can touch; the joints from 2, 3 or 4 on, counted from 0 here, change their distance."""
+"""Pairs of tubes that can touch and share no joint; 0, 1, 2: the joints from 2, 3, 4 on change their distance."""
 
 
 class ArmTubes:
-    """Distances of an arm's tubes; `tool` is whether the geometry's tool is really there."""
+    """Distances of an arm's tubes; `tool` is whether the geometry's tool is mounted."""
 
     def __init__(self, geometry: ArmGeometry, outline: ArmOutline, *, tool: bool) -> None:
         self._arm, self._outline, self._tool = geometry, outline, geometry.tool if tool else 0.0
@@ -45,12 +45,12 @@ class ArmTubes:
         return min(elbow - thick, wrist_1 - shape.forearm, min(wrist_2, flange) - shape.wrist)
 
     def nearest(self, q: Sequence[float]) -> float:
-        """Least distance of two tubes at the joints `q` (6,) [rad]; below 0 if they overlap; in m."""
+        """Smallest distance of two tubes at the joints `q` (6,) [rad], in m; below 0 if they overlap."""
         tubes = self.tubes(q)
-        return min(self._distance(tubes, one, other) for one, other, _ in _PAIRS)
+        return min(self._distance(tubes, first, other) for first, other, _ in _PAIRS)
 
     def change(self, here: Sequence[float], there: Sequence[float]) -> float:
-        """No height of `lowest` and no distance changes by more from the joints `here` to `there` (6,) [rad]; in m."""
+        """Upper bound on the change of `lowest` and of any distance [m] between two sets of joints (6,) [rad]."""
         levers = self._levers
         return (
             levers[0] * abs(there[1] - here[1])
@@ -62,8 +62,8 @@ class ArmTubes:
     def nearer_than(self, margin: float, q: Sequence[float]) -> bool:
         """Whether two tubes are nearer than `margin` [m] at the joints `q` (6,) [rad].
 
-        A pair is computed anew only after the joints between its tubes have turned far enough, since it was computed
-        last, to bring it within the margin: each turn moves a tube by at most its angle times the arm's length beyond.
+        A pair is computed again only when the joints between its tubes have turned far enough since the last time to
+        bring it within the margin: a turn moves a tube by at most its angle times the length of the arm beyond.
         """
         moved, at, levers = [0.0] * 3, self._at, self._levers
         beyond = levers[3] * abs(q[4] - at[4])
@@ -72,21 +72,21 @@ class ArmTubes:
             moved[group] = beyond
         self._at = list(q)
         tubes: list[Tube] = []
-        for place, (one, other, group) in enumerate(_PAIRS):
+        for place, (first, other, group) in enumerate(_PAIRS):
             self._near[place] -= moved[group]
             if not self._near[place] >= margin:
                 tubes = tubes or self.tubes(q)
-                self._near[place] = self._distance(tubes, one, other)
+                self._near[place] = self._distance(tubes, first, other)
         return self.least < margin
 
     @property
     def least(self) -> float:
-        """The least distance of two tubes that is possible at the joints of `nearer_than` [m]."""
+        """Lower bound on the smallest distance of two tubes at the joints of `nearer_than` [m]."""
         return min(self._near)
 
     @staticmethod
-    def _distance(tubes: list[Tube], one: int, other: int) -> float:
-        (start, end, radius), (other_start, other_end, other_radius) = tubes[one], tubes[other]
+    def _distance(tubes: list[Tube], first: int, other: int) -> float:
+        (start, end, radius), (other_start, other_end, other_radius) = tubes[first], tubes[other]
         return math.sqrt(segment_distance2(start, end, other_start, other_end)) - radius - other_radius
 
     def tubes(self, q: Sequence[float]) -> list[Tube]:
@@ -114,7 +114,7 @@ def segment_distance2(start: Point, end: Point, other_start: Point, other_end: P
     gx, gy, gz = start[0] - other_start[0], start[1] - other_start[1], start[2] - other_start[2]
     a, e = max(wx * wx + wy * wy + wz * wz, 1e-12), max(ox * ox + oy * oy + oz * oz, 1e-12)
     b, c, f = wx * ox + wy * oy + wz * oz, wx * gx + wy * gy + wz * gz, ox * gx + oy * gy + oz * gz
-    slant = a * e - b * b  # 0 if they are parallel: then any first point will do
+    slant = a * e - b * b  # 0 for parallel segments: any first point will do
     share = min(max((b * f - c * e) / slant, 0.0), 1.0) if slant > 1e-9 * a * e else 0.0
     other = min(max((b * share + f) / e, 0.0), 1.0)
     share = min(max((b * other - c) / a, 0.0), 1.0)

@@ -1,4 +1,4 @@
-"""The guards that keep an arm out of places: each acts at its limit, lets the arm out, and brakes in time."""
+"""The guards of forbidden regions: each acts at its limit, lets the arm leave, and brakes in time."""
 
 import math
 from dataclasses import replace
@@ -15,11 +15,11 @@ from bam_envs.robots.fake import FakeRobot
 from bam_envs.robots.physics.kinematic_arm import ArmContacts, segment_distance2
 from bam_envs.robots.ur import UR_MODELS
 from bam_envs.robots.ur5e import arm_spec
+from bam_envs.safety.arm_tubes import ArmTubes
 from bam_envs.safety.gate import SafeRobot
 from bam_envs.safety.guard import Limits, Tick
-from bam_envs.safety.places import Collision, WorkspaceBox
+from bam_envs.safety.region_guards import Collision, WorkspaceBox
 from bam_envs.safety.singularity import Singularity
-from bam_envs.safety.tubes import ArmTubes
 from bam_envs.testing import ARM_HOME
 
 ARM, HOME, ROW = arm_spec("ur5e", with_object=False), [*ARM_HOME, 0.085], np.arange(1)
@@ -146,7 +146,7 @@ def test_an_arm_that_is_told_to_go_through_something_rests_before_it_and_is_stop
     sent, stop = drive(robot, state, [*goal, 0.085], 400)
     assert str(stop).startswith(
         "The robot was stopped by changed commands (G18): 21 of the last 100 commands were changed to keep the robot "
-        "out of a place, and 20 are allowed: the report names the guards that changed them."
+        "out of a forbidden region, and 20 are allowed: the report names the guards that changed them."
     )
     tubes = tubes_of()
     assert min(UR5E_GRIPPER.tool_point(q)[2] for q in sent.tolist()) >= -1e-9

@@ -1,7 +1,7 @@
-"""The guards that keep an arm out of a place: a box around its tool, its own links, and the table.
+"""The guards that keep an arm out of forbidden regions: outside its workspace box, its own links, and the table.
 
-Each looks where the robot would come to rest if it braked after the command, and shortens the step until that is
-outside the place, if necessary by braking harder than the limit on acceleration. An arm that is in such a place
+Each computes where the arm would come to rest if it braked after the command, and shortens the step until that pose is
+outside the region, if necessary by braking harder than the limit on acceleration. An arm that is inside such a region
 already may stay or leave, and must not go farther in.
 """
 
@@ -10,17 +10,17 @@ from collections.abc import Sequence
 
 from bam_envs.core.errors import InvalidValue
 from bam_envs.core.robot import RobotSpec
+from bam_envs.safety.arm_tubes import ArmTubes
 from bam_envs.safety.guard import Guard, Limits, Numbers, Tick, ToolPoint, columns_in, picker
-from bam_envs.safety.tubes import ArmTubes
 
 _HALVINGS = 6
-"""The allowed share of a step is found to 1/64."""
+"""Number of bisections: the allowed share of a step is found to 1/64."""
 _TOUCH = 1e-9
-"""A robot this little in a place [m] is outside."""
+"""An arm this little inside a region [m] counts as outside."""
 
 
-class Place(Guard):
-    """Base class of the guards of an arm: `depth` says how far in a forbidden place it is at some joints."""
+class ForbiddenRegion(Guard):
+    """Base class: `depth` gives the distance by which an arm is inside a forbidden region."""
 
     keeps_out = True
 
@@ -29,28 +29,28 @@ class Place(Guard):
         self._pick = picker(self._joints)
 
     def depth(self, joints: Sequence[float]) -> float:
-        """How far in a forbidden place the arm is at `joints` (k,) [rad]; 0 outside."""
+        """Distance by which the arm is inside the region at `joints` (k,) [rad], in m; 0 outside."""
         raise NotImplementedError
 
     def is_outside(self, joints: Sequence[float]) -> bool:
-        """Whether the arm at `joints` (k,) [rad] is outside; called once in each tick, and may be quicker."""
+        """Whether the arm is outside at `joints` (k,) [rad]; called once in each tick, so subclasses make it fast."""
         return self.depth(joints) <= _TOUCH
 
     def rest(self, last: Numbers, step: Numbers, share: float = 1.0) -> Numbers:
         """Where the joints come to rest after `share` of `step` from `last`, if they brake together. Shape: (k,)."""
-        # Braking takes n steps, each shorter by the same part: together they are (n - 1) / 2 first ones long.
+        # Braking takes n steps, each shorter by the same amount: together they have (n - 1) / 2 times the first length.
         braking = math.ceil(share * max(map(abs, step)) / self._change - 1e-6)
         share *= 1.0 + max(0, braking - 1) / 2.0
-        return [one + share * way for one, way in zip(last, step, strict=True)]
+        return [start + share * way for start, way in zip(last, step, strict=True)]
 
     def limit(self, tick: Tick) -> bool:
         """Shorten the step of all joints."""
         last = self._pick(tick.last)
-        step = [one - before for one, before in zip(self._pick(tick.command), last, strict=True)]
+        step = [wanted - before for wanted, before in zip(self._pick(tick.command), last, strict=True)]
         if self.is_outside(self.rest(last, step)):
             return False
         here = max(self.depth(last), _TOUCH)
-        if self.depth(self.rest(last, step)) <= here:  # it comes out
+        if self.depth(self.rest(last, step)) <= here:  # it leaves
             return False
         least, most = 0.0, 1.0
         for _ in range(_HALVINGS):
@@ -59,18 +59,18 @@ class Place(Guard):
                 least = middle
             else:
                 most = middle
-        for at, one, way in zip(self._joints, last, step, strict=True):
-            tick.command[at] = one + least * way
+        for at, start, way in zip(self._joints, last, step, strict=True):
+            tick.command[at] = start + least * way
         return True
 
 
-class WorkspaceBox(Place):
-    """The tool stays in a box, whose longest edge this is; zero is a limit like any other number.
+class WorkspaceBox(ForbiddenRegion):
+    """The tool stays in a box; the limit shown is its longest edge.
 
     Args:
         spec: The arm.
-        limits: Its limits, of which the acceleration counts.
-        low: Lowest x, y and z [m], in ``base_link``; minus infinity for none.
+        limits: Its limits; `joint_acceleration` is used.
+        low: Lowest x, y and z [m], in ``base_link``; minus infinity for no limit.
         high: Highest x, y and z [m].
         tool: Forward kinematics of one pose.
 
@@ -102,7 +102,7 @@ class WorkspaceBox(Place):
         if self.depth(joints) <= _TOUCH:
             return None
         at, low, high = (
-            ", ".join(f"{one:.3f}" for one in point) for point in (self._tool(joints), self._low, self._high)
+            ", ".join(f"{value:.3f}" for value in point) for point in (self._tool(joints), self._low, self._high)
         )
         return (
             f"the tool would be at {at} m, outside the box from {low} to {high} m: widen the box, or choose another "
@@ -110,8 +110,8 @@ class WorkspaceBox(Place):
         )
 
 
-class Collision(Place):
-    """Tubes of the arm that share no joint stay apart, and all stay above the table."""
+class Collision(ForbiddenRegion):
+    """Links of the arm that share no joint stay apart, and all links stay above the table."""
 
     number, name, unit, setting = "G24", "collision", "m", "clearance"
 
@@ -127,7 +127,7 @@ class Collision(Place):
         return max(0.0, self.limit_value - distance)
 
     def is_outside(self, joints: Sequence[float]) -> bool:
-        """As `depth`, without what cannot be near."""
+        """As in the base class; distances that the motion cannot have used up are not computed again."""
         if self._tubes.change(self._at, joints) < self._room:
             return True
         height = self._tubes.lowest(joints) - self._table
