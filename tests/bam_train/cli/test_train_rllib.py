@@ -124,7 +124,7 @@ def start():
     """Starts the program in a process group of its own, as a shell does, with its standard error piped."""
     with contextlib.ExitStack() as stack:
 
-        def start(*arguments, folder=None, runners=0):
+        def start(*arguments, runners=0):
             command = [sys.executable, "-m", "bam_train.cli.train", "--env", "bam/reach", "--algo", "ppo"]
             command += ["--trainer", "rllib", "--num-env-runners", str(runners), "--steps", "100000000"]
             for setting in SMALL:
@@ -137,7 +137,6 @@ def start():
                     text=True,
                     env=environment(),
                     start_new_session=True,
-                    cwd=folder,
                 )
             )
             stack.callback(process.kill)  # Ray's own processes end with it
@@ -174,31 +173,30 @@ def folders_of(processes):
     return {found for one in processes for found in re.findall(r"/\S*bam-ray-\w+", " ".join(one.cmdline()))}
 
 
-SENT = ((signal.SIGINT, os.killpg, 130), (signal.SIGTERM, as_timeout_does, 143), (signal.SIGHUP, os.killpg, 129))
-
-
 @pytest.mark.slow
-def test_a_signal_saves_and_leaves_no_process(here, start):
-    """Three runs at once, each with a Ray of its own, the first with a runner."""
-    runs = []
-    for runners, sent in zip((1, 0, 0), SENT, strict=True):
-        folder = here / sent[0].name
-        folder.mkdir()
-        runs.append((start("--eval-every", "100000000", folder=folder, runners=runners), folder, sent))
-    for process, folder, (number, send, status) in runs:
-        wait_for(process, "steps/s")
-        processes = psutil.Process(process.pid).children(recursive=True)
-        assert len(processes) > 5
-        (rays,) = folders_of(processes)
-        send(process.pid, number)  # a terminal sends Ctrl-C, and SIGHUP at its end, to the whole group
-        _, err = process.communicate(timeout=120)
-        assert process.returncode == status, err
-        assert "finishing the update and saving" in err
-        assert "Traceback" not in err
-        assert err.splitlines()[-1] == "  bam-train --resume runs/reach-rllib-ppo/last.zip"
-        assert Checkpoint.open(folder / "runs" / "reach-rllib-ppo" / "last.zip").manifest.steps >= 256
-        assert not any(one.is_running() for one in processes)
-        assert not os.path.exists(rays)
+@pytest.mark.parametrize(
+    ("number", "send", "status", "runners"),
+    [
+        (signal.SIGINT, os.killpg, 130, 1),
+        (signal.SIGTERM, as_timeout_does, 143, 0),
+        (signal.SIGHUP, os.killpg, 129, 0),
+    ],
+)
+def test_a_signal_saves_and_leaves_no_process(here, start, number, send, status, runners):
+    process = start("--eval-every", "100000000", runners=runners)
+    wait_for(process, "steps/s")
+    processes = psutil.Process(process.pid).children(recursive=True)
+    assert len(processes) > 5
+    (rays,) = folders_of(processes)
+    send(process.pid, number)  # a terminal sends Ctrl-C, and SIGHUP at its end, to the whole group
+    _, err = process.communicate(timeout=120)
+    assert process.returncode == status, err
+    assert "finishing the update and saving" in err
+    assert "Traceback" not in err
+    assert err.splitlines()[-1] == "  bam-train --resume runs/reach-rllib-ppo/last.zip"
+    assert Checkpoint.open(here / "runs" / "reach-rllib-ppo" / "last.zip").manifest.steps >= 256
+    assert not any(one.is_running() for one in processes)
+    assert not os.path.exists(rays)
 
 
 @pytest.mark.slow
