@@ -8,8 +8,15 @@ from bam_envs.core.robot import RobotState
 from bam_envs.ros.codec import encode_sink
 
 QUICK = ("bam/pick-v0", "bam/mir100-avoidance-v0", "bam/ur-empty-v0")
-EACH = [one if one in QUICK else pytest.param(one, marks=pytest.mark.slow) for one in ENVIRONMENTS]
-"""Every environment; `make quick` tests an arm with a gripper, a base and an arm alone."""
+"""An arm with a gripper, a base and an arm alone: the environments of `make quick`."""
+
+
+def each(ids):
+    """Parameters of a test; those that `make quick` leaves out are slow."""
+    return [one if one in QUICK else pytest.param(one, marks=pytest.mark.slow) for one in ids]
+
+
+EACH = each(ENVIRONMENTS)
 
 
 def make_task(env_id, num_envs=1, **options):
