@@ -81,8 +81,8 @@ class Pacer:
 
     def wait(self) -> float:
         """Wait until the next tick is due and start it; returns its lateness [s], 0 without a period."""
-        while self.period is not None and self.slack > 0:
-            self._sleep(self.slack)
+        while self.period is not None and (slack := self.slack) > 0:
+            self._sleep(slack)
         return self.tick()
 
     def tick(self) -> float:

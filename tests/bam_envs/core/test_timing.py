@@ -50,6 +50,15 @@ def test_deadlines_are_absolute():
     assert (pacer.ticks, pacer.missed, pacer.rate) == (4, 0, 8.0)
 
 
+def test_a_deadline_that_passes_while_it_is_looked_at_is_not_slept_for():
+    clock, times = Clock(), iter([100.0, 100.0, 100.1249, 100.1251, 100.1252, 100.1253])
+    pacer = Pacer(0.125, now=lambda: next(times), sleep=clock.sleep)  # time.sleep refuses negative times
+    pacer.start()
+    pacer.tick()
+    assert pacer.wait() == pytest.approx(0.0002)
+    assert clock.slept == [pytest.approx(0.0001)]
+
+
 def test_late_sleeps_do_not_add_up():
     clock = Clock(overshoot=0.001)
     pacer = paced(clock)
