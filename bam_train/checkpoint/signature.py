@@ -127,9 +127,9 @@ def _write_new(path: Path, data: bytes, mode: int) -> None:
             except OSError:
                 path.unlink()
                 raise
-    except FileExistsError as error:
-        raise OutputError(f"{path}: a key is there already. Choose another name, or move that one away") from error
     except OSError as error:
+        if isinstance(error, FileExistsError) and path.exists():
+            raise OutputError(f"{path}: a key is there already. Choose another name, or move that one away") from error
         raise OutputError(f"{path}: cannot be written: {error.strerror or error}. Choose another place") from error
 
 
@@ -186,8 +186,10 @@ def trusted_keys(folder: Path) -> list[PublicKey]:
     """The keys in a folder; none if there is no such folder.
 
     Raises:
-        BadKey: A file there is no key, or others than its owner can change the folder or a key.
+        BadKey: A file there is no key, or others than its owner can change the folder or a key; `folder` is a file.
     """
+    if folder.is_file():
+        raise BadKey(f"{folder}: a file, and a folder of public keys is expected. Give its folder")
     paths = sorted(folder.glob("*.pub"))
     for path in (folder, *paths) if os.name == "posix" and paths else ():
         if path.stat().st_mode & 0o022:
@@ -200,6 +202,7 @@ def trust(path: Path, folder: Path) -> Path:
 
     Raises:
         BadKey: There is no key at `path`, or another one of that name is trusted already.
+        OutputError: It cannot be written.
     """
     key = read_public_key(path)
     place = folder / f"{key.name}.pub"
@@ -207,6 +210,12 @@ def trust(path: Path, folder: Path) -> Path:
         if read_public_key(place).text == key.text:
             return place
         raise BadKey(f"{place}: another key of that name is trusted. Remove that file first, if it is to be replaced")
+    try:
+        folder.mkdir(mode=0o755, parents=True, exist_ok=True)  # also where others of a group may change new folders
+    except OSError as error:
+        raise OutputError(
+            f"{folder}: cannot be made a folder: {error.strerror or error}. Choose another place"
+        ) from error
     _write_new(place, key.line.encode(), 0o644)
     return place
 
@@ -268,20 +277,20 @@ def verify(checkpoint: Checkpoint, folder: Path) -> Signature:
         text, raw = (base64.b64decode(encoded, validate=True) for encoded in (found.public_key, found.signature))
     except (msgspec.MsgspecError, ValueError) as error:
         raise AlteredCheckpoint(path, SIGNATURE, f"{SIGNATURE}: {error}. Sign it again") from error
-    known = next((key for key in trusted_keys(folder) if key.text == found.public_key), None)
-    if known is None:
-        why = f"was signed by {found.signer} with the key {found.public_key[:12]}..., which {folder} does not trust"
-        raise UntrustedCheckpoint(path, f"{why}. If you trust that person, run bam-sign trust with their .pub file")
     manifest = _manifest(checkpoint)
     try:
         Ed25519PublicKey.from_public_bytes(text).verify(raw, _signed(found.signer, found.created, manifest))
-    except InvalidSignature as error:
+    except (InvalidSignature, ValueError) as error:  # ValueError: a key of another length
         why = f"{MANIFEST} or {SIGNATURE} was altered after {found.signer} signed: the signature does not fit"
         raise AlteredCheckpoint(path, MANIFEST, f"{why}. {AGAIN}") from error
     with open_zip(path) as archive:  # the other members were compared when it was opened
         for name, info in list_members(path, archive).items():
             if name.startswith(RESUME):
                 deque(chunks(path, archive, info, checkpoint.manifest.sha256.get(name)), maxlen=0)
+    known = next((key for key in trusted_keys(folder) if key.text == found.public_key), None)
+    if known is None:
+        why = f"was signed by {found.signer} with the key {found.public_key[:12]}..., which {folder} does not trust"
+        raise UntrustedCheckpoint(path, f"{why}. If you trust that person, run bam-sign trust with their .pub file")
     return msgspec.structs.replace(found, signer=known.name)  # a signer may call himself anything
 
 

@@ -124,7 +124,7 @@ def link_profile(link: object) -> LinkProfile:
         raise InvalidValue(
             f"link: {link} cannot be read: {error.strerror or error}. Write it with bam-doctor --measure {link}"
         ) from error
-    except (msgspec.DecodeError, UnicodeDecodeError) as error:
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
         raise InvalidValue(f"link: {link} is not JSON: {error}. Write it with bam-doctor --measure {link}") from error
 
 

@@ -245,9 +245,10 @@ def test_what_is_no_profile(tmp_path):
         with pytest.raises(InvalidValue) as caught:
             link_profile(link)
         assert str(caught.value) == text
-    (tmp_path / "cut.json").write_text('{"command_delay": [0.1')
-    with pytest.raises(InvalidValue, match=r"cut\.json is not JSON: .*\. Write it with bam-doctor --measure "):
-        link_profile(tmp_path / "cut.json")
+    for content in ('{"command_delay": [0.1', "[" * 100_000):
+        (tmp_path / "cut.json").write_text(content)
+        with pytest.raises(InvalidValue, match=r"cut\.json is not JSON: .*\. Write it with bam-doctor --measure "):
+            link_profile(tmp_path / "cut.json")
 
 
 # ---- environments

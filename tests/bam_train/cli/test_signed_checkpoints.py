@@ -152,9 +152,25 @@ def test_new_digests_do_not_make_up_for_a_change(signed, keys, forge):
         admit(signed, keys, allow_unsigned=True)
 
 
+def test_what_was_changed_after_a_stranger_signed_is_refused_too(signed, tmp_path):
+    members = members_of(signed)
+    other = members[MANIFEST].replace(b'"seed": 0', b'"seed": 1').replace(b'"seed":0', b'"seed":1')
+    assert other != members[MANIFEST]
+    for change in ({MANIFEST: other}, {"bam/resume/rng.json": b"[1, 3]"}):
+        write(signed, members | change)
+        with pytest.raises(AlteredCheckpoint):
+            admit(signed, tmp_path / "nobody", allow_unsigned=True)
+
+
 @pytest.mark.parametrize(
     ("field", "value"),
-    [("signer", "bob"), ("created", "2031-01-01"), ("signature", "A" * 86 + "=="), ("public_key", None)],
+    [
+        ("signer", "bob"),
+        ("public_key", "A" * 44),
+        ("created", "2031-01-01"),
+        ("signature", "A" * 86 + "=="),
+        ("public_key", None),
+    ],
 )
 def test_every_field_of_the_signature_counts(signed, keys, tmp_path, field, value):
     members = members_of(signed)
@@ -319,6 +335,25 @@ def test_others_must_not_decide_whom_this_computer_trusts(signed, keys):
     (keys / "broken.pub").write_text("nonsense")
     with pytest.raises(BadKey, match=r"broken\.pub: expected one line"):
         verify(Checkpoint.open(signed), keys)
+
+
+def test_a_folder_of_trusted_keys_is_made_for_its_owner_alone_to_change(signed, key, tmp_path):
+    before = os.umask(0o002)
+    try:
+        trust(public_path(key), tmp_path / "new" / "trusted")
+    finally:
+        os.umask(before)
+    assert verify(Checkpoint.open(signed), tmp_path / "new" / "trusted").signer == "alice"
+
+
+def test_a_file_in_the_place_of_a_folder_is_named(signed, key, tmp_path):
+    file = public_path(key)
+    with pytest.raises(OutputError, match=r"x\.key: cannot be written: File exists\. Choose another place$"):
+        make_key(file / "x.key", "alice")
+    with pytest.raises(OutputError, match=rf"{file}: cannot be made a folder: File exists\. Choose another place$"):
+        trust(file, file)
+    with pytest.raises(BadKey, match=rf"^{file}: a file, and a folder of public keys is expected\. Give its folder$"):
+        verify(Checkpoint.open(signed), file)
 
 
 def test_another_key_of_a_trusted_name_is_refused(tmp_path, keys, key):
