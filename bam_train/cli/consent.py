@@ -11,12 +11,12 @@ from typing import Any
 import gymnasium as gym
 
 from bam_envs.core.robot import RobotSpec
-from bam_envs.live.evidence import Evidence
+from bam_envs.live.inspection import Inspection
 from bam_envs.safety.guard import is_base
 from bam_train.checkpoint import Checkpoint
 from bam_train.cli.console import say
+from bam_train.deploy.checkpoint_admission import has_real_robot
 from bam_train.deploy.contract_table import Contract
-from bam_train.deploy.trust import has_real_robot
 from bam_train.env_location import Place
 from bam_train.environments import environment_of, make_env, require_fit
 from bam_train.errors import SettingsError
@@ -76,8 +76,8 @@ def connected_env(
         if not place.shadow:
             require_consent(env, f"{who}: {checkpoint.path}", yes=yes, plan=plan)
         signals.raise_again()
-        if wiggle and contract.evidence is not None and not place.shadow:
-            require_motion(env, f"{checkpoint.path} and the robot at {place.text}", contract.evidence)
+        if wiggle and contract.inspection is not None and not place.shadow:
+            require_motion(env, f"{checkpoint.path} and the robot at {place.text}", contract.inspection)
             signals.raise_again()
     except BaseException:
         env.close()  # type: ignore[no-untyped-call]
@@ -113,7 +113,7 @@ def required_contract(checkpoint: Checkpoint, env: Any, place: Place, motion: Pa
 
         lines = recorded_motion(motion, env.unwrapped.robot.spec, place.robot)
         contract = replace(contract, checks=(*contract.checks, *lines))
-    info = None if contract.evidence is None else contract.evidence.info
+    info = None if contract.inspection is None else contract.inspection.info
     if contract.refused or info is None or not info.simulated or motion is not None:
         for line in contract.lines():
             say(line)
@@ -121,13 +121,13 @@ def required_contract(checkpoint: Checkpoint, env: Any, place: Place, motion: Pa
     return contract
 
 
-def require_motion(env: Any, who: str, evidence: Evidence) -> None:
+def require_motion(env: Any, who: str, inspection: Inspection) -> None:
     """Move each axis a little, and refuse a robot of which one does not move as commanded: `ContractRefused`."""
     from bam_train.deploy.arm_checks import measured_joints
     from bam_train.deploy.wiggle import wiggle
 
     robot = env.unwrapped.robot
-    joints = None if is_base(robot.spec) else measured_joints(evidence, robot.spec)
+    joints = None if is_base(robot.spec) else measured_joints(inspection, robot.spec)
     moved = Contract(tuple(wiggle(robot, None if joints is None else joints[-1])))
     for line in moved.lines():
         say(line)

@@ -45,9 +45,9 @@ def deploy_checkpoint(config: DeployConfig, signals: SignalMemory) -> int:
     from bam_envs.core.timing import Pacer
     from bam_train.checkpoint import Checkpoint
     from bam_train.cli.consent import connected_env
+    from bam_train.deploy.checkpoint_admission import Admission
     from bam_train.deploy.deployment import Deployment
     from bam_train.deploy.journal import Journal
-    from bam_train.deploy.trust import Admission
 
     checkpoint = Checkpoint.open(config.checkpoint)
     if config.print_guards:
@@ -199,8 +199,8 @@ def _recorder(
     """The recorder that the flags ask for, started; None for none."""
     if config.record is None and (config.no_record or place.robot is None):
         return None
+    from bam_train.deploy.checkpoint_admission import has_real_robot
     from bam_train.deploy.flight import deployment_facts, flight_recorder, new_recording, watch_cameras
-    from bam_train.deploy.trust import has_real_robot
 
     path = config.record or new_recording(checkpoint.manifest.env)
     facts = {**deployment_facts(checkpoint, env), "seed": config.seed, "address": place.text, "marks": ", ".join(marks)}

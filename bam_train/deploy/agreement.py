@@ -1,4 +1,4 @@
-"""Agreement of a policy with whoever drives the robot: what it would have commanded, and how the robot then moved."""
+"""Agreement of a policy with whoever drives the robot: its commands, not sent, compared with the robot's motion."""
 
 import math
 from collections import deque
@@ -13,23 +13,23 @@ from bam_envs.safety.guard import Limits, columns_in, is_base, measured_places
 
 Array = NDArray[np.float64]
 STILL = 0.02
-"""A robot that moves slower than this share of its speed limits stands still."""
+"""Share of the speed limits below which a robot counts as still."""
 BLOCK = 1.0
-"""Length of the blocks whose means are taken as independent [s]: ticks that follow each other are not."""
-_FEWEST = 10
-"""Blocks that an interval needs."""
+"""Length of the blocks whose means count as independent samples [s]; successive ticks are correlated."""
+_MIN_BLOCKS = 10
+"""Minimum number of blocks for an interval."""
 
 
 @dataclass(frozen=True)
 class Agreement:
-    """How far a policy agrees with whoever drives: 1 the same motion, 0 the opposite one."""
+    """Agreement of a policy with whoever drives: 1 for the same motion, 0 for the opposite motion."""
 
     mean: float | None
-    """Of all ticks in which one of both moves; None if the robot moves in none."""
+    """Mean over the ticks in which policy or robot moves; None if the robot never moves."""
     interval: tuple[float, float] | None
-    """95 % interval of the mean; None for less than ten blocks of a second."""
+    """95 % confidence interval of the mean; None for less than ten blocks of a second."""
     ticks: int
-    """Number of ticks in which one of both moves."""
+    """Number of ticks in which policy or robot moves."""
     still: int
     """Number of ticks in which neither does."""
 
@@ -41,7 +41,7 @@ class Agreement:
 
     @property
     def text(self) -> str:
-        """For people: ``agreement with whoever drives: 0.83 (0.79 to 0.87) in 412 moving ticks``."""
+        """One line: ``agreement with whoever drives: 0.83 (0.79 to 0.87) in 412 moving ticks``."""
         if self.mean is None and self.ticks:
             return f"agreement with whoever drives: nobody drove; the policy would have moved in {self.ticks} ticks"
         if self.mean is None:
@@ -55,12 +55,12 @@ class Agreement:
 class Shadow:
     """Compares commands that are not sent with the motion of the robot; memory is bounded.
 
-    In each tick p is the velocity that the policy asks for, and d the measured one after the lag of the robot, both as
-    shares of the speed limits; the tick's agreement is 1 - abs(p - d) / (abs(p) + abs(d)). Grippers do not count.
+    In each tick, p is the velocity that the policy commands and d the measured one after the robot's lag, as shares of
+    the speed limits. The agreement of the tick is 1 - |p - d| / (|p| + |d|). Grippers are ignored.
 
     Args:
         spec: The robot.
-        limits: Its limits.
+        limits: The speed limits, and the lag if it is set.
     """
 
     def __init__(self, spec: RobotSpec, limits: Limits) -> None:
@@ -73,20 +73,20 @@ class Shadow:
         self._places = [places[column] for column in self._columns]
         self._base, self._period = base, spec.period
         lag = spec.lag if limits.lag is None else limits.lag
-        self._asked: deque[Array] = deque(maxlen=1 + round(lag / spec.period))
+        self._commanded: deque[Array] = deque(maxlen=1 + round(lag / spec.period))
         self._size = max(1, round(BLOCK / spec.period))
         self._block: list[float] = []
-        self._blocks, self._mean, self._squares = 0, 0.0, 0.0  # Welford's, of the means of blocks
+        self._blocks, self._mean, self._squares = 0, 0.0, 0.0  # Welford's algorithm over the block means
         self._sum, self._ticks, self._still, self._driven = 0.0, 0, 0, False
 
     def __call__(self, command: Array, before: RobotState, after: RobotState) -> None:
-        """Take one tick, as `bam_envs.live.shadow.ShadowRobot.watch`."""
+        """Compare one tick; called as `bam_envs.live.shadow_robot.ShadowRobot.watch`."""
         here, there = self._values(before), self._values(after)
         wanted = command[0, self._columns]
-        asked = wanted if self._base else (wanted - here) / self._period
+        commanded = wanted if self._base else (wanted - here) / self._period
         moved = there if self._base else (there - here) / self._period
-        self._asked.append(asked / self._fastest)
-        p, d = self._asked[0], moved / self._fastest
+        self._commanded.append(commanded / self._fastest)
+        p, d = self._commanded[0], moved / self._fastest
         size = float(np.linalg.norm(p)), float(np.linalg.norm(d))
         if max(size) < STILL:
             self._still += 1
@@ -113,7 +113,7 @@ class Shadow:
         """The agreement so far."""
         mean = self._sum / self._ticks if self._driven else None
         interval = None
-        if mean is not None and self._blocks >= _FEWEST:
+        if mean is not None and self._blocks >= _MIN_BLOCKS:
             half = _student(self._blocks - 1) * math.sqrt(self._squares / (self._blocks - 1) / self._blocks)
             interval = max(0.0, mean - half), min(1.0, mean + half)
         return Agreement(mean, interval, self._ticks, self._still)

@@ -1,7 +1,7 @@
-"""Is a live arm the one that the policy was made for? Its kinematics, the sense of its joints, and their limits.
+"""Checks of a live arm against the arm of a policy: kinematics, sense of the joints, and their limits.
 
-The pose of the tool, as the arm's own controller measures it, is compared with the one computed from the joints. It
-shows swapped and mirrored joints, other units, and another arm.
+The pose of the tool, as measured by the arm's own controller, is compared with the pose computed from the joints. A
+difference reveals swapped and mirrored joints, other units, and another arm.
 """
 
 import itertools
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from bam_envs.core.errors import ProtocolError
 from bam_envs.core.kinematics import UR5E_GRIPPER, UR_JOINTS, ArmGeometry, angle_between, quaternions
 from bam_envs.core.robot import RobotSpec
-from bam_envs.live.evidence import DESCRIPTION, Evidence
+from bam_envs.live.inspection import DESCRIPTION, Inspection
 from bam_envs.robots.ur import UR_MODELS
 from bam_train.deploy.contract_table import Check, check
 from bam_train.deploy.robot_checks import FACTORS, readings
@@ -23,11 +23,11 @@ from bam_train.deploy.urdf import Urdf, read_urdf
 from bam_train.errors import FormatError
 
 Array = NDArray[np.float64]
-BESIDE, TURNED = 0.015, 0.06
-"""Tolerance of the tool's pose: beside the flange's axis [m], and turned [rad]; a factory's calibration is less."""
+OFF_AXIS, ROTATION = 0.015, 0.06
+"""Tolerance of the tool's pose: distance from the flange's axis [m], and angle [rad]; calibrations are smaller."""
 LONGEST_TOOL = 0.4
 """Longest tool of a robot whose policy moves the flange [m]."""
-_STILL = 0.05  # most that a joint may move while it is observed [rad]
+_STILL = 0.05  # maximum motion of a joint at rest [rad]
 
 
 class Pose(NamedTuple):
@@ -38,7 +38,7 @@ class Pose(NamedTuple):
 
 
 def geometry_of(env: Any) -> ArmGeometry | None:
-    """The lengths of the arm that the task of `env` is made for; None for other robots."""
+    """The geometry of the arm in the task of `env`; None for other robots."""
     spec, model = env.unwrapped.robot.spec, getattr(env.unwrapped.task, "model", None)
     if model is not None:
         geometry: ArmGeometry = model.geometry
@@ -46,24 +46,24 @@ def geometry_of(env: Any) -> ArmGeometry | None:
     return UR5E_GRIPPER if spec.command.labels[:6] == UR_JOINTS else None
 
 
-def arm_checks(spec: RobotSpec, geometry: ArmGeometry, margin: float, evidence: Evidence) -> Iterator[Check]:
-    """The lines about the limits, the kinematics and the sense of the joints of an arm.
+def arm_checks(spec: RobotSpec, geometry: ArmGeometry, margin: float, inspection: Inspection) -> Iterator[Check]:
+    """Lines about limits, kinematics and sense of the joints of an arm.
 
     Args:
         spec: Signals and commands of the task.
         geometry: The arm that the task is made for.
         margin: Distance that the guards keep from the end of a joint's travel [rad].
-        evidence: Its messages.
+        inspection: The messages of the arm.
     """
-    urdf, why = _description(evidence)
+    urdf, why = _description(inspection)
     yield from _limits(spec, margin, urdf, why)
-    joints = measured_joints(evidence, spec)
-    if joints is None:  # refused in other lines
+    joints = measured_joints(inspection, spec)
+    if joints is None:  # the line of the signal is refused
         return
     if urdf is not None:
         yield from _described_kinematics(geometry, joints, urdf)
-    pose, why = _tool_pose(evidence)
-    expected = f"as computed, within {BESIDE:g} m and {math.degrees(TURNED):.0f} degrees"
+    pose, why = _tool_pose(inspection)
+    expected = f"as computed, within {OFF_AXIS:g} m and {math.degrees(ROTATION):.0f} degrees"
     if np.ptp(joints, axis=0).max() > _STILL:
         pose, why = None, "the arm moves"
     if pose is None:
@@ -81,27 +81,27 @@ def arm_checks(spec: RobotSpec, geometry: ArmGeometry, margin: float, evidence: 
     yield _senses(geometry, q, pose)
 
 
-def measured_joints(evidence: Evidence, spec: RobotSpec) -> Array | None:
+def measured_joints(inspection: Inspection, spec: RobotSpec) -> Array | None:
     """The measured joints (k, 6) [rad], or None if they are outside their range or unreadable."""
     signal = next(signal for signal in spec.signals if signal.name == "joint_position")
-    source = next(source for source in evidence.sources if source.signal == "joint_position")
+    source = next(source for source in inspection.sources if source.signal == "joint_position")
     try:
-        values = readings(evidence, source, len(signal.labels))[1]
+        values = readings(inspection, source, len(signal.labels))[1]
     except ProtocolError:
         return None
     inside = (values >= np.array(signal.low)).all() and (values <= np.array(signal.high)).all()
     return values if len(values) and inside else None
 
 
-def _tool_pose(evidence: Evidence) -> tuple[Pose | None, str]:
+def _tool_pose(inspection: Inspection) -> tuple[Pose | None, str]:
     """The measured pose of the tool; or None, and why it is not known."""
     found: dict[str, Array] = {}
     for name, size in (("tool_position", 3), ("tool_quaternion", 4)):
-        source = next((source for source in evidence.sources if source.signal == name), None)
+        source = next((source for source in inspection.sources if source.signal == name), None)
         if source is None:
             continue
         try:
-            values = readings(evidence, source, size)[1]
+            values = readings(inspection, source, size)[1]
         except ProtocolError as error:
             return None, str(error).removesuffix(".")
         if len(values):
@@ -115,7 +115,7 @@ def _tool_pose(evidence: Evidence) -> tuple[Pose | None, str]:
 
 
 def _gap(geometry: ArmGeometry, q: Array, pose: Pose) -> tuple[float, float, float]:
-    """Where a tool is from the flange that the joints (6,) put there: beside its axis, along it [m], turned [rad]."""
+    """Measured pose minus the flange computed from joints `q` (6,): off its axis [m], along it [m], rotation [rad]."""
     flange, axes = geometry.flange_pose(q[None])
     x, y, along = axes[0].T @ (pose.position - flange[0])
     turned = 0.0 if pose.quaternion is None else float(angle_between(quaternions(axes), pose.quaternion[None])[0])
@@ -123,27 +123,27 @@ def _gap(geometry: ArmGeometry, q: Array, pose: Pose) -> tuple[float, float, flo
 
 
 def _near(beside: float, turned: float) -> bool:
-    return beside <= BESIDE and turned <= TURNED
+    return beside <= OFF_AXIS and turned <= ROTATION
 
 
 def _fits(geometry: ArmGeometry, q: Array, pose: Pose) -> bool:
     beside, along, turned = _gap(geometry, q, pose)
-    return _near(beside, turned) and -BESIDE <= along <= LONGEST_TOOL
+    return _near(beside, turned) and -OFF_AXIS <= along <= LONGEST_TOOL
 
 
 def _tool_length(geometry: ArmGeometry, along: float) -> Check:
-    """The tool is as long as the policy's, or the robot gives the pose of its flange."""
+    """The tool has the length of the policy's tool, or 0 if the robot reports the pose of its flange."""
     if geometry.tool == 0.0:
-        fits, expected = -BESIDE <= along <= LONGEST_TOOL, f"0 to {LONGEST_TOOL:g} m before the flange"
+        fits, expected = -OFF_AXIS <= along <= LONGEST_TOOL, f"0 to {LONGEST_TOOL:g} m before the flange"
     else:
-        fits = min(abs(along - geometry.tool), abs(along)) <= BESIDE
+        fits = min(abs(along - geometry.tool), abs(along)) <= OFF_AXIS
         expected = f"{geometry.tool:g} m, or 0 for the flange"
     hint = "" if fits else ": set the tool centre point (TCP) of the robot so"
     return check("tool length", expected, f"{along:.3f} m{hint}", fits=fits)
 
 
 def _senses(geometry: ArmGeometry, q: Array, pose: Pose) -> Check:
-    """A joint's sense is shown if the tool would be elsewhere with the joint at the opposite angle."""
+    """The sense of a joint is shown if the opposite angle would put the tool at another pose."""
     hidden = [name for i, name in enumerate(UR_JOINTS) if _fits(geometry, np.where(np.arange(6) == i, -q, q), pose)]
     found = (
         "shown by the tool's pose"
@@ -154,16 +154,16 @@ def _senses(geometry: ArmGeometry, q: Array, pose: Pose) -> Check:
 
 
 def _explained(geometry: ArmGeometry, q: Array, pose: Pose) -> str:
-    """What is wrong with a pose that does not fit: the one change with which it would."""
-    for text, arm, joints, measured in _changes(geometry, q, pose):
+    """Describe a pose that does not fit, by the common mistake that explains it or by its distance."""
+    for text, arm, joints, measured in _common_mistakes(geometry, q, pose):
         if _fits(arm, joints, measured):
             return text
     beside, along, turned = _gap(geometry, q, pose)
     return f"{math.hypot(beside, along - geometry.tool):.3f} m and {math.degrees(turned):.0f} degrees away"
 
 
-def _changes(geometry: ArmGeometry, q: Array, pose: Pose) -> Iterator[tuple[str, ArmGeometry, Array, Pose]]:
-    """Common mistakes: text, arm, joints, and pose without the mistake."""
+def _common_mistakes(geometry: ArmGeometry, q: Array, pose: Pose) -> Iterator[tuple[str, ArmGeometry, Array, Pose]]:
+    """Text of each mistake, and arm, joints and pose without it."""
     for i, name in enumerate(UR_JOINTS):
         yield f"{name} has the opposite sign", geometry, np.where(np.arange(6) == i, -q, q), pose
     for i, j in itertools.combinations(range(6), 2):
@@ -179,9 +179,9 @@ def _changes(geometry: ArmGeometry, q: Array, pose: Pose) -> Iterator[tuple[str,
     yield "the tool's pose is turned by 180 degrees about z: base instead of base_link", geometry, q, half_turn
 
 
-def _description(evidence: Evidence) -> tuple[Urdf | None, str]:
+def _description(inspection: Inspection) -> tuple[Urdf | None, str]:
     """The robot's URDF; or None, and why it is not known."""
-    letters = evidence.letters.get(DESCRIPTION, ())
+    letters = inspection.letters.get(DESCRIPTION, ())
     if not letters:
         return None, f"nobody publishes {DESCRIPTION}"
     message: Any = letters[-1].message
@@ -192,7 +192,7 @@ def _description(evidence: Evidence) -> tuple[Urdf | None, str]:
 
 
 def _limits(spec: RobotSpec, margin: float, urdf: Urdf | None, why: str) -> Iterator[Check]:
-    """The joints can go wherever the guards let commands go."""
+    """The range of each joint in the URDF includes the range that the guards allow."""
     command = spec.command
     joints = [(i, urdf[name]) for i, name in enumerate(command.labels) if urdf is not None and name in urdf]
     if not joints:
@@ -209,23 +209,23 @@ def _limits(spec: RobotSpec, margin: float, urdf: Urdf | None, why: str) -> Iter
 
 
 def _described_kinematics(geometry: ArmGeometry, joints: Array, urdf: Urdf) -> Iterator[Check]:
-    """The arm of the URDF is the task's, at the measured joints."""
+    """The URDF puts the flange where the task's arm has it at the measured joints."""
     q = joints[-1]
     described = urdf.pose("base_link", "tool0", dict(zip(UR_JOINTS, q, strict=True)))
     if described is None:
         return
     pose = Pose(described[0], quaternions(described[1][None])[0])
     beside, along, turned = _gap(geometry, q, pose)
-    fits = _near(beside, turned) and abs(along) <= BESIDE
+    fits = _near(beside, turned) and abs(along) <= OFF_AXIS
     found = f"{math.hypot(beside, along):.3f} m" if fits else _explained_model(geometry, q, pose)
-    yield check(f"kinematics in {DESCRIPTION}", f"flange within {BESIDE:g} m", found, fits=fits)
+    yield check(f"kinematics in {DESCRIPTION}", f"flange within {OFF_AXIS:g} m", found, fits=fits)
 
 
 def _explained_model(geometry: ArmGeometry, q: Array, pose: Pose) -> str:
     names: Sequence[str] = [
         name
         for name, model in UR_MODELS.items()
-        if (gap := _gap(model.geometry, q, pose)) and _near(gap[0], gap[2]) and abs(gap[1]) <= BESIDE
+        if (gap := _gap(model.geometry, q, pose)) and _near(gap[0], gap[2]) and abs(gap[1]) <= OFF_AXIS
     ]
     beside, along, _ = _gap(geometry, q, pose)
     return f"those of a {names[0]}" if names else f"{math.hypot(beside, along):.3f} m away"

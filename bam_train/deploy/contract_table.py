@@ -1,15 +1,14 @@
-"""The table of a contract: what was compared, what was expected, what was found, and the verdict."""
+"""The table of a contract: each line has its subject, the expected and the found value, and a verdict."""
 
-from collections.abc import Iterable
 from dataclasses import asdict, dataclass, field
 from typing import Any, Literal
 
-from bam_envs.live.evidence import Evidence
+from bam_envs.live.inspection import Inspection
 from bam_train.errors import ContractRefused
 
-Verdict = Literal["ok", "refused", "not told"]
+Verdict = Literal["ok", "refused", "unknown"]
 _WIDEST = 60
-"""Most characters of a column other than the last, so that a long text does not widen the table."""
+"""Maximum width of a column, so that a long text does not widen the table [characters]."""
 
 
 @dataclass(frozen=True)
@@ -20,21 +19,21 @@ class Check:
     expected: str
     found: str
     verdict: Verdict
-    """``"not told"`` if the robot does not report it."""
+    """``"unknown"`` if the robot's messages do not decide the line, which then does not refuse the robot."""
 
 
 def check(what: str, expected: str, found: str, *, fits: bool | None) -> Check:
-    """One line; `fits` is None for what the robot does not report."""
-    return Check(what, expected, found, "not told" if fits is None else "ok" if fits else "refused")
+    """One line; `fits` is None for an unknown result."""
+    return Check(what, expected, found, "unknown" if fits is None else "ok" if fits else "refused")
 
 
 @dataclass(frozen=True)
 class Contract:
-    """What was compared between a checkpoint and a robot."""
+    """The comparison of a checkpoint with a robot."""
 
     checks: tuple[Check, ...]
-    evidence: Evidence | None = field(default=None, repr=False)
-    """What the robot showed."""
+    inspection: Inspection | None = field(default=None, repr=False)
+    """The messages of the robot that were compared."""
 
     @property
     def refused(self) -> tuple[Check, ...]:
@@ -42,7 +41,7 @@ class Contract:
         return tuple(line for line in self.checks if line.verdict == "refused")
 
     def lines(self) -> list[str]:
-        """The table for people, with its head; what was refused comes with the whole text."""
+        """The table as text, with a header; only refused lines are never shortened."""
         rows = [("what", "expected", "found", "verdict")]
         rows += [(line.what, line.expected, line.found, line.verdict) for line in self.checks]
         widths = [min(_WIDEST, max(len(row[column]) for row in rows)) for column in range(3)]
@@ -59,19 +58,14 @@ class Contract:
         return [asdict(line) for line in self.checks]
 
     def require(self, who: str, moved: str = "nothing has moved") -> None:
-        """Raise `ContractRefused`, which names the first refused line, if there are any.
+        """Raise `ContractRefused`, which names the first refused line, if a line is refused.
 
         Args:
-            who: The two parties, for the message.
-            moved: What the robot has done until now.
+            who: Checkpoint and robot, for the message.
+            moved: Motion of the robot so far, for the message.
         """
         if self.refused:
             first, *others = self.refused
             more = f" (and {len(others)} more)" if others else ""
             text = f"{first.what}: expected {first.expected}, found {first.found}{more}"
             raise ContractRefused(first.what, f"{who} do not fit: {text}; correct the robot or its profile; {moved}")
-
-
-def joined(*groups: Iterable[Check]) -> Contract:
-    """The contract with the lines of all groups, in order."""
-    return Contract(tuple(line for group in groups for line in group))

@@ -31,16 +31,14 @@ from bam_train.loop.gym.gym_spaces import NAME
 from bam_train.recording.recorder import WARNING, Recorder
 
 STAGES = ("step", "wait", "late", "policy", "age", "record")
-"""What /latency has; see `RecorderAgent`."""
+"""Names of the latencies in /latency; see `RecorderAgent`."""
 _SCALARS = {
     "/status": ("code", "guard"),
     "/latency": STAGES,
     "/episode": ("episode", "step", "reward", "terminated", "truncated", "success"),
 }
-
-
-MOST_BESIDE = 32
-"""Most numbers of a signal that is recorded with a command outside the ticks; those of a laser are more."""
+MAX_SENT_SIGNAL = 32
+"""Maximum size of the signals in /sent, which leaves out laser scans."""
 
 
 class Stopwatch:
@@ -57,7 +55,7 @@ def flight_recorder(path: Path, env: gym.Env[Any, Any], metadata: Mapping[str, A
     Args:
         path: The file.
         env: The environment.
-        metadata: What is deployed: text, or values that are kept as JSON.
+        metadata: Description of the deployment: text, or values that are stored as JSON.
     """
     report: Mapping[str, Any] = getattr(getattr(env.unwrapped, "robot", None), "report", dict)()
     texts = {key: value if isinstance(value, str) else json.dumps(value) for key, value in metadata.items()}
@@ -65,7 +63,7 @@ def flight_recorder(path: Path, env: gym.Env[Any, Any], metadata: Mapping[str, A
 
 
 def new_recording(env_id: str, folder: Path = Path("recordings")) -> Path:
-    """A file that does not exist yet, named by the time (UTC) and the environment."""
+    """Path of a new file, named by the time (UTC) and the environment."""
     name = env_id.rpartition(":")[2].rpartition("/")[2].rpartition("-v")[0]
     stem = f"{time.strftime('%Y-%m-%dT%H%M%SZ', time.gmtime())}-{name}"
     paths = (folder / f"{stem}{'' if k == 1 else f'-{k}'}.mcap" for k in itertools.count(1))
@@ -73,7 +71,7 @@ def new_recording(env_id: str, folder: Path = Path("recordings")) -> Path:
 
 
 def deployment_facts(checkpoint: Checkpoint, env: gym.Env[Any, Any]) -> dict[str, Any]:
-    """What a recording says of a deployment, by name."""
+    """Metadata of a deployment for its recording."""
     manifest, robot = checkpoint.manifest, getattr(env.unwrapped, "robot", None)
     info = getattr(robot, "info", None)
     return {
@@ -89,7 +87,7 @@ def deployment_facts(checkpoint: Checkpoint, env: gym.Env[Any, Any]) -> dict[str
 
 
 def watch_cameras(recorder: Recorder, place: Place) -> list[str]:
-    """Connect the cameras in the live robot's profile, and record them; returns a line for each one that is not."""
+    """Connect and record the cameras of the live robot's profile; returns a warning for each camera left out."""
     left_out = []
     for source in load_profile(place.profile).cameras if place.robot and place.profile else ():
         endpoint = Endpoint.with_token_file(place.robot or "", ca_file=place.ca_file, token_file=place.token_file)
@@ -106,7 +104,7 @@ def watch_cameras(recorder: Recorder, place: Place) -> list[str]:
 
 
 class RecorderAgent(Agent):
-    """Records each tick: last in the chain, so that the action is the one that the environment gets.
+    """Records each tick; the last agent in the chain, so that the action is the one that the environment gets.
 
     The latencies are ``step``, from an action to the observation that it led to; ``wait``, until the next deadline;
     ``late``, the delay of the tick after that; ``policy``, from then to the next action; ``age`` of a guarded
@@ -117,7 +115,7 @@ class RecorderAgent(Agent):
         env: The environment.
         names: The variables of the observation.
         journal: The journal.
-        watch: The times of the tick.
+        watch: The times of the tick, filled in by the other agents.
     """
 
     writes = ()
@@ -132,11 +130,11 @@ class RecorderAgent(Agent):
         self._names, self.reads = names, (*names, "action", "env/reward")
         self._numbers: list[str] = []
         self._pictures: list[str] = []
-        self._declared = False  # what /sent has
+        self._declared = False  # the layout of /sent
         self._warned = 0
         self._decided, self._took, self._age = 0.0, math.nan, math.nan
         self._sent: tuple[Sequence[float], RobotState] | None = None
-        """The last command that no tick has yet."""
+        """The last command, and the state after it, until a tick records them."""
         observe = getattr(self._robot, "observe", None)
         if observe is not None:
             observe(self._was_sent)
@@ -147,11 +145,11 @@ class RecorderAgent(Agent):
             self.record_last_command()
 
     def record_last_command(self) -> None:
-        """Record the last command on its own, if no tick has it."""
+        """Record the last command in /sent, if no tick has recorded it."""
         if self._sent is None:
             return
         (command, state), self._sent = self._sent, None
-        signals = [signal for signal in self._robot.spec.signals if len(signal.labels) <= MOST_BESIDE]
+        signals = [signal for signal in self._robot.spec.signals if len(signal.labels) <= MAX_SENT_SIGNAL]
         if not self._declared:
             names = [f"{signal.name}.{label}" for signal in signals for label in signal.labels]
             commands = [f"command.{label}" for label in self._robot.spec.command.labels]
@@ -190,7 +188,7 @@ class RecorderAgent(Agent):
         self._took = self._decided - begun
 
     def _describe(self, state: Any, observed: Mapping[str, NDArray[Any]], action: NDArray[Any]) -> None:
-        """Name the numbers of a tick, in the order of `forward`."""
+        """Declare the names of a tick's numbers, in the order of `forward`."""
         labels = {
             kind: [str(row["name"]) for row in rows] for kind, rows in getattr(self._env, "describe", dict)().items()
         }
@@ -211,7 +209,7 @@ class RecorderAgent(Agent):
         self._recorder.declare({topic: names for topic, names in layout.items() if names}, extra)
 
     def _status(self) -> tuple[int, int]:
-        """Number, and place in the recorder's list, of the guard that changed the last command."""
+        """Number of the guard that changed the last command, and its index in the recorder's list."""
         guard: str = getattr(self._robot, "status", "")
         if not guard:
             return 0, 0

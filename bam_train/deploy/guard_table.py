@@ -1,4 +1,4 @@
-"""The table that ``bam-deploy --print-guards`` prints: every guard, and every limit that ``--guard`` changes."""
+"""The tables of ``bam-deploy --print-guards``: every guard, and every limit that ``--guard`` changes."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
@@ -7,22 +7,22 @@ from typing import Any
 from bam_envs.core.robot import RobotSpec
 from bam_envs.safety.guard import BOUNDS, Limits, is_base
 
-BESIDE = (
+OUTSIDE_THE_GATE = (
     "G1   contract, signature  compared and verified before a live robot moves (exit status 3 or 1)",
-    "G6   heartbeat            a server that gives no sign of life for 1 s is a lost link",
+    "G6   heartbeat            a server that is silent for 1 s is a lost link",
     "G17  length               an episode ends at the environment's time limit, a deployment after --episodes",
     "G20  one in command       a served robot is commanded by one program at a time, with a lease of 2 s",
     "G21  latch                a stop lasts until a person decides: the program ends, or resume() is called",
     "G22  status code          each tick's is published on /bam/status and recorded; 0, or the number of the guard",
 )
-"""Protection of which the gate is not the place."""
+"""Protection that other parts provide."""
 
 
 def in_force(guards: Sequence[Mapping[str, Any]], limits: Limits, spec: RobotSpec) -> dict[str, float | None]:
-    """The value of each limit, also where `limits` leave it to the robot; None for a guard that is not there.
+    """The value of each limit, also where `limits` leaves it to the robot; None if the robot has no such guard.
 
     Args:
-        guards: The guards, from `SafeRobot.guards`.
+        guards: The result of `SafeRobot.guards`.
         limits: The limits of the robot.
         spec: The robot.
     """
@@ -32,11 +32,11 @@ def in_force(guards: Sequence[Mapping[str, Any]], limits: Limits, spec: RobotSpe
 
 
 def guard_lines(guards: Sequence[Mapping[str, Any]], limits: Mapping[str, float | None]) -> list[str]:
-    """Lines for people.
+    """Both tables as text.
 
     Args:
-        guards: The guards, from `SafeRobot.guards`.
-        limits: The value of each limit, from `in_force`.
+        guards: The result of `SafeRobot.guards`.
+        limits: The result of `in_force`.
     """
     rows = [["guard", "", "limit", "set by", "what it does"]]
     for guard in guards:
@@ -48,10 +48,10 @@ def guard_lines(guards: Sequence[Mapping[str, Any]], limits: Mapping[str, float 
     for name, (least, most, unit) in BOUNDS.items():
         value = limits[name]
         settings.append([name, "-" if value is None else f"{value:g}", f"{least:g}", f"{most:g}", unit])
-    return [*_aligned(rows), "", "beside the gate", *BESIDE, "", *_aligned(settings)]
+    return [*_aligned(rows), "", "outside the gate", *OUTSIDE_THE_GATE, "", *_aligned(settings)]
 
 
 def _aligned(rows: Sequence[Sequence[str]]) -> list[str]:
-    """Each row as one line, its columns below those of the others."""
+    """Each row as one line, in aligned columns."""
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     return ["  ".join(text.ljust(width) for text, width in zip(row, widths, strict=True)).rstrip() for row in rows]

@@ -55,7 +55,7 @@ class Journal:
     startup: float | None = None
     """CPU time of this process from its start to the first observation [s]; None before it."""
     marks: tuple[str, ...] = ()
-    """What each status line says of this deployment, such as ``"UNSIGNED"``."""
+    """Marks of this deployment, such as ``"UNSIGNED"``, which every status line shows."""
     warnings: dict[str, str] = field(default_factory=dict)
     """The newest warning of each guard of a live robot, by its title; see `SafeRobot.warnings`."""
 
@@ -125,7 +125,7 @@ class DeployReport:
     shadow: Shadow | None = None
     """The comparison with whoever drove the robot."""
     recorder: Recorder | None = None
-    """What recorded it, if anything."""
+    """The recorder, if the deployment was recorded."""
 
     def to_json(self) -> dict[str, Any]:
         """The report as JSON values; times in the unit of their name."""
@@ -174,7 +174,7 @@ class DeployReport:
         ]
 
     def lines(self) -> list[str]:
-        """The report for people, in a few lines, without details of a fault, which were shown when it occurred."""
+        """The report as text, without details of a fault, which were shown when it occurred."""
         journal, reason = self.journal, self.ending.reason.partition(":")[0]
         successes = journal.successes
         succeeded = "" if successes is None else f", {successes} success{'' if successes == 1 else 'es'}"

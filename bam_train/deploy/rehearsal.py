@@ -10,7 +10,7 @@ import numpy as np
 
 from bam_envs.core.errors import SafetyStop, StaleState
 from bam_envs.core.registry import entry_of
-from bam_envs.live.rehearsed import rehearsed_robot, time_to_stop
+from bam_envs.live.rehearsed_robot import rehearsed_robot, time_to_stop
 from bam_envs.robots.linked import LinkedRobot
 from bam_train.checkpoint import Checkpoint
 from bam_train.deploy.journal import EpisodeRecord
@@ -20,7 +20,7 @@ from bam_train.errors import SettingsError
 from bam_train.evaluation import wilson_interval
 
 HALTS_WITHIN = 1.0
-"""The halt of an episode is tried in this time after its start [s], when the robot is on its way."""
+"""Time from the start of an episode within which its halt is tried, while the robot moves [s]."""
 
 
 @dataclass
@@ -35,7 +35,7 @@ class RehearsalReport:
     """Seed of the first episode; episode k has seed + k."""
     records: list[EpisodeRecord] = field(default_factory=list)
     halts: list[float] = field(default_factory=list)
-    """Time from a halt until the robot rested, once an episode [s]; infinite if it did not rest."""
+    """Time from a halt to rest, once an episode [s]; infinite if the robot did not come to rest."""
     guards: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
     """Counts of the guards, by name; see `SafeRobot.report`."""
 
@@ -63,7 +63,7 @@ class RehearsalReport:
         }
 
     def lines(self) -> list[str]:
-        """The report for people."""
+        """The report as text."""
         facts, times = self.to_json(), "no halt was tried"
         counts = "{successes} of {episodes}".format(**facts)
         low, high = facts["success_interval"]
@@ -86,7 +86,7 @@ class RehearsalReport:
         ]
 
     def _by_guard(self, effect: str, of: str) -> str:
-        """Which guards had an `effect`, and in how many `of` all episodes or ticks."""
+        """The guards that had an `effect`, each with its count `of` all episodes or ticks."""
         counts = {f"{name} ({row['number']})": row[effect] for name, row in self.guards.items()}
         return ", ".join(f"by {title} in {count} of {of}" for title, count in counts.items() if count) or "never"
 
@@ -99,7 +99,7 @@ class Rehearsal:
         link: See `bam_envs.robots.linked.link_profile`.
         named: The environment that the user expects.
         profile: The robot profile with the limits of the guards; by default the shipped one for the robot.
-        guards: Limits that differ from the profile's.
+        guards: Limits that replace the profile's.
 
     Raises:
         SettingsError: The environment is not one of `bam_envs`, and has no robot that could be put behind a link.
@@ -133,23 +133,23 @@ class Rehearsal:
             policy: Has ``reset()`` and ``act(observation)``: a `FrozenPolicy`.
             episodes: Number of episodes.
             seed: Seed of the first one.
-            tell: Called with a line about each stop by a guard: the first one by a guard has its reason.
+            tell: Called with a line about each stop by a guard; the first line of each guard has the reason.
         """
-        report, told = RehearsalReport(self.checkpoint.path, self.checkpoint.manifest.env, self.link, seed), set[str]()
+        report, shown = RehearsalReport(self.checkpoint.path, self.checkpoint.manifest.env, self.link, seed), set[str]()
         for k in range(episodes):
             report.records.append(EpisodeRecord(seed + k))
             try:
                 self._play(policy, report)
             except (SafetyStop, StaleState) as stop:
                 short = str(stop).partition(":")[0]
-                tell(f"episode with seed {seed + k}: {short if short in told else stop}")
-                told.add(short)
+                tell(f"episode with seed {seed + k}: {short if short in shown else stop}")
+                shown.add(short)
                 self._gate.resume()
         report.guards = self._gate.report()
         return report
 
     def _play(self, policy: Any, report: RehearsalReport) -> None:
-        """Play one episode; at a moment drawn from its seed a halt is tried, and the robot then goes on as it was."""
+        """Play one episode; at a moment drawn from its seed a halt is tried, and the robot's state is then restored."""
         record = report.records[-1]
         halt_at = 1 + np.random.default_rng(record.seed).integers(round(HALTS_WITHIN / self._linked.spec.period))
         observation, _ = self.env.reset(seed=record.seed)

@@ -1,6 +1,6 @@
-"""Does what a live robot publishes and listens to fit the task? Pure functions of collected messages.
+"""Checks of the topics of a live robot against a task: pure functions of collected messages.
 
-A topic whose messages cannot be read is refused in the topic's own line, and its signals have no further lines.
+A topic whose messages cannot be read is refused in its own line, and its signals have no further lines.
 """
 
 import math
@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from bam_envs.core.errors import ProtocolError
 from bam_envs.core.robot import RobotSpec, SignalSpec
-from bam_envs.live.evidence import Evidence
+from bam_envs.live.inspection import Inspection
 from bam_envs.live.state import Letter, SourceAge, concerns
 from bam_envs.ros.codec import decode_source
 from bam_envs.ros.messages import Message, bare_type, number_at, same_type
@@ -21,42 +21,42 @@ from bam_envs.safety.guards import MeasuredLimits
 from bam_train.deploy.contract_table import Check, check
 
 Array = NDArray[np.float64]
-SLOWER = 0.8
-"""Least number of states per command."""
+STATES_PER_COMMAND = 0.8
+"""Minimum number of states per command."""
 BEYOND = 0.05
-"""How far a measured number may be beyond its range, as a share of the range: fingers and noise."""
+"""Tolerance of a measured number outside its range, as a share of the range: for noise, and fingers that give."""
 FACTORS = {"rad": {"degrees": math.degrees(1)}, "m": {"millimetres": 1000.0, "centimetres": 100.0}}
-"""Other units of a number, and how much greater a number is in them."""
+"""SI unit to other units and the factor by which numbers are greater in them."""
 RATE_OFF = 0.1
 """Tolerance of a measured speed against the change of the measured position [unit/s], and as a share of it."""
 SPEED_OF = {"joint_velocity": "joint_position", "base_velocity": "base_pose"}
-_SCAN_OFF, _RANGE_OFF = 0.02, 10.0  # tolerated share of an angle, tolerated factor of a scanner's range
-_SHORTEST = 0.05  # least time over which a speed is compared [s]
+_SCAN_OFF, _RANGE_OFF = 0.02, 10.0  # relative tolerance of an angle, factor of tolerance of a range
+_SHORTEST = 0.05  # minimum time over which a speed is compared [s]
 
 
-def readings(evidence: Evidence, source: Source, size: int) -> tuple[Array, Array]:
+def readings(inspection: Inspection, source: Source, size: int) -> tuple[Array, Array]:
     """Arrival times (k,) [s] and values (k, size) [SI] of a signal; `ProtocolError` for an unreadable message."""
-    letters = [letter for letter in evidence.letters.get(source.topic, ()) if concerns(source, letter.message)]
+    letters = [letter for letter in inspection.letters.get(source.topic, ()) if concerns(source, letter.message)]
     values = [decode_source(source, letter.message, size) for letter in letters]
     return np.array([letter.arrived for letter in letters]), np.array(values).reshape(-1, size)
 
 
-def robot_checks(profile: RobotProfile, spec: RobotSpec, evidence: Evidence) -> Iterator[Check]:
+def robot_checks(profile: RobotProfile, spec: RobotSpec, inspection: Inspection) -> Iterator[Check]:
     """The lines about topics, rates, ages, units, ranges and commands of a live robot."""
     sizes = {signal.name: len(signal.labels) for signal in spec.signals}
-    required = [source for source in evidence.sources if source.signal in sizes]
-    lockstep = evidence.info is not None and evidence.info.lockstep
+    required = [source for source in inspection.sources if source.signal in sizes]
+    lockstep = inspection.info is not None and inspection.info.lockstep
     readable: dict[str, tuple[Array, Array]] = {}
     for topic in dict.fromkeys(source.topic for source in required):
         sources = [source for source in required if source.topic == topic]
-        trouble, found = _topic_trouble(evidence, sources, sizes)
-        yield check(f"topic {topic}", sources[0].type, trouble or sources[0].type, fits=not trouble)
-        if trouble:
+        problem, found = _read_topic(inspection, sources, sizes)
+        yield check(f"topic {topic}", sources[0].type, problem or sources[0].type, fits=not problem)
+        if problem:
             continue
         readable |= found
         if not lockstep:
-            yield from _timing(profile, spec, evidence, sources[0])
-        yield from _scan_geometry(sources[0], evidence.letters[topic][-1].message)
+            yield from _timing(profile, spec, inspection, sources[0])
+        yield from _scan_geometry(sources[0], inspection.letters[topic][-1].message)
     for signal in spec.signals:
         if signal.name in readable:
             lines = list(_range(signal, readable[signal.name][1]))
@@ -65,21 +65,21 @@ def robot_checks(profile: RobotProfile, spec: RobotSpec, evidence: Evidence) -> 
                 del readable[signal.name]
     for speed, position in SPEED_OF.items():
         if speed in readable and position in readable and not lockstep:
-            simulated = evidence.info is not None and evidence.info.simulated
+            simulated = inspection.info is not None and inspection.info.simulated
             yield _speed(speed, position, *readable[speed], *readable[position], simulated)
-    yield from _commands(evidence)
-    if evidence.info is not None and evidence.info.lockstep and evidence.info.period is not None:
-        period = evidence.info.period
+    yield from _commands(inspection)
+    if inspection.info is not None and inspection.info.lockstep and inspection.info.period is not None:
+        period = inspection.info.period
         yield check("robot's period", f"{spec.period:g} s", f"{period:g} s", fits=period == spec.period)
 
 
-def _topic_trouble(
-    evidence: Evidence, sources: Sequence[Source], sizes: dict[str, int]
+def _read_topic(
+    inspection: Inspection, sources: Sequence[Source], sizes: dict[str, int]
 ) -> tuple[str, dict[str, tuple[Array, Array]]]:
-    """Why the messages of a topic cannot be used, or nothing; and the readings of its signals."""
+    """Why the messages of a topic cannot be used, or ""; and the readings of its signals."""
     topic, expected = sources[0].topic, sources[0].type
-    if evidence.types is not None:
-        kind = evidence.types[topic]
+    if inspection.types is not None:
+        kind = inspection.types[topic]
         if not kind:
             return "nobody publishes it", {}
         if not same_type(kind, expected):
@@ -87,42 +87,42 @@ def _topic_trouble(
     found: dict[str, tuple[Array, Array]] = {}
     for source in sources:
         try:
-            times, values = readings(evidence, source, sizes[source.signal])
+            times, values = readings(inspection, source, sizes[source.signal])
         except ProtocolError as error:
             return str(error).removeprefix(f"{topic}: ").removesuffix("."), {}
         if not len(times):
-            return f"no message in {evidence.seconds:.1f} s", {}
+            return f"no message in {inspection.seconds:.1f} s", {}
         found[source.signal] = times, values
     return "", found
 
 
-def _timing(profile: RobotProfile, spec: RobotSpec, evidence: Evidence, source: Source) -> Iterator[Check]:
+def _timing(profile: RobotProfile, spec: RobotSpec, inspection: Inspection, source: Source) -> Iterator[Check]:
     """Rate and age of the messages of a topic."""
-    letters = [letter for letter in evidence.letters[source.topic] if concerns(source, letter.message)]
+    letters = [letter for letter in inspection.letters[source.topic] if concerns(source, letter.message)]
     allowed = source.max_age or profile.max_age
-    least = 1 / allowed if source.max_age else max(1 / allowed, SLOWER / spec.period)
+    least = 1 / allowed if source.max_age else max(1 / allowed, STATES_PER_COMMAND / spec.period)
     try:
-        new, ages = _new_and_ages(evidence, source, letters)
+        new, ages = _new_and_ages(inspection, source, letters)
     except ProtocolError as error:
         yield check(f"rate of {source.topic}", f"at least {least:.3g} Hz", str(error), fits=False)
         return
     rate = (len(new) - 1) / (new[-1] - new[0]) if len(new) > 1 and new[-1] > new[0] else 0.0
-    what = f"{rate:.3g} Hz" if rate else f"{len(new)} new in {evidence.seconds:.1f} s"
+    what = f"{rate:.3g} Hz" if rate else f"{len(new)} new in {inspection.seconds:.1f} s"
     yield check(f"rate of {source.topic}", f"at least {least:.3g} Hz", what, fits=rate >= least)
     if rate >= least:
         age = statistics.median(ages)
         yield check(f"age of {source.topic}", f"at most {allowed:g} s", f"{age:.3f} s", fits=age <= allowed)
 
 
-def _new_and_ages(evidence: Evidence, source: Source, letters: Sequence[Letter]) -> tuple[list[float], list[float]]:
-    """Arrivals of the new measurements [s], and the age of each message at its arrival [s]."""
-    watch, new, ages, before = SourceAge(evidence.wall_ahead), [], [], math.nan
+def _new_and_ages(inspection: Inspection, source: Source, letters: Sequence[Letter]) -> tuple[list[float], list[float]]:
+    """Arrival times of messages with a new stamp [s], and the age of each message at its arrival [s]."""
+    tracker, new, ages, before = SourceAge(inspection.wall_ahead), [], [], math.nan
     for letter in letters:
-        watch.look(letter, source.topic, evidence.server_offset)
-        ages.append(max(0.0, watch.at(letter.arrived)))
-        if watch.stamp is None or watch.stamp != before:
+        tracker.look(letter, source.topic, inspection.server_offset)
+        ages.append(max(0.0, tracker.at(letter.arrived)))
+        if tracker.stamp is None or tracker.stamp != before:
             new.append(letter.arrived)
-        before = math.nan if watch.stamp is None else watch.stamp
+        before = math.nan if tracker.stamp is None else tracker.stamp
     return new, ages
 
 
@@ -150,7 +150,7 @@ def _scan_geometry(source: Source, message: Message) -> Iterator[Check]:
 def _range(signal: SignalSpec, values: Array) -> Iterator[Check]:
     """The measured numbers of a signal are inside their range, and a quaternion has the length 1."""
     low, high = np.array(signal.low), np.array(signal.high)
-    # A guard stops a robot that is beyond its data sheet at all.
+    # Measured limits (G7) stop a robot at the first value outside these ranges, so there is no tolerance.
     room = (0.0 if signal.name in MeasuredLimits.SIGNALS else BEYOND) * (high - low)
     outside = ((values < low - room) | (values > high + room)).any(axis=0)
     unit = signal.units[0] if len(set(signal.units)) == 1 else ", ".join(signal.units)
@@ -175,7 +175,7 @@ def _span(low: ArrayLike, high: ArrayLike) -> str:
 
 
 def _other_unit(signal: SignalSpec, values: Array) -> str:
-    """``" (degrees?)"`` if the values would be inside their range in that unit, and not all near 0; else nothing."""
+    """``" (degrees?)"`` if the values, not all near 0, are inside their range in another unit; else ""."""
     low, high = np.array(signal.low), np.array(signal.high)
     for name, factor in FACTORS.get(signal.units[0], {}).items():
         si = values / factor
@@ -187,9 +187,9 @@ def _other_unit(signal: SignalSpec, values: Array) -> str:
 def _speed(
     speed: str, position: str, times: Array, speeds: Array, at: Array, positions: Array, simulated: bool
 ) -> Check:
-    """The measured speeds are those at which the measured position changes.
+    """Compare the measured speeds with the change of the measured positions.
 
-    A simulated gripper at rest on an object may chatter: its speed is then that of one moment, not of a motion.
+    A simulated gripper at rest on an object may chatter: its measured speed is then not that of a motion.
     """
     what, expected = f"{speed} against {position}", f"equal within {RATE_OFF:g}"
     if len(at) < 2 or at[-1] - at[0] < _SHORTEST:
@@ -205,12 +205,12 @@ def _speed(
     still = np.abs(changed).max() < RATE_OFF and (simulated or off[worst] <= RATE_OFF)
     if still:
         return check(what, expected, "not shown at rest", fits=None)
-    found = f"{measured[worst]:.3g} told, {changed[worst]:.3g} by {position}"
+    found = f"{measured[worst]:.3g} measured, {changed[worst]:.3g} from {position}"
     return check(what, expected, found, fits=bool(off[worst] <= RATE_OFF))
 
 
 def driven(poses: Array) -> Array:
-    """How far a base has driven forwards [m] and turned [rad] since the first of `poses` (k, 3). Shape: (k, 2)."""
+    """Distance driven forwards [m] and angle turned [rad] since the first of the `poses` (k, 3). Shape: (k, 2)."""
     steps = np.diff(poses, axis=0)
     turned = np.angle(np.exp(1j * steps[:, 2]))
     heading = poses[:-1, 2] + turned / 2
@@ -218,10 +218,10 @@ def driven(poses: Array) -> Array:
     return np.concatenate([np.zeros((1, 2)), np.cumsum(np.stack([forwards, turned], axis=1), axis=0)])
 
 
-def _commands(evidence: Evidence) -> Iterator[Check]:
-    """Somebody takes each part of a command, with its type."""
-    for sink in evidence.sinks:
-        kind = None if evidence.types is None else evidence.types[sink.topic]
-        found = "not told" if kind is None else bare_type(kind) or "nobody listens"
+def _commands(inspection: Inspection) -> Iterator[Check]:
+    """Each topic of a command has a subscriber and the expected type."""
+    for sink in inspection.sinks:
+        kind = None if inspection.types is None else inspection.types[sink.topic]
+        found = "unknown" if kind is None else bare_type(kind) or "nobody listens"
         fits = None if kind is None else bare_type(kind) == bare_type(sink.type)
         yield check(f"command {sink.topic}", sink.type, found, fits=fits)

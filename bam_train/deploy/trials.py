@@ -1,20 +1,20 @@
-"""Trials of a checkpoint on a robot: their record, and the test that says when they are enough.
+"""Trials of a checkpoint on a robot: their record, and the statistical test that decides when they are enough.
 
-The record is a file of JSON lines. A line is written, and is on the disk, before a trial begins, and another one at its
-end: a trial that has only the first one, because the program or the computer was stopped, has failed. Each line carries
-an HMAC of itself and of the line before it; its key, the number of lines and the last HMAC are in a folder that only
-this user can read. So a line that was edited, removed, added or moved is found, at the end of the file too; so is an
-emptied file. Part of a line at the end, which a crash leaves, is ignored. Whoever can read that folder can write any
+The record is a file of JSON lines. A line is written and flushed to the disk before a trial begins, and another one at
+its end: a trial without the second line, because the program or the computer was stopped, has failed. Each line has an
+HMAC of itself and of the line before it. The key, the number of lines and the last HMAC are in a folder that only this
+user can read, so that edited, removed, added and moved lines are detected, also at the end of the file, and so is an
+emptied file. An incomplete line at the end, which a crash leaves, is ignored. Whoever can read that folder can forge a
 record.
 
-The test may be looked at after every trial, and ended at any time, because it is a test martingale (J. Ville, 1939;
+The test is valid after every trial, and may be ended at any time, because it is a test martingale (J. Ville, 1939;
 I. Waudby-Smith and A. Ramdas, "Estimating means of bounded random variables by betting", 2023). For a success rate of
 at most the threshold t, each factor
 
     success: q / t,    failure: (1 - q) / (1 - t),    for any q > t,
 
-has an expectation of at most 1. So the product of the factors ever reaches 1 / alpha with a probability of at most
-alpha. The mean of the products for a few q finds both policies far above the threshold and those just above it.
+has an expectation of at most 1, so that the product of the factors ever reaches 1 / alpha with a probability of at most
+alpha. The mean of the products for several q is sensitive far above the threshold and just above it.
 """
 
 import contextlib
@@ -39,24 +39,24 @@ except ImportError:  # Windows: two programs must not write to one record at onc
     fcntl = None  # type: ignore[assignment]
 
 ALPHA = 0.05
-"""Maximum probability that a policy passes whose success rate is not above the threshold."""
+"""Maximum probability that a policy passes although its success rate is not above the threshold."""
 _MIXTURE = {0.1: 0.8, 0.3: 0.1, 0.6: 0.1}
-"""Failure rate 1 - q of an alternative, as a share of that at the threshold, to its weight."""
-_MOST = 2**28  # bytes of a record
+"""(1 - q) / (1 - t) of each alternative q, to its weight in the mean."""
+_MAX_SIZE = 2**28  # of a record [bytes]
 
 
 @dataclass(frozen=True)
 class Evidence:
-    """What trials say for a success rate above a threshold."""
+    """Evidence of trials for a success rate above a threshold."""
 
     successes: int
     trials: int
     threshold: float
-    """Success rate that is to be exceeded; from 0 to 1, exclusive."""
+    """Success rate to exceed, between 0 and 1, exclusive."""
 
     @property
     def value(self) -> float:
-        """The test martingale: 1 without trials, enough at 1 / `ALPHA`."""
+        """Value of the test martingale: 1 without trials; from 1 / `ALPHA` on the trials are enough."""
         failures, logs = self.trials - self.successes, []
         for share, weight in _MIXTURE.items():
             success = math.log((1 - share * (1 - self.threshold)) / self.threshold)
@@ -83,7 +83,7 @@ class Evidence:
 
     @property
     def text(self) -> str:
-        """For people: ``18 of 19 trials succeeded; 30 more without a failure would show more than 90 %``."""
+        """One line: ``18 of 19 trials succeeded; 30 more without a failure would show more than 90 %``."""
         done = f"{self.successes} of {self.trials} trial{'' if self.trials == 1 else 's'} succeeded"
         above = f"more than {100 * self.threshold:g} %"
         if self.is_enough:
@@ -93,22 +93,22 @@ class Evidence:
 
 @dataclass(frozen=True)
 class Subject:
-    """What is tried, and where."""
+    """The checkpoint and the robot of a trial."""
 
     checkpoint: str
     """`Checkpoint.digest`."""
     robot: str
     """Address of the robot."""
     simulated: bool = False
-    """Whether the robot is simulated: such trials say nothing of a real one at that address."""
+    """Whether the robot is simulated; such trials do not count for a real robot at the same address."""
 
 
 class TrialRecord:
     """The trials in one file of JSON lines; several programs may write to it.
 
     Args:
-        path: The file, made by the first trial.
-        private: Folder for the keys of records, which only this user can read; made by the first trial.
+        path: The file; the first trial creates it.
+        private: Folder for the keys of records, which only this user can read; the first trial creates it.
     """
 
     def __init__(self, path: Path, private: Path) -> None:
@@ -126,27 +126,27 @@ class TrialRecord:
         return Evidence(len(begun & succeeded), len(begun), threshold)
 
     def begin(self, subject: Subject, **facts: Any) -> str:
-        """Write that a trial begins, with further `facts` (JSON); the name of the trial."""
+        """Record the start of a trial, with further `facts` (JSON values), and return the name of the trial."""
         name = f"{_now()} {secrets.token_hex(4)}"
         self._append({"begun": name, **vars(subject), **facts})
         return name
 
     def end(self, name: str, success: bool, reason: str) -> None:
-        """Write how the trial `name` ended."""
+        """Record the end of the trial `name`."""
         self._append({"ended": name, "success": success, "reason": reason, "time": _now()})
 
     def _append(self, row: dict[str, Any]) -> None:
         try:
             self.path.parent.mkdir(parents=True, exist_ok=True)
             self._private.mkdir(parents=True, exist_ok=True, mode=0o700)
-            was_there = self.path.exists()
+            existed = self.path.exists()
             with _locked(self.path) as file:
-                book = self._read() if was_there or os.fstat(file.fileno()).st_size else _Book.new()
-                file.truncate(book.size)  # without the part of a line that a crash left
+                book = self._read() if existed or os.fstat(file.fileno()).st_size else _Book.new()
+                file.truncate(book.size)  # remove an incomplete line
                 file.seek(book.size)
                 rows = [row] if book.lines else [{"format": 1, "record": book.name, "created": _now()}, row]
                 if not book.lines:
-                    self._save(book)  # its key, before the first line
+                    self._save(book)  # the key must exist before the first line
                 for new_row in rows:
                     file.write(book.add(new_row))
                 file.flush()
@@ -159,23 +159,23 @@ class TrialRecord:
             ) from error
 
     def _read(self) -> "_Book":
-        """Every line, checked."""
+        """Read the record and verify every line."""
         try:
             with self.path.open("rb") as file:
-                first = file.readline(_MOST)
+                first = file.readline(_MAX_SIZE)
                 if not first.endswith(b"\n"):
                     self._require_new()
                     return _Book.new()
                 name = _json(first).get("record")
                 if not (isinstance(name, str) and name.isalnum()):
                     raise self._bad("line 1 was edited")
-                key, number_saved, last = self._state(name)  # before the lines, to which others may add meanwhile
-                whole = (first + file.read(_MOST)).rpartition(b"\n")[0]
+                key, number_saved, last = self._state(name)  # read first: another program may append lines meanwhile
+                whole = (first + file.read(_MAX_SIZE)).rpartition(b"\n")[0]
         except OSError as error:
             why = f"cannot be read: {error.strerror or error}"
             if error.filename in (None, self.path, str(self.path)):
                 raise BadTrials(f"{self.path}: {why}. Give another file with --trials") from error
-            text = f"its key {error.filename} {why}. A record is of use only to the user who made it. {_AGAIN}"
+            text = f"its key {error.filename} {why}. A record is of use only to the user who made it. {_REMEDY}"
             raise BadTrials(f"{self.path}: {text}") from error
         book = _Book(name, key)
         for number, line in enumerate(whole.split(b"\n"), 1):
@@ -191,14 +191,14 @@ class TrialRecord:
         return book
 
     def _require_new(self) -> None:
-        """`BadTrials` if there were lines in the file at this path, in which there is none."""
+        """`BadTrials` if the file at this path, now without a line, had lines before."""
         for path in self._private.glob("*.json"):
             state = _json(path.read_bytes())
             if state.get("path") == str(self.path.resolve()) and state.get("lines"):
                 raise self._bad(f"its lines were removed: it had {state['lines']}")
 
     def _state(self, name: str) -> tuple[bytes, int, str]:
-        """Key, number of lines and last HMAC of the record `name`."""
+        """Saved key, number of lines and last HMAC of the record `name`."""
         path = self._private / f"{name}.json"
         state = _json(path.read_bytes())
         try:
@@ -207,10 +207,10 @@ class TrialRecord:
             raise self._bad(f"{path} is damaged") from error
 
     def _bad(self, why: str) -> BadTrials:
-        return BadTrials(f"{self.path}: {why}. {_AGAIN}")
+        return BadTrials(f"{self.path}: {why}. {_REMEDY}")
 
     def _save(self, book: "_Book") -> None:
-        """Replace the key, the number of lines and the last HMAC in one step."""
+        """Save key, number of lines and last HMAC atomically."""
         path, count = str(self.path.resolve()), len(book.lines)
         state = {"key": book.key.hex(), "lines": count, "last": book.last, "path": path}
         descriptor, temporary = tempfile.mkstemp(dir=self._private)  # with mode 0600
@@ -221,12 +221,12 @@ class TrialRecord:
         os.replace(temporary, self._private / f"{book.name}.json")
 
 
-_AGAIN = "Restore it from a copy, or move it away and begin the trials again"
+_REMEDY = "Restore it from a copy, or move it away and begin the trials again"
 
 
 @dataclass
 class _Book:
-    """The lines of a record, and what the next one needs."""
+    """The lines of a record, with the key and the last HMAC for the next line."""
 
     name: str
     key: bytes
@@ -240,12 +240,12 @@ class _Book:
         return cls(secrets.token_hex(8), secrets.token_bytes(32))
 
     def mac(self, row: dict[str, Any]) -> str:
-        """The HMAC of a row after the last one."""
+        """The HMAC of a row that follows the last row."""
         text = json.dumps([self.last, row], sort_keys=True).encode()
         return hmac.new(self.key, text, hashlib.sha256).hexdigest()
 
     def add(self, row: dict[str, Any]) -> bytes:
-        """Take a row, and return its line."""
+        """Append a row, and return its line in the file."""
         self.last = self.mac(row)
         line = json.dumps({**row, "hmac": self.last}).encode() + b"\n"
         self.lines.append(row)
@@ -254,7 +254,7 @@ class _Book:
 
 
 def _json(line: bytes) -> dict[str, Any]:
-    """The table in a line; an empty one if it has none."""
+    """The JSON object in a line; an empty one if there is none."""
     with contextlib.suppress(ValueError, RecursionError):
         row = json.loads(line)
         if isinstance(row, dict):
@@ -264,7 +264,7 @@ def _json(line: bytes) -> dict[str, Any]:
 
 @contextlib.contextmanager
 def _locked(path: Path) -> Iterator[IO[bytes]]:
-    """The file at `path`, made if need be, locked against other programs."""
+    """The file at `path`, created if necessary, locked against other programs."""
     with os.fdopen(os.open(path, os.O_RDWR | os.O_CREAT, 0o644), "r+b") as file:
         if fcntl is not None:
             with contextlib.suppress(OSError):  # a file system without locks
@@ -277,13 +277,13 @@ def _subject_of(row: dict[str, Any]) -> Subject:
 
 
 class Trials:
-    """The trials of one deployment: one an episode, from its first command on.
+    """The trials of one deployment; each episode is one trial.
 
     Args:
-        record: Where they are recorded.
-        subject: What is tried, and where.
-        threshold: Success rate that is to be exceeded.
-        facts: For people: what else each first line holds (JSON), such as the environment and the recording.
+        record: The record to which they are added.
+        subject: Checkpoint and robot.
+        threshold: Success rate to exceed.
+        facts: Further entries (JSON values) of each first line, such as the environment and the recording.
     """
 
     def __init__(self, record: TrialRecord, subject: Subject, threshold: float, facts: Mapping[str, Any]) -> None:
@@ -292,11 +292,11 @@ class Trials:
 
     @property
     def evidence(self) -> Evidence:
-        """The evidence of all trials so far, of earlier deployments too. Raises BadTrials as `TrialRecord.evidence`."""
+        """The evidence of all trials so far, including earlier deployments; raises BadTrials."""
         return self.record.evidence(self.subject, self.threshold)
 
     def begin(self, seed: int) -> None:
-        """Record that a trial begins; raises BadTrials if that is impossible, and then nothing may move."""
+        """Record the start of a trial; raises BadTrials if that fails, and then the robot must not move."""
         self._running = self.record.begin(self.subject, **self.facts, seed=seed)
 
     def end(self, success: bool, reason: str) -> None:

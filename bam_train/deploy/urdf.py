@@ -1,4 +1,4 @@
-"""Reads the joints of a robot's URDF, its description in XML: limits, and where they put a link."""
+"""Joints of a robot's URDF (its description in XML): limits, and forward kinematics."""
 
 import math
 from collections.abc import Mapping
@@ -13,7 +13,7 @@ from bam_train.errors import FormatError
 
 Array = NDArray[np.float64]
 LARGEST = 8 * 2**20
-"""Most characters of a URDF that are read."""
+"""Maximum length of a URDF [characters]."""
 
 
 @dataclass(frozen=True)
@@ -56,11 +56,15 @@ class Urdf(dict[str, UrdfJoint]):
 
 
 def read_urdf(text: object) -> Urdf:
-    """The joints in the text of a URDF; `FormatError` says what is wrong with it."""
+    """The joints in the text of a URDF.
+
+    Raises:
+        FormatError: The text is not a URDF.
+    """
     if not isinstance(text, str) or len(text) > LARGEST or "<!" in text.replace("<!--", ""):  # no declared entities
         raise FormatError("the robot's description is no URDF")
     try:
-        root = ElementTree.fromstring(text)  # without declarations there is nothing to expand
+        root = ElementTree.fromstring(text)  # without entity declarations nothing is expanded
         return Urdf({str(element.get("name")): _joint(element) for element in root.findall("joint")})
     except (ElementTree.ParseError, ValueError, AttributeError) as error:
         raise FormatError(f"the robot's description is no URDF: {error}") from error
@@ -98,7 +102,7 @@ def _pose(position: Array, angles: Array) -> Array:
 
 
 def _moved(joint: UrdfJoint, position: float) -> Array:
-    """The motion of a joint to `position`. Shape: (4, 4)."""
+    """Transform of a joint at `position` [rad, m]. Shape: (4, 4)."""
     pose = np.eye(4)
     if joint.kind in ("revolute", "continuous"):
         pose[:3, :3] = _rotation(joint.axis, position)

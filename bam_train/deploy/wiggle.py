@@ -1,6 +1,6 @@
-"""Does each axis of a live robot move as it is commanded? By a recording, or by a small, slow motion of each axis.
+"""Check that each axis of a live robot moves as commanded: from a recording, or with a small motion of each axis.
 
-That motion passes the guards like any other.
+The commands of that motion pass the guards like any other.
 """
 
 import math
@@ -14,31 +14,31 @@ from bam_envs.core.errors import SafetyStop
 from bam_envs.core.robot import Initial, RobotSpec, RobotState, SignalSpec
 from bam_envs.safety.gate import SafeRobot
 from bam_envs.safety.guard import is_base, measured_places
+from bam_train.deploy.checkpoint_admission import SHADOW
 from bam_train.deploy.contract_table import Check, check
 from bam_train.deploy.robot_checks import FACTORS, driven
-from bam_train.deploy.trust import SHADOW
 from bam_train.recording.recording import Recording
 
 Array = NDArray[np.float64]
 FAR = {"rad": 0.03, "m": 0.01, "m/s": 0.05, "rad/s": 0.1}
-"""How far each axis moves, or how fast a base drives and turns, by the unit of its command."""
-THERE, STAY = 1.0, 0.5
-"""Time for the way there, as for the way back, and the time at rest after each [s]."""
-_MOST_LAG = 0.5  # longest delay of the measured motion behind the commands [s]
+"""Amplitude of the motion of each axis, a speed for a base, by the unit of its command."""
+MOVE_TIME, REST_TIME = 1.0, 0.5
+"""Duration of the motion in each direction, and of the rest after it [s]."""
+_MAX_LAG = 0.5  # maximum delay of the measured motion behind the commands [s]
 _MOVED, _LEAST, _MOST = 0.3, 0.6, 1.6
-"""Share of the commanded motion that counts as motion at all, and the least and most that is right."""
+"""Shares of the commanded motion: minimum that counts as motion, minimum and maximum of a correct motion."""
 _HELD = 0.2
-"""The same least share of a gripper, which closes no further than what it holds."""
+"""Minimum share of a correct motion of a gripper, which may hold an object."""
 _FIT, _ENOUGH = 0.8, 0.2
-"""Share of a motion that its commands must explain, and share of `FAR` that shows anything."""
+"""Share of a motion that the commands must explain, and share of `FAR` from which a motion is compared."""
 
 
 def wiggle(robot: SafeRobot, joints: Array | None) -> Iterator[Check]:
-    """Move each axis a little and back; one line for each. The robot is halted afterwards.
+    """Move each axis a little and back, and yield a line for each. The robot is halted afterwards.
 
     Args:
-        robot: A connected robot, whose owner has allowed the motion.
-        joints: The measured joints of an arm (k,) [rad], where it begins; None for a base.
+        robot: A connected robot; the operator has allowed the motion.
+        joints: The measured joints of an arm (k,) [rad]; None for a base.
     """
     spec, command = robot.spec, robot.spec.command
     signals, label = {} if joints is None else {"joint_position": joints[None]}, "the axes"
@@ -59,7 +59,7 @@ def wiggle(robot: SafeRobot, joints: Array | None) -> Iterator[Check]:
 
 
 def recorded_motion(path: Path, spec: RobotSpec, address: str) -> Iterator[Check]:
-    """The lines about the motion of each axis in the longest episode of a recording of the live robot at `address`.
+    """Lines about the motion of each axis in the longest episode of a recording of the live robot at `address`.
 
     A recording of another robot, of a simulation, or of a shadow, which sends nothing, is refused.
 
@@ -67,9 +67,9 @@ def recorded_motion(path: Path, spec: RobotSpec, address: str) -> Iterator[Check
         BadRecording: There is no such recording, or it is of another robot.
     """
     recording = Recording.open(path)
-    told = recording.metadata
-    found = told.get("address", "") if told.get("robot") else "a simulation"
-    if SHADOW in told.get("marks", ""):
+    metadata = recording.metadata
+    found = metadata.get("address", "") if metadata.get("robot") else "a simulation"
+    if SHADOW in metadata.get("marks", ""):
         found = "a shadow, which sends nothing"
     fits = found.rstrip("/") == address.rstrip("/")
     yield check(f"recording {path.name}", address, found, fits=fits)
@@ -83,7 +83,7 @@ def recorded_motion(path: Path, spec: RobotSpec, address: str) -> Iterator[Check
 
 
 def _compared(spec: RobotSpec, commands: Sequence[Array], measured: Sequence[Array]) -> Iterator[Check]:
-    """`motion_checks` of the commands, and of what was measured after each."""
+    """`motion_checks` of the commands and the measurement after each."""
     sent, seen = np.array(commands), np.array(measured)
     if is_base(spec):
         sent, seen = np.cumsum(sent * spec.period, axis=0), driven(seen)
@@ -91,11 +91,11 @@ def _compared(spec: RobotSpec, commands: Sequence[Array], measured: Sequence[Arr
 
 
 def motion_checks(command: SignalSpec, commanded: Array, measured: Array, period: float) -> Iterator[Check]:
-    """One line for each axis: whether its motion was the commanded one, as far, that way, and not another axis's.
+    """Compare distance, direction and axis of each measured motion with the commanded one; yields a line for each axis.
 
     Args:
         command: Labels and units of the axes.
-        commanded: Commanded positions (k, m), one each period; of a base, how far it should have driven and turned.
+        commanded: Commanded positions (k, m), one row a period; for a base, distance driven [m] and angle turned [rad].
         measured: Measured positions (k, m); NaN where nothing is measured.
         period: Time between two rows [s].
     """
@@ -105,14 +105,14 @@ def motion_checks(command: SignalSpec, commanded: Array, measured: Array, period
         if not np.isfinite(measured[:, i]).all():
             found = "it is not measured", None
         elif moved[i]:
-            found = _motion(command, i, commanded, measured[:, i], moved, round(_MOST_LAG / period))
+            found = _motion(command, i, commanded, measured[:, i], moved, round(_MAX_LAG / period))
         yield check(f"motion of {label}", "as commanded", found[0], fits=found[1])
 
 
 def _motion(
     command: SignalSpec, i: int, commanded: Array, measured: Array, moved: NDArray[np.bool_], most_lag: int
 ) -> tuple[str, bool | None]:
-    """How the measured axis `i` (k,) moved, for the commands to all axes (k, m); and whether that is right."""
+    """How the measured axis `i` (k,) moved, for the commands to all axes (k, m); and whether that is correct."""
     gain, fit = _best_fit(commanded[:, i], measured, most_lag)
     unit = command.units[i].removesuffix("/s")
     others = {
@@ -120,26 +120,26 @@ def _motion(
         for j, label in enumerate(command.labels)
         if j != i and moved[j] and command.units[j] == command.units[i]
     }
-    like = [label for label, (other, how_well) in others.items() if how_well >= max(_FIT, fit) and _right(other, unit)]
+    like = [label for label, (other, how_well) in others.items() if how_well >= max(_FIT, fit) and _fits(other, unit)]
     if np.ptp(measured) < _MOVED * np.ptp(commanded[:, i]) and not like:
         return "it did not move", False
     if fit < _FIT:
         return f"it moved as {like[0]} was commanded" if like else "it did not follow its commands", False
     if gain < 0:
         return "it moved the other way", False
-    if _right(gain, unit):
+    if _fits(gain, unit):
         return (f"{gain:.2f} of what was commanded", True) if not like else (f"as {like[0]} was commanded, too", None)
     units = FACTORS.get(unit, {}).items()
-    hint = next((f" ({name}?)" for name, much in units if _right(gain / much, unit) or _right(gain * much, unit)), "")
+    hint = next((f" ({name}?)" for name, much in units if _fits(gain / much, unit) or _fits(gain * much, unit)), "")
     return f"it moved {gain:.2g} times as far{hint}", False
 
 
-def _right(gain: float, unit: str) -> bool:
+def _fits(gain: float, unit: str) -> bool:
     return (_HELD if unit == "m" else _LEAST) <= gain <= _MOST
 
 
 def _best_fit(commanded: Array, measured: Array, most_lag: int) -> tuple[float, float]:
-    """Least squares, at the delay that fits best: the measured motion per commanded one, and the share it explains."""
+    """Least squares at the best delay: gain from commanded to measured motion, and the share explained (R^2)."""
     best = 0.0, -math.inf
     for lag in range(min(most_lag, len(commanded) - 2) + 1):
         sent, seen = commanded[: len(commanded) - lag], measured[lag:]
@@ -153,11 +153,11 @@ def _best_fit(commanded: Array, measured: Array, most_lag: int) -> tuple[float, 
 
 
 def _goals(command: SignalSpec, start: Array, period: float) -> Iterator[tuple[str, Array]]:
-    """Label of the axis that moves and command (m,), one each period: each axis goes a little way and comes back."""
-    there, stay = math.ceil(THERE / period), math.ceil(STAY / period)
-    way = (1 - np.cos(np.pi * np.arange(1, there + 1) / there)) / 2
-    shares = np.concatenate([way, np.ones(stay), way[::-1], np.zeros(stay)])
-    speeds = np.concatenate([np.ones(there), np.zeros(stay), -np.ones(there), np.zeros(stay)])
+    """Yield the label of the moving axis and the command (m,) of each period; axes move one after the other."""
+    moving, resting = math.ceil(MOVE_TIME / period), math.ceil(REST_TIME / period)
+    path = (1 - np.cos(np.pi * np.arange(1, moving + 1) / moving)) / 2
+    shares = np.concatenate([path, np.ones(resting), path[::-1], np.zeros(resting)])
+    speeds = np.concatenate([np.ones(moving), np.zeros(resting), -np.ones(moving), np.zeros(resting)])
     for i, unit in enumerate(command.units):
         middle = (command.low[i] + command.high[i]) / 2
         far = FAR[unit] if start[i] <= middle or unit.endswith("/s") else -FAR[unit]
@@ -168,7 +168,7 @@ def _goals(command: SignalSpec, start: Array, period: float) -> Iterator[tuple[s
 
 
 def _measured(spec: RobotSpec, state: RobotState) -> Array:
-    """The measured position of each axis (m,), NaN if not measured; of a base its pose (3,)."""
+    """The measured position of each axis (m,), NaN if not measured; for a base its pose (3,)."""
     if is_base(spec):
         pose: Array = state.signals["base_pose"][0]
         return pose

@@ -216,7 +216,7 @@ def test_the_contract_is_compared_without_a_command(rosbridge, robot_node):
     assert [(one.what, one.found) for one in contract.refused] == []
     verdicts = {one.what: one.verdict for one in contract.checks}
     assert [verdicts[f"rate of {topic}"] for topic in STATES] == ["ok"] * 3
-    assert verdicts["command /forward_position_controller/commands"] == "not told"  # this bridge has no rosapi
+    assert verdicts["command /forward_position_controller/commands"] == "unknown"  # this bridge has no rosapi
     assert robot_node.ask("report")["received"] == []
     elsewhere = check_contract(Checkpoint.open(PICK), env, Place(robot=f"{rosbridge.url}/cell"), timeout=0.5)
     assert [one.what for one in elsewhere.refused] == [f"topic {topic}" for topic in STATES]

@@ -115,8 +115,8 @@ def _all_steps(diagnosis: Diagnosis, subject: _Subject | None) -> Iterator[Step]
     except (BamEnvsError, ContractRefused) as error:
         yield Step(CONTRACT, "failed", str(error))
         return
-    untold = [line.what for line in contract.checks if line.verdict == "not told"]
-    warnings = [f"not told by the robot: {listed(untold)}"] if untold else []
+    unknown = [line.what for line in contract.checks if line.verdict == "unknown"]
+    warnings = [f"unknown: {listed(unknown)}"] if unknown else []
     yield Step(CONTRACT, "warning" if warnings else "ok", f"{len(contract.checks)} lines", tuple(warnings))
 
 

@@ -6,7 +6,7 @@ from pathlib import Path
 from bam_envs.core.errors import InvalidValue
 from bam_envs.core.robot import RobotSpec
 from bam_envs.live.rosbridge_robot import RosbridgeRobot
-from bam_envs.live.shadow import ShadowRobot
+from bam_envs.live.shadow_robot import ShadowRobot
 from bam_envs.robots.profile import load_profile, profile_for
 from bam_envs.ros.profile_tables import RobotProfile
 from bam_envs.rosbridge.endpoint import Endpoint

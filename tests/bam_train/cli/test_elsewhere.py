@@ -260,7 +260,7 @@ def test_each_axis_is_wiggled_first_or_shown_by_a_recording(serve, run, commands
     assert status == 0, err
     assert ["recording flight.mcap", "ok"] in [[line[0], line[-1]] for line in lines]
     moved = {line[0].removeprefix("motion of "): line[-1] for line in lines if line[0].startswith("motion of ")}
-    assert moved == dict.fromkeys([*UR_JOINTS, "gripper_width"], "ok") | {"wrist_2_joint": "not told"}
+    assert moved == dict.fromkeys([*UR_JOINTS, "gripper_width"], "ok") | {"wrist_2_joint": "unknown"}
 
 
 def test_a_recording_of_a_simulation_shows_nothing(serve, run, tmp_path):

@@ -15,7 +15,7 @@ import pytest
 from bam_train.checkpoint import MANIFEST, POLICY, Checkpoint, safetensors_file, write_checkpoint
 from bam_train.checkpoint.signature import make_key, public_path, sign, trust, verify
 from bam_train.cli.sign import main
-from bam_train.deploy.trust import Admission
+from bam_train.deploy.checkpoint_admission import Admission
 from bam_train.env_location import HERE
 from bam_train.errors import AlteredCheckpoint, BadKey, CheckpointError, OutputError, UntrustedCheckpoint
 from bam_train.policy import onnx_session

@@ -16,8 +16,8 @@ from bam_envs.ros.codec import read_info
 from bam_envs.safety.guard import BOUNDS, Limits
 from bam_train.checkpoint import Checkpoint
 from bam_train.cli.deploy import main as deploy
+from bam_train.deploy.checkpoint_admission import Admission
 from bam_train.deploy.trials import Subject, TrialRecord, Trials
-from bam_train.deploy.trust import Admission
 from bam_train.env_location import HERE, Place
 from bam_train.errors import BadTrials, SettingsError, TrialsNeeded
 from bam_train.recording.recording import Recording

@@ -13,7 +13,7 @@ import pytest
 
 from bam_envs.core.kinematics import UR5E_GRIPPER, UR_JOINTS, quaternions
 from bam_envs.core.robot import RobotState
-from bam_envs.live.evidence import TOOL_POSE, Evidence
+from bam_envs.live.inspection import TOOL_POSE, Inspection
 from bam_envs.live.state import Letter
 from bam_envs.robots.mir100 import base_spec
 from bam_envs.robots.profile import load_profile
@@ -48,9 +48,9 @@ class Watched:
     def contract(self):
         robot = SimpleNamespace(spec=self.spec, limits=Limits())
         env = SimpleNamespace(unwrapped=SimpleNamespace(robot=robot, task=self.task))
-        return Contract(tuple(live_checks(env, self.profile, self.evidence())))
+        return Contract(tuple(live_checks(env, self.profile, self.inspection())))
 
-    def evidence(self):
+    def inspection(self):
         names = {signal.name for signal in self.spec.signals} | {*TOOL_POSE}
         sources = tuple(source for source in self.profile.state if source.signal in names)
         sinks = self.profile.sinks()
@@ -70,7 +70,7 @@ class Watched:
         if self.urdf is not None:
             letters["/robot_description"] = [Letter({"data": self.urdf}, BEGIN, 1)]
         letters = {topic: tuple(found) for topic, found in letters.items()}
-        return Evidence(self.info, sources, sinks, types, letters, self.seconds, WALL - BEGIN, -self.clock)
+        return Inspection(self.info, sources, sinks, types, letters, self.seconds, WALL - BEGIN, -self.clock)
 
     def noisy(self, values, scale):
         values = np.asarray(values, float)
@@ -312,7 +312,7 @@ ARMS = [
     (
         altered(joint_velocity=lambda x: x + 1.0),
         "joint_velocity against joint_position",
-        "1 told, 0 by joint_position",
+        "1 measured, 0 from joint_position",
     ),
     (having(rate=5.0), f"rate of {JOINT_TOPIC}", "5 Hz"),
     (having(frozen=True), f"rate of {JOINT_TOPIC}", "1 new in 0.5 s"),
@@ -346,8 +346,8 @@ BASES = [
     (sending(SCAN, put("angle_increment", lambda x: -x)), f"angle_increment of {SCAN}", "-0.008727"),
     (sending(SCAN, put("angle_min", math.degrees)), f"angle_min of {SCAN}", "-135 (degrees?)"),
     (sending(SCAN, put("range_max", 29000.0)), f"range_max of {SCAN}", "2.9e+04 (millimetres?)"),
-    (altered(base_velocity=mirrored(0)), "base_velocity against base_pose", "-0.3 told, 0.3 by base_pose"),
-    (altered(base_velocity=mirrored(1)), "base_velocity against base_pose", "-0.4 told, 0.4 by base_pose"),
+    (altered(base_velocity=mirrored(0)), "base_velocity against base_pose", "-0.3 measured, 0.3 from base_pose"),
+    (altered(base_velocity=mirrored(1)), "base_velocity against base_pose", "-0.4 measured, 0.4 from base_pose"),
     (altered(base_velocity=lambda x: 1000 * x), "base_velocity", "linear_velocity at 300"),
     (typed("/cmd_vel", "geometry_msgs/TwistStamped"), "command /cmd_vel", "geometry_msgs/TwistStamped"),
 ]
@@ -380,7 +380,7 @@ def test_what_a_robot_does_not_report_is_not_told():
     arm.measures_tool = False
     contract = arm.contract()
     assert refused(contract) == {}
-    assert {one.what: one.found for one in contract.checks if one.verdict == "not told"} == {
+    assert {one.what: one.found for one in contract.checks if one.verdict == "unknown"} == {
         "joint_velocity against joint_position": "not shown at rest",
         "joint limits": "nobody publishes /robot_description",
         "tool pose": "the robot does not report the pose of its tool",
@@ -398,7 +398,7 @@ def test_a_simulated_gripper_that_chatters_on_an_object_is_no_wrong_speed():
 def test_a_joint_at_zero_does_not_show_its_sense():
     arm = Arm(joints=JOINTS * (1, 1, 1, 1, 1, 0))
     last = arm.contract().checks[-1]
-    assert (last.verdict, last.found) == ("not told", "not shown at 0 or 180 degrees: wrist_3_joint; give --wiggle")
+    assert (last.verdict, last.found) == ("unknown", "not shown at 0 or 180 degrees: wrist_3_joint; give --wiggle")
 
 
 def test_the_tool_pose_in_a_frame_that_the_profile_does_not_name_is_not_compared():
@@ -406,7 +406,7 @@ def test_the_tool_pose_in_a_frame_that_the_profile_does_not_name_is_not_compared
     sending("/tcp_pose_broadcaster/pose", put("header.frame_id", "left_base"))(arm)
     contract = arm.contract()
     found = {one.what: one for one in contract.checks}["tool pose"]
-    assert found.verdict == "not told"
+    assert found.verdict == "unknown"
     assert found.found.startswith("/tcp_pose_broadcaster/pose: header.frame_id must be 'base', not 'left_base'")
 
 

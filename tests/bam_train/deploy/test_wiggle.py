@@ -139,7 +139,7 @@ def test_an_axis_that_did_not_move_or_is_not_measured_is_not_told():
     commanded, measured = motion(np.random.default_rng(0))
     commanded[:, 0], measured[:, 6] = commanded[0, 0], np.nan
     lines = {one.what: one for one in motion_checks(ARM, commanded, measured, PERIOD)}
-    assert [(one.what, one.found) for one in lines.values() if one.verdict == "not told"] == [
+    assert [(one.what, one.found) for one in lines.values() if one.verdict == "unknown"] == [
         ("motion of shoulder_pan_joint", "it was not commanded to move"),
         ("motion of gripper_width", "it is not measured"),
     ]
@@ -149,7 +149,7 @@ def test_two_axes_that_were_commanded_alike_are_not_told_apart():
     commanded, measured = motion(np.random.default_rng(0))
     commanded[:, 1], measured[:, 1] = commanded[:, 0], measured[:, 0]
     lines = {one.what: (one.found, one.verdict) for one in motion_checks(ARM, commanded, measured, PERIOD)}
-    assert lines["motion of shoulder_pan_joint"] == ("as shoulder_lift_joint was commanded, too", "not told")
+    assert lines["motion of shoulder_pan_joint"] == ("as shoulder_lift_joint was commanded, too", "unknown")
 
 
 def test_a_gripper_that_holds_something_closes_no_further():

@@ -1,4 +1,4 @@
-"""What a real robot asks of a checkpoint before it moves: a signature that this computer trusts, and trials."""
+"""Admission of a checkpoint to a real robot: a signature that this computer trusts, and enough trials."""
 
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -15,14 +15,13 @@ from bam_train.errors import SettingsError, TrialsNeeded, UntrustedCheckpoint
 from bam_train.policy import FrozenPolicy
 
 UNSIGNED, UNPROVEN, TRIAL, SHADOW = "UNSIGNED", "UNPROVEN", "trial", "shadow: nothing is sent"
-"""Marks of a deployment: nobody trusted has signed its checkpoint; full speed without enough trials; on trial; somebody
-else drives."""
+"""Marks of a deployment: no trusted signature; full speed without enough trials; on trial; somebody else drives."""
 TRIALS = Path("recordings") / "trials.jsonl"
-"""The record of trials."""
+"""Default record of trials."""
 
 
 def has_real_robot(env: Any) -> bool:
-    """Whether a robot that is not simulated would move; known once it is connected."""
+    """Whether the environment has a real robot; known once it is connected."""
     info = getattr(getattr(env.unwrapped, "robot", None), "info", None)
     return info is not None and not info.simulated
 
@@ -33,32 +32,32 @@ class Admission:
 
     checkpoint: Checkpoint
     keys: Path | None = None
-    """Folder of the trusted public keys; None: that of this user."""
+    """Folder of the trusted public keys; None: `trusted_folder`."""
     allow_unsigned: bool = False
     record: Path | None = None
     """The record of trials; None: `TRIALS`."""
     i_know: bool = False
     """Whether full speed is allowed without enough trials."""
     marks: tuple[str, ...] = ()
-    """For `Journal.marks`."""
+    """Marks for `Journal.marks`, set by the call."""
     trials: Trials | None = None
-    """For `Deployment`: the trials of a robot on trial."""
+    """Trials for `Deployment`, set by the call if the robot is on trial."""
     shadow: Shadow | None = None
-    """The comparison with whoever drives the robot."""
+    """Comparison with whoever drives the robot, set by the call for a shadow."""
     policy: FrozenPolicy = field(init=False)
     """The frozen policy, once it is admitted."""
 
     def __call__(self, env: gym.Env[Any, Any], place: Place) -> list[str]:
-        """Check signature and trials if the robot is real, and load the policy; returns lines for a person.
+        """Check signature and trials if the robot is real, and load the policy; returns lines for the operator.
 
-        A simulated robot needs no signature, and trials only if its place says whether it is on trial.
+        A simulated robot needs no signature, and trials only if `place.trial` is set.
 
         Raises:
-            UntrustedCheckpoint: The robot is real, and nobody trusted has signed the checkpoint.
-            AlteredCheckpoint: It is not as it was signed.
-            TrialsNeeded: Full speed is asked for, and there are not enough trials.
+            UntrustedCheckpoint: The robot is real, and the checkpoint has no trusted signature.
+            AlteredCheckpoint: The checkpoint was changed after it was signed.
+            TrialsNeeded: Full speed is requested without enough trials.
             BadTrials: The record of trials was edited, or cannot be read.
-            SettingsError: There is a record of trials, and the robot is simulated and not on trial.
+            SettingsError: A record of trials is given for a simulated robot that is not on trial.
         """
         lines = self._signature() if has_real_robot(env) else []
         if place.shadow:

@@ -7,7 +7,7 @@ import pytest
 
 from bam_envs.core.errors import InvalidValue, StaleState
 from bam_envs.core.robot import Initial
-from bam_envs.live.rehearsed import RehearsedRobot, rehearsed_robot, time_to_stop
+from bam_envs.live.rehearsed_robot import RehearsedRobot, rehearsed_robot, time_to_stop
 from bam_envs.robots.fake import FakeRobot
 from bam_envs.robots.linked import PROFILES, LinkedRobot, LinkProfile
 from bam_envs.robots.physics.kinematic_base import open_floor

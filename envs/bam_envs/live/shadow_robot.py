@@ -1,4 +1,4 @@
-"""A live robot that somebody else drives: what a policy would do is compared with that, and nothing is sent."""
+"""A live robot that somebody else drives: its motion is compared with a policy's commands, which are not sent."""
 
 from collections.abc import Callable
 from typing import Any
@@ -17,13 +17,13 @@ from bam_envs.safety.guard import Limits
 Watch = Callable[[NDArray[np.float64], RobotState, RobotState], None]
 """Called at each step with the command (1, m) that was not sent, the state before it, and the one a period later."""
 _STALE = 1.0
-"""Age of a state at which the robot is taken as gone [s]."""
+"""Age of the newest state from which the robot counts as lost [s]."""
 
 
 class ShadowRobot(RosbridgeRobot):
-    """The states of a `RosbridgeRobot`. It advertises nothing, opens no session, and publishes nothing, halts included.
+    """A read-only `RosbridgeRobot`: it advertises no topic, opens no session, and publishes nothing, not even a halt.
 
-    A command in its states is that of a robot at rest where it is: tasks count from the robot, not from the policy.
+    The command in its states is that of a robot at rest, so that tasks continue from the robot, not from the policy.
     """
 
     needs_clearance = False
@@ -31,21 +31,21 @@ class ShadowRobot(RosbridgeRobot):
     def __init__(self, *arguments: Any, limits: Limits, **options: Any) -> None:
         super().__init__(*arguments, **options)
         self.limits = limits
-        """Those that its guards would have, if it was commanded."""
+        """The limits that its guards would have; the commands are compared with them."""
         self.watch: Watch = lambda command, before, after: None
 
     def _advertise(self, control: RosbridgeLink, halting: RosbridgeLink, types: bringup.TopicTypes) -> None:
-        """Nothing: it sends no commands."""
+        """Do nothing: no command is sent."""
 
     def _open_session(self, control: RosbridgeLink) -> None:
-        """Nothing: it does not drive."""
+        """Do nothing: a session is for the program that drives."""
 
     def not_ready(self) -> str | None:
-        """None: whoever drives it looks after that."""
+        """Return None: readiness is the concern of whoever drives the robot."""
         return None
 
     def reset(self, env_ids: EnvIds, initial: Initial) -> RobotState:
-        """A fresh state; the robot goes on with what it does, and `initial` has no effect."""
+        """A fresh state; the robot is not moved, and `initial` has no effect."""
         control = self._wait_up()
         if control.epoch != self._epoch or self._cut.is_set():
             self._begin(control)
@@ -54,11 +54,11 @@ class ShadowRobot(RosbridgeRobot):
         return self.measure()
 
     def step(self, command: Any) -> RobotState:
-        """Wait until one period is over; `command` (1, m) goes to `watch`, and not to the robot.
+        """Wait until the period is over; `command` (1, m) is passed to `watch` instead of the robot.
 
         Raises:
             LinkLost: The link dropped.
-            StaleState: The robot publishes no more.
+            StaleState: The robot has stopped publishing states.
         """
         before = self.measure()
         self._pacer.tick()
@@ -71,4 +71,4 @@ class ShadowRobot(RosbridgeRobot):
         return after
 
     def halt(self) -> None:
-        """Nothing: a client that only reads must not stop the robot of another one."""
+        """Do nothing: a read-only client must not stop a robot that somebody else drives."""

@@ -1,6 +1,6 @@
-"""A simulated robot behind a simulated link, guarded as a live one is: what an operator rehearses a deployment with.
+"""A simulated robot behind a simulated link, with the guards of a live robot, for rehearsals of a deployment.
 
-Time is the simulation's: it advances by a period with each command, and the ages of states are counted in it.
+Time is simulated: it advances by one period with each command, and the ages of states are in simulated time.
 """
 
 import math
@@ -15,14 +15,14 @@ from bam_envs.ros.codec import RobotInfo
 from bam_envs.safety.gate import ClearedCommand, SafeRobot
 from bam_envs.safety.guard import is_base, measured_places
 
-RESTS = 0.02
-"""A robot rests when its joints are slower than this [rad/s], or its drive [m/s] and its turning [rad/s]."""
+AT_REST = 0.02
+"""Speed below which a joint [rad/s], or a base [m/s and rad/s], is at rest."""
 LONGEST_STOP = 5.0
-"""Longest time for which a robot is watched until it rests [s]."""
+"""Maximum time until a halted robot is at rest [s]."""
 
 
 class RehearsedRobot:
-    """One simulated robot behind a link, which takes cleared commands only, as a live one does.
+    """One simulated robot behind a link, which takes cleared commands only, like a live robot.
 
     Args:
         robot: The robot behind the link.
@@ -40,7 +40,7 @@ class RehearsedRobot:
         self.robot.connect()
 
     def not_ready(self) -> None:
-        """Nothing: it is always ready."""
+        """Return None: it is always ready."""
 
     def reset(self, env_ids: EnvIds, initial: Initial) -> RobotState:
         """Set the robot to `initial`, at rest."""
@@ -82,12 +82,12 @@ def rehearsed_robot(
     guards: Mapping[str, float] | None = None,
     straight: bool = False,
 ) -> SafeRobot:
-    """`robot` behind the guards of a live one.
+    """A `SafeRobot` around `robot`, with the limits of a live robot.
 
     Args:
         robot: One simulated robot behind a link.
         profile: The robot profile with the limits of the guards; by default the shipped one for the robot.
-        guards: Limits that differ from the profile's, such as ``{"lag": 0.15}``.
+        guards: Limits that replace the profile's, such as ``{"lag": 0.15}``.
         straight: Whether the task moves the tool in straight lines, see `SafeRobot`.
 
     Raises:
@@ -101,16 +101,17 @@ def rehearsed_robot(
 
 
 def time_to_stop(robot: LinkedRobot) -> float:
-    """The time from sending a halt to one robot until it rests [s]; infinite if that takes longer than `LONGEST_STOP`.
+    """Time from sending a halt to one robot until it is at rest [s]; infinite if longer than `LONGEST_STOP`.
 
-    The halt goes through the link, once, as any command, and nothing follows it. Afterwards the robot is as it was.
+    The halt is sent through the link once, like any command, and nothing follows it. The robot's state is restored
+    afterwards.
     """
     before, spec = robot.state_dict(), robot.spec
     speeds = spec.command.units if is_base(spec) else [f"{unit}/s" for unit in spec.command.units]
     places = measured_places(spec, speeds)
 
     def moves() -> bool:
-        return any(abs(robot.there.signals[name][0, column]) > RESTS for _, name, column in places)
+        return any(abs(robot.there.signals[name][0, column]) > AT_REST for _, name, column in places)
 
     robot.step(robot.rest(robot.newest))
     periods = 1

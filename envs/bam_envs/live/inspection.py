@@ -1,4 +1,4 @@
-"""What a live robot shows to a client that only listens: its description, types, messages. Nothing is sent to it."""
+"""Inspect a live robot by listening only: its description, topics, types and messages. No command is sent."""
 
 import threading
 import time
@@ -23,23 +23,24 @@ DESCRIPTION, DESCRIPTION_TYPE = "/robot_description", "std_msgs/String"
 """The topic on which a robot publishes its URDF, latched."""
 TOOL_POSE = ("tool_position", "tool_quaternion")
 """Optional signals of an arm: the pose of its tool, as its controller measures it."""
-_AGAIN = 0.1
+_RETRY = 0.1
+"""Time between two questions for the type of a topic [s]."""
 _AGES = 3
-"""Number of the longest allowed ages for which messages are collected."""
+"""Duration of the collection, in multiples of the longest allowed age of a state."""
 
 
 @dataclass(frozen=True)
-class Evidence:
-    """The collected messages of a robot, and what its server says of them; topics are without the namespace."""
+class Inspection:
+    """The collected messages of a robot and the types of its topics, which are named without the namespace."""
 
     info: RobotInfo | None
     """The robot's description of itself; None if it has none."""
     sources: tuple[Source, ...]
-    """Where the signals of the task come from, and the pose of the tool if the profile has it."""
+    """Topics of the task's signals, and of the tool's pose if the profile has it."""
     sinks: tuple[Sink, ...]
-    """Where the commands of the task go."""
+    """Topics of the task's commands."""
     types: Mapping[str, str] | None
-    """Type of each topic on the server, empty if it does not know it; None if the server does not answer."""
+    """Type of each topic on the server, empty if the server does not know it; None without an answer."""
     letters: Mapping[str, tuple[Letter, ...]]
     """Messages of each topic, in order."""
     seconds: float
@@ -68,9 +69,9 @@ class _Inbox:
         return listen
 
 
-def gather(
+def inspect_robot(
     endpoint: Endpoint, profile: RobotProfile, spec: RobotSpec, *, listen: float | None = None, timeout: float = TIMEOUT
-) -> Evidence:
+) -> Inspection:
     """Listen to a robot over a connection of its own, which is closed afterwards; moves nothing.
 
     Args:
@@ -79,7 +80,7 @@ def gather(
         spec: Signals and commands of the task.
         listen: Time for which messages are collected after the first of each topic [s]; None: three times the longest
             allowed age of a state, at least `LISTEN`.
-        timeout: Longest wait for the first message of each topic, and for a topic that nobody offers [s].
+        timeout: Longest wait for the first message of each topic, and for a missing topic [s].
 
     Raises:
         NoServer: There is no usable server.
@@ -102,17 +103,17 @@ def gather(
         wanted = {**needed, **{source.topic: source.type for source in extra}, DESCRIPTION: DESCRIPTION_TYPE}
         types = _types(link, TopicTypes(link, profile, timeout), wanted, needed, timeout)
         inbox = _Inbox()
-        begun = _listen(link, inbox, wanted, {sink.topic for sink in sinks}, types)
-        first = {source.topic for source in required} & inbox.letters.keys()
+        start = _listen(link, inbox, wanted, {sink.topic for sink in sinks}, types)
+        awaited = {source.topic for source in required} & inbox.letters.keys()
         with inbox.changed:
-            inbox.changed.wait_for(lambda: all(inbox.letters[topic] for topic in first) or not link.is_up, timeout)
+            inbox.changed.wait_for(lambda: all(inbox.letters[topic] for topic in awaited) or not link.is_up, timeout)
             inbox.changed.wait_for(lambda: not link.is_up, listen)
-            letters = {topic: tuple(found) for topic, found in inbox.letters.items()}
+            letters = {topic: tuple(collected) for topic, collected in inbox.letters.items()}
         if not link.is_up:
             raise LinkLost(f"{link.url}: the link dropped while the robot's topics were checked.")
-        seconds = time.monotonic() - begun
+        seconds = time.monotonic() - start
         ahead = time.time() - time.monotonic()
-        return Evidence(info, (*required, *extra), sinks, types, letters, seconds, ahead, link.clock_offset)
+        return Inspection(info, (*required, *extra), sinks, types, letters, seconds, ahead, link.clock_offset)
     finally:
         link.close()
 
@@ -120,10 +121,10 @@ def gather(
 def _types(
     link: RosbridgeLink, types: TopicTypes, wanted: Mapping[str, str], needed: Mapping[str, str], timeout: float
 ) -> Mapping[str, str] | None:
-    """The type of each of the `wanted` topics; waits for the `needed` ones: nodes take a while to be discovered."""
+    """Types of the `wanted` topics; waits for the `needed` ones, because the discovery of nodes takes time."""
     deadline, found = Deadline(timeout), {topic: types.type_of(link.namespace + topic) for topic in wanted}
     while types.answers and not all(found[topic] for topic in needed) and not deadline.passed:
-        time.sleep(_AGAIN)
+        time.sleep(_RETRY)
         found |= {topic: types.type_of(link.namespace + topic) for topic in needed if not found[topic]}
     return found if types.answers else None
 
@@ -131,7 +132,7 @@ def _types(
 def _listen(
     link: RosbridgeLink, inbox: _Inbox, wanted: Mapping[str, str], sinks: set[str], types: Mapping[str, str] | None
 ) -> float:
-    """Subscribe to every topic that can be read, other than commands; returns the time [s], local monotonic clock."""
+    """Subscribe to the `wanted` topics other than commands; returns the time on the monotonic clock [s]."""
     for topic, expected in wanted.items():
         kind = expected if types is None else types[topic]
         if topic not in sinks and kind and same_type(kind, expected):

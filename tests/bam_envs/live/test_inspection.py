@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from bam_envs.core.errors import NoServer
-from bam_envs.live.evidence import DESCRIPTION, gather
+from bam_envs.live.inspection import DESCRIPTION, inspect_robot
 from bam_envs.robots.profile import load_profile
 from bam_envs.robots.ur5e import arm_spec
 from bam_envs.rosbridge.endpoint import Endpoint
@@ -19,24 +19,27 @@ TOOL = "/tcp_pose_broadcaster/pose"
 
 
 def listened(url, **options):
-    return gather(Endpoint(url), PROFILE, SPEC, **{"listen": 0.1, "timeout": 5.0, **options})
+    return inspect_robot(Endpoint(url), PROFILE, SPEC, **{"listen": 0.1, "timeout": 5.0, **options})
 
 
 def test_what_a_robot_publishes_is_collected(server, robot_on, simulation):
     scripted = robot_on(server, info=simulation)
     server.advertise(DESCRIPTION, "std_msgs/String", latch=True)
     server.publish(DESCRIPTION, {"data": "<robot/>"})
-    evidence = listened(server.url)
-    assert evidence.info == simulation
-    assert [source.topic for source in evidence.sources if source.topic == TOOL] == [TOOL, TOOL]
-    assert [sink.topic for sink in evidence.sinks] == COMMANDS
-    kinds = {**{one.topic: one.type for one in (*evidence.sources, *evidence.sinks)}, DESCRIPTION: "std_msgs/String"}
-    assert evidence.types == {**kinds, TOOL: ""}  # the simulated robot does not measure its tool
-    assert sorted(evidence.letters) == sorted([*STATES, DESCRIPTION])
-    assert all(evidence.letters[topic][0].message["header"] for topic in STATES)
-    assert [letter.number for letter in evidence.letters["/joint_states"]][:2] == [1, 2]
-    assert evidence.letters[DESCRIPTION][0].message == {"data": "<robot/>"}
-    assert abs(evidence.server_offset) < 5.0
+    inspection = listened(server.url)
+    assert inspection.info == simulation
+    assert [source.topic for source in inspection.sources if source.topic == TOOL] == [TOOL, TOOL]
+    assert [sink.topic for sink in inspection.sinks] == COMMANDS
+    kinds = {
+        **{one.topic: one.type for one in (*inspection.sources, *inspection.sinks)},
+        DESCRIPTION: "std_msgs/String",
+    }
+    assert inspection.types == {**kinds, TOOL: ""}  # the simulated robot does not measure its tool
+    assert sorted(inspection.letters) == sorted([*STATES, DESCRIPTION])
+    assert all(inspection.letters[topic][0].message["header"] for topic in STATES)
+    assert [letter.number for letter in inspection.letters["/joint_states"]][:2] == [1, 2]
+    assert inspection.letters[DESCRIPTION][0].message == {"data": "<robot/>"}
+    assert abs(inspection.server_offset) < 5.0
     assert scripted.commands == []
     assert scripted.halts == 0
 
@@ -48,28 +51,28 @@ def test_the_pose_of_the_tool_is_collected_where_it_is_measured(server, robot_on
 
 def test_a_topic_that_nobody_publishes_is_waited_for_and_left_out(server, robot_on):
     robot_on(server, spec=arm_spec("ur5e", with_object=False))
-    evidence = listened(server.url, timeout=0.2)
-    assert evidence.types["/object_pose"] == ""
-    assert "/object_pose" not in evidence.letters
-    assert evidence.letters["/joint_states"]
-    assert evidence.info is None
+    inspection = listened(server.url, timeout=0.2)
+    assert inspection.types["/object_pose"] == ""
+    assert "/object_pose" not in inspection.letters
+    assert inspection.letters["/joint_states"]
+    assert inspection.info is None
 
 
 def test_a_silent_topic_has_no_letters(server, robot_on):
     scripted = robot_on(server)
     scripted.mangle = lambda topic, message: None if topic == "/object_pose" else message
-    evidence = listened(server.url, timeout=0.2)
-    assert evidence.letters["/object_pose"] == ()
-    assert evidence.letters["/joint_states"]
+    inspection = listened(server.url, timeout=0.2)
+    assert inspection.letters["/object_pose"] == ()
+    assert inspection.letters["/joint_states"]
 
 
 def test_a_server_without_rosapi_tells_no_types(lax, robot_on):
     running = lax()
     robot_on(running)
-    evidence = listened(running.url)
-    assert evidence.types is None
-    assert all(evidence.letters[topic] for topic in STATES)
-    assert evidence.letters[TOOL] == ()
+    inspection = listened(running.url)
+    assert inspection.types is None
+    assert all(inspection.letters[topic] for topic in STATES)
+    assert inspection.letters[TOOL] == ()
     kinds = {message["op"] for _, message in running.frames}
     assert kinds == {"call_service", "subscribe"}
 
@@ -92,6 +95,6 @@ def unused_port():
 
 def test_joints_at_another_namespace(server, robot_on):
     robot_on(server, namespace="/cell")
-    evidence = listened(f"{server.url}/cell")
-    joints = evidence.letters["/joint_states"][-1].message["position"]
+    inspection = listened(f"{server.url}/cell")
+    joints = inspection.letters["/joint_states"][-1].message["position"]
     assert np.isfinite(joints).all()
