@@ -12,15 +12,35 @@ import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
+from bam_train.errors import OutputError
+
 try:
     import fcntl
 except ImportError:  # Windows: files that were left stay
     fcntl = None  # type: ignore[assignment]
 
 
+def require_writable(path: Path) -> Path:
+    """Check, before any work is done, that `replacing` can write to `path`; returns it with ``~`` expanded.
+
+    Raises:
+        OutputError: It is a folder, or nothing may be written where it would be.
+    """
+    path = path.expanduser()
+    folder = next((one for one in path.absolute().parents if one.exists()), path)
+    why = "it is a folder" if path.is_dir() else f"{folder} is a file" if not folder.is_dir() else ""
+    if why or not os.access(folder, os.W_OK):
+        raise OutputError(f"{path}: cannot be written: {why or 'no permission'}; choose another file")
+    return path
+
+
 @contextlib.contextmanager
 def replacing(target: Path, suffix: str = ".tmp") -> Iterator[Path]:
-    """Yield a temporary file beside `target`; it replaces `target` in one step at the end, or is removed on error."""
+    """Yield a temporary file beside `target`; it replaces `target` in one step at the end, or is removed on error.
+
+    Missing folders are made.
+    """
+    target.parent.mkdir(parents=True, exist_ok=True)
     descriptor, path = _locked(target, suffix)
     try:
         yield path

@@ -1,7 +1,6 @@
 """Videos of a policy, as an animated GIF (Pillow) or an MP4 (imageio with its ffmpeg)."""
 
 import importlib
-import os
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -12,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bam_envs.core.errors import InvalidValue, MissingExtra
-from bam_train.atomic_file import replacing
+from bam_train.atomic_file import replacing, require_writable
 from bam_train.errors import OutputError, SettingsError
 
 Frame = NDArray[np.uint8]
@@ -24,17 +23,13 @@ def require_video_path(path: Path) -> Path:
 
     Raises:
         SettingsError: Neither ``.gif`` nor ``.mp4``.
-        OutputError: No such folder, or it may not be written to.
+        OutputError: It is a folder, or nothing may be written where it would be.
         MissingExtra: The package that writes this kind of video is not installed.
     """
     path = path.expanduser()
     if path.suffix.lower() not in _WRITERS:
         raise SettingsError(f"{path}: expected a video that ends in .gif or .mp4, found {path.suffix or 'no suffix'!r}")
-    if not path.parent.is_dir():
-        raise OutputError(f"{path}: there is no folder {path.parent}; make it first")
-    if path.is_dir() or not os.access(path.parent, os.W_OK):
-        why = "it is a folder" if path.is_dir() else "no permission"
-        raise OutputError(f"{path}: cannot be written: {why}; choose another file")
+    require_writable(path)
     try:
         for module in ("PIL",) if path.suffix.lower() == ".gif" else ("imageio", "imageio_ffmpeg"):
             importlib.import_module(module)

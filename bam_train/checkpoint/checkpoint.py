@@ -165,7 +165,6 @@ def write_checkpoint(path: str | Path, manifest_fields: Mapping[str, Any], membe
     try:
         if target.is_dir():
             raise IsADirectoryError(None, "it is a folder; give the name of a file in it")
-        target.parent.mkdir(parents=True, exist_ok=True)
         with (
             replacing(target) as temporary,
             temporary.open("wb") as file,

@@ -200,11 +200,11 @@ def _recorder(
     if config.record is None and (config.no_record or place.robot is None):
         return None
     from bam_train.deploy.checkpoint_admission import has_real_robot
-    from bam_train.deploy.flight import deployment_facts, flight_recorder, new_recording, watch_cameras
+    from bam_train.deploy.flight import deployment_facts, flight_recorder, recording_names, watch_cameras
 
-    path = config.record or new_recording(checkpoint.manifest.env)
+    path, *others = recording_names(checkpoint.manifest.env) if config.record is None else [config.record.expanduser()]
     facts = {**deployment_facts(checkpoint, env), "seed": config.seed, "address": place.text, "marks": ", ".join(marks)}
-    recorder = flight_recorder(path.expanduser(), env, facts)
+    recorder = flight_recorder(path, env, facts, others)
     recorder.start()
     if has_real_robot(env):
         recorder.event("nobody was asked before the robot moves (--yes)" if config.yes else "the operator lets it move")

@@ -1,6 +1,5 @@
 """The flight recorder's agent: it hands the numbers of every tick of a deployment to a `Recorder`."""
 
-import itertools
 import json
 import math
 import platform
@@ -49,25 +48,27 @@ class Stopwatch:
     """Delay of the tick after its deadline [s]."""
 
 
-def flight_recorder(path: Path, env: gym.Env[Any, Any], metadata: Mapping[str, Any]) -> Recorder:
+def flight_recorder(
+    path: Path, env: gym.Env[Any, Any], metadata: Mapping[str, Any], others: Sequence[Path] = ()
+) -> Recorder:
     """A recorder for a deployment in `env`, which has not started.
 
     Args:
         path: The file.
         env: The environment.
         metadata: Description of the deployment: text, or values that are stored as JSON.
+        others: See `Recorder`.
     """
     report: Mapping[str, Any] = getattr(getattr(env.unwrapped, "robot", None), "report", dict)()
     texts = {key: value if isinstance(value, str) else json.dumps(value) for key, value in metadata.items()}
-    return Recorder(path, texts, [f"{name} ({row['number']})" for name, row in report.items()])
+    return Recorder(path, texts, [f"{name} ({row['number']})" for name, row in report.items()], others=others)
 
 
-def new_recording(env_id: str, folder: Path = Path("recordings")) -> Path:
-    """Path of a new file, named by the time (UTC) and the environment."""
+def recording_names(env_id: str) -> list[Path]:
+    """Files for a recording, named by the time (UTC) and the environment; all but the first have a number too."""
     name = env_id.rpartition(":")[2].rpartition("/")[2].rpartition("-v")[0]
     stem = f"{time.strftime('%Y-%m-%dT%H%M%SZ', time.gmtime())}-{name}"
-    paths = (folder / f"{stem}{'' if k == 1 else f'-{k}'}.mcap" for k in itertools.count(1))
-    return next(path for path in paths if not path.exists())
+    return [Path("recordings") / f"{stem}{'' if k == 1 else f'-{k}'}.mcap" for k in range(1, 100)]
 
 
 def deployment_facts(checkpoint: Checkpoint, env: gym.Env[Any, Any]) -> dict[str, Any]:

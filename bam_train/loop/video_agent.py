@@ -50,7 +50,6 @@ def record_video(env: gym.Env[Any, Any], policy: Agent, path: str | Path, *, arr
     """
     path = Path(path).expanduser().resolve()
     path = path if path.suffix else path.with_suffix(".mp4")
-    path.parent.mkdir(parents=True, exist_ok=True)
     path = require_video_path(path)
     agent = policy.agent if isinstance(policy, TemporalAgent) else policy
     try:

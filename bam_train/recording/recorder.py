@@ -77,11 +77,19 @@ class Recorder:
         metadata: Text by name, for whoever opens the file; may be changed until `start`.
         guards: Titles of the guards, such as ``"joint speed (G8)"``, for `/status`.
         size: Bytes of memory for what is not on the disk yet.
+        others: Where there is a file at `path` already, the first of these files that is not there is made instead,
+            and is `path` from `start` on.
     """
 
     def __init__(
-        self, path: Path, metadata: Mapping[str, str] | None = None, guards: Sequence[str] = (), size: int = _RING
+        self,
+        path: Path,
+        metadata: Mapping[str, str] | None = None,
+        guards: Sequence[str] = (),
+        size: int = _RING,
+        others: Sequence[Path] = (),
     ) -> None:
+        self._paths = [path, *others]
         self.path, self.metadata, self.guards = path, dict(metadata or {}), ("", *guards)
         self._places = {title: place for place, title in enumerate(self.guards)}
         self._ring_size, self._writes = size, 0
@@ -101,7 +109,7 @@ class Recorder:
         """
         descriptor = make_shared_file(self._ring_size)
         self._ring = ring = Ring(descriptor)
-        head = {"path": str(self.path), "metadata": self.metadata, "guards": self.guards}
+        head = {"paths": [str(path) for path in self._paths], "metadata": self.metadata, "guards": self.guards}
         ring.write(json.dumps(head).encode())
         program = [sys.executable, "-c", _PROGRAM, str(descriptor), str(os.getpid())]
         try:
@@ -123,6 +131,7 @@ class Recorder:
                 self._process = None
                 raise OutputError(ring.failure or f"{self.path}: the recorder's process did not start")
             time.sleep(0.002)
+        self.path = self._paths[ring.ready - 1]
 
     @property
     def pid(self) -> int:

@@ -51,7 +51,7 @@ class RecordingFile:
     """The MCAP file, and what was registered in it."""
 
     def __init__(self, head: dict[str, Any]) -> None:
-        self.file: BinaryIO = open(head["path"], "xb")  # noqa: SIM115 - closed by `close`
+        self.file = _new_file(head["paths"])
         self._writer = Writer(self.file, chunk_size=2**62, compression=CompressionType.ZSTD)  # `settle` ends chunks
         self._writer.start(profile="", library="bam-train")
         self._guards: list[str] = head["guards"]
@@ -167,6 +167,14 @@ class RecordingFile:
         self.file.close()
 
 
+def _new_file(paths: list[str]) -> BinaryIO:
+    """Make the first of these files that is not there yet: choosing it and making it are one step."""
+    for path in paths[:-1]:
+        with suppress(FileExistsError):
+            return open(path, "xb")
+    return open(paths[-1], "xb")
+
+
 def _text(value: str) -> str:
     """The text without what UTF-8 cannot have, such as parts of a file name in another encoding."""
     return value.encode(errors="replace").decode()
@@ -204,18 +212,19 @@ def main() -> None:
         os.nice(5)
     ring, parent = Ring(int(sys.argv[1])), int(sys.argv[2])
     head = json.loads(ring.read() or b"{}")
+    last = head["paths"][-1]
     try:
-        Path(head["path"]).parent.mkdir(parents=True, exist_ok=True)
+        Path(last).parent.mkdir(parents=True, exist_ok=True)
         file = RecordingFile(head)
-        ring.begin()
+        ring.begin(1 + head["paths"].index(file.file.name))
         drain(ring, file, parent)
         file.close()
         return
     except OSError as error:
         remedy = "; nothing is recorded from now on" if ring.ready else ". Choose another file"
         why = f"cannot be written: {error.strerror or error}{remedy}"
-        if isinstance(error, FileExistsError) and error.filename == head["path"]:
-            what = "a folder" if Path(head["path"]).is_dir() else "a recording"
+        if isinstance(error, FileExistsError) and error.filename == last:
+            what = "a folder" if Path(last).is_dir() else "a recording"
             why = f"{what} is there already. Choose another file"
-        ring.fail(f"{head['path']}: {why}")
+        ring.fail(f"{last}: {why}")
     os._exit(1)  # Python would try to write again what its buffer still holds

@@ -26,7 +26,7 @@ class _Head(ctypes.Structure):
     _fields_ = (
         ("written", ctypes.c_uint64),  # bytes since the start
         ("read", ctypes.c_uint64),
-        ("ready", ctypes.c_uint64),  # the reader has begun
+        ("ready", ctypes.c_uint64),  # the reader has begun: a number that it gives
         ("closed", ctypes.c_uint64),  # the writer writes nothing more
         ("failed", ctypes.c_uint64),  # the reader reads nothing more
         ("reason", ctypes.c_char * _TEXT),
@@ -82,18 +82,18 @@ class Ring:
         self._head.read = start + ((_RECORD.size + size + 7) & ~7)
         return data
 
-    def begin(self) -> None:
-        """The reader's first act, once it can take records."""
-        self._head.ready = 1
+    def begin(self, number: int = 1) -> None:
+        """The reader's first act, once it can take records; `number`, not 0, is what `ready` says from then on."""
+        self._head.ready = number
 
     def close(self) -> None:
         """The writer's last act."""
         self._head.closed = 1
 
     @property
-    def ready(self) -> bool:
-        """Whether the reader has begun."""
-        return bool(self._head.ready)
+    def ready(self) -> int:
+        """The number that the reader has begun with; 0 before."""
+        return int(self._head.ready)
 
     @property
     def closed(self) -> bool:

@@ -64,12 +64,13 @@ def test_nothing_is_left_of_a_film_that_failed(tmp_path):
     ("name", "error", "text"),
     [
         ("film.avi", SettingsError, "{}/film.avi: expected a video that ends in .gif or .mp4, found '.avi'"),
-        ("films/film.gif", OutputError, "{0}/films/film.gif: there is no folder {0}/films; make it first"),
+        ("file/film.gif", OutputError, "{0}/file/film.gif: cannot be written: {0}/file is a file; choose another file"),
         ("folder.gif", OutputError, "{}/folder.gif: cannot be written: it is a folder; choose another file"),
     ],
 )
 def test_paths_are_refused_before_the_work(tmp_path, name, error, text):
     (tmp_path / "folder.gif").mkdir()
+    (tmp_path / "file").touch()
     with pytest.raises(error) as caught:
         require_video_path(tmp_path / name)
     assert str(caught.value) == text.format(tmp_path)

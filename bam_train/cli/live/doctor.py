@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json as json_module
-import os
 from dataclasses import asdict, dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Any
@@ -131,7 +130,8 @@ def _shown(steps: Iterator[Step], config: DoctorConfig) -> Iterator[Step]:
 
 
 def _require_sane(config: DoctorConfig) -> None:
-    from bam_train.errors import OutputError, SettingsError
+    from bam_train.atomic_file import require_writable
+    from bam_train.errors import SettingsError
 
     if config.env is not None and config.checkpoint is None:
         raise SettingsError("--env says what a checkpoint was trained on; give --checkpoint too, or leave it out")
@@ -139,11 +139,7 @@ def _require_sane(config: DoctorConfig) -> None:
         return
     if config.measure.suffix != ".json":
         raise SettingsError(f"--measure: expected a .json file, found {str(config.measure)!r}")
-    folder = config.measure.expanduser().parent
-    if not folder.is_dir():
-        raise OutputError(f"--measure: there is no folder {config.measure.parent}; make it first")
-    if not os.access(folder, os.W_OK):
-        raise OutputError(f"--measure: the folder {config.measure.parent} cannot be written; choose another one")
+    require_writable(config.measure)
 
 
 def _write_measured(config: DoctorConfig, diagnosis: Diagnosis) -> dict[str, Any] | None:

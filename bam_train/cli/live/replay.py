@@ -25,9 +25,11 @@ MOST_EVENTS = 20
 
 def replay(config: ReplayConfig) -> None:
     """Run the program with its parsed flags."""
+    from bam_train.atomic_file import require_writable
     from bam_train.recording.recording import Recording
     from bam_train.video import require_video_path
 
+    picture = None if config.plot is None else require_writable(config.plot)
     video = None if config.video is None else require_video_path(config.video)
     recording = Recording.open(config.recording)
     found = _checkpoint(config, recording)
@@ -37,11 +39,11 @@ def replay(config: ReplayConfig) -> None:
         tell(json_module.dumps(facts, allow_nan=False))
     else:
         tell(*lines_of(recording), *_played_lines(played, why))
-    if config.plot is not None:
+    if picture is not None:
         from bam_train.recording.drawing import plot
 
-        plot(recording, config.plot.expanduser())
-        say(f"bam-replay: {config.plot}: drawn")
+        plot(recording, picture)
+        say(f"bam-replay: {picture}: drawn")
     if video is not None:
         _film(recording, found, config.env, video)
 

@@ -30,7 +30,7 @@ def nobody():
 
 
 def test_a_healthy_robot(run, served, tmp_path):
-    path = tmp_path / "link.json"
+    path = tmp_path / "new" / "link.json"
     status, out, err = run(doctor, served, "--seconds", 0.8, "--measure", path)
     assert (status, err) == (0, "")
     lines = out.splitlines()
@@ -95,7 +95,7 @@ def test_too_short_a_measurement_writes_no_file(run, served, tmp_path):
     [
         (["ws://127.0.0.1:1", "--env", "bam/pick"], "--env says what a checkpoint was trained on; give --checkpoint"),
         (["ws://127.0.0.1:1", "--measure", "link.txt"], "--measure: expected a .json file, found 'link.txt'"),
-        (["ws://127.0.0.1:1", "--measure", "nowhere/a.json"], "--measure: there is no folder nowhere; make it first"),
+        (["ws://127.0.0.1:1", "--measure", "/dev/null/a.json"], "/dev/null/a.json: cannot be written: /dev/null is a"),
         (["tcp://127.0.0.1:1"], "A live robot's address is ws://host:port or wss://host:port; 'tcp://127.0.0.1:1' is"),
         (["127.0.0.1:1"], "A live robot's address is ws://host:port or wss://host:port, not '127.0.0.1:1'. Did you"),
         (["ws://127.0.0.1:1", "--profile", "ur5"], "Unknown robot profile 'ur5'. Did you mean 'ur5e'?"),

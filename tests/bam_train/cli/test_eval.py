@@ -123,7 +123,9 @@ def test_other_spaces(corridor_checkpoint, run):
 def test_bad_numbers_and_files_are_refused_before_anything_is_loaded(run, tmp_path):
     assert run(main, "no.zip", "--episodes", -3)[0] == 2
     film = tmp_path / "films" / "a.gif"
-    assert refused(run, "no.zip", "--video", film) == f"{film}: there is no folder {tmp_path}/films; make it first"
+    film.parent.touch()
+    text = f"{film}: cannot be written: {film.parent} is a file; choose another file"
+    assert refused(run, "no.zip", "--video", film) == text
     assert refused(run, tmp_path / "no.zip") == (
         f"{tmp_path}/no.zip: no such file. Train one with bam-train, or check the name"
     )

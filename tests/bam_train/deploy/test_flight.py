@@ -1,6 +1,7 @@
 """What the recording of a deployment holds."""
 
 import json
+import re
 
 import gymnasium as gym
 import numpy as np
@@ -17,7 +18,7 @@ from bam_envs.tasks.pick import PickTask
 from bam_envs.tasks.reach import ReachTask
 from bam_envs.testing.drivers import DrivenRobot
 from bam_train.deploy.deployment import Deployment
-from bam_train.deploy.flight import flight_recorder, new_recording
+from bam_train.deploy.flight import flight_recorder, recording_names
 from bam_train.deploy.journal import Ending, Journal
 
 
@@ -182,8 +183,7 @@ def test_pictures_and_whole_numbers_are_recorded(recorded):
     assert json.loads(found["metadata"]["layout"]["observation"]) == {"level": ["<f4", 1, 2]}
 
 
-def test_a_new_recording_has_a_new_name(tmp_path):
-    first = new_recording("somewhere:bam/pick-place-v0", tmp_path)
-    assert first.name.endswith("Z-pick-place.mcap")
-    first.touch()
-    assert new_recording("bam/pick-place-v0", tmp_path) != first
+def test_recordings_are_named_by_time_and_environment():
+    first, second, *_ = recording_names("somewhere:bam/pick-place-v0")
+    assert re.fullmatch(r"recordings/\d{4}-\d\d-\d\dT\d{6}Z-pick-place\.mcap", str(first))
+    assert second == first.with_stem(f"{first.stem}-2")

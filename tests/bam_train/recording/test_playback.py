@@ -242,7 +242,7 @@ def test_somebody_elses_mcap_file_is_refused(tmp_path, topic, content):
 
 
 def test_a_recording_is_drawn(small_chunks, tmp_path, capsys):
-    plot, video, cut = tmp_path / "a.png", tmp_path / "a.gif", tmp_path / "cut.mcap"
+    plot, video, cut = tmp_path / "new" / "a.png", tmp_path / "new" / "too" / "a.gif", tmp_path / "cut.mcap"
     cut.write_bytes(small_chunks[:20_000])
     ticks = Recording.open(cut).ticks
     assert 3 < ticks < 15
@@ -253,11 +253,10 @@ def test_a_recording_is_drawn(small_chunks, tmp_path, capsys):
     ]
     assert plot.read_bytes().startswith(b"\x89PNG")
     assert video.read_bytes().startswith(b"GIF8")
-    assert call(replay, cut, "--plot", tmp_path / "nowhere" / "a.png") == 1
-    assert capsys.readouterr().err == (
-        f"bam-replay: {tmp_path / 'nowhere' / 'a.png'}: cannot be written: No such file or directory. "
-        "Choose another .png\n"
-    )
+    for flag, name in (("--plot", "a.png"), ("--video", "a.gif")):
+        assert call(replay, cut, flag, cut / name) == 1
+        told = capsys.readouterr()  # before the work
+        assert told == ("", f"bam-replay: {cut}/{name}: cannot be written: {cut} is a file; choose another file\n")
 
 
 def test_a_plot_is_whole_or_absent(small_chunks, tmp_path, capsys):

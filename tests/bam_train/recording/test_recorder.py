@@ -174,7 +174,7 @@ def test_what_is_a_second_old_is_on_the_disk_itself(tmp_path, monkeypatch):
     synced, path = [(time.monotonic(), b"")], tmp_path / "a.mcap"
     monkeypatch.setattr(os, "fsync", lambda _: synced.append((time.monotonic(), path.read_bytes())))
     descriptor = make_shared_file(2**20)
-    ring, file = Ring(descriptor), RecordingFile({"path": str(path), "metadata": {}, "guards": [""]})
+    ring, file = Ring(descriptor), RecordingFile({"paths": [str(path)], "metadata": {}, "guards": [""]})
     thread = threading.Thread(target=drain, args=(Ring(descriptor), file, os.getppid()))
     thread.start()
     ring.write(LAYOUT_RECORD + TIMES.pack(0, 0.0, 0.0, 0) + b'{"layout": {"/state": ["k"]}, "extra": {}}')
@@ -267,6 +267,22 @@ def test_a_file_that_is_there_is_kept(started, tmp_path):
     assert path.read_text() == "mine"
     with pytest.raises(OutputError, match=r": a folder is there already\. Choose another file$"):
         started(".")
+
+
+def test_programs_that_start_at_once_have_a_file_each(tmp_path):
+    names = [tmp_path / f"a{k}.mcap" for k in range(5)]
+    names[1].write_text("mine")
+    recorders = [Recorder(names[0], others=names[1:]) for _ in range(3)]
+    threads = [threading.Thread(target=one.start) for one in recorders]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert [one.close() for one in recorders] == ["", "", ""]
+    assert sorted(one.path for one in recorders) == [names[0], names[2], names[3]]
+    with pytest.raises(OutputError, match=rf"^{names[1]}: a recording is there already\. Choose another file$"):
+        Recorder(names[0], others=names[1:2]).start()
+    assert names[1].read_text() == "mine"
 
 
 def test_a_file_name_in_another_encoding_is_told(tmp_path):
