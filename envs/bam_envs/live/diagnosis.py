@@ -1,6 +1,6 @@
 """Check a live robot step by step, from its port to its guards, without moving it.
 
-Each step relies on those before it, so the first that fails ends the diagnosis: it is the cause of all that follows.
+Each step needs the steps before it, so that the first failure ends the diagnosis.
 """
 
 import asyncio
@@ -32,12 +32,12 @@ STEPS = (
     *("port", "websocket", "rosbridge", "topics", "rates and ages", "clock", "round trip", "command path", "guards"),
 )
 """Names of the steps, in their order."""
-CLOCK_APART = 1.0
+MAX_CLOCK_OFFSET = 1.0
 """Offset of the server's clock above which a step warns [s]."""
-LOST_WARNS, LOST_FAILS = 0.05, 0.10
-"""Share of lost pings above which a step warns, and fails."""
+LOSS_WARNING, LOSS_FAILURE = 0.05, 0.10
+"""Share of lost pings above which a step warns, and above which it fails."""
 _HANDSHAKE = 2**20
-"""Largest message of the connection that is opened for the handshake alone [bytes]."""
+"""Maximum message size of the connection that tests the handshake [bytes]."""
 Verdict = Literal["ok", "warning", "failed"]
 
 
@@ -48,27 +48,27 @@ class Step:
     name: str
     verdict: Verdict
     found: str
-    """What was found; of a step that failed: why, and what to do."""
+    """The findings; for a failed step its cause and the remedy."""
     warnings: tuple[str, ...] = ()
-    """What to look at although the step passed."""
+    """Problems that do not fail the step."""
 
 
 @dataclass
 class _Findings:
-    """What a step that passed has found."""
+    """Findings of one step."""
 
     text: list[str] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)
 
 
 class Diagnosis:
-    """The checks of one robot. `close` it at the end.
+    """The checks of one robot; call `close` at the end.
 
     Args:
         url: Its address, ``ws://host:port`` or ``wss://host:port``, and the namespace of its topics.
-        robot: The robot of a task at that address, not connected; None: that of `profile`.
-        profile: Its profile, a shipped name or a file; None: the one of the robot's task, or the shipped one most of
-            whose topics are there.
+        robot: The robot of a task at that address, not connected; None: the robot of `profile`.
+        profile: Its profile, a shipped name or a file; None: the profile of the task's robot, or the shipped one with
+            the largest share of its topics on the server.
         ca_file: PEM file of the authorities to trust instead of the system's.
         token_file: File with the server's shared secret.
         seconds: Duration of the measurement [s].
@@ -93,7 +93,7 @@ class Diagnosis:
         self._credentials: dict[str, Any] = {"ca_file": ca_file, "token_file": token_file}
         self.robot, self.seconds = robot, seconds
         self.measurement: LinkMeasurement | None = None
-        """What was measured; None before the step ``"rates and ages"``."""
+        """The measured link; None before the step ``"rates and ages"``."""
         self.profile: RobotProfile | None = None if profile is None else load_profile(profile)
         if profile is None and robot is not None:
             self.profile = profile_for(robot.spec)
@@ -103,7 +103,7 @@ class Diagnosis:
         self._timeout = endpoint.timeout or bringup.TIMEOUT
 
     def steps(self) -> Iterator[Step]:
-        """Make one step after the other, up to the first that fails."""
+        """Run the steps in order, up to the first failure."""
         for name in STEPS:
             check: Callable[[_Findings], None] = getattr(self, f"_{name.replace(' ', '_')}")
             findings = _Findings()
@@ -116,7 +116,7 @@ class Diagnosis:
             yield Step(name, verdict, "; ".join(findings.text), tuple(findings.warnings))
 
     def close(self) -> None:
-        """Close all links; the robot was not moved, and is not halted."""
+        """Close all links; the robot is not halted, because it was not moved."""
         self._link.close()
         if self.robot is not None:
             self.robot.close()
@@ -124,19 +124,19 @@ class Diagnosis:
     # ---- the server
 
     def _port(self, findings: _Findings) -> None:
-        address, begun = self.endpoint.address, time.monotonic()
+        address, start = self.endpoint.address, time.monotonic()
         asyncio.run(open_port(address, self._timeout)).close()
-        findings.text.append(f"{address.host}:{address.port} is open, connected in {_ms(time.monotonic() - begun)}")
+        findings.text.append(f"{address.host}:{address.port} is open, connected in {_ms(time.monotonic() - start)}")
 
     def _websocket(self, findings: _Findings) -> None:
-        begun = time.monotonic()
+        start = time.monotonic()
 
         async def shake_hands() -> float:
             socket = await open_socket(self.endpoint, self._timeout, _HANDSHAKE)
-            taken = time.monotonic() - begun
+            duration = time.monotonic() - start
             with suppress(asyncio.TimeoutError):
                 await asyncio.wait_for(socket.close(), self._timeout)
-            return taken
+            return duration
 
         kind = "with TLS, " if self.endpoint.address.secure else ""
         findings.text.append(f"a WebSocket server, {kind}opened in {_ms(asyncio.run(shake_hands()))}")
@@ -165,7 +165,7 @@ class Diagnosis:
                 signals = ", ".join(source.signal for source in sources if source.topic == topic)
                 raise ProtocolError(
                     f"there is no topic {link.namespace}{topic} ({kind}), which has {signals}. Does its driver "
-                    f"run, and is the topic called so? Topics are in the profile of {profile.name} "
+                    f"run, and is its name right? Topics are in the profile of {profile.name} "
                     "(--profile); with --checkpoint only those of its task are needed."
                     f"{namespaces_with(link, 'topics', topic)}"
                 )
@@ -181,18 +181,18 @@ class Diagnosis:
             answer: dict[str, Any] = {}
             with suppress(BamEnvsError):  # a server without rosapi
                 answer = self._link.call("/rosapi/topics", "rosapi/Topics", {}, self._timeout)
-            there, namespace = {str(topic) for topic in answer.get("topics") or ()}, self._link.namespace
+            present, namespace = {str(topic) for topic in answer.get("topics") or ()}, self._link.namespace
 
             def share(profile: RobotProfile) -> float:
                 topics = {source.topic for source in profile.state if not source.optional}
-                elsewhere = sum(any(name.endswith(topic) for name in there) for topic in topics)  # in any namespace
-                return (len({namespace + topic for topic in topics} & there) + elsewhere) / len(topics)
+                elsewhere = sum(any(name.endswith(topic) for name in present) for topic in topics)  # in any namespace
+                return (len({namespace + topic for topic in topics} & present) + elsewhere) / len(topics)
 
             self.profile = max((load_profile(name) for name in ("ur5e", *shipped_profiles())), key=share)
         return self.profile
 
     def _rates_and_ages(self, findings: _Findings) -> None:
-        robot, profile = self._known()
+        robot, profile = self._robot_and_profile()
         period, info = robot.spec.period, self._info
         state = LiveState(profile, robot.spec)
         self.measurement = measure_link(
@@ -214,7 +214,7 @@ class Diagnosis:
             _require_states(reading, limit, self.seconds, profile)
             if key not in seen:
                 findings.text.append(f"{reading.source.topic} {reading.rate:.4g} Hz, age {_p50_p99(reading.ages)}")
-                _warn_of_states(reading, limit, period, findings.warnings)
+                _warn_about_states(reading, limit, period, findings.warnings)
             seen.add(key)
 
     # ---- the link
@@ -227,11 +227,11 @@ class Diagnosis:
             return
         side = "behind" if offset > 0 else "ahead of"
         findings.text.append(f"the server's clock is {_ms(abs(offset))} {side} this computer's")
-        if abs(offset) > CLOCK_APART:
+        if abs(offset) > MAX_CLOCK_OFFSET:
             findings.warnings.append("set both clocks by the same NTP server, or recordings of both cannot be compared")
 
     def _round_trip(self, findings: _Findings) -> None:
-        robot, profile = self._known()
+        robot, profile = self._robot_and_profile()
         measured, life = self._measured(), profile.command_life(robot.spec.period)
         if not len(measured.trips):
             raise ProtocolError(
@@ -239,21 +239,21 @@ class Diagnosis:
                 "so that commands may not arrive either. Does the server let clients use this topic (topics_glob)?"
             )
         findings.text.append(
-            f"{_p50_p99(measured.back)} of {len(measured.trips)} pings, one every {_ms(robot.spec.period)}; "
+            f"{_p50_p99(measured.round_trips)} of {len(measured.trips)} pings, one every {_ms(robot.spec.period)}; "
             f"{measured.lost:.2%} lost, {measured.copies} doubled"
         )
-        if measured.lost > LOST_FAILS:
+        if measured.lost > LOSS_FAILURE:
             raise LinkLost(
-                f"{measured.lost:.1%} of {len(measured.trips)} pings did not come back, and {LOST_FAILS:.0%} may. "
+                f"{measured.lost:.1%} of {len(measured.trips)} pings did not come back, and {LOSS_FAILURE:.0%} may. "
                 "Use a cable, or a network that is less busy."
             )
-        p50, p99 = np.percentile(measured.back, [50, 99])
+        p50, p99 = np.percentile(measured.round_trips, [50, 99])
         if p50 / 2 > life:
             raise LinkLost(
-                f"one way takes {_ms(p50 / 2)} (half of p50 of the round trip), and a command means something for "
+                f"one way takes {_ms(p50 / 2)} (half of p50 of the round trip), and a command is valid for "
                 f"{_ms(life)}: none would be executed. Use a cable, or run the policy nearer to the robot."
             )
-        if measured.lost > LOST_WARNS:
+        if measured.lost > LOSS_WARNING:
             findings.warnings.append(f"{measured.lost:.1%} of the pings were lost; a cable loses none")
         if p99 - p50 / 2 > life:
             findings.warnings.append(f"more than 1 % of the commands come later than {_ms(life)}, and are dropped")
@@ -261,7 +261,7 @@ class Diagnosis:
     # ---- commands, without sending one
 
     def _command_path(self, findings: _Findings) -> None:
-        robot, _ = self._known()
+        robot, _ = self._robot_and_profile()
         robot.connect()  # checks types and listeners of all command topics and opens the connection that halts
         why = robot.not_ready()
         if why is not None:
@@ -269,11 +269,11 @@ class Diagnosis:
         if self._has_rosapi:
             findings.text.append("the topics of commands have listeners")
         else:
-            findings.warnings.append("without a rosapi node the server cannot say whether anybody listens")
+            findings.warnings.append("without a rosapi node the server cannot report whether anybody listens")
         findings.text.append("the connection that halts is open; ready; nothing was sent")
 
     def _guards(self, findings: _Findings) -> None:
-        robot, _ = self._known()
+        robot, _ = self._robot_and_profile()
         findings.text.append(f"{len(robot.report())} guards; bam-deploy --print-guards shows them")
         findings.warnings.extend(robot.warnings)
         spec, newest = robot.spec, {reading.source.signal: reading.values for reading in self._measured().readings}
@@ -286,16 +286,16 @@ class Diagnosis:
                     "the first command brings it to that limit"
                 )
 
-    # ---- what earlier steps have made
+    # ---- results of earlier steps
 
-    def _known(self) -> tuple[SafeRobot, RobotProfile]:
+    def _robot_and_profile(self) -> tuple[SafeRobot, RobotProfile]:
         if self.robot is None or self.profile is None:
-            raise StaleState("the robot is not known before its topics are checked")
+            raise StaleState("the topics of the robot have not been checked yet")
         return self.robot, self.profile
 
     def _measured(self) -> LinkMeasurement:
         if self.measurement is None:
-            raise StaleState("nothing was measured yet")
+            raise StaleState("the link has not been measured yet")
         return self.measurement
 
 
@@ -319,7 +319,7 @@ def _require_states(reading: Reading, limit: float, seconds: float, profile: Rob
         )
 
 
-def _warn_of_states(reading: Reading, limit: float, period: float, warnings: list[str]) -> None:
+def _warn_about_states(reading: Reading, limit: float, period: float, warnings: list[str]) -> None:
     topic, worst = reading.source.topic, float(reading.ages.max())
     if reading.unread:
         warnings.append(f"{topic}: {reading.unread} of {reading.count} messages cannot be read: {reading.error}")
@@ -330,7 +330,7 @@ def _warn_of_states(reading: Reading, limit: float, period: float, warnings: lis
 
 
 def _ms(seconds: float) -> str:
-    """A time for people: ``0.42 ms``, ``12.3 ms``, ``3.2 s``."""
+    """A duration as text: ``0.42 ms``, ``12.3 ms``, ``3.2 s``."""
     return f"{seconds:.1f} s" if seconds >= 1.0 else f"{1e3 * seconds:.3g} ms"
 
 

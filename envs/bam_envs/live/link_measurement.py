@@ -1,6 +1,6 @@
-"""Measure the link to a live robot at rest: messages of our own go there and back, and its states are collected.
+"""Measure the link to a live robot at rest: pings go to the server and back, and states are collected.
 
-Nothing is sent that a robot listens to.
+Pings have a topic of their own, so that the robot receives nothing.
 """
 
 import math
@@ -29,17 +29,17 @@ from bam_envs.rosbridge.client import RosbridgeLink
 Array = NDArray[np.float64]
 PING_TOPIC = "/bam/ping"
 """Where pings are published and subscribed (std_msgs/String)."""
-_AGAIN = 0.1
-"""Time between two pings while none has come back yet [s]."""
-_LAST_PINGS = 1.0
-"""Longest wait for pings that are on their way at the end [s]."""
-_FEWEST = 10
-"""Fewest pings that come back, of which quantiles are made."""
+_RETRY = 0.1
+"""Time between two pings before the first echo [s]."""
+_LAST_ECHOES = 1.0
+"""Longest wait for the last echoes [s]."""
+_MIN_ECHOES = 10
+"""Minimum number of echoes for quantiles."""
 
 
 @dataclass(frozen=True)
 class Reading:
-    """The messages of one source, as the guards of a deployment would see them."""
+    """The messages of one source during the measurement."""
 
     source: Source
     count: int
@@ -47,56 +47,56 @@ class Reading:
     rate: float
     """Messages a second [Hz]; 0 for fewer than two."""
     arrival: Array
-    """Age of each message when it arrived [s], by its stamp, or 0 without one."""
+    """Age of each message at its arrival [s], by its stamp; 0 without a stamp."""
     ages: Array
-    """Age of the newest message at each period of the task [s]; empty without messages."""
+    """Age of the newest message at each tick of the task [s]; empty without messages."""
     values: Array
-    """The newest numbers [SI]; NaN if none are readable. Shape: (k,)."""
+    """The newest values [SI]; NaN if no message is readable. Shape: (k,)."""
     unread: int
-    """Number of messages without readable numbers."""
+    """Number of unreadable messages."""
     error: str
-    """Why the first of those is unreadable."""
+    """Error of the first unreadable message; "" for none."""
 
 
 @dataclass(frozen=True)
 class LinkMeasurement:
-    """What was measured in `seconds`."""
+    """A measured link, and the messages of each source."""
 
     seconds: float
     """Duration of the measurement [s]."""
     trips: Array
-    """Time until each ping came back, in the order of sending [s]; NaN if it did not. Shape: (number of pings,).
-
-    Empty if none came back before the measurement began."""
+    """Round trip of each ping, in order [s]; NaN for a lost ping; empty if the server echoes none. Shape: (pings,)."""
     copies: int
-    """Number of pings that came back once more."""
+    """Number of echoes that arrived more than once."""
     readings: tuple[Reading, ...]
     """One for each source of the task's signals."""
 
     @property
     def lost(self) -> float:
-        """Share of the pings that did not come back."""
+        """Share of lost pings; 1 without pings."""
         return float(np.isnan(self.trips).mean()) if len(self.trips) else 1.0
 
     @property
-    def back(self) -> Array:
-        """The round trips of those that came back [s]."""
+    def round_trips(self) -> Array:
+        """Round trips of the pings that came back [s]."""
         return self.trips[np.isfinite(self.trips)]
 
     def profile(self, about: str = "") -> LinkProfile:
-        """The link as simulations take it; `about` says what was measured.
+        """The link as a profile for simulations; `about` describes the measurement.
 
-        One way is a round trip less half the median, so that each way has all of the jitter. A state is as old as its
-        stamp says if it has one; a ping is lost on both ways with the same probability.
+        The delay of one direction is the round trip minus half the median, so that each direction has all of the
+        jitter. The delay of a state is its age by its stamp, if it has one. Both directions have the same loss.
 
         Raises:
             InvalidValue: Too few pings came back.
         """
-        back, state = self.back, self.readings[0]
-        if len(back) < _FEWEST:
-            raise InvalidValue(f"{len(back)} pings came back, and quantiles need {_FEWEST}. Measure for longer.")
-        one_way = np.maximum(back - np.median(back) / 2, 0.0)
-        states = np.maximum(state.arrival, back.min() / 2) if state.arrival.any() else one_way
+        round_trips, state = self.round_trips, self.readings[0]
+        if len(round_trips) < _MIN_ECHOES:
+            raise InvalidValue(
+                f"{len(round_trips)} pings came back, and quantiles need {_MIN_ECHOES}. Measure for longer."
+            )
+        one_way = np.maximum(round_trips - np.median(round_trips) / 2, 0.0)
+        states = np.maximum(state.arrival, round_trips.min() / 2) if state.arrival.any() else one_way
         runs = [len(list(run)) for is_lost, run in groupby(np.isnan(self.trips)) if is_lost]
         loss = 1 - math.sqrt(1 - self.lost)
         return LinkProfile(
@@ -131,24 +131,24 @@ class _Log(Mailbox):
 
 
 class _Pings:
-    """Pings on `topic` and their echoes, on the monotonic clock [s]."""
+    """Pings on `topic` and their echoes; times on the monotonic clock [s]."""
 
     def __init__(self, link: RosbridgeLink, topic: str) -> None:
         self._link, self._topic, self._name = link, topic, secrets.token_hex(4)
         self.sent: list[float] = []
-        self.came: dict[int, float] = {}
+        self.echoes: dict[int, float] = {}
         self.copies = 0
         self._changed = threading.Condition()
         link.advertise(topic, "std_msgs/String")
-        self._leave = link.subscribe(topic, "std_msgs/String", self._listen)
+        self._unsubscribe = link.subscribe(topic, "std_msgs/String", self._listen)
 
     def _listen(self, message: Message, caller: Caller) -> None:
         name, _, number = str(message.get("data")).partition(" ")
         if name != self._name:
             return
         with self._changed:
-            self.copies += int(number) in self.came
-            self.came.setdefault(int(number), time.monotonic())
+            self.copies += int(number) in self.echoes
+            self.echoes.setdefault(int(number), time.monotonic())
             self._changed.notify_all()
 
     def send(self) -> None:
@@ -156,26 +156,26 @@ class _Pings:
         self.sent.append(time.monotonic())
         self._link.publish(self._topic, {"data": f"{self._name} {len(self.sent) - 1}"})
 
-    def begin(self, timeout: float) -> bool:
-        """Send pings until one comes back, and forget them; False if none does within `timeout` [s]."""
-        for _ in range(max(1, round(timeout / _AGAIN))):  # a bridge loses messages until its nodes know each other
+    def start(self, timeout: float) -> bool:
+        """Send pings until the first echo, and forget them; False without an echo within `timeout` [s]."""
+        for _ in range(max(1, round(timeout / _RETRY))):  # a bridge loses messages until its nodes know each other
             self.send()
-            if self._wait(1, _AGAIN):
+            if self._wait(1, _RETRY):
                 break
-        self._wait(len(self.sent), _AGAIN)
-        found, self._name = bool(self.came), secrets.token_hex(4)  # those that come later do not count
-        self.sent, self.came, self.copies = [], {}, 0
-        return found
+        self._wait(len(self.sent), _RETRY)
+        was_echoed, self._name = bool(self.echoes), secrets.token_hex(4)  # later echoes are ignored
+        self.sent, self.echoes, self.copies = [], {}, 0
+        return was_echoed
 
-    def end(self) -> Array:
-        """Wait for the last pings; the round trip of each [s], NaN if it did not come back."""
-        self._wait(len(self.sent), _LAST_PINGS)
-        self._leave()
-        return np.array([self.came.get(number, math.nan) - sent for number, sent in enumerate(self.sent)])
+    def stop(self) -> Array:
+        """Wait for the last echoes, and return the round trip of each ping [s]; NaN for a lost ping."""
+        self._wait(len(self.sent), _LAST_ECHOES)
+        self._unsubscribe()
+        return np.array([self.echoes.get(number, math.nan) - sent for number, sent in enumerate(self.sent)])
 
     def _wait(self, count: int, timeout: float) -> bool:
         with self._changed:
-            return self._changed.wait_for(lambda: len(self.came) >= count, timeout)
+            return self._changed.wait_for(lambda: len(self.echoes) >= count, timeout)
 
 
 def measure_link(
@@ -188,16 +188,16 @@ def measure_link(
     timeout: float,
     describes_itself: bool,
 ) -> LinkMeasurement:
-    """Send a ping every period and collect states for some time; the robot does not move.
+    """Send a ping every period and collect states; the robot does not move.
 
     Args:
-        link: A link that is up; declarations stay on it.
+        link: A connected link; its new topics and subscriptions remain.
         profile: The topics of the robot.
         state: The signals to collect; its mailbox is replaced.
         period: Time between two commands of the task [s].
         seconds: Duration [s].
         timeout: Longest wait for the first ping to come back [s].
-        describes_itself: Whether the robot does, so that all of its states are asked for.
+        describes_itself: Whether the robot has a description; the rate of its states is then not throttled.
 
     Raises:
         LinkLost: The link dropped.
@@ -207,27 +207,27 @@ def measure_link(
     types, ahead = TopicTypes(link, profile, timeout), time.time() - time.monotonic()
     for topic, kind in {source.topic: source.type for source in state.sources}.items():
         name, least = link.namespace + topic, least_interval(profile, period, topic, describes_itself=describes_itself)
-        kind, ears = types.check(name, kind), state.listener(topic)
-        link.subscribe(name, kind, ears, throttle_ms=least, queue_length=1 if least else 0)
+        kind, listener = types.check(name, kind), state.listener(topic)
+        link.subscribe(name, kind, listener, throttle_ms=least, queue_length=1 if least else 0)
     pings, pacer, epoch = _Pings(link, link.namespace + PING_TOPIC), Pacer(period), link.epoch
-    comes_back = pings.begin(timeout)
+    are_echoed = pings.start(timeout)
     log.letters.clear()
-    begun = time.monotonic()
+    start = time.monotonic()
     pacer.start()
-    while time.monotonic() < begun + seconds:
+    while time.monotonic() < start + seconds:
         pacer.wait()
-        if comes_back:
+        if are_echoed:
             pings.send()
-    ended = time.monotonic()
-    trips = pings.end()
+    end = time.monotonic()
+    trips = pings.stop()
     if link.epoch != epoch:
         raise LinkLost(f"{link.url}: the link dropped during the measurement, and is back. Measure again.")
-    ticks = np.arange(begun, ended, period)
+    ticks = np.arange(start, end, period)
     readings = tuple(
         _reading(source, profile, log.letters[source.signal], ticks, ahead, link.clock_offset)
         for source in state.sources
     )
-    return LinkMeasurement(ended - begun, trips, pings.copies, readings)
+    return LinkMeasurement(end - start, trips, pings.copies, readings)
 
 
 def _reading(
@@ -238,7 +238,7 @@ def _reading(
     ahead: float,
     server_offset: float | None,
 ) -> Reading:
-    """What `letters` of a source are at the times `ticks` [s, monotonic]; for `ahead` see `SourceAge`."""
+    """Summarise the `letters` of a source at the times `ticks` [s, monotonic clock]; for `ahead` see `SourceAge`."""
     tracker, size = SourceAge(ahead), len(profile.signal(source.signal).labels)
     arrived, measured, errors = [], [], []
     values: Array = np.full(size, np.nan)
@@ -251,9 +251,10 @@ def _reading(
             continue
         arrived.append(letter.arrived)
         measured.append(letter.arrived - tracker.at(letter.arrived))
-    came, at = np.array(arrived), np.array(measured)
-    newest = np.searchsorted(came, ticks, side="right") - 1
-    ages = (ticks - at[newest])[newest >= 0] if len(came) else np.empty(0)
-    rate = (len(came) - 1) / (came[-1] - came[0]) if len(came) > 1 and came[-1] > came[0] else 0.0
+    arrivals, stamps = np.array(arrived), np.array(measured)
+    newest = np.searchsorted(arrivals, ticks, side="right") - 1
+    ages = (ticks - stamps[newest])[newest >= 0] if len(arrivals) else np.empty(0)
+    duration = arrivals[-1] - arrivals[0] if len(arrivals) else 0.0
+    rate = (len(arrivals) - 1) / duration if duration > 0.0 else 0.0
     first = errors[0] if errors else ""
-    return Reading(source, len(letters), rate, came - at, ages, values, len(errors), first)
+    return Reading(source, len(letters), rate, arrivals - stamps, ages, values, len(errors), first)

@@ -1,9 +1,9 @@
-"""Simulated robots behind a simulated link: late, lost and repeated commands, late, lost and empty states.
+"""Simulated robots behind a simulated link: late, lost and repeated commands; late, lost and unreadable states.
 
 Time is counted in periods of the robot. A delay d [s] is floor(d / T + u) periods T, u uniform in [0, 1), so that the
 mean is right also where d is shorter than T. Messages keep their order, as on TCP: a late one holds up those behind it.
-What is drawn follows from the seed of the episode and the number of the step alone: environment i of a batch equals a
-single one with the same seed, bit for bit.
+Random numbers depend only on the seed of the episode and the number of the step: environment i of a batch equals a
+single environment with the same seed, bit for bit.
 """
 
 from collections.abc import Mapping
@@ -26,12 +26,12 @@ from bam_envs.safety.guard import is_base, measured_places
 Array = NDArray[np.float64]
 Counts = NDArray[np.int64]
 LONGEST = 32
-"""Maximum delay of a message [periods]; later ones count as lost."""
+"""Maximum delay of a message [periods]; a later message counts as lost."""
 WATCHDOG = 0.5
 """Time after the last command at which a base stops by itself [s]; an arm stays where its last command sent it."""
 NEVER = np.iinfo(np.int64).max
 _COMMANDS, _STATES = 0, 1  # the two directions
-_STAMP = "stamp"  # of a state, kept beside its signals
+_STAMP = "stamp"  # key of the time stamp beside the signals of a state
 
 Quantiles = Annotated[
     list[Annotated[float, Meta(ge=0, le=60)]],
@@ -42,12 +42,12 @@ Share = Annotated[float, Meta(ge=0, le=0.9)]
 
 @dataclass(frozen=True)
 class LinkProfile:
-    """What a link does to the messages of a robot; ``bam-doctor --measure`` writes it as JSON.
+    """Delay, loss and damage of the messages of a robot on a link; ``bam-doctor --measure`` writes it as JSON.
 
     A delay is a distribution: its quantiles [s] at equally spaced probabilities from 0 to 1, in rising order.
 
     Raises:
-        InvalidValue: A value does not fit; names it.
+        InvalidValue: A value is invalid; the error names it.
     """
 
     command_delay: Quantiles
@@ -59,13 +59,13 @@ class LinkProfile:
     state_loss: Share = 0.0
     """Share of states that never arrive."""
     burst: Annotated[float, Meta(ge=1, le=1000)] = 1.0
-    """Mean number of messages that are lost in a row; at least what chance alone makes of it."""
+    """Mean number of consecutive lost messages; at least that of independent losses."""
     duplicates: Fraction = 0.0
-    """Share of steps in which the command before the newest one arrives again, after it."""
+    """Share of steps in which the previous command arrives again after the newest one."""
     nulls: Fraction = 0.0
-    """Share of states with a null in place of a number, which are dropped when they arrive."""
+    """Share of states with a null in place of a number, which are dropped on arrival."""
     about: str = ""
-    """What was measured, where and when; for people."""
+    """Description of the measurement, for people."""
 
     def __post_init__(self) -> None:
         check_fields(self, lambda name: f"link: {name}")
@@ -75,12 +75,12 @@ class LinkProfile:
                 raise InvalidValue(f"link: {name}: expected quantiles in rising order, found {brief(values)}")
 
     def to_json(self) -> str:
-        """The content of a file for `link_profile`."""
+        """The profile as JSON, for a file that `link_profile` reads."""
         return msgspec.json.format(msgspec.json.encode(self), indent=1).decode()
 
 
 def quantiles(p50: float, p90: float, p99: float, most: float) -> list[float]:
-    """101 quantiles on straight lines through four [s]; the smallest is half the median."""
+    """101 quantiles by linear interpolation through the given ones [s]; the smallest is half the median."""
     through = np.interp(np.linspace(0, 1, 101), [0, 0.5, 0.9, 0.99, 1], [p50 / 2, p50, p90, p99, most])
     return [float(value) for value in through]
 
@@ -94,14 +94,14 @@ PROFILES: dict[str, LinkProfile] = {
     "lte": _both_ways(quantiles(0.03, 0.06, 0.15, 0.4), loss=0.005, burst=3.0, duplicates=0.0, nulls=0.0),
     "bad": _both_ways(quantiles(0.05, 0.15, 0.4, 1.0), loss=0.05, burst=5.0, duplicates=0.01, nulls=0.01),
 }
-"""Shipped profiles, both directions alike: a busy wireless network, a mobile network, one that nobody should use."""
+"""Shipped profiles, equal in both directions: a busy wireless network, a mobile network, an unusable network."""
 
 
 def link_profile(link: object) -> LinkProfile:
-    """The profile that `link` names or holds: a shipped name, the name of a JSON file, a table, or a profile itself.
+    """The profile for a shipped name, the path of a JSON file, a table, or a profile itself.
 
     Raises:
-        InvalidValue: There is no such profile or file, or it holds nonsense; names the field.
+        InvalidValue: There is no such profile or file, or a value in it is invalid; the error names the field.
     """
     if isinstance(link, LinkProfile):
         return link
@@ -129,7 +129,7 @@ def link_profile(link: object) -> LinkProfile:
 
 
 def portable(link: object) -> object:
-    """`link` without a file, which need not be where a checkpoint is used: a shipped name, a table, or None."""
+    """`link` with the content of a file in its place, for a checkpoint: a shipped name, a table, or None."""
     if link is None or link in list(PROFILES):
         return link
     return asdict(link_profile(link))
@@ -138,35 +138,35 @@ def portable(link: object) -> object:
 class LinkedRobot:
     """Simulated robots behind a link; a `Robot` around a `Robot`.
 
-    Each period one command is sent, and the robots execute the newest one that has arrived. Returned states are the
-    newest that have arrived, with the command that was sent; ``truth`` is of now.
+    In each period one command is sent, and the robots execute the newest command that has arrived. Returned states are
+    the newest that have arrived, with the command that was sent; ``truth`` is current.
 
     Args:
         robot: The robots behind the link.
-        profile: What the link does.
+        profile: The properties of the link.
     """
 
     def __init__(self, robot: Robot, profile: LinkProfile) -> None:
         self.robot, self.profile, self.spec, self.num_robots = robot, profile, robot.spec, robot.num_robots
         n, m = robot.num_robots, len(robot.spec.command.labels)
         self._is_base = is_base(robot.spec)
-        self._seeds, self._count = np.zeros(n, np.uint64), np.zeros(n, np.int64)  # the steps of the episode
-        self._sent = np.zeros((n, LONGEST + 1, m))  # command k is at k % (LONGEST + 1), and so are states
+        self._seeds, self._count = np.zeros(n, np.uint64), np.zeros(n, np.int64)  # number of the step in the episode
+        self._sent = np.zeros((n, LONGEST + 1, m))  # ring buffers: command k, like state k, is at k % (LONGEST + 1)
         self._states: dict[str, Array] = {}
-        self._due = np.full((n, 2, LONGEST + 1), NEVER)  # the step at which command k, state k arrives
-        self._last_due = np.zeros((n, 2), np.int64)  # the latest arrival so far: messages keep their order
+        self._due = np.full((n, 2, LONGEST + 1), NEVER)  # step at which command k, state k arrives
+        self._last_due = np.zeros((n, 2), np.int64)  # latest arrival so far: messages keep their order
         self._lost = np.zeros((n, 2), bool)  # whether the last command, state was lost: losses come in bursts
         self._newest = np.zeros((n, 2), np.int64)  # number of the newest command, state that has arrived
-        self._heard = np.zeros(n, np.int64)  # the step at which the robot heard a new command
-        self._now: dict[str, Array] = {}  # the newest state that has arrived
+        self._heard = np.zeros(n, np.int64)  # step at which the last new command arrived
+        self._arrived_state: dict[str, Array] = {}  # the newest state that has arrived
         self._command = np.zeros((n, m))  # the newest command that has arrived
         self._last_sent = np.zeros((n, m))
         nothing = RobotState({}, np.zeros(n), self._last_sent)
         self.there = nothing
-        """The newest state at the robots' end; without signals before `reset`."""
+        """The current state of the robots; without signals before `reset`."""
         self.newest = nothing
-        """The newest state that has arrived here, as returned last."""
-        self._rows = np.arange(n)
+        """The newest state that has arrived; the one returned last."""
+        self._env_ids = np.arange(n)
 
     def connect(self) -> None:
         """Make the robots ready."""
@@ -179,11 +179,11 @@ class LinkedRobot:
         return age
 
     def reset(self, env_ids: EnvIds, initial: Initial) -> RobotState:
-        """Bring these robots to `initial`; nothing is on its way then."""
+        """Bring these robots to `initial`; messages on their way are dropped."""
         state = self.robot.reset(env_ids, initial)
         self._seeds[env_ids] = mixed(np.asarray(initial.seeds).astype(np.uint64) + np.uint64(0x11AB))
-        for zero in (self._count, self._newest, self._heard, self._lost, self._last_due):
-            zero[env_ids] = 0
+        for counter in (self._count, self._newest, self._heard, self._lost, self._last_due):
+            counter[env_ids] = 0
         self._due[env_ids] = NEVER
         self._command, self._last_sent = self._command.copy(), self._last_sent.copy()
         self._command[env_ids] = self._last_sent[env_ids] = state.command[env_ids]
@@ -191,97 +191,97 @@ class LinkedRobot:
         for name, array in signals.items():
             if name not in self._states:
                 self._states[name] = np.zeros((len(array), LONGEST + 1, *array.shape[1:]))
-                self._now[name] = array.copy()
-            self._now[name] = self._now[name].copy()
-            self._now[name][env_ids] = array[env_ids]
-        return self._seen(state)
+                self._arrived_state[name] = array.copy()
+            self._arrived_state[name] = self._arrived_state[name].copy()
+            self._arrived_state[name][env_ids] = array[env_ids]
+        return self._store(state)
 
     def step(self, command: Array) -> RobotState:
-        """Send `command` (n, m), SI units; one period later, the newest state that has arrived.
+        """Send `command` (n, m), SI units; returns the newest state that has arrived one period later.
 
         Raises:
-            InvalidValue: It has another shape, or is not finite.
+            InvalidValue: The command has another shape, or is not finite.
         """
         command = checked_command(command, self._command.shape)
         draws = self._next_step()
         slot = self._count % (LONGEST + 1)
-        self._last_sent = self._sent[self._rows, slot] = command
+        self._last_sent = self._sent[self._env_ids, slot] = command
         self._post(_COMMANDS, draws[:3])
         return self._advance(draws)
 
     def wait(self) -> RobotState:
-        """Send nothing for a period; the newest state that has arrived."""
+        """Send nothing for one period; returns the newest state that has arrived."""
         draws = self._next_step()
-        self._due[self._rows, _COMMANDS, self._count % (LONGEST + 1)] = NEVER
+        self._due[self._env_ids, _COMMANDS, self._count % (LONGEST + 1)] = NEVER
         return self._advance(draws)
 
     def _next_step(self) -> Array:
-        """Begin the next step; its random numbers from 0 to 1. Shape: (7, n)."""
+        """Begin the next step; returns its random numbers in [0, 1). Shape: (7, n)."""
         self._count = self._count + 1
         steps = mixed(self._count.astype(np.uint64) * np.uint64(7) + np.arange(7, dtype=np.uint64)[:, None])
         draws: Array = (mixed(self._seeds + steps) >> np.uint64(11)).astype(np.float64) / 2**53
         return draws
 
-    def _post(self, way: int, draws: Array) -> None:
-        """Draw when message number `count` of each robot arrives."""
+    def _post(self, direction: int, draws: Array) -> None:
+        """Draw the step at which message number `count` of each robot arrives; `draws` has shape (3, n)."""
         profile = self.profile
         loss, delay = (
             (profile.command_loss, profile.command_delay)
-            if way == _COMMANDS
+            if direction == _COMMANDS
             else (profile.state_loss, profile.state_delay)
         )
-        # A chain of two states whose share of losses is `loss` and whose mean run of losses is `burst`.
+        # Gilbert model: a Markov chain with the share of losses `loss` and the mean length of a loss `burst`.
         stay = max(loss, 1 - 1 / profile.burst)
-        lost = draws[0] < np.where(self._lost[:, way], stay, loss / (1 - loss) * (1 - stay))
-        self._lost[:, way] = lost
-        if way == _STATES:
+        lost = draws[0] < np.where(self._lost[:, direction], stay, loss / (1 - loss) * (1 - stay))
+        self._lost[:, direction] = lost
+        if direction == _STATES:
             lost = lost | (draws[0] > 1 - profile.nulls)
         late = np.interp(draws[1], np.linspace(0, 1, len(delay)), delay) / self.spec.period
-        due = np.maximum(self._count + np.floor(late + draws[2]).astype(np.int64), self._last_due[:, way])
+        due = np.maximum(self._count + np.floor(late + draws[2]).astype(np.int64), self._last_due[:, direction])
         lost = lost | (due >= self._count + LONGEST)
-        self._due[self._rows, way, self._count % (LONGEST + 1)] = np.where(lost, NEVER, due)
-        self._last_due[:, way] = np.where(lost, self._last_due[:, way], due)
+        self._due[self._env_ids, direction, self._count % (LONGEST + 1)] = np.where(lost, NEVER, due)
+        self._last_due[:, direction] = np.where(lost, self._last_due[:, direction], due)
 
-    def _arrivals(self, way: int) -> Any:
-        """Take in what arrives in this step; a mask of the robots with a newer message. Shape: (n,) bool."""
+    def _arrivals(self, direction: int) -> Any:
+        """Receive the messages of this step; returns a mask of robots with a newer message. Shape: (n,) bool."""
         numbers = self._count[:, None] - np.arange(LONGEST + 1)
-        due = np.take_along_axis(self._due[:, way], numbers % (LONGEST + 1), axis=1)
-        arrived = (due <= self._count[:, None]) & (numbers > self._newest[:, way, None])
+        due = np.take_along_axis(self._due[:, direction], numbers % (LONGEST + 1), axis=1)
+        arrived = (due <= self._count[:, None]) & (numbers > self._newest[:, direction, None])
         newer = arrived.any(axis=1)
         newest = self._count - arrived.argmax(axis=1)
-        self._newest[:, way] = np.where(newer, newest, self._newest[:, way])
+        self._newest[:, direction] = np.where(newer, newest, self._newest[:, direction])
         return newer
 
     def _advance(self, draws: Array) -> RobotState:
-        """One period: the robots execute the newest command, and their state is sent here."""
+        """Advance one period: the robots execute the newest command, and send their state."""
         newer = self._arrivals(_COMMANDS)
         number = self._newest[:, _COMMANDS]
         self._heard = np.where(newer, self._count, self._heard)
-        self._command = np.where(newer[:, None], self._sent[self._rows, number % (LONGEST + 1)], self._command)
+        self._command = np.where(newer[:, None], self._sent[self._env_ids, number % (LONGEST + 1)], self._command)
         repeated = (draws[6] < self.profile.duplicates) & (number > 1) & newer
-        executed = np.where(repeated[:, None], self._sent[self._rows, (number - 1) % (LONGEST + 1)], self._command)
+        executed = np.where(repeated[:, None], self._sent[self._env_ids, (number - 1) % (LONGEST + 1)], self._command)
         if self._is_base:
             silent = (self._count - self._heard) * self.spec.period > WATCHDOG
             executed = np.where(silent[:, None], 0.0, executed)
         state = self.robot.step(executed)
         slot = self._count % (LONGEST + 1)
         for name, array in {**state.signals, _STAMP: state.stamp[:, None]}.items():
-            self._states[name][self._rows, slot] = array
+            self._states[name][self._env_ids, slot] = array
         self._post(_STATES, draws[3:6])
         newer, place = self._arrivals(_STATES), self._newest[:, _STATES] % (LONGEST + 1)
         for name, array in self._states.items():
             mask = newer.reshape(-1, *[1] * (array.ndim - 2))
-            self._now[name] = np.where(mask, array[self._rows, place], self._now[name])
-        return self._seen(state)
+            self._arrived_state[name] = np.where(mask, array[self._env_ids, place], self._arrived_state[name])
+        return self._store(state)
 
-    def _seen(self, there: RobotState) -> RobotState:
-        signals = dict(self._now)
+    def _store(self, there: RobotState) -> RobotState:
+        signals = dict(self._arrived_state)
         stamp = signals.pop(_STAMP)[:, 0]
         self.there, self.newest = there, RobotState(signals, stamp, self._last_sent, there.truth)
         return self.newest
 
     def rest(self, state: RobotState) -> Array:
-        """The command that stops robots measured in `state`: no speed of a base, an arm where it is. Shape: (n, m)."""
+        """The command that stops robots measured in `state`: zero speed, or the measured joints. Shape: (n, m)."""
         if self._is_base:
             return np.zeros_like(self._command)
         rest: Array = self._last_sent.copy()
@@ -291,7 +291,7 @@ class LinkedRobot:
         return rest
 
     def halt(self) -> None:
-        """Stop moving, at once; commands on their way are dropped."""
+        """Stop moving at once; commands on their way are dropped."""
         self.robot.halt()
         if self.there.signals:
             self._due[:, _COMMANDS] = NEVER
@@ -302,26 +302,26 @@ class LinkedRobot:
         self.robot.close()
 
     def render(self, mode: str, marks: list[Any]) -> Any:
-        """The image of environment 0, where it is now; see the robot's own."""
+        """The image of environment 0, in its current state; see `render` of the robot."""
         robot: Any = self.robot
         return robot.render(mode, marks)
 
     _MEMORY = ("_seeds", "_count", "_sent", "_due", "_last_due", "_lost", "_newest", "_heard", "_command", "_last_sent")
 
     def state_dict(self) -> dict[str, Any]:
-        """Everything that the future of robots and link depends on."""
+        """The complete state of robots and link."""
         robot: Any = self.robot
-        tables = {"states": self._states, "now": self._now}
+        tables = {"states": self._states, "now": self._arrived_state}
         copies = {key: {name: array.copy() for name, array in table.items()} for key, table in tables.items()}
         return {"robot": robot.state_dict(), **copies, **{name: getattr(self, name).copy() for name in self._MEMORY}}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> RobotState:
-        """Restore the result of `state_dict`; returns the state."""
+        """Restore the result of `state_dict`; returns the newest state that has arrived."""
         robot: Any = self.robot
         there: RobotState = robot.load_state_dict(state["robot"])
-        self._states, self._now = (
+        self._states, self._arrived_state = (
             {name: np.array(array) for name, array in state[key].items()} for key in ("states", "now")
         )
         for name in self._MEMORY:
             setattr(self, name, np.array(state[name]))
-        return self._seen(there)
+        return self._store(there)

@@ -211,7 +211,7 @@ def test_some_unreadable_states_are_a_warning_and_measured(server, robot_on, pat
 
 @pytest.mark.slow
 def test_a_server_that_passes_no_message_on_and_whose_clock_is_apart(lax, robot_on, patient, monkeypatch):
-    monkeypatch.setattr("bam_envs.live.diagnosis.CLOCK_APART", 0.0)
+    monkeypatch.setattr("bam_envs.live.diagnosis.MAX_CLOCK_OFFSET", 0.0)
     server = lax()
     robot_on(server)
     steps = diagnose(server.url, profile=patient())[1]
@@ -308,6 +308,6 @@ def test_a_delay_of_the_network_is_in_both_directions(server, robot_on, patient)
         time.sleep(2 * delay)  # the last bytes are on their way
     assert steps["guards"].verdict != "failed"
     link = diagnosis.measurement.profile()
-    assert diagnosis.measurement.back.min() >= 2 * delay
+    assert diagnosis.measurement.round_trips.min() >= 2 * delay
     for delays in (link.command_delay, link.state_delay):
         assert 0.8 * delay <= delays[50] <= 10 * delay
