@@ -1,5 +1,6 @@
 """Before a robot moves: check that its environment fits the policy, show its limits, and ask a person for consent."""
 
+import math
 import os
 import sys
 from collections.abc import Callable, Mapping, Sequence
@@ -172,7 +173,8 @@ def require_consent(env: Any, who: str, *, yes: bool, plan: Sequence[str] = ()) 
         say(line)
     for name, guard in guards_of(env).items():
         if guard["limit"] not in (None, ""):
-            say(f"  {name} ({guard['number']}): {guard['limit']:.3g} {guard['unit']}".rstrip())
+            limit = "off" if guard["limit"] == math.inf else f"{guard['limit']:.3g} {guard['unit']}"
+            say(f"  {name} ({guard['number']}): {limit}")
     for warning in getattr(robot, "warnings", ()):
         say(f"  warning: {warning}")
     if (why := robot.not_ready()) is not None:

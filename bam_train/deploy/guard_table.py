@@ -5,7 +5,7 @@ from dataclasses import asdict
 from typing import Any
 
 from bam_envs.core.robot import RobotSpec
-from bam_envs.safety.guard import BOUNDS, Limits, is_base
+from bam_envs.safety.guard import BOUNDS, Limits, is_base, limits_of
 
 OUTSIDE_THE_GATE = (
     "G1   contract, signature  compared and verified before a live robot moves (exit status 3 or 1)",
@@ -28,7 +28,9 @@ def in_force(guards: Sequence[Mapping[str, Any]], limits: Limits, spec: RobotSpe
     """
     floor = limits.table_height if "m" in spec.command.units and not is_base(spec) else None
     chosen = {guard["setting"]: guard["limit"] for guard in guards} | {"lag": spec.lag, "box_z_min": floor}
-    return {name: chosen.get(name) if value is None else value for name, value in asdict(limits).items()}
+    values = {name: chosen.get(name) if value is None else value for name, value in asdict(limits).items()}
+    useful = limits_of(guards)
+    return {name: value if name in useful else None for name, value in values.items()}
 
 
 def guard_lines(guards: Sequence[Mapping[str, Any]], limits: Mapping[str, float | None]) -> list[str]:

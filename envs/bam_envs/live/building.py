@@ -1,6 +1,6 @@
 """The one function that builds a live robot: a `RosbridgeRobot` behind the guards of a `SafeRobot`."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 from bam_envs.core.errors import InvalidValue
@@ -11,7 +11,7 @@ from bam_envs.robots.profile import load_profile, profile_for
 from bam_envs.ros.profile_tables import RobotProfile
 from bam_envs.rosbridge.endpoint import Endpoint
 from bam_envs.safety.gate import SafeRobot
-from bam_envs.safety.guard import Limits, ToolPosition
+from bam_envs.safety.guard import Limits, ToolPosition, limits_of
 
 
 def live_robot(
@@ -45,7 +45,7 @@ def live_robot(
 
     Raises:
         InvalidValue: The address is not that of a robot, a file cannot be read, or the profile lacks a signal or
-            command of `spec`; or a limit is outside its bounds, or contradicts another one.
+            command of `spec`; or a limit is outside its bounds, contradicts another one, or changes no guard.
         UnknownName: There is no such profile, command mode or limit.
     """
     require_robot_address(url)
@@ -53,11 +53,13 @@ def live_robot(
     chosen = _chosen(profile, spec)
     robot = RosbridgeRobot(endpoint, chosen, spec=spec, command=command)
     chosen_limits = limits or profile_limits(chosen)
-    if guards:
+    if guards is not None:
         chosen_limits = chosen_limits.changed(guards)
     if trial:
         chosen_limits = chosen_limits.on_trial(base=chosen.kind == "base")
-    return SafeRobot(robot, limits=chosen_limits, tool_position=tool_position, straight=straight)
+    safe = SafeRobot(robot, limits=chosen_limits, tool_position=tool_position, straight=straight)
+    require_effect(safe, guards or {})
+    return safe
 
 
 def shadow_robot(
@@ -72,7 +74,8 @@ def shadow_robot(
     """A live robot that somebody else drives: its states are read, and nothing is sent. Arguments: see `live_robot`."""
     require_robot_address(url)
     endpoint, chosen = Endpoint.with_token_file(url, ca_file=ca_file, token_file=token_file), _chosen(profile, spec)
-    return ShadowRobot(endpoint, chosen, spec=spec, limits=profile_limits(chosen).changed(guards or {}))
+    limits = profile_limits(chosen).changed({} if guards is None else guards)
+    return ShadowRobot(endpoint, chosen, spec=spec, limits=limits)
 
 
 def _chosen(profile: RobotProfile | str | Path | None, spec: RobotSpec | None) -> RobotProfile:
@@ -85,6 +88,17 @@ def _chosen(profile: RobotProfile | str | Path | None, spec: RobotSpec | None) -
 def profile_limits(profile: RobotProfile) -> Limits:
     """The limits of the guards for a robot of `profile`."""
     return Limits.of({"max_age": profile.max_age, **profile.limits})
+
+
+def require_effect(robot: SafeRobot, limits: Iterable[str]) -> None:
+    """`InvalidValue` if a guard that one of the `limits` changes is not among those of `robot`, or is off."""
+    useful = limits_of(robot.guards())
+    for name in limits:
+        if name not in useful:
+            raise InvalidValue(
+                f"The limit {name} would change nothing: {robot.spec.name} has no guard for it in this task. Leave it "
+                "out; bam-deploy --print-guards lists the guards."
+            )
 
 
 def require_robot_address(url: str) -> None:

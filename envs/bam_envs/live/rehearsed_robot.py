@@ -8,7 +8,7 @@ from collections.abc import Mapping
 
 from bam_envs.core.errors import InvalidValue
 from bam_envs.core.robot import EnvIds, Initial, RobotState
-from bam_envs.live.building import profile_limits
+from bam_envs.live.building import profile_limits, require_effect
 from bam_envs.robots.linked import Array, LinkedRobot
 from bam_envs.robots.profile import load_profile, profile_for
 from bam_envs.ros.codec import RobotInfo
@@ -91,13 +91,16 @@ def rehearsed_robot(
         straight: Whether the task moves the tool in straight lines, see `SafeRobot`.
 
     Raises:
-        InvalidValue: There are several robots, the profile has no such commands, or a limit is outside its bounds.
+        InvalidValue: There are several robots, the profile has no such commands, or a limit is outside its bounds or
+            changes no guard.
     """
     labels = robot.spec.command.labels
     chosen = profile_for(robot.spec) if profile is None else load_profile(profile).narrowed(labels)
     tool = getattr(robot.robot, "tool_position", None)  # forward kinematics of an arm that is no UR5e
-    limits = profile_limits(chosen).changed(guards or {})
-    return SafeRobot(RehearsedRobot(robot), limits=limits, tool_position=tool, straight=straight)
+    limits = profile_limits(chosen).changed({} if guards is None else guards)
+    safe = SafeRobot(RehearsedRobot(robot), limits=limits, tool_position=tool, straight=straight)
+    require_effect(safe, guards or {})
+    return safe
 
 
 def time_to_stop(robot: LinkedRobot) -> float:

@@ -182,6 +182,8 @@ class JointFollowing(Following):
 class BaseFollowing(Following):
     """Commands stay within reach of the measured speed; a base that does not follow its commands is held."""
 
+    setting = "lag"
+
     def __init__(self, name: str, unit: str, acceleration: float, spec: RobotSpec, limits: Limits) -> None:
         super().__init__(spec, limits)
         self.name, self.unit, rates = name, unit, max_rate(spec.command)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import operator
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from types import MappingProxyType
 from typing import Annotated, Any
@@ -18,6 +18,7 @@ from bam_envs.core.errors import InvalidValue, UnknownName
 from bam_envs.core.kinematics import ArmGeometry
 from bam_envs.core.robot import RobotSpec, SignalSpec
 from bam_envs.core.validation import check
+from bam_envs.core.wording import brief
 
 Array = NDArray[np.float64]
 Numbers = list[float]
@@ -175,6 +176,8 @@ class Limits:
 
     def changed(self, values: Mapping[str, float]) -> Limits:
         """These limits with other `values`, as an operator gives them. Raises the errors of `of`."""
+        if not isinstance(values, Mapping):
+            raise InvalidValue(f"guards= must be limits by name, such as {{'joint_speed': 0.3}}, not {brief(values)}.")
         current = {limit.name: getattr(self, limit.name) for limit in fields(self)}
         limits = Limits.of({**current, **values})
         if "reset_speed" in values:  # in a profile it may be above the speed that a person lowered
@@ -224,6 +227,25 @@ ORDERED: tuple[tuple[str, str], ...] = (
     ("box_z_min", "box_z_max"),
 )
 """Pairs of limits, the first of which is at most the second."""
+BESIDE: Mapping[str, str] = MappingProxyType(
+    {
+        **dict.fromkeys(("reset_tolerance", "reset_timeout"), "reset_speed"),
+        **dict.fromkeys(("laser_slow", "collision_time"), "laser_stop"),
+        "follow_tolerance": "joint_speed",
+        "hold_time": "max_age",
+        "link_warn": "link_stop",
+        "clamp_warn": "clamp_stop",
+        "singularity_slow": "singularity_stop",
+        "table_height": "box_z_min",
+    }
+)
+"""Limits that are no `Guard.setting`, and one that is, of the same guard."""
+
+
+def limits_of(guards: Iterable[Mapping[str, Any]]) -> set[str]:
+    """The names of the limits that change at least one of `guards`, from `SafeRobot.guards`."""
+    settings = ", ".join(guard["setting"] for guard in guards if guard["limit"] is not None).split(", ")
+    return {name for name in BOUNDS if BESIDE.get(name, name) in settings}
 
 
 def require_bounded(limits: Limits, spec: RobotSpec) -> None:

@@ -88,7 +88,8 @@ class WorkspaceBox(ForbiddenRegion):
         self._low, self._high = (*map(float, low),), (*map(float, high),)
         require_room(self._low, self._high)
         self._tool = tool
-        self.limit_value = max(most - least for least, most in zip(self._low, self._high, strict=True))
+        edges = [most - least for least, most in zip(self._low, self._high, strict=True)]
+        self.limit_value = max(edge for edge in edges if edge < math.inf)
 
     def depth(self, joints: Sequence[float]) -> float:
         """Distance of the tool outside the box, along the axis where it is farthest [m]."""
@@ -148,4 +149,7 @@ class Collision(ForbiddenRegion):
 def require_room(low: Sequence[float], high: Sequence[float]) -> None:
     """`InvalidValue` if a box from `low` to `high` [m] is empty."""
     if not all(least < most for least, most in zip(low, high, strict=True)):
-        raise InvalidValue(f"A workspace box needs room: low {low} must be below high {high} on every axis.")
+        raise InvalidValue(
+            f"A workspace box needs room: low {low} must be below high {high} on every axis. Change the limits box_* "
+            "(box_z_min is table_height unless it is given)."
+        )

@@ -160,6 +160,29 @@ def test_some_limits_of_its_guards():
     with pytest.raises(InvalidValue) as caught:
         live_robot("ws://robot", guards={"tool_speed": 2.0})
     assert str(caught.value) == "The limit tool_speed of a live robot must be 0.005 to 1 m/s, not 2."
+    for wrong in (5, [], "joint_speed=0.3"):
+        with pytest.raises(InvalidValue) as caught:
+            live_robot("ws://robot", guards=wrong)
+        expected = f"guards= must be limits by name, such as {{'joint_speed': 0.3}}, not {wrong!r}."
+        assert str(caught.value) == expected
+
+
+@pytest.mark.parametrize(
+    ("spec", "limit", "value"),
+    [
+        (base_spec(), "box_x_min", -1.0),
+        (base_spec(with_scans=False), "laser_slow", 0.5),
+        (arm_spec("ur5e", with_object=False), "base_speed", 0.3),
+        (arm_spec("ur5e", with_object=False), "singularity_slow", 15.0),  # not along straight lines
+    ],
+)
+def test_a_limit_that_no_guard_of_the_robot_has_is_refused(spec, limit, value):
+    with pytest.raises(InvalidValue) as caught:
+        live_robot("ws://robot", spec, guards={limit: value})
+    assert str(caught.value) == (
+        f"The limit {limit} would change nothing: {spec.name} has no guard for it in this task. Leave it out; "
+        "bam-deploy --print-guards lists the guards."
+    )
 
 
 def test_what_its_guards_did_is_published_in_every_tick(server, robot_on, start_pose):

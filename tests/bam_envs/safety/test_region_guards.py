@@ -101,7 +101,8 @@ def test_a_box_needs_room():
     with pytest.raises(InvalidValue) as caught:
         box_of((0, 0, 1), (1, 1, 1))
     assert str(caught.value) == (
-        "A workspace box needs room: low (0.0, 0.0, 1.0) must be below high (1.0, 1.0, 1.0) on every axis."
+        "A workspace box needs room: low (0.0, 0.0, 1.0) must be below high (1.0, 1.0, 1.0) on every axis. "
+        "Change the limits box_* (box_z_min is table_height unless it is given)."
     )
     with pytest.raises(InvalidValue, match=r"box_x_min of 0.5 and box_x_max of 0.4 contradict each other"):
         Limits(box_x_min=0.5, box_x_max=0.4)

@@ -1,6 +1,7 @@
 """Asking a person before a real robot moves."""
 
 import io
+import math
 import sys
 from types import SimpleNamespace
 
@@ -41,10 +42,13 @@ def consent(monkeypatch, robot, answer=None, yes=False, plan=()):
 
 
 def test_before_a_real_robot_moves_its_limits_are_shown_and_somebody_asked(monkeypatch, capsys):
-    consent(monkeypatch, RealArm(), "yes\n")
+    robot = RealArm()
+    robot.report = lambda: {**GUARDS, "laser zones": {"number": "G12", "limit": math.inf, "unit": "m"}}
+    consent(monkeypatch, robot, "yes\n")
     assert capsys.readouterr().err == (
         "bam-deploy: pick.zip will move ur5e at ws://10.0.0.5:9090, within\n"
         "  joint speed (G8): 3.14 rad/s\n"
+        "  laser zones (G12): off\n"
         "Is the robot clear of people, and a hand on its emergency stop? Type yes to go on: "
     )
 

@@ -25,6 +25,17 @@ def test_every_guard_has_a_number_a_name_a_limit_and_says_what_it_does(run, name
     assert set(table["limits"]) == set(BOUNDS)
     left_to_the_robot = {"reach-ppo.zip": (0.1, 0.1, 0.0), "mir100-navigation-ppo.zip": (0.3, 0.5, None)}
     assert tuple(table["limits"][limit] for limit in ("lag", "watchdog", "box_z_min")) == left_to_the_robot[name]
+    without_guard = {"reach-ppo.zip": "base_speed", "mir100-navigation-ppo.zip": "joint_speed"}
+    assert table["limits"][without_guard[name]] is None
+
+
+@pytest.mark.parametrize(
+    ("name", "guard", "limit"),
+    [("mir100-navigation-ppo.zip", "laser zones", None), ("ur-reach-ppo.zip", "workspace box", 4.0)],
+)
+def test_a_guard_without_scans_is_off_and_a_box_without_a_bottom_is_not(run, name, guard, limit):
+    table = json.loads(run(main, CHECKPOINTS / name, "--print-guards", "--json")[1])
+    assert [one["limit"] for one in table["guards"] if one["name"] == guard] == [limit]
 
 
 def test_a_guard_that_is_changed_is_shown_so(run):
