@@ -141,8 +141,9 @@ class Rehearsal:
             try:
                 self._play(policy, report)
             except (SafetyStop, StaleState) as stop:
-                short = str(stop).partition(":")[0]
-                tell(f"episode with seed {seed + k}: {short if short in shown else stop}")
+                why = str(stop).removesuffix(" When it is safe, call resume().")
+                short = why.partition(":")[0]
+                tell(f"episode with seed {seed + k}: {short if short in shown else why}")
                 shown.add(short)
                 self._gate.resume()
         report.guards = self._gate.report()

@@ -8,12 +8,12 @@ import gymnasium as gym
 import numpy as np
 
 from bam_envs.core.errors import RobotFault
-from bam_envs.core.registry import entry_of
+from bam_envs.core.registry import are_same, entry_of
 from bam_envs.core.robot_env import RobotEnv
 from bam_envs.robots.replay_robot import ReplayRobot
 from bam_train.checkpoint import Checkpoint
 from bam_train.environments import environment_of, make_env
-from bam_train.errors import BadRecording
+from bam_train.errors import BadRecording, CheckpointMismatch
 from bam_train.recording.recording import Recording
 
 ELSEWHERE = ("randomize", "link", "guards", "trial")
@@ -66,8 +66,10 @@ def replay_env(
         BadRecording: No robot was recorded, or another one.
         CheckpointError: It belongs to another environment, or to one that must be named.
     """
-    if recording.metadata.get("env"):
-        checkpoint.requires_env(recording.metadata["env"])
+    recorded, trained = recording.metadata.get("env"), checkpoint.manifest.env
+    if recorded and not are_same(recorded, trained):
+        text = f"was trained on {trained}, and {recording.path} is of {recorded}. Give a checkpoint of {recorded}"
+        raise CheckpointMismatch(checkpoint.path, text)
     env_id, kwargs = environment_of(checkpoint, named)
     kwargs = {name: value for name, value in kwargs.items() if name not in ELSEWHERE}
     entry, longest = entry_of(env_id), max(map(len, recording.episodes()), default=0) - 1

@@ -102,7 +102,7 @@ class Ring:
 
     def fail(self, reason: str) -> None:
         """The reader's last act, if it cannot go on."""
-        self._head.reason = reason.encode()[: _TEXT - 1]
+        self._head.reason = reason.encode(errors="replace")[: _TEXT - 1]
         self._head.failed = 1
 
     @property

@@ -157,8 +157,8 @@ def lines_of(recording: Recording) -> list[str]:
         lines.append(
             f"episode {number} (seed {row['seed']}): {how} after {row['length']} steps, return {row['return']:.2f}"
         )
-    changed = ", ".join(f"{guard} in {count} ticks" for guard, count in facts["guards"].items())
-    lines.append(f"guards changed the command: {changed}" if changed else "no guard changed a command")
+    acted = [f"{guard} in {count} tick{'s' if count > 1 else ''}" for guard, count in facts["guards"].items()]
+    lines.append(f"guard that acted last: {', '.join(acted)}" if acted else "no guard acted")
     for stage, row in facts["latency_ms"].items():
         lines.append(f"{stage}: p50 {row['p50']:.2f} ms, p99 {row['p99']:.2f} ms, max {row['max']:.2f} ms")
     return [*lines, *_event_lines(recording)]

@@ -63,6 +63,7 @@ def test_a_stop_ends_its_episode_only(run, tmp_path):
     assert [record["end"] for record in report["per_episode"]] == ["stopped", "stopped"]
     begin = "bam-deploy: episode with seed 100000{}: The robot was stopped by state age (G3)"
     assert lines[0].startswith(f"{begin.format(0)}: the newest state is ")
+    assert "resume" not in lines[0]
     assert lines[1:] == [begin.format(1)]
 
 

@@ -128,7 +128,7 @@ def test_summary_for_people_and_programs(pick, capsys):
     assert lines[2:5] == [
         "episode 1 (seed 1000000): success after 35 steps, return 38.48",
         "episode 2 (seed 1000001): success after 33 steps, return 39.01",
-        "no guard changed a command",
+        "no guard acted",
     ]
     assert [line.partition(":")[0] for line in lines[5:10]] == ["step", "wait", "late", "policy", "record"]
     assert lines[-2].endswith(" s: episodes done")
@@ -168,7 +168,8 @@ def test_a_checkpoint_that_is_gone_or_changed(pick, corridor_checkpoint, tmp_pat
     assert call(replay, path, "--checkpoint", tmp_path / "moved.zip") == 0
     assert capsys.readouterr().out.splitlines()[-1].startswith("played: the same observation in ")
     assert call(replay, pick, "--checkpoint", checkpoint) == 1
-    assert "was trained on test/Corridor-v0, not on bam/pick-v0" in capsys.readouterr().err
+    told = f"was trained on test/Corridor-v0, and {pick} is of bam/pick-v0. Give a checkpoint of bam/pick-v0"
+    assert capsys.readouterr().err == f"bam-replay: {checkpoint}: {told}\n"
 
 
 def test_a_recording_cut_anywhere_is_readable(small_chunks, tmp_path, capsys):

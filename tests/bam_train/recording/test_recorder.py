@@ -290,6 +290,9 @@ def test_a_file_name_in_another_encoding_is_told(tmp_path):
     recorder.start()
     assert recorder.close() == ""
     assert Recording.open(recorder.path).metadata == {"checkpoint": "a?.zip"}
+    (named := tmp_path / "b\udcff.mcap").touch()
+    with pytest.raises(OutputError, match=r"b\?\.mcap: a recording is there already"):
+        Recorder(named).start()
 
 
 def test_files_of_the_folder_it_is_started_in_hide_nothing(started, tmp_path, monkeypatch):
