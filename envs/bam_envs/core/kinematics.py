@@ -91,14 +91,15 @@ class ArmGeometry:
 
     def tool_point(self, q: Sequence[float]) -> tuple[float, float, float]:
         """`tool_position` of one pose (6,) [rad] in plain numbers, which take a tenth of the time; x, y, z [m]."""
-        q23 = q[1] + q[2]
-        q234 = q23 + q[3]
-        c1, s1, c234, s234 = math.cos(q[0]), math.sin(q[0]), math.cos(q234), math.sin(q234)
+        q1, q2, q3, q4, q5, _ = q
+        q23 = q2 + q3
+        q234 = q23 + q4
+        c1, s1, c234, s234 = math.cos(q1), math.sin(q1), math.cos(q234), math.sin(q234)
         end = self.d6 + self.tool
-        across = end * math.sin(q[4])
-        radial = self.a2 * math.cos(q[1]) + self.a3 * math.cos(q23) + self.d5 * s234 - across * c234
-        sideways = self.d4 + end * math.cos(q[4])
-        height = self.d1 + self.a2 * math.sin(q[1]) + self.a3 * math.sin(q23) - self.d5 * c234 - across * s234
+        across = end * math.sin(q5)
+        radial = self.a2 * math.cos(q2) + self.a3 * math.cos(q23) + self.d5 * s234 - across * c234
+        sideways = self.d4 + end * math.cos(q5)
+        height = self.d1 + self.a2 * math.sin(q2) + self.a3 * math.sin(q23) - self.d5 * c234 - across * s234
         return -(radial * c1 + sideways * s1), sideways * c1 - radial * s1, height
 
     def flange_pose(self, q: Array) -> tuple[Array, Array]:
@@ -162,10 +163,7 @@ class ArmGeometry:
         Returns:
             Joint positions [rad], the last of which follows `yaw` without a jump. Shape: (n, 6).
         """
-        return _rows(*self.joints_down(*_columns(position), *_columns(yaw[:, None])))
-
-    def joints_down(self, x: Column, y: Column, z: Column, yaw: Column) -> tuple[Column, ...]:
-        """`reach_down` of columns: of n tool positions (n,) each, or of one in plain numbers."""
+        x, y, z = position.T
         # Seen from above, (radial, d4) turned by q1 is (x, y): the wrist passes beside the base at distance d4.
         radial = np.sqrt(np.maximum(x * x + y * y - self.d4**2, 1e-12))
         q1 = np.arctan2(y, x) - np.arctan2(self.d4, radial)
@@ -176,7 +174,19 @@ class ArmGeometry:
         first = np.arctan2(self.a3 * np.sin(q3), self.a2 + self.a3 * np.cos(q3))
         q2 = np.arctan2(height, along) - first
         q2 = q2 - 2 * np.pi * np.rint((q2 + np.pi / 2) / (2 * np.pi))  # the branch around -90 degrees
-        return q1, q2, q3, -np.pi / 2 - q2 - q3, -np.pi / 2, q1 - yaw - np.pi / 2
+        return _rows(q1, q2, q3, -np.pi / 2 - q2 - q3, -np.pi / 2, q1 - yaw - np.pi / 2)
+
+    def joints_down(self, x: float, y: float, z: float, yaw: float) -> list[float]:
+        """`reach_down` of one tool position in plain numbers: the same bits, by the same functions of NumPy."""
+        radial = math.sqrt(max(x * x + y * y - self.d4**2, 1e-12))
+        q1 = float(np.arctan2(y, x) - np.arctan2(self.d4, radial))
+        along, height = self.d5 - radial, z + self.d6 + self.tool - self.d1
+        cosine = (along * along + height * height - self.a2**2 - self.a3**2) / (2 * self.a2 * self.a3)
+        q3 = float(np.arccos(min(max(cosine, -1.0), 1.0)))
+        first = np.arctan2(self.a3 * np.sin(q3), self.a2 + self.a3 * np.cos(q3))
+        q2 = float(np.arctan2(height, along) - first)
+        q2 = q2 - 2 * math.pi * float(np.rint((q2 + math.pi / 2) / (2 * math.pi)))
+        return [q1, q2, q3, -math.pi / 2 - q2 - q3, -math.pi / 2, q1 - yaw - math.pi / 2]
 
 
 def _columns(rows: Array) -> Sequence[Column]:

@@ -25,6 +25,7 @@ LEASH = 0.03
 """Maximum distance of the tool target from the measured tool, along each axis [m]."""
 WORKSPACE = np.array([[0.30, -0.25, 0.016], [0.70, 0.25, 0.35]])
 """Box for the tool target: lowest and highest x, y, z [m]."""
+_CORNERS = WORKSPACE.tolist()
 MIDDLE, HALF = WORKSPACE.mean(axis=0), (WORKSPACE[1] - WORKSPACE[0]) / 2
 YAW_LIMIT = 1.2  # farthest the gripper turns from straight ahead [rad]; a cube needs pi/4
 
@@ -106,7 +107,7 @@ class ToolControl(Memory):
             self._continue_from(np.zeros(1, np.int64), sent)
         dx, dy, dz, turn, grip = action[0].tolist()
         here, yaw, before = self.target[0].tolist(), self.yaw.item(), self._joints[0].tolist()
-        travel, rows = [], zip(here, (dx, dy, dz), tool[0].tolist(), *WORKSPACE.tolist(), strict=True)
+        travel, rows = [], zip(here, (dx, dy, dz), tool[0].tolist(), *_CORNERS, strict=True)
         for at, move, measured, low, high in rows:
             target = _limited(at + _limited(move, -1.0, 1.0) * TOOL_STEP, measured - LEASH, measured + LEASH)
             travel.append(_limited(target, low, high) - at)
@@ -117,7 +118,7 @@ class ToolControl(Memory):
         share = 1.0
         for _ in range(3):
             x, y, z = [at + way * share for at, way in zip(here, travel, strict=True)]
-            joints = [float(one) for one in GEOMETRY.joints_down(x, y, z, yaw + turn * share)]
+            joints = GEOMETRY.joints_down(x, y, z, yaw + turn * share)
             fastest = max(1e-9, *(abs(one - begin) for one, begin in zip(joints, before, strict=True)))
             if fastest <= JOINT_STEP:
                 break
