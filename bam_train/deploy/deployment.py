@@ -275,7 +275,7 @@ class _JournalAgent(Agent):
         self._robot = robot
 
     def forward(self, t: int, seed: int, watcher: Watcher, **kwargs: Any) -> None:
-        self._watch.stepped = time.perf_counter()
+        self._watch.stepped, done = time.perf_counter(), self.get(("env/done", t))[0]
         if t == 0:
             self._journal.begin(seed)
             if self._trials is not None:
@@ -283,11 +283,11 @@ class _JournalAgent(Agent):
             self._pacer.start()
         else:  # the step that led to time t
             success = self.get((f"env/{SUCCESS}", t))[0] if self.get((f"env/{SAYS_SUCCESS}", t))[0] else None
-            end = next((end for end in _ENDS if self.get((f"env/{end}", t))[0]), "stopped")
+            end = next(end for end in _ENDS if self.get((f"env/{end}", t))[0]) if done else "stopped"
             self._journal.warn(getattr(self._robot, "warnings", ()))
             record = self._journal.step(self.get(("env/reward", t))[0], success, end)
             watcher.ticked(record, self.get(("action", t - 1))[0], self._pacer)
             if end != "stopped":
                 watcher.ended(record)
-        self._watch.late = 0.0 if self.get(("env/done", t))[0] else self._pacer.wait()
+        self._watch.late = 0.0 if done else self._pacer.wait()
         self._watch.waited = time.perf_counter()

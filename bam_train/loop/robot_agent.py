@@ -153,7 +153,7 @@ class PolicyAgent(Agent):
             PolicyError: An action is not finite.
         """
         steps = self.get((self._timestep, t))
-        if not steps.all():
+        if 0 in steps.tolist():
             begun = np.flatnonzero(steps == 0)
             self.policy.reset(*(() if len(begun) == len(steps) else (begun,)))
         values = [self.get((name, t)) for name in self.names]

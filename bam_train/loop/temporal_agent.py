@@ -113,7 +113,7 @@ class TemporalAgent(Agent):
             if stop_variable is not None:
                 if stop_variable not in workspace:
                     raise UnknownVariable(stop_variable, workspace.keys(), "stop_variable")
-                if workspace.get(stop_variable, t).all():
+                if all(workspace.get(stop_variable, t).ravel().tolist()):  # quicker for a few
                     return
             t += 1
             if end is not None and t >= end:

@@ -156,7 +156,7 @@ class RobotEnv(_RobotAndTask, gym.Env[NDArray[np.float32], NDArray[np.float32]])
         array = np.asarray(action, dtype=np.float32)
         if array.shape != self.action_space.shape:
             raise InvalidValue(f"The action must have shape {self.action_space.shape}, not {array.shape}.")
-        if not np.isfinite(array).all():
+        if not all(map(math.isfinite, array.ravel().tolist())):
             raise InvalidValue(f"The action must be finite numbers, not {array.tolist()}.")
         return array
 
