@@ -114,6 +114,7 @@ class SafeRobot(metaclass=Sealed):
         "_checks",
         "_clock",
         "_code",
+        "_every",
         "_further",
         "_guards",
         "_halts",
@@ -164,6 +165,7 @@ class SafeRobot(metaclass=Sealed):
         self._further = tuple(guards)
         self._guards = tuple(default_guards(robot.spec, self._limits, tool_position=tool_position, straight=straight))
         self._checks = tuple(one for one in self._guards if type(one).fault is not Guard.fault)
+        self._every = (*self._further, *self._guards)
         self._trips = tuple(one for one in self._guards if isinstance(one, MeasuredLimits))
         self._unmeasured = [math.nan] * len(robot.spec.command.labels)
         self._limiters = tuple(one for one in self._guards if type(one).limit is not Guard.limit)
@@ -176,7 +178,7 @@ class SafeRobot(metaclass=Sealed):
             names = ", ".join(command.labels[at] for at in sorted(unmeasured))
             raise InvalidValue(f"The guards need {names} of {robot.spec.name} measured in rad; no signal has it.")
         self._report: dict[str, dict[str, Any]] = {}
-        for one in (*self._further, *self._guards):
+        for one in self._every:
             facts = {"number": one.number, "limit": one.limit_value, "unit": one.unit}
             self._report[one.name] = {**facts, "altered": 0, "held": 0, "stopped": 0}
         self._stopped: tuple[str, str] | None = None
@@ -240,7 +242,7 @@ class SafeRobot(metaclass=Sealed):
     @property
     def warnings(self) -> tuple[str, ...]:
         """The current warnings of the guards: ``"link quality (G16): only 93 of the last 100 ticks ..."``."""
-        return tuple(f"{one.title}: {one.warning}" for one in (*self._further, *self._guards) if one.warning)
+        return tuple(f"{one.title}: {one.warning}" for one in self._every if one.warning)
 
     @property
     def info(self) -> Any:
@@ -258,7 +260,7 @@ class SafeRobot(metaclass=Sealed):
 
     def guards(self) -> list[dict[str, Any]]:
         """The guards in their order: number, name, limit, unit, name of the setting in `Limits`, and what it does."""
-        every = dict.fromkeys((*self._further, *self._guards))  # the tool's speed is limited twice
+        every = dict.fromkeys(self._every)  # the tool's speed is limited twice
         return [
             {
                 "number": one.number,
@@ -416,7 +418,7 @@ class SafeRobot(metaclass=Sealed):
         )
 
     def _restart(self, *, forgive: bool = False) -> None:
-        for guard in (*self._further, *self._guards):
+        for guard in self._every:
             guard.restart()
             if forgive:
                 guard.forgive()
@@ -515,7 +517,7 @@ class SafeRobot(metaclass=Sealed):
     def resume(self) -> None:
         """Let a stopped robot move again, from its position. A person decides this, never a program."""
         if self._stopped is not None:
-            for guard in (*self._further, *self._guards):
+            for guard in self._every:
                 guard.resumed()
         self._stopped, self._bad, self._last, self._sent_at, self._before = None, 0, None, None, None
         self._status, self._code, self._kept_out = "", 0, False
@@ -565,7 +567,7 @@ class SafeRobot(metaclass=Sealed):
                     f"{low[column]:.3f} to {high[column]:.3f} rad that the guards allow. Choose another start, or a "
                     "smaller position_margin."
                 )
-        for guard in (*self._further, *self._guards):
+        for guard in self._every:
             if (reason := guard.start_fault(start)) is not None:
                 raise InvalidValue(f"{guard.title} does not allow the start pose: {reason}.")
         return start
