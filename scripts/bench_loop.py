@@ -461,10 +461,10 @@ def main() -> int:
     """Read the options, run, print."""
     formatter = argparse.RawDescriptionHelpFormatter
     parser = argparse.ArgumentParser(description=__doc__, epilog=EXAMPLES, formatter_class=formatter)
-    parser.add_argument("--quick", action="store_true", help="3 rounds instead of 9, 50,000 ticks instead of 1,000,000")
+    parser.add_argument("--quick", action="store_true", help="3 rounds instead of 9, 20,000 ticks instead of 1,000,000")
     parser.add_argument("--only", nargs="+", choices=list(BENCHES), metavar="NAME", help="these rows only")
     arguments = parser.parse_args()
-    options = Options(3, 50_000) if arguments.quick else Options(9, 1_000_000)
+    options = Options(3, 20_000) if arguments.quick else Options(9, 1_000_000)
     figures: list[Figure] = []
     for name, bench in BENCHES.items():
         if not arguments.only or name in arguments.only:

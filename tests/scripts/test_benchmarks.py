@@ -87,9 +87,9 @@ def test_loop_without_torch(bench):
     *deployment, notebook = loop_table(lines)
     assert re.fullmatch("notebook  .* needs torch +pip install torch", notebook)
     assert [re.split("  +", line.strip())[0] for line in deployment] == [
-        "deployment, 50,000 ticks, one episode",
+        "deployment, 20,000 ticks, one episode",
         "what the loop adds to a tick",
-        "deployment, 50,000 ticks, episodes of 50",
+        "deployment, 20,000 ticks, episodes of 50",
         "what the loop adds to a tick",
     ]
     assert all(line.endswith("< 5 MB  met") for line in deployment[::2])

@@ -10,7 +10,7 @@ import torch
 from bam_train.loop import Workspace
 
 SCRIPT = Path(__file__).parents[2] / "scripts" / "ppo_pick.py"
-SHORT = ["--steps", "4096", "--num-envs", "8", "--episodes", "4"]
+SHORT = ["--steps", "3072", "--num-envs", "8", "--episodes", "4"]
 
 
 @pytest.fixture(scope="module")
@@ -47,7 +47,7 @@ def test_a_short_run_says_where_it_is_and_repeats_itself(run):
     ] * 2
     steps = [int(line.split(" steps")[0].replace(",", "")) for line in evaluations]
     assert 5 * 512 - 64 < steps[0] <= 5 * 512
-    assert 4096 <= steps[1] < 4096 + 512
+    assert 3072 <= steps[1] < 3072 + 512
     assert last == f"success 0.0% in 4 fresh episodes, after {steps[1]:,} steps, seed 3"
     assert without_seconds(run(*SHORT, "--seed", "3")[1]) == without_seconds(out)
 

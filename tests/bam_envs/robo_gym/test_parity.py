@@ -135,7 +135,7 @@ def always(*action):
 @pytest.mark.parametrize("stem", ["NoObstacleNavigationMir100", "ObstacleAvoidanceMir100"])
 def test_bases_with_random_actions(stem):
     both = Both(stem)
-    ends = [both.play(seed, randomly(seed, hold=1 + 9 * (seed % 3))) for seed in range(5)]
+    ends = [both.play(seed, randomly(seed, hold=1 + 9 * seed)) for seed in range(3)]
     assert sum(steps for steps, _ in ends) > 300
 
 
@@ -161,7 +161,7 @@ def test_a_base_that_stands_still(stem):
 
 def test_a_base_with_and_without_boxes():
     both = Both("ObstacleAvoidanceMir100")
-    ends = [both.play(seed, to_target)[1]["final_status"] for seed in range(20)]
+    ends = [both.play(seed, to_target)[1]["final_status"] for seed in range(5)]
     assert {"collision", "success"} <= set(ends)
     ends = [Both("NoObstacleNavigationMir100").play(seed, to_target) for seed in range(3)]
     assert [info["final_status"] for _, info in ends] == ["success"] * 3
@@ -170,7 +170,7 @@ def test_a_base_with_and_without_boxes():
 @pytest.mark.parametrize("stem", UR)
 def test_arms_with_random_actions(stem):
     both = Both(stem)
-    steps = sum(both.play(i, randomly(i, scale=(0.05, 0.3, 1.0)[i], hold=1 + 9 * i))[0] for i in range(3))
+    steps = sum(both.play(i, randomly(i, scale=(0.05, 0.3, 1.0)[i], hold=1 + 9 * i), steps=300)[0] for i in range(3))
     assert steps > 200
 
 
@@ -205,10 +205,10 @@ JOINTS = ["base", "shoulder", "elbow", "wrist_1", "wrist_2", "wrist_3"]
 FIXED = [{"fix_base": True}, {"fix_wrist_3": False}, {"fix_shoulder": True, "fix_elbow": True}, {"fix_wrist_1": True}]
 MODELS = ("ur3", "ur3e", "ur5e", "ur10", "ur10e", "ur16e")
 OPTIONS = [
-    *((stem, fixed, 0.3, 1, 100) for stem in UR for fixed in FIXED),
-    *((stem, {"ur_model": model}, 0.3, 5, 100) for stem in UR[:3] for model in MODELS),
+    *((stem, fixed, 0.3, 1, 50) for stem in UR for fixed in FIXED),
+    *((stem, {"ur_model": model}, 0.3, 5, 50) for stem in UR[:3] for model in MODELS),
     *(("EndEffectorPositioningUR", {"restrict_wrist_1": one}, 1.0, 10, 150) for one in (True, False)),
-    *((stem, {"include_polar_to_elbow": one}, 0.1, 1, 200) for stem in UR[2:] for one in (True, False)),
+    *((stem, {"include_polar_to_elbow": one}, 0.1, 1, 100) for stem in UR[2:] for one in (True, False)),
     ("AvoidanceRaad2022TestUR", {}, 0.1, 1, 100),
 ]
 
@@ -224,16 +224,14 @@ def test_the_flange_reaches_its_target():
     both.reset(0)
     x, y, z = (both.env.get_rs_state()[f"ee_to_ref_translation_{axis}"] for axis in "xyz")
     target = [x, y, z + 0.12, 0, 0, 0]
-    ends = {
-        both.play(seed, randomly(seed, hold=10), ee_target_pose=target)[1].get("final_status") for seed in range(10)
-    }
-    assert "success" in ends
+    ends = (both.play(seed, randomly(seed, hold=10), ee_target_pose=target)[1] for seed in range(10))
+    assert any(info.get("final_status") == "success" for info in ends)
 
 
 @pytest.mark.parametrize("stem", UR)
 def test_an_arm_collides(stem):
     both = Both(stem)
-    assert any(both.play(seed, randomly(seed, hold=30))[1]["final_status"] == "collision" for seed in range(4))
+    assert any(both.play(seed, randomly(seed, hold=30))[1]["final_status"] == "collision" for seed in range(2, 6))
 
 
 @pytest.mark.parametrize("live", [False, True])
