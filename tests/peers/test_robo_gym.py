@@ -3,10 +3,11 @@
 import json
 import os
 import subprocess
-import sys
 
 import pytest
 
+from bam_train.cli.flags import TrainConfig
+from bam_train.cli.train import train
 from tests.peers.conftest import PEERS
 
 PYTHON = str(PEERS / "robo_gym" / "bin" / "python")
@@ -45,12 +46,11 @@ def test_a_policy_of_ours_in_robo_gym(env_id, request, tmp_path):
     """A checkpoint that was trained with parity=True does there what it does here."""
     pytest.importorskip("stable_baselines3")
     root, path = request.config.rootpath, tmp_path / "policy.zip"
-    arguments = ["--env", env_id, "--algo", "ppo", "--steps", "8192", "--eval-episodes", "2", "--out", path]
-    parity = ["--set", "env_kwargs.parity=true"]
-    run(sys.executable, "-m", "bam_train.cli.train", *arguments, *parity, "--runs", tmp_path / "runs", root=root)
-    program = ["-m", "tests.peers.robo_gym_policy", path, env_id, "4"]
+    settings = {"env": env_id, "algo": "ppo", "steps": 8192, "eval_episodes": 1, "set": ("env_kwargs.parity=true",)}
+    train(TrainConfig(**settings, out=path, runs=tmp_path / "runs"))
+    program = ["-m", "tests.peers.robo_gym_policy", path, env_id, "2"]
     episodes = [json.loads(line) for line in run(PYTHON, *program, root=root).splitlines()]
-    assert len(episodes) == 4
+    assert len(episodes) == 2
     for episode in episodes:
         ours, theirs = episode["ours"], episode["theirs"]
         assert (ours["status"], ours["steps"]) == (theirs["status"], theirs["steps"])
