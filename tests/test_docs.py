@@ -1,6 +1,7 @@
 """The pages say what is true: generated parts are current, examples run, commands and links exist."""
 
 import importlib.util
+import json
 import os
 import re
 import shlex
@@ -306,17 +307,37 @@ def test_added_contracts_hold(added):
 ADDED = [words for words in commands(ROOT / "docs" / "adding.md") if words[0] in ("bam-train", "python")]
 
 
+COMMANDS = """
+import json, runpy, sys
+from bam_train.cli import deploy, train
+for program, *arguments in json.loads(sys.argv.pop()):
+    sys.argv = [program, *arguments]
+    try:
+        if program.endswith(".py"):
+            runpy.run_path(program, run_name="__main__")
+        else:
+            (train if program == "bam-train" else deploy).main()
+    except SystemExit as end:
+        if end.code:
+            raise
+"""
+"""Runs one command after another: torch is imported once."""
+
+
 @pytest.mark.training
-@pytest.mark.parametrize("words", ADDED, ids=" ".join)
-def test_added_things_train_and_deploy(added, words):
+def test_added_things_train_and_deploy(added):
     """The commands of the page, over one rollout."""
-    program = ["-m", "bam_train.cli.train"] if words[0] == "bam-train" else [words[1]]
-    arguments = words[1:] if words[0] == "bam-train" else words[2:]
-    out = f"{arguments[1].replace(':', '-').replace('/', '-')}.zip"
-    python(*program, *arguments, "--steps", "4096", "--eval-episodes", "2", "--out", out, folder=added)
-    named = ["--env", arguments[1]]
-    text = python("-m", "bam_train.cli.deploy", out, *named, "--episodes", "1", "--fast", folder=added)
-    assert text.startswith("episodes done: 1 of 1 episodes")
+    assert len(ADDED) == 3
+    lines = []
+    for words in ADDED:
+        program, *arguments = words[words[0] == "python" :]
+        out = f"{arguments[1].replace(':', '-').replace('/', '-')}.zip"
+        lines += [
+            [program, *arguments, "--steps", "4096", "--eval-episodes", "2", "--out", out],
+            ["bam-deploy", out, "--env", arguments[1], "--episodes", "1", "--fast"],
+        ]
+    said = python("-c", COMMANDS, json.dumps(lines), folder=added)
+    assert len(re.findall("^episodes done: 1 of 1 episodes", said, re.MULTILINE)) == 3
 
 
 def test_added_environments_are_described(added):

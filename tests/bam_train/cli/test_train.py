@@ -165,7 +165,9 @@ class Program:
 
     def __init__(self, context, folder, *arguments):
         reader, writer = context.Pipe(duplex=False)
-        flags = ["--env", "CartPole-v1", "--algo", "ppo", "--set", "n_steps=64", "--set", "policy_kwargs.net_arch=[8]"]
+        flags = ["--env", "CartPole-v1", "--algo", "ppo"]
+        for setting in ("n_steps=64", "n_epochs=1", "policy_kwargs.net_arch=[8]"):
+            flags += ["--set", setting]
         code = f"""
 import os, sys
 os.chdir({str(folder)!r})
