@@ -1,5 +1,9 @@
 from __future__ import annotations
 
+import multiprocessing
+import os
+import threading
+
 import gymnasium as gym
 import pytest
 
@@ -24,3 +28,70 @@ def cartpole_checkpoint(corridor_checkpoint):
     env = gym.make("CartPole-v1")
     spaces = {name: space_to_json(getattr(env, name)) for name in ("observation_space", "action_space")}
     return corridor_checkpoint("cartpole.zip", env="CartPole-v1", **spaces)
+
+
+LONGEST = 300.0
+"""Seconds after which a program that was started is killed."""
+
+
+class Program:
+    """`bam-train` in a process group of its own, as a shell starts it, with its standard error a pipe."""
+
+    def __init__(self, context, folder, arguments):
+        reader, writer = context.Pipe(duplex=False)
+        code = f"""
+import os, sys
+os.setsid()
+os.chdir({str(folder)!r})
+os.dup2(writer.fileno(), 2)
+sys.stderr = open(2, "w", buffering=1, closefd=False)
+from bam_train.cli.train import main
+main({list(arguments)!r})
+"""
+        self.process = context.Process(target=exec, args=(code, {"writer": writer}))
+        self.process.start()
+        self.pid = self.process.pid
+        self.stderr = os.fdopen(os.dup(reader.fileno()))
+        reader.close()
+        writer.close()
+        self.timer = threading.Timer(LONGEST, self.process.kill)
+        self.timer.start()
+
+    def send(self, number):
+        os.kill(self.pid, number)
+
+    def wait_for(self, words):
+        """Read standard error up to a line that holds `words`."""
+        lines = []
+        for line in self.stderr:
+            lines.append(line)
+            if words in line:
+                return
+        raise AssertionError(f"never said {words!r}, but {lines}")
+
+    def end(self):
+        """The exit status, and what else it said."""
+        said = self.stderr.read()
+        self.process.join(20)
+        return self.process.exitcode, said
+
+    def close(self):
+        self.timer.cancel()
+        self.process.kill()  # Ray's own processes end with it
+        self.process.join()
+        self.stderr.close()
+
+
+@pytest.fixture
+def start_forked():
+    """``start_forked(modules, folder, *arguments)`` starts a `Program`, forked from a process with these modules."""
+    context, programs = multiprocessing.get_context("forkserver"), []
+
+    def start(modules, folder, *arguments):
+        context.set_forkserver_preload(["pytest", "torch._dynamo", "bam_train.cli.train", *modules])
+        programs.append(Program(context, folder, arguments))
+        return programs[-1]
+
+    yield start
+    for program in programs:
+        program.close()

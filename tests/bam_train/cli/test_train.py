@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import multiprocessing
 import os
 import signal
 import subprocess
@@ -160,58 +159,21 @@ def test_a_nan_keeps_the_last_good_checkpoint(bam_train):
 # In a process of its own
 
 
-class Program:
-    """`bam-train` in a process that has imported what it needs, its standard error a pipe."""
-
-    def __init__(self, context, folder, *arguments):
-        reader, writer = context.Pipe(duplex=False)
-        flags = ["--env", "CartPole-v1", "--algo", "ppo"]
-        for setting in ("n_steps=64", "n_epochs=1", "policy_kwargs.net_arch=[8]"):
-            flags += ["--set", setting]
-        code = f"""
-import os, sys
-os.chdir({str(folder)!r})
-os.dup2(writer.fileno(), 2)
-sys.stderr = open(2, "w", buffering=1, closefd=False)
-from bam_train.cli.train import main
-main({[*flags, *arguments]!r})
-"""
-        self.process = context.Process(target=exec, args=(code, {"writer": writer}))
-        self.process.start()
-        self.stderr = os.fdopen(os.dup(reader.fileno()))
-        reader.close()
-        writer.close()
-
-    def send(self, number):
-        os.kill(self.process.pid, number)
-
-    def wait_for(self, words):
-        """Read standard error up to a line that holds `words`."""
-        assert any(words in line for line in self.stderr), f"never said {words!r}"
-
-    def end(self):
-        """The exit status, and what else it said."""
-        said = self.stderr.read()
-        self.process.join(20)
-        return self.process.exitcode, said
+IMPORTED = (
+    *("torch.utils.tensorboard", "matplotlib.pyplot", "onnxruntime", "stable_baselines3"),
+    *("bam_train.trainers.sb3.sb3_trainer", "bam_train.trainers.training_run"),
+)
+QUICK = ("--set", "n_steps=64", "--set", "n_epochs=1", "--set", "policy_kwargs.net_arch=[8]")
 
 
 @pytest.fixture
-def start(here):
-    """Starts a `Program`; all of them are forked from one process."""
-    context, programs = multiprocessing.get_context("forkserver"), []
-    imported = ("torch.utils.tensorboard", "matplotlib.pyplot", "onnxruntime", "stable_baselines3", "pytest")
-    context.set_forkserver_preload([*imported, "bam_train.trainers.sb3.sb3_trainer", "bam_train.trainers.training_run"])
+def start(here, start_forked):
+    """Starts the program."""
 
     def start(*arguments):
-        programs.append(Program(context, here, *arguments))
-        return programs[-1]
+        return start_forked(IMPORTED, here, "--env", "CartPole-v1", "--algo", "ppo", *QUICK, *arguments)
 
-    yield start
-    for program in programs:
-        program.process.kill()
-        program.process.join()
-        program.stderr.close()
+    return start
 
 
 LONG = ("--steps", "10000000", "--eval-every", "256", "--eval-episodes", "1")

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import contextlib
 import os
 import re
 import signal
 import socket
 import subprocess
 import sys
-import threading
 import time
 
 import pytest
@@ -120,46 +118,15 @@ def test_checkpoints_are_copied(one_ray, bam_train, here):
 
 
 @pytest.fixture
-def start():
-    """Starts the program in a process group of its own, as a shell does, with its standard error piped."""
-    with contextlib.ExitStack() as stack:
+def start(here, start_forked):
+    """Starts the program."""
 
-        def start(*arguments, runners=0):
-            command = [sys.executable, "-m", "bam_train.cli.train", "--env", "bam/reach", "--algo", "ppo"]
-            command += ["--trainer", "rllib", "--num-env-runners", str(runners), "--steps", "100000000"]
-            for setting in SMALL:
-                command += ["--set", setting]
-            process = stack.enter_context(
-                subprocess.Popen(
-                    [*command, *arguments],
-                    stdout=subprocess.PIPE,
-                    stderr=subprocess.PIPE,
-                    text=True,
-                    env=environment(),
-                    start_new_session=True,
-                )
-            )
-            stack.callback(process.kill)  # Ray's own processes end with it
-            timer = threading.Timer(LONGEST, process.kill)
-            timer.start()
-            stack.callback(timer.cancel)
-            return process
+    def start(*arguments, runners=0):
+        command = ["--env", "bam/reach", "--algo", "ppo", "--trainer", "rllib", "--num-env-runners", str(runners)]
+        command += ["--steps", "100000000", *(word for setting in SMALL for word in ("--set", setting))]
+        return start_forked(["bam_train.trainers.rllib.rllib_trainer"], here, *command, *arguments)
 
-        yield start
-
-
-LONGEST = 300.0
-"""Seconds after which a program that was started is killed."""
-
-
-def wait_for(process, words):
-    """Read standard error up to a line that holds `words`."""
-    lines = []
-    for line in process.stderr:
-        lines.append(line)
-        if words in line:
-            return
-    raise AssertionError(f"never said {words!r}, but {lines}")
+    return start
 
 
 def as_timeout_does(group, number):
@@ -184,13 +151,13 @@ def folders_of(processes):
 )
 def test_a_signal_saves_and_leaves_no_process(here, start, number, send, status, runners):
     process = start("--eval-every", "100000000", runners=runners)
-    wait_for(process, "steps/s")
+    process.wait_for("steps/s")
     processes = psutil.Process(process.pid).children(recursive=True)
     assert len(processes) > 5
     (rays,) = folders_of(processes)
     send(process.pid, number)  # a terminal sends Ctrl-C, and SIGHUP at its end, to the whole group
-    _, err = process.communicate(timeout=120)
-    assert process.returncode == status, err
+    found, err = process.end()
+    assert found == status, err
     assert "finishing the update and saving" in err
     assert "Traceback" not in err
     assert err.splitlines()[-1] == "  bam-train --resume runs/reach-rllib-ppo/last.zip"
@@ -207,8 +174,8 @@ def test_ctrl_c_while_it_is_set_up_leaves_no_process(start):
         processes = set(psutil.Process(process.pid).children(recursive=True))
         time.sleep(0.1)
     os.killpg(process.pid, signal.SIGINT)
-    _, err = process.communicate(timeout=120)
-    assert process.returncode == 130, err
+    status, err = process.end()
+    assert status == 130, err
     assert err.splitlines()[-1] == "bam-train: interrupted"
     _, alive = psutil.wait_procs(processes, timeout=10)
     assert not alive
@@ -217,16 +184,14 @@ def test_ctrl_c_while_it_is_set_up_leaves_no_process(start):
 @pytest.mark.slow
 def test_two_signals_quit_at_once_and_leave_no_process(start):
     process = start("--set", "num_epochs=100000")
-    wait_for(process, "ppo on bam/reach-v0, seed 0")
+    process.wait_for("ppo on bam/reach-v0, seed 0")
     time.sleep(1.0)  # into the first update, which takes minutes
     processes = psutil.Process(process.pid).children(recursive=True)
     folders = folders_of(processes)
     os.killpg(process.pid, signal.SIGINT)
-    wait_for(process, "finishing the update")
+    process.wait_for("finishing the update")
     os.killpg(process.pid, signal.SIGINT)
-    _, err = process.communicate(timeout=20)
-    assert process.returncode == 130
-    assert err == "bam-train: quit at once; no checkpoint had been saved yet\n"
+    assert process.end() == (130, "bam-train: quit at once; no checkpoint had been saved yet\n")
     _, alive = psutil.wait_procs(processes, timeout=10)  # less than Ray's agents take to see that nobody is left
     assert not alive
     assert len(folders) == 1
