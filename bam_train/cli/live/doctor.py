@@ -26,7 +26,7 @@ CONTRACT = "contract"
 
 
 def examine(config: DoctorConfig, signals: SignalMemory) -> int:
-    """Run the program with its parsed flags; returns the exit status: 1 if a step failed, 3 if it is the contract."""
+    """Run the program with its parsed flags; returns the exit status: 1 if a step failed or nothing was written, 3 for the contract."""
     _require_sane(config)
     from bam_envs.live.diagnosis import STEPS, Diagnosis
 
@@ -63,7 +63,7 @@ def examine(config: DoctorConfig, signals: SignalMemory) -> int:
         }
         tell(json_module.dumps(report, allow_nan=False))
     if failed is None:
-        return 0
+        return 1 if config.measure is not None and measured is None else 0
     say(f"bam-doctor: {failed.name} failed: {failed.found}")
     refused = subject is not None and subject.contract is not None and subject.contract.refused
     return ContractRefused.exit_status if refused else 1

@@ -167,7 +167,7 @@ class Diagnosis:
                     f"there is no topic {link.namespace}{topic} ({kind}), which has {signals}. Does its driver "
                     f"run, and is its name right? Topics are in the profile of {profile.name} "
                     "(--profile); with --checkpoint only those of its task are needed."
-                    f"{namespaces_with(link, 'topics', topic)}"
+                    f"{namespaces_with(link, 'topics', topic)}{self._another_robot(profile)}"
                 )
         findings.text.append(f"profile {profile.name}: {', '.join(topics)}")
         self._has_rosapi = types.answers
@@ -178,18 +178,33 @@ class Diagnosis:
 
     def _chosen_profile(self) -> RobotProfile:
         if self.profile is None:
-            answer: dict[str, Any] = {}
-            with suppress(BamEnvsError):  # a server without rosapi
-                answer = self._link.call("/rosapi/topics", "rosapi/Topics", {}, self._timeout)
-            present, namespace = {str(topic) for topic in answer.get("topics") or ()}, self._link.namespace
-
-            def share(profile: RobotProfile) -> float:
-                topics = {source.topic for source in profile.state if not source.optional}
-                elsewhere = sum(any(name.endswith(topic) for name in present) for topic in topics)  # in any namespace
-                return (len({namespace + topic for topic in topics} & present) + elsewhere) / len(topics)
-
-            self.profile = max((load_profile(name) for name in ("ur5e", *shipped_profiles())), key=share)
+            self.profile, _ = self._best_profile()
         return self.profile
+
+    def _best_profile(self) -> tuple[RobotProfile, float]:
+        """The shipped profile most of whose topics are there, and 0 if none of them is."""
+        answer: dict[str, Any] = {}
+        with suppress(BamEnvsError):  # a server without rosapi
+            answer = self._link.call("/rosapi/topics", "rosapi/Topics", {}, self._timeout)
+        present, namespace = {str(topic) for topic in answer.get("topics") or ()}, self._link.namespace
+
+        def share(profile: RobotProfile) -> float:
+            topics = {source.topic for source in profile.state if not source.optional}
+            elsewhere = sum(any(name.endswith(topic) for name in present) for topic in topics)  # in any namespace
+            return (len({namespace + topic for topic in topics} & present) + elsewhere) / len(topics)
+
+        best = max((load_profile(name) for name in ("ur5e", *shipped_profiles())), key=share)
+        return best, share(best)
+
+    def _another_robot(self, profile: RobotProfile) -> str:
+        """A sentence for an error, if an arm is where `profile` has a base, or a base where it has an arm."""
+        best, share = self._best_profile()
+        if best.kind == profile.kind or not share:
+            return ""
+        return (
+            f" The topics here are those of {best.name}: is this the right robot? If so, choose a checkpoint and a "
+            "profile for it."
+        )
 
     def _rates_and_ages(self, findings: _Findings) -> None:
         robot, profile = self._robot_and_profile()

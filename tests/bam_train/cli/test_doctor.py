@@ -75,6 +75,15 @@ def test_a_refused_contract(run, served, forge, tmp_path):
     assert any(line.split() == ["period", "[s]", "0.1", "0.05", "refused"] for line in out.splitlines())
 
 
+def test_a_checkpoint_for_another_robot(run, served):
+    status, _, err = run(doctor, served, "--checkpoint", PICK.with_name("mir100-navigation-ppo.zip"))
+    assert status == 1
+    assert err.startswith("bam-doctor: topics failed: there is no topic /robot_pose (geometry_msgs/Pose), which has ")
+    assert err.endswith(
+        " The topics here are those of ur5e: is this the right robot? If so, choose a checkpoint and a profile for it.\n"
+    )
+
+
 def test_json_of_a_failure(run, nobody):
     status, out, _ = run(doctor, nobody, "--json")
     report = json.loads(out)
@@ -85,7 +94,8 @@ def test_json_of_a_failure(run, nobody):
 
 def test_too_short_a_measurement_writes_no_file(run, served, tmp_path):
     path = tmp_path / "link.json"
-    _, _, err = run(doctor, served, "--seconds", 0.05, "--measure", path)
+    status, _, err = run(doctor, served, "--seconds", 0.05, "--measure", path)
+    assert status == 1
     assert err.endswith("pings came back, and quantiles need 10. Measure for longer.\n")
     assert not path.exists()
 
