@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 LIVE_ONLY = (
     *("robot", "transport", "rate", "fast", "render", "wiggle", "motion", "stage", "i_know", "trials", "shadow"),
-    *("record", "print_guards", "ca_file", "token_file", "timeout"),
+    *("record", "print_guards", "ca_file", "token_file", "timeout", "keys", "allow_unsigned"),
 )
 """Flags that a rehearsal has no use for."""
 ANY_ROBOT = "ws://127.0.0.1:9090"
@@ -146,6 +146,7 @@ def _run(
 
 def _checked_place(config: DeployConfig) -> Place:
     """The place of the environment by the flags; invalid flags are refused before anything is loaded."""
+    from bam_envs.core.wording import as_flag
     from bam_train.env_location import Place, addresses, read_guards
     from bam_train.errors import SettingsError
 
@@ -177,8 +178,9 @@ def _checked_place(config: DeployConfig) -> Place:
         raise SettingsError(
             "a live robot is driven at the rate that its policy was made for; leave out --rate and --fast"
         )
-    if robot is None and (config.stage or config.trials):
-        raise SettingsError("--stage and --trials are for a live robot; give its address with --robot too")
+    for name in ("stage", "trials", "keys", "allow_unsigned"):
+        if robot is None and getattr(config, name):
+            raise SettingsError(f"{as_flag(name)} is for a live robot; give its address with --robot too")
     if config.shadow and (robot is None or config.stage or config.wiggle or config.trials):
         raise SettingsError("--shadow needs --robot, and moves nothing; leave out --stage, --wiggle and --trials")
     if config.i_know and config.stage != "full":

@@ -26,7 +26,7 @@ CONTRACT = "contract"
 
 
 def examine(config: DoctorConfig, signals: SignalMemory) -> int:
-    """Run the program with its parsed flags; returns the exit status: 1 if a step failed or nothing was written, 3 for the contract."""
+    """Run the program with its parsed flags; returns the exit status, also 1 if --measure wrote no file."""
     _require_sane(config)
     from bam_envs.live.diagnosis import STEPS, Diagnosis
 

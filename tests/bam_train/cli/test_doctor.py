@@ -80,7 +80,7 @@ def test_a_checkpoint_for_another_robot(run, served):
     assert status == 1
     assert err.startswith("bam-doctor: topics failed: there is no topic /robot_pose (geometry_msgs/Pose), which has ")
     assert err.endswith(
-        " The topics here are those of ur5e: is this the right robot? If so, choose a checkpoint and a profile for it.\n"
+        "The topics here are those of ur5e: is this the right robot? If so, choose a checkpoint and a profile for it.\n"
     )
 
 

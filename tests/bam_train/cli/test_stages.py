@@ -205,7 +205,13 @@ def test_nothing_moves_if_a_trial_cannot_be_recorded(corridor, tmp_path):
 @pytest.mark.parametrize(
     ("flags", "text"),
     [
-        (("--stage", "trial"), "--stage and --trials are for a live robot; give its address with --robot too"),
+        (("--stage", "trial"), "--stage is for a live robot; give its address with --robot too"),
+        (("--trials", "a.jsonl"), "--trials is for a live robot; give its address with --robot too"),
+        (("--keys", "trusted"), "--keys is for a live robot; give its address with --robot too"),
+        (
+            ("--transport", "tcp://127.0.0.1:9", "--allow-unsigned"),
+            "--allow-unsigned is for a live robot; give its address with --robot too",
+        ),
         (("--i-know",), "--i-know is for --stage full alone; leave it out"),
     ],
 )

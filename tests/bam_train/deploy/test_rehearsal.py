@@ -105,6 +105,10 @@ def test_the_report_for_people():
         (("wifi", "--robot", "ws://a:1"), "--rehearse simulates the robot, its link and its time; leave out --robot"),
         (("wifi", "--fast"), "--rehearse simulates the robot, its link and its time; leave out --fast"),
         (
+            ("wifi", "--allow-unsigned"),
+            "--rehearse simulates the robot, its link and its time; leave out --allow-unsigned",
+        ),
+        (
             ("wifi", "--print-guards"),
             "--rehearse simulates the robot, its link and its time; leave out --print-guards",
         ),
