@@ -1,9 +1,9 @@
 """Signatures of checkpoints: Ed25519 over the manifest, which holds the sha256 of every other member.
 
-The signature is a member of its own, ``bam/signature.json``, which the manifest does not list: signing changes no other
-member. What is signed is the text ``bam-train checkpoint signature 1``, the signer's name, the time, and the bytes of
-``bam/manifest.json``, each after its length as 8 bytes. A key is two files: ``NAME.key``, PKCS 8 in PEM, mode 0600; and
-``NAME.pub``, one line ``ed25519 BASE64 NAME``. A computer trusts the public keys in one folder.
+The signature is the member ``bam/signature.json``, which the manifest does not list: signing changes no other member.
+The signed bytes are the text ``bam-train checkpoint signature 1``, the signer's name, the time, and the content of
+``bam/manifest.json``, each preceded by its length in 8 bytes (big-endian). A key has two files: ``NAME.key``, PKCS 8 in
+PEM, mode 0600; and ``NAME.pub``, one line ``ed25519 BASE64 NAME``. A computer trusts the public keys in one folder.
 """
 
 import base64
@@ -30,17 +30,17 @@ from bam_train.errors import AlteredCheckpoint, BadKey, OutputError, UntrustedCh
 
 _NAME = r"[A-Za-z0-9][A-Za-z0-9_.@-]{0,63}"
 Name = Annotated[str, Meta(pattern=f"^{_NAME}$")]
-_MOST_KEY = 2**14  # bytes of a key file that are read
+_MAX_KEY_SIZE = 2**14  # of a key file [bytes]
 
 
 class Signature(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """The member ``bam/signature.json``."""
 
     format: Literal[1]
-    """Version of what is signed."""
+    """Version of the signed bytes."""
     algorithm: Literal["ed25519"]
     signer: Name
-    """Name of the key, as whoever made it gave it."""
+    """Name of the key, chosen by its owner."""
     created: Annotated[str, Meta(max_length=40)]
     """UTC, ISO 8601."""
     public_key: Annotated[str, Meta(min_length=44, max_length=44)]
@@ -51,10 +51,10 @@ class Signature(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 @dataclass(frozen=True)
 class PublicKey:
-    """A key that signatures are verified with."""
+    """A key that verifies signatures."""
 
     name: str
-    """Of whoever signs with it."""
+    """Name of the owner."""
     text: str
     """Base64 of its 32 bytes."""
 
@@ -65,12 +65,12 @@ class PublicKey:
 
 
 def config_folder() -> Path:
-    """This user's own folder: ``bam-train`` below ``$XDG_CONFIG_HOME`` or ``~/.config``."""
+    """This user's configuration folder: ``bam-train`` below ``$XDG_CONFIG_HOME`` or ``~/.config``."""
     return Path(os.environ.get("XDG_CONFIG_HOME") or "~/.config").expanduser() / "bam-train"
 
 
 def trusted_folder() -> Path:
-    """Where this user keeps the public keys that are trusted: ``$BAM_TRUSTED_KEYS``, else in `config_folder`."""
+    """Folder of the public keys that this user trusts: ``$BAM_TRUSTED_KEYS``, else in `config_folder`."""
     named = os.environ.get("BAM_TRUSTED_KEYS")
     return Path(named).expanduser() if named else config_folder() / "trusted"
 
@@ -79,7 +79,7 @@ def trusted_folder() -> Path:
 
 
 def public_path(path: Path) -> Path:
-    """Where the public key of the private key at `path` is: beside it."""
+    """Path of the public key, beside the private key at `path`."""
     return path.with_suffix(".pub") if path.suffix == ".key" else path.with_name(f"{path.name}.pub")
 
 
@@ -87,7 +87,7 @@ def make_key(path: Path, name: str) -> PublicKey:
     """Make a key: the private one at `path`, which only this user can read, and the public one at `public_path`.
 
     Raises:
-        BadKey: `name` is not a name, or `path` is one for a public key.
+        BadKey: `name` is not a valid name, or `path` is that of a public key.
         OutputError: One of the files exists, or cannot be written.
     """
     from cryptography.hazmat.primitives import serialization
@@ -134,10 +134,10 @@ def _write_new(path: Path, data: bytes, mode: int) -> None:
 
 
 def read_private_key(path: Path) -> tuple[Any, PublicKey]:
-    """The private key of `make_key` and its public one.
+    """The private key at `path`, and its public key.
 
     Raises:
-        BadKey: There is none, others can read it, or it is no Ed25519 key.
+        BadKey: The file cannot be read, others can read it, or it is not an Ed25519 key.
     """
     from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
     from cryptography.hazmat.primitives.serialization import load_pem_private_key
@@ -149,7 +149,7 @@ def read_private_key(path: Path) -> tuple[Any, PublicKey]:
             mode = stat.S_IMODE(os.fstat(file.fileno()).st_mode)
             if mode & 0o077 and os.name == "posix":
                 raise BadKey(f"{path}: others can read this private key (mode {mode:04o}). Run: chmod 600 {path}")
-            key = load_pem_private_key(file.read(_MOST_KEY), None)
+            key = load_pem_private_key(file.read(_MAX_KEY_SIZE), None)
     except OSError as error:
         remedy = "Make one with bam-sign keygen, or give another with --key"
         raise BadKey(f"{path}: the private key cannot be read: {error.strerror or error}. {remedy}") from error
@@ -167,11 +167,11 @@ def read_public_key(path: Path) -> PublicKey:
     """The key in a ``.pub`` file.
 
     Raises:
-        BadKey: There is none, or it is none.
+        BadKey: The file cannot be read, or is not a public key.
     """
     try:
         with path.open("rb") as file:
-            text = file.read(_MOST_KEY).decode("ascii", "replace")
+            text = file.read(_MAX_KEY_SIZE).decode("ascii", "replace")
     except OSError as error:
         raise BadKey(f"{path}: the public key cannot be read: {error.strerror or error}. Check its name") from error
     if "PRIVATE KEY-----" in text:
@@ -224,12 +224,12 @@ def trust(path: Path, folder: Path) -> Path:
 
 
 def sign(path: Path, key_path: Path) -> Signature:
-    """Sign a checkpoint, every member of which is verified first; a signature that it has is replaced.
+    """Sign a checkpoint after verifying its members; an existing signature is replaced.
 
     Raises:
         BadKey: As of `read_private_key`.
-        CheckpointError: The checkpoint is not whole.
-        OutputError: It cannot be written; nothing was changed.
+        CheckpointError: The checkpoint is damaged.
+        OutputError: The file cannot be written, and is unchanged.
     """
     key, public = read_private_key(key_path)
     checkpoint = Checkpoint.open(path)
@@ -240,13 +240,13 @@ def sign(path: Path, key_path: Path) -> Signature:
     with open_zip(target) as source:
         try:
             _copy_signed(target, source, checkpoint, made)
-        except OSError as error:  # inside, as `open_zip` would say that it cannot be read
+        except OSError as error:  # caught here: `open_zip` would report a file that cannot be read
             raise OutputError(f"{path}: cannot be written: {error.strerror or error}. Make room beside it") from error
     return made
 
 
 def _copy_signed(target: Path, source: zipfile.ZipFile, checkpoint: Checkpoint, signature: Signature) -> None:
-    """Replace the file by a copy with this signature in the place of the one that it may have."""
+    """Replace the file by a copy with this signature."""
     with replacing(target) as temporary, zipfile.ZipFile(temporary, "w") as archive:
         for name, info in list_members(target, source).items():
             if name != SIGNATURE:
@@ -291,11 +291,11 @@ def verify(checkpoint: Checkpoint, folder: Path) -> Signature:
     if known is None:
         why = f"was signed by {found.signer} with the key {found.public_key[:12]}..., which {folder} does not trust"
         raise UntrustedCheckpoint(path, f"{why}. If you trust that person, run bam-sign trust with their .pub file")
-    return msgspec.structs.replace(found, signer=known.name)  # a signer may call himself anything
+    return msgspec.structs.replace(found, signer=known.name)  # signers choose their names
 
 
 def _manifest(checkpoint: Checkpoint) -> bytes:
-    """The bytes of the manifest, which must be the one that the checkpoint was opened with."""
+    """The bytes of the manifest, which must be unchanged since the checkpoint was opened."""
     data = _member(checkpoint.path, MANIFEST)
     if hashlib.sha256(data).hexdigest() != checkpoint.digest:
         raise AlteredCheckpoint(checkpoint.path, MANIFEST, f"{MANIFEST} was replaced while it was read. Try again")
@@ -303,13 +303,13 @@ def _manifest(checkpoint: Checkpoint) -> bytes:
 
 
 def _signed(signer: str, created: str, manifest: bytes) -> bytes:
-    """The bytes that are signed; lengths keep one part from being read as another."""
+    """The bytes that are signed; the lengths make the parts unambiguous."""
     parts = [b"bam-train checkpoint signature 1", signer.encode(), created.encode(), manifest]
     return b"".join(len(part).to_bytes(8, "big") + part for part in parts)
 
 
 def _member(path: Path, name: str) -> bytes:
-    """A member's bytes; b"" if there is none."""
+    """The bytes of a member; b"" if it is missing."""
     with open_zip(path) as archive:
         infos = list_members(path, archive)
         return b"".join(chunks(path, archive, infos[name])) if name in infos else b""

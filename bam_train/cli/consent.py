@@ -1,4 +1,4 @@
-"""Before a robot moves: check that its environment fits the policy, show its limits, and ask a person for consent."""
+"""Steps before a robot moves: check that the environment fits the policy, show the limits, and ask for consent."""
 
 import math
 import os
@@ -39,26 +39,25 @@ def connected_env(
     motion: Path | None = None,
     wiggle: bool = False,
 ) -> gym.Env[Any, Any]:
-    """Make the environment of a checkpoint; its robot is connected and has not moved, and there is consent to move it.
+    """Make the environment of a checkpoint, connect its robot, and obtain consent to move it.
 
     Args:
         checkpoint: The checkpoint of the policy that will act.
         place: The place of the environment.
-        signals: A signal whose exception Python discarded is raised again before the robot moves.
-        who: The program that will move the robot, for the question to a person.
+        signals: Raises a signal whose exception Python discarded again, before the robot moves.
+        who: The program that will move the robot, for the question to the operator.
         episodes: Number of planned episodes.
-        yes: Do not ask before a real robot moves.
-        render: Show the simulation in a window.
+        yes: Whether to skip the question before a real robot moves.
+        render: Whether to show the simulation in a window.
         named: The environment that the user expects.
         env_kwargs: Arguments of the environment, which override the checkpoint's.
-        admit: Called with the environment, connected, and its place, before anybody is asked; returns lines for a
-            person.
-        motion: Recording of the live robot in which each axis must have moved as it was commanded.
-        wiggle: Move each axis of a live robot a little first, to see whether it moves as commanded.
+        admit: Called with the connected environment and its place before the question; returns lines for the operator.
+        motion: Recording of the live robot in which each axis must have moved as commanded.
+        wiggle: Whether to move each axis of a live robot a little first, to check that it moves as commanded.
 
     Raises:
         ContractRefused: The live robot does not fit the checkpoint.
-        CheckpointMismatch: Another environment does not.
+        CheckpointMismatch: An environment without a live robot does not fit.
     """
     env_id, saved = environment_of(checkpoint, named, elsewhere=bool(place.transport))
     make = partial(make_env, env_id, {**saved, **(env_kwargs or {})}, render_mode="human" if render else None)
@@ -95,9 +94,9 @@ def _connect(env: Any, signals: SignalMemory) -> None:
 
 
 def required_contract(checkpoint: Checkpoint, env: Any, place: Place, motion: Path | None = None) -> Contract:
-    """The contract of a checkpoint with a live robot, shown to a person if the robot is real; moves nothing.
+    """The contract of a checkpoint with a live robot, shown if the robot is real or refused; moves nothing.
 
-    Any other environment is compared with the checkpoint only, and the contract is empty.
+    For any other environment, only spaces and signals are compared, and the contract is empty.
 
     Raises:
         ContractRefused: They do not fit; the table is shown.
@@ -123,7 +122,7 @@ def required_contract(checkpoint: Checkpoint, env: Any, place: Place, motion: Pa
 
 
 def require_motion(env: Any, who: str, inspection: Inspection) -> None:
-    """Move each axis a little, and refuse a robot of which one does not move as commanded: `ContractRefused`."""
+    """Move each axis a little; raises `ContractRefused` if an axis does not move as commanded."""
     from bam_train.deploy.arm_checks import measured_joints
     from bam_train.deploy.wiggle import wiggle
 
@@ -142,28 +141,28 @@ def guards_of(env: Any) -> dict[str, dict[str, Any]]:
 
 
 def plan_lines(env: Any, env_id: str, address: str, episodes: int, *, wiggle: bool = False) -> list[str]:
-    """Lines for a person about the planned episodes."""
+    """Lines for the operator about the planned episodes."""
     spec = getattr(getattr(env.unwrapped, "robot", None), "spec", None)
     planned = "1 episode" if episodes == 1 else f"{episodes} episodes, one after the other without a pause"
     begin = "where the base stands"
     if isinstance(spec, RobotSpec) and not is_base(spec):
         gripper = "opening the gripper and " if "m" in spec.command.units else ""
         begin = f"by {gripper}going to the start pose"
-    first = ["  first each axis moves a little and back, to see whether it moves as commanded"] if wiggle else []
+    first = ["  first each axis moves a little and back, to check that it moves as commanded"] if wiggle else []
     return [f"  address: {address}", *first, f"  {env_id}: {planned}", f"  each begins {begin}"]
 
 
 def require_consent(env: Any, who: str, *, yes: bool, plan: Sequence[str] = ()) -> None:
-    """Ask a person once before the real robot of `env`, if it has one, moves; it is connected, and stands still.
+    """Ask the operator once before the real robot of `env` moves; do nothing for any other environment.
 
     Args:
-        env: The environment, single or vector.
+        env: The environment, single or vector, with a connected robot.
         who: The program that will move the robot, for the first line.
-        yes: Show the lines, and do not ask.
+        yes: Whether to show the lines without asking.
         plan: Lines about the planned episodes.
 
     Raises:
-        SettingsError: The robot is not ready to move, the answer is not yes, or there is nobody to ask.
+        SettingsError: The robot is not ready to move, the answer is not yes, or standard input is not a terminal.
     """
     if not has_real_robot(env):
         return

@@ -154,7 +154,7 @@ class DeployConfig:
     motion: File = None
     """Recording (.mcap) of this robot in which each axis must have moved as it was commanded."""
     wiggle: bool = False
-    """Move each axis of a live robot a little and back first, to see whether it moves as commanded."""
+    """Move each axis of a live robot a little and back first, to check that it moves as commanded."""
     stage: Annotated[Literal["trial", "full"] | None, tyro.conf.arg(metavar="trial|full")] = None
     """trial (default on a real robot): a quarter of the speed, in a box around the start; full: as its limits say."""
     i_know: bool = False

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from bam_train.cli.flags import SignConfig
 
 FLAGS = {"keygen": "name", "sign": "key", "verify": "keys", "trust": "keys"}
-"""Action to the one flag that it takes."""
+"""Action to the flag that it takes."""
 
 
 def sign_checkpoint(config: SignConfig) -> None:

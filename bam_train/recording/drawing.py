@@ -1,4 +1,4 @@
-"""A recording as a figure and as a video."""
+"""Draw a recording as a figure, and decode its pictures for a video."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 MOST_LINES = 16
-"""Numbers of a signal that are drawn; those of a longer one, such as a laser's, are left out."""
+"""Maximum size of a signal that is drawn; larger ones, such as a laser scan, are left out."""
 _CHANNELS = {"mono8": 1, "rgb8": 3, "rgba8": 4}
 
 
@@ -30,7 +30,7 @@ def plot(recording: Recording, path: Path) -> None:
     """Draw states, commands, actions, status and latencies over time into an image file.
 
     Raises:
-        BadRecording: There is no tick in it.
+        BadRecording: The recording has no tick.
         MissingExtra: matplotlib is not installed.
         OutputError: The file cannot be written.
     """
@@ -38,12 +38,12 @@ def plot(recording: Recording, path: Path) -> None:
         from matplotlib.figure import Figure
     except ImportError as error:
         raise MissingExtra("matplotlib", "notebook", "--plot") from error
-    rows = _rows(recording)
+    plots = _plots(recording)
     if not recording.ticks:
         raise BadRecording(f"{recording.path}: no whole tick is in it; there is nothing to draw")
-    figure = Figure(figsize=(10, 0.8 + 1.7 * len(rows)), layout="constrained")
-    axes = figure.subplots(len(rows), 1, sharex=True, squeeze=False)[:, 0]
-    for panel, (name, draw) in zip(axes, rows, strict=True):
+    figure = Figure(figsize=(10, 0.8 + 1.7 * len(plots)), layout="constrained")
+    axes = figure.subplots(len(plots), 1, sharex=True, squeeze=False)[:, 0]
+    for panel, (name, draw) in zip(axes, plots, strict=True):
         draw(panel)
         panel.set_ylabel(name, fontsize="small")
         panel.grid(alpha=0.3)
@@ -61,21 +61,21 @@ def plot(recording: Recording, path: Path) -> None:
         raise OutputError(f"{path}: cannot be written: {why}. Choose another .png") from error
 
 
-def _rows(recording: Recording) -> list[tuple[str, Callable[[Axes], None]]]:
+def _plots(recording: Recording) -> list[tuple[str, Callable[[Axes], None]]]:
     """Name and drawing function of each plot, from top to bottom."""
-    rows: list[tuple[str, Callable[[Axes], None]]] = []
+    plots: list[tuple[str, Callable[[Axes], None]]] = []
     groups: dict[str, list[str]] = {}
     for name in recording.tables["/state"].names if "/state" in recording.tables else ():
         if "." in name:
             groups.setdefault(name.split(".", 1)[0], []).append(name)
     for group, names in groups.items():
         if len(names) <= MOST_LINES:
-            rows.append((group, partial(_lines, recording, "/state", names)))
+            plots.append((group, partial(_lines, recording, "/state", names)))
     for topic in ("/command", "/action"):
         names = list(recording.tables[topic].names[1:]) if topic in recording.tables else []
         if 0 < len(names) <= MOST_LINES:
-            rows.append((topic[1:], partial(_lines, recording, topic, names)))
-    return [*rows, ("status", partial(_status, recording)), ("latency [ms]", partial(_latency, recording))]
+            plots.append((topic[1:], partial(_lines, recording, topic, names)))
+    return [*plots, ("status", partial(_status, recording)), ("latency [ms]", partial(_latency, recording))]
 
 
 def _seconds(recording: Recording, topic: str) -> NDArray[np.float64]:
@@ -106,7 +106,7 @@ def _latency(recording: Recording, axes: Axes) -> None:
 
 
 def frames(recording: Recording, topic: str | None = None) -> Iterator[NDArray[np.uint8]]:
-    """The recorded pictures of one topic, by default the first one that has any. Shape: (height, width, 3).
+    """The recorded pictures of a topic, by default the first with pictures. Shape: (height, width, 3), RGB.
 
     Raises:
         BadRecording: A picture cannot be decoded.

@@ -1,4 +1,4 @@
-"""Playing a recording: the same states through the same environment, and what a policy does in them."""
+"""Play a recording: the recorded states pass through the environment again, and a policy acts on them."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
@@ -16,22 +16,22 @@ from bam_train.environments import environment_of, make_env
 from bam_train.errors import BadRecording, CheckpointMismatch
 from bam_train.recording.recording import Recording
 
-ELSEWHERE = ("randomize", "link", "guards", "trial")
-"""Arguments of an environment that concern its robot, which is replaced."""
+ROBOT_OPTIONS = ("randomize", "link", "guards", "trial")
+"""Arguments of an environment for its robot, which is replaced."""
 
 
 @dataclass
-class Played:
-    """How far a policy agrees with a recording."""
+class Playback:
+    """Agreement of a policy with a recording."""
 
     ticks: int = 0
     """Ticks played."""
     observations: int = 0
-    """Of these, those with the same observation, bit for bit."""
+    """Ticks with the same observation, bit for bit."""
     actions: int = 0
-    """Those with the same action, bit for bit."""
+    """Ticks with the same action, bit for bit."""
     worst: float = 0.0
-    """Largest difference between a number of an action and the recorded one."""
+    """Largest difference between a component of an action and the recorded one."""
 
     @property
     def same(self) -> bool:
@@ -39,7 +39,7 @@ class Played:
         return self.observations == self.actions == self.ticks
 
     def to_json(self) -> dict[str, Any]:
-        """As JSON values."""
+        """The report as JSON values."""
         return asdict(self) | {"same": self.same}
 
     def compare(self, observation: bool, action: Any, recorded: Any) -> None:
@@ -60,21 +60,21 @@ def replay_env(
         recording: The recording of a robot.
         checkpoint: Names the environment.
         named: The environment that the user expects.
-        render_mode: ``"rgb_array"`` draws the simulated robot where the recorded one was.
+        render_mode: ``"rgb_array"`` draws the simulated robot in the recorded states.
 
     Raises:
-        BadRecording: No robot was recorded, or another one.
-        CheckpointError: It belongs to another environment, or to one that must be named.
+        BadRecording: No robot was recorded, or another robot.
+        CheckpointError: The checkpoint belongs to another environment, or its environment must be named.
     """
     recorded, trained = recording.metadata.get("env"), checkpoint.manifest.env
     if recorded and not are_same(recorded, trained):
         text = f"was trained on {trained}, and {recording.path} is of {recorded}. Give a checkpoint of {recorded}"
         raise CheckpointMismatch(checkpoint.path, text)
     env_id, kwargs = environment_of(checkpoint, named)
-    kwargs = {name: value for name, value in kwargs.items() if name not in ELSEWHERE}
+    kwargs = {name: value for name, value in kwargs.items() if name not in ROBOT_OPTIONS}
     entry, longest = entry_of(env_id), max(map(len, recording.episodes()), default=0) - 1
     if entry is not None and longest > (kwargs.get("max_episode_steps") or entry.max_episode_steps):
-        kwargs["max_episode_steps"] = -1  # a trial is slow, and its episodes are longer
+        kwargs["max_episode_steps"] = -1  # episodes on trial take more steps
     env = make_env(env_id, kwargs, render_mode=render_mode)
     inner = env.unwrapped
     if not isinstance(inner, RobotEnv):
@@ -87,33 +87,35 @@ def replay_env(
     return env
 
 
-def play(recording: Recording, env: gym.Env[Any, Any], policy: Any, shown: Callable[[], None] = lambda: None) -> Played:
-    """Let `policy` act on every recorded tick; the environment goes on with the recorded action.
+def play(
+    recording: Recording, env: gym.Env[Any, Any], policy: Any, on_tick: Callable[[], None] = lambda: None
+) -> Playback:
+    """Let `policy` act on every recorded tick; the environment is stepped with the recorded action.
 
     Args:
         recording: The recording.
         env: The environment from `replay_env`.
         policy: Has ``reset()`` and ``act(observation)``.
-        shown: Called at each tick, to take a picture.
+        on_tick: Called at each tick, to take a picture.
     """
-    played, seed = Played(), _seed(recording)
-    observed, [acted] = recording.arrays("observation"), recording.arrays("action").values()
+    played, seed = Playback(), _seed(recording)
+    observations, [actions] = recording.arrays("observation"), recording.arrays("action").values()
     for number, ticks in enumerate(recording.episodes()):
         policy.reset()
         observation, _ = env.reset(seed=seed + number)
         for k in ticks:
-            shown()
-            played.compare(_same(observation, observed, k), policy.act(observation), acted[k])
+            on_tick()
+            played.compare(_same(observation, observations, k), policy.act(observation), actions[k])
             if k == ticks[-1]:
                 break
             try:
-                observation, _, terminated, truncated, _ = env.step(acted[k])
+                observation, _, terminated, truncated, _ = env.step(actions[k])
             except RobotFault:
                 break
             if (terminated or truncated) and k + 1 != ticks[-1]:
                 raise BadRecording(
-                    f"{recording.path}: episode {number + 1} ends after {k + 1 - ticks[0]} steps here, and it had "
-                    f"{ticks[-1] - ticks[0]}; play it with the versions in its metadata"
+                    f"{recording.path}: episode {number + 1} ends after {k + 1 - ticks[0]} steps, and was recorded "
+                    f"with {ticks[-1] - ticks[0]}; play it with the versions in its metadata"
                 )
     return played
 
@@ -125,15 +127,15 @@ def _seed(recording: Recording) -> int:
     return int(text)
 
 
-def play_observations(recording: Recording, policy: Any) -> Played:
-    """Let `policy` act on every recorded observation, of an environment without a robot; not on pictures."""
-    played, [acted] = Played(), recording.arrays("action").values()
+def play_observations(recording: Recording, policy: Any) -> Playback:
+    """Let `policy` act on every recorded observation, for an environment without a robot; pictures are left out."""
+    played, [actions] = Playback(), recording.arrays("action").values()
     observed = recording.arrays("observation")
     for ticks in recording.episodes():
         policy.reset()
         for k in ticks:
             parts = {name: array[k] for name, array in observed.items()}
-            played.compare(True, policy.act(parts.get("", parts)), acted[k])
+            played.compare(True, policy.act(parts.get("", parts)), actions[k])
     return played
 
 

@@ -27,7 +27,7 @@ CONTRACT = "contract"
 
 def examine(config: DoctorConfig, signals: SignalMemory) -> int:
     """Run the program with its parsed flags; returns the exit status, also 1 if --measure wrote no file."""
-    _require_sane(config)
+    _require_valid(config)
     from bam_envs.live.diagnosis import STEPS, Diagnosis
 
     paths = {"ca_file": config.ca_file, "token_file": config.token_file}
@@ -71,13 +71,13 @@ def examine(config: DoctorConfig, signals: SignalMemory) -> int:
 
 @dataclass
 class _Subject:
-    """The checkpoint, with its environment for the robot, which is not connected yet."""
+    """The checkpoint, and its environment for the robot, not connected."""
 
     checkpoint: Checkpoint
     env: Any
     place: Place
     contract: Contract | None = None
-    """The table, once it was checked."""
+    """The contract, once it was checked."""
 
     @classmethod
     def of(cls, config: DoctorConfig, files: dict[str, Any]) -> _Subject | None:
@@ -120,16 +120,16 @@ def _all_steps(diagnosis: Diagnosis, subject: _Subject | None) -> Iterator[Step]
 
 
 def _shown(steps: Iterator[Step], config: DoctorConfig) -> Iterator[Step]:
-    """The steps, each printed as soon as it is made unless JSON was asked for."""
+    """The steps, each printed at once unless JSON is requested."""
     for step in steps:
         if not config.json:
-            text = "" if step.verdict == "failed" else step.found  # why it failed comes last, on standard error
+            text = "" if step.verdict == "failed" else step.found  # a cause is printed last, on standard error
             lines = [f"{step.name:<16}{step.verdict:<9}{text}".rstrip()]
             tell(*lines, *(f"{'':<25}warning: {warning}" for warning in step.warnings))
         yield step
 
 
-def _require_sane(config: DoctorConfig) -> None:
+def _require_valid(config: DoctorConfig) -> None:
     from bam_train.atomic_file import require_writable
     from bam_train.errors import SettingsError
 
@@ -143,7 +143,7 @@ def _require_sane(config: DoctorConfig) -> None:
 
 
 def _write_measured(config: DoctorConfig, diagnosis: Diagnosis) -> dict[str, Any] | None:
-    """Write the link as `LinkProfile`, and return it as JSON values; None if it was not measured, or not asked for."""
+    """Write the link as a `LinkProfile`, and return it as JSON values; None if it was not measured or requested."""
     if config.measure is None:
         return None
     from bam_envs.core.errors import InvalidValue

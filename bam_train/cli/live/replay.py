@@ -15,12 +15,12 @@ from bam_train.cli.program import run_program
 if TYPE_CHECKING:
     from bam_train.checkpoint import Checkpoint
     from bam_train.cli.flags import ReplayConfig
-    from bam_train.recording.playback import Played
+    from bam_train.recording.playback import Playback
     from bam_train.recording.recording import Recording
 
 LEVELS = {3: "warning: ", 4: "error: "}
 MOST_EVENTS = 20
-"""Events that are shown; of more, the first and the last half of so many."""
+"""Maximum number of events shown: half of them from the start, half from the end."""
 
 
 def replay(config: ReplayConfig) -> None:
@@ -32,8 +32,8 @@ def replay(config: ReplayConfig) -> None:
     picture = None if config.plot is None else require_writable(config.plot)
     video = None if config.video is None else require_video_path(config.video)
     recording = Recording.open(config.recording)
-    found = _checkpoint(config, recording)
-    played, why = (None, found) if isinstance(found, str) else (_played(config, recording, found), "")
+    checkpoint = _checkpoint(config, recording)
+    played, why = (None, checkpoint) if isinstance(checkpoint, str) else (_play(config, recording, checkpoint), "")
     if config.json:
         facts = {**facts_of(recording), "played": None if played is None else played.to_json(), "not_played": why}
         tell(json_module.dumps(facts, allow_nan=False))
@@ -45,11 +45,11 @@ def replay(config: ReplayConfig) -> None:
         plot(recording, picture)
         say(f"bam-replay: {picture}: drawn")
     if video is not None:
-        _film(recording, found, config.env, video)
+        _write_video(recording, checkpoint, config.env, video)
 
 
 def _checkpoint(config: ReplayConfig, recording: Recording) -> Checkpoint | str:
-    """The checkpoint to play with; else why there is none."""
+    """The checkpoint to play; else the reason for its absence."""
     from bam_train.checkpoint import Checkpoint
 
     if not recording.ticks:
@@ -61,11 +61,11 @@ def _checkpoint(config: ReplayConfig, recording: Recording) -> Checkpoint | str:
         return f"its checkpoint {path} is not here; give it with --checkpoint"
     checkpoint = Checkpoint.open(path)
     if checkpoint.digest != recording.metadata.get("checkpoint_sha256"):
-        return f"{path} is another checkpoint than then; give --checkpoint {path} to play it with that one"
+        return f"{path} has changed since the recording; give --checkpoint {path} to play it with that one"
     return checkpoint
 
 
-def _played(config: ReplayConfig, recording: Recording, checkpoint: Checkpoint) -> Played:
+def _play(config: ReplayConfig, recording: Recording, checkpoint: Checkpoint) -> Playback:
     from bam_train.policy import FrozenPolicy
     from bam_train.recording.playback import play, play_observations, replay_env
 
@@ -76,7 +76,7 @@ def _played(config: ReplayConfig, recording: Recording, checkpoint: Checkpoint) 
         return play(recording, env, policy)
 
 
-def _played_lines(played: Played | None, why: str) -> list[str]:
+def _played_lines(played: Playback | None, why: str) -> list[str]:
     if played is None:
         return [f"not played: {why}"]
     lines = [f"played: the same observation in {played.observations} of {played.ticks} ticks, "]
@@ -120,7 +120,7 @@ def _seconds(recording: Recording) -> float:
 
 
 def _episodes(recording: Recording) -> list[dict[str, Any]]:
-    """Length, return, end and success of each episode; without an end, it was cut short."""
+    """Length, return, end and success of each episode; ``"stopped"`` without an end."""
     rows, seed = [], int(recording.metadata.get("seed", 0))
     for number, ticks in enumerate(recording.episodes()):
         table, last = recording.tables["/episode"], ticks[-1]
@@ -140,13 +140,14 @@ def _episodes(recording: Recording) -> list[dict[str, Any]]:
 
 def lines_of(recording: Recording) -> list[str]:
     """The summary for people."""
-    facts, told = facts_of(recording), recording.metadata
+    facts, metadata = facts_of(recording), recording.metadata
     end = "complete" if recording.complete else "its end is missing: it was cut off or damaged"
-    policy = Path(told.get("checkpoint", "")).name or "no checkpoint"
-    on = " ".join(filter(None, [told.get("env"), told.get("address") and f"at {told['address']}", told.get("robot")]))
-    marks = f", {told['marks']}" if told.get("marks") else ""
+    policy = Path(metadata.get("checkpoint", "")).name or "no checkpoint"
+    address = metadata.get("address")
+    on = " ".join(filter(None, [metadata.get("env"), address and f"at {address}", metadata.get("robot")]))
+    marks = f", {metadata['marks']}" if metadata.get("marks") else ""
     lines = [
-        f"{recording.path}: {policy} ({told.get('checkpoint_sha256', '')[:12]}) on {on}{marks}",
+        f"{recording.path}: {policy} ({metadata.get('checkpoint_sha256', '')[:12]}) on {on}{marks}",
         f"{recording.ticks} ticks in {duration(facts['seconds'])}, {end}",
     ]
     episodes = facts["per_episode"]
@@ -172,8 +173,8 @@ def _event_lines(recording: Recording) -> list[str]:
     return texts if len(texts) <= MOST_EVENTS else [*texts[:half], f"... {len(texts) - 2 * half} more", *texts[-half:]]
 
 
-def _film(recording: Recording, checkpoint: Checkpoint | str, named: str | None, path: Path) -> None:
-    """A video of the recorded pictures, else of the simulated robot where the recorded one was."""
+def _write_video(recording: Recording, checkpoint: Checkpoint | str, named: str | None, path: Path) -> None:
+    """Write a video of the recorded pictures, else of the simulated robot in the recorded states."""
     from bam_train.errors import SettingsError
     from bam_train.recording.drawing import frames
     from bam_train.video import open_video, picture

@@ -162,7 +162,7 @@ def test_a_checkpoint_that_is_gone_or_changed(pick, corridor_checkpoint, tmp_pat
     assert call(replay, path) == 0
     last = capsys.readouterr().out.splitlines()[-1]
     assert last == (
-        f"not played: {checkpoint} is another checkpoint than then; give --checkpoint {checkpoint} to play it with "
+        f"not played: {checkpoint} has changed since the recording; give --checkpoint {checkpoint} to play it with "
         "that one"
     )
     assert call(replay, path, "--checkpoint", tmp_path / "moved.zip") == 0
