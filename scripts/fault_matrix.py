@@ -29,8 +29,10 @@ from mcap.records import Channel, Message
 from mcap.stream_reader import StreamReader
 from zstandard import ZstdError
 
+from bam_envs.core.wording import did_you_mean
 from bam_envs.testing.robot_cell import CellLog, Network, RobotCell, StateFault
 from bam_train.checkpoint import Checkpoint
+from bam_train.errors import BamTrainError
 
 ROOT = Path(__file__).parents[1]
 CHECKPOINT = ROOT / "checkpoints" / "reach-ppo.zip"
@@ -362,10 +364,17 @@ def main() -> None:
     parser.add_argument("--plain", action="store_true", help="a robot without sessions, halt topic and description")
     parser.add_argument("--json", action="store_true", help="print one JSON object a fault instead of a table")
     options = parser.parse_args()
-    env_id, wrong = Checkpoint.open(options.checkpoint).manifest.env, 0
+    try:
+        env_id, wrong = Checkpoint.open(options.checkpoint).manifest.env, 0
+    except BamTrainError as error:
+        parser.error(str(error))
     is_base = "m/s" in RobotCell(env_id).spec.command.units
     rows = [fault for fault in FAULTS if not (is_base and fault.name == JOINT)]
     chosen = [fault for fault in rows if not options.only or any(text in fault.name for text in options.only)]
+    for text in options.only or ():
+        if not any(text in fault.name for fault in rows):
+            names = [fault.name for fault in rows]
+            parser.error(f"--only: no fault's name has {text!r}. {did_you_mean(text, names, cutoff=0.3)}")
     if not options.json:
         print(f"{'fault':40}{'motion':>9}{'rest':>9}{'end':>9}{'exit':>6}")
     for fault in chosen:

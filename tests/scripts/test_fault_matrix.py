@@ -25,6 +25,21 @@ def cell(whole_cell):
 
 
 @pytest.mark.parametrize(
+    ("flags", "text"),
+    [
+        (("--only", "bridge", "--only", "frozn"), "--only: no fault's name has 'frozn'. Did you mean 'network frozen"),
+        (("--checkpoint", "none.zip"), "none.zip: no such file. Train one with bam-train, or check the name"),
+    ],
+)
+def test_a_typo_is_refused(matrix, monkeypatch, capsys, flags, text):
+    monkeypatch.setattr("sys.argv", ["fault_matrix.py", *flags])
+    with pytest.raises(SystemExit) as caught:
+        matrix.main()
+    assert caught.value.code == 2
+    assert f"fault_matrix.py: error: {text}" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
     ("name", "status", "said"),
     [
         ("policy process killed", -9, ()),
