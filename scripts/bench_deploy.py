@@ -1,8 +1,8 @@
-"""What a deployment costs: guards, one tick without the network, 100 Hz over loopback, the recorder, and its memory.
+"""Benchmark of a deployment: guards, one tick without the network, 100 Hz over loopback, recorder, and memory.
 
-Each figure stands next to something bare that is measured in the same run and in turns, so that a busy machine slows
-both alike. The robot of all figures but the third is a stand-in in this process: it takes and gives the frames of a
-rosbridge server, and is where it was told to be.
+Each figure is compared with a baseline that is measured in turns in the same run, so that a busy machine slows both
+alike. Except at 100 Hz, the robot is a stand-in in this process, which takes and returns the frames of a rosbridge
+server and follows its commands exactly.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ clock = time.perf_counter
 
 
 class StandIn:
-    """A live robot without its network: commands become frames, states come from frames."""
+    """A live robot without its network: commands are encoded as frames, states are decoded from frames."""
 
     needs_clearance = True
     num_robots = 1
@@ -48,23 +48,23 @@ class StandIn:
         self.spec, self.profile = spec, profile_for(spec)
         self.info = RobotInfo(spec.name, simulated=True, period=spec.period, text="a stand-in")
         self.now, self.inside = 0.0, 0.0  # time of the robot; duration of the last step [s]
-        self.came, self.entered, self.left = 0.0, 0.0, 0.0  # frames of a state, a command, its frames [s]
+        self.state_at, self.command_at, self.sent_at = 0.0, 0.0, 0.0  # frames of a state, a command, its frames [s]
         self._tagger, self._command = Tagger(key=b"0" * 32), np.array([HOME])
         self._live = LiveState(self.profile, spec)
-        self._ears = {source.topic: self._live.listener(source.topic) for source in self._live.sources}
+        self._listeners = {source.topic: self._live.listener(source.topic) for source in self._live.sources}
         self._signals = {signal.name: np.zeros((1, len(signal.labels))) for signal in spec.signals}
         self._signals["object_quaternion"] = np.array([[1.0, 0.0, 0.0, 0.0]])
         self._signals["object_position"] = np.array([[0.5, 0.0, 0.02]])
 
     def steps(self) -> float:
-        """Time that passes with steps only [s]."""
+        """Simulated time, which advances with steps [s]."""
         return self.now
 
     def connect(self) -> None:
-        """It is there."""
+        """Do nothing: the robot needs no connection."""
 
     def reset(self, env_ids: Any, initial: Any) -> Any:
-        """It stays where it is."""
+        """Return the state; nothing moves."""
         return self._state()
 
     def step(self, cleared: Any) -> Any:
@@ -72,16 +72,16 @@ class StandIn:
         from bam_envs.ros.codec import encode_sink
         from bam_envs.rosbridge.encoding import dump_json
 
-        self.entered, values = clock(), cleared.for_robot(self)[0]
+        self.command_at, values = clock(), cleared.for_robot(self)[0]
         tag = self._tagger.next(1, 0.1)
         for sink in self.profile.sinks():
             topic, _, message = encode_sink(sink, self.spec, values, tag, sign=self._tagger.sign)
             dump_json({"op": "publish", "topic": topic, "msg": message})
-        self.left = clock()
+        self.sent_at = clock()
         self.now += self.spec.period
         self._command = values[None].copy()
         state = self._state()
-        self.inside = clock() - self.entered
+        self.inside = clock() - self.command_at
         return state
 
     def _state(self) -> Any:
@@ -95,10 +95,10 @@ class StandIn:
         state = RobotState(self._signals, np.zeros(1), self._command)
         messages = encode_state(self.profile, state, 0, write_stamp(time.time()))
         frames = [json.dumps({"op": "publish", "topic": topic, "msg": message}) for topic, _, message in messages]
-        self.came = clock()
+        self.state_at = clock()
         for frame in frames:
             message = decode_server_frame(frame.encode())
-            self._ears[message["topic"]](message["msg"], UNKNOWN_CALLER)
+            self._listeners[message["topic"]](message["msg"], UNKNOWN_CALLER)
         return self.measure()
 
     def measure(self) -> Any:
@@ -110,13 +110,13 @@ class StandIn:
 
     def age(self) -> float:
         """Age of the state [s]."""
-        return min(self._live.age(), 0.01)  # as if a busy computer did not pause between a frame and its use
+        return min(self._live.age(), 0.01)  # ignores pauses of a busy computer between a frame and its use
 
     def halt(self) -> None:
-        """It does not move between steps."""
+        """Do nothing: the robot does not move between steps."""
 
     def close(self) -> None:
-        """Nothing is open."""
+        """Do nothing: no connection is open."""
 
 
 def microseconds(times: Samples) -> tuple[float, float]:
@@ -139,7 +139,7 @@ def guarded(standin: StandIn) -> Any:
     """The stand-in behind all guards, as `make_env` builds a robot for a task that moves the tool in straight lines."""
     from bam_envs.safety.gate import Limits, SafeRobot
 
-    # It may be kept out of places in all of its ticks (G18), because nothing here moves for a purpose.
+    # Changed commands (G18) are not limited, because the motion is random.
     return SafeRobot(standin, limits=Limits(clamp_stop=1.0), clock=standin.steps, straight=True)
 
 
@@ -171,7 +171,7 @@ def measure_guards(count: int) -> Iterator[str]:
 
 
 class ClockedPolicy:
-    """A policy that notes how long its last action took."""
+    """A policy that measures the duration of its last action."""
 
     def __init__(self, policy: Any) -> None:
         self.policy, self.reset, self.took = policy, policy.reset, 0.0
@@ -185,7 +185,7 @@ class ClockedPolicy:
 
 
 class ClockedEnv(gym.Wrapper[Any, Any, Any, Any]):
-    """Notes when an observation is made, and when its command comes out; the way to a start pose is no tick."""
+    """Measures the time from an observation to its command; the way to a start pose is not counted."""
 
     def __init__(
         self, env: gym.Env[Any, Any], policy: ClockedPolicy, standin: StandIn, shares: Sequence[float]
@@ -194,37 +194,37 @@ class ClockedEnv(gym.Wrapper[Any, Any, Any, Any]):
         self.policy, self.standin, self.shares = policy, standin, shares
         self.keeps = True
         """Whether durations are kept, which takes memory."""
-        self.made = self.came = 0.0
+        self.made = self.state_at = 0.0
         self.times: dict[str, list[float]] = {"policy": [], "command": [], "frames": [], "recorder": []}
         """Durations [s]: of the policy, from an observation to its command, from a state's frames to the command's, and
         of the recorder, the last of `shares`."""
 
     def reset(self, **arguments: Any) -> Any:
         """Begin an episode."""
-        begun = self.env.reset(**arguments)
-        self.came, self.made = self.standin.came, clock()
-        return begun
+        result = self.env.reset(**arguments)
+        self.state_at, self.made = self.standin.state_at, clock()
+        return result
 
     def step(self, action: Any) -> Any:
-        """One step, which ends the tick."""
-        stepped, robot = self.env.step(action), self.standin
+        """Step the environment, which ends the tick."""
+        result, robot = self.env.step(action), self.standin
         if self.keeps:
             share = self.shares[-1] if self.shares else 0.0
-            durations = (self.policy.took, robot.entered - self.made, robot.left - self.came, share)
+            durations = (self.policy.took, robot.command_at - self.made, robot.sent_at - self.state_at, share)
             for times, duration in zip(self.times.values(), durations, strict=True):
                 times.append(duration)
-        self.came, self.made = robot.came, clock()
-        return stepped
+        self.state_at, self.made = robot.state_at, clock()
+        return result
 
 
-class Quiet:
-    """Watches a deployment for its memory: after `WARM` ticks and at the end."""
+class MemoryWatcher:
+    """Watcher of a deployment that measures its memory after `WARM` ticks."""
 
     def __init__(self) -> None:
         self.ticks, self.warm = 0, 0.0
 
     def ticked(self, record: Any, action: Any, pacer: Any) -> None:
-        """Count."""
+        """Count the tick, and measure the memory at `WARM`."""
         self.ticks += 1
         if self.ticks == WARM:
             self.warm = resident()
@@ -233,10 +233,10 @@ class Quiet:
         """Nothing is shown."""
 
 
-def deploy(ticks: int, recording: Path | None = None, shares: Sequence[float] = ()) -> tuple[ClockedEnv, Quiet]:
-    """A deployment of so many ticks of bam/pick without waiting, on the stand-in, recorded in a file if given.
+def deploy(ticks: int, recording: Path | None = None, shares: Sequence[float] = ()) -> tuple[ClockedEnv, MemoryWatcher]:
+    """Run a deployment of bam/pick on the stand-in without waiting, for `ticks`; recorded if a file is given.
 
-    `shares` has what the recorder took so far, by tick [s].
+    `shares` has the time that the recorder took in each tick so far [s].
     """
     from bam_envs.core.registry import ENVIRONMENTS
     from bam_envs.core.robot_env import RobotEnv
@@ -253,7 +253,7 @@ def deploy(ticks: int, recording: Path | None = None, shares: Sequence[float] = 
     inner: gym.Env[Any, Any] = RobotEnv(guarded(standin), entry.make_task(1, {}))
     env = ClockedEnv(gym.wrappers.TimeLimit(inner, steps), policy, standin, shares)
     env.keeps = recording is not None
-    recorder, watcher = None if recording is None else flight_recorder(recording, env, {}), Quiet()
+    recorder, watcher = None if recording is None else flight_recorder(recording, env, {}), MemoryWatcher()
     if recorder is not None:
         recorder.start()
     deployment = Deployment(env, policy, Pacer(None), Journal(-(-ticks // steps)), recorder=recorder)
@@ -300,14 +300,14 @@ def measure_rate(seconds: float, rounds: int) -> Iterator[str]:
     """100 Hz against the embedded server, and a loop that only sleeps, in turns: how late commands are sent."""
     from bam_envs.core.timing import Pacer
 
-    ours: list[float] = []
-    bare: list[float] = []
+    lateness: list[float] = []
+    baseline: list[float] = []
     count = int(100 * seconds / rounds)
     with Server("realtime robot") as server:
         robot, state = live_arm(f"ws://127.0.0.1:{server.ports[0]}", period=0.01)
         pacer = robot._robot._pacer
         tick = pacer.tick
-        pacer.tick = lambda: ours.append(tick())
+        pacer.tick = lambda: lateness.append(tick())
         for _ in range(rounds):
             pacer.start()
             for _ in range(count):
@@ -315,10 +315,10 @@ def measure_rate(seconds: float, rounds: int) -> Iterator[str]:
             robot.halt()  # the next round begins a new motion
             asleep = Pacer(0.01)
             asleep.start()
-            bare += [asleep.wait() for _ in range(count)]
+            baseline += [asleep.wait() for _ in range(count)]
         robot.close()
-    late, alone = (100 * float((np.array(lateness) > LATE).mean()) for lateness in (ours, bare))
-    p50, p99 = 1e3 * np.percentile(ours, [50, 99])
+    late, alone = (100 * float((np.array(times) > LATE).mean()) for times in (lateness, baseline))
+    p50, p99 = 1e3 * np.percentile(lateness, [50, 99])
     text = f"{late:.2f} % late by > 1 ms"
     yield row("100 Hz against the embedded server", text, f"< {LATE_SHARE:g} %", at_most(late, LATE_SHARE))
     yield f"  lateness p50 {p50:.2f}, p99 {p99:.2f} ms; a loop that only sleeps has {alone:.2f} % such ticks"
@@ -341,7 +341,7 @@ def resident() -> float:
 
 
 def main() -> None:
-    """Measure what was asked for."""
+    """Run the selected measurements."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     names = ("guards", "tick", "rate", "memory")
     parser.add_argument("--only", choices=names, action="append", help="measure this alone; may be given several times")

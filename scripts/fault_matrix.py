@@ -1,8 +1,8 @@
-"""What happens when something fails while a policy moves a robot: one fault after the other, in a simulated robot cell.
+"""Inject faults while a policy moves a robot in a simulated robot cell, and print a table of the outcomes.
 
-Robot, driver, rosbridge server and bam-deploy are processes of their own. Each row strikes while the arm moves, and
-shows how long commands for motion still arrive and the robot still moves, what the operator sees, the exit status, and
-what the recording holds.
+Robot, driver, rosbridge server and bam-deploy are separate processes. Each fault is injected while the robot moves. Its
+row shows the times of the last motion command, of rest and of the end, the exit status, the operator's screen, and the
+content of the recording.
 """
 
 from __future__ import annotations
@@ -37,23 +37,23 @@ from bam_train.errors import BamTrainError
 ROOT = Path(__file__).parents[1]
 CHECKPOINT = ROOT / "checkpoints" / "reach-ppo.zip"
 FAST, AT_REST = 0.1, 0.02
-"""A fault strikes above the first speed; below the second one the robot is at rest [rad/s or m/s]."""
+"""Speed above which a fault is injected, and speed below which the robot is at rest [rad/s or m/s]."""
 BRAKING = 0.3
-"""Time in which a robot that rests comes to a stand [s]."""
+"""Maximum braking time of the robot [s]."""
 FREEZE, RESTART = 5.0, 10.0
-"""How long the network is frozen, and after what time a bridge is restarted [s]."""
+"""Duration of a frozen network, and time until a bridge is restarted [s]."""
 LONGEST = 120.0
-"""Longest time that a deployment may take [s]."""
+"""Maximum duration of a deployment [s]."""
 PLAIN = ("--allow-unsigned", "--stage", "full", "--i-know")
-"""Flags for a robot that may be a real one."""
+"""Flags for a robot without a description, which counts as real."""
 LOST = 1.0
-"""What a recording may lack before a fault [s]."""
+"""Maximum loss of a recording before a fault [s]."""
 WATCHED = 1.0
-"""How long the robot is watched after the end of everything [s]."""
+"""Time for which the robot is observed after the end of the deployment [s]."""
 
 
 class Deployment:
-    """A bam-deploy in a process of its own.
+    """A bam-deploy in a separate process.
 
     Args:
         command: Its program and arguments.
@@ -75,14 +75,14 @@ class Deployment:
         self.ended = time.monotonic()
 
     def finish(self) -> int:
-        """Wait for its end; the exit status."""
+        """Wait for the end of the process, and return its exit status."""
         self._reading.join(LONGEST)
-        self.process.kill()  # what has not ended by now never will
+        self.process.kill()  # a process that has not ended by now hangs
         self._reading.join()
         return self.process.returncode
 
-    def said(self, start: float = 0.0) -> tuple[str, ...]:
-        """What the operator saw since `start`, other than ends of episodes."""
+    def messages(self, start: float = 0.0) -> tuple[str, ...]:
+        """Lines on standard error since `start` [s], without those about episodes."""
         return tuple(line for at, line in self.lines if at >= start and not line.startswith("episode "))
 
 
@@ -97,20 +97,20 @@ class Scene:
     flags: tuple[str, ...]
     """Further flags of each bam-deploy."""
     deployment: Deployment = field(init=False)
-    back: float | None = None
-    """When the link came back [s], monotonic clock."""
+    link_back: float | None = None
+    """Time at which the link was restored [s], monotonic clock."""
     others: list[str] = field(default_factory=list)
-    """What others than the operator of the deployment saw."""
+    """Messages of other programs."""
 
     def deploy(
         self, name: str, *before: str, program: tuple[str, ...] = ("-m", "bam_train.cli.deploy"), disk: str = ""
     ) -> Deployment:
-        """Start a bam-deploy.
+        """Start a bam-deploy, and return it.
 
         Args:
-            name: Of its recording.
-            before: What stands before its command.
-            program: What Python runs.
+            name: Name of its recording.
+            before: Words before its command.
+            program: Arguments of Python.
             disk: The subfolder for its recording.
         """
         recording = f"{name}.mcap"
@@ -137,21 +137,21 @@ def restart_bridge(scene: Scene) -> None:
     scene.cell.kill("bridge")
     time.sleep(RESTART)
     scene.cell.restart_bridge()
-    scene.back = time.monotonic()
+    scene.link_back = time.monotonic()
 
 
 def freeze_network(scene: Scene) -> None:
     scene.network.freeze()
     time.sleep(FREEZE)
-    scene.back = time.monotonic()
+    scene.link_back = time.monotonic()
     scene.network.thaw()
 
 
-def jump(scene: Scene) -> None:
+def jump_clock(scene: Scene) -> None:
     scene.clock.touch()
 
 
-def hog(scene: Scene) -> None:
+def hog_cores(scene: Scene) -> None:
     burners = [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(2 * (os.cpu_count() or 1))]
     time.sleep(FREEZE)
     for burner in burners:
@@ -161,16 +161,16 @@ def hog(scene: Scene) -> None:
 
 def deploy_twice(scene: Scene) -> None:
     second = scene.deploy("second")
-    scene.others.append(f"the second one, status {second.finish()}: {second.said()[-1]}")
+    scene.others.append(f"the second deployment, status {second.finish()}: {second.messages()[-1]}")
 
 
 def interrupt(times: int) -> Callable[[Scene], None]:
-    def act(scene: Scene) -> None:
+    def inject(scene: Scene) -> None:
         for _ in range(times):
             scene.deployment.process.send_signal(signal.SIGINT)
             time.sleep(0.02)
 
-    return act
+    return inject
 
 
 def send_nulls(scene: Scene) -> None:
@@ -186,12 +186,12 @@ class Fault:
     """One row of the matrix."""
 
     name: str
-    act: Callable[[Scene], None]
+    inject: Callable[[Scene], None]
     statuses: tuple[int, ...]
     """Exit statuses with which the deployment may end."""
     deploy: Callable[[Scene], Deployment] = lambda scene: scene.deploy("first")
     is_recorded: bool = True
-    """Whether the recording goes on until the fault."""
+    """Whether the recording has to continue until the fault."""
 
 
 def with_clock(scene: Scene) -> Deployment:
@@ -200,16 +200,16 @@ def with_clock(scene: Scene) -> Deployment:
 
 
 def with_full_disk(scene: Scene) -> Deployment:
-    """A deployment whose recording fills its disk: a small one of its own, which ends with it."""
+    """A deployment whose recording fills a small disk, which is mounted for it."""
     disk = scene.folder / "disk"
     disk.mkdir()
     script = 'mount -t tmpfs -o size=64k none "$0" && "$@"; status=$?; cp "$0"/*.mcap "$0"/..; exit $status'
-    own = ("unshare", "--user", "--map-root-user", "--mount", "sh", "-c", script, str(disk))
-    return scene.deploy("first", *own, disk=disk.name)
+    mounted = ("unshare", "--user", "--map-root-user", "--mount", "sh", "-c", script, str(disk))
+    return scene.deploy("first", *mounted, disk=disk.name)
 
 
 JOINT = "joint vanishes from the message"
-"""A row for arms."""
+"""Name of the row that applies to arms only."""
 FAULTS = (
     Fault("policy process killed", kill_policy, (-signal.SIGKILL,)),
     Fault("bridge killed", lambda scene: scene.cell.kill("bridge"), (4,)),
@@ -220,8 +220,8 @@ FAULTS = (
     Fault(JOINT, wrong_states(StateFault.SHORT), (1,)),
     Fault("NaN in the state", send_nulls, (1,)),
     Fault("robot's clock jumps by an hour", wrong_states(StateFault.CLOCK), (0, 3, 4)),
-    Fault("this computer's clock jumps by an hour", jump, (0,), with_clock),
-    Fault("all cores hogged for 5 s", hog, (0, 3, 4)),
+    Fault("this computer's clock jumps by an hour", jump_clock, (0,), with_clock),
+    Fault("all cores hogged for 5 s", hog_cores, (0, 3, 4)),
     Fault("disk full", lambda scene: None, (0,), with_full_disk, is_recorded=False),
     Fault("two deployments to one robot", deploy_twice, (0,)),
     Fault("Ctrl-C", interrupt(1), (130,)),
@@ -229,12 +229,12 @@ FAULTS = (
 )
 
 
-# ---- what came of them
+# ---- the outcomes
 
 
 @dataclass(frozen=True)
 class Recorded:
-    """What a recording holds."""
+    """The content of a recording."""
 
     ticks: int
     last: float
@@ -244,18 +244,18 @@ class Recorded:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What a fault did; times from the fault [s]."""
+    """The outcome of a fault; times from the fault [s]."""
 
     name: str
     motion: float
-    """When the last command for motion arrived; 0: before."""
+    """Time of the last motion command; 0: before the fault."""
     rest: float
-    """From when on the robot stood still."""
+    """Time from which the robot was at rest."""
     ended: float
-    """When the deployment ended."""
+    """Time of the end of the deployment."""
     status: int
     saw: tuple[str, ...]
-    """What was on the operator's screen."""
+    """Lines on the operator's screen."""
     recorded: str
     problems: tuple[str, ...]
 
@@ -267,7 +267,7 @@ class Outcome:
 
 
 def strike(fault: Fault, cell: RobotCell, checkpoint: Path, flags: tuple[str, ...] = ()) -> Outcome:
-    """Let a deployment move the robot of `cell`, let the fault happen, and watch."""
+    """Start a deployment in `cell`, inject the fault while the robot moves, and return the outcome."""
     with contextlib.ExitStack() as stack:
         network = stack.enter_context(Network(cell.port))
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
@@ -276,47 +276,47 @@ def strike(fault: Fault, cell: RobotCell, checkpoint: Path, flags: tuple[str, ..
         stack.callback(deployment.finish)
         stack.callback(deployment.process.kill)
         start = await_policy(scene, fault)
-        fault.act(scene)
+        fault.inject(scene)
         status = deployment.finish()
         time.sleep(WATCHED)
         log, recorded = cell.log().since(start), read_recording(deployment.recording)
-    saw = (*deployment.said(start), *scene.others)
+    saw = (*deployment.messages(start), *scene.others)
     problems = [*([] if status in fault.statuses else [f"exit status {status}"])]
-    problems += judge(log, start, deployment.ended, scene.back, cell.command_timeout)
+    problems += problems_of(log, start, deployment.ended, scene.link_back, cell.command_timeout)
     if fault.is_recorded and recorded.last < start - LOST:
         problems.append("the recording ends before the fault")
     after = f"{recorded.last - start:+.2f} s" if recorded.ticks else "never"
-    said = f"{recorded.ticks} ticks, the last {after}; {'; '.join(recorded.events) or 'no events'}"
+    content = f"{recorded.ticks} ticks, the last {after}; {'; '.join(recorded.events) or 'no events'}"
     times = (last_motion(log, start) - start, last_moving(log, start) - start, deployment.ended - start)
-    return Outcome(fault.name, *times, status, saw, said, tuple(problems))
+    return Outcome(fault.name, *times, status, saw, content, tuple(problems))
 
 
 def await_policy(scene: Scene, fault: Fault) -> float:
-    """Wait until the policy moves the robot, no longer the way to the start pose; the time now [s]."""
-    deadline, begun = time.monotonic() + LONGEST, not fault.is_recorded
-    while not begun or not (scene.cell.log().speeds[-3:] > FAST).any():
-        begun = begun or read_recording(scene.deployment.recording).ticks > 5
+    """Wait until the policy moves the robot, after the way to the start pose; returns the time [s]."""
+    deadline, has_started = time.monotonic() + LONGEST, not fault.is_recorded
+    while not has_started or not (scene.cell.log().speeds[-3:] > FAST).any():
+        has_started = has_started or read_recording(scene.deployment.recording).ticks > 5
         if time.monotonic() > deadline or scene.deployment.process.poll() is not None:
             scene.deployment.process.kill()
-            raise RuntimeError(f"status {scene.deployment.finish()}, {scene.deployment.said()[-1:]}")
+            raise RuntimeError(f"status {scene.deployment.finish()}, {scene.deployment.messages()[-1:]}")
         time.sleep(0.01)
     return time.monotonic()
 
 
 def last_motion(log: CellLog, start: float) -> float:
-    """When the last command for motion arrived [s]; `start` if none did after it."""
+    """Time of the last motion command [s]; `start` if there was none after it."""
     motions = log.motions()
     return max(start, float(motions[-1])) if len(motions) else start
 
 
 def last_moving(log: CellLog, start: float) -> float:
-    """When the robot moved last [s]; `start` if it did not after it."""
+    """Time of the robot's last motion [s]; `start` if there was none after it."""
     moving = log.times[log.speeds > AT_REST]
     return max(start, float(moving[-1])) if len(moving) else start
 
 
-def judge(log: CellLog, start: float, ended: float, back: float | None, watchdog: float) -> Iterator[str]:
-    """What is wrong with what the robot did since `start`."""
+def problems_of(log: CellLog, start: float, ended: float, link_back: float | None, watchdog: float) -> Iterator[str]:
+    """Describe each wrong motion or command since `start` [s]."""
     commanded, moving = max([start, *log.arrivals()]), last_moving(log, start)
     if moving > commanded + watchdog + BRAKING:
         yield f"it moved {moving - commanded:.2f} s after the last command"
@@ -324,13 +324,13 @@ def judge(log: CellLog, start: float, ended: float, back: float | None, watchdog
         yield f"it still moves {log.times[-1] - commanded:.2f} s after the last command"
     if last_motion(log, start) > ended:
         yield "a command came after the end"
-    late = 0 if back is None else int((log.motions() > back).sum())
+    late = 0 if link_back is None else int((log.motions() > link_back).sum())
     if late:
         yield f"{late} commands from before the cut arrived after it"
 
 
 def read_recording(path: Path) -> Recorded:
-    """What is readable of a recording, also of one that was cut, or is written meanwhile."""
+    """The readable content of a recording, which may be incomplete or still being written."""
     topics, ticks, events = dict[int, str](), list[float](), list[str]()
     damage = (McapError, ZstdError, struct.error, ValueError, EOFError, OverflowError, MemoryError)
     with contextlib.suppress(FileNotFoundError, *damage), path.open("rb") as file:
@@ -354,12 +354,12 @@ def run_with_jumping_clock(file: Path, arguments: list[str]) -> None:
 
 
 def main() -> None:
-    """Print the matrix; exit status 1 if something is wrong."""
+    """Print the matrix; exit status 1 if a row has a problem."""
     if sys.argv[1:2] == ["--jumping-clock"]:
         run_with_jumping_clock(Path(sys.argv[2]), sys.argv[3:])
         return
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--only", action="append", help="faults whose name has this text; may be given several times")
+    parser.add_argument("--only", action="append", help="run faults whose names contain this text; may be repeated")
     parser.add_argument("--checkpoint", type=Path, default=CHECKPOINT, help="the policy; its environment has a robot")
     parser.add_argument("--plain", action="store_true", help="a robot without sessions, halt topic and description")
     parser.add_argument("--json", action="store_true", help="print one JSON object a fault instead of a table")

@@ -50,7 +50,7 @@ def test_a_typo_is_refused(matrix, monkeypatch, capsys, flags, text):
 )
 def test_the_robot_rests_and_the_operator_knows_why(matrix, cell, monkeypatch, name, status, said):
     monkeypatch.setattr(matrix, "BRAKING", 5.0)  # on a busy computer
-    fault = next(one for one in matrix.FAULTS if one.name == name)
+    fault = next(fault for fault in matrix.FAULTS if fault.name == name)
     outcome = None
     for _ in range(3):
         with contextlib.suppress(RuntimeError):  # guards stop a deployment before its fault: the computer is too busy

@@ -1,8 +1,7 @@
-"""A robot cell for tests of faults: a robot with a watchdog, its driver and a rosbridge server, a process each.
+"""A robot cell for fault tests: a robot with a watchdog, its driver and a rosbridge server, in one process each.
 
-Each process can be killed alone, as in a real cell. The robot keeps time by itself, rests when it hears no command for
-its command timeout, and writes down at every tick what it was told and how fast it moved. The driver can be told to
-publish wrong states.
+Each process can be killed alone, as in a real cell. The robot runs in real time, stops when no command arrives for its
+command timeout, and logs its command and its speed at every tick. The driver can publish faulty states on request.
 """
 
 from __future__ import annotations
@@ -45,18 +44,18 @@ from bam_envs.rosbridge.sessions import LEASE_TOPIC, SESSION_SERVICE
 Array = NDArray[np.float64]
 _PROCESSES = multiprocessing.get_context("spawn")
 _START = 60.0
-"""Longest time that a process takes to start [s]."""
+"""Maximum time for the start of a process [s]."""
 _HOUR = 3600.0
-_WIRE = 1 << 16
-"""Longest message between robot and driver [bytes]."""
+_MAX_MESSAGE = 1 << 16
+"""Maximum size of a message between robot and driver [bytes]."""
 
 
 class StateFault(IntEnum):
-    """What is wrong with the states that the driver publishes."""
+    """Faults of the states that the driver publishes."""
 
     NONE = 0
     SILENT = 1
-    """None is published."""
+    """No state is published."""
     SHORT = 2
     """The last joint is missing."""
     CLOCK = 3
@@ -65,16 +64,16 @@ class StateFault(IntEnum):
 
 @dataclass(frozen=True)
 class CellLog:
-    """What the robot was told and how it moved, one row a tick."""
+    """Commands and motion of the robot, one row for each tick."""
 
     times: Array
     """Monotonic clock, the same in all processes [s]. Shape: (n,)."""
     commands: Array
     """Number of commands that have arrived. Shape: (n,)."""
     resting: Array
-    """1 while it executes no command, else 0. Shape: (n,)."""
+    """1 while the robot executes no command, else 0. Shape: (n,)."""
     targets: Array
-    """The command that it executes [SI]. Shape: (n, m)."""
+    """The command that the robot executes [SI]. Shape: (n, m)."""
     speeds: Array
     """The greatest measured speed of a joint, or of the base [rad/s or m/s]. Shape: (n,)."""
     is_base: bool
@@ -86,14 +85,14 @@ class CellLog:
         return times
 
     def motions(self) -> Array:
-        """Times of the commands that ask for motion [s]: a base's that are not 0, an arm's that are new."""
+        """Times of the motion commands [s]: for a base those that are not 0, for an arm those that are new."""
         arrived = np.diff(self.commands, prepend=self.commands[:1]) > 0
         moves = self.targets if self.is_base else np.diff(self.targets, axis=0, prepend=self.targets[:1])
         times: Array = self.times[arrived & (np.abs(moves).max(axis=1, initial=0.0) > 1e-6)]
         return times
 
     def since(self, start: float) -> CellLog:
-        """The rows from `start` on, and the one before."""
+        """The rows from `start` [s] on, and the row before."""
         first = max(0, int(np.searchsorted(self.times, start)) - 1)
         fields = self.times, self.commands, self.resting, self.targets, self.speeds
         times, commands, resting, targets, speeds = (values[first:] for values in fields)
@@ -105,7 +104,7 @@ class RobotCell:
 
     Args:
         env_id: The environment of the robot.
-        describes_itself: False: a robot like those of other makers, without a halt topic, sessions and description.
+        describes_itself: False for a robot like those of other makers, without halt topic, sessions and description.
     """
 
     def __init__(self, env_id: str, *, describes_itself: bool = True) -> None:
@@ -116,7 +115,7 @@ class RobotCell:
         self.command_timeout = profile_for(self.spec).command_life(self.spec.period)
         """The robot's watchdog [s]."""
         self._fault: Any = _PROCESSES.Value(ctypes.c_int, StateFault.NONE, lock=False)
-        self._port: Any = _PROCESSES.Value(ctypes.c_int, 0, lock=False)  # a free one, which a restarted bridge keeps
+        self._port: Any = _PROCESSES.Value(ctypes.c_int, 0, lock=False)  # a free port, which a restarted bridge keeps
         self._stack = contextlib.ExitStack()
 
     def __enter__(self) -> RobotCell:
@@ -131,8 +130,8 @@ class RobotCell:
             """The running processes: ``robot``, ``driver`` and ``bridge``; each has ``kill()``."""
             robot = self._start("robot", run_robot, self._env_id, near, self._path)
             bridge = self._start("bridge", run_bridge, self._port)
-            told = self.spec, far, self._port, self._fault, self._describes_itself, bridge
-            _await([robot, bridge, self._start("driver", run_driver, *told)])
+            arguments = self.spec, far, self._port, self._fault, self._describes_itself, bridge
+            _await([robot, bridge, self._start("driver", run_driver, *arguments)])
             self._stack = stack.pop_all()
         return self
 
@@ -151,15 +150,15 @@ class RobotCell:
         process.join()
 
     def restart_bridge(self) -> None:
-        """Start a bridge at the address of the one that was killed; returns when it listens."""
+        """Start a bridge at the address of the killed bridge; returns when it listens."""
         _await([self._start("bridge", run_bridge, self._port)])
 
     def publish_wrongly(self, fault: StateFault) -> None:
-        """Let the driver publish wrong states from now on."""
+        """Let the driver publish faulty states from now on."""
         self._fault.value = fault
 
     def log(self) -> CellLog:
-        """What the robot was told, and how it moved, until now."""
+        """Commands and motion of the robot so far."""
         size = len(self.spec.command.labels)
         data = np.fromfile(self._path)
         rows = data[: len(data) // (size + 4) * (size + 4)].reshape(-1, size + 4)
@@ -193,7 +192,7 @@ def _be_another_computer() -> None:
 
 
 def run_robot(env_id: str, wire: socket.socket, path: Path, ready: Any) -> None:
-    """The main function of the robot's process: it takes orders and sends states on `wire`, and writes its log."""
+    """Main function of the robot's process: it receives method calls and sends states on `wire`, and writes its log."""
     _be_another_computer()
     env: Any = gym.make(env_id, disable_env_checker=True).unwrapped
     profile = profile_for(env.robot.spec)
@@ -227,14 +226,14 @@ def run_robot(env_id: str, wire: socket.socket, path: Path, ready: Any) -> None:
 def _received(wire: socket.socket) -> list[Any]:
     """The messages that have arrived on `wire`."""
     messages = []
-    with contextlib.suppress(OSError):  # no more of them, or the other end is gone
+    with contextlib.suppress(OSError):  # no further message, or the other end is closed
         while True:
-            messages.append(pickle.loads(wire.recv(_WIRE)))
+            messages.append(pickle.loads(wire.recv(_MAX_MESSAGE)))
     return messages
 
 
 def _send(wire: socket.socket, message: object) -> None:
-    with contextlib.suppress(OSError):  # the other end is full, or gone
+    with contextlib.suppress(OSError):  # the buffer is full, or the other end is closed
         wire.send(pickle.dumps(message))
 
 
@@ -276,7 +275,7 @@ class DrivenRobot:
 
 
 class _DriversBus(Bus):
-    """The driver's link, with the faults of its states, and for a robot that does not describe itself."""
+    """The driver's link, which adds the faults of its states and can hide the robot's description."""
 
     def __init__(self, link: RosbridgeLink, fault: Any, describes_itself: bool) -> None:
         self._link, self._fault, self._describes_itself = link, fault, describes_itself
@@ -312,12 +311,12 @@ class _DriversBus(Bus):
 
 
 def _untagged(message: Message) -> Message:
-    """The message without the field in which our tags are."""
+    """The message without the field that holds a tag."""
     return {key: value for key, value in message.items() if key not in ("layout", "header")}
 
 
 def _shortened(message: Message) -> Message:
-    """A sensor_msgs/JointState without its last joint; any other message as it is."""
+    """A sensor_msgs/JointState without its last joint; any other message unchanged."""
     if "name" not in message:
         return message
     return {key: value[:-1] if isinstance(value, list) else value for key, value in message.items()}
@@ -326,7 +325,7 @@ def _shortened(message: Message) -> Message:
 def run_driver(
     spec: RobotSpec, wire: socket.socket, port: Any, fault: Any, describes_itself: bool, bridge: Any, ready: Any
 ) -> None:
-    """The main function of the driver's process: topics of the robot on the server at `port`, once `bridge` is set."""
+    """Main function of the driver's process: offers the robot on the server at `port` once `bridge` is set."""
     _be_another_computer()
     profile = profile_for(spec)
     bridge.wait(_START)
@@ -340,7 +339,7 @@ def run_driver(
 
 
 def run_bridge(port: Any, ready: Any) -> None:
-    """The main function of the bridge's process, on `port`, which it sets if it is 0."""
+    """Main function of the bridge's process; it listens on `port`, which it sets if it is 0."""
     _be_another_computer()
     port.value = BridgeServer(port=port.value).start().port
     ready.set()
@@ -351,7 +350,7 @@ _POSITION = re.compile(rb'("(?:position|x)": ?\[?)(-?[0-9.e-]{4,})')
 
 
 def _null(found: re.Match[bytes]) -> bytes:
-    """Null in the place of a number, as long as it is: the length of a frame does not change."""
+    """Replace a number by null, padded to its length, so that the length of the frame does not change."""
     return found[1] + b"null".ljust(len(found[2]))
 
 
@@ -359,10 +358,10 @@ def _null(found: re.Match[bytes]) -> bytes:
 
 
 class Network:
-    """Passes connections on to a port, with faults on request; a context manager.
+    """Forwards connections to a port, with faults on request; a context manager.
 
     Args:
-        port: Of the server on 127.0.0.1.
+        port: Port of the server on 127.0.0.1.
     """
 
     def __init__(self, port: int) -> None:
@@ -370,7 +369,7 @@ class Network:
         self._works = asyncio.Event()
         self._works.set()
         self.nulls = False
-        """Whether a position in each state arrives as null, which rosbridge sends for NaN."""
+        """Whether a position in each state is replaced by null, which rosbridge sends for NaN."""
         self._thread = threading.Thread(target=self._loop.run_forever, daemon=True)
         self._listener = socket.create_server(("127.0.0.1", 0))
         self._listener.setblocking(False)
@@ -393,11 +392,11 @@ class Network:
         return f"ws://127.0.0.1:{self._listener.getsockname()[1]}"
 
     def freeze(self) -> None:
-        """Deliver nothing more; what is sent is kept."""
+        """Hold all data back; it is buffered."""
         self._loop.call_soon_threadsafe(self._works.clear)
 
     def thaw(self) -> None:
-        """Deliver again, first what was kept."""
+        """Deliver the buffered data, and all data from now on."""
         self._loop.call_soon_threadsafe(self._works.set)
 
     async def _end(self) -> None:
@@ -408,13 +407,13 @@ class Network:
         await asyncio.gather(*others, return_exceptions=True)
 
     async def _accept(self) -> None:
-        carried = set()  # the loop itself keeps only weak references
+        tasks = set()  # the loop keeps only weak references
         while True:
             near, _ = await self._loop.sock_accept(self._listener)
-            carried.add(self._loop.create_task(self._carry(near)))
+            tasks.add(self._loop.create_task(self._forward(near)))
 
-    async def _carry(self, near: socket.socket) -> None:
-        """Carry one connection; plain sockets also deliver what a client sent before it reset the connection."""
+    async def _forward(self, near: socket.socket) -> None:
+        """Forward one connection; plain sockets also deliver data that a client sent before a reset of the connection."""
         with near, socket.socket() as far:
             far.setblocking(False)
             with contextlib.suppress(OSError):
@@ -424,7 +423,7 @@ class Network:
 
     async def _pump(self, source: socket.socket, sink: socket.socket) -> None:
         try:
-            while data := await self._loop.sock_recv(source, _WIRE):
+            while data := await self._loop.sock_recv(source, _MAX_MESSAGE):
                 await self._works.wait()
                 await self._loop.sock_sendall(sink, _POSITION.sub(_null, data) if self.nulls else data)
         finally:
