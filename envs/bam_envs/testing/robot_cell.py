@@ -413,7 +413,7 @@ class Network:
             tasks.add(self._loop.create_task(self._forward(near)))
 
     async def _forward(self, near: socket.socket) -> None:
-        """Forward one connection; plain sockets also deliver data that a client sent before a reset of the connection."""
+        """Forward one connection; plain sockets also deliver data sent before a reset of the connection."""
         with near, socket.socket() as far:
             far.setblocking(False)
             with contextlib.suppress(OSError):
