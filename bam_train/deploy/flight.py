@@ -8,7 +8,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from importlib.metadata import version
 from pathlib import Path
 from time import perf_counter
-from typing import Any
+from typing import Any, cast
 
 import gymnasium as gym
 import numpy as np
@@ -73,7 +73,7 @@ def recording_names(env_id: str) -> list[Path]:
 
 def deployment_facts(checkpoint: Checkpoint, env: gym.Env[Any, Any]) -> dict[str, Any]:
     """Metadata of a deployment for its recording."""
-    manifest, robot = checkpoint.manifest, getattr(env.unwrapped, "robot", None)
+    manifest, robot = checkpoint.manifest, cast("Any", getattr(env.unwrapped, "robot", None))
     info = getattr(robot, "info", None)
     return {
         "checkpoint": str(checkpoint.path.resolve()),
@@ -82,6 +82,7 @@ def deployment_facts(checkpoint: Checkpoint, env: gym.Env[Any, Any]) -> dict[str
         "env_kwargs": manifest.env_kwargs,
         "period_s": control_period(env) or manifest.period,
         "robot": "" if info is None else info.text,
+        "profile": "" if info is None else robot.spec.name,
         "guards": getattr(robot, "report", dict)(),
         "versions": {"bam-train": version("bam-train"), "python": platform.python_version()},
     }

@@ -17,8 +17,9 @@ from bam_envs.safety.gate import SafeRobot
 from bam_envs.tasks.pick import PickTask
 from bam_envs.tasks.reach import ReachTask
 from bam_envs.testing.drivers import DrivenRobot
+from bam_train.checkpoint import Checkpoint
 from bam_train.deploy.deployment import Deployment
-from bam_train.deploy.flight import flight_recorder, recording_names
+from bam_train.deploy.flight import deployment_facts, flight_recorder, recording_names
 from bam_train.deploy.journal import Ending, Journal
 
 
@@ -181,6 +182,14 @@ def test_pictures_and_whole_numbers_are_recorded(recorded):
     assert found["/episode"][1]["success"] == found["/episode"][1]["terminated"] == 1.0
     assert "/state" not in found
     assert json.loads(found["metadata"]["layout"]["observation"]) == {"level": ["<f4", 1, 2]}
+
+
+def test_a_recording_names_the_profile_of_a_live_robot(corridor_checkpoint):
+    checkpoint = Checkpoint.open(corridor_checkpoint())
+    for options, name in (({"robot": "ws://10.0.0.5:9090", "profile": "ur5e_trajectory"}, "ur5e_trajectory"), ({}, "")):
+        env = gym.make("bam/pick-v0", disable_env_checker=True, **options)
+        assert deployment_facts(checkpoint, env)["profile"] == name
+        env.close()
 
 
 def test_recordings_are_named_by_time_and_environment():
