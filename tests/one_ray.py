@@ -1,8 +1,21 @@
 """One Ray for every test that trains with it: the first one starts it, and the tests of Ray itself stop it."""
 
 import contextlib
+import inspect
+import sys
+from types import SimpleNamespace
 
 import pytest
+
+
+def make_connectors_quickly():
+    """Each connector of RLlib looks up the source of all its callers, of which it needs one; a test has dozens."""
+    connector_v2 = pytest.importorskip("ray.rllib.connectors.connector_v2")
+
+    def stack():
+        return [None, SimpleNamespace(frame=sys._getframe(2))]
+
+    connector_v2.inspect = SimpleNamespace(stack=stack, getargvalues=inspect.getargvalues)
 
 
 class SharedRay:
@@ -15,6 +28,7 @@ class SharedRay:
             from bam_train.settings import TrainSettings
             from bam_train.trainers.rllib.ray_cluster import cluster
 
+            make_connectors_quickly()
             self._stack.enter_context(cluster(TrainSettings(env="bam/reach-v0", algo="ppo", trainer="rllib")))
 
     def stop(self):

@@ -50,7 +50,7 @@ def test_no_robot_is_faster_than_its_task_lets_it_be(make_rows, env_id, randomiz
     assert 0.5 < seen <= slack
 
 
-@pytest.mark.parametrize("env_id", SCRIPTED)
+@pytest.mark.parametrize("env_id", each(SCRIPTED))
 @pytest.mark.parametrize("randomize", [False, True])
 @pytest.mark.parametrize("actions", ["random", "scripted"])
 def test_measured_speeds(make_rows, env_id, randomize, actions):
@@ -72,7 +72,7 @@ def test_measured_speeds(make_rows, env_id, randomize, actions):
     assert 0.1 < joint_speed <= JOINT_SPEED * SLACK
 
 
-@pytest.mark.parametrize("env_id", SCRIPTED)
+@pytest.mark.parametrize("env_id", each(SCRIPTED))
 def test_commanded_speeds_whatever_the_actions(make_rows, env_id):
     """To the limit for half a second each way, into the table and into the cube."""
     envs = make_rows(env_id, 16)

@@ -19,6 +19,9 @@ from bam_train.errors import PolicyError
 from bam_train.policy import FrozenPolicy
 from bam_train.trainers.algorithms import RLLIB_ALGORITHMS
 from bam_train.trainers.rllib.rllib_freezing import FrozenModule, RLlibPolicy, golden, one_by_one, parts_of
+from tests.one_ray import make_connectors_quickly
+
+make_connectors_quickly()
 
 NUMBERS = Box(-np.array([1, 2, 3], np.float32), np.array([1, 2, 3], np.float32))
 ARM = Box(-np.array([2, 3], np.float32), np.array([1, 5], np.float32))
