@@ -1,4 +1,4 @@
-"""The recorder of a deployment: a tick hands its numbers to another process, which encodes them and writes the file.
+"""The recorder of a deployment: it passes the numbers of each tick to another process, which encodes and writes them.
 
 Topics of the file, as JSON with a schema:
 
@@ -6,14 +6,14 @@ Topics of the file, as JSON with a schema:
 topic          content
 =============  ======================================================================================
 /state         each signal of the robot by label, SI units; ``stamp`` is the robot's own time [s]
-/truth         what only a simulation knows, such as contacts
+/truth         values that only a simulation has, such as contacts
 /observation   each number of the observation by name
 /action        each number of the policy's action by name
 /command       each number of the command that was sent, after the guards, by label, SI units
 /status        ``code`` (0 is fine, else the guard's number) and the ``guard`` that changed the command
 /latency       time of each stage of the tick, by name [s]
 /episode       episode, step, reward, terminated, truncated and success
-/events        foxglove.Log: what the operator did and was told
+/events        foxglove.Log: actions of the operator, and messages to the operator
 /sent          commands outside the ticks, with the state that each led to: on the way to the start pose of a
                live robot, and the last one before a fault
 /camera/NAME   foxglove.CompressedImage
@@ -22,7 +22,7 @@ topic          content
 
 The log time of a message is the wall clock; ``t`` in it is the monotonic clock [s]. All messages of a tick have the
 same sequence number. /command and /status have the time at which the command was sent, a step before the state that it
-led to. A number that is not finite is null. The metadata record ``deployment`` says what was deployed.
+led to. A number that is not finite is null. The metadata record ``deployment`` describes the deployment.
 """
 
 import json
@@ -49,9 +49,9 @@ _PROGRAM = (  # without the folder it is started in, whose files could hide ours
     "import sys; sys.path[:] = filter(None, sys.path); import bam_train.recording.recorder_process as it; it.main()"
 )
 _RING = 16 * 2**20
-_START, _END = 20.0, 10.0  # seconds that the process may take to start and to end
-_LOOK = 64
-"""Records between two looks at whether the process is alive."""
+_START, _END = 20.0, 10.0  # maximum time for the start and the end of the process [s]
+_CHECK = 64
+"""Number of records between two checks that the process is alive."""
 
 
 class Camera(Protocol):
@@ -70,13 +70,13 @@ class Camera(Protocol):
 class Recorder:
     """Writes one MCAP file from another process; after `start`, only `close` waits for the disk.
 
-    Once something fails, nothing more is recorded: `fault` says why, and a warning is logged.
+    The first failure ends the recording: `fault` has its cause, and a warning is logged.
 
     Args:
         path: The file; an existing one is refused, missing folders are made.
-        metadata: Text by name, for whoever opens the file; may be changed until `start`.
+        metadata: Text by name, for readers of the file; may be changed until `start`.
         guards: Titles of the guards, such as ``"joint speed (G8)"``, for `/status`.
-        size: Bytes of memory for what is not on the disk yet.
+        size: Size of the buffer for data that is not on the disk yet [bytes].
         others: Where there is a file at `path` already, the first of these files that is not there is made instead,
             and is `path` from `start` on.
     """
@@ -140,22 +140,22 @@ class Recorder:
 
     @property
     def fault(self) -> str:
-        """Why nothing is recorded any more; "" while all is well."""
+        """Cause of the end of the recording; "" while it works."""
         return self._fault or ("" if self._ring is None else self._ring.failure)
 
     def place(self, guard: str) -> int:
-        """The number by which a tick names the guard with this title; 0 for none."""
+        """Index of the guard with this title in `guards`, for a tick; 0 for none."""
         return self._places.get(guard, 0)
 
     def declare(
         self, layout: Mapping[str, Sequence[str]], extra: Mapping[str, str] | None = None, series: int = 0
     ) -> None:
-        """Say which numbers a tick has from now on.
+        """Declare the numbers of a tick from now on.
 
         Args:
             layout: Topic to the names of its numbers, in the order of a tick; ``group.name`` is shown as a table.
-            extra: Text by name that readers of the numbers need, kept as the metadata record ``layout``.
-            series: Which ticks: 0 for those of the loop.
+            extra: Text by name for readers of the numbers, stored as the metadata record ``layout``.
+            series: Number of the series of ticks; 0 for those of the loop.
         """
         content = {"layout": {topic: list(names) for topic, names in layout.items()}, "extra": dict(extra or {})}
         if content != self._declared.get(series):
@@ -165,12 +165,12 @@ class Recorder:
     def tick(
         self, arrays: Iterable[NDArray[Any]], numbers: Sequence[float] = (), sent_ago: float = 0.0, series: int = 0
     ) -> None:
-        """Record one tick, whose numbers, one after the other, are those of the layout.
+        """Record one tick, with the numbers in the order of the layout.
 
         Args:
-            arrays: Arrays of any shape; bool and whole numbers are recorded as numbers.
+            arrays: Arrays of any shape and numeric dtype, recorded as float64.
             numbers: The numbers after those of the arrays.
-            sent_ago: How long ago the command of this tick was sent [s].
+            sent_ago: Time since the command of this tick was sent [s].
             series: As in `declare`.
         """
         if self._fault:
@@ -185,13 +185,13 @@ class Recorder:
         self._write(TICK, content, sent_ago, series)
 
     def event(self, text: str, level: int = INFO) -> None:
-        """Record what the operator did or was told."""
+        """Record an action of the operator, or a message to the operator."""
         self._write(EVENT, bytes([level]) + text.encode(errors="replace"))
 
     def image(self, camera: str, form: str, data: bytes) -> None:
         """Record one encoded image of a camera; `form` is its format: jpeg, png or webp.
 
-        Where the disk is behind, images are left out first: half of the memory is kept for the ticks.
+        On a slow disk, images are left out first: half of the buffer is reserved for ticks.
         """
         self._write_picture(IMAGE, [camera, form], data)
 
@@ -222,11 +222,11 @@ class Recorder:
         self._writes += 1
         if not self._ring.write(b"".join((kind, TIMES.pack(time.time_ns(), time.monotonic(), ago, series), data))):
             self._fail(self._ring.failure or f"{self.path}: the disk is too slow; nothing is recorded from now on")
-        elif self._writes % _LOOK == 0 and (fault := self._status()):
+        elif self._writes % _CHECK == 0 and (fault := self._status()):
             self._fail(fault)
 
     def _status(self) -> str:
-        """What ended the process early; "" if nothing did."""
+        """Cause of an early end of the process; "" while it runs."""
         status = None if self._process is None else self._process.poll()
         if status is None or self.fault:
             return self.fault

@@ -1,8 +1,8 @@
-"""The process that writes a recording: it takes records out of the ring, encodes them and flushes them to the disk.
+"""The process that writes a recording: it reads records from the ring, encodes them and flushes them to the disk.
 
-It ends the file properly when the deployment closes the ring, and also when the deployment's process is gone. What a
-kill of this process may cost is one look into the ring: the messages of each look are appended as a small chunk of
-their own, and `_SETTLE` later one compressed chunk with an index takes the place of these.
+It completes the file when the deployment closes the ring, and also when the deployment's process has ended. If this
+process is killed, at most the messages since the last poll are lost: the messages of each poll are appended as a small
+chunk, and every `_SETTLE` seconds one compressed chunk with an index replaces the small chunks.
 """
 
 import base64
@@ -26,13 +26,13 @@ from mcap.writer import CompressionType, Writer
 from bam_train.recording.ring import EVENT, IMAGE, LAYOUT, PIXELS, TICK, TIMES, Ring
 
 _POLL = 0.02
-"""Time between two looks into the ring [s]."""
+"""Time between two polls of the ring [s]."""
 _SETTLE = 0.5
-"""Time between two chunks with an index, which are flushed to the disk itself [s]: twice that may a power cut cost."""
+"""Time between two chunks with an index, which are synced to the disk [s]; a power cut may cost twice that."""
 _SENT = ("/command", "/status")
-"""Topics with the time at which the command was sent."""
+"""Topics whose time is that of sending the command."""
 _GUARDED = ("/status", "/sent")
-"""Topics that name a guard, whose place in the list the tick has."""
+"""Topics that name a guard; the tick has its index in the list."""
 _NUMBER, _TEXT, _WHOLE = {"type": "number"}, {"type": "string"}, {"type": "integer"}
 _STAMP = {"type": "object", "properties": {"sec": _WHOLE, "nsec": _WHOLE}}
 _IMAGE = {"timestamp": _STAMP, "frame_id": _TEXT, "data": {"type": "string", "contentEncoding": "base64"}}
@@ -44,11 +44,11 @@ _KNOWN = {
     "foxglove.RawImage": {**_IMAGE, **_SIZE, "encoding": _TEXT},
 }
 """Properties of Foxglove's own schemas."""
-_encode = msgspec.json.Encoder().encode  # what is not finite becomes null
+_encode = msgspec.json.Encoder().encode  # NaN and infinity become null
 
 
 class RecordingFile:
-    """The MCAP file, and what was registered in it."""
+    """The MCAP file, with its channels and layouts."""
 
     def __init__(self, head: dict[str, Any]) -> None:
         self.file = _new_file(head["paths"])
@@ -60,7 +60,7 @@ class RecordingFile:
         self._channels: dict[str, int] = {}
         self._sequences: Counter[int] = Counter()
         self._new = RecordBuilder()
-        """Messages since the last look into the ring."""
+        """Messages since the last poll of the ring."""
         self._begin = self._end = self.file.tell()  # of the small chunks
         self._metadata("deployment", {key: _text(value) for key, value in head["metadata"].items()})
 
@@ -137,7 +137,7 @@ class RecordingFile:
         Message(channel, wall, data, wall, sequence).write(self._new)
 
     def save(self) -> None:
-        """Append the new messages as a small chunk, where this process's end cannot harm them any more."""
+        """Append the new messages as a small chunk, so that a kill of this process does not lose them."""
         if not self._new.count:
             return
         data: bytes = self._new.end()  # type: ignore[no-untyped-call]
@@ -150,7 +150,7 @@ class RecordingFile:
         self.file.seek(self._begin)
 
     def settle(self) -> None:
-        """Put one chunk in the place of the small ones, and flush it to the disk itself."""
+        """Replace the small chunks by one chunk, and sync it to the disk."""
         self._new.end()  # type: ignore[no-untyped-call]
         self.file.seek(self._begin)
         self._writer.flush()  # type: ignore[no-untyped-call]
@@ -176,7 +176,7 @@ def _new_file(paths: list[str]) -> BinaryIO:
 
 
 def _text(value: str) -> str:
-    """The text without what UTF-8 cannot have, such as parts of a file name in another encoding."""
+    """The text without characters that UTF-8 cannot encode, such as those of file names in other encodings."""
     return value.encode(errors="replace").decode()
 
 
@@ -189,10 +189,10 @@ def nested(values: list[tuple[list[str], Any]]) -> dict[str, Any]:
 
 
 def drain(ring: Ring, file: RecordingFile, parent: int) -> None:
-    """Write the records of the ring into the file until it is closed, or the process `parent` is gone."""
+    """Write the records of the ring into the file until the ring is closed, or the process `parent` has ended."""
     settled = time.monotonic()
     while True:
-        over = ring.closed or os.getppid() != parent  # looked at first: what was written before is still read
+        over = ring.closed or os.getppid() != parent  # checked first, so that earlier records are still read
         while (record := ring.read()) is not None:
             file.add(record)
         if over:
@@ -227,4 +227,4 @@ def main() -> None:
             what = "a folder" if Path(last).is_dir() else "a recording"
             why = f"{what} is there already. Choose another file"
         ring.fail(f"{last}: {why}")
-    os._exit(1)  # Python would try to write again what its buffer still holds
+    os._exit(1)  # skips Python's attempt to write its buffer again

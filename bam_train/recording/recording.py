@@ -1,4 +1,4 @@
-"""Reading a recording, also one that was cut off or damaged: everything before that place is there."""
+"""Read a recording; one that was cut off or damaged is read up to that place."""
 
 import json
 import struct
@@ -20,16 +20,16 @@ from bam_train.errors import BadRecording
 
 Array = NDArray[np.float64]
 TICKS = ("/state", "/truth", "/command", "/observation", "/action", "/status", "/latency", "/episode")
-"""Topics with one message for each tick; robots alone have the first three."""
+"""Topics with one message for each tick; the first three need a robot."""
 _ALWAYS = ("/action", "/status", "/latency", "/episode")
-"""Those that every deployment has."""
+"""Topics that every deployment has."""
 _Rows: TypeAlias = dict[str, list[tuple[int, dict[str, Any]]]]
-"""Topic to the time and the content of its messages."""
-_MOST_CHUNK = 2**28  # bytes of a chunk, unpacked: a camera's largest picture is far smaller
+"""Topic to time [ns] and content of each message."""
+_MAX_CHUNK = 2**28  # of an unpacked chunk [bytes]; a camera's largest picture is far smaller
 _LENGTH = (LookupError, OverflowError, EOFError, MemoryError)
 _DAMAGE = (McapError, ZstdError, msgspec.MsgspecError, struct.error, ValueError, *_LENGTH)
 _FOREIGN = (msgspec.MsgspecError, ValueError, LookupError, TypeError, OverflowError, RecursionError)
-"""Exceptions for the content of messages that we did not write."""
+"""Exceptions for messages with unexpected content."""
 _decode = msgspec.json.Decoder().decode
 
 
@@ -51,7 +51,7 @@ class Table:
 
 @dataclass(frozen=True)
 class Event:
-    """What the operator did or was told."""
+    """An action of the operator, or a message to the operator."""
 
     time: int
     """Wall clock [ns]."""
@@ -65,7 +65,7 @@ class Recording:
 
     path: Path
     metadata: dict[str, str] = field(default_factory=dict)
-    """What was deployed; see `bam_train.deploy.flight.deployment_facts`."""
+    """Description of the deployment; see `bam_train.deploy.flight.deployment_facts`."""
     kinds: dict[str, dict[str, list[Any]]] = field(default_factory=dict)
     """Dtype and shape of each array of ``truth``, ``observation`` and ``action``."""
     tables: dict[str, Table] = field(default_factory=dict)
@@ -74,14 +74,14 @@ class Recording:
     """The guard that changed the command that led to each tick; "" for none."""
     events: list[Event] = field(default_factory=list)
     complete: bool = False
-    """Whether the recorder ended the file; else it was cut off or damaged, and its end is missing."""
+    """Whether the recorder completed the file; else it was cut off or damaged."""
 
     @classmethod
     def open(cls, path: str | Path) -> "Recording":
         """Read a recording up to its end, or to the place where it is cut off or damaged; without its pictures.
 
         Raises:
-            BadRecording: There is no such file, or it is no recording of `bam-deploy`.
+            BadRecording: There is no such file, or it is not a recording of `bam-deploy`.
         """
         recording = cls(Path(path).expanduser())
         rows: _Rows = {topic: [] for topic in TICKS}
@@ -144,7 +144,7 @@ class Recording:
             self.events.append(Event(message.log_time, int(content["level"]), str(content["message"])))
 
     def _fill(self, rows: _Rows) -> None:
-        ticks = min(map(len, rows.values()), default=0)  # of the last tick, some messages may be missing
+        ticks = min(map(len, rows.values()), default=0)  # the last tick may be incomplete
         self.guards = [str(content.pop("guard", "")) for _, content in rows.get("/status", [])[:ticks]]
         for topic, messages in rows.items():
             flat = [_flat(content) for _, content in messages[:ticks]]
@@ -166,7 +166,7 @@ class Recording:
         return [range(start, end) for start, end in zip(starts, [*starts[1:], self.ticks], strict=True)]
 
     def arrays(self, kind: str) -> dict[str, NDArray[Any]]:
-        """The arrays of ``"observation"``, ``"action"`` or ``"truth"``, (ticks, ...) each; an only one is called ""."""
+        """The arrays of ``"observation"``, ``"action"`` or ``"truth"``, (ticks, ...) each; "" names a single one."""
         table = self.tables.get(f"/{kind}")
         try:
             return {} if table is None else _split(table.numbers[:, 1:], self.kinds.get(kind, {}))
@@ -208,8 +208,8 @@ class Recording:
 def _unpacked(record: McapRecord) -> list[McapRecord]:
     if not isinstance(record, Chunk):
         return [record]
-    if record.uncompressed_size > _MOST_CHUNK:
-        raise ValueError("a chunk that no recorder writes")
+    if record.uncompressed_size > _MAX_CHUNK:
+        raise ValueError("the chunk is too large")
     return breakup_chunk(record, validate_crc=True)
 
 
@@ -222,7 +222,7 @@ def _flat(content: dict[str, Any]) -> dict[str, Any]:
 
 
 def _split(numbers: Array, kinds: dict[str, list[Any]]) -> dict[str, NDArray[Any]]:
-    """Numbers (ticks, k), one array after the other, as the arrays that they were."""
+    """Split numbers (ticks, k) into the recorded arrays."""
     arrays, at = {}, 0
     for name, (dtype, *shape) in kinds.items():
         size = int(np.prod(shape))

@@ -1,4 +1,4 @@
-"""A ring of records in memory that two processes share: one writes and never waits, the other reads.
+"""A ring buffer of records in shared memory: one process writes without waiting, another one reads.
 
 The memory begins with a head of 8 KiB (`_Head`); the rest is the ring. Each record is its size, a CRC-32 and its
 bytes, padded to 8. The writer stores the bytes first and the new end afterwards; where the processor swaps the two, the
@@ -16,7 +16,7 @@ from typing import Any
 TICK, LAYOUT, EVENT, IMAGE, PIXELS = b"T", b"L", b"E", b"I", b"P"
 """Kinds of records, as their first byte."""
 TIMES = struct.Struct("=qddB")
-"""Then: wall clock [ns], monotonic clock [s], how long before that the command was sent [s], and the series."""
+"""Following fields: wall clock [ns], monotonic clock [s], time since the command was sent [s], and the series."""
 _RECORD = struct.Struct("=II")
 _HEAD = 8192
 _TEXT = 8000
@@ -50,13 +50,13 @@ class Ring:
 
     def __init__(self, descriptor: int) -> None:
         now = {"flags": mmap.MAP_SHARED | mmap.MAP_POPULATE} if hasattr(mmap, "MAP_POPULATE") else {}
-        self._map = mmap.mmap(descriptor, 0, **now)  # its pages exist from now on, not from their first use in a tick
+        self._map = mmap.mmap(descriptor, 0, **now)  # maps all pages now instead of at their first use in a tick
         self._head: Any = _Head.from_buffer(self._map)
         self._bytes = memoryview(self._map)[_HEAD:]
         self._size = len(self._bytes)
 
     def write(self, data: bytes) -> bool:
-        """Append a record; False if there is no room for it, or the reader has failed."""
+        """Append a record; False if the buffer is full, or the reader has failed."""
         size = (_RECORD.size + len(data) + 7) & ~7
         start = self._head.written
         if start + size - self._head.read > self._size or self._head.failed:
@@ -67,7 +67,7 @@ class Ring:
 
     @property
     def room(self) -> int:
-        """Bytes that are free."""
+        """Free space [bytes]."""
         return self._size - int(self._head.written - self._head.read)
 
     def read(self) -> bytes | None:
@@ -87,7 +87,7 @@ class Ring:
         self._head.ready = number
 
     def close(self) -> None:
-        """The writer's last act."""
+        """Called by the writer at its end."""
         self._head.closed = 1
 
     @property
@@ -101,13 +101,13 @@ class Ring:
         return bool(self._head.closed)
 
     def fail(self, reason: str) -> None:
-        """The reader's last act, if it cannot go on."""
+        """Called by the reader if it cannot continue, with the cause."""
         self._head.reason = reason.encode(errors="replace")[: _TEXT - 1]
         self._head.failed = 1
 
     @property
     def failure(self) -> str:
-        """Why the reader cannot go on; "" if it can."""
+        """Cause of a failure of the reader; "" for none."""
         return self._head.reason.decode(errors="replace") if self._head.failed else ""
 
     def _put(self, position: int, data: bytes) -> None:
