@@ -51,6 +51,14 @@ class Playback:
         self.worst = max(self.worst, float(np.abs(action - recorded).max()))
 
 
+def require_same_env(recording: Recording, checkpoint: Checkpoint) -> None:
+    """Raise CheckpointMismatch unless `recording` is of the environment of `checkpoint`, if it says which it is of."""
+    recorded, trained = recording.metadata.get("env"), checkpoint.manifest.env
+    if recorded and not are_same(recorded, trained):
+        text = f"was trained on {trained}, and {recording.path} is of {recorded}. Give a checkpoint of {recorded}"
+        raise CheckpointMismatch(checkpoint.path, text)
+
+
 def replay_env(
     recording: Recording, checkpoint: Checkpoint, named: str | None = None, render_mode: str | None = None
 ) -> gym.Env[Any, Any]:
@@ -66,10 +74,7 @@ def replay_env(
         BadRecording: No robot was recorded, or another robot.
         CheckpointError: The checkpoint belongs to another environment, or its environment must be named.
     """
-    recorded, trained = recording.metadata.get("env"), checkpoint.manifest.env
-    if recorded and not are_same(recorded, trained):
-        text = f"was trained on {trained}, and {recording.path} is of {recorded}. Give a checkpoint of {recorded}"
-        raise CheckpointMismatch(checkpoint.path, text)
+    require_same_env(recording, checkpoint)
     env_id, kwargs = environment_of(checkpoint, named)
     kwargs = {name: value for name, value in kwargs.items() if name not in ROBOT_OPTIONS}
     entry, longest = entry_of(env_id), max(map(len, recording.episodes()), default=0) - 1

@@ -66,9 +66,13 @@ def _checkpoint(config: ReplayConfig, recording: Recording) -> Checkpoint | str:
 
 
 def _play(config: ReplayConfig, recording: Recording, checkpoint: Checkpoint) -> Playback:
+    from bam_train.environments import environment_of
     from bam_train.policy import FrozenPolicy
-    from bam_train.recording.playback import play, play_observations, replay_env
+    from bam_train.recording.playback import play, play_observations, replay_env, require_same_env
 
+    require_same_env(recording, checkpoint)
+    if config.env is not None:
+        environment_of(checkpoint, config.env, elsewhere=True)
     policy = FrozenPolicy.from_checkpoint(checkpoint)
     if "/state" not in recording.tables:
         return play_observations(recording, policy)

@@ -148,6 +148,11 @@ def test_an_environment_without_a_robot(corridor_checkpoint, tmp_path, capsys):
     lines = capsys.readouterr().out.splitlines()
     ticks = Recording.open(path).ticks
     assert lines[-1] == f"played: the same observation in {ticks} of {ticks} ticks, the same action in {ticks}"
+    assert call(replay, path, "--checkpoint", PICK) == 1
+    told = f"was trained on bam/pick-v0, and {path} is of test/Corridor-v0. Give a checkpoint of test/Corridor-v0"
+    assert capsys.readouterr() == ("", f"bam-replay: {PICK}: {told}\n")
+    assert call(replay, path, "--env", "bam/pick") == 1
+    assert "was trained on test/Corridor-v0, not on bam/pick" in capsys.readouterr().err
 
 
 def test_a_checkpoint_that_is_gone_or_changed(pick, corridor_checkpoint, tmp_path, capsys):
