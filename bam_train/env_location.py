@@ -28,7 +28,7 @@ class Place:
     timeout: float | None = None
     """Longest wait for an answer of `transport` [s]; None for its default."""
     guards: tuple[tuple[str, float], ...] = ()
-    """Names and values of limits of the live robot's guards that differ from the profile's."""
+    """Names and values of limits that replace those in the live robot's profile."""
     trial: bool | None = False
     """Whether a live robot is on trial: slow, and in a box around its start; None: if it is real."""
     shadow: bool = False
@@ -95,7 +95,7 @@ class Place:
         link = {"ca_file": self.ca_file, "token_file": self.token_file}
         guards = {"guards": dict(self.guards)} if self.guards else {}
         trial: dict[str, Any] = {}
-        if self.trial:  # with as much more time as it is slower
+        if self.trial:  # more steps in proportion to the lower speed
             steps = kwargs.get("max_episode_steps") or entry.max_episode_steps
             trial = {"trial": True, "max_episode_steps": -1 if steps == -1 else round(steps / TRIAL_SPEED)}
         shadow = {"shadow": True} if self.shadow else {}
@@ -103,7 +103,7 @@ class Place:
 
 
 SIMULATED: Mapping[str, Any] = {"randomize": False, "link": None, "action_delay": None}
-"""Arguments of an environment that only a simulated robot has, with their values for a perfect one."""
+"""Arguments of an environment that only a simulated robot has, with their values for an ideal one."""
 HERE = Place()
 """The simulation here."""
 
@@ -112,7 +112,7 @@ def read_guards(texts: Sequence[str]) -> tuple[tuple[str, float], ...]:
     """Parse the texts of ``--guard NAME=VALUE``.
 
     Raises:
-        SettingsError: There is no such limit, one comes twice or is outside its bounds, or two contradict each other.
+        SettingsError: A limit is unknown, repeated or outside its bounds, or two limits contradict each other.
     """
     values: dict[str, float] = {}
     for text in texts:

@@ -1,8 +1,8 @@
-"""How well checkpoints do when robot, link or computer are worse than in training; prints a table in Markdown.
+"""Evaluate checkpoints with disturbed robots, links and computers, and print a table in Markdown.
 
-Each column plays the same episodes: plain; with domain randomisation; with actions that reach the task two steps late,
-as those of a slow policy; with commands that reach the robot two steps late; and under each link profile. The share of
-the plain success that is left stands in brackets.
+Each column has the same episodes: plain; with domain randomisation; with actions that reach the task two steps late,
+like those of a slow policy; with commands that reach the robot two steps late; and with each link profile. The ratio to
+the plain success rate is in brackets.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from bam_train.policy import FrozenPolicy
 
 FOLDER = Path(__file__).resolve().parents[1] / "checkpoints"
 SEED = 3_000_000
-"""Seed of the first episode: neither training nor `bam-eval` has played it."""
+"""Seed of the first episode; neither training nor `bam-eval` uses it."""
 STEPS = 2
 """Delay of late actions and commands [steps]."""
 
@@ -47,10 +47,10 @@ def row(path: Path, episodes: int) -> list[str]:
     manifest = checkpoint.manifest
     entry = entry_of(manifest.env)
     if entry is None:
-        raise BamTrainError(f"{path}: {manifest.env} has no robot that a link could be put before; leave it out")
+        raise BamTrainError(f"{path}: {manifest.env} has no robot for a link; leave it out")
     policy, cells, plain = FrozenPolicy.from_checkpoint(checkpoint), [path.name], 0.0
-    for name, given in columns(entry.period).items():
-        report = evaluate(policy, manifest.env, {**manifest.env_kwargs, **given}, episodes=episodes, seed=SEED)
+    for name, options in columns(entry.period).items():
+        report = evaluate(policy, manifest.env, {**manifest.env_kwargs, **options}, episodes=episodes, seed=SEED)
         rate = report.success_rate or 0.0
         plain = rate if name == "plain" else plain
         cells.append(f"{rate:.1%}" + (f" ({rate / plain:.3f})" if plain and name != "plain" else ""))

@@ -53,9 +53,9 @@ def deploy_checkpoint(config: DeployConfig, signals: SignalMemory) -> int:
     if config.print_guards:
         return print_guards(config, checkpoint, place)
     admission = Admission(checkpoint, config.keys, config.allow_unsigned, config.trials, config.i_know)
-    asked: Any = {"episodes": config.episodes, "yes": config.yes, "render": config.render, "named": config.env}
-    asked |= {"wiggle": config.wiggle, "motion": config.motion}
-    env = connected_env(checkpoint, place, signals, who="bam-deploy", admit=admission, **asked)
+    options: Any = {"episodes": config.episodes, "yes": config.yes, "render": config.render, "named": config.env}
+    options |= {"wiggle": config.wiggle, "motion": config.motion}
+    env = connected_env(checkpoint, place, signals, who="bam-deploy", admit=admission, **options)
     try:
         pacer = Pacer(_period(config, checkpoint, env))
         recorder = _recorder(config, checkpoint, place, env, admission.marks)
@@ -226,7 +226,7 @@ def _period(config: DeployConfig, checkpoint: Checkpoint, env: gym.Env[Any, Any]
     if config.rate is None and usual is None:
         raise SettingsError(f"{checkpoint.manifest.env} does not say its rate; give --rate HZ, or --fast not to wait")
     if config.rate is not None and usual is not None and not math.isclose(config.rate * usual, 1.0, rel_tol=1e-6):
-        say(f"bam-deploy: warning: {config.rate:g} Hz is asked for, and the policy was made for {1 / usual:g} Hz")
+        say(f"bam-deploy: warning: {config.rate:g} Hz is requested, and the policy was made for {1 / usual:g} Hz")
     return usual if config.rate is None else 1 / config.rate
 
 

@@ -131,7 +131,7 @@ class DeployConfig:
     transport: Url = None
     """Whole environment that runs elsewhere: ws://10.0.0.5:9090/bam_001 (GymAPI), tcp://10.0.0.5:9091."""
     profile: Name = None
-    """What the live robot's topics are: a shipped name, or a .toml or .yaml file."""
+    """Topics and limits of the live robot: a shipped profile's name, or a .toml or .yaml file."""
     guard: Assignments = ()
     """One limit of the live robot's guards, any number of times: joint_speed=0.3; --print-guards has their names."""
     print_guards: bool = False
@@ -141,26 +141,26 @@ class DeployConfig:
     token_file: File = None
     """File with the token that the server asks for."""
     timeout: Annotated[Positive | None, tyro.conf.arg(metavar="S")] = None
-    """Longest that an answer of --transport is waited for [s]; 30 by default."""
+    """Longest wait for an answer of --transport [s]; 30 by default."""
     rehearse: Annotated[str | None, tyro.conf.arg(metavar="LINK")] = None
-    """Rehearse in simulated time: the simulated robot behind wifi, lte, bad or a .json file of bam-doctor, and
-    behind the guards of a live robot."""
+    """Rehearse in simulated time: the simulated robot behind a link (wifi, lte, bad or a .json file of bam-doctor) and
+    the guards of a live robot."""
     yes: bool = False
     """Do not ask before a real robot moves."""
     keys: Folder = None
     """Public keys that a real robot trusts; $BAM_TRUSTED_KEYS or ~/.config/bam-train/trusted by default."""
     allow_unsigned: bool = False
-    """Let a checkpoint move a real robot that nobody trusted has signed; every status line says so."""
+    """Let a checkpoint without a trusted signature move a real robot; every status line shows UNSIGNED."""
     motion: File = None
-    """Recording (.mcap) of this robot in which each axis must have moved as it was commanded."""
+    """Recording (.mcap) of this robot in which each axis must have moved as commanded."""
     wiggle: bool = False
     """Move each axis of a live robot a little and back first, to check that it moves as commanded."""
     stage: Annotated[Literal["trial", "full"] | None, tyro.conf.arg(metavar="trial|full")] = None
-    """trial (default on a real robot): a quarter of the speed, in a box around the start; full: as its limits say."""
+    """trial (default on a real robot): a quarter of the speed, in a box around the start; full: at its limits."""
     i_know: bool = False
     """Let --stage full run before trials on this robot have shown that the policy succeeds."""
     shadow: bool = False
-    """Send nothing: compute what the policy would do while somebody else drives the live robot, and compare both."""
+    """Send nothing: compare the policy's commands with the motion of a live robot that somebody else drives."""
     trials: File = None
     """Record of the trials; recordings/trials.jsonl by default."""
     rate: Annotated[Positive | None, tyro.conf.arg(metavar="HZ")] = None
@@ -170,7 +170,7 @@ class DeployConfig:
     render: bool = False
     """Show the robot in a window."""
     record: File = None
-    """Record every tick into this .mcap file; by default a live robot's go to a new file in recordings/."""
+    """Record every tick into this .mcap file; by default a live robot is recorded into a new file in recordings/."""
     no_record: bool = False
     """Do not record a live robot."""
     json: bool = False
@@ -179,16 +179,16 @@ class DeployConfig:
 
 @dataclass(frozen=True)
 class DoctorConfig:
-    """Check a live robot step by step without moving it, name the first step that fails, and measure its link."""
+    """Check a live robot step by step without moving it, name the first failing step, and measure its link."""
 
     url: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="URL")]
     """Address of the robot behind rosbridge, such as ws://10.0.0.5:9090."""
     checkpoint: File = None
-    """Check what the task of this checkpoint needs, and its contract with the robot."""
+    """Check the topics of this checkpoint's task, and its contract with the robot."""
     env: EnvId = None
     """Refuse the checkpoint unless it was trained on this environment; needed for some_module:Env-v0."""
     profile: Name = None
-    """What the robot's topics are: a shipped name, or a .toml or .yaml file; by default the one that fits best."""
+    """Topics and limits of the robot: a shipped profile's name, or a .toml or .yaml file; by default the best fit."""
     ca_file: File = None
     """Certificates that wss:// trusts instead of the system's."""
     token_file: File = None
@@ -203,12 +203,12 @@ class DoctorConfig:
 
 @dataclass(frozen=True)
 class ReplayConfig:
-    """Sum up a recording of bam-deploy, play it through its environment with a policy, and draw it."""
+    """Summarise a recording of bam-deploy, play it through its environment with a policy, and draw it."""
 
     recording: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RECORDING")]
     """The .mcap file that bam-deploy wrote."""
     checkpoint: File = None
-    """Checkpoint whose policy acts on the recorded states; by default the recorded one, if it is where it was."""
+    """Checkpoint whose policy acts on the recorded states; by default the recorded one, if it is at its path."""
     env: EnvId = None
     """Environment that the checkpoint belongs to; needed for some_module:Env-v0."""
     plot: File = None
@@ -306,7 +306,7 @@ class SignConfig:
     """Make a key, sign a checkpoint with it, verify one, or trust somebody's public key."""
 
     action: tyro.conf.Positional[Literal["keygen", "sign", "verify", "trust"]]
-    """What to do."""
+    """Action of the program."""
     file: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="FILE")]
     """keygen: the private key to write; sign, verify: a checkpoint; trust: a public key, NAME.pub."""
     key: File = None

@@ -1,4 +1,4 @@
-"""Tasks whose actions come late, as those of a policy that is slow, or on another computer than the task."""
+"""Tasks with delayed actions, like those of a slow policy, or of a policy on another computer than the task."""
 
 from collections.abc import Sequence
 from typing import Annotated, Any
@@ -17,38 +17,38 @@ _Steps = Annotated[int, Meta(ge=0, le=32, description="a whole number from 0 to 
 
 
 def read_delay(value: object) -> tuple[int, int]:
-    """Least and greatest delay [steps] of the option ``action_delay``: a number, or both in a list.
+    """Minimum and maximum delay [steps] from the option ``action_delay``: a number, or both in a list.
 
     Raises:
-        InvalidValue: It is neither, or the least is greater than the greatest.
+        InvalidValue: `value` is neither, or the minimum is above the maximum.
     """
     pair = list(value) if isinstance(value, (list, tuple)) else [value, value]
     if len(pair) != 2:
         raise InvalidValue(f"action_delay: expected a whole number from 0 to 32, or two of them, found {value!r}")
-    least, most = (check(one, _Steps, "action_delay") for one in pair)
+    least, most = (check(steps, _Steps, "action_delay") for steps in pair)
     if least > most:
         raise InvalidValue(f"action_delay: expected the least and the greatest number of steps, found {value!r}")
     return least, most
 
 
 class LateActions:
-    """A `Task` around a `Task`: an action counts some steps after it was given; until then, zero does.
+    """A `Task` around a `Task`: an action takes effect some steps later; until then, the action is zero.
 
-    The number of steps is drawn for each episode, from its seed.
+    The delay is drawn for each episode from its seed.
 
     Args:
         task: The task.
-        delay: Least and greatest number of steps.
+        delay: Minimum and maximum delay [steps].
     """
 
     def __init__(self, task: Task, delay: tuple[int, int]) -> None:
         self.task, (self._least, self._most) = task, delay
-        self._rows = np.arange(task.num_envs)
+        self._env_ids = np.arange(task.num_envs)
         self._delay = np.zeros(task.num_envs, np.int64)
         self._actions = np.zeros((task.num_envs, self._most + 1, *task.action_space.shape), np.float32)  # newest first
 
     def __getattr__(self, name: str) -> Any:
-        """Everything else is that of the task: spaces, labels, observations, options of `reset`."""
+        """Any other attribute is that of the task: spaces, labels, observations, options of `reset`."""
         if name == "task" or name.startswith("__"):
             raise AttributeError(name)
         return getattr(self.task, name)
@@ -61,26 +61,26 @@ class LateActions:
         return initial
 
     def on_reset(self, env_ids: EnvIds, state: RobotState) -> None:
-        """Forget the actions of the episode before."""
+        """Reset the delayed actions to zero."""
         self._actions[env_ids] = 0.0
         self.task.on_reset(env_ids, state)
 
     def _late(self) -> NDArray[np.float32]:
-        late: NDArray[np.float32] = self._actions[self._rows, self._delay]
+        late: NDArray[np.float32] = self._actions[self._env_ids, self._delay]
         return late
 
     def command(self, action: Floats, state: RobotState) -> Array:
-        """The command of the action that counts now. Shapes: (n, a) -> (n, m)."""
+        """The command of the delayed action. Shapes: (n, a) -> (n, m)."""
         self._actions = np.roll(self._actions, 1, axis=1)
         self._actions[:, 0] = action
         return self.task.command(self._late(), state)
 
     def score(self, state: RobotState, action: Floats) -> Score:
-        """The outcome of the step, for the action that counted in it."""
+        """The outcome of the step, for the delayed action."""
         return self.task.score(state, self._late())
 
     def state_dict(self) -> dict[str, Any]:
-        """The memory of the task, the delays and the actions that are still to count."""
+        """The state of the task, the delays and the pending actions."""
         return {"task": self.task.state_dict(), "delay": self._delay.copy(), "actions": self._actions.copy()}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:

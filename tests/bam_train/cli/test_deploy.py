@@ -64,7 +64,7 @@ def test_report_for_programs(corridor_checkpoint, starting_cell, run):
         (
             ("--rate", 2000),
             2000,
-            "bam-deploy: warning: 2000 Hz is asked for, and the policy was made for 20 Hz\n",
+            "bam-deploy: warning: 2000 Hz is requested, and the policy was made for 20 Hz\n",
         ),
     ],
 )
