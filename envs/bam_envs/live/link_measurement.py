@@ -224,7 +224,7 @@ def measure_link(
         raise LinkLost(f"{link.url}: the link dropped during the measurement, and is back. Measure again.")
     ticks = np.arange(start, end, period)
     readings = tuple(
-        _reading(source, profile, log.letters[source.signal], ticks, ahead, link.clock_offset)
+        _reading(source, profile, log.letters[source.signal].copy(), ticks, ahead, link.clock_offset)
         for source in state.sources
     )
     return LinkMeasurement(end - start, trips, pings.copies, readings)
@@ -242,7 +242,7 @@ def _reading(
     tracker, size = SourceAge(ahead), len(profile.signal(source.signal).labels)
     arrived, measured, errors = [], [], []
     values: Array = np.full(size, np.nan)
-    for letter in list(letters):
+    for letter in letters:
         try:
             tracker.look(letter, source.topic, server_offset)
             values = decode_source(source, letter.message, size)
