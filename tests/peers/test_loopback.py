@@ -1,5 +1,6 @@
 """No packet of the ROS 2 that these tests run leaves this machine: the kernel says where its sockets are bound."""
 
+import contextlib
 import os
 from pathlib import Path
 
@@ -7,7 +8,10 @@ LOOPBACK, DISCOVERY = "127.0.0.1", "239.255.0.1"
 
 
 def udp_sockets(pid):
-    links = [os.readlink(entry) for entry in Path(f"/proc/{pid}/fd").iterdir()]
+    links = []
+    for entry in Path(f"/proc/{pid}/fd").iterdir():
+        with contextlib.suppress(FileNotFoundError):  # closed meanwhile
+            links.append(os.readlink(entry))
     inodes = {link[8:-1] for link in links if link.startswith("socket:[")}
     rows = [line.split() for line in Path(f"/proc/{pid}/net/udp").read_text().splitlines()[1:]]
     return {address(row[1]) for row in rows if row[9] in inodes}, inodes

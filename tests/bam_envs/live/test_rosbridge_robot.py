@@ -296,7 +296,7 @@ def test_a_command_that_waited_in_this_process_is_not_sent(server, robot_on, con
 
     def clock():
         nonlocal jump
-        if looks:  # the process is stopped between two looks at the clock
+        if looks and threading.current_thread() is threading.main_thread():  # it is stopped between two looks
             looks.append(None)
             jump = 5.0 if len(looks) == 5 else jump  # after the lifetime of the command began
         return time.monotonic() + jump
