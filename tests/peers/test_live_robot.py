@@ -192,11 +192,14 @@ def test_a_topic_that_is_not_what_the_profile_says(changes, text, rosbridge, rob
 
 def test_a_diagnosis_finds_it_well_and_moves_nothing(rosbridge, robot_node):
     robot_node.ask("forget")
-    diagnosis = Diagnosis(rosbridge.url, seconds=2.0)
-    try:
-        steps = list(diagnosis.steps())
-    finally:
-        diagnosis.close()
+    for _ in range(3):  # on a busy computer, states come late
+        diagnosis = Diagnosis(rosbridge.url, seconds=2.0)
+        try:
+            steps = list(diagnosis.steps())
+        finally:
+            diagnosis.close()
+        if steps[-1].name == STEPS[-1]:
+            break
     assert [step.name for step in steps] == list(STEPS)
     assert all(step.verdict != "failed" for step in steps), steps
     assert diagnosis.profile.name == "ur5e"
