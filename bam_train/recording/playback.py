@@ -103,7 +103,7 @@ def play(
         policy: Has ``reset()`` and ``act(observation)``.
         on_tick: Called at each tick, to take a picture.
     """
-    played, seed = Playback(), _seed(recording)
+    played, seed = Playback(), recording.seed
     observations, [actions] = recording.arrays("observation"), recording.arrays("action").values()
     for number, ticks in enumerate(recording.episodes()):
         policy.reset()
@@ -123,13 +123,6 @@ def play(
                     f"with {ticks[-1] - ticks[0]}; play it with the versions in its metadata"
                 )
     return played
-
-
-def _seed(recording: Recording) -> int:
-    text = recording.metadata.get("seed", "0")
-    if not text.isdecimal():
-        raise BadRecording(f"{recording.path}: its metadata says seed {text!r}, which is no number. Get the file again")
-    return int(text)
 
 
 def play_observations(recording: Recording, policy: Any) -> Playback:

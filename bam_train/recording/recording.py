@@ -158,6 +158,14 @@ class Recording:
         """Number of whole ticks."""
         return len(self.guards)
 
+    @property
+    def seed(self) -> int:
+        """Seed of the first episode. Raises BadRecording if the metadata has something else."""
+        text = self.metadata.get("seed", "0")
+        if not text.isdecimal():
+            raise BadRecording(f"{self.path}: its metadata says seed {text!r}, which is no number. Get the file again")
+        return int(text)
+
     def episodes(self) -> list[range]:
         """The ticks of each episode; the first one of each is the reset."""
         if not self.ticks:

@@ -125,7 +125,7 @@ def _seconds(recording: Recording) -> float:
 
 def _episodes(recording: Recording) -> list[dict[str, Any]]:
     """Length, return, end and success of each episode; ``"stopped"`` without an end."""
-    rows, seed = [], int(recording.metadata.get("seed", 0))
+    rows, seed = [], recording.seed
     for number, ticks in enumerate(recording.episodes()):
         table, last = recording.tables["/episode"], ticks[-1]
         ends = [end for end in ("terminated", "truncated") if table.column(end)[last]]

@@ -1,4 +1,7 @@
-"""The base class of guards, the tick that a guard checks, and the limits of a robot."""
+"""The base class of guards, the tick that a guard checks, and the limits of a robot.
+
+Longer than most files: each of the limits stands here with its default, its bounds and what it means.
+"""
 
 from __future__ import annotations
 

@@ -2,6 +2,8 @@
 
 Each process can be killed alone, as in a real cell. The robot runs in real time, stops when no command arrives for its
 command timeout, and logs its command and its speed at every tick. The driver can publish faulty states on request.
+
+Longer than most files: the cell, its processes and what they tell each other are one subject.
 """
 
 from __future__ import annotations

@@ -15,6 +15,7 @@ from bam_envs.core.timing import Pacer
 from bam_train.checkpoint import Checkpoint
 from bam_train.cli.deploy import main as deploy
 from bam_train.cli.deploy_display import PlainDisplay
+from bam_train.cli.live.replay import facts_of
 from bam_train.cli.live.replay import main as replay
 from bam_train.deploy.deployment import Deployment
 from bam_train.deploy.flight import deployment_facts, flight_recorder
@@ -300,8 +301,10 @@ def test_recorded_pictures_are_there_again(tmp_path):
 def test_a_seed_that_is_no_number_is_refused(pick):
     recording = Recording.open(pick)
     recording.metadata["seed"] = "soon"
-    with pytest.raises(BadRecording, match=r"its metadata says seed 'soon', which is no number\. Get the file again$"):
-        play(recording, replay_env(recording, Checkpoint.open(PICK)), None)
+    text = r"its metadata says seed 'soon', which is no number\. Get the file again$"
+    for read in (facts_of, lambda damaged: play(damaged, replay_env(damaged, Checkpoint.open(PICK)), None)):
+        with pytest.raises(BadRecording, match=text):
+            read(recording)
 
 
 def test_an_episode_longer_than_the_environments_is_played_to_its_end(tmp_path):
