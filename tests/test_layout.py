@@ -33,6 +33,7 @@ ORDER = {
             "loop",
             "evaluation",
             "deploy",
+            "agent",
             "trainers",
             "compat",
             "cli",
