@@ -28,6 +28,8 @@ from bam_train.signals import handled, interrupt
 
 WINDOW = 1000
 """Minimum number of ticks that the workspace of a deployment keeps: 50 s at 20 Hz."""
+STOP = "deployment/stop"
+"""Variable (1,): whether the episode ends at this time."""
 _ENDS = ("terminated", "truncated")
 
 
@@ -95,7 +97,9 @@ class Deployment:
             It is called between two ticks, so it must be fast; if it fails, the deployment ends.
         recorder: Records every tick, if given; it has started, and is closed at the end. If it fails, the deployment
             goes on.
-        trials: Where each episode is recorded as a trial, if given.
+        trials: Where each episode is recorded as a trial, if given; may be exchanged between two episodes.
+        boundary: Agent that runs between a deadline and the policy, and writes `STOP`, which ends the episode.
+        switch: Handler of SIGINT and SIGTERM; None: one of its own.
 
     Raises:
         WiringError: An agent reads a variable that no agent writes; the robot has not been connected.
@@ -113,18 +117,23 @@ class Deployment:
         sink: Sink | None = None,
         recorder: Recorder | None = None,
         trials: Trials | None = None,
+        boundary: Agent | None = None,
+        switch: StopSwitch | None = None,
     ) -> None:
         self.env, self.pacer, self.journal, self.recorder, self.trials = env, pacer, journal, recorder, trials
-        self.switch = StopSwitch(lambda: self._robot.halt())
+        self.switch = switch or StopSwitch(lambda: self._robot.halt())
         """Handler of SIGINT and SIGTERM."""
         self._robot = _DeployedRobot(env, self.switch)
         self._workspace = Workspace(window=window, sink=None if sink is None else _silent_once_broken(sink))
         watch, names = Stopwatch(), self._robot.observation_names
+        self._policy = policy_agent = PolicyAgent(policy, names, single=True)
+        self._stop_variable = "env/done" if boundary is None else STOP
         chain: list[Agent] = [
             _StopAgent(self.switch, watch),
             self._robot,
-            _JournalAgent(journal, pacer, watch, trials, getattr(env.unwrapped, "robot", None)),
-            PolicyAgent(policy, names, single=True),
+            _JournalAgent(self, watch, getattr(env.unwrapped, "robot", None)),
+            *(() if boundary is None else (boundary,)),
+            policy_agent,
             *agents,
         ]
         self._flight = None if recorder is None else RecorderAgent(recorder, env, names, journal, watch)
@@ -149,11 +158,31 @@ class Deployment:
             finally:
                 self._end_recording(ending)
 
+    def swap(self, policy: Any) -> None:
+        """Let another policy act from the next action on; called between two ticks, as by the `boundary` agent."""
+        policy.reset()
+        self._policy.policy = policy
+
+    def episode(self, watcher: Watcher, *, seed: int) -> EpisodeRecord:
+        """Run one episode; afterwards the robot is halted, and stays connected. After an exception it is closed."""
+        self._loop(self._workspace, t=0, stop_variable=self._stop_variable, seed=seed, watcher=watcher)
+        self._robot.halt()  # the sink and the next reset may be slow
+        record = self.journal.records[-1]
+        if self.trials is not None:
+            self.trials.end(record.success is True, record.end)
+        self._workspace.flush()
+        return record
+
+    def record_command(self) -> None:
+        """Record the last command, if no tick has: that of a person who drives, or the one before a fault."""
+        if self._flight is not None:
+            self._flight.record_last_command()
+
     def _end_recording(self, ending: Ending | None) -> None:
         """Record how it ended; without an ending, leave the rest to the recorder's process, which outlives this one."""
         if self.recorder is None or self._flight is None:
             return
-        self._flight.record_last_command()
+        self.record_command()
         if ending is None:
             self.recorder.event("ended at once, by a signal", ERROR)
         else:
@@ -166,18 +195,14 @@ class Deployment:
                 self.switch.armed = True
                 self.switch.raise_again()  # for an earlier signal
                 for k in range(self.journal.wanted):
-                    self._loop(self._workspace, t=0, stop_variable="env/done", seed=seed + k, watcher=watcher)
-                    self._robot.halt()  # the sink and the next reset may be slow
-                    if self.trials is not None:
-                        self.trials.end(self.journal.records[-1].success is True, self.journal.records[-1].end)
-                    self._workspace.flush()
+                    self.episode(watcher, seed=seed + k)
             finally:  # inside the outer try: a signal that comes before this line is still caught
                 self.switch.armed = False
             ending = Ending("episodes done", 0)
         except Stopped:
             ending = Ending("interrupted", 128 + self.switch.came[0])
         except Exception as error:  # after any fault, the robot must be halted and the report made
-            ending = _ending_of(error)
+            ending = ending_of(error)
         except BaseException:
             if not self._robot.closing:
                 self._robot.halt()
@@ -189,7 +214,7 @@ class Deployment:
         return _unless_it_fails(ending, "recording", self._workspace.flush)  # of an episode that was cut short
 
 
-def _ending_of(error: Exception) -> Ending:
+def ending_of(error: Exception) -> Ending:
     """The ending for an exception: it points the operator to the network, the robot, or the program."""
     text = fault_text(error).replace("call resume()", "run it again")  # the program ends here and cannot be resumed
     if isinstance(error, LinkLost):
@@ -269,17 +294,17 @@ class _JournalAgent(Agent):
     reads_previous = ("action",)
     writes = ()
 
-    def __init__(self, journal: Journal, pacer: Pacer, watch: Stopwatch, trials: Trials | None, robot: Any) -> None:
+    def __init__(self, deployment: Deployment, watch: Stopwatch, robot: Any) -> None:
         super().__init__()
-        self._journal, self._pacer, self._watch, self._trials = journal, pacer, watch, trials
-        self._robot = robot
+        self._deployment, self._journal, self._pacer = deployment, deployment.journal, deployment.pacer
+        self._watch, self._robot = watch, robot
 
     def forward(self, t: int, seed: int, watcher: Watcher, **kwargs: Any) -> None:
         self._watch.stepped, done = time.perf_counter(), self.get(("env/done", t))[0]
         if t == 0:
             self._journal.begin(seed)
-            if self._trials is not None:
-                self._trials.begin(seed)  # before the first command
+            if self._deployment.trials is not None:
+                self._deployment.trials.begin(seed)  # before the first command
             self._pacer.start()
         else:  # the step that led to time t
             success = self.get((f"env/{SUCCESS}", t))[0] if self.get((f"env/{SAYS_SUCCESS}", t))[0] else None
