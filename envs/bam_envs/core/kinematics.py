@@ -148,7 +148,29 @@ class ArmGeometry:
         places[:, 3:, 1] += self.d4
         places[:, 4:] -= self.d5 * across[:, 3, None]
         places[:, 5] += self.d6 * axes[:, 5, :, 2]
-        return _turned(places, c[:, 0], s[:, 0]), _turned(axes.swapaxes(2, 3), c[:, 0], s[:, 0]).swapaxes(2, 3)
+        return turned(places, c[:, 0], s[:, 0]), turned(axes.swapaxes(2, 3), c[:, 0], s[:, 0]).swapaxes(2, 3)
+
+    def jacobian(self, q: Sequence[float]) -> list[list[float]]:
+        """Velocity of the tool [m/rad] and axis of each joint at the joints `q` (6,) [rad]. Shape: (6, 6), a row each.
+
+        Velocities and axes are in the arm's vertical plane (radial, sideways, height); `turned` brings them from and to
+        ``base_link``.
+        """
+        low = q[1] + q[2] + q[3]
+        sine, cosine, s5, c5 = math.sin(low), math.cos(low), math.sin(q[4]), math.cos(q[4])
+        end = self.d6 + self.tool
+        out = -s5 * cosine, c5, -s5 * sine
+        # From each joint to the tool, radially (x) and in height (z); joints 2 to 6 are `d4` beside the plane.
+        x5, z5 = end * out[0], end * out[2]
+        x4, z4 = x5 + self.d5 * sine, z5 - self.d5 * cosine
+        x3, z3 = x4 + self.a3 * math.cos(q[1] + q[2]), z4 + self.a3 * math.sin(q[1] + q[2])
+        x2, z2 = x3 + self.a2 * math.cos(q[1]), z3 + self.a2 * math.sin(q[1])
+        beside = end * c5
+        rows = [[self.d4 + beside, -x2, 0.0, 0.0, 0.0, 1.0]]
+        rows += [[-z, 0.0, x, 0.0, 1.0, 0.0] for x, z in ((x2, z2), (x3, z3), (x4, z4))]
+        axis = sine, 0.0, -cosine
+        rows += [[-cosine * beside, cosine * x5 + sine * z5, -sine * beside, *axis], [0.0, 0.0, 0.0, *out]]
+        return rows
 
     def reach_down(self, position: Array, yaw: Array) -> Array:
         """Joint positions that put the tool at `position`, pointing straight down, its x axis at `yaw` from world x.
@@ -245,8 +267,11 @@ UR_JOINTS = (
 """Names of the joints of a Universal Robots arm, from its base on."""
 
 
-def _turned(vectors: Array, c1: Array, s1: Array) -> Array:
-    """Vectors (n, ..., 3) of the arm's vertical plane (radial, sideways, height) in ``base_link``."""
+def turned(vectors: Array, c1: Array, s1: Array) -> Array:
+    """Vectors (n, ..., 3) of the arm's vertical plane (radial, sideways, height) in ``base_link``, and back.
+
+    `c1` and `s1` are cosine and sine of joint 1. Shape: (n,). The two frames mirror each other, so one turn does both.
+    """
     shape = (len(c1), *[1] * (vectors.ndim - 2))
     c1, s1 = c1.reshape(shape), s1.reshape(shape)
     turned = np.empty_like(vectors)

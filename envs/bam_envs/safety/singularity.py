@@ -27,6 +27,7 @@ class Singularity(Guard):
     def __init__(self, spec: RobotSpec, limits: Limits, geometry: ArmGeometry) -> None:
         self._slow, self.limit_value = limits.singularity_slow, limits.singularity_stop
         self._arm, self._joints = geometry, columns_in(spec.command, "rad")
+        self._unit = (abs(geometry.a2) + abs(geometry.a3)) / 2.0
         self._at: Sequence[float] = [math.inf] * 6
         self._rates = [least + most / self._slow for least, most in zip(_SMALLEST, _LARGEST, strict=True)]
         self._room = 0.0  # smallest singular value minus the largest one divided by `singularity_slow`, at least
@@ -52,25 +53,7 @@ class Singularity(Guard):
 
     def condition(self, q: Sequence[float]) -> float:
         """Condition number of the Jacobian at the joints `q` (6,) [rad]."""
-        values = np.linalg.svd(np.array(self._jacobian(q)), compute_uv=False).tolist()
+        rows = [[value / self._unit for value in row[:3]] + row[3:] for row in self._arm.jacobian(q)]
+        values = np.linalg.svd(np.array(rows), compute_uv=False).tolist()
         self._room = values[-1] - values[0] / self._slow
         return float(values[0] / max(values[-1], 1e-12))
-
-    def _jacobian(self, q: Sequence[float]) -> list[list[float]]:
-        """Velocity of the tool and turning speed for each joint, in the arm's vertical plane. Shape: (6, 6)."""
-        arm, low = self._arm, q[1] + q[2] + q[3]
-        unit = (abs(arm.a2) + abs(arm.a3)) / 2.0
-        sine, cosine, s5, c5 = math.sin(low), math.cos(low), math.sin(q[4]), math.cos(q[4])
-        end = arm.d6 + arm.tool
-        out = -s5 * cosine, c5, -s5 * sine
-        # From each joint to the tool, radially (x) and in height (z); joints 2 to 6 are `arm.d4` beside the plane.
-        x5, z5 = end * out[0], end * out[2]
-        x4, z4 = x5 + arm.d5 * sine, z5 - arm.d5 * cosine
-        x3, z3 = x4 + arm.a3 * math.cos(q[1] + q[2]), z4 + arm.a3 * math.sin(q[1] + q[2])
-        x2, z2 = x3 + arm.a2 * math.cos(q[1]), z3 + arm.a2 * math.sin(q[1])
-        beside = end * c5
-        rows = [[-(arm.d4 + beside), x2, 0.0, 0.0, 0.0, 1.0]]
-        rows += [[z, 0.0, -x, 0.0, 1.0, 0.0] for x, z in ((x2, z2), (x3, z3), (x4, z4))]
-        axis = sine, 0.0, -cosine
-        rows += [[cosine * beside, -cosine * x5 - sine * z5, sine * beside, *axis], [0.0, 0.0, 0.0, *out]]
-        return [[value / unit for value in row[:3]] + row[3:] for row in rows]

@@ -4,7 +4,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from bam_envs.core.kinematics import LINKS, UR5E, angle_between, cube_yaw_phase, from_angles, quaternions
+from bam_envs.core.kinematics import LINKS, UR5E, angle_between, cube_yaw_phase, from_angles, quaternions, turned
 from bam_envs.robots.physics.mujoco_batch import MODELS
 from bam_envs.robots.ur import UR_MODELS
 from bam_envs.robots.ur5e import GEOMETRY
@@ -218,3 +218,16 @@ def test_the_angle_between_two():
 def test_small_angles_are_exact():
     turned = from_angles(np.array([[0.0, 0.0, 1e-9]]))
     np.testing.assert_allclose(angle_between(turned, np.array([[0.0, 0.0, 0.0, 1.0]])), [1e-9], rtol=1e-9)
+
+
+@pytest.mark.parametrize("arm", [GEOMETRY, UR_MODELS["ur10"].geometry])
+def test_the_jacobian_is_that_by_differences(arm):
+    for q in random_joints(20):
+        rows = np.array(arm.jacobian(q.tolist())).reshape(1, 6, 2, 3)
+        rows = turned(rows, np.cos(q[:1]), np.sin(q[:1]))[0]  # in base_link
+        for joint, step in enumerate(1e-6 * np.eye(6)):
+            (ahead, axes), (behind, others) = arm.flange_pose((q + step)[None]), arm.flange_pose((q - step)[None])
+            points = [end[0] + arm.tool * turn[0, :, 2] for end, turn in ((ahead, axes), (behind, others))]
+            turn = (axes[0] - others[0]) @ arm.flange_pose(q[None])[1][0].T / 2e-6
+            np.testing.assert_allclose(rows[joint, 0], (points[0] - points[1]) / 2e-6, atol=1e-6)
+            np.testing.assert_allclose(rows[joint, 1], [turn[2, 1], turn[0, 2], turn[1, 0]], atol=1e-6)
