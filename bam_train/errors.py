@@ -24,6 +24,9 @@
     │   ├── WiringError            an agent reads what no agent writes
     │   ├── RemoteAgentError       an agent in another process failed, or its process ended
     │   └── AgentInUse             an agent is called by two threads at once
+    ├── UnknownVersion             a version that a live agent does not have
+    ├── FolderInUse                a folder of versions that another live agent uses
+    ├── CandidateRefused           a checkpoint that a live agent does not take
     ├── ContractRefused            a robot that does not fit the checkpoint; nothing has moved
     ├── EnvironmentFailed          an environment gave NaN or infinity
     ├── TrainingFailed             training cannot continue (a NaN loss); the last good checkpoint is kept
@@ -152,6 +155,20 @@ class RemoteAgentError(LoopError):
 
 class AgentInUse(LoopError):  # noqa: N818
     """An agent is called by two threads at once."""
+
+
+class UnknownVersion(BamTrainError, LookupError):  # noqa: N818
+    """A name or digest of which a live agent has no version, or several."""
+
+
+class FolderInUse(BamTrainError):  # noqa: N818
+    """A folder of versions that another live agent uses."""
+
+
+class CandidateRefused(BamTrainError):  # noqa: N818
+    """A checkpoint that a live agent does not take; the policy before it drives on."""
+
+    exit_status = 3
 
 
 class ContractRefused(BamTrainError):  # noqa: N818

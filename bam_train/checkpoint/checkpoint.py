@@ -59,8 +59,12 @@ class Checkpoint:
     """Hex sha256 of the manifest, which has that of every other member."""
 
     @classmethod
-    def open(cls, path: str | Path) -> Checkpoint:
+    def open(cls, path: str | Path, *, members: bool = True) -> Checkpoint:
         """Verify the manifest, the list of members, and every member but those below ``bam/resume/``.
+
+        Args:
+            path: The file.
+            members: False: leave the members to `read`, which verifies each of them anyway.
 
         Raises:
             NotACheckpoint: No such file, not a zip, truncated, too large, or no manifest in it.
@@ -73,7 +77,7 @@ class Checkpoint:
             data = b"".join(chunks(path, archive, infos[MANIFEST]))
             manifest = parse_manifest(path, data)
             require_same_members(path, set(infos), set(manifest.sha256))
-            for name, expected in manifest.sha256.items():
+            for name, expected in manifest.sha256.items() if members else ():
                 if not name.startswith(RESUME):  # may have gigabytes; `read` verifies it
                     deque(chunks(path, archive, infos[name], expected), maxlen=0)
         return cls(path, manifest, hashlib.sha256(data).hexdigest())

@@ -1,0 +1,288 @@
+"""The folder of versions: complete or absent, found by name or digest, safe from kills, full disks and other agents."""
+
+import contextlib
+import json
+import os
+import random
+import resource
+import signal
+import subprocess
+import sys
+import threading
+import time
+
+import numpy as np
+import pytest
+
+from bam_train.agent.versions import KEPT, Versions, load_policy
+from bam_train.checkpoint import Checkpoint
+from bam_train.errors import AlteredCheckpoint, CheckpointError, FolderInUse, OutputError, UnknownVersion
+
+_PROGRAM = """
+import sys
+from pathlib import Path
+from bam_train.agent.versions import Versions
+from bam_train.checkpoint import Checkpoint
+versions = Versions(Path(sys.argv[1]))
+checkpoints = [Checkpoint.open(path) for path in sys.argv[2:]]
+print("ready", flush=True)
+while True:
+    for checkpoint in checkpoints:
+        versions.point({"champion": versions.add(checkpoint).digest, "previous": checkpoint.digest})
+"""
+"""Adds versions and moves names without end."""
+
+
+@pytest.fixture
+def versions(tmp_path):
+    return Versions(tmp_path / "state" / "versions")
+
+
+@pytest.fixture
+def some(corridor_checkpoint):
+    """Makes n checkpoints."""
+
+    def make(n):
+        return [Checkpoint.open(corridor_checkpoint(f"{seed}.zip", seed=seed)) for seed in range(n)]
+
+    return make
+
+
+def files(versions):
+    return sorted(path.name for path in versions.folder.iterdir() if not path.name.endswith(".lock"))
+
+
+@contextlib.contextmanager
+def full_disk(size):
+    """Within the block, no file can grow beyond `size` bytes."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+
+
+def test_a_version_is_a_copy_that_is_found_by_name_and_digest(versions, some):
+    one, other = some(2)
+    added = versions.add(one)
+    assert versions.add(one).path == added.path
+    versions.add(other)
+    one.path.unlink()
+    assert versions.folder.stat().st_mode & 0o777 == 0o700
+    assert files(versions) == sorted(f"{checkpoint.digest}.zip" for checkpoint in (one, other))
+    assert [version.digest for version in versions.all()] == [other.digest, one.digest]
+    assert Checkpoint.open(added.path).digest == one.digest
+    versions.point({"champion": one.digest[:6], "candidate": one.digest, "previous": other.digest})
+    for text in ("champion", "candidate", one.digest, one.digest[:6]):
+        assert versions.find(text).digest == one.digest
+    assert versions.names == {"champion": one.digest, "candidate": one.digest, "previous": other.digest}
+    assert versions.find("champion").to_json() == {
+        "digest": one.digest,
+        "names": ["candidate", "champion"],
+        "added": versions.find(one.digest).added,
+        "env": "test/Corridor-v0",
+        "algorithm": "ppo",
+    }
+    versions.point({"candidate": None})
+    assert versions.named("candidate") is None
+    assert versions.named("champion").names == ("champion",)
+    assert Versions(versions.folder).names == {"champion": one.digest, "previous": other.digest}
+
+
+def test_an_unknown_version_is_one_line_with_those_there_are(versions, some):
+    with pytest.raises(UnknownVersion) as caught:
+        versions.find("champion")
+    assert str(caught.value) == "'champion': no such version. Push one first"
+    one, other = some(2)
+    for checkpoint in (one, other):
+        versions.add(checkpoint)
+    versions.point({"champion": one.digest})
+    known = f"Choose from: {other.digest[:12]}, champion = {one.digest[:12]}"
+    for text in ("previous", "", one.digest[:5], "f" * 64, f"{one.digest}0"):
+        with pytest.raises(UnknownVersion) as caught:
+            versions.find(text)
+        assert str(caught.value) == f"{text!r}: no such version. {known}"
+    with pytest.raises(UnknownVersion):
+        versions.point({"previous": "ffffff"})
+    assert versions.names == {"champion": one.digest}
+
+
+def test_several_versions_with_one_beginning_are_not_guessed(versions, some):
+    (one,) = some(1)
+    digest = versions.add(one).digest
+    twin = digest[:20] + ("0" if digest[20] != "0" else "1") * 44
+    (versions.folder / f"{twin}.zip").write_bytes(b"")
+    with pytest.raises(UnknownVersion) as caught:
+        versions.find(digest[:20])
+    assert str(caught.value).startswith(f"{digest[:20]!r}: 2 versions begin with it. Choose from: ")
+    assert versions.find(digest[:21]).digest == digest
+
+
+@pytest.mark.parametrize("text", ["../secret", "../../secret.zip", "/etc/passwd", "..", "\0", "*", "[0-9a-f]*", "a/b"])
+def test_no_text_leads_out_of_the_folder(versions, some, text, corridor_checkpoint):
+    versions.add(some(1)[0])
+    corridor_checkpoint("secret.zip")
+    with pytest.raises(UnknownVersion):
+        versions.find(text)
+    (versions.folder / "names.json").write_text(json.dumps({"champion": text}))
+    with pytest.raises(UnknownVersion):
+        versions.find("champion")
+
+
+def test_other_files_in_the_folder_are_no_versions(versions, some):
+    versions.add(some(1)[0])
+    for name in ("notes.zip", "A" * 64 + ".zip", "0" * 63 + ".zip"):
+        (versions.folder / name).write_bytes(b"")
+    assert len(versions.all()) == 1
+
+
+def test_the_oldest_versions_without_a_name_are_removed(versions, some):
+    checkpoints = some(KEPT + 3)
+    versions.add(checkpoints[0])
+    versions.point({"previous": checkpoints[0].digest})
+    for checkpoint in checkpoints[1:]:
+        versions.add(checkpoint)
+    kept = [checkpoint.digest for checkpoint in (checkpoints[0], *checkpoints[3:])]
+    assert [version.digest for version in reversed(versions.all())] == kept
+
+
+def test_a_clock_that_was_set_back_does_not_make_a_new_version_the_oldest(versions, some):
+    one, other = some(2)
+    tomorrow = time.time() + 86400
+    os.utime(versions.add(one).path, (tomorrow, tomorrow))
+    versions.add(other)
+    assert [version.digest for version in versions.all()] == [other.digest, one.digest]
+
+
+def test_a_file_that_was_changed_after_it_was_verified_is_not_kept(versions, some, forge):
+    (one,) = some(1)
+    forge(one.path, seed=99)
+    with pytest.raises(AlteredCheckpoint) as caught:
+        versions.add(one)
+    assert str(caught.value) == f"{one.path}: was changed while it was read. Push it again"
+    assert files(versions) == []
+
+
+@pytest.mark.parametrize("text", ["", "[]", '{"champion": 3}', '{"champion": "ab'])
+def test_damaged_names_are_one_line(versions, text):
+    (versions.folder / "names.json").write_text(text)
+    with pytest.raises(OutputError, match=r"names\.json: cannot be read: [^\n]*\. Restore or remove it$"):
+        versions.find("champion")
+
+
+# Disk
+
+
+def test_a_full_disk_is_one_line_and_nothing_is_lost(versions, some):
+    one, other = some(2)
+    versions.add(one)
+    versions.point({"champion": one.digest})
+    before = files(versions)
+    why = f"{versions.folder}: versions cannot be kept there: File too large. Make room, or give another --folder"
+    with full_disk(40):
+        for change in (lambda: versions.add(other), lambda: versions.point({"previous": one.digest})):
+            with pytest.raises(OutputError) as caught:
+                change()
+            assert str(caught.value) == why
+    assert files(versions) == before
+    assert versions.names == {"champion": one.digest}
+    assert load_policy(versions.find("champion")).act(np.ones(1, np.float32)) == 1
+    versions.add(other)
+
+
+def test_a_folder_that_cannot_be_made_is_one_line(tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(OutputError) as caught:
+        Versions(tmp_path / "file" / "versions")
+    why = "versions cannot be kept there: Not a directory. Make room, or give another --folder"
+    assert str(caught.value) == f"{tmp_path}/file/versions: {why}"
+
+
+def test_the_folder_survives_a_kill_at_any_moment(versions, some):
+    checkpoints = some(4)
+    paths = [str(checkpoint.path) for checkpoint in checkpoints]
+    moments = random.Random(0)
+    for _ in range(8):
+        command = [sys.executable, "-c", _PROGRAM, str(versions.folder), *paths]
+        with subprocess.Popen(command, stdout=subprocess.PIPE) as process:
+            process.stdout.readline()
+            time.sleep(moments.random() * 0.1)
+            process.send_signal(signal.SIGKILL)
+        for version in versions.all():
+            assert Checkpoint.open(version.path).digest == version.digest
+        assert all(versions.find(name).digest == digest for name, digest in versions.names.items())
+    with versions.held():  # removes what was half written
+        assert [name for name in files(versions) if name.endswith(".tmp")] == []
+
+
+# Others
+
+
+def test_a_second_agent_is_refused_until_the_first_ends(versions):
+    with versions.held():
+        with pytest.raises(FolderInUse) as caught, Versions(versions.folder).held():
+            pass
+        other = f"another bam-agent (process {os.getpid()})"
+        assert str(caught.value) == f"{versions.folder}: {other} uses it. End that one, or give another --folder"
+    with Versions(versions.folder).held():
+        pass
+
+
+def test_the_lock_of_a_killed_agent_is_free(versions):
+    program = (
+        "import sys, time; from pathlib import Path; from bam_train.agent.versions import Versions\n"
+        "with Versions(Path(sys.argv[1])).held(): print('held', flush=True); time.sleep(60)"
+    )
+    with subprocess.Popen([sys.executable, "-c", program, str(versions.folder)], stdout=subprocess.PIPE) as process:
+        process.stdout.readline()
+        with pytest.raises(FolderInUse, match=rf"\(process {process.pid}\)"), versions.held():
+            pass
+        process.kill()
+    with versions.held():
+        pass
+
+
+def test_many_may_add_and_move_names_at_once(versions, some):
+    checkpoints, errors = some(6), []
+
+    def work(mine):
+        own = Versions(versions.folder)
+        try:
+            for _ in range(5):
+                for name, checkpoint in mine.items():
+                    own.add(checkpoint)
+                    own.point({name: checkpoint.digest})
+                    assert own.find(name).digest == checkpoint.digest
+        except Exception as error:
+            errors.append(error)
+
+    names = ["champion", "candidate", "previous"]
+    groups = [{name: checkpoints[2 * k]} for k, name in enumerate(names)]
+    threads = [threading.Thread(target=work, args=(group,)) for group in groups]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert errors == []
+    assert versions.names == {name: checkpoints[2 * k].digest for k, name in enumerate(names)}
+
+
+# The policy
+
+
+def test_the_policy_of_a_version_is_loaded_without_its_golden_actions(versions, some):
+    policy = load_policy(versions.add(some(1)[0]))
+    assert policy.act(np.zeros(1, np.float32)) == 1
+
+
+def test_a_version_that_was_changed_is_not_loaded(versions, some, forge):
+    one, other = some(2)
+    version = versions.add(one)
+    version.path.write_bytes(versions.add(other).path.read_bytes())
+    with pytest.raises(CheckpointError) as caught:
+        load_policy(version)
+    assert str(caught.value) == f"{version.path}: is another checkpoint than its name says. Push it again"
+    version.path.write_bytes(b"PK")
+    with pytest.raises(CheckpointError, match="not a whole zip file"):
+        load_policy(version)
