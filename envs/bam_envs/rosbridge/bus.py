@@ -12,6 +12,7 @@ from typing import Any, Literal, Protocol, TypeVar
 
 from bam_envs.core.errors import BamEnvsError, LinkLost, RemoteError
 from bam_envs.core.wording import listed
+from bam_envs.rosbridge.tokens import Role
 
 T = TypeVar("T")
 Message = Mapping[str, Any]
@@ -25,7 +26,8 @@ class Caller:
     name: str  # unique among the callers of a bus
     address: str = ""  # its network address, for people
     session: str = ""  # the session whose signature the message bears; empty without one
-    operator: bool = False  # whether it showed the operator's token
+    operator: bool = False  # whether it showed a token that administers, and may take command from others
+    role: Role = "drive"  # what it may do
     silence: Callable[[], float] = field(default=lambda: math.inf, compare=False)
     """Time since the last sign of life of its connection [s]; infinite if the bus does not know."""
 

@@ -1,19 +1,25 @@
 """Shared secrets that clients show to servers, and the limit on guesses."""
 
+from __future__ import annotations
+
 import hmac
 import ipaddress
+import logging
 import os
 import stat
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
-from typing import Literal
+from typing import Literal, get_args
 
 from bam_envs.core.errors import InvalidValue
 
-Role = Literal["client", "operator"]
+Role = Literal["watch", "drive", "administer"]
+ROLES: tuple[Role, ...] = get_args(Role)
+"""From the least to the most: each role may do what those before it may."""
+_log = logging.getLogger(__name__)
 _WINDOW = 1.0
 _OF_ONE, _OF_ALL = 4, 32  # wrong tokens from one address, and from all that were wrong lately, in `_WINDOW` [s]
 _LATELY = 60.0
@@ -36,29 +42,105 @@ def read_token(path: str | Path, *, private: bool = False) -> str:
     return token
 
 
-class Tokens:
-    """The secrets of one server, each may be None: of clients, and of operators, who may take command from others."""
+def read_tokens(path: str | Path) -> dict[str, Role]:
+    """The secrets in the file of a server, each with its role; no other user may read the file.
 
-    def __init__(self, client: str | None = None, operator: str | None = None) -> None:
-        if "" in (client, operator):
+    The file holds one secret, which administers, or lines of a role and a secret: ``drive 2Yb7...``. Empty lines and
+    those that begin with # are skipped. `InvalidValue` for another file; the text shows no secret.
+    """
+    numbered = enumerate(read_token(path, private=True).splitlines(), 1)
+    lines = {number: line.split() for number, line in numbered if line.strip() and not line.strip().startswith("#")}
+    if len(lines) == 1 and len(words := next(iter(lines.values()))) == 1:
+        return {words[0]: "administer"}
+    secrets: dict[str, Role] = {}
+    for number, words in lines.items():
+        role = next((one for one in ROLES if one == words[0]), None)
+        if len(words) != 2 or role is None:
+            raise InvalidValue(
+                f"The token file {path}, line {number}: expected watch, drive or administer, a blank and a token; or "
+                "one token alone in the file, which administers."
+            )
+        if secrets.setdefault(words[1], role) != role:
+            raise InvalidValue(
+                f"The token file {path}, line {number}: its token has another role above; make a new one."
+            )
+    if not secrets:
+        raise InvalidValue(f"The token file {path} is empty; put a secret into it.")
+    return secrets
+
+
+class Tokens:
+    """The secrets of one server, each with the role that it gives; `otherwise` is the role of who shows none.
+
+    With `otherwise` None a client must show one. `InvalidValue` for an empty secret.
+    """
+
+    def __init__(self, secrets: Mapping[str, Role] | None = None, otherwise: Role | None = None) -> None:
+        self.version = 0
+        """Grows whenever the secrets change."""
+        self.otherwise = otherwise
+        self._secrets = dict(secrets or {})
+        if "" in self._secrets:
             raise InvalidValue("Token: expected a text, found an empty one.")
+
+    @classmethod
+    def of_clients(cls, client: str | None = None, operator: str | None = None) -> Tokens:
+        """Those of a server with one secret for clients, who drive, and one for operators, who administer; or None."""
         if operator is not None and operator == client:
             raise InvalidValue("The operator's token must be another one than that of the clients.")
-        self._client, self._operator = client, operator
-        self.needed = client is not None  # whether a client must show one
-        self.exist = self.needed or operator is not None  # whether there is anything to show
+        given: tuple[tuple[str | None, Role], ...] = ((client, "drive"), (operator, "administer"))
+        return cls({secret: role for secret, role in given if secret is not None}, "drive" if client is None else None)
+
+    @property
+    def needed(self) -> bool:
+        """Whether a client must show a secret."""
+        return self.otherwise is None
+
+    @property
+    def exist(self) -> bool:
+        """Whether there is anything to show."""
+        return bool(self._secrets)
 
     def role(self, shown: Iterable[str]) -> Role | None:
-        """The role that one of these tokens gives; None if all are wrong."""
-        role: Role | None = None
+        """The highest role that one of these secrets gives; None if all are wrong."""
+        given: list[Role] = []
         # In constant time: the duration of a refusal must not reveal how much of the token was right.
         for text in shown:
             data = text.encode("utf-8", "surrogatepass")  # a stranger may send anything, even invalid text
-            if self._client is not None and hmac.compare_digest(data, self._client.encode()):
-                role = role or "client"
-            if self._operator is not None and hmac.compare_digest(data, self._operator.encode()):
-                role = "operator"
-        return role
+            given += [role for secret, role in self._secrets.items() if hmac.compare_digest(data, secret.encode())]
+        return max(given, key=ROLES.index, default=None)
+
+    def refresh(self) -> None:
+        """Read the secrets again if their file has changed; without a file there is nothing to do."""
+
+
+class TokenFile(Tokens):
+    """The secrets of `read_tokens`, read again when the file changes; a file with a mistake changes nothing."""
+
+    def __init__(self, path: str | Path) -> None:
+        self._path, self._stamp = Path(path), _stamp(path)
+        super().__init__(read_tokens(path))
+
+    def refresh(self) -> None:
+        """Read the file again if it has changed; a mistake in it is logged, once, and the secrets stay as they are."""
+        stamp, self._stamp = self._stamp, _stamp(self._path)
+        if stamp == self._stamp:
+            return
+        try:
+            self._secrets = read_tokens(self._path)
+        except InvalidValue as error:
+            _log.warning("The tokens stay as they were: %s", error)
+            return
+        self.version += 1
+        _log.warning("The token file %s has changed; its tokens are the valid ones now.", self._path)
+
+
+def _stamp(path: str | Path) -> tuple[int, ...]:
+    try:
+        status = os.stat(path)
+    except OSError:
+        return ()
+    return status.st_mtime_ns, status.st_size, status.st_ino, status.st_mode
 
 
 class Guesses:

@@ -3,7 +3,7 @@ import os
 import pytest
 
 from bam_envs.core.errors import InvalidValue
-from bam_envs.rosbridge.tokens import Guesses, Tokens, read_token
+from bam_envs.rosbridge.tokens import Guesses, TokenFile, Tokens, read_token, read_tokens
 
 
 @pytest.mark.parametrize(
@@ -38,11 +38,12 @@ def test_a_servers_token_file_is_its_users_alone(tmp_path, mode):
 
 
 def test_roles():
-    tokens = Tokens("secret", "mine")
+    tokens = Tokens.of_clients("secret", "mine")
     shown = [[], [""], ["secre"], ["secret"], ["x", "mine"], ["mine", "secret"], ["\ud800"]]
-    assert [tokens.role(one) for one in shown] == [None, None, None, "client", "operator", "operator", None]
-    assert (tokens.needed, Tokens(operator="mine").needed, Tokens().exist) == (True, False, False)
-    assert Tokens(operator="mine").role(["secret"]) is None
+    assert [tokens.role(one) for one in shown] == [None, None, None, "drive", "administer", "administer", None]
+    only_operator = Tokens.of_clients(None, "mine")
+    assert (tokens.needed, only_operator.needed, Tokens.of_clients().exist) == (True, False, False)
+    assert (only_operator.otherwise, only_operator.role(["secret"])) == ("drive", None)
 
 
 @pytest.mark.parametrize(
@@ -55,8 +56,72 @@ def test_roles():
 )
 def test_tokens_that_cannot_be(given, text):
     with pytest.raises(InvalidValue) as error:
-        Tokens(*given)
+        Tokens.of_clients(*given)
     assert str(error.value) == text
+
+
+@pytest.fixture
+def token_file(tmp_path):
+    path = tmp_path / "tokens"
+    path.touch(0o600)
+    return path
+
+
+@pytest.mark.parametrize(
+    ("content", "secrets"),
+    [
+        ("one\n", {"one": "administer"}),
+        ("drive one", {"one": "drive"}),
+        (
+            "# the console on the wall\nwatch one\n\n  drive two\ndrive three\nadminister\tfour\n",
+            {"one": "watch", "two": "drive", "three": "drive", "four": "administer"},
+        ),
+    ],
+)
+def test_the_token_file_of_a_server(token_file, content, secrets):
+    token_file.write_text(content)
+    assert read_tokens(token_file) == secrets
+
+
+@pytest.mark.parametrize(
+    ("content", "text"),
+    [
+        (
+            "drive one\ndriv two",
+            ", line 2: expected watch, drive or administer, a blank and a token; or one token alone in the file, which "
+            "administers.",
+        ),
+        ("drive one\nwatch one", ", line 2: its token has another role above; make a new one."),
+        ("# nothing\n", " is empty; put a secret into it."),
+    ],
+)
+def test_a_token_file_of_a_server_that_is_none(token_file, content, text):
+    token_file.write_text(content)
+    with pytest.raises(InvalidValue) as error:
+        read_tokens(token_file)
+    assert str(error.value) == f"The token file {token_file}{text}"
+
+
+def test_a_token_file_that_changes(token_file, caplog):
+    token_file.write_text("one")
+    tokens = TokenFile(token_file)
+    tokens.refresh()
+    assert (tokens.version, tokens.role(["one"])) == (0, "administer")
+    token_file.write_text("drive two\nwatch")
+    tokens.refresh()
+    tokens.refresh()
+    assert (tokens.version, tokens.role(["one"])) == (0, "administer")
+    token_file.write_text("drive two\nwatch three")
+    tokens.refresh()
+    assert (tokens.version, tokens.role(["one"]), tokens.role(["two"])) == (1, None, "drive")
+    token_file.unlink()
+    tokens.refresh()
+    assert tokens.role(["three"]) == "watch"
+    assert [record.getMessage().partition(":")[0] for record in caplog.records] == [
+        "The tokens stay as they were",
+        f"The token file {token_file} has changed; its tokens are the valid ones now.",
+        "The tokens stay as they were",
+    ]
 
 
 def tries(guesses, addresses):

@@ -67,7 +67,7 @@ class TcpServer:
         self.max_clients, self.patience = max_clients, patience
         self.most = _ROOM + 2 * action_size(server.spec())
         """Largest request [bytes]."""
-        self._tokens, self._guesses = Tokens(token, operator_token), Guesses()
+        self._tokens, self._guesses = Tokens.of_clients(token, operator_token), Guesses()
         self.freshness = FreshnessCheck()
         self._listener: socket.socket | None = None
         self._thread: threading.Thread | None = None
@@ -168,7 +168,7 @@ class TcpServer:
             if present >= self.max_clients:
                 raise RemoteError(f"All {self.max_clients} places for clients are taken; try again when one has left.")
             # An open connection is a sign of life of the system at its other end.
-            name, operator = connection.client, role == "operator"
+            name, operator = connection.client, role == "administer"
             connection.caller = Caller(name, name, operator=operator, silence=lambda: 0.0)
         for one in older:
             one.drop()

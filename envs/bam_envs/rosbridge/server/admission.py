@@ -5,7 +5,7 @@ import contextlib
 import errno
 import logging
 import ssl
-from collections.abc import Callable
+from collections.abc import Awaitable, Callable, Iterable
 from http import HTTPStatus
 from pathlib import Path
 from urllib.parse import parse_qs, urlsplit
@@ -15,13 +15,15 @@ from websockets.http11 import Request, Response
 from bam_envs.core.errors import InvalidValue, ProtocolError
 from bam_envs.rosbridge.encoding import decode_frame
 from bam_envs.rosbridge.server.client_session import ServerOptions
+from bam_envs.rosbridge.server.refusals import Refusals
 from bam_envs.rosbridge.server.server_connection import BridgeConnection
+from bam_envs.rosbridge.server.site import Site, is_websocket
 from bam_envs.rosbridge.tokens import Guesses, Tokens
 
-_NO_TOKEN = (
-    "This server needs its token: send the header 'Authorization: Bearer TOKEN', or open the URL with ?token=TOKEN."
-)
+_BEARER = "This server needs its token: send the header 'Authorization: Bearer TOKEN'"
 _TOO_OFTEN = "Too many wrong tokens came from this address; try again in a second."
+_WRONG = "The token is wrong."
+_REVOKED = "The token of this connection is valid no longer."
 _NO_PAGES = "A web page comes in only with the token of this server, and it was started without one."
 _PAGE_REFUSED = (
     "The web page %r was refused: a browser comes in only with a token. "
@@ -29,45 +31,71 @@ _PAGE_REFUSED = (
 )
 _FIRST = 'The first message of a page must be its token, within {:g} s: {{"op": "auth", "token": TOKEN}}'
 _POLICY_VIOLATION = 1008  # close code for a client that does not show its token
+_STATUS = {_TOO_OFTEN: HTTPStatus.TOO_MANY_REQUESTS}
 _logger = logging.getLogger(__name__)
 
 
 class Admission:
     """Admits or refuses clients; `present` returns the number of clients."""
 
-    def __init__(self, tokens: Tokens, options: ServerOptions, present: Callable[[], int]) -> None:
-        self._tokens, self._guesses = tokens, Guesses()
-        self._options, self._present = options, present
+    def __init__(
+        self, tokens: Tokens, options: ServerOptions, present: Callable[[], int], site: Site | None, secure: bool
+    ) -> None:
+        self._tokens, self._guesses, self._version = tokens, Guesses(), tokens.version
+        self._options, self._present, self._site, self._secure = options, present, site, secure
+        self._refusals = Refusals(_logger)
 
     def check(self, connection: BridgeConnection, request: Request) -> Response | None:
-        """The refusal of a request to open a WebSocket, or None; a page may show its token later (`greet`)."""
+        """A page, or the refusal of a request, or None for a WebSocket; a page may show its token later (`greet`)."""
+        refusal = None
+        if self._site is not None:
+            refusal = self._site.refusal(request, secure=self._secure, tokens=self._tokens.exist)
+            if refusal is None and not is_websocket(request):
+                return self._site.response(request)
+        refusal = refusal or self._refusal(connection, request)
+        if refusal is None:
+            return None
+        status, text = refusal
+        if text != _NO_PAGES:
+            self._refusals.note(connection.host, text)
+        response = connection.respond(status, text + "\n")
+        if status is HTTPStatus.UNAUTHORIZED:
+            response.headers["WWW-Authenticate"] = "Bearer"
+        return response
+
+    def _refusal(self, connection: BridgeConnection, request: Request) -> tuple[HTTPStatus, str] | None:
+        """Why a client may not open a WebSocket; else None, and a client without `greet` before it has its role."""
         headers, is_page = request.headers.get_all("Authorization"), "Origin" in request.headers
         shown = [text.partition(" ")[2].strip() for text in headers if text.lower().startswith("bearer ")]
-        shown += parse_qs(urlsplit(request.path).query).get("token", [])
+        if self._site is None:
+            shown += parse_qs(urlsplit(request.path).query).get("token", [])
+        no_token = f"{_BEARER}." if self._site else f"{_BEARER}, or open the URL with ?token=TOKEN."
         if shown and self._tokens.exist:
             # Several different tokens would be several guesses.
             refusal = self._judge(connection, shown if len(set(shown)) == 1 else [])
-            if refusal == _TOO_OFTEN:
-                return connection.respond(HTTPStatus.TOO_MANY_REQUESTS, _TOO_OFTEN + "\n")
             if refusal is not None:
-                return _unauthorized(connection)
-        elif is_page and not self._tokens.exist:
+                text = no_token if refusal == _WRONG and not self._site else refusal
+                return _STATUS.get(refusal, HTTPStatus.UNAUTHORIZED), text
+        elif is_page and not self._tokens.exist and self._site is None:
             # Any page open in a browser on this computer reaches loopback; programs send no Origin.
             _logger.warning(_PAGE_REFUSED, ", ".join(request.headers.get_all("Origin"))[:100])
-            return connection.respond(HTTPStatus.FORBIDDEN, _NO_PAGES + "\n")
-        elif is_page:
+            return HTTPStatus.FORBIDDEN, _NO_PAGES
+        elif is_page and self._tokens.exist:
             return None  # browsers set no headers, and an address with a token is logged; `greet` reads a message
         elif self._tokens.needed:
-            return _unauthorized(connection)
+            return HTTPStatus.UNAUTHORIZED, no_token
         if full := self._full():
-            return connection.respond(HTTPStatus.SERVICE_UNAVAILABLE, full + "\n")
-        connection.role = connection.role or "client"
+            connection.role = None
+            return HTTPStatus.SERVICE_UNAVAILABLE, full
+        connection.role = connection.role or self._tokens.otherwise
         return None
 
     async def greet(self, connection: BridgeConnection) -> None:
         """Close a connection that was opened without a token unless its first message shows one."""
         if connection.role is not None:
             return
+        if self._site is not None and self._site.socket(connection.request) is not None:
+            await connection.send('{"event": "auth"}')
         limit = self._options.token_timeout
         reason: str | None = _FIRST.format(limit)
         with contextlib.suppress(asyncio.TimeoutError, ProtocolError):
@@ -77,27 +105,35 @@ class Admission:
         if reason is None and (full := self._full()):
             connection.role, reason = None, full
         if reason is not None:
+            self._refusals.note(connection.host, reason)
             await connection.close(_POLICY_VIOLATION, reason)
+
+    def revoked(self, connections: Iterable[BridgeConnection]) -> list[Awaitable[None]]:
+        """Close the connections whose token is valid no longer, or has another role; the closings are to be awaited."""
+        self._tokens.refresh()
+        if self._tokens.version == self._version:
+            return []
+        self._version = self._tokens.version
+        gone = [one for one in connections if one.secret and self._tokens.role([one.secret]) != one.role]
+        for one in gone:
+            self._refusals.note(one.host, _REVOKED)
+        return [one.close(_POLICY_VIOLATION, _REVOKED) for one in gone]
 
     def _judge(self, connection: BridgeConnection, shown: list[str]) -> str | None:
         """Set the role of a client that shows these tokens; returns the reason for a refusal, or None."""
         if not self._guesses.may_try(connection.host):
             return _TOO_OFTEN
+        self._tokens.refresh()
         connection.role = self._tokens.role(shown)
         if connection.role is None:
             self._guesses.wrong(connection.host)
-            return "The token is wrong."
+            return _WRONG
+        connection.secret = shown[0]
         return None
 
     def _full(self) -> str:
         most = self._options.max_clients
         return f"There are {most} clients, and no room for more." if self._present() >= most else ""
-
-
-def _unauthorized(connection: BridgeConnection) -> Response:
-    response = connection.respond(HTTPStatus.UNAUTHORIZED, _NO_TOKEN + "\n")
-    response.headers["WWW-Authenticate"] = "Bearer"
-    return response
 
 
 def tls_context(cert: str, key: str | None) -> ssl.SSLContext:

@@ -10,8 +10,9 @@ import time
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
-from bam_envs.core.errors import BamEnvsError, InvalidValue, ProtocolError
+from bam_envs.core.errors import BamEnvsError, InvalidValue, ProtocolError, RemoteError
 from bam_envs.core.wording import brief
+from bam_envs.ros.codec import HALT_TOPIC, INFO_SERVICE
 from bam_envs.ros.interfaces import complete, normal_name, request_type, response_type
 from bam_envs.ros.messages import write_stamp
 from bam_envs.rosbridge.bus import Caller, Handler, Listener, Message, deliver, tell
@@ -32,9 +33,12 @@ from bam_envs.rosbridge.server.client_session import (
     read_text,
     read_wish,
 )
+from bam_envs.rosbridge.server.refusals import Refusals
 from bam_envs.rosbridge.server.services import Services, checked, packed_response
 from bam_envs.rosbridge.server.topics import Stream, Topic, Topics
 
+_FOR_WATCHERS = frozenset({"subscribe", "unsubscribe", "set_level", "fragment", "call_service"})
+_ON_HALT = frozenset({"advertise", "unadvertise", "publish"})  # what a watcher may do on the topic that halts, only
 _logger = logging.getLogger(__name__)
 _PROCESS = Caller("this process")
 _OPERATIONS = (
@@ -71,6 +75,7 @@ class Bridge:
         self.services = Services(self._events.append)
         self._fragmented: set[Session] = set()
         self._leave: list[Callable[[Caller], None]] = []
+        self._refusals = Refusals(_logger)
         rosapi: dict[str, tuple[str, Handler]] = {
             "get_time": ("GetTime", lambda *_: {"time": _time_of_day(clock())}),
             "topics": ("Topics", lambda *_: {"topics": [*self.topics], "types": self.topics.kinds}),
@@ -142,6 +147,8 @@ class Bridge:
             if name not in _OPERATIONS:
                 unknown = f"Unknown op {name!r:.40}; expected one of {', '.join(_OPERATIONS)}, fragment."
                 raise ProtocolError(_NO_ACTIONS if "action" in name else _NO_AUTH if name == "auth" else unknown)
+            if session.caller.role == "watch":
+                self._require_watching(session, name, message)
             getattr(self, f"_{name}")(session, incoming, now)
         except BamEnvsError as error:
             number: Id = None
@@ -281,6 +288,8 @@ class Bridge:
             service = self.services.get(name)
             if service is None:
                 raise ProtocolError(f"Service {name} does not exist")
+            if session.caller.role == "watch" and not (service.inline or name.endswith(INFO_SERVICE)):
+                raise self._refused(session, f"The service {name}")
             call.timeout, values = read_number(message, "timeout", 0), incoming.content_of(request_type(service.kind))
             call.wish = read_wish(message)
             self.services.call(call, service, values, now)
@@ -317,6 +326,16 @@ class Bridge:
         self._events.append(Send(session, pack({**result, "id": read_id(incoming.message)})))
 
     # ---- inside
+
+    def _require_watching(self, session: Session, name: str, message: Mapping[str, Any]) -> None:
+        """Refuse what a client that may only watch asks for; everybody may halt the robot."""
+        halts = name in _ON_HALT and read_name(message, "topic").endswith(HALT_TOPIC)
+        if name not in _FOR_WATCHERS and not halts:
+            raise self._refused(session, name)
+
+    def _refused(self, session: Session, what: str) -> RemoteError:
+        self._refusals.note(session.caller.shown, f"{what} is not for the role watch")
+        return RemoteError("This needs a token of the role drive; the token shown may watch, and halt the robot.")
 
     def _existing(self, name: str) -> Topic:
         topic = self.topics.get(name)

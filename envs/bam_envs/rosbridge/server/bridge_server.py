@@ -26,6 +26,8 @@ from bam_envs.rosbridge.server.admission import Admission, listening_error, tls_
 from bam_envs.rosbridge.server.bridge import Bridge, Incoming
 from bam_envs.rosbridge.server.client_session import Call, Send, ServerOptions, Session
 from bam_envs.rosbridge.server.server_connection import BridgeConnection
+from bam_envs.rosbridge.server.site import Handler as SiteHandler
+from bam_envs.rosbridge.server.site import Site
 from bam_envs.rosbridge.threads import LoopThread, Workers
 from bam_envs.rosbridge.tokens import Tokens
 
@@ -35,6 +37,7 @@ _HANDLER_THREADS = 32
 _SHORT = 4096  # longest frame that is decoded in the network thread [bytes]
 _TURN = 4  # frames of one client that are read before those of other clients
 _QUEUE = 2  # messages of a client that are read from its socket before they are processed
+_EXPEL = 0.5  # time between two looks at the file of the tokens [s]
 _logger = logging.getLogger(__name__)
 # The logger of `websockets`, which reports every port scanner with a traceback.
 _quiet = logging.getLogger(f"{__name__}.websockets")
@@ -52,6 +55,9 @@ class BridgeServer(Bus):
         token: Clients must show it: ``Authorization: Bearer TOKEN``, or ``?token=TOKEN`` in the URL; a page in a
             browser also by its first message, ``{"op": "auth", "token": TOKEN}``. Without a token no page is admitted.
         operator_token: A client that shows this one instead is an operator (`Caller.operator`).
+        tokens: Instead of these two, any secrets with their roles. When their file changes, connections whose token is
+            valid no longer are closed within a second.
+        site: Pages and WebSocket paths of an application on the same port.
         options: Limits and timeouts.
     """
 
@@ -64,6 +70,8 @@ class BridgeServer(Bus):
         key: str | None = None,
         token: str | None = None,
         operator_token: str | None = None,
+        tokens: Tokens | None = None,
+        site: Site | None = None,
         options: ServerOptions | None = None,
     ) -> None:
         if not 0 <= port <= 65535:
@@ -76,7 +84,9 @@ class BridgeServer(Bus):
         self._bridge = Bridge(self.options)
         self._connections: dict[Session, BridgeConnection] = {}
         self._sockets: set[BridgeConnection] = set()
-        self._admission = Admission(Tokens(token, operator_token), self.options, lambda: len(self._connections))
+        self._visitors: set[BridgeConnection] = set()  # on paths of the site
+        tokens, self._site = tokens or Tokens.of_clients(token, operator_token), site
+        self._admission = Admission(tokens, self.options, lambda: self.clients, site, secure=cert is not None)
         self._numbers = itertools.count(1)
         self._thread = LoopThread("bam-bridge-server")
         self._workers = Workers(_HANDLER_THREADS, "bam-bridge-handler")
@@ -92,7 +102,7 @@ class BridgeServer(Bus):
     @property
     def clients(self) -> int:
         """Number of clients."""
-        return len(self._connections)
+        return len(self._connections) + len(self._visitors)
 
     @property
     def held(self) -> tuple[int, int]:
@@ -181,8 +191,16 @@ class BridgeServer(Bus):
         )
         self.port = server.sockets[0].getsockname()[1]
         listening.set_result(None)
+        expelling = asyncio.create_task(self._expel())
         await self._stop.wait()
+        expelling.cancel()
         await self._shut(server)
+
+    async def _expel(self) -> None:
+        """Close connections whose token was taken out of its file."""
+        while True:
+            await asyncio.sleep(_EXPEL)
+            await asyncio.gather(*self._admission.revoked(list(self._sockets)), return_exceptions=True)
 
     async def _shut(self, server: Server) -> None:
         # asyncio leaks a socket that was accepted just before its server is closed. So accept no more, let accepted
@@ -213,9 +231,13 @@ class BridgeServer(Bus):
         caller = Caller(
             f"client{next(self._numbers)}",
             f"{host}:{port}",
-            operator=connection.role == "operator",
+            operator=connection.role == "administer" and bool(connection.secret),
+            role=connection.role,
             silence=lambda: time.monotonic() - connection.heard,
         )
+        if self._site is not None and (handler := self._site.socket(connection.request)) is not None:
+            await self._visit(connection, caller, handler)
+            return
         session = self._bridge.open(caller)
         self._connections[session] = connection
         try:
@@ -226,6 +248,18 @@ class BridgeServer(Bus):
             del self._connections[session]
             self._bridge.lost(session)
             self._flush()
+
+    async def _visit(self, connection: BridgeConnection, caller: Caller, serve: SiteHandler) -> None:
+        self._visitors.add(connection)
+        try:
+            await serve(connection, caller)
+        except ConnectionClosed as end:
+            _logger.debug("%s at %s left: %s", caller.name, caller.address, end)
+        except Exception:  # `websockets` closes the connection, and its logger is quiet
+            _logger.exception("the connection of %s failed", caller.address)
+            raise
+        finally:
+            self._visitors.discard(connection)
 
     async def _read(self, connection: BridgeConnection, session: Session) -> None:
         for number in itertools.count(1):

@@ -80,6 +80,7 @@ class BridgeConnection(ServerConnection):
         self._most_unsent = limits.max_message + limits.outbox_size
         self.outbox = Outbox(limits.outbox_size, limits.outbox_of_a_topic)
         self.role: Role | None = None  # of an admitted client; None before
+        self.secret = ""  # the token that gave the role; empty for a client that showed none
         self.host = ""  # the IP address of the client
         self.heard = time.monotonic()  # when data last arrived [s, monotonic]
         self.born = self.heard  # when the socket opened [s, monotonic]
@@ -131,8 +132,14 @@ class BridgeConnection(ServerConnection):
     # ---- incoming
 
     async def next_frame(self) -> bytes:
-        """Wait for the next message."""
+        """Wait for the next message, text or not."""
         message = await self.recv(decode=False)
+        self._waiting -= self._whole.popleft()
+        return message
+
+    async def next_message(self) -> str | bytes:
+        """Wait for the next message: text as `str`, another one as `bytes`."""
+        message = await self.recv()
         self._waiting -= self._whole.popleft()
         return message
 

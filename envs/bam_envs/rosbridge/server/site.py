@@ -1,0 +1,126 @@
+"""A site on the port of a rosbridge server: pages, WebSocket paths of its own, and who may open them."""
+
+import ipaddress
+import re
+from collections.abc import Awaitable, Callable, Mapping
+from dataclasses import dataclass, field
+from http import HTTPStatus
+from pathlib import Path
+from typing import NamedTuple
+from urllib.parse import parse_qs
+
+from websockets.datastructures import Headers
+from websockets.http11 import Request, Response
+
+from bam_envs.core.errors import InvalidValue
+from bam_envs.core.wording import brief
+from bam_envs.rosbridge.bus import Caller
+from bam_envs.rosbridge.server.server_connection import BridgeConnection
+
+_TYPES = {
+    ".html": "text/html; charset=utf-8",
+    ".css": "text/css; charset=utf-8",
+    ".js": "text/javascript; charset=utf-8",
+    ".json": "application/json",
+    ".svg": "image/svg+xml",
+    ".png": "image/png",
+    ".ico": "image/x-icon",
+    ".woff2": "font/woff2",
+}
+_HEADERS = {
+    "Content-Security-Policy": (
+        "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' blob: data:; font-src 'self'; "
+        "connect-src 'self'; worker-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
+    ),
+    "X-Content-Type-Options": "nosniff",
+    "X-Frame-Options": "DENY",
+    "Referrer-Policy": "no-referrer",
+    "Cross-Origin-Opener-Policy": "same-origin",
+    "Cross-Origin-Resource-Policy": "same-origin",
+    "Cache-Control": "no-store",
+}
+"""What keeps a page to its own server; scripts and styles stand in files, not in the page."""
+_IN_ADDRESS = "A token never stands in an address, which is logged: send the header 'Authorization: Bearer TOKEN'."
+
+Handler = Callable[[BridgeConnection, Caller], Awaitable[None]]
+"""Serves one admitted WebSocket, in the network thread; the connection closes when it returns."""
+
+
+class Page(NamedTuple):
+    """What is sent for one path."""
+
+    kind: str  # its media type
+    body: bytes
+
+
+@dataclass(frozen=True)
+class Site:
+    """Pages by their exact path, and WebSockets by theirs; rosbridge has the path ``/``.
+
+    A server with a site takes a token from the header ``Authorization`` or a page's first message, never from an
+    address. A web page comes in only from the server itself: its Origin must be the address in the header ``Host``,
+    which must be a loopback one while the server has no tokens (a foreign name may be made to lead here). A WebSocket
+    of a page that has yet to show its token is told so: ``{"event": "auth"}``.
+    """
+
+    pages: Mapping[str, Page] = field(default_factory=dict)
+    sockets: Mapping[str, Handler] = field(default_factory=dict)
+
+    def refusal(self, request: Request, *, secure: bool, tokens: bool) -> tuple[HTTPStatus, str] | None:
+        """Why a request is refused, before its token is looked at; None if it is not."""
+        hosts, origins = request.headers.get_all("Host"), request.headers.get_all("Origin")
+        if len(hosts) != 1:
+            return HTTPStatus.BAD_REQUEST, f"Expected one header Host, found {len(hosts)}."
+        own = f"{'https' if secure else 'http'}://{hosts[0]}"
+        if origins and origins != [own]:
+            return (
+                HTTPStatus.FORBIDDEN,
+                f"The page {brief(', '.join(origins))} is not of this server, which is {brief(own)}.",
+            )
+        if not tokens and not _is_loopback(hosts[0]):
+            reason = f"Without tokens this server is there for 127.0.0.1 and localhost only, not for {brief(hosts[0])}."
+            return HTTPStatus.FORBIDDEN, reason
+        path, query = _path(request), request.path.partition("?")[2]
+        if "token" in parse_qs(query, keep_blank_values=True):
+            return HTTPStatus.BAD_REQUEST, _IN_ADDRESS
+        known = {"/", *self.sockets} if is_websocket(request) else self.pages
+        if path not in known:
+            return HTTPStatus.NOT_FOUND, f"There is no {brief(path)} here."
+        return None
+
+    def response(self, request: Request) -> Response:
+        """The page that a request asks for."""
+        page = self.pages[_path(request)]
+        length = {"Content-Type": page.kind, "Content-Length": str(len(page.body)), "Connection": "close"}
+        return Response(HTTPStatus.OK.value, HTTPStatus.OK.phrase, Headers({**length, **_HEADERS}), page.body)
+
+    def socket(self, request: Request | None) -> Handler | None:
+        """What serves the WebSocket of a request; None for that of rosbridge."""
+        return None if request is None else self.sockets.get(_path(request))
+
+
+def is_websocket(request: Request) -> bool:
+    """Whether a request wants to become a WebSocket."""
+    return any("websocket" in text.lower() for text in request.headers.get_all("Upgrade"))
+
+
+def _path(request: Request) -> str:
+    return request.path.partition("?")[0]  # neither decoded nor joined with anything: a name in a table, or none
+
+
+def read_pages(folder: Path) -> dict[str, Page]:
+    """The files of a folder as pages of a `Site`, without subfolders; ``index.html`` is also ``/``."""
+    pages: dict[str, Page] = {}
+    for path in sorted(one for one in folder.iterdir() if one.is_file() and not one.name.startswith((".", "_"))):
+        if path.suffix not in _TYPES:
+            raise InvalidValue(f"{path}: expected a page with one of {', '.join(_TYPES)}.")
+        pages[f"/{path.name}"] = Page(_TYPES[path.suffix], path.read_bytes())
+    return {**pages, "/": pages["/index.html"]} if "/index.html" in pages else pages
+
+
+def _is_loopback(host: str) -> bool:
+    name = re.sub(r":\d*$", "", host).strip("[]").lower()
+    try:
+        return name == "localhost" or ipaddress.ip_address(name).is_loopback
+    except ValueError:
+        return False
