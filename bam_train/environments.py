@@ -218,21 +218,30 @@ def fit_pairs(checkpoint: Checkpoint, env: AnyEnv) -> list[tuple[str, Any, Any]]
 
     The values are plain JSON; those that one of the two does not give are left out.
     """
-    manifest, single = checkpoint.manifest, "single_" if isinstance(env, VectorEnv) else ""
-    pairs = [
-        (name, getattr(manifest, name), space_to_json(getattr(env, single + name)))
-        for name in ("observation_space", "action_space")
-    ]
-    describe = getattr(env.unwrapped, "describe", None)
-    signals = {} if describe is None else describe()
-    if signals and manifest.signals:
-        pairs.append(("signals", _names_and_units(manifest.signals), _names_and_units(signals)))
-    plain = [(name, *json.loads(json.dumps(values))) for name, *values in pairs]  # tuples as lists
-    period = getattr(env.unwrapped, "period", None)
+    return interface_pairs(checkpoint, interface_of(env))
+
+
+def interface_of(env: AnyEnv) -> dict[str, Any]:
+    """What a policy sees of `env`, as plain JSON: its spaces, signals and period [s]; {} and None where unknown."""
+    single = "single_" if isinstance(env, VectorEnv) else ""
+    spaces = {name: space_to_json(getattr(env, single + name)) for name in ("observation_space", "action_space")}
+    describe, period = getattr(env.unwrapped, "describe", None), getattr(env.unwrapped, "period", None)
+    signals = {} if describe is None else _names_and_units(describe())
+    plain: dict[str, Any] = json.loads(json.dumps({**spaces, "signals": signals}))  # tuples as lists
+    return {**plain, "period": None if period is None else float(period)}
+
+
+def interface_pairs(checkpoint: Checkpoint, interface: Mapping[str, Any]) -> list[tuple[str, Any, Any]]:
+    """As `fit_pairs`, for an environment of which `interface_of` is given."""
+    manifest = checkpoint.manifest
+    pairs = [(name, getattr(manifest, name), interface[name]) for name in ("observation_space", "action_space")]
+    if interface["signals"] and manifest.signals:
+        pairs.append(("signals", _names_and_units(manifest.signals), interface["signals"]))
+    period = interface["period"]
     if period is not None and manifest.period is not None:
         same = math.isclose(period, manifest.period, rel_tol=1e-9)
-        plain.append(("period [s]", manifest.period, manifest.period if same else float(period)))
-    return plain
+        pairs.append(("period [s]", manifest.period, manifest.period if same else period))
+    return pairs
 
 
 def first_difference(theirs: Any, ours: Any, name: str) -> tuple[str, Any, Any] | None:

@@ -69,15 +69,7 @@ class FrozenPolicy:
         """Load the policy of an open checkpoint."""
         manifest = checkpoint.manifest
         policy = cls.from_graph(checkpoint.read(POLICY), manifest.observation_space, manifest.action_space)
-        try:
-            worst, row = policy.worst_difference(checkpoint.arrays(GOLDEN))
-        except PolicyError as error:
-            raise PolicyError(f"{checkpoint.path}: {GOLDEN} does not fit the policy: {error}") from error
-        if not worst <= TOLERANCE:  # NaN too
-            raise PolicyError(
-                f"{checkpoint.path}: the frozen policy differs from the trainer's by {worst:.3g} in row {row} of "
-                f"{GOLDEN}, expected at most {TOLERANCE}. Save it again with this version of bam-train"
-            )
+        policy.require_golden(checkpoint)
         return policy
 
     @classmethod
@@ -164,35 +156,32 @@ class FrozenPolicy:
         self._state = dict(zip(self._zero_state, state, strict=True))
         return _int64(action)
 
+    def require_golden(self, checkpoint: Checkpoint) -> None:
+        """Raise PolicyError unless the policy of a checkpoint acts as the trainer did."""
+        try:
+            worst, row = self.worst_difference(checkpoint.arrays(GOLDEN))
+        except PolicyError as error:
+            raise PolicyError(f"{checkpoint.path}: {GOLDEN} does not fit the policy: {error}") from error
+        if not worst <= TOLERANCE:  # NaN too
+            raise PolicyError(
+                f"{checkpoint.path}: the frozen policy differs from the trainer's by {worst:.3g} in row {row} of "
+                f"{GOLDEN}, expected at most {TOLERANCE}. Save it again with this version of bam-train"
+            )
+
     def worst_difference(self, golden: Mapping[str, np.ndarray]) -> tuple[float, int]:
         """Act on recorded observations; return the largest difference from the recorded actions and its row.
 
         Args:
             golden: ``action`` and the observations by name, (n, ...) each; if recurrent, the steps of one episode.
         """
-        names = {"action", *(part.name for part in self._arrays)}
-        if set(golden) != names:
-            raise PolicyError(f"expected the arrays {sorted(names)}, found {sorted(golden)}")
-        rows = {name: array.shape[:1] for name, array in golden.items()}
-        if len(set(rows.values())) != 1 or rows["action"] in ((), (0,)):
-            raise PolicyError(f"expected as many rows in each array, found {rows}")
-        expected, action = golden["action"], self._action
-        if len(expected) > MOST_GOLDEN:
-            raise PolicyError(f"expected at most {MOST_GOLDEN} rows, found {len(expected)}")
-        if expected.shape[1:] != action.shape:
-            raise PolicyError(f"action: expected shape {action.shape}, found {expected.shape[1:]}")
-        expected = expected.astype(np.float64)
-
-        def observation(chosen: Any) -> Any:
-            parts = {part.name.removeprefix("observation."): golden[part.name][chosen] for part in self._arrays}
-            return parts if self._is_dict else parts["observation"]
-
+        self.require_rows(golden)
+        action, expected = self._action, golden["action"].astype(np.float64)
         single = len(expected) if self.recurrent else min(_SINGLE, len(expected))
         self.reset()
-        found = np.array([self.act(observation(k)) for k in range(single)])
+        found = np.array([self.act(self.recorded(golden, k)) for k in range(single)])
         self.reset()
         if not self.recurrent:
-            found = np.concatenate([found, self.act_batch(observation(slice(None)))[single:]])
+            found = np.concatenate([found, self.act_batch(self.recorded(golden, slice(None)))[single:]])
         unit = np.ones(())  # or half the range of a Box if that is more: float32 rounds relative to it
         if action.kind == "Box" and action.low is not None and action.high is not None:
             half = (action.high - action.low) / 2
@@ -200,6 +189,26 @@ class FrozenPolicy:
         worst = (np.abs(found.astype(np.float64) - expected) / unit).reshape(len(expected), -1).max(axis=1)
         row = int(np.argmax(np.where(np.isnan(worst), np.inf, worst)))
         return float(worst[row]), row
+
+    def require_rows(self, golden: Mapping[str, np.ndarray]) -> int:
+        """The number of rows of recorded arrays; raises PolicyError where they do not fit the policy."""
+        names = {"action", *(part.name for part in self._arrays)}
+        if set(golden) != names:
+            raise PolicyError(f"expected the arrays {sorted(names)}, found {sorted(golden)}")
+        rows = {name: array.shape[:1] for name, array in golden.items()}
+        if len(set(rows.values())) != 1 or rows["action"] in ((), (0,)):
+            raise PolicyError(f"expected as many rows in each array, found {rows}")
+        found = golden["action"].shape
+        if found[0] > MOST_GOLDEN:
+            raise PolicyError(f"expected at most {MOST_GOLDEN} rows, found {found[0]}")
+        if found[1:] != self._action.shape:
+            raise PolicyError(f"action: expected shape {self._action.shape}, found {found[1:]}")
+        return len(golden["action"])
+
+    def recorded(self, golden: Mapping[str, np.ndarray], rows: Any) -> Any:
+        """The observations in these rows of recorded arrays, as `act` or `act_batch` takes them."""
+        parts = {part.name.removeprefix("observation."): golden[part.name][rows] for part in self._arrays}
+        return parts if self._is_dict else parts["observation"]
 
 
 def _int64(array: np.ndarray) -> np.ndarray:
