@@ -171,6 +171,12 @@ class CandidateRefused(BamTrainError):  # noqa: N818
     exit_status = 3
 
 
+class AgentRefused(BamTrainError):  # noqa: N818 - reads as what happened
+    """A live agent refuses what it was asked."""
+
+    exit_status = 3
+
+
 class ContractRefused(BamTrainError):  # noqa: N818
     """A robot does not fit the checkpoint; `what` is the first line of the contract that does not."""
 

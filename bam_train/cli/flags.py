@@ -315,3 +315,62 @@ class SignConfig:
     """Your name in signatures; keygen: the file's name by default."""
     keys: Folder = None
     """Folder of the public keys that are trusted; $BAM_TRUSTED_KEYS or ~/.config/bam-train/trusted by default."""
+
+
+@dataclass(frozen=True)
+class AgentConfig:
+    """Stay on a robot's computer, and run a policy that people pause, take over from, and exchange.
+
+    A running agent is asked with bam-agent status|pause|resume|versions|stop URL.
+    """
+
+    policy: File = None
+    """The checkpoint.zip to begin with; by default the champion in the folder."""
+    robot: Url = None
+    """Live robot behind rosbridge, such as ws://127.0.0.1:9090; by default a simulated one."""
+    port: Port = 9095
+    """Port for people and programs; 0 takes a free one."""
+    bind: str = "127.0.0.1"
+    """Address to listen on; 127.0.0.1 is this computer only, 0.0.0.0 all its networks, which needs --token-file."""
+    token_file: File = None
+    """File with the secrets that people show: one token, or lines of watch, drive or administer and a token."""
+    cert: File = None
+    """Certificate in PEM, for https:// and wss://."""
+    key: File = None
+    """Its key, if it is in another file."""
+    folder: Path = Path("agent")
+    """Folder of the versions, the audit file, the trials and the recordings."""
+    env: EnvId = None
+    """Refuse the checkpoint unless it was trained on this environment; needed for some_module:Env-v0."""
+    set: Assignments = ()
+    """One keyword argument of the simulated robot's environment, any number of times: randomize=true."""
+    profile: Name = None
+    """Topics and limits of the live robot: a shipped profile's name, or a .toml or .yaml file."""
+    guard: Assignments = ()
+    """One limit of the live robot's guards, any number of times: joint_speed=0.3."""
+    ca_file: File = None
+    """Certificates that a wss:// robot is trusted by instead of the system's."""
+    robot_token_file: File = None
+    """File with the token that the robot's rosbridge server asks for."""
+    keys: Folder = None
+    """Public keys that a real robot trusts; $BAM_TRUSTED_KEYS or ~/.config/bam-train/trusted by default."""
+    allow_unsigned: bool = False
+    """Let a checkpoint without a trusted signature move a real robot; every status shows UNSIGNED."""
+    stage: Annotated[Literal["trial", "full"] | None, tyro.conf.arg(metavar="trial|full")] = None
+    """trial (default on a real robot): a quarter of the speed, in a box around the start; full: at its limits."""
+    i_know: bool = False
+    """Let --stage full run before trials on this robot have shown that the policy succeeds."""
+    yes: bool = False
+    """Do not ask before a real robot moves."""
+    paused: bool = False
+    """Start paused, as an agent does that ran before in its folder."""
+    resume: bool = False
+    """Let the policy go on when a person hands the robot back; by default the agent stays paused."""
+    lease: Annotated[Positive, tyro.conf.arg(metavar="S")] = 30.0
+    """Time without use after which a person loses the robot again [s]."""
+    guard_stops: Count = 2
+    """Stops by a guard after which a candidate is rolled back."""
+    seed: Seed = 1_000_000
+    """Seed of the first episode; episode k gets seed + k."""
+    no_record: bool = False
+    """Do not record."""

@@ -84,14 +84,7 @@ class Admission:
         return [f"  signed by {found.signer}, {found.created}"]
 
     def _stage(self, address: str, *, is_trial: bool, simulated: bool) -> list[str]:
-        from bam_train.checkpoint.signature import config_folder
-
-        manifest = self.checkpoint.manifest
-        record = TrialRecord((self.record or TRIALS).expanduser(), config_folder() / "trials")
-        subject = Subject(self.checkpoint.digest, address.rstrip("/"), simulated)
-        threshold = manifest.settings.get("trial_threshold")
-        threshold = threshold if type(threshold) is float and 0 < threshold < 1 else 0.9
-        trials = Trials(record, subject, threshold, {"env": manifest.env, "file": str(self.checkpoint.path)})
+        trials = trials_of(self.checkpoint, self.record, address, simulated=simulated)
         evidence = trials.evidence
         if is_trial:
             self.marks, self.trials = (*self.marks, TRIAL), trials
@@ -103,3 +96,15 @@ class Admission:
             raise TrialsNeeded(f"--stage full: {self.checkpoint.path} at {address}: {evidence.text}. {remedy}")
         self.marks = (*self.marks, UNPROVEN)
         return [f"  {UNPROVEN}: {evidence.text}"]
+
+
+def trials_of(checkpoint: Checkpoint, record: Path | None, address: str, *, simulated: bool) -> Trials:
+    """The trials of a checkpoint on the robot at `address`, in the file `record` (None: `TRIALS`)."""
+    from bam_train.checkpoint.signature import config_folder
+
+    manifest = checkpoint.manifest
+    book = TrialRecord((record or TRIALS).expanduser(), config_folder() / "trials")
+    subject = Subject(checkpoint.digest, address.rstrip("/"), simulated)
+    threshold = manifest.settings.get("trial_threshold")
+    threshold = threshold if type(threshold) is float and 0 < threshold < 1 else 0.9
+    return Trials(book, subject, threshold, {"env": manifest.env, "file": str(checkpoint.path)})

@@ -15,7 +15,9 @@ from typing import Any, Protocol
 import gymnasium as gym
 
 from bam_envs.core.errors import BamEnvsError, LinkLost, SafetyStop
+from bam_envs.core.robot import RobotState
 from bam_envs.core.timing import Pacer
+from bam_envs.safety.guard import Tick
 from bam_train.deploy.flight import RecorderAgent, Stopwatch
 from bam_train.deploy.journal import Ending, EpisodeRecord, Journal
 from bam_train.deploy.trials import Trials
@@ -125,7 +127,8 @@ class Deployment:
         """Handler of SIGINT and SIGTERM."""
         self._robot = _DeployedRobot(env, self.switch)
         self._workspace = Workspace(window=window, sink=None if sink is None else _silent_once_broken(sink))
-        watch, names = Stopwatch(), self._robot.observation_names
+        self._watch = watch = Stopwatch()
+        names = self._robot.observation_names
         self._policy = policy_agent = PolicyAgent(policy, names, single=True)
         self._stop_variable = "env/done" if boundary is None else STOP
         chain: list[Agent] = [
@@ -172,6 +175,16 @@ class Deployment:
             self.trials.end(record.success is True, record.end)
         self._workspace.flush()
         return record
+
+    @property
+    def latency(self) -> float:
+        """Time from the last deadline to the command that followed it [s]."""
+        return max(0.0, self._watch.begun - self._watch.waited)
+
+    def sent(self, tick: Tick, state: RobotState) -> None:
+        """Take a command that a `SafeRobot` has sent, for the recording: `SafeRobot.observe` has one observer only."""
+        if self._flight is not None:
+            self._flight.sent(tick, state)
 
     def record_command(self) -> None:
         """Record the last command, if no tick has: that of a person who drives, or the one before a fault."""

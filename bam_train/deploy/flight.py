@@ -139,9 +139,10 @@ class RecorderAgent(Agent):
         """The last command, and the state after it, until a tick records them."""
         observe = getattr(self._robot, "observe", None)
         if observe is not None:
-            observe(self._was_sent)
+            observe(self.sent)
 
-    def _was_sent(self, tick: Tick, state: RobotState) -> None:
+    def sent(self, tick: Tick, state: RobotState) -> None:
+        """Keep a command and the state that it led to; those on the way to a start pose are recorded at once."""
         self._age, self._sent = tick.age, (tick.command, state)
         if tick.approach:
             self.record_last_command()

@@ -31,6 +31,7 @@ from bam_envs.core.robot import EnvIds, Initial, RobotSpec, RobotState
 from bam_envs.core.timing import Pacer
 from bam_envs.live import bringup
 from bam_envs.live.state import Letter, LiveState
+from bam_envs.live.take_over import TakeOver
 from bam_envs.ros.codec import (
     HALT_TOPIC,
     INFO_SERVICE,
@@ -109,6 +110,7 @@ class RosbridgeRobot:
         self._sending, self._halts = threading.Lock(), 0
         self._halt_failed = False  # and the failure was reported
         self._commanded = False  # since `connect`
+        self._take_over: TakeOver | None = None  # of a robot that a live agent drives
         self._session_over = False  # as the robot's side reported
         self._refusals: list[BamEnvsError] = []
         self._status = ""  # of this tick, as JSON
@@ -213,6 +215,8 @@ class RosbridgeRobot:
             self._readiness.begin(control)
             self._info = bringup.info_by_profile(self.url, self.profile, self._readiness.unknown)
         self._open_session(control)
+        if self._take_over is not None:
+            self._take_over.look()
         self._refusals.clear()
         self._state.read()
         self._sent = None
@@ -222,6 +226,7 @@ class RosbridgeRobot:
         self._session_over = True  # until one is open: a reset after a failure tries again
         if self._describes_itself:
             self._session.open(control)
+        self._take_over = TakeOver(control, self._session.tagger) if self.info.agent else None
         self._session_over = False
 
     def _on_down(self, error: LinkLost) -> None:
@@ -263,6 +268,9 @@ class RosbridgeRobot:
             self._open_session(control)  # the robot's side restarted and lost the session
         self._refusals.clear()
         self._require_ready(self.not_ready())
+        if self._take_over is not None:
+            self._take_over.take()
+            self._session.drive()
         if self.info.simulated:
             self._set_scene(control, initial)
         self._await(lambda slots: self._state.age() <= self.profile.max_age)
@@ -395,8 +403,8 @@ class RosbridgeRobot:
         self._halts += 1
         halting = self._halting
         self._owed.clear()  # pending commands will not be executed
-        if halting is None:
-            return
+        if halting is None or (self._take_over is not None and not self._take_over.taken):
+            return  # whoever has not taken over from a live agent must not stop it by looking
         first = self._sending.acquire(timeout=_HALT_WAITS)
         try:
             halting.publish(self.namespace + HALT_TOPIC, {})
@@ -454,6 +462,9 @@ class RosbridgeRobot:
         """Halt if this client sent a command, then drop both connections. Idempotent."""
         if self._commanded:  # a client that only reads must not stop the robot of another one
             self.halt()
+        if self._take_over is not None:
+            self._take_over.hand_back()
+            self._take_over = None
         self._session.leave()
         control, halting = self._control, self._halting
         self._control = self._halting = None

@@ -36,6 +36,8 @@ Message = Mapping[str, Any]
 Envelope = tuple[str, str, dict[str, Any]]  # topic, type, message
 Sign = Callable[[Tag, str, bytes], str]  # the text of a tag on a topic with that content; `Tagger.sign` is one
 INFO_SERVICE = "/bam/robot"  # describes a served robot (std_srvs/Trigger; `RobotInfo` in its message)
+AGENT_TOPIC = "/bam/agent"
+"""Requests to the live agent of a robot: who drives, take over, hand back; see `bam_envs.live.take_over`."""
 HALT_TOPIC = "/bam/halt"  # stops a served robot (std_msgs/Empty)
 STATUS_TOPIC = "/bam/status"  # what the guards did in each tick (std_msgs/String of JSON), sent by the client
 SCENE_TOPIC = "/bam/scene"
@@ -61,6 +63,7 @@ class RobotInfo:
     period: Positive | None = None  # time between two commands [s], if reported
     text: str = ""  # one line for people
     watchdog: NonNegative | None = None  # time after which it stops by itself without a command [s], if known
+    agent: bool = False  # whether a live agent drives it, from which a person takes over (`AGENT_TOPIC`)
 
     def to_json(self) -> str:
         """The text for the answer of `INFO_SERVICE`."""

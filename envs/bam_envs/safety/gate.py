@@ -258,6 +258,10 @@ class SafeRobot(metaclass=Sealed):
         """Age of the newest state of a live robot [s]; 0 for any other."""
         return 0.0 if self._live is None else float(self._live.age())
 
+    def measure(self) -> RobotState:
+        """The newest state of a live robot; raises StaleState if it is too old for a motion to begin."""
+        return _copied(self._fresh_state())
+
     def guards(self) -> list[dict[str, Any]]:
         """The guards in their order: number, name, limit, unit, name of the setting in `Limits`, and what it does."""
         every = dict.fromkeys(self._every)  # the tool's speed is limited twice

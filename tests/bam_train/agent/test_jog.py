@@ -11,7 +11,7 @@ from bam_envs.core.robot import RobotSpec, RobotState, SignalSpec
 from bam_envs.robots.mir100 import base_spec
 from bam_envs.robots.ur5e import GEOMETRY, GRIPPER_OPEN, arm_spec
 from bam_envs.testing import ARM_HOME
-from bam_train.agent.jog import FRESH, LEASH, Jogger
+from bam_train.agent.front.jog import FRESH, LEASH, Jogger
 
 ARM, BASE, PERIOD = arm_spec("ur5e", with_object=False), base_spec(with_scans=False), 0.05
 HOME = np.array([*ARM_HOME, 0.04])

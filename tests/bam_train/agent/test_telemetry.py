@@ -13,7 +13,7 @@ from bam_envs.robots.mir100 import base_spec
 from bam_envs.robots.ur5e import GEOMETRY, arm_spec
 from bam_envs.safety.guard import Limits
 from bam_envs.testing import ARM_HOME
-from bam_train.agent.telemetry import Telemetry
+from bam_train.agent.front.telemetry import Telemetry
 
 ARM, BASE = arm_spec("ur5e", with_object=False), base_spec()
 SHARES = {"value", "limit", "unit", "share"}

@@ -35,6 +35,11 @@ class CommandLease:
         """The client in command, or None."""
         return self._holder
 
+    @property
+    def connection(self) -> str:
+        """Name of the connection on which it was taken."""
+        return self._caller.name
+
     def on_change(self, listener: Change) -> None:
         """Call `listener` whenever command changes, in the thread that changes it, without this object's lock."""
         self._listeners.append(listener)

@@ -82,10 +82,18 @@ class RobotService:
         bus: The bus of its topics.
         lease: The lease on command; shared with everything else that moves the robot.
         namespace: Prefix of every topic, such as ``/cell_1``; or empty.
+        info: Its description for clients; None: that of a simulated robot.
     """
 
     def __init__(
-        self, robot: ServedRobot, profile: RobotProfile, bus: Bus, lease: CommandLease, *, namespace: str = ""
+        self,
+        robot: ServedRobot,
+        profile: RobotProfile,
+        bus: Bus,
+        lease: CommandLease,
+        *,
+        namespace: str = "",
+        info: RobotInfo | None = None,
     ) -> None:
         profile = profile.narrowed(robot.spec.command.labels)
         self._robot, self._profile, self._bus, self._lease = robot, profile, bus, lease
@@ -93,17 +101,19 @@ class RobotService:
         text = f"{profile.name}, served in real time; it rests {robot.command_timeout:g} s after the last command"
         if lockstep:
             text = f"{profile.name}, served in lockstep: its time advances with commands, {robot.spec.period:g} s each"
-        self.info = RobotInfo(profile.name, True, lockstep, robot.spec.period, text, robot.command_timeout)
+        self.info = info or RobotInfo(profile.name, True, lockstep, robot.spec.period, text, robot.command_timeout)
         """Its description for clients."""
+        self._at_once = lockstep or getattr(robot, "at_once", False)  # whether a command does not wait for the clock
         self._slot = CommandSlot()
-        self._sessions = Sessions(lambda name: lease.holder == Caller("", session=name).client)
+        self.sessions = Sessions(lambda name: lease.holder == Caller("", session=name).client)
+        """The sessions of clients."""
         self._completing = {mode[-1].topic for mode in profile.commands.values()}
         self._low, self._high = np.array(robot.spec.command.low), np.array(robot.spec.command.high)
         self._answered = ""  # `Tag.echo` of the last command that was executed
         self._connected = True
         self._moving = threading.Lock()  # an order is begun before a halt, or not at all
         self._unsubscribe: list[Callable[[], None]] = []
-        self._scene = StringRpcService(bus, namespace + SCENE_TOPIC, self._set_scene, self._sessions)
+        self._scene = StringRpcService(bus, namespace + SCENE_TOPIC, self._set_scene, self.sessions)
         self.clock = Ticker(self.tick, IDLE_PERIOD if lockstep else robot.tick_period)
         """Moves the robot and publishes."""
 
@@ -116,9 +126,8 @@ class RobotService:
             self._listen(topic, kind, partial(self._on_command, topic))
         self._listen(HALT_TOPIC, "std_msgs/Empty", self._on_halt)
         self._listen(LEASE_TOPIC, "std_msgs/String", self._on_lease)
-        self._bus.serve(self._namespace + SESSION_SERVICE, "std_srvs/Trigger", self._sessions.open)
-        answer = {"success": True, "message": self.info.to_json()}
-        self._bus.serve(self._namespace + INFO_SERVICE, "std_srvs/Trigger", lambda request, caller: answer)
+        self._bus.serve(self._namespace + SESSION_SERVICE, "std_srvs/Trigger", self.sessions.open)
+        self._bus.serve(self._namespace + INFO_SERVICE, "std_srvs/Trigger", self._describe)
         self._bus.on_leave(self._on_leave)
         self._lease.on_change(self._on_change)
         self._scene.start()
@@ -135,6 +144,9 @@ class RobotService:
     def _listen(self, topic: str, kind: str, listener: Listener) -> None:
         self._unsubscribe.append(self._bus.subscribe(self._namespace + topic, kind, listener))
 
+    def _describe(self, request: Message, caller: Caller) -> Message:
+        return {"success": True, "message": self.info.to_json()}
+
     def _on_command(self, topic: str, message: Message, caller: Caller) -> None:
         command = self._robot.spec.command
         places, received, tag, content = decode_command(self._profile, self._robot.spec, topic, message)
@@ -147,12 +159,12 @@ class RobotService:
         if self._robot.fault is not None:
             raise RemoteError(f"{self._profile.name} failed, and needs a reset: {self._robot.fault}")
         if tag is not None:
-            self._sessions.prove(tag, topic, content, caller).require(tag, topic)
+            self.sessions.prove(tag, topic, content, caller).require(tag, topic)
             caller = replace(caller, session=tag.session)
         self._lease.take(caller.client, caller, shown=caller.shown)
         echo, complete = "" if tag is None else tag.echo, topic in self._completing
         self._slot.put(Order(values, complete, echo, caller.client))
-        if complete and self.info.lockstep:
+        if complete and self._at_once:
             self.clock.wake()
 
     def _on_lease(self, message: Message, caller: Caller) -> None:
@@ -161,13 +173,13 @@ class RobotService:
         tag = read_tag(text)
         if tag is None or word not in (RENEW, LEAVE):
             raise ProtocolError(f"{LEASE_TOPIC}: expected {RENEW} or {LEAVE} and a signed tag.")
-        fresh = self._sessions.prove(tag, LEASE_TOPIC, word.encode(), caller, anywhere=word == LEAVE)
+        fresh = self.sessions.prove(tag, LEASE_TOPIC, word.encode(), caller, anywhere=word == LEAVE)
         fresh.require(tag, LEASE_TOPIC)
         client = replace(caller, session=tag.session).client
         if word == RENEW:
             self._lease.renew(client)
         else:
-            self._sessions.end(tag.session)
+            self.sessions.end(tag.session)
             self._lease.release(client)
 
     def _on_halt(self, message: Message, caller: Caller) -> None:
@@ -186,7 +198,7 @@ class RobotService:
 
     def _on_leave(self, caller: Caller) -> None:
         # What another service gave command to, that one takes it from and halts, behind the step that runs.
-        for name in self._sessions.left(caller):
+        for name in self.sessions.left(caller):
             self._lease.release(replace(caller, session=name).client)
         self._lease.release(caller.client)
 

@@ -89,11 +89,7 @@ class ServeOptions:
     @property
     def _is_open(self) -> bool:
         """Whether other computers reach it."""
-        try:
-            loopback = ipaddress.ip_address(self.bind).is_loopback
-        except ValueError:  # a name: only this one is sure to stay on this computer
-            loopback = self.bind == "localhost"
-        return self.listens and not loopback
+        return self.listens and not is_loopback(self.bind)
 
     @property
     def _place(self) -> str:
@@ -114,3 +110,11 @@ class ServeOptions:
         """The prefix of every name: ``/bam_001``, or an empty text."""
         stripped = self.namespace.strip("/")
         return f"/{stripped}" if stripped else ""
+
+
+def is_loopback(address: str) -> bool:
+    """Whether only this computer reaches a server at `address`."""
+    try:
+        return ipaddress.ip_address(address).is_loopback
+    except ValueError:  # a name: only this one is sure to stay on this computer
+        return address == "localhost"

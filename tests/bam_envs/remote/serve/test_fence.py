@@ -90,7 +90,7 @@ def test_a_reset_opens_a_session_where_the_old_one_is_not_known_any_more(serve_e
     live = make("bam/pick-v0", robot=served.bus.url)
     live.reset(seed=1)
     live.step(ACTION)
-    served.robot_service._sessions.end(live.unwrapped.robot._robot._session.tagger.session)
+    served.robot_service.sessions.end(live.unwrapped.robot._robot._session.tagger.session)
     with pytest.raises(RemoteError, match="is not open here: reset\\(\\), which opens one at /bam/session"):
         live.step(ACTION)
     served.lease.release(served.lease.holder)

@@ -1,0 +1,49 @@
+"""The options of a live agent."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from bam_train.env_location import Place
+
+
+@dataclass(frozen=True)
+class AgentOptions:
+    """What a live agent drives, what it listens to, and where it keeps its versions."""
+
+    robot: str
+    """Address of the robot behind rosbridge."""
+    folder: Path
+    """Folder of the versions, the audit file and the recordings."""
+    profile: str | None = None
+    guards: tuple[tuple[str, float], ...] = ()
+    ca_file: str | None = None
+    robot_token_file: str | None = None
+    bind: str = "127.0.0.1"
+    port: int = 9095
+    cert: str | None = None
+    key: str | None = None
+    token_file: str | None = None
+    keys: Path | None = None
+    allow_unsigned: bool = False
+    stage: str | None = None
+    """``"trial"``, ``"full"``, or None: on trial if the robot is real."""
+    i_know: bool = False
+    seed: int = 1_000_000
+    resume: bool = False
+    """Whether the policy goes on when a person hands the robot back."""
+    lease: float = 30.0
+    """Time without use after which a person loses the lease [s]."""
+    guard_stops: int = 2
+    """Number of stops by guards after which a candidate is rolled back."""
+    record: bool = True
+
+    def place(self, *, trial: bool | None) -> Place:
+        """The place of the robot."""
+        return Place(
+            self.robot,
+            profile=self.profile,
+            ca_file=self.ca_file,
+            token_file=self.robot_token_file,
+            guards=self.guards,
+            trial=trial,
+        )

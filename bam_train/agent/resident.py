@@ -1,0 +1,591 @@
+"""The resident program on a robot's computer: it owns the robot, and runs the active policy episode after episode.
+
+Only the main thread moves the robot: the chain of a `Deployment` while the policy drives, or the newest command of the
+person who has taken over. Requests wait in a queue and are executed by the main thread between two ticks; a halt is
+executed at once, in the thread in which it comes.
+
+Longer than most files: it is one object with one state, and every request that changes it.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from bam_envs.core.errors import BamEnvsError, LinkLost, NotInCommand, SafetyStop, StaleState
+from bam_envs.core.robot import Initial
+from bam_train.agent.agent_messages import Answer, Ask, Drive, Halt, Message, Report, Sent
+from bam_train.agent.agent_options import AgentOptions
+from bam_train.agent.agent_states import TRANSITIONS, State
+from bam_train.agent.robot_session import RobotSession
+from bam_train.agent.versions import CANDIDATE, CHAMPION, PREVIOUS, Version, Versions
+from bam_train.checkpoint import Checkpoint
+from bam_train.deploy.deployment import STOP, StopSwitch, fault_text
+from bam_train.deploy.journal import EpisodeRecord
+from bam_train.errors import AgentRefused, BamTrainError, ContractRefused, PolicyError
+from bam_train.loop import Agent
+
+if TYPE_CHECKING:
+    from bam_train.agent.audit import Audit
+
+_log = logging.getLogger(__name__)
+_FLAGS = np.array([False]), np.array([True])
+_LOOK = 0.2  # time between two looks at the link while the robot rests [s]
+_AGAIN = 1.0  # time between two attempts to reach the robot [s]
+_REPORT = 0.5  # time between two reports while nothing changes [s]
+FRESH = 0.2
+"""Age of a person's newest command from which the robot rests, at least one and a half periods [s]."""
+_RECENT = 20  # episodes in the status
+
+
+class _Interrupted(BaseException):
+    """A request ends the way to the start pose."""
+
+
+@dataclass(frozen=True)
+class Driver:
+    """Who has taken over."""
+
+    lease: str
+    """Name of the lease's owner on the port."""
+    who: str
+    """The same for people."""
+
+
+@dataclass
+class Choice:
+    """A version that is to act: at the next tick, or from the next episode on."""
+
+    version: Version
+    policy: Any
+    stage: str | None
+    """``"trial"``, ``"full"`` or None: as the agent's setting says."""
+    names: dict[str, str | None]
+    """Names that move when it becomes active, to digests."""
+    why: str
+    who: str = "the agent"
+    active: threading.Event = field(default_factory=threading.Event)
+
+
+class _Boundary(Agent):
+    """Between a deadline and the policy: executes the requests that came, which may end the episode."""
+
+    reads = ("env/done",)
+    writes = (STOP,)
+
+    def __init__(self, resident: Resident) -> None:
+        super().__init__()
+        self._resident = resident
+
+    def forward(self, t: int, **kwargs: Any) -> None:
+        ends = self._resident.between_ticks()
+        self.set((STOP, t), _FLAGS[ends or bool(self.get(("env/done", t))[0])])
+
+
+class Resident:
+    """The live agent, which runs in the main thread until it is asked to end.
+
+    Args:
+        options: What it drives.
+        versions: Its versions; one of them is called `CHAMPION`.
+        audit: Where every change of state is written.
+        send: Sends a message to the front process.
+        tell: Called with a line for the operator.
+        admit: See `RobotSession`.
+        is_running: Whether the policy drives as soon as the robot is there.
+    """
+
+    def __init__(
+        self,
+        options: AgentOptions,
+        versions: Versions,
+        audit: Audit,
+        *,
+        send: Callable[[Message], None],
+        tell: Callable[[str], None],
+        admit: Callable[[Any, Sequence[str]], None],
+        is_running: bool,
+    ) -> None:
+        self.options, self.versions, self.audit = options, versions, audit
+        self.state, self.why, self.since = State.WAITING, "it starts", time.time()
+        self.switch = StopSwitch(self.halt)
+        """Handler of signals."""
+        self.session: RobotSession | None = None
+        self.driver: Driver | None = None
+        self.active: Version = versions.find(CHAMPION)
+        self._stage = options.stage
+        self._policies: dict[str, Any] = {}  # by digest: of the versions with a name
+        self._chosen: Choice | None = None  # for the next tick
+        self._next: Choice | None = None  # for the next episode
+        self._send, self._tell, self._admit = send, tell, admit
+        self._news = threading.Condition()
+        self._requests: deque[tuple[Callable[[], dict[str, Any] | None], int]] = deque()
+        self._command: Drive | None = None
+        self._is_running, self._stopped, self._quitting = is_running, "", False
+        self._seed, self._reported = options.seed, 0.0
+        self._episodes: deque[int | None] = deque(maxlen=_RECENT)
+        self._ticks = self._completed = self._successes = self._late = 0
+        self._link_ms = self._loop_ms = 0.0
+        self._names = {name: one.digest for name in (CHAMPION, CANDIDATE, PREVIOUS) if (one := versions.named(name))}
+
+    # ---- what other threads call
+
+    def halt(self) -> None:
+        """Stop the robot now; the next command begins at its position. Thread-safe."""
+        session = self.session
+        if session is not None:
+            session.robot.halt()
+
+    def take(self, message: Message) -> None:
+        """Take a message of the front process. Thread-safe; returns at once."""
+        if isinstance(message, Drive):
+            with self._news:
+                self._command = message
+                self._news.notify()
+        elif isinstance(message, Halt):
+            self.halt()
+            if message.stop:
+                self.post(lambda: self._pause(message.who, message.address, "the stop button"))
+        elif isinstance(message, Ask):
+            self._ask(message)
+
+    def post(self, do: Callable[[], dict[str, Any] | None], number: int = 0) -> None:
+        """Let the main thread call `do` between two ticks; its result answers the request `number`. Thread-safe."""
+        with self._news:
+            self._requests.append((do, number))
+            self._news.notify()
+
+    def front_died(self) -> None:
+        """The front process died, and with it every client: whoever drives holds now, and the agent is paused then."""
+        self.halt()
+
+        def end() -> None:
+            if self.driver is not None:
+                self._hand_back("the agent", "", self.driver.lease, why="the front process died, and with it the link")
+
+        self.post(end)
+
+    def quit(self) -> None:
+        """End the program between two ticks. Thread-safe."""
+
+        def end() -> None:
+            self._quitting = True
+
+        self.post(end)
+
+    def _ask(self, ask: Ask) -> None:
+        known: dict[str, Callable[..., dict[str, Any] | None]] = {
+            "pause": self._pause,
+            "resume": self._resume,
+            "take": self._take_over,
+            "cut": self._cut,
+            "hand_back": self._hand_back,
+            "scene": self._scene,
+            "rollback": self._roll_back,
+        }
+        do = known.get(ask.op)
+        if do is None:
+            self._send(Answer(ask.number, error=f"{ask.op}: this agent does not know that", kind="AgentRefused"))
+            return
+        self.post(lambda: do(ask.who, ask.address, **ask.arguments), ask.number)
+
+    # ---- the main thread
+
+    def run(self) -> None:
+        """Run until `quit`, or a signal, which raises `Stopped`; then the robot is halted, and the link dropped."""
+        try:
+            self._report()
+            while not self._quitting:
+                self._armed(self._turn)
+        finally:
+            self.switch.armed = False
+            self._drop("the program ends")
+
+    @property
+    def _connected(self) -> RobotSession:
+        if self.session is None:
+            raise AgentRefused(f"The agent waits for the robot: {self.why}")
+        return self.session
+
+    def _armed(self, do: Callable[[], None]) -> None:
+        """Call `do`, which a signal may interrupt."""
+        self.switch.armed = True
+        self.switch.raise_again()
+        try:
+            do()
+        finally:
+            self.switch.armed = False
+
+    def _turn(self) -> None:
+        """One episode, one look at a resting robot, or one command of a person."""
+        self._execute()
+        if self.session is None:
+            self._reach_robot()
+        elif self.driver is not None:
+            self._drive()
+        elif self._is_running:
+            self._play()
+        else:
+            self._rest()
+
+    def _execute(self) -> None:
+        """Execute the requests that wait."""
+        while self._requests:
+            with self._news:
+                do, number = self._requests.popleft()
+            try:
+                result = do()
+                answer = Answer(number, result=result or {})
+            except (BamTrainError, BamEnvsError) as error:
+                answer = Answer(number, error=" ".join(str(error).split()), kind=type(error).__name__)
+            if number:
+                self._send(answer)
+
+    def between_ticks(self) -> bool:
+        """Called by the chain between a deadline and the policy: whether the episode ends here."""
+        deployment = self._connected.deployment
+        self._loop_ms += 0.05 * (1e3 * deployment.latency - self._loop_ms)
+        if self._requests:
+            self._execute()
+        if self._chosen is not None and not self._needs_another_stage(self._chosen):
+            self._activate(self._chosen)
+            self._chosen = None
+        return not self._plays()
+
+    def _plays(self) -> bool:
+        """Whether the episode that runs goes on."""
+        return self._is_running and self.driver is None and self._chosen is None and not self._quitting
+
+    def _play(self) -> None:
+        """One episode of the active policy."""
+        for choice in (self._chosen, self._next):
+            if choice is not None:
+                self._chosen = self._next = None
+                if self._needs_another_stage(choice):
+                    self._stage = choice.stage
+                    self._drop("another stage")
+                self._activate(choice)
+                return
+        session = self._connected
+        self._change(State.TRIAL if self._is_on_trial else State.RUNNING, self.why)
+        seed, self._seed = self._seed, self._seed + 1
+        try:
+            record = session.deployment.episode(self, seed=seed)
+        except _Interrupted:
+            self.halt()
+            return
+        except Exception as error:
+            self._failed(error)
+            return
+        if record.end == "stopped":
+            return
+        self._completed += 1
+        self._successes += record.success is True
+        self._episodes.append(None if record.success is None else int(record.success))
+        self._watch_candidate(record)
+
+    @property
+    def _is_on_trial(self) -> bool:
+        return self._names.get(CANDIDATE) == self.active.digest or (
+            self.session is not None and self.session.stage == "trial"
+        )
+
+    def _watch_candidate(self, record: EpisodeRecord) -> None:
+        """Promote the candidate, or roll it back, as its trials say."""
+
+    def _needs_another_stage(self, choice: Choice) -> bool:
+        """Whether the limits of the robot change with this choice, for which it is connected anew."""
+        session = self.session
+        return session is not None and session.is_real and choice.stage is not None and choice.stage != session.stage
+
+    def _activate(self, choice: Choice) -> None:
+        """Let the chosen policy act from now on."""
+        before, self.active = self.active, choice.version
+        self._policies[choice.version.digest] = choice.policy
+        if self.session is not None:
+            self.session.deployment.swap(choice.policy)
+            self.session.policy = choice.policy
+        for name, digest in choice.names.items():
+            if digest is None:
+                self._names.pop(name, None)
+            else:
+                self._names[name] = digest
+        text = f"{choice.version.digest[:12]} acts instead of {before.digest[:12]}: {choice.why}"
+        self._note("swap", text, choice.who)
+        threading.Thread(target=self.versions.point, args=(choice.names,), name="bam-names").start()
+        choice.active.set()
+        self._report()
+
+    # ---- the robot rests, or a person drives it
+
+    def _rest(self) -> None:
+        self._change(State.STOPPED if self._stopped else State.PAUSED, self.why)
+        for choice in (self._chosen, self._next):
+            if choice is not None:
+                self._chosen = self._next = None
+                self._stage = choice.stage or self._stage
+                self._activate(choice)
+        with self._news:
+            self._news.wait_for(lambda: bool(self._requests) or bool(self.switch.came), _LOOK)
+        self._require_link()
+        self._report(_REPORT)
+
+    def _require_link(self) -> None:
+        if self.session is not None and not self.session.is_up:
+            self._failed(LinkLost(f"{self.options.robot}: no state came for more than a second."))
+
+    def _drive(self) -> None:
+        """Send the newest command of the person who has taken over, or rest while there is none."""
+        session = self._connected
+        life = max(FRESH, 1.5 * session.robot.spec.period)
+        with self._news:
+            self._news.wait_for(lambda: bool(self._requests) or self._command is not None, life)
+            drive, self._command = self._command, None
+        if self._requests:
+            return
+        if drive is None or self.driver is None or drive.driver != self.driver.lease:
+            session.robot.halt()
+            self._require_link()
+            self._report(_REPORT)
+            return
+        try:
+            session.robot.step(np.array([drive.command]))
+            session.deployment.record_command()
+            self._ticks += 1
+        except Exception as error:
+            self._failed(error)
+        self._report(_REPORT)
+
+    def _sent(self, tick: Any, state: Any) -> None:
+        """After each command: requests may interrupt the way to a start pose."""
+        session = self.session
+        if session is None:
+            return
+        session.deployment.sent(tick, state)
+        self._send(Sent(list(tick.command)))
+        self._link_ms += 0.05 * (1e3 * tick.age - self._link_ms)
+        if tick.approach and self.driver is None and self._requests:
+            self._execute()
+            if not self._plays():
+                raise _Interrupted
+
+    # ---- the link
+
+    def _reach_robot(self) -> None:
+        """Connect, and check the contract; on failure wait a little."""
+        self._change(State.WAITING, self.why)
+        try:
+            checkpoint = Checkpoint.open(self.active.path)
+            self.session = RobotSession(
+                self.options,
+                checkpoint,
+                self._stage,
+                boundary=_Boundary(self),
+                switch=self.switch,
+                admit=self._admit,
+            )
+        except (BamEnvsError, ContractRefused) as error:
+            self._change(State.WAITING, fault_text(error))
+            with self._news:
+                self._news.wait_for(lambda: bool(self._requests), _AGAIN)
+            self._report(_REPORT)
+            return
+        self._admit = lambda env, lines: None  # the operator is asked once
+        policy = self._policies.get(self.active.digest)
+        if policy is not None:
+            self.session.deployment.swap(policy)
+        self._policies[self.active.digest] = policy or self.session.policy
+        self.session.robot.observe(self._sent)
+        self._note("connected", f"{self.options.robot}: the robot fits, stage {self.session.stage}")
+        if self._stopped:
+            self._change(State.STOPPED, self._stopped)
+        elif not self._is_running:
+            self._change(State.PAUSED, self.why if self.why.startswith("paused") else "the robot is there")
+
+    def _drop(self, why: str) -> None:
+        """Halt the robot and drop the link."""
+        session, self.session = self.session, None
+        if session is not None:
+            session.event(f"the link is dropped: {why}")
+            session.close()
+
+    def _failed(self, error: Exception) -> None:
+        """What a fault while the robot moved leads to: waiting for the robot, stopped by a guard, or paused."""
+        text = fault_text(error)
+        session, driver = self.session, self.driver
+        self.halt()
+        self._drop(text)
+        if driver is not None:
+            self._end_driving(driver, text)
+        if isinstance(error, SafetyStop) and not isinstance(error, StaleState):
+            self._stopped, self._is_running = text, False
+            self._change(State.STOPPED, text)
+            if session is not None:
+                self._guard_stopped(text)
+        elif isinstance(error, BamEnvsError):  # lost, stale, or somebody else drives: it goes on when it can
+            self._change(State.WAITING, text)
+        else:
+            if isinstance(error, PolicyError):
+                self._policy_failed(text)
+            else:
+                _log.error("The episode failed", exc_info=error)
+            self._is_running = False
+            self._change(State.PAUSED, f"paused by a fault: {text}")
+
+    def _guard_stopped(self, text: str) -> None:
+        """Count a guard's stop of a candidate."""
+
+    def _policy_failed(self, text: str) -> None:
+        """Roll back a candidate whose policy is broken."""
+
+    # ---- requests, in the main thread
+
+    def _pause(self, who: str, address: str, why: str = "") -> dict[str, Any]:
+        self.halt()
+        self._is_running, self._stopped = False, ""
+        if self.driver is not None:
+            self._end_driving(self.driver, f"paused by {who}")
+        if self.session is not None:
+            self._change(State.PAUSED, f"paused by {who}{f': {why}' if why else ''}", who, address)
+        return self.status()
+
+    def _resume(self, who: str, address: str, why: str = "") -> dict[str, Any]:
+        if self.driver is not None:
+            raise AgentRefused(
+                f"{self.driver.who} drives the robot; take it back first, or wait until it is handed back"
+            )
+        if self._stopped:
+            self._note("resume", f"{who} lets the robot move again after: {self._stopped}", who, address)
+        self._stopped, self._is_running = "", True
+        text = f"resumed by {who}{f': {why}' if why else ''}"
+        if self.session is not None:
+            self._change(State.TRIAL if self._is_on_trial else State.RUNNING, text, who, address)
+        return self.status()
+
+    def _take_over(self, who: str, address: str, lease: str, force: bool = False) -> dict[str, Any]:
+        if self.session is None or self._stopped:
+            reason = self._stopped or self.why
+            raise NotInCommand(f"The agent is {self.state.value} ({reason}); nobody can take over now.")
+        self.halt()
+        if self.driver is not None and self.driver.lease != lease:
+            self._note("take over", f"{who} takes over from {self.driver.who}", who, address)
+        self.driver, self._command = Driver(lease, who), None
+        self._change(State.TAKEN_OVER, f"taken over by {who}", who, address)
+        return self.status()
+
+    def _cut(self, who: str, address: str, lease: str) -> None:
+        """The link of the owner was cut: hold; the front process ends the lease later."""
+        if self.driver is not None and self.driver.lease == lease:
+            self.halt()
+            self._command = None
+            self._change(State.TAKEN_OVER, f"the link of {self.driver.who} was cut; the robot holds", who, address)
+
+    def _hand_back(
+        self, who: str, address: str, lease: str, resume: bool | None = None, why: str = ""
+    ) -> dict[str, Any]:
+        driver = self.driver
+        if driver is None or driver.lease != lease:
+            return self.status()
+        self.halt()
+        goes_on = (self.options.resume if resume is None else resume) and not why
+        self._is_running = goes_on
+        self._end_driving(driver, why or f"handed back by {who}")
+        text = why or f"handed back by {who}"
+        if goes_on:
+            self._change(State.TRIAL if self._is_on_trial else State.RUNNING, text, who, address)
+        else:
+            self._change(State.PAUSED, text, who, address)
+        return self.status()
+
+    def _end_driving(self, driver: Driver, why: str) -> None:
+        self.driver, self._command, self._is_running = None, None, self._is_running and self.options.resume
+        self._send(Report({**self.status(), "ended": driver.lease, "why": why}))
+
+    def _scene(self, who: str, address: str, pose: list[list[float]] | None, seed: int) -> None:
+        """Put the scene of a simulated robot in place, for the person who drives."""
+        session = self.session
+        if session is None or session.is_real:
+            raise AgentRefused("Only a simulated robot has a scene that can be set.")
+        robot = session.robot
+        signals = dict(robot.measure().signals)  # an arm begins where it is: it does not move
+        signals.pop("object_pose", None)
+        if pose is not None:
+            signals["object_pose"] = np.array(pose)
+        robot.reset(np.array([0]), Initial(signals, np.array([seed])))
+
+    def _roll_back(self, who: str, address: str, why: str = "") -> dict[str, Any]:
+        raise AgentRefused("There is no version to roll back to.")
+
+    # ---- what is shown
+
+    def ticked(self, record: EpisodeRecord, action: Any, pacer: Any) -> None:
+        """Called by the deployment after every step."""
+        self._ticks, self._late = self._ticks + 1, pacer.missed
+        self._report(_REPORT)
+
+    def ended(self, record: EpisodeRecord) -> None:
+        """Called by the deployment after every episode."""
+
+    def _change(self, state: State, why: str, who: str = "the agent", where: str = "") -> None:
+        """Go to `state`, if it is another one or for another reason, and write that down."""
+        before = self.state
+        if before is state and why == self.why:
+            return
+        if before is not state and state not in TRANSITIONS[before]:
+            raise RuntimeError(f"no transition leads from {before.value} to {state.value}")
+        self.state, self.why, self.since = state, why, time.time()
+        if before is not state:
+            self._note("state", f"{before.value} -> {state.value}: {why}", who, where)
+        self._report()
+
+    def _note(self, what: str, text: str, who: str = "the agent", where: str = "") -> None:
+        """Write to the log, the recording and the audit file."""
+        self._tell(text)
+        if self.session is not None:
+            self.session.event(f"{text} ({who}{f' at {where}' if where else ''})")
+        self.audit.write(what, text, who=who, where=where, digest=self.active.digest)
+
+    def status(self) -> dict[str, Any]:
+        """The status for everybody who looks."""
+        session = self.session
+        journal = None if session is None else session.deployment.journal
+        record = journal.records[-1] if journal is not None and journal.records else None
+        return {
+            "state": self.state.value,
+            "why": self.why,
+            "since": self.since,
+            "active": self.active.digest,
+            "names": dict(self._names),
+            "stage": None if session is None else session.stage,
+            "owner": None if self.driver is None else self.driver.who,
+            "robot": self.options.robot if session is None else session.robot.info.text,
+            "simulated": None if session is None else not session.is_real,
+            "period": None if session is None else session.robot.spec.period,
+            "episode": 0 if journal is None else journal.begun,
+            "steps": 0 if record is None else record.length,
+            "ticks": self._ticks,
+            "episodes": self._completed,
+            "successes": self._successes,
+            "recent": list(self._episodes),
+            "late": self._late,
+            "link_ms": round(self._link_ms, 3),
+            "loop_ms": round(self._loop_ms, 3),
+            "recording": None if session is None or session.recorder is None else str(session.recorder.path),
+            "marks": [] if session is None else list(session.marks),
+            "warnings": [] if journal is None else list(journal.warnings.values()),
+            "guards": {} if session is None else session.robot.report(),
+        }
+
+    def _report(self, least: float = 0.0) -> None:
+        """Send the status, unless the last one is younger than `least` [s]."""
+        now = time.monotonic()
+        if now - self._reported >= least:
+            self._reported = now
+            self._send(Report(self.status()))

@@ -1,0 +1,142 @@
+"""One connection of a live agent to its robot, from the check of the contract to the end of the link."""
+
+import contextlib
+import logging
+import math
+import threading
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import Any
+
+import gymnasium as gym
+
+from bam_envs.core.timing import Pacer
+from bam_train.agent.agent_options import AgentOptions
+from bam_train.checkpoint import Checkpoint
+from bam_train.deploy.checkpoint_admission import Admission, has_real_robot
+from bam_train.deploy.contract import check_contract
+from bam_train.deploy.deployment import Deployment, StopSwitch
+from bam_train.deploy.flight import deployment_facts, flight_recorder, recording_names, watch_cameras
+from bam_train.deploy.journal import Journal
+from bam_train.environments import control_period, environment_of, make_env
+from bam_train.errors import BamTrainError
+from bam_train.loop import Agent
+from bam_train.recording.recorder import Recorder
+
+_log = logging.getLogger(__name__)
+CONNECTED_WITHIN = 1.0
+"""Age of the robot's newest state at rest from which the link counts as lost [s]."""
+
+
+class _HeldOpen(gym.Wrapper[Any, Any, Any, Any]):
+    """An environment that the loop cannot close: the end of an episode halts the robot, and keeps the link."""
+
+    def close(self) -> None:
+        self.unwrapped.robot.halt()  # type: ignore[attr-defined]
+
+
+class RobotSession:
+    """The robot, connected and checked, with the deployment that drives it. Made by the constructor, or an error.
+
+    Args:
+        options: The options of the agent.
+        checkpoint: The checkpoint whose policy begins.
+        stage: ``"trial"``, ``"full"``, or None: on trial if the robot is real.
+        boundary: See `Deployment`.
+        switch: See `Deployment`.
+        admit: Called with the connected environment before anything can move; lines for the operator are given too.
+
+    Raises:
+        ContractRefused: The robot does not fit the checkpoint.
+        UntrustedCheckpoint: The robot is real, and the checkpoint has no trusted signature.
+        BamEnvsError: The robot cannot be reached.
+    """
+
+    def __init__(
+        self,
+        options: AgentOptions,
+        checkpoint: Checkpoint,
+        stage: str | None,
+        *,
+        boundary: Agent,
+        switch: StopSwitch,
+        admit: Callable[[Any, Sequence[str]], None],
+    ) -> None:
+        self.checkpoint = checkpoint
+        self.env_id, kwargs = environment_of(checkpoint)
+        self.stage = stage or "full"
+        """The stage at which the robot moves."""
+        place = options.place(trial=True if stage == "trial" else None)
+        self._env = make_env(self.env_id, kwargs, place=place)
+        try:
+            check_contract(checkpoint, self._env, place).require(f"{checkpoint.path} and the robot at {place.text}")
+            self.robot.connect()
+            self.is_real = has_real_robot(self._env)
+            if self.is_real and stage != "trial":
+                self.stage = stage or "trial"
+                place = replace(place, trial=self.stage == "trial")
+                self._env.close()  # type: ignore[no-untyped-call]
+                self._env = make_env(self.env_id, kwargs, place=place)  # the limits are fixed when a robot is made
+                self.robot.connect()
+            record = options.folder / "trials.jsonl"
+            admission = Admission(checkpoint, options.keys, options.allow_unsigned, record, options.i_know)
+            if place.trial is None:
+                admission.record = None
+            lines = admission(self._env, place)
+            admit(self._env, lines)
+            self.policy, self.marks = admission.policy, admission.marks
+            self.recorder = self._start_recorder(options, checkpoint) if options.record else None
+            self.deployment = Deployment(
+                _HeldOpen(self._env),
+                self.policy,
+                Pacer(control_period(self._env)),
+                Journal(0, marks=self.marks),
+                recorder=self.recorder,
+                boundary=boundary,
+                switch=switch,
+            )
+        except BaseException:
+            self._env.close()  # type: ignore[no-untyped-call]
+            raise
+
+    @property
+    def robot(self) -> Any:
+        """The robot behind its guards."""
+        return self._env.unwrapped.robot  # type: ignore[attr-defined]
+
+    @property
+    def task(self) -> Any:
+        """The task."""
+        return self._env.unwrapped.task  # type: ignore[attr-defined]
+
+    @property
+    def is_up(self) -> bool:
+        """Whether the robot's states still come, as far as its newest one shows."""
+        return math.isfinite(self.robot.age()) and self.robot.age() < CONNECTED_WITHIN
+
+    def event(self, text: str) -> None:
+        """Record an action of a person, or of the agent."""
+        if self.recorder is not None:
+            self.recorder.event(text)
+
+    def close(self) -> None:
+        """Halt the robot and drop the link; the end of the recording is written in another thread."""
+        self.deployment.record_command()
+        self._env.close()  # type: ignore[no-untyped-call]
+        if self.recorder is not None:
+            threading.Thread(target=self.recorder.close, name="bam-recorder-end").start()
+
+    def _start_recorder(self, options: AgentOptions, checkpoint: Checkpoint) -> Recorder | None:
+        """The recorder, started; without room for a recording the agent goes on."""
+        names = [options.folder / name for name in recording_names(self.env_id)]
+        facts = {**deployment_facts(checkpoint, self._env), "address": options.robot, "marks": ", ".join(self.marks)}
+        recorder = flight_recorder(names[0], self._env, facts, names[1:])
+        try:
+            recorder.start()
+        except BamTrainError as error:
+            _log.warning("Nothing is recorded: %s", error)
+            return None
+        with contextlib.suppress(BamTrainError):
+            for warning in watch_cameras(recorder, options.place(trial=None)):
+                _log.warning("%s", warning)
+        return recorder

@@ -1,0 +1,186 @@
+"""The resident half of `bam-agent`: it makes a live agent of the flags, and runs it until a signal."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from contextlib import ExitStack
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from bam_train.cli.console import ShownFormatter, say
+from bam_train.signals import SignalMemory
+
+if TYPE_CHECKING:
+    from bam_train.agent.agent_options import AgentOptions
+    from bam_train.agent.versions import Version, Versions
+    from bam_train.cli.flags import AgentConfig
+
+
+def _tell(line: str) -> None:
+    say(f"bam-agent: {line}")
+
+
+def run_agent(config: AgentConfig, signals: SignalMemory) -> int:
+    """Run the program with its parsed flags; returns 128 + the signal that ended it."""
+    from bam_train.agent.audit import Audit
+    from bam_train.agent.front_link import FrontLink
+    from bam_train.agent.resident import Resident
+    from bam_train.agent.simulated_box import SimulatedBox
+    from bam_train.agent.versions import CHAMPION, Versions
+    from bam_train.checkpoint import Checkpoint
+    from bam_train.deploy.deployment import Stopped
+    from bam_train.environments import environment_of
+    from bam_train.settings import parse_assignment
+    from bam_train.signals import handled
+
+    options = _options(config)
+    handler = logging.StreamHandler()
+    handler.setFormatter(ShownFormatter("bam-agent: %(message)s"))
+    logging.basicConfig(level=logging.WARNING, handlers=[handler])
+    with ExitStack() as stack:
+        versions = Versions(options.folder / "versions")
+        stack.enter_context(versions.held())
+        ran_before = versions.named(CHAMPION) is not None
+        active = _install(config, versions)
+        env_id, env_kwargs = environment_of(Checkpoint.open(active.path), config.env)
+        if not options.robot:
+            given = {
+                ".".join(path): value for path, value in (parse_assignment(one, "randomize=true") for one in config.set)
+            }
+            box = SimulatedBox(env_id, {**env_kwargs, **given})
+            stack.callback(box.close)
+            box.start()
+            options = replace(options, robot=box.url)
+        audit = Audit(options.folder / "audit.jsonl")
+        stack.callback(audit.close)
+        resident: Resident
+        front = FrontLink(
+            _front(options, env_id, env_kwargs),
+            lambda message: resident.take(message),
+            lambda: resident.front_died(),
+        )
+        resident = Resident(
+            options,
+            versions,
+            audit,
+            send=front.send,
+            tell=_tell,
+            admit=partial(_admit, config, signals),
+            is_running=not (config.paused or ran_before),
+        )
+        stack.callback(front.close)
+        front.start()
+        scheme = "wss" if options.cert else "ws"
+        where = f"{options.bind}:{front.options.port}"
+        _tell(f"listens on {scheme}://{where}; the console is at {scheme.replace('ws', 'http')}://{where}")
+        if ran_before and not config.paused:
+            _tell(f"it ran before in {options.folder}, so it starts paused")
+        with handled(resident.switch, ignored_too=True):
+            resident.switch.came += signals.came
+            try:
+                resident.run()
+            except Stopped:
+                return 128 + resident.switch.came[0]
+    return 0
+
+
+def _install(config: AgentConfig, versions: Versions) -> Version:
+    """The version that begins: the one of --policy, or the champion of the folder."""
+    from bam_train.agent.versions import CHAMPION, PREVIOUS
+    from bam_train.checkpoint import Checkpoint
+    from bam_train.errors import SettingsError
+
+    champion = versions.named(CHAMPION)
+    if config.policy is None:
+        if champion is None:
+            raise SettingsError(f"{versions.folder} has no version yet; give a checkpoint with --policy")
+        return champion
+    version = versions.add(Checkpoint.open(config.policy.expanduser()))
+    if champion is None or champion.digest != version.digest:
+        before: dict[str, str | None] = {} if champion is None else {PREVIOUS: champion.digest}
+        versions.point({CHAMPION: version.digest, **before})
+    return versions.find(version.digest)
+
+
+def _admit(config: AgentConfig, signals: SignalMemory, env: Any, lines: Sequence[str]) -> None:
+    """Ask the operator once before a real robot moves."""
+    from bam_train.cli.consent import require_consent
+
+    signals.raise_again()
+    plan = [*lines, "  episode after episode, until it is paused or taken over"]
+    require_consent(env, "bam-agent", yes=config.yes, plan=plan)
+    signals.raise_again()
+
+
+def _options(config: AgentConfig) -> AgentOptions:
+    """The options of the agent by its flags; invalid flags are refused."""
+    from bam_envs.remote.serve.serve_options import is_loopback
+    from bam_train.agent.agent_options import AgentOptions
+    from bam_train.env_location import read_guards
+    from bam_train.errors import SettingsError
+
+    if config.robot is None:
+        for name, value in (("--profile", config.profile), ("--ca-file", config.ca_file), ("--guard", config.guard)):
+            if value:
+                raise SettingsError(f"{name} is for a live robot; give its address with --robot too")
+    elif config.set:
+        raise SettingsError("--set changes the simulated robot, and --robot names another one; leave one of them out")
+    if not is_loopback(config.bind) and config.token_file is None:
+        raise SettingsError(
+            f"anybody who reaches {config.bind} could drive the robot: give --token-file, or leave out --bind"
+        )
+    if config.cert is None and config.key is not None:
+        raise SettingsError("--key means something only with --cert")
+    options = AgentOptions(
+        config.robot or "",
+        config.folder.expanduser(),
+        profile=config.profile,
+        guards=read_guards(config.guard),
+        ca_file=_text(config.ca_file),
+        robot_token_file=_text(config.robot_token_file),
+        bind=config.bind,
+        port=config.port,
+        cert=_text(config.cert),
+        key=_text(config.key),
+        token_file=_text(config.token_file),
+        keys=config.keys,
+        allow_unsigned=config.allow_unsigned,
+        stage=config.stage,
+        i_know=config.i_know,
+        seed=config.seed,
+        resume=config.resume,
+        lease=config.lease,
+        guard_stops=config.guard_stops,
+        record=not config.no_record,
+    )
+    options.place(trial=None).require_sane()
+    return options
+
+
+def _text(path: Path | None) -> str | None:
+    return None if path is None else str(path.expanduser())
+
+
+def _front(options: AgentOptions, env_id: str, env_kwargs: dict[str, Any]) -> Any:
+    from bam_train.agent.agent_messages import Front
+    from bam_train.agent.resident import FRESH
+
+    return Front(
+        env=env_id,
+        env_kwargs=env_kwargs,
+        robot=options.robot,
+        profile=options.profile,
+        ca_file=options.ca_file,
+        robot_token_file=options.robot_token_file,
+        bind=options.bind,
+        port=options.port,
+        cert=options.cert,
+        key=options.key,
+        token_file=options.token_file,
+        folder=str(options.folder),
+        lease=options.lease,
+        command_timeout=FRESH,
+    )
