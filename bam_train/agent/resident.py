@@ -542,15 +542,16 @@ class Resident:
             raise RuntimeError(f"no transition leads from {before.value} to {state.value}")
         self.state, self.why, self.since = state, why, time.time()
         if before is not state:
-            self._note("state", f"{before.value} -> {state.value}: {why}", who, where)
+            self._note("state", f"{before.value} -> {state.value}: {why}", who, where, before)
         self._report()
 
-    def _note(self, what: str, text: str, who: str = "the agent", where: str = "") -> None:
-        """Write to the log, the recording and the audit file."""
+    def _note(self, what: str, text: str, who: str = "the agent", where: str = "", before: State | None = None) -> None:
+        """Write to the log, the recording and the audit file; `before` is the state that the event has changed."""
         self._tell(text)
         if self.session is not None:
             self.session.event(f"{text} ({who}{f' at {where}' if where else ''})")
-        self.audit.write(what, text, who=who, where=where, digest=self.active.digest)
+        after = None if before is None else self.state
+        self.audit.write(what, text, who=who, where=where, digest=self.active.digest, before=before, after=after)
 
     def status(self) -> dict[str, Any]:
         """The status for everybody who looks."""
