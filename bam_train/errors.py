@@ -171,7 +171,7 @@ class CandidateRefused(BamTrainError):  # noqa: N818
     exit_status = 3
 
 
-class AgentRefused(BamTrainError):  # noqa: N818 - reads as what happened
+class RequestRefused(BamTrainError):  # noqa: N818 - reads as what happened
     """A live agent refuses what it was asked."""
 
     exit_status = 3

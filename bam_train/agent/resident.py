@@ -29,7 +29,7 @@ from bam_train.agent.versions import CANDIDATE, CHAMPION, PREVIOUS, Version, Ver
 from bam_train.checkpoint import Checkpoint
 from bam_train.deploy.deployment import STOP, StopSwitch, fault_text
 from bam_train.deploy.journal import EpisodeRecord
-from bam_train.errors import AgentRefused, BamTrainError, ContractRefused, PolicyError
+from bam_train.errors import RequestRefused, BamTrainError, ContractRefused, PolicyError
 from bam_train.loop import Agent
 
 if TYPE_CHECKING:
@@ -192,7 +192,7 @@ class Resident:
         }
         do = known.get(ask.op)
         if do is None:
-            self._send(Answer(ask.number, error=f"{ask.op}: this agent does not know that", kind="AgentRefused"))
+            self._send(Answer(ask.number, error=f"{ask.op}: this agent does not know that", kind="RequestRefused"))
             return
         self.post(lambda: do(ask.who, ask.address, **ask.arguments), ask.number)
 
@@ -211,7 +211,7 @@ class Resident:
     @property
     def _connected(self) -> RobotSession:
         if self.session is None:
-            raise AgentRefused(f"The agent waits for the robot: {self.why}")
+            raise RequestRefused(f"The agent waits for the robot: {self.why}")
         return self.session
 
     def _armed(self, do: Callable[[], None]) -> None:
@@ -458,7 +458,7 @@ class Resident:
 
     def _resume(self, who: str, address: str, why: str = "") -> dict[str, Any]:
         if self.driver is not None:
-            raise AgentRefused(
+            raise RequestRefused(
                 f"{self.driver.who} drives the robot; take it back first, or wait until it is handed back"
             )
         if self._stopped:
@@ -512,7 +512,7 @@ class Resident:
         """Put the scene of a simulated robot in place, for the person who drives."""
         session = self.session
         if session is None or session.is_real:
-            raise AgentRefused("Only a simulated robot has a scene that can be set.")
+            raise RequestRefused("Only a simulated robot has a scene that can be set.")
         robot = session.robot
         signals = dict(robot.measure().signals)  # an arm begins where it is: it does not move
         signals.pop("object_pose", None)
@@ -521,7 +521,7 @@ class Resident:
         robot.reset(np.array([0]), Initial(signals, np.array([seed])))
 
     def _roll_back(self, who: str, address: str, why: str = "") -> dict[str, Any]:
-        raise AgentRefused("There is no version to roll back to.")
+        raise RequestRefused("There is no version to roll back to.")
 
     # ---- what is shown
 

@@ -44,7 +44,7 @@ from bam_train.agent.agent_messages import (
 from bam_train.agent.front.remote_robot import RemoteRobot
 from bam_train.env_location import Place
 from bam_train.environments import make_env
-from bam_train.errors import AgentRefused, BamTrainError
+from bam_train.errors import RequestRefused, BamTrainError
 
 _log = logging.getLogger(__name__)
 CUT = 2.0
@@ -202,7 +202,7 @@ class FrontProcess:
         finally:
             self._pending.pop(number, None)
         if answer.result is None:
-            raise (NotInCommand if answer.kind == "NotInCommand" else AgentRefused)(answer.error)
+            raise (NotInCommand if answer.kind == "NotInCommand" else RequestRefused)(answer.error)
         return answer.result
 
     def _ask_now(self, op: str, arguments: dict[str, Any]) -> dict[str, Any]:
