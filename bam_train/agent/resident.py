@@ -14,7 +14,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -25,11 +25,12 @@ from bam_train.agent.agent_messages import Answer, Ask, Drive, Halt, Message, Re
 from bam_train.agent.agent_options import AgentOptions
 from bam_train.agent.agent_states import TRANSITIONS, State
 from bam_train.agent.robot_session import RobotSession
-from bam_train.agent.versions import CANDIDATE, CHAMPION, PREVIOUS, Version, Versions
+from bam_train.agent.succession import Choice, Succession
+from bam_train.agent.versions import Versions
 from bam_train.checkpoint import Checkpoint
 from bam_train.deploy.deployment import STOP, StopSwitch, fault_text
 from bam_train.deploy.journal import EpisodeRecord
-from bam_train.errors import RequestRefused, BamTrainError, ContractRefused, PolicyError
+from bam_train.errors import BamTrainError, ContractRefused, PolicyError, RequestRefused
 from bam_train.loop import Agent
 
 if TYPE_CHECKING:
@@ -57,21 +58,6 @@ class Driver:
     """Name of the lease's owner on the port."""
     who: str
     """The same for people."""
-
-
-@dataclass
-class Choice:
-    """A version that is to act: at the next tick, or from the next episode on."""
-
-    version: Version
-    policy: Any
-    stage: str | None
-    """``"trial"``, ``"full"`` or None: as the agent's setting says."""
-    names: dict[str, str | None]
-    """Names that move when it becomes active, to digests."""
-    why: str
-    who: str = "the agent"
-    active: threading.Event = field(default_factory=threading.Event)
 
 
 class _Boundary(Agent):
@@ -113,18 +99,18 @@ class Resident:
         admit: Callable[[Any, Sequence[str]], None],
         is_running: bool,
     ) -> None:
-        self.options, self.versions, self.audit = options, versions, audit
+        self.options, self.audit = options, audit
         self.state, self.why, self.since = State.WAITING, "it starts", time.time()
         self.switch = StopSwitch(self.halt)
         """Handler of signals."""
         self.session: RobotSession | None = None
         self.driver: Driver | None = None
-        self.active: Version = versions.find(CHAMPION)
+        self.succession = Succession(self, versions)
+        """Which version acts."""
         self._stage = options.stage
-        self._policies: dict[str, Any] = {}  # by digest: of the versions with a name
-        self._chosen: Choice | None = None  # for the next tick
-        self._next: Choice | None = None  # for the next episode
-        self._send, self._tell, self._admit = send, tell, admit
+        self._chosen: Choice | None = None  # acts as soon as it may
+        self.send = send
+        self._tell, self._admit = tell, admit
         self._news = threading.Condition()
         self._requests: deque[tuple[Callable[[], dict[str, Any] | None], int]] = deque()
         self._command: Drive | None = None
@@ -133,7 +119,6 @@ class Resident:
         self._episodes: deque[int | None] = deque(maxlen=_RECENT)
         self._ticks = self._completed = self._successes = self._late = 0
         self._link_ms = self._loop_ms = 0.0
-        self._names = {name: one.digest for name in (CHAMPION, CANDIDATE, PREVIOUS) if (one := versions.named(name))}
 
     # ---- what other threads call
 
@@ -191,10 +176,12 @@ class Resident:
             "rollback": self._roll_back,
         }
         do = known.get(ask.op)
-        if do is None:
-            self._send(Answer(ask.number, error=f"{ask.op}: this agent does not know that", kind="RequestRefused"))
-            return
-        self.post(lambda: do(ask.who, ask.address, **ask.arguments), ask.number)
+        if ask.op in ("push", "use"):
+            self.succession.begin(ask)
+        elif do is None:
+            self.send(Answer(ask.number, error=f"{ask.op}: this agent does not know that", kind="RequestRefused"))
+        else:
+            self.post(lambda: do(ask.who, ask.address, **ask.arguments), ask.number)
 
     # ---- the main thread
 
@@ -246,7 +233,7 @@ class Resident:
             except (BamTrainError, BamEnvsError) as error:
                 answer = Answer(number, error=" ".join(str(error).split()), kind=type(error).__name__)
             if number:
-                self._send(answer)
+                self.send(answer)
 
     def between_ticks(self) -> bool:
         """Called by the chain between a deadline and the policy: whether the episode ends here."""
@@ -254,27 +241,25 @@ class Resident:
         self._loop_ms += 0.05 * (1e3 * deployment.latency - self._loop_ms)
         if self._requests:
             self._execute()
-        if self._chosen is not None and not self._needs_another_stage(self._chosen):
-            self._activate(self._chosen)
-            self._chosen = None
+        if self._chosen is not None and self._chosen.at_once and not self._slows(self._chosen):
+            self._activate()
         return not self._plays()
 
     def _plays(self) -> bool:
         """Whether the episode that runs goes on."""
-        return self._is_running and self.driver is None and self._chosen is None and not self._quitting
+        waits = self._chosen is not None and self._chosen.at_once
+        return self._is_running and self.driver is None and not waits and not self._quitting
 
     def _play(self) -> None:
         """One episode of the active policy."""
-        for choice in (self._chosen, self._next):
-            if choice is not None:
-                self._chosen = self._next = None
-                if self._needs_another_stage(choice):
-                    self._stage = choice.stage
-                    self._drop("another stage")
-                self._activate(choice)
-                return
+        if self._chosen is not None:
+            self._activate()
         session = self._connected
-        self._change(State.TRIAL if self._is_on_trial else State.RUNNING, self.why)
+        if session.is_real and self._stage is not None and self._stage != session.stage:
+            self._drop(f"for the stage {self._stage}")
+            return
+        session.deployment.trials = self.succession.trials()
+        self._change(self._driving, self.why)
         seed, self._seed = self._seed, self._seed + 1
         try:
             record = session.deployment.episode(self, seed=seed)
@@ -289,37 +274,48 @@ class Resident:
         self._completed += 1
         self._successes += record.success is True
         self._episodes.append(None if record.success is None else int(record.success))
-        self._watch_candidate(record)
+        self.succession.ended(record)
 
     @property
-    def _is_on_trial(self) -> bool:
-        return self._names.get(CANDIDATE) == self.active.digest or (
-            self.session is not None and self.session.stage == "trial"
-        )
+    def _driving(self) -> State:
+        """The state in which the policy drives."""
+        on_trial = self.succession.is_candidate or (self.session is not None and self.session.stage == "trial")
+        return State.TRIAL if on_trial else State.RUNNING
 
-    def _watch_candidate(self, record: EpisodeRecord) -> None:
-        """Promote the candidate, or roll it back, as its trials say."""
+    def choose(self, choice: Choice) -> None:
+        """Let another version act as soon as it may. Thread-safe."""
 
-    def _needs_another_stage(self, choice: Choice) -> bool:
-        """Whether the limits of the robot change with this choice, for which it is connected anew."""
+        def set_choice() -> None:
+            self._chosen = choice
+
+        if threading.current_thread() is threading.main_thread():
+            set_choice()
+        else:
+            self.post(set_choice)
+
+    def stage_of_champion(self) -> None:
+        """Move at the stage of the agent's setting from the next episode on."""
+        self._stage = self.options.stage
+
+    def _slows(self, choice: Choice) -> bool:
+        """Whether the robot gets closer limits first, for which the episode ends."""
         session = self.session
-        return session is not None and session.is_real and choice.stage is not None and choice.stage != session.stage
+        return session is not None and session.is_real and choice.stage == "trial" and session.stage != "trial"
 
-    def _activate(self, choice: Choice) -> None:
-        """Let the chosen policy act from now on."""
-        before, self.active = self.active, choice.version
-        self._policies[choice.version.digest] = choice.policy
+    def _activate(self) -> None:
+        """Let the chosen version act from now on."""
+        choice, self._chosen = self._chosen, None
+        if choice is None:
+            return
+        before = self.succession.active
+        self.succession.activate(choice)
         if self.session is not None:
             self.session.deployment.swap(choice.policy)
-            self.session.policy = choice.policy
-        for name, digest in choice.names.items():
-            if digest is None:
-                self._names.pop(name, None)
-            else:
-                self._names[name] = digest
-        text = f"{choice.version.digest[:12]} acts instead of {before.digest[:12]}: {choice.why}"
-        self._note("swap", text, choice.who)
-        threading.Thread(target=self.versions.point, args=(choice.names,), name="bam-names").start()
+        self._stage = choice.stage or self._stage
+        after = choice.version.digest[:12]
+        self.note("swap", f"{after} acts instead of {before.digest[:12]}: {choice.why}", choice.who)
+        if self.state.drives:
+            self._change(self._driving, choice.why, choice.who)
         choice.active.set()
         self._report()
 
@@ -327,11 +323,7 @@ class Resident:
 
     def _rest(self) -> None:
         self._change(State.STOPPED if self._stopped else State.PAUSED, self.why)
-        for choice in (self._chosen, self._next):
-            if choice is not None:
-                self._chosen = self._next = None
-                self._stage = choice.stage or self._stage
-                self._activate(choice)
+        self._activate()
         with self._news:
             self._news.wait_for(lambda: bool(self._requests) or bool(self.switch.came), _LOOK)
         self._require_link()
@@ -369,7 +361,7 @@ class Resident:
         if session is None:
             return
         session.deployment.sent(tick, state)
-        self._send(Sent(list(tick.command)))
+        self.send(Sent(list(tick.command)))
         self._link_ms += 0.05 * (1e3 * tick.age - self._link_ms)
         if tick.approach and self.driver is None and self._requests:
             self._execute()
@@ -380,9 +372,11 @@ class Resident:
 
     def _reach_robot(self) -> None:
         """Connect, and check the contract; on failure wait a little."""
-        self._change(State.WAITING, self.why)
+        if not self._stopped:
+            self._change(State.WAITING, self.why)
         try:
-            checkpoint = Checkpoint.open(self.active.path)
+            self._activate()
+            checkpoint = Checkpoint.open(self.succession.active.path)
             self.session = RobotSession(
                 self.options,
                 checkpoint,
@@ -392,18 +386,17 @@ class Resident:
                 admit=self._admit,
             )
         except (BamEnvsError, ContractRefused) as error:
-            self._change(State.WAITING, fault_text(error))
+            if not self._stopped:
+                self._change(State.WAITING, fault_text(error))
             with self._news:
                 self._news.wait_for(lambda: bool(self._requests), _AGAIN)
             self._report(_REPORT)
             return
         self._admit = lambda env, lines: None  # the operator is asked once
-        policy = self._policies.get(self.active.digest)
-        if policy is not None:
-            self.session.deployment.swap(policy)
-        self._policies[self.active.digest] = policy or self.session.policy
+        self.session.deployment.swap(self.succession.policy())
+        self.succession.load_previous()
         self.session.robot.observe(self._sent)
-        self._note("connected", f"{self.options.robot}: the robot fits, stage {self.session.stage}")
+        self.note("connected", f"{self.options.robot}: the robot fits, stage {self.session.stage}")
         if self._stopped:
             self._change(State.STOPPED, self._stopped)
         elif not self._is_running:
@@ -428,22 +421,17 @@ class Resident:
             self._stopped, self._is_running = text, False
             self._change(State.STOPPED, text)
             if session is not None:
-                self._guard_stopped(text)
+                self.succession.guard_stopped(text)
         elif isinstance(error, BamEnvsError):  # lost, stale, or somebody else drives: it goes on when it can
             self._change(State.WAITING, text)
         else:
-            if isinstance(error, PolicyError):
-                self._policy_failed(text)
-            else:
+            if not isinstance(error, BamTrainError):
                 _log.error("The episode failed", exc_info=error)
+            if isinstance(error, PolicyError) and self.succession.policy_failed(text):
+                self._change(State.WAITING, text)  # until the other version is connected
+                return
             self._is_running = False
             self._change(State.PAUSED, f"paused by a fault: {text}")
-
-    def _guard_stopped(self, text: str) -> None:
-        """Count a guard's stop of a candidate."""
-
-    def _policy_failed(self, text: str) -> None:
-        """Roll back a candidate whose policy is broken."""
 
     # ---- requests, in the main thread
 
@@ -462,11 +450,11 @@ class Resident:
                 f"{self.driver.who} drives the robot; take it back first, or wait until it is handed back"
             )
         if self._stopped:
-            self._note("resume", f"{who} lets the robot move again after: {self._stopped}", who, address)
+            self.note("resume", f"{who} lets the robot move again after: {self._stopped}", who, address)
         self._stopped, self._is_running = "", True
         text = f"resumed by {who}{f': {why}' if why else ''}"
         if self.session is not None:
-            self._change(State.TRIAL if self._is_on_trial else State.RUNNING, text, who, address)
+            self._change(self._driving, text, who, address)
         return self.status()
 
     def _take_over(self, who: str, address: str, lease: str, force: bool = False) -> dict[str, Any]:
@@ -475,7 +463,7 @@ class Resident:
             raise NotInCommand(f"The agent is {self.state.value} ({reason}); nobody can take over now.")
         self.halt()
         if self.driver is not None and self.driver.lease != lease:
-            self._note("take over", f"{who} takes over from {self.driver.who}", who, address)
+            self.note("take over", f"{who} takes over from {self.driver.who}", who, address)
         self.driver, self._command = Driver(lease, who), None
         self._change(State.TAKEN_OVER, f"taken over by {who}", who, address)
         return self.status()
@@ -499,14 +487,14 @@ class Resident:
         self._end_driving(driver, why or f"handed back by {who}")
         text = why or f"handed back by {who}"
         if goes_on:
-            self._change(State.TRIAL if self._is_on_trial else State.RUNNING, text, who, address)
+            self._change(self._driving, text, who, address)
         else:
             self._change(State.PAUSED, text, who, address)
         return self.status()
 
     def _end_driving(self, driver: Driver, why: str) -> None:
         self.driver, self._command, self._is_running = None, None, self._is_running and self.options.resume
-        self._send(Report({**self.status(), "ended": driver.lease, "why": why}))
+        self.send(Report({**self.status(), "ended": driver.lease, "why": why}))
 
     def _scene(self, who: str, address: str, pose: list[list[float]] | None, seed: int) -> None:
         """Put the scene of a simulated robot in place, for the person who drives."""
@@ -521,7 +509,12 @@ class Resident:
         robot.reset(np.array([0]), Initial(signals, np.array([seed])))
 
     def _roll_back(self, who: str, address: str, why: str = "") -> dict[str, Any]:
-        raise RequestRefused("There is no version to roll back to.")
+        text = f"{who}{f': {why}' if why else ''}"
+        choice = self.succession.back(who, text)
+        self._chosen = choice
+        if not self._plays():
+            self._activate()
+        return {**self.status(), "digest": choice.version.digest}
 
     # ---- what is shown
 
@@ -542,16 +535,16 @@ class Resident:
             raise RuntimeError(f"no transition leads from {before.value} to {state.value}")
         self.state, self.why, self.since = state, why, time.time()
         if before is not state:
-            self._note("state", f"{before.value} -> {state.value}: {why}", who, where, before)
+            self.note("state", f"{before.value} -> {state.value}: {why}", who, where, before)
         self._report()
 
-    def _note(self, what: str, text: str, who: str = "the agent", where: str = "", before: State | None = None) -> None:
+    def note(self, what: str, text: str, who: str = "the agent", where: str = "", before: State | None = None) -> None:
         """Write to the log, the recording and the audit file; `before` is the state that the event has changed."""
         self._tell(text)
         if self.session is not None:
             self.session.event(f"{text} ({who}{f' at {where}' if where else ''})")
-        after = None if before is None else self.state
-        self.audit.write(what, text, who=who, where=where, digest=self.active.digest, before=before, after=after)
+        after, digest = None if before is None else self.state, self.succession.active.digest
+        self.audit.write(what, text, who=who, where=where, digest=digest, before=before, after=after)
 
     def status(self) -> dict[str, Any]:
         """The status for everybody who looks."""
@@ -562,8 +555,8 @@ class Resident:
             "state": self.state.value,
             "why": self.why,
             "since": self.since,
-            "active": self.active.digest,
-            "names": dict(self._names),
+            "active": self.succession.active.digest,
+            "names": dict(self.succession.names),
             "stage": None if session is None else session.stage,
             "owner": None if self.driver is None else self.driver.who,
             "robot": self.options.robot if session is None else session.robot.info.text,
@@ -589,4 +582,4 @@ class Resident:
         now = time.monotonic()
         if now - self._reported >= least:
             self._reported = now
-            self._send(Report(self.status()))
+            self.send(Report(self.status()))

@@ -18,7 +18,7 @@ from bam_train.deploy.contract import check_contract
 from bam_train.deploy.deployment import Deployment, StopSwitch
 from bam_train.deploy.flight import deployment_facts, flight_recorder, recording_names, watch_cameras
 from bam_train.deploy.journal import Journal
-from bam_train.environments import control_period, environment_of, make_env
+from bam_train.environments import control_period, environment_of, interface_of, make_env
 from bam_train.errors import BamTrainError
 from bam_train.loop import Agent
 from bam_train.recording.recorder import Recorder
@@ -63,11 +63,11 @@ class RobotSession:
         admit: Callable[[Any, Sequence[str]], None],
     ) -> None:
         self.checkpoint = checkpoint
-        self.env_id, kwargs = environment_of(checkpoint)
+        self.env_id, self.env_kwargs = environment_of(checkpoint)
         self.stage = stage or "full"
         """The stage at which the robot moves."""
         place = options.place(trial=True if stage == "trial" else None)
-        self._env = make_env(self.env_id, kwargs, place=place)
+        self._env = make_env(self.env_id, self.env_kwargs, place=place)
         try:
             check_contract(checkpoint, self._env, place).require(f"{checkpoint.path} and the robot at {place.text}")
             self.robot.connect()
@@ -76,7 +76,7 @@ class RobotSession:
                 self.stage = stage or "trial"
                 place = replace(place, trial=self.stage == "trial")
                 self._env.close()  # type: ignore[no-untyped-call]
-                self._env = make_env(self.env_id, kwargs, place=place)  # the limits are fixed when a robot is made
+                self._env = make_env(self.env_id, self.env_kwargs, place=place)  # a robot's limits are fixed
                 self.robot.connect()
             record = options.folder / "trials.jsonl"
             admission = Admission(checkpoint, options.keys, options.allow_unsigned, record, options.i_know)
@@ -85,6 +85,7 @@ class RobotSession:
             lines = admission(self._env, place)
             admit(self._env, lines)
             self.policy, self.marks = admission.policy, admission.marks
+            self.interface = interface_of(self._env)
             self.recorder = self._start_recorder(options, checkpoint) if options.record else None
             self.deployment = Deployment(
                 _HeldOpen(self._env),

@@ -44,7 +44,7 @@ from bam_train.agent.agent_messages import (
 from bam_train.agent.front.remote_robot import RemoteRobot
 from bam_train.env_location import Place
 from bam_train.environments import make_env
-from bam_train.errors import RequestRefused, BamTrainError
+from bam_train.errors import BamTrainError, RequestRefused
 
 _log = logging.getLogger(__name__)
 CUT = 2.0

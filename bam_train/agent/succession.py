@@ -1,0 +1,303 @@
+"""Which version of a live agent acts: candidates come, are promoted or rolled back.
+
+A candidate is checked in another process and loaded in a thread, while the old policy drives. What follows happens in
+the main thread, between two ticks or two episodes.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import threading
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from bam_envs.core.errors import BamEnvsError
+from bam_train.agent.agent_messages import Answer, Ask, Progress
+from bam_train.agent.candidate import CandidateRequest, check_candidate
+from bam_train.agent.probation import Judgement, Probation
+from bam_train.agent.versions import CANDIDATE, CHAMPION, PREVIOUS, Version, Versions, load_policy
+from bam_train.checkpoint import Checkpoint
+from bam_train.deploy.checkpoint_admission import trials_of
+from bam_train.deploy.journal import EpisodeRecord
+from bam_train.deploy.trials import Trials
+from bam_train.errors import BadTrials, BamTrainError, OutputError, RequestRefused, TrialsNeeded
+
+if TYPE_CHECKING:
+    from bam_train.agent.resident import Resident
+
+_log = logging.getLogger(__name__)
+_EPISODE = 3600.0  # longest wait for the end of an episode [s]
+_TRIAL = 24 * 3600.0  # longest wait for the end of a trial [s]
+
+
+@dataclass
+class Choice:
+    """A version that is to act: at the next tick, or from the next episode on."""
+
+    version: Version
+    policy: Any
+    names: Mapping[str, str | None]
+    """Names that move when it becomes active, to digests; None removes a name."""
+    why: str
+    who: str
+    stage: str | None = None
+    """``"trial"``, ``"full"`` or None: as before."""
+    at_once: bool = True
+    """Whether it acts from the next tick on, and not from the next episode."""
+    trials: Trials | None = None
+    """Its trials, if it is a candidate."""
+    active: threading.Event = field(default_factory=threading.Event)
+    outcome: threading.Event = field(default_factory=threading.Event)
+    """Set once it was promoted or rolled back."""
+    result: str = ""
+    """``"promoted"``, ``"rolled back"`` or ``"replaced"``, with the reason."""
+
+
+class Succession:
+    """The versions of an agent that act, one after the other.
+
+    Args:
+        resident: The agent.
+        versions: Its folder; one version is called `CHAMPION`.
+    """
+
+    def __init__(self, resident: Resident, versions: Versions) -> None:
+        self._resident, self.versions = resident, versions
+        self.active = versions.find(CHAMPION)
+        """The version that acts, or will when the robot is there."""
+        self.names = dict(versions.names)
+        """The digest that each name stands for."""
+        self.probation: Probation | None = None
+        self.choice: Choice | None = None
+        """The candidate that acts."""
+        self._policies: dict[str, Any] = {}  # of versions with a name, by digest
+        self._saving = threading.Lock()
+
+    @property
+    def is_candidate(self) -> bool:
+        """Whether a candidate acts."""
+        return self.names.get(CANDIDATE) == self.active.digest
+
+    def policy(self) -> Any:
+        """The policy of the active version; loaded if need be."""
+        digest = self.active.digest
+        if digest not in self._policies:
+            self._policies[digest] = load_policy(self.active)
+        return self._policies[digest]
+
+    def load_previous(self) -> None:
+        """Load what a roll-back needs, in another thread: then it takes one tick."""
+
+        def load() -> None:
+            for name in (CHAMPION, PREVIOUS):
+                with contextlib.suppress(BamTrainError):
+                    if name in self.names and self.names[name] not in self._policies:
+                        self._policies[self.names[name]] = load_policy(self.versions.find(name))
+
+        threading.Thread(target=load, name="bam-previous").start()
+
+    # ---- requests, in a thread of their own until the choice is made
+
+    def begin(self, ask: Ask) -> None:
+        """Execute a request (`push`, `use`) in another thread, which answers it."""
+        threading.Thread(target=self._serve, args=(ask,), name=f"bam-{ask.op}", daemon=True).start()
+
+    def _serve(self, ask: Ask) -> None:
+        resident = self._resident
+        try:
+            result = self._push(ask) if ask.op == "push" else self._use(ask)
+            resident.send(Answer(ask.number, result=result))
+        except (BamTrainError, BamEnvsError) as error:
+            text = " ".join(str(error).split())
+            resident.post(lambda: resident.note("refused", text, ask.who, ask.address))
+            resident.send(Answer(ask.number, error=text, kind=type(error).__name__))
+
+    def _push(self, ask: Ask) -> dict[str, Any]:
+        resident, arguments = self._resident, ask.arguments
+        session = resident.session
+        path, name = Path(arguments["path"]), str(arguments.get("file") or "the candidate")
+        try:
+            if session is None:
+                raise RequestRefused("the agent waits for the robot, and checks no candidate without it; push it later")
+            resident.send(Progress(ask.number, "checking"))
+            verdict = check_candidate(
+                CandidateRequest(
+                    path,
+                    name,
+                    self.versions.folder,
+                    session.env_id,
+                    session.env_kwargs,
+                    session.interface,
+                    simulated=not session.is_real,
+                    keys=resident.options.keys,
+                    allow_unsigned=resident.options.allow_unsigned,
+                )
+            )
+        finally:
+            path.unlink(missing_ok=True)
+        if not verdict.ok:
+            raise RequestRefused(verdict.reason)
+        return {**self._choose(self.versions.find(verdict.digest), ask), "lines": list(verdict.lines)}
+
+    def _use(self, ask: Ask) -> dict[str, Any]:
+        return self._choose(self.versions.find(str(ask.arguments.get("version", ""))), ask)
+
+    def _choose(self, version: Version, ask: Ask) -> dict[str, Any]:
+        """Let `version` act as the request says, and wait until it does."""
+        resident, arguments = self._resident, ask.arguments
+        choice = self._made(version, ask)
+        when = "tick" if choice.at_once else "episode"
+        resident.send(Progress(ask.number, f"accepted; it acts from the next {when} on"))
+        resident.choose(choice)
+        if not choice.active.wait(_EPISODE):
+            raise RequestRefused(f"{version.digest[:12]} was accepted, and did not become active in an hour")
+        if arguments.get("wait") and choice.trials is not None:
+            resident.send(Progress(ask.number, "acts as the candidate; its trials decide"))
+            if not choice.outcome.wait(_TRIAL):
+                raise RequestRefused("the trial did not end in a day")
+        status = resident.status()
+        return {
+            "digest": version.digest,
+            "stage": status["stage"],
+            "state": status["state"],
+            "names": status["names"],
+            "active": status["active"],
+            "owner": status["owner"],
+            "outcome": choice.result,
+        }
+
+    def _made(self, version: Version, ask: Ask) -> Choice:
+        resident, digest = self._resident, version.digest
+        session, policy = resident.session, self._policies.get(digest) or load_policy(version)
+        stage, address = ask.arguments.get("stage", "auto"), resident.options.robot
+        is_real = session is not None and session.is_real
+        checkpoint = Checkpoint.open(version.path, members=False)
+        record = resident.options.folder / "trials.jsonl"
+        trials = trials_of(checkpoint, record, address, simulated=not is_real)
+        if stage == "full" and is_real and not (resident.options.i_know or trials.evidence.is_enough):
+            evidence = trials.evidence.text
+            raise TrialsNeeded(f"--stage full: {digest[:12]} at {address}: {evidence}. Push it as a trial first")
+        at_once = ask.arguments.get("when", "episode") == "tick"
+        why = f"{ask.op} by {ask.who}"
+        champion = self.names[CHAMPION]
+        if stage == "full":
+            names: dict[str, str | None] = {CANDIDATE: None}
+            names |= {CHAMPION: digest, PREVIOUS: champion} if digest != champion else {}
+            return Choice(version, policy, names, why, ask.who, "full" if is_real else None, at_once)
+        slow = "trial" if is_real or stage == "trial" else None
+        return Choice(version, policy, {CANDIDATE: digest}, why, ask.who, slow, at_once, trials)
+
+    # ---- the main thread
+
+    def activate(self, choice: Choice) -> None:
+        """Make the chosen version the active one: the caller lets its policy act."""
+        self._close_choice("replaced: another version acts")
+        self.active, self._policies[choice.version.digest] = choice.version, choice.policy
+        for name, digest in choice.names.items():
+            if digest is None:
+                self.names.pop(name, None)
+            else:
+                self.names[name] = digest
+        self._save(choice.names)
+        bound = 0.9 if choice.trials is None else choice.trials.threshold
+        self.choice, self.probation = choice, Probation(bound, self._resident.options.guard_stops)
+        kept = {self.active.digest, *self.names.values()}
+        self._policies = {digest: policy for digest, policy in self._policies.items() if digest in kept}
+
+    def _save(self, names: Mapping[str, str | None]) -> None:
+        """Move names in the folder, in another thread: a tick does not wait for the disk."""
+
+        def save() -> None:
+            with self._saving:
+                try:
+                    self.versions.point(names)
+                except OutputError as error:
+                    _log.warning("The names were not saved: %s", error)
+
+        threading.Thread(target=save, name="bam-names").start()
+
+    def back(self, who: str, why: str) -> Choice:
+        """The choice that rolls back: from a candidate to the champion, else to the version before it.
+
+        Raises:
+            RequestRefused: There is none.
+        """
+        champion, previous = self.names.get(CHAMPION), self.names.get(PREVIOUS)
+        names: dict[str, str | None]
+        if self.active.digest != champion and champion is not None:
+            target, names = champion, {CANDIDATE: None}
+        elif previous is not None:
+            target, names = previous, {CHAMPION: previous, PREVIOUS: champion, CANDIDATE: None}
+        else:
+            raise RequestRefused(
+                "There is no version to roll back to: the champion acts, and there was none before it."
+            )
+        version = self.versions.find(target)
+        policy = self._policies.get(target) or load_policy(version)
+        return Choice(version, policy, names, f"rolled back: {why}", who, self._resident.options.stage)
+
+    def ended(self, record: EpisodeRecord) -> None:
+        """Judge the active version after an episode."""
+        choice = self.choice
+        if choice is None or self.probation is None:
+            return
+        evidence = None
+        if self.is_candidate and choice.trials is not None:
+            try:
+                evidence = choice.trials.evidence
+            except BadTrials as error:
+                _log.warning("%s", error)
+        self._judged(self.probation.ended(record.success, trials=evidence))
+
+    def guard_stopped(self, text: str) -> None:
+        """Judge the active version after a guard stopped the robot."""
+        if self.probation is not None:
+            self._judged(self.probation.ended(None, stopped_by=text))
+
+    def policy_failed(self, text: str) -> bool:
+        """Judge the active version after a fault of its policy; whether another one acts now."""
+        if self.probation is None:
+            return False
+        return self._judged(self.probation.failed(text))
+
+    def _judged(self, judgement: Judgement | None) -> bool:
+        if judgement is None:
+            return False
+        resident = self._resident
+        if judgement.decision == "promote":
+            self._promote(judgement.reason)
+            return False
+        try:
+            choice = self.back("the agent", judgement.reason)
+        except RequestRefused as error:
+            resident.note("trial", f"{self.active.digest[:12]} would be rolled back: {judgement.reason}. {error}")
+            self.probation = None
+            return False
+        self._close_choice(f"rolled back: {judgement.reason}")
+        resident.choose(choice)
+        return True
+
+    def _promote(self, reason: str) -> None:
+        digest, champion = self.active.digest, self.names.get(CHAMPION)
+        names: dict[str, str | None] = {CHAMPION: digest, CANDIDATE: None}
+        names |= {PREVIOUS: champion} if champion not in (None, digest) else {}
+        self.names.pop(CANDIDATE, None)
+        self.names |= {name: one for name, one in names.items() if one is not None}
+        self._save(names)
+        self._resident.note("promoted", f"{digest[:12]} is the champion: {reason}")
+        self._resident.stage_of_champion()
+        self._close_choice(f"promoted: {reason}")
+
+    def _close_choice(self, result: str) -> None:
+        """Tell whoever waits what became of the candidate."""
+        choice = self.choice
+        if choice is not None and not choice.outcome.is_set():
+            choice.result = result
+            choice.outcome.set()
+
+    def trials(self) -> Trials | None:
+        """The trials of the active version, if it is a candidate."""
+        return self.choice.trials if self.choice is not None and self.is_candidate else None
