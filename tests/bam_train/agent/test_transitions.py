@@ -1,0 +1,127 @@
+import json
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+from bam_train.agent.transitions import MOST, TransitionLog, TransitionsAgent, decode, encode
+from bam_train.errors import FormatError
+from bam_train.loop import Agent, Agents, PolicyAgent, RobotAgent, TemporalAgent, Workspace
+
+
+def three():
+    log, rng = TransitionLog(), np.random.default_rng(0)
+    for step in range(3):
+        seen, after, action = (rng.standard_normal(n).astype(np.float32) for n in (4, 4, 2))
+        ends, digest = (step == 2, False, step == 2), "" if step == 1 else "ab"
+        log.add(seen, action, 0.1 * step, after, *ends, step == 1, 7, step, digest)
+    return log.take()
+
+
+def same(one, other):
+    for name, value in vars(one).items():
+        found = getattr(other, name)
+        if name == "policy":
+            assert found == value
+        else:
+            assert found.dtype == value.dtype, name
+            np.testing.assert_array_equal(found, value)
+
+
+def test_a_message_carries_every_bit():
+    sent = three()
+    same(sent, decode(json.loads(json.dumps(encode(sent)))))
+    assert sent.policy == ["ab", "", "ab"]
+    assert sent.intervention.tolist() == [False, True, False]
+    assert sent.ends.tolist() == [False, False, True]
+
+
+def test_pictures_keep_their_shape():
+    log = TransitionLog()
+    log.add(np.ones((2, 3)), np.zeros(1), 0.0, np.zeros((2, 3)), False, True, False, False, 0, 0, "ab")
+    decoded = decode(encode(log.take()))
+    assert decoded.observation.shape == (1, 2, 3)
+    assert len(decoded) == 1
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"count": -1}, "transitions: count: expected a whole number up to 10000, found -1"),
+        ({"count": MOST + 1}, "transitions: count: expected a whole number up to 10000, found 10001"),
+        ({"terminated": [0, 0, 1]}, "transitions: terminated: expected 3 values of type bool, found [0, 0, 1]"),
+        ({"episode": [1, 1]}, "transitions: episode: expected 3 values of type int, found [1, 1]"),
+        ({"step": [0, 1, 2**64]}, f"transitions: step: expected 3 values of type int, found [0, 1, {2**64}]"),
+        ({"policy": None}, "transitions: policy: expected 3 values of type str, found None"),
+        ({"action": [1.0]}, "transitions: action: expected an array of 3 rows, found [1.0]"),
+        ({"reward": {"shape": [3], "data": "?"}}, "transitions: reward: expected base64, found '?'"),
+        (
+            {"reward": {"shape": [3], "data": "AAAA"}},
+            "transitions: reward: expected 12 bytes for shape [3], found 3",
+        ),
+        (
+            {"reward": {"shape": [3, 1], "data": "AAAAAAAAAAAAAAAA"}},
+            "transitions: reward: expected shape (3,), found (3, 1)",
+        ),
+        ({"reward": {"shape": [3], "data": "AADAfwAAAAAAAAAA"}}, "transitions: reward: expected finite numbers"),
+        (
+            {"next_observation": {"shape": [3, 1], "data": "AAAAAAAAAAAAAAAA"}},
+            "transitions: next_observation: expected shape (3, 4), found (3, 1)",
+        ),
+    ],
+)
+def test_a_bad_message_is_refused(change, message):
+    with pytest.raises(FormatError) as error:
+        decode(encode(three()) | change)
+    assert str(error.value) == message
+
+
+def test_a_full_log_keeps_the_newest_and_counts_the_others():
+    log = TransitionLog(most=2)
+    for step in range(5):
+        log.add(np.zeros(1), np.zeros(1), step, np.zeros(1), False, False, False, False, 0, step, "")
+    assert log.lost == 3
+    assert log.take().step.tolist() == [3, 4]
+    assert log.take() is None
+
+
+class Counting(gym.Env):
+    """Observation: the number of the step; two steps an episode."""
+
+    observation_space = gym.spaces.Box(-9, 9, (1,), np.float32)
+    action_space = gym.spaces.Box(-1, 1, (1,), np.float32)
+
+    def reset(self, *, seed=None, options=None):
+        self.t = 0
+        return np.zeros(1, np.float32), {}
+
+    def step(self, action):
+        self.t += 1
+        return np.full(1, self.t, np.float32), float(action[0]), self.t == 2, False, {"is_success": self.t == 2}
+
+
+class HalfOfIt:
+    def reset(self):
+        pass
+
+    def act(self, observation):
+        return (observation + 1) / 4
+
+
+def test_the_loop_collects_each_step_of_each_episode():
+    log, digests = TransitionLog(), iter("aabbccdd")
+    robot = RobotAgent(Counting())
+    chain: list[Agent] = [robot, PolicyAgent(HalfOfIt(), robot.observation_names, single=True)]
+    loop = TemporalAgent(Agents(*chain, TransitionsAgent(log, lambda: next(digests))))
+    for _ in range(2):
+        loop(Workspace(window=2), t=0, stop_variable="env/done")
+    found = log.take()
+    assert found.episode.tolist() == [0, 0, 1, 1]
+    assert found.step.tolist() == [0, 1, 0, 1]
+    assert found.observation[:, 0].tolist() == [0, 1, 0, 1]
+    assert found.next_observation[:, 0].tolist() == [1, 2, 1, 2]
+    assert found.reward.tolist() == found.action[:, 0].tolist() == [0.25, 0.5, 0.25, 0.5]
+    assert found.terminated.tolist() == found.success.tolist() == [False, True, False, True]
+    assert not found.truncated.any()
+    assert not found.intervention.any()
+    assert found.policy == ["a", "a", "b", "c"]
