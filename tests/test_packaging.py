@@ -50,6 +50,9 @@ def test_the_wheel_holds_two_packages_and_nothing_else(wheel):
         "bam_train/trainers/presets/pick-ppo.toml",
         "bam_train/trainers/presets/reach-ppo.toml",
         "bam_train/trainers/presets/pick-place-ppo.toml",
+        "bam_train/agent/console/index.html",
+        "bam_train/agent/console/console.css",
+        "bam_train/agent/console/main.js",
     ],
 )
 def test_the_wheel_holds_types_models_and_presets(wheel, name):

@@ -1,0 +1,173 @@
+"""Pictures of a robot's cameras for people who look: the newest of each camera, on a WebSocket of its own.
+
+A camera is connected only while somebody looks. A picture is sent when the one before it was drawn, so that a slow
+link gets fewer pictures, and never old ones; commands have another socket, and wait for none of them.
+"""
+
+import asyncio
+import contextlib
+import io
+import json
+import threading
+from collections.abc import Mapping
+from typing import Protocol
+
+import numpy as np
+from websockets.exceptions import ConnectionClosed
+
+from bam_envs.core.errors import BamEnvsError, MissingExtra
+from bam_envs.live.camera import CameraImage, Pixels
+from bam_envs.rosbridge.bus import Caller
+from bam_envs.rosbridge.server.server_connection import BridgeConnection
+
+_LOOK, _AGAIN, _ALIVE = 0.02, 2.0, 1.0
+"""Times between two looks at a camera, two attempts to connect it, and two signs of life to a page [s]."""
+_QUALITY = 80
+"""Quality of pictures that arrive uncompressed, and are sent as JPEG."""
+
+
+class Camera(Protocol):
+    """What `LiveCamera` has."""
+
+    def connect(self) -> None:
+        """Connect, and wait for a first image."""
+
+    def latest(self) -> CameraImage:
+        """The newest image."""
+
+    def file(self) -> tuple[int, str, bytes] | None:
+        """Number, kind and bytes of the newest image, as it arrived."""
+
+    def close(self) -> None:
+        """Drop the connection."""
+
+
+class CameraFeed:
+    """Serves the pictures of `cameras`, by their names; `serve` is a handler of a `Site`.
+
+    A page gets ``{"cameras": [names]}``, and then binary messages: the number of the camera (one byte) and a JPEG or
+    PNG. It answers each with ``{"op": "next", "camera": number}``. ``{"camera": number, "error": text}`` says why there
+    are no pictures.
+    """
+
+    def __init__(self, cameras: Mapping[str, Camera]) -> None:
+        self._names, self._readers = list(cameras), [_Reader(one) for one in cameras.values()]
+        self._viewers = 0
+
+    async def serve(self, connection: BridgeConnection, caller: Caller) -> None:
+        """Send pictures until the connection closes."""
+        self._viewers += 1
+        if self._viewers == 1:
+            for reader in self._readers:
+                reader.start()
+        try:
+            await self._show(connection)
+        finally:
+            self._viewers -= 1
+            if self._viewers == 0:
+                self.close()
+
+    def close(self) -> None:
+        """Disconnect the cameras. Idempotent."""
+        for reader in self._readers:
+            reader.stop()
+
+    async def _show(self, connection: BridgeConnection) -> None:
+        ready, shown, told = set(range(len(self._names))), [0] * len(self._names), [""] * len(self._names)
+        await connection.send(json.dumps({"cameras": self._names}))
+        listening = asyncio.create_task(_listen(connection, ready))
+        silent = 0.0
+        try:
+            while not listening.done():
+                for number, reader in enumerate(self._readers):
+                    if reader.error != told[number]:
+                        told[number] = reader.error
+                        await connection.send(json.dumps({"camera": number, "error": reader.error}))
+                    at, data = reader.newest
+                    if number in ready and at != shown[number]:
+                        ready.discard(number)
+                        shown[number], silent = at, 0.0
+                        await connection.send(bytes([number]) + data)
+                await asyncio.sleep(_LOOK)
+                silent += _LOOK
+                if silent > _ALIVE:
+                    await connection.send('{"event": "alive"}')
+                    silent = 0.0
+        finally:
+            listening.cancel()
+            with contextlib.suppress(asyncio.CancelledError, ConnectionClosed):
+                await listening
+
+
+async def _listen(connection: BridgeConnection, ready: set[int]) -> None:
+    """Note which cameras' pictures were drawn, until the connection closes."""
+    while True:
+        with contextlib.suppress(ValueError, AttributeError):
+            message = json.loads(await connection.next_message())
+            if message.get("op") == "next" and isinstance(message.get("camera"), int):
+                ready.add(message["camera"])
+
+
+class _Reader:
+    """Reads one camera in a thread of its own."""
+
+    def __init__(self, camera: Camera) -> None:
+        self._camera = camera
+        self._stopped, self._thread = threading.Event(), threading.Thread()
+        self.newest: tuple[int, bytes] = (0, b"")
+        """Number and file of the newest picture; 0: there is none."""
+        self.error = ""
+
+    def start(self) -> None:
+        self._stopped = stopped = threading.Event()
+        self.newest, self.error = (0, b""), ""
+        before = self._thread
+        self._thread = threading.Thread(target=self._run, args=(stopped, before), name="bam-camera", daemon=True)
+        self._thread.start()
+
+    def stop(self) -> None:
+        self._stopped.set()
+
+    def _run(self, stopped: threading.Event, before: threading.Thread) -> None:
+        if before.ident is not None:
+            before.join()  # it closes the camera
+        while not stopped.is_set():
+            self._attempt(stopped)
+
+    def _attempt(self, stopped: threading.Event) -> None:
+        """Read the camera until it fails; then wait a little."""
+        try:
+            self._camera.connect()
+            self.error = ""
+            self._read(stopped)
+        except BamEnvsError as error:
+            self.error = str(error)
+            stopped.wait(_AGAIN)
+        finally:
+            self._camera.close()
+
+    def _read(self, stopped: threading.Event) -> None:
+        seen = 0
+        while not stopped.wait(_LOOK):
+            file = self._camera.file()
+            if file is not None:
+                number, _, data = file
+            else:  # as it arrived, no browser draws it
+                image = self._camera.latest()
+                number, data = image.number, b"" if image.number == seen else jpeg(image.pixels)
+            if number != seen:
+                seen, self.newest = number, (number, data)
+
+
+def jpeg(pixels: Pixels) -> bytes:
+    """Colours, greys, or distances [m] (up to the farthest one) as a JPEG; `MissingExtra` without Pillow."""
+    try:
+        from PIL import Image
+    except ImportError as error:
+        raise MissingExtra("pillow", "sim", "A picture of a camera that does not compress it") from error
+    if pixels.dtype != np.uint8:
+        known = np.nan_to_num(pixels, nan=0.0, posinf=0.0)
+        pixels = (255.0 * known / max(float(known.max()), 1e-9)).astype(np.uint8)
+    buffer, picture = io.BytesIO(), Image.fromarray(pixels[..., :3] if pixels.ndim == 3 else pixels)
+    picture.save(buffer, "JPEG", quality=_QUALITY)
+    return buffer.getvalue()

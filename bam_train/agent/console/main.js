@@ -1,0 +1,226 @@
+// The console: one socket for status and orders, one for pictures; the buttons, and the space bar, which always stops.
+
+import { showCameras } from "./cameras.js";
+import { Connection } from "./connection.js";
+import { Jogging } from "./jogging.js";
+import { say, showAudit, showNear, showStatus, showTelemetry, showVersions } from "./panels.js";
+import { Picture } from "./picture.js";
+import { Plots } from "./plots.js";
+
+const byId = (id) => document.getElementById(id);
+const SPEEDS = [0.05, 0.1, 0.25]; // [m/s]
+const LOOK = 2000; // time between two looks at versions and log [ms]
+
+let status = { state: "not connected" };
+let telemetry = null;
+let owner = null; // how the status calls this page while it drives; "" until it says so; null: it does not drive
+let cameras = null;
+
+const connection = new Connection("/agent", { open: connected, lost, event, token: askToken });
+const picture = new Picture(byId("picture"));
+const plots = new Plots(byId("plots"));
+const jogging = new Jogging(byId("pads"), jog, held, stop);
+
+// ---- the connection
+
+function connected() {
+  connection.request("watch", { on: true }).then(entered, fault);
+}
+
+function entered() {
+  byId("entry").hidden = true;
+  byId("main").hidden = false;
+  say("link", "");
+  fault("");
+  look();
+  cameras ??= showCameras(byId("cameras"));
+  cameras.again();
+}
+
+function lost(reason) {
+  endDriving();
+  status = { ...status, state: "not connected" };
+  say("state", "○ not connected");
+  say("link", `⚠ No connection to the robot${reason ? ` (${reason})` : ""}; trying again. STOP does not reach it now.`);
+  enable();
+}
+
+function askToken(reason) {
+  say("link", "");
+  say("entry-reason", reason);
+  if (byId("entry").hidden) {
+    byId("entry").hidden = false;
+    byId("main").hidden = true;
+    byId("token").focus();
+  }
+}
+
+byId("entry").onsubmit = (submit) => {
+  submit.preventDefault();
+  sessionStorage.setItem("person", byId("person").value.trim());
+  const token = byId("token").value.trim();
+  byId("token").value = "";
+  byId("entry-reason").textContent = "…";
+  connection.enter(token);
+};
+
+function event(message) {
+  if (message.event === "status") {
+    const before = status;
+    status = message.status;
+    if (owner === "" && status.state === "taken over") owner = status.owner;
+    if (owner && (status.state !== "taken over" || status.owner !== owner)) endDriving();
+    showStatus(status, owner !== null);
+    enable();
+    if (before.active !== status.active || before.state !== status.state) look();
+  } else if (message.event === "telemetry") {
+    telemetry = message;
+    plots.add(message);
+    requestAnimationFrame(draw);
+  }
+}
+
+function draw() {
+  if (telemetry === null) return;
+  picture.draw(telemetry);
+  plots.draw();
+  showTelemetry(telemetry);
+  showNear(telemetry.near ?? {}, status.guards ?? {});
+  telemetry = null;
+}
+
+function look() {
+  if (!connection.ready || document.visibilityState !== "visible") return;
+  connection.request("versions").then(({ versions }) => showVersions(versions, status)).catch(() => {});
+  connection.request("audit").then((result) => showAudit(result.lines ?? result.audit ?? [])).catch(() => {});
+}
+setInterval(look, LOOK);
+
+function fault(error) {
+  byId("error").hidden = !error;
+  say("error", error ? `⚠ ${error.message ?? error}` : "");
+}
+
+// ---- orders
+
+async function order(op, fields) {
+  try {
+    fault("");
+    return await connection.request(op, fields);
+  } catch (error) {
+    fault(error);
+    return null;
+  }
+}
+
+function stop() {
+  jogging.release();
+  const sent = performance.now();
+  say("stop-note", "Stop sent …");
+  connection.request("stop").then(
+    () => {
+      say("stop-note", `Stopped. The robot's side answered after ${(performance.now() - sent).toFixed(0)} ms.`);
+      byId("stop").dataset.answered = Number(byId("stop").dataset.answered ?? 0) + 1;
+    },
+    (error) => say("stop-note", `⚠ STOP did not arrive: ${error.message} Use the emergency stop.`),
+  );
+}
+
+byId("stop").addEventListener("pointerdown", (press) => {
+  if (press.button !== 0) return;
+  press.preventDefault();
+  stop();
+});
+byId("stop").addEventListener("click", (click) => {
+  if (click.detail === 0) stop(); // by the keyboard, or by an aid; the pointer has stopped already
+});
+
+// The space bar stops, whatever has the focus, except while a text is typed.
+for (const name of ["keydown", "keyup"]) {
+  addEventListener(name, (key) => {
+    if (key.code !== "Space" || key.target.matches?.("input:not([type=button])")) return;
+    key.preventDefault();
+    key.stopImmediatePropagation();
+    if (name === "keydown" && !key.repeat) stop();
+  }, { capture: true });
+}
+
+byId("pause").onclick = () => order("pause", { why: "console" });
+byId("resume").onclick = () => order("resume", { why: "console" });
+byId("back-run").onclick = () => handBack(true);
+byId("back-pause").onclick = () => handBack(false);
+byId("take").onclick = async () => {
+  const force = Boolean(status.owner) && owner === null;
+  if (force && !(await ask(`${status.owner} drives this robot. Take it by force?`))) return;
+  const result = await order("take", { force });
+  if (result === null) return;
+  owner = result.owner ?? "";
+  jogging.start(telemetryIsOfBase());
+  byId("jog").hidden = false;
+  showStatus(status, true);
+  enable();
+};
+byId("roll-back").onclick = async () => {
+  if (await ask("Roll back to the previous version?")) await order("rollback", { why: "console" });
+  look();
+};
+
+function handBack(resume) {
+  endDriving();
+  order("hand_back", { resume });
+}
+
+function ask(text) {
+  const dialog = byId("question");
+  say("question-text", text);
+  dialog.showModal();
+  return new Promise((resolve) => {
+    dialog.onclose = () => resolve(dialog.returnValue === "yes");
+    byId("yes").onclick = () => dialog.close("yes");
+    byId("no").onclick = () => dialog.close("no");
+    dialog.oncancel = () => { dialog.returnValue = "no"; };
+  });
+}
+
+function enable() {
+  const { state } = status, here = state !== "not connected", mine = owner !== null;
+  const may = {
+    "pause": here && (state === "running" || state === "trial" || mine || state === "stopped by a guard"),
+    "resume": here && !mine && (state === "paused" || state === "stopped by a guard"),
+    "take": here && !mine && !["waiting for the robot", "stopped by a guard"].includes(state),
+    "back-run": mine,
+    "back-pause": mine,
+    "roll-back": here && Boolean(status.names?.previous),
+  };
+  for (const [id, enabled] of Object.entries(may)) byId(id).disabled = !enabled;
+}
+
+// ---- driving
+
+function telemetryIsOfBase() {
+  return Boolean(picture.shown?.base);
+}
+
+function endDriving() {
+  owner = null;
+  jogging.end();
+  byId("jog").hidden = true;
+}
+
+function jog(message) {
+  if (connection.backlog > 2000) return; // the network is stuck: what waits would arrive too late
+  connection.send(message);
+}
+
+function held(names) {
+  say("jog-state", names.length ? `Moving: ${names.join(", ")}` : "Hold a key or button to move the robot.");
+}
+
+byId("speed").onclick = () => {
+  jogging.speed = SPEEDS[(SPEEDS.indexOf(jogging.speed) + 1) % SPEEDS.length];
+  byId("speed").textContent = `Speed ${jogging.speed.toFixed(2)} m/s`;
+};
+addEventListener("gamepadconnected", () => say("gamepad", "Gamepad: hold the right shoulder button and move the sticks; A closes, Y opens, B stops."));
+addEventListener("gamepaddisconnected", () => { jogging.release(); say("gamepad", "Gamepad: none."); });
+
+enable();

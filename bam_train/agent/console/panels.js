@@ -1,0 +1,124 @@
+// What the status says, in words: the text of every panel.
+
+const ICONS = {
+  "waiting for the robot": "…", "paused": "❚❚", "running": "▶", "trial": "◔", "taken over": "⇄", "stopped by a guard": "✖",
+};
+const byId = (id) => document.getElementById(id);
+const short = (digest) => (digest ? digest.slice(0, 12) : "-");
+const NEAR = 0.8; // share of a limit from which on a guard is said to be near
+
+// Text only where it changed: a screen reader announces every change.
+export function say(id, text) {
+  const place = byId(id);
+  if (place.textContent !== text) place.textContent = text;
+}
+
+function element(kind, text, children = []) {
+  const made = document.createElement(kind);
+  if (text !== null) made.textContent = text;
+  made.append(...children);
+  return made;
+}
+
+function rows(table, head, lines) {
+  const cells = (kind, line) => element("tr", null, line.map((text) => element(kind, String(text))));
+  table.replaceChildren(cells("th", head), ...lines.map((line) => cells("td", line)));
+}
+
+const duration = (seconds) => (seconds < 90 ? `${Math.round(seconds)} s` : `${Math.round(seconds / 60)} min`);
+
+export function showStatus(status, mine) {
+  say("robot", status.robot || "Robot console");
+  say("state", `${ICONS[status.state] ?? "○"} ${status.state}`);
+  say("why", status.why ? `${status.why}` : "");
+  const until = status.owner_until == null ? "" : `, ${status.owner_until.toFixed(0)} s left`;
+  say("owner", mine ? "You drive." : status.owner ? `Driven by ${status.owner}${until}` : "");
+  document.title = `${status.state} - robot console`;
+  showRun(status);
+  showGuardTable(status.guards ?? {});
+  byId("warnings").replaceChildren(...(status.warnings ?? []).map((text) => element("li", `⚠ ${text}`)));
+}
+
+function showRun(status) {
+  const recent = status.recent ?? [], judged = recent.filter((one) => one !== null), good = judged.filter(Boolean).length;
+  const rate = judged.length ? `${good} of ${judged.length} (${Math.round((100 * good) / judged.length)} %)` : "none judged yet";
+  const ms = (value) => (value == null ? "-" : `${value.toFixed(1)} ms`);
+  const facts = {
+    "Active version": `${nameOf(status)}${short(status.active)}`,
+    "Stage": status.stage ?? "-",
+    "Environment": status.env ?? "-",
+    "Robot": status.simulated == null ? "-" : status.simulated ? "simulated" : "real",
+    "Success, last 20 episodes": rate,
+    "Episodes": `${status.episodes ?? 0}, step ${status.steps ?? 0} of this one`,
+    "Link latency": ms(status.link_ms),
+    "Loop latency": `${ms(status.loop_ms)} of ${ms(status.period == null ? null : 1000 * status.period)}`,
+    "Late ticks": `${status.late ?? 0} of ${status.ticks ?? 0}`,
+    "In this state for": status.since ? duration(Date.now() / 1000 - status.since) : "-",
+    "Recording": status.recording ?? "none",
+    "Software": status.agent ? `bam-train ${status.agent}` : "-",
+  };
+  byId("run").replaceChildren(...Object.entries(facts).flatMap(([name, text]) => [element("dt", name), element("dd", text)]));
+  const signs = recent.map((one) => (one === null ? "·" : one ? "✓" : "✗")).join(" ");
+  say("recent", recent.length ? `Oldest to newest: ${signs}  (✓ success, ✗ none, · not judged)` : "");
+}
+
+function nameOf(status) {
+  const names = Object.entries(status.names ?? {}).filter(([, digest]) => digest === status.active).map(([name]) => name);
+  return names.length ? `${names.join(", ")} ` : "";
+}
+
+function showGuardTable(guards) {
+  const lines = Object.entries(guards).map(([name, row]) => {
+    const limit = row.limit == null ? "off" : `${Number(row.limit.toPrecision(3))} ${row.unit}`;
+    return [`${name} (${row.number})`, limit, row.altered, row.held, row.stopped];
+  });
+  rows(byId("guard-table"), ["guard", "limit", "altered", "held", "stopped"], lines);
+}
+
+// Bars: how near the guards are that the newest state can be compared with, the nearest first.
+export function showNear(near, guards) {
+  const list = byId("guards"), names = Object.keys(near);
+  if (list.dataset.names !== names.join()) {
+    list.dataset.names = names.join();
+    list.replaceChildren(...names.map((name) => {
+      const bar = element("progress", null);
+      bar.max = 1;
+      bar.setAttribute("aria-label", name);
+      return element("li", null, [element("span", ""), bar]);
+    }));
+  }
+  names.forEach((name, at) => {
+    const { value, limit, unit, share } = near[name], counts = guards[name];
+    const word = share >= 1 ? "✖ acts" : share >= NEAR ? "⚠ near" : "✓ clear";
+    const acted = counts ? `; altered ${counts.altered}, held ${counts.held}, stopped ${counts.stopped}` : "";
+    const [text, bar] = list.children[at].children;
+    text.textContent = `${word}: ${name} ${value.toPrecision(3)} ${unit}, limit ${Number(limit.toPrecision(3))}${acted}`;
+    bar.value = share;
+  });
+}
+
+export function showTelemetry({ tool, base, t }) {
+  const at = (values, unit) => values.map((value) => value.toFixed(3)).join(", ") + ` ${unit}`;
+  say("tool", tool ? `Tool at x, y, z: ${at(tool, "m")}` : base ? `Base at x, y: ${at(base.slice(0, 2), "m")}, yaw ${base[2].toFixed(2)} rad` : "");
+  byId("tool").dataset.t = t;
+}
+
+export function showVersions(versions, status) {
+  const lines = versions.map((one) => [
+    one.digest === status.active ? "▶ acts" : "",
+    [].concat(one.names ?? []).join(", ") || "-",
+    short(one.digest),
+    time(one.added),
+    one.env ?? "-",
+    one.algorithm ?? "-",
+  ]);
+  rows(byId("versions"), ["", "names", "digest", "added", "environment", "algorithm"], lines);
+}
+
+const time = (value) => (typeof value === "number" ? new Date(1000 * value).toLocaleString() : (value ?? "-"));
+
+export function showAudit(lines) {
+  const text = (line) =>
+    typeof line === "string" ? line : `${time(line.time ?? line.t)}  ${line.text ?? line.what}  (${[line.who, line.where ?? line.address].filter(Boolean).join(" at ")})`;
+  byId("audit").replaceChildren(...[...lines].reverse().slice(0, 50).map((line) => element("li", text(line))));
+}

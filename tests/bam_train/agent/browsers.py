@@ -1,0 +1,129 @@
+"""Chromium for tests: started once, and driven by selenium through Debian's chromedriver of the same version."""
+
+import contextlib
+import json
+import os
+import shutil
+import signal
+import time
+from pathlib import Path
+
+import pytest
+
+FLAGS = ("--headless=new", "--no-sandbox", "--disable-gpu", "--disable-dev-shm-usage", "--window-size=1200,900")
+DEADLINE = 20.0
+
+
+def new_browser():
+    """A browser, or a skipped test where there is none (a failed one with CI=true)."""
+    chromium, driver = shutil.which("chromium"), shutil.which("chromedriver")
+    if chromium is None or driver is None:
+        reason = "no browser: apt-get install chromium chromium-driver"
+        (pytest.fail if os.environ.get("CI") == "true" else pytest.skip)(reason)
+    from selenium import webdriver
+
+    options = webdriver.ChromeOptions()
+    options.binary_location = chromium
+    for flag in FLAGS:
+        options.add_argument(flag)
+    options.set_capability("goog:loggingPrefs", {"browser": "ALL", "performance": "ALL"})
+    return webdriver.Chrome(options=options, service=webdriver.ChromeService(driver))
+
+
+def until(condition, what="it"):
+    """Wait until a condition holds, and return its value."""
+    end = time.monotonic() + DEADLINE
+    while not (value := condition()):
+        assert time.monotonic() < end, f"{what} did not come in {DEADLINE:g} s"
+        time.sleep(0.02)
+    return value
+
+
+class Page:
+    """The console in a browser."""
+
+    def __init__(self, browser):
+        self.browser = browser
+
+    def open(self, url):
+        self.browser.get(url)
+        return self
+
+    def element(self, name):
+        return self.browser.find_element("id", name)
+
+    def text(self, name):
+        return self.element(name).text
+
+    def click(self, name):
+        until(lambda: self.element(name).is_enabled(), f"the button {name}")
+        self.run("arguments[0].scrollIntoView({block: 'center'})", self.element(name))
+        self.element(name).click()
+
+    def shows(self, name, text):
+        """Wait until an element contains a text."""
+        until(lambda: text in self.text(name), f"{text!r} in {name}")
+
+    def press(self, key):
+        """Press a key, and hold it."""
+        self._key("rawKeyDown", key)
+
+    def let(self, key):
+        self._key("keyUp", key)
+
+    def _key(self, kind, key):
+        code = {" ": "Space", "Enter": "Enter", "Tab": "Tab"}.get(key, f"Key{key.upper()}")
+        number = {"Enter": 13, "Tab": 9}.get(key, ord(key[0].upper()))
+        self.cdp("Input.dispatchKeyEvent", type=kind, key=key, code=code, windowsVirtualKeyCode=number)
+        if kind == "rawKeyDown" and key == "Enter":
+            self.cdp("Input.dispatchKeyEvent", type="char", key=key, text="\r")
+
+    def tap(self, key):
+        self.press(key)
+        self.let(key)
+
+    def run(self, script, *arguments):
+        return self.browser.execute_script(script, *arguments)
+
+    def cdp(self, command, **arguments):
+        return self.browser.execute_cdp_cmd(command, arguments)
+
+    def complaints(self):
+        """What the page wrote to its console since the last look."""
+        return [entry["message"] for entry in self.browser.get_log("browser")]
+
+    def requested(self):
+        """The addresses that the page asked for since the last look."""
+        events = [json.loads(entry["message"])["message"] for entry in self.browser.get_log("performance")]
+        http = [one["params"]["request"]["url"] for one in events if one["method"] == "Network.requestWillBeSent"]
+        return http + [one["params"]["url"] for one in events if one["method"] == "Network.webSocketCreated"]
+
+    @contextlib.contextmanager
+    def frozen(self):
+        """The processes that run pages are stopped, as on a computer that hangs."""
+        pids = renderers(self.browser.service.process.pid)
+        assert pids
+        for pid in pids:
+            os.kill(pid, signal.SIGSTOP)
+        try:
+            yield
+        finally:
+            for pid in pids:
+                os.kill(pid, signal.SIGCONT)
+
+
+def renderers(root):
+    """The processes below `root` that run pages."""
+    parents = {}
+    for folder in Path("/proc").glob("[0-9]*"):
+        with contextlib.suppress(OSError):
+            state = (folder / "stat").read_text().rpartition(")")[2].split()
+            parents[int(folder.name)] = int(state[1]), (folder / "cmdline").read_bytes()
+    found, family = [], {root}
+    for pid in sorted(parents):  # children have higher numbers, but for a wrap-around
+        parent, command = parents[pid]
+        if parent in family:
+            family.add(pid)
+            if b"--type=renderer" in command:
+                found.append(pid)
+    return found

@@ -1,0 +1,136 @@
+"""Pictures of cameras: the newest only, one at a time, and only while somebody looks."""
+
+import io
+import json
+import time
+
+import numpy as np
+import pytest
+from PIL import Image
+from websockets.sync.client import connect
+
+from bam_envs.core.errors import StaleState
+from bam_envs.live.camera import CameraImage
+from bam_envs.rosbridge.server import BridgeServer, Site
+from bam_envs.rosbridge.tokens import Tokens
+from bam_train.agent.camera_feed import CameraFeed, jpeg
+
+DEADLINE = 10.0
+
+
+class Camera:
+    """A camera whose pictures are their numbers as text, or arrays."""
+
+    def __init__(self, faults=(), pixels=None):
+        self.faults, self.pixels = list(faults), pixels
+        self.number, self.is_connected, self.connections = 0, False, 0
+
+    def connect(self):
+        if self.faults:
+            raise self.faults.pop(0)
+        self.is_connected, self.connections = True, self.connections + 1
+
+    def close(self):
+        self.is_connected = False
+
+    def file(self):
+        assert self.is_connected
+        self.number += 1
+        return None if self.pixels is not None else (self.number, "jpeg", str(self.number).encode())
+
+    def latest(self):
+        return CameraImage(self.pixels, None, self.number)
+
+
+@pytest.fixture
+def look():
+    """Opens a page's socket to some cameras."""
+    servers = []
+
+    def open_socket(**cameras):
+        feed = CameraFeed(cameras)
+        servers.append(
+            BridgeServer(port=0, tokens=Tokens(otherwise="administer"), site=Site({}, {"/camera": feed.serve}))
+        )
+        return connect(servers[-1].start().url + "/camera")
+
+    yield open_socket
+    for server in servers:
+        server.close()
+
+
+def pictures(client):
+    """The next message that is no sign of life."""
+    while True:
+        message = client.recv(DEADLINE)
+        if message != '{"event": "alive"}':
+            return message
+
+
+def until(condition):
+    end = time.monotonic() + DEADLINE
+    while not condition():
+        assert time.monotonic() < end
+        time.sleep(0.01)
+
+
+def test_a_picture_comes_when_the_one_before_was_drawn_and_it_is_the_newest(look):
+    wrist, cell = Camera(), Camera()
+    with look(wrist=wrist, cell=cell) as client:
+        assert json.loads(client.recv(DEADLINE)) == {"cameras": ["wrist", "cell"]}
+        first = {message[0]: int(message[1:]) for message in (pictures(client), pictures(client))}
+        assert set(first) == {0, 1}
+        seen = wrist.number
+        until(lambda: wrist.number > seen + 5)
+        assert client.recv(DEADLINE) == '{"event": "alive"}'  # nothing else, for a second
+        before = wrist.number
+        client.send('{"op": "next", "camera": 0}')
+        message = pictures(client)
+        assert message[0] == 0
+        assert before <= int(message[1:]) + 2
+        assert int(message[1:]) > first[0] + 5
+
+
+def test_nonsense_of_a_page_has_no_effect(look):
+    with look(wrist=Camera()) as client:
+        for nonsense in ("", "[]", "{}", '{"op": "next", "camera": "x"}', '{"op": "next", "camera": 7}', b"\x00\xff"):
+            client.send(nonsense)
+        client.recv(DEADLINE)
+        assert pictures(client)[0] == 0
+        client.send('{"op": "next", "camera": 0}')
+        assert pictures(client)[0] == 0
+
+
+def test_a_camera_is_connected_only_while_somebody_looks(look):
+    camera = Camera()
+    assert not camera.is_connected
+    with look(wrist=camera) as client:
+        pictures(client)
+        until(lambda: camera.is_connected)
+    until(lambda: not camera.is_connected)
+    assert camera.connections == 1
+
+
+def test_a_camera_that_is_not_there_says_so(look):
+    with look(wrist=Camera(faults=[StaleState("/wrist: no image in 3 s.")] * 9)) as client:
+        client.recv(DEADLINE)
+        assert json.loads(pictures(client)) == {"camera": 0, "error": "/wrist: no image in 3 s."}
+
+
+def test_uncompressed_pictures_become_jpeg(look):
+    with look(wrist=Camera(pixels=np.full((48, 64, 3), (200, 10, 10), np.uint8))) as client:
+        client.recv(DEADLINE)
+        picture = Image.open(io.BytesIO(pictures(client)[1:]))
+    assert (picture.format, picture.size) == ("JPEG", (64, 48))
+    assert np.abs(np.asarray(picture)[24, 32].astype(int) - (200, 10, 10)).max() < 8
+
+
+def test_greys_distances_and_what_is_transparent():
+    grey = np.asarray(Image.open(io.BytesIO(jpeg(np.full((8, 8), 100, np.uint8)))))
+    assert grey.shape == (8, 8)
+    depth = np.full((8, 8), 1.0, np.float32)
+    depth[:, 4:], depth[0, 0] = 2.0, np.nan
+    near = np.asarray(Image.open(io.BytesIO(jpeg(depth))))
+    assert abs(int(near[4, 1]) - 127) < 12
+    assert near[4, 6] > 240
+    assert np.asarray(Image.open(io.BytesIO(jpeg(np.zeros((8, 8, 4), np.uint8))))).shape == (8, 8, 3)

@@ -1,0 +1,369 @@
+"""The console in a real browser: what it shows, what its buttons do, and that nothing moves once nobody holds a key."""
+
+import io
+import time
+
+import pytest
+from PIL import Image
+
+from bam_envs.live.camera import CameraImage
+from bam_envs.rosbridge.tokens import Tokens
+from bam_train.agent.jog import FRESH
+from tests.bam_train.agent.browsers import Page, new_browser, until
+from tests.bam_train.agent.fake_agent import FakeAgent
+
+ROLES = Tokens({"watching": "watch", "driving": "drive", "secret": "administer"})
+
+
+@pytest.fixture(scope="module")
+def browser():
+    browser = new_browser()
+    yield browser
+    browser.quit()
+
+
+@pytest.fixture
+def page(browser):
+    """The browser with one new tab, which is in front."""
+    before = browser.window_handles
+    browser.switch_to.new_window("tab")
+    page = browser.current_window_handle
+    for tab in before:
+        browser.switch_to.window(tab)
+        browser.close()
+    browser.switch_to.window(page)
+    browser.get_log("browser")
+    return Page(browser)
+
+
+@pytest.fixture
+def agent():
+    with FakeAgent() as agent:
+        yield agent
+
+
+@pytest.fixture
+def driven(page, agent):
+    """The page that has taken over, and holds no key yet."""
+    page.open(agent.url).click("take")
+    page.shows("owner", "You drive.")
+    return page
+
+
+def test_the_page_shows_everything_and_asks_nobody_else(page, agent):
+    page.requested()
+    page.open(agent.url).shows("state", "▶ running")
+    page.shows("tool", "Tool at x, y, z:")
+    page.shows("guards", "✓ clear: joint speed 0.00 rad/s, limit 1; altered 3, held 0, stopped 0")
+    page.shows("versions", "champion")
+    page.shows("audit", "running -> paused (anna)")
+    for text in ("4 of 5 (80 %)", "1.3 ms", "0.5 ms of 50.0 ms", "2 of 1000", "champion aaaaaaaaaaaa"):
+        page.shows("run", text)
+    assert page.text("warnings") == "⚠ link quality (G16): a warning"
+    assert "✓ ✓ ✗ · ✓ ✓" in page.text("recent")
+    drawn = "const c = document.querySelector(arguments[0]);"
+    drawn += "return c.getContext('2d').getImageData(0, 0, c.width, c.height).data.some((value) => value)"
+    for canvas in ("#picture", "#plots canvas"):
+        until(lambda canvas=canvas: page.run(drawn, canvas), f"a drawing on {canvas}")
+    assert {url.split("/")[2] for url in page.requested()} == {f"127.0.0.1:{agent.server.port}"}
+    assert page.complaints() == []
+
+
+def test_the_stop_button_and_the_space_bar_stop_whatever_has_the_focus(page, agent):
+    page.open(agent.url).shows("state", "running")
+    page.click("stop")
+    page.shows("state", "❚❚ paused")
+    page.shows("stop-note", "Stopped.")
+    for count, focus in enumerate((None, "resume", "stop", "take"), 2):
+        page.run("document.activeElement.blur(); document.getElementById(arguments[0])?.focus()", focus)
+        page.tap(" ")
+        until(lambda count=count: len(agent.did("stop")) == count, "the stop")
+    assert [op for op, _, _ in agent.orders] == ["stop"] * 5
+    page.run("document.getElementById('stop').focus()")
+    page.tap("Enter")
+    until(lambda: len(agent.did("stop")) == 6, "the stop")
+    page.press(" ")
+    page.cdp("Input.dispatchKeyEvent", type="rawKeyDown", key=" ", code="Space", autoRepeat=True)
+    page.let(" ")
+    until(lambda: len(agent.did("stop")) == 7, "the stop")
+    assert page.complaints() == []
+
+
+def test_the_buttons(page, agent):
+    page.open(agent.url).click("pause")
+    page.shows("state", "❚❚ paused")
+    page.click("resume")
+    page.shows("state", "▶ running")
+    page.click("take")
+    page.shows("state", "⇄ taken over")
+    page.click("back-pause")
+    page.shows("state", "❚❚ paused")
+    assert not page.element("jog").is_displayed()
+    page.click("take")
+    page.click("back-run")
+    page.shows("state", "▶ running")
+    page.click("roll-back")
+    page.click("no")
+    page.click("roll-back")
+    page.click("yes")
+    page.shows("run", "previous bbbbbbbbbbbb")
+    orders = [(op, message.get("resume"), message.get("name")) for op, _, message in agent.orders]
+    expected = [("pause", None), ("resume", None), ("take", None), ("hand_back", False), ("take", None)]
+    expected += [("hand_back", True), ("rollback", None)]
+    assert orders == [(*order, "console") for order in expected]
+
+
+def test_a_robot_that_somebody_else_drives_is_taken_by_force_only(page, agent):
+    agent.driver, agent.owner, agent.state = "anna's socket", "anna (10.0.0.7)", "taken over"
+    page.open(agent.url).shows("owner", "Driven by anna (10.0.0.7), 20 s left")
+    page.click("take")
+    page.shows("question-text", "anna (10.0.0.7) drives this robot. Take it by force?")
+    page.click("no")
+    assert agent.did("take") == []
+    page.click("take")
+    page.click("yes")
+    page.shows("owner", "You drive.")
+    agent.driver, agent.owner = "anna's socket", "anna (10.0.0.7)"  # and she takes it back
+    page.shows("owner", "Driven by anna")
+    assert not page.element("jog").is_displayed()
+
+
+def test_the_robot_moves_only_while_a_key_is_held(driven, agent):
+    for key, axis, way in (("w", 0, 1), ("a", 1, 1), ("f", 2, -1)):
+        before = agent.telemetry.message(agent.robot_state(), 0.0)["tool"]
+        driven.press(key)
+        until(lambda: agent.moves, "a motion")
+        driven.let(key)
+        until(lambda: not agent.moves, "the end of the motion")
+        after = agent.telemetry.message(agent.robot_state(), 0.0)["tool"]
+        moved = [new - old for new, old in zip(after, before, strict=True)]
+        assert way * moved[axis] > 0.003
+        assert max(abs(one) for at, one in enumerate(moved) if at != axis) < 0.002
+    assert [message["seq"] for _, message in agent.twists] == list(range(len(agent.twists)))
+    assert agent.twists[-1][1]["twist"] == [0, 0, 0, 0]
+    driven.shows("jog-state", "Hold a key or button")
+    driven.shows("guards", "tool speed")
+
+
+def test_a_button_moves_the_robot_while_it_is_held_and_a_key_with_a_modifier_does_not(driven, agent):
+    from selenium.webdriver import ActionChains
+
+    pad = driven.browser.find_element("css selector", "[data-move=Up]")
+    ActionChains(driven.browser).move_to_element(pad).click_and_hold().perform()
+    until(lambda: agent.moves, "a motion")
+    driven.shows("jog-state", "Moving: Up")
+    ActionChains(driven.browser).move_by_offset(0, -300).perform()
+    until(lambda: not agent.moves, "the end of the motion")
+    ActionChains(driven.browser).release().perform()
+    sent = len(agent.twists)
+    driven.cdp("Input.dispatchKeyEvent", type="rawKeyDown", key="w", code="KeyW", modifiers=2)
+    driven.let("w")
+    driven.tap("o")
+    until(lambda: len(agent.twists) > sent, "the gripper's command")
+    assert agent.twists[sent][1]["gripper"] == -1
+
+
+def close_it(page):
+    page.browser.switch_to.new_window("tab")
+    other = page.browser.current_window_handle
+    page.browser.switch_to.window(next(tab for tab in page.browser.window_handles if tab != other))
+    page.press("w")  # the new tab took the key away
+    time.sleep(0.2)
+    page.browser.close()
+    page.browser.switch_to.window(other)
+
+
+def hide_it(page):
+    page.browser.switch_to.new_window("tab")
+
+
+def reload_it(page):
+    page.browser.refresh()
+
+
+def blur_it(page):
+    page.run("window.dispatchEvent(new Event('blur'))")
+
+
+def suspend_it(page):
+    page.cdp("Page.setWebLifecycleState", state="frozen")
+
+
+@pytest.mark.parametrize("leave", [close_it, hide_it, reload_it, blur_it, suspend_it])
+def test_a_page_that_is_left_in_mid_jog_leaves_the_robot_at_rest(driven, agent, leave):
+    driven.press("w")
+    until(lambda: agent.moves, "a motion")
+    leave(driven)
+    until(lambda: not agent.moves, "the end of the motion")
+    last, joints = agent.twists[-1][0], agent.joints
+    assert agent.commands[-1][0] - last <= FRESH
+    time.sleep(0.5)
+    assert (agent.twists[-1][0], agent.joints is joints) == (last, True)
+
+
+def test_a_page_that_is_frozen_in_mid_jog_leaves_the_robot_at_rest_also_when_it_thaws(driven, agent):
+    driven.press("w")
+    until(lambda: agent.moves, "a motion")
+    with driven.frozen():
+        until(lambda: not agent.moves, "the end of the motion")
+        last, joints = agent.twists[-1][0], agent.joints
+        assert agent.commands[-1][0] - last <= FRESH
+        time.sleep(0.5)
+        assert agent.twists[-1][0] == last
+    until(lambda: driven.text("jog-state").startswith("Hold a key"), "the release of the key")
+    time.sleep(0.3)
+    assert [message["twist"] for at, message in agent.twists if at > last] in ([], [[0, 0, 0, 0]])
+    assert agent.joints is joints
+    driven.let("w")
+    driven.press("w")  # pressed again, it moves again
+    until(lambda: agent.moves, "a motion")
+    driven.let("w")
+
+
+def test_a_gamepad_moves_the_robot_while_its_shoulder_button_is_held_and_stops_it(page, agent):
+    pad = """
+      const buttons = Array.from({length: 16}, () => ({pressed: false}));
+      window.pad = {mapping: "standard", axes: [0, 0, 0, 0], buttons};
+      navigator.getGamepads = () => [null, window.pad];
+      document.hasFocus = () => true;
+    """
+    made = page.cdp("Page.addScriptToEvaluateOnNewDocument", source=pad)
+    page.open(agent.url).click("take")
+    page.shows("owner", "You drive.")
+    page.run("pad.axes = [0, -1, 0, 0]")
+    time.sleep(0.3)
+    assert agent.twists == []
+    page.run("pad.buttons[5].pressed = true")
+    until(lambda: agent.moves, "a motion")
+    assert agent.twists[-1][1]["twist"] == pytest.approx([0.1, 0, 0, 0])
+    page.run("pad.axes = [0, 0.1, 0.1, 0]")  # a stick that does not come back to its middle
+    until(lambda: not agent.moves, "the end of the motion")
+    page.run("pad.buttons[1].pressed = true")
+    page.shows("state", "paused")
+    assert len(agent.did("stop")) == 1
+    page.cdp("Page.removeScriptToEvaluateOnNewDocument", **made)
+
+
+def test_a_phone_shows_state_and_stop_without_scrolling_sideways(page, agent):
+    page.cdp("Emulation.setDeviceMetricsOverride", width=360, height=740, deviceScaleFactor=2, mobile=True)
+    page.open(agent.url).click("take")
+    page.shows("owner", "You drive.")
+    page.shows("versions", "champion")
+    page.run("document.querySelectorAll('details').forEach((one) => { one.open = true; })")
+    in_view = """
+      const box = document.getElementById(arguments[0]).getBoundingClientRect();
+      const top = document.elementFromPoint(box.x + box.width / 2, box.y + box.height / 2);
+      return [box.left >= 0 && box.right <= 360 && box.top >= 0 && box.bottom <= innerHeight, top.id];
+    """
+    for part in (0, 0.5, 1):
+        page.run("scrollTo(0, arguments[0] * document.documentElement.scrollHeight)", part)
+        assert page.run("return [document.documentElement.scrollWidth, innerWidth, scrollX]") == [360, 360, 0]
+        assert page.run(in_view, "stop") == [True, "stop"]
+        assert page.run(in_view, "state") == [True, "state"]
+    page.click("stop")
+    page.shows("state", "paused")
+
+
+def test_the_page_is_there_for_a_keyboard_and_a_screen_reader(page, agent):
+    page.open(agent.url).shows("state", "running")
+    names, focused = set(), "return document.activeElement.id || document.activeElement.tagName"
+    for _ in range(20):
+        page.tap("Tab")
+        names.add(page.run(focused))
+    assert {"pause", "take", "roll-back", "stop", "SUMMARY"} <= names
+    page.run("document.getElementById('pause').focus()")
+    page.tap("Enter")
+    page.shows("state", "paused")
+    live = page.run("return [...document.querySelectorAll('[aria-live], [role=alert]')].map((one) => one.id)")
+    assert set(live) == {"state", "link", "error", "jog-state", "stop-note"}
+    nameless = "return [...document.querySelectorAll('button, canvas, progress, section, dialog')].filter((one) =>"
+    nameless += " !one.textContent.trim() && !one.ariaLabel).length"
+    assert page.run(nameless) == 0
+
+
+def test_a_token_is_asked_for_kept_in_this_tab_and_never_in_an_address(page):
+    with FakeAgent(ROLES) as agent:
+        page.requested()
+        page.open(agent.url).shows("entry-reason", "This robot asks for a token.")
+        assert not page.element("main").is_displayed()
+        page.element("token").send_keys("wrong one\n")
+        page.shows("entry-reason", "The token is wrong.")
+        page.element("person").send_keys("Anna B")
+        page.element("token").send_keys("secret\n")
+        page.shows("state", "running")
+        page.click("pause")
+        page.shows("state", "paused")
+        assert agent.orders[0][2]["name"] == "Anna B"
+        assert page.run("return [sessionStorage.token, localStorage.length, document.cookie]") == ["secret", 0, ""]
+        page.browser.refresh()
+        page.shows("state", "paused")
+        assert not [url for url in page.requested() if "secret" in url or "wrong" in url]
+        page.run("sessionStorage.clear()")
+
+
+def test_a_role_that_only_watches_may_stop_and_is_told_what_it_may_not(page):
+    with FakeAgent(ROLES) as agent:
+        page.open(agent.url).shows("entry-reason", "token")
+        page.element("token").send_keys("watching\n")
+        page.shows("state", "running")
+        page.click("pause")
+        page.shows("error", "⚠ pause needs the role drive.")
+        page.click("stop")
+        page.shows("state", "paused")
+        page.run("sessionStorage.clear()")
+        assert len(agent.did("stop")) == 1
+
+
+def test_the_page_comes_back_when_the_robot_does(page):
+    with FakeAgent() as agent:
+        page.open(agent.url).click("take")
+        page.shows("owner", "You drive.")
+        port = agent.server.port
+    page.shows("state", "○ not connected")
+    page.shows("link", "STOP does not reach it now.")
+    assert not page.element("jog").is_displayed()
+    page.click("stop")
+    page.shows("stop-note", "⚠ STOP did not arrive: There is no connection to the robot. Use the emergency stop.")
+    with FakeAgent(port=port) as agent:
+        page.shows("state", "▶ running")
+        page.tap(" ")
+        page.shows("state", "paused")
+        assert len(agent.did("stop")) == 1
+    page.complaints()  # of the refused connections
+
+
+class FakeCamera:
+    """Takes a picture each time that it is asked."""
+
+    def __init__(self, colour, is_there=True):
+        buffer = io.BytesIO()
+        Image.new("RGB", (640, 480), colour).save(buffer, "JPEG")
+        self.data, self.number = buffer.getvalue(), 0
+
+    def connect(self):
+        pass
+
+    def close(self):
+        pass
+
+    def file(self):
+        self.number += 1
+        return self.number, "jpeg", self.data
+
+    def latest(self) -> CameraImage:
+        raise NotImplementedError
+
+
+def test_pictures_of_cameras(page):
+    with FakeAgent(cameras={"wrist": FakeCamera("red"), "cell": FakeCamera("blue")}) as agent:
+        page.open(agent.url)
+        drawn = "return [...document.querySelectorAll('#cameras canvas')].map((one) => Number(one.dataset.drawn ?? 0))"
+        until(lambda: page.run(drawn) and min(page.run(drawn)) > 5, "pictures")
+        middle = "const c = document.querySelectorAll('#cameras canvas')[arguments[0]];"
+        middle += "return [...c.getContext('2d').getImageData(320, 240, 1, 1).data]"
+        assert page.run(middle, 0)[0] > 240
+        assert page.run(middle, 1)[2] > 240
+        assert page.text("cameras").split() == ["wrist", "cell"]
+        page.click("stop")
+        page.shows("state", "paused")
+        assert page.complaints() == []

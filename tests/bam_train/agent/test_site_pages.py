@@ -1,0 +1,32 @@
+"""The files of the console: all there, small, and good without internet and under the strict policy of their server."""
+
+import re
+
+import pytest
+
+from bam_train.agent.site_pages import console_pages
+
+PAGES = {path: page.body.decode() for path, page in console_pages().items()}
+
+
+def test_the_pages():
+    scripts = {path for path in PAGES if path.endswith(".js")}
+    assert scripts >= {"/main.js", "/connection.js", "/jogging.js"}
+    assert set(PAGES) - scripts == {"/", "/index.html", "/console.css", "/icon.svg"}
+    assert PAGES["/"] == PAGES["/index.html"]
+    assert sum(map(len, PAGES.values())) < 80_000
+
+
+def test_every_file_that_a_page_names_is_there():
+    named = re.findall(r'(?:href|src)="([^"]+)"', PAGES["/"])
+    named += [name for text in PAGES.values() for name in re.findall(r'from "\./([^"]+)"', text)]
+    assert {f"/{name}" for name in named} == set(PAGES) - {"/", "/index.html"}
+
+
+@pytest.mark.parametrize("path", sorted(PAGES))
+def test_nothing_comes_from_elsewhere_and_no_code_stands_in_the_page(path):
+    text = PAGES[path].replace("http://www.w3.org/2000/svg", "")
+    assert not re.search(r"https?://|//[a-z]+\.", text)
+    assert not re.search(r"\beval\(|innerHTML|document\.write|new Function", text)
+    if path.endswith("html"):
+        assert not re.search(r"<script>|<style>|\sstyle=|\son[a-z]+=", text)
