@@ -12,10 +12,10 @@ from bam_envs.robots.ur5e import arm_spec
 from bam_envs.rosbridge.server import BridgeServer, Site
 from bam_envs.safety.guard import Limits
 from bam_envs.testing import ARM_HOME
-from bam_train.agent.camera_feed import CameraFeed
-from bam_train.agent.jog import Jogger
-from bam_train.agent.site_pages import console_pages
-from bam_train.agent.telemetry import Telemetry
+from bam_train.agent.front.camera_feed import CameraFeed
+from bam_train.agent.front.jog import Jogger
+from bam_train.agent.front.site_pages import console_pages
+from bam_train.agent.front.telemetry import Telemetry
 
 SPEC = arm_spec("ur5e", with_object=False)
 GUARDS = {

@@ -13,7 +13,7 @@ from bam_envs.core.errors import StaleState
 from bam_envs.live.camera import CameraImage
 from bam_envs.rosbridge.server import BridgeServer, Site
 from bam_envs.rosbridge.tokens import Tokens
-from bam_train.agent.camera_feed import CameraFeed, jpeg
+from bam_train.agent.front.camera_feed import CameraFeed, jpeg
 
 DEADLINE = 10.0
 

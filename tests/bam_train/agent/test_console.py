@@ -8,7 +8,7 @@ from PIL import Image
 
 from bam_envs.live.camera import CameraImage
 from bam_envs.rosbridge.tokens import Tokens
-from bam_train.agent.jog import FRESH
+from bam_train.agent.front.jog import FRESH
 from tests.bam_train.agent.browsers import Page, new_browser, until
 from tests.bam_train.agent.fake_agent import FakeAgent
 

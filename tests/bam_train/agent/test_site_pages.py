@@ -4,7 +4,7 @@ import re
 
 import pytest
 
-from bam_train.agent.site_pages import console_pages
+from bam_train.agent.front.site_pages import console_pages
 
 PAGES = {path: page.body.decode() for path, page in console_pages().items()}
 

@@ -8,4 +8,4 @@ from bam_envs.rosbridge.server import Page, read_pages
 
 def console_pages() -> Mapping[str, Page]:
     """The pages by their path; ``/`` is the console."""
-    return read_pages(Path(__file__).parent / "console")
+    return read_pages(Path(__file__).parents[1] / "console")
