@@ -27,6 +27,9 @@
     ├── UnknownVersion             a version that a live agent does not have
     ├── FolderInUse                a folder of versions that another live agent uses
     ├── CandidateRefused           a checkpoint that a live agent does not take
+    ├── RequestRefused             a request that a live agent refuses
+    │   └── RoleTooLow             one that needs a token of a higher role
+    ├── AgentRefused               a live agent elsewhere refuses a request; carries the kind of its error
     ├── ContractRefused            a robot that does not fit the checkpoint; nothing has moved
     ├── EnvironmentFailed          an environment gave NaN or infinity
     ├── TrainingFailed             training cannot continue (a NaN loss); the last good checkpoint is kept
@@ -175,6 +178,18 @@ class RequestRefused(BamTrainError):  # noqa: N818 - reads as what happened
     """A live agent refuses what it was asked."""
 
     exit_status = 3
+
+
+class RoleTooLow(RequestRefused):
+    """A request that needs a token of a higher role."""
+
+
+class AgentRefused(BamTrainError):  # noqa: N818
+    """A live agent elsewhere refuses a request, or failed; `kind` is the name of its exception there."""
+
+    def __init__(self, kind: str, message: str, exit_status: int = 1) -> None:
+        self.kind, self.exit_status = kind, exit_status
+        super().__init__(message)
 
 
 class ContractRefused(BamTrainError):  # noqa: N818

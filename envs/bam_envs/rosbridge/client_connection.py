@@ -297,10 +297,10 @@ async def open_port(address: Address, timeout: float) -> socket.socket:
         raise NoServer(address.url, _no_connection(address, error, timeout)) from error
 
 
-async def open_socket(endpoint: Endpoint, timeout: float, max_message: int) -> ClientConnection:
+async def open_socket(endpoint: Endpoint, timeout: float, max_message: int, path: str = "/") -> ClientConnection:
     """Connect and do the WebSocket handshake in `timeout` [s]; `max_message` limits received messages [bytes].
 
-    `NoServer` gives the reason why that failed.
+    `NoServer` gives the reason why that failed; an `InvalidStatus` is its cause if a web server answered.
     """
     address, context = endpoint.address, endpoint.tls_context()
     deadline = time.monotonic() + timeout
@@ -309,7 +309,7 @@ async def open_socket(endpoint: Endpoint, timeout: float, max_message: int) -> C
     plain = await open_port(address, timeout)
     try:
         return await connect(
-            f"{address.url}/",
+            f"{address.url}{path}",
             sock=plain,
             ssl=context,
             server_hostname=address.host if context is not None else None,
@@ -324,7 +324,10 @@ async def open_socket(endpoint: Endpoint, timeout: float, max_message: int) -> C
     except InvalidStatus as error:
         status = error.response.status_code
         text = f"a web server answers there, with HTTP {status}: no WebSocket. Is it the right port?"
-        if status in (401, 403):
+        said = bytes(error.response.body or b"")[:300].decode(errors="replace").strip()
+        if status in (400, 403, 429, 503) and said.endswith("."):  # a server of ours gives its reason
+            text = f"the server refuses this client (HTTP {status}): {said}"
+        elif status in (401, 403):
             text = f"the token was refused (HTTP {status}). Give the server's token (--token-file)."
         raise NoServer(address.url, text) from error
     except TimeoutError as error:

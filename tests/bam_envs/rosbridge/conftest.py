@@ -2,22 +2,19 @@
 
 import asyncio
 import contextlib
-import datetime
-import ipaddress
 import json
 import socket
-import ssl
 import threading
 import time
 from http import HTTPStatus
 
 import pytest
-from cryptography import x509
-from cryptography.hazmat.primitives import hashes, serialization
-from cryptography.hazmat.primitives.asymmetric import ec
 from websockets.asyncio.server import serve
 from websockets.exceptions import ConnectionClosed
 
+from tests.tls_certificates import certificates
+
+__all__ = ["certificates"]  # fixtures from elsewhere
 DEADLINE = 10.0
 
 
@@ -231,39 +228,6 @@ def free_port():
     """A port at which nothing listens."""
     with socket.create_server(("127.0.0.1", 0)) as taken:
         return taken.getsockname()[1]
-
-
-@pytest.fixture(scope="session")
-def certificates(tmp_path_factory):
-    """Make a self-signed certificate for some hosts: its file, and the TLS settings of a server that has it."""
-
-    def make(*hosts):
-        directory = tmp_path_factory.mktemp("tls")
-        key = ec.generate_private_key(ec.SECP256R1())
-        (directory / "cert.pem").write_bytes(_certificate(key, hosts).public_bytes(serialization.Encoding.PEM))
-        (directory / "key.pem").write_bytes(
-            key.private_bytes(
-                serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption()
-            )
-        )
-        context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
-        context.load_cert_chain(directory / "cert.pem", directory / "key.pem")
-        return str(directory / "cert.pem"), context
-
-    return make
-
-
-def _certificate(key, hosts):
-    name = x509.Name([x509.NameAttribute(x509.NameOID.COMMON_NAME, hosts[0])])
-    now = datetime.datetime.now(datetime.timezone.utc)
-    names = [x509.IPAddress(ipaddress.ip_address(one)) if one[0].isdigit() else x509.DNSName(one) for one in hosts]
-    builder = x509.CertificateBuilder(name, name, key.public_key(), x509.random_serial_number())
-    builder = builder.not_valid_before(now - datetime.timedelta(days=1)).not_valid_after(
-        now + datetime.timedelta(days=1)
-    )
-    builder = builder.add_extension(x509.SubjectAlternativeName(names), critical=False)
-    builder = builder.add_extension(x509.BasicConstraints(ca=True, path_length=None), critical=True)
-    return builder.sign(key, hashes.SHA256())
 
 
 @pytest.fixture

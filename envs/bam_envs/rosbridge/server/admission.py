@@ -39,11 +39,17 @@ class Admission:
     """Admits or refuses clients; `present` returns the number of clients."""
 
     def __init__(
-        self, tokens: Tokens, options: ServerOptions, present: Callable[[], int], site: Site | None, secure: bool
+        self,
+        tokens: Tokens,
+        options: ServerOptions,
+        present: Callable[[], int],
+        refusals: Refusals,
+        site: Site | None,
+        secure: bool,
     ) -> None:
         self._tokens, self._guesses, self._version = tokens, Guesses(), tokens.version
         self._options, self._present, self._site, self._secure = options, present, site, secure
-        self._refusals = Refusals(_logger)
+        self._refusals = refusals
 
     def check(self, connection: BridgeConnection, request: Request) -> Response | None:
         """A page, or the refusal of a request, or None for a WebSocket; a page may show its token later (`greet`)."""

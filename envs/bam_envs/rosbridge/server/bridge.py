@@ -68,14 +68,19 @@ class Incoming(NamedTuple):
 class Bridge:
     """All clients, topics and services of one server. `clock` is the wall clock [s], for ``/rosapi/get_time``."""
 
-    def __init__(self, options: ServerOptions | None = None, clock: Callable[[], float] = time.time) -> None:
+    def __init__(
+        self,
+        options: ServerOptions | None = None,
+        clock: Callable[[], float] = time.time,
+        refusals: Refusals | None = None,
+    ) -> None:
         self.options = options or ServerOptions()
         self._events: list[Event] = []
         self.topics = Topics(self._events.append)
         self.services = Services(self._events.append)
         self._fragmented: set[Session] = set()
         self._leave: list[Callable[[Caller], None]] = []
-        self._refusals = Refusals(_logger)
+        self._refusals = refusals or Refusals(_logger)
         rosapi: dict[str, tuple[str, Handler]] = {
             "get_time": ("GetTime", lambda *_: {"time": _time_of_day(clock())}),
             "topics": ("Topics", lambda *_: {"topics": [*self.topics], "types": self.topics.kinds}),

@@ -25,6 +25,7 @@ from bam_envs.rosbridge.endpoint import Address
 from bam_envs.rosbridge.server.admission import Admission, listening_error, tls_context
 from bam_envs.rosbridge.server.bridge import Bridge, Incoming
 from bam_envs.rosbridge.server.client_session import Call, Send, ServerOptions, Session
+from bam_envs.rosbridge.server.refusals import Refusals
 from bam_envs.rosbridge.server.server_connection import BridgeConnection
 from bam_envs.rosbridge.server.site import Handler as SiteHandler
 from bam_envs.rosbridge.server.site import Site
@@ -37,6 +38,7 @@ _HANDLER_THREADS = 32
 _SHORT = 4096  # longest frame that is decoded in the network thread [bytes]
 _TURN = 4  # frames of one client that are read before those of other clients
 _QUEUE = 2  # messages of a client that are read from its socket before they are processed
+_BROKEN = (1002, 1003, 1007, 1009)  # close codes for what breaks the protocol, or is too large
 _EXPEL = 0.5  # time between two looks at the file of the tokens [s]
 _logger = logging.getLogger(__name__)
 # The logger of `websockets`, which reports every port scanner with a traceback.
@@ -81,12 +83,15 @@ class BridgeServer(Bus):
         self.host, self.port = host, port
         self.options = options or ServerOptions()
         self._cert, self._key = cert, key
-        self._bridge = Bridge(self.options)
+        self._refusals = Refusals(_logger)
+        self._bridge = Bridge(self.options, refusals=self._refusals)
         self._connections: dict[Session, BridgeConnection] = {}
         self._sockets: set[BridgeConnection] = set()
         self._visitors: set[BridgeConnection] = set()  # on paths of the site
         tokens, self._site = tokens or Tokens.of_clients(token, operator_token), site
-        self._admission = Admission(tokens, self.options, lambda: self.clients, site, secure=cert is not None)
+        self._admission = Admission(
+            tokens, self.options, lambda: self.clients, self._refusals, site, secure=cert is not None
+        )
         self._numbers = itertools.count(1)
         self._thread = LoopThread("bam-bridge-server")
         self._workers = Workers(_HANDLER_THREADS, "bam-bridge-handler")
@@ -173,7 +178,9 @@ class BridgeServer(Bus):
         self._stop, options = asyncio.Event(), self.options
         extra: dict[str, Any] = {"ssl": tls, "ssl_handshake_timeout": options.open_timeout} if tls else {}
         # `websockets` does not know that its handlers get the connections that this makes.
-        extra["create_connection"] = functools.partial(BridgeConnection, sockets=self._sockets, limits=options)
+        extra["create_connection"] = functools.partial(
+            BridgeConnection, sockets=self._sockets, limits=options, refusals=self._refusals
+        )
         extra["process_request"], handler = self._admission.check, cast(Any, self._serve)
         server = await serve(
             handler,
@@ -243,7 +250,7 @@ class BridgeServer(Bus):
         try:
             await self._read(connection, session)
         except ConnectionClosed as end:
-            _logger.debug("%s at %s left: %s", session.caller.name, session.caller.address, end)
+            self._note_end(caller, end)
         finally:
             del self._connections[session]
             self._bridge.lost(session)
@@ -254,12 +261,17 @@ class BridgeServer(Bus):
         try:
             await serve(connection, caller)
         except ConnectionClosed as end:
-            _logger.debug("%s at %s left: %s", caller.name, caller.address, end)
+            self._note_end(caller, end)
         except Exception:  # `websockets` closes the connection, and its logger is quiet
             _logger.exception("the connection of %s failed", caller.address)
             raise
         finally:
             self._visitors.discard(connection)
+
+    def _note_end(self, caller: Caller, end: ConnectionClosed) -> None:
+        if end.sent is not None and end.sent.code in _BROKEN and not end.rcvd_then_sent:
+            self._refusals.note(caller.address, f"Its connection was closed: {end.sent}.")
+        _logger.debug("%s at %s left: %s", caller.name, caller.address, end)
 
     async def _read(self, connection: BridgeConnection, session: Session) -> None:
         for number in itertools.count(1):

@@ -6,16 +6,18 @@ from collections import Counter, deque
 from typing import Any
 
 from websockets.asyncio.server import ServerConnection
-from websockets.frames import DATA_OPCODES, Frame
+from websockets.frames import DATA_OPCODES, Frame, Opcode
 from websockets.protocol import Event, State
 
 from bam_envs.rosbridge.server.client_session import Packet, ServerOptions
+from bam_envs.rosbridge.server.refusals import Refusals
 from bam_envs.rosbridge.tokens import Role
 
 TRY_AGAIN_LATER = 1013  # close code of a client that does not read what it must get
 # Most sockets without an admitted client, in all and of one address; the oldest is closed for a new one.
 _STRANGERS, _STRANGERS_OF_ONE = 128, 32
 _OF_A_STRANGER = 65536  # most unread data of a client before its admission [bytes]
+_LOOK = 1.0  # longest time that a socket is open which only looks for the port [s]
 _FRAME = 200  # approximate overhead of a frame [bytes]
 
 
@@ -74,9 +76,16 @@ class Outbox:
 class BridgeConnection(ServerConnection):
     """A connection with an `Outbox` that counts its unread data; one of `sockets`, the open ones of the server."""
 
-    def __init__(self, *args: Any, sockets: set["BridgeConnection"], limits: ServerOptions, **options: Any) -> None:
+    def __init__(
+        self,
+        *args: Any,
+        sockets: set["BridgeConnection"],
+        limits: ServerOptions,
+        refusals: Refusals,
+        **options: Any,
+    ) -> None:
         super().__init__(*args, **options)
-        self._sockets, self._most_unfinished = sockets, limits.unfinished
+        self._sockets, self._most_unfinished, self._refusals = sockets, limits.unfinished, refusals
         self._most_unsent = limits.max_message + limits.outbox_size
         self.outbox = Outbox(limits.outbox_size, limits.outbox_of_a_topic)
         self.role: Role | None = None  # of an admitted client; None before
@@ -85,7 +94,8 @@ class BridgeConnection(ServerConnection):
         self.heard = time.monotonic()  # when data last arrived [s, monotonic]
         self.born = self.heard  # when the socket opened [s, monotonic]
         self._waiting = 0  # size of complete frames that are not taken yet [bytes]
-        self._message, self._whole = 0, deque[int]()  # sizes of the unfinished message and of complete messages
+        self._message, self._is_text = 0, False  # of the unfinished message: its size, and whether it is text
+        self._whole = deque[tuple[int, bool]]()  # the same of complete messages
         self._takes_more = True
         self._closing: asyncio.Task[None] | None = None
 
@@ -132,16 +142,29 @@ class BridgeConnection(ServerConnection):
     # ---- incoming
 
     async def next_frame(self) -> bytes:
-        """Wait for the next message, text or not."""
-        message = await self.recv(decode=False)
-        self._waiting -= self._whole.popleft()
-        return message
+        """Wait for the next message."""
+        return (await self.next_data())[0]
 
     async def next_message(self) -> str | bytes:
-        """Wait for the next message: text as `str`, another one as `bytes`."""
-        message = await self.recv()
-        self._waiting -= self._whole.popleft()
-        return message
+        """Wait for the next message, a text as `str`; text that is no UTF-8 has � in it."""
+        data, is_text = await self.next_data()
+        return data.decode(errors="replace") if is_text else data
+
+    async def next_data(self) -> tuple[bytes, bool]:
+        """Wait for the next message; returns it, and whether it is text, which may be no UTF-8."""
+        message = await self.recv(decode=False)
+        size, is_text = self._whole.popleft()
+        self._waiting -= size
+        return message, is_text
+
+    def limit_messages(self, most: int) -> None:
+        """Close the connection (1009) if a later message is larger than `most` bytes."""
+        self.protocol.max_message_size = most
+
+    def cut(self, why: str) -> None:
+        """Drop the connection at once, and log why."""
+        self._refusals.note(self.host, why)
+        self.transport.abort()
 
     @property
     def unfinished(self) -> int:
@@ -157,11 +180,16 @@ class BridgeConnection(ServerConnection):
         strangers = [one for one in here if one.role is None]
         host, most = Counter(one.host for one in strangers).most_common(1)[0]
         if most > _STRANGERS_OF_ONE or len(strangers) > _STRANGERS:
-            min((one for one in strangers if one.host == host), key=lambda one: one.born).transport.abort()
+            min((one for one in strangers if one.host == host), key=lambda one: one.born).cut(
+                "It opens too many sockets."
+            )
 
     def connection_lost(self, exc: Exception | None) -> None:
         """asyncio: the socket closed."""
         self._sockets.discard(self)
+        # A socket that was closed at once, and empty, is a look whether the port is open.
+        if self.request is None and (self.heard > self.born or time.monotonic() - self.born > _LOOK):
+            self._refusals.note(self.host, "It sent no complete request.")
         super().connection_lost(exc)
 
     def data_received(self, data: bytes) -> None:
@@ -169,12 +197,12 @@ class BridgeConnection(ServerConnection):
         self.heard = time.monotonic()
         super().data_received(data)
         if self.role is None and self.unfinished > _OF_A_STRANGER:
-            self.transport.abort()
+            self.cut(f"It sent more than {_OF_A_STRANGER} bytes before its token.")
         elif self.unfinished > _OF_A_STRANGER and sum(one.unfinished for one in self._sockets) > self._most_unfinished:
-            max(self._sockets, key=lambda one: one.unfinished).transport.abort()
+            max(self._sockets, key=lambda one: one.unfinished).cut("Its unfinished messages fill the memory.")
         # Answers to pings that are never read would pile up.
         if not self._takes_more and self.transport.get_write_buffer_size() > self._most_unsent:
-            self.transport.abort()
+            self.cut("It does not read what it asked for.")
 
     def process_event(self, event: Event) -> None:
         """websockets: a frame arrived."""
@@ -182,7 +210,8 @@ class BridgeConnection(ServerConnection):
             cost = len(event.data) + _FRAME
             self._waiting += cost
             self._message += cost
+            self._is_text = event.opcode is Opcode.TEXT if event.opcode is not Opcode.CONT else self._is_text
             if event.fin:
-                self._whole.append(self._message)
+                self._whole.append((self._message, self._is_text))
                 self._message = 0
         super().process_event(event)

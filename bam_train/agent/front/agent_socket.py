@@ -1,0 +1,392 @@
+"""The server side of the agent socket: who asks for what, in which role, and what the `Hub` behind it answers.
+
+Halts and twists go to the hub at once, in the network thread; everything else in worker threads, so that nothing that
+takes long holds them up. What waits for a client is bounded: of events it gets the newest only.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any, Protocol
+
+import msgspec
+import numpy as np
+
+from bam_envs import __version__
+from bam_envs.core.errors import BamEnvsError, InvalidValue, NotInCommand, ProtocolError
+from bam_envs.rosbridge.bus import Caller
+from bam_envs.rosbridge.server.client_session import Packet
+from bam_envs.rosbridge.server.refusals import Refusals
+from bam_envs.rosbridge.server.server_connection import BridgeConnection
+from bam_envs.rosbridge.server.site import Handler
+from bam_envs.rosbridge.threads import Workers
+from bam_envs.rosbridge.tokens import Role
+from bam_train.agent.front.upload import Upload, remove_leftovers
+from bam_train.agent.remote import agent_protocol as protocol
+from bam_train.errors import BamTrainError, RoleTooLow
+
+_log = logging.getLogger(__name__)
+_THREADS = 32
+_AT_ONCE = 4  # most unanswered requests of one client
+_PUSHES = 4  # most uploads, and pushes that wait for their answer, of all clients
+_RATE, _BURST = 200.0, 400.0  # most messages of one client a second, and at once
+_STALLED = 10.0  # longest time between two pieces of an upload [s]
+_FLOOD = 1008  # close code
+_EVENTS = {"watch": ("status", "telemetry"), "transitions": ("transitions",)}
+"""Request to the kinds of events that it turns on."""
+_NEWEST = {"status": 1, "telemetry": 1}
+"""Most events of a kind that wait for a slow client; of others, as many as the server lets."""
+
+
+@dataclass(frozen=True)
+class Person:
+    """Somebody at the other end of an agent socket."""
+
+    name: str
+    """As they call themselves, such as anna@laptop; else the address."""
+    address: str
+    """Network address with the port."""
+    role: Role
+    connection: str
+    """Unique name of the socket."""
+
+
+Event = Mapping[str, Any]
+Progress = Callable[[str], None]
+
+
+class Hub(Protocol):
+    """The agent behind the socket."""
+
+    incoming: Path
+    """Folder for uploads."""
+
+    def ask(self, op: str, arguments: dict[str, Any], person: Person, progress: Progress) -> dict[str, Any]:
+        """Do what is asked for, in a worker thread, and return the result; tell `progress` in lines of text.
+
+        For ``push``, ``path`` in `arguments` is the complete upload, whose digest was compared; it is removed
+        afterwards if it is still there. Raises `BamTrainError` or `BamEnvsError`, of one line.
+        """
+
+    def stop(self, person: Person) -> dict[str, Any]:
+        """Halt, in the network thread: must return at once."""
+
+    def jog(self, message: dict[str, Any], person: Person) -> None:
+        """Take a twist, in the network thread: must return at once. Raises as `ask`."""
+
+    def listen(self, kind: str, listener: Callable[[Event], None]) -> Callable[[], None]:
+        """Call `listener`, in any thread, with each event of a kind: status, telemetry, transitions."""
+
+    def left(self, person: Person) -> None:
+        """The socket has closed; in the network thread: must return at once."""
+
+
+class AgentSocket:
+    """Serves the agent socket; `serve` is its handler for a `Site`, at `agent_protocol.PATH`.
+
+    Args:
+        hub: The agent behind it.
+        most_upload: Most bytes of an upload.
+        stalled: Longest time between two pieces of an upload [s].
+    """
+
+    def __init__(self, hub: Hub, *, most_upload: int = 256 * 2**20, stalled: float = _STALLED) -> None:
+        self.hub, self.most_upload, self.stalled = hub, most_upload, stalled
+        self.refusals = Refusals(_log)
+        self.pushes = 0  # uploads, and pushes without an answer yet
+        self.learner: Person | None = None  # who gets the transitions
+        self._workers = Workers(_THREADS, "bam-agent-ask")
+        self._feeds = {kind: _Feed(hub, kind) for kinds in _EVENTS.values() for kind in kinds}
+        remove_leftovers(hub.incoming)
+
+    @property
+    def sockets(self) -> dict[str, Handler]:
+        """For a `Site`."""
+        return {protocol.PATH: self.serve}
+
+    async def serve(self, connection: BridgeConnection, caller: Caller) -> None:
+        """Serve one socket until it closes."""
+        await _Client(self, connection, caller).run()
+
+    def close(self) -> None:
+        """End the worker threads."""
+        self._workers.close()
+
+    def work(self, task: Callable[[], None]) -> None:
+        """Run `task`, which must not raise, in a worker thread; called in the network thread."""
+        self._workers.submit(task)
+
+    def feed(self, kind: str, client: _Client, on: bool) -> None:
+        """Send a client the events of a kind, or no longer."""
+        (self._feeds[kind].add if on else self._feeds[kind].discard)(client)
+
+
+class _Feed:
+    """The clients that want one kind of events; the hub is asked for these only while there is one."""
+
+    def __init__(self, hub: Hub, kind: str) -> None:
+        self._hub, self._kind, self._clients = hub, kind, set[_Client]()
+        self._unlisten: Callable[[], None] = lambda: None
+
+    def add(self, client: _Client) -> None:
+        if not self._clients:
+            loop = asyncio.get_running_loop()
+            self._unlisten = self._hub.listen(self._kind, partial(self._pass_on, loop))
+        self._clients.add(client)
+
+    def discard(self, client: _Client) -> None:
+        if client in self._clients:
+            self._clients.discard(client)
+            if not self._clients:
+                self._unlisten()
+
+    def _pass_on(self, loop: asyncio.AbstractEventLoop, event: Event) -> None:
+        packet = Packet((_encode(event),), text=True, stream=self._kind)
+        with contextlib.suppress(RuntimeError):  # the server was closed a moment ago
+            loop.call_soon_threadsafe(self._send, packet)
+
+    def _send(self, packet: Packet) -> None:
+        for client in self._clients:
+            client.send(packet, _NEWEST.get(self._kind, 0))
+
+
+class _Client:
+    """One socket."""
+
+    def __init__(self, owner: AgentSocket, connection: BridgeConnection, caller: Caller) -> None:
+        self._owner, self._hub, self._connection, self._caller = owner, owner.hub, connection, caller
+        self._person = Person(caller.address, caller.address, caller.role, caller.name)
+        self._loop = asyncio.get_running_loop()
+        self._last = -1  # id of the last request
+        self._running = 0  # requests that worker threads execute
+        self._upload: Upload | None = None
+        self._push: protocol.Push | None = None
+        self._skip = 0  # bytes of an upload that failed, which are still on their way
+        self._room, self._at = _BURST, time.monotonic()  # messages that may come at once, and when that was so
+
+    async def run(self) -> None:
+        """Take messages until the socket closes."""
+        self._connection.limit_messages(protocol.LONGEST_CHUNK)
+        hello = {"event": "hello", "protocol": protocol.PROTOCOL, "agent": __version__, "role": self._caller.role}
+        self._send(hello)
+        try:
+            while True:
+                try:
+                    limit = None if self._upload is None else self._owner.stalled
+                    data, is_text = await asyncio.wait_for(self._connection.next_data(), limit)
+                except asyncio.TimeoutError:
+                    self._end_upload(ProtocolError(f"The upload stood still for {self._owner.stalled:g} s."))
+                    continue
+                if (is_text or (self._upload is None and self._skip <= 0)) and not self._has_room():
+                    reason = f"More than {_RATE:g} messages a second came."
+                    self._note(reason)
+                    await self._connection.close(_FLOOD, reason)
+                    return
+                await (self._take(data) if is_text else self._take_piece(data))
+        finally:
+            self._leave()
+
+    def _leave(self) -> None:
+        for kinds in _EVENTS.values():
+            for kind in kinds:
+                self._owner.feed(kind, self, False)
+        if self._learns:
+            self._owner.learner = None
+        if self._upload is not None:
+            self._upload.remove()
+            self._upload = None
+            self._owner.pushes -= 1
+        self._hub.left(self._person)
+
+    def _has_room(self) -> bool:
+        now = time.monotonic()
+        self._room, self._at = min(_BURST, self._room + _RATE * (now - self._at)) - 1.0, now
+        return self._room >= 0.0
+
+    # ---- requests
+
+    async def _take(self, data: bytes) -> None:
+        number = None
+        try:
+            request = protocol.decode_request(data)
+            number = request.id
+            if number is not None:
+                if number <= self._last:
+                    raise protocol.BadRequest(f"The id {number} is not above {self._last}: ids grow.", number)
+                self._last = number
+            if request.name:
+                shown = "".join(one if one.isprintable() else "?" for one in request.name)
+                self._person = replace(self._person, name=shown)
+            self._require_role(request)
+            await self._do(request)
+        except protocol.BadRequest as error:
+            self._note(str(error))
+            self._refuse(error.number, error)
+        except (BamTrainError, BamEnvsError) as error:
+            self._refuse(number, error)
+
+    def _require_role(self, request: protocol.Request) -> None:
+        op, role = request.__struct_config__.tag, self._caller.role
+        if not protocol.may(role, type(request)):
+            self._note(f"{op} is for the role {request.role}, and its token has the role {role}")
+            raise RoleTooLow(f"{op} needs a token of the role {request.role}; the token shown has the role {role}.")
+        if isinstance(request, protocol.Take) and request.force and not self._caller.operator:
+            self._note("taking command by force needs a token that administers")
+            raise RoleTooLow("Taking command by force needs a token of the role administer (bam-agent --token-file).")
+
+    async def _do(self, request: protocol.Request) -> None:
+        match request:
+            case protocol.Stop():
+                self._answer(request.id, self._hub.stop(self._person))
+            case protocol.Jog():
+                self._hub.jog(_arguments(request), self._person)
+            case protocol.Watch():
+                self._switch("watch", request.on)
+                self._answer(request.id, {"on": request.on})
+            case protocol.Transitions():
+                self._learn(request.on)
+                self._answer(request.id, {"on": request.on})
+            case protocol.Push():
+                await self._begin_upload(request)
+            case _:
+                self._ask(request, _arguments(request))
+
+    def _switch(self, op: str, on: bool) -> None:
+        for kind in _EVENTS[op]:
+            self._owner.feed(kind, self, on)
+
+    def _learn(self, on: bool) -> None:
+        learner = self._owner.learner
+        if on and learner is not None and not self._learns:
+            who = learner.name if learner.name == learner.address else f"{learner.name} ({learner.address})"
+            raise NotInCommand(f"{who} learns from this robot already, and there is one learner at a time.")
+        if on or self._learns:
+            self._owner.learner = self._person if on else None
+        self._switch("transitions", on)
+
+    @property
+    def _learns(self) -> bool:
+        learner = self._owner.learner
+        return learner is not None and learner.connection == self._caller.name
+
+    def _ask(self, request: protocol.Request, arguments: dict[str, Any], upload: Upload | None = None) -> None:
+        """Let a worker thread execute a request and answer it."""
+        if self._running >= _AT_ONCE:
+            raise InvalidValue(f"At most {_AT_ONCE} requests may be unanswered; wait for an answer first.")
+        self._running += 1
+        op, person, number = str(request.__struct_config__.tag), self._person, request.id
+
+        def progress(text: str) -> None:
+            self._post(lambda: self._send({"id": number, "progress": text}))
+
+        def work() -> None:
+            try:
+                result, error = self._hub.ask(op, arguments, person, progress), None
+            except Exception as failure:  # a request is always answered
+                result, error = {}, failure
+            if upload is not None:
+                upload.remove()
+            self._post(lambda: finish(result, error))
+
+        def finish(result: dict[str, Any], error: Exception | None) -> None:
+            self._running -= 1
+            self._owner.pushes -= upload is not None
+            if error is None:
+                self._answer(number, result)
+            else:
+                self._refuse(number, error)
+
+        self._owner.work(work)
+
+    # ---- uploads
+
+    async def _begin_upload(self, push: protocol.Push) -> None:
+        if self._upload is not None or self._owner.pushes >= _PUSHES:
+            whose = "of this socket" if self._upload is not None else "of others"
+            raise InvalidValue(f"Uploads {whose} are not done yet; push again when they are.")
+        make = partial(Upload, self._hub.incoming, push.size, push.sha256, self._owner.most_upload)
+        try:
+            self._upload, self._push = await self._loop.run_in_executor(None, make), push
+        except InvalidValue as error:
+            self._note(str(error))
+            raise
+        self._owner.pushes += 1
+        self._send({"id": push.id, "progress": "the agent takes the upload"})
+
+    async def _take_piece(self, data: bytes) -> None:
+        upload, push = self._upload, self._push
+        if upload is None or push is None:
+            self._skip -= len(data)
+            if self._skip < 0:
+                self._note("It sent bytes that belong to no upload.")
+                self._refuse(None, ProtocolError("Binary frames belong to an upload, and none has begun: push first."))
+            return
+        try:
+            complete = await self._loop.run_in_executor(None, upload.write, data)
+        except (BamTrainError, BamEnvsError) as error:
+            self._note(str(error))
+            self._end_upload(error)
+            return
+        if complete:
+            self._upload = None
+            try:
+                self._ask(push, {**_arguments(push), "path": upload.path}, upload)
+            except BamEnvsError as error:
+                upload.remove()
+                self._owner.pushes -= 1
+                self._refuse(push.id, error)
+
+    def _end_upload(self, error: Exception) -> None:
+        upload, push, self._upload = self._upload, self._push, None
+        if upload is not None and push is not None:
+            upload.remove()
+            self._owner.pushes -= 1
+            self._skip = upload.size - upload.received
+            self._refuse(push.id, error)
+
+    # ---- answers
+
+    def _answer(self, number: int, result: dict[str, Any]) -> None:
+        self._send({"id": number, "ok": True, "result": result})
+
+    def _refuse(self, number: int | None, error: Exception) -> None:
+        if not isinstance(error, (BamTrainError, BamEnvsError)):
+            _log.error("the agent failed", exc_info=error)
+        text = " ".join((str(error) or type(error).__name__).split())
+        self._send({"id": number, "ok": False, "error": text, "kind": type(error).__name__})
+
+    def _send(self, message: Mapping[str, Any]) -> None:
+        self.send(Packet((_encode(message),), text=True), 0)
+
+    def send(self, packet: Packet, keep: int) -> None:
+        """Send a packet, or let it wait for a slow client."""
+        self._connection.put(packet, keep)
+        self._connection.flush()
+
+    def _post(self, work: Callable[[], None]) -> None:
+        with contextlib.suppress(RuntimeError):  # the server was closed a moment ago
+            self._loop.call_soon_threadsafe(work)
+
+    def _note(self, why: str) -> None:
+        self._owner.refusals.note(self._caller.address, why)
+
+
+def _arguments(request: protocol.Request) -> dict[str, Any]:
+    return {name: getattr(request, name) for name in request.__struct_fields__ if name not in ("id", "name")}
+
+
+def _encode(message: Mapping[str, Any]) -> bytes:
+    return msgspec.json.encode(message, enc_hook=_plain)
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, (np.ndarray, np.generic)):
+        return value.tolist()
+    raise TypeError(f"{type(value).__name__} cannot be sent")

@@ -1,0 +1,1 @@
+"""A live agent elsewhere: the protocol of its socket, and the client of programs."""
