@@ -23,7 +23,7 @@ from bam_train.checkpoint import Checkpoint
 from bam_train.deploy.checkpoint_admission import trials_of
 from bam_train.deploy.journal import EpisodeRecord
 from bam_train.deploy.trials import Trials
-from bam_train.errors import BadTrials, BamTrainError, OutputError, RequestRefused, TrialsNeeded
+from bam_train.errors import BadTrials, BamTrainError, RequestRefused, TrialsNeeded
 
 if TYPE_CHECKING:
     from bam_train.agent.resident import Resident
@@ -201,20 +201,20 @@ class Succession:
                 self.names.pop(name, None)
             else:
                 self.names[name] = digest
-        self._save(choice.names)
+        self._save()
         bound = 0.9 if choice.trials is None else choice.trials.threshold
         self.choice, self.probation = choice, Probation(bound, self._resident.options.guard_stops)
         kept = {self.active.digest, *self.names.values()}
         self._policies = {digest: policy for digest, policy in self._policies.items() if digest in kept}
 
-    def _save(self, names: Mapping[str, str | None]) -> None:
-        """Move names in the folder, in another thread: a tick does not wait for the disk."""
+    def _save(self) -> None:
+        """Save the names in the folder, in another thread: a tick does not wait for the disk."""
 
         def save() -> None:
-            with self._saving:
+            with self._saving:  # the last thread saves the last names, whichever comes first
                 try:
-                    self.versions.point(names)
-                except OutputError as error:
+                    self.versions.point({**dict.fromkeys(self.versions.names), **self.names})
+                except BamTrainError as error:
                     _log.warning("The names were not saved: %s", error)
 
         threading.Thread(target=save, name="bam-names").start()
@@ -286,7 +286,7 @@ class Succession:
         names |= {PREVIOUS: champion} if champion not in (None, digest) else {}
         self.names.pop(CANDIDATE, None)
         self.names |= {name: one for name, one in names.items() if one is not None}
-        self._save(names)
+        self._save()
         self._resident.note("promoted", f"{digest[:12]} is the champion: {reason}")
         self._resident.stage_of_champion()
         self._close_choice(f"promoted: {reason}")
