@@ -44,6 +44,7 @@ def test_the_wheel_holds_two_packages_and_nothing_else(wheel):
     [
         "bam_envs/py.typed",
         "bam_train/py.typed",
+        "bam_train/agent/bam-agent.service",
         "bam_envs/robots/physics/models/ur5e_gripper.xml",
         "bam_envs/robots/physics/models/ur5e_cube.xml",
         "bam_envs/robots/physics/models/floor.xml",
@@ -55,7 +56,7 @@ def test_the_wheel_holds_two_packages_and_nothing_else(wheel):
         "bam_train/agent/console/main.js",
     ],
 )
-def test_the_wheel_holds_types_models_and_presets(wheel, name):
+def test_the_wheel_holds_types_models_presets_and_the_service(wheel, name):
     assert name in wheel.namelist()
 
 

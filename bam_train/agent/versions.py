@@ -19,7 +19,7 @@ from typing import IO, Any
 
 from bam_train.atomic_file import remove_orphans, replacing
 from bam_train.checkpoint import MANIFEST, POLICY, Checkpoint
-from bam_train.errors import AlteredCheckpoint, CheckpointError, FolderInUse, OutputError, UnknownVersion
+from bam_train.errors import AlteredCheckpoint, CheckpointError, FolderInUse, OutputError, SettingsError, UnknownVersion
 from bam_train.policy import FrozenPolicy
 
 try:
@@ -27,7 +27,7 @@ try:
 except ImportError:  # Windows: two agents must not share a folder
     fcntl = None  # type: ignore[assignment]
 
-CHAMPION, CANDIDATE, PREVIOUS = "champion", "candidate", "previous"
+CHAMPION, CANDIDATE, PREVIOUS, GIVEN = "champion", "candidate", "previous", "given"
 KEPT = 20
 """Number of versions without a name that are kept."""
 _SHORTEST = 6
@@ -111,6 +111,24 @@ class Versions:
             for one in [one for one in self.all() if not one.names and one.digest != checkpoint.digest][KEPT - 1 :]:
                 one.path.unlink(missing_ok=True)
             return self.find(checkpoint.digest)
+
+    def first(self, given: Path | None) -> Version:
+        """The version that an agent begins with: a checkpoint that is given for the first time, or the champion.
+
+        An agent that is started again with the same checkpoint, as after a power cut, goes on with its champion.
+
+        Raises:
+            SettingsError: There is neither.
+        """
+        names = self._names()
+        if given is not None:
+            version = self.add(Checkpoint.open(given.expanduser()))
+            if version.digest != names.get(GIVEN) or CHAMPION not in names:
+                before = {PREVIOUS: names[CHAMPION]} if names.get(CHAMPION, version.digest) != version.digest else {}
+                self.point({GIVEN: version.digest, CHAMPION: version.digest, **before})
+        elif CHAMPION not in names:
+            raise SettingsError(f"{self.folder} has no version yet; give a checkpoint with --policy")
+        return self.find(CHAMPION)
 
     def all(self) -> list[Version]:
         """Every version, the newest first."""

@@ -325,7 +325,7 @@ class AgentConfig:
     """
 
     policy: File = None
-    """The checkpoint.zip to begin with; by default the champion in the folder."""
+    """The checkpoint.zip to begin with; an agent that is started again with the same one goes on with its champion."""
     robot: Url = None
     """Live robot behind rosbridge, such as ws://127.0.0.1:9090; by default a simulated one."""
     port: Port = 9095

@@ -15,7 +15,6 @@ from bam_train.signals import SignalMemory
 
 if TYPE_CHECKING:
     from bam_train.agent.agent_options import AgentOptions
-    from bam_train.agent.versions import Version, Versions
     from bam_train.cli.flags import AgentConfig
 
 
@@ -44,7 +43,7 @@ def run_agent(config: AgentConfig, signals: SignalMemory) -> int:
         versions = Versions(options.folder / "versions")
         stack.enter_context(versions.held())
         ran_before = versions.named(CHAMPION) is not None
-        active = _install(config, versions)
+        active = versions.first(config.policy)
         env_id, env_kwargs = environment_of(Checkpoint.open(active.path), config.env)
         if not options.robot:
             given = {
@@ -85,24 +84,6 @@ def run_agent(config: AgentConfig, signals: SignalMemory) -> int:
             except Stopped:
                 return 128 + resident.switch.came[0]
     return 0
-
-
-def _install(config: AgentConfig, versions: Versions) -> Version:
-    """The version that begins: the one of --policy, or the champion of the folder."""
-    from bam_train.agent.versions import CHAMPION, PREVIOUS
-    from bam_train.checkpoint import Checkpoint
-    from bam_train.errors import SettingsError
-
-    champion = versions.named(CHAMPION)
-    if config.policy is None:
-        if champion is None:
-            raise SettingsError(f"{versions.folder} has no version yet; give a checkpoint with --policy")
-        return champion
-    version = versions.add(Checkpoint.open(config.policy.expanduser()))
-    if champion is None or champion.digest != version.digest:
-        before: dict[str, str | None] = {} if champion is None else {PREVIOUS: champion.digest}
-        versions.point({CHAMPION: version.digest, **before})
-    return versions.find(version.digest)
 
 
 def _admit(config: AgentConfig, signals: SignalMemory, env: Any, lines: Sequence[str]) -> None:

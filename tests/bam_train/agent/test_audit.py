@@ -119,7 +119,7 @@ def test_a_kill_costs_nothing_that_was_synced(path):
         "for k in range(10**9): audit.write('note', str(k), who='me')"
     )
     with subprocess.Popen([sys.executable, "-c", program, str(path)]) as process:
-        wait_until(path.exists)
+        wait_until(lambda: texts(path))
         process.kill()
     with closing(Audit(path)) as audit:
         note(audit, "after")

@@ -16,7 +16,7 @@ import pytest
 
 from bam_train.agent.versions import KEPT, Versions, load_policy
 from bam_train.checkpoint import Checkpoint
-from bam_train.errors import AlteredCheckpoint, CheckpointError, FolderInUse, OutputError, UnknownVersion
+from bam_train.errors import AlteredCheckpoint, CheckpointError, FolderInUse, OutputError, SettingsError, UnknownVersion
 
 _PROGRAM = """
 import sys
@@ -169,6 +169,25 @@ def test_damaged_names_are_one_line(versions, text):
     (versions.folder / "names.json").write_text(text)
     with pytest.raises(OutputError, match=r"names\.json: cannot be read: [^\n]*\. Restore or remove it$"):
         versions.find("champion")
+
+
+# The version to begin with
+
+
+def test_an_agent_that_is_started_again_goes_on_with_its_champion(versions, some):
+    one, pushed, other = some(3)
+    with pytest.raises(SettingsError) as caught:
+        versions.first(None)
+    assert str(caught.value) == f"{versions.folder} has no version yet; give a checkpoint with --policy"
+    assert versions.first(one.path).digest == one.digest
+    assert versions.names == {"champion": one.digest, "given": one.digest}
+    versions.add(pushed)
+    versions.point({"champion": pushed.digest, "previous": one.digest})
+    for given in (one.path, None):
+        assert versions.first(given).digest == pushed.digest
+    assert versions.first(other.path).digest == other.digest
+    assert versions.names == {"champion": other.digest, "previous": pushed.digest, "given": other.digest}
+    assert versions.first(one.path).digest == one.digest
 
 
 # Disk
