@@ -23,7 +23,7 @@ from bam_train.checkpoint import Checkpoint
 from bam_train.deploy.checkpoint_admission import trials_of
 from bam_train.deploy.journal import EpisodeRecord
 from bam_train.deploy.trials import Trials
-from bam_train.errors import BadTrials, BamTrainError, RequestRefused, TrialsNeeded
+from bam_train.errors import BadTrials, BamTrainError, CandidateRefused, RequestRefused, TrialsNeeded
 
 if TYPE_CHECKING:
     from bam_train.agent.resident import Resident
@@ -139,7 +139,7 @@ class Succession:
         finally:
             path.unlink(missing_ok=True)
         if not verdict.ok:
-            raise RequestRefused(verdict.reason)
+            raise CandidateRefused(verdict.reason)
         return {**self._choose(self.versions.find(verdict.digest), ask), "lines": list(verdict.lines)}
 
     def _use(self, ask: Ask) -> dict[str, Any]:
