@@ -10,6 +10,7 @@ import numpy as np
 from bam_envs.core.robot import RobotState
 from bam_envs.robots.ur5e import arm_spec
 from bam_envs.rosbridge.server import BridgeServer, Site
+from bam_envs.rosbridge.tokens import Tokens
 from bam_envs.safety.guard import Limits
 from bam_envs.testing import ARM_HOME
 from bam_train.agent.front.camera_feed import CameraFeed
@@ -60,12 +61,13 @@ class FakeAgent:
     def __init__(self, tokens=None, cameras=None, port=0):
         self.feed = CameraFeed(cameras or {})
         site = Site(console_pages(), {"/agent": self.serve, "/camera": self.feed.serve})
-        self.server = BridgeServer(port=port, tokens=tokens, site=site)
+        self.server = BridgeServer(port=port, tokens=tokens or Tokens(otherwise="administer"), site=site)
         self.jogger = Jogger(SPEC, SPEC.period)
         self.telemetry = Telemetry(SPEC, Limits())
         self.joints = np.array([[*ARM_HOME, 0.085]])
         self.state, self.owner, self.active = "running", None, "a" * 64
         self.orders, self.commands, self.twists = [], [], []
+        self.refusal = ""  # the answer to every request but a stop
         self.driver = None  # the socket that has taken over
         self._stopped = threading.Event()
 
@@ -115,6 +117,7 @@ class FakeAgent:
 
     async def serve(self, connection, caller):
         watching = None
+        await connection.send(json.dumps({"event": "hello", "role": caller.role}))
         try:
             while True:
                 message = json.loads(await connection.next_message())
@@ -153,8 +156,8 @@ class FakeAgent:
             return {"ok": True, "result": {"versions": VERSIONS}}
         if op == "audit":
             return {"ok": True, "result": {"lines": ["12:00 running -> paused (anna)"]}}
-        if op != "stop" and caller.role == "watch" and op not in ("status", "watch"):
-            return {"ok": False, "error": f"{op} needs the role drive.", "kind": "AgentRefused"}
+        if self.refusal and op not in ("stop", "watch"):
+            return {"ok": False, "error": self.refusal, "kind": "RequestRefused"}
         if op == "take":
             if self.driver not in (None, connection) and not message["force"]:
                 return {"ok": False, "error": f"{self.owner} drives this robot.", "kind": "NotInCommand"}

@@ -301,17 +301,29 @@ def test_a_token_is_asked_for_kept_in_this_tab_and_never_in_an_address(page):
         page.run("sessionStorage.clear()")
 
 
-def test_a_role_that_only_watches_may_stop_and_is_told_what_it_may_not(page):
+@pytest.mark.parametrize(("token", "allowed"), [("watching", set()), ("driving", {"pause", "take"})])
+def test_a_role_sees_what_it_may_do_and_everybody_may_stop(page, token, allowed):
     with FakeAgent(ROLES) as agent:
         page.open(agent.url).shows("entry-reason", "token")
-        page.element("token").send_keys("watching\n")
+        page.element("token").send_keys(f"{token}\n")
         page.shows("state", "running")
-        page.click("pause")
-        page.shows("error", "⚠ pause needs the role drive.")
+        buttons = ("pause", "resume", "take", "roll-back")
+        until(lambda: {one for one in buttons if page.element(one).is_enabled()} == allowed, "the buttons")
         page.click("stop")
         page.shows("state", "paused")
         page.run("sessionStorage.clear()")
         assert len(agent.did("stop")) == 1
+
+
+def test_what_is_refused_is_said(page, agent):
+    page.open(agent.url).shows("state", "running")
+    agent.refusal = "anna drives this robot."
+    page.click("pause")
+    page.shows("error", "⚠ anna drives this robot.")
+    agent.refusal = ""
+    page.click("pause")
+    page.shows("state", "paused")
+    assert not page.element("error").is_displayed()
 
 
 def test_the_page_comes_back_when_the_robot_does(page):
