@@ -15,8 +15,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from bam_envs.core.errors import BamEnvsError
+from bam_envs.core.registry import are_same
 from bam_train.agent.agent_messages import Answer, Ask, Progress
-from bam_train.agent.candidate import CandidateRequest, check_candidate
+from bam_train.agent.candidate import CandidateRequest, Verdict, check_candidate
 from bam_train.agent.probation import Judgement, Probation
 from bam_train.agent.versions import CANDIDATE, CHAMPION, PREVIOUS, Version, Versions, load_policy
 from bam_train.checkpoint import Checkpoint
@@ -116,34 +117,45 @@ class Succession:
             resident.send(Answer(ask.number, error=text, kind=type(error).__name__))
 
     def _push(self, ask: Ask) -> dict[str, Any]:
-        resident, arguments = self._resident, ask.arguments
-        session = resident.session
-        path, name = Path(arguments["path"]), str(arguments.get("file") or "the candidate")
+        path = Path(ask.arguments["path"])
         try:
-            if session is None:
-                raise RequestRefused("the agent waits for the robot, and checks no candidate without it; push it later")
-            resident.send(Progress(ask.number, "checking"))
-            verdict = check_candidate(
-                CandidateRequest(
-                    path,
-                    name,
-                    self.versions.folder,
-                    session.env_id,
-                    session.env_kwargs,
-                    session.interface,
-                    simulated=not session.is_real,
-                    keys=resident.options.keys,
-                    allow_unsigned=resident.options.allow_unsigned,
-                )
-            )
+            verdict = self._checked(path, str(ask.arguments.get("file") or "the candidate"), ask)
         finally:
             path.unlink(missing_ok=True)
-        if not verdict.ok:
-            raise CandidateRefused(verdict.reason)
         return {**self._choose(self.versions.find(verdict.digest), ask), "lines": list(verdict.lines)}
 
     def _use(self, ask: Ask) -> dict[str, Any]:
-        return self._choose(self.versions.find(str(ask.arguments.get("version", ""))), ask)
+        version = self.versions.find(str(ask.arguments.get("version", "")))
+        self._checked(version.path, version.digest[:12], ask)  # it may be of a time when the agent ran something else
+        return self._choose(version, ask)
+
+    def _checked(self, path: Path, name: str, ask: Ask) -> Verdict:
+        """Check a file in another process, which puts it into the folder.
+
+        Raises:
+            CandidateRefused: It is refused.
+            RequestRefused: There is no robot to check it for.
+        """
+        resident, session = self._resident, self._resident.session
+        if session is None:
+            raise RequestRefused("the agent waits for the robot, and checks no candidate without it; push it later")
+        resident.send(Progress(ask.number, "checking"))
+        verdict = check_candidate(
+            CandidateRequest(
+                path,
+                name,
+                self.versions.folder,
+                session.env_id,
+                session.env_kwargs,
+                session.interface,
+                simulated=not session.is_real,
+                keys=resident.options.keys,
+                allow_unsigned=resident.options.allow_unsigned,
+            )
+        )
+        if not verdict.ok:
+            raise CandidateRefused(verdict.reason)
+        return verdict
 
     def _choose(self, version: Version, ask: Ask) -> dict[str, Any]:
         """Let `version` act as the request says, and wait until it does."""
@@ -236,6 +248,9 @@ class Succession:
                 "There is no version to roll back to: the champion acts, and there was none before it."
             )
         version = self.versions.find(target)
+        if not are_same(version.env, self.active.env):
+            text = f"{target[:12]} was trained on {version.env}, and the agent runs {self.active.env}"
+            raise RequestRefused(f"There is no version to roll back to: {text}.")
         policy = self._policies.get(target) or load_policy(version)
         return Choice(version, policy, names, f"rolled back: {why}", who, self._resident.options.stage)
 

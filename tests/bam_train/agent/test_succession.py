@@ -1,0 +1,139 @@
+"""Which version acts: candidates that come, are promoted, rolled back, or refused while the old one acts on."""
+
+import threading
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+
+from bam_train.agent.agent_messages import Ask
+from bam_train.agent.agent_options import AgentOptions
+from bam_train.agent.succession import Succession
+from bam_train.agent.versions import Versions
+from bam_train.checkpoint import Checkpoint
+from bam_train.deploy.journal import EpisodeRecord
+from bam_train.environments import interface_of, make_env
+from bam_train.errors import RequestRefused
+
+CHECKPOINTS = Path(__file__).parents[3] / "checkpoints"
+PICK, REACH = CHECKPOINTS / "pick-ppo.zip", CHECKPOINTS / "reach-ppo.zip"
+
+
+class Agent:
+    """A resident without a robot: what was chosen acts at once."""
+
+    def __init__(self, folder, given=PICK):
+        self.options = AgentOptions("ws://127.0.0.1:9090", folder)
+        versions = Versions(folder / "versions")
+        env = versions.first(given).env
+        self.session = SimpleNamespace(env_id=env, env_kwargs={}, interface=interface_of(make_env(env)), is_real=False)
+        self.succession, self.sent, self.notes = Succession(self, versions), [], []
+        self.answered = threading.Event()
+
+    def send(self, message):
+        self.sent.append(message)
+        if hasattr(message, "kind"):
+            self.answered.set()
+
+    def post(self, do, number=0):
+        do()
+
+    def note(self, what, text, who="the agent", where=""):
+        self.notes.append((what, text))
+
+    def choose(self, choice):
+        self.succession.activate(choice)
+        choice.active.set()
+
+    def stage_of_champion(self):
+        pass
+
+    def status(self):
+        return {"stage": "full", "state": "running", "names": self.succession.names, "active": "", "owner": None}
+
+    def ask(self, op, **arguments):
+        self.answered.clear()
+        self.succession.begin(Ask(1, op, arguments, "anna", "10.0.0.7"))
+        assert self.answered.wait(60)
+        return self.sent[-1]
+
+
+@pytest.fixture
+def agent(tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path / "config"))
+    return Agent(tmp_path)
+
+
+@pytest.fixture
+def better(tmp_path, forge):
+    """A file with the policy of another training."""
+    path = tmp_path / "better.zip"
+    path.write_bytes(PICK.read_bytes())
+    return forge(path, seed=7)
+
+
+def names(agent):
+    return {name: digest[:6] for name, digest in agent.succession.names.items()}
+
+
+def test_a_pushed_candidate_acts_and_is_promoted_by_its_trials(agent, better):
+    old, new = agent.succession.active.digest, Checkpoint.open(better).digest
+    answer = agent.ask("push", path=str(better), file="better.zip")
+    assert (answer.error, answer.result["digest"]) == ("", new)
+    assert answer.result["lines"][1] == "fits bam/pick-v0: spaces, 50 signals, period 0.05 s"
+    assert not better.exists()
+    assert agent.succession.active.digest == new
+    assert agent.succession.names == {"champion": old, "given": old, "candidate": new}
+    trials = agent.succession.trials()
+    for seed in range(33):
+        trials.begin(seed)
+        trials.end(True, "terminated")
+        agent.succession.ended(EpisodeRecord(seed, success=True, end="terminated"))
+    assert agent.succession.names == {"champion": new, "given": old, "previous": old}
+    text = "33 of 33 trials succeeded, which shows more than 90 % (error probability at most 5 %)"
+    assert agent.notes[-1] == ("promoted", f"{new[:12]} is the champion: {text}")
+
+
+def test_a_candidate_that_fails_is_rolled_back(agent, better):
+    old = agent.succession.active.digest
+    agent.ask("push", path=str(better))
+    choice = agent.succession.choice
+    for seed in range(3):
+        agent.succession.ended(EpisodeRecord(seed, success=False, end="truncated"))
+    assert agent.succession.active.digest == old
+    assert agent.succession.names == {"champion": old, "given": old}
+    why = "0 of 3 episodes succeeded, which shows less than 90 % (error probability at most 5 %)"
+    assert choice.result == f"rolled back: {why}"
+
+
+def test_a_refused_candidate_changes_nothing(agent, better):
+    before = names(agent)
+    better.write_bytes(better.read_bytes()[:-100])
+    answer = agent.ask("push", path=str(better), file="better.zip")
+    why = "not a whole zip file: truncated, altered or something else. Copy it again from its source, or train again"
+    assert (answer.kind, answer.error) == ("CandidateRefused", f"better.zip: {why}")
+    assert agent.notes == [("refused", f"better.zip: {why}")]
+    assert not better.exists()
+    assert names(agent) == before
+
+
+def test_a_version_of_another_environment_does_not_act(tmp_path, agent):
+    """The agent ran it once, in the same folder."""
+    pick, reach = agent.succession.active.digest, Checkpoint.open(REACH).digest
+    other = Agent(tmp_path, REACH)
+    assert other.succession.names == {"champion": reach, "given": reach, "previous": pick}
+    answer = other.ask("use", version="previous")
+    why = "was trained on bam/pick-v0, and the agent runs bam/reach-v0. Push a checkpoint for that"
+    assert (answer.kind, answer.error) == ("CandidateRefused", f"{pick[:12]}: {why}")
+    with pytest.raises(RequestRefused) as caught:
+        other.succession.back("anna", "it is slow")
+    why = f"{pick[:12]} was trained on bam/pick-v0, and the agent runs bam/reach-v0"
+    assert str(caught.value) == f"There is no version to roll back to: {why}."
+    assert other.succession.active.digest == reach
+
+
+def test_without_the_robot_no_candidate_is_checked(agent, better):
+    agent.session = None
+    answer = agent.ask("push", path=str(better))
+    why = "the agent waits for the robot, and checks no candidate without it; push it later"
+    assert (answer.kind, answer.error) == ("RequestRefused", why)
