@@ -86,6 +86,7 @@ class Resident:
         tell: Called with a line for the operator.
         admit: See `RobotSession`.
         is_running: Whether the policy drives as soon as the robot is there.
+        connect: Connects the robot; `RobotSession`.
     """
 
     def __init__(
@@ -98,6 +99,7 @@ class Resident:
         tell: Callable[[str], None],
         admit: Callable[[Any, Sequence[str]], None],
         is_running: bool,
+        connect: Callable[..., RobotSession] = RobotSession,
     ) -> None:
         self.options, self.audit = options, audit
         self.state, self.why, self.since = State.WAITING, "it starts", time.time()
@@ -110,7 +112,7 @@ class Resident:
         self._stage = options.stage
         self._chosen: Choice | None = None  # acts as soon as it may
         self.send = send
-        self._tell, self._admit = tell, admit
+        self._tell, self._admit, self._connect = tell, admit, connect
         self._news = threading.Condition()
         self._requests: deque[tuple[Callable[[], dict[str, Any] | None], int]] = deque()
         self._command: Drive | None = None
@@ -377,7 +379,7 @@ class Resident:
         try:
             self._activate()
             checkpoint = Checkpoint.open(self.succession.active.path)
-            self.session = RobotSession(
+            self.session = self._connect(
                 self.options,
                 checkpoint,
                 self._stage,

@@ -28,10 +28,11 @@ CONNECTED_WITHIN = 1.0
 """Age of the robot's newest state at rest from which the link counts as lost [s]."""
 
 
-class _HeldOpen(gym.Wrapper[Any, Any, Any, Any]):
+class HeldOpen(gym.Wrapper[Any, Any, Any, Any]):
     """An environment that the loop cannot close: the end of an episode halts the robot, and keeps the link."""
 
     def close(self) -> None:
+        """Halt the robot."""
         self.unwrapped.robot.halt()  # type: ignore[attr-defined]
 
 
@@ -88,7 +89,7 @@ class RobotSession:
             self.interface = interface_of(self._env)
             self.recorder = self._start_recorder(options, checkpoint) if options.record else None
             self.deployment = Deployment(
-                _HeldOpen(self._env),
+                HeldOpen(self._env),
                 self.policy,
                 Pacer(control_period(self._env)),
                 Journal(0, marks=self.marks),

@@ -178,8 +178,8 @@ class Deployment:
 
     @property
     def latency(self) -> float:
-        """Time from the last deadline to the command that followed it [s]."""
-        return max(0.0, self._watch.begun - self._watch.waited)
+        """Time from a deadline to the step that followed it, in the last tick [s]."""
+        return self._watch.latency
 
     def sent(self, tick: Tick, state: RobotState) -> None:
         """Take a command that a `SafeRobot` has sent, for the recording: `SafeRobot.observe` has one observer only."""
@@ -282,7 +282,8 @@ class _StopAgent(Agent):
         self._switch, self._watch = switch, watch
 
     def forward(self, **kwargs: Any) -> None:
-        self._watch.begun = time.perf_counter()
+        watch, now = self._watch, time.perf_counter()
+        watch.latency, watch.begun = now - watch.waited, now
         self._switch.raise_again()
 
 

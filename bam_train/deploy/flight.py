@@ -46,6 +46,8 @@ class Stopwatch:
     begun = stepped = waited = 0.0
     late = 0.0
     """Delay of the tick after its deadline [s]."""
+    latency = 0.0
+    """Time from the deadline of the tick before to its step [s]."""
 
 
 def flight_recorder(

@@ -15,19 +15,22 @@ import time
 from collections.abc import Callable
 from concurrent.futures import Future
 from concurrent.futures import TimeoutError as NoAnswer
-from pathlib import Path
 from typing import Any
 
 import msgspec
 
 from bam_envs.core.errors import BamEnvsError, LinkLost, NotInCommand, RemoteError
+from bam_envs.live.camera import LiveCamera
 from bam_envs.remote.serve.command_lease import CommandLease
 from bam_envs.remote.serve.robot_service import RobotService
 from bam_envs.ros.codec import AGENT_TOPIC, HALT_TOPIC, RobotInfo
 from bam_envs.rosbridge.bus import UNKNOWN_CALLER, Caller
 from bam_envs.rosbridge.bus import Message as Fields
+from bam_envs.rosbridge.endpoint import Endpoint
 from bam_envs.rosbridge.server import BridgeServer
+from bam_envs.rosbridge.server.site import Site
 from bam_envs.rosbridge.string_rpc import StringRpcService
+from bam_envs.rosbridge.tokens import TokenFile, Tokens
 from bam_train.agent.agent_messages import (
     Answer,
     Ask,
@@ -41,7 +44,11 @@ from bam_train.agent.agent_messages import (
     Sent,
     adopted,
 )
+from bam_train.agent.front.agent_socket import AgentSocket
+from bam_train.agent.front.camera_feed import CameraFeed
+from bam_train.agent.front.hub import AgentHub
 from bam_train.agent.front.remote_robot import RemoteRobot
+from bam_train.agent.front.site_pages import console_pages
 from bam_train.env_location import Place
 from bam_train.environments import make_env
 from bam_train.errors import BamTrainError, RequestRefused
@@ -95,6 +102,10 @@ class AgentLease(CommandLease):
         end = self._cut[2] if self._cut is not None else self._used + self.seconds
         return max(0.0, end - self._now())
 
+    def use(self) -> None:
+        """Begin the time without use anew."""
+        self._used = self._now()
+
     def cut(self, client: str, shown: str) -> None:
         """Keep the lease of a client whose link was cut for `CUT` [s]."""
         self._cut = client, shown, self._now() + CUT
@@ -127,8 +138,6 @@ class FrontProcess:
 
     def __init__(self, options: Front, send: Callable[[Message], None]) -> None:
         self.options, self.send = options, send
-        self.incoming = Path(options.folder) / "incoming"
-        """Folder for uploads."""
         self.status: dict[str, Any] = {"state": "waiting for the robot", "active": None, "owner": None}
         """The last report of the resident."""
         place = Place(
@@ -152,6 +161,8 @@ class FrontProcess:
         self._handing: dict[str, bool | None] = {}  # clients that hand back -> whether the policy goes on
         self.sent: list[float] | None = None
         """The command that was sent last."""
+        self.changed: Callable[[], None] = lambda: None
+        """Called when the status has changed."""
         self._stopped = threading.Event()
 
     # ---- the resident
@@ -181,6 +192,7 @@ class FrontProcess:
         self.status = status
         drivable = state not in ("waiting for the robot", "stopped by a guard")
         self.robot.why_not = "" if drivable else f"the agent is {state}: {status.get('why')}"
+        self.changed()
 
     def ask(
         self,
@@ -225,13 +237,18 @@ class FrontProcess:
     def _on_leave(self, caller: Caller) -> None:
         """A connection ended: if it was the owner's, the robot holds at once, and the lease ends a little later."""
         holder = self.lease.holder
-        if holder is None or holder in self._handing:
+        if holder is None:
             return
-        connected = caller.name == self.lease.connection
-        if connected or caller.client == holder:
-            shown = self.lease.owner or holder
-            self.send(Ask(0, "cut", {"lease": holder}, shown, caller.address))
-            self.lease.cut(holder, shown)
+        if caller.name == self.lease.connection or caller.client == holder:
+            self.cut(holder, caller.address)
+
+    def cut(self, client: str, address: str) -> None:
+        """The link of `client` ended: if it has the lease, the robot holds, and the lease ends a little later."""
+        if self.lease.holder == client and client not in self._handing:
+            shown = self.lease.owner or client
+            self.send(Ask(0, "cut", {"lease": client}, shown, address))
+            self.lease.cut(client, shown)
+            self.lease.release(client)
 
     def _watch_lease(self) -> None:
         """End leases that are over."""
@@ -309,6 +326,12 @@ class FrontProcess:
         if self._service is not None:
             self._service.info = self._info()
 
+    def cameras(self) -> dict[str, LiveCamera]:
+        """The cameras of the robot's profile by name; not connected yet."""
+        options = self.options
+        endpoint = Endpoint.with_token_file(options.robot, ca_file=options.ca_file, token_file=options.robot_token_file)
+        return {one.name: LiveCamera(endpoint, one) for one in self.shadow.profile.cameras}
+
     def _on_halt(self, message: Fields, caller: Caller) -> None:
         """Stop the policy; the halt of whoever drives, or has just handed back, over another connection does not."""
         if self.lease.owner is None and time.monotonic() - self._ended_at > _HALT_LATE:
@@ -325,17 +348,27 @@ def main() -> None:
     channel = Channel(end, lambda message: receivers[0](message), lambda: front.stop())
     try:
         front = FrontProcess(options, channel.send)
-        server = BridgeServer(options.bind, options.port, cert=options.cert, key=options.key)
+        hub = AgentHub(front, by_force=options.token_file is not None)
+        console = AgentSocket(hub)
+        pictures = CameraFeed(front.cameras())
+        site = Site(console_pages(), {**console.sockets, "/camera": pictures.serve})
+        tokens = Tokens(otherwise="administer") if options.token_file is None else TokenFile(options.token_file)
+        where: Any = {"cert": options.cert, "key": options.key, "tokens": tokens, "site": site}
+        server = BridgeServer(options.bind, options.port, **where)
         server.start()
     except (BamEnvsError, BamTrainError) as error:
         end.send(msgspec.msgpack.encode(Listening(error=str(error))))
         return
     receivers.append(front.take)
     channel.start()
+    hub.start()
     try:
         front.serve(server)
     finally:
+        hub.close()
         server.close()
+        console.close()
+        pictures.close()
 
 
 if __name__ == "__main__":
