@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from bam_envs.core.registry import ENVIRONMENTS
+from bam_envs.core.registry import ENVIRONMENTS, resolve
 from bam_envs.robots.physics.domain_randomization import Ranges
 from bam_envs.tasks import (
     isaac_reach,
@@ -38,6 +38,8 @@ FLAGS_OF = {
     "bam-replay": "recording.md",
     "bam-serve": "remote.md",
     "bam-sign": "signing.md",
+    "bam-agent": "live-agent.md",
+    "bam-push": "live-agent.md",
 }
 EXAMPLES = {"PYTHONPATH": os.pathsep.join([str(ROOT), str(ROOT / "envs")]), "OMP_NUM_THREADS": "1"}
 
@@ -213,6 +215,17 @@ def test_commands_exist(page):
             assert (ROOT / words[1]).exists() or f"`{words[1]}`" in page.read_text()
         else:
             assert words[0] in {*PROGRAMS, "pip", "pytest", "python3", "ray", "ros2", "source"}
+
+
+def test_the_workflow_for_ci_has_commands_that_exist():
+    yaml = pytest.importorskip("yaml")
+    steps = yaml.safe_load((ROOT / "docs" / "live-agent-ci.yml").read_text())["jobs"]["deploy"]["steps"]
+    lines = [line for step in steps for line in step.get("run", "").replace("\\\n", "").splitlines() if "bam-" in line]
+    programs = [re.split(r"[ |]", line.strip())[0] for line in lines if line.strip().startswith("bam-")]
+    assert programs == ["bam-eval", "bam-sign", "bam-push"]
+    config = resolve("bam_train.cli.live.agent_flags:PushConfig")
+    given = re.findall(r"--([a-z-]+)", lines[-1])
+    assert set(given) <= {name.replace("_", "-") for name in config.__dataclass_fields__}
 
 
 TRAINING = [words for page in PAGES for words in commands(page) if words[0] == "bam-train" and "--resume" not in words]

@@ -70,11 +70,13 @@ def test_console_scripts(wheel):
     name = next(name for name in wheel.namelist() if name.endswith("entry_points.txt"))
     lines = sorted(line for line in wheel.read(name).decode().splitlines() if " = " in line)
     assert lines == [
+        "bam-agent = bam_train.cli.live.live_agent:main",
         "bam-deploy = bam_train.cli.deploy:main",
         "bam-doctor = bam_train.cli.live.doctor:main",
         "bam-envs = bam_train.cli.envs:main",
         "bam-eval = bam_train.cli.eval:main",
         "bam-export = bam_train.cli.export:main",
+        "bam-push = bam_train.cli.live.push:main",
         "bam-replay = bam_train.cli.live.replay:main",
         "bam-serve = bam_train.cli.serve:main",
         "bam-sign = bam_train.cli.sign:main",

@@ -122,6 +122,8 @@ def parse(
         arguments: Instead of those of the process.
         description: The docstring of a script; of a program it is that of `config`.
     """
+    from inspect import cleandoc
+
     import tyro
 
     remedy = f"Run {prog if description is None else f'python {sys.argv[0]}'} --help"
@@ -130,7 +132,11 @@ def parse(
     try:
         with contextlib.redirect_stderr(box):
             parsed = tyro.cli(
-                config, prog=prog, description=description or config.__doc__, args=arguments, config=no_pairs
+                config,
+                prog=prog,
+                description=description or cleandoc(config.__doc__ or ""),
+                args=arguments,
+                config=no_pairs,
             )
     except SystemExit as stop:
         if stop.code:

@@ -1,0 +1,67 @@
+"""The flags of the programs around a live agent; see `bam_train.cli.flags`."""
+
+from dataclasses import dataclass
+from typing import Annotated, Literal
+
+import tyro
+
+from bam_train.cli.flags import File, Positive
+
+Seconds = Annotated[Positive, tyro.conf.arg(metavar="S")]
+
+
+@dataclass(frozen=True)
+class AskConfig:
+    """Ask a live agent on a robot's computer for its state, to pause, to resume, for its versions, or to stop.
+
+    Exit status: 0 done, 1 the agent cannot be reached, or failed, 2 wrong usage, 3 the agent refuses.
+    """
+
+    action: tyro.conf.Positional[Literal["status", "pause", "resume", "versions", "stop"]]
+    """What to ask for; stop halts the robot at once, and pauses the agent."""
+    url: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="URL")]
+    """Address of the agent, such as ws://robot:9095 (wss:// with TLS)."""
+    token_file: File = None
+    """File with one token of the agent: status, versions and stop need the role watch, the others drive."""
+    ca_file: File = None
+    """Certificates that wss:// trusts instead of the system's."""
+    why: str = ""
+    """The reason, for the agent's audit file and for other people."""
+    timeout: Seconds = 10.0
+    """Longest time to connect, and to wait for the answer [s]."""
+    json: bool = False
+    """Print one JSON object on standard output, with at least state, active (a digest) and owner."""
+
+
+@dataclass(frozen=True)
+class PushConfig:
+    """Push a checkpoint to a live agent: it is checked there, and acts as the candidate; or roll back.
+
+    bam-push CHECKPOINT URL, or bam-push --rollback URL. Exit status: 0 done, 1 the agent cannot be reached, or failed,
+    2 wrong usage, 3 the agent refuses the candidate or the request, 5 with --wait: the candidate was rolled back, or
+    replaced before its trials were done.
+    """
+
+    checkpoint: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="CHECKPOINT")]
+    """The checkpoint.zip that bam-train wrote, signed for a real robot; left out with --rollback."""
+    url: Annotated[tyro.conf.Positional[str | None], tyro.conf.arg(metavar="URL", help_behavior_hint="")] = None
+    """Address of the agent, such as ws://robot:9095 (wss:// with TLS)."""
+    token_file: File = None
+    """File with one token of the agent, of the role administer."""
+    ca_file: File = None
+    """Certificates that wss:// trusts instead of the system's."""
+    stage: Literal["auto", "trial", "full"] = "auto"
+    """trial: it acts as the candidate until its trials decide, at trial speed on a real robot; full: it is the champion
+    at once, on a real robot only after enough trials; auto: as trial, at full speed on a simulated robot."""
+    when: Literal["tick", "episode"] = "episode"
+    """When it begins to act: at the next tick, or with the next episode."""
+    wait: bool = False
+    """Return when the trials have ended: the candidate was promoted, rolled back or replaced."""
+    rollback: bool = False
+    """Go back: from a candidate to the champion, from the champion to the version before it."""
+    why: str = ""
+    """The reason, for the agent's audit file and for other people."""
+    timeout: Seconds = 10.0
+    """Longest time to connect, and to wait for a first answer [s]."""
+    json: bool = False
+    """Print one JSON object on standard output, with at least state, active (a digest) and owner."""

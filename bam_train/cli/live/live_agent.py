@@ -1,0 +1,107 @@
+"""`bam-agent`, a live agent on a robot's computer; `bam-agent status|pause|resume|versions|stop URL` asks one."""
+
+from __future__ import annotations
+
+import json as json_module
+import sys
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+from bam_train.cli.console import duration, tell
+from bam_train.cli.program import run_program
+from bam_train.signals import SignalMemory
+
+if TYPE_CHECKING:
+    from bam_train.agent.remote.agent_client import AgentClient
+    from bam_train.cli.flags import AgentConfig
+    from bam_train.cli.live.agent_flags import AskConfig, PushConfig
+
+SHORT = 12
+"""Digits of a digest that people see."""
+
+
+def ask_agent(config: AskConfig, signals: SignalMemory) -> None:
+    """Run the program with its parsed flags."""
+
+    def ask(agent: AgentClient) -> dict[str, Any]:
+        given: dict[str, Any] = {"why": config.why} if config.action in ("pause", "resume", "stop") else {}
+        result: dict[str, Any] = agent.ask(config.action, **given)
+        return result if config.action == "status" else {**agent.ask("status"), **result}
+
+    found = with_agent(config, config.url, ask)
+    if not config.json:
+        tell(*(_versions(found) if config.action == "versions" else status_lines(found)))
+
+
+def with_agent(config: AskConfig | PushConfig, url: str, do: Callable[[AgentClient], dict[str, Any]]) -> dict[str, Any]:
+    """Call `do` with a connected client; with --json, print its result, or the error, as one JSON object."""
+    from bam_envs.core.errors import BamEnvsError
+    from bam_train.agent.remote.agent_client import AgentClient
+    from bam_train.errors import AgentRefused, BamTrainError
+
+    nothing = {"state": None, "active": None, "owner": None}
+    try:
+        files: dict[str, Any] = {"token_file": config.token_file, "ca_file": config.ca_file}
+        with AgentClient(url, timeout=config.timeout, **files) as agent:
+            result = {**nothing, **do(agent)}
+    except (BamTrainError, BamEnvsError) as error:
+        if config.json:
+            kind = error.kind if isinstance(error, AgentRefused) else type(error).__name__
+            tell(json_module.dumps({**nothing, "error": str(error), "kind": kind}))
+        raise
+    if config.json:
+        tell(json_module.dumps(result))
+    return result
+
+
+def status_lines(status: Mapping[str, Any]) -> Iterator[str]:
+    """What a live agent does, for people."""
+    get = status.get
+    since = f" for {duration(max(0.0, time.time() - get('since', 0.0)))}" if get("since") else ""
+    why = f": {get('why')}" if get("why") else ""
+    yield f"{get('state')}{since}{why}"
+    if active := get("active"):
+        names = ", ".join(name for name, digest in (get("names") or {}).items() if digest == active)
+        yield f"  policy    {active[:SHORT]}{f' ({names})' if names else ''}, stage {get('stage') or '-'}"
+    if get("robot"):
+        yield f"  robot     {get('robot')}"
+    if owner := get("owner"):
+        left = get("owner_until")
+        yield f"  owner     {owner}{'' if left is None else f', {left:.0f} s left'}"
+    if get("episodes") is not None:
+        recent = [one for one in get("recent") or () if one is not None]
+        yield f"  episodes  {get('episodes')}, {get('successes')} succeeded; of the last {len(recent)}: {sum(recent)}"
+    if get("ticks") is not None:
+        yield f"  ticks     {get('ticks')}, {get('late')} late; link {get('link_ms')} ms, policy {get('loop_ms')} ms"
+    for name, guard in (get("guards") or {}).items():
+        did = [f"{did} {guard[did]}" for did in ("altered", "held", "stopped") if guard.get(did)]
+        if did:
+            yield f"  guard     {name}: {', '.join(did)}"
+    yield from (f"  warning   {text}" for text in get("warnings") or ())
+
+
+def _versions(found: Mapping[str, Any]) -> Iterator[str]:
+    for one in found.get("versions", ()):
+        added = time.strftime("%Y-%m-%d %H:%M", time.localtime(one["added"]))
+        acts = " (acts)" if one["digest"] == found["active"] else ""
+        facts = one["digest"][:SHORT], added, one["env"], one["algorithm"], ", ".join(one["names"]) + acts
+        yield "  ".join(facts).rstrip()
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Ask a live agent if the first argument is an action and no flag; else be one."""
+    given = sys.argv[1:] if arguments is None else [*arguments]
+    if given and not given[0].startswith("-"):
+        run_program("bam-agent", "bam_train.cli.live.agent_flags:AskConfig", ask_agent, given)
+    run_program("bam-agent", "bam_train.cli.flags:AgentConfig", _run_agent, given)
+
+
+def _run_agent(config: AgentConfig, signals: SignalMemory) -> int:
+    from bam_train.cli.live.run_agent import run_agent
+
+    return run_agent(config, signals)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,74 @@
+"""`bam-push CHECKPOINT URL`: a new candidate for a live agent; `bam-push --rollback URL`: back to the one before."""
+
+from __future__ import annotations
+
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from bam_train.cli.console import say, tell
+from bam_train.cli.live.live_agent import SHORT, status_lines, with_agent
+from bam_train.cli.program import run_program
+from bam_train.signals import SignalMemory
+
+if TYPE_CHECKING:
+    from bam_train.agent.remote.agent_client import AgentClient
+    from bam_train.cli.live.agent_flags import PushConfig
+
+ROLLED_BACK = 5
+"""Exit status when the candidate was rolled back, or replaced before its trials were done."""
+
+
+def push(config: PushConfig, signals: SignalMemory) -> int:
+    """Run the program with its parsed flags; returns the exit status."""
+    path, url = _arguments(config)
+
+    def do(agent: AgentClient) -> dict[str, Any]:
+        if path is None:
+            return {**agent.ask("rollback", why=config.why), **agent.ask("status")}
+        return agent.push(
+            path, stage=config.stage, when=config.when, wait=config.wait, why=config.why, progress=_progress
+        )
+
+    result = with_agent(config, url, do)
+    outcome = str(result.get("outcome") or "")
+    if not config.json:
+        digest = result.get("digest")
+        tell(
+            *([] if digest is None else [f"{digest[:SHORT]}: {outcome or 'accepted'}"]),
+            *(f"  {line}" for line in result.get("lines") or ()),
+            *status_lines(result),
+        )
+    if config.wait and outcome and not outcome.startswith("promoted"):
+        say(f"bam-push: {outcome}")
+        return ROLLED_BACK
+    return 0
+
+
+def _arguments(config: PushConfig) -> tuple[Path | None, str]:
+    """The checkpoint, None for a roll-back, and the address."""
+    first, url = config.checkpoint, config.url
+    if config.rollback:
+        if url is not None:
+            raise _misused("--rollback takes no CHECKPOINT: bam-push --rollback URL")
+        if config.wait:
+            raise _misused("--rollback has nothing to wait for; leave --wait out")
+        return None, first
+    if url is None:
+        raise _misused(f"{'CHECKPOINT' if '://' in first else 'URL'} is missing: bam-push CHECKPOINT URL")
+    return Path(first).expanduser(), url
+
+
+def _misused(text: str) -> SystemExit:
+    say(f"bam-push: {text}. Run bam-push --help")
+    return SystemExit(2)
+
+
+def _progress(text: str) -> None:
+    say(f"bam-push: {text}")
+
+
+main = partial(run_program, "bam-push", "bam_train.cli.live.agent_flags:PushConfig", push)
+
+if __name__ == "__main__":
+    main()

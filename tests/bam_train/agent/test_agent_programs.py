@@ -1,0 +1,199 @@
+"""`bam-push`, and what `bam-agent` asks, against a real port with a fake agent behind it."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from bam_train.cli.live import live_agent as agent
+from bam_train.cli.live import push
+from bam_train.errors import RequestRefused
+
+DIGEST = "3f2a91c0d7aa" + 52 * "0"
+STATUS = {
+    "state": "trial",
+    "why": "push by anna@laptop",
+    "since": 1.0,
+    "active": DIGEST,
+    "names": {"champion": 64 * "1", "candidate": DIGEST},
+    "owner": None,
+    "owner_until": None,
+    "stage": "trial",
+    "robot": "ur5e, served in real time",
+    "ticks": 1200,
+    "late": 3,
+    "link_ms": 1.25,
+    "loop_ms": 0.5,
+    "episodes": 22,
+    "successes": 20,
+    "recent": [1, 0, None, 1],
+    "guards": {"G8 joint speed": {"altered": 2, "held": 0, "stopped": 1}, "G1 position": {"altered": 0}},
+    "warnings": ["the link is slow"],
+}
+LINES = [
+    "trial for ",
+    "  policy    3f2a91c0d7aa (candidate), stage trial",
+    "  robot     ur5e, served in real time",
+    "  episodes  22, 20 succeeded; of the last 3: 2",
+    "  ticks     1200, 3 late; link 1.25 ms, policy 0.5 ms",
+    "  guard     G8 joint speed: altered 2, stopped 1",
+    "  warning   the link is slow",
+]
+
+
+@pytest.fixture
+def hub(hub):
+    """The fake hub with answers of a live agent."""
+    hub.outcome = ""
+
+    def ask(op, arguments, person, progress):
+        hub.asked.append((op, arguments, person))
+        if op == "resume":
+            raise RequestRefused("The robot was stopped by a guard; pause first.")
+        if op == "versions":
+            one = {"digest": DIGEST, "names": ["candidate"], "added": 0.0, "env": "bam/pick-v0", "algorithm": "ppo"}
+            return {"versions": [one]}
+        if op == "push":
+            progress("checking")
+            return {**STATUS, "digest": DIGEST, "lines": ["signed by alice"], "outcome": hub.outcome}
+        return dict(STATUS) if op == "status" else {}
+
+    hub.ask = ask
+    return hub
+
+
+@pytest.fixture
+def run(capsys, tmp_path, server):
+    """Run a program with the token of a role: exit status, standard output and error."""
+
+    def run(main, *arguments, token="a"):
+        path = tmp_path / f"token-{token}"
+        path.write_text(token)
+        with pytest.raises(SystemExit) as done:
+            main([*map(str, arguments), "--token-file", str(path)])
+        return done.value.code or 0, *capsys.readouterr()
+
+    return run
+
+
+@pytest.fixture
+def checkpoint(tmp_path):
+    path = tmp_path / "pick.zip"
+    path.write_bytes(b"a checkpoint")
+    return path
+
+
+def test_status(hub, server, run):
+    status, out, _ = run(agent.main, "status", server.url, token="w")
+    lines = out.splitlines()
+    assert status == 0
+    assert lines[0].startswith(LINES[0])
+    assert lines[0].endswith(": push by anna@laptop")
+    assert lines[1:] == LINES[1:]
+    status, out, _ = run(agent.main, "status", server.url, "--json", token="w")
+    assert (status, json.loads(out)) == (0, STATUS)
+
+
+def test_pause_and_stop(hub, server, run):
+    status, out, _ = run(agent.main, "pause", server.url, "--why", "lunch", "--json", token="d")
+    assert (status, json.loads(out)) == (0, STATUS)
+    assert [(op, arguments) for op, arguments, _ in hub.asked] == [("pause", {"why": "lunch"}), ("status", {})]
+    assert run(agent.main, "stop", server.url, token="w")[0] == 0
+    assert len(hub.stops) == 1
+
+
+def test_versions(hub, server, run):
+    status, out, _ = run(agent.main, "versions", server.url)
+    assert status == 0
+    assert out.startswith("3f2a91c0d7aa  19")
+    assert out.endswith("  bam/pick-v0  ppo  candidate (acts)\n")
+    found = json.loads(run(agent.main, "versions", server.url, "--json")[1])
+    assert (found["state"], found["active"], found["owner"]) == ("trial", DIGEST, None)
+    assert [one["digest"] for one in found["versions"]] == [DIGEST]
+
+
+def test_a_refusal_has_status_3(hub, server, run):
+    text = "The robot was stopped by a guard; pause first."
+    assert run(agent.main, "resume", server.url) == (3, "", f"bam-agent: {text}\n")
+    status, out, _ = run(agent.main, "resume", server.url, "--json")
+    nothing = {"state": None, "active": None, "owner": None}
+    assert (status, json.loads(out)) == (3, {**nothing, "error": text, "kind": "RequestRefused"})
+    text = "resume needs a token of the role drive; the token shown has the role watch."
+    assert run(agent.main, "resume", server.url, token="w") == (3, "", f"bam-agent: {text}\n")
+
+
+def test_no_agent_has_status_1(server, run):
+    text = "the token was refused (HTTP 401). Give the server's token (--token-file)."
+    assert run(agent.main, "status", server.url, token="x") == (1, "", f"bam-agent: {server.url}: {text}\n")
+    url = "ws://127.0.0.1:1"
+    text = "refused: nothing listens there. Does bam-agent run there, with this port?"
+    assert run(agent.main, "status", url) == (1, "", f"bam-agent: {url}: {text}\n")
+
+
+def test_push(hub, server, run, checkpoint):
+    given = ("--stage", "trial", "--when", "tick", "--why", "better")
+    status, out, err = run(push.main, checkpoint, server.url, *given)
+    assert (status, err) == (0, "bam-push: checking\n")
+    lines = out.splitlines()
+    assert lines[:2] == ["3f2a91c0d7aa: accepted", "  signed by alice"]
+    assert lines[3:] == LINES[1:]
+    arguments = dict(hub.asked[0][1])
+    assert not Path(arguments.pop("path")).exists()
+    del arguments["sha256"]
+    assert arguments == {
+        "size": 12,
+        "stage": "trial",
+        "when": "tick",
+        "wait": False,
+        "file": "pick.zip",
+        "why": "better",
+    }
+    status, out, _ = run(push.main, checkpoint, server.url, "--json")
+    assert (status, json.loads(out)["active"]) == (0, DIGEST)
+
+
+@pytest.mark.parametrize(
+    ("outcome", "status"),
+    [("promoted: 30 of 30", 0), ("rolled back: a guard stopped it twice", 5), ("replaced: another version acts", 5)],
+)
+def test_push_that_waits(hub, server, run, checkpoint, outcome, status):
+    hub.outcome = outcome
+    code, out, err = run(push.main, checkpoint, server.url, "--wait")
+    assert (code, out.splitlines()[0]) == (status, f"3f2a91c0d7aa: {outcome}")
+    assert err.splitlines()[1:] == ([f"bam-push: {outcome}"] if status else [])
+    assert hub.asked[0][1]["wait"] is True
+
+
+def test_roll_back(hub, server, run):
+    assert run(push.main, "--rollback", server.url, "--why", "it drops the cube")[0] == 0
+    assert hub.asked[0][:2] == ("rollback", {"why": "it drops the cube"})
+    text = "rollback needs a token of the role administer; the token shown has the role drive."
+    assert run(push.main, server.url, "--rollback", token="d") == (3, "", f"bam-push: {text}\n")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "text"),
+    [
+        (["ws://robot:9095"], "CHECKPOINT is missing: bam-push CHECKPOINT URL"),
+        (["pick.zip"], "URL is missing: bam-push CHECKPOINT URL"),
+        (["--rollback", "pick.zip", "ws://robot"], "--rollback takes no CHECKPOINT: bam-push --rollback URL"),
+        (["--rollback", "ws://robot", "--wait"], "--rollback has nothing to wait for; leave --wait out"),
+    ],
+)
+def test_wrong_usage_has_status_2(run, arguments, text):
+    assert run(push.main, *arguments) == (2, "", f"bam-push: {text}. Run bam-push --help\n")
+
+
+def test_an_unknown_action_has_status_2(run):
+    text = "action: expected pause, resume, status, stop or versions, found 'halt'"
+    assert run(agent.main, "halt", "ws://robot") == (2, "", f"bam-agent: {text}. Run bam-agent --help\n")
+
+
+def test_help_names_the_exit_statuses(capsys):
+    for main, arguments, last in ((push.main, [], "5 with --wait: "), (agent.main, ["stop"], "3 the agent refuses.")):
+        with pytest.raises(SystemExit) as done:
+            main([*arguments, "--help"])
+        assert done.value.code == 0
+        out = capsys.readouterr().out
+        assert "Exit status: 0 done, " in out
+        assert last in out
