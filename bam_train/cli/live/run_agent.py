@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import logging
+import os
 from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import replace
 from functools import partial
+from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -55,6 +57,9 @@ def run_agent(config: AgentConfig, signals: SignalMemory) -> int:
             options = replace(options, robot=box.url)
         audit = Audit(options.folder / "audit.jsonl")
         stack.callback(audit.close)
+        begun = f"bam-agent {version('bam-train')} (process {os.getpid()}) at {options.robot}"
+        audit.write("started", begun, who="the agent", digest=active.digest)
+        stack.callback(audit.write, "ended", f"process {os.getpid()}", who="the agent")
         resident: Resident
         front = FrontLink(
             _front(options, env_id, env_kwargs),

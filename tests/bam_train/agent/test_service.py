@@ -4,14 +4,22 @@ import os
 import re
 import shlex
 import shutil
+import signal
 import subprocess
+import sys
+import time
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import pytest
 
 import bam_train.agent
+from bam_envs.core.errors import BamEnvsError
+from bam_train.agent.audit import tail
+from bam_train.agent.remote.agent_client import AgentClient
 from bam_train.cli.flags import AgentConfig
 from bam_train.cli.program import parse
+from bam_train.errors import BamTrainError
 
 UNIT = Path(bam_train.agent.__file__).with_name("bam-agent.service")
 PROGRAM = "/opt/bam-train/bin/bam-agent"
@@ -68,3 +76,52 @@ def test_it_starts_paused_on_this_computer_only_and_always_again():
     assert (config.paused, config.yes, config.allow_unsigned, config.stage) == (True, True, False, None)
     names = ("Restart", "NoNewPrivileges", "ProtectSystem", "PrivateTmp", "User")
     assert [found[name] for name in names] == ["always", "yes", "strict", "yes", "bam-agent"]
+
+
+# The program, with a simulated robot
+
+
+@contextmanager
+def service(folder, *flags):
+    """The process of ``bam-agent``, and the address that it listens on."""
+    checkpoint = Path(__file__).parents[3] / "checkpoints" / "pick-ppo.zip"
+    command = ["bam_train.cli.live.live_agent", "--policy", checkpoint, "--port", "0", "--folder", folder, "--yes"]
+    command = [sys.executable, "-m", *map(str, command), "--no-record", *flags]
+    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
+        try:
+            line = next(line for line in process.stderr if "listens on" in line)
+            yield process, re.search(r"ws://127\.0\.0\.1:\d+", line)[0]
+        finally:
+            process.kill()
+
+
+def state(url, *expected):
+    """The status, once the agent is in one of these states."""
+    end = time.monotonic() + 60
+    while time.monotonic() < end:
+        with suppress(BamTrainError, BamEnvsError), AgentClient(url) as agent:
+            status = agent.ask("status")
+            if status["state"] in expected:
+                return status
+        time.sleep(0.05)
+    raise AssertionError(f"not {expected} within 60 s")
+
+
+@pytest.mark.slow
+def test_an_agent_that_was_killed_starts_paused_and_is_written_down(tmp_path):
+    folder = tmp_path / "agent"
+    with service(folder) as (process, url):
+        state(url, "running")
+        process.kill()
+    with service(folder) as (process, url):
+        assert state(url, "paused")["why"] == "the robot is there"
+        process.send_signal(signal.SIGTERM)
+        assert process.wait(60) == 143
+    events = [event for event in tail(folder / "audit.jsonl") if event["what"] in ("started", "ended", "state")]
+    assert [(event["what"], event.get("to")) for event in events] == [
+        ("started", None),
+        ("state", "running"),
+        ("started", None),
+        ("state", "paused"),
+        ("ended", None),
+    ]
