@@ -1,7 +1,6 @@
 // The socket of the agent: the token first, requests with answers, events; opened again whenever it closes.
 
 const QUIET = 3000; // time without a message after which the connection counts as lost [ms]
-const PATIENCE = 400; // time in which a server that wants a token says so [ms]
 const REFUSED = 1008; // close code for a client without a right token
 const ASKED = "This robot asks for a token.";
 
@@ -27,9 +26,6 @@ export class Connection {
     this.socket = socket;
     socket.binaryType = "arraybuffer";
     this.heard = performance.now();
-    socket.onopen = () => {
-      this.timer = setTimeout(() => this.begin(), (this.wantsToken ? 5 : 1) * PATIENCE);
-    };
     socket.onmessage = (message) => this.take(message.data);
     socket.onclose = (end) => {
       if (socket === this.socket) this.close(end.code, end.reason);
@@ -44,16 +40,15 @@ export class Connection {
     }
     const message = JSON.parse(data);
     if (message.event === "auth") {
-      clearTimeout(this.timer);
       this.wantsToken = true;
       const token = sessionStorage.getItem("token");
       if (token) this.show(token);
       else this.on.token(ASKED);
       return;
     }
+    if (!this.ready) this.begin();
     const waiting = this.waiting.get(message.id);
     if (waiting === undefined) {
-      if (!this.ready) this.begin();
       this.on.event(message);
     } else if (message.progress === undefined) {
       this.waiting.delete(message.id);
@@ -62,8 +57,8 @@ export class Connection {
     }
   }
 
+  // The server has let this page in: it says hello.
   begin() {
-    clearTimeout(this.timer);
     this.ready = true;
     this.delay = 250;
     this.on.open();
@@ -77,8 +72,8 @@ export class Connection {
 
   show(token) {
     this.shown = true;
+    this.heard = performance.now();
     this.socket.send(JSON.stringify({ op: "auth", token }));
-    this.begin();
   }
 
   // Open it again if it closed for want of a token, which is there now.
@@ -87,7 +82,6 @@ export class Connection {
   }
 
   close(code, reason) {
-    clearTimeout(this.timer);
     this.ready = false;
     for (const { reject } of this.waiting.values()) reject(new Error("The connection closed before the answer."));
     this.waiting.clear();
@@ -105,7 +99,7 @@ export class Connection {
 
   look() {
     if (this.socket.readyState > WebSocket.OPEN || performance.now() - this.heard < QUIET) return;
-    if (this.wantsToken && !this.ready) return; // a person types
+    if (this.wantsToken && !this.shown) return; // a person types
     const socket = this.socket;
     this.socket = { readyState: WebSocket.CLOSED };
     socket.close();

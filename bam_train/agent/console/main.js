@@ -13,6 +13,7 @@ const LOOK = 2000; // time between two looks at versions and log [ms]
 
 let status = { state: "not connected" };
 let telemetry = null;
+let role = "watch"; // what this page's token may do
 let owner = null; // how the status calls this page while it drives; "" until it says so; null: it does not drive
 let cameras = null;
 
@@ -65,7 +66,9 @@ byId("entry").onsubmit = (submit) => {
 };
 
 function event(message) {
-  if (message.event === "status") {
+  if (message.event === "hello") {
+    role = message.role;
+  } else if (message.event === "status") {
     const before = status;
     status = message.status;
     if (owner === "" && status.state === "taken over") owner = status.owner;
@@ -77,6 +80,8 @@ function event(message) {
     telemetry = message;
     plots.add(message);
     requestAnimationFrame(draw);
+  } else if (message.ok === false) {
+    fault(message.error); // of a twist
   }
 }
 
@@ -92,7 +97,7 @@ function draw() {
 function look() {
   if (!connection.ready || document.visibilityState !== "visible") return;
   connection.request("versions").then(({ versions }) => showVersions(versions, status)).catch(() => {});
-  connection.request("audit").then((result) => showAudit(result.lines ?? result.audit ?? [])).catch(() => {});
+  connection.request("audit").then((result) => showAudit(result.lines)).catch(() => {});
 }
 setInterval(look, LOOK);
 
@@ -183,14 +188,14 @@ function ask(text) {
 }
 
 function enable() {
-  const { state } = status, here = state !== "not connected", mine = owner !== null;
+  const { state } = status, mine = owner !== null, here = state !== "not connected" && role !== "watch";
   const may = {
     "pause": here && (state === "running" || state === "trial" || mine || state === "stopped by a guard"),
     "resume": here && !mine && (state === "paused" || state === "stopped by a guard"),
     "take": here && !mine && !["waiting for the robot", "stopped by a guard"].includes(state),
     "back-run": mine,
     "back-pause": mine,
-    "roll-back": here && Boolean(status.names?.previous),
+    "roll-back": here && role === "administer" && Boolean(status.names?.previous),
   };
   for (const [id, enabled] of Object.entries(may)) byId(id).disabled = !enabled;
 }

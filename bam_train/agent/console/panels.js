@@ -31,8 +31,8 @@ export function showStatus(status, mine) {
   say("robot", status.robot || "Robot console");
   say("state", `${ICONS[status.state] ?? "○"} ${status.state}`);
   say("why", status.why ? `${status.why}` : "");
-  const until = status.owner_until == null ? "" : `, ${status.owner_until.toFixed(0)} s left`;
-  say("owner", mine ? "You drive." : status.owner ? `Driven by ${status.owner}${until}` : "");
+  const until = status.owner_until == null ? "" : `; the lease ends in ${status.owner_until.toFixed(0)} s unless it is used`;
+  say("owner", mine ? `You drive${until}.` : status.owner ? `${status.owner} drives${until}.` : "");
   document.title = `${status.state} - robot console`;
   showRun(status);
   showGuardTable(status.guards ?? {});
@@ -115,10 +115,13 @@ export function showVersions(versions, status) {
   rows(byId("versions"), ["", "names", "digest", "added", "environment", "algorithm"], lines);
 }
 
-const time = (value) => (typeof value === "number" ? new Date(1000 * value).toLocaleString() : (value ?? "-"));
+const time = (value) => {
+  const date = new Date(typeof value === "number" ? 1000 * value : value);
+  return Number.isNaN(date.getTime()) ? "-" : date.toLocaleString();
+};
 
 export function showAudit(lines) {
-  const text = (line) =>
-    typeof line === "string" ? line : `${time(line.time ?? line.t)}  ${line.text ?? line.what}  (${[line.who, line.where ?? line.address].filter(Boolean).join(" at ")})`;
-  byId("audit").replaceChildren(...[...lines].reverse().slice(0, 50).map((line) => element("li", text(line))));
+  const from = ({ who, where }) => (where ? `${who} at ${where}` : who);
+  const text = (line) => `${time(line.time)}  ${line.text} (${from(line)})`;
+  byId("audit").replaceChildren(...[...lines].reverse().map((line) => element("li", text(line))));
 }

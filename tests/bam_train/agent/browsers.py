@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 FLAGS = ("--headless=new", "--no-sandbox", "--disable-gpu", "--disable-dev-shm-usage", "--window-size=1200,900")
-DEADLINE = 20.0
+DEADLINE = 30.0
 
 
 def new_browser():

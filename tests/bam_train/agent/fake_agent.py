@@ -1,21 +1,26 @@
 """A live agent for tests of the console: its port, pages and agent socket, with an arm that does as it is told."""
 
-import asyncio
-import json
+import itertools
+import tempfile
 import threading
 import time
+from pathlib import Path
 
 import numpy as np
 
+from bam_envs.core.errors import NotInCommand
 from bam_envs.core.robot import RobotState
 from bam_envs.robots.ur5e import arm_spec
 from bam_envs.rosbridge.server import BridgeServer, Site
+from bam_envs.rosbridge.tokens import Tokens
 from bam_envs.safety.guard import Limits
 from bam_envs.testing import ARM_HOME
+from bam_train.agent.front.agent_socket import AgentSocket
 from bam_train.agent.front.camera_feed import CameraFeed
 from bam_train.agent.front.jog import Jogger
 from bam_train.agent.front.site_pages import console_pages
 from bam_train.agent.front.telemetry import Telemetry
+from bam_train.errors import RequestRefused
 
 SPEC = arm_spec("ur5e", with_object=False)
 GUARDS = {
@@ -49,9 +54,18 @@ VERSIONS = [
     {"digest": "b" * 64, "names": ["previous"], "added": 1.7e9, "env": "bam/pick-v0", "algorithm": "ppo"},
 ]
 
+AUDIT = {
+    "time": "2026-01-01T12:00:00.000000+00:00",
+    "monotonic": 1.0,
+    "what": "state",
+    "text": "running -> paused: paused by anna",
+    "who": "anna",
+    "where": "10.0.0.7:4242",
+}
+
 
 class FakeAgent:
-    """Answers the agent socket.
+    """The hub of an agent socket.
 
     With their times [s, monotonic]: `orders`, the requests that change something; `twists` that were taken;
     `commands` that moved the arm.
@@ -59,32 +73,40 @@ class FakeAgent:
 
     def __init__(self, tokens=None, cameras=None, port=0):
         self.feed = CameraFeed(cameras or {})
-        site = Site(console_pages(), {"/agent": self.serve, "/camera": self.feed.serve})
-        self.server = BridgeServer(port=port, tokens=tokens, site=site)
+        self._folder = tempfile.TemporaryDirectory()
+        self.incoming = Path(self._folder.name)
+        self._socket = AgentSocket(self)
+        site = Site(console_pages(), {**self._socket.sockets, "/camera": self.feed.serve})
+        self.server = BridgeServer(port=port, tokens=tokens or Tokens(otherwise="administer"), site=site)
         self.jogger = Jogger(SPEC, SPEC.period)
         self.telemetry = Telemetry(SPEC, Limits())
         self.joints = np.array([[*ARM_HOME, 0.085]])
         self.state, self.owner, self.active = "running", None, "a" * 64
         self.orders, self.commands, self.twists = [], [], []
+        self.refusal = ""  # the answer to every request but a stop
         self.driver = None  # the socket that has taken over
+        self._listeners = {}
         self._stopped = threading.Event()
 
     def __enter__(self):
         self.server.start()
-        threading.Thread(target=self._drive, daemon=True).start()
+        for run in (self._drive, self._show):
+            threading.Thread(target=run, daemon=True).start()
         return self
 
     def __exit__(self, *error):
         self._stopped.set()
         self.server.close()
         self.feed.close()
+        self._socket.close()
+        self._folder.cleanup()
 
     @property
     def url(self):
         return self.server.url.replace("ws", "http", 1)
 
     def did(self, op):
-        return [at for name, at, _ in self.orders if name == op]
+        return [at for name, at, *_ in self.orders if name == op]
 
     @property
     def moves(self):
@@ -113,59 +135,68 @@ class FakeAgent:
                 self.commands.append((now, command))
                 self.joints = command
 
-    async def serve(self, connection, caller):
-        watching = None
-        try:
-            while True:
-                message = json.loads(await connection.next_message())
-                if message["op"] == "watch":
-                    watching = watching or asyncio.create_task(self._show(connection))
-                elif message["op"] == "jog":
-                    if self.driver is connection and self.jogger.put(message):
-                        self.twists.append((time.monotonic(), message))
-                    continue
-                answer = self.answer(message, connection, caller)
-                await connection.send(json.dumps({"id": message["id"], **answer}))
-                await connection.send(json.dumps({"event": "status", "status": self.status()}))
-        finally:
-            if watching is not None:
-                watching.cancel()
-            if self.driver is connection:
-                self.end_driving("paused")
+    # ---- the hub of the agent socket
 
-    async def _show(self, connection):
-        for number in range(10**9):
-            state = self.telemetry.message(self.robot_state(), time.time(), command=self.joints)
-            await connection.send(json.dumps(state))
+    def listen(self, kind, listener):
+        self._listeners.setdefault(kind, []).append(listener)
+        if kind == "status":
+            listener({"event": "status", "status": self.status()})
+        return lambda: self._listeners[kind].remove(listener)
+
+    def tell(self, kind, event):
+        for listener in self._listeners.get(kind, []):
+            listener({"event": kind, **event})
+
+    def _show(self):
+        """The events, for those who watch."""
+        for number in itertools.count():
+            if self._stopped.wait(0.1):
+                return
+            self.tell("telemetry", self.telemetry.message(self.robot_state(), time.time(), command=self.joints))
             if number % 5 == 0:
-                await connection.send(json.dumps({"event": "status", "status": self.status()}))
-            await asyncio.sleep(0.1)
+                self.tell("status", {"status": self.status()})
+
+    def left(self, person):
+        if self.driver == person.connection:
+            self.end_driving("paused")
 
     def end_driving(self, state):
         self.driver, self.owner, self.state = None, None, state
         self.jogger.release()
 
-    def answer(self, message, connection, caller):
-        op = message["op"]
-        if op not in ("status", "versions", "audit", "watch"):
-            self.orders.append((op, time.monotonic(), message))
+    def jog(self, message, person):
+        if self.driver == person.connection and self.jogger.put(message):
+            self.twists.append((time.monotonic(), message))
+
+    def stop(self, person):
+        self.orders.append(("stop", time.monotonic(), {}, person))
+        self.end_driving("paused")
+        self.tell("status", {"status": self.status()})
+        return self.status()
+
+    def ask(self, op, arguments, person, progress):
+        if self.refusal:
+            raise RequestRefused(self.refusal)
         if op == "versions":
-            return {"ok": True, "result": {"versions": VERSIONS}}
+            return {"versions": VERSIONS}
         if op == "audit":
-            return {"ok": True, "result": {"lines": ["12:00 running -> paused (anna)"]}}
-        if op != "stop" and caller.role == "watch" and op not in ("status", "watch"):
-            return {"ok": False, "error": f"{op} needs the role drive.", "kind": "AgentRefused"}
+            return {"lines": [AUDIT]}
+        self.orders.append((op, time.monotonic(), arguments, person))
+        self._obey(op, arguments, person)
+        self.tell("status", {"status": self.status()})
+        return self.status()
+
+    def _obey(self, op, arguments, person):
         if op == "take":
-            if self.driver not in (None, connection) and not message["force"]:
-                return {"ok": False, "error": f"{self.owner} drives this robot.", "kind": "NotInCommand"}
-            self.driver, self.owner, self.state = connection, f"{message['name']} ({caller.address})", "taken over"
+            if self.driver not in (None, person.connection) and not arguments["force"]:
+                raise NotInCommand(f"{self.owner} drives this robot.")
+            self.driver, self.owner, self.state = person.connection, f"{person.name} ({person.address})", "taken over"
             self.jogger.release()
-        elif op in ("stop", "pause"):
+        elif op == "pause":
             self.end_driving("paused")
         elif op == "resume":
             self.state = "running"
         elif op == "hand_back":
-            self.end_driving("running" if message["resume"] else "paused")
+            self.end_driving("running" if arguments["resume"] else "paused")
         elif op == "rollback":
             self.active = "b" * 64
-        return {"ok": True, "result": self.status()}

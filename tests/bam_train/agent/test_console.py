@@ -46,7 +46,7 @@ def agent():
 def driven(page, agent):
     """The page that has taken over, and holds no key yet."""
     page.open(agent.url).click("take")
-    page.shows("owner", "You drive.")
+    page.shows("owner", "You drive")
     return page
 
 
@@ -56,7 +56,7 @@ def test_the_page_shows_everything_and_asks_nobody_else(page, agent):
     page.shows("tool", "Tool at x, y, z:")
     page.shows("guards", "✓ clear: joint speed 0.00 rad/s, limit 1; altered 3, held 0, stopped 0")
     page.shows("versions", "champion")
-    page.shows("audit", "running -> paused (anna)")
+    page.shows("audit", "running -> paused: paused by anna (anna at 10.0.0.7:4242)")
     for text in ("4 of 5 (80 %)", "1.3 ms", "0.5 ms of 50.0 ms", "2 of 1000", "champion aaaaaaaaaaaa"):
         page.shows("run", text)
     assert page.text("warnings") == "⚠ link quality (G16): a warning"
@@ -78,7 +78,7 @@ def test_the_stop_button_and_the_space_bar_stop_whatever_has_the_focus(page, age
         page.run("document.activeElement.blur(); document.getElementById(arguments[0])?.focus()", focus)
         page.tap(" ")
         until(lambda count=count: len(agent.did("stop")) == count, "the stop")
-    assert [op for op, _, _ in agent.orders] == ["stop"] * 5
+    assert [op for op, *_ in agent.orders] == ["stop"] * 5
     page.run("document.getElementById('stop').focus()")
     page.tap("Enter")
     until(lambda: len(agent.did("stop")) == 6, "the stop")
@@ -107,25 +107,40 @@ def test_the_buttons(page, agent):
     page.click("roll-back")
     page.click("yes")
     page.shows("run", "previous bbbbbbbbbbbb")
-    orders = [(op, message.get("resume"), message.get("name")) for op, _, message in agent.orders]
+    orders = [(op, arguments.get("resume"), person.name) for op, _, arguments, person in agent.orders]
     expected = [("pause", None), ("resume", None), ("take", None), ("hand_back", False), ("take", None)]
     expected += [("hand_back", True), ("rollback", None)]
     assert orders == [(*order, "console") for order in expected]
 
 
-def test_a_robot_that_somebody_else_drives_is_taken_by_force_only(page, agent):
-    agent.driver, agent.owner, agent.state = "anna's socket", "anna (10.0.0.7)", "taken over"
-    page.open(agent.url).shows("owner", "Driven by anna (10.0.0.7), 20 s left")
-    page.click("take")
-    page.shows("question-text", "anna (10.0.0.7) drives this robot. Take it by force?")
-    page.click("no")
-    assert agent.did("take") == []
-    page.click("take")
-    page.click("yes")
-    page.shows("owner", "You drive.")
-    agent.driver, agent.owner = "anna's socket", "anna (10.0.0.7)"  # and she takes it back
-    page.shows("owner", "Driven by anna")
-    assert not page.element("jog").is_displayed()
+def enter(page, agent, token):
+    """Open the page and show a token."""
+    page.open(agent.url).shows("entry-reason", "This robot asks for a token.")
+    page.element("token").send_keys(f"{token}\n")
+    until(lambda: page.element("main").is_displayed(), "the page")
+
+
+def test_a_robot_that_somebody_else_drives_is_taken_by_force_only(page):
+    with FakeAgent(ROLES) as agent:
+        agent.driver, agent.owner, agent.state = "anna's socket", "anna (10.0.0.7)", "taken over"
+        enter(page, agent, "driving")
+        page.shows("owner", "anna (10.0.0.7) drives; the lease ends in 20 s unless it is used.")
+        page.click("take")
+        page.shows("question-text", "anna (10.0.0.7) drives this robot. Take it by force?")
+        page.click("no")
+        page.click("take")
+        page.click("yes")
+        page.shows("error", "Taking command by force needs a token of the role administer")
+        page.run("sessionStorage.clear()")
+        enter(page, agent, "secret")
+        page.click("take")
+        page.click("yes")
+        page.shows("owner", "You drive")
+        assert [arguments["force"] for op, _, arguments, _ in agent.orders] == [True]
+        agent.driver, agent.owner = "anna's socket", "anna (10.0.0.7)"  # and she takes it back
+        page.shows("owner", "anna (10.0.0.7) drives")
+        assert not page.element("jog").is_displayed()
+        page.run("sessionStorage.clear()")
 
 
 def test_the_robot_moves_only_while_a_key_is_held(driven, agent):
@@ -229,7 +244,7 @@ def test_a_gamepad_moves_the_robot_while_its_shoulder_button_is_held_and_stops_i
     """
     made = page.cdp("Page.addScriptToEvaluateOnNewDocument", source=pad)
     page.open(agent.url).click("take")
-    page.shows("owner", "You drive.")
+    page.shows("owner", "You drive")
     page.run("pad.axes = [0, -1, 0, 0]")
     time.sleep(0.3)
     assert agent.twists == []
@@ -247,7 +262,7 @@ def test_a_gamepad_moves_the_robot_while_its_shoulder_button_is_held_and_stops_i
 def test_a_phone_shows_state_and_stop_without_scrolling_sideways(page, agent):
     page.cdp("Emulation.setDeviceMetricsOverride", width=360, height=740, deviceScaleFactor=2, mobile=True)
     page.open(agent.url).click("take")
-    page.shows("owner", "You drive.")
+    page.shows("owner", "You drive")
     page.shows("versions", "champion")
     page.run("document.querySelectorAll('details').forEach((one) => { one.open = true; })")
     in_view = """
@@ -293,7 +308,7 @@ def test_a_token_is_asked_for_kept_in_this_tab_and_never_in_an_address(page):
         page.shows("state", "running")
         page.click("pause")
         page.shows("state", "paused")
-        assert agent.orders[0][2]["name"] == "Anna B"
+        assert agent.orders[0][3].name == "Anna B"
         assert page.run("return [sessionStorage.token, localStorage.length, document.cookie]") == ["secret", 0, ""]
         page.browser.refresh()
         page.shows("state", "paused")
@@ -301,23 +316,34 @@ def test_a_token_is_asked_for_kept_in_this_tab_and_never_in_an_address(page):
         page.run("sessionStorage.clear()")
 
 
-def test_a_role_that_only_watches_may_stop_and_is_told_what_it_may_not(page):
+@pytest.mark.parametrize(("token", "allowed"), [("watching", set()), ("driving", {"pause", "take"})])
+def test_a_role_sees_what_it_may_do_and_everybody_may_stop(page, token, allowed):
     with FakeAgent(ROLES) as agent:
-        page.open(agent.url).shows("entry-reason", "token")
-        page.element("token").send_keys("watching\n")
+        enter(page, agent, token)
         page.shows("state", "running")
-        page.click("pause")
-        page.shows("error", "⚠ pause needs the role drive.")
+        buttons = ("pause", "resume", "take", "roll-back")
+        until(lambda: {one for one in buttons if page.element(one).is_enabled()} == allowed, "the buttons")
         page.click("stop")
         page.shows("state", "paused")
         page.run("sessionStorage.clear()")
         assert len(agent.did("stop")) == 1
 
 
+def test_what_is_refused_is_said(page, agent):
+    page.open(agent.url).shows("state", "running")
+    agent.refusal = "anna drives this robot."
+    page.click("pause")
+    page.shows("error", "⚠ anna drives this robot.")
+    agent.refusal = ""
+    page.click("pause")
+    page.shows("state", "paused")
+    assert not page.element("error").is_displayed()
+
+
 def test_the_page_comes_back_when_the_robot_does(page):
     with FakeAgent() as agent:
         page.open(agent.url).click("take")
-        page.shows("owner", "You drive.")
+        page.shows("owner", "You drive")
         port = agent.server.port
     page.shows("state", "○ not connected")
     page.shows("link", "STOP does not reach it now.")
