@@ -96,9 +96,9 @@ class Sent(msgspec.Struct, tag=True, frozen=True):
 
 
 class Rows(msgspec.Struct, tag=True, frozen=True):
-    """Transitions, for a learner."""
+    """Transitions, for a learner; see `bam_train.agent.transitions`."""
 
-    rows: list[dict[str, Any]]
+    event: dict[str, Any]
 
 
 Message = Front | Listening | Ask | Answer | Progress | Halt | Drive | Report | Sent | Rows

@@ -10,7 +10,16 @@ from typing import Any
 
 import msgspec
 
-from bam_train.agent.agent_messages import Channel, Front, Listening, Message, Report, child_environment, socket_pair
+from bam_train.agent.agent_messages import (
+    Channel,
+    Front,
+    Listening,
+    Message,
+    Report,
+    Rows,
+    child_environment,
+    socket_pair,
+)
 from bam_train.errors import RequestRefused
 
 _log = logging.getLogger(__name__)
@@ -59,7 +68,7 @@ class FrontLink:
             self._status = message
         channel = self._channel
         if channel is not None:
-            channel.send(message, can_wait=not isinstance(message, Report))
+            channel.send(message, can_wait=not isinstance(message, (Report, Rows)))
 
     def close(self) -> None:
         """End it. Idempotent."""

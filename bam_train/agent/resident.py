@@ -21,11 +21,12 @@ import numpy as np
 
 from bam_envs.core.errors import BamEnvsError, LinkLost, NotInCommand, SafetyStop, StaleState
 from bam_envs.core.robot import Initial
-from bam_train.agent.agent_messages import Answer, Ask, Drive, Halt, Message, Report, Sent
+from bam_train.agent.agent_messages import Answer, Ask, Drive, Halt, Message, Report, Rows, Sent
 from bam_train.agent.agent_options import AgentOptions
 from bam_train.agent.agent_states import TRANSITIONS, State
 from bam_train.agent.robot_session import RobotSession
 from bam_train.agent.succession import Choice, Succession
+from bam_train.agent.transitions import TransitionLog, TransitionsAgent, encode
 from bam_train.agent.versions import Versions
 from bam_train.checkpoint import Checkpoint
 from bam_train.deploy.deployment import STOP, StopSwitch, fault_text
@@ -112,6 +113,9 @@ class Resident:
         self._stage = options.stage
         self._chosen: Choice | None = None  # acts as soon as it may
         self.send = send
+        self.transitions = TransitionLog()
+        """For a learner."""
+        self.transitions.wanted = False
         self._tell, self._admit, self._connect = tell, admit, connect
         self._news = threading.Condition()
         self._requests: deque[tuple[Callable[[], dict[str, Any] | None], int]] = deque()
@@ -154,6 +158,7 @@ class Resident:
         self.halt()
 
         def end() -> None:
+            self.transitions.wanted = False
             if self.driver is not None:
                 self._hand_back("the agent", "", self.driver.lease, why="the front process died, and with it the link")
 
@@ -176,6 +181,7 @@ class Resident:
             "hand_back": self._hand_back,
             "scene": self._scene,
             "rollback": self._roll_back,
+            "transitions": self._stream,
         }
         do = known.get(ask.op)
         if ask.op in ("push", "use"):
@@ -384,6 +390,7 @@ class Resident:
                 checkpoint,
                 self._stage,
                 boundary=_Boundary(self),
+                agents=[TransitionsAgent(self.transitions, lambda: self.succession.active.digest)],
                 switch=self.switch,
                 admit=self._admit,
             )
@@ -510,6 +517,10 @@ class Resident:
             signals["object_pose"] = np.array(pose)
         robot.reset(np.array([0]), Initial(signals, np.array([seed])))
 
+    def _stream(self, who: str, address: str, on: bool) -> None:
+        """Send the transitions to a learner from now on, or no longer."""
+        self.transitions.wanted = on
+
     def _roll_back(self, who: str, address: str, why: str = "") -> dict[str, Any]:
         text = f"{who}{f': {why}' if why else ''}"
         choice = self.succession.back(who, text)
@@ -580,8 +591,10 @@ class Resident:
         }
 
     def _report(self, least: float = 0.0) -> None:
-        """Send the status, unless the last one is younger than `least` [s]."""
+        """Send the status, and transitions, unless the last ones are younger than `least` [s]."""
         now = time.monotonic()
         if now - self._reported >= least:
             self._reported = now
             self.send(Report(self.status()))
+            if self.transitions.wanted and (rows := self.transitions.take()) is not None:
+                self.send(Rows(encode(rows)))

@@ -44,6 +44,7 @@ class RobotSession:
         checkpoint: The checkpoint whose policy begins.
         stage: ``"trial"``, ``"full"``, or None: on trial if the robot is real.
         boundary: See `Deployment`.
+        agents: See `Deployment`.
         switch: See `Deployment`.
         admit: Called with the connected environment before anything can move; lines for the operator are given too.
 
@@ -60,6 +61,7 @@ class RobotSession:
         stage: str | None,
         *,
         boundary: Agent,
+        agents: Sequence[Agent],
         switch: StopSwitch,
         admit: Callable[[Any, Sequence[str]], None],
     ) -> None:
@@ -95,6 +97,7 @@ class RobotSession:
                 Journal(0, marks=self.marks),
                 recorder=self.recorder,
                 boundary=boundary,
+                agents=agents if isinstance(self._env.observation_space, gym.spaces.Box) else (),
                 switch=switch,
             )
         except BaseException:

@@ -140,6 +140,8 @@ class TransitionLog:
     """The newest transitions until they are sent, at most `most`; used by one thread."""
 
     def __init__(self, most: int = MOST) -> None:
+        self.wanted = True
+        """Whether there is anybody who takes them; else nothing is kept."""
         self._rows: deque[tuple[Any, ...]] = deque(maxlen=most)
         self.lost = 0
         """Number of transitions that were dropped because nobody took them in time."""
@@ -180,10 +182,13 @@ class TransitionsAgent(Agent):
 
     def forward(self, t: int, **kwargs: Any) -> None:
         """Add the step from time t - 1 to t."""
-        observation, get = self.get((self._observation, t))[0].copy(), self.get
         if t == 0:
             self._episode += 1
-        elif self._before is not None:
+        if not self._log.wanted:
+            self._before = None
+            return
+        observation, get = self.get((self._observation, t))[0].copy(), self.get
+        if t > 0 and self._before is not None:
             seen, action, policy = self._before
             terminated, truncated = (bool(get((f"env/{end}", t))[0]) for end in _ENDS)
             success = bool(get((f"env/{SUCCESS}", t))[0]) and bool(get((f"env/{SAYS_SUCCESS}", t))[0])

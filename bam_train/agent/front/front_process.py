@@ -23,9 +23,10 @@ from bam_envs.core.errors import BamEnvsError, LinkLost, NotInCommand, RemoteErr
 from bam_envs.live.camera import LiveCamera
 from bam_envs.remote.serve.command_lease import CommandLease
 from bam_envs.remote.serve.robot_service import RobotService
-from bam_envs.ros.codec import AGENT_TOPIC, HALT_TOPIC, RobotInfo
+from bam_envs.ros.codec import AGENT_STEP_TOPIC, AGENT_TOPIC, HALT_TOPIC, RobotInfo
 from bam_envs.rosbridge.bus import UNKNOWN_CALLER, Caller
 from bam_envs.rosbridge.bus import Message as Fields
+from bam_envs.rosbridge.encoding import load_json
 from bam_envs.rosbridge.endpoint import Endpoint
 from bam_envs.rosbridge.server import BridgeServer
 from bam_envs.rosbridge.server.site import Site
@@ -41,6 +42,7 @@ from bam_train.agent.agent_messages import (
     Message,
     Progress,
     Report,
+    Rows,
     Sent,
     adopted,
 )
@@ -49,6 +51,7 @@ from bam_train.agent.front.camera_feed import CameraFeed
 from bam_train.agent.front.hub import AgentHub
 from bam_train.agent.front.remote_robot import RemoteRobot
 from bam_train.agent.front.site_pages import console_pages
+from bam_train.agent.transitions import EVENT
 from bam_train.env_location import Place
 from bam_train.environments import make_env
 from bam_train.errors import BamTrainError, RequestRefused
@@ -157,6 +160,9 @@ class FrontProcess:
         self._pending: dict[int, tuple[Future[Any], Callable[[str], None]]] = {}
         self._numbers = itertools.count(1)
         self._driver: str | None = None  # the last owner of the lease
+        self.hub = AgentHub(self, by_force=options.token_file is not None)
+        """What the agent socket asks."""
+        self._episode = 0  # of people
         self._ended_at = -_HALT_LATE  # of the last lease [s]
         self._handing: dict[str, bool | None] = {}  # clients that hand back -> whether the policy goes on
         self.sent: list[float] | None = None
@@ -177,6 +183,8 @@ class FrontProcess:
             waiting = self._pending.pop(message.number, None)
             if waiting is not None:
                 waiting[0].set_result(message)
+        elif isinstance(message, Rows):
+            self.hub.tell(EVENT, message.event)
         elif isinstance(message, Progress) and message.number in self._pending:
             self._pending[message.number][1](message.text)
 
@@ -276,7 +284,8 @@ class FrontProcess:
             except (BamTrainError, BamEnvsError):
                 self.lease.release(caller.client)
                 raise
-            return {"state": self.status["state"]}
+            self._episode += 1
+            return {"state": self.status["state"], "learner": self.hub.has_learner}
         if do == "hand_back":
             self.hand_back(caller.client, who, caller.address)
             return {"state": self.status["state"]}
@@ -303,6 +312,7 @@ class FrontProcess:
         self._service = service = RobotService(robot, self.shadow.profile, server, self.lease, info=self._info())
         requests = StringRpcService(server, AGENT_TOPIC, self.answer_client, service.sessions)
         server.subscribe(HALT_TOPIC, "std_msgs/Empty", self._on_halt)
+        server.subscribe(AGENT_STEP_TOPIC, "std_msgs/String", self._on_step)
         service.start()
         requests.start()
         self.robot.start()
@@ -326,6 +336,11 @@ class FrontProcess:
         if self._service is not None:
             self._service.info = self._info()
 
+    def _on_step(self, message: Fields, caller: Caller) -> None:
+        """A step of the program that has taken over, over the connection on which it took the lease."""
+        if caller.name == self.lease.connection and self.lease.holder is not None:
+            self.hub.tell_step(load_json(message.get("data"), AGENT_STEP_TOPIC), self._episode)
+
     def cameras(self) -> dict[str, LiveCamera]:
         """The cameras of the robot's profile by name; not connected yet."""
         options = self.options
@@ -348,8 +363,7 @@ def main() -> None:
     channel = Channel(end, lambda message: receivers[0](message), lambda: front.stop())
     try:
         front = FrontProcess(options, channel.send)
-        hub = AgentHub(front, by_force=options.token_file is not None)
-        console = AgentSocket(hub)
+        console = AgentSocket(front.hub)
         pictures = CameraFeed(front.cameras())
         site = Site(console_pages(), {**console.sockets, "/camera": pictures.serve})
         tokens = Tokens(otherwise="administer") if options.token_file is None else TokenFile(options.token_file)
@@ -361,11 +375,11 @@ def main() -> None:
         return
     receivers.append(front.take)
     channel.start()
-    hub.start()
+    front.hub.start()
     try:
         front.serve(server)
     finally:
-        hub.close()
+        front.hub.close()
         server.close()
         console.close()
         pictures.close()

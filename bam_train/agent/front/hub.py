@@ -4,21 +4,23 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from bam_envs.core.errors import BamEnvsError, InvalidValue, NotInCommand, RemoteError
+from bam_envs.core.errors import BamEnvsError, InvalidValue, NotInCommand, ProtocolError, RemoteError
 from bam_envs.core.robot import RobotState
 from bam_envs.core.timing import Ticker
+from bam_envs.ros.codec import AGENT_STEP_TOPIC
 from bam_envs.rosbridge.bus import Caller
-from bam_train.agent.agent_messages import Drive, Halt
+from bam_train.agent.agent_messages import Ask, Drive, Halt
 from bam_train.agent.audit import tail
 from bam_train.agent.front.agent_socket import Person
 from bam_train.agent.front.jog import Jogger
 from bam_train.agent.front.telemetry import Telemetry
+from bam_train.agent.transitions import EVENT, TransitionLog, encode
 from bam_train.agent.versions import Versions
 
 if TYPE_CHECKING:
@@ -110,10 +112,14 @@ class AgentHub:
         """Call `listener` with every event of this kind; returns a function that ends this."""
         listeners = self._listeners.setdefault(kind, [])
         listeners.append(listener)
+        if kind == EVENT:
+            self._front.send(Ask(0, "transitions", {"on": True}, "a learner", ""))
 
         def end() -> None:
             if listener in listeners:
                 listeners.remove(listener)
+            if kind == EVENT and not listeners:
+                self._front.send(Ask(0, "transitions", {"on": False}, "a learner", ""))
 
         return end
 
@@ -122,6 +128,27 @@ class AgentHub:
         self._front.cut(_client(person), person.address)
 
     # ---- what it does
+
+    @property
+    def has_learner(self) -> bool:
+        """Whether a learner listens."""
+        return bool(self._listeners.get(EVENT))
+
+    def tell_step(self, row: Mapping[str, Any], episode: int) -> None:
+        """Pass on a step of a person's program to the learner, as an intervention; raises ProtocolError."""
+        log = TransitionLog()
+        try:
+            arrays = [np.array(row[name], np.float32) for name in ("observation", "action", "next_observation")]
+            flags = bool(row["terminated"]), False, bool(row["success"]), True
+            reward, step = float(row["reward"]), int(row["step"])
+        except (KeyError, TypeError, ValueError) as error:
+            raise ProtocolError(f"{AGENT_STEP_TOPIC}: expected the numbers of a step: {error!r:.80}") from error
+        if not all(np.isfinite(array).all() for array in arrays) or not np.isfinite(reward):
+            raise ProtocolError(f"{AGENT_STEP_TOPIC}: expected finite numbers.")
+        log.add(arrays[0], arrays[1], reward, arrays[2], *flags, episode, step, "")
+        rows = log.take()
+        if rows is not None:
+            self.tell(EVENT, encode(rows))
 
     def status(self) -> dict[str, Any]:
         """The last status of the resident, with the lease."""

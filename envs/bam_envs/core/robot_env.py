@@ -127,6 +127,8 @@ class RobotEnv(_RobotAndTask, gym.Env[NDArray[np.float32], NDArray[np.float32]])
         self.last_state: RobotState | None = None
         """The newest state, kept after the end of an episode."""
         self._first = np.zeros(1, dtype=np.int64)
+        self._observed: NDArray[np.float32] = np.zeros(0, np.float32)
+        self._tell_step = getattr(robot, "tell_step", None)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -137,7 +139,8 @@ class RobotEnv(_RobotAndTask, gym.Env[NDArray[np.float32], NDArray[np.float32]])
         self.state = self.last_state = self._begin(self._first, [self.np_random], task_options)
         if self.render_mode == "human":
             self.render()
-        return self.task.observe(self.state)[0], {"is_success": False}
+        self._observed = self.task.observe(self.state)[0]
+        return self._observed, {"is_success": False}
 
     def step(self, action: NDArray[np.float32]) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]:
         """Send the command of `action` (a,); observe and score one period later."""
@@ -148,6 +151,10 @@ class RobotEnv(_RobotAndTask, gym.Env[NDArray[np.float32], NDArray[np.float32]])
         observation = self.task.observe(state)[0]
         terminated = bool(score.terminated[0])
         self.state, self.last_state = None if terminated else state, state
+        if self._tell_step is not None:
+            reward, success = float(score.reward[0]), bool(score.success[0])
+            self._tell_step(self._observed, batch[0], reward, observation, terminated=terminated, success=success)
+            self._observed = observation
         if self.render_mode == "human":
             self.render()
         return observation, float(score.reward[0]), terminated, False, plain_info(score)

@@ -376,6 +376,11 @@ class RosbridgeRobot:
         if self._status:
             control.publish_soon(self.namespace + STATUS_TOPIC, {"data": self._status})
 
+    def tell_step(self, *step: Any, **ends: Any) -> None:
+        """Tell a live agent the numbers of a step of a person's program, if a learner wants them; see `TakeOver`."""
+        if self._take_over is not None:
+            self._take_over.tell_step(*step, **ends)
+
     def measure(self) -> RobotState:
         """The newest state, with the command that was sent last. Raises the errors of `step`."""
         self._connected()

@@ -5,12 +5,16 @@ lease, and pauses the policy; to hand back ends the lease, and the agent's setti
 """
 
 import getpass
+import json
 import socket
 from contextlib import suppress
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from bam_envs.core.errors import BamEnvsError, NotInCommand
-from bam_envs.ros.codec import AGENT_TOPIC
+from bam_envs.ros.codec import AGENT_STEP_TOPIC, AGENT_TOPIC
 from bam_envs.ros.freshness import Tagger
 from bam_envs.rosbridge.client import RosbridgeLink
 from bam_envs.rosbridge.string_rpc import StringRpc
@@ -34,6 +38,8 @@ class TakeOver:
         self._link, self._rpc = link, StringRpc(link, link.namespace + AGENT_TOPIC, tagger)
         self.taken = False
         """Whether this client drives."""
+        self._is_watched = False  # whether a learner wants the steps
+        self._step = 0
 
     def look(self) -> None:
         """Raise `NotInCommand` if somebody else drives; the policy does not count."""
@@ -43,8 +49,29 @@ class TakeOver:
 
     def take(self) -> None:
         """Take over; the policy is paused. Raises `NotInCommand` if somebody else drives, or nobody can now."""
-        self._call("take")
-        self.taken = True
+        answer = self._call("take")
+        self.taken, self._step = True, 0
+        self._is_watched = answer.get("learner") is True
+        if self._is_watched:
+            self._link.advertise(self._link.namespace + AGENT_STEP_TOPIC, "std_msgs/String")
+
+    def tell_step(
+        self,
+        observation: NDArray[np.float32],
+        action: NDArray[np.float32],
+        reward: float,
+        next_observation: NDArray[np.float32],
+        *,
+        terminated: bool,
+        success: bool,
+    ) -> None:
+        """Publish the numbers of a step on `AGENT_STEP_TOPIC`, as JSON, if the agent has a learner."""
+        if self.taken and self._is_watched:
+            arrays = {"observation": observation, "action": action, "next_observation": next_observation}
+            row = {name: np.asarray(array, np.float64).tolist() for name, array in arrays.items()}
+            row |= {"reward": reward, "terminated": terminated, "success": success, "step": self._step}
+            self._link.publish_soon(self._link.namespace + AGENT_STEP_TOPIC, {"data": json.dumps(row)})
+        self._step += 1
 
     def hand_back(self) -> None:
         """End the lease, if this client has it. Never raises; the agent ends it by itself when the link is cut."""

@@ -38,6 +38,8 @@ Sign = Callable[[Tag, str, bytes], str]  # the text of a tag on a topic with tha
 INFO_SERVICE = "/bam/robot"  # describes a served robot (std_srvs/Trigger; `RobotInfo` in its message)
 AGENT_TOPIC = "/bam/agent"
 """Requests to the live agent of a robot: who drives, take over, hand back; see `bam_envs.live.take_over`."""
+AGENT_STEP_TOPIC = "/bam/agent/step"
+"""The steps of the environment of whoever has taken over from a live agent, for a learner (std_msgs/String of JSON)."""
 HALT_TOPIC = "/bam/halt"  # stops a served robot (std_msgs/Empty)
 STATUS_TOPIC = "/bam/status"  # what the guards did in each tick (std_msgs/String of JSON), sent by the client
 SCENE_TOPIC = "/bam/scene"

@@ -139,6 +139,7 @@ class SafeRobot(metaclass=Sealed):
         "_status",
         "_stopped",
         "_tell",
+        "_tell_step",
         "_trips",
         "_unmeasured",
     )
@@ -161,6 +162,7 @@ class SafeRobot(metaclass=Sealed):
             require_bounded(self._limits, robot.spec)
         self._observer: Observer | None = None
         self._tell: Any = getattr(self._live, "tell_status", None)
+        self._tell_step: Any = getattr(self._live, "tell_step", None)
         self._shape = Shape(robot.spec)
         self._further = tuple(guards)
         self._guards = tuple(default_guards(robot.spec, self._limits, tool_position=tool_position, straight=straight))
@@ -290,6 +292,11 @@ class SafeRobot(metaclass=Sealed):
         It is called between two commands, so it must be fast, and it must change neither argument.
         """
         self._observer = observer
+
+    def tell_step(self, *step: Any, **ends: Any) -> None:
+        """Pass on the numbers of a step of the environment, for a learner at the robot's side; see `TakeOver`."""
+        if self._tell_step is not None:
+            self._tell_step(*step, **ends)
 
     def connect(self) -> None:
         """Connect the robot. Moves nothing."""
