@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from bam_envs import __version__
 from bam_envs.core.errors import BamEnvsError, LinkLost, NotInCommand, SafetyStop, StaleState
 from bam_envs.core.robot import Initial
 from bam_train.agent.agent_messages import Answer, Ask, Drive, Halt, Message, Report, Rows, Sent
@@ -492,8 +493,8 @@ class Resident:
             return self.status()
         self.halt()
         goes_on = (self.options.resume if resume is None else resume) and not why
-        self._is_running = goes_on
         self._end_driving(driver, why or f"handed back by {who}")
+        self._is_running = goes_on
         text = why or f"handed back by {who}"
         if goes_on:
             self._change(self._driving, text, who, address)
@@ -574,6 +575,7 @@ class Resident:
             "owner": None if self.driver is None else self.driver.who,
             "robot": self.options.robot if session is None else session.robot.info.text,
             "simulated": None if session is None else not session.is_real,
+            "env": self.succession.active.env,
             "period": None if session is None else session.robot.spec.period,
             "episode": 0 if journal is None else journal.begun,
             "steps": 0 if record is None else record.length,
@@ -588,6 +590,7 @@ class Resident:
             "marks": [] if session is None else list(session.marks),
             "warnings": [] if journal is None else list(journal.warnings.values()),
             "guards": {} if session is None else session.robot.report(),
+            "agent": __version__,
         }
 
     def _report(self, least: float = 0.0) -> None:

@@ -281,9 +281,10 @@ class _StopAgent(Agent):
         super().__init__()
         self._switch, self._watch = switch, watch
 
-    def forward(self, **kwargs: Any) -> None:
-        watch, now = self._watch, time.perf_counter()
-        watch.latency, watch.begun = now - watch.waited, now
+    def forward(self, t: int, **kwargs: Any) -> None:
+        watch, watch.begun = self._watch, time.perf_counter()
+        if t > 0:  # a reset follows no deadline
+            watch.latency = watch.begun - watch.waited
         self._switch.raise_again()
 
 

@@ -16,10 +16,8 @@ import numpy as np
 from websockets.exceptions import ConnectionClosed
 
 from bam_envs.core.errors import BamEnvsError, MissingExtra
-from bam_envs.live.camera import CameraImage, LiveCamera, Pixels
-from bam_envs.ros.profile_tables import RobotProfile
+from bam_envs.live.camera import CameraImage, Pixels
 from bam_envs.rosbridge.bus import Caller
-from bam_envs.rosbridge.endpoint import Endpoint
 from bam_envs.rosbridge.server.server_connection import BridgeConnection
 
 _LOOK, _AGAIN, _ALIVE = 0.02, 2.0, 1.0
@@ -55,11 +53,6 @@ class CameraFeed:
     def __init__(self, cameras: Mapping[str, Camera]) -> None:
         self._names, self._readers = list(cameras), [_Reader(one) for one in cameras.values()]
         self._viewers = 0
-
-    @classmethod
-    def of(cls, profile: RobotProfile, endpoint: Endpoint) -> "CameraFeed":
-        """The cameras in the profile of the robot at `endpoint`."""
-        return cls({source.name: LiveCamera(endpoint, source) for source in profile.cameras})
 
     async def serve(self, connection: BridgeConnection, caller: Caller) -> None:
         """Send pictures until the connection closes."""

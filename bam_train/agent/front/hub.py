@@ -46,7 +46,8 @@ class AgentHub:
         self._versions = Versions(Path(front.options.folder) / "versions")
         self._listeners: dict[str, list[Listener]] = {}
         shadow = front.shadow
-        geometry = getattr(front.task, "geometry", None)
+        model = getattr(front.task, "model", None)  # of a Universal Robots arm of any size
+        geometry = None if model is None else model.geometry
         self._telemetry = Telemetry(shadow.spec, shadow.limits, geometry=geometry)
         try:
             self._jogger: Jogger | None = Jogger(shadow.spec, shadow.spec.period, geometry=geometry)
