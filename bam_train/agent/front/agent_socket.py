@@ -33,9 +33,9 @@ from bam_train.agent.remote import agent_protocol as protocol
 from bam_train.errors import BamTrainError, RoleTooLow
 
 _log = logging.getLogger(__name__)
-_THREADS = 32
+_THREADS = 64
 _AT_ONCE = 4  # most unanswered requests of one client
-_PUSHES = 4  # most uploads, and pushes that wait for their answer, of all clients
+_PUSHES = 4  # most uploads, and pushes that wait for their answer, of all clients that are there
 _RATE, _BURST = 200.0, 400.0  # most messages of one client a second, and at once
 _STALLED = 10.0  # longest time between two pieces of an upload [s]
 _FLOOD = 1008  # close code
@@ -166,6 +166,7 @@ class _Client:
         self._loop = asyncio.get_running_loop()
         self._last = -1  # id of the last request
         self._running = 0  # requests that worker threads execute
+        self._pushes = 0  # its share of the owner's
         self._upload: Upload | None = None
         self._push: protocol.Push | None = None
         self._skip = 0  # bytes of an upload that failed, which are still on their way
@@ -201,9 +202,12 @@ class _Client:
             self._owner.learner = None
         if self._upload is not None:
             self._upload.remove()
-            self._upload = None
-            self._owner.pushes -= 1
+        self._count_push(-self._pushes)
         self._hub.left(self._person)
+
+    def _count_push(self, change: int) -> None:
+        self._pushes += change
+        self._owner.pushes += change
 
     def _has_room(self) -> bool:
         now = time.monotonic()
@@ -213,10 +217,10 @@ class _Client:
     # ---- requests
 
     async def _take(self, data: bytes) -> None:
-        number = None
+        number, op = None, "request"
         try:
             request = protocol.decode_request(data)
-            number = request.id
+            number, op = request.id, str(request.__struct_config__.tag)
             if number is not None:
                 if number <= self._last:
                     raise protocol.BadRequest(f"The id {number} is not above {self._last}: ids grow.", number)
@@ -230,15 +234,15 @@ class _Client:
             self._note(str(error))
             self._refuse(error.number, error)
         except (BamTrainError, BamEnvsError) as error:
+            # A lease says how long it lasts: of twists, many a second, the log gets equal lines.
+            self._note(f"{op}: {type(error).__name__ if op == 'jog' else error}")
             self._refuse(number, error)
 
     def _require_role(self, request: protocol.Request) -> None:
         op, role = request.__struct_config__.tag, self._caller.role
         if not protocol.may(role, type(request)):
-            self._note(f"{op} is for the role {request.role}, and its token has the role {role}")
             raise RoleTooLow(f"{op} needs a token of the role {request.role}; the token shown has the role {role}.")
         if isinstance(request, protocol.Take) and request.force and not self._caller.operator:
-            self._note("taking command by force needs a token that administers")
             raise RoleTooLow("Taking command by force needs a token of the role administer (bam-agent --token-file).")
 
     async def _do(self, request: protocol.Request) -> None:
@@ -297,10 +301,12 @@ class _Client:
 
         def finish(result: dict[str, Any], error: Exception | None) -> None:
             self._running -= 1
-            self._owner.pushes -= upload is not None
+            if upload is not None and self._pushes:
+                self._count_push(-1)
             if error is None:
                 self._answer(number, result)
             else:
+                self._note(f"{op}: {' '.join(str(error).split())}")
                 self._refuse(number, error)
 
         self._owner.work(work)
@@ -312,12 +318,8 @@ class _Client:
             whose = "of this socket" if self._upload is not None else "of others"
             raise InvalidValue(f"Uploads {whose} are not done yet; push again when they are.")
         make = partial(Upload, self._hub.incoming, push.size, push.sha256, self._owner.most_upload)
-        try:
-            self._upload, self._push = await self._loop.run_in_executor(None, make), push
-        except InvalidValue as error:
-            self._note(str(error))
-            raise
-        self._owner.pushes += 1
+        self._upload, self._push = await self._loop.run_in_executor(None, make), push
+        self._count_push(1)
         self._send({"id": push.id, "progress": "the agent takes the upload"})
 
     async def _take_piece(self, data: bytes) -> None:
@@ -331,7 +333,6 @@ class _Client:
         try:
             complete = await self._loop.run_in_executor(None, upload.write, data)
         except (BamTrainError, BamEnvsError) as error:
-            self._note(str(error))
             self._end_upload(error)
             return
         if complete:
@@ -340,15 +341,16 @@ class _Client:
                 self._ask(push, {**_arguments(push), "path": upload.path}, upload)
             except BamEnvsError as error:
                 upload.remove()
-                self._owner.pushes -= 1
+                self._count_push(-1)
                 self._refuse(push.id, error)
 
     def _end_upload(self, error: Exception) -> None:
         upload, push, self._upload = self._upload, self._push, None
         if upload is not None and push is not None:
             upload.remove()
-            self._owner.pushes -= 1
+            self._count_push(-1)
             self._skip = upload.size - upload.received
+            self._note(f"push: {error}")
             self._refuse(push.id, error)
 
     # ---- answers

@@ -28,7 +28,7 @@ from bam_envs.rosbridge.bus import UNKNOWN_CALLER, Caller
 from bam_envs.rosbridge.bus import Message as Fields
 from bam_envs.rosbridge.encoding import load_json
 from bam_envs.rosbridge.endpoint import Endpoint
-from bam_envs.rosbridge.server import BridgeServer
+from bam_envs.rosbridge.server import BridgeServer, ServerOptions
 from bam_envs.rosbridge.server.site import Site
 from bam_envs.rosbridge.string_rpc import StringRpcService
 from bam_envs.rosbridge.tokens import TokenFile, Tokens
@@ -367,7 +367,8 @@ def main() -> None:
         pictures = CameraFeed(front.cameras())
         site = Site(console_pages(), {**console.sockets, "/camera": pictures.serve})
         tokens = Tokens(otherwise="administer") if options.token_file is None else TokenFile(options.token_file)
-        where: Any = {"cert": options.cert, "key": options.key, "tokens": tokens, "site": site}
+        network = ServerOptions(open_timeout=2.0, max_clients=64)
+        where: Any = {"cert": options.cert, "key": options.key, "tokens": tokens, "site": site, "options": network}
         server = BridgeServer(options.bind, options.port, **where)
         server.start()
     except (BamEnvsError, BamTrainError) as error:

@@ -22,6 +22,7 @@ from bam_train.agent.front.jog import Jogger
 from bam_train.agent.front.telemetry import Telemetry
 from bam_train.agent.transitions import EVENT, TransitionLog, encode
 from bam_train.agent.versions import Versions
+from bam_train.errors import BamTrainError
 
 if TYPE_CHECKING:
     from bam_train.agent.front.front_process import FrontProcess
@@ -173,7 +174,7 @@ class AgentHub:
                 self._jogger.release()
         try:
             front.ask("take", {"lease": client}, person.name, person.address)
-        except BamEnvsError:
+        except (BamTrainError, BamEnvsError):
             front.lease.release(client)
             raise
         return self.status()

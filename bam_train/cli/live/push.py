@@ -26,9 +26,9 @@ def push(config: PushConfig, signals: SignalMemory) -> int:
     def do(agent: AgentClient) -> dict[str, Any]:
         if path is None:
             return {**agent.ask("rollback", why=config.why), **agent.ask("status")}
-        return agent.push(
-            path, stage=config.stage, when=config.when, wait=config.wait, why=config.why, progress=_progress
-        )
+        choice: dict[str, Any] = {"stage": config.stage, "when": config.when, "wait": config.wait, "why": config.why}
+        result = agent.push(path, **choice, progress=_progress)
+        return {**agent.ask("status"), **result}
 
     result = with_agent(config, url, do)
     outcome = str(result.get("outcome") or "")

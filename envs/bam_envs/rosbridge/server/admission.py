@@ -142,9 +142,24 @@ class Admission:
         return f"There are {most} clients, and no room for more." if self._present() >= most else ""
 
 
+class _LoggedTls(ssl.SSLObject):
+    """Logs handshakes that fail, which asyncio keeps to itself; it does not know the address."""
+
+    _refusals = Refusals(_logger)
+
+    def do_handshake(self) -> None:
+        try:
+            super().do_handshake()
+        except ssl.SSLError as error:
+            if not isinstance(error, (ssl.SSLWantReadError, ssl.SSLWantWriteError)):
+                self._refusals.note("A client", f"TLS failed: {error.reason}.")
+            raise
+
+
 def tls_context(cert: str, key: str | None) -> ssl.SSLContext:
     """TLS settings of a server, from the files of its certificate chain and its key (None: in the same file)."""
     context, files = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER), " and ".join(filter(None, (cert, key)))
+    context.sslobject_class = _LoggedTls
     try:
         context.load_cert_chain(cert, key)
     except ssl.SSLError as error:
