@@ -474,7 +474,7 @@ class Resident:
         self.halt()
         if self.driver is not None and self.driver.lease != lease:
             self.note("take over", f"{who} takes over from {self.driver.who}", who, address)
-        self.driver, self._command = Driver(lease, who), None
+        self.driver, self._command, self._is_running = Driver(lease, who), None, False
         self._change(State.TAKEN_OVER, f"taken over by {who}", who, address)
         return self.status()
 
@@ -503,7 +503,7 @@ class Resident:
         return self.status()
 
     def _end_driving(self, driver: Driver, why: str) -> None:
-        self.driver, self._command, self._is_running = None, None, self._is_running and self.options.resume
+        self.driver, self._command = None, None
         self.send(Report({**self.status(), "ended": driver.lease, "why": why}))
 
     def _scene(self, who: str, address: str, pose: list[list[float]] | None, seed: int) -> None:

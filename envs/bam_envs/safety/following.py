@@ -45,6 +45,12 @@ class Following(Guard):
         # A command lasts for a period after it is sent, and the robot is behind it by its lag.
         self._sent: deque[Numbers] = deque(maxlen=2 + ticks_of(self._lag, spec))
         self._strikes, self._good, self._forgiven = 0, 0, ticks_of(FORGIVEN, spec)
+        self._spec, self._own_lag = spec, self._lag
+
+    def relayed(self, delay: float) -> None:
+        """Explain that the robot gets commands later by `delay` [s], from a live agent that has guards of its own."""
+        self._lag = self._own_lag + delay
+        self._sent = deque(maxlen=2 + ticks_of(self._lag, self._spec))
 
     def restart(self) -> None:
         """Forget the commands: the next one begins at the robot's position."""

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from bam_envs.core.errors import InvalidValue, ResetNeeded, SafetyStop, StaleState, StartNotReached
 from bam_envs.core.robot import EnvIds, Initial, Robot, RobotSpec, RobotState
+from bam_envs.safety.following import Following
 from bam_envs.safety.guard import (
     Guard,
     Limits,
@@ -40,6 +41,9 @@ __all__ = ["ClearedCommand", "Limits", "SafeRobot"]
 Array = NDArray[np.float64]
 Observer = Callable[[Tick, RobotState], None]
 """See `SafeRobot.observe`."""
+RELAYED = 2.0
+"""Longest time for which a live agent keeps a command of whoever has taken over: the tick in which it came, and the one
+in which its own guards execute it [periods]."""
 GRIPPER_TIME = 1.0
 """Longest wait for the gripper to open before an arm goes to its start pose [s]."""
 GRIPPER_NEAR = 0.002
@@ -303,6 +307,8 @@ class SafeRobot(metaclass=Sealed):
         self._robot.connect()
         watchdog = getattr(self.info, "watchdog", None)
         for guard in self._guards:
+            if isinstance(guard, Following):
+                guard.relayed(RELAYED * self.spec.period if getattr(self.info, "agent", False) else 0.0)
             if isinstance(guard, Watchdog) and (watchdog is not None or self._is_real()):
                 guard.connected(watchdog)
 

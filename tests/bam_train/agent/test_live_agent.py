@@ -1,0 +1,270 @@
+"""The whole agent, as a program with its simulated robot: taken over, pushed to, paused, killed, without its robot."""
+
+import contextlib
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+import bam_envs  # noqa: F401 - registers the environments
+from bam_envs.core.errors import NotInCommand, RobotFault
+from bam_train.agent.remote.agent_client import AgentClient
+from bam_train.policy import FrozenPolicy
+
+PICK = Path(__file__).parents[3] / "checkpoints" / "pick-ppo.zip"
+DEADLINE = 40.0
+PROGRAM = [sys.executable, "-m", "bam_train.cli.live.live_agent"]
+
+
+class Program:
+    """A bam-agent on a free port."""
+
+    def __init__(self, folder, *flags):
+        self.lines, self._changed = [], threading.Condition()
+        self.process = subprocess.Popen(
+            [*PROGRAM, "--port", "0", "--folder", str(folder), *flags],
+            stdin=subprocess.DEVNULL,
+            stderr=subprocess.PIPE,
+            text=True,
+            env={**os.environ, "XDG_CONFIG_HOME": str(folder / "config")},
+        )
+        self._reader = threading.Thread(target=self._read)
+        self._reader.start()
+        self.url = re.search(r"ws://\S+?(?=;)", self.line("listens on"))[0]
+        self.agent = AgentClient(self.url, name="anna@laptop").connect()
+
+    def _read(self):
+        for line in self.process.stderr:
+            with self._changed:
+                self.lines.append(line.rstrip())
+                self._changed.notify_all()
+
+    def line(self, text):
+        """The first line with a text, once there is one."""
+        with self._changed:
+            assert self._changed.wait_for(lambda: any(text in line for line in self.lines), DEADLINE), self.lines
+            return next(line for line in self.lines if text in line)
+
+    def state(self, wanted=None):
+        """The status, once its state is the wanted one."""
+        end = time.monotonic() + DEADLINE
+        while True:
+            status = self.agent.ask("status")
+            if wanted is None or status["state"] == wanted:
+                return status
+            assert time.monotonic() < end, status
+            time.sleep(0.02)
+
+    def run(self):
+        """Let the policy drive, whatever was before; on a busy computer a guard may have stopped the robot."""
+        end = time.monotonic() + DEADLINE
+        while self.agent.ask("status")["state"] != "running":
+            assert time.monotonic() < end, self.lines
+            self.agent.ask("pause")
+            self.agent.ask("resume")
+
+    def end(self, number=signal.SIGINT):
+        self.agent.close()
+        self.process.send_signal(number)
+        status = self.process.wait(DEADLINE)
+        self._reader.join()
+        self.process.stderr.close()
+        return status
+
+
+@pytest.fixture
+def start():
+    with contextlib.ExitStack() as stack:
+
+        def begin(folder, *flags):
+            program = Program(folder, *flags)
+            stack.callback(lambda: program.process.poll() is not None or program.end(signal.SIGKILL))
+            return program
+
+        yield begin
+
+
+@pytest.fixture(scope="module")
+def running(tmp_path_factory):
+    program = Program(tmp_path_factory.mktemp("agent"), "--policy", str(PICK))
+    yield program
+    program.end()
+
+
+def taken(url, **options):
+    return gym.make("bam/pick-v0", robot=url, disable_env_checker=True, **options)
+
+
+def begun(env):
+    """The start of an episode; on a busy computer a guard may stop the robot on its way to the start pose."""
+    for _ in range(4):
+        with contextlib.suppress(RobotFault):
+            return env.reset(seed=3)
+        env.unwrapped.robot.resume()
+    return env.reset(seed=3)
+
+
+def test_a_program_takes_over_and_hands_back(running):
+    running.run()
+    env, policy = taken(running.url), FrozenPolicy.load(PICK)
+    observation, _ = begun(env)
+    status = running.state()
+    assert status["state"] == "taken over"
+    assert re.fullmatch(r".+@.+ \(127\.0\.0\.1:\d+\)", status["owner"])
+    other = taken(running.url)
+    with pytest.raises(NotInCommand, match=r"drives this robot; the lease ends .* s after its last use\. Ask for it"):
+        other.unwrapped.robot.connect()
+    for _ in range(5):
+        observation, *_ = env.step(policy.act(observation))
+    env.close()
+    status = running.state("paused")
+    assert (status["owner"], status["why"].split(" by ")[0]) == (None, "handed back")
+    running.run()
+    assert running.state()["stage"] == "full"
+
+
+def test_the_cut_link_of_the_owner_holds_the_robot_and_pauses_the_policy(running):
+    running.run()
+    program = (
+        "import sys, time, gymnasium as gym, bam_envs\n"
+        f"env = gym.make('bam/pick-v0', robot={running.url!r}, disable_env_checker=True)\n"
+        "env.unwrapped.robot.connect()\n"
+        "env.unwrapped.robot._robot._take_over.take()\n"
+        "print('driving', flush=True)\n"
+        "time.sleep(60)\n"
+    )
+    driver = subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE, text=True)
+    assert driver.stdout.readline() == "driving\n"
+    assert running.state()["state"] == "taken over"
+    driver.kill()
+    driver.communicate()
+    assert "its link was cut" in running.state("paused")["why"]
+    assert running.state()["owner"] is None
+
+
+def test_a_push_acts_between_two_ticks_and_is_rolled_back(running, tmp_path, forge):
+    running.run()
+    candidate = tmp_path / "candidate.zip"
+    candidate.write_bytes(PICK.read_bytes())
+    candidate = forge(candidate, seed=7)
+    champion = running.state()["active"]
+    pushed = running.agent.push(candidate, when="tick")
+    assert pushed["state"] == "trial"
+    assert pushed["names"]["candidate"] == pushed["digest"] == running.state()["active"] != champion
+    back = running.agent.ask("rollback", why="too slow")
+    assert (back["active"], back["state"], back["names"]["champion"]) == (champion, "running", champion)
+    for text in ("push by anna@laptop", "rolled back: anna@laptop: too slow"):
+        running.line(f"acts instead of {(champion if 'push' in text else pushed['digest'])[:12]}: {text}")
+
+
+def test_stop_halts_and_pauses(running):
+    running.run()
+    running.agent.ask("stop")
+    assert running.state("paused")["why"] == "paused by anna@laptop: the stop button"
+
+
+def test_the_front_process_is_started_again(running):
+    running.run()
+    front = next(
+        int(pid)
+        for pid in os.listdir("/proc")
+        if pid.isdigit() and _parent(pid) == running.process.pid and "front_process" in _command(pid)
+    )
+    before = running.state()["ticks"]
+    os.kill(front, signal.SIGKILL)
+    running.line("The front process died; it is started again")
+    end = time.monotonic() + DEADLINE
+    while True:
+        with contextlib.suppress(Exception):
+            running.agent = AgentClient(running.url, name="anna@laptop").connect()
+            break
+        assert time.monotonic() < end
+        time.sleep(0.1)
+    assert running.state("running")["ticks"] > before
+
+
+def _parent(pid):
+    with contextlib.suppress(OSError):
+        return int(Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[1])
+
+
+def _command(pid):
+    with contextlib.suppress(OSError):
+        return Path(f"/proc/{pid}/cmdline").read_text()
+    return ""
+
+
+def test_a_restart_is_paused_and_keeps_the_versions(start, tmp_path):
+    first = start(tmp_path, "--policy", str(PICK))
+    active = first.state("running")["active"]
+    assert first.end(signal.SIGTERM) == 128 + signal.SIGTERM
+    again = start(tmp_path)
+    again.line("so it starts paused")
+    status = again.state("paused")
+    assert (status["active"], status["ticks"]) == (active, 0)
+    lines = [json.loads(line) for line in (tmp_path / "audit.jsonl").read_text().splitlines()]
+    assert {"time", "monotonic", "what", "text", "who", "digest"} <= lines[0].keys()
+    assert again.end() == 128 + signal.SIGINT
+
+
+def test_a_lost_robot_is_waited_for_and_checked_again(start, tmp_path, serve_program):
+    robot = serve_program()
+    program = start(tmp_path, "--policy", str(PICK), "--robot", robot.url)
+    program.state("running")
+    robot.end()
+    assert "link" in program.state("waiting for the robot")["why"]
+    serve_program(robot.port)
+    program.state("running")
+    assert sum("the robot fits" in line for line in program.lines) == 2
+
+
+@pytest.fixture
+def serve_program():
+    """Start bam-serve with bam/pick on a port."""
+    processes = []
+
+    class Served:
+        def __init__(self, port=0):
+            command = [sys.executable, "-m", "bam_train.cli.serve", "--port", str(port)]
+            self.process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
+            processes.append(self.process)
+            line = self.process.stderr.readline()
+            self.url = re.search(r"ws://[\d.:]+", line)[0]
+            self.port = int(self.url.rpartition(":")[2])
+
+        def end(self):
+            self.process.kill()
+            self.process.wait()
+
+    yield Served
+    for process in processes:
+        process.kill()
+        process.wait()
+        process.stderr.close()
+
+
+def test_take_overs_at_random_moments_make_no_jump(running):
+    """Of the robot's joints, as its states show them: none moves faster than its limit."""
+    from bam_train.agent.remote.agent_client import AgentClient as Client
+
+    rng, positions = np.random.default_rng(1), []
+    watcher = Client(running.url).connect()
+    watcher.listen("watch", lambda event: event["event"] == "telemetry" and positions.append(event))
+    for _ in range(10):
+        running.run()
+        time.sleep(rng.uniform(0.0, 0.3))
+        assert running.agent.ask("take")["state"] == "taken over"
+        assert running.agent.ask("hand_back", resume=True)["state"] == "running"
+    watcher.close()
+    speeds = [value for event in positions for value in event["state"]["joint_velocity"].values()]
+    assert len(speeds) > 0
+    assert max(map(abs, speeds)) < 3.2
