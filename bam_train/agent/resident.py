@@ -32,7 +32,7 @@ from bam_train.agent.versions import Versions
 from bam_train.checkpoint import Checkpoint
 from bam_train.deploy.deployment import STOP, StopSwitch, fault_text
 from bam_train.deploy.journal import EpisodeRecord
-from bam_train.errors import BamTrainError, ContractRefused, PolicyError, RequestRefused
+from bam_train.errors import BamTrainError, PolicyError, RequestRefused
 from bam_train.loop import Agent
 
 if TYPE_CHECKING:
@@ -122,6 +122,7 @@ class Resident:
         self._requests: deque[tuple[Callable[[], dict[str, Any] | None], int]] = deque()
         self._command: Drive | None = None
         self._is_running, self._stopped, self._quitting = is_running, "", False
+        self._was_connected = self._holds = False
         self._seed, self._reported = options.seed, 0.0
         self._episodes: deque[int | None] = deque(maxlen=_RECENT)
         self._ticks = self._completed = self._successes = self._late = 0
@@ -352,10 +353,13 @@ class Resident:
         if self._requests:
             return
         if drive is None or self.driver is None or drive.driver != self.driver.lease:
-            session.robot.halt()
+            if not self._holds:  # once: each halt of an arm holds it where gravity has pulled it
+                session.robot.halt()
+            self._holds = True
             self._require_link()
             self._report(_REPORT)
             return
+        self._holds = False
         try:
             session.robot.step(np.array([drive.command]))
             session.deployment.record_command()
@@ -395,13 +399,16 @@ class Resident:
                 switch=self.switch,
                 admit=self._admit,
             )
-        except (BamEnvsError, ContractRefused) as error:
+        except (BamEnvsError, BamTrainError) as error:
+            if not (self._was_connected or isinstance(error, BamEnvsError)):
+                raise  # a setting, a file or a robot that is wrong when the program starts
             if not self._stopped:
                 self._change(State.WAITING, fault_text(error))
             with self._news:
                 self._news.wait_for(lambda: bool(self._requests), _AGAIN)
             self._report(_REPORT)
             return
+        self._was_connected = True
         self._admit = lambda env, lines: None  # the operator is asked once
         self.session.deployment.swap(self.succession.policy())
         self.succession.load_previous()
@@ -474,7 +481,7 @@ class Resident:
         self.halt()
         if self.driver is not None and self.driver.lease != lease:
             self.note("take over", f"{who} takes over from {self.driver.who}", who, address)
-        self.driver, self._command, self._is_running = Driver(lease, who), None, False
+        self.driver, self._command, self._is_running, self._holds = Driver(lease, who), None, False, True
         self._change(State.TAKEN_OVER, f"taken over by {who}", who, address)
         return self.status()
 
