@@ -21,7 +21,7 @@ from bam_envs.ros.messages import bare_type, same_type, tag_text
 from bam_envs.ros.profile_tables import Readiness, RobotProfile, Sink
 from bam_envs.rosbridge.bus import Caller, Listener, Message, namespaces_with
 from bam_envs.rosbridge.client import RosbridgeLink
-from bam_envs.rosbridge.sessions import LEASE_TOPIC, LEAVE, RENEW, SESSION_SERVICE, read_session
+from bam_envs.rosbridge.sessions import LEASE_TOPIC, LEAVE, RENEW, SESSION_SERVICE, is_forbidden, read_session
 
 TIMEOUT = 3.0
 """Longest wait for the answer of a service, and for a first message, unless the endpoint has a timeout [s]."""
@@ -44,13 +44,17 @@ _ACTIVE = ("active", "running")
 def ask(link: RosbridgeLink, service: str, tries: int = _TRIES) -> dict[str, Any] | None:
     """Call `service`, which takes no arguments; None if it does not exist, `LinkLost` if it does not answer.
 
+    `RemoteError` if this client may only watch.
+
     It is called several times: a ROS 2 bridge creates a client for each call, and loses an answer that comes before
     client and service have discovered each other.
     """
     try:
         return link.call(service, "", {}, TIMEOUT / _TRIES)
-    except RemoteError:  # there is no such service
-        return None
+    except RemoteError as error:
+        if is_forbidden(error):
+            raise
+        return None  # there is no such service
     except LinkLost:
         if tries == 1 or not link.is_up:
             raise

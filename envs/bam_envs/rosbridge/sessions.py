@@ -22,6 +22,8 @@ LEASE_TOPIC = "/bam/lease"
 """Where the driver renews its lease, or leaves (std_msgs/String: `RENEW` or `LEAVE`, a blank, a signed tag)."""
 RENEW, LEAVE = "renew", "leave"
 _NOT_OPEN, _ELSEWHERE = "is not open here", "is of another connection"
+FORBIDDEN = "This needs a token of the role drive; the token shown may watch, and halt the robot."
+"""Answer to a client that may only watch."""
 _MOST = 64  # sessions of one caller; the oldest is closed for a new one
 
 
@@ -86,6 +88,11 @@ class Sessions:
 def is_over(error: RemoteError) -> bool:
     """Whether `error` is a refusal after which a new session is needed."""
     return _NOT_OPEN in str(error) or _ELSEWHERE in str(error)
+
+
+def is_forbidden(error: RemoteError) -> bool:
+    """Whether `error` is a refusal for want of a token that lets its owner drive."""
+    return FORBIDDEN in str(error)
 
 
 def read_session(response: Mapping[str, Any], where: str) -> Tagger:

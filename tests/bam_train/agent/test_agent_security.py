@@ -18,9 +18,13 @@ import time
 import zipfile
 from pathlib import Path
 
+import gymnasium as gym
 import pytest
 from websockets.exceptions import ConnectionClosed, InvalidMessage, InvalidStatus
 from websockets.sync.client import connect
+
+import bam_envs  # noqa: F401 - registers the environments
+from bam_envs.core.errors import RemoteError
 
 DEADLINE = 60.0
 CHECKPOINT = Path(__file__).parents[3] / "checkpoints" / "pick-ppo.zip"
@@ -420,6 +424,17 @@ def test_a_watcher_of_the_topics_sends_nothing(agent, refusals):
         client.send(json.dumps({"op": "call_service", "id": "1", "service": "/bam/session"}))
         assert receive(client)["values"] == reason
     refusals("publish is not for the role watch")
+    refusals("The service /bam/session is not for the role watch")
+
+
+def test_a_watcher_who_would_drive_by_a_program(agent, refusals, tmp_path):
+    path = tmp_path / "token"
+    path.write_text("www")
+    env = gym.make("bam/pick-v0", robot=f"ws://127.0.0.1:{agent.port}", token_file=str(path))
+    with contextlib.closing(env), pytest.raises(RemoteError) as error:
+        env.reset()
+    reason = "This needs a token of the role drive; the token shown may watch, and halt the robot."
+    assert str(error.value).endswith(reason)
     refusals("The service /bam/session is not for the role watch")
 
 

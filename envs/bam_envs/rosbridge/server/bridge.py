@@ -36,6 +36,7 @@ from bam_envs.rosbridge.server.client_session import (
 from bam_envs.rosbridge.server.refusals import Refusals
 from bam_envs.rosbridge.server.services import Services, checked, packed_response
 from bam_envs.rosbridge.server.topics import Stream, Topic, Topics
+from bam_envs.rosbridge.sessions import FORBIDDEN
 
 _FOR_WATCHERS = frozenset({"subscribe", "unsubscribe", "set_level", "fragment", "call_service"})
 _ON_HALT = frozenset({"advertise", "unadvertise", "publish"})  # what a watcher may do on the topic that halts, only
@@ -340,7 +341,7 @@ class Bridge:
 
     def _refused(self, session: Session, what: str) -> RemoteError:
         self._refusals.note(session.caller.shown, f"{what} is not for the role watch")
-        return RemoteError("This needs a token of the role drive; the token shown may watch, and halt the robot.")
+        return RemoteError(FORBIDDEN)
 
     def _existing(self, name: str) -> Topic:
         topic = self.topics.get(name)
