@@ -29,7 +29,8 @@ if TYPE_CHECKING:
 
 Listener = Callable[[dict[str, Any]], None]
 _SHOW = 0.1  # time between two messages of telemetry [s]
-_LONG = 3600.0  # longest wait for a candidate's trial [s]
+_LONG = 3700.0  # longest wait until a candidate acts [s]; the agent itself gives up after an hour
+_TRIAL = 25 * 3600.0  # the same until its trial has ended, for which the agent waits a day [s]
 
 
 class AgentHub:
@@ -91,7 +92,7 @@ class AgentHub:
             return self.status()
         if op == "push":
             arguments = {**arguments, "path": str(arguments["path"])}
-        long = _LONG if op in ("push", "use") else 10.0
+        long = _TRIAL if arguments.get("wait") else _LONG if op in ("push", "use") else 10.0
         return self._front.ask(op, arguments, person.name, person.address, progress, long)
 
     def stop(self, person: Person) -> dict[str, Any]:
