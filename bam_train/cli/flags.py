@@ -83,6 +83,11 @@ class TrainConfig(SettingsFlags):  # type: ignore[misc]
     """Overwrite the checkpoint at --out instead of adding a number to its name."""
     runs: Path = Path("runs")
     """Folder in which the run's own folder is made."""
+    learner: Annotated[str | None, _unset("URL")] = None
+    """Learn from the robot of the live agent at this address, such as ws://robot:9095, while it runs (algorithm rlpd);
+    candidates are pushed to it. --token-file and --ca-file are those of the agent."""
+    push_every: Count = 10
+    """Episodes of the robot between two candidates of --learner."""
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ import sys
 import time
 from collections.abc import Callable
 from functools import partial
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from bam_train.cli.console import count, tell
 from bam_train.cli.program import run_program
@@ -39,6 +39,8 @@ def train(config: TrainConfig) -> int:
     if "transport" in flags:
         flags["transport"] = list(addresses(flags["transport"]))
     given = merge(file, read_assignments(config.set), flags)
+    if config.learner is not None:
+        return _learn(config, config.learner, given, checkpoint)
     settings = resolve(given) if checkpoint is None else resolve_resumed(given, checkpoint)
     if config.print_config:
         tell(*json.dumps(settings.to_mapping(), indent=2).split("\n"))
@@ -85,6 +87,27 @@ def _train(config: TrainConfig, settings: TrainSettings, checkpoint: Checkpoint 
     if outcome.failure is not None:
         raise outcome.failure
     return 128 + came[0] if came else 0
+
+
+def _learn(config: TrainConfig, url: str, given: dict[str, Any], checkpoint: Checkpoint | None) -> int:
+    """Learn from a live agent; returns the exit status."""
+    from bam_train.cli.console import say
+    from bam_train.cli.experiment import signals_ask
+    from bam_train.trainers.live.live_run import learn
+
+    with signals_ask() as stopped:
+        learn(
+            url,
+            given,
+            checkpoint,
+            out=config.out,
+            runs=config.runs.expanduser(),
+            force=config.force,
+            push_every=config.push_every,
+            tell=say,
+            stopped=stopped,
+        )
+    return 0
 
 
 def _stop_on_signals(run: TrainingRun, came: list[int]) -> Callable[[int], None]:

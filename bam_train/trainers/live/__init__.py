@@ -1,0 +1,1 @@
+"""Learning from a live agent while it runs."""

@@ -1,0 +1,194 @@
+"""A learner at its live agent: transitions come, candidates go; the robot does not wait for any of it.
+
+Without the agent the learner waits, and goes on when it is there again. What a cut link loses is lost.
+"""
+
+from __future__ import annotations
+
+import queue
+import threading
+import time
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+from bam_envs.core.errors import BamEnvsError
+from bam_train.agent.remote.agent_client import AgentClient
+from bam_train.agent.transitions import decode
+from bam_train.errors import AgentRefused, BamTrainError, OutputError, TrainingFailed
+from bam_train.trainers.live.live_learner import LiveLearner
+from bam_train.trainers.run_folder import RunFolder
+
+_UPDATES = 20  # updates between two looks at what came
+_LOOK = 0.2  # longest wait for transitions [s]
+_AGAIN = 2.0  # time between two attempts to reach the agent [s]
+_GHOST = 60.0  # time for which an agent may take this learner, whose link was cut, for another one [s]
+_SAVE_EVERY, _TELL_EVERY = 60.0, 15.0  # [s]
+
+
+class LiveSession:
+    """Learns from the agent at an address until the steps are done.
+
+    Args:
+        learner: The learner.
+        connect: Makes a client of the agent, not connected yet.
+        folder: Where the newest state and the candidates are written.
+        out: Where the last policy goes.
+        push_every: Episodes of the robot between two candidates.
+        tell: Called with a line for the user.
+        stopped: Whether the user wants to end.
+    """
+
+    def __init__(
+        self,
+        learner: LiveLearner,
+        connect: Callable[[], AgentClient],
+        folder: RunFolder,
+        out: Path,
+        *,
+        push_every: int,
+        tell: Callable[[str], None],
+        stopped: Callable[[], bool],
+    ) -> None:
+        self.learner, self._connect, self._folder, self._out = learner, connect, folder, out
+        self._push_every, self._tell, self._stopped = push_every, tell, stopped
+        self._events: queue.SimpleQueue[Mapping[str, Any]] = queue.SimpleQueue()
+        self._client: AgentClient | None = None
+        self._learned_at: float | None = None  # when transitions came last [s]
+        self._pusher: threading.Thread | None = None
+        self._pushed = len(learner.experience.outcomes)  # episodes at the last candidate
+        self._saved = self._told = time.monotonic()
+
+    def run(self) -> bool:
+        """Learn until the steps are done (True), or the user wants to end (False); saves in both cases.
+
+        Raises:
+            AgentRefused: Another learner is there, or the token does not administer.
+            TrainingFailed: A loss is not finite, or the agent runs another environment.
+        """
+        try:
+            while not self._stopped() and not self._done:
+                if self._client is None:
+                    self._reach()
+                    continue
+                self._take()
+                self._update()
+                enough = len(self.learner.experience.outcomes) >= self._pushed + self._push_every
+                if enough and self.learner.is_ready:
+                    self._begin_push()
+                self._look_after_files()
+            if self._done:
+                self._finish()
+            return self._done
+        finally:
+            self._save()
+            if self._client is not None:
+                self._client.close()
+
+    @property
+    def _done(self) -> bool:
+        return self.learner.steps >= self.learner.settings.steps and self.learner.due <= 0
+
+    # ---- the link
+
+    def _reach(self) -> None:
+        client = self._connect()
+        try:
+            client.connect().listen("transitions", self._events.put)
+            status = client.ask("status")
+        except AgentRefused:
+            client.close()
+            if self._learned_at is None or time.monotonic() - self._learned_at > _GHOST:
+                raise
+            time.sleep(_AGAIN)
+        except BamEnvsError as error:
+            client.close()
+            self._tell(f"{error} It is tried again.")
+            self._wait(_AGAIN)
+        else:
+            self._client = client
+            self._tell(f"learns from {client.url}: {status.get('state')}, {status.get('robot')}")
+
+    def _wait(self, seconds: float) -> None:
+        end = time.monotonic() + seconds
+        while time.monotonic() < end and not self._stopped():
+            time.sleep(min(_LOOK, seconds))
+
+    def _take(self) -> None:
+        """Take the transitions that came; wait a little if there is nothing else to do."""
+        client, can_wait = self._client, self.learner.due <= 0
+        try:
+            while True:
+                event = self._events.get(timeout=_LOOK) if can_wait else self._events.get_nowait()
+                can_wait = False
+                self.learner.add(decode(event))
+                self._learned_at = time.monotonic()
+        except queue.Empty:
+            pass
+        if client is not None and client.error is not None:
+            self._tell(f"{client.error} The robot goes on; this learner waits for it.")
+            client.close()
+            self._client = None
+
+    def _update(self) -> None:
+        self.learner.learn(_UPDATES)
+        if time.monotonic() - self._told > _TELL_EVERY:
+            self._told = time.monotonic()
+            figures = self.learner.statistics()
+            rate = figures["success_rate"]
+            shown = "unknown" if rate is None else f"{rate:.0%}"
+            self._tell(
+                f"{self.learner.steps} steps ({figures['interventions']} of a person), {figures['episodes']} episodes, "
+                f"{figures['updates']} updates; success of the last episodes {shown}"
+            )
+
+    # ---- candidates and files
+
+    def _begin_push(self) -> None:
+        """Push a candidate that explores, in another thread, unless one is still on its way."""
+        if self._pusher is not None and self._pusher.is_alive():
+            return
+        self._pushed = len(self.learner.experience.outcomes)
+        path = self._folder.path / "candidate.zip"
+        try:
+            self.learner.save(path, explores=True)
+        except OutputError as error:
+            self._tell(f"{error}. Learning goes on")
+            return
+        self._pusher = threading.Thread(target=self._push, args=(path,), name="bam-push", daemon=True)
+        self._pusher.start()
+
+    def _push(self, path: Path) -> dict[str, Any]:
+        client = self._client
+        if client is None:
+            return {}
+        try:
+            # On trial: the champion stays until trials show that a candidate succeeds. The memory of a policy begins
+            # with an episode.
+            return client.push(path, stage="auto", when="episode", why="learnt on this robot")
+        except (BamTrainError, BamEnvsError) as error:
+            self._tell(f"the candidate does not act: {error}")
+            return {}
+
+    def _finish(self) -> None:
+        """Push the policy that does not explore, and save it as the result."""
+        checkpoint = self.learner.save(self._out)
+        if self._pusher is not None:
+            self._pusher.join()
+        result = self._push(self._out)
+        acts = "it acts on the robot now" if result.get("active") == checkpoint.digest else "push it with bam-push"
+        self._tell(f"the policy after {self.learner.steps} steps is in {self._out} ({checkpoint.digest[:12]}); {acts}")
+
+    def _look_after_files(self) -> None:
+        if time.monotonic() - self._saved > _SAVE_EVERY:
+            self._save()
+
+    def _save(self) -> None:
+        self._saved = time.monotonic()
+        try:
+            self.learner.save(self._folder.last, resumable=True)
+            self._folder.add({"kind": "training", "steps": self.learner.steps, **self.learner.statistics()})
+        except OutputError as error:
+            self._tell(f"{error}. Learning goes on")
+        except TrainingFailed as error:
+            self._tell(str(error))

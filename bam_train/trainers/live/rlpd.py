@@ -1,0 +1,261 @@
+"""RLPD: soft actor-critic that learns from demonstrations and from a robot's experience at the same time.
+
+P. J. Ball, L. Smith, I. Kostrikov, S. Levine: Efficient Online Reinforcement Learning with Offline Data (2023),
+https://arxiv.org/abs/2302.02948: half of each batch are demonstrations, the critics are an ensemble with layer
+normalisation, whose target is the least of a random subset, and there are several updates for each step of the robot.
+
+Two things differ, because a robot must stay useful while it learns. Successful episodes of the robot count as
+demonstrations too, beside those of a person (Oh et al., Self-Imitation Learning, https://arxiv.org/abs/1806.05635).
+And the actor imitates: demonstrations, and of its own experience what the critics value more than its usual actions
+(Nair et al., AWAC, https://arxiv.org/abs/2006.09359), instead of climbing the critics' slope, which in the first
+thousands of steps leads away from all that was ever tried; ``value_weight`` adds that part of SAC again.
+"""
+
+import math
+from dataclasses import dataclass
+from typing import Annotated, Any
+
+import torch
+from msgspec import Meta
+from torch import nn
+from torch.nn import functional
+
+from bam_train.errors import TrainingFailed
+from bam_train.trainers.frozen_network import Layer
+
+_Count = Annotated[int, Meta(ge=1, le=100_000)]
+_Positive = Annotated[float, Meta(gt=0, le=1e6)]
+_Share = Annotated[float, Meta(ge=0, le=1)]
+_Weight = Annotated[float, Meta(ge=0, le=1e6)]
+_DRAWS = 2  # actions that the usual value of an observation is the mean of
+_MOST = 3.0  # greatest exponent of the weight of an action
+
+
+@dataclass(frozen=True)
+class Hyperparameters:
+    """Arguments of the algorithm."""
+
+    gamma: _Share = 0.98
+    """Discount of a step."""
+    ahead: _Count = 5
+    """Steps whose rewards are added before the critics' value of what follows."""
+    tau: _Share = 0.005
+    """Share of the critics that the target critics take over at each update."""
+    learning_rate: _Positive = 3e-4
+    batch_size: _Count = 256
+    update_ratio: Annotated[float, Meta(gt=0, le=100)] = 2.0
+    """Updates of the critics for each step of the robot."""
+    actor_every: _Count = 2
+    """Updates of the critics for each one of the actor."""
+    critics: Annotated[int, Meta(ge=2, le=100)] = 5
+    """Size of the ensemble."""
+    subset: Annotated[int, Meta(ge=1, le=100)] = 2
+    """Critics of which the least value is the target, drawn for each update."""
+    critic_width: _Count = 128
+    actor_width: _Count = 256
+    history: Annotated[int, Meta(ge=0, le=64)] = 5
+    """Last actions that the policy remembers, so that it can act on a robot that is late."""
+    reward_scale: _Positive = 0.1
+    deviation: _Positive = 0.15
+    """Standard deviation of the first explorations, before the squashing of actions to [-1, 1]."""
+    target_entropy: float = -10.0
+    temperature: _Positive = 0.002
+    """The first weight of the entropy."""
+    demonstration_share: _Share = 0.5
+    """Share of a batch that are demonstrations: half of them of a person, half of the robot's own successes."""
+    imitation_weight: _Weight = 1.0
+    """Weight of the imitation of demonstrations in the actor's loss."""
+    advantage_weight: _Weight = 1.0
+    """Weight of the imitation of experience, each action by the exponential of its advantage."""
+    advantage_scale: _Weight = 1.0
+    """Exponent of that for an advantage of one standard deviation."""
+    value_weight: _Weight = 0.0
+    """Weight of SAC's own loss, value and entropy of drawn actions, relative to the mean value."""
+    warmup: Annotated[int, Meta(ge=0, le=10**9)] = 4000
+    """Updates of the critics before they count for the actor."""
+    actor_after: Annotated[int, Meta(ge=0, le=10**9)] = 1000
+    """Steps of policies, not of a person, before the actor changes and the first candidate is pushed: a person's
+    demonstrations alone are too few to imitate nothing else."""
+
+
+@dataclass(frozen=True)
+class Batch:
+    """n transitions; the last `demonstrations` of them are demonstrations."""
+
+    seen: torch.Tensor
+    """Observation and last actions. Shape: (n, inputs)."""
+    action: torch.Tensor
+    """In [-1, 1]. Shape: (n, a)."""
+    reward: torch.Tensor
+    """Discounted sum of the rewards until `after`. Shape: (n,)."""
+    after: torch.Tensor
+    """`seen` some steps later. Shape: (n, inputs)."""
+    discount: torch.Tensor
+    """Of the value of `after`: 0 where the task ended before. Shape: (n,)."""
+    demonstrations: int
+
+
+class Critics(Layer):
+    """An ensemble of networks with layer normalisation: observation and action to a value each."""
+
+    def __init__(self, count: int, inputs: int, width: int) -> None:
+        super().__init__()
+        sizes = ((inputs, width), (width, width), (width, 1))
+        self.weights = nn.ParameterList(_uniform(count, i, o, fan=i) for i, o in sizes)
+        self.biases = nn.ParameterList(_uniform(count, 1, o, fan=i) for i, o in sizes)
+        self.scales = nn.ParameterList(nn.Parameter(torch.ones(count, 1, width)) for _ in range(2))
+        self.shifts = nn.ParameterList(nn.Parameter(torch.zeros(count, 1, width)) for _ in range(2))
+
+    def forward(self, seen: torch.Tensor, action: torch.Tensor, chosen: torch.Tensor | None = None) -> torch.Tensor:
+        """Values of the `chosen` critics, or of all. Shapes: (n, inputs), (n, a) -> (critics, n)."""
+
+        def of(parameters: nn.ParameterList, layer: int) -> torch.Tensor:
+            return parameters[layer] if chosen is None else parameters[layer][chosen]
+
+        weight = of(self.weights, 0)
+        x = torch.cat([seen, action], 1).expand(len(weight), -1, -1)
+        for layer in range(2):
+            x = torch.baddbmm(of(self.biases, layer), x, of(self.weights, layer))
+            x = functional.layer_norm(x, x.shape[-1:]) * of(self.scales, layer) + of(self.shifts, layer)
+            x = functional.relu(x)
+        return torch.baddbmm(of(self.biases, 2), x, of(self.weights, 2)).squeeze(-1)
+
+
+def _uniform(count: int, rows: int, columns: int, fan: int) -> nn.Parameter:
+    return nn.Parameter((2 * torch.rand(count, rows, columns) - 1) / math.sqrt(fan))
+
+
+class Actor(Layer):
+    """Observation and last actions to mean and logarithm of the deviation of the next action, before squashing."""
+
+    def __init__(self, inputs: int, actions: int, width: int, deviation: float) -> None:
+        super().__init__()
+        layers = (nn.Linear(inputs, width), nn.ReLU(), nn.Linear(width, width), nn.ReLU())
+        self.layers, self.mean = nn.Sequential(*layers), nn.Linear(width, actions)
+        self.log_deviation = nn.Linear(width, actions)
+        nn.init.zeros_(self.log_deviation.weight)
+        nn.init.constant_(self.log_deviation.bias, math.log(deviation))
+
+    def forward(self, seen: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Shapes: (n, inputs) -> (n, a), (n, a)."""
+        x = self.layers(seen)
+        return self.mean(x), self.log_deviation(x).clamp(-5.0, 0.0)
+
+    def draw(self, seen: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        """Drawn actions in [-1, 1] (n, a), the logarithm of their density (n,), and the means in [-1, 1] (n, a)."""
+        mean, log_deviation = self(seen)
+        noise = torch.randn_like(mean)
+        raw = mean + noise * log_deviation.exp()
+        # log of the derivative of tanh: 2 (log 2 - x - softplus(-2 x))
+        slope = 2 * (math.log(2) - raw - functional.softplus(-2 * raw))
+        density = -0.5 * noise**2 - log_deviation - 0.5 * math.log(2 * math.pi) - slope
+        return torch.tanh(raw), density.sum(-1), torch.tanh(mean)
+
+
+class Rlpd:
+    """Actor, critics and their optimisers.
+
+    Args:
+        inputs: Numbers of an observation and of the last actions.
+        actions: Numbers of an action.
+        settings: The hyperparameters.
+    """
+
+    def __init__(self, inputs: int, actions: int, settings: Hyperparameters) -> None:
+        self.settings, self.updates = settings, 0
+        self.actor = Actor(inputs, actions, settings.actor_width, settings.deviation)
+        shape = settings.critics, inputs + actions, settings.critic_width
+        self.critics, self._target = Critics(*shape), Critics(*shape)
+        self._target.load_state_dict(self.critics.state_dict())
+        self._log_temperature = torch.tensor(math.log(settings.temperature), requires_grad=True)
+        rate = settings.learning_rate
+        self._optimisers = {
+            "critics": torch.optim.Adam(self.critics.parameters(), lr=rate),
+            "actor": torch.optim.Adam(self.actor.parameters(), lr=rate),
+            "temperature": torch.optim.Adam([self._log_temperature], lr=rate),
+        }
+        self.metrics: dict[str, float] = {}
+        """Numbers of the last updates."""
+
+    def update(self, batch: Batch, *, actor: bool = True) -> None:
+        """Update the critics, and every so often the actor, unless it is to stay as it is.
+
+        Raises:
+            TrainingFailed: A loss is not finite.
+        """
+        self._update_critics(batch)
+        self.updates += 1
+        if actor and self.updates % self.settings.actor_every == 0:
+            self._update_actor(batch)
+
+    def _update_critics(self, batch: Batch) -> None:
+        settings = self.settings
+        with torch.no_grad():
+            action, density, _ = self.actor.draw(batch.after)
+            chosen = torch.randperm(settings.critics)[: settings.subset]
+            value = self._target(batch.after, action, chosen).amin(0) - self._log_temperature.exp() * density
+            target = settings.reward_scale * batch.reward + batch.discount * value
+        loss = ((self.critics(batch.seen, batch.action) - target) ** 2).sum(0).mean()
+        self._descend("critics", loss)
+        with torch.no_grad():
+            for new, old in zip(self.critics.parameters(), self._target.parameters(), strict=True):
+                old.lerp_(new, settings.tau)
+        self.metrics |= {"loss/critics": loss.item(), "value": target.mean().item()}
+
+    def _update_actor(self, batch: Batch) -> None:
+        settings, own = self.settings, len(batch.seen) - batch.demonstrations
+        drawn, density, mean = self.actor.draw(batch.seen)
+        errors, losses = ((mean - batch.action) ** 2).mean(1), {}
+        if batch.demonstrations and settings.imitation_weight:
+            losses["imitation"] = settings.imitation_weight * errors[own:].mean()
+        if self.updates > settings.warmup and settings.advantage_weight:
+            weights = self._weights(batch.seen[:own], batch.action[:own])
+            losses["advantage"] = settings.advantage_weight * (weights * errors[:own]).mean()
+        temperature = self._log_temperature.exp()
+        if self.updates > settings.warmup and settings.value_weight:
+            value = self.critics(batch.seen, drawn).mean(0)
+            gain = (temperature.detach() * density - value).mean() / value.detach().abs().mean().clamp(min=1e-3)
+            losses["value"] = settings.value_weight * gain
+            self._descend("temperature", -temperature * (density.detach().mean() + settings.target_entropy))
+        if losses:
+            self._descend("actor", torch.stack([*losses.values()]).sum())
+        self.metrics |= {f"loss/{name}": loss.item() for name, loss in losses.items()}
+
+    @torch.no_grad()  # type: ignore[untyped-decorator] # torch is not typed here
+    def _weights(self, seen: torch.Tensor, action: torch.Tensor) -> torch.Tensor:
+        """Weights of the actions that were tried, by their advantage over drawn ones; their mean is 1. Shape: (n,)."""
+        usual = [self.critics(seen, self.actor.draw(seen)[0]).mean(0) for _ in range(_DRAWS)]
+        advantage = self.critics(seen, action).mean(0) - torch.stack(usual).mean(0)
+        exponent = self.settings.advantage_scale * advantage / advantage.std().clamp(min=1e-6)
+        weights = exponent.clamp(max=_MOST).exp()
+        return weights / weights.mean()
+
+    def _descend(self, name: str, loss: torch.Tensor) -> None:
+        if not torch.isfinite(loss):
+            raise TrainingFailed(f"the loss of the {name} is {loss.item()}: try a smaller learning_rate")
+        optimiser = self._optimisers[name]
+        optimiser.zero_grad()
+        loss.backward()
+        optimiser.step()
+
+    def state_dict(self) -> dict[str, Any]:
+        """Everything that the next updates depend on, except torch's random numbers."""
+        return {
+            "actor": self.actor.state_dict(),
+            "critics": self.critics.state_dict(),
+            "target": self._target.state_dict(),
+            "temperature": self._log_temperature.detach().clone(),
+            "optimisers": {name: one.state_dict() for name, one in self._optimisers.items()},
+            "updates": self.updates,
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Restore the result of `state_dict`."""
+        self.actor.load_state_dict(state["actor"])
+        self.critics.load_state_dict(state["critics"])
+        self._target.load_state_dict(state["target"])
+        with torch.no_grad():
+            self._log_temperature.copy_(state["temperature"])
+        for name, optimiser in self._optimisers.items():
+            optimiser.load_state_dict(state["optimisers"][name])
+        self.updates = int(state["updates"])
