@@ -28,6 +28,8 @@ JOINT_SPEED = 0.5
 """Fastest joint of an arm [rad/s]; near a singularity the tool slows down instead."""
 LEASH = 0.03
 """Farthest that the commanded tool is ahead of the measured one [m], as in `bam_envs.tasks.tool_control`."""
+_SAG = 0.002
+"""A motion begins at the last command if the arm is as near to it as this [m], else where the arm is: it was halted."""
 _SINGULAR, _DAMPING = 0.1, 0.1
 """Least singular value of the Jacobian without damping, and the damping at 0 (m and rad weigh the same)."""
 _DRIFT = 1e-3
@@ -109,12 +111,15 @@ class Jogger:
         return delay - self._delay > FRESH
 
     def command(self, state: RobotState) -> Array | None:
-        """The command of the next period (1, m), or None: there is no fresh twist, and nothing is to be sent.
+        """The command of the next period (1, m), or None: nothing is to be sent, as there is no fresh twist.
 
         `state` has n = 1; its ``command`` is the last one that the robot was sent, from where the gripper goes on.
         """
-        if self._clock() - self._newest.at > FRESH:
+        newest = self._newest
+        if self._clock() - newest.at > FRESH:
             self._sent = None
+            return None
+        if self._sent is None and not (any(newest.twist) or newest.grip):  # nothing moves, nothing is to move
             return None
         self._sent = command = self._drive() if is_base(self._spec) else self._reach(state)
         return np.array([command])
@@ -130,7 +135,7 @@ class Jogger:
         here = goal.copy()
         for place, signal, column in self._measured:
             here[place] = state.signals[signal][0, column]
-        if self._gap(goal, here) > 2 * LEASH:  # somebody else moved the arm, or holds it
+        if self._gap(goal, here) > (_SAG if self._sent is None else 2 * LEASH):  # it was halted, or is held
             goal[joints] = here[joints]
         ahead = goal.copy()
         ahead[joints] += self._step(goal[joints])

@@ -127,3 +127,54 @@ def renderers(root):
             if b"--type=renderer" in command:
                 found.append(pid)
     return found
+
+
+@pytest.fixture(scope="module")
+def browser():
+    browser = new_browser()
+    yield browser
+    browser.quit()
+
+
+@pytest.fixture
+def page(browser):
+    """The browser with one new tab, which is in front."""
+    before = browser.window_handles
+    browser.switch_to.new_window("tab")
+    page = browser.current_window_handle
+    for tab in before:
+        browser.switch_to.window(tab)
+        browser.close()
+    browser.switch_to.window(page)
+    browser.get_log("browser")
+    return Page(browser)
+
+
+def close_it(page):
+    page.browser.switch_to.new_window("tab")
+    other = page.browser.current_window_handle
+    page.browser.switch_to.window(next(tab for tab in page.browser.window_handles if tab != other))
+    page.press("w")  # the new tab took the key away
+    time.sleep(0.2)
+    page.browser.close()
+    page.browser.switch_to.window(other)
+
+
+def hide_it(page):
+    page.browser.switch_to.new_window("tab")
+
+
+def reload_it(page):
+    page.browser.refresh()
+
+
+def blur_it(page):
+    page.run("window.dispatchEvent(new Event('blur'))")
+
+
+def suspend_it(page):
+    page.cdp("Page.setWebLifecycleState", state="frozen")
+
+
+LEAVINGS = close_it, hide_it, reload_it, blur_it, suspend_it
+"""How a page is left while a key is held."""

@@ -9,31 +9,11 @@ from PIL import Image
 from bam_envs.live.camera import CameraImage
 from bam_envs.rosbridge.tokens import Tokens
 from bam_train.agent.front.jog import FRESH
-from tests.bam_train.agent.browsers import Page, new_browser, until
+from tests.bam_train.agent.browsers import LEAVINGS, browser, page, until
 from tests.bam_train.agent.fake_agent import FakeAgent
 
+__all__ = ["browser", "page"]  # fixtures from elsewhere
 ROLES = Tokens({"watching": "watch", "driving": "drive", "secret": "administer"})
-
-
-@pytest.fixture(scope="module")
-def browser():
-    browser = new_browser()
-    yield browser
-    browser.quit()
-
-
-@pytest.fixture
-def page(browser):
-    """The browser with one new tab, which is in front."""
-    before = browser.window_handles
-    browser.switch_to.new_window("tab")
-    page = browser.current_window_handle
-    for tab in before:
-        browser.switch_to.window(tab)
-        browser.close()
-    browser.switch_to.window(page)
-    browser.get_log("browser")
-    return Page(browser)
 
 
 @pytest.fixture
@@ -178,33 +158,7 @@ def test_a_button_moves_the_robot_while_it_is_held_and_a_key_with_a_modifier_doe
     assert agent.twists[sent][1]["gripper"] == -1
 
 
-def close_it(page):
-    page.browser.switch_to.new_window("tab")
-    other = page.browser.current_window_handle
-    page.browser.switch_to.window(next(tab for tab in page.browser.window_handles if tab != other))
-    page.press("w")  # the new tab took the key away
-    time.sleep(0.2)
-    page.browser.close()
-    page.browser.switch_to.window(other)
-
-
-def hide_it(page):
-    page.browser.switch_to.new_window("tab")
-
-
-def reload_it(page):
-    page.browser.refresh()
-
-
-def blur_it(page):
-    page.run("window.dispatchEvent(new Event('blur'))")
-
-
-def suspend_it(page):
-    page.cdp("Page.setWebLifecycleState", state="frozen")
-
-
-@pytest.mark.parametrize("leave", [close_it, hide_it, reload_it, blur_it, suspend_it])
+@pytest.mark.parametrize("leave", LEAVINGS)
 def test_a_page_that_is_left_in_mid_jog_leaves_the_robot_at_rest(driven, agent, leave):
     driven.press("w")
     until(lambda: agent.moves, "a motion")

@@ -136,7 +136,7 @@ def test_clocks_that_drift_apart_do_no_harm(arm, clock):
 def test_the_gripper_closes_opens_and_otherwise_keeps_its_command(arm):
     widths = []
     for seq, grip in enumerate([0, 1, 0, -1, 0]):
-        arm.put(twist(seq, gripper=grip))
+        arm.put(twist(seq, 0.01, gripper=grip))
         widths.append(arm.command(arm_state())[0, 6])
     assert widths == [0.04, 0.0, 0.0, GRIPPER_OPEN, GRIPPER_OPEN]
 
@@ -152,14 +152,23 @@ def test_the_command_stays_near_an_arm_that_does_not_follow_and_comes_back_at_on
     assert np.linalg.norm(tool(arm.command(arm_state(HOME))) - tool(HOME[None])) < np.linalg.norm(ahead) - 0.009
 
 
-def test_a_motion_begins_at_the_last_command_or_at_an_arm_that_is_elsewhere(arm, clock):
-    sagged, elsewhere = HOME - 0.002, HOME - 0.3
-    arm.put(twist(1))
-    np.testing.assert_allclose(arm.command(arm_state(HOME, sagged)), HOME[None])
-    clock.now += 1.0
-    assert arm.command(arm_state()) is None
-    arm.put(twist(2))
-    np.testing.assert_allclose(arm.command(arm_state(HOME, elsewhere)), [[*elsewhere[:6], HOME[6]]])
+def test_a_motion_begins_at_the_last_command_or_at_an_arm_that_was_halted(arm, clock):
+    for seq, (measured, expected) in enumerate([(HOME - 0.0005, HOME), (HOME - 0.02, HOME - 0.02)]):
+        arm.put(twist(seq, 0.1))
+        start = np.append(expected[:6], HOME[6])
+        moved = tool(arm.command(arm_state(HOME, measured))) - tool(start[None])
+        np.testing.assert_allclose(moved, [0.1 * PERIOD, 0, 0], atol=1e-4)
+        clock.now += 1.0
+        assert arm.command(arm_state()) is None
+
+
+def test_a_twist_of_zeros_holds_what_moves_and_wakes_nothing(arm, clock):
+    arm.put(twist(0, 0.0))
+    assert arm.command(arm_state(HOME, HOME - 0.01)) is None
+    arm.put(twist(1, 0.1))
+    moving = arm.command(arm_state())
+    arm.put(twist(2, 0.0))
+    np.testing.assert_array_equal(arm.command(arm_state()), moving)
 
 
 def test_a_state_is_not_changed(arm):
