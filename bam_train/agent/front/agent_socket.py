@@ -174,7 +174,6 @@ class _Client:
 
     async def run(self) -> None:
         """Take messages until the socket closes."""
-        self._connection.limit_messages(protocol.LONGEST_CHUNK)
         hello = {"event": "hello", "protocol": protocol.PROTOCOL, "agent": __version__, "role": self._caller.role}
         self._send(hello)
         try:

@@ -12,6 +12,7 @@ import threading
 from collections.abc import Mapping
 from typing import Protocol
 
+import msgspec
 import numpy as np
 from websockets.exceptions import ConnectionClosed
 
@@ -75,7 +76,7 @@ class CameraFeed:
     async def _show(self, connection: BridgeConnection) -> None:
         ready, shown, told = set(range(len(self._names))), [0] * len(self._names), [""] * len(self._names)
         await connection.send(json.dumps({"cameras": self._names}))
-        listening = asyncio.create_task(_listen(connection, ready))
+        listening = asyncio.create_task(_listen(connection, ready, len(self._names)))
         silent = 0.0
         try:
             while not listening.done():
@@ -99,13 +100,18 @@ class CameraFeed:
                 await listening
 
 
-async def _listen(connection: BridgeConnection, ready: set[int]) -> None:
+class _Next(msgspec.Struct):
+    op: str
+    camera: int = -1
+
+
+async def _listen(connection: BridgeConnection, ready: set[int], cameras: int) -> None:
     """Note which cameras' pictures were drawn, until the connection closes."""
     while True:
-        with contextlib.suppress(ValueError, AttributeError):
-            message = json.loads(await connection.next_message())
-            if message.get("op") == "next" and isinstance(message.get("camera"), int):
-                ready.add(message["camera"])
+        with contextlib.suppress(msgspec.MsgspecError, RecursionError):  # also lists in lists in lists
+            message = msgspec.json.decode(await connection.next_message(), type=_Next)
+            if message.op == "next" and 0 <= message.camera < cameras:
+                ready.add(message.camera)
 
 
 class _Reader:

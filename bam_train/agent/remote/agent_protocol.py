@@ -24,8 +24,8 @@ PROTOCOL = 1
 """Version of this protocol; a change that a program must know about has another one."""
 LONGEST_TEXT = 65_536
 """Most bytes of a text frame."""
-CHUNK, LONGEST_CHUNK = 262_144, 1_048_576
-"""Bytes of an upload in one binary frame: as sent, and at most."""
+CHUNK = 262_144
+"""Bytes of an upload in one binary frame, as sent; at most 1 MiB is taken."""
 
 Name = Annotated[str, Meta(max_length=100)]
 Text = Annotated[str, Meta(max_length=1000)]

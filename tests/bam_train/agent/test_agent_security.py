@@ -352,7 +352,7 @@ def test_a_flood_of_wrong_tokens(agent, refusals):
     refusals("Too many wrong tokens came from this address; try again in a second.")
 
 
-@pytest.mark.parametrize(("path", "size"), [("/agent", 1 << 21), ("/", 1 << 25)])
+@pytest.mark.parametrize(("path", "size"), [("/agent", 1 << 21), ("/camera", 1 << 21), ("/", 1 << 25)])
 def test_a_giant_frame(agent, refusals, path, size):
     with agent.open(path, "ddd") as client:
         with contextlib.suppress(ConnectionClosed):
@@ -394,6 +394,22 @@ def test_deep_json(agent, refusals):
             assert answer_or_refusal(client)["error"].startswith("This is no request: ")
         assert ask(client, "status")["ok"]
     refusals("This is no request: maximum recursion depth exceeded")
+
+
+def test_nonsense_on_the_socket_of_the_cameras(agent):
+    """Which is passed over: nothing is asked for there but the next picture."""
+    with agent.open("/camera", token="www") as client:
+        assert receive(client) == {"cameras": []}
+        for text in (
+            "[" * 60_000,
+            '{"op": "next", "camera": [' + "[" * 60_000,
+            '{"op": "next", "camera": 10}',
+            "x",
+            "[]",
+        ):
+            client.send(text)
+        client.send(bytes(range(256)))
+        assert receive(client) == {"event": "alive"}
 
 
 @pytest.mark.parametrize(

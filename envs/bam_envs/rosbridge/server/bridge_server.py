@@ -38,7 +38,7 @@ _HANDLER_THREADS = 32
 _SHORT = 4096  # longest frame that is decoded in the network thread [bytes]
 _TURN = 4  # frames of one client that are read before those of other clients
 _QUEUE = 2  # messages of a client that are read from its socket before they are processed
-_BROKEN = (1002, 1003, 1007, 1009)  # close codes for what breaks the protocol, or is too large
+_OF_THE_SITE = 2**20  # largest message to a socket of the site [bytes]
 _EXPEL = 0.5  # time between two looks at the file of the tokens [s]
 _logger = logging.getLogger(__name__)
 # The logger of `websockets`, which reports every port scanner with a traceback.
@@ -250,7 +250,7 @@ class BridgeServer(Bus):
         try:
             await self._read(connection, session)
         except ConnectionClosed as end:
-            self._note_end(caller, end)
+            _logger.debug("%s at %s left: %s", caller.name, caller.address, end)
         finally:
             del self._connections[session]
             self._bridge.lost(session)
@@ -258,20 +258,16 @@ class BridgeServer(Bus):
 
     async def _visit(self, connection: BridgeConnection, caller: Caller, serve: SiteHandler) -> None:
         self._visitors.add(connection)
+        connection.limit_messages(_OF_THE_SITE)
         try:
             await serve(connection, caller)
         except ConnectionClosed as end:
-            self._note_end(caller, end)
+            _logger.debug("%s at %s left: %s", caller.name, caller.address, end)
         except Exception:  # `websockets` closes the connection, and its logger is quiet
             _logger.exception("the connection of %s failed", caller.address)
             raise
         finally:
             self._visitors.discard(connection)
-
-    def _note_end(self, caller: Caller, end: ConnectionClosed) -> None:
-        if end.sent is not None and end.sent.code in _BROKEN and not end.rcvd_then_sent:
-            self._refusals.note(caller.address, f"Its connection was closed: {end.sent}.")
-        _logger.debug("%s at %s left: %s", caller.name, caller.address, end)
 
     async def _read(self, connection: BridgeConnection, session: Session) -> None:
         for number in itertools.count(1):

@@ -43,7 +43,7 @@ _HEADERS = {
 _IN_ADDRESS = "A token never stands in an address, which is logged: send the header 'Authorization: Bearer TOKEN'."
 
 Handler = Callable[[BridgeConnection, Caller], Awaitable[None]]
-"""Serves one admitted WebSocket, in the network thread; the connection closes when it returns."""
+"""Serves one admitted WebSocket, in the network thread; its messages have at most 1 MiB. It closes at the end."""
 
 
 class Page(NamedTuple):
