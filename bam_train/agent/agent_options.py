@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 from pathlib import Path
 
+from bam_envs.remote.serve.serve_options import is_loopback
 from bam_train.env_location import Place
 
 
@@ -36,6 +37,13 @@ class AgentOptions:
     guard_stops: int = 2
     """Number of stops by guards after which a candidate is rolled back."""
     record: bool = True
+
+    @property
+    def warning(self) -> str | None:
+        """A warning about an address that other computers reach, in one line; None if there is no reason for one."""
+        if is_loopback(self.bind) or self.cert:
+            return None
+        return f"tokens and commands go over {self.bind} unencrypted: give --cert and --key, or trust that network"
 
     def place(self, *, trial: bool | None) -> Place:
         """The place of the robot."""

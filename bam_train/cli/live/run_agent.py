@@ -80,6 +80,8 @@ def run_agent(config: AgentConfig, signals: SignalMemory) -> int:
         scheme = "wss" if options.cert else "ws"
         where = f"{options.bind}:{front.options.port}"
         _tell(f"listens on {scheme}://{where}; the console is at {scheme.replace('ws', 'http')}://{where}")
+        if options.warning is not None:
+            _tell(options.warning)
         if ran_before and not config.paused:
             _tell(f"it ran before in {options.folder}, so it starts paused")
         with handled(resident.switch, ignored_too=True):

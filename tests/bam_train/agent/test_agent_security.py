@@ -25,6 +25,7 @@ from websockets.sync.client import connect
 
 import bam_envs  # noqa: F401 - registers the environments
 from bam_envs.core.errors import RemoteError
+from bam_train.agent.agent_options import AgentOptions
 
 DEADLINE = 60.0
 CHECKPOINT = Path(__file__).parents[3] / "checkpoints" / "pick-ppo.zip"
@@ -484,6 +485,16 @@ def test_a_pickle_is_never_opened(agent, refusals, tmp_path, wrapped):
     assert refused["ok"] is False
     refusals("push: ")
     assert not mark.exists()
+
+
+@pytest.mark.parametrize(
+    ("bind", "cert", "warns"),
+    [("127.0.0.1", None, False), ("localhost", None, False), ("0.0.0.0", None, True), ("0.0.0.0", "cert.pem", False)],
+)
+def test_tls_is_recommended_where_other_computers_connect(bind, cert, warns):
+    text = "tokens and commands go over 0.0.0.0 unencrypted: give --cert and --key, or trust that network"
+    options = AgentOptions("ws://robot:9090", Path("agent"), bind=bind, cert=cert)
+    assert options.warning == (text if warns else None)
 
 
 def test_tls_is_not_talked_down(new_server, certificates, caplog):
