@@ -20,7 +20,7 @@ from bam_train.agent.agent_messages import (
     child_environment,
     socket_pair,
 )
-from bam_train.errors import RequestRefused
+from bam_train.errors import SettingsError
 
 _log = logging.getLogger(__name__)
 _PROGRAM = (  # without the folder it is started in, whose files could hide ours
@@ -54,13 +54,13 @@ class FrontLink:
         return 0 if self._process is None else self._process.pid
 
     def start(self) -> None:
-        """Start the process; returns when clients can connect. Raises RequestRefused if it cannot listen."""
+        """Start the process; returns when clients can connect. Raises SettingsError if it cannot listen."""
         self._spawn()
         if not self._listening.wait(_START):
             self._error = f"the front process did not start in {_START:g} s"
         if self._error:
             self.close()
-            raise RequestRefused(self._error)
+            raise SettingsError(self._error)
 
     def send(self, message: Message) -> None:
         """Send a message to it; while it is away, only the newest status is kept."""

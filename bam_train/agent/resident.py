@@ -45,6 +45,8 @@ _AGAIN = 1.0  # time between two attempts to reach the robot [s]
 _REPORT = 0.5  # time between two reports while nothing changes [s]
 FRESH = 0.2
 """Age of a person's newest command from which the robot rests, at least one and a half periods [s]."""
+THERE = "the robot is there, and fits"
+"""Why the agent no longer waits."""
 _RECENT = 20  # episodes in the status
 
 
@@ -269,7 +271,7 @@ class Resident:
             self._drop(f"for the stage {self._stage}")
             return
         session.deployment.trials = self.succession.trials()
-        self._change(self._driving, self.why)
+        self._change(self._driving, THERE if self.state is State.WAITING else self.why)
         seed, self._seed = self._seed, self._seed + 1
         try:
             record = session.deployment.episode(self, seed=seed)
@@ -417,7 +419,7 @@ class Resident:
         if self._stopped:
             self._change(State.STOPPED, self._stopped)
         elif not self._is_running:
-            self._change(State.PAUSED, self.why if self.why.startswith("paused") else "the robot is there")
+            self._change(State.PAUSED, self.why if self.why.startswith("paused") else THERE)
 
     def _drop(self, why: str) -> None:
         """Halt the robot and drop the link."""

@@ -14,7 +14,7 @@ from bam_envs.remote.serve.serve_options import ServeOptions
 from bam_envs.remote.serve.served_environment import ServedEnvironment
 from bam_train.agent.agent_messages import child_environment
 from bam_train.environments import make_env
-from bam_train.errors import RequestRefused
+from bam_train.errors import SettingsError
 
 _PROGRAM = (  # without the folder it is started in, whose files could hide ours
     "import sys; sys.path[:] = filter(None, sys.path); import bam_train.agent.simulated_box as it; it.main()"
@@ -36,7 +36,7 @@ class SimulatedBox:
         """Address of the robot, once it is started."""
 
     def start(self) -> None:
-        """Start the process; returns when the robot can be reached. Raises RequestRefused if it cannot be simulated."""
+        """Start the process; returns when the robot can be reached. Raises SettingsError if it cannot be simulated."""
         self._process = subprocess.Popen(
             [sys.executable, "-c", _PROGRAM, self._what],
             stdin=subprocess.PIPE,  # its end, however this process ends, ends that one
@@ -48,7 +48,7 @@ class SimulatedBox:
         self.url = self._process.stdout.readline().strip() if self._process.stdout else ""
         if not self.url:
             self._process.wait()
-            raise RequestRefused("The simulated robot did not start; its log is above.")
+            raise SettingsError("The simulated robot did not start; its log is above.")
 
     @property
     def pid(self) -> int:

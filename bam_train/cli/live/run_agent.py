@@ -30,7 +30,7 @@ def run_agent(config: AgentConfig, signals: SignalMemory) -> int:
     from bam_train.agent.front_link import FrontLink
     from bam_train.agent.resident import Resident
     from bam_train.agent.simulated_box import SimulatedBox
-    from bam_train.agent.versions import CHAMPION, Versions
+    from bam_train.agent.versions import Versions
     from bam_train.checkpoint import Checkpoint
     from bam_train.deploy.deployment import Stopped
     from bam_train.environments import environment_of
@@ -44,7 +44,9 @@ def run_agent(config: AgentConfig, signals: SignalMemory) -> int:
     with ExitStack() as stack:
         versions = Versions(options.folder / "versions")
         stack.enter_context(versions.held())
-        ran_before = versions.named(CHAMPION) is not None
+        ran_before = (options.folder / "audit.jsonl").exists()
+        if config.policy is not None:
+            environment_of(Checkpoint.open(config.policy.expanduser()), config.env)  # before it becomes the champion
         active = versions.first(config.policy)
         env_id, env_kwargs = environment_of(Checkpoint.open(active.path), config.env)
         if not options.robot:
@@ -57,9 +59,6 @@ def run_agent(config: AgentConfig, signals: SignalMemory) -> int:
             options = replace(options, robot=box.url)
         audit = Audit(options.folder / "audit.jsonl")
         stack.callback(audit.close)
-        begun = f"bam-agent {version('bam-train')} (process {os.getpid()}) at {options.robot}"
-        audit.write("started", begun, who="the agent", digest=active.digest)
-        stack.callback(audit.write, "ended", f"process {os.getpid()}", who="the agent")
         resident: Resident
         front = FrontLink(
             _front(options, env_id, env_kwargs),
@@ -77,6 +76,9 @@ def run_agent(config: AgentConfig, signals: SignalMemory) -> int:
         )
         stack.callback(front.close)
         front.start()
+        begun = f"bam-agent {version('bam-train')} (process {os.getpid()}) at {options.robot}"
+        audit.write("started", begun, who="the agent", digest=active.digest)
+        stack.callback(audit.write, "ended", f"process {os.getpid()}", who="the agent")
         scheme = "wss" if options.cert else "ws"
         where = f"{options.bind}:{front.options.port}"
         _tell(f"listens on {scheme}://{where}; the console is at {scheme.replace('ws', 'http')}://{where}")
@@ -89,6 +91,7 @@ def run_agent(config: AgentConfig, signals: SignalMemory) -> int:
             try:
                 resident.run()
             except Stopped:
+                _tell("interrupted: the robot is halted, and nobody drives it")
                 return 128 + resident.switch.came[0]
     return 0
 
