@@ -46,14 +46,15 @@ def _cell(value: object) -> str:
 
 
 def field_docs(kind: type) -> dict[str, str]:
-    """The string below each field of a dataclass, inherited ones too."""
+    """The string below each field of a dataclass or member of an enum, inherited ones too."""
     docs = {}
     for owner in reversed(kind.__mro__[:-1]):
         with contextlib.suppress(OSError):  # made without a source
             body = ast.parse(textwrap.dedent(inspect.getsource(owner))).body[0].body  # type: ignore[attr-defined]
             for field, text in itertools.pairwise(body):
-                if isinstance(field, ast.AnnAssign) and isinstance(text, ast.Expr):
-                    docs[ast.unparse(field.target)] = code(str(ast.literal_eval(text.value)))
+                if isinstance(field, (ast.AnnAssign, ast.Assign)) and isinstance(text, ast.Expr):
+                    target = field.target if isinstance(field, ast.AnnAssign) else field.targets[0]
+                    docs[ast.unparse(target)] = code(str(ast.literal_eval(text.value)))
     return docs
 
 
@@ -347,6 +348,37 @@ def listing(module: str) -> str:
     return f"```\n{text}\n```"
 
 
+def agent_states() -> str:
+    """The states of a live agent, and those that may follow each."""
+    from bam_train.agent.agent_states import TRANSITIONS, State
+
+    docs = field_docs(State)
+    rows = [
+        [f"**{state.value}**", docs[state.name], ", ".join(one.value for one in State if one in TRANSITIONS[state])]
+        for state in State
+    ]
+    return table(["state", "what the agent does", "may be followed by"], rows)
+
+
+def agent_requests() -> str:
+    """The requests of the agent socket, with the least role that may send each."""
+    from bam_train.agent.remote.agent_protocol import OPS
+
+    rows = []
+    for op, kind in OPS.items():
+        names = ", ".join(f"`{name}`" for name in kind.__struct_fields__ if name not in ("id", "name"))
+        rows.append([f"`{op}`", names, kind.role, code(inspect.cleandoc(kind.__doc__ or "").partition("; see `")[0])])
+    return table(["op", "arguments", "least role", "what it does"], rows)
+
+
+def audit_fields() -> str:
+    """The fields of a line in the audit file of a live agent."""
+    from bam_train.agent.audit import Event
+
+    names, docs = zip(Event.__struct_encode_fields__, Event.__struct_fields__, strict=True), field_docs(Event)
+    return table(["field", "meaning"], [[f"`{name}`", docs[field]] for name, field in names])
+
+
 PARTS: dict[str, Callable[..., str]] = {
     "environments": environments,
     "environment": environment,
@@ -361,6 +393,9 @@ PARTS: dict[str, Callable[..., str]] = {
     "robo-gym": robo_gym,
     "run-folder": run_folder,
     "members": members,
+    "agent-states": agent_states,
+    "agent-requests": agent_requests,
+    "audit-fields": audit_fields,
 }
 """Name of a generated part to what writes it."""
 

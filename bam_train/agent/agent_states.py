@@ -9,11 +9,17 @@ class State(Enum):
     """What a live agent does; the value is its name for people."""
 
     WAITING = "waiting for the robot"
+    """There is no link to the robot, or it was not checked yet; the agent tries again every second."""
     PAUSED = "paused"
+    """Nothing is sent, and the robot rests."""
     RUNNING = "running"
+    """The champion drives, episode after episode."""
     TRIAL = "trial"
+    """A candidate drives; or, on a real robot, the policy drives at trial speed."""
     TAKEN_OVER = "taken over"
+    """A person or their program drives; without a fresh command the robot rests."""
     STOPPED = "stopped by a guard"
+    """A guard halted the robot, which rests until a person resumes or pauses the agent."""
 
     @property
     def drives(self) -> bool:

@@ -44,9 +44,9 @@ class Event(msgspec.Struct, frozen=True, omit_defaults=True, rename={"before": "
     text: str
     """What happened, and why."""
     who: str
-    """Name of a person or program."""
+    """Name of a person or program, as they call themselves; ``the agent`` for what it did by itself."""
     where: str = ""
-    """Address it came from; "" for this computer."""
+    """Address it came from; "" for what the agent did by itself."""
     digest: str = ""
     """The active version."""
     before: str = ""
