@@ -597,10 +597,18 @@ class Resident:
             "loop_ms": round(self._loop_ms, 3),
             "recording": None if session is None or session.recorder is None else str(session.recorder.path),
             "marks": [] if session is None else list(session.marks),
-            "warnings": [] if journal is None else list(journal.warnings.values()),
+            "warnings": self._warnings(),
             "guards": {} if session is None else session.robot.report(),
             "agent": __version__,
         }
+
+    def _warnings(self) -> list[str]:
+        """What the operator should know: of the guards, the recording and the audit file."""
+        found, session = [], self.session
+        if session is not None:
+            found = [f"{title}: {text}" for title, text in session.deployment.journal.warnings.items()]
+            found += [f"recording: {session.recorder.fault}"] if session.recorder and session.recorder.fault else []
+        return [*found, *([f"audit: {self.audit.fault}"] if self.audit.fault else [])]
 
     def _report(self, least: float = 0.0) -> None:
         """Send the status, and transitions, unless the last ones are younger than `least` [s]."""
