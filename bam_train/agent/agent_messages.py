@@ -69,12 +69,11 @@ class Progress(msgspec.Struct, tag=True, frozen=True):
 
 
 class Halt(msgspec.Struct, tag=True, frozen=True):
-    """Halt at once; with `stop`, the agent is paused too, for the reason `why`."""
+    """Halt at once; with `stop`, the agent is paused too."""
 
     who: str
     address: str = ""
     stop: bool = False
-    why: str = ""
 
 
 class Drive(msgspec.Struct, tag=True, frozen=True):

@@ -50,8 +50,9 @@ class Experience:
     def add(self, transitions: Transitions) -> int:
         """Add what came; returns the number of transitions that can be learnt from now on."""
         before = self.added
-        marks = np.flatnonzero((np.diff(transitions.episode) != 0) | (np.diff(transitions.intervention) != 0)) + 1
-        for rows in np.split(np.arange(len(transitions)), marks):
+        same = (np.diff(transitions.episode) == 0) & (np.diff(transitions.intervention) == 0)
+        starts = np.flatnonzero(~same | (transitions.step[1:] == 0)) + 1  # an agent that reconnects counts from 0 again
+        for rows in np.split(np.arange(len(transitions)), starts):
             if len(rows):
                 self._extend(_some(transitions, rows))
         return self.added - before
@@ -60,7 +61,7 @@ class Experience:
         """Add a piece of one episode."""
         person = bool(piece.intervention[0])
         running = self._open.get(person)
-        if running and running[0].episode[0] != piece.episode[0]:
+        if running and (running[0].episode[0] != piece.episode[0] or piece.step[0] == 0):
             self._close(person)
         self._open.setdefault(person, []).append(piece)
         if piece.ends[-1]:

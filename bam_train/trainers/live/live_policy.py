@@ -1,8 +1,8 @@
 """The frozen policy of a live learner: an actor that remembers its last actions, and may explore.
 
 A robot runs frozen policies, which draw no random numbers. So a policy that explores carries its noise: a table of
-`TAPE` draws, of which each step takes the next, from the first on when an episode begins. Each candidate has another
-table, so that episodes of different candidates explore differently.
+`TAPE` draws, of which each step takes the next. An episode begins at a place that follows from its first observation;
+otherwise the noise of a step would be the same in all episodes of a candidate, and would be imitated like a skill.
 """
 
 import copy
@@ -19,11 +19,12 @@ from bam_train.trainers.frozen_network import FrozenNetwork, action_head, pack
 from bam_train.trainers.live.rlpd import Actor
 
 TAPE = 512
-"""Steps of noise in a policy; a longer episode begins again with the first."""
+"""Steps of noise in a policy, a power of two; after the last comes the first."""
+_FINE = 1000.0  # parts of a number that make another beginning
 
 
 class LivePolicy(FrozenNetwork):
-    """A copy of an actor, from raw observations to actions; its state are the last actions, and a count of steps.
+    """A copy of an actor, from raw observations to actions; its state are the last actions, and a place in the noise.
 
     Args:
         actor: The actor.
@@ -46,10 +47,11 @@ class LivePolicy(FrozenNetwork):
         self.head = action_head(action_space, tanh=True, scale=True, clip=True)
         self.kept = (history - 1) * action_space.shape[0]
         self.noise = None if noise is None else torch.as_tensor(noise, dtype=torch.float32)
+        self.odd = torch.arange(1, 2 * int(np.prod(observation_space.shape)), 2, dtype=torch.float64)
         if history:
             self.state["actions"] = torch.zeros(2, history * action_space.shape[0])
         if noise is not None:
-            self.state["count"] = torch.zeros(2, 1)
+            self.state["place"] = torch.zeros(2, 1)  # 0: an episode begins; else 1 more than the place in the table
 
     def forward(self, *inputs: torch.Tensor) -> Any:
         """The action, and the next state."""
@@ -58,16 +60,23 @@ class LivePolicy(FrozenNetwork):
         seen = observation.flatten(1) if actions is None else torch.cat([observation.flatten(1), actions], 1)
         mean, log_deviation = self.actor(seen)
         following = []
+        place = torch.zeros(())
         if self.noise is not None:
-            noise = self.noise.index_select(0, state[-1][:, 0].long())
-            mean = mean + noise * log_deviation.exp()
+            place = torch.where(state[-1] < 0.5, self._beginning(observation.flatten(1)), state[-1] - 1.0)
+            mean = mean + self.noise.index_select(0, place[:, 0].long()) * log_deviation.exp()
         if actions is not None:
             following.append(torch.cat([torch.tanh(mean), actions[:, : self.kept]], 1))
         if self.noise is not None:
-            count = state[-1] + 1.0
-            following.append(count * (count < TAPE).float())
+            place = place + 1.0
+            following.append(place * (place < TAPE).float() + 1.0)
         action = self.head(mean)
         return (action, *following) if following else action
+
+    def _beginning(self, observation: torch.Tensor) -> torch.Tensor:
+        """A place in the table for the first observation, in whole numbers, which are exact everywhere. (n, 1)."""
+        parts = (observation * _FINE).long().abs().double()
+        total = (parts * self.odd).sum(1, keepdim=True)
+        return (total - TAPE * (total / TAPE).long().double()).float()
 
 
 def require_spaces(observed: Any, acted: Any) -> tuple[spaces.Box, spaces.Box]:

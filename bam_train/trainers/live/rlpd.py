@@ -71,7 +71,7 @@ class Hyperparameters:
     """Exponent of that for an advantage of one standard deviation."""
     value_weight: _Weight = 0.0
     """Weight of SAC's own loss, value and entropy of drawn actions, relative to the mean value."""
-    warmup: Annotated[int, Meta(ge=0, le=10**9)] = 4000
+    warmup: Annotated[int, Meta(ge=0, le=10**9)] = 6000
     """Updates of the critics before they count for the actor."""
     actor_after: Annotated[int, Meta(ge=0, le=10**9)] = 1000
     """Steps of policies, not of a person, before the actor changes and the first candidate is pushed: a person's
@@ -183,7 +183,8 @@ class Rlpd:
         Raises:
             TrainingFailed: A loss is not finite.
         """
-        self._update_critics(batch)
+        if self.settings.advantage_weight or self.settings.value_weight:
+            self._update_critics(batch)
         self.updates += 1
         if actor and self.updates % self.settings.actor_every == 0:
             self._update_actor(batch)

@@ -50,9 +50,9 @@ class FakeHub:
             raise KeyError("a mistake")
         return dict(STATUS)
 
-    def stop(self, person, why):
+    def stop(self, person):
         self.threads.add(threading.current_thread().name)
-        self._add(self.stops, (person, why))
+        self._add(self.stops, person)
         return dict(STATUS)
 
     def jog(self, message, person):

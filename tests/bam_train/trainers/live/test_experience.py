@@ -84,6 +84,14 @@ def test_an_episode_that_was_interrupted_counts_without_an_end(new):
     assert experience.state_dict()["discount"][:2, 0].tolist() == [0.25, 0.5]
 
 
+def test_an_agent_that_reconnects_counts_from_0_again(new):
+    experience = new()
+    first, _ = pieces(episode(0, [1, 2, 4]), 2)
+    experience.add(first)
+    assert experience.add(episode(0, [1])) == 3
+    assert len(experience.outcomes) == 2
+
+
 def test_demonstrations_are_a_persons_and_successes(new):
     experience, rng = new(), np.random.default_rng(0)
     experience.add(episode(0, [0] * 4))

@@ -54,6 +54,11 @@ def test_a_run_goes_on_as_if_it_had_not_been_interrupted(settings, tmp_path):
     assert actions[0] == actions[1]
 
 
+def _first(policy, seen):
+    policy.reset()
+    return policy.act(seen).item()
+
+
 def test_candidates_explore_and_the_result_does_not(settings, tmp_path):
     learner, seen = LiveLearner.create(settings()), np.zeros(2, np.float32)
     policies = [
@@ -65,6 +70,11 @@ def test_candidates_explore_and_the_result_does_not(settings, tmp_path):
     for policy, before in zip(policies, actions, strict=True):
         policy.reset()
         assert [policy.act(seen).item() for _ in range(4)] == before
+    first = [
+        _first(policies[0], np.full(2, place, np.float32)) - _first(policies[2], np.full(2, place, np.float32))
+        for place in (0.1, 0.2, 0.3)
+    ]  # the noise, which is another one in each episode
+    assert len({round(noise, 4) for noise in first}) == 3
     manifest = Checkpoint.open(tmp_path / "0.zip").manifest
     assert (manifest.trainer, manifest.algorithm, manifest.env) == ("live", "rlpd", ENV)
 
