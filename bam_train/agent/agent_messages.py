@@ -69,11 +69,12 @@ class Progress(msgspec.Struct, tag=True, frozen=True):
 
 
 class Halt(msgspec.Struct, tag=True, frozen=True):
-    """Halt at once; with `stop`, the agent is paused too."""
+    """Halt at once; with `stop`, the agent is paused too, for the reason `why`."""
 
     who: str
     address: str = ""
     stop: bool = False
+    why: str = ""
 
 
 class Drive(msgspec.Struct, tag=True, frozen=True):

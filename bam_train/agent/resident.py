@@ -147,7 +147,7 @@ class Resident:
         elif isinstance(message, Halt):
             self.halt()
             if message.stop:
-                self.post(lambda: self._pause(message.who, message.address, "the stop button"))
+                self.post(lambda: self._pause(message.who, message.address, message.why or "the stop button"))
         elif isinstance(message, Ask):
             self._ask(message)
 

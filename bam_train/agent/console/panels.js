@@ -89,7 +89,7 @@ export function showNear(near, guards) {
   }
   names.forEach((name, at) => {
     const { value, limit, unit, share } = near[name], counts = guards[name];
-    const word = share >= 1 ? "✖ acts" : share >= NEAR ? "⚠ near" : "✓ clear";
+    const word = share >= 1 ? "✖ at its limit" : share >= NEAR ? "⚠ near" : "✓ clear";
     const acted = counts ? `; altered ${counts.altered}, held ${counts.held}, stopped ${counts.stopped}` : "";
     const [text, bar] = list.children[at].children;
     text.textContent = `${word}: ${name} ${value.toPrecision(3)} ${unit}, limit ${Number(limit.toPrecision(3))}${acted}`;

@@ -75,7 +75,7 @@ class Hub(Protocol):
         afterwards if it is still there. Raises `BamTrainError` or `BamEnvsError`, of one line.
         """
 
-    def stop(self, person: Person) -> dict[str, Any]:
+    def stop(self, person: Person, why: str) -> dict[str, Any]:
         """Halt, in the network thread: must return at once."""
 
     def jog(self, message: dict[str, Any], person: Person) -> None:
@@ -247,7 +247,7 @@ class _Client:
     async def _do(self, request: protocol.Request) -> None:
         match request:
             case protocol.Stop():
-                self._answer(request.id, self._hub.stop(self._person))
+                self._answer(request.id, self._hub.stop(self._person, request.why))
             case protocol.Jog():
                 self._hub.jog(_arguments(request), self._person)
             case protocol.Watch():

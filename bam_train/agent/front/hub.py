@@ -95,9 +95,9 @@ class AgentHub:
         long = _TRIAL if arguments.get("wait") else _LONG if op in ("push", "use") else 10.0
         return self._front.ask(op, arguments, person.name, person.address, progress, long)
 
-    def stop(self, person: Person) -> dict[str, Any]:
+    def stop(self, person: Person, why: str) -> dict[str, Any]:
         """Halt at once, then pause."""
-        self._front.send(Halt(person.name, person.address, stop=True))
+        self._front.send(Halt(person.name, person.address, stop=True, why=why))
         return {"state": "paused"}
 
     def jog(self, message: dict[str, Any], person: Person) -> None:

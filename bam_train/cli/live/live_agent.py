@@ -19,6 +19,8 @@ if TYPE_CHECKING:
 
 SHORT = 12
 """Digits of a digest that people see."""
+_DRIVEN = ("running", "trial", "taken over")
+_STOPS = 2.0  # longest wait until a stopped agent says that it is paused [s]
 
 
 def ask_agent(config: AskConfig, signals: SignalMemory) -> None:
@@ -27,11 +29,23 @@ def ask_agent(config: AskConfig, signals: SignalMemory) -> None:
     def ask(agent: AgentClient) -> dict[str, Any]:
         given: dict[str, Any] = {"why": config.why} if config.action in ("pause", "resume", "stop") else {}
         result: dict[str, Any] = agent.ask(config.action, **given)
+        if config.action == "stop":
+            return _rest(agent)
         return result if config.action == "status" else {**agent.ask("status"), **result}
 
     found = with_agent(config, config.url, ask)
     if not config.json:
         tell(*(_versions(found) if config.action == "versions" else status_lines(found)))
+
+
+def _rest(agent: AgentClient) -> dict[str, Any]:
+    """The status once nobody drives any more: a stop is answered before the agent has paused."""
+    end = time.monotonic() + _STOPS
+    while True:
+        status: dict[str, Any] = agent.ask("status")
+        if status["state"] not in _DRIVEN or time.monotonic() > end:
+            return status
+        time.sleep(0.05)
 
 
 def with_agent(config: AskConfig | PushConfig, url: str, do: Callable[[AgentClient], dict[str, Any]]) -> dict[str, Any]:
@@ -71,7 +85,7 @@ def status_lines(status: Mapping[str, Any]) -> Iterator[str]:
         yield f"  owner     {owner}{'' if left is None else f', {left:.0f} s left'}"
     if get("episodes") is not None:
         recent = [one for one in get("recent") or () if one is not None]
-        yield f"  episodes  {get('episodes')}, {get('successes')} succeeded; of the last {len(recent)}: {sum(recent)}"
+        yield f"  episodes  {get('episodes')}, {get('successes')} succeeded; {sum(recent)} of the last {len(recent)}"
     if get("ticks") is not None:
         yield f"  ticks     {get('ticks')}, {get('late')} late; link {get('link_ms')} ms, policy {get('loop_ms')} ms"
     for name, guard in (get("guards") or {}).items():

@@ -50,9 +50,9 @@ class FakeHub:
             raise KeyError("a mistake")
         return dict(STATUS)
 
-    def stop(self, person):
+    def stop(self, person, why):
         self.threads.add(threading.current_thread().name)
-        self._add(self.stops, person)
+        self._add(self.stops, (person, why))
         return dict(STATUS)
 
     def jog(self, message, person):

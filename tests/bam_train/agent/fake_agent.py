@@ -168,7 +168,7 @@ class FakeAgent:
         if self.driver == person.connection and self.jogger.put(message):
             self.twists.append((time.monotonic(), message))
 
-    def stop(self, person):
+    def stop(self, person, why):
         self.orders.append(("stop", time.monotonic(), {}, person))
         self.end_driving("paused")
         self.tell("status", {"status": self.status()})

@@ -34,7 +34,7 @@ LINES = [
     "trial for ",
     "  policy    3f2a91c0d7aa (candidate), stage trial",
     "  robot     ur5e, served in real time",
-    "  episodes  22, 20 succeeded; of the last 3: 2",
+    "  episodes  22, 20 succeeded; 2 of the last 3",
     "  ticks     1200, 3 late; link 1.25 ms, policy 0.5 ms",
     "  guard     G8 joint speed: altered 2, stopped 1",
     "  warning   the link is slow",
@@ -56,7 +56,7 @@ def hub(hub):
         if op == "push":
             progress("checking")
             return {**STATUS, "digest": DIGEST, "lines": ["signed by alice"], "outcome": hub.outcome}
-        return dict(STATUS) if op == "status" else {}
+        return STATUS | ({"state": "paused"} if hub.stops else {}) if op == "status" else {}
 
     hub.ask = ask
     return hub
@@ -98,8 +98,9 @@ def test_pause_and_stop(hub, server, run):
     status, out, _ = run(agent.main, "pause", server.url, "--why", "lunch", "--json", token="d")
     assert (status, json.loads(out)) == (0, STATUS)
     assert [(op, arguments) for op, arguments, _ in hub.asked] == [("pause", {"why": "lunch"}), ("status", {})]
-    assert run(agent.main, "stop", server.url, token="w")[0] == 0
-    assert len(hub.stops) == 1
+    status, out, _ = run(agent.main, "stop", server.url, "--why", "smoke", "--json", token="w")
+    assert (status, json.loads(out)["state"]) == (0, "paused")
+    assert [why for _, why in hub.stops] == ["smoke"]
 
 
 def test_versions(hub, server, run):

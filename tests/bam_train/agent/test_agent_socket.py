@@ -165,7 +165,7 @@ def test_force_needs_a_token_that_administers(hub, new_server, new_raw):
 def test_stop_and_jog_go_to_the_hub_at_once(hub, new_raw):
     watcher, driver = new_raw("w"), new_raw("d")
     assert watcher.ask("stop", name="eve")["result"]["state"] == "paused"
-    assert [person.name for person in hub.stops] == ["eve"]
+    assert [(person.name, why) for person, why in hub.stops] == [("eve", "")]
     driver.socket.send('{"op": "jog", "seq": 12, "twist": [0.1, 0, 0, 0], "gripper": 1, "sent": 4.5}')
     driver.ask("status")
     assert hub.jogs == [{"seq": 12, "twist": [0.1, 0.0, 0.0, 0.0], "gripper": 1, "sent": 4.5}]

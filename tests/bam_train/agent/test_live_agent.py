@@ -194,6 +194,9 @@ def test_stop_halts_and_pauses(running):
     running.run()
     running.agent.ask("stop")
     assert running.state("paused")["why"] == "paused by anna@laptop: the stop button"
+    running.run()
+    running.agent.ask("stop", why="smoke")
+    assert running.state("paused")["why"] == "paused by anna@laptop: smoke"
 
 
 def test_the_front_process_is_started_again(running):
