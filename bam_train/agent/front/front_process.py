@@ -80,6 +80,14 @@ class AgentLease(CommandLease):
     def take(
         self, client: str, caller: Caller = UNKNOWN_CALLER, *, force: bool = False, shown: str | None = None
     ) -> bool:
+        """A command of `client` came: it renews its lease, and never begins one, so that a stop or a pause holds."""
+        if self.holder != client:
+            reason = self.refusal() if self.owner else "its lease has ended, or never began. Reset to take over."
+            raise NotInCommand(f"This program is not in command: {reason}")
+        self.use()
+        return False
+
+    def grant(self, client: str, caller: Caller, *, force: bool = False, shown: str | None = None) -> bool:
         """See `CommandLease.take`; whoever has the lease keeps it until it ends, also while silent."""
         holder = self.holder
         if (holder not in (None, client) or self._cut is not None) and not force:
@@ -278,7 +286,7 @@ class FrontProcess:
             refusal = None if owner is None else self.lease.refusal()
             return {"owner": owner, "refusal": refusal, "state": self.status["state"]}
         if do == "take":
-            self.lease.take(caller.client, caller, shown=who)
+            self.lease.grant(caller.client, caller, shown=who)
             try:
                 self.ask("take", {"lease": caller.client}, who, caller.address)
             except (BamTrainError, BamEnvsError):

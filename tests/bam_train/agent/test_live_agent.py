@@ -137,6 +137,11 @@ def begun(env):
     return env.reset(seed=3)
 
 
+def drive(env):
+    for _ in range(200):
+        env.step(np.zeros(5, np.float32))
+
+
 def test_a_program_takes_over_and_hands_back(running):
     running.run()
     env, policy = taken(running.url), FrozenPolicy.load(PICK)
@@ -154,6 +159,19 @@ def test_a_program_takes_over_and_hands_back(running):
     assert (status["owner"], status["why"].split(" by ")[0]) == (None, "handed back")
     running.run()
     assert running.state()["stage"] == "full"
+
+
+def test_a_stop_ends_the_driving_of_a_program(running):
+    env = taken(running.url)
+    begun(env)
+    running.agent.ask("stop")
+    running.state("paused")
+    with pytest.raises(NotInCommand, match=r"has ended, or never began\. Reset to take over"):
+        drive(env)
+    assert running.state()["state"] == "paused"
+    begun(env)
+    assert running.state()["state"] == "taken over"
+    env.close()
 
 
 def test_the_cut_link_of_the_owner_holds_the_robot_and_pauses_the_policy(running):
