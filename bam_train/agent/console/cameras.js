@@ -26,7 +26,8 @@ export function showCameras(parent) {
       canvas.setAttribute("aria-label", `Camera ${name}`);
       caption.append(`${name} `, text);
       figure.append(canvas, caption);
-      return { figure, canvas, text, at: -Infinity, drawn: 0 };
+      canvas.drawn = 0;
+      return { figure, canvas, text, at: -Infinity };
     });
     parent.replaceChildren(...shown.map(({ figure }) => figure));
   }
@@ -40,8 +41,7 @@ export function showCameras(parent) {
       place.canvas.getContext("2d").drawImage(picture, 0, 0);
       picture.close();
       place.at = performance.now();
-      place.drawn += 1;
-      place.canvas.dataset.drawn = place.drawn;
+      place.canvas.drawn += 1;
     } finally {
       connection.send({ op: "next", camera });
     }

@@ -10,9 +10,11 @@ import { Plots } from "./plots.js";
 const byId = (id) => document.getElementById(id);
 const SPEEDS = [0.05, 0.1, 0.25]; // [m/s]
 const LOOK = 2000; // time between two looks at versions and log [ms]
+const WRITE = 250; // least time between two sets of plots and numbers [ms]
 
 let status = { state: "not connected" };
 let telemetry = null;
+let written = -Infinity; // when plots and numbers were drawn
 let role = "watch"; // what this page's token may do
 let owner = null; // how the status calls this page while it drives; "" until it says so; null: it does not drive
 let cameras = null;
@@ -87,11 +89,14 @@ function event(message) {
 
 function draw() {
   if (telemetry === null) return;
-  picture.draw(telemetry);
-  plots.draw();
-  showTelemetry(telemetry);
-  showNear(telemetry.near ?? {}, status.guards ?? {});
+  const newest = telemetry, now = performance.now();
   telemetry = null;
+  picture.draw(newest);
+  if (now - written < WRITE) return;
+  written = now;
+  plots.draw();
+  showTelemetry(newest);
+  showNear(newest.near ?? {}, status.guards ?? {});
 }
 
 function look() {

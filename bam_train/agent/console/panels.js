@@ -97,10 +97,9 @@ export function showNear(near, guards) {
   });
 }
 
-export function showTelemetry({ tool, base, t }) {
+export function showTelemetry({ tool, base }) {
   const at = (values, unit) => values.map((value) => value.toFixed(3)).join(", ") + ` ${unit}`;
   say("tool", tool ? `Tool at x, y, z: ${at(tool, "m")}` : base ? `Base at x, y: ${at(base.slice(0, 2), "m")}, yaw ${base[2].toFixed(2)} rad` : "");
-  byId("tool").dataset.t = t;
 }
 
 export function showVersions(versions, status) {

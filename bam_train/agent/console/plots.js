@@ -43,6 +43,7 @@ export class Plots {
   draw() {
     const end = this.rows.at(-1)?.[0];
     if (end === undefined) return;
+    const captions = []; // written last: a written text makes the next look at a size slow
     for (const [name, { canvas, text, labels }] of this.plots) {
       const rows = this.rows.filter(([, values]) => values[name]).map(([t, values]) => [t, values[name]]);
       const [context, width, height] = cleared(canvas);
@@ -66,7 +67,9 @@ export class Plots {
         if (last !== null) context.fillText(at + 1, width - 18 + 9 * (at % 2), y(last) + 4);
       });
       const newest = rows.at(-1)[1];
-      text.textContent = labels.map((label, at) => `${at + 1} ${label.replace("_joint", "")} ${newest[at]?.toFixed(3) ?? "-"}`).join(" · ");
+      const numbers = labels.map((label, at) => `${at + 1} ${label.replace("_joint", "")} ${newest[at]?.toFixed(3) ?? "-"}`);
+      captions.push([text, numbers.join(" · ")]);
     }
+    for (const [text, caption] of captions) text.textContent = caption;
   }
 }

@@ -337,7 +337,7 @@ class FakeCamera:
 def test_pictures_of_cameras(page):
     with FakeAgent(cameras={"wrist": FakeCamera("red"), "cell": FakeCamera("blue")}) as agent:
         page.open(agent.url)
-        drawn = "return [...document.querySelectorAll('#cameras canvas')].map((one) => Number(one.dataset.drawn ?? 0))"
+        drawn = "return [...document.querySelectorAll('#cameras canvas')].map((one) => one.drawn)"
         until(lambda: page.run(drawn) and min(page.run(drawn)) > 5, "pictures")
         middle = "const c = document.querySelectorAll('#cameras canvas')[arguments[0]];"
         middle += "return [...c.getContext('2d').getImageData(320, 240, 1, 1).data]"
