@@ -23,6 +23,7 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")  # before NumPy reads it
 
 import gymnasium as gym
 import numpy as np
+from bench_console import measure_stop
 from bench_deploy import at_most, row
 from bench_link import Server
 
@@ -343,7 +344,10 @@ def main() -> None:
     """Run the selected measurements."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument(
-        "--only", choices=("late", "takeover", "push"), action="append", help="measure this alone; may be repeated"
+        "--only",
+        choices=("late", "takeover", "push", "stop"),
+        action="append",
+        help="measure this alone; may be repeated",
     )
     parser.add_argument("--ticks", type=int, default=10_000, help="ticks of each kind at 100 Hz")
     parser.add_argument("--count", type=int, default=500, help="take-overs")
@@ -352,6 +356,7 @@ def main() -> None:
     measurements: dict[str, Callable[[], Iterator[str]]] = {
         "takeover": lambda: measure_take_over(options.count),
         "push": lambda: measure_push(5),
+        "stop": lambda: measure_stop(100),
         "late": lambda: measure_late(options.ticks, options.rounds),
     }
     print(row("figure", "measured", "target", ""))

@@ -4,6 +4,8 @@ import re
 
 import pytest
 
+from tests.bam_train.agent.browsers import require_browser
+
 
 @pytest.fixture
 def bench(run_script, tmp_path):
@@ -50,6 +52,14 @@ def test_smoothness(bench):
     assert float(rms) < float(figures["held"][0]) / 5
     assert 80 <= float(lag) <= 110
     assert success == "100%"
+
+
+def test_console(bench):
+    require_browser()
+    lines = bench("bench_console", "--presses", 3, "--cameras", 2, "--rate", 5)
+    assert re.match(r"stop button to halt, 2 cameras at 5 Hz +p50 [\d.]+, p99 [\d.]+ ms +p99 <= 100 ms", lines[1])
+    drawn = re.fullmatch(r"  3 presses; at most [\d.]+ ms; the page drew ([\d.]+) pictures a second", lines[2])
+    assert 0.0 < float(drawn[1]) <= 6.0
 
 
 def test_link(bench):

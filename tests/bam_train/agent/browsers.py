@@ -14,12 +14,18 @@ FLAGS = ("--headless=new", "--no-sandbox", "--disable-gpu", "--disable-dev-shm-u
 DEADLINE = 30.0
 
 
-def new_browser():
-    """A browser, or a skipped test where there is none (a failed one with CI=true)."""
+def require_browser():
+    """The paths of browser and driver; without them the test is skipped, and fails with CI=true."""
     chromium, driver = shutil.which("chromium"), shutil.which("chromedriver")
     if chromium is None or driver is None:
         reason = "no browser: apt-get install chromium chromium-driver"
         (pytest.fail if os.environ.get("CI") == "true" else pytest.skip)(reason)
+    return chromium, driver
+
+
+def new_browser():
+    """A browser without a page."""
+    chromium, driver = require_browser()
     from selenium import webdriver
 
     options = webdriver.ChromeOptions()
