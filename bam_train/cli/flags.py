@@ -324,13 +324,15 @@ class SignConfig:
 
 @dataclass(frozen=True)
 class AgentConfig:
-    """Stay on a robot's computer, and run a policy that people pause, take over from, and exchange.
+    """Stay on a robot's computer and run a policy, episode after episode; people watch, pause, take over, push others.
 
-    A running agent is asked with bam-agent status|pause|resume|versions|stop URL.
+    Without --robot it brings a simulated robot. The console is at http://127.0.0.1:9095, in any browser.
+
+    Ask an agent that runs: bam-agent status|pause|resume|versions|stop URL. Give it another policy: bam-push.
     """
 
     policy: File = None
-    """The checkpoint.zip to begin with; an agent that is started again with the same one goes on with its champion."""
+    """The checkpoint.zip to begin with; started again with the same one, or none, an agent goes on with its champion."""
     robot: Url = None
     """Live robot behind rosbridge, such as ws://127.0.0.1:9090; by default a simulated one."""
     port: Port = 9095
@@ -338,11 +340,11 @@ class AgentConfig:
     bind: str = "127.0.0.1"
     """Address to listen on; 127.0.0.1 is this computer only, 0.0.0.0 all its networks, which needs --token-file."""
     token_file: File = None
-    """File with the secrets that people show: one token, or lines of watch, drive or administer and a token."""
+    """File with the tokens that let people in: lines of watch, drive or administer and a token; or one token alone."""
     cert: File = None
     """Certificate in PEM, for https:// and wss://."""
     key: File = None
-    """Its key, if it is in another file."""
+    """Private key of the certificate, if it is in another file."""
     folder: Path = Path("agent")
     """Folder of the versions, the audit file, the trials and the recordings."""
     env: EnvId = None
@@ -372,10 +374,10 @@ class AgentConfig:
     resume: bool = False
     """Let the policy go on when a person hands the robot back; by default the agent stays paused."""
     lease: Annotated[Positive, tyro.conf.arg(metavar="S")] = 30.0
-    """Time without use after which a person loses the robot again [s]."""
+    """Time without a command after which a person who has taken over loses the robot again [s]."""
     guard_stops: Count = 2
-    """Stops by a guard after which a candidate is rolled back."""
+    """Stops by a guard, within 100 episodes, after which a policy that was pushed is rolled back."""
     seed: Seed = 1_000_000
     """Seed of the first episode; episode k gets seed + k."""
     no_record: bool = False
-    """Do not record."""
+    """Do not record what the robot does."""

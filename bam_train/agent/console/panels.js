@@ -45,7 +45,7 @@ function showRun(status) {
   const ms = (value) => (value == null ? "-" : `${value.toFixed(1)} ms`);
   const facts = {
     "Active version": `${nameOf(status)}${short(status.active)}`,
-    "Stage": status.stage ?? "-",
+    "Stage": [...new Set([status.stage ?? "-", ...(status.marks ?? [])])].join(", "),
     "Environment": status.env ?? "-",
     "Robot": status.simulated == null ? "-" : status.simulated ? "simulated" : "real",
     "Success, last 20 episodes": rate,

@@ -12,13 +12,14 @@ Seconds = Annotated[Positive, tyro.conf.arg(metavar="S")]
 
 @dataclass(frozen=True)
 class AskConfig:
-    """Ask a live agent on a robot's computer for its state, to pause, to resume, for its versions, or to stop.
+    """Ask the live agent on a robot's computer for its state or its versions, or let it pause, resume or stop.
 
+    bam-agent status|pause|resume|versions|stop URL.
     Exit status: 0 done, 1 the agent cannot be reached, or failed, 2 wrong usage, 3 the agent refuses.
     """
 
     action: tyro.conf.Positional[Literal["status", "pause", "resume", "versions", "stop"]]
-    """What to ask for; stop halts the robot at once, and pauses the agent."""
+    """status and versions change nothing; stop halts the robot at once, and pauses the agent."""
     url: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="URL")]
     """Address of the agent, such as ws://robot:9095 (wss:// with TLS)."""
     token_file: File = None
@@ -35,7 +36,7 @@ class AskConfig:
 
 @dataclass(frozen=True)
 class PushConfig:
-    """Push a checkpoint to a live agent: it is checked there, and acts as the candidate; or roll back.
+    """Push a checkpoint to a live agent, which checks it and tries it as the candidate; or roll back.
 
     bam-push CHECKPOINT URL, or bam-push --rollback URL. Exit status: 0 done, 1 the agent cannot be reached, or failed,
     2 wrong usage, 3 the agent refuses the candidate or the request, 5 with --wait: the candidate was rolled back, or
@@ -56,9 +57,9 @@ class PushConfig:
     when: Literal["tick", "episode"] = "episode"
     """When it begins to act: at the next tick, or with the next episode."""
     wait: bool = False
-    """Return when the trials have ended: the candidate was promoted, rolled back or replaced."""
+    """Return once the trials have ended: the candidate was promoted, rolled back or replaced."""
     rollback: bool = False
-    """Go back: from a candidate to the champion, from the champion to the version before it."""
+    """Push nothing, and go back: from a candidate to the champion, from the champion to the version before it."""
     why: str = ""
     """The reason, for the agent's audit file and for other people."""
     timeout: Seconds = 10.0

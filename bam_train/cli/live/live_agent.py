@@ -76,8 +76,9 @@ def status_lines(status: Mapping[str, Any]) -> Iterator[str]:
     why = f": {get('why')}" if get("why") else ""
     yield f"{get('state')}{since}{why}"
     if active := get("active"):
+        marks = "".join(f", {mark}" for mark in get("marks") or () if mark != get("stage"))
         names = ", ".join(name for name, digest in (get("names") or {}).items() if digest == active)
-        yield f"  policy    {active[:SHORT]}{f' ({names})' if names else ''}, stage {get('stage') or '-'}"
+        yield f"  policy    {active[:SHORT]}{f' ({names})' if names else ''}, stage {get('stage') or '-'}{marks}"
     if get("robot"):
         yield f"  robot     {get('robot')}"
     if owner := get("owner"):

@@ -35,7 +35,7 @@ def push(config: PushConfig, signals: SignalMemory) -> int:
     if not config.json:
         digest = result.get("digest")
         tell(
-            *([] if digest is None else [f"{digest[:SHORT]}: {outcome or 'accepted'}"]),
+            *([] if digest is None else [f"{digest[:SHORT]}: {outcome or ('accepted' if path else 'acts again')}"]),
             *(f"  {line}" for line in result.get("lines") or ()),
             *status_lines(result),
         )

@@ -19,6 +19,7 @@ STATUS = {
     "owner": None,
     "owner_until": None,
     "stage": "trial",
+    "marks": ["UNSIGNED", "trial"],
     "robot": "ur5e, served in real time",
     "ticks": 1200,
     "late": 3,
@@ -32,7 +33,7 @@ STATUS = {
 }
 LINES = [
     "trial for ",
-    "  policy    3f2a91c0d7aa (candidate), stage trial",
+    "  policy    3f2a91c0d7aa (candidate), stage trial, UNSIGNED",
     "  robot     ur5e, served in real time",
     "  episodes  22, 20 succeeded; 2 of the last 3",
     "  ticks     1200, 3 late; link 1.25 ms, policy 0.5 ms",
@@ -166,7 +167,8 @@ def test_push_that_waits(hub, server, run, checkpoint, outcome, status):
 
 
 def test_roll_back(hub, server, run):
-    assert run(push.main, "--rollback", server.url, "--why", "it drops the cube")[0] == 0
+    status, out, _ = run(push.main, "--rollback", server.url, "--why", "it drops the cube")
+    assert (status, out.splitlines()[0].split()[0]) == (0, "trial")
     assert hub.asked[0][:2] == ("rollback", {"why": "it drops the cube"})
     text = "rollback needs a token of the role administer; the token shown has the role drive."
     assert run(push.main, server.url, "--rollback", token="d") == (3, "", f"bam-push: {text}\n")
