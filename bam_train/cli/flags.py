@@ -332,7 +332,7 @@ class AgentConfig:
     """
 
     policy: File = None
-    """The checkpoint.zip to begin with; started again with the same one, or none, an agent goes on with its champion."""
+    """The checkpoint.zip to begin with; started again with the same one or none, an agent goes on with its champion."""
     robot: Url = None
     """Live robot behind rosbridge, such as ws://127.0.0.1:9090; by default a simulated one."""
     port: Port = 9095
