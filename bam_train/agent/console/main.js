@@ -10,10 +10,12 @@ import { Plots } from "./plots.js";
 const byId = (id) => document.getElementById(id);
 const SPEEDS = [0.05, 0.1, 0.25]; // [m/s]
 const LOOK = 2000; // time between two looks at versions and log [ms]
+const OLD = 1000; // age of the newest state from which on the page says that it is old [ms]
 const WRITE = 250; // least time between two sets of plots and numbers [ms]
 
 let status = { state: "not connected" };
 let telemetry = null;
+let heard = -Infinity; // when it came
 let written = -Infinity; // when plots and numbers were drawn
 let role = "watch"; // what this page's token may do
 let owner = null; // how the status calls this page while it drives; "" until it says so; null: it does not drive
@@ -80,6 +82,7 @@ function event(message) {
     if (before.active !== status.active || before.state !== status.state) look();
   } else if (message.event === "telemetry") {
     telemetry = message;
+    heard = performance.now();
     plots.add(message);
     requestAnimationFrame(draw);
   } else if (message.ok === false) {
@@ -98,6 +101,13 @@ function draw() {
   showTelemetry(newest);
   showNear(newest.near ?? {}, status.guards ?? {});
 }
+
+function age() {
+  const old = performance.now() - heard;
+  byId("picture").classList.toggle("old", old > OLD);
+  if (old > OLD) say("tool", Number.isFinite(old) ? `⚠ Old: no state of the robot came for ${Math.round(old / 1000)} s.` : "");
+}
+setInterval(age, 500);
 
 function look() {
   if (!connection.ready || document.visibilityState !== "visible") return;

@@ -83,6 +83,7 @@ class FakeAgent:
         self.joints = np.array([[*ARM_HOME, 0.085]])
         self.state, self.owner, self.active = "running", None, "a" * 64
         self.orders, self.commands, self.twists = [], [], []
+        self.measures = True  # whether the robot sends states
         self.refusal = ""  # the answer to every request but a stop
         self.driver = None  # the socket that has taken over
         self._listeners = {}
@@ -152,7 +153,8 @@ class FakeAgent:
         for number in itertools.count():
             if self._stopped.wait(0.1):
                 return
-            self.tell("telemetry", self.telemetry.message(self.robot_state(), time.time(), command=self.joints))
+            if self.measures:
+                self.tell("telemetry", self.telemetry.message(self.robot_state(), time.time(), command=self.joints))
             if number % 5 == 0:
                 self.tell("status", {"status": self.status()})
 

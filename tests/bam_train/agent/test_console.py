@@ -283,6 +283,14 @@ def test_a_role_sees_what_it_may_do_and_everybody_may_stop(page, token, allowed)
         assert len(agent.did("stop")) == 1
 
 
+def test_an_old_state_is_called_old(page, agent):
+    page.open(agent.url).shows("tool", "Tool at x, y, z:")
+    agent.measures = False
+    page.shows("tool", "⚠ Old: no state of the robot came for")
+    agent.measures = True
+    page.shows("tool", "Tool at x, y, z:")
+
+
 def test_what_is_refused_is_said(page, agent):
     page.open(agent.url).shows("state", "running")
     agent.refusal = "anna drives this robot."
