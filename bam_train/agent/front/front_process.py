@@ -54,13 +54,14 @@ from bam_train.agent.front.site_pages import console_pages
 from bam_train.agent.transitions import EVENT
 from bam_train.env_location import Place
 from bam_train.environments import make_env
-from bam_train.errors import BamTrainError, RequestRefused
+from bam_train.errors import BamTrainError, CandidateRefused, RequestRefused, TrialsNeeded, UnknownVersion
 
 _log = logging.getLogger(__name__)
 CUT = 2.0
 """Time for which the lease of an owner stays whose link was cut [s]."""
 _LOOK = 0.1  # time between two looks at the lease [s]
 _HALT_LATE = 1.0  # longest time for which a halt comes after the end of its sender's lease [s]
+_REFUSALS = {one.__name__: one for one in (NotInCommand, CandidateRefused, TrialsNeeded, UnknownVersion)}
 _ANSWER = 10.0  # longest wait for an answer of the resident, unless it needs longer [s]
 
 
@@ -230,7 +231,7 @@ class FrontProcess:
         finally:
             self._pending.pop(number, None)
         if answer.result is None:
-            raise (NotInCommand if answer.kind == "NotInCommand" else RequestRefused)(answer.error)
+            raise _REFUSALS.get(answer.kind, RequestRefused)(answer.error)
         return answer.result
 
     def _ask_now(self, op: str, arguments: dict[str, Any]) -> dict[str, Any]:

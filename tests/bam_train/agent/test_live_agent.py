@@ -19,6 +19,7 @@ import bam_envs  # noqa: F401 - registers the environments
 from bam_envs.core.errors import NotInCommand, RobotFault
 from bam_train.agent.remote.agent_client import AgentClient
 from bam_train.checkpoint import GOLDEN, POLICY, Checkpoint, safetensors_file
+from bam_train.errors import AgentRefused
 from bam_train.policy import FrozenPolicy
 from bam_train.recording.recording import Recording
 
@@ -206,6 +207,16 @@ def test_a_push_acts_between_two_ticks_and_is_rolled_back(running, tmp_path, for
     assert (back["active"], back["state"], back["names"]["champion"]) == (champion, "running", champion)
     for text in ("push by anna@laptop", "rolled back: anna@laptop: too slow"):
         running.line(f"acts instead of {(champion if 'push' in text else pushed['digest'])[:12]}: {text}")
+
+
+def test_a_refused_candidate_changes_nothing(running):
+    champion = running.state()["active"]
+    with pytest.raises(AgentRefused, match="was trained on bam/reach-v0, and the agent runs bam/pick-v0") as refused:
+        running.agent.push(PICK.with_name("reach-ppo.zip"))
+    assert refused.value.kind == "CandidateRefused"
+    with pytest.raises(AgentRefused, match="no such version") as refused:
+        running.agent.ask("use", version="elsewhere")
+    assert (refused.value.kind, running.state()["active"]) == ("UnknownVersion", champion)
 
 
 def test_stop_halts_and_pauses(running):
