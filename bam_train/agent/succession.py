@@ -167,7 +167,10 @@ class Succession:
         if not choice.active.wait(_EPISODE):
             raise RequestRefused(f"{version.digest[:12]} was accepted, and did not become active in an hour")
         if arguments.get("wait") and choice.trials is not None:
-            resident.send(Progress(ask.number, "acts as the candidate; its trials decide"))
+            news = "acts as the candidate; its trials decide"
+            if not resident.state.drives:
+                news = f"is the candidate; its trials begin when the agent runs, and it is {resident.state.value} now"
+            resident.send(Progress(ask.number, news))
             if not choice.outcome.wait(_TRIAL):
                 raise RequestRefused("the trial did not end in a day")
         status = resident.status()
@@ -195,10 +198,11 @@ class Succession:
         at_once = ask.arguments.get("when", "episode") == "tick"
         why = f"{ask.op} by {ask.who}"
         champion = self.names[CHAMPION]
-        if stage == "full":
+        if stage == "full" or digest == champion:  # the champion has no trial to pass
             names: dict[str, str | None] = {CANDIDATE: None}
             names |= {CHAMPION: digest, PREVIOUS: champion} if digest != champion else {}
-            return Choice(version, policy, names, why, ask.who, "full" if is_real else None, at_once)
+            own = "full" if is_real and stage == "full" else resident.options.stage
+            return Choice(version, policy, names, why, ask.who, own, at_once)
         slow = "trial" if is_real or stage == "trial" else None
         return Choice(version, policy, {CANDIDATE: digest}, why, ask.who, slow, at_once, trials)
 

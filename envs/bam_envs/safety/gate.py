@@ -305,11 +305,12 @@ class SafeRobot(metaclass=Sealed):
     def connect(self) -> None:
         """Connect the robot. Moves nothing."""
         self._robot.connect()
-        watchdog = getattr(self.info, "watchdog", None)
+        watchdog, has_agent = getattr(self.info, "watchdog", None), getattr(self.info, "agent", False)
         for guard in self._guards:
             if isinstance(guard, Following):
-                guard.relayed(RELAYED * self.spec.period if getattr(self.info, "agent", False) else 0.0)
-            if isinstance(guard, Watchdog) and (watchdog is not None or self._is_real()):
+                guard.relayed(RELAYED * self.spec.period if has_agent else 0.0)
+            # A live agent halts the robot by itself, and the watchdog behind it is the agent's concern.
+            if isinstance(guard, Watchdog) and not has_agent and (watchdog is not None or self._is_real()):
                 guard.connected(watchdog)
 
     def _is_real(self) -> bool:
