@@ -28,10 +28,14 @@ ALGORITHM, TRAINER = "rlpd", "live"
 STATE, NOTES = "bam/resume/state", "bam/resume/notes.json"
 _LARGEST = 500_000  # transitions that are kept
 _RECENT = 50  # episodes of the success rate
-_VARIANTS: tuple[dict[str, Any], ...] = ({}, {"action_delay": [0, 5]})
-"""Arguments of our environments in which a policy is copied, so that the copy is right off its own path too."""
+_VARIANTS: tuple[dict[str, Any], ...] = (
+    {},
+    *({"link": {"command_delay": [late, late], "state_delay": [0.0, 0.0]}} for late in (0.1, 0.2)),
+)
+"""Arguments of our environments in which a policy is copied, so that the copy is right on a late robot too."""
 _NOISES = (0.0, 0.3)
 _ENVS, _STEPS, _FITS = 32, 250, 3000
+_COPIED = 20_000  # simulated observations that are kept while learning
 
 
 class LiveLearner:
@@ -173,11 +177,20 @@ class LiveLearner:
             for noise in _NOISES
         ]
         seen, action = (torch.from_numpy(np.concatenate(column)) for column in zip(*pieces, strict=True))
-        actor, limit = self.rlpd.actor, 0.97  # tanh never gets to 1
+        limit = 0.97  # tanh never gets to 1
+        action = action.clamp(-limit, limit)
+        kept = self._rng.permutation(len(seen))[:_COPIED]
+
+        def label(observations: Any) -> Any:
+            policy.reset()
+            return self.experience.normalised(np.stack([policy.act_batch(one[None])[0] for one in observations]))
+
+        self.experience.copy_from(seen[kept].numpy(), action[kept].numpy(), label)
+        actor = self.rlpd.actor
         rate = torch.optim.Adam(actor.parameters(), lr=1e-3)
         for k in range(_FITS):
             rows = torch.from_numpy(self._rng.integers(len(seen), size=256))
-            loss = ((torch.tanh(actor(seen[rows])[0]) - action[rows].clamp(-limit, limit)) ** 2).mean()
+            loss = ((torch.tanh(actor(seen[rows])[0]) - action[rows]) ** 2).mean()
             rate.param_groups[0]["lr"] = 1e-3 * (1 - k / _FITS)
             rate.zero_grad()
             loss.backward()

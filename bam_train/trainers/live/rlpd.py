@@ -65,6 +65,9 @@ class Hyperparameters:
     """Share of a batch that are demonstrations: half of them of a person, half of the robot's own successes."""
     imitation_weight: _Weight = 1.0
     """Weight of the imitation of demonstrations in the actor's loss."""
+    copy_weight: _Weight = 1.0
+    """Weight of the imitation of the policy that the first one is a copy of, on simulated observations: without it, a
+    few demonstrations are learnt by heart, and everything else is forgotten."""
     advantage_weight: _Weight = 1.0
     """Weight of the imitation of experience, each action by the exponential of its advantage."""
     advantage_scale: _Weight = 1.0
@@ -93,6 +96,8 @@ class Batch:
     discount: torch.Tensor
     """Of the value of `after`: 0 where the task ended before. Shape: (n,)."""
     demonstrations: int
+    copied: tuple[torch.Tensor, torch.Tensor] | None = None
+    """`seen` and `action` of the policy that the first one is a copy of. Shapes: (m, inputs), (m, a)."""
 
 
 class Critics(Layer):
@@ -209,6 +214,9 @@ class Rlpd:
         errors, losses = ((mean - batch.action) ** 2).mean(1), {}
         if batch.demonstrations and settings.imitation_weight:
             losses["imitation"] = settings.imitation_weight * errors[own:].mean()
+        if batch.copied is not None and settings.copy_weight:
+            copy = torch.tanh(self.actor(batch.copied[0])[0])
+            losses["copy"] = settings.copy_weight * functional.mse_loss(copy, batch.copied[1])
         if self.updates > settings.warmup and settings.advantage_weight:
             weights = self._weights(batch.seen[:own], batch.action[:own])
             losses["advantage"] = settings.advantage_weight * (weights * errors[:own]).mean()
