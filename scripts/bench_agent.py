@@ -156,9 +156,10 @@ class FastAgent:
 
 
 def swap_on(fast: FastAgent, ended: threading.Event) -> None:
-    """Swap the policy every `SWAP_EVERY` ticks, as a push does after its check; the check of a file runs beside it."""
-    from bam_train.agent.agent_messages import Ask
+    """Load and swap a policy every `SWAP_EVERY` ticks, as a push does; the check of a file runs beside it."""
     from bam_train.agent.candidate import CandidateRequest, check_candidate
+    from bam_train.agent.succession import Choice
+    from bam_train.agent.versions import load_policy
 
     agent, number = fast.agent, 0
 
@@ -175,8 +176,9 @@ def swap_on(fast: FastAgent, ended: threading.Event) -> None:
     checker.start()
     while not ended.wait(SWAP_EVERY / RATE):
         number += 1
-        arguments = {"version": fast.digests[number % 2], "stage": "full", "when": "tick"}
-        agent.take(Ask(number, "use", arguments, "bench", "127.0.0.1"))
+        version = agent.succession.versions.find(fast.digests[number % 2])
+        names: dict[str, str | None] = {"champion": version.digest}
+        agent.choose(Choice(version, load_policy(version), names, "benchmark", "bench"))
     checker.join()
 
 
