@@ -251,6 +251,10 @@ class Resident:
         """Called by the chain between a deadline and the policy: whether the episode ends here."""
         deployment = self._connected.deployment
         self._loop_ms += 0.05 * (1e3 * deployment.latency - self._loop_ms)
+        return self._settled()
+
+    def _settled(self) -> bool:
+        """Execute what waits, and swap the policy if that is asked for now; whether the episode ends here."""
         if self._requests:
             self._execute()
         if self._chosen is not None and self._chosen.at_once and not self._slows(self._chosen):
@@ -378,10 +382,8 @@ class Resident:
         session.deployment.sent(tick, state)
         self.send(Sent(list(tick.command)))
         self._link_ms += 0.05 * (1e3 * tick.age - self._link_ms)
-        if tick.approach and self.driver is None and self._requests:
-            self._execute()
-            if not self._plays():
-                raise _Interrupted
+        if tick.approach and self.driver is None and self._requests and self._settled():
+            raise _Interrupted
 
     # ---- the link
 
