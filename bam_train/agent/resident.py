@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from bam_envs import __version__
-from bam_envs.core.errors import BamEnvsError, LinkLost, NotInCommand, SafetyStop, StaleState
+from bam_envs.core.errors import BamEnvsError, LinkLost, NotInCommand, NotReady, RemoteError, SafetyStop
 from bam_envs.core.robot import Initial
 from bam_train.agent.agent_messages import Answer, Ask, Drive, Halt, Message, Report, Rows, Sent
 from bam_train.agent.agent_options import AgentOptions
@@ -434,19 +434,20 @@ class Resident:
         """What a fault while the robot moved leads to: waiting for the robot, stopped by a guard, or paused."""
         text = fault_text(error)
         session, driver = self.session, self.driver
+        stopped = isinstance(error, SafetyStop) or (session is not None and session.robot.stopped is not None)
         self.halt()
         self._drop(text)
         if driver is not None:
             self._end_driving(driver, text)
-        if isinstance(error, SafetyStop) and not isinstance(error, StaleState):
+        if stopped:  # also by the age of its state: only a person lets it move again
             self._stopped, self._is_running = text, False
             self._change(State.STOPPED, text)
             if session is not None:
                 self.succession.guard_stopped(text)
-        elif isinstance(error, BamEnvsError):  # lost, stale, or somebody else drives: it goes on when it can
+        elif isinstance(error, (LinkLost, RemoteError, NotReady)):  # or somebody else drives: it goes on when it can
             self._change(State.WAITING, text)
         else:
-            if not isinstance(error, BamTrainError):
+            if not isinstance(error, (BamTrainError, BamEnvsError)):
                 _log.error("The episode failed", exc_info=error)
             if isinstance(error, PolicyError) and self.succession.policy_failed(text):
                 self._change(State.WAITING, text)  # until the other version is connected

@@ -2,6 +2,7 @@
 
 A candidate is checked in another process and loaded in a thread, while the old policy drives. What follows happens in
 the main thread, between two ticks or two episodes.
+Longer than most files: the way of a candidate, from its check to a roll-back, is one.
 """
 
 from __future__ import annotations

@@ -2,6 +2,7 @@
 
 Halts and twists go to the hub at once, in the network thread; everything else in worker threads, so that nothing that
 takes long holds them up. What waits for a client is bounded: of events it gets the newest only.
+Longer than most files: a socket is one object from its greeting to its last upload.
 """
 
 from __future__ import annotations

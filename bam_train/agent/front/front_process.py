@@ -2,6 +2,7 @@
 
 It serves the robot over rosbridge, for programs that take over; the agent socket, for the console and the programs
 `bam-agent` and `bam-push`; and the pages of the console. It decides who has the lease, and passes on the rest.
+Longer than most files: the lease, and everything that changes it, are read together.
 """
 
 from __future__ import annotations

@@ -1,4 +1,7 @@
-"""A blocking client of a live agent, for programs: requests, uploads, events."""
+"""A blocking client of a live agent, for programs: requests, uploads, events.
+
+Longer than most files: it is one client, with all that may go wrong between two computers.
+"""
 
 from __future__ import annotations
 
