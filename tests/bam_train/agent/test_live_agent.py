@@ -76,10 +76,12 @@ class Program:
             self.agent.ask("resume")
 
     def ticks(self, number):
-        """Wait until the policy has driven for so many more ticks."""
+        """Wait until the policy has driven for so many more ticks; on a busy computer a guard may stop the robot."""
         until, end = self.agent.ask("status")["ticks"] + number, time.monotonic() + DEADLINE
         while (status := self.agent.ask("status"))["ticks"] < until:
             assert time.monotonic() < end, status
+            if status["state"] == "stopped by a guard":
+                self.agent.ask("resume")
             time.sleep(0.05)
 
     def end(self, number=signal.SIGINT):
