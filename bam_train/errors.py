@@ -13,6 +13,7 @@
     ├── TrialsNeeded               full speed before trials have shown that the policy succeeds
     ├── BadKey                     a key for signing or verifying that cannot be used
     ├── BadRecording               a file that is no recording, or does not fit what it is played with
+    ├── BadDataSet                 a folder that is no data set, a damaged one, or episodes that do not belong into it
     ├── FormatError                bytes that do not follow their file format (safetensors, ONNX)
     ├── PolicyError                a frozen policy that cannot run, or an observation that does not fit it
     ├── SettingsError              a setting or option that does not exist or does not fit
@@ -100,6 +101,10 @@ class BadKey(BamTrainError):  # noqa: N818
 
 class BadRecording(BamTrainError, ValueError):  # noqa: N818
     """A file that is no recording of a deployment, or one that does not fit what it is played with."""
+
+
+class BadDataSet(BamTrainError, ValueError):  # noqa: N818
+    """A folder that is no data set, a damaged one, or episodes that do not belong into it; the text names the place."""
 
 
 class FormatError(BamTrainError, ValueError):

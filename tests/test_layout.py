@@ -32,6 +32,7 @@ ORDER = {
             "recording",
             "loop",
             "evaluation",
+            "data",
             "deploy",
             "agent",
             "trainers",

@@ -108,6 +108,7 @@ def test_the_base_install_is_small(metadata):
 def test_extras(metadata):
     assert sorted(metadata.get_all("Provides-Extra")) == [
         "all",
+        "data",
         "dev",
         "docs",
         "notebook",

@@ -25,7 +25,7 @@ EXTRAS = {
     "stable_baselines3": "train",
     "sb3_contrib": "train",
     "ray": "rllib",
-    "pyarrow": "rllib",
+    "pyarrow": "data",
     "onnx": "train",
     "tensorboard": "train",
     "matplotlib": "train",

@@ -1,0 +1,7 @@
+"""Data sets: episodes in a folder of Parquet that LeRobot v3.0 opens, with every number of them bit for bit."""
+
+from bam_train.data.data_set import DataSet
+from bam_train.data.data_set_writer import DataSetWriter
+from bam_train.data.episode import DataSetInfo, Episode, Transitions
+
+__all__ = ["DataSet", "DataSetInfo", "DataSetWriter", "Episode", "Transitions"]

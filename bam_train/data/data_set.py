@@ -1,0 +1,247 @@
+"""Read a data set: its episodes as they were recorded, one file in memory at a time."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from bam_envs.core.errors import BamEnvsError
+from bam_train.data.arrow_columns import from_arrow
+from bam_train.data.episode import Array, DataSetInfo, Episode, Transitions, Values, digest_of, joined, leaves_of
+from bam_train.data.layout import (
+    BAM,
+    CHUNK,
+    DATA,
+    DEFAULTS,
+    EPISODES,
+    FINAL,
+    FORMAT,
+    INFO,
+    LIGHT,
+    NEXT,
+    Files,
+    file_name,
+)
+from bam_train.errors import BadDataSet
+
+MOST_BYTES = 2**26
+"""Bytes of a file that are in memory together, unless one episode has more."""
+
+
+class DataSet:
+    """The episodes at a place; `open` reads it. Others may append to it meanwhile: the episodes here stay the same."""
+
+    def __init__(self, files: Files, info: DataSetInfo, head: Mapping[str, Any], columns: Mapping[str, Any]) -> None:
+        self._files, self.info = files, info
+        self.extra: dict[str, dict[str, Any]] = dict(columns)
+        """Dtype and shape of each further column."""
+        self.features = {name: one for name, one in head["features"].items() if name not in DEFAULTS}
+        """Columns of the steps, as LeRobot describes them."""
+        self.total_frames = int(head["total_frames"])
+        self._observation = leaves_of(info.observation_space, "observation")
+        self._action = leaves_of(info.action_space, "action")
+        self._rows = self._read_rows(int(head["total_episodes"]))
+
+    @property
+    def place(self) -> str:
+        """Where it is, as it was given."""
+        return self._files.text
+
+    @classmethod
+    def open(cls, place: str | Path) -> DataSet:
+        """Open the data set at `place`.
+
+        Raises:
+            BadDataSet: There is none, a file of it is missing or damaged, or a newer bam-train wrote it.
+        """
+        files = Files(place)
+        if not files.exists(INFO):
+            raise BadDataSet(f"{place}: is no data set: it has no {INFO}; give a folder that bam-data wrote")
+        head = files.read_json(INFO)
+        if not files.exists(BAM):
+            raise BadDataSet(f"{place}: has no {BAM}, so its environment is unknown; bam-train did not write it")
+        own = files.read_json(BAM)
+        if not isinstance(own.get("format"), int) or own["format"] > FORMAT:
+            raise BadDataSet(f"{place}: has format {own.get('format')}; this bam-train reads up to {FORMAT}. Update it")
+        try:
+            return cls(files, DataSetInfo.from_json(own), head, own["columns"])
+        except (KeyError, TypeError, ValueError, BamEnvsError) as error:
+            raise BadDataSet(f"{place}: {BAM} or {INFO} is damaged: {error!r}; run bam-data check {place}") from error
+
+    def _read_rows(self, count: int) -> list[dict[str, Any]]:
+        rows: list[dict[str, Any]] = []
+        number = 0
+        while len(rows) < count:
+            name = file_name(EPISODES, number)
+            table = self._files.open_parquet(name).read(columns=list(LIGHT))
+            rows += table.to_pylist()
+            number += 1
+        if [row["episode_index"] for row in rows] != list(range(len(rows))):
+            raise BadDataSet(f"{self.place}: its episodes are not numbered from 0 on; run bam-data check {self.place}")
+        self.next_file = number
+        return rows[:count]
+
+    def __len__(self) -> int:
+        return len(self._rows)
+
+    @property
+    def digests(self) -> list[str]:
+        """SHA-256 of every episode."""
+        return [row["bam/digest"] for row in self._rows]
+
+    @property
+    def digest(self) -> str:
+        """SHA-256 of the digests of all episodes."""
+        return hashlib.sha256("\n".join(self.digests).encode()).hexdigest()
+
+    @property
+    def tasks(self) -> list[str]:
+        """The sentences of the tasks, in the order of their indices."""
+        return list(dict.fromkeys(task for row in self._rows for task in row["tasks"]))
+
+    def facts(self, index: int) -> dict[str, Any]:
+        """Facts of an episode without its numbers, with its length, return, success and end."""
+        row = self._rows[self._index(index)]
+        ends = {name: row[f"bam/{name}"] for name in ("success", "terminated", "truncated")}
+        return {**json.loads(row["bam/facts"]), "length": row["length"], "return": row["bam/return"], **ends}
+
+    def _index(self, index: int) -> int:
+        if not -len(self) <= index < len(self):
+            raise IndexError(f"{self.place}: has {len(self)} episodes, and there is no episode {index}")
+        return index % len(self)
+
+    def __getitem__(self, index: int) -> Episode:
+        return next(self.episodes([index]))
+
+    def __iter__(self) -> Iterator[Episode]:
+        return self.episodes()
+
+    def episodes(self, indices: Sequence[int] | None = None) -> Iterator[Episode]:
+        """The episodes, or those of `indices` in this order; neighbours are read together.
+
+        Raises:
+            BadDataSet: A file is missing, or does not hold the numbers that were written.
+            IndexError: There is no such episode.
+        """
+        wanted = range(len(self)) if indices is None else [self._index(int(index)) for index in indices]
+        start = 0
+        while start < len(wanted):
+            number = self._file_of(wanted[start])
+            end = start + 1
+            while end < len(wanted) and self._file_of(wanted[end]) == number:
+                end += 1
+            yield from self._of_file(number, wanted[start:end])
+            start = end
+
+    def _file_of(self, index: int) -> int:
+        row = self._rows[index]
+        return int(row["data/chunk_index"]) * CHUNK + int(row["data/file_index"])
+
+    def _of_file(self, number: int, indices: Sequence[int]) -> Iterator[Episode]:
+        import pyarrow as pa
+
+        name = file_name(DATA, number)
+        try:
+            data, finals = self._files.open_parquet(name), self._files.open_parquet(file_name(EPISODES, number))
+            last = finals.read(columns=["episode_index", *(FINAL + leaf.column for leaf in self._observation)])
+            first = last["episode_index"][0].as_py()
+            batch: list[int] = []
+            size = 0
+            for place, index in enumerate(indices):
+                batch.append(index)
+                size += data.metadata.row_group(index - first).total_byte_size
+                if size >= MOST_BYTES or place == len(indices) - 1:
+                    table = data.read_row_groups([one - first for one in batch])
+                    yield from self._of_table(name, table, last, first, batch)
+                    batch, size = [], 0
+        except (OSError, pa.ArrowException, KeyError, IndexError) as error:
+            why = str(error).partition("\n")[0]
+            raise BadDataSet(f"{self.place}: {name} is damaged: {why}; run bam-data check {self.place}") from error
+
+    def _of_table(self, name: str, table: Any, last: Any, first: int, indices: list[int]) -> Iterator[Episode]:
+        start = 0
+        for index in indices:
+            length = self._rows[index]["length"]
+            steps = table.slice(start, length)
+            start += length
+            try:
+                numbers = np.unique(steps["episode_index"].to_numpy()).tolist()
+                if len(steps) != length or numbers != [index]:
+                    raise ValueError(f"its place has {len(steps)} steps of episodes {numbers}")
+                yield self._episode(index, steps, last.slice(index - first, 1))
+            except (ValueError, KeyError) as error:
+                raise BadDataSet(
+                    f"{self.place}: {name}: episode {index} is damaged: {error}; run bam-data check {self.place}"
+                ) from error
+
+    def _episode(self, index: int, steps: Any, final: Any) -> Episode:
+        row = self._rows[index]
+        arrays = {}
+        for leaf in self._observation:
+            parts = (steps[leaf.column], final[FINAL + leaf.column])
+            arrays[leaf.column] = np.concatenate([from_arrow(one, leaf.shape, leaf.dtype) for one in parts])
+        arrays |= {leaf.column: from_arrow(steps[leaf.column], leaf.shape, leaf.dtype) for leaf in self._action}
+        rewards = from_arrow(steps["next.reward"], (), np.dtype(np.float64))
+        end = (row["bam/terminated"], row["bam/truncated"], row["bam/success"])
+        digest = digest_of({**arrays, "reward": rewards}, *end)
+        if digest != row["bam/digest"]:
+            raise ValueError("its numbers are not those that were written")
+        return Episode(
+            joined(self.info.observation_space, arrays, self._observation),
+            joined(self.info.action_space, arrays, self._action),
+            rewards,
+            *end,
+            columns=self._columns(row, steps, [*arrays, *NEXT, *DEFAULTS]),
+            facts=json.loads(row["bam/facts"]),
+            digest=digest,
+        )
+
+    def _columns(self, row: Mapping[str, Any], steps: Any, others: list[str]) -> dict[str, Array]:
+        """The further columns of an episode, and those that somebody added to the files."""
+        own = json.loads(row["bam/columns"])
+        names = [name for name in steps.column_names if name not in others and (name in own or name not in self.extra)]
+        found = {}
+        for name in names:
+            known = self.extra.get(name)
+            found[name] = from_arrow(steps[name], None if known is None else tuple(known["shape"]))
+        return found
+
+    def transitions(self, indices: Sequence[int] | None = None) -> Transitions:
+        """All steps of the episodes, or of those of `indices`, in memory."""
+        wanted = range(len(self)) if indices is None else [self._index(int(index)) for index in indices]
+        episodes = list(self.episodes(wanted))
+        terminals = [
+            np.arange(len(one)) == len(one) - 1 if one.terminated else np.zeros(len(one), bool) for one in episodes
+        ]
+        before = [_cut(one.observations, slice(None, -1)) for one in episodes]
+        after = [_cut(one.observations, slice(1, None)) for one in episodes]
+        counts = [len(one) for one in episodes]
+        if not episodes:
+            raise BadDataSet(f"{self.place}: has no episodes yet; record some first")
+        return Transitions(
+            _concatenated(before),
+            _concatenated([one.actions for one in episodes]),
+            np.concatenate([one.rewards for one in episodes]),
+            _concatenated(after),
+            np.concatenate(terminals),
+            np.repeat(np.asarray(wanted, np.int64), counts),
+        )
+
+
+def _cut(values: Values, part: slice) -> Values:
+    if isinstance(values, dict):
+        return {key: _cut(one, part) for key, one in values.items()}
+    return tuple(_cut(one, part) for one in values) if isinstance(values, tuple) else values[part]
+
+
+def _concatenated(each: Sequence[Values]) -> Values:
+    if isinstance(each[0], dict):
+        return {key: _concatenated([one[key] for one in each]) for key in each[0]}
+    if isinstance(each[0], tuple):
+        return tuple(_concatenated(parts) for parts in zip(*each, strict=True))
+    return np.concatenate(each)

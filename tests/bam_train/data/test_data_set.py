@@ -1,0 +1,224 @@
+"""Episodes come back bit for bit, appended ones too; what does not fit is refused with one line."""
+
+import re
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+from bam_train.data import DataSet, DataSetInfo, DataSetWriter, Episode
+from bam_train.errors import BadDataSet
+
+pytest.importorskip("pyarrow")
+SPACES = {
+    "box": gym.spaces.Box(-np.inf, np.inf, (3,), np.float32),
+    "one number": gym.spaces.Box(-1, 1, (1,), np.float64),
+    "no axis": gym.spaces.Box(-1, 1, (), np.float32),
+    "matrix": gym.spaces.Box(-9, 9, (2, 3), np.int16),
+    "picture": gym.spaces.Box(0, 255, (4, 5, 3), np.uint8),
+    "grey": gym.spaces.Box(0, 255, (4, 5, 1), np.uint8),
+    "discrete": gym.spaces.Discrete(4, start=2),
+    "multi": gym.spaces.MultiDiscrete([3, 4]),
+    "binary": gym.spaces.MultiBinary(3),
+    "nested": gym.spaces.Dict(
+        {
+            "camera": gym.spaces.Box(0, 255, (4, 5, 3), np.uint8),
+            "arm": gym.spaces.Dict({"joints": gym.spaces.Box(-1, 1, (6,), np.float32), "mode": gym.spaces.Discrete(3)}),
+            "pair": gym.spaces.Tuple([gym.spaces.Box(-1, 1, (2,), np.float16), gym.spaces.MultiBinary(2)]),
+        }
+    ),
+}
+
+
+def info_of(observation="box", action="box", **changes):
+    values = {"env": "bam/pick-v0", "env_kwargs": {}, "period": 0.05, "robot": "ur5e"}
+    return DataSetInfo(
+        **{**values, "observation_space": SPACES[observation], "action_space": SPACES[action], **changes}
+    )
+
+
+def samples(space, count):
+    """`count` values of a space, as arrays with the steps first."""
+    if isinstance(space, gym.spaces.Dict):
+        return {key: samples(part, count) for key, part in space.spaces.items()}
+    if isinstance(space, gym.spaces.Tuple):
+        return tuple(samples(part, count) for part in space.spaces)
+    return np.stack([np.asarray(space.sample(), space.dtype) for _ in range(count)])
+
+
+def episode(info, steps, seed=0, **changes):
+    info.observation_space.seed(seed)
+    info.action_space.seed(seed)
+    values = {"rewards": np.random.default_rng(seed).normal(size=steps), "terminated": seed % 2 == 0}
+    values |= {"truncated": seed % 2 == 1, "success": [True, False, None][seed % 3], "facts": {"seed": seed}}
+    values |= {"observations": samples(info.observation_space, steps + 1), "actions": samples(info.action_space, steps)}
+    return Episode(**{**values, **changes})
+
+
+def assert_equal(found, expected):
+    """The same structure, dtypes, shapes and bits."""
+    assert type(found) is type(expected)
+    if isinstance(expected, dict):
+        assert list(found) == list(expected)
+        found, expected = tuple(found.values()), tuple(expected.values())
+    if isinstance(expected, tuple):
+        assert len(found) == len(expected)
+        for one, other in zip(found, expected, strict=True):
+            assert_equal(one, other)
+    else:
+        assert (found.dtype, found.shape) == (expected.dtype, expected.shape)
+        assert found.tobytes() == expected.tobytes()
+
+
+def write(place, info, episodes, **options):
+    with DataSetWriter(place, info, **options) as writer:
+        return [writer.add(one) for one in episodes]
+
+
+@pytest.mark.parametrize("observation", SPACES)
+@pytest.mark.parametrize("action", ["box", "one number", "discrete", "multi", "nested"])
+def test_every_number_comes_back(tmp_path, observation, action):
+    info = info_of(observation, action)
+    written = [episode(info, steps, steps) for steps in (1, 3, 2, 5)]
+    assert write(tmp_path / "d", info, written, flush_episodes=3) == [0, 1, 2, 3]
+    data = DataSet.open(tmp_path / "d")
+    assert (len(data), data.info) == (4, info)
+    assert data.digests == [one.digest for one in written]
+    for found, expected in zip(data.episodes(), written, strict=True):
+        assert_equal(found.observations, expected.observations)
+        assert_equal(found.actions, expected.actions)
+        assert_equal(found.rewards, expected.rewards)
+        for name in ("terminated", "truncated", "success", "facts", "digest"):
+            assert getattr(found, name) == getattr(expected, name)
+
+
+def test_bits_that_are_no_numbers_come_back(tmp_path):
+    info = info_of()
+    odd = np.array([0x7FC00001, 0xFFC12345, 0x80000000, 0x7F800000, 0x00000001, 0], np.uint32).view(np.float32)
+    one = episode(info, 3)
+    one.observations[:2] = odd.reshape(2, 3)
+    write(tmp_path / "d", info, [one])
+    assert_equal(DataSet.open(tmp_path / "d")[0].observations, one.observations)
+
+
+def test_further_columns_of_some_episodes(tmp_path):
+    info = info_of()
+    columns = {"time": 1.7e9 + np.arange(4) / 3, "guard": np.array(["", "joint speed (G8)", "", "ü"])}
+    columns |= {"raw_action": np.ones((4, 3)), "intervention": np.array([True, False, True, True])}
+    columns |= {"info.contact": np.arange(8, dtype=np.int8).reshape(4, 2, 1)}
+    written = [episode(info, 4), episode(info, 4, columns=columns), episode(info, 4, 1)]
+    write(tmp_path / "d", info, written[:2])
+    write(tmp_path / "d", info, written[2:])
+    data = DataSet.open(tmp_path / "d")
+    assert [list(one.columns) for one in data] == [[], list(columns), []]
+    for name, values in data[1].columns.items():
+        if name == "guard":
+            assert values.tolist() == columns[name].tolist()
+        else:
+            assert_equal(values, columns[name])
+
+
+def test_order_indices_and_transitions(tmp_path):
+    info = info_of()
+    written = [episode(info, 2 + number, number) for number in range(5)]
+    for one in written:
+        write(tmp_path / "d", info, [one])
+    data = DataSet.open(tmp_path / "d")
+    assert [one.facts["seed"] for one in data.episodes([4, 0, -1, 2])] == [4, 0, 4, 2]
+    assert data.facts(1) == {
+        "seed": 1,
+        "length": 3,
+        "return": float(written[1].rewards.sum()),
+        "success": False,
+        "terminated": False,
+        "truncated": True,
+    }
+    with pytest.raises(IndexError, match="has 5 episodes, and there is no episode 5"):
+        data[5]
+    steps = data.transitions([3, 2])
+    assert steps.episode.tolist() == [3] * 5 + [2] * 4
+    assert steps.terminals.tolist() == [False] * 8 + [True]
+    assert_equal(steps.observations, np.concatenate([written[k].observations[:-1] for k in (3, 2)]))
+    assert_equal(steps.next_observations, np.concatenate([written[k].observations[1:] for k in (3, 2)]))
+    assert_equal(steps.actions, np.concatenate([written[k].actions for k in (3, 2)]))
+
+
+@pytest.mark.parametrize(
+    ("changes", "text"),
+    [
+        ({"env": "bam/reach-v0"}, 'env is "bam/pick-v0" there, and "bam/reach-v0" of the new episodes'),
+        ({"period": 0.1}, "period is 0.05 there, and 0.1 of the new episodes"),
+        ({"contract": {"action": [{"name": "x", "unit": "mm"}]}}, "contract.action is null there, and "),
+        ({"observation_space": SPACES["matrix"]}, "observation_space.shape is [3] there, and [2, 3]"),
+    ],
+)
+def test_episodes_of_something_else_are_refused(tmp_path, changes, text):
+    write(tmp_path / "d", info_of(), [episode(info_of(), 2)])
+    with pytest.raises(BadDataSet, match=re.escape(text)):
+        DataSetWriter(tmp_path / "d", info_of(**changes))
+    assert len(DataSet.open(tmp_path / "d")) == 1
+
+
+def test_a_second_writer_hears_who_is_first(tmp_path):
+    with DataSetWriter(tmp_path / "d", info_of()) as writer:
+        with pytest.raises(BadDataSet, match=r"is being written by process \d+ on .+ since 20..-..-.. ..:..:.. UTC; "):
+            DataSetWriter(tmp_path / "d", info_of())
+        writer.add(episode(info_of(), 2))
+        assert len(DataSet.open(tmp_path / "d")) == 0
+        writer.flush()
+        assert len(DataSet.open(tmp_path / "d")) == 1
+    with DataSetWriter(tmp_path / "d", info_of()) as writer:
+        assert writer.add(episode(info_of(), 2)) == 1
+
+
+@pytest.mark.parametrize(
+    ("changes", "text"),
+    [
+        ({"rewards": np.zeros(0)}, "an episode without a step"),
+        ({"rewards": np.zeros(3)}, "observation.state: expected shape (4, 3), found (3, 3)"),
+        ({"observations": np.zeros((3, 3), complex)}, "observation.state: expected float32, found complex128"),
+        ({"columns": {"action.x": np.zeros(2)}}, "a column cannot be called 'action.x'"),
+        ({"columns": {"x": np.zeros(3)}}, "column x: expected 2 steps, found shape (3,)"),
+        (
+            {"columns": {"force": np.zeros((2, 3))}},
+            "column force is float64 of shape [3], and that of earlier episodes",
+        ),
+    ],
+)
+def test_episodes_that_do_not_fit_are_refused(tmp_path, changes, text):
+    info = info_of()
+    with DataSetWriter(tmp_path / "d", info) as writer:
+        writer.add(episode(info, 2, columns={"force": np.zeros(2)}))
+        with pytest.raises(BadDataSet, match=re.escape(text)):
+            writer.add(episode(info, 2, **changes))
+    assert len(DataSet.open(tmp_path / "d")) == 1
+
+
+def test_what_is_no_data_set(tmp_path):
+    with pytest.raises(BadDataSet, match=r"d: is no data set: it has no meta/info\.json"):
+        DataSet.open(tmp_path / "d")
+    write(tmp_path / "d", info_of(), [episode(info_of(), 2)])
+    (tmp_path / "d/meta/bam.json").rename(tmp_path / "bam.json")
+    with pytest.raises(BadDataSet, match=r"has no meta/bam\.json, so its environment is unknown"):
+        DataSet.open(tmp_path / "d")
+
+
+def damaged(path, kind):
+    if kind == "missing":
+        path.unlink()
+    elif kind == "truncated":
+        path.write_bytes(path.read_bytes()[:-20])
+    else:
+        path.write_bytes(path.with_name("file-000.parquet").read_bytes())
+
+
+@pytest.mark.parametrize("kind", ["missing", "truncated", "another"])
+@pytest.mark.parametrize("folder", ["data", "meta/episodes"])
+def test_a_damaged_file_is_one_line(tmp_path, kind, folder):
+    info = info_of()
+    for number in range(2):
+        write(tmp_path / "d", info, [episode(info, 2, number)])
+    damaged(tmp_path / "d" / folder / "chunk-000/file-001.parquet", kind)
+    with pytest.raises(BadDataSet, match="run bam-data check") as found:
+        list(DataSet.open(tmp_path / "d"))
+    assert "\n" not in str(found.value)
