@@ -6,7 +6,7 @@ import json
 import math
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -69,6 +69,9 @@ class Manifest:
     """UTC, ISO 8601."""
     sha256: dict[str, _Digest]
     """Hex digest of every other member."""
+    data: dict[str, Any] = field(default_factory=dict)
+    """What it learnt from a data set: the ``digest`` of the set, those of its training ``episodes``, and the number of
+    their ``steps``; {} if it learnt from none."""
 
 
 _Number = Annotated[int, Meta(ge=-(2**63), le=2**63 - 1)]
@@ -116,12 +119,19 @@ class _Scores(Struct):
     episodes: _Count | None = None
 
 
+class _Data(Struct):
+    digest: _Digest | None = None
+    episodes: list[_Digest] = []
+    steps: _Count = 0
+
+
 class _Contents(Struct):
     """Fields whose content is checked besides the types of `Manifest`."""
 
     observation_space: _Space
     action_space: _Space
     scores: _Scores
+    data: _Data = msgspec.field(default_factory=_Data)
 
 
 class _Head(Struct):

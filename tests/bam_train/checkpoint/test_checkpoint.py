@@ -328,6 +328,14 @@ def test_a_manifest_of_wrong_types_is_refused(path: Path, field: str, value: Any
             write_checkpoint(path, {**FIELDS, field: value}, MEMBERS)
 
 
+def test_a_checkpoint_names_the_episodes_that_it_learnt_from(path: Path):
+    assert Checkpoint.open(path).manifest.data == {}
+    data = {"digest": "a" * 64, "episodes": ["b" * 64, "c" * 64], "steps": 84}
+    assert Checkpoint.open(write_checkpoint(path, {**FIELDS, "data": data}, MEMBERS).path).manifest.data == data
+    with pytest.raises(CheckpointError, match="episodes"):
+        write_checkpoint(path, {**FIELDS, "data": {**data, "episodes": ["b"]}}, MEMBERS)
+
+
 def test_fields_of_a_later_minor_version_are_left_out(path: Path):
     rewrite(path, {}, mood="good")
     assert Checkpoint.open(path).manifest.env == "bam/pick-v0"
