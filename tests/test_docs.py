@@ -26,6 +26,7 @@ from bam_envs.tasks import (
 )
 from bam_train.checkpoint import Checkpoint
 from bam_train.cli import train
+from bam_train.cli.data.bam_data import COMMANDS as DATA_COMMANDS
 from bam_train.settings import tomllib
 
 ROOT = Path(__file__).parents[1]
@@ -34,6 +35,7 @@ PAGES = [ROOT / "README.md", ROOT / "CHANGELOG.md", ROOT / "checkpoints" / "READ
 PROGRAMS = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["scripts"]
 FLAGS_OF = {
     "bam-train": "training.md",
+    "bam-data": "data.md",
     "bam-doctor": "doctor.md",
     "bam-replay": "recording.md",
     "bam-serve": "remote.md",
@@ -189,18 +191,23 @@ def test_every_field_of_a_table_has_its_meaning(make_docs):
     )
 
 
-@pytest.mark.parametrize("program", PROGRAMS)
+@pytest.mark.parametrize(
+    "program", [*sorted(PROGRAMS.keys() - {"bam-data"}), *(f"bam-data {command}" for command in DATA_COMMANDS)]
+)
 def test_flags_in_the_tables_are_those_of_the_programs(program, monkeypatch, capsys):
-    module, _, name = PROGRAMS[program].partition(":")
+    words = program.split()
+    module, _, name = PROGRAMS[words[0]].partition(":")
     main = getattr(importlib.import_module(module), name)
-    monkeypatch.setattr(sys, "argv", [program, "--help"])
+    monkeypatch.setattr(sys, "argv", [*words, "--help"])
     monkeypatch.setattr(sys, "path", list(sys.path))
     with pytest.raises(SystemExit) as caught:
         main()
     assert caught.value.code == 0
     there = set(re.findall(r"--[a-z][a-z-]*", capsys.readouterr().out)) - {"--help"}
     config = f"{program.removeprefix('bam-').capitalize()}Config"
-    page = (ROOT / "docs" / FLAGS_OF.get(program, "deploying.md")).read_text()
+    if words[0] == "bam-data":
+        config = DATA_COMMANDS[words[1]].flags.partition(":")[2]
+    page = (ROOT / "docs" / FLAGS_OF.get(words[0], "deploying.md")).read_text()
     table = re.search(rf"generated: flags \S+:{config} .*?<!-- /generated -->", page, re.DOTALL)[0]
     assert set(re.findall(r"^\| `(--[a-z-]+)`", table, re.MULTILINE)) == there
 

@@ -1,0 +1,59 @@
+"""`bam-data COMMAND`: collect, check and turn data sets into other formats."""
+
+from __future__ import annotations
+
+import pkgutil
+import sys
+from dataclasses import dataclass
+
+from bam_train.cli.console import say, tell
+from bam_train.cli.program import run_program
+
+
+@dataclass(frozen=True)
+class Command:
+    """A command of `bam-data`."""
+
+    help: str
+    flags: str
+    """Its configuration, ``"module:Class"``."""
+    run: str
+    """Takes the configuration and returns an exit status, ``"module:function"``; imported once the flags are read."""
+
+
+_FLAGS = "bam_train.cli.data.data_flags"
+COMMANDS = {
+    "collect": Command(
+        "run a policy in simulation and record it", f"{_FLAGS}:CollectConfig", "bam_train.cli.data.recorded:collect"
+    ),
+}
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Run the command that the first argument names, with the others as its flags."""
+    given = sys.argv[1:] if arguments is None else arguments
+    name = given[0] if given else ""
+    if name in ("-h", "--help"):
+        tell("usage: bam-data COMMAND [OPTIONS]", "", "Record, check and convert data sets: episodes for learning.", "")
+        tell(*(f"  {command:<10}{row.help}" for command, row in COMMANDS.items()))
+        tell("", "bam-data COMMAND --help shows the options of one.")
+        raise SystemExit(0)
+    if name not in COMMANDS:
+        from bam_envs.core.wording import closest
+
+        close = closest(name, COMMANDS)
+        what = "COMMAND is missing" if not name else f"there is no command {name!r}"
+        choice = f", did you mean {close!r}?" if close else f"; there are {', '.join(COMMANDS)}."
+        say(f"bam-data: {what}{choice} Run bam-data --help")
+        raise SystemExit(2)
+    command = COMMANDS[name]
+    run_program(
+        f"bam-data {name}",
+        command.flags,
+        lambda config, _: pkgutil.resolve_name(command.run)(config),
+        given[1:],
+    )
+
+
+if __name__ == "__main__":
+    main()

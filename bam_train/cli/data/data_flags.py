@@ -1,0 +1,40 @@
+"""The flags of the commands of `bam-data`; see `bam_train.cli.flags`."""
+
+from dataclasses import dataclass
+from typing import Annotated
+
+import tyro
+from msgspec import Meta
+
+from bam_train.cli.flags import Assignments, Count, EnvId, Seed
+
+DataPlace = Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="PLACE")]
+Share = Annotated[float, Meta(ge=0, le=1), tyro.conf.arg(metavar="SHARE")]
+
+
+@dataclass(frozen=True)
+class CollectConfig:
+    """Run a policy in simulation and add its episodes to a data set, which is made if there is none."""
+
+    place: DataPlace
+    """The data set: a folder, or an address such as s3://bucket/pick."""
+    policy: Annotated[str, tyro.conf.arg(metavar="CHECKPOINT|scripted|random")]
+    """Who acts: a checkpoint.zip, the script that solves bam/reach, bam/pick or bam/pick-place, or chance."""
+    env: EnvId = None
+    """Environment; of a checkpoint, its own by default."""
+    set: Assignments = ()
+    """An argument of the environment, any number of times: randomize=true. It wins over the checkpoint's."""
+    episodes: Count = 100
+    """How many episodes: the first ones that begin."""
+    seed: Seed = 0
+    """Seed of the first environment, the noise and the random actions; environment i gets seed + i."""
+    noise: Annotated[float, Meta(ge=0), tyro.conf.arg(metavar="X")] = 0.0
+    """Standard deviation of noise on continuous actions; what the policy said is kept as raw_action."""
+    random: Share = 0.0
+    """Share of the steps with a random action instead of the policy's."""
+    task: Annotated[str | None, tyro.conf.arg(metavar="TEXT")] = None
+    """What the episodes are about, as a sentence; by default the environment's id."""
+    num_envs: Annotated[Count | None, tyro.conf.arg(metavar="N")] = None
+    """Environments stepped side by side; by default as many as is quick."""
+    json: bool = False
+    """Print one JSON object on standard output instead of a line."""

@@ -1,0 +1,45 @@
+"""The commands of `bam-data` that write data sets: collect, import and check."""
+
+from __future__ import annotations
+
+import json
+import time
+from typing import TYPE_CHECKING
+
+from bam_train.cli.console import percent, say, tell
+
+if TYPE_CHECKING:
+    from bam_train.cli.data.data_flags import CollectConfig
+
+
+def collect(config: CollectConfig) -> None:
+    """Collect episodes in simulation."""
+    from bam_train.data import collect as collecting
+    from bam_train.settings import read_env_kwargs
+
+    last = time.monotonic()
+
+    def on_progress(done: int, episodes: int) -> None:
+        nonlocal last
+        if done < episodes and time.monotonic() - last > 5:
+            last = time.monotonic()
+            say(f"bam-data: {done} of {episodes} episodes")
+
+    found = collecting.collect(
+        config.place,
+        config.policy,
+        config.env,
+        read_env_kwargs(config.set),
+        episodes=config.episodes,
+        seed=config.seed,
+        noise=config.noise,
+        random=config.random,
+        num_envs=config.num_envs,
+        facts={} if config.task is None else {"task": config.task},
+        on_progress=on_progress,
+    )
+    if config.json:
+        tell(json.dumps({"place": config.place, **vars(found)}))
+        return
+    share = percent(found.successes / found.episodes)
+    tell(f"{config.place}: {found.episodes} episodes, {found.steps} steps added; {share} of them succeeded")

@@ -1,0 +1,167 @@
+"""Collect episodes of a policy in simulation: many environments side by side, everything recorded."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from contextlib import closing
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+
+from bam_envs.core.registry import resolve_id
+from bam_envs.tasks.scripted import scripted_policy
+from bam_train.checkpoint import Checkpoint
+from bam_train.data.episode import Array
+from bam_train.data.record_dataset import RecordVectorDataset
+from bam_train.environments import environment_of, make_vector_env, require_env_kwargs, require_fit
+from bam_train.errors import SettingsError
+from bam_train.evaluation import BatchPolicy, default_num_envs
+from bam_train.policy import FrozenPolicy
+
+SCRIPTED, RANDOM = "scripted", "random"
+
+
+@dataclass
+class Collected:
+    """What was collected."""
+
+    episodes: int = 0
+    steps: int = 0
+    successes: int = 0
+
+
+class RandomPolicy:
+    """Actions drawn uniformly from the space."""
+
+    def __init__(self, space: gym.Space[Any], seed: int) -> None:
+        self._space = space
+        space.seed(seed)
+
+    def reset(self, env_ids: Any = None) -> None:
+        """Nothing: it has no memory."""
+
+    def act_batch(self, observations: Any) -> Any:
+        """Actions for all environments of the space, whatever is observed."""
+        return self._space.sample()
+
+
+def collect(
+    place: str | Path,
+    policy: str,
+    env: str | None = None,
+    env_kwargs: Mapping[str, Any] | None = None,
+    *,
+    episodes: int = 100,
+    seed: int = 0,
+    noise: float = 0.0,
+    random: float = 0.0,
+    num_envs: int | None = None,
+    facts: Mapping[str, Any] | None = None,
+    on_progress: Callable[[int, int], None] = lambda done, episodes: None,
+) -> Collected:
+    """Record the first `episodes` that begin, whole, into the data set at `place`.
+
+    Args:
+        place: The data set; episodes are added to those that are there.
+        policy: A checkpoint, ``"scripted"`` or ``"random"``.
+        env: Gymnasium id; of a checkpoint, its own by default.
+        env_kwargs: Arguments of the environment; they win over the checkpoint's.
+        episodes: At least 1.
+        seed: Environment i is seeded with ``seed + i`` at first, and not again; also of noise and random actions.
+        noise: Standard deviation that is added to continuous actions, which are then clipped to their bounds.
+        random: Share of the steps with an action drawn uniformly instead.
+        num_envs: Environments side by side; by default as many as is quick.
+        facts: Further facts of every episode.
+        on_progress: Called with the number of whole episodes and of all.
+
+    Raises:
+        SettingsError: Something does not fit the environment.
+        BadDataSet: The place holds something else.
+    """
+    checkpoint = None if policy in (SCRIPTED, RANDOM) else Checkpoint.open(Path(policy).expanduser())
+    if checkpoint is not None:
+        env_id, kwargs = environment_of(checkpoint, env)
+    elif env is None:
+        raise SettingsError(f"--policy {policy} is of no environment; give --env too")
+    else:
+        env_id, kwargs = resolve_id(env), {}
+    require_env_kwargs(env_id, env_kwargs or {})
+    kwargs |= env_kwargs or {}
+    envs = make_vector_env(env_id, kwargs, num_envs or default_num_envs(env_id, episodes))
+    with closing(envs):
+        if checkpoint is not None:
+            require_fit(checkpoint, envs)
+        name = policy if checkpoint is None else checkpoint.digest
+        told = {"policy": name, "noise": noise, "random": random, "num_envs": envs.num_envs, **(facts or {})}
+        actor = _policy(policy, checkpoint, env_id, envs.action_space, seed)
+        disturb = Disturbance(envs.single_action_space, noise, random, envs.num_envs, seed)
+        recorded = RecordVectorDataset(envs, place, facts=told, keep=lambda number, _: number < episodes)
+        return _run(recorded, actor, disturb, episodes, seed, on_progress)
+
+
+def _policy(policy: str, checkpoint: Checkpoint | None, env_id: str, space: gym.Space[Any], seed: int) -> BatchPolicy:
+    if checkpoint is not None:
+        return FrozenPolicy.from_checkpoint(checkpoint)
+    return RandomPolicy(space, seed) if policy == RANDOM else scripted_policy(env_id)
+
+
+def _run(
+    envs: Any,
+    policy: BatchPolicy,
+    disturb: Disturbance,
+    episodes: int,
+    seed: int,
+    on_progress: Callable[[int, int], None],
+) -> Collected:
+    done, running = Collected(), np.zeros(envs.num_envs, np.int64)
+    number, begun = np.arange(envs.num_envs), envs.num_envs
+    with closing(envs):
+        observations, _ = envs.reset(seed=seed)
+        policy.reset()
+        while done.episodes < episodes:
+            wanted = np.array(policy.act_batch(observations))
+            actions = disturb(wanted)
+            envs.extra = {} if actions is wanted else {"raw_action": wanted}
+            observations, _, terminated, truncated, infos = envs.step(actions)
+            running += 1
+            ended = np.flatnonzero(terminated | truncated)
+            for i in ended.tolist():
+                if number[i] < episodes:
+                    done.episodes += 1
+                    done.steps += int(running[i])
+                    done.successes += bool(infos.get("final_info", {}).get("is_success", np.zeros(i + 1))[i])
+                number[i], begun, running[i] = begun, begun + 1, 0
+            if ended.size:
+                policy.reset(ended.tolist())
+                on_progress(done.episodes, episodes)
+    return done
+
+
+class Disturbance:
+    """Noise on actions of n environments, and random ones instead."""
+
+    def __init__(self, space: gym.Space[Any], noise: float, random: float, num_envs: int, seed: int) -> None:
+        if noise and not isinstance(space, gym.spaces.Box):
+            raise SettingsError(f"--noise is for continuous actions, found {space}; use --random")
+        self._space, self._noise, self._random = space, noise, random
+        self._rng = np.random.default_rng([seed, 1])
+        self._draws = gym.vector.utils.batch_space(space, num_envs)
+        self._draws.seed(seed + 1)
+
+    def __call__(self, actions: Array) -> Array:
+        """The actions that the environments get. Shape: (n, ...)."""
+        if not self._noise and not self._random:
+            return actions
+        disturbed = actions.copy()
+        if self._noise:
+            disturbed = disturbed + self._noise * self._rng.standard_normal(actions.shape)
+        if self._random:
+            drawn = self._rng.random(len(actions)) < self._random
+            disturbed[drawn] = np.asarray(self._draws.sample())[drawn]
+        if isinstance(self._space, gym.spaces.Box):
+            np.clip(disturbed, self._space.low, self._space.high, out=disturbed)
+        changed: Array = disturbed.astype(actions.dtype)
+        return changed

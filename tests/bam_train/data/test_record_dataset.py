@@ -1,0 +1,135 @@
+"""What happens in an environment is what is in the data set, in one and in several side by side."""
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium.vector import AutoresetMode
+
+import bam_envs  # noqa: F401
+from bam_train.data import DataSet, RecordDataset
+from bam_train.data.collect import collect
+from bam_train.errors import BadDataSet, SettingsError
+
+pytest.importorskip("pyarrow")
+
+
+class Counting(gym.Env):
+    """Observations count the steps; infos of several kinds; ends after as many steps as the seed says."""
+
+    observation_space = gym.spaces.Dict({"n": gym.spaces.Box(0, 99, (2,), np.float32), "k": gym.spaces.Discrete(9)})
+    action_space = gym.spaces.Discrete(3)
+    metadata = {"render_modes": [], "render_fps": 10}  # noqa: RUF012
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.limit, self.n = 2 + int(self.np_random.integers(4)), 0
+        return self.seen(), {"is_success": False}
+
+    def seen(self):
+        return {"n": np.array([self.n, self.limit], np.float32), "k": np.int64(self.n)}
+
+    def step(self, action):
+        self.n += 1
+        over = self.n == self.limit
+        info = {"is_success": over, "deep": {"x": np.arange(2) * self.n}, "odd": {1, 2} if over else "text"}
+        return self.seen(), float(action), over, False, info if self.n > 1 else {}
+
+
+@pytest.fixture
+def counting():
+    gym.register("Counting-v0", Counting)
+    yield "Counting-v0"
+    del gym.registry["Counting-v0"]
+
+
+def test_one_environment(tmp_path, counting):
+    env = RecordDataset(gym.make(counting, disable_env_checker=True), tmp_path / "d", facts={"group": "a"})
+    lengths = []
+    for seed in range(3):
+        env.reset(seed=seed)
+        over, length = False, 0
+        while not over:
+            _, _, over, _, _ = env.step(length % 3)
+            length += 1
+        lengths.append(length)
+    env.reset(seed=3)
+    env.step(1)
+    env.close()
+    data = DataSet.open(tmp_path / "d")
+    assert (data.info.env, data.info.period, data.info.env_kwargs) == (counting, 0.1, {})
+    assert [len(one) for one in data] == [*lengths, 1]
+    first = data[0]
+    assert first.observations["n"][:, 0].tolist() == first.observations["k"].tolist() == list(range(lengths[0] + 1))
+    assert first.actions.tolist() == [k % 3 for k in range(lengths[0])] == first.rewards.tolist()
+    assert (first.terminated, first.truncated, first.success) == (True, False, True)
+    assert first.facts["seed"] == 0
+    assert first.facts["group"] == "a"
+    assert first.columns["info.deep.x"][1].tolist() == [0, 2]
+    assert np.isnan(first.columns["info.deep.x"][0]).all()
+    assert first.columns["info.odd"].tolist() == ["", *["text"] * (lengths[0] - 2), "[1, 2]"]
+    assert np.diff(first.columns["time"]).min() > 0
+    assert (data[3].terminated, data[3].truncated, data[3].facts["end"]) == (False, True, "cut off")
+
+
+def test_several_equal_one_each(tmp_path, counting):
+    """The same seeds and actions give the same digests, whether environments stand alone or side by side."""
+    options = {"vector_kwargs": {"autoreset_mode": AutoresetMode.SAME_STEP}, "disable_env_checker": True}
+    envs = RecordDataset(
+        gym.make_vec(counting, 3, vectorization_mode="sync", **options), tmp_path / "d", keep=lambda k, _: k < 5
+    )
+    envs.reset(seed=0)
+    for _ in range(12):
+        envs.step(np.array([1, 1, 1]))
+    envs.close()
+    data = DataSet.open(tmp_path / "d")
+    assert sorted(data.facts(k).get("seed", -1) for k in range(len(data))) == [-1, -1, 0, 1, 2]
+    for one in data:
+        assert one.observations["n"][:, 0].tolist() == list(range(len(one) + 1))
+        assert one.observations["n"][0, 1] == len(one)
+        if "seed" in one.facts:
+            alone = RecordDataset(gym.make(counting, disable_env_checker=True), tmp_path / f"{one.facts['seed']}")
+            alone.reset(seed=one.facts["seed"])
+            while not alone.step(1)[2]:
+                pass
+            alone.close()
+            [single] = DataSet.open(tmp_path / f"{one.facts['seed']}")
+            assert single.digest == one.digest
+            assert single.columns["info.odd"].tolist() == one.columns["info.odd"].tolist()
+            np.testing.assert_array_equal(single.columns["info.deep.x"], one.columns["info.deep.x"])
+
+
+def test_other_restarts_are_refused(tmp_path, counting):
+    envs = gym.make_vec(counting, 2, vectorization_mode="sync")
+    with pytest.raises(BadDataSet, match="side by side are recorded in autoreset mode SAME_STEP"):
+        RecordDataset(envs, tmp_path / "d")
+
+
+def test_collect(tmp_path):
+    pytest.importorskip("mujoco")
+    found = collect(tmp_path / "d", "scripted", "bam/reach", episodes=5, num_envs=2, random=0.3, noise=0.1, seed=7)
+    data = DataSet.open(tmp_path / "d")
+    assert (found.episodes, found.steps) == (len(data), data.total_frames) == (5, found.steps)
+    env = gym.make("bam/reach-v0")
+    for one in data:
+        raw = one.columns["raw_action"]
+        assert raw.shape == one.actions.shape
+        assert (raw != one.actions).any()
+        assert {"command", "raw_command", "time", "info.is_success"} <= one.columns.keys()
+        if "seed" in one.facts:
+            seen = [env.reset(seed=one.facts["seed"])[0], *(env.step(action)[0] for action in one.actions)]
+            np.testing.assert_array_equal(one.observations, np.stack(seen))
+    env.close()
+    assert data.facts(0)["policy"] == "scripted"
+    assert data.info.contract["command"][0]["unit"] == "rad"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "text"),
+    [
+        ({"policy": "random"}, "--policy random is of no environment; give --env too"),
+        ({"policy": "random", "env": "CartPole-v1", "noise": 0.1}, "--noise is for continuous actions, found Discrete"),
+    ],
+)
+def test_collecting_what_does_not_fit(tmp_path, arguments, text):
+    with pytest.raises(SettingsError, match=text):
+        collect(tmp_path / "d", episodes=1, **arguments)
