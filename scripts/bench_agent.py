@@ -76,7 +76,7 @@ def fast_session(url: str) -> Callable[..., Any]:
 
     class FastSession(RobotSession):
         def __init__(
-            self, options: Any, checkpoint: Any, stage: Any, *, boundary: Any, agents: Any, switch: Any, admit: Any
+            self, options: Any, checkpoint: Any, stage: Any, *, boundary: Any, agents: Any, switch: Any, **rest: Any
         ) -> None:
             self.checkpoint, self.env_id, self.env_kwargs = checkpoint, checkpoint.manifest.env, {}
             self.stage, self.is_real, self.marks, self.recorder = "full", False, (), None
@@ -92,7 +92,7 @@ def fast_session(url: str) -> Callable[..., Any]:
             self.deployment = Deployment(
                 HeldOpen(self._env),
                 self.policy,
-                Pacer(1 / RATE),
+                Pacer(1 / RATE, sleep=rest["sleep"]),
                 Journal(0),
                 recorder=self.recorder,
                 boundary=boundary,

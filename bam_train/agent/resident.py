@@ -48,6 +48,8 @@ FRESH = 0.2
 THERE = "the robot is there, and fits"
 """Why the agent no longer waits."""
 _RECENT = 20  # episodes in the status
+_AT_ONCE = ("pause", "take")
+"""Requests for which the robot is halted before they are executed."""
 
 
 class _Interrupted(BaseException):
@@ -121,6 +123,7 @@ class Resident:
         self.transitions.wanted = False
         self._tell, self._admit, self._connect = tell, admit, connect
         self._news = threading.Condition()
+        self._hurry = threading.Event()  # a request that ends the tick
         self._requests: deque[tuple[Callable[[], dict[str, Any] | None], int]] = deque()
         self._command: Drive | None = None
         self._is_running, self._stopped, self._quitting = is_running, "", False
@@ -194,6 +197,9 @@ class Resident:
             self.send(Answer(ask.number, error=f"{ask.op}: this agent does not know that", kind="RequestRefused"))
         else:
             self.post(lambda: do(ask.who, ask.address, **ask.arguments), ask.number)
+            if ask.op in _AT_ONCE:
+                self._hurry.set()
+                self.halt()
 
     # ---- the main thread
 
@@ -236,6 +242,7 @@ class Resident:
 
     def _execute(self) -> None:
         """Execute the requests that wait."""
+        self._hurry.clear()
         while self._requests:
             with self._news:
                 do, number = self._requests.popleft()
@@ -402,6 +409,7 @@ class Resident:
                 agents=[TransitionsAgent(self.transitions, lambda: self.succession.active.digest)],
                 switch=self.switch,
                 admit=self._admit,
+                sleep=self._hurry.wait,
             )
         except (BamEnvsError, BamTrainError) as error:
             if not (self._was_connected or isinstance(error, BamEnvsError)):

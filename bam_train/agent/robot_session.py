@@ -47,6 +47,7 @@ class RobotSession:
         agents: See `Deployment`.
         switch: See `Deployment`.
         admit: Called with the connected environment before anything can move; lines for the operator are given too.
+        sleep: See `Pacer`.
 
     Raises:
         ContractRefused: The robot does not fit the checkpoint.
@@ -64,6 +65,7 @@ class RobotSession:
         agents: Sequence[Agent],
         switch: StopSwitch,
         admit: Callable[[Any, Sequence[str]], None],
+        sleep: Callable[[float], bool],
     ) -> None:
         self.checkpoint = checkpoint
         self.env_id, self.env_kwargs = environment_of(checkpoint)
@@ -93,7 +95,7 @@ class RobotSession:
             self.deployment = Deployment(
                 HeldOpen(self._env),
                 self.policy,
-                Pacer(control_period(self._env)),
+                Pacer(control_period(self._env), sleep=sleep),
                 Journal(0, marks=self.marks),
                 recorder=self.recorder,
                 boundary=boundary,

@@ -54,7 +54,7 @@ class Pacer:
     Args:
         period: Time between two ticks [s]; None runs as fast as possible, without deadlines.
         now: The clock [s]; monotonic.
-        sleep: Waits for a time [s].
+        sleep: Waits for a time [s]; if it returns True, the tick starts now.
     """
 
     def __init__(
@@ -62,7 +62,7 @@ class Pacer:
         period: float | None,
         *,
         now: Callable[[], float] = time.monotonic,
-        sleep: Callable[[float], None] = time.sleep,
+        sleep: Callable[[float], bool | None] = time.sleep,
     ) -> None:
         self.period, self._now, self._sleep = period, now, sleep
         self.ticks = 0
@@ -82,7 +82,8 @@ class Pacer:
     def wait(self) -> float:
         """Wait until the next tick is due and start it; returns its lateness [s], 0 without a period."""
         while self.period is not None and (slack := self.slack) > 0:
-            self._sleep(slack)
+            if self._sleep(slack):
+                break
         return self.tick()
 
     def tick(self) -> float:

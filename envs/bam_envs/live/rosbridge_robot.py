@@ -108,6 +108,7 @@ class RosbridgeRobot:
         self._epoch = 0  # of the connection that was verified; another one needs a reset
         self._cut = threading.Event()
         self._sending, self._halts = threading.Lock(), 0
+        self._woken = threading.Event()  # by a halt or a drop of the link, which end the wait of a step
         self._halt_failed = False  # and the failure was reported
         self._commanded = False  # since `connect`
         self._take_over: TakeOver | None = None  # of a robot that a live agent drives
@@ -231,6 +232,7 @@ class RosbridgeRobot:
 
     def _on_down(self, error: LinkLost) -> None:
         self._cut.set()
+        self._woken.set()
         self._state.mailbox.clear()
         if self._readiness is not None:
             self._readiness.mailbox.clear()
@@ -300,7 +302,8 @@ class RosbridgeRobot:
     def step(self, command: Array | ClearedCommand) -> RobotState:
         """Send a command that passed the guards (any other is refused), and return the state at the end of the period.
 
-        A simulated robot in lockstep, whose time advances with commands only, ends the period with its answer.
+        A simulated robot in lockstep, whose time advances with commands only, ends the period with its answer. Any
+        other period ends with a halt, too.
 
         Raises:
             InvalidValue: The command did not pass the guards.
@@ -319,13 +322,15 @@ class RosbridgeRobot:
         lockstep = self.info.lockstep  # no time passes between commands: a late one is valid until the wait times out
         life = self._answer_timeout if lockstep else self._command_life
         if not lockstep:
-            self._await_deadline()
+            self._await_deadline(halts)
+            if self._halts != halts:
+                return self.measure()
         tag, until = self._session.tagger.next(self._epoch, life), self._clock() + life
         self._pacer.tick()
         self._send(control, values, tag, halts, until)
         self._publish_status(control)
         if not lockstep:
-            self._cut.wait(max(0.0, self._pacer.slack - self._lead))
+            self._wait(self._pacer.slack - self._lead, halts)
             self._ended_at = self._clock()
         elif not self._state.await_answer(
             tag.echo, lambda: self._cut.is_set() or bool(self._refusals), self._answer_timeout
@@ -339,13 +344,19 @@ class RosbridgeRobot:
         self._require_accepted()
         return self.measure()
 
-    def _await_deadline(self) -> None:
+    def _await_deadline(self, halts: int) -> None:
         """Wait until the command is due; the next period ends earlier by the time that its computation took."""
         worked, period = self._clock() - self._ended_at, self.spec.period
         if worked < period:  # a longer pause is not spent on one command
             self._lead = min(max(worked, _LEAD_DECAY * self._lead), _LEAD * period)
-        self._cut.wait(max(0.0, self._pacer.slack))
+        self._wait(self._pacer.slack, halts)
         self._require_link()
+
+    def _wait(self, seconds: float, halts: int) -> None:
+        """Wait, at most until the link drops, or until there were more than `halts` halts."""
+        self._woken.clear()
+        if not self._cut.is_set() and self._halts == halts:
+            self._woken.wait(max(0.0, seconds))
 
     def _send(self, control: RosbridgeLink, command: Array, tag: Tag, halts: int, until: float) -> None:
         """Send every part of `command` (m,), unless there were more than `halts` halts: one came after `step` began.
@@ -406,6 +417,7 @@ class RosbridgeRobot:
     def halt(self) -> None:
         """Stop moving and keep the link, over the separate connection. Thread-safe; never raises."""
         self._halts += 1
+        self._woken.set()
         halting = self._halting
         self._owed.clear()  # pending commands will not be executed
         if halting is None or (self._take_over is not None and not self._take_over.taken):
@@ -475,6 +487,7 @@ class RosbridgeRobot:
         self._control = self._halting = None
         self._commanded = False
         self._cut.set()
+        self._woken.set()
         for link in (control, halting):
             if link is not None:
                 link.close()

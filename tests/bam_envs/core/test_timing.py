@@ -50,6 +50,14 @@ def test_deadlines_are_absolute():
     assert (pacer.ticks, pacer.missed, pacer.rate) == (4, 0, 8.0)
 
 
+def test_a_wait_that_is_ended_early_begins_the_tick_and_a_new_grid():
+    clock = Clock()
+    pacer = Pacer(0.125, now=clock.now, sleep=lambda seconds: clock.sleep(0.03125) or True)
+    pacer.start()
+    assert starts(clock, pacer, [0.0, 0.0, 0.0]) == [0.0, 0.03125, 0.0625]
+    assert pacer.slack == 0.125
+
+
 def test_a_deadline_that_passes_while_it_is_looked_at_is_not_slept_for():
     clock, times = Clock(), iter([100.0, 100.0, 100.1249, 100.1251, 100.1252, 100.1253])
     pacer = Pacer(0.125, now=lambda: next(times), sleep=clock.sleep)  # time.sleep refuses negative times

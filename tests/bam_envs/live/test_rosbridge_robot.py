@@ -23,7 +23,7 @@ from bam_envs.core.robot import Initial
 from bam_envs.core.timing import Deadline
 from bam_envs.live.rosbridge_robot import RosbridgeRobot
 from bam_envs.robots.profile import load_profile
-from bam_envs.robots.ur5e import JOINTS
+from bam_envs.robots.ur5e import JOINTS, arm_spec
 from bam_envs.ros.codec import HALT_TOPIC, SCENE_TOPIC, RobotInfo
 from bam_envs.ros.freshness import read_tag
 from bam_envs.ros.messages import tag_text
@@ -165,6 +165,18 @@ def test_steps_last_a_period_each_and_end_before_their_deadlines_by_the_time_tha
         early.append(begin + number * period - time.monotonic())
         time.sleep(0.004)  # what it takes to compute the next one
     assert 0.002 < max(early) <= 0.1 * period + 0.001
+
+
+def test_a_halt_ends_the_wait_of_a_step_and_the_next_command_keeps_to_the_period(server, robot_on, connect):
+    robot_on(server)
+    robot, gate = connect(server.url, spec=replace(arm_spec("ur5e", with_object=False), period=1.0))
+    begin, halt = time.monotonic(), threading.Timer(0.05, lambda: robot.halt())
+    halt.start()
+    gate.step(gate.state.command)
+    assert time.monotonic() - begin < 0.9
+    halt.join()
+    gate.step(gate.state.command)
+    assert time.monotonic() - begin > 1.5  # the command waited for its period, and lasted for one
 
 
 def test_lockstep(server, robot_on, connect, simulation):
