@@ -36,6 +36,8 @@
     ├── TrainingFailed             training cannot continue (a NaN loss); the last good checkpoint is kept
     │   └── ProcessesLost          processes that training needs have ended; earlier checkpoints are good
     └── OutputError                no space, no permission, or a file that is in the way
+        └── PlaceError             a place, such as one in a bucket, that cannot be reached, read or written
+            └── NoSuchPlace        nothing is there
 
 Third-party errors are mapped to these at the border, with the cause kept by ``from``.
 """
@@ -221,3 +223,15 @@ class ProcessesLost(TrainingFailed):
 
 class OutputError(BamTrainError, OSError):
     """A file cannot be written: no space, no permission, or something in the way."""
+
+
+class PlaceError(OutputError):
+    """A place that cannot be reached, read or written; `why` is the text without its name."""
+
+    def __init__(self, place: object, why: str) -> None:
+        super().__init__(f"{place}: {why}")
+        self.why = self.strerror = why
+
+
+class NoSuchPlace(PlaceError, FileNotFoundError):  # noqa: N818
+    """Nothing is at the place."""
