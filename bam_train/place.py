@@ -100,7 +100,9 @@ class Place:
             PlaceError: pyarrow is not installed, or a region or an endpoint is malformed.
         """
         with self._errors("opened"):
-            return _filesystem(self._scheme, self.bucket, self._query)
+            # pyarrow looks at neither variable
+            endpoint = os.environ.get("AWS_ENDPOINT_URL_S3") or os.environ.get("AWS_ENDPOINT_URL") or ""
+            return _filesystem(self._scheme, self.bucket, self._query, endpoint)
 
     # What a path has
 
@@ -299,10 +301,11 @@ class Place:
             )
             raise PlaceError(self, text) from error
         except (OSError, ValueError) as error:  # ValueError: pyarrow's ArrowInvalid
-            if self.local is not None:
-                why = getattr(error, "strerror", None) or " ".join(str(error).split())
-                raise PlaceError(self, f"cannot be {done}: {why}") from error
-            raise PlaceError(self, f"cannot be {done}: {_explained(self._told(error), self)}") from error
+            if self.local is None:
+                raise PlaceError(self, f"cannot be {done}: {_explained(self._told(error), self)}") from error
+            if isinstance(error, ValueError):
+                raise
+            raise PlaceError(self, f"cannot be {done}: {error.strerror or error}. Check its permissions") from error
 
     def _told(self, error: Exception) -> str:
         """The text of an error; the answer to a HEAD request has no reason, that of a list has."""
@@ -365,7 +368,7 @@ def _file_path(text: str) -> Path:
 
 
 @functools.lru_cache
-def _filesystem(scheme: str, bucket: str, query: str) -> Any:
+def _filesystem(scheme: str, bucket: str, query: str, endpoint: str) -> Any:
     import pyarrow.fs
 
     options = dict(parse_qsl(query))
@@ -375,7 +378,6 @@ def _filesystem(scheme: str, bucket: str, query: str) -> Any:
         from datetime import timedelta
 
         return pyarrow.fs.GcsFileSystem(retry_time_limit=timedelta(seconds=REQUEST_TIMEOUT), **options)
-    endpoint = os.environ.get("AWS_ENDPOINT_URL_S3") or os.environ.get("AWS_ENDPOINT_URL")  # pyarrow looks at neither
     if endpoint:
         options.setdefault("endpoint_override", endpoint)
     if "endpoint_override" not in options and not {"AWS_REGION", "AWS_DEFAULT_REGION"} & os.environ.keys():

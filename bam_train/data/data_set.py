@@ -27,7 +27,8 @@ from bam_train.data.layout import (
     Files,
     file_name,
 )
-from bam_train.errors import BadDataSet
+from bam_train.errors import BadDataSet, PlaceError
+from bam_train.place import Place
 
 MOST_BYTES = 2**26
 """Bytes of a file that are in memory together, unless one episode has more."""
@@ -53,7 +54,7 @@ class DataSet:
         return self._files.text
 
     @classmethod
-    def open(cls, place: str | Path) -> DataSet:
+    def open(cls, place: str | Path | Place) -> DataSet:
         """Open the data set at `place`.
 
         Raises:
@@ -159,6 +160,8 @@ class DataSet:
                     table = data.read_row_groups([one - first for one in batch])
                     yield from self._of_table(name, table, last, first, batch)
                     batch, size = [], 0
+        except PlaceError:
+            raise
         except (OSError, pa.ArrowException, KeyError, IndexError) as error:
             why = str(error).partition("\n")[0]
             raise BadDataSet(f"{self.place}: {name} is damaged: {why}; run bam-data check {self.place}") from error

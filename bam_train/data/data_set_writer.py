@@ -36,6 +36,7 @@ from bam_train.data.layout import (
 from bam_train.data.statistics import add_stats
 from bam_train.environments import first_difference, short_json
 from bam_train.errors import BadDataSet
+from bam_train.place import Place
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -46,6 +47,7 @@ except ImportError:  # Windows
     fcntl = None  # type: ignore[assignment]
 
 LOCK = "meta/.writer"
+ELSEWHERE = "wait for its end, or write into another place and use bam-data merge"
 
 
 class DataSetWriter:
@@ -62,7 +64,7 @@ class DataSetWriter:
     """
 
     def __init__(
-        self, place: str | Path, info: DataSetInfo, *, flush_episodes: int = 50, flush_bytes: int = 2**26
+        self, place: str | Path | Place, info: DataSetInfo, *, flush_episodes: int = 50, flush_bytes: int = 2**26
     ) -> None:
         self._files, self.info = Files(place), info
         self._flush_episodes, self._flush_bytes = flush_episodes, flush_bytes
@@ -279,7 +281,9 @@ class DataSetWriter:
             self._unlock()
 
     def _locked(self) -> Any:
-        path = self._files.root / LOCK
+        path = self._files.root.local and self._files.root.local / LOCK
+        if path is None:
+            return self._noted()
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
             file = path.open("a+")
@@ -294,21 +298,49 @@ class DataSetWriter:
             file.seek(0)
             who = file.read() or "another process"
             file.close()
-            raise BadDataSet(
-                f"{self._files.text}: is being written by {who}; wait for its end, or write into another place and use "
-                "bam-data merge"
-            ) from error
+            raise BadDataSet(f"{self._files.text}: is being written by {who}; {ELSEWHERE}") from error
         file.truncate(0)
-        since = time.strftime("%Y-%m-%d %H:%M:%S UTC", time.gmtime())
-        file.write(f"process {os.getpid()} on {socket.gethostname()} since {since}")
+        file.write(_writer())
         file.flush()
         return file
 
+    def _noted(self) -> Place:
+        """The lock in a bucket, which has none of its own: a note of who writes; nobody's if its process has ended."""
+        note = self._files.root / LOCK
+        who = note.read_bytes().decode() if note.exists() else ""
+        if who and _is_alive(who):
+            raise BadDataSet(
+                f"{self._files.text}: is being written by {who}; {ELSEWHERE}. If that has ended: remove {note}"
+            )
+        note.write_bytes(_writer().encode())
+        return note
+
     def _unlock(self) -> None:
-        if self._lock is not None:
+        if isinstance(self._lock, Place):
+            self._lock.delete()
+        elif self._lock is not None:
             self._lock.truncate(0)
             self._lock.close()
-            self._lock = None
+        self._lock = None
+
+
+def _is_alive(who: str) -> bool:
+    """Whether a writer may still write; of one on another computer nobody knows."""
+    _, process, _, host, *_ = [*who.split(), *[""] * 5]
+    try:
+        if fcntl is not None and host == socket.gethostname():
+            os.kill(int(process), 0)
+    except ProcessLookupError:
+        return False
+    except (PermissionError, ValueError):
+        pass
+    return True
+
+
+def _writer() -> str:
+    """Who writes, and since when."""
+    since = time.strftime("%Y-%m-%d %H:%M:%S UTC", time.gmtime())
+    return f"process {os.getpid()} on {socket.gethostname()} since {since}"
 
 
 def require_same(place: str, there: DataSetInfo, given: DataSetInfo) -> None:

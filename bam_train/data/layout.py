@@ -19,9 +19,9 @@ import json
 from pathlib import Path
 from typing import Any
 
-from bam_train.atomic_file import replacing
 from bam_train.data.arrow_columns import Arrow
-from bam_train.errors import BadDataSet
+from bam_train.errors import BadDataSet, PlaceError
+from bam_train.place import Place
 
 VERSION = "v3.0"
 FORMAT = 1
@@ -48,8 +48,8 @@ LIGHT = (
 class Files:
     """The files of one data set."""
 
-    def __init__(self, place: str | Path) -> None:
-        self.root = Path(place).expanduser()
+    def __init__(self, place: str | Path | Place) -> None:
+        self.root = Place(place)
         self.text = str(place)
 
     def exists(self, name: str) -> bool:
@@ -62,6 +62,8 @@ class Files:
             value = json.loads((self.root / name).read_bytes())
         except FileNotFoundError as error:
             raise BadDataSet(f"{self.text}: {name} is missing; copy the folder again, whole") from error
+        except PlaceError:
+            raise
         except (OSError, ValueError) as error:
             raise BadDataSet(f"{self.text}: {name} cannot be read: {error}; run bam-data check {self.text}") from error
         if not isinstance(value, dict):
@@ -70,7 +72,7 @@ class Files:
 
     def write_json(self, name: str, value: dict[str, Any]) -> None:
         """Replace a JSON file."""
-        with replacing(self.root / name) as path:
+        with (self.root / name).replacing() as path:
             path.write_text(json.dumps(value, indent=2))
 
     def write_table(self, name: str, table: Arrow, groups: list[int] | None = None) -> None:
@@ -79,7 +81,7 @@ class Files:
 
         texts = [field.name for field in table.schema if str(field.type) == "string"]
         options = {"compression": "snappy", "use_dictionary": texts}  # a dictionary of floats would merge kinds of NaN
-        with replacing(self.root / name) as path, pq.ParquetWriter(path, table.schema, **options) as writer:
+        with (self.root / name).replacing() as path, pq.ParquetWriter(path, table.schema, **options) as writer:
             first = 0
             for rows in groups or [len(table)]:
                 writer.write_table(table.slice(first, rows), row_group_size=max(rows, 1))
@@ -91,9 +93,12 @@ class Files:
         import pyarrow.parquet as pq
 
         try:
-            return pq.ParquetFile(self.root / name)
+            file = self.root / name
+            return pq.ParquetFile(file.local or file.open_input(), pre_buffer=file.local is None)  # few, large requests
         except FileNotFoundError as error:
             raise BadDataSet(f"{self.text}: {name} is missing; run bam-data check {self.text}") from error
+        except PlaceError:
+            raise
         except (OSError, pa.ArrowInvalid) as error:
             why = str(error).partition("\n")[0]
             raise BadDataSet(

@@ -1,0 +1,84 @@
+"""Data sets in a bucket: the same files, digests and refusals as on a disk."""
+
+import os
+import subprocess
+import sys
+from urllib.parse import urlsplit
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+from bam_train.data import DataSet, DataSetInfo, DataSetWriter, Episode
+from bam_train.data.data_set_writer import LOCK
+from bam_train.errors import BadDataSet, PlaceError
+from bam_train.place import Place
+from tests.object_store import Proxy, bucket_fixture  # noqa: F401
+
+BOX = gym.spaces.Box(-1.0, 1.0, (3,), np.float32)
+INFO = DataSetInfo("bam/reach-v0", {}, BOX, BOX, 0.05, "", {})
+
+
+def episode(number, steps=20):
+    numbers = np.random.default_rng(number).uniform(-1, 1, (2 * steps + 1, 3)).astype(np.float32)
+    rewards = np.arange(steps, dtype=np.float64)
+    return Episode(numbers[: steps + 1], numbers[steps + 1 :], rewards, True, False, True, {}, {"seed": number}, "")
+
+
+def write(place, numbers, **options):
+    with DataSetWriter(place, INFO, **options) as writer:
+        for number in numbers:
+            writer.add(episode(number))
+
+
+def test_a_bucket_has_what_a_disk_has(bucket, tmp_path):
+    for place in (tmp_path / "data", f"{bucket}/data"):
+        write(place, range(3))
+        write(place, range(3, 5))
+    here, there = DataSet.open(tmp_path / "data"), DataSet.open(f"{bucket}/data")
+    assert (len(there), there.digests) == (5, here.digests)
+    for one, other in zip(here.episodes(), there.episodes(), strict=True):
+        assert np.array_equal(one.observations, other.observations)
+    assert not (Place(bucket) / "data" / LOCK).exists()
+
+
+def test_one_writer_in_a_bucket(bucket):
+    place = f"{bucket}/locked"
+    with DataSetWriter(place, INFO), pytest.raises(BadDataSet, match=f"is being written by process {os.getpid()} on "):
+        DataSetWriter(place, INFO)
+    write(place, range(1))
+
+
+def test_a_writer_that_was_killed_loses_what_it_had_not_flushed_and_nothing_else(bucket):
+    place = f"{bucket}/killed"
+    code = f"""
+import os
+from tests.bam_train.data.test_places_of_data import *
+writer = DataSetWriter({place!r}, INFO, flush_episodes=2)
+for number in range(5):
+    writer.add(episode(number))
+os._exit(9)
+"""
+    assert subprocess.run([sys.executable, "-c", code], timeout=60).returncode == 9
+    assert len(DataSet.open(place)) == 4
+    write(place, range(4, 6))
+    there = DataSet.open(place)
+    assert [there.facts(index)["seed"] for index in range(len(there))] == list(range(6))
+
+
+def test_a_connection_that_is_cut_while_episodes_are_read(bucket):
+    write(f"{bucket}/cut", range(40))
+    service = urlsplit(os.environ["AWS_ENDPOINT_URL"])
+    with Proxy((service.hostname, service.port), after=20_000, cuts=2) as proxy:
+        data = DataSet.open(f"{bucket}/cut?endpoint_override={proxy.endpoint}")
+        assert [one.facts["seed"] for one in data.episodes()] == list(range(40))
+    with Proxy((service.hostname, service.port), after=10**9, cuts=0) as proxy:
+        data = DataSet.open(f"{bucket}/cut?endpoint_override={proxy.endpoint}")
+        proxy.after, proxy.cuts = 0, 10**6
+        with pytest.raises(PlaceError, match="cannot be read: no connection"):
+            list(data.episodes())
+
+
+def test_nothing_at_a_place(bucket):
+    with pytest.raises(BadDataSet, match=r"is no data set: it has no meta/info\.json"):
+        DataSet.open(f"{bucket}/nothing")
