@@ -24,7 +24,7 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")  # before NumPy reads it
 import gymnasium as gym
 import numpy as np
 from bench_console import measure_stop
-from bench_deploy import at_most, row
+from bench_deploy import GROWTH, StandIn, at_most, guarded, resident, row
 from bench_link import Server
 
 CHECKPOINTS = Path(__file__).resolve().parents[1] / "checkpoints"
@@ -60,8 +60,8 @@ class Slower(gym.ActionWrapper[Any, Any, Any]):
         return 0.2 * np.asarray(action)
 
 
-def fast_session(url: str) -> Callable[..., Any]:
-    """What makes the session of an agent with `RATE` at `url`."""
+def fast_session(url: str | None) -> Callable[..., Any]:
+    """What makes the session of an agent with `RATE` at `url`; None: without waiting, with a stand-in for the robot."""
     from bam_envs.core.registry import ENVIRONMENTS
     from bam_envs.core.robot_env import RobotEnv
     from bam_envs.core.timing import Pacer
@@ -80,10 +80,13 @@ def fast_session(url: str) -> Callable[..., Any]:
         ) -> None:
             self.checkpoint, self.env_id, self.env_kwargs = checkpoint, checkpoint.manifest.env, {}
             self.stage, self.is_real, self.marks, self.recorder = "full", False, (), None
-            robot = live_robot(url, replace(arm_spec("ur5e", with_object=True), period=1 / RATE))
+            spec = arm_spec("ur5e", with_object=True)
+            live = url and live_robot(url, replace(spec, period=1 / RATE))
+            robot: Any = live or guarded(StandIn(ENVIRONMENTS[self.env_id].make_robot(1, False, {}).spec))
             task = ENVIRONMENTS[self.env_id].make_task(1, {})
             self._env: Any = gym.wrappers.TimeLimit(Slower(RobotEnv(robot, task)), 500)
-            robot.connect()
+            if live:
+                live.connect()
             self.policy, self.interface = FrozenPolicy.from_checkpoint(checkpoint), interface_of(self._env)
             if options.record:
                 path = options.folder / f"{time.monotonic_ns()}.mcap"
@@ -92,7 +95,7 @@ def fast_session(url: str) -> Callable[..., Any]:
             self.deployment = Deployment(
                 HeldOpen(self._env),
                 self.policy,
-                Pacer(1 / RATE, sleep=rest["sleep"]),
+                Pacer(1 / RATE if url else None, sleep=rest["sleep"]),
                 Journal(0),
                 recorder=self.recorder,
                 boundary=boundary,
@@ -106,7 +109,7 @@ def fast_session(url: str) -> Callable[..., Any]:
 class FastAgent:
     """A resident at `RATE` in this process, for a number of ticks."""
 
-    def __init__(self, url: str, folder: Path, new: Path, *, record: bool) -> None:
+    def __init__(self, url: str | None, folder: Path, new: Path, *, record: bool) -> None:
         from bam_train.agent.agent_options import AgentOptions
         from bam_train.agent.audit import Audit
         from bam_train.agent.resident import Resident
@@ -122,7 +125,7 @@ class FastAgent:
         self.late: list[float] = []
         self.front: Any = None
         self.agent = Resident(
-            AgentOptions(url, folder, record=record),
+            AgentOptions(url or "a stand-in", folder, record=record),
             versions,
             self.audit,
             send=lambda message: self.front.send(message) if self.front is not None else None,
@@ -322,6 +325,35 @@ def measure_take_over(count: int) -> Iterator[str]:
         yield f"  the policy was not running {stops} times in between"
 
 
+def measure_memory(ticks: int, swaps: int) -> Iterator[str]:
+    """Memory of the tick's process, which records and swaps, as fast as it can, with a stand-in for the robot."""
+    from bam_train.agent.succession import Choice
+    from bam_train.agent.versions import load_policy
+
+    sizes: list[float] = []
+    counted = 0
+
+    def swap(fast: FastAgent, ended: threading.Event) -> None:
+        nonlocal counted
+        while not ended.wait(0.01):
+            if len(fast.late) >= (counted + 1) * ticks // (swaps + 1):
+                counted += 1
+                version = fast.agent.succession.versions.find(fast.digests[counted % 2])
+                names: dict[str, str | None] = {"champion": version.digest}
+                fast.agent.choose(Choice(version, load_policy(version), names, "benchmark", "bench"))
+            if len(fast.late) >= (len(sizes) + 1) * ticks // 10:
+                sizes.append(resident() - 8 * len(fast.late))
+
+    with tempfile.TemporaryDirectory() as folder:
+        new = trained(Path(folder))
+        fast = FastAgent(None, Path(folder) / "agent", new, record=True)
+        fast.run(ticks, swap)
+    growth = [(size - sizes[0]) / 1e6 for size in sizes]
+    met = at_most(growth[-1], GROWTH)
+    yield row(f"memory, {ticks:,} ticks, {counted} swaps", f"{growth[-1]:+.2f} MB", f"< {GROWTH:g} MB", met)
+    yield "  growth since the first tenth, tenth by tenth [MB]: " + ", ".join(f"{one:+.1f}" for one in growth)
+
+
 def measure_push(count: int) -> Iterator[str]:
     """From bam-push of a checkpoint to the tick at which it acts."""
     from bam_train.agent.remote.agent_client import AgentClient
@@ -347,19 +379,21 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument(
         "--only",
-        choices=("late", "takeover", "push", "stop"),
+        choices=("late", "takeover", "push", "stop", "memory"),
         action="append",
         help="measure this alone; may be repeated",
     )
     parser.add_argument("--ticks", type=int, default=10_000, help="ticks of each kind at 100 Hz")
     parser.add_argument("--count", type=int, default=500, help="take-overs")
     parser.add_argument("--rounds", type=int, default=2, help="turns")
+    parser.add_argument("--memory-ticks", type=int, default=1_000_000, help="ticks for the memory, a swap each 1,000")
     options = parser.parse_args()
     measurements: dict[str, Callable[[], Iterator[str]]] = {
         "takeover": lambda: measure_take_over(options.count),
         "push": lambda: measure_push(5),
         "stop": lambda: measure_stop(100),
         "late": lambda: measure_late(options.ticks, options.rounds),
+        "memory": lambda: measure_memory(options.memory_ticks, options.memory_ticks // 1000),
     }
     print(row("figure", "measured", "target", ""))
     for name, measure in measurements.items():
