@@ -279,6 +279,7 @@ def measure_take_over(count: int) -> Iterator[str]:
     rng, stops = np.random.default_rng(0), 0
     times: list[float] = []
     jumps: list[float] = []
+    rests: list[float] = []
     commands: list[tuple[float, Any, Any]] = []
     with ServedEnvironment(make_env("bam/pick-v0", {}), ServeOptions(port=0)) as served:
         robot: Any = served.robot_service._robot  # type: ignore[union-attr]
@@ -313,6 +314,9 @@ def measure_take_over(count: int) -> Iterator[str]:
                 if late:
                     times.append(late[0][0] - begun)
                     jumps += [float((np.abs(sent - before)[:6] / step[:6]).max()) for _, sent, before in late]
+                    while not robot.resting and time.monotonic() < deadline:  # the driver is silent now
+                        time.sleep(0.0005)
+                    rests.append(time.monotonic() - late[-1][0])
                 commands.clear()
                 driver.close()
             agent.close()
@@ -321,6 +325,9 @@ def measure_take_over(count: int) -> Iterator[str]:
     text = f"p50 {p50:.1f}, p99 {p99:.1f} ms"
     yield row(f"{len(times)} take-overs", text, f"<= {limit:g} ms (p99)", at_most(p99, limit))
     yield row("longest step of a joint", f"{max(jumps):.2f} of a period's", "<= 1", at_most(max(jumps), 1.0))
+    p50, worst = 1e3 * np.median(rests), 1e3 * max(rests)
+    text = f"p50 {p50:.0f}, worst {worst:.0f} ms"
+    yield row("from a silent driver's command to rest", text, "<= 200 ms", at_most(worst, 200.0))
     if stops:
         yield f"  the policy was not running {stops} times in between"
 
