@@ -6,7 +6,6 @@ One number a step is a plain column; several, of any shape, are a list of fixed 
 from __future__ import annotations
 
 import io
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -79,12 +78,3 @@ def pixels_of(data: bytes) -> Array:
     with Image.open(io.BytesIO(data)) as image:
         pixels = np.array(image)
     return pixels[..., None] if pixels.ndim == 2 else pixels
-
-
-def feature_of(array: Array, names: Sequence[str] | None = None, *, is_image: bool = False) -> dict[str, Any]:
-    """What LeRobot's info.json says of a column."""
-    if is_image:
-        return {"dtype": "image", "shape": list(array.shape[1:]), "names": ["height", "width", "channels"]}
-    size = int(np.prod(array.shape[1:]))
-    dtype = "string" if array.dtype.kind in "UO" else str(array.dtype)
-    return {"dtype": dtype, "shape": [size], "names": list(names) if names and len(names) == size else None}

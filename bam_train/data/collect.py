@@ -19,6 +19,7 @@ from bam_train.data.record_dataset import RecordVectorDataset
 from bam_train.environments import environment_of, make_vector_env, require_env_kwargs, require_fit
 from bam_train.errors import SettingsError
 from bam_train.evaluation import BatchPolicy, default_num_envs
+from bam_train.place import Place
 from bam_train.policy import FrozenPolicy
 
 SCRIPTED, RANDOM = "scripted", "random"
@@ -49,7 +50,7 @@ class RandomPolicy:
 
 
 def collect(
-    place: str | Path,
+    place: str | Path | Place,
     policy: str,
     env: str | None = None,
     env_kwargs: Mapping[str, Any] | None = None,

@@ -79,7 +79,7 @@ class DataSet:
         number = 0
         while len(rows) < count:
             name = file_name(EPISODES, number)
-            table = self._files.open_parquet(name).read(columns=list(LIGHT))
+            table = self._files.open_parquet(name, LIGHT)
             rows += table.to_pylist()
             number += 1
         if [row["episode_index"] for row in rows] != list(range(len(rows))):
@@ -148,8 +148,10 @@ class DataSet:
 
         name = file_name(DATA, number)
         try:
-            data, finals = self._files.open_parquet(name), self._files.open_parquet(file_name(EPISODES, number))
-            last = finals.read(columns=["episode_index", *(FINAL + leaf.column for leaf in self._observation)])
+            data = self._files.open_parquet(name)
+            last = self._files.open_parquet(
+                file_name(EPISODES, number), ["episode_index", *(FINAL + leaf.column for leaf in self._observation)]
+            )
             first = last["episode_index"][0].as_py()
             batch: list[int] = []
             size = 0
@@ -176,14 +178,19 @@ class DataSet:
                 numbers = np.unique(steps["episode_index"].to_numpy()).tolist()
                 if len(steps) != length or numbers != [index]:
                     raise ValueError(f"its place has {len(steps)} steps of episodes {numbers}")
-                yield self._episode(index, steps, last.slice(index - first, 1))
+                yield self.read(self._rows[index], steps, last.slice(index - first, 1))
             except (ValueError, KeyError) as error:
                 raise BadDataSet(
                     f"{self.place}: {name}: episode {index} is damaged: {error}; run bam-data check {self.place}"
                 ) from error
 
-    def _episode(self, index: int, steps: Any, final: Any) -> Episode:
-        row = self._rows[index]
+    def read(self, row: Mapping[str, Any], steps: Any, final: Any) -> Episode:
+        """An episode of its rows in the files: that of the episodes, those of its steps, and its last observation.
+
+        Raises:
+            ValueError: They are not the numbers that were written.
+            KeyError: A column is missing.
+        """
         arrays = {}
         for leaf in self._observation:
             parts = (steps[leaf.column], final[FINAL + leaf.column])

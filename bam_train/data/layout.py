@@ -15,14 +15,26 @@ count yet does not exist for readers.
 
 from __future__ import annotations
 
+import itertools
 import json
+import os
+import re
+import socket
+import time
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 from bam_train.data.arrow_columns import Arrow
 from bam_train.errors import BadDataSet, PlaceError
 from bam_train.place import Place
 
+try:
+    import fcntl
+except ImportError:  # Windows
+    fcntl = None  # type: ignore[assignment]
+
+LOCK = "meta/.writer"
 VERSION = "v3.0"
 FORMAT = 1
 """Of bam.json."""
@@ -80,21 +92,52 @@ class Files:
         import pyarrow.parquet as pq
 
         texts = [field.name for field in table.schema if str(field.type) == "string"]
-        options = {"compression": "snappy", "use_dictionary": texts}  # a dictionary of floats would merge kinds of NaN
+        options = {
+            "compression": "snappy",
+            "use_dictionary": texts,
+            "write_page_checksum": True,
+        }  # a dictionary of floats would merge kinds of NaN
         with (self.root / name).replacing() as path, pq.ParquetWriter(path, table.schema, **options) as writer:
             first = 0
             for rows in groups or [len(table)]:
                 writer.write_table(table.slice(first, rows), row_group_size=max(rows, 1))
                 first += rows
 
-    def open_parquet(self, name: str) -> Any:
-        """A ``pyarrow.parquet.ParquetFile``."""
+    def numbers(self, template: str) -> list[int]:
+        """The numbers of the data or episodes files that are there."""
+        folder = self.root / template.partition("/chunk")[0]
+        chunks = [one for one in (folder.list() if folder.is_dir() else ()) if re.fullmatch(r"chunk-\d{3,}", one.name)]
+        paths = [(chunk.name, file.name) for chunk in chunks for file in chunk.list()]
+        found = [(chunk, re.fullmatch(r"file-(\d{3})\.parquet", file)) for chunk, file in paths]
+        return sorted(int(chunk[6:]) * CHUNK + int(match[1]) for chunk, match in found if match)
+
+    def copy_aside(self, name: str, folder: str) -> None:
+        """Copy a file, if it is there, into a folder of the data set, under the first free name."""
+        if self.exists(name):
+            target = f"{folder}/{name.replace('/', '-')}"
+            copies = itertools.chain([target], (f"{target}.{k}" for k in itertools.count(2)))
+            with (self.root / name).local_copy() as path:
+                (self.root / next(one for one in copies if not self.exists(one))).put(path)
+
+    def delete(self, name: str) -> None:
+        """Delete a file, if it is there."""
+        if self.exists(name):
+            (self.root / name).delete()
+
+    def open_parquet(self, name: str, columns: Sequence[str] | None = None) -> Any:
+        """A ``pyarrow.parquet.ParquetFile``, or the table of some of its columns.
+
+        Raises:
+            BadDataSet: The file is missing or damaged.
+        """
         import pyarrow as pa
         import pyarrow.parquet as pq
 
         try:
-            file = self.root / name
-            return pq.ParquetFile(file.local or file.open_input(), pre_buffer=file.local is None)  # few, large requests
+            place = self.root / name
+            options = {"pre_buffer": place.local is None, "page_checksum_verification": True}  # few, large requests
+            file = pq.ParquetFile(place.local or place.open_input(), **options)
+            return file if columns is None else file.read(columns=list(columns))
         except FileNotFoundError as error:
             raise BadDataSet(f"{self.text}: {name} is missing; run bam-data check {self.text}") from error
         except PlaceError:
@@ -102,8 +145,78 @@ class Files:
         except (OSError, pa.ArrowInvalid) as error:
             why = str(error).partition("\n")[0]
             raise BadDataSet(
-                f"{self.text}: {name} is truncated or no Parquet file: {why}; run bam-data check {self.text}"
+                f"{self.text}: {name} is damaged or no Parquet file: {why}; run bam-data check {self.text}"
             ) from error
+
+
+class WriterLock:
+    """The right to write a data set, which ends with the process; in a bucket, a note of who writes.
+
+    Raises:
+        BadDataSet: Somebody else has it, or the place cannot be written.
+    """
+
+    def __init__(self, files: Files) -> None:
+        self._text, self._note = files.text, files.root / LOCK
+        since = time.strftime("%Y-%m-%d %H:%M:%S UTC", time.gmtime())
+        me = f"process {os.getpid()} on {socket.gethostname()} since {since}"
+        self._file: IO[str] | None = None
+        if self._note.local is None:
+            who = self._note.read_bytes().decode() if self._note.exists() else ""
+            if who and _may_live(who):
+                self._refuse(who, f". If that has ended: remove {self._note}")
+            self._note.write_bytes(me.encode())
+        else:
+            self._file = self._locked(self._note.local)
+            self._file.truncate(0)
+            self._file.write(me)
+            self._file.flush()
+        self.is_held = True
+        """Whether it has not been released."""
+
+    def _locked(self, path: Path) -> IO[str]:
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            file = path.open("a+")
+        except OSError as error:
+            raise BadDataSet(f"{self._text}: cannot be written: {error.strerror}; choose another place") from error
+        try:
+            if fcntl is not None:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            file.seek(0)
+            who = file.read() or "another process"
+            file.close()
+            self._refuse(who)
+        return file
+
+    def _refuse(self, who: str, more: str = "") -> None:
+        raise BadDataSet(
+            f"{self._text}: is being written by {who}; wait for its end, or write into another place and use "
+            f"bam-data merge{more}"
+        )
+
+    def release(self) -> None:
+        """Let others write; idempotent."""
+        if self.is_held and self._file is None:
+            self._note.delete()
+        elif self.is_held and self._file is not None:
+            self._file.truncate(0)
+            self._file.close()
+        self.is_held = False
+
+
+def _may_live(who: str) -> bool:
+    """Whether a writer may still write; of one on another computer nobody knows."""
+    _, process, _, host, *_ = [*who.split(), *[""] * 5]
+    try:
+        if fcntl is not None and host == socket.gethostname():
+            os.kill(int(process), 0)
+    except ProcessLookupError:
+        return False
+    except (PermissionError, ValueError):
+        pass
+    return True
 
 
 def file_name(template: str, number: int) -> str:

@@ -19,6 +19,7 @@ from bam_train.data.data_set_writer import DataSetWriter
 from bam_train.data.episode import Array, DataSetInfo, Episode, Leaf, joined, leaves_of
 from bam_train.environments import AnyEnv, control_period
 from bam_train.errors import BadDataSet, SettingsError
+from bam_train.place import Place
 
 Keep = Callable[[int, "int | None"], bool]
 """Whether an episode is recorded, by its number in the order of beginning and its seed."""
@@ -252,7 +253,7 @@ class RecordDataset(gym.Wrapper[Any, Any, Any, Any]):
     def __init__(
         self,
         env: gym.Env[Any, Any],
-        place: str | Path,
+        place: str | Path | Place,
         info: DataSetInfo | None = None,
         facts: Mapping[str, Any] | None = None,
         keep: Keep | None = None,
@@ -301,7 +302,7 @@ class RecordVectorDataset(VectorWrapper):
     def __init__(
         self,
         env: VectorEnv[Any, Any, Any],
-        place: str | Path,
+        place: str | Path | Place,
         info: DataSetInfo | None = None,
         facts: Mapping[str, Any] | None = None,
         keep: Keep | None = None,

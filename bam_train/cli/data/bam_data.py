@@ -21,11 +21,11 @@ class Command:
     """Takes the configuration and returns an exit status, ``"module:function"``; imported once the flags are read."""
 
 
+_RECORDED = "bam_train.cli.data.recorded"
 _FLAGS = "bam_train.cli.data.data_flags"
 COMMANDS = {
-    "collect": Command(
-        "run a policy in simulation and record it", f"{_FLAGS}:CollectConfig", "bam_train.cli.data.recorded:collect"
-    ),
+    "collect": Command("run a policy in simulation and record it", f"{_FLAGS}:CollectConfig", f"{_RECORDED}:collect"),
+    "check": Command("say what is whole, and mend the rest", f"{_FLAGS}:CheckConfig", f"{_RECORDED}:check"),
 }
 
 

@@ -38,3 +38,19 @@ class CollectConfig:
     """Environments stepped side by side; by default as many as is quick."""
     json: bool = False
     """Print one JSON object on standard output instead of a line."""
+
+
+@dataclass(frozen=True)
+class CheckConfig:
+    """Read a whole data set, compare every episode with its digest, and mend what is not whole.
+
+    Files that are not whole are copied to its folder damaged/ first, and every whole episode in them is kept. Exit
+    status: 0 the data set is whole now, 1 it cannot be mended, or is not whole with --no-mend.
+    """
+
+    place: DataPlace
+    """The data set."""
+    no_mend: bool = False
+    """Say what is not whole, and change nothing."""
+    json: bool = False
+    """Print one JSON object on standard output instead of lines."""

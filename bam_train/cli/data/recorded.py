@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from bam_train.cli.console import percent, say, tell
 
 if TYPE_CHECKING:
-    from bam_train.cli.data.data_flags import CollectConfig
+    from bam_train.cli.data.data_flags import CheckConfig, CollectConfig
 
 
 def collect(config: CollectConfig) -> None:
@@ -43,3 +43,29 @@ def collect(config: CollectConfig) -> None:
         return
     share = percent(found.successes / found.episodes)
     tell(f"{config.place}: {found.episodes} episodes, {found.steps} steps added; {share} of them succeeded")
+
+
+def check(config: CheckConfig) -> int:
+    """Check a data set, and mend it; returns the exit status."""
+    from bam_train.data.layout import Files, WriterLock
+    from bam_train.data.mending import look, mend
+
+    files = Files(config.place)
+    found = look(files) if config.no_mend else None
+    if found is None:
+        lock = WriterLock(files)
+        try:
+            found = mend(files)
+        finally:
+            lock.release()
+    status = int(config.no_mend and not found.is_whole)
+    if config.json:
+        tell(json.dumps({"place": config.place, **vars(found), "whole": not status}))
+        return status
+    for line in found.notes:
+        say(f"bam-data: note: {line}")
+    for line in found.problems:
+        say(f"bam-data: {'not whole' if config.no_mend else 'mended'}: {line}")
+    whole = "whole" if found.is_whole else "not whole" if config.no_mend else "whole again"
+    tell(f"{config.place}: {whole}: {found.episodes} episodes, {found.frames} steps")
+    return status

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from bam_train.data import DataSet, DataSetInfo, DataSetWriter, Episode
-from bam_train.data.data_set_writer import LOCK
+from bam_train.data.layout import LOCK
 from bam_train.errors import BadDataSet, PlaceError
 from bam_train.place import Place
 from tests.object_store import Proxy, bucket_fixture  # noqa: F401

@@ -1,0 +1,203 @@
+"""One data file and the episodes file of the same number, which a flush writes together."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from bam_train.data.arrow_columns import Arrow, to_arrow
+from bam_train.data.episode import Array, DataSetInfo, Episode, leaves_of
+from bam_train.data.layout import (
+    BAM,
+    CHUNK,
+    DATA,
+    DEFAULTS,
+    EPISODES,
+    FINAL,
+    FORMAT,
+    INFO,
+    NEXT,
+    TASKS,
+    VERSION,
+    Files,
+    file_name,
+    tasks_table,
+)
+
+
+@dataclass
+class Columns:
+    """An episode as columns."""
+
+    episode: Episode
+    steps: dict[str, Array]
+    """Of each step, the further columns included. Shape: (T, ...)."""
+    final: dict[str, Array]
+    """The last observation. Shape: (1, ...)."""
+
+    @classmethod
+    def of(cls, episode: Episode, observed: Mapping[str, Array], acted: Mapping[str, Array]) -> Columns:
+        """An episode with its observations, (T + 1, ...), and actions by column."""
+        last = np.arange(len(episode)) == len(episode) - 1
+        ends = [last, last & episode.terminated, last & episode.truncated, last & bool(episode.success)]
+        steps = {name: values[:-1] for name, values in observed.items()} | dict(acted)
+        steps |= dict(zip(NEXT, [episode.rewards, *ends], strict=True)) | episode.columns
+        return cls(episode, steps, {name: values[-1:] for name, values in observed.items()})
+
+    @classmethod
+    def read(cls, episode: Episode, info: DataSetInfo) -> Columns:
+        """An episode as a reader gives it."""
+        observation, action = leaves_of(info.observation_space, "observation"), leaves_of(info.action_space, "action")
+        observed = {leaf.column: leaf.of(episode.observations) for leaf in observation}
+        return cls.of(episode, observed, {leaf.column: leaf.of(episode.actions) for leaf in action})
+
+
+@dataclass
+class Head:
+    """How far a data set is written: the content of its info.json."""
+
+    info: DataSetInfo
+    extra: dict[str, dict[str, Any]]
+    """Dtype and shape of each further column."""
+    episodes: int = 0
+    frames: int = 0
+    file: int = 0
+    """Number of the next file."""
+    tasks: list[str] = field(default_factory=list)
+
+    def task(self, episode: Episode) -> int:
+        """Index of the episode's task, which is added if it is new."""
+        task = str(episode.facts.get("task") or self.info.env)
+        if task not in self.tasks:
+            self.tasks.append(task)
+        return self.tasks.index(task)
+
+    def pass_by(self, episodes: Sequence[Episode]) -> None:
+        """Count the episodes of the next file, which is there."""
+        for episode in episodes:
+            self.task(episode)
+            self.episodes, self.frames = self.episodes + 1, self.frames + len(episode)
+        self.file += 1
+
+    def write_pair(self, files: Files, episodes: Sequence[Columns]) -> None:
+        """Write the next data file, the tasks and the next episodes file; `write` makes them visible."""
+        import pyarrow as pa
+
+        images = {leaf.column for leaf in leaves_of(self.info.observation_space, "observation") if leaf.is_image}
+        tables, rows = [], []
+        for one in episodes:
+            for name, values in one.episode.columns.items():
+                self.extra.setdefault(name, kind_of(values))
+            steps = {name: to_arrow(values, is_image=name in images) for name, values in one.steps.items()}
+            tables.append(pa.table(steps | self._places(one.episode)))
+            rows.append(self._row(one))
+            self.episodes, self.frames = self.episodes + 1, self.frames + len(one.episode)
+        data = pa.concat_tables(tables, promote_options="default")
+        files.write_table(file_name(DATA, self.file), data, [len(table) for table in tables])
+        files.write_table(TASKS, tasks_table(self.tasks))
+        files.write_table(file_name(EPISODES, self.file), _table(rows, images))
+        self.file += 1
+
+    def _places(self, episode: Episode) -> dict[str, Arrow]:
+        """The columns that LeRobot needs."""
+        import pyarrow as pa
+
+        index = np.arange(len(episode))
+        columns = {
+            "timestamp": (index / self.info.fps).astype(np.float32),
+            "frame_index": index,
+            "episode_index": np.full(len(episode), self.episodes),
+            "index": self.frames + index,
+            "task_index": np.full(len(episode), self.task(episode)),
+        }
+        return {name: pa.array(values) for name, values in columns.items()}
+
+    def _row(self, one: Columns) -> dict[str, Any]:
+        episode, places = one.episode, {"chunk_index": self.file // CHUNK, "file_index": self.file % CHUNK}
+        return {
+            "episode_index": self.episodes,
+            "tasks": [self.tasks[self.task(episode)]],
+            "length": len(episode),
+            **{f"data/{name}": value for name, value in places.items()},
+            "dataset_from_index": self.frames,
+            "dataset_to_index": self.frames + len(episode),
+            **{f"meta/episodes/{name}": value for name, value in places.items()},
+            "bam/digest": episode.digest,
+            "bam/terminated": bool(episode.terminated),
+            "bam/truncated": bool(episode.truncated),
+            "bam/success": None if episode.success is None else bool(episode.success),
+            "bam/return": float(np.sum(episode.rewards)),
+            "bam/facts": json.dumps(episode.facts),
+            "bam/columns": json.dumps(list(episode.columns)),
+            **{FINAL + name: values for name, values in one.final.items()},
+        }
+
+    def write_columns(self, files: Files) -> None:
+        """Replace bam.json."""
+        files.write_json(BAM, {"format": FORMAT, **self.info.to_json(), "columns": self.extra})
+
+    def write(self, files: Files) -> None:
+        """Replace info.json: from now on, readers see the episodes so far."""
+        content = {
+            "codebase_version": VERSION,
+            "robot_type": self.info.robot or None,
+            "total_episodes": self.episodes,
+            "total_frames": self.frames,
+            "total_tasks": len(self.tasks),
+            "chunks_size": CHUNK,
+            "data_files_size_in_mb": 100,
+            "video_files_size_in_mb": 200,
+            "fps": self.info.fps,
+            "splits": {"train": f"0:{self.episodes}"},
+            "data_path": DATA,
+            "video_path": None,
+            "features": self.features(),
+        }
+        files.write_json(INFO, content)
+
+    def features(self) -> dict[str, dict[str, Any]]:
+        """The columns as LeRobot describes them."""
+        spaces = {"observation": self.info.observation_space, "action": self.info.action_space}
+        found = {}
+        for kind, space in spaces.items():
+            for leaf in leaves_of(space, kind):
+                found[leaf.column] = self._feature(leaf.column, str(leaf.dtype), leaf.shape)
+                if leaf.is_image:
+                    names = ["height", "width", "channels"]
+                    found[leaf.column] = {"dtype": "image", "shape": list(leaf.shape), "names": names}
+        found |= {name: self._feature(name, "float64" if name == NEXT[0] else "bool", ()) for name in NEXT}
+        texts = {"str": "string"}
+        found |= {
+            name: self._feature(name, texts.get(one["dtype"], one["dtype"]), one["shape"])
+            for name, one in self.extra.items()
+        }
+        return found | {name: self._feature(name, dtype, ()) for name, dtype in DEFAULTS.items()}
+
+    def _feature(self, name: str, dtype: str, shape: Sequence[int]) -> dict[str, Any]:
+        kind = {"observation.state": "observation", "raw_action": "action", "raw_command": "command"}.get(name, name)
+        labels: Sequence[Mapping[str, Any]] = self.info.contract.get(kind, [])
+        size = int(np.prod(shape))
+        names = [str(one.get("name")) for one in labels] if len(labels) == size else None
+        return {"dtype": dtype, "shape": [size], "names": names}
+
+
+def kind_of(values: Array) -> dict[str, Any]:
+    """Dtype and shape of a further column, as bam.json has them."""
+    return {"dtype": "str" if values.dtype.kind in "UO" else str(values.dtype), "shape": list(values.shape[1:])}
+
+
+def _table(rows: list[dict[str, Any]], images: set[str]) -> Arrow:
+    import pyarrow as pa
+
+    columns: dict[str, Any] = {}
+    for name in rows[0]:
+        values = [row[name] for row in rows]
+        if name.startswith(FINAL):
+            columns[name] = to_arrow(np.concatenate(values), is_image=name.removeprefix(FINAL) in images)
+        else:
+            columns[name] = pa.array(values, pa.bool_() if name == "bam/success" else None)
+    return pa.table(columns)
