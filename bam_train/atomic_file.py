@@ -9,7 +9,7 @@ import contextlib
 import os
 import re
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from bam_train.errors import OutputError
@@ -18,6 +18,10 @@ try:
     import fcntl
 except ImportError:  # Windows: files that were left stay
     fcntl = None  # type: ignore[assignment]
+
+
+REPLACED: list[Callable[[Path], None]] = []
+"""Called with each file that `replacing` has replaced."""
 
 
 def require_writable(path: Path) -> Path:
@@ -61,6 +65,8 @@ def replacing(target: Path, suffix: str = ".tmp") -> Iterator[Path]:
             os.fsync(folder)
         finally:
             os.close(folder)
+    for tell in REPLACED:
+        tell(target)
 
 
 def _locked(target: Path, suffix: str) -> tuple[int, Path]:

@@ -230,7 +230,8 @@ class PlaceError(OutputError):
 
     def __init__(self, place: object, why: str) -> None:
         super().__init__(f"{place}: {why}")
-        self.why = self.strerror = why
+        self.why = why
+        self.strerror = why.removeprefix("cannot be written: ")
 
 
 class NoSuchPlace(PlaceError, FileNotFoundError):  # noqa: N818

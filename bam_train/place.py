@@ -58,7 +58,10 @@ class Place:
     """The path as `filesystem` has it: ``bucket/key``, or a path on this computer."""
 
     def __init__(self, text: str | Path | Place) -> None:
-        self.text = str(text)
+        # A Path has made one slash of two
+        self.text = (
+            re.sub(r"(?i)(\b(?:s3|gs|gcs|https?)):/(?!/)", r"\1://", str(text)) if isinstance(text, Path) else str(text)
+        )
         self._scheme, self._query = "", ""
         found = _SCHEME.match(self.text)
         scheme = found[1].lower() if found else ""

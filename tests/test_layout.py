@@ -23,7 +23,7 @@ ORDER = {
         "testing",
     ],
     "bam_train": [
-        *("errors", "signals", "atomic_file", "place", "env_location", "settings", "finite_envs"),
+        *("errors", "signals", "atomic_file", "place", "stand_ins", "env_location", "settings", "finite_envs"),
         *(
             "checkpoint",
             "policy",

@@ -12,6 +12,8 @@ import sys
 import traceback
 from typing import TYPE_CHECKING, Any, TextIO
 
+from bam_train.stand_ins import with_addresses
+
 if TYPE_CHECKING:
     from rich.console import Console
     from rich.text import Text
@@ -23,6 +25,7 @@ def shown(text: str) -> str:
     Control characters (C0, C1), those that turn the direction of writing, line separators and halves of surrogate pairs
     are shown as in Python's string literals.
     """
+    text = with_addresses(text)
     return text if text.isprintable() else "".join(one if one.isprintable() else repr(one)[1:-1] for one in text)
 
 

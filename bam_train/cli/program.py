@@ -17,6 +17,7 @@ from typing import Any, TypeVar, get_args
 
 from bam_train.cli.console import drop, say, show_logs_and_tracebacks
 from bam_train.signals import SignalMemory, Terminated
+from bam_train.stand_ins import standing_in
 
 Config = TypeVar("Config")
 
@@ -53,7 +54,12 @@ def run_program(
     sys.path.append(os.getcwd())  # --env my_module:Env-v0, as with python -m; last, so that it hides nothing
     show_logs_and_tracebacks()
     signals = SignalMemory()
-    sys.exit(guarded(lambda: main(parse(pkgutil.resolve_name(flags), prog, arguments), signals), prog, signals))
+
+    def run() -> int | None:
+        with standing_in(parse(pkgutil.resolve_name(flags), prog, arguments)) as config:
+            return main(config, signals)
+
+    sys.exit(guarded(run, prog, signals))
 
 
 def guarded(main: Callable[[], int | None], prog: str, signals: SignalMemory | None = None) -> int:
