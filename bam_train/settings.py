@@ -44,9 +44,10 @@ class TrainSettings:
     """Environment: any Gymnasium id, such as bam/pick, CartPole-v1 or some_module:Env-v0."""
     algo: str
     """Algorithm: ppo, a2c, sac, td3, ddpg, dqn, tqc, trpo, qrdqn, crossq or recurrent-ppo.
-    With --trainer rllib: ppo, appo, impala, sac, tqc, dqn, bc, marwil, cql or iql."""
+    With --trainer rllib: ppo, appo, impala, sac, tqc, dqn, bc, marwil, cql or iql. With --data: bc, iql, cql, td3bc,
+    awac, bcq, bear, cal-ql, crr, plas or rebrac."""
     steps: _Steps = 100_000
-    """Environment steps of the whole run, also after --resume."""
+    """Environment steps of the whole run, also after --resume; with --data, updates."""
     seed: Annotated[int, Meta(ge=0, le=10**15)] = 0
     """Seed of weights, exploration and environments (environment i gets seed + i)."""
     num_envs: Annotated[int, Meta(ge=1, le=100_000)] = 1
@@ -56,7 +57,7 @@ class TrainSettings:
     threads: Annotated[int, Meta(ge=1, le=1024)] = 1
     """Threads that torch computes with (default 1: more is slower on small networks)."""
     trainer: str = "sb3"
-    """Library that trains: sb3 (default) or rllib."""
+    """Library that trains: sb3 (default), rllib, or offline (default with --data)."""
     start: str | None = None
     """Checkpoint whose weights a new run of sb3 begins with: to harden a policy with env_kwargs.randomize, say."""
     until_success: _Share | None = None
@@ -84,7 +85,8 @@ class TrainSettings:
     address: str | None = None
     """Ray cluster that rllib trains on; by default it starts one on this computer, for this run."""
     data: str | None = None
-    """Recorded episodes that bc, marwil, cql and iql of rllib learn from: Parquet files, also at an fsspec address."""
+    """Data set to learn from, without its environment, which it names; also at an address, such as s3://bucket/pick.
+    With --trainer rllib also plain Parquet files, for bc, marwil, cql and iql."""
     normalize: bool | dict[str, Any] = False
     """Normalise observations and rewards by running statistics; a table gives VecNormalize's arguments."""
     hyperparameters: dict[str, Any] = field(default_factory=dict)

@@ -113,6 +113,7 @@ def test_extras(metadata):
         "dev",
         "docs",
         "notebook",
+        "offline",
         "rllib",
         "sim",
         "train",

@@ -37,7 +37,7 @@ _METAVARS = {
     "until_success": "SHARE",
     "trial_threshold": "SHARE",
     "address": "auto|HOST:PORT",
-    "data": "FOLDER",
+    "data": "PLACE",
     "start": "CHECKPOINT",
     "transport": "URL,...",
     "ca_file": "FILE",

@@ -27,6 +27,7 @@ EXTRAS = {
     "sb3_contrib": "train",
     "ray": "rllib",
     "pyarrow": "data",
+    "d3rlpy": "offline",
     "onnx": "train",
     "tensorboard": "train",
     "matplotlib": "train",

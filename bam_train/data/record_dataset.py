@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from bam_envs.core.robot_env import RobotEnv, RobotVectorEnv
 from bam_envs.remote.values import plain_info, tree_to_json
+from bam_train.checkpoint.manifest import WHERE
 from bam_train.data.data_set_writer import DataSetWriter
 from bam_train.data.episode import Array, DataSetInfo, Episode, Leaf, joined, leaves_of
 from bam_train.environments import AnyEnv, control_period
@@ -23,6 +24,9 @@ from bam_train.place import Place
 
 Keep = Callable[[int, "int | None"], bool]
 """Whether an episode is recorded, by its number in the order of beginning and its seed."""
+
+_NOT_RECORDED = WHERE | {"env_id", "id", "render_mode", "num_envs", "vectorization_mode"}
+"""Arguments that say where or how an environment runs, not which one it is."""
 
 
 def info_of(
@@ -44,7 +48,9 @@ def info_of(
     if name is None:
         raise SettingsError("the environment has no id to record; give env_id=")
     kwargs = dict((spec.kwargs if spec is not None else {}) if env_kwargs is None else env_kwargs)
-    kwargs = {key: value for key, value in kwargs.items() if key not in ("render_mode", "num_envs")}
+    registered = gym.registry.get(name)
+    usual = {} if registered is None else {**registered.kwargs, "max_episode_steps": registered.max_episode_steps}
+    kwargs = {key: value for key, value in kwargs.items() if key not in _NOT_RECORDED and usual.get(key) != value}
     inner: Any = env.unwrapped
     own = control_period(inner)
     return DataSetInfo(

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import io
 import pkgutil
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -14,12 +16,13 @@ if TYPE_CHECKING:
     from bam_train.trainers.base import Trainer
 
 TRAINERS: dict[str, str] = {
+    "offline": "bam_train.trainers.offline.offline_trainer:OfflineTrainer",
     "rllib": "bam_train.trainers.rllib.rllib_trainer:RLlibTrainer",
     "sb3": "bam_train.trainers.sb3.sb3_trainer:SB3Trainer",
 }
 """``"module:Class"`` of each trainer, by name."""
 
-EXTRAS: dict[str, str] = {"rllib": "rllib", "sb3": "train"}
+EXTRAS: dict[str, str] = {"offline": "offline", "rllib": "rllib", "sb3": "train"}
 """Extra of bam-train that installs the packages of each trainer, by name."""
 
 
@@ -87,10 +90,32 @@ _RLLIB = (
     Algorithm("cql", "ray.rllib.algorithms.cql:CQLConfig", _BOX, offline=True),
     Algorithm("iql", "ray.rllib.algorithms.iql:IQLConfig", _BOX, offline=True),
 )
+_OFFLINE = (
+    Algorithm("bc", "bam_train.trainers.offline.implicit_q:Cloning", ("Box", "Discrete"), offline=True),
+    Algorithm("iql", "bam_train.trainers.offline.implicit_q:ImplicitQ", ("Box", "Discrete"), offline=True),
+    Algorithm("awac", "d3rlpy.algos:AWACConfig", _BOX, offline=True),
+    Algorithm("bcq", "d3rlpy.algos:BCQConfig", ("Box", "Discrete"), offline=True),
+    Algorithm("bear", "d3rlpy.algos:BEARConfig", _BOX, offline=True),
+    Algorithm("cal-ql", "d3rlpy.algos:CalQLConfig", _BOX, offline=True),
+    Algorithm("cql", "d3rlpy.algos:CQLConfig", ("Box", "Discrete"), offline=True),
+    Algorithm("crr", "d3rlpy.algos:CRRConfig", _BOX, offline=True),
+    Algorithm("plas", "d3rlpy.algos:PLASConfig", _BOX, offline=True),
+    Algorithm("rebrac", "d3rlpy.algos:ReBRACConfig", _BOX, offline=True),
+    Algorithm("td3bc", "d3rlpy.algos:TD3PlusBCConfig", _BOX, offline=True),
+)
 SB3_ALGORITHMS = {algorithm.name: algorithm for algorithm in _SB3}
 RLLIB_ALGORITHMS = {algorithm.name: algorithm for algorithm in _RLLIB}
-ALGORITHMS = {"rllib": RLLIB_ALGORITHMS, "sb3": SB3_ALGORITHMS}
+OFFLINE_ALGORITHMS = {algorithm.name: algorithm for algorithm in _OFFLINE}
+ALGORITHMS = {"offline": OFFLINE_ALGORITHMS, "rllib": RLLIB_ALGORITHMS, "sb3": SB3_ALGORITHMS}
 """Algorithms by trainer and name."""
+
+
+def without_notice() -> contextlib.AbstractContextManager[object]:
+    """Hide what is printed on standard error while a library is imported.
+
+    gym, which d3rlpy needs and stable-baselines3 imports where it is installed, prints that it is no longer maintained.
+    """
+    return contextlib.redirect_stderr(io.StringIO())
 
 
 def load_trainer(name: str) -> type[Trainer]:
@@ -98,7 +123,8 @@ def load_trainer(name: str) -> type[Trainer]:
     if name not in TRAINERS:
         raise SettingsError(f"Unknown trainer {name!r}. {did_you_mean(name, TRAINERS)}")
     try:
-        trainer: type[Trainer] = pkgutil.resolve_name(TRAINERS[name])
+        with without_notice():
+            trainer: type[Trainer] = pkgutil.resolve_name(TRAINERS[name])
     except ModuleNotFoundError as error:
         raise MissingExtra(str(error.name).partition(".")[0], EXTRAS[name], f"The {name} trainer") from error
     return trainer

@@ -59,6 +59,9 @@ class Trainer(Protocol):
     settings: TrainSettings
     notices: list[str]
     """Messages for the user about this run, one line each."""
+    evaluations: str
+    """``choose``: the best evaluation chooses the checkpoint; ``report``: the last weights are it; ``none``: there are
+    no environments here to evaluate in."""
 
     @classmethod
     def complete(cls, settings: TrainSettings) -> TrainSettings:

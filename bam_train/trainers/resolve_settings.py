@@ -26,7 +26,7 @@ CHANGEABLE = frozenset(
 """Settings that may change in a resumed run: when to stop, how to evaluate, where to compute and where the environment
 runs; not what to learn."""
 
-OF_RLLIB = ("num_env_runners", "num_learners", "num_gpus", "address", "data")
+OF_RLLIB = ("num_env_runners", "num_learners", "num_gpus", "address")
 """Settings of the rllib trainer only."""
 
 NOWHERE: dict[str, Any] = {"transport": [], "ca_file": None, "token_file": None, "address": None}
@@ -44,8 +44,9 @@ def resolve(given: Mapping[str, Any]) -> TrainSettings:
 
     Raises UnknownName for an unknown environment, SettingsError for any other setting that is unknown or does not fit.
     """
+    given = {**_of_data(given), **given}
     asked = TrainSettings.from_mapping(given)
-    env = _resolve_env(asked.env, elsewhere=bool(asked.transport))
+    env = _resolve_env(asked.env, elsewhere=bool(asked.transport or asked.data))
     require_algorithm(asked.trainer, asked.algo)
     entry = entry_of(env)  # also by an id of robo-gym
     preset = read_preset(env if entry is None else entry.id, asked.algo, asked.trainer)
@@ -70,14 +71,29 @@ def resolve(given: Mapping[str, Any]) -> TrainSettings:
     return completed
 
 
+def _of_data(given: Mapping[str, Any]) -> dict[str, Any]:
+    """Settings that follow from a data set: its trainer, environment and arguments."""
+    if given.get("data") is None:
+        return {}
+    from bam_train.data import DataSet
+
+    trainer = given.get("trainer", "offline")
+    if trainer != "offline" and given.get("env") is not None:
+        return {}  # for rllib it may be plain Parquet files
+    info = DataSet.open(given["data"]).info
+    return {"trainer": trainer, "env": info.env, **({"env_kwargs": info.env_kwargs} if info.env_kwargs else {})}
+
+
 def _require_of_trainer(settings: TrainSettings) -> None:
     """Refuse settings that belong to the other trainer."""
-    if settings.trainer == "sb3":
+    if settings.trainer == "sb3" and settings.data is not None:
+        raise SettingsError(f"data: {settings.algo} of sb3 learns in the environment; leave --data or --trainer out")
+    if settings.trainer != "rllib":
         for field in fields(TrainSettings):
             if field.name in OF_RLLIB and getattr(settings, field.name) != field.default:
-                text = "the sb3 trainer has no use for it; leave it out, or add --trainer rllib"
+                text = f"the {settings.trainer} trainer has no use for it; leave it out, or add --trainer rllib"
                 raise SettingsError(f"{field.name}: {text}")
-    elif settings.start is not None:
+    if settings.trainer != "sb3" and settings.start is not None:
         raise SettingsError(f"start: the {settings.trainer} trainer has no use for it; leave it out")
 
 
@@ -117,8 +133,13 @@ def resolve_resumed(given: Mapping[str, Any], checkpoint: Checkpoint) -> TrainSe
                 f"was trained with --{name} {saved[name]!r}, and an address is never read from a file: "
                 f"give --{name} again{here}",
             )
-    elsewhere = bool(given.get("transport"))
+    goes_online = checkpoint.manifest.trainer == "offline" and given.get("env") is not None
+    elsewhere = bool(given.get("transport")) or (checkpoint.manifest.trainer == "offline" and not goes_online)
     own, asked = own_settings(checkpoint, given.get("env"), elsewhere=elsewhere), dict(given)
+    if checkpoint.manifest.trainer == "offline" and given.get("data") is not None:
+        own["data"] = given["data"]  # moved; the trainer compares the episodes
+    if goes_online:
+        own |= _online(own, given, checkpoint)
     if given.get("env") is not None:
         asked["env"] = _resolve_env(given["env"], elsewhere=elsewhere)
     if asked.get("normalize") is True and own.get("normalize"):
@@ -135,6 +156,18 @@ def resolve_resumed(given: Mapping[str, Any], checkpoint: Checkpoint) -> TrainSe
         text = f"has trained {done} of {completed.steps} steps already; give a larger total with --steps"
         raise SettingsError(f"{checkpoint.path}: {text}")
     return completed
+
+
+def _online(own: Mapping[str, Any], given: Mapping[str, Any], checkpoint: Checkpoint) -> dict[str, Any]:
+    """Settings with which a run on a data set goes on in its environment; {} if it did so before."""
+    if own["hyperparameters"].get("online_from") is not None:
+        return {}
+    if own["algo"] != "iql":
+        text = f"was trained by {own['algo']}, from which no run goes online"
+        raise CheckpointMismatch(checkpoint.path, f"{text}: leave --env out, or train with --algo iql first")
+    hyperparameters = {**own["hyperparameters"], "online_from": checkpoint.manifest.steps}
+    num_envs = given.get("num_envs", max(8, own["num_envs"]))
+    return {"hyperparameters": hyperparameters, "num_envs": num_envs, "eval_every": None}
 
 
 def _require_same(differing: list[tuple[str, Any, Any]], checkpoint: Checkpoint) -> None:

@@ -112,11 +112,15 @@ def require_room(path: Path, flag: str = "--runs", folder: Path | None = None) -
 
 
 def draw_curve(records: Sequence[dict[str, Any]], title: str, path: Path) -> None:
-    """Draw return, and success if it is known, over steps into a PNG: training as lines, evaluations as dots."""
+    """Draw return, and success if it is known, over steps into a PNG: training as lines, evaluations as dots.
+
+    The losses too, if there are no training episodes because the run learns from a data set.
+    """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    names = ["return_mean"]
+    losses = {name for record in records for name in record if name.startswith("loss/")}
+    names = ["return_mean", *(sorted(losses) if all(record.get("episodes") == 0 for record in records[:1]) else [])]
     if any(record.get("success_rate") is not None for record in records):
         names.append("success_rate")
     figure = Figure(figsize=(8, 2.6 * len(names) + 0.8), layout="constrained")
@@ -131,7 +135,7 @@ def draw_curve(records: Sequence[dict[str, Any]], title: str, path: Path) -> Non
             known = [record for record in records if record["kind"] == kind and record.get(name) is not None]
             if known:
                 axes.plot([row["steps"] for row in known], [row[name] for row in known], label=kind, **style)
-        axes.set_ylabel({"return_mean": "mean return", "success_rate": "success rate"}[name])
+        axes.set_ylabel({"return_mean": "mean return", "success_rate": "success rate"}.get(name, name))
         if name == "success_rate":
             axes.set_ylim(-0.03, 1.03)
         axes.grid(alpha=0.3)

@@ -191,19 +191,24 @@ class TrainingRun:
         self.watcher.training(progress, statistics, rate, left)
 
     def _evaluate(self) -> None:
-        """Evaluate the frozen policy, and keep it if it is the best."""
+        """Evaluate the frozen policy, and keep it if it is the best, or if evaluations choose nothing."""
         steps = self._evaluated_at = self.trainer.steps
+        if self.trainer.evaluations == "none":
+            self._scores = {"steps": steps}
+            self._keep()
+            return
         with self.trainer.undisturbed(), self.trainer.evaluation_envs() as envs:
             last = steps >= self.settings.steps
             report, self._reached = evaluate_for_success(self.trainer.freeze(), self.settings, last=last, envs=envs)
         if report.success_rate is None and self.settings.until_success is not None and not self._scores:
             self.watcher.note(f"{self.settings.env} reports no is_success, so --until-success has no effect")
         self._scores = {**report.to_json(), "steps": steps}
-        better = self.best is None or _rank(self._scores) > _rank(self.best)
+        chosen = self.best is not None and self.trainer.evaluations == "choose"
+        better = not chosen or _rank(self._scores) > _rank(self.best or {})
         self._add("evaluation", steps, self._scores)
         numbers = {"eval/return_mean": report.return_mean, "eval/success_rate": report.success_rate}
         self.trainer.log({name: value for name, value in numbers.items() if value is not None})
-        self.watcher.evaluated(steps, report, better)
+        self.watcher.evaluated(steps, report, better and self.trainer.evaluations == "choose")
         if better:
             self._keep()
 

@@ -50,6 +50,8 @@ _EPISODES = 100
 class RLlibTrainer:
     """A run of one algorithm of RLlib; made by `create` or `load`."""
 
+    evaluations = "choose"
+
     def __init__(self, settings: TrainSettings, seed: int) -> None:
         self.settings = settings
         self.notices: list[str] = []

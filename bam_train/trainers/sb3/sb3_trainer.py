@@ -48,6 +48,8 @@ class _Stop(Exception):  # noqa: N818 - never leaves this module
 class SB3Trainer:
     """A run of one algorithm of stable-baselines3 or sb3-contrib; made by `create` or `load`."""
 
+    evaluations = "choose"
+
     def __init__(self, settings: TrainSettings, model: Any, venv: VecEnv) -> None:
         self.settings, self.model, self.venv = settings, model, venv
         self.notices: list[str] = []

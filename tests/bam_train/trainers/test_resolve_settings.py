@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -63,7 +64,10 @@ ROBO_GYM = {"env": "NoObstacleNavigationMir100Sim", "algo": "ppo"}
         ),
         ({"trainer": "sb"}, "Unknown trainer 'sb'. Did you mean 'sb3'?"),
         ({"start": "a.zip", "trainer": "rllib"}, "start: the rllib trainer has no use for it; leave it out"),
-        ({"data": "a.parquet"}, "data: the sb3 trainer has no use for it; leave it out, or add --trainer rllib"),
+        (
+            {"data": "a.parquet", "trainer": "sb3"},
+            "data: ppo of sb3 learns in the environment; leave --data or --trainer out",
+        ),
         (
             {"transport": ["tcp://a:1"], "env_kwargs": {"randomize": True}},
             "env_kwargs: randomize: the environment runs at tcp://a:1; give its arguments to bam-serve there",
@@ -99,7 +103,7 @@ def test_a_link_is_kept_without_its_file(tmp_path):
 
 
 def test_the_table_of_trainers():
-    with pytest.raises(SettingsError, match=r"^Unknown trainer 'x'\. Choose from: rllib, sb3\.$"):
+    with pytest.raises(SettingsError, match=r"^Unknown trainer 'x'\. Choose from: offline, rllib, sb3\.$"):
         load_trainer("x")
     require_algorithm("sb3", "recurrent-ppo")
     assert load_trainer("sb3").__name__ == "SB3Trainer"
@@ -112,7 +116,9 @@ def test_every_preset_is_complete_and_of_an_environment_of_ours(name):
     assert len(found) == 1
     env, trainer, algo = found[0]
     assert read_preset(env, algo, trainer)
-    resolve({"env": env, "algo": algo, "trainer": trainer})
+    needs_data = pytest.raises(SettingsError, match=r"^data: \w+ learns from a data set, found none")
+    with needs_data if trainer == "offline" else contextlib.nullcontext():
+        resolve({"env": env, "algo": algo, "trainer": trainer})
     assert read_preset("CartPole-v1", "ppo") == {}
 
 

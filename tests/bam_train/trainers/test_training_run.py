@@ -32,6 +32,7 @@ class Counter:
 
     def __init__(self, settings, begin, save_takes):
         self.settings, self.steps, self.save_takes, self.now = settings, begin, save_takes, 0.0
+        self.evaluations = "choose"
         self.saved, self.refuse, self.logged, self.notices, self.news = [], [], [], [], []
         self.fails_at, self.failure, self.statistics, self.rows = None, None, STATISTICS, None
 

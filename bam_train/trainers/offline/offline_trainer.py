@@ -1,0 +1,251 @@
+"""`OfflineTrainer`: a run on the episodes of a data set, without its environment; and online after that.
+
+A step of the run is an update of the learner; online, a step of the environments. Evaluations in simulation report, and
+choose nothing: the checkpoint has the last weights. Online, they choose the best as in any other run.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import functools
+import json
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+from gymnasium.vector import VectorEnv
+
+from bam_envs.core.errors import BamEnvsError
+from bam_envs.core.registry import are_same
+from bam_envs.core.spaces import space_to_json
+from bam_envs.core.validation import read_table
+from bam_train.checkpoint import GOLDEN, POLICY, Checkpoint, write_checkpoint
+from bam_train.checkpoint.safetensors_file import pack
+from bam_train.data import DataSet
+from bam_train.environments import control_period, make_env, require_fit
+from bam_train.errors import CheckpointMismatch, SettingsError
+from bam_train.policy import FrozenPolicy
+from bam_train.settings import TrainSettings, differences
+from bam_train.trainers.algorithms import OFFLINE_ALGORITHMS
+from bam_train.trainers.base import OnProgress, Progress, Statistics, manifest
+from bam_train.trainers.offline.implicit_q import Cloning, ImplicitQ, ImplicitQLearner
+from bam_train.trainers.offline.offline_policy import OfflinePolicy
+from bam_train.trainers.offline.online_phase import OnlinePhase
+from bam_train.trainers.offline.training_data import ActionCode, Normaliser, read_batch
+from bam_train.trainers.resolve_settings import own_settings
+from bam_train.trainers.tensorboard_files import TensorBoardFiles
+
+STATE, NOTES = "bam/resume/state", "bam/resume/notes.json"
+_OWN: dict[str, type[Cloning]] = {"bc": Cloning, "iql": ImplicitQ}
+_REPORT_EVERY = 50  # updates between two reports of progress
+_LOGGED = 200  # entries of TensorBoard in a run
+
+
+class OfflineTrainer:
+    """Made by `create` or `load`; `indices` are those of the training episodes."""
+
+    def __init__(self, settings: TrainSettings, data: DataSet, indices: list[int]) -> None:
+        torch.set_num_threads(settings.threads)
+        torch.manual_seed(settings.seed)
+        self.settings, self._data, self._indices = settings, data, indices
+        self.notices: list[str] = []
+        self._spaces = data.info.observation_space, data.info.action_space
+        self._code, self._normaliser = ActionCode(self._spaces[1]), Normaliser(self._spaces[0])
+        batch, self._reward_scale = read_batch(data, indices, self._normaliser, self._code, fit=True)
+        self._manifest_data = {
+            "digest": data.digest,
+            "episodes": [data.digests[index] for index in indices],
+            "steps": len(batch),
+        }
+        own = _OWN.get(settings.algo)
+        if own is not None:
+            values = read_table(own, settings.hyperparameters, "hyperparameters", SettingsError)
+            self.learner: Any = ImplicitQLearner(values, self._normaliser.inputs, self._code, batch)
+        else:
+            from bam_train.trainers.offline.d3rlpy_learner import D3rlpyLearner
+
+            self.learner = D3rlpyLearner(
+                settings.algo, settings.hyperparameters, self._normaliser.inputs, self._code, batch, settings.seed
+            )
+        self._steps = self._logged = 0
+        self._board: TensorBoardFiles | None = None
+        self._online: OnlinePhase | None = None
+        if settings.hyperparameters.get("online_from") is not None:
+            self._online = OnlinePhase(settings, self._normaliser, self._code, self._reward_scale)
+        self.evaluations = "choose" if self._online else "report"
+        if self._online is None and not _is_here(settings):
+            self.evaluations = "none"
+            self.notices.append(
+                f"{settings.env} is not here: no evaluation in simulation; bam-eval --data estimates the policy's value"
+            )
+
+    @classmethod
+    def complete(cls, settings: TrainSettings) -> TrainSettings:
+        """Check the settings against the data set, and add the defaults of the algorithm."""
+        data = _open(settings)
+        if settings.until_success is not None and settings.hyperparameters.get("online_from") is None:
+            raise SettingsError("until_success: nothing is chosen by simulation while learning from data; leave it out")
+        OFFLINE_ALGORITHMS[settings.algo].require_actions(settings.env, type(data.info.action_space).__name__)
+        Normaliser(data.info.observation_space), ActionCode(data.info.action_space)
+        own = _OWN.get(settings.algo)
+        if own is not None:
+            table = read_table(own, settings.hyperparameters, "hyperparameters", SettingsError)
+            values = dataclasses.asdict(table)
+        else:
+            from bam_train.trainers.offline.d3rlpy_learner import complete
+
+            values = complete(settings.algo, settings.hyperparameters, type(data.info.action_space).__name__)
+        env_kwargs = settings.env_kwargs or data.info.env_kwargs
+        begun = values.get("online_from")
+        every = settings.eval_every or (settings.steps if begun is None else max(1000, (settings.steps - begun) // 20))
+        return dataclasses.replace(settings, hyperparameters=values, env_kwargs=env_kwargs, eval_every=every)
+
+    @classmethod
+    def create(cls, settings: TrainSettings) -> OfflineTrainer:
+        """Set up a new run of complete settings."""
+        data = _open(settings)
+        return cls(settings, data, list(range(len(data))))
+
+    @classmethod
+    def load(cls, checkpoint: Checkpoint, settings: TrainSettings | None = None) -> OfflineTrainer:
+        """Set up a run that continues from a checkpoint, on the same episodes, or online.
+
+        Raises:
+            CheckpointMismatch: The data set lacks an episode that the checkpoint was trained on.
+        """
+        own = own_settings(checkpoint, elsewhere=True) if settings is None else {}
+        settings = settings or TrainSettings.from_mapping(own, str(checkpoint.path))
+        data = _open(settings)
+        places = {digest: index for index, digest in enumerate(data.digests)}
+        missing = [digest for digest in checkpoint.manifest.data.get("episodes", []) if digest not in places]
+        if missing:
+            text = f"was trained on an episode ({missing[0][:12]}) that {data.place} does not have"
+            raise CheckpointMismatch(checkpoint.path, f"{text}; give the data set it was trained on with --data")
+        trainer = cls(settings, data, [places[digest] for digest in checkpoint.manifest.data["episodes"]])
+        with checkpoint.fitting(STATE):
+            state = checkpoint.state(STATE, torch.as_tensor)
+            trainer.learner.load_state_dict(state["learner"])
+            if trainer._online is not None and state["online"] is not None:
+                trainer._online.load_state_dict(state["online"])
+            torch.set_rng_state(state["torch"])
+        if trainer._online is not None:
+            require_fit(checkpoint, trainer._online.envs)
+        trainer._steps = checkpoint.manifest.steps
+        return trainer
+
+    def log_to(self, folder: Path) -> None:
+        """Write TensorBoard files into a folder from now on."""
+        self._board = TensorBoardFiles(folder)
+
+    @property
+    def steps(self) -> int:
+        """Updates, and online steps of the environments, since the start of the run."""
+        return self._steps
+
+    def train(self, steps: int, on_progress: OnProgress) -> None:
+        """Train until the run has at least `steps` steps, or `on_progress` returns False."""
+        while self._steps < steps:
+            if self._online is None:
+                for _ in range(min(_REPORT_EVERY, steps - self._steps)):
+                    self.learner.update(self._steps, steps)
+                    self._steps += 1
+            else:
+                self._steps += self._online.step(self.learner)
+            if self._steps - self._logged >= steps // _LOGGED:
+                self._logged = self._steps
+                self.log(self.learner.metrics)
+            if not on_progress(Progress(self._steps, steps, self._statistics)):
+                return
+
+    def _statistics(self) -> Statistics:
+        metrics = dict(self.learner.metrics)
+        if self._online is not None:
+            return self._online.statistics(metrics)
+        return Statistics(episodes=0, return_mean=None, length_mean=None, success_rate=None, metrics=metrics)
+
+    @functools.cached_property
+    def _described(self) -> tuple[dict[str, Any], float | None]:
+        """Signals and period [s]: the environment's, or those of the data set where it is not here."""
+        info = self._data.info
+        with contextlib.suppress(SettingsError, BamEnvsError), contextlib.closing(_make(self.settings)) as env:
+            describe = getattr(env.unwrapped, "describe", None)
+            return describe() if describe else {}, control_period(env)
+        return info.contract, info.period
+
+    def _policy(self) -> OfflinePolicy:
+        learner = self.learner
+        return OfflinePolicy(learner.network(), self._normaliser, *self._spaces, tanh=learner.tanh)
+
+    def save(self, path: Path, scores: Mapping[str, Any], notes: Mapping[str, Any]) -> Checkpoint:
+        """Write a checkpoint that can be resumed and deployed."""
+        with self.undisturbed():
+            onnx, golden = self._policy().members()
+        online = None if self._online is None else self._online.state_dict()
+        state = {"learner": self.learner.state_dict(), "online": online, "torch": torch.get_rng_state()}
+        members = {POLICY: onnx, GOLDEN: golden, NOTES: json.dumps(dict(notes)).encode(), **pack(STATE, state)}
+        signals, period = self._described
+        known = {"signals": signals, "period": period, "steps": self.steps, "scores": scores}
+        fields = {**manifest(self.settings, self._spaces, known), "data": self._manifest_data}
+        return write_checkpoint(path, fields, members)
+
+    def freeze(self) -> FrozenPolicy:
+        """Freeze the current policy."""
+        with self.undisturbed():
+            graph = self._policy().onnx_file()
+        return FrozenPolicy.from_graph(graph, *map(space_to_json, self._spaces))
+
+    @contextlib.contextmanager
+    def undisturbed(self) -> Iterator[None]:
+        """Restore the random number generator of training after the ``with`` block."""
+        before = torch.get_rng_state()
+        try:
+            yield
+        finally:
+            torch.set_rng_state(before)
+
+    @contextlib.contextmanager
+    def evaluation_envs(self) -> Iterator[VectorEnv[Any, Any, Any] | None]:
+        """None: others are made."""
+        yield None
+
+    def log(self, metrics: Mapping[str, float]) -> None:
+        """Write numbers into TensorBoard's files."""
+        if self._board is not None:
+            self._board.write(dict(metrics), self.steps)
+
+    def close(self) -> None:
+        """Close environments and log files."""
+        if self._board is not None:
+            self._board.close()
+        if self._online is not None:
+            self._online.envs.close()
+
+
+def _open(settings: TrainSettings) -> DataSet:
+    """The data set of a run; raises SettingsError if there is none, or it is of another environment."""
+    if settings.data is None:
+        raise SettingsError(f"data: {settings.algo} learns from a data set, found none. Give its place with --data")
+    data = DataSet.open(settings.data)
+    if not len(data):
+        raise SettingsError(f"data: {settings.data} has no episodes yet. Record some first")
+    if data.info.env != settings.env and not are_same(settings.env, data.info.env):
+        raise SettingsError(f"data: {settings.data} is of {data.info.env}, not of {settings.env}; leave --env out")
+    differing = differences(settings.env_kwargs, data.info.env_kwargs)
+    for name, wanted, found in differing[:1]:
+        raise SettingsError(f"env_kwargs.{name}: {settings.data} was recorded with {found!r}, not {wanted!r}")
+    return data
+
+
+def _make(settings: TrainSettings) -> Any:
+    return make_env(settings.env, settings.env_kwargs)
+
+
+def _is_here(settings: TrainSettings) -> bool:
+    """Whether the environment can be made on this computer."""
+    try:
+        _make(settings).close()
+    except (SettingsError, BamEnvsError):
+        return False
+    return True

@@ -1,0 +1,127 @@
+"""Offline to online: the learner goes on with its own experience, half of every batch, beside the data set."""
+
+from __future__ import annotations
+
+from collections import deque
+from typing import Any
+
+import numpy as np
+import torch
+
+from bam_train.environments import make_vector_env
+from bam_train.errors import SettingsError
+from bam_train.settings import TrainSettings
+from bam_train.trainers.base import Statistics
+from bam_train.trainers.offline.implicit_q import ImplicitQLearner
+from bam_train.trainers.offline.training_data import ActionCode, Batch, Normaliser
+
+_LARGEST = 200_000  # own transitions that are kept
+_RECENT = 100  # episodes of the statistics
+_DONE = 0.5  # the learning rate stays at half of the first one
+
+
+class OnlinePhase:
+    """The environments of a run that went online, and what was seen in them."""
+
+    def __init__(self, settings: TrainSettings, normaliser: Normaliser, code: ActionCode, reward_scale: float) -> None:
+        self.envs: Any = make_vector_env(settings.env, settings.env_kwargs, settings.num_envs, settings.place)
+        self._normaliser, self._code, self._reward_scale = normaliser, code, reward_scale
+        self._rng = np.random.default_rng(settings.seed)
+        self._observation: Any = None
+        self._own: Batch | None = None  # a ring buffer
+        self._added, self._due = 0, 0.0
+        self._running = np.zeros((2, self.envs.num_envs))  # return and length of the running episodes
+        self._ended: deque[tuple[float, float, bool | None]] = deque(maxlen=_RECENT)
+
+    def step(self, learner: ImplicitQLearner) -> int:
+        """Step all environments once, then do the updates that are due; returns the number of steps."""
+        if learner.iql is None:
+            raise SettingsError("online: behaviour cloning has no critics to go on with; train with --algo iql first")
+        if self._observation is None:
+            self._observation, _ = self.envs.reset(seed=int(self._rng.integers(2**31)))
+        seen = self._normaliser(self._observation)
+        codes = self._explore(learner, seen, learner.iql.exploration)
+        actions = self._code.decode(codes, self.envs.single_action_space)
+        after, rewards, terminated, truncated, infos = self.envs.step(actions)
+        ended = terminated | truncated
+        following = _with_last(after, infos["final_obs"], ended) if ended.any() else after
+        reward = torch.as_tensor(rewards / self._reward_scale, dtype=torch.float32)
+        self._keep(Batch(seen, codes, reward, self._normaliser(following), torch.as_tensor(terminated).float()))
+        self._count(rewards, ended, infos)
+        self._observation = after
+        self._due += len(rewards) * learner.iql.update_ratio
+        size = learner.settings.batch_size
+        while self._due >= 1:
+            self._due -= 1
+            recorded = learner.data.rows(torch.randint(len(learner.data), (size - size // 2,)))
+            learner.update_online(self._drawn(size // 2).joined(recorded), _DONE)
+        return len(rewards)
+
+    def _explore(self, learner: ImplicitQLearner, seen: torch.Tensor, exploration: float) -> torch.Tensor:
+        """Codes of the policy's actions with noise. Shape: (n, k)."""
+        with torch.no_grad():
+            scores = learner.actor(seen)
+        if self._code.is_discrete:
+            choice = scores.argmax(1)
+            tried = torch.rand(len(choice)) < exploration
+            choice = torch.where(tried, torch.randint(self._code.size, choice.shape), choice)
+            return torch.nn.functional.one_hot(choice, self._code.size).float()
+        return (torch.tanh(scores) + exploration * torch.randn_like(scores)).clamp(-1, 1)
+
+    def _keep(self, batch: Batch) -> None:
+        """Write transitions into the ring buffer."""
+        if self._own is None:
+            self._own = Batch(*(torch.zeros(_LARGEST, *column.shape[1:]) for column in batch.columns()))
+        rows = (torch.arange(len(batch)) + self._added) % _LARGEST
+        for column, new in zip(self._own.columns(), batch.columns(), strict=True):
+            column[rows] = new
+        self._added += len(batch)
+
+    def _drawn(self, count: int) -> Batch:
+        """Random transitions of the own ones, of which there are some."""
+        own: Any = self._own
+        return own.rows(torch.randint(min(self._added, _LARGEST), (count,)))  # type: ignore[no-any-return]
+
+    def _count(self, rewards: Any, ended: Any, infos: Any) -> None:
+        """Add to the returns and lengths of the running episodes, and note those that ended."""
+        self._running += [rewards, np.ones(len(rewards))]
+        success = infos.get("final_info", {}).get("is_success")
+        for row in np.flatnonzero(ended).tolist():
+            total, length = self._running[:, row].tolist()
+            self._ended.append((total, length, None if success is None else bool(success[row])))
+        self._running[:, ended] = 0.0
+
+    def statistics(self, metrics: dict[str, float]) -> Statistics:
+        """Means over the last episodes."""
+        known = [success for _, _, success in self._ended if success is not None]
+        totals, lengths = [one[0] for one in self._ended], [one[1] for one in self._ended]
+        return Statistics(
+            episodes=len(totals),
+            return_mean=float(np.mean(totals)) if totals else None,
+            length_mean=float(np.mean(lengths)) if lengths else None,
+            success_rate=float(np.mean(known)) if known else None,
+            metrics=metrics,
+        )
+
+    def state_dict(self) -> dict[str, Any]:
+        """The own transitions and the random numbers; running episodes begin anew."""
+        kept = min(self._added, _LARGEST)
+        own = None if self._own is None else [column[:kept] for column in self._own.columns()]
+        return {"own": own, "added": self._added, "due": self._due, "rng": dict(self._rng.bit_generator.state)}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Restore the result of `state_dict`."""
+        if state["own"] is not None:
+            self._keep(Batch(*state["own"]))
+        self._added, self._due = int(state["added"]), float(state["due"])
+        self._rng.bit_generator.state = state["rng"]
+
+
+def _with_last(after: Any, last: Any, ended: Any) -> Any:
+    """Observations after a step, with the `last` ones of the episodes that `ended` instead of the first of new ones."""
+    if isinstance(after, dict):
+        return {key: _with_last(value, last[key], ended) for key, value in after.items()}
+    observations = np.array(after)
+    for row in np.flatnonzero(ended).tolist():
+        observations[row] = last[row]
+    return observations
