@@ -31,6 +31,7 @@ KINDS = {
         "bam_train/compat/test_rllib_new_layout.py",
         "bam_train/cli/test_train_rllib.py",
         "bam_train/cli/test_export.py",
+        "bam_train/data/export/test_export_rllib.py",
         "scripts/test_bench_scale.py",
         "scripts/test_policy_from_cp.py",
         "scripts/test_training_inference.py",

@@ -27,6 +27,8 @@ EXTRAS = {
     "sb3_contrib": "train",
     "ray": "rllib",
     "pyarrow": "data",
+    "minari": "data",
+    "h5py": "data",
     "d3rlpy": "offline",
     "onnx": "train",
     "tensorboard": "train",

@@ -111,6 +111,10 @@ class DataSet:
         ends = {name: row[f"bam/{name}"] for name in ("success", "terminated", "truncated")}
         return {**json.loads(row["bam/facts"]), "length": row["length"], "return": row["bam/return"], **ends}
 
+    def columns_of(self, index: int) -> list[str]:
+        """Names of the further columns of an episode, without reading it."""
+        return list(json.loads(self._rows[self._index(index)]["bam/columns"]))
+
     def _index(self, index: int) -> int:
         if not -len(self) <= index < len(self):
             raise IndexError(f"{self.place}: has {len(self)} episodes, and there is no episode {index}")

@@ -21,11 +21,19 @@ class Command:
     """Takes the configuration and returns an exit status, ``"module:function"``; imported once the flags are read."""
 
 
-_RECORDED = "bam_train.cli.data.recorded"
-_FLAGS = "bam_train.cli.data.data_flags"
+_RECORDED, _OPENED = "bam_train.cli.data.recorded", "bam_train.cli.data.opened"
+_FLAGS, _VIEW = "bam_train.cli.data.data_flags", "bam_train.cli.data.view_flags"
 COMMANDS = {
     "collect": Command("run a policy in simulation and record it", f"{_FLAGS}:CollectConfig", f"{_RECORDED}:collect"),
     "check": Command("say what is whole, and mend the rest", f"{_FLAGS}:CheckConfig", f"{_RECORDED}:check"),
+    "info": Command("what it is of, and how much is in it", f"{_VIEW}:InfoConfig", f"{_OPENED}:show_info"),
+    "stats": Command(
+        "success by groups, and the size of every number", f"{_VIEW}:StatsConfig", f"{_OPENED}:show_stats"
+    ),
+    "export": Command("write it for another library", f"{_VIEW}:ExportDataConfig", f"{_OPENED}:export_data"),
+    "merge": Command("add the episodes of several to one", f"{_VIEW}:MergeConfig", f"{_OPENED}:merge_data"),
+    "split": Command("split it in two, for training and for testing", f"{_VIEW}:SplitConfig", f"{_OPENED}:split_data"),
+    "filter": Command("copy the episodes for which something holds", f"{_VIEW}:FilterConfig", f"{_OPENED}:filter_data"),
 }
 
 

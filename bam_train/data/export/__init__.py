@@ -1,0 +1,85 @@
+"""Data sets in the formats of other libraries: the same numbers, with the first and last observation of each episode.
+
+========  ================================  ==========================================================================
+format    written                           opened by
+========  ================================  ==========================================================================
+minari    folder, root of one data set      ``minari.load_dataset`` with ``MINARI_DATASETS_PATH`` set to it
+d3rlpy    file .h5                          ``d3rlpy.dataset.ReplayBuffer.load``
+lerobot   folder                            ``LeRobotDataset``, ``datasets.load_dataset``, Rerun, `DataSet`
+rllib     folder of Parquet                 ``config.offline_data(input_=...)`` of RLlib
+hdf5      file .hdf5, as robomimic has it   h5py
+mcap      file .mcap                        Foxglove, ``bam-replay``; the topics of a deployment's recording
+========  ================================  ==========================================================================
+"""
+
+from __future__ import annotations
+
+import os
+import pkgutil
+import shutil
+import tempfile
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+
+from bam_envs.core.wording import did_you_mean
+from bam_train.data.data_set import DataSet
+from bam_train.errors import OutputError, SettingsError
+
+_HERE = "bam_train.data.export"
+FORMATS = {
+    "minari": f"{_HERE}.to_minari:write",
+    "d3rlpy": f"{_HERE}.to_d3rlpy:write",
+    "lerobot": f"{_HERE}.to_lerobot:write",
+    "rllib": f"{_HERE}.to_rllib:write",
+    "hdf5": f"{_HERE}.to_hdf5:write",
+    "mcap": f"{_HERE}.to_mcap:write",
+}
+"""Each takes a data set, indices of episodes and a path to write, and returns how to open what was written."""
+_FOLDERS = ("minari", "lerobot", "rllib")
+
+
+def export(data: DataSet, kind: str, out: Path, indices: Sequence[int] | None = None) -> str:
+    """Write the episodes of `data`, or those of `indices`, as `kind`; `out` appears at the end, whole.
+
+    Returns:
+        How to open it, in one line of Python or of a shell.
+
+    Raises:
+        SettingsError: There is no such format, or it has no place for these spaces.
+        OutputError: There is something at `out`, or it cannot be written.
+        BadDataSet: The data set is damaged, or has no episode.
+    """
+    if kind not in FORMATS:
+        raise SettingsError(f"--to: there is no format {kind!r}. {did_you_mean(kind, FORMATS)}")
+    chosen = range(len(data)) if indices is None else indices
+    if not len(chosen):
+        raise SettingsError(f"{data.place}: there is no episode to export; record some first")
+    write: Callable[[DataSet, Sequence[int], Path], str] = pkgutil.resolve_name(FORMATS[kind])
+    with _new(out.expanduser(), is_folder=kind in _FOLDERS) as path:
+        opened = write(data, chosen, path)
+    return opened.replace(str(path), str(out))
+
+
+@contextmanager
+def _new(out: Path, *, is_folder: bool) -> Iterator[Path]:
+    """Yield a path beside `out`, an empty folder or no file yet, which becomes `out` at the end."""
+    if out.exists() and not (is_folder and out.is_dir() and not any(out.iterdir())):
+        raise OutputError(f"{out}: is there already; choose another place")
+    try:
+        out.parent.mkdir(parents=True, exist_ok=True)
+        folder = Path(tempfile.mkdtemp(prefix=f".{out.name}.", dir=out.parent))
+    except OSError as error:
+        raise OutputError(f"{out}: cannot be written: {error.strerror}; choose another place") from error
+    path = folder / out.name
+    try:
+        if is_folder:
+            path.mkdir()
+        yield path
+        os.replace(path, out)
+    except OSError as error:
+        if isinstance(error, OutputError):
+            raise
+        raise OutputError(f"{out}: cannot be written: {error.strerror or error}; choose another place") from error
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)

@@ -1,0 +1,131 @@
+"""Merge, split and filter data sets: episodes keep their numbers, digests, facts and order."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import operator
+import re
+from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+from bam_envs.core.wording import did_you_mean
+from bam_train.data.data_set import DataSet
+from bam_train.data.data_set_writer import DataSetWriter, require_same
+from bam_train.errors import BadDataSet, SettingsError
+
+_SIGNS: dict[str, Callable[[Any, Any], bool]] = {
+    "!=": operator.ne,
+    ">=": operator.ge,
+    "<=": operator.le,
+    "=": operator.eq,
+    ">": operator.gt,
+    "<": operator.lt,
+    "~": lambda found, wanted: str(wanted) in str(found),
+}
+
+
+def merge(sets: Sequence[DataSet], out: str | Path) -> tuple[int, int]:
+    """Add the episodes of all `sets`, one set after the other, to the data set at `out`.
+
+    Returns:
+        How many were added, and how many were left out because they are there already.
+
+    Raises:
+        BadDataSet: Two are of different environments, spaces, units or periods; nothing is written then.
+    """
+    one = sets[0]
+    try:
+        for one in sets[1:]:
+            require_same(sets[0].place, sets[0].info, one.info)
+    except BadDataSet as error:
+        raise BadDataSet(f"{one.place}: does not fit the others: {error}") from error
+    return _copy([(one, range(len(one))) for one in sets], out)
+
+
+def choose(data: DataSet, conditions: Sequence[str]) -> list[int]:
+    """Indices of the episodes for which all conditions hold, such as ``success=true`` and ``return>=10``.
+
+    A condition names a fact of the episode, ``index``, ``digest``, ``length``, ``return``, ``success``, ``terminated``
+    or ``truncated``; then comes = != > >= < <= or ~ (contains), and a value. A fact that is missing fits only !=.
+
+    Raises:
+        SettingsError: A condition cannot be read, or no episode has the fact.
+    """
+    rows = [{**data.facts(i), "index": i, "digest": digest} for i, digest in enumerate(data.digests)]
+    known = {name for row in rows for name in row}
+    kept = list(range(len(rows)))
+    for condition in conditions:
+        found = re.fullmatch(r"([\w.-]+?)\s*(!=|>=|<=|=|>|<|~)\s*(.*)", condition.strip())
+        if found is None:
+            raise SettingsError(f"--where: expected NAME=VALUE, NAME>VALUE or the like, found {condition!r}")
+        name, sign, text = found.groups()
+        if name not in known and rows:
+            raise SettingsError(f"--where: no episode of {data.place} has {name!r}. {did_you_mean(name, known)}")
+        kept = [i for i in kept if _holds(rows[i].get(name), sign, text)]
+    return kept
+
+
+def _holds(found: Any, sign: str, text: str) -> bool:
+    if found is None and text not in ("null", "None"):
+        return sign == "!="
+    try:
+        wanted = text if isinstance(found, str) else json.loads(text.replace("None", "null"))
+    except ValueError:
+        wanted = text
+    try:
+        return _SIGNS[sign](found, wanted)
+    except TypeError as error:
+        raise SettingsError(f"--where: {found!r} cannot be compared with {text!r} by {sign}") from error
+
+
+def copy_episodes(data: DataSet, indices: Sequence[int], out: str | Path) -> tuple[int, int]:
+    """Add some episodes of `data` to the data set at `out`; returns as `merge`."""
+    return _copy([(data, indices)], out)
+
+
+def split(data: DataSet, share: float, by: str | None = None) -> tuple[list[int], list[int]]:
+    """Indices of two parts, the first with about `share` of the episodes.
+
+    An episode's part follows from its digest alone: it stays the same when episodes are added, merged or filtered, and
+    two copies of an episode are never in different parts. With `by`, episodes with the same value of that fact, such
+    as ``policy`` or ``group``, stay together.
+
+    Raises:
+        SettingsError: An episode lacks the fact.
+    """
+    parts: tuple[list[int], list[int]] = ([], [])
+    for index, digest in enumerate(data.digests):
+        if by is not None:
+            facts = data.facts(index)
+            if by not in facts:
+                raise SettingsError(f"--by: episode {index} of {data.place} has no {by!r}. {did_you_mean(by, facts)}")
+            digest = hashlib.sha256(json.dumps(facts[by]).encode()).hexdigest()
+        parts[int(digest[:13], 16) >= share * 16**13].append(index)
+    return parts
+
+
+def _copy(sources: Iterable[tuple[DataSet, Sequence[int]]], out: str | Path) -> tuple[int, int]:
+    sources = list(sources)
+    if any(_same_place(one.place, out) for one, _ in sources):
+        raise BadDataSet(f"{out}: is read and cannot be written too; choose another --out")
+    added = left_out = 0
+    with DataSetWriter(out, sources[0][0].info) as writer:
+        there = set(DataSet.open(out).digests)
+        for data, indices in sources:
+            new = [i for i in indices if data.digests[i] not in there]
+            left_out += len(indices) - len(new)
+            for episode in data.episodes(new):
+                if episode.digest in there:
+                    left_out += 1
+                    continue
+                there.add(episode.digest)
+                writer.add(episode)
+                added += 1
+    return added, left_out
+
+
+def _same_place(one: str, other: str | Path) -> bool:
+    a, b = Path(one).expanduser(), Path(other).expanduser()
+    return one == str(other) or (a.exists() and b.exists() and a.samefile(b))

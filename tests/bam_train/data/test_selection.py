@@ -1,0 +1,115 @@
+"""Merged, split and filtered episodes keep numbers, digests, facts and order; what does not fit is refused."""
+
+import json
+
+import pytest
+
+from bam_train.cli.data.bam_data import main
+from bam_train.data import DataSet, DataSetInfo, DataSetWriter
+from bam_train.data.selection import choose, copy_episodes, merge, split
+from bam_train.errors import BadDataSet, SettingsError
+from tests.bam_train.data.export.test_export import SPACES, record
+
+
+def test_merge_keeps_order_digests_and_facts(tmp_path):
+    a, b = record(tmp_path / "a", count=5), record(tmp_path / "b", count=7)
+    out = tmp_path / "out"
+    assert merge([b, a], out) == (7, 5)
+    found = DataSet.open(out)
+    assert found.digests == b.digests
+    assert [found.facts(i) for i in range(7)] == [b.facts(i) for i in range(7)]
+    assert found[6].columns["guard"].tolist() == b[6].columns["guard"].tolist()
+    assert merge([a, b], out) == (0, 12)
+    with pytest.raises(BadDataSet, match="b: is read and cannot be written too; choose another --out"):
+        merge([a, b], b.place)
+
+
+@pytest.mark.parametrize(
+    ("change", "what"),
+    [
+        ({"env": "bam/reach-v0"}, 'env is "bam/pick-v0" there, and "bam/reach-v0" of the new episodes'),
+        ({"period": 0.1}, "period is 0.05 there, and 0.1 of the new episodes"),
+        ({"contract": {"action": [{"name": "dx", "unit": "mm"}]}}, r"contract.action is null there, and \[\{"),
+    ],
+)
+def test_others_are_not_merged(change, what, tmp_path):
+    a = record(tmp_path / "a")
+    values = {"env": "bam/pick-v0", "env_kwargs": {}, "period": 0.05, "robot": "ur5e"}
+    info = DataSetInfo(
+        **{**values, **change}, **dict(zip(("observation_space", "action_space"), SPACES["box"], strict=True))
+    )
+    with DataSetWriter(tmp_path / "b", info) as writer:
+        writer.add(a[0])
+    with pytest.raises(BadDataSet, match=f"b: does not fit the others: .*a: {what}"):
+        merge([a, DataSet.open(tmp_path / "b")], tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+def test_conditions(tmp_path):
+    data = record(tmp_path / "a")
+    assert choose(data, ["success=true"]) == [0, 2, 4]
+    assert choose(data, ["length>=5", "truncated=false"]) == [2, 4]
+    assert choose(data, ["seed!=3", "policy~b", "index<4"]) == [0, 1, 2]
+    assert choose(data, ["digest=" + data.digests[1]]) == [1]
+    assert choose(data, ["policy=other"]) == []
+    with pytest.raises(SettingsError, match=r"has 'lenght'. Did you mean 'length'"):
+        choose(data, ["lenght=3"])
+    with pytest.raises(SettingsError, match="expected NAME=VALUE, NAME>VALUE or the like, found 'success'"):
+        choose(data, ["success"])
+    with pytest.raises(SettingsError, match="3 cannot be compared with 'long' by >"):
+        choose(data, ["length>long"])
+
+
+def test_a_split_stays_when_episodes_are_added(tmp_path):
+    small, large = record(tmp_path / "a", count=20), record(tmp_path / "b", count=60)
+    first, second = split(large, 0.7)
+    assert sorted(first + second) == list(range(60))
+    assert 0.5 < len(first) / 60 < 0.9
+    of_small = {small.digests[i] for i in split(small, 0.7)[0]}
+    assert of_small == {large.digests[i] for i in first} & set(small.digests)
+    together, others = split(large, 0.7, by="policy")
+    assert 60 in (len(together), len(others))
+    with pytest.raises(SettingsError, match=r"episode 0 of .* has no 'grup'"):
+        split(large, 0.7, by="grup")
+
+
+def test_programs(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    data = record("a")
+    copy_episodes(data, [1, 3], "b")
+
+    def run(*arguments):
+        with pytest.raises(SystemExit) as caught:
+            main(list(arguments))
+        out, err = capsys.readouterr()
+        return caught.value.code, out, err
+
+    assert run("filter", "a", "--out", "c", "--where", "success=true") == (0, "c: 3 episodes added\n", "")
+    assert run("merge", "b", "c", "a", "--out", "d") == (
+        0,
+        "d: 6 episodes added; 5 left out, which are in it already\n",
+        "",
+    )
+    status, out, _ = run("split", "a", "--out", "train", "--rest", "test", "--share", "0.5")
+    assert (status, len(DataSet.open("train")) + len(DataSet.open("test"))) == (0, 6)
+    status, out, _ = run("info", "a", "--json")
+    told = json.loads(out)
+    assert (told["env"], told["episodes"], told["policies"], told["digest"]) == (
+        "bam/pick-v0",
+        6,
+        {"abc": 6},
+        data.digest,
+    )
+    status, out, _ = run("stats", "a", "--by", "policy", "--json")
+    told = json.loads(out)
+    assert (told["groups"][0]["group"], told["groups"][0]["success"]) == ("abc", 0.5)
+    least = min(float(one.rewards.min()) for one in data)
+    assert next(row for row in told["numbers"] if row["column"] == "next.reward")["min"] == least
+    assert run("stats", "a")[1].startswith("     episodes  steps  success (95 %)")
+    assert "  robot       ur5e\n" in run("info", "a")[1]
+    assert run("export", "a", "--to", "mcap", "--out", "a.mcap")[1].startswith("a.mcap: 6 episodes as mcap\n")
+    assert run("export", "a", "--to", "hdf5", "--out", "a.mcap") == (
+        1,
+        "",
+        "bam-data export: a.mcap: is there already; choose another place\n",
+    )
