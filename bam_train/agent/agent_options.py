@@ -37,6 +37,8 @@ class AgentOptions:
     guard_stops: int = 2
     """Number of stops by guards after which a candidate is rolled back."""
     record: bool = True
+    data: str | None = None
+    """Data set to which the episodes of each recording are added at its end."""
 
     @property
     def warning(self) -> str | None:

@@ -22,6 +22,7 @@ from bam_train.environments import control_period, environment_of, interface_of,
 from bam_train.errors import BamTrainError
 from bam_train.loop import Agent
 from bam_train.recording.recorder import Recorder
+from bam_train.recording.recording import Recording
 
 _log = logging.getLogger(__name__)
 CONNECTED_WITHIN = 1.0
@@ -67,7 +68,7 @@ class RobotSession:
         admit: Callable[[Any, Sequence[str]], None],
         sleep: Callable[[float], bool],
     ) -> None:
-        self.checkpoint = checkpoint
+        self.checkpoint, self._data = checkpoint, options.data
         self.env_id, self.env_kwargs = environment_of(checkpoint)
         self.stage = stage or "full"
         """The stage at which the robot moves."""
@@ -131,7 +132,21 @@ class RobotSession:
         self.deployment.record_command()
         self._env.close()  # type: ignore[no-untyped-call]
         if self.recorder is not None:
-            threading.Thread(target=self.recorder.close, name="bam-recorder-end").start()
+            threading.Thread(target=self._end_recording, args=(self.recorder,), name="bam-recorder-end").start()
+
+    def _end_recording(self, recorder: Recorder) -> None:
+        recorder.close()
+        if self._data is None:
+            return
+        from bam_train.data.record_dataset import info_of  # not above: the tick's process needs neither before
+        from bam_train.data.recordings import add_recording
+
+        try:
+            info = info_of(self._env, self.env_id, self.env_kwargs, self.checkpoint.manifest.period)
+            for note in add_recording(Recording.open(recorder.path), self._data, info):
+                _log.info("%s", note)
+        except BamTrainError as error:
+            _log.warning("%s; run bam-data import %s %s", error, self._data, recorder.path)
 
     def _start_recorder(self, options: AgentOptions, checkpoint: Checkpoint) -> Recorder | None:
         """The recorder, started; without room for a recording the agent goes on."""

@@ -11,6 +11,7 @@ import math
 import sys
 from contextlib import closing, nullcontext
 from functools import partial
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from bam_train.cli.console import make_console, say, tell
@@ -141,7 +142,31 @@ def _run(
         for warning in report.warnings():
             say(f"bam-deploy: warning: {warning}")
         tell(*([json_module.dumps(report.to_json(), allow_nan=False)] if config.json else report.lines()))
+        _add_to_data_set(config, checkpoint, env, deployment.recorder)
     return ending.status
+
+
+def _add_to_data_set(
+    config: DeployConfig, checkpoint: Checkpoint, env: gym.Env[Any, Any], recorder: Recorder | None
+) -> None:
+    """Add the recorded episodes to the data set of ``--record``; the recording stays, whatever happens."""
+    from bam_train.data.recordings import add_recording, is_data_set
+    from bam_train.errors import BamTrainError
+    from bam_train.recording.recording import Recording
+
+    if recorder is None or config.record is None or not is_data_set(str(config.record)):
+        return
+    from bam_train.data.record_dataset import info_of
+
+    manifest = checkpoint.manifest
+    try:
+        info = info_of(env, config.env or manifest.env, manifest.env_kwargs, manifest.period)
+        for note in add_recording(Recording.open(recorder.path), config.record, info):
+            say(f"bam-deploy: note: {note}")
+    except BamTrainError as error:
+        again = f"bam-data import {config.record} {recorder.path}"
+        raise type(error)(f"{error}. The recording is whole: run {again}") from error
+    say(f"bam-deploy: {recorder.path} is in {config.record} now")
 
 
 def _checked_place(config: DeployConfig) -> Place:
@@ -201,10 +226,14 @@ def _recorder(
     """The recorder that the flags ask for, started; None for none."""
     if config.record is None and (config.no_record or place.robot is None):
         return None
+    from bam_train.data.recordings import is_data_set
     from bam_train.deploy.checkpoint_admission import has_real_robot
     from bam_train.deploy.flight import deployment_facts, flight_recorder, recording_names, watch_cameras
 
-    path, *others = recording_names(checkpoint.manifest.env) if config.record is None else [config.record.expanduser()]
+    if config.record is None or is_data_set(str(config.record)):
+        path, *others = recording_names(checkpoint.manifest.env)
+    else:
+        path, others = Path(config.record).expanduser(), []
     facts = {**deployment_facts(checkpoint, env), "seed": config.seed, "address": place.text, "marks": ", ".join(marks)}
     recorder = flight_recorder(path, env, facts, others)
     recorder.start()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json as json_module
-from contextlib import closing
+from contextlib import AbstractContextManager, closing, nullcontext
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -55,9 +55,15 @@ def evaluate_checkpoint(config: EvalConfig) -> None:
     with closing(make_vector_env(subject.env, subject.env_kwargs, num_envs)) as envs:
         if subject.checkpoint is not None:
             require_fit(subject.checkpoint, envs)
-        report = evaluate(
-            subject.policy, subject.env, episodes=config.episodes, seed=config.seed, env=envs, on_progress=on_progress
-        )
+        with _recorded(config, subject, envs) as used:
+            report = evaluate(
+                subject.policy,
+                subject.env,
+                episodes=config.episodes,
+                seed=config.seed,
+                env=used,
+                on_progress=on_progress,
+            )
     if config.json:
         facts = {"checkpoint": str(path), "algorithm": subject.algorithm, "steps": subject.steps}
         asked = {"env_kwargs": subject.asked} if subject.asked else {}
@@ -66,6 +72,22 @@ def evaluate_checkpoint(config: EvalConfig) -> None:
         tell(*_table(report, subject, path))
     if video is not None:
         _record(config, subject, video)
+
+
+def _recorded(config: EvalConfig, subject: _Subject, envs: Any) -> AbstractContextManager[Any]:
+    """The environments; with ``--record``, each evaluated episode of theirs goes into the data set."""
+    if config.record is None:
+        return nullcontext(envs)
+    from bam_train.data.record_dataset import RecordVectorDataset, info_of
+
+    end = config.seed + config.episodes
+    policy = config.checkpoint.name if subject.checkpoint is None else subject.checkpoint.digest
+    info = info_of(envs, subject.env, subject.env_kwargs)
+
+    def is_counted(number: int, seed: int | None) -> bool:
+        return seed is not None and seed < end
+
+    return closing(RecordVectorDataset(envs, config.record, info, {"policy": policy}, is_counted))
 
 
 def _own(config: EvalConfig, path: Path) -> _Subject:

@@ -27,6 +27,10 @@ EnvId = Annotated[str | None, tyro.conf.arg(metavar="ID")]
 Url = Annotated[str | None, tyro.conf.arg(metavar="URL")]
 
 
+DataSetOrFile = Annotated[str | None, tyro.conf.arg(metavar="FILE|PLACE")]
+DataSetName = Annotated[str | None, tyro.conf.arg(metavar="PLACE")]
+
+
 def _unset(metavar: str) -> object:
     """Annotation of a flag whose help shows `metavar` and no default."""
     return tyro.conf.arg(metavar=metavar, help_behavior_hint="")
@@ -113,6 +117,8 @@ class EvalConfig:
     """Print one JSON object on standard output instead of a table."""
     video: File = None
     """Record the first episodes into this .gif or .mp4 file."""
+    record: DataSetName = None
+    """Add the episodes to this data set: a folder, or an address such as s3://bucket/pick."""
     video_episodes: Count = 3
     """How many episodes the video shows."""
     trust_pickle: bool = False
@@ -174,8 +180,9 @@ class DeployConfig:
     """Do not wait for deadlines: as fast as it goes."""
     render: bool = False
     """Show the robot in a window."""
-    record: File = None
-    """Record every tick into this .mcap file; by default a live robot is recorded into a new file in recordings/."""
+    record: DataSetOrFile = None
+    """Record every tick into this .mcap file, or add the episodes to this data set: a folder, an address, or a name
+    without a suffix. By default a live robot is recorded into a new file in recordings/."""
     no_record: bool = False
     """Do not record a live robot."""
     json: bool = False
@@ -381,3 +388,5 @@ class AgentConfig:
     """Seed of the first episode; episode k gets seed + k."""
     no_record: bool = False
     """Do not record what the robot does."""
+    record: DataSetName = None
+    """Add the episodes to this data set too, whenever a recording ends."""

@@ -15,7 +15,7 @@ from bam_envs.core.registry import resolve_id
 from bam_envs.tasks.scripted import scripted_policy
 from bam_train.checkpoint import Checkpoint
 from bam_train.data.episode import Array
-from bam_train.data.record_dataset import RecordVectorDataset
+from bam_train.data.record_dataset import RecordVectorDataset, info_of
 from bam_train.environments import environment_of, make_vector_env, require_env_kwargs, require_fit
 from bam_train.errors import SettingsError
 from bam_train.evaluation import BatchPolicy, default_num_envs
@@ -99,7 +99,9 @@ def collect(
         told = {"policy": name, "noise": noise, "random": random, "num_envs": envs.num_envs, **(facts or {})}
         actor = _policy(policy, checkpoint, env_id, envs.action_space, seed)
         disturb = Disturbance(envs.single_action_space, noise, random, envs.num_envs, seed)
-        recorded = RecordVectorDataset(envs, place, facts=told, keep=lambda number, _: number < episodes)
+        recorded = RecordVectorDataset(
+            envs, place, info_of(envs, env_id, kwargs), told, keep=lambda number, _: number < episodes
+        )
         return _run(recorded, actor, disturb, episodes, seed, on_progress)
 
 

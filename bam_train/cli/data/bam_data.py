@@ -25,6 +25,7 @@ _RECORDED, _OPENED = "bam_train.cli.data.recorded", "bam_train.cli.data.opened"
 _FLAGS, _VIEW = "bam_train.cli.data.data_flags", "bam_train.cli.data.view_flags"
 COMMANDS = {
     "collect": Command("run a policy in simulation and record it", f"{_FLAGS}:CollectConfig", f"{_RECORDED}:collect"),
+    "import": Command("add the episodes of recordings (.mcap)", f"{_FLAGS}:ImportConfig", f"{_RECORDED}:import_"),
     "check": Command("say what is whole, and mend the rest", f"{_FLAGS}:CheckConfig", f"{_RECORDED}:check"),
     "info": Command("what it is of, and how much is in it", f"{_VIEW}:InfoConfig", f"{_OPENED}:show_info"),
     "stats": Command(

@@ -1,6 +1,7 @@
 """The flags of the commands of `bam-data`; see `bam_train.cli.flags`."""
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Annotated
 
 import tyro
@@ -54,3 +55,22 @@ class CheckConfig:
     """Say what is not whole, and change nothing."""
     json: bool = False
     """Print one JSON object on standard output instead of lines."""
+
+
+@dataclass(frozen=True)
+class ImportConfig:
+    """Add the episodes of recordings of bam-deploy and bam-agent (.mcap) to a data set; those that it has are left out.
+
+    An episode that was cut off is added as truncated, with the fact "end": "cut off".
+    """
+
+    place: DataPlace
+    """The data set, which is made if there is none."""
+    recordings: Annotated[tyro.conf.Positional[tuple[Path, ...]], tyro.conf.arg(metavar="RECORDING...")]
+    """The .mcap files."""
+    env: EnvId = None
+    """Environment of the recordings; needed for some_module:Env-v0."""
+    task: Annotated[str | None, tyro.conf.arg(metavar="TEXT")] = None
+    """What the episodes are about, as a sentence; by default the environment's id."""
+    group: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
+    """Fact of every episode, by which evaluations are divided, such as the object or the site."""

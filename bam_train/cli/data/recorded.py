@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from bam_train.cli.console import percent, say, tell
 
 if TYPE_CHECKING:
-    from bam_train.cli.data.data_flags import CheckConfig, CollectConfig
+    from bam_train.cli.data.data_flags import CheckConfig, CollectConfig, ImportConfig
 
 
 def collect(config: CollectConfig) -> None:
@@ -43,6 +43,24 @@ def collect(config: CollectConfig) -> None:
         return
     share = percent(found.successes / found.episodes)
     tell(f"{config.place}: {found.episodes} episodes, {found.steps} steps added; {share} of them succeeded")
+
+
+def import_(config: ImportConfig) -> None:
+    """Add recordings to a data set."""
+    from bam_train.data import DataSet
+    from bam_train.data.recordings import add_recording, info_of_recording
+    from bam_train.recording.recording import Recording
+
+    facts = {name: value for name in ("task", "group") if (value := getattr(config, name)) is not None}
+    if not config.recordings:
+        say("bam-data import: RECORDING is missing. Run bam-data import --help")
+        raise SystemExit(2)
+    for path in config.recordings:
+        recording = Recording.open(path)
+        for note in add_recording(recording, config.place, info_of_recording(recording, config.env), **facts):
+            say(f"bam-data: note: {note}")
+    data = DataSet.open(config.place)
+    tell(f"{config.place}: {len(data)} episodes, {data.total_frames} steps now")
 
 
 def check(config: CheckConfig) -> int:

@@ -146,6 +146,7 @@ def _options(config: AgentConfig) -> AgentOptions:
         lease=config.lease,
         guard_stops=config.guard_stops,
         record=not config.no_record,
+        data=config.record,
     )
     options.place(trial=None).require_sane()
     return options
