@@ -1,0 +1,69 @@
+"""LeRobot 0.4.4 and Hugging Face datasets open a data set as it was recorded, and as it was exported."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from bam_train.data.export import export
+from tests.bam_train.data.export.test_export import record
+from tests.peers.conftest import PEERS
+
+FOLDER = PEERS / "lerobot"
+READER = Path(__file__).parent / "lerobot_reader.py"
+
+
+@pytest.fixture(scope="module", autouse=True)
+def lerobot(peers):
+    pytest.importorskip("torch")
+    if not (FOLDER / "lerobot").exists():
+        (pytest.fail if os.environ.get("CI") == "true" else pytest.skip)("no peers: run scripts/install_peers")
+
+
+def read(root, tmp_path):
+    env = {name: value for name, value in os.environ.items() if not name.startswith(("PYTEST", "PYTHON"))}
+    env |= {"PYTHONPATH": str(FOLDER), "HF_HUB_OFFLINE": "1", "HF_HOME": str(tmp_path / "hf"), "OMP_NUM_THREADS": "1"}
+    done = subprocess.run(
+        [sys.executable, READER, root, "0.05", tmp_path / "cache"],
+        env=env,
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=300,
+        cwd=tmp_path,
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    return json.loads(done.stdout.splitlines()[-1])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("how", ["recorded", "exported"])
+def test_every_episode_is_read(how, tmp_path):
+    data = record(tmp_path / "data", "nested")
+    root = tmp_path / "data"
+    if how == "exported":
+        root = tmp_path / "out"
+        export(data, "lerobot", root)
+    found = read(root, tmp_path)
+    assert found["fps"] == 20
+    assert len(found["episodes"]) == len(data)
+    assert found["stats"]["action"] == pytest.approx(np.concatenate([one.actions for one in data]).mean(0), abs=1e-5)
+    table = [np.asarray(one, np.float64) for one in found["table"]["action"]]
+    np.testing.assert_array_equal(np.stack(table), np.concatenate([one.actions for one in data]).astype(np.float64))
+    np.testing.assert_array_equal(found["table"]["next.reward"], np.concatenate([one.rewards for one in data]))
+    for index, ours in enumerate(data):
+        theirs = found["episodes"][index]
+        np.testing.assert_array_equal(np.float32(theirs["observation.arm"]), ours.observations["arm"][:-1])
+        now_and_next = np.float32(theirs["action"])
+        np.testing.assert_array_equal(now_and_next[:, 0], ours.actions)
+        np.testing.assert_array_equal(now_and_next[:-1, 1], ours.actions[1:])
+        assert theirs["action_is_pad"] == [[False, False]] * (len(ours) - 1) + [[False, True]]
+        np.testing.assert_allclose(theirs["next.reward"], ours.rewards, rtol=1e-6)
+        assert theirs["next.done"] == [False] * (len(ours) - 1) + [True]
+        assert theirs["next.terminated"][-1] == ours.terminated
+        assert theirs["task"] == ["bam/pick-v0"] * len(ours)
+        np.testing.assert_array_equal(np.uint8(found["pictures"][index]), ours.observations["camera"][:-1])
