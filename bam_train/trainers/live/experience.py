@@ -1,6 +1,5 @@
 """What a learner has seen: transitions of whole episodes, with the last actions before each, and which to imitate."""
 
-from collections.abc import Callable
 from dataclasses import fields
 from typing import Any
 
@@ -12,7 +11,7 @@ from bam_train.agent.transitions import Transitions
 from bam_train.trainers.live.rlpd import Batch
 
 Floats = NDArray[np.float32]
-_COLUMNS = ("seen", "action", "reward", "after", "discount", "label")
+_COLUMNS = ("seen", "action", "reward", "after", "discount")
 
 
 class Experience:
@@ -37,9 +36,9 @@ class Experience:
         self._size, self._low, self._high, self._history = size, low, high, history
         self._gamma, self._ahead = gamma, ahead
         inputs, actions = observation + history * len(low), len(low)
-        widths = dict(zip(_COLUMNS, (inputs, actions, 1, inputs, 1, actions), strict=True))
+        widths = dict(zip(_COLUMNS, (inputs, actions, 1, inputs, 1), strict=True))
         self._columns = {name: np.zeros((size, width), np.float32) for name, width in widths.items()}
-        self._person, self._success, self._labelled = (np.zeros(size, np.bool_) for _ in range(3))
+        self._person, self._success = np.zeros(size, np.bool_), np.zeros(size, np.bool_)
         self.added = 0
         """Transitions added so far."""
         self.interventions = 0
@@ -47,18 +46,6 @@ class Experience:
         self.outcomes: list[tuple[bool, bool, str]] = []
         """Of each episode: whether it succeeded, whether a person drove, and the policy's digest at its end."""
         self._open: dict[bool, list[Transitions]] = {}
-        self._simulated = np.zeros((0, inputs), np.float32), np.zeros((0, actions), np.float32)
-        self._label: Callable[[Floats], Floats] | None = None
-
-    def copy_from(self, seen: Floats, action: Floats, label: Callable[[Floats], Floats]) -> None:
-        """Give batches what a policy does: on simulated observations, and by `label` on those of the robot.
-
-        Args:
-            seen: Simulated observations with the last actions. Shape: (m, inputs).
-            action: The policy's actions there, in [-1, 1]. Shape: (m, a).
-            label: Its actions, in [-1, 1], for the observations of an episode. Shapes: (n, ...) -> (n, a).
-        """
-        self._simulated, self._label = (seen, action), label
 
     def add(self, transitions: Transitions) -> int:
         """Add what came; returns the number of transitions that can be learnt from now on."""
@@ -90,12 +77,10 @@ class Experience:
         reward, last = self._returns(whole.reward)
         discount = self._gamma ** (last - np.arange(count) + 1.0) * ~whole.terminated[last]
         rows = (np.arange(count) + self.added) % self._size
-        label = None if person or self._label is None else self._label(whole.observation)
-        values = (seen, actions, reward[:, None], after[last], discount[:, None], actions if label is None else label)
+        values = (seen, actions, reward[:, None], after[last], discount[:, None])
         for name, value in zip(_COLUMNS, values, strict=True):
             self._columns[name][rows] = value
         self._person[rows], self._success[rows] = person, success and not person
-        self._labelled[rows] = label is not None
         self.added, self.interventions = self.added + count, self.interventions + count * person
         self.outcomes.append((success, person, whole.policy[-1]))
 
@@ -132,21 +117,8 @@ class Experience:
         for k, rows in enumerate(kinds):
             parts.append(rows[rng.integers(len(rows), size=wanted // len(kinds) + (k < wanted % len(kinds)))])
         chosen = np.concatenate(parts)
-        seen, action, reward, after, discount, _ = (torch.from_numpy(self._columns[name][chosen]) for name in _COLUMNS)
-        copied = self._copied(count // 2, rng)
-        return Batch(seen, action, reward[:, 0], after, discount[:, 0], wanted, copied)
-
-    def _copied(self, count: int, rng: np.random.Generator) -> tuple[torch.Tensor, torch.Tensor] | None:
-        """What the first policy does, half of it on the robot, as far as there is both."""
-        rows, simulated = np.flatnonzero(self._labelled[: len(self)]), len(self._simulated[0])
-        if not len(rows) and not simulated:
-            return None
-        own = 0 if not len(rows) else count if not simulated else count // 2
-        picked = rows[rng.integers(len(rows), size=own)] if own else rows[:0]
-        drawn = rng.integers(simulated, size=count - own) if simulated else np.zeros(0, np.int64)
-        pairs = zip(("seen", "label"), self._simulated, strict=True)
-        seen, action = (np.concatenate([self._columns[name][picked], made[drawn]]) for name, made in pairs)
-        return torch.from_numpy(seen), torch.from_numpy(action)
+        seen, action, reward, after, discount = (torch.from_numpy(self._columns[name][chosen]) for name in _COLUMNS)
+        return Batch(seen, action, reward[:, 0], after, discount[:, 0], wanted)
 
     def state_dict(self) -> dict[str, Any]:
         """The complete episodes, as arrays."""
@@ -154,7 +126,6 @@ class Experience:
         arrays = {name: column[:valid] for name, column in self._columns.items()}
         counts: dict[str, Any] = {"added": self.added, "interventions": self.interventions}
         kinds = {"person": self._person[:valid], "success": self._success[:valid]}
-        counts |= {"simulated": list(self._simulated), "labelled": self._labelled[:valid]}
         return {**arrays, **kinds, **counts, "outcomes": [list(outcome) for outcome in self.outcomes]}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
@@ -164,7 +135,6 @@ class Experience:
         for name, column in self._columns.items():
             column[:valid] = state[name]
         self._person[:valid], self._success[:valid] = state["person"], state["success"]
-        self._simulated, self._labelled[:valid] = tuple(state["simulated"]), state["labelled"]
         self.outcomes = [(bool(success), bool(person), str(policy)) for success, person, policy in state["outcomes"]]
 
 

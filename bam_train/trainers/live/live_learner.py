@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -35,7 +36,6 @@ _VARIANTS: tuple[dict[str, Any], ...] = (
 """Arguments of our environments in which a policy is copied, so that the copy is right on a late robot too."""
 _NOISES = (0.0, 0.3)
 _ENVS, _STEPS, _FITS = 32, 250, 3000
-_COPIED = 20_000  # simulated observations that are kept while learning
 
 
 class LiveLearner:
@@ -126,11 +126,12 @@ class LiveLearner:
 
     def learn(self, most: int) -> int:
         """Do the updates that are due, at most `most`; returns how many."""
-        count = min(most, self.due)
-        settings = self.hyperparameters
+        count, settings = min(most, self.due), self.hyperparameters
+        size, share = settings.batch_size, settings.demonstration_share
+        if not self.rlpd.has_critics:  # which alone learn from the rest of a batch
+            size, share = max(1, round(share * size)), 1.0
         for _ in range(count):
-            batch = self.experience.sample(settings.batch_size, settings.demonstration_share, self._rng)
-            self.rlpd.update(batch, actor=self.is_ready)
+            self.rlpd.update(partial(self.experience.sample, size, share, self._rng), actor=self.is_ready)
         return max(count, 0)
 
     def statistics(self) -> dict[str, Any]:
@@ -149,7 +150,7 @@ class LiveLearner:
     def policy(self, *, explores: bool = False) -> LivePolicy:
         """The policy as it is; one that explores has a new table of noise."""
         noise = self._rng.standard_normal((TAPE, len(self.acted.low))) if explores else None
-        return LivePolicy(self.rlpd.actor, self.hyperparameters.history, self.observed, self.acted, noise)
+        return LivePolicy(self.rlpd.average, self.hyperparameters.history, self.observed, self.acted, noise)
 
     def freeze(self) -> FrozenPolicy:
         """The deterministic policy, for evaluation."""
@@ -179,13 +180,6 @@ class LiveLearner:
         seen, action = (torch.from_numpy(np.concatenate(column)) for column in zip(*pieces, strict=True))
         limit = 0.97  # tanh never gets to 1
         action = action.clamp(-limit, limit)
-        kept = self._rng.permutation(len(seen))[:_COPIED]
-
-        def label(observations: Any) -> Any:
-            policy.reset()
-            return self.experience.normalised(np.stack([policy.act_batch(one[None])[0] for one in observations]))
-
-        self.experience.copy_from(seen[kept].numpy(), action[kept].numpy(), label)
         actor = self.rlpd.actor
         rate = torch.optim.Adam(actor.parameters(), lr=1e-3)
         for k in range(_FITS):
@@ -195,6 +189,7 @@ class LiveLearner:
             rate.zero_grad()
             loss.backward()
             rate.step()
+        self.rlpd.average.load_state_dict(actor.state_dict())
 
     def _labelled(self, policy: Any, env_kwargs: Mapping[str, Any], noise: float) -> tuple[Any, Any]:
         """What the actor would see while `policy` drives with noise, and what that policy says there."""

@@ -4,14 +4,17 @@ P. J. Ball, L. Smith, I. Kostrikov, S. Levine: Efficient Online Reinforcement Le
 https://arxiv.org/abs/2302.02948: half of each batch are demonstrations, the critics are an ensemble with layer
 normalisation, whose target is the least of a random subset, and there are several updates for each step of the robot.
 
-Two things differ, because a robot must stay useful while it learns. Successful episodes of the robot count as
-demonstrations too, beside those of a person (Oh et al., Self-Imitation Learning, https://arxiv.org/abs/1806.05635).
-And the actor imitates: demonstrations, and of its own experience what the critics value more than its usual actions
-(Nair et al., AWAC, https://arxiv.org/abs/2006.09359), instead of climbing the critics' slope, which in the first
-thousands of steps leads away from all that was ever tried; ``value_weight`` adds that part of SAC again.
+What differs, because a robot must stay useful while it learns: the actor imitates, instead of climbing the critics'
+slope, which in the first thousands of steps leads away from all that was ever tried. It imitates a person, and the
+robot's own successful episodes (Oh et al., Self-Imitation Learning, https://arxiv.org/abs/1806.05635), with noise on
+what it sees, without which a dozen demonstrations are learnt by heart; and the average of its weights drives. The
+critics count only where a setting says so: ``advantage_weight`` for what they value more than the usual actions
+(Nair et al., AWAC, https://arxiv.org/abs/2006.09359), ``value_weight`` for SAC's own loss.
 """
 
+import copy
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Annotated, Any
 
@@ -51,6 +54,11 @@ class Hyperparameters:
     """Size of the ensemble."""
     subset: Annotated[int, Meta(ge=1, le=100)] = 2
     """Critics of which the least value is the target, drawn for each update."""
+    blur: Annotated[float, Meta(ge=0, le=10)] = 0.1
+    """Standard deviation of the noise on what the actor sees while it imitates, by that of each number in the batch: a
+    few demonstrations are then learnt for what is around them too."""
+    average: Annotated[float, Meta(gt=0, le=1)] = 0.002
+    """Share of the actor that its average, which drives the robot, takes over at each update of the actor."""
     critic_width: _Count = 128
     actor_width: _Count = 256
     history: Annotated[int, Meta(ge=0, le=64)] = 5
@@ -65,20 +73,17 @@ class Hyperparameters:
     """Share of a batch that are demonstrations: half of them of a person, half of the robot's own successes."""
     imitation_weight: _Weight = 1.0
     """Weight of the imitation of demonstrations in the actor's loss."""
-    copy_weight: _Weight = 1.0
-    """Weight of the imitation of the policy that the first one is a copy of, on simulated observations: without it, a
-    few demonstrations are learnt by heart, and everything else is forgotten."""
-    advantage_weight: _Weight = 1.0
-    """Weight of the imitation of experience, each action by the exponential of its advantage."""
+    advantage_weight: _Weight = 0.0
+    """Weight of the imitation of experience, each action by the exponential of its advantage; about 1 where there is no
+    person and success is rare. Without it, and without `value_weight`, no critics are learnt."""
     advantage_scale: _Weight = 1.0
     """Exponent of that for an advantage of one standard deviation."""
     value_weight: _Weight = 0.0
     """Weight of SAC's own loss, value and entropy of drawn actions, relative to the mean value."""
     warmup: Annotated[int, Meta(ge=0, le=10**9)] = 6000
     """Updates of the critics before they count for the actor."""
-    actor_after: Annotated[int, Meta(ge=0, le=10**9)] = 1000
-    """Steps of policies, not of a person, before the actor changes and the first candidate is pushed: a person's
-    demonstrations alone are too few to imitate nothing else."""
+    actor_after: Annotated[int, Meta(ge=0, le=10**9)] = 300
+    """Steps of policies, not of a person, before the actor changes and the first candidate is pushed."""
 
 
 @dataclass(frozen=True)
@@ -96,8 +101,6 @@ class Batch:
     discount: torch.Tensor
     """Of the value of `after`: 0 where the task ended before. Shape: (n,)."""
     demonstrations: int
-    copied: tuple[torch.Tensor, torch.Tensor] | None = None
-    """`seen` and `action` of the policy that the first one is a copy of. Shapes: (m, inputs), (m, a)."""
 
 
 class Critics(Layer):
@@ -169,6 +172,8 @@ class Rlpd:
     def __init__(self, inputs: int, actions: int, settings: Hyperparameters) -> None:
         self.settings, self.updates = settings, 0
         self.actor = Actor(inputs, actions, settings.actor_width, settings.deviation)
+        self.average = copy.deepcopy(self.actor).requires_grad_(False)
+        """The actor's weights, averaged over its last updates: it drives."""
         shape = settings.critics, inputs + actions, settings.critic_width
         self.critics, self._target = Critics(*shape), Critics(*shape)
         self._target.load_state_dict(self.critics.state_dict())
@@ -182,16 +187,29 @@ class Rlpd:
         self.metrics: dict[str, float] = {}
         """Numbers of the last updates."""
 
-    def update(self, batch: Batch, *, actor: bool = True) -> None:
+    @property
+    def has_critics(self) -> bool:
+        """Whether critics are learnt."""
+        return bool(self.settings.advantage_weight or self.settings.value_weight)
+
+    def update(self, draw: Callable[[], Batch], *, actor: bool = True) -> None:
         """Update the critics, and every so often the actor, unless it is to stay as it is.
+
+        Args:
+            draw: Gives a batch; not called if nothing is to be updated.
+            actor: Whether the actor may change.
 
         Raises:
             TrainingFailed: A loss is not finite.
         """
-        if self.settings.advantage_weight or self.settings.value_weight:
-            self._update_critics(batch)
         self.updates += 1
-        if actor and self.updates % self.settings.actor_every == 0:
+        actor = actor and self.updates % self.settings.actor_every == 0
+        if not actor and not self.has_critics:
+            return
+        batch = draw()
+        if self.has_critics:
+            self._update_critics(batch)
+        if actor:
             self._update_actor(batch)
 
     def _update_critics(self, batch: Batch) -> None:
@@ -203,20 +221,16 @@ class Rlpd:
             target = settings.reward_scale * batch.reward + batch.discount * value
         loss = ((self.critics(batch.seen, batch.action) - target) ** 2).sum(0).mean()
         self._descend("critics", loss)
-        with torch.no_grad():
-            for new, old in zip(self.critics.parameters(), self._target.parameters(), strict=True):
-                old.lerp_(new, settings.tau)
+        _follow(self._target, self.critics, settings.tau)
         self.metrics |= {"loss/critics": loss.item(), "value": target.mean().item()}
 
     def _update_actor(self, batch: Batch) -> None:
         settings, own = self.settings, len(batch.seen) - batch.demonstrations
-        drawn, density, mean = self.actor.draw(batch.seen)
+        blurred = batch.seen + settings.blur * batch.seen.std(0, correction=0) * torch.randn_like(batch.seen)
+        drawn, density, mean = self.actor.draw(blurred)
         errors, losses = ((mean - batch.action) ** 2).mean(1), {}
         if batch.demonstrations and settings.imitation_weight:
             losses["imitation"] = settings.imitation_weight * errors[own:].mean()
-        if batch.copied is not None and settings.copy_weight:
-            copy = torch.tanh(self.actor(batch.copied[0])[0])
-            losses["copy"] = settings.copy_weight * functional.mse_loss(copy, batch.copied[1])
         if self.updates > settings.warmup and settings.advantage_weight:
             weights = self._weights(batch.seen[:own], batch.action[:own])
             losses["advantage"] = settings.advantage_weight * (weights * errors[:own]).mean()
@@ -228,6 +242,7 @@ class Rlpd:
             self._descend("temperature", -temperature * (density.detach().mean() + settings.target_entropy))
         if losses:
             self._descend("actor", torch.stack([*losses.values()]).sum())
+            _follow(self.average, self.actor, settings.average)
         self.metrics |= {f"loss/{name}": loss.item() for name, loss in losses.items()}
 
     @torch.no_grad()  # type: ignore[untyped-decorator] # torch is not typed here
@@ -251,6 +266,7 @@ class Rlpd:
         """Everything that the next updates depend on, except torch's random numbers."""
         return {
             "actor": self.actor.state_dict(),
+            "average": self.average.state_dict(),
             "critics": self.critics.state_dict(),
             "target": self._target.state_dict(),
             "temperature": self._log_temperature.detach().clone(),
@@ -261,6 +277,7 @@ class Rlpd:
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restore the result of `state_dict`."""
         self.actor.load_state_dict(state["actor"])
+        self.average.load_state_dict(state.get("average", state["actor"]))
         self.critics.load_state_dict(state["critics"])
         self._target.load_state_dict(state["target"])
         with torch.no_grad():
@@ -268,3 +285,10 @@ class Rlpd:
         for name, optimiser in self._optimisers.items():
             optimiser.load_state_dict(state["optimisers"][name])
         self.updates = int(state["updates"])
+
+
+@torch.no_grad()  # type: ignore[untyped-decorator] # torch is not typed here
+def _follow(average: nn.Module, newest: nn.Module, share: float) -> None:
+    """Move the weights of `average` by `share` towards those of `newest`."""
+    for old, new in zip(average.parameters(), newest.parameters(), strict=True):
+        old.lerp_(new, share)

@@ -41,6 +41,7 @@ def line():
 def settings():
     def make(**changes):
         small = {"critic_width": 16, "actor_width": 16, "history": 2, "batch_size": 16, "warmup": 4, "actor_after": 0}
+        small |= {"average": 0.05, "blur": 0.02, "advantage_weight": 1.0}
         small |= changes.pop("hyperparameters", {})
         values = {"env": ENV, "algo": "rlpd", "trainer": "live", "steps": 200, "hyperparameters": small}
         return TrainSettings(**{**values, **changes})

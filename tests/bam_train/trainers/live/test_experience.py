@@ -119,20 +119,3 @@ def test_it_goes_on_from_its_state(new):
     for experience in (one, other):
         experience.add(episode(1, [1], person=True))
     np.testing.assert_equal(one.state_dict(), other.state_dict())
-
-
-def test_the_first_policy_is_shown_on_simulated_and_real_observations(new):
-    experience, rng = new(), np.random.default_rng(0)
-    experience.add(episode(0, [0] * 2))
-    assert experience.sample(8, 0.5, rng).copied is None
-    simulated = np.full((3, 3), 9, np.float32), np.full((3, 1), 0.9, np.float32)
-    experience.copy_from(*simulated, lambda observations: -observations / 10)
-    experience.add(episode(1, [0] * 4))
-    experience.add(episode(0, [0] * 4, person=True))
-    seen, action = experience.sample(16, 0.5, rng).copied
-    np.testing.assert_array_equal(seen[4:], 9)
-    np.testing.assert_allclose(action[4:], 0.9)
-    np.testing.assert_allclose(action[:4, 0], -seen[:4, 0] / 10)
-    other = new()
-    other.load_state_dict(experience.state_dict())
-    np.testing.assert_equal(other.state_dict(), experience.state_dict())

@@ -37,6 +37,19 @@ def test_what_the_critics_value_changes_the_actor(settings, weights):
     assert all(np.isfinite(value) for value in learner.statistics().values())
 
 
+def test_the_average_of_the_weights_drives(settings):
+    seen, moved = np.zeros(2, np.float32), []
+    for average in (1e-6, 1.0):
+        values = {"average": average, "advantage_weight": 0.0, "learning_rate": 1e-2}
+        learner = LiveLearner.create(settings(hyperparameters=values))
+        before = learner.freeze().act(seen)
+        learner.add(play(10, person=True))
+        learner.learn(40)
+        moved.append(abs(learner.freeze().act(seen) - before).item())
+        assert {"loss/imitation"} == {name for name in learner.statistics() if name.startswith("loss")}  # no critics
+    assert moved[0] < 1e-4 < 1e-2 < moved[1]
+
+
 def test_a_run_goes_on_as_if_it_had_not_been_interrupted(settings, tmp_path):
     through, first = (LiveLearner.create(settings()) for _ in range(2))
     actions = []
