@@ -28,7 +28,7 @@ HERE = {
     "keys": "it says whom this computer trusts",
 }
 """Flags of what has to be on this computer, and why."""
-TEXTS = ("checkpoint", "policy", "profile")
+TEXTS = ("checkpoint", "policy", "profile", "record")
 """Flags that may name a file, and something else."""
 ADDRESSES: dict[str, str] = {}
 """Ends of folders on this computer, and the addresses for which they stand in."""

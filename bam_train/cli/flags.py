@@ -78,15 +78,15 @@ class TrainConfig(SettingsFlags):  # type: ignore[misc]
     print_config: bool = False
     """Print all settings of the run as JSON, and do not train."""
     out: _File = None
-    """Where the best checkpoint goes (default checkpoints/<env>-<algo>.zip)."""
+    """Where the best checkpoint goes (default checkpoints/<env>-<algo>.zip); it may be s3://bucket/pick.zip."""
     copy_to: Annotated[str | None, _unset("URL")] = None
-    """Copy every checkpoint that goes to --out to an fsspec address too, such as s3://bucket/runs/."""
+    """Copy every checkpoint that goes to --out to an address too, such as s3://bucket/runs/."""
     resume: _File = None
     """Checkpoint to go on from, with its settings and up to --steps in all."""
     force: bool = False
     """Overwrite the checkpoint at --out instead of adding a number to its name."""
     runs: Path = Path("runs")
-    """Folder in which the run's own folder is made."""
+    """Folder in which the run's own folder is made; it may be s3://bucket/runs."""
     learner: Annotated[str | None, _unset("URL")] = None
     """Learn from the robot of the live agent at this address, such as ws://robot:9095, while it runs (algorithm rlpd);
     candidates are pushed to it. --token-file and --ca-file are those of the agent."""
@@ -99,7 +99,7 @@ class EvalConfig:
     """Evaluate the frozen policy of a checkpoint over seeded episodes."""
 
     checkpoint: CheckpointFile
-    """The checkpoint.zip that bam-train wrote."""
+    """The checkpoint.zip that bam-train wrote, also at s3://bucket/pick.zip."""
     episodes: Count = 100
     """How many episodes."""
     seed: Seed = 1_000_000
@@ -130,7 +130,7 @@ class DeployConfig:
     """Run the frozen policy of a checkpoint on a robot, simulated here or live, at the rate it was made for."""
 
     checkpoint: CheckpointFile
-    """The checkpoint.zip that bam-train wrote."""
+    """The checkpoint.zip that bam-train wrote, also at s3://bucket/pick.zip."""
     episodes: Count = 5
     """How many episodes."""
     seed: Seed = 1_000_000
@@ -218,7 +218,7 @@ class ReplayConfig:
     """Summarise a recording of bam-deploy, play it through its environment with a policy, and draw it."""
 
     recording: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RECORDING")]
-    """The .mcap file that bam-deploy wrote."""
+    """The .mcap file that bam-deploy wrote, also at s3://bucket/pick.mcap."""
     checkpoint: File = None
     """Checkpoint whose policy acts on the recorded states; by default the recorded one, if it is at its path."""
     env: EnvId = None

@@ -24,6 +24,7 @@ from typing import Any
 
 from bam_train.atomic_file import remove_orphans
 from bam_train.errors import OutputError
+from bam_train.place import Place
 
 LEAST_FREE = 20_000_000
 """Minimum free bytes of the disk before training."""
@@ -153,14 +154,17 @@ class Copies:
     """A place to which checkpoints are copied.
 
     Args:
-        url: An fsspec address, such as ``s3://bucket/runs/`` or ``file:///mnt/share/pick.zip``: a file if it ends in
-            ``.zip``, else a folder. Raises OutputError if it is malformed.
+        url: A `Place` in a bucket, ``s3://bucket/runs/``, or another fsspec address, ``file:///mnt/share/pick.zip``: a
+            file if it ends in ``.zip``, else a folder. Raises OutputError if it is malformed.
     """
 
     def __init__(self, url: str) -> None:
         self.url = url
         if "://" not in url:
             raise OutputError(f"{url}: --copy-to expects an address, such as s3://bucket/runs/, or a file's: file:///…")
+        self._place = Place(url) if url.startswith(("s3://", "gs://", "gcs://")) else None
+        if self._place is not None:
+            return
         try:
             fsspec: Any = importlib.import_module("fsspec.core")
         except ModuleNotFoundError as error:
@@ -172,6 +176,9 @@ class Copies:
 
     def copy(self, checkpoint: Path) -> None:
         """Copy a checkpoint there and overwrite an earlier copy; raises OutputError if that fails."""
+        if self._place is not None:
+            (self._place if self._place.suffix == ".zip" else self._place / checkpoint.name).put(checkpoint)
+            return
         target = self._path if self._path.endswith(".zip") else posixpath.join(self._path, checkpoint.name)
         try:
             if "file" not in self._files.protocol:

@@ -12,7 +12,9 @@ import pytest
 
 from bam_train.atomic_file import replacing
 from bam_train.errors import OutputError
+from bam_train.place import Place
 from bam_train.trainers.run_folder import Copies, RunFolder, draw_curve, require_room
+from tests.object_store import bucket_fixture  # noqa: F401
 
 
 def test_each_run_has_a_folder_of_its_own(tmp_path):
@@ -148,10 +150,20 @@ def test_without_fsspec(monkeypatch):
     with pytest.raises(
         OutputError, match=r"^--copy-to needs fsspec, which is not installed\. Run: pip install fsspec$"
     ):
-        Copies("s3://bucket/")
+        Copies("abfs://bucket/")
 
 
 def test_a_kind_of_address_whose_package_is_missing(fsspec, monkeypatch):
-    monkeypatch.setitem(sys.modules, "s3fs", None)
-    with pytest.raises(OutputError, match=r"^s3://bucket/: cannot be copied to: .*s3fs"):
-        Copies("s3://bucket/")
+    monkeypatch.setitem(sys.modules, "adlfs", None)
+    with pytest.raises(OutputError, match=r"^abfs://bucket/: cannot be copied to: .*adlfs"):
+        Copies("abfs://bucket/")
+
+
+def test_into_a_bucket_of_s3(checkpoint, bucket):
+    for url in (f"{bucket}/runs/", f"{bucket}/best.zip"):
+        Copies(url).copy(checkpoint)
+    assert (Place(bucket) / "runs" / "pick-ppo.zip").read_bytes() == (Place(bucket) / "best.zip").read_bytes() == b"one"
+    with pytest.raises(
+        OutputError, match=r"^s3://none-such/pick-ppo\.zip: cannot be written: there is no bucket none-such\."
+    ):
+        Copies("s3://none-such").copy(checkpoint)
