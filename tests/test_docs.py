@@ -42,6 +42,7 @@ FLAGS_OF = {
     "bam-sign": "signing.md",
     "bam-agent": "live-agent.md",
     "bam-push": "live-agent.md",
+    "bam-gate": "data.md",
 }
 EXAMPLES = {"PYTHONPATH": os.pathsep.join([str(ROOT), str(ROOT / "envs")]), "OMP_NUM_THREADS": "1"}
 
@@ -229,7 +230,7 @@ def test_the_workflow_for_ci_has_commands_that_exist():
     steps = yaml.safe_load((ROOT / "docs" / "live-agent-ci.yml").read_text())["jobs"]["deploy"]["steps"]
     lines = [line for step in steps for line in step.get("run", "").replace("\\\n", "").splitlines() if "bam-" in line]
     programs = [re.split(r"[ |]", line.strip())[0] for line in lines if line.strip().startswith("bam-")]
-    assert programs == ["bam-eval", "bam-sign", "bam-push"]
+    assert programs == ["bam-eval", "bam-gate", "bam-sign", "bam-push"]
     config = resolve("bam_train.cli.live.agent_flags:PushConfig")
     given = re.findall(r"--([a-z-]+)", lines[-1])
     assert set(given) <= {name.replace("_", "-") for name in config.__dataclass_fields__}

@@ -36,6 +36,7 @@ ORDER = {
             "deploy",
             "agent",
             "trainers",
+            "estimation",
             "compat",
             "cli",
         ),

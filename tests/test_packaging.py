@@ -77,6 +77,7 @@ def test_console_scripts(wheel):
         "bam-envs = bam_train.cli.envs:main",
         "bam-eval = bam_train.cli.eval:main",
         "bam-export = bam_train.cli.export:main",
+        "bam-gate = bam_train.cli.data.run_gate:main",
         "bam-push = bam_train.cli.live.push:main",
         "bam-replay = bam_train.cli.live.replay:main",
         "bam-serve = bam_train.cli.serve:main",

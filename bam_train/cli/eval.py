@@ -34,6 +34,9 @@ class _Subject(NamedTuple):
 
 def evaluate_checkpoint(config: EvalConfig) -> None:
     """Run the program with its parsed flags."""
+    if config.data is not None:
+        _on_data(config, config.data)
+        return
     from bam_train.environments import make_env, make_vector_env, require_fit
     from bam_train.evaluation import default_num_envs, evaluate
     from bam_train.trainers.sb3.plain_sb3_zip import is_plain_sb3
@@ -88,6 +91,32 @@ def _recorded(config: EvalConfig, subject: _Subject, envs: Any) -> AbstractConte
         return seed is not None and seed < end
 
     return closing(RecordVectorDataset(envs, config.record, info, {"policy": policy}, is_counted))
+
+
+def _on_data(config: EvalConfig, place: str) -> None:
+    """Estimate from recorded episodes how good the policy of a checkpoint is."""
+    from bam_train.checkpoint import Checkpoint
+    from bam_train.cli.data.data_table import data_lines
+    from bam_train.data import DataSet
+    from bam_train.estimation.data_evaluation import evaluate_on_data
+
+    checkpoint = Checkpoint.open(config.checkpoint)
+    if config.env is not None:
+        checkpoint.requires_env(config.env)
+    report = evaluate_on_data(
+        checkpoint,
+        DataSet.open(place),
+        seen=config.seen,
+        by=config.by,
+        seed=config.seed,
+        on_progress=lambda done, updates: say(f"bam-eval: {done} of {updates} updates") if done % 1000 == 0 else None,
+    )
+    manifest, path = checkpoint.manifest, checkpoint.path
+    if config.json:
+        facts = {"checkpoint": str(path), "algorithm": manifest.algorithm, "steps_trained": manifest.steps}
+        tell(json_module.dumps({**report.to_json(), "data": place, **facts}, allow_nan=False))
+    else:
+        tell(*data_lines(report, f"{path} ({manifest.algorithm}, {manifest.steps:,} steps)", place))
 
 
 def _own(config: EvalConfig, path: Path) -> _Subject:

@@ -96,7 +96,7 @@ class TrainConfig(SettingsFlags):  # type: ignore[misc]
 
 @dataclass(frozen=True)
 class EvalConfig:
-    """Evaluate the frozen policy of a checkpoint over seeded episodes."""
+    """Evaluate the frozen policy of a checkpoint over seeded episodes, or on recorded ones."""
 
     checkpoint: CheckpointFile
     """The checkpoint.zip that bam-train wrote, also at s3://bucket/pick.zip."""
@@ -123,6 +123,14 @@ class EvalConfig:
     """How many episodes the video shows."""
     trust_pickle: bool = False
     """Load a plain stable-baselines3 zip, which runs whatever code is in it."""
+    data: Annotated[str | None, tyro.conf.arg(metavar="PLACE")] = None
+    """Play nothing, and estimate from the recorded episodes of this data set how good the policy is; then only --env,
+    --seed, --json, --seen and --by count."""
+    seen: Literal["refuse", "skip", "use"] = "refuse"
+    """What becomes of episodes of --data that the policy learnt from."""
+    by: Annotated[tuple[str, ...], tyro.conf.UseAppendAction, tyro.conf.arg(metavar="FACT")] = ()
+    """A fact of the episodes of --data, such as object, site or date, that divides them into groups, any number of
+    times; by default every fact with 2 to 20 values."""
 
 
 @dataclass(frozen=True)

@@ -39,8 +39,8 @@ class PushConfig:
     """Push a checkpoint to a live agent, which checks it and tries it as the candidate; or roll back.
 
     bam-push CHECKPOINT URL, or bam-push --rollback URL. Exit status: 0 done, 1 the agent cannot be reached, or failed,
-    2 wrong usage, 3 the agent refuses the candidate or the request, 5 with --wait: the candidate was rolled back, or
-    replaced before its trials were done.
+    2 wrong usage, 3 the agent refuses the candidate or the request, or --gate does not let it through, 5 with --wait:
+    the candidate was rolled back, or replaced before its trials were done.
     """
 
     checkpoint: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="CHECKPOINT")]
@@ -58,6 +58,8 @@ class PushConfig:
     """When it begins to act: at the next tick, or with the next episode."""
     wait: bool = False
     """Return once the trials have ended: the candidate was promoted, rolled back or replaced."""
+    gate: File = None
+    """The agent's champion as a file: push only if bam-gate finds the candidate better than it, or not worse."""
     rollback: bool = False
     """Push nothing, and go back: from a candidate to the champion, from the champion to the version before it."""
     why: str = ""

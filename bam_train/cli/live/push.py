@@ -26,6 +26,8 @@ def push(config: PushConfig, signals: SignalMemory) -> int:
     def do(agent: AgentClient) -> dict[str, Any]:
         if path is None:
             return {**agent.ask("rollback", why=config.why), **agent.ask("status")}
+        if config.gate is not None:
+            _pass_gate(agent, path, config.gate)
         choice: dict[str, Any] = {"stage": config.stage, "when": config.when, "wait": config.wait, "why": config.why}
         result = agent.push(path, **choice, progress=_progress)
         return {**agent.ask("status"), **result}
@@ -53,10 +55,34 @@ def _arguments(config: PushConfig) -> tuple[Path | None, str]:
             raise _misused("--rollback takes no CHECKPOINT: bam-push --rollback URL")
         if config.wait:
             raise _misused("--rollback has nothing to wait for; leave --wait out")
+        if config.gate is not None:
+            raise _misused("--rollback pushes nothing through a gate; leave --gate out")
         return None, first
     if url is None:
         raise _misused(f"{'CHECKPOINT' if '://' in first else 'URL'} is missing: bam-push CHECKPOINT URL")
     return Path(first).expanduser(), url
+
+
+def _pass_gate(agent: AgentClient, candidate: Path, champion: Path) -> None:
+    """Refuse a candidate that `bam-gate` finds neither better nor not worse than the agent's champion."""
+    from bam_train.checkpoint import Checkpoint
+    from bam_train.cli.data.gate_flags import GateConfig
+    from bam_train.cli.data.run_gate import decide
+    from bam_train.errors import CandidateRefused
+
+    digest = Checkpoint.open(champion).digest
+    found = (agent.ask("status").get("names") or {}).get("champion") or "none"
+    if found != digest:
+        text = (
+            f"has the digest {digest[:SHORT]}, and the agent's champion {found[:SHORT]}; give that one's file to --gate"
+        )
+        raise CandidateRefused(f"{champion}: {text}")
+    report = decide(GateConfig(candidate, champion))
+    for line in report["lines"]:
+        _progress(line)
+    if report["verdict"] not in ("better", "not worse"):
+        text = f"bam-gate finds it {report['verdict']} against {champion}, so it was not pushed"
+        raise CandidateRefused(f"{candidate}: {text}")
 
 
 def _misused(text: str) -> SystemExit:

@@ -181,6 +181,7 @@ def test_roll_back(hub, server, run):
         (["pick.zip"], "URL is missing: bam-push CHECKPOINT URL"),
         (["--rollback", "pick.zip", "ws://robot"], "--rollback takes no CHECKPOINT: bam-push --rollback URL"),
         (["--rollback", "ws://robot", "--wait"], "--rollback has nothing to wait for; leave --wait out"),
+        (["--rollback", "ws://robot", "--gate", "a.zip"], "--rollback pushes nothing through a gate; leave --gate out"),
     ],
 )
 def test_wrong_usage_has_status_2(run, arguments, text):
