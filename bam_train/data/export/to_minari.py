@@ -82,7 +82,7 @@ def _spec(info: DataSetInfo) -> str:
 @contextmanager
 def _root(path: Path) -> Iterator[None]:
     before = os.environ.get("MINARI_DATASETS_PATH")
-    os.environ["MINARI_DATASETS_PATH"] = str(path)
+    os.environ["MINARI_DATASETS_PATH"] = str(path.resolve())  # Minari cannot size a file below a relative one
     try:
         yield
     finally:

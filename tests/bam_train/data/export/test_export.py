@@ -1,6 +1,7 @@
 """The libraries themselves read the numbers of every episode, with its first and last observation."""
 
 import json
+from pathlib import Path
 
 import gymnasium as gym
 import numpy as np
@@ -66,7 +67,8 @@ def equal(found, expected):
 def test_minari(kind, tmp_path, monkeypatch):
     minari = pytest.importorskip("minari")
     data = record(tmp_path / "data", kind)
-    opened = export(data, "minari", tmp_path / "out")
+    monkeypatch.chdir(tmp_path)
+    opened = export(data, "minari", Path("out"))  # relative, as people type it
     assert opened.endswith('minari.load_dataset("bam/pick/recorded-v0")\'')
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "out"))
     found = minari.load_dataset("bam/pick/recorded-v0")
