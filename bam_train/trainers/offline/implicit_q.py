@@ -7,8 +7,7 @@ https://arxiv.org/abs/2110.06169) never asks for the value of an action that nob
     actor: imitate a with the weight exp(scale (Q(s, a) - V(s)) / deviation)
 
 Q and V do not depend on the actor. So offline they are learnt first, and the actor then clones the data by the weights
-of the final values. A Box action is cloned by its absolute error, whose best guess is the median of what was done: a
-mean of two good actions need not be good.
+of the final values.
 """
 
 from __future__ import annotations
@@ -42,14 +41,16 @@ class Cloning:
     batch_size: _Count = 256
     width: _Count = 256
     """Units of each of the actor's two hidden layers."""
-    loss: Annotated[str, Meta(pattern="^(absolute|squared)$")] = "absolute"
-    """Error of a Box action: absolute (the median of what was done) or squared (the mean)."""
+    loss: Annotated[str, Meta(pattern="^(absolute|squared)$")] = "squared"
+    """Error of a Box action: squared (the mean of what was done; default of bc) or absolute (the median)."""
 
 
 @dataclass(frozen=True)
 class ImplicitQ(Cloning):
     """Hyperparameters of implicit Q-learning."""
 
+    loss: Annotated[str, Meta(pattern="^(absolute|squared)$")] = "absolute"
+    """As of cloning; among actions of which many are bad, the median is the better guess."""
     gamma: _Share = 0.98
     """Discount of a step."""
     expectile: _Share = 0.7

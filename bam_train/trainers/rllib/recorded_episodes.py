@@ -1,7 +1,8 @@
-"""Recorded episodes for bc, marwil, cql and iql: Parquet files with one row per step.
+"""Recorded episodes for bc, marwil, cql and iql: a data set, or plain Parquet files with one row per step.
 
-Columns: ``eps_id`` (text), ``obs``, ``actions`` (in the environment's action space), ``rewards``, ``new_obs``,
-``terminateds``, ``truncateds``; others are ignored. The rows of an episode are consecutive.
+A data set is read while learning (`streamed_episodes`). Plain files have the columns ``eps_id`` (text), ``obs``,
+``actions`` (in the environment's action space), ``rewards``, ``new_obs``, ``terminateds``, ``truncateds``; others are
+ignored. The rows of an episode are consecutive.
 
 RLlib sends every row of every update through Ray Data as a separate episode, at a few thousand rows a second. Here a
 learner reads the files into its memory once and draws rows from it, a hundred times as fast. One update learns from
@@ -26,9 +27,11 @@ from ray.rllib.core import DEFAULT_MODULE_ID
 from ray.rllib.offline.offline_data import OfflineData
 from ray.rllib.utils.spaces.space_utils import normalize_action
 
+from bam_train.data import DataSet
 from bam_train.errors import SettingsError
 from bam_train.settings import TrainSettings
 from bam_train.trainers.rllib import register_foreign
+from bam_train.trainers.rllib.streamed_episodes import blocks, columns_of, draws, is_data_set, require_fit
 from bam_train.trainers.zero_based_spaces import less_start
 
 Array = NDArray[Any]
@@ -73,25 +76,36 @@ class RecordedData(OfflineData):  # type: ignore[misc]
     def sample(self, num_samples: int, return_iterator: bool = True, num_shards: int = 1) -> list[Draws]:
         """One endless iterator for each learner, with its own random numbers."""
         seed = self._config.seed or 0
-        return [Draws(self._config.input_[0], self._config, seed + shard) for shard in range(max(1, num_shards))]
+        count = max(1, num_shards)
+        return [Draws(self._config.input_[0], self._config, seed, shard, count) for shard in range(count)]
 
 
 class Draws:
-    """Batches of random rows of files; pickled without the rows."""
+    """Batches of random rows for the learner `shard` of `shards`; pickled without the rows."""
 
-    def __init__(self, data: str, config: Any, seed: int) -> None:
-        self._data, self._seed = data, seed
+    def __init__(self, data: str, config: Any, seed: int, shard: int = 0, shards: int = 1) -> None:
+        self._data, self._seed, self._shard, self._shards = data, seed + shard, shard, shards
         self._spaces = config.observation_space, config.action_space
         self._gamma = float(config.gamma)
 
     def iter_torch_batches(self, *, batch_size: int, device: Any = None, **_: Any) -> Iterator[dict[str, Any]]:
         """Yield batches of tensors (batch_size, ...) by module and column, as ``default_policy/obs``."""
+        if is_data_set(self._data):
+            for batch in self._streamed(batch_size):
+                yield {f"{DEFAULT_MODULE_ID}/{name}": torch.from_numpy(one).to(device) for name, one in batch.items()}
         table = load(self._data, *self._spaces, self._gamma)
         columns = {name: torch.from_numpy(values).to(device or "cpu") for name, values in table.items()}
         rng = np.random.default_rng(self._seed)
         while True:
             rows = torch.from_numpy(rng.integers(len(table["rewards"]), size=batch_size)).to(device or "cpu")
             yield {f"{DEFAULT_MODULE_ID}/{name}": values[rows] for name, values in columns.items()}
+
+    def _streamed(self, batch_size: int) -> Iterator[dict[str, Array]]:
+        """Batches of a data set, of which a few blocks of episodes are in memory."""
+        data, rng = DataSet.open(self._data), np.random.default_rng(self._seed)
+        parts = blocks(data, self._shard, self._shards, rng)
+        tables = (for_learners(self._data, *columns_of(data, part), *self._spaces, self._gamma) for part in parts)
+        return draws(tables, batch_size, rng, every=len(next(blocks(data, 0, 1, rng))) == len(data))
 
 
 def load(data: str, observation_space: Space[Any], action_space: Space[Any], gamma: float) -> dict[str, Array]:
@@ -112,9 +126,21 @@ def load(data: str, observation_space: Space[Any], action_space: Space[Any], gam
         for name in COLUMNS
         if name != "eps_id"
     }
-    rewards = columns["rewards"].astype(np.float32)
     episode = np.asarray(table["eps_id"].to_pylist())
     last = np.append(episode[1:] != episode[:-1], True) | columns["terminateds"] | columns["truncateds"]
+    return for_learners(data, columns, last, observation_space, action_space, gamma)
+
+
+def for_learners(
+    data: str,
+    columns: dict[str, Array],
+    last: Array,
+    observation_space: Space[Any],
+    action_space: Space[Any],
+    gamma: float,
+) -> dict[str, Array]:
+    """The result of `load` from the columns of files; `last` (rows,) says which rows end an episode."""
+    rewards = columns["rewards"].astype(np.float32)
     total, targets = 0.0, np.empty_like(rewards)
     for t in range(len(rewards) - 1, -1, -1):  # R_t = r_t + gamma R_{t+1}, 0 after an episode's last row
         total = float(rewards[t]) + (0.0 if last[t] else gamma * total)
@@ -181,6 +207,9 @@ def _open(data: str) -> tuple[str, Any]:
 
 def _require_columns(data: str, observation_space: Space[Any], action_space: Space[Any]) -> None:
     """Refuse files that lack a column, or have observations or actions of another shape."""
+    if is_data_set(data):
+        require_fit(data, observation_space, action_space)
+        return
     path, filesystem = _open(data)
     try:
         dataset = pyarrow.parquet.ParquetDataset(path, filesystem=filesystem)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import copy
 import dataclasses
+import functools
 import logging
 import math
 import random
@@ -22,6 +23,7 @@ from ray.rllib.core import DEFAULT_MODULE_ID
 
 from bam_envs.core.spaces import space_to_json
 from bam_train.checkpoint import Checkpoint, write_checkpoint
+from bam_train.data import DataSet
 from bam_train.environments import control_period, make_env, require_fit
 from bam_train.errors import SettingsError, TrainingFailed
 from bam_train.policy import FrozenPolicy
@@ -41,6 +43,7 @@ from bam_train.trainers.rllib.rllib_hyperparameters import (
 )
 from bam_train.trainers.rllib.robot_env_runner import ENDS
 from bam_train.trainers.rllib.runner_deaths import RunnerWatch
+from bam_train.trainers.rllib.streamed_episodes import is_data_set
 from bam_train.trainers.tensorboard_files import TensorBoardFiles
 
 _EPISODES = 100
@@ -238,7 +241,17 @@ class RLlibTrainer:
                 **rllib_state.members(self.algorithm, notes),
             }
         known = {"signals": self._signals, "period": self._period, "steps": self.steps, "scores": scores}
-        return write_checkpoint(path, manifest(self.settings, self._spaces, known), members)
+        fields = {**manifest(self.settings, self._spaces, known), "data": self._learnt_from}
+        return write_checkpoint(path, fields, members)
+
+    @functools.cached_property
+    def _learnt_from(self) -> dict[str, Any]:
+        """What the manifest says of the data set, which has episodes of this run only when it began."""
+        if self.settings.data is None or not is_data_set(self.settings.data):
+            return {}
+        data = DataSet.open(self.settings.data)
+        steps = sum(data.facts(index)["length"] for index in range(len(data)))
+        return {"digest": data.digest, "episodes": data.digests, "steps": steps}
 
     def freeze(self) -> FrozenPolicy:
         """Freeze the current policy."""
