@@ -12,8 +12,8 @@ if "+cpu" in torch.__version__:
     for name in ("nms", "qnms"):
         library.define(f"{name}(Tensor dets, Tensor scores, float iou_threshold) -> Tensor")
 
-from datasets import load_dataset  # noqa: E402
-from lerobot.datasets.lerobot_dataset import LeRobotDataset  # noqa: E402
+from datasets import load_dataset
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 root, period = sys.argv[1], float(sys.argv[2])
 data = LeRobotDataset("bam/data", root=root, delta_timestamps={"action": [0.0, period]})
