@@ -16,6 +16,7 @@
     ├── BadDataSet                 a folder that is no data set, a damaged one, or episodes that do not belong into it
     ├── FormatError                bytes that do not follow their file format (safetensors, ONNX)
     ├── PolicyError                a frozen policy that cannot run, or an observation that does not fit it
+    ├── NoDetector                 episodes of which no detector of unusual observations can be made, or none is there
     ├── SettingsError              a setting or option that does not exist or does not fit
     ├── LoopError                  the interaction loop
     │   ├── UnknownVariable        a variable that no agent wrote
@@ -115,6 +116,10 @@ class FormatError(BamTrainError, ValueError):
 
 class PolicyError(BamTrainError, ValueError):
     """A frozen policy that cannot run, or an observation that does not fit it."""
+
+
+class NoDetector(BamTrainError, ValueError):  # noqa: N818 - named for the cause
+    """Episodes of which no detector of unusual observations can be made; or there is none, and one is needed."""
 
 
 class SettingsError(BamTrainError, ValueError):

@@ -36,6 +36,8 @@ class AgentOptions:
     """Time without use after which a person loses the lease [s]."""
     guard_stops: int = 2
     """Number of stops by guards after which a candidate is rolled back."""
+    unusual: str = "warn"
+    """What unusual observations lead to: ``"warn"``, ``"hold"`` or ``"stop"``."""
     record: bool = True
     data: str | None = None
     """Data set to which the episodes of each recording are added at its end."""

@@ -91,6 +91,7 @@ class RobotSession:
             lines = admission(self._env, place)
             admit(self._env, lines)
             self.policy, self.marks = admission.policy, admission.marks
+            self.robot.react(options.unusual)
             self.interface = interface_of(self._env)
             self.recorder = self._start_recorder(options, checkpoint) if options.record else None
             self.deployment = Deployment(

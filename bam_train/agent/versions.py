@@ -19,6 +19,7 @@ from typing import IO, Any
 
 from bam_train.atomic_file import remove_orphans, replacing
 from bam_train.checkpoint import MANIFEST, POLICY, Checkpoint
+from bam_train.detector import Detector
 from bam_train.errors import AlteredCheckpoint, CheckpointError, FolderInUse, OutputError, SettingsError, UnknownVersion
 from bam_train.policy import FrozenPolicy
 
@@ -224,7 +225,9 @@ def load_policy(version: Version) -> FrozenPolicy:
     if checkpoint.digest != version.digest:
         raise CheckpointError(version.path, "is another checkpoint than its name says. Push it again")
     manifest = checkpoint.manifest
-    return FrozenPolicy.from_graph(checkpoint.read(POLICY), manifest.observation_space, manifest.action_space)
+    policy = FrozenPolicy.from_graph(checkpoint.read(POLICY), manifest.observation_space, manifest.action_space)
+    policy.detector = Detector.of(checkpoint)
+    return policy
 
 
 def _require_same(copy: Path, checkpoint: Checkpoint) -> None:

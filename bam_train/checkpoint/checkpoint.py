@@ -6,6 +6,7 @@
     bam/manifest.json         environment, settings, and the sha256 of every other member
     bam/policy.onnx           the frozen policy
     bam/golden.safetensors    observations, and the trainer's actions for them
+    bam/detector.safetensors  the detector of unusual observations, if there is one
     bam/resume/...            everything needed to resume exactly
     bam/signature.json        who vouches for the manifest, if `bam-sign` signed it
 

@@ -24,6 +24,7 @@ _MOST_BYTES = {
     SIGNATURE: 2**14,
     "bam/policy.onnx": 2**28,
     "bam/golden.safetensors": 2**26,
+    "bam/detector.safetensors": 2**24,
     RESUME: 64 * 2**30,  # the largest replay buffers are a tenth of this
     "": 2**29,
 }

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
 LIVE_ONLY = (
     *("robot", "transport", "rate", "fast", "render", "wiggle", "motion", "stage", "i_know", "trials", "shadow"),
-    *("record", "print_guards", "ca_file", "token_file", "timeout", "keys", "allow_unsigned"),
+    *("unusual", "record", "print_guards", "ca_file", "token_file", "timeout", "keys", "allow_unsigned"),
 )
 """Flags that a rehearsal has no use for."""
 ANY_ROBOT = "ws://127.0.0.1:9090"
@@ -49,16 +49,23 @@ def deploy_checkpoint(config: DeployConfig, signals: SignalMemory) -> int:
     from bam_train.deploy.checkpoint_admission import Admission
     from bam_train.deploy.deployment import Deployment
     from bam_train.deploy.journal import Journal
+    from bam_train.detector import DETECTOR
+    from bam_train.errors import NoDetector
 
     checkpoint = Checkpoint.open(config.checkpoint)
     if config.print_guards:
         return print_guards(config, checkpoint, place)
+    if config.unusual is not None and not checkpoint.has(DETECTOR):
+        remedy = f"Add one: bam-eval {checkpoint.path} --add-detector"
+        raise NoDetector(f"--unusual: {checkpoint.path} has no detector of unusual observations. {remedy}")
     admission = Admission(checkpoint, config.keys, config.allow_unsigned, config.trials, config.i_know)
     options: Any = {"episodes": config.episodes, "yes": config.yes, "render": config.render, "named": config.env}
     options |= {"wiggle": config.wiggle, "motion": config.motion}
     env = connected_env(checkpoint, place, signals, who="bam-deploy", admit=admission, **options)
     try:
         pacer = Pacer(_period(config, checkpoint, env))
+        if config.unusual is not None:
+            env.unwrapped.robot.react(config.unusual)  # type: ignore[attr-defined]
         recorder = _recorder(config, checkpoint, place, env, admission.marks)
     except BaseException:
         env.close()  # type: ignore[no-untyped-call]
@@ -203,11 +210,13 @@ def _checked_place(config: DeployConfig) -> Place:
         raise SettingsError(
             "a live robot is driven at the rate that its policy was made for; leave out --rate and --fast"
         )
-    for name in ("stage", "trials", "keys", "allow_unsigned"):
+    for name in ("stage", "trials", "keys", "allow_unsigned", "unusual"):
         if robot is None and getattr(config, name):
             raise SettingsError(f"{as_flag(name)} is for a live robot; give its address with --robot too")
     if config.shadow and (robot is None or config.stage or config.wiggle or config.trials):
         raise SettingsError("--shadow needs --robot, and moves nothing; leave out --stage, --wiggle and --trials")
+    if config.shadow and config.unusual:
+        raise SettingsError("--shadow sends nothing, and --unusual is about what is sent; leave --unusual out")
     if config.i_know and config.stage != "full":
         raise SettingsError("--i-know is for --stage full alone; leave it out")
     if config.robot is None and (config.wiggle or config.motion is not None):

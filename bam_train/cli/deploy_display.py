@@ -83,6 +83,7 @@ class LiveDisplay(PlainDisplay):
             "step": f"{record.length}, return {record.total:.2f}",
             "loop": rate_text(pacer),
             **({} if pacer.period is None else {"lateness": lateness_text(pacer)}),
+            **({} if self._journal.unusual is None else {"unusual": f"{self._journal.unusual:.2f} of 1"}),
             **numbers_of(self._env, action),
         }
         table = Table.grid(padding=(0, 2))

@@ -45,6 +45,9 @@ def evaluate_checkpoint(config: EvalConfig) -> None:
     video = None if config.video is None else require_video_path(config.video)
     path = config.checkpoint.expanduser()
     subject = (_foreign if is_plain_sb3(path) else _own)(config, path)
+    if config.add_detector:
+        _add_detector(subject, path)
+        return
     if video is not None:  # try one picture before the evaluation
         with closing(make_env(subject.env, subject.env_kwargs, render_mode="rgb_array")) as env:
             env.reset(seed=0)
@@ -117,6 +120,22 @@ def _on_data(config: EvalConfig, place: str) -> None:
         tell(json_module.dumps({**report.to_json(), "data": place, **facts}, allow_nan=False))
     else:
         tell(*data_lines(report, f"{path} ({manifest.algorithm}, {manifest.steps:,} steps)", place))
+
+
+def _add_detector(subject: _Subject, path: Path) -> None:
+    """Add a detector of unusual observations to a checkpoint, of new episodes of its policy."""
+    from bam_train.checkpoint import Checkpoint
+    from bam_train.checkpoint.zip_members import SIGNATURE, list_members, open_zip
+    from bam_train.detection import add_own_detector
+    from bam_train.errors import NotACheckpoint
+
+    if subject.checkpoint is None:
+        raise NotACheckpoint(path, "a plain stable-baselines3 file has no place for a detector. Train with bam-train")
+    with open_zip(path) as archive:
+        was_signed = SIGNATURE in list_members(path, archive)
+    add_own_detector(path, subject.policy, subject.env, subject.env_kwargs)
+    signed = ["  signature removed, as it was of the checkpoint without it: bam-sign sign again"] if was_signed else []
+    tell(f"{path}: has a detector of unusual observations; digest {Checkpoint.open(path).digest[:12]}", *signed)
 
 
 def _own(config: EvalConfig, path: Path) -> _Subject:

@@ -24,6 +24,7 @@ File = Annotated[Path | None, tyro.conf.arg(metavar="FILE")]
 Folder = Annotated[Path | None, tyro.conf.arg(metavar="FOLDER")]
 Name = Annotated[str | None, tyro.conf.arg(metavar="NAME")]
 EnvId = Annotated[str | None, tyro.conf.arg(metavar="ID")]
+Unusual = Annotated[Literal["warn", "hold", "stop"] | None, tyro.conf.arg(metavar="warn|hold|stop")]
 Url = Annotated[str | None, tyro.conf.arg(metavar="URL")]
 
 
@@ -131,6 +132,9 @@ class EvalConfig:
     by: Annotated[tuple[str, ...], tyro.conf.UseAppendAction, tyro.conf.arg(metavar="FACT")] = ()
     """A fact of the episodes of --data, such as object, site or date, that divides them into groups, any number of
     times; by default every fact with 2 to 20 values."""
+    add_detector: bool = False
+    """Evaluate nothing: add the detector of unusual observations to the checkpoint, of new episodes of its policy;
+    bam-train does so at the end. The digest changes, and a signature is removed."""
 
 
 @dataclass(frozen=True)
@@ -182,6 +186,9 @@ class DeployConfig:
     """Send nothing: compare the policy's commands with the motion of a live robot that somebody else drives."""
     trials: File = None
     """Record of the trials; recordings/trials.jsonl by default."""
+    unusual: Unusual = None
+    """What the guard does when observations are unusual for the policy: warn (default), hold, or stop a live robot; by
+    the checkpoint's detector."""
     rate: Annotated[Positive | None, tyro.conf.arg(metavar="HZ")] = None
     """Actions a second [Hz]; by default the environment's own."""
     fast: bool = False
@@ -390,6 +397,8 @@ class AgentConfig:
     """Let the policy go on when a person hands the robot back; by default the agent stays paused."""
     lease: Annotated[Positive, tyro.conf.arg(metavar="S")] = 30.0
     """Time without a command after which a person who has taken over loses the robot again [s]."""
+    unusual: Unusual = None
+    """What the guard does when observations are unusual for the policy: warn (default), hold, or stop the robot."""
     guard_stops: Count = 2
     """Stops by a guard, within 100 episodes, after which a policy that was pushed is rolled back."""
     seed: Seed = 1_000_000

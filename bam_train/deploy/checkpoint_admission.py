@@ -69,6 +69,8 @@ class Admission:
         elif self.record is not None:
             raise SettingsError("--trials: a simulated robot is on trial only with --stage trial; give that too")
         self.policy = FrozenPolicy.from_checkpoint(self.checkpoint)
+        if place.shadow:
+            self.policy.detector = None  # the robot answers somebody else's actions
         return lines
 
     def _signature(self) -> list[str]:

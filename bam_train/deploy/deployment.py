@@ -138,6 +138,7 @@ class Deployment:
             *(() if boundary is None else (boundary,)),
             policy_agent,
             *agents,
+            _DetectorAgent(self, policy_agent),
         ]
         self._flight = None if recorder is None else RecorderAgent(recorder, env, names, journal, watch)
         chain += [] if self._flight is None else [self._flight]
@@ -286,6 +287,34 @@ class _StopAgent(Agent):
         if t > 0:  # a reset follows no deadline
             watch.latency = watch.begun - watch.waited
         self._switch.raise_again()
+
+
+class _DetectorAgent(Agent):
+    """Compares what the policy sees and does, and how the robot answers, with its training, if it has a detector."""
+
+    writes = ()
+
+    def __init__(self, deployment: "Deployment", policy: PolicyAgent) -> None:
+        super().__init__()
+        self._policy, self._journal = policy, deployment.journal
+        self._of: Any = None  # the detector of the running episode
+        self._tell = getattr(getattr(deployment.env.unwrapped, "robot", None), "tell_unusual", None)
+        self.reads = (*policy.names, "action", "env/done")
+
+    def forward(self, t: int, **kwargs: Any) -> None:
+        journal = self._journal
+        detector: Any = getattr(self._policy.policy, "detector", None)
+        if detector is None or self.get(("env/done", t))[0]:
+            journal.unusual = None if detector is None else journal.unusual
+            return
+        if t == 0 or detector is not self._of:
+            detector.begin()
+            self._of = detector
+        level = detector.step(self.get((self._policy.names[0], t))[0], self.get(("action", t))[0])
+        text = f"{detector.reason} (score {level:.2f}, usual is at most 1)" if level > 1.0 else ""
+        journal.compare(level, text, begins=t == 0)
+        if text and self._tell is not None:
+            self._tell(text)
 
 
 class _DeployedRobot(RobotAgent):

@@ -35,6 +35,7 @@ _SCALARS = {
     "/status": ("code", "guard"),
     "/latency": STAGES,
     "/episode": ("episode", "step", "reward", "terminated", "truncated", "success"),
+    "/unusual": ("level",),
 }
 MAX_SENT_SIGNAL = 32
 """Maximum size of the signals in /sent, which leaves out laser scans."""
@@ -180,6 +181,7 @@ class RecorderAgent(Agent):
             *(self._age, self._took, self._journal.begun - 1, t, get(("env/reward", t))[0]),
             *(record.end == "terminated", record.end == "truncated"),
             math.nan if record.success is None else record.success,
+            math.nan if self._journal.unusual is None else self._journal.unusual,
         ]
         arrays = [*[get((name, t)) for name in self._numbers], action]
         if state is not None:

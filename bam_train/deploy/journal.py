@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from bam_envs.core.timing import Lateness, Pacer
+from bam_envs.safety.unusual import UnusualObservations
 from bam_train.checkpoint import Checkpoint
 from bam_train.deploy.agreement import Shadow
 from bam_train.deploy.trials import Trials
@@ -34,6 +35,7 @@ class EpisodeRecord:
         return {"seed": self.seed, "length": self.length, "return": total, "success": self.success, "end": self.end}
 
 
+UNUSUAL = UnusualObservations().title
 KEPT = 1000
 """Maximum number of records kept; older episodes are only counted, so that memory is bounded."""
 
@@ -59,6 +61,14 @@ class Journal:
     warnings: dict[str, str] = field(default_factory=dict)
     """The newest warning of each guard of a live robot, by its title; see `SafeRobot.warnings`."""
 
+    unusual: float | None = None
+    """Newest level of the detector, above 1 if the observations are unusual for the policy; None without a detector."""
+    highest: float | None = None
+    """Highest of these."""
+    alarms: int = 0
+    """Number of episodes with a level above 1."""
+    _alarmed: bool = False
+
     @property
     def marked(self) -> str:
         """The marks as the end of a status line: ``", UNSIGNED"``; empty without any."""
@@ -67,6 +77,14 @@ class Journal:
     def warn(self, warnings: Sequence[str]) -> None:
         """Keep the warnings of the guards, each of which begins with the guard's title."""
         self.warnings.update(warning.split(": ", 1) for warning in warnings)  # type: ignore[misc]
+
+    def compare(self, level: float, text: str, *, begins: bool) -> None:
+        """Keep the detector's level of a tick, and the reason if it is above 1; `begins`: the episode's first one."""
+        self.unusual, self.highest = level, max(level, self.highest or 0.0)
+        self._alarmed = self._alarmed and not begins
+        if text and not self._alarmed:
+            self._alarmed, self.alarms = True, self.alarms + 1
+            self.warnings[UNUSUAL] = text
 
     def begin(self, seed: int) -> EpisodeRecord:
         """Append the record of a new episode, and return it."""
@@ -155,6 +173,7 @@ class DeployReport:
                 for name, guard in self.guards.items()
             },
             "per_episode": [record.to_json() for record in journal.records],
+            **({} if journal.highest is None else {"unusual": {"highest": journal.highest, "alarms": journal.alarms}}),
             **({} if self.recorder is None else {"recording": str(self.recorder.path)}),
         }
 

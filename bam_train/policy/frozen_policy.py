@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from bam_train.checkpoint import GOLDEN, POLICY, Checkpoint
+from bam_train.detector import Detector
 from bam_train.errors import FormatError, PolicyError
 from bam_train.policy.array_specs import ArraySpec, array_spec, observation_arrays
 
@@ -29,7 +30,10 @@ class FrozenPolicy:
         observation_space: JSON form, as in the manifest.
         action_space: JSON form, as in the manifest.
         recurrent: Whether the action depends on the observations since `reset`.
+        detector: The detector of unusual observations in its checkpoint; None if there is none.
     """
+
+    detector: Detector | None = None
 
     def __init__(
         self, session: OnnxSession, observation_space: Mapping[str, Any], action_space: Mapping[str, Any]
@@ -70,6 +74,7 @@ class FrozenPolicy:
         manifest = checkpoint.manifest
         policy = cls.from_graph(checkpoint.read(POLICY), manifest.observation_space, manifest.action_space)
         policy.require_golden(checkpoint)
+        policy.detector = Detector.of(checkpoint)
         return policy
 
     @classmethod

@@ -15,9 +15,13 @@ from typing import Any, Protocol
 
 from gymnasium.vector import VectorEnv
 
-from bam_envs.core.errors import RobotFault
-from bam_train.errors import EnvironmentFailed, OutputError, ProcessesLost, TrainingFailed
+from bam_envs.core.errors import BamEnvsError, RobotFault
+from bam_train.checkpoint import Checkpoint
+from bam_train.detection import WANTED, add_detector, add_own_detector
+from bam_train.detector import DETECTOR, LEAST_TICKS
+from bam_train.errors import BamTrainError, EnvironmentFailed, NoDetector, OutputError, ProcessesLost, TrainingFailed
 from bam_train.evaluation import BatchPolicy, EvaluationReport, evaluate
+from bam_train.policy import FrozenPolicy
 from bam_train.settings import TrainSettings
 from bam_train.trainers.base import Progress, Statistics, Trainer
 from bam_train.trainers.run_folder import Copies, RunFolder, unwritable
@@ -140,6 +144,7 @@ class TrainingRun:
         if self._stop and self._kept is None and not self.out.exists():
             self._kept = self.out if self._write(self.out, None, "--out") else None  # none was evaluated
             self._copy()
+        self._detect()
         if "copy" in self._failures:
             self._copy()  # the cause of the failure may be gone
         self.done = True
@@ -152,6 +157,29 @@ class TrainingRun:
             last_steps=self._last_steps,
             failure=next(iter(self._failures.values()), None),
         )
+
+    def _detect(self) -> None:
+        """Add a detector to the best checkpoint; a run that was stopped, or is a short trial, gets none.
+
+        It is made of new episodes, or of the data set that the policy has learnt from.
+        """
+        settings, steps = self.settings, min(WANTED, self.trainer.steps // 10)
+        if self._stop or self._kept is None or steps < 2 * LEAST_TICKS or Checkpoint.open(self._kept).has(DETECTOR):
+            return
+        rollouts: Any = getattr(self.trainer, "rollouts", None)
+        try:
+            if rollouts is not None:
+                add_detector(self._kept, rollouts())
+            else:
+                policy = FrozenPolicy.load(self._kept)
+                with self.trainer.undisturbed(), self.trainer.evaluation_envs() as envs:
+                    add_own_detector(self._kept, policy, settings.env, settings.env_kwargs, steps=steps, envs=envs)
+        except NoDetector:
+            return
+        except (BamTrainError, BamEnvsError) as error:
+            self.watcher.note(f"{self._kept} gets no detector of unusual observations: {error}")
+            return
+        self._copy()
 
     def _between(self, progress: Progress) -> bool:
         """Record, evaluate and save between two updates; False ends training."""

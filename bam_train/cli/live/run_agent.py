@@ -144,6 +144,7 @@ def _options(config: AgentConfig) -> AgentOptions:
         seed=config.seed,
         resume=config.resume,
         lease=config.lease,
+        unusual=config.unusual or "warn",
         guard_stops=config.guard_stops,
         record=not config.no_record,
         data=config.record,

@@ -10,11 +10,13 @@ import contextlib
 import dataclasses
 import functools
 import json
+import random
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 import torch
+from gymnasium import spaces
 from gymnasium.vector import VectorEnv
 
 from bam_envs.core.errors import BamEnvsError
@@ -24,6 +26,8 @@ from bam_envs.core.validation import read_table
 from bam_train.checkpoint import GOLDEN, POLICY, Checkpoint, write_checkpoint
 from bam_train.checkpoint.safetensors_file import pack
 from bam_train.data import DataSet
+from bam_train.detection import WANTED
+from bam_train.detector import Rollout
 from bam_train.environments import control_period, make_env, require_fit
 from bam_train.errors import CheckpointMismatch, SettingsError
 from bam_train.policy import FrozenPolicy
@@ -189,6 +193,19 @@ class OfflineTrainer:
         known = {"signals": signals, "period": period, "steps": self.steps, "scores": scores}
         fields = {**manifest(self.settings, self._spaces, known), "data": self._manifest_data}
         return write_checkpoint(path, fields, members)
+
+    def rollouts(self) -> Iterator[Rollout]:
+        """Some of the training episodes in random order, for the detector of unusual observations."""
+        if not isinstance(self._spaces[0], spaces.Box) or self._spaces[0].dtype == "uint8":
+            return
+        ticks, order = 0, list(self._indices)
+        random.Random(self.settings.seed).shuffle(order)
+        for index in order:
+            episode = self._data[index]
+            yield Rollout(episode.observations, episode.actions, episode.success)
+            ticks += len(episode)
+            if ticks >= WANTED:
+                return
 
     def freeze(self) -> FrozenPolicy:
         """Freeze the current policy."""

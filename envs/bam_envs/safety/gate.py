@@ -35,6 +35,7 @@ from bam_envs.safety.guard import (
 )
 from bam_envs.safety.guards import LATE, Freshness, MeasuredLimits, Shape, default_guards
 from bam_envs.safety.link_guards import Share, Watchdog
+from bam_envs.safety.unusual import UnusualObservations
 
 __all__ = ["ClearedCommand", "Limits", "SafeRobot"]
 
@@ -296,6 +297,18 @@ class SafeRobot(metaclass=Sealed):
         It is called between two commands, so it must be fast, and it must change neither argument.
         """
         self._observer = observer
+
+    def react(self, reaction: str) -> None:
+        """Set what unusual observations lead to: ``"warn"``, ``"hold"`` or ``"stop"``."""
+        for guard in self._guards:
+            if isinstance(guard, UnusualObservations):
+                guard.react(reaction)
+
+    def tell_unusual(self, reason: str) -> None:
+        """Take the reason why the observations of this episode are unusual for the policy; see `react`."""
+        for guard in self._guards:
+            if isinstance(guard, UnusualObservations):
+                guard.told(reason)
 
     def tell_step(self, *step: Any, **ends: Any) -> None:
         """Pass on the numbers of a step of the environment, for a learner at the robot's side; see `TakeOver`."""

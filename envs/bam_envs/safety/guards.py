@@ -45,6 +45,7 @@ from bam_envs.safety.link_guards import (
 from bam_envs.safety.region_guards import Collision, WorkspaceBox
 from bam_envs.safety.singularity import Singularity
 from bam_envs.safety.trial_box import TrialBox
+from bam_envs.safety.unusual import UnusualObservations
 
 Array = NDArray[np.float64]
 LATE = 2.0
@@ -277,7 +278,7 @@ def default_guards(
     counting = [LateTicks(spec, limits), LinkQuality(spec, limits), ChangedCommands(limits)]
     first = [Finite(spec, limits), Freshness(spec, limits), Pace(spec, limits), ActionAge(limits)]
     watched = [Answers(spec, limits), Watchdog(spec, limits)]
-    return [Shape(spec), *counting, *first, *watched, *moving, MeasuredLimits(spec)]
+    return [Shape(spec), *counting, *first, *watched, *moving, UnusualObservations(), MeasuredLimits(spec)]
 
 
 def _arm_guards(spec: RobotSpec, limits: Limits, tool_position: ToolPosition | None, straight: bool) -> list[Guard]:

@@ -92,6 +92,7 @@ def test_the_list_of_an_arm():
         ("G23", "following", 0.05, "rad"),
         ("G10", "workspace box", 4.0, "m"),
         ("G24", "collision", 0.005, "m"),
+        ("G19", "unusual observations", 1.0, "of the bound"),
         ("G7", "measured limits", 0.0, "beyond the data sheet"),
     ]
 
@@ -119,6 +120,7 @@ def test_the_list_of_a_base():
         ("G23", "base following", 0.2, "m/s"),
         ("G23", "turn following", 0.25, "rad/s"),
         ("G12", "laser zones", math.inf, "m"),  # no scans are measured
+        ("G19", "unusual observations", 1.0, "of the bound"),
         ("G7", "measured limits", 0.0, "beyond the data sheet"),
     ]
 

@@ -1,0 +1,94 @@
+"""Make the detector of a checkpoint: of fresh episodes of its frozen policy, or of a data set."""
+
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from gymnasium.vector import VectorEnv
+
+from bam_train.checkpoint import Checkpoint
+from bam_train.checkpoint.added_members import add_members
+from bam_train.detector import DETECTOR, LEAST_TICKS, MOST_NUMBERS, Detector, Rollout, make_detector
+from bam_train.environments import make_vector_env
+from bam_train.errors import NoDetector
+from bam_train.evaluation import BatchPolicy
+from bam_train.finite_envs import FiniteVectorEnv
+
+SEED = 4_000_000
+"""First seed of the episodes, far from those of training and evaluations."""
+WANTED = 24_000
+"""Steps that a detector is made of: 600 episodes of bam/pick, half a minute of CPU time."""
+SIDE_BY_SIDE = 64
+
+
+def add_detector(path: str | Path, rollouts: Iterable[Rollout]) -> Detector:
+    """Make a detector of episodes, and add it to the checkpoint at `path`, whose digest changes.
+
+    Raises:
+        NoDetector: None can be made of these episodes; the checkpoint is unchanged.
+        CheckpointError: It cannot be read or written.
+    """
+    detector = make_detector(rollouts)
+    add_members(path, {DETECTOR: detector.to_bytes()})
+    return detector
+
+
+def add_own_detector(
+    path: str | Path,
+    policy: BatchPolicy,
+    env: str,
+    env_kwargs: dict[str, Any],
+    *,
+    steps: int = WANTED,
+    envs: VectorEnv[Any, Any, Any] | None = None,
+) -> Detector:
+    """As `add_detector`, of about `steps` steps of the checkpoint's own policy in new episodes of its environment.
+
+    Raises:
+        NoDetector: Too few steps, or the observations are not up to `MOST_NUMBERS` numbers.
+    """
+    box = Checkpoint.open(path, members=False).manifest.observation_space
+    if box.get("type") != "Box" or box["dtype"] == "uint8" or np.prod(box["shape"]) > MOST_NUMBERS:
+        raise NoDetector(f"a detector needs observations of at most {MOST_NUMBERS} numbers, not pictures or mappings")
+    if steps < LEAST_TICKS:
+        raise NoDetector(f"a detector needs at least {LEAST_TICKS} steps, found {steps}")
+    if envs is not None:
+        return add_detector(path, fresh_episodes(envs, env, policy, steps))
+    with_own = make_vector_env(env, env_kwargs, SIDE_BY_SIDE)
+    try:
+        return add_detector(path, fresh_episodes(with_own, env, policy, steps))
+    finally:
+        with_own.close()
+
+
+def fresh_episodes(
+    envs: VectorEnv[Any, Any, Any], env: str, policy: BatchPolicy, steps: int, seed: int = SEED
+) -> list[Rollout]:
+    """Whole episodes of `policy` of about `steps` steps in all: every one that begins before as many are done."""
+    finite, n = FiniteVectorEnv(envs, env), envs.num_envs
+    observation, _ = finite.reset(seed=[seed + i for i in range(n)])
+    policy.reset()
+    running: list[list[tuple[Any, Any]] | None] = [[] for _ in range(n)]  # None: what runs there is not counted
+    done, count = list[Rollout](), 0
+    for _ in range(steps):  # an episode of that many steps has no end
+        action = np.asarray(policy.act_batch(observation))
+        after, _, terminated, truncated, info = finite.step(action)
+        for i, pairs in enumerate(running):
+            if pairs is not None:
+                pairs.append((observation[i], action[i]))
+        ended = np.flatnonzero(terminated | truncated)
+        for i in ended.tolist():
+            pairs = running[i]
+            if pairs is None:
+                continue
+            count += len(pairs)
+            success = info.get("final_info", {}).get("is_success")
+            seen, acted = (np.array(part) for part in zip(*pairs, strict=True))
+            done.append(Rollout(seen, acted, None if success is None else bool(success[i])))
+            running[i] = [] if count < steps else None
+        if not any(pairs is not None for pairs in running):
+            break
+        policy.reset(ended)
+        observation = after
+    return done
