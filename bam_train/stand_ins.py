@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 if TYPE_CHECKING:
+    from bam_train.errors import PlaceError
     from bam_train.place import Place
 
 Config = TypeVar("Config")
@@ -57,7 +58,7 @@ def standing_in(config: Config) -> Iterator[Config]:
         if place.local is None and name in HERE:
             raise PlaceError(place, f"--{name} takes a path on this computer: {HERE[name]}")
     root = Path(tempfile.mkdtemp(prefix="bam-")).resolve()
-    stand_ins = [_StandIn(name, place, root / name) for name, place in places.items() if place.local is None]
+    stand_ins: list[_StandIn] = []  # whole ones: what was fetched in part must never be put
 
     def put(path: Path) -> None:
         for one in stand_ins:
@@ -65,16 +66,20 @@ def standing_in(config: Config) -> Iterator[Config]:
                 one.put()
 
     try:
-        for one in stand_ins:
-            one.fetch()
+        for name, place in places.items():
+            if place.local is None:
+                one = _StandIn(name, place, root / name)
+                one.fetch()
+                stand_ins.append(one)
         REPLACED.append(put)
         paths = {name: place.local for name, place in places.items()} | {one.flag: one.path for one in stand_ins}
         changed = {name: str(path) if isinstance(given[name], str) else path for name, path in paths.items()}
         yield dataclasses.replace(config, **changed)  # type: ignore[type-var]
     finally:
         REPLACED.clear()
-        for one in stand_ins:
-            one.put(last=True)
+        failures = [error for one in stand_ins if (error := one.put_last()) is not None]
+        if failures:
+            raise failures[0]
         shutil.rmtree(root)
 
 
@@ -91,14 +96,15 @@ def _is_data(name: str, value: object) -> bool:
 
 
 class _StandIn:
-    """A folder here, `folder`, for the one in a bucket that holds the place of a flag."""
+    """A folder here, `folder`, for the one in a bucket that holds the place of a flag, or is it (``--runs``)."""
 
     def __init__(self, flag: str, place: Place, folder: Path) -> None:
-        self.flag, self.place, self.folder, self.path = flag, place, folder, folder / place.name
+        self.flag, self.place, self.folder = flag, place, folder
+        self.above, self.path = (place, folder) if flag == "runs" else (place.parent, folder / place.name)
         self._known: dict[Path, Any] = {}
         folder.mkdir()
         self._shown = f"{folder.parent.name}/{folder.name}/"
-        ADDRESSES[self._shown] = f"{str(place.parent).partition('?')[0].rstrip('/')}/"
+        ADDRESSES[self._shown] = f"{str(self.above).partition('?')[0].rstrip('/')}/"
 
     def fetch(self) -> None:
         """Copy what is read; of what is written, make a file or folder for each name that is taken."""
@@ -107,34 +113,38 @@ class _StandIn:
         if self.flag not in WRITTEN:
             self.place.copy_to(self.path)
         else:
-            above, here = (self.place, self.path) if self.flag == "runs" else (self.place.parent, self.folder)
-            here.mkdir(exist_ok=True)
             with contextlib.suppress(NoSuchPlace):  # as yet
-                for one in above.list():
-                    (here / one.name).mkdir() if self.flag == "runs" else (here / one.name).touch()
-            probe = above / ".bam-train"  # whether it may be written is known before any work is done
+                for one in self.above.list():
+                    taken = self.folder / one.name
+                    taken.mkdir() if self.flag == "runs" else taken.touch()
+            probe = self.above / ".bam-train"  # whether it may be written is known before any work is done
             probe.write_bytes(b"")
             probe.delete()
         self._known = {path: _state(path) for path in self._files()}
 
-    def put(self, *, last: bool = False) -> None:
-        """Put what has changed since; on an error at the end, all is kept on this computer."""
-        from bam_train.errors import PlaceError
-
+    def put(self) -> None:
+        """Put what has changed since."""
         for path in self._files():
             if self._known.get(path) == (state := _state(path)):
                 continue
-            target = self.place.parent
+            target = self.above
             for part in path.relative_to(self.folder).parts:
                 target /= part
-            try:
-                target.put(path)
-            except PlaceError as error:
-                if not last:
-                    raise
-                ADDRESSES.pop(self._shown)
-                raise PlaceError(target, f"{error.why.rstrip('.')}. What belongs there is kept in {path}") from error
+            target.put(path)
             self._known[path] = state
+
+    def put_last(self) -> PlaceError | None:
+        """Put what is left; returns an error that says where on this computer it is kept."""
+        from bam_train.errors import PlaceError
+
+        try:
+            self.put()
+        except PlaceError as error:
+            ADDRESSES.pop(self._shown)
+            kept = PlaceError(self.above, f"{error.why.rstrip('.')}. What belongs there is kept in {self.folder}")
+            kept.__cause__ = error
+            return kept
+        return None
 
     def _files(self) -> list[Path]:
         return [path for path in sorted(self.folder.rglob("*")) if path.is_file() and not path.name.startswith(".")]

@@ -6,6 +6,7 @@ import shutil
 import sys
 import tempfile
 from pathlib import Path
+from urllib.parse import urlsplit
 
 import pytest
 
@@ -15,7 +16,7 @@ from bam_train.cli import eval, sign, train
 from bam_train.cli.live import replay
 from bam_train.errors import PlaceError
 from bam_train.place import Place
-from tests.object_store import answering, bucket_fixture, environment  # noqa: F401
+from tests.object_store import Proxy, answering, bucket_fixture, environment  # noqa: F401
 
 SHIPPED = Path(__file__).parents[2] / "checkpoints" / "reach-ppo.zip"
 
@@ -121,12 +122,21 @@ def test_what_cannot_be_put_at_the_end_is_kept(bucket, clean, monkeypatch):
             config.plot.write_bytes(b"picture")
             monkeypatch.setenv("AWS_ENDPOINT_URL", endpoint)
 
-    kept = r"plot\.png: cannot be written: .*\. What belongs there is kept in /\S+$"
+    kept = r"^s3://bam-lab: cannot be written: .*\. What belongs there is kept in /\S+$"
     with answering(403, "AccessDenied") as endpoint, pytest.raises(PlaceError, match=kept) as caught:
         write(f"{bucket}/plot.png", endpoint)
     kept = Path(str(caught.value).rpartition(" ")[2])
-    assert kept.read_bytes() == b"picture"
-    shutil.rmtree(kept.parents[1])
+    assert (kept / "plot.png").read_bytes() == b"picture"
+    shutil.rmtree(kept.parent)
+
+
+def test_what_was_fetched_in_part_is_never_put(bucket, run):
+    Place(f"{bucket}/whole.zip").put(SHIPPED)
+    service = urlsplit(os.environ["AWS_ENDPOINT_URL"])
+    with Proxy((service.hostname, service.port), after=20_000, cuts=10**6) as proxy:
+        status, _, err = run(eval.main, f"{bucket}/whole.zip?endpoint_override={proxy.endpoint}")
+    assert (status, err.count("\n"), "cannot be read: no connection" in err) == (1, 1, True)
+    assert Place(f"{bucket}/whole.zip").read_bytes() == SHIPPED.read_bytes()
 
 
 def test_file_addresses_are_paths(run):
