@@ -88,6 +88,8 @@ class TrainConfig(SettingsFlags):  # type: ignore[misc]
     """Overwrite the checkpoint at --out instead of adding a number to its name."""
     runs: Path = Path("runs")
     """Folder in which the run's own folder is made; it may be s3://bucket/runs."""
+    record: Annotated[str | None, _unset("PLACE")] = None
+    """Add the episodes of training to this data set; of --trainer sb3 with an environment of bam_envs."""
     learner: Annotated[str | None, _unset("URL")] = None
     """Learn from the robot of the live agent at this address, such as ws://robot:9095, while it runs (algorithm rlpd);
     candidates are pushed to it. --token-file and --ca-file are those of the agent."""

@@ -51,6 +51,7 @@ def train(config: TrainConfig) -> int:
 def _train(config: TrainConfig, settings: TrainSettings, checkpoint: Checkpoint | None) -> int:
     """Train with complete settings, and print the outcome; returns the exit status."""
     from bam_train.cli.train_display import LiveDisplay, MayClose, PlainDisplay, summarise
+    from bam_train.errors import SettingsError
     from bam_train.settings import file_stem
     from bam_train.trainers import load_trainer
     from bam_train.trainers.best_checkpoint import choose_output
@@ -69,6 +70,12 @@ def _train(config: TrainConfig, settings: TrainSettings, checkpoint: Checkpoint 
     with contextlib.redirect_stderr(MayClose(sys.stderr)), contextlib.ExitStack() as handlers:
         try:
             settings = trainer.settings  # as the trainer completed them
+            if config.record is not None:
+                if not hasattr(trainer, "record"):
+                    raise SettingsError(
+                        f"--record is for --trainer sb3, found {settings.trainer}; use bam-data collect"
+                    )
+                trainer.record(config.record)
             folder = RunFolder(runs, file_stem(settings.env, settings.algo, settings.trainer))
             folder.write_config(settings.to_mapping())
             trainer.log_to(folder.tensorboard)

@@ -108,6 +108,8 @@ class Tracks:
         self._count = self._first = 0
         self._steps: list[dict[str, Array]] = []
         """Columns of the steps from number `_first` on, (n, ...) each."""
+        self._seen: dict[str, Array] = {}
+        self._time = 0.0
         self._shapes: dict[str, tuple[int, ...] | None] = {}
         inner: Any = env.unwrapped
         self._tap = Tap(inner.robot) if isinstance(inner, (RobotEnv, RobotVectorEnv)) else None
@@ -141,6 +143,9 @@ class Tracks:
             truncated: Shape (n,).
             infos: Further columns, of `info_columns` and others.
         """
+        if not self._seen:  # the episodes were restored, and their beginnings are unknown
+            self._observe(final)
+            return []
         columns = self._seen | _copied(self._action, actions) | {"reward": np.array(rewards, np.float64)}
         columns |= {"time": np.full(self._n, self._time), **({} if self._tap is None else self._tap.commands)}
         columns |= {name: values for name, values in infos.items() if self._fits(name, values)}
@@ -325,6 +330,12 @@ class RecordVectorDataset(VectorWrapper):
         self._tracks = Tracks(env, info, env.num_envs, facts or {}, keep)
         self.extra: dict[str, Array] = {}
         """Further columns (n, ...) of the next step, such as ``raw_action``."""
+
+    def __getattr__(self, name: str) -> Any:
+        """Any other attribute is the environments'."""
+        if name == "env":  # it is being copied or unpickled
+            raise AttributeError(name)
+        return getattr(self.env, name)
 
     def __del__(self) -> None:
         """Nothing: the environments, which others may use too, close themselves."""

@@ -23,8 +23,9 @@ from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
 from bam_envs.core.spaces import space_to_json
 from bam_train.checkpoint import Checkpoint, write_checkpoint
+from bam_train.data.record_dataset import RecordVectorDataset, info_of
 from bam_train.environments import control_period, make_env, make_vector_env, require_fit
-from bam_train.errors import CheckpointMismatch, TrainingFailed
+from bam_train.errors import CheckpointMismatch, SettingsError, TrainingFailed
 from bam_train.policy import FrozenPolicy
 from bam_train.settings import TrainSettings
 from bam_train.trainers.algorithms import SB3_ALGORITHMS
@@ -125,6 +126,16 @@ class SB3Trainer:
                 f"{before} and are {settings.steps}: the result differs from an unbroken run's"
             )
         return trainer
+
+    def record(self, place: str) -> None:
+        """Add the episodes of training to the data set at `place` from now on."""
+        if not isinstance(self.venv, BatchVecEnv):
+            raise SettingsError(
+                f"--record: {self.settings.env} is not of bam_envs; use bam-data collect, or RecordDataset"
+            )
+        batch, facts = self.venv.batch, {"policy": f"{self.settings.algo} in training", "run": self.settings.seed}
+        info = info_of(batch.env, self.settings.env, self.settings.env_kwargs)
+        batch.env = RecordVectorDataset(batch.env, place, info, facts)
 
     def log_to(self, folder: Path) -> None:
         """Write TensorBoard files into a folder from now on."""

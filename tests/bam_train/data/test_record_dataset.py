@@ -133,3 +133,21 @@ def test_collect(tmp_path):
 def test_collecting_what_does_not_fit(tmp_path, arguments, text):
     with pytest.raises(SettingsError, match=text):
         collect(tmp_path / "d", episodes=1, **arguments)
+
+
+def test_training_is_recorded(tmp_path):
+    """Every step of training, through the environments of stable-baselines3."""
+    pytest.importorskip("mujoco")
+    pytest.importorskip("stable_baselines3")
+    from bam_train.trainers.resolve_settings import resolve
+    from bam_train.trainers.sb3.sb3_trainer import SB3Trainer
+
+    small = {"num_envs": 2, "hyperparameters": {"n_steps": 64, "batch_size": 64, "n_epochs": 1}}
+    trainer = SB3Trainer.create(resolve({"env": "bam/reach", "algo": "ppo", "steps": 128, **small}))
+    trainer.record(str(tmp_path / "d"))
+    trainer.train(128, lambda progress: True)
+    trainer.close()
+    data = DataSet.open(tmp_path / "d")
+    assert data.total_frames == 128
+    assert [data.facts(k).get("end") for k in range(len(data))][-2:] == ["cut off", "cut off"]
+    assert data.facts(0)["policy"] == "ppo in training"
