@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from bam_train.data import DataSet
 from bam_train.data.record_dataset import RecordVectorDataset
 from bam_train.environments import make_vector_env
+from bam_train.estimation.data_evaluation import within_bounds
 from bam_train.estimation.fitted_q import fit_q
 from bam_train.estimation.steps import read_steps
 from bam_train.evaluation import evaluate
@@ -111,7 +112,8 @@ def main() -> int:
             print(f"data set {seed}: {len(data)} episodes, {own:.1%} succeeded", flush=True)
             values = []
             for number, policy in enumerate(policies):
-                found = fit_q(read_steps(data, policy, range(len(data)), by_success=True)).estimate()
+                fitted = fit_q(read_steps(data, policy, range(len(data)), by_success=True))
+                found = within_bounds(fitted.estimate(), by_success=True)
                 low, high = found.interval
                 covered.append(low <= truth[number] <= high)
                 values.append(found.value)

@@ -118,6 +118,7 @@ def evaluate_on_data(
     divisions = _divisions(data, facts, by)
     by_success = all(one["success"] is not None for one in facts)
     steps = read_steps(data, FrozenPolicy.from_checkpoint(checkpoint), indices, by_success)
+    require_contrast(data, steps)
     fitted = fit_q(steps, seed=seed, on_progress=on_progress)
     ratios = action_ratios(steps, data.info.action_space, seed)
     agrees, difference = _agreement(steps, data.info.action_space)
@@ -176,6 +177,13 @@ def require_enough(data: DataSet, episodes: int) -> None:
         raise BadDataSet(f"{data.place}: has {text}. Record more: bam-data collect")
 
 
+def require_contrast(data: DataSet, steps: Steps) -> None:
+    """Refuse episodes that all ended alike: nothing in them tells how a policy would do worse, or better."""
+    if np.ptp(steps.returns) == 0:
+        text = "every episode has the same success or return, so nothing tells a good policy from a bad one"
+        raise BadDataSet(f"{data.place}: {text}. Add others, such as bam-data collect --random 0.6")
+
+
 def _divisions(data: DataSet, facts: list[dict[str, Any]], by: Sequence[str]) -> dict[str, list[str]]:
     """The value of each fact that divides the episodes, by its name."""
     measured = {"length", "return", "success", "terminated", "truncated", "seed", "end"}
@@ -228,8 +236,10 @@ def _groups(
 
 
 def within_bounds(estimate: Estimate, by_success: bool) -> Estimate:
-    """A success rate is between 0 and 1."""
+    """A success rate is between 0 and 1, and no surer than that of as many episodes of the policy itself (Wilson)."""
     if not by_success:
         return estimate
-    low, high = (min(1.0, max(0.0, bound)) for bound in estimate.interval)
+    episodes = round(estimate.effective)
+    least, most = wilson_interval(round(estimate.value * episodes), episodes)
+    low, high = min(least, max(0.0, estimate.interval[0])), max(most, min(1.0, estimate.interval[1]))
     return Estimate(estimate.value, (low, high), estimate.effective)

@@ -16,6 +16,7 @@ from bam_train.environments import environment_of, make_vector_env, require_env_
 from bam_train.errors import SettingsError
 from bam_train.estimation.data_evaluation import (
     Seen,
+    require_contrast,
     require_enough,
     require_same_interface,
     unseen_indices,
@@ -25,7 +26,7 @@ from bam_train.estimation.estimates import Estimate
 from bam_train.estimation.fitted_q import fit_q
 from bam_train.estimation.paired_test import Pairs, Verdict, verdict_of
 from bam_train.estimation.steps import read_steps
-from bam_train.evaluation import Episode, default_num_envs, play_wave
+from bam_train.evaluation import Episode, default_num_envs, play_wave, wilson_interval
 from bam_train.finite_envs import FiniteVectorEnv
 from bam_train.policy import FrozenPolicy
 
@@ -180,8 +181,13 @@ def compare_on_data(
     require_enough(data, len(indices))
     by_success = all(data.facts(index)["success"] is not None for index in indices)
     steps = [read_steps(data, FrozenPolicy.from_checkpoint(one), indices, by_success) for one in both]
+    require_contrast(data, steps[0])
     fitted = [fit_q(one) for one in steps]
     difference = fitted[0].estimate(other=fitted[1])
+    if by_success:  # no surer than as many pairs without a difference
+        half, value = wilson_interval(0, len(indices))[1], difference.value
+        low, high = difference.interval
+        difference = Estimate(value, (min(low, value - half), max(high, value + half)), difference.effective)
     unit = 1.0 if by_success else max(1e-9, float(steps[0].returns.std()))
     return DataComparison(
         place=data.place,

@@ -44,12 +44,12 @@ def episode(rng, right):
 def make_data(tmp_path, corridor):
     """Writes a data set: ``make_data(name, episodes, propensity=True)``; half of it at the site a, half at b."""
 
-    def make(name="data", episodes=120, *, propensity=True, env=corridor, seed=0, cells=4.0):
+    def make(name="data", episodes=120, *, propensity=True, env=corridor, seed=0, cells=4.0, right=0.7):
         rng, place = np.random.default_rng(seed), tmp_path / name
         space = type(Corridor.observation_space)(0.0, cells, (1,), np.float32)
         with DataSetWriter(place, DataSetInfo(env, {}, space, Corridor.action_space, 0.05)) as writer:
             for number in range(episodes):
-                *parts, chances = episode(rng, 0.7)
+                *parts, chances = episode(rng, right)
                 columns = {"propensity": chances} if propensity else {}
                 writer.add(Episode(*parts, columns=columns, facts={"site": "ab"[number % 2], "seed": number}))
         return place

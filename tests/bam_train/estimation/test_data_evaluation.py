@@ -7,6 +7,7 @@ import pytest
 from bam_train.cli.data import run_gate as gate
 from bam_train.cli.eval import main
 from bam_train.data import DataSet
+from bam_train.evaluation import wilson_interval
 
 pytest.importorskip("pyarrow")
 
@@ -93,7 +94,16 @@ def test_data_of_another_environment(corridor_checkpoint, make_data, run):
 
 def test_a_policy_is_not_worse_than_itself_on_data(corridor_checkpoint, make_data, run):
     path, place = corridor_checkpoint(), make_data()
-    status, out, _ = run(gate.main, path, path, "--data", place, "--no-simulation", "--json")
+    status, out, _ = run(gate.main, path, path, "--data", place, "--no-simulation", "--json", "--margin", 0.05)
     report = json.loads(out)
     assert (status, report["verdict"], report["simulation"]) == (1, "not worse", None)
-    assert report["data"]["difference"]["interval"] == [0.0, 0.0]
+    half = wilson_interval(0, 120)[1]
+    assert report["data"]["difference"]["interval"] == [-half, half]
+
+
+def test_data_without_failures_tells_nothing(corridor_checkpoint, make_data, run):
+    path, place = corridor_checkpoint(), make_data(episodes=20, right=1.0)
+    text = "every episode has the same success or return, so nothing tells a good policy from a bad one"
+    for main_, arguments in ((main, [path]), (gate.main, [path, path, "--no-simulation"])):
+        error = run(main_, *arguments, "--data", place)[2]
+        assert error.endswith(f": {place}: {text}. Add others, such as bam-data collect --random 0.6\n")
