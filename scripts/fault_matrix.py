@@ -299,7 +299,7 @@ def await_policy(scene: Scene, fault: Fault) -> float:
         if time.monotonic() > deadline or scene.deployment.process.poll() is not None:
             scene.deployment.process.kill()
             raise RuntimeError(f"status {scene.deployment.finish()}, {scene.deployment.messages()[-1:]}")
-        time.sleep(0.01)
+        time.sleep(0.03)
     return time.monotonic()
 
 

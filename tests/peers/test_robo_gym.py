@@ -46,7 +46,8 @@ def test_a_policy_of_ours_in_robo_gym(env_id, request, tmp_path):
     """A checkpoint that was trained with parity=True does there what it does here."""
     pytest.importorskip("stable_baselines3")
     root, path = request.config.rootpath, tmp_path / "policy.zip"
-    settings = {"env": env_id, "algo": "ppo", "steps": 8192, "eval_episodes": 1, "set": ("env_kwargs.parity=true",)}
+    small = ("n_steps=64", "batch_size=64", "n_epochs=1", "num_envs=2", "env_kwargs.parity=true")
+    settings = {"env": env_id, "algo": "ppo", "steps": 256, "eval_episodes": 1, "set": small}
     train(TrainConfig(**settings, out=path, runs=tmp_path / "runs"))
     program = ["-m", "tests.peers.robo_gym_policy", path, env_id, "2"]
     episodes = [json.loads(line) for line in run(PYTHON, *program, root=root).splitlines()]

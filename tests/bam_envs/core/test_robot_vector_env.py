@@ -52,7 +52,7 @@ KINDS = [one if one[0] in QUICK else pytest.param(*one, marks=pytest.mark.slow) 
 
 @pytest.mark.parametrize(("env_id", "options"), KINDS, ids=IDS)
 def test_a_row_is_a_single_environment_bit_for_bit(make, make_rows, actions_of, env_id, options):
-    rows, seed = 3, 40
+    rows, seed = 2, 40
     steps, limit = steps_of(env_id)
     envs = make_rows(env_id, rows, **options, **limit)
     first, _ = envs.reset(seed=seed)
@@ -262,7 +262,7 @@ def test_without_physics_too(actions_of):
 
 @pytest.mark.parametrize("env_id", EACH)
 def test_no_number_is_ever_nan(make_rows, env_id):
-    envs = make_rows(env_id, 64, randomize=True)
+    envs = make_rows(env_id, 24, randomize=True)
     envs.reset(seed=0)
     space, rng = envs.single_observation_space, np.random.default_rng(0)
     for step in range(210 if env_id == "bam/pick-v0" else 110):

@@ -154,7 +154,7 @@ CASES = {
 @pytest.mark.parametrize("case", CASES.values(), ids=CASES)
 def test_the_graph_acts_as_rllib(case):
     live = Live(**case)
-    observations = live.frozen().draw(60 if "conv_filters" in case else 200, np.random.default_rng(0))
+    observations = live.frozen().draw(20 if "conv_filters" in case else 60, np.random.default_rng(0))
     expected, found = live.actions(observations), live.policy().act_batch(observations.get("", observations))
     assert found.dtype == live.spaces[1].dtype
     assert len(np.unique(expected, axis=0)) > 1
