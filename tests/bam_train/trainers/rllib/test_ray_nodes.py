@@ -36,8 +36,9 @@ def nodes(no_ray, monkeypatch):
     for name in ("RAY_AUTH_MODE", "RAY_AUTH_TOKEN", "RAY_ADDRESS"):
         monkeypatch.delenv(name, raising=False)
     memory = {"num_cpus": 1, "object_store_memory": 100 * 2**20}
+    head = {**memory, "include_dashboard": False, "_system_config": {"health_check_period_ms": 500}}  # of dead nodes
     with loopback_only():
-        cluster = Cluster(initialize_head=True, head_node_args={**memory, "include_dashboard": False})
+        cluster = Cluster(initialize_head=True, head_node_args=head)
         try:
             yield cluster, cluster.add_node(**memory)
         finally:
@@ -90,6 +91,7 @@ class Plan:
         if self.stages[0]():
             self.stages.pop(0)
             self.since = time.monotonic()
+        time.sleep(0.1)  # in which others start and are missed
         return bool(self.stages)
 
 
