@@ -135,8 +135,8 @@ def always(*action):
 @pytest.mark.parametrize("stem", ["NoObstacleNavigationMir100", "ObstacleAvoidanceMir100"])
 def test_bases_with_random_actions(stem):
     both = Both(stem)
-    ends = [both.play(seed, randomly(seed, hold=1 + 9 * seed)) for seed in range(3)]
-    assert sum(steps for steps, _ in ends) > 300
+    ends = [both.play(seed, randomly(seed, hold=1 + 9 * seed), steps=150) for seed in range(3)]
+    assert sum(steps for steps, _ in ends) > 200
 
 
 @pytest.mark.parametrize(
@@ -170,8 +170,8 @@ def test_a_base_with_and_without_boxes():
 @pytest.mark.parametrize("stem", UR)
 def test_arms_with_random_actions(stem):
     both = Both(stem)
-    steps = sum(both.play(i, randomly(i, scale=(0.05, 0.3, 1.0)[i], hold=1 + 9 * i), steps=300)[0] for i in range(3))
-    assert steps > 200
+    steps = sum(both.play(i, randomly(i, scale=(0.05, 0.3, 1.0)[i], hold=1 + 9 * i), steps=120)[0] for i in range(3))
+    assert steps > 100
 
 
 @pytest.mark.parametrize("stem", UR)
@@ -205,8 +205,8 @@ JOINTS = ["base", "shoulder", "elbow", "wrist_1", "wrist_2", "wrist_3"]
 FIXED = [{"fix_base": True}, {"fix_wrist_3": False}, {"fix_shoulder": True, "fix_elbow": True}, {"fix_wrist_1": True}]
 MODELS = ("ur3", "ur3e", "ur5e", "ur10", "ur10e", "ur16e")
 OPTIONS = [
-    *((stem, fixed, 0.3, 1, 50) for stem in UR for fixed in FIXED),
-    *((stem, {"ur_model": model}, 0.3, 5, 50) for stem in UR[:3] for model in MODELS),
+    *((stem, fixed, 0.3, 1, 20) for stem in UR for fixed in FIXED),
+    *((stem, {"ur_model": model}, 0.3, 5, 20) for stem in UR[:3] for model in MODELS),
     *(("EndEffectorPositioningUR", {"restrict_wrist_1": one}, 1.0, 10, 150) for one in (True, False)),
     *((stem, {"include_polar_to_elbow": one}, 0.1, 1, 100) for stem in UR[2:] for one in (True, False)),
     ("AvoidanceRaad2022TestUR", {}, 0.1, 1, 100),
