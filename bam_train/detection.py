@@ -62,6 +62,12 @@ def add_own_detector(
         with_own.close()
 
 
+def unusual_episodes(detector: Detector, rollouts: Iterable[Rollout]) -> dict[str, float]:
+    """Number of recorded `episodes`, of those with `alarms`, and the `highest` level; actions are the recorded ones."""
+    levels = [float(detector.levels(one).max()) for one in rollouts if len(one.actions)]
+    return {"episodes": len(levels), "alarms": sum(one > 1 for one in levels), "highest": max(levels, default=0.0)}
+
+
 def fresh_episodes(
     envs: VectorEnv[Any, Any, Any], env: str, policy: BatchPolicy, steps: int, seed: int = SEED
 ) -> list[Rollout]:

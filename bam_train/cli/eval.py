@@ -101,25 +101,35 @@ def _on_data(config: EvalConfig, place: str) -> None:
     from bam_train.checkpoint import Checkpoint
     from bam_train.cli.data.data_table import data_lines
     from bam_train.data import DataSet
+    from bam_train.detection import unusual_episodes
+    from bam_train.detector import Detector, Rollout
     from bam_train.estimation.data_evaluation import evaluate_on_data
 
     checkpoint = Checkpoint.open(config.checkpoint)
     if config.env is not None:
         checkpoint.requires_env(config.env)
+    data, detector = DataSet.open(place), Detector.of(checkpoint)
     report = evaluate_on_data(
         checkpoint,
-        DataSet.open(place),
+        data,
         seen=config.seen,
         by=config.by,
         seed=config.seed,
         on_progress=lambda done, updates: say(f"bam-eval: {done} of {updates} updates") if done % 1000 == 0 else None,
     )
     manifest, path = checkpoint.manifest, checkpoint.path
+    unusual: dict[str, Any] = {}
+    if detector is not None:
+        rollouts = (Rollout(one.observations, one.actions) for one in data.episodes())
+        unusual["unusual"] = found = unusual_episodes(detector, rollouts)
     if config.json:
-        facts = {"checkpoint": str(path), "algorithm": manifest.algorithm, "steps_trained": manifest.steps}
+        facts = {"checkpoint": str(path), "algorithm": manifest.algorithm, "steps_trained": manifest.steps, **unusual}
         tell(json_module.dumps({**report.to_json(), "data": place, **facts}, allow_nan=False))
-    else:
-        tell(*data_lines(report, f"{path} ({manifest.algorithm}, {manifest.steps:,} steps)", place))
+        return
+    tell(*data_lines(report, f"{path} ({manifest.algorithm}, {manifest.steps:,} steps)", place))
+    if unusual:
+        share = f"{found['alarms']} of {found['episodes']} episodes unlike its training"
+        tell(f"  unusual   {share}; highest level {found['highest']:.2f}, and above 1 is an alarm")
 
 
 def _add_detector(subject: _Subject, path: Path) -> None:
