@@ -28,6 +28,7 @@ from bam_train.environments import control_period
 from bam_train.loop import Agent
 from bam_train.loop.gym.gym_spaces import NAME
 from bam_train.recording.recorder import WARNING, Recorder
+from bam_train.stand_ins import with_addresses
 
 STAGES = ("step", "wait", "late", "policy", "age", "record")
 """Names of the latencies in /latency; see `RecorderAgent`."""
@@ -79,7 +80,7 @@ def deployment_facts(checkpoint: Checkpoint, env: gym.Env[Any, Any]) -> dict[str
     manifest, robot = checkpoint.manifest, cast("Any", getattr(env.unwrapped, "robot", None))
     info = getattr(robot, "info", None)
     return {
-        "checkpoint": str(checkpoint.path.resolve()),
+        "checkpoint": with_addresses(str(checkpoint.path.resolve())),
         "checkpoint_sha256": checkpoint.digest,
         "env": manifest.env,
         "env_kwargs": manifest.env_kwargs,
