@@ -45,7 +45,7 @@ class TrainSettings:
     algo: str
     """Algorithm: ppo, a2c, sac, td3, ddpg, dqn, tqc, trpo, qrdqn, crossq or recurrent-ppo.
     With --trainer rllib: ppo, appo, impala, sac, tqc, dqn, bc, marwil, cql or iql. With --data: bc, iql, cql, td3bc,
-    awac, bcq, bear, cal-ql, crr, plas or rebrac."""
+    awac, cal-ql, plas or rebrac."""
     steps: _Steps = 100_000
     """Environment steps of the whole run, also after --resume; with --data, updates."""
     seed: Annotated[int, Meta(ge=0, le=10**15)] = 0

@@ -21,8 +21,8 @@ from bam_train.trainers.library_arguments import fit, require_known
 from bam_train.trainers.offline.training_data import ActionCode, Batch
 
 
-def _config_class(algorithm: str, kind: str) -> Any:
-    """The configuration class of an algorithm for Box or Discrete actions; raises MissingExtra without d3rlpy."""
+def _config_class(algorithm: str) -> Any:
+    """The configuration class of an algorithm; raises MissingExtra without d3rlpy."""
     try:
         with without_notice():
             import d3rlpy.algos
@@ -32,7 +32,7 @@ def _config_class(algorithm: str, kind: str) -> Any:
 
     structlog.configure(logger_factory=structlog.ReturnLoggerFactory())  # it writes on standard output
     name = OFFLINE_ALGORITHMS[algorithm].reference.rpartition(":")[2]
-    return getattr(d3rlpy.algos, f"Discrete{name}" if kind == "Discrete" else name)
+    return getattr(d3rlpy.algos, name)
 
 
 def _defaults(kind: Any) -> dict[str, Any]:
@@ -44,9 +44,9 @@ def _defaults(kind: Any) -> dict[str, Any]:
     }
 
 
-def complete(algorithm: str, given: Mapping[str, Any], kind: str) -> dict[str, Any]:
+def complete(algorithm: str, given: Mapping[str, Any]) -> dict[str, Any]:
     """Check hyperparameters by name and type, and add d3rlpy's defaults."""
-    defaults = _defaults(_config_class(algorithm, kind))
+    defaults = _defaults(_config_class(algorithm))
     require_known(given, defaults, f"{algorithm} hyperparameter", {}, ())
     return {name: fit(name, given[name], type(one)) if name in given else one for name, one in defaults.items()}
 
@@ -59,8 +59,8 @@ class D3rlpyLearner:
     def __init__(
         self, algorithm: str, values: Mapping[str, Any], inputs: int, code: ActionCode, data: Batch, seed: int
     ) -> None:
-        self.data, self._code, self.iql = data, code, None
-        kind = _config_class(algorithm, "Discrete" if code.is_discrete else "Box")
+        self.data, self.iql = data, None
+        kind = _config_class(algorithm)
         import d3rlpy
 
         d3rlpy.seed(seed)
@@ -77,14 +77,13 @@ class D3rlpyLearner:
         from d3rlpy.torch_utility import TorchMiniBatch
 
         batch = self.data.rows(torch.randint(len(self.data), (self._size,)))
-        action = batch.action.argmax(1, keepdim=True) if self._code.is_discrete else batch.action
         reward, terminal = batch.reward[:, None], batch.terminal[:, None]
         made = TorchMiniBatch(
             observations=batch.seen,
-            actions=action,
+            actions=batch.action,
             rewards=reward,
             next_observations=batch.after,
-            next_actions=torch.zeros_like(action),
+            next_actions=torch.zeros_like(batch.action),
             returns_to_go=torch.zeros_like(reward),
             terminals=terminal,
             intervals=torch.ones_like(reward),
@@ -96,8 +95,8 @@ class D3rlpyLearner:
             raise TrainingFailed(f"{wrong[0]} is {self.metrics[wrong[0]]}: try a smaller learning rate")
 
     def network(self) -> nn.Module:
-        """From normalised observations to actions in [-1, 1], or scores of Discrete ones."""
-        return _Best(self._impl, self._code)
+        """From normalised observations to actions in [-1, 1]."""
+        return _Best(self._impl)
 
     def _parts(self) -> dict[str, Any]:
         return {name: one for name, one in vars(self._impl.modules).items() if hasattr(one, "load_state_dict")}
@@ -115,16 +114,15 @@ class D3rlpyLearner:
 class _Best(Layer):
     """The greedy action of d3rlpy, computed by its own code."""
 
-    def __init__(self, impl: Any, code: ActionCode) -> None:
+    def __init__(self, impl: Any) -> None:
         super().__init__()
-        self.impl, self.code = impl, code
+        self.impl = impl
 
     def __deepcopy__(self, memo: Any) -> _Best:
-        same = _Best(copy.deepcopy(self.impl, memo), self.code)
+        same = _Best(copy.deepcopy(self.impl, memo))
         for module in same.impl.modules.get_torch_modules().values():
             module.eval().requires_grad_(False)
         return same
 
     def forward(self, seen: torch.Tensor) -> torch.Tensor:
-        best = self.impl.inner_predict_best_action(seen)
-        return torch.nn.functional.one_hot(best, self.code.size).float() if self.code.is_discrete else best
+        return self.impl.inner_predict_best_action(seen)

@@ -100,7 +100,7 @@ class OfflineTrainer:
         else:
             from bam_train.trainers.offline.d3rlpy_learner import complete
 
-            values = complete(settings.algo, settings.hyperparameters, type(data.info.action_space).__name__)
+            values = complete(settings.algo, settings.hyperparameters)
         env_kwargs = settings.env_kwargs or data.info.env_kwargs
         begun = values.get("online_from")
         every = settings.eval_every or (settings.steps if begun is None else max(1000, (settings.steps - begun) // 20))

@@ -147,7 +147,7 @@ def test_offline_to_online(bam_train):
         ({"data": "nowhere"}, "nowhere: is no data set: it has no meta/info.json; give a folder that bam-data wrote"),
         ({"env": "bam/reach"}, "data: points is of elsewhere/Point-v0, not of bam/reach-v0; leave --env out"),
         ({"until_success": 0.9}, "until_success: nothing is chosen by simulation while learning from data"),
-        ({"algo": "ppo"}, "Unknown algorithm 'ppo'. It is one of rllib's; those of offline are: awac, bc, bcq"),
+        ({"algo": "ppo"}, "Unknown algorithm 'ppo'. It is one of rllib's; those of offline are: awac, bc, cal-ql"),
         ({"set": ("widht=3",)}, "hyperparameters: unknown key 'widht'"),
     ],
 )
