@@ -23,6 +23,7 @@ class Command:
 
 _RECORDED, _OPENED = "bam_train.cli.data.recorded", "bam_train.cli.data.opened"
 _FLAGS, _VIEW = "bam_train.cli.data.data_flags", "bam_train.cli.data.view_flags"
+_SEEN = "bam_train.cli.data.pictures"
 COMMANDS = {
     "collect": Command("run a policy in simulation and record it", f"{_FLAGS}:CollectConfig", f"{_RECORDED}:collect"),
     "import": Command("add the episodes of recordings (.mcap)", f"{_FLAGS}:ImportConfig", f"{_RECORDED}:import_"),
@@ -35,6 +36,8 @@ COMMANDS = {
     "merge": Command("add the episodes of several to one", f"{_VIEW}:MergeConfig", f"{_OPENED}:merge_data"),
     "split": Command("split it in two, for training and for testing", f"{_VIEW}:SplitConfig", f"{_OPENED}:split_data"),
     "filter": Command("copy the episodes for which something holds", f"{_VIEW}:FilterConfig", f"{_OPENED}:filter_data"),
+    "plot": Command("draw episodes, distributions, success and failures", f"{_VIEW}:PlotConfig", f"{_SEEN}:plot_data"),
+    "show": Command("play an episode as a film", f"{_VIEW}:ShowConfig", f"{_SEEN}:show_episode"),
 }
 
 

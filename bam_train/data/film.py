@@ -1,0 +1,69 @@
+"""The pictures of an episode: those that were recorded, or its actions once more in the environment."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from bam_envs.core.wording import did_you_mean
+from bam_train.data.data_set import DataSet
+from bam_train.data.episode import Episode, leaves_of
+from bam_train.environments import make_env, must_be_named
+from bam_train.errors import SettingsError
+from bam_train.video import Frame, picture
+
+_SAME = 1e-4
+"""Largest difference of an observation that is played again from the recorded one."""
+
+
+def frames(data: DataSet, index: int, camera: str | None = None) -> Iterator[Frame]:
+    """The pictures of an episode, RGB. Shape of each: (height, width, 3).
+
+    Raises:
+        SettingsError: There are no pictures, and the episode cannot be played again: its seed is not known, its
+            environment is not this one's, or it goes another way.
+    """
+    episode = data[index]
+    cameras = {leaf.column.removeprefix("observation.images."): leaf for leaf in _cameras(data)}
+    if camera is not None and camera not in cameras:
+        raise SettingsError(f"--camera: {data.place} has no {camera!r}. {did_you_mean(camera, cameras)}")
+    if cameras:
+        leaf = cameras[camera or next(iter(cameras))]
+        for pixels in leaf.of(episode.observations):
+            yield np.repeat(pixels, 3, axis=2) if pixels.shape[2] == 1 else pixels[:, :, :3]
+        return
+    yield from _played(data, index, episode)
+
+
+def _cameras(data: DataSet) -> list[object]:
+    return [leaf for leaf in leaves_of(data.info.observation_space, "observation") if leaf.is_image]
+
+
+def _played(data: DataSet, index: int, episode: Episode) -> Iterator[Frame]:
+    what = f"{data.place}: episode {index} has no pictures"
+    if "seed" not in episode.facts:
+        raise SettingsError(f"{what}, and its seed is not known; show one with a seed, or record pictures")
+    if must_be_named(data.info.env):
+        raise SettingsError(f"{what}, and {data.info.env} is in a module that is not installed as trusted")
+    env = make_env(data.info.env, data.info.env_kwargs, render_mode="rgb_array")
+    try:
+        observation, _ = env.reset(seed=int(episode.facts["seed"]))
+        for step in range(len(episode) + 1):
+            if not _is_same(observation, episode.observations, step):
+                raise SettingsError(
+                    f"{what}, and played again it differs from step {step} on; its environment was another one"
+                )
+            yield picture(env)
+            if step < len(episode):
+                observation, *_ = env.step(episode.actions[step])
+    finally:
+        env.close()
+
+
+def _is_same(found: object, recorded: object, step: int) -> bool:
+    if isinstance(recorded, dict) and isinstance(found, dict):
+        return all(_is_same(found[key], part, step) for key, part in recorded.items())
+    if isinstance(recorded, tuple) and isinstance(found, tuple):
+        return all(_is_same(one, part, step) for one, part in zip(found, recorded, strict=True))
+    return np.allclose(np.asarray(found), np.asarray(recorded)[step], rtol=_SAME, atol=_SAME, equal_nan=True)
