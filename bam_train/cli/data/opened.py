@@ -29,7 +29,7 @@ def export_data(config: flags.ExportDataConfig) -> None:
 def show_info(config: flags.InfoConfig) -> None:
     """Say what a data set is of."""
     from bam_train.data import DataSet
-    from bam_train.data.summary import groups
+    from bam_train.data.views.summary import groups
 
     data = DataSet.open(config.place)
     info, found = data.info, groups(data) if len(data) else []
@@ -93,7 +93,7 @@ def filter_data(config: flags.FilterConfig) -> None:
 def show_stats(config: flags.StatsConfig) -> None:
     """Print tables of groups and numbers."""
     from bam_train.cli.envs import aligned
-    from bam_train.data.summary import groups, numbers
+    from bam_train.data.views.summary import groups, numbers
 
     data = _open(config.place)
     by_group, each = groups(data, config.by), numbers(data)

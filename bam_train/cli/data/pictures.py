@@ -14,7 +14,7 @@ def plot_data(config: PlotConfig) -> None:
     """Draw a data set."""
     from bam_train.atomic_file import require_writable
     from bam_train.data import DataSet
-    from bam_train.data.figures import plot
+    from bam_train.data.views.figures import plot
 
     path = require_writable(config.out)
     against = None if config.against is None else DataSet.open(config.against)
@@ -25,7 +25,7 @@ def plot_data(config: PlotConfig) -> None:
 def show_episode(config: ShowConfig) -> None:
     """Make a film of an episode."""
     from bam_train.data import DataSet
-    from bam_train.data.film import frames
+    from bam_train.data.views.film import frames
     from bam_train.errors import SettingsError
     from bam_train.video import open_video, require_video_path
 

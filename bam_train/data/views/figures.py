@@ -89,7 +89,7 @@ _HEIGHTS = {
 
 
 def _spread(count: int) -> list[int]:
-    return np.unique(np.linspace(0, count - 1, min(count, MOST_SAMPLES)).astype(int)).tolist()
+    return [int(one) for one in np.unique(np.linspace(0, count - 1, min(count, MOST_SAMPLES)).astype(int))]
 
 
 def _some_of_each_end(data: DataSet) -> list[int]:
@@ -104,13 +104,13 @@ def _some_of_each_end(data: DataSet) -> list[int]:
 def _labels(data: DataSet, kind: str, size: int) -> list[str]:
     given = data.info.contract.get(kind) or []
     if len(given) == size:
-        return [f"{one.get('name')} [{one.get('unit')}]" if one.get("unit") else str(one.get("name")) for one in given]
+        return [str(one.get("name")) for one in given]
     return [f"{kind} {i}" for i in range(size)]
 
 
 def _named(data: DataSet, episodes: Sequence[Episode]) -> dict[str, Array]:
     """Each number of observations and actions that is no picture, by name. Shape: (steps,)."""
-    found = {}
+    found: dict[str, Array] = {}
     for kind, space in (("observation", data.info.observation_space), ("action", data.info.action_space)):
         leaves = [leaf for leaf in leaves_of(space, kind) if not leaf.is_image]
         parts = []

@@ -8,7 +8,7 @@ import numpy as np
 
 from bam_envs.core.wording import did_you_mean
 from bam_train.data.data_set import DataSet
-from bam_train.data.episode import Episode, leaves_of
+from bam_train.data.episode import Episode, Leaf, leaves_of
 from bam_train.environments import make_env, must_be_named
 from bam_train.errors import SettingsError
 from bam_train.video import Frame, picture
@@ -36,7 +36,7 @@ def frames(data: DataSet, index: int, camera: str | None = None) -> Iterator[Fra
     yield from _played(data, index, episode)
 
 
-def _cameras(data: DataSet) -> list[object]:
+def _cameras(data: DataSet) -> list[Leaf]:
     return [leaf for leaf in leaves_of(data.info.observation_space, "observation") if leaf.is_image]
 
 
@@ -58,7 +58,7 @@ def _played(data: DataSet, index: int, episode: Episode) -> Iterator[Frame]:
             if step < len(episode):
                 observation, *_ = env.step(episode.actions[step])
     finally:
-        env.close()
+        env.close()  # type: ignore[no-untyped-call]
 
 
 def _is_same(found: object, recorded: object, step: int) -> bool:

@@ -1,0 +1,88 @@
+"""Pictures of a data set: what is drawn, films of recorded pictures and of actions that are played again."""
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+from bam_train.cli.data.bam_data import main
+from bam_train.data import DataSet, RecordDataset
+from bam_train.data.views.film import frames
+from bam_train.errors import SettingsError
+from tests.bam_train.data.export.test_export import record
+
+
+def run(capsys, *arguments):
+    with pytest.raises(SystemExit) as caught:
+        main(list(map(str, arguments)))
+    out, err = capsys.readouterr()
+    return caught.value.code, out, err
+
+
+def reach(place, seed=3):
+    env = RecordDataset(gym.make("bam/reach-v0"), place)
+    env.action_space.seed(seed)
+    for number in range(2):
+        env.reset(seed=seed + number)
+        over = False
+        while not over:
+            _, _, terminated, truncated, _ = env.step(env.action_space.sample())
+            over = terminated or truncated
+    env.close()
+    return DataSet.open(place)
+
+
+@pytest.mark.parametrize("kind", ["box", "nested", "discrete"])
+def test_plot_draws_what_there_is(kind, tmp_path, capsys):
+    pytest.importorskip("matplotlib")
+    image = pytest.importorskip("PIL.Image")
+    record(tmp_path / "a", kind, 3)
+    record(tmp_path / "b", kind, 4)
+    given = ("plot", tmp_path / "a", "--out", tmp_path / "a.png")
+    drawn = f"{tmp_path}/a.png: episodes, numbers, success\n"
+    assert run(capsys, *given, "--against", tmp_path / "b") == (0, drawn, "")
+    with image.open(tmp_path / "a.png") as picture:
+        assert picture.size[0] == 1200
+    status, _, err = run(capsys, *given, "--kind", "table")
+    assert (status, err.partition(": --kind")[2]) == (
+        1,
+        f" table: {tmp_path}/a: its observations have no object_x and object_y; leave it out\n",
+    )
+
+
+def test_a_film_of_recorded_pictures(tmp_path, capsys):
+    pytest.importorskip("PIL")
+    data = record(tmp_path / "a", "nested", 3)
+    found = list(frames(data, 1, "camera"))
+    np.testing.assert_array_equal(found, data[1].observations["camera"])
+    status, out, _ = run(capsys, "show", tmp_path / "a", "--episode", "-2", "--out", tmp_path / "e.gif")
+    assert (status, out.partition(", return")[0]) == (0, f"{tmp_path}/e.gif: episode 1, 5 pictures")
+    with pytest.raises(SettingsError, match="has no 'kamera'"):
+        next(frames(data, 0, "kamera"))
+    status, _, err = run(capsys, "show", tmp_path / "a", "--episode", "3", "--out", tmp_path / "e.gif")
+    assert (status, err) == (
+        1,
+        f"bam-data show: --episode: {tmp_path}/a has 3 episodes, and there is no 3\n",
+    )
+
+
+def test_a_film_of_actions_that_are_played_again(tmp_path):
+    pytest.importorskip("mujoco")
+    data = reach(tmp_path / "a")
+    film = frames(data, 1)
+    first, second = next(film), next(film)
+    assert first.shape == second.shape
+    assert first.ndim == 3
+    film.close()
+
+
+def test_another_way_is_refused(tmp_path, monkeypatch):
+    pytest.importorskip("mujoco")
+    data = reach(tmp_path / "a")
+    other = data[0]
+    other.facts["seed"] = 99
+    monkeypatch.setattr(DataSet, "__getitem__", lambda self, index: other)
+    with pytest.raises(SettingsError, match="and played again it differs from step 0 on"):
+        next(frames(data, 0))
+    del other.facts["seed"]
+    with pytest.raises(SettingsError, match="its seed is not known"):
+        next(frames(data, 0))
