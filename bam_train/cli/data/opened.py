@@ -19,10 +19,11 @@ def export_data(config: flags.ExportDataConfig) -> None:
     from bam_train.data import DataSet
     from bam_train.data.export import export
     from bam_train.data.selection import choose
+    from bam_train.place import Place
 
     data = DataSet.open(config.place)
     chosen = choose(data, config.where)
-    opened = export(data, config.to, Path(config.out), chosen)
+    opened = export(data, config.to, Path(Place(config.out)), chosen)
     tell(f"{config.out}: {_episodes(len(chosen))} as {config.to}", f"  open it with  {opened}")
 
 
