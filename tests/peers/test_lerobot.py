@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bam_train.data.export import export
 from tests.bam_train.data.export.test_export import record
 from tests.peers.conftest import PEERS
 
@@ -41,14 +40,9 @@ def read(root, tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("how", ["recorded", "exported"])
-def test_every_episode_is_read(how, tmp_path):
+def test_every_episode_is_read(tmp_path):
     data = record(tmp_path / "data", "nested")
-    root = tmp_path / "data"
-    if how == "exported":
-        root = tmp_path / "out"
-        export(data, "lerobot", root)
-    found = read(root, tmp_path)
+    found = read(tmp_path / "data", tmp_path)
     assert found["fps"] == 20
     assert len(found["episodes"]) == len(data)
     assert found["stats"]["action"] == pytest.approx(np.concatenate([one.actions for one in data]).mean(0), abs=1e-5)

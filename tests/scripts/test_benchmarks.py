@@ -83,13 +83,6 @@ def loop_table(lines):
     return lines[2:]
 
 
-def test_loop_without_bbrl(bench):
-    """Our own figure is there, and how to compare it."""
-    (line,) = loop_table(bench("bench_loop", "--quick", "--only", "notebook", hidden=["bbrl"]))
-    pattern = r"notebook's agents, 10,000 steps +\d+\.\d us/step +pip install bbrl==1\.0\.1 +>= 2x"
-    assert re.fullmatch(pattern, line)
-
-
 def test_loop_without_torch(bench):
     """It says what is missing; a deployment needs neither torch nor BBRL."""
     lines = bench("bench_loop", "--quick", "--only", "notebook", "deployment", hidden=["torch", "bbrl"])

@@ -68,4 +68,4 @@ def test_without_pyarrow(run, monkeypatch):
     monkeypatch.delitem(sys.modules, "pyarrow.parquet", raising=False)
     status, out, err = run(REACH, "--out", "rows")
     assert (status, out) == (1, "")
-    assert err == 'record_parquet: needs pyarrow, which is not installed. Run: pip install "bam-train[rllib]"\n'
+    assert err == 'record_parquet: needs pyarrow, which is not installed. Run: pip install "bam-train[data]"\n'

@@ -116,7 +116,7 @@ class RosbridgeRobot:
         self._refusals: list[BamEnvsError] = []
         self._status = ""  # of this tick, as JSON
         self._sent: Array | None = None
-        self._sent_at = -math.inf
+        self._sent_at, self._sent_after = -math.inf, 0  # when, and after how many halts
         self._answers = False  # whether it reports the commands it has executed, in real time
         self._owed: dict[int, float] = {}  # number of each command without an answer -> when it was sent [s]
 
@@ -349,6 +349,8 @@ class RosbridgeRobot:
         worked, period = self._clock() - self._ended_at, self.spec.period
         if worked < period:  # a longer pause is not spent on one command
             self._lead = min(max(worked, _LEAD_DECAY * self._lead), _LEAD * period)
+        if self._sent_after != halts:  # the robot is at rest, and whoever takes over need not wait for so long
+            self._pacer.hasten()
         self._wait(self._pacer.slack, halts)
         self._require_link()
 
@@ -373,7 +375,7 @@ class RosbridgeRobot:
                 self._commanded = True
                 self._session.drive()
                 control.publish_all([(self.namespace + topic, message) for topic, _, message in envelopes])
-                self._sent, self._sent_at = command.copy(), self._clock()
+                self._sent, self._sent_at, self._sent_after = command.copy(), self._clock(), halts
                 if self._answers:
                     self._owed[tag.sequence] = self._sent_at
 

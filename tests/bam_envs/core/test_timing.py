@@ -58,6 +58,19 @@ def test_a_wait_that_is_ended_early_begins_the_tick_and_a_new_grid():
     assert pacer.slack == 0.125
 
 
+def test_a_tick_that_is_hastened_is_due_half_a_period_after_the_last():
+    clock = Clock()
+    pacer = paced(clock)
+    pacer.wait()
+    pacer.hasten()
+    assert pacer.slack == 0.0625
+    pacer.wait()
+    assert pacer.slack == 0.125
+    clock.work(0.1)
+    pacer.hasten()  # it is due already
+    assert pacer.wait() == pytest.approx(0.0375)
+
+
 def test_a_deadline_that_passes_while_it_is_looked_at_is_not_slept_for():
     clock, times = Clock(), iter([100.0, 100.0, 100.1249, 100.1251, 100.1252, 100.1253])
     pacer = Pacer(0.125, now=lambda: next(times), sleep=clock.sleep)  # time.sleep refuses negative times

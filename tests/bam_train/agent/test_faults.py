@@ -28,7 +28,7 @@ class Session:
             report=dict,
             observe=lambda observer: None,
         )
-        journal = SimpleNamespace(records=[], begun=0, warnings={})
+        journal = SimpleNamespace(records=[], begun=0, warnings={}, unusual=None)
 
         def episode(watcher, seed):
             raise error

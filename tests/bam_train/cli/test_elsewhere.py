@@ -118,7 +118,7 @@ def test_a_policy_drives_a_robot_over_its_topics(serve, run, tmp_path, monkeypat
     report = json.loads(out)
     assert (status, report["stop_reason"], report["successes"]) == (0, "episodes done", 1), err
     assert report["robot"] == served.bus.url
-    numbers = {f"G{number}" for number in (2, 3, 4, 5, 7, 8, 9, 10, 13, 14, 15, 16, 18, 23, 24)}
+    numbers = {f"G{number}" for number in (2, 3, 4, 5, 7, 8, 9, 10, 13, 14, 15, 16, 18, 19, 23, 24)}
     assert {row["number"] for row in report["guards"].values()} == numbers
     assert all(row["stopped"] == 0 for row in report["guards"].values())
     assert "will move" not in err  # it said that it is simulated
