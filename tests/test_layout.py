@@ -16,6 +16,7 @@ ORDER = {
         "safety",
         "robots",
         "tasks",
+        "local",
         "live",
         "remote",
         "make_env",

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import gymnasium as gym
 
 from bam_envs.core.errors import InvalidValue
-from bam_envs.core.registry import ENVIRONMENTS
+from bam_envs.core.registry import ENVIRONMENTS, EnvEntry
 from bam_envs.core.validation import PositiveInt, check
 
 if TYPE_CHECKING:
@@ -79,6 +79,7 @@ def make_env(
     from bam_envs.core.robot_env import RobotEnv
 
     entry = ENVIRONMENTS[env_id]
+    _require_robot(entry, robot=robot, randomize=randomize or None, link=link, action_delay=action_delay)
     task = entry.make_task(1, task_options)
     simulated = entry.make_robot(1, randomize, task_options)
     if robot is None:
@@ -103,6 +104,13 @@ def _refuse_for_simulations(profile: object, guards: object, trial: bool, shadow
     if trial or shadow:
         name = "trial" if trial else "shadow"
         raise InvalidValue(f"{name}=True is for a live robot; give its address with robot= too.")
+
+
+def _require_robot(entry: EnvEntry, **given: object) -> None:
+    """Refuse the options of a robot where there is none."""
+    names = [name for name, value in given.items() if value is not None]
+    if names and not entry.has_robot:
+        raise InvalidValue(f"{', '.join(names)}: {entry.id} has no robot; leave it out.")
 
 
 def _behind(link: Any, robot: Robot) -> Robot:
@@ -183,6 +191,7 @@ def make_vector_env(
     from bam_envs.core.robot_env import RobotVectorEnv
 
     entry = ENVIRONMENTS[env_id]
+    _require_robot(entry, randomize=randomize or None, link=link, action_delay=action_delay)
     return RobotVectorEnv(
         _behind(link, entry.make_robot(num_envs, randomize, task_options)),
         _late(action_delay, entry.make_task(num_envs, task_options)),

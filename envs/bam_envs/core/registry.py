@@ -38,6 +38,10 @@ MAKE_OPTIONS = (
 """Arguments of `gymnasium.make` for every environment here, besides the options of its task."""
 
 
+NO_ROBOT = "bam_envs.local.local_task:NoRobot"
+"""The robot of an environment that has none."""
+
+
 @dataclass(frozen=True)
 class EnvEntry:
     """One environment."""
@@ -49,7 +53,7 @@ class EnvEntry:
     task: str
     """``"module:Class"`` of the task."""
     robot: str
-    """``"module:function"`` that makes the simulated robot."""
+    """``"module:function"`` that makes the simulated robot, or `NO_ROBOT`."""
     max_episode_steps: int
     """Steps after which an episode is truncated."""
     period: float = 0.05
@@ -58,6 +62,11 @@ class EnvEntry:
     """Arguments of the task that its robot takes too."""
     variants: dict[str, str] = field(default_factory=dict)
     """Flags that plug-ins add, such as ``parity`` -> ``"module:Class"`` of the task with that flag."""
+
+    @property
+    def has_robot(self) -> bool:
+        """Whether it moves a robot."""
+        return self.robot != NO_ROBOT
 
     def options(self) -> dict[str, Any]:
         """The options of the task, flags of variants among them, with their defaults."""

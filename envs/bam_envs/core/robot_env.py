@@ -103,14 +103,20 @@ class _RobotAndTask:
         if self.render_mode is None:
             gym.logger.warn('render() without a render_mode shows nothing. Make it with render_mode="rgb_array".')
             return None
-        draw = getattr(self.robot, "render", None)
+        draw, picture = getattr(self.robot, "render", None), getattr(self.task, "picture", None)
+        if picture is not None and self.render_mode == "rgb_array":
+            drawn: NDArray[np.uint8] = picture()
+            return drawn
         if draw is None:
-            raise InvalidValue(f"The robot {self.robot.spec.name!r} has no picture; use render_mode=None.")
+            other = "None" if picture is None else '"rgb_array"'
+            name = f"The robot {self.robot.spec.name!r}" if picture is None else type(self.task).__name__
+            what = "picture" if picture is None else "window"
+            raise InvalidValue(f"{name} has no {what}; use render_mode={other}.")
         image: NDArray[np.uint8] | None = draw(self.render_mode, self.task.marks())
         return image
 
 
-class RobotEnv(_RobotAndTask, gym.Env[NDArray[np.float32], NDArray[np.float32]]):
+class RobotEnv(_RobotAndTask, gym.Env[Any, Any]):
     """One robot and one task. The robot is connected at the first `reset`.
 
     Args:
@@ -127,28 +133,26 @@ class RobotEnv(_RobotAndTask, gym.Env[NDArray[np.float32], NDArray[np.float32]])
         self.last_state: RobotState | None = None
         """The newest state, kept after the end of an episode."""
         self._first = np.zeros(1, dtype=np.int64)
-        self._observed: NDArray[np.float32] = np.zeros(0, np.float32)
+        self._observed: Any = None
         self._tell_step = getattr(robot, "tell_step", None)
 
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[NDArray[np.float32], dict[str, Any]]:
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Begin an episode; a live robot goes to its start pose slowly."""
         gym.Env.reset(self, seed=seed)
         task_options = self._reset_options(options)
         self.state = self.last_state = self._begin(self._first, [self.np_random], task_options)
         if self.render_mode == "human":
             self.render()
-        self._observed = self.task.observe(self.state)[0]
+        self._observed = first_of(self.task.observe(self.state))
         return self._observed, {"is_success": False}
 
-    def step(self, action: NDArray[np.float32]) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]:
-        """Send the command of `action` (a,); observe and score one period later."""
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        """Send the command of `action` (a,), or a whole number; observe and score one period later."""
         before = self._running()
-        batch = self._checked(action)[None]
+        batch = checked_action(self.action_space, action)[None]
         state = self.robot.step(self.task.command(batch, before))
         score = self.task.score(state, batch)
-        observation = self.task.observe(state)[0]
+        observation = first_of(self.task.observe(state))
         terminated = bool(score.terminated[0])
         self.state, self.last_state = None if terminated else state, state
         if self._tell_step is not None:
@@ -159,14 +163,6 @@ class RobotEnv(_RobotAndTask, gym.Env[NDArray[np.float32], NDArray[np.float32]])
             self.render()
         return observation, float(score.reward[0]), terminated, False, plain_info(score)
 
-    def _checked(self, action: Any) -> NDArray[np.float32]:
-        array = np.asarray(action, dtype=np.float32)
-        if array.shape != self.action_space.shape:
-            raise InvalidValue(f"The action must have shape {self.action_space.shape}, not {array.shape}.")
-        if not all(map(math.isfinite, array.ravel().tolist())):
-            raise InvalidValue(f"The action must be finite numbers, not {array.tolist()}.")
-        return array
-
     def render(self) -> NDArray[np.uint8] | None:  # type: ignore[override]
         """An image (480, 640, 3) for ``rgb_array``, None for ``human``."""
         return self._draw()
@@ -175,6 +171,31 @@ class RobotEnv(_RobotAndTask, gym.Env[NDArray[np.float32], NDArray[np.float32]])
         """Halt the robot and drop the link."""
         self.state = None
         self.robot.close()
+
+
+def first_of(observations: Any) -> Any:
+    """The observation of the first environment from those of n."""
+    if isinstance(observations, Mapping):
+        return {key: value[0] for key, value in observations.items()}
+    return observations[0]
+
+
+def checked_action(space: gym.Space[Any], action: Any) -> NDArray[Any]:
+    """`action` as an array that `space` can use: of its shape, and finite; whole numbers only inside it.
+
+    Raises:
+        InvalidValue: It cannot be used.
+    """
+    array = np.asarray(action)
+    if array.shape != space.shape:
+        raise InvalidValue(f"The action must have shape {space.shape}, not {array.shape}.")
+    if isinstance(space, gym.spaces.Box):
+        array = array.astype(np.float32, copy=False)
+        if not all(map(math.isfinite, array.ravel().tolist())):
+            raise InvalidValue(f"The action must be finite numbers, not {array.tolist()}.")
+    elif array.dtype.kind not in "iu" or not space.contains(array.astype(space.dtype)[()]):
+        raise InvalidValue(f"The action must be in {space}, not {array.tolist()}.")
+    return array
 
 
 def plain_info(score: Score) -> dict[str, Any]:
@@ -201,7 +222,7 @@ def _plain(value: Any) -> Any:
     return float(value) if isinstance(value, np.generic) else value
 
 
-class RobotVectorEnv(_RobotAndTask, gym.vector.VectorEnv[NDArray[np.float32], NDArray[np.float32], NDArray[Any]]):
+class RobotVectorEnv(_RobotAndTask, gym.vector.VectorEnv[Any, Any, NDArray[Any]]):
     """n simulated robots stepped together; environment i equals a `RobotEnv` with the same seed, bit for bit.
 
     An environment whose episode ends starts the next one in the same step (`AutoresetMode.SAME_STEP`): its last
@@ -231,7 +252,7 @@ class RobotVectorEnv(_RobotAndTask, gym.vector.VectorEnv[NDArray[np.float32], ND
 
     def reset(
         self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[NDArray[np.float32], dict[str, Any]]:
+    ) -> tuple[Any, dict[str, Any]]:
         """Begin an episode in every environment, or in those of ``options["reset_mask"]`` (n,) bool.
 
         Args:
@@ -256,14 +277,14 @@ class RobotVectorEnv(_RobotAndTask, gym.vector.VectorEnv[NDArray[np.float32], ND
             raise InvalidValue(f"seed must be one number or {self.num_envs} of them, not {len(seeds)}.")
         return seeds
 
-    def _reset(self, env_ids: EnvIds, options: Mapping[str, Any]) -> NDArray[np.float32]:
+    def _reset(self, env_ids: EnvIds, options: Mapping[str, Any]) -> Any:
         self.state = self._begin(env_ids, [self._rngs[i] for i in env_ids], options)
         self.elapsed[env_ids] = 0
         return self.task.observe(self.state)
 
     def step(
-        self, actions: NDArray[np.float32]
-    ) -> tuple[NDArray[np.float32], NDArray[np.float64], NDArray[np.bool_], NDArray[np.bool_], dict[str, Any]]:
+        self, actions: Any
+    ) -> tuple[Any, NDArray[np.float64], NDArray[np.bool_], NDArray[np.bool_], dict[str, Any]]:
         """Step every environment with `actions` (n, a); those whose episode ended begin the next one."""
         before = self._running()
         actions = self._checked(actions)
@@ -281,9 +302,7 @@ class RobotVectorEnv(_RobotAndTask, gym.vector.VectorEnv[NDArray[np.float32], ND
             observation = self._next_episodes(ended, observation, infos)
         return observation, score.reward, score.terminated, truncated, infos
 
-    def _next_episodes(
-        self, ended: NDArray[np.bool_], observation: NDArray[np.float32], infos: dict[str, Any]
-    ) -> NDArray[np.float32]:
+    def _next_episodes(self, ended: NDArray[np.bool_], observation: Any, infos: dict[str, Any]) -> Any:
         """Save the last observation and info of ended episodes in `infos`, and begin the next episodes."""
         values = {key: value for key, value in infos.items() if not key.startswith("_")}
         masks = {"_" + key: infos["_" + key] for key in values}
@@ -293,10 +312,15 @@ class RobotVectorEnv(_RobotAndTask, gym.vector.VectorEnv[NDArray[np.float32], ND
         infos["final_obs"], infos["_final_obs"], infos["_final_info"] = observation, ended, ended
         return self._reset(np.flatnonzero(ended), {})
 
-    def _checked(self, actions: Any) -> NDArray[np.float32]:
-        array = np.asarray(actions, dtype=np.float32)
+    def _checked(self, actions: Any) -> NDArray[Any]:
+        array = np.asarray(actions)
         if array.shape != self.action_space.shape:
             raise InvalidValue(f"The actions must have shape {self.action_space.shape}, not {array.shape}.")
+        if not isinstance(self.action_space, gym.spaces.Box):
+            if array.dtype.kind not in "iu" or not self.action_space.contains(array.astype(self.action_space.dtype)):
+                raise InvalidValue(f"The actions must be in {self.single_action_space}, not {brief(array.tolist())}.")
+            return array
+        array = array.astype(np.float32, copy=False)
         finite = np.isfinite(array).reshape(len(array), -1).all(axis=1)
         if not finite.all():
             wrong = np.flatnonzero(~finite).tolist()
@@ -323,7 +347,7 @@ class RobotVectorEnv(_RobotAndTask, gym.vector.VectorEnv[NDArray[np.float32], ND
             "rngs": [rng.bit_generator.state for rng in self._rngs],
         }
 
-    def load_state_dict(self, state: dict[str, Any]) -> NDArray[np.float32]:
+    def load_state_dict(self, state: dict[str, Any]) -> Any:
         """Restore the result of `state_dict`; returns the observation."""
         robot: Any = self.robot
         restored: RobotState = robot.load_state_dict(state["robot"])

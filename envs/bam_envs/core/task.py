@@ -52,11 +52,12 @@ class Task(Protocol):
     """
 
     num_envs: int
-    observation_space: spaces.Box
-    """Observation space of a single environment."""
-    action_space: spaces.Box
-    """Action space of a single environment."""
+    observation_space: spaces.Space[Any]
+    """Observation space of a single environment: arrays, or a Dict of them."""
+    action_space: spaces.Space[Any]
+    """Action space of a single environment: a Box, a Discrete or a MultiDiscrete."""
     observation_labels: tuple[Label, ...]
+    """One for each number, in order; an image has one, with its name."""
     action_labels: tuple[Label, ...]
 
     def sample_initial(self, env_ids: EnvIds, rngs: Sequence[np.random.Generator]) -> Initial:
@@ -68,8 +69,8 @@ class Task(Protocol):
         `state` has all n environments.
         """
 
-    def observe(self, state: RobotState) -> Floats:
-        """The observation for the policy. Shape: (n, ...)."""
+    def observe(self, state: RobotState) -> Any:
+        """The observation for the policy: an array (n, ...), or a new dict of them."""
 
     def command(self, action: Floats, state: RobotState) -> Array:
         """The command to the robot, SI units. Shapes: (n, a) -> (n, m)."""

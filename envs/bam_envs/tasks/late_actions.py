@@ -45,7 +45,9 @@ class LateActions:
         self.task, (self._least, self._most) = task, delay
         self._env_ids = np.arange(task.num_envs)
         self._delay = np.zeros(task.num_envs, np.int64)
-        self._actions = np.zeros((task.num_envs, self._most + 1, *task.action_space.shape), np.float32)  # newest first
+        self._actions = np.zeros(
+            (task.num_envs, self._most + 1, *(task.action_space.shape or ())), np.float32
+        )  # newest first
 
     def __getattr__(self, name: str) -> Any:
         """Any other attribute is that of the task: spaces, labels, observations, options of `reset`."""
