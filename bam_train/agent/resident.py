@@ -127,7 +127,7 @@ class Resident:
         self._requests: deque[tuple[Callable[[], dict[str, Any] | None], int]] = deque()
         self._command: Drive | None = None
         self._is_running, self._stopped, self._quitting = is_running, "", False
-        self._was_connected = self._holds = False
+        self._was_connected = self._holds = self._was_cut_short = False
         self._seed, self._reported = options.seed, 0.0
         self._episodes: deque[int | None] = deque(maxlen=_RECENT)
         self._ticks = self._completed = self._successes = self._late = 0
@@ -258,6 +258,7 @@ class Resident:
         """Called by the chain between a deadline and the policy: whether the episode ends here."""
         deployment = self._connected.deployment
         self._loop_ms += 0.05 * (1e3 * deployment.latency - self._loop_ms)
+        self._was_cut_short = self._hurry.is_set()
         return self._settled()
 
     def _settled(self) -> bool:
@@ -406,7 +407,11 @@ class Resident:
                 checkpoint,
                 self._stage,
                 boundary=_Boundary(self),
-                agents=[TransitionsAgent(self.transitions, lambda: self.succession.active.digest)],
+                agents=[
+                    TransitionsAgent(
+                        self.transitions, lambda: self.succession.active.digest, lambda: self._was_cut_short
+                    )
+                ],
                 switch=self.switch,
                 admit=self._admit,
                 sleep=self._hurry.wait,

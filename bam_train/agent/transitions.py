@@ -169,14 +169,22 @@ class TransitionsAgent(Agent):
     Args:
         log: Where they go.
         policy: Returns the digest of the policy that acts now.
+        cut_short: Returns whether a request ended the last step before its time; such a step is left out.
         observation: Variable of the observation, which is one array.
     """
 
     writes = ()
 
-    def __init__(self, log: TransitionLog, policy: Callable[[], str], observation: str = "env/env_obs") -> None:
+    def __init__(
+        self,
+        log: TransitionLog,
+        policy: Callable[[], str],
+        cut_short: Callable[[], bool] = lambda: False,
+        observation: str = "env/env_obs",
+    ) -> None:
         super().__init__()
         self._log, self._policy, self._observation, self._episode = log, policy, observation, -1
+        self._cut_short = cut_short
         self.reads = (observation, "action", *(f"env/{name}" for name in ("reward", *_ENDS, SUCCESS, SAYS_SUCCESS)))
         self._before: tuple[Any, Any, str] | None = None
 
@@ -188,7 +196,7 @@ class TransitionsAgent(Agent):
             self._before = None
             return
         observation, get = self.get((self._observation, t))[0].copy(), self.get
-        if t > 0 and self._before is not None:
+        if t > 0 and self._before is not None and not self._cut_short():
             seen, action, policy = self._before
             terminated, truncated = (bool(get((f"env/{end}", t))[0]) for end in _ENDS)
             success = bool(get((f"env/{SUCCESS}", t))[0]) and bool(get((f"env/{SAYS_SUCCESS}", t))[0])

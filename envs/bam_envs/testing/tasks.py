@@ -77,7 +77,7 @@ class TaskContract:
             assert len({label.name for label in labels}) == len(labels), "label names repeat"
             np.testing.assert_array_equal(space.low, np.array([label.low for label in labels], np.float32))
             np.testing.assert_array_equal(space.high, np.array([label.high for label in labels], np.float32))
-            if space is task.action_space:
+            if labels is task.action_labels:
                 assert space.low.tolist() == [-1] * len(labels)
                 assert space.high.tolist() == [1] * len(labels)
 

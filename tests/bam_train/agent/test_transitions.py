@@ -108,14 +108,24 @@ class HalfOfIt:
         return (observation + 1) / 4
 
 
-def test_the_loop_collects_each_step_of_each_episode():
-    log, digests = TransitionLog(), iter("aabbccdd")
-    robot = RobotAgent(Counting())
+def two_episodes(*arguments):
+    log, robot = TransitionLog(), RobotAgent(Counting())
     chain: list[Agent] = [robot, PolicyAgent(HalfOfIt(), robot.observation_names, single=True)]
-    loop = TemporalAgent(Agents(*chain, TransitionsAgent(log, lambda: next(digests))))
+    loop = TemporalAgent(Agents(*chain, TransitionsAgent(log, *arguments)))
     for _ in range(2):
         loop(Workspace(window=2), t=0, stop_variable="env/done")
-    found = log.take()
+    return log.take()
+
+
+def test_a_step_that_a_request_cut_short_is_left_out():
+    cut = iter([False, True, True, False])
+    found = two_episodes(lambda: "a", lambda: next(cut))
+    assert list(zip(found.episode.tolist(), found.step.tolist(), strict=True)) == [(0, 0), (1, 1)]
+
+
+def test_the_loop_collects_each_step_of_each_episode():
+    digests = iter("aabbccdd")
+    found = two_episodes(lambda: next(digests))
     assert found.episode.tolist() == [0, 0, 1, 1]
     assert found.step.tolist() == [0, 1, 0, 1]
     assert found.observation[:, 0].tolist() == [0, 1, 0, 1]
