@@ -23,6 +23,7 @@ from typing import Any, get_type_hints
 from bam_envs.core.registry import ENVIRONMENTS, EnvEntry, resolve
 from bam_envs.core.robot import SignalSpec
 from bam_envs.core.robot_env import describe
+from bam_envs.core.spaces import space_text
 
 DOCS = Path(__file__).resolve().parents[1] / "docs"
 _PART = re.compile(r"(<!-- generated: (?P<name>\S+)(?: (?P<argument>\S+))? -->\n)(.*?)(<!-- /generated -->)", re.DOTALL)
@@ -74,9 +75,12 @@ def environments() -> str:
     rows = []
     for entry in ENVIRONMENTS.values():
         task = resolve(entry.task)(1)
-        shapes = [f"{len(task.observation_labels)} numbers", f"{len(task.action_labels)} numbers"]
-        seconds = f"{entry.max_episode_steps * entry.period:g} s"
-        rows.append([f"[`{entry.id}`]({page_of(entry.id)})", entry.summary, *shapes, entry.max_episode_steps, seconds])
+        shapes = [space_text(task.observation_space), space_text(task.action_space)]
+        if entry.has_robot:
+            shapes = [f"{len(task.observation_labels)} numbers", f"{len(task.action_labels)} numbers"]
+        steps = entry.max_episode_steps
+        seconds = f"{steps * entry.period:g} s" if entry.has_robot else ""
+        rows.append([f"[`{entry.id}`]({page_of(entry.id)})", entry.summary, *shapes, steps, seconds])
     header = ["id", "what to do", "observation", "action", "steps an episode", "which is"]
     return table(header, rows)
 
@@ -97,8 +101,11 @@ def environment(env_id: str) -> str:
     task = resolve(entry.task)
     docs = sections(task.__doc__ or "")
     signals = describe(resolve(entry.robot)(1), resolve(entry.task)(1))
-    parts = [f"{entry.summary[0].upper()}{entry.summary[1:]}. One step is {entry.period:g} s of robot time."]
-    docs["End"] += f" Truncated after {entry.max_episode_steps} steps ({entry.max_episode_steps * entry.period:g} s)."
+    limit, robot = entry.time_limit, entry.has_robot
+    time = f"One step is {entry.period:g} s of robot time." if robot else "There is no robot."
+    parts = [f"{entry.summary[0].upper()}{entry.summary[1:]}. {time}"]
+    if limit is not None:
+        docs["End"] += f" Truncated after {limit} steps{f' ({limit * entry.period:g} s)' * robot}."
     docs["Info"] += " `is_success`, as everywhere."
     names = [name for name in docs if name in (*SECTIONS, *OPTIONAL)]
     parts += [f"**{name}.** {docs[name]}" for name in names]
@@ -110,7 +117,8 @@ def environment(env_id: str) -> str:
     for kind in ("observation", "action"):
         rows = signals[kind]
         lines = [[where, *line] for where, line in _joined(rows)]
-        parts.append(f"**{kind.capitalize()}**: float32, shape ({len(rows)},)")
+        space = getattr(resolve(entry.task)(1), f"{kind}_space")
+        parts.append(f"**{kind.capitalize()}**: {f'float32, shape ({len(rows)},)' if robot else space_text(space)}")
         parts.append(table(["numbers", "names", "meaning", "unit", "scale", "min", "max"], lines))
     return "\n\n".join(parts)
 

@@ -26,6 +26,7 @@ def show_environments(config: EnvsConfig) -> None:
 def overview() -> list[dict[str, Any]]:
     """Facts of each environment of `bam_envs`, as JSON values; imports no simulator."""
     from bam_envs.core.registry import ENVIRONMENTS, resolve
+    from bam_envs.core.spaces import space_text
     from bam_envs.robo_gym.table import ROBO_GYM
 
     tasks = [(entry, resolve(entry.task)(1)) for entry in ENVIRONMENTS.values()]
@@ -33,8 +34,8 @@ def overview() -> list[dict[str, Any]]:
         {
             "id": entry.id,
             "summary": entry.summary,
-            "observation": f"{task.observation_space.dtype} {task.observation_space.shape}",
-            "action": f"{task.action_space.dtype} {task.action_space.shape}",
+            "observation": space_text(task.observation_space),
+            "action": space_text(task.action_space),
             "episode_steps": entry.max_episode_steps,
             "rate_hz": 1 / entry.period,
             "robo_gym": [name for name, theirs in ROBO_GYM.items() if theirs.env_id == entry.id],
@@ -69,6 +70,7 @@ def details(name: str) -> dict[str, Any]:
 
     env_id = resolve_id(name)
     entry, theirs = entry_of(env_id), ROBO_GYM.get(env_id)
+    steps = None if entry is None else entry.max_episode_steps
     env = make_env(theirs.twin if theirs is not None and theirs.is_live else env_id)
     try:
         describe = getattr(env.unwrapped, "describe", None)
@@ -78,7 +80,7 @@ def details(name: str) -> dict[str, Any]:
             "summary": None if entry is None else entry.summary,
             "same_as": None if theirs is None else theirs.env_id,
             "is_live": theirs is not None and theirs.is_live,
-            "episode_steps": getattr(env.spec, "max_episode_steps", None) if entry is None else entry.max_episode_steps,
+            "episode_steps": getattr(env.spec, "max_episode_steps", None) if entry is None else steps,
             "rate_hz": None if period is None else 1 / period,
             "observation_space": space_to_json(env.observation_space),
             "action_space": space_to_json(env.action_space),
@@ -94,11 +96,12 @@ def detail_lines(facts: dict[str, Any]) -> list[str]:
     if facts["same_as"] is not None:
         live = ", with a live robot: rs_address='IP:PORT' or robot='ws://IP:PORT'" if facts["is_live"] else ""
         lines.append(f"robo-gym's name of {facts['same_as']}{live}")
-    steps = "no time limit" if facts["episode_steps"] is None else f"{facts['episode_steps']} steps an episode"
+    count = facts["episode_steps"]
+    steps = "no time limit" if count is None else f"{count} step{'s' * (count > 1)} an episode"
     lines.append(f"{steps}, {'no rate given' if facts['rate_hz'] is None else format(facts['rate_hz'], 'g') + ' Hz'}")
     if not facts["signals"]:
         lines += [f"{kind}: {json_module.dumps(facts[kind + '_space'])}" for kind in ("observation", "action")]
-    for kind, signals in facts["signals"].items():
+    for kind, signals in ((kind, signals) for kind, signals in facts["signals"].items() if signals):
         columns = ("name", "low", "high", "scale", "unit", "meaning")
         keys = [key for key in columns if any(key in signal for signal in signals)]
         values = [[signal.get(key, "") for key in keys] for signal in folded(signals)]

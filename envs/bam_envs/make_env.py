@@ -110,7 +110,7 @@ def _require_robot(entry: EnvEntry, **given: object) -> None:
     """Refuse the options of a robot where there is none."""
     names = [name for name, value in given.items() if value is not None]
     if names and not entry.has_robot:
-        raise InvalidValue(f"{', '.join(names)}: {entry.id} has no robot; leave it out.")
+        raise InvalidValue(f"{entry.id} has no robot; leave out what is for one: {', '.join(names)}.")
 
 
 def _behind(link: Any, robot: Robot) -> Robot:

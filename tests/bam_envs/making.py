@@ -16,7 +16,10 @@ def each(ids):
     return [one if one in QUICK else pytest.param(one, marks=pytest.mark.slow) for one in ids]
 
 
-EACH = each(ENVIRONMENTS)
+ROBOTS = [env_id for env_id, entry in ENVIRONMENTS.items() if entry.has_robot]
+LOCAL = [env_id for env_id, entry in ENVIRONMENTS.items() if not entry.has_robot]
+"""The environments without a robot."""
+EACH = each(ROBOTS)
 
 
 def make_task(env_id, num_envs=1, **options):

@@ -55,13 +55,18 @@ class EnvEntry:
     robot: str
     """``"module:function"`` that makes the simulated robot, or `NO_ROBOT`."""
     max_episode_steps: int
-    """Steps after which an episode is truncated."""
+    """Steps after which an episode is truncated; 1 where every episode ends in its first step by itself."""
     period: float = 0.05
     """Time between two actions [s]."""
     robot_options: tuple[str, ...] = ()
     """Arguments of the task that its robot takes too."""
     variants: dict[str, str] = field(default_factory=dict)
     """Flags that plug-ins add, such as ``parity`` -> ``"module:Class"`` of the task with that flag."""
+
+    @property
+    def time_limit(self) -> int | None:
+        """Steps after which an episode is truncated; None where it never is."""
+        return self.max_episode_steps if self.max_episode_steps > 1 else None
 
     @property
     def has_robot(self) -> bool:
@@ -189,6 +194,14 @@ _ENTRIES = (
         period=1 / 30,
         robot_options=("ur_model",),
     ),
+    EnvEntry(
+        "bam/grid-world-v0",
+        "walk to a target on a square board",
+        "bam_envs.local.grid_world:GridWorld",
+        NO_ROBOT,
+        max_episode_steps=100,
+        period=0.1,
+    ),
 )
 ENVIRONMENTS: dict[str, EnvEntry] = {entry.id: entry for entry in _ENTRIES}
 ALIASES: dict[str, Alias] = {}
@@ -198,7 +211,7 @@ ALIASES: dict[str, Alias] = {}
 def register() -> None:
     """Register every environment with Gymnasium; idempotent. Plug-ins must add their variants before."""
     for entry in ENVIRONMENTS.values():
-        register_id(entry.id, "bam_envs.make_env", entry.max_episode_steps)
+        register_id(entry.id, "bam_envs.make_env", entry.time_limit)
 
 
 def register_alias(env_id: str, alias: Alias, module: str) -> None:

@@ -68,6 +68,13 @@ def space_to_json(space: Space[Any]) -> Json:
     raise UnknownName("kind of space", type(space).__name__, _KINDS)
 
 
+def space_text(space: Space[Any]) -> str:
+    """A space in a few words, such as ``float32 (18,)``, ``Discrete(4)``, or for a Dict ``agent: int64 (2,), ...``."""
+    if isinstance(space, spaces.Dict):
+        return ", ".join(f"{key}: {space_text(one)}" for key, one in space.spaces.items())
+    return f"{space.dtype} {space.shape}" if isinstance(space, spaces.Box) else str(space)
+
+
 def space_from_json(value: Mapping[str, Any]) -> Space[Any]:
     """Decode a space that `space_to_json` encoded.
 

@@ -4,7 +4,7 @@
 
     from bam_envs.testing import RobotContract, TaskContract, TransportContract
 
-    class TestMyRobot(RobotContract):  # a TaskContract likewise
+    class TestMyRobot(RobotContract):  # a TaskContract or LocalTaskContract likewise
         def make(self, num_robots):
             return MyRobot(num_robots)
 
@@ -18,7 +18,7 @@ override the hooks that name an arm. `DrivenRobot` simulates a live robot whose 
 
 from bam_envs.testing.drivers import DrivenRobot
 from bam_envs.testing.robots import ARM_HOME, RobotContract
-from bam_envs.testing.tasks import TaskContract
+from bam_envs.testing.tasks import LocalTaskContract, TaskContract
 from bam_envs.testing.transports import TransportContract
 
-__all__ = ["ARM_HOME", "DrivenRobot", "RobotContract", "TaskContract", "TransportContract"]
+__all__ = ["ARM_HOME", "DrivenRobot", "LocalTaskContract", "RobotContract", "TaskContract", "TransportContract"]

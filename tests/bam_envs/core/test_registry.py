@@ -24,6 +24,7 @@ def test_the_table():
         "bam/ur-avoidance-v0": (1000, 0.05),
         "bam/ur-track-v0": (1000, 0.05),
         "bam/isaac-reach-v0": (600, 1 / 30),
+        "bam/grid-world-v0": (100, 0.1),
     }
     for key, entry in ENVIRONMENTS.items():
         assert entry.id == key

@@ -49,7 +49,7 @@ def test_what_the_other_end_says(make, env_id):
     there, entry = make(env_id), ENVIRONMENTS[env_id]
     env = RemoteEnv(LocalTransport(there))
     assert (env.observation_space, env.action_space) == (there.observation_space, there.action_space)
-    assert (env.env_id, env.period, env.max_episode_steps) == (env_id, entry.period, entry.max_episode_steps)
+    assert (env.env_id, env.period, env.max_episode_steps) == (env_id, entry.period, entry.time_limit)
     assert env.describe() == there.unwrapped.describe()
     env.close()
 

@@ -92,7 +92,7 @@ def test_what_the_other_end_says(make_rows, env_id):
     for name in ("observation_space", "action_space", "single_observation_space", "single_action_space"):
         assert getattr(envs, name) == getattr(there, name)
     assert envs.metadata["autoreset_mode"] == AutoresetMode.SAME_STEP
-    assert (envs.env_id, envs.period, envs.max_episode_steps) == (env_id, entry.period, entry.max_episode_steps)
+    assert (envs.env_id, envs.period, envs.max_episode_steps) == (env_id, entry.period, entry.time_limit)
     assert envs.describe() == there.unwrapped.describe()
 
 

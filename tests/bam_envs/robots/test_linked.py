@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from bam_envs.core.errors import InvalidValue
-from bam_envs.core.registry import ENVIRONMENTS
 from bam_envs.core.robot import Initial
 from bam_envs.robots.fake import FakeRobot
 from bam_envs.robots.linked import PROFILES, LinkedRobot, LinkProfile, link_profile, portable, quantiles
@@ -14,6 +13,7 @@ from bam_envs.robots.physics.kinematic_base import open_floor
 from bam_envs.testing import RobotContract
 from bam_envs.testing.assertions import assert_same_state
 from bam_envs.testing.robots import ARM_HOME
+from tests.bam_envs.making import ROBOTS
 
 PERIOD = 0.05
 AT_ONCE = [0.0, 0.0]
@@ -254,7 +254,7 @@ def test_what_is_no_profile(tmp_path):
 # ---- environments
 
 
-@pytest.mark.parametrize("env_id", ENVIRONMENTS)
+@pytest.mark.parametrize("env_id", ROBOTS)
 def test_every_environment_can_be_behind_a_link(make, make_rows, env_id, actions_of):
     one, rows = make(env_id, link="lte", randomize=True), make_rows(env_id, 2, link="lte", randomize=True)
     bare = make_rows(env_id, 2, randomize=True)

@@ -15,6 +15,7 @@ from bam_envs.core.robot_env import RobotEnv
 from bam_envs.safety.gate import SafeRobot
 from bam_envs.safety.guard import Limits
 from bam_envs.testing.drivers import DrivenRobot
+from tests.bam_envs.making import ROBOTS
 
 CHECKPOINTS = Path(__file__).parents[3] / "checkpoints"
 ROW = np.zeros(1, np.int64)
@@ -75,7 +76,7 @@ def a_policy(env_id, kind, seed):
 
 @settings(max_examples=10, deadline=None)
 @given(
-    st.sampled_from(sorted(ENVIRONMENTS)),
+    st.sampled_from(sorted(ROBOTS)),
     st.sampled_from(["learnt", "constant", "random"]),
     st.sampled_from([("ignore", 0.0), ("slow", 0.3), ("slow", 0.1), ("delay", 0.1), ("delay", 0.5)]),
     st.sampled_from([0.1, 0.15, 0.3, 0.5, 1.0, 5.0, 30.0]),

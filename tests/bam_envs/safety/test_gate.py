@@ -14,7 +14,6 @@ import pytest
 import bam_envs
 import bam_train
 from bam_envs.core.errors import BamEnvsError, InvalidValue
-from bam_envs.core.registry import ENVIRONMENTS
 from bam_envs.core.robot import Initial
 from bam_envs.live.building import live_robot
 from bam_envs.live.rosbridge_robot import RosbridgeRobot
@@ -23,6 +22,7 @@ from bam_envs.robots.profile import load_profile
 from bam_envs.safety.gate import ClearedCommand, SafeRobot
 from bam_envs.safety.guard import BOUNDS, Limits
 from bam_envs.testing import ARM_HOME, DrivenRobot
+from tests.bam_envs.making import ROBOTS
 
 NOBODY = "ws://127.0.0.1:9"
 SOURCES = [path for package in (bam_envs, bam_train) for path in sorted(Path(package.__file__).parent.rglob("*.py"))]
@@ -46,7 +46,7 @@ def test_a_live_robot_is_built_behind_the_gate_and_nowhere_else():
     assert callers("_clear") == ["gate.py"]
 
 
-@pytest.mark.parametrize("env_id", sorted(ENVIRONMENTS))
+@pytest.mark.parametrize("env_id", sorted(ROBOTS))
 def test_an_environment_on_a_live_robot_has_the_gate(env_id):
     env = gym.make(env_id, robot=NOBODY, disable_env_checker=True)
     assert isinstance(env.unwrapped.robot, SafeRobot)

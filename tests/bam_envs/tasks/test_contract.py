@@ -9,7 +9,7 @@ from bam_envs.robots.ur import UR_MODELS
 from bam_envs.tasks.isaac_reach import DEFAULT
 from bam_envs.tasks.pick import PickTask
 from bam_envs.testing import TaskContract
-from tests.bam_envs.making import make_task
+from tests.bam_envs.making import ROBOTS, make_task
 
 PARITY = {"parity": True, "rs_state_to_info": True}
 SPEEDS = {
@@ -129,7 +129,7 @@ VARIANTS = [(env_id, {flag: True}) for env_id, entry in ENVIRONMENTS.items() for
 SIZES = [("bam/ur-reach-v0", {"ur_model": model}) for model in UR_MODELS]
 
 
-@pytest.mark.parametrize(("env_id", "options"), [*((env_id, {}) for env_id in ENVIRONMENTS), *VARIANTS, *SIZES])
+@pytest.mark.parametrize(("env_id", "options"), [*((env_id, {}) for env_id in ROBOTS), *VARIANTS, *SIZES])
 @pytest.mark.filterwarnings("ignore:.*A Box observation space m(ini|axi)mum value is -?infinity")  # robo-gym's bounds
 @pytest.mark.filterwarnings("ignore:.*we recommend using a symmetric and normalized space")  # Isaac Lab's actions
 @pytest.mark.filterwarnings("ignore:.*maximum and minimum values are equal")  # an elbow that sees nothing

@@ -4,11 +4,10 @@ import numpy as np
 import pytest
 
 from bam_envs.core.errors import InvalidValue
-from bam_envs.core.registry import ENVIRONMENTS
 from bam_envs.tasks.late_actions import LateActions, read_delay
 from bam_envs.tasks.reach import ReachTask
 from bam_envs.testing import TaskContract
-from tests.bam_envs.making import make_task
+from tests.bam_envs.making import ROBOTS, make_task
 
 
 @pytest.mark.parametrize("env_id", ["bam/reach-v0", "bam/pick-place-v0"])
@@ -18,7 +17,7 @@ class TestContract(TaskContract):
         self.make = lambda num_envs: LateActions(make_task(env_id, num_envs), (0, 2))
 
 
-@pytest.mark.parametrize("env_id", ENVIRONMENTS)
+@pytest.mark.parametrize("env_id", ROBOTS)
 def test_an_action_counts_two_steps_later(make, env_id, actions_of):
     late, prompt = make(env_id, action_delay=2), make(env_id)
     actions = actions_of(0, 8, late.action_space.shape[0])

@@ -3,10 +3,9 @@
 import numpy as np
 import pytest
 
-from bam_envs.core.registry import ENVIRONMENTS
 from bam_envs.robots.ur5e import GEOMETRY
 from bam_envs.tasks.scripted import SCRIPTED, scripted_policy
-from tests.bam_envs.making import each
+from tests.bam_envs.making import ROBOTS, each
 
 TOOL_SPEED, JOINT_SPEED = 0.25, 1.0
 """Limits [m/s] and [rad/s]."""
@@ -33,7 +32,7 @@ def limits(env_id, envs):
     return ("base_velocity", np.array(DRIVEN)) if "mir100" in env_id else ("joint_velocity", JOINT_SPEED)
 
 
-@pytest.mark.parametrize("env_id", each(one for one in ENVIRONMENTS if one not in SCRIPTED))
+@pytest.mark.parametrize("env_id", each(one for one in ROBOTS if one not in SCRIPTED))
 @pytest.mark.parametrize("randomize", [False, True])
 def test_no_robot_is_faster_than_its_task_lets_it_be(make_rows, env_id, randomize):
     """The others, tool and joints, are measured below."""

@@ -11,9 +11,9 @@ from gymnasium import spaces
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
 from gymnasium.wrappers import Autoreset, TimeLimit
 
-from bam_envs.core.registry import ENVIRONMENTS
 from bam_train.errors import LoopError, SettingsError, ValueMismatch
 from bam_train.loop import Agent, Agents, ParallelGymAgent, TemporalAgent, VecGymAgent, Workspace
+from tests.bam_envs.making import ROBOTS
 
 MODES = list(AutoresetMode)
 RESETTING = [AutoresetMode.SAME_STEP, AutoresetMode.DISABLED]
@@ -146,7 +146,7 @@ def test_our_robots(toys, include_last_state):
     assert (ends == 10).all()
 
 
-@pytest.mark.parametrize("env_id", ENVIRONMENTS)
+@pytest.mark.parametrize("env_id", ROBOTS)
 def test_a_robots_episode_is_that_of_one_environment(toys, env_id):
     n = 3
     make = partial(gym.make_vec, env_id, num_envs=n, max_episode_steps=8)
