@@ -22,6 +22,7 @@ from bam_train.environments import (
     require_fit,
 )
 from bam_train.errors import CheckpointMismatch, SettingsError
+from tests.bam_envs.making import ROBOTS
 
 
 def test_rows_reset_in_the_same_step(corridor):
@@ -132,7 +133,7 @@ def test_signals_and_period_must_fit(corridor, corridor_checkpoint, fields, mess
     )
 
 
-@pytest.mark.parametrize("env_id", ENVIRONMENTS)
+@pytest.mark.parametrize("env_id", ROBOTS)
 def test_every_environment_of_ours_fits_what_it_says_of_itself(corridor_checkpoint, env_id):
     env, rows = make_env(env_id), make_vector_env(env_id, None, 2)
     said = {
