@@ -90,7 +90,38 @@ def tick() -> Iterator[Row]:
     yield Row("record a deployment's tick", found, "<= 30 us", bool(np.median(took) <= 30))
 
 
-BENCHES: dict[str, Callable[[], Iterator[Row]]] = {"collect": collect, "tick": tick}
+def batches() -> Iterator[Row]:
+    """Batches of 256 transitions as our learners draw them, against d3rlpy's replay buffer with the same episodes."""
+    import d3rlpy
+    import torch
+
+    from bam_train.data import DataSet
+    from bam_train.data.collect import collect as collecting
+    from bam_train.data.export import export
+    from bam_train.trainers.offline.training_data import ActionCode, Normaliser, read_batch
+
+    def rate(draw: Callable[[], object], count: int) -> float:
+        draw()
+        begun = time.process_time()
+        for _ in range(count):
+            draw()
+        return count / (time.process_time() - begun)
+
+    with tempfile.TemporaryDirectory() as folder:
+        collecting(Path(folder) / "d", "scripted", "bam/pick-v0", episodes=200, num_envs=64)
+        data = DataSet.open(Path(folder) / "d")
+        export(data, "d3rlpy", Path(folder) / "d.h5")
+        with open(Path(folder) / "d.h5", "rb") as file:
+            theirs = d3rlpy.dataset.ReplayBuffer.load(file, d3rlpy.dataset.InfiniteBuffer())
+        normaliser, code = Normaliser(data.info.observation_space), ActionCode(data.info.action_space)
+        ours, _ = read_batch(data, range(len(data)), normaliser, code, fit=True)
+        slow = rate(lambda: theirs.sample_transition_batch(256), 100)
+        fast = rate(lambda: ours.rows(torch.randint(len(ours), (256,))), 2000)
+    found = f"{fast:,.0f} a CPU-second, d3rlpy {slow:,.0f}: {fast / slow:.0f} times as many"
+    yield Row("draw batches of 256 transitions", found, ">= 10 times d3rlpy", fast >= 10 * slow)
+
+
+BENCHES: dict[str, Callable[[], Iterator[Row]]] = {"collect": collect, "batches": batches, "tick": tick}
 
 
 def main() -> int:

@@ -98,6 +98,7 @@ def main() -> int:
     parser.add_argument("--sets", type=int, default=5, help="data sets (default 5)")
     parser.add_argument("--episodes", type=int, default=400, help="episodes of each (default 400)")
     parser.add_argument("--truth", type=int, default=1000, help="simulated episodes of each policy (default 1000)")
+    parser.add_argument("--seed", type=int, default=0, help="seed of the first data set (default 0)")
     parser.add_argument("--json", type=Path, help="write the pairs to this file")
     arguments = parser.parse_args()
     began = time.process_time()
@@ -105,7 +106,7 @@ def main() -> int:
     truth = [evaluate(one, ENV, episodes=arguments.truth, seed=5_000_000).success_rate or 0.0 for one in policies]
     print("truth", np.round(truth, 3).tolist(), f"{time.process_time() - began:.0f} CPU-s", flush=True)
     covered, correlations, pairs = [], [], []
-    for seed in range(arguments.sets):
+    for seed in range(arguments.seed, arguments.seed + arguments.sets):
         with tempfile.TemporaryDirectory() as folder:
             data = record(Path(folder) / "data", arguments.episodes, seed)
             own = np.mean([bool(data.facts(i)["success"]) for i in range(len(data))])
