@@ -98,7 +98,7 @@ def collect(
         name = policy if checkpoint is None else checkpoint.digest
         told = {"policy": name, "noise": noise, "random": random, "num_envs": envs.num_envs, **(facts or {})}
         actor = _policy(policy, checkpoint, env_id, envs.action_space, seed)
-        disturb = Disturbance(envs.single_action_space, noise, random, envs.num_envs, seed)
+        disturb = Disturbance(envs.single_action_space, noise, 1.0 if policy == RANDOM else random, envs.num_envs, seed)
         recorded = RecordVectorDataset(
             envs, place, info_of(envs, env_id, kwargs), told, keep=lambda number, _: number < episodes
         )
@@ -127,7 +127,7 @@ def _run(
         while done.episodes < episodes:
             wanted = np.array(policy.act_batch(observations))
             actions = disturb(wanted)
-            envs.extra = {} if actions is wanted else {"raw_action": wanted}
+            envs.extra = disturb.columns(wanted, actions)
             observations, _, terminated, truncated, infos = envs.step(actions)
             running += 1
             ended = np.flatnonzero(terminated | truncated)
@@ -168,3 +168,22 @@ class Disturbance:
             np.clip(disturbed, self._space.low, self._space.high, out=disturbed)
         changed: Array = disturbed.astype(actions.dtype)
         return changed
+
+    def columns(self, wanted: Array, actions: Array) -> dict[str, Array]:
+        """What a data set has of a step beside `actions`: ``raw_action`` and, where it is known, ``propensity``.
+
+        Whole numbers have a probability, and so has a drawn action of a Box its density; noise that is cut at the
+        bounds has neither.
+        """
+        columns = {} if actions is wanted or self._random == 1 else {"raw_action": wanted}
+        axes = tuple(range(1, actions.ndim))
+        if isinstance(self._space, gym.spaces.Box):
+            volume = float(np.prod(self._space.high.astype(np.float64) - self._space.low))
+            if self._random == 1 and not self._noise and np.isfinite(volume):
+                columns["propensity"] = np.full(len(actions), 1 / volume)
+        elif isinstance(self._space, gym.spaces.Discrete | gym.spaces.MultiDiscrete):
+            choices = float(
+                np.prod(self._space.n if isinstance(self._space, gym.spaces.Discrete) else self._space.nvec)
+            )
+            columns["propensity"] = self._random / choices + (1 - self._random) * (actions == wanted).all(axis=axes)
+        return columns

@@ -274,6 +274,8 @@ class RecordDataset(gym.Wrapper[Any, Any, Any, Any]):
         info = info or info_of(env)
         self.writer = DataSetWriter(place, info, **options)
         self._tracks = Tracks(env, info, 1, facts or {}, keep)
+        self.extra: dict[str, Array] = {}
+        """Further columns (1, ...) of the next step, such as ``intervention``."""
 
     def _add(self, episodes: Iterable[Episode]) -> None:
         for episode in episodes:
@@ -294,7 +296,7 @@ class RecordDataset(gym.Wrapper[Any, Any, Any, Any]):
             array = np.asarray(value)
             values[key] = array[None] if array.dtype.kind in "biuf" else _objects([value])
         ends = (np.array([terminated]), np.array([truncated]))
-        columns = info_columns(values, 1)
+        columns = info_columns(values, 1) | self.extra
         self._add(self._tracks.step(_batched(action), _batched(observation), [reward], *ends, columns))
         return observation, reward, terminated, truncated, info
 

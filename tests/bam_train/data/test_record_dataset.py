@@ -123,6 +123,25 @@ def test_collect(tmp_path):
     assert data.info.contract["command"][0]["unit"] == "rad"
 
 
+@pytest.mark.parametrize(("env", "propensity"), [("CartPole-v1", 1 / 2), ("Pendulum-v1", 1 / 4)])
+def test_collecting_at_random_records_how_likely_each_action_was(tmp_path, env, propensity):
+    collect(tmp_path / "d", "random", env, episodes=1, env_kwargs={"max_episode_steps": 5})
+    [one] = DataSet.open(tmp_path / "d")
+    assert set(one.columns["propensity"].tolist()) == {propensity}
+    assert "raw_action" not in one.columns
+
+
+def test_further_columns_of_a_step(tmp_path, counting):
+    env = RecordDataset(gym.make(counting), tmp_path / "d")
+    env.reset()
+    for person in (False, True):
+        env.extra = {"intervention": np.array([person])}
+        env.step(env.action_space.sample())
+    env.close()
+    [one] = DataSet.open(tmp_path / "d")
+    assert one.columns["intervention"].tolist() == [False, True]
+
+
 @pytest.mark.parametrize(
     ("arguments", "text"),
     [
