@@ -20,7 +20,7 @@ from bam_envs.core.wording import did_you_mean
 from bam_envs.robo_gym.making import constructor_options, require_values
 from bam_envs.robo_gym.table import ROBO_GYM
 from bam_envs.robots.linked import link_profile
-from bam_envs.tasks.late_actions import read_delay
+from bam_envs.tasks.wrappers.late_actions import read_delay
 from bam_train.checkpoint import Checkpoint
 from bam_train.checkpoint.manifest import WHERE
 from bam_train.env_location import HERE, Place
@@ -99,6 +99,7 @@ def require_env_kwargs(env: str, given: Mapping[str, Any]) -> None:
             )
     try:
         require_values(theirs, given) if theirs else require_kinds(env, options | {"randomize": False}, given)
+        entry.read_cameras(given)
         if given.get("link") is not None:
             link_profile(given["link"])
         if given.get("action_delay") is not None:

@@ -21,8 +21,8 @@ from bam_envs.core.robot import EnvIds, RobotState
 from bam_envs.core.robot_env import RobotVectorEnv
 from bam_envs.core.task import Array, Floats, Score
 from bam_envs.robots.physics.mujoco_arm import SimulatedArm
-from bam_envs.tasks.late_actions import LateActions
 from bam_envs.tasks.pick import PickTask
+from bam_envs.tasks.wrappers.late_actions import LateActions
 from bam_train.cli.program import guarded, parse
 from bam_train.detection import fresh_episodes
 from bam_train.detector import TICKS, Detector, Rollout

@@ -20,6 +20,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, get_type_hints
 
+from bam_envs.core.env_options import CAMERA_OPTIONS as IMAGES
 from bam_envs.core.registry import ENVIRONMENTS, EnvEntry, resolve
 from bam_envs.core.robot import SignalSpec
 from bam_envs.core.robot_env import describe
@@ -114,6 +115,9 @@ def environment(env_id: str) -> str:
     if options := arguments(entry):
         named = [[f"`{name}`", default, meaning] for name, default, meaning in options]
         parts.append(f"**Options**: arguments of `gym.make`\n\n{table(['name', 'default', 'meaning'], named)}")
+    if entry.cameras:
+        both = " and ".join(f"`{name}`" for name in entry.cameras)
+        parts.append(f"**Images**: with `camera=` of {both}; see [images](index.md#images).")
     for kind in ("observation", "action"):
         rows = signals[kind]
         lines = [[where, *line] for where, line in _joined(rows)]
@@ -169,7 +173,7 @@ def arguments(entry: EnvEntry) -> list[tuple[str, str, str]]:
         body = re.search(r"^Args:\n((?:[ ]{4}.*\n?|\n)+)", inspect.cleandoc(kind.__doc__ or ""), re.MULTILINE)
         text = textwrap.dedent(body[1]) if body else ""
         meanings = dict(re.findall(r"^(\w+): ((?:.*\n?)(?:^ +.*\n?)*)", text, re.MULTILINE)) | meanings
-    options = entry.options()
+    options = {name: value for name, value in entry.options().items() if name not in IMAGES}
     return [(name, _default(options[name]), code(meanings[name])) for name in options]
 
 

@@ -84,6 +84,7 @@ def details(name: str) -> dict[str, Any]:
             "rate_hz": None if period is None else 1 / period,
             "observation_space": space_to_json(env.observation_space),
             "action_space": space_to_json(env.action_space),
+            "cameras": [] if entry is None else list(entry.cameras),
             "signals": {} if describe is None else describe(),
         }
     finally:
@@ -99,6 +100,8 @@ def detail_lines(facts: dict[str, Any]) -> list[str]:
     count = facts["episode_steps"]
     steps = "no time limit" if count is None else f"{count} step{'s' * (count > 1)} an episode"
     lines.append(f"{steps}, {'no rate given' if facts['rate_hz'] is None else format(facts['rate_hz'], 'g') + ' Hz'}")
+    if facts["cameras"]:
+        lines.append(f"images: camera={' or '.join(facts['cameras'])}, such as --set env_kwargs.camera=front")
     if not facts["signals"]:
         lines += [f"{kind}: {json_module.dumps(facts[kind + '_space'])}" for kind in ("observation", "action")]
     for kind, signals in ((kind, signals) for kind, signals in facts["signals"].items() if signals):

@@ -187,7 +187,8 @@ class RecorderAgent(Agent):
         arrays = [*[get((name, t)) for name in self._numbers], action]
         if state is not None:
             truth = _numeric(state.truth).values() if state.truth else ()
-            arrays = [state.stamp, *state.signals.values(), *truth, state.command, *arrays]
+            measured = [state.signals[one.name] for one in self._robot.spec.signals if one.name in state.signals]
+            arrays = [state.stamp, *measured, *truth, state.command, *arrays]
         self._recorder.tick(arrays, scalars, begun - self._decided if t else 0.0)
         for name in self._pictures:
             self._recorder.pixels(name.removeprefix("env/"), get((name, t))[0])
@@ -209,7 +210,8 @@ class RecorderAgent(Agent):
             present = [signal for signal in spec.signals if signal.name in state.signals]
             signals = [f"{signal.name}.{label}" for signal in present for label in signal.labels]
             layout = {"/state": ["stamp", *signals], "/truth": _named(truth), "/command": list(spec.command.labels)}
-        layout["/observation"] = _named(arrays, labels.get("observation"))
+        pictures = {name.removeprefix(f"env/{NAME}/") for name in self._pictures}
+        layout["/observation"] = _named(arrays, [one for one in labels.get("observation", ()) if one not in pictures])
         layout["/action"] = _named({"": action}, labels.get("action"))
         layout |= {topic: list(names) for topic, names in _SCALARS.items()}
         kinds = {"truth": truth, "observation": arrays, "action": {"": action}}

@@ -5,14 +5,27 @@ They are the arguments of its task's constructor. Kinds are checked because any 
 """
 
 import inspect
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from numbers import Real
-from typing import Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
+from msgspec import Meta
 from numpy.typing import NDArray
 
 from bam_envs.core.errors import InvalidValue, UnknownName
+from bam_envs.core.robot import CameraSpec
+from bam_envs.core.validation import check
+
+CAMERA_OPTIONS: dict[str, Any] = {
+    "camera": None,
+    "image_size": 64,
+    "depth": False,
+    "segmentation": False,
+    "looks": "fixed",
+}
+"""Options of an environment with cameras, and their defaults."""
+_Size = Annotated[int, Meta(ge=8, le=512, description="a whole number of pixels from 8 to 512")]
 
 
 def constructor_options(task: type) -> dict[str, Any]:
@@ -71,3 +84,27 @@ def finite_numbers(value: Any, size: int, name: str) -> NDArray[np.float64]:
     if numbers.shape != (size,) or not np.isfinite(numbers).all():
         raise InvalidValue(f"{name} must be {size} finite numbers, not {value!r}.")
     return numbers
+
+
+def read_cameras(env_id: str, known: Sequence[str], given: Mapping[str, Any]) -> tuple[CameraSpec, ...]:
+    """The cameras that the options in `given` ask for; () without the option ``camera``.
+
+    Raises:
+        UnknownName: The environment has no such camera.
+        InvalidValue: An option has a value of the wrong kind, or no effect.
+    """
+    camera, options = given.get("camera"), {**CAMERA_OPTIONS, **given}
+    if camera is None:
+        changed = [name for name in CAMERA_OPTIONS if given.get(name, CAMERA_OPTIONS[name]) != CAMERA_OPTIONS[name]]
+        if changed:
+            raise InvalidValue(f"{changed[0]}= of {env_id} is for images; give camera= too, such as {known[0]!r}.")
+        return ()
+    names = check([camera] if isinstance(camera, str) else camera, list[str], f"camera= of {env_id}")
+    for name in names:
+        if name not in known:
+            raise UnknownName(f"camera of {env_id}", name, known)
+    if not names or len(set(names)) != len(names):
+        raise InvalidValue(f"camera= of {env_id} must be one or more different names, not {names!r}.")
+    size = check(options["image_size"], _Size, f"image_size= of {env_id}")
+    check(options["looks"], Literal["fixed", "random"], f"looks= of {env_id}")
+    return tuple(CameraSpec(name, size, options["depth"], options["segmentation"]) for name in names)

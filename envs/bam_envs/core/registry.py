@@ -13,8 +13,9 @@ from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
 
-from bam_envs.core.env_options import constructor_options, require_kinds, require_known
+from bam_envs.core.env_options import CAMERA_OPTIONS, constructor_options, read_cameras, require_kinds, require_known
 from bam_envs.core.errors import InvalidValue, UnknownName
+from bam_envs.core.robot import CameraSpec
 
 if TYPE_CHECKING:
     from bam_envs.core.robot import Robot
@@ -60,6 +61,8 @@ class EnvEntry:
     """Time between two actions [s]."""
     robot_options: tuple[str, ...] = ()
     """Arguments of the task that its robot takes too."""
+    cameras: tuple[str, ...] = ()
+    """Cameras of its robot, whose images its observations can have."""
     variants: dict[str, str] = field(default_factory=dict)
     """Flags that plug-ins add, such as ``parity`` -> ``"module:Class"`` of the task with that flag."""
 
@@ -74,8 +77,13 @@ class EnvEntry:
         return self.robot != NO_ROBOT
 
     def options(self) -> dict[str, Any]:
-        """The options of the task, flags of variants among them, with their defaults."""
-        return constructor_options(resolve(self.task)) | dict.fromkeys(self.variants, False)
+        """The options of the task, flags of variants and cameras among them, with their defaults."""
+        images = CAMERA_OPTIONS if self.cameras else {}
+        return constructor_options(resolve(self.task)) | images | dict.fromkeys(self.variants, False)
+
+    def read_cameras(self, given: Mapping[str, Any]) -> tuple[CameraSpec, ...]:
+        """The cameras that these options ask for; raises the errors of `bam_envs.core.env_options.read_cameras`."""
+        return read_cameras(self.id, self.cameras, given) if self.cameras else ()
 
     def make_task(self, num_envs: int, given: Mapping[str, Any]) -> Task:
         """The task of `num_envs` environments, with the options `given`.
@@ -89,7 +97,12 @@ class EnvEntry:
         require_kinds(self.id, options, given)
         flags = [flag for flag in self.variants if given.get(flag)]
         kind = resolve(self.variants[flags[0]] if flags else self.task)
-        task: Task = kind(num_envs, **{name: value for name, value in given.items() if name not in self.variants})
+        images = CAMERA_OPTIONS if self.cameras else {}
+        own = {name: value for name, value in given.items() if name not in self.variants and name not in images}
+        task: Task = kind(num_envs, **own)
+        cameras = self.read_cameras(given)
+        if cameras:
+            task = resolve("bam_envs.tasks.wrappers.camera_task:CameraTask")(task, cameras)
         return task
 
     def make_robot(self, num_robots: int, randomize: bool, task_options: Mapping[str, Any]) -> Robot:
@@ -100,6 +113,9 @@ class EnvEntry:
         """
         require_kinds(self.id, {"randomize": False}, {"randomize": randomize})
         shared = {name: task_options[name] for name in self.robot_options if name in task_options}
+        cameras = self.read_cameras(task_options)
+        if cameras:
+            shared |= {"cameras": cameras, "looks": task_options.get("looks", CAMERA_OPTIONS["looks"])}
         robot: Robot = resolve(self.robot)(num_robots, randomize=randomize, **shared)
         return robot
 
@@ -114,6 +130,7 @@ class Alias:
     """Variant of the environment that the other id names; "" for the environment itself."""
 
 
+_CAMERAS = ("front", "wrist")
 _ENTRIES = (
     EnvEntry(
         "bam/reach-v0",
@@ -121,6 +138,7 @@ _ENTRIES = (
         "bam_envs.tasks.reach:ReachTask",
         "bam_envs.robots.physics.mujoco_arm:arm_scene",
         max_episode_steps=100,
+        cameras=_CAMERAS,
     ),
     EnvEntry(
         "bam/pick-v0",
@@ -128,6 +146,7 @@ _ENTRIES = (
         "bam_envs.tasks.pick:PickTask",
         "bam_envs.robots.physics.mujoco_arm:cube_scene",
         max_episode_steps=100,
+        cameras=_CAMERAS,
     ),
     EnvEntry(
         "bam/pick-place-v0",
@@ -135,6 +154,7 @@ _ENTRIES = (
         "bam_envs.tasks.pick_place:PickPlaceTask",
         "bam_envs.robots.physics.mujoco_arm:cube_scene",
         max_episode_steps=200,
+        cameras=_CAMERAS,
     ),
     EnvEntry(
         "bam/mir100-navigation-v0",

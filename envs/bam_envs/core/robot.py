@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
+from gymnasium import spaces
 from numpy.typing import NDArray
 
 from bam_envs.core.errors import InvalidValue
@@ -14,6 +15,10 @@ from bam_envs.core.errors import InvalidValue
 Array = NDArray[np.float64]
 EnvIds = NDArray[np.int64]
 """Indices of some of the n environments that are stepped together. Shape: (k,)."""
+FARTHEST = 4.0
+"""Greatest distance in a depth image [m]; what is farther away, or nothing, counts as that far."""
+SEGMENTS = ("nothing", "table", "arm", "gripper", "object")
+"""Meaning of the ids in a segmentation."""
 
 
 @dataclass(frozen=True)
@@ -67,6 +72,30 @@ class BaseBody:
 
 
 @dataclass(frozen=True)
+class CameraSpec:
+    """One camera, whose images are square."""
+
+    name: str
+    """Name of the camera, and of its colour images, uint8 (size, size, 3) RGB, among the signals of a state."""
+    size: int = 64
+    """Width and height of its images [pixels]."""
+    depth: bool = False
+    """Whether ``<name>_depth`` is a signal too: float32 (size, size, 1), distance from the camera's plane [m]."""
+    segmentation: bool = False
+    """Whether ``<name>_segmentation`` is a signal too: uint8 (size, size, 1), indices of `SEGMENTS`."""
+
+    def spaces(self) -> dict[str, spaces.Box]:
+        """Spaces of its images, by signal."""
+        square = (self.size, self.size)
+        images = {self.name: spaces.Box(0, 255, (*square, 3), np.uint8)}
+        if self.depth:
+            images[f"{self.name}_depth"] = spaces.Box(0.0, FARTHEST, (*square, 1), np.float32)
+        if self.segmentation:
+            images[f"{self.name}_segmentation"] = spaces.Box(0, len(SEGMENTS) - 1, (*square, 1), np.uint8)
+        return images
+
+
+@dataclass(frozen=True)
 class RobotSpec:
     """The description of a robot, known before it is connected."""
 
@@ -81,6 +110,8 @@ class RobotSpec:
     """Delay of a steadily moving joint behind its commands, at the end of a period [s]."""
     body: BaseBody | None = field(default=None, compare=False)
     """Shape and laser scanners of a base, if they are known."""
+    cameras: tuple[CameraSpec, ...] = ()
+    """Its cameras, whose images are signals without labels."""
 
     def describe(self) -> dict[str, list[dict[str, Any]]]:
         """Labels, units and limits of state and command, as plain values."""
@@ -98,8 +129,8 @@ def describe_signal(signal: SignalSpec) -> list[dict[str, Any]]:
 class RobotState:
     """The measurements of n robots at one time."""
 
-    signals: dict[str, Array]
-    """Each signal in the order of its labels. Shape: (n, k)."""
+    signals: dict[str, NDArray[Any]]
+    """Each signal in the order of its labels, (n, k), and the images of cameras, (n, height, width, channels)."""
     stamp: Array
     """Time of the measurement [s]: the robot's monotonic clock, or simulated time. Shape: (n,)."""
     command: Array

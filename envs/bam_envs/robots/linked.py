@@ -190,7 +190,7 @@ class LinkedRobot:
         signals = {**state.signals, _STAMP: state.stamp[:, None]}
         for name, array in signals.items():
             if name not in self._states:
-                self._states[name] = np.zeros((len(array), LONGEST + 1, *array.shape[1:]))
+                self._states[name] = np.zeros((len(array), LONGEST + 1, *array.shape[1:]), array.dtype)
                 self._arrived_state[name] = array.copy()
             self._arrived_state[name] = self._arrived_state[name].copy()
             self._arrived_state[name][env_ids] = array[env_ids]

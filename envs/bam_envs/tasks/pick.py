@@ -10,7 +10,15 @@ from bam_envs.core.kinematics import cube_yaw_phase
 from bam_envs.core.robot import EnvIds, Initial, RobotState
 from bam_envs.core.task import Array, Floats, Label, Memory, Score, draw_seeds, labelled_box, limited
 from bam_envs.robots.ur5e import GEOMETRY
-from bam_envs.tasks.tool_control import ACTION_LABELS, HALF, HAND_LABELS, MIDDLE, ToolControl, hand_state
+from bam_envs.tasks.tool_control import (
+    ACTION_LABELS,
+    HALF,
+    HAND_LABELS,
+    JOINT_LABELS,
+    MIDDLE,
+    ToolControl,
+    hand_state,
+)
 
 CUBE_AREA = np.array([[0.35, -0.20], [0.65, 0.20]])
 """Range of the cube at the start: lowest and highest x, y [m]."""
@@ -76,6 +84,7 @@ class PickTask(Memory):
     action_labels = ACTION_LABELS
     moves_straight = True  # the tool, along straight lines: singularities count
     observation_labels: tuple[Label, ...] = HAND_LABELS + OBJECT_LABELS
+    robot_labels: tuple[Label, ...] = HAND_LABELS + JOINT_LABELS
 
     def __init__(self, num_envs: int = 1) -> None:
         self.num_envs = num_envs
@@ -134,6 +143,12 @@ class PickTask(Memory):
             phase.real[:, None],
             phase.imag[:, None],
         ]
+
+    def robot_columns(self, state: RobotState) -> list[Array]:
+        """See `robot_labels`: what the robot itself measures, not clipped. Shape: (n, k) each."""
+        sense = self.sense(state)
+        hand = hand_state(state, self.control, sense.tool, sense.x_axis)
+        return [*hand, state.signals["joint_position"] / np.pi]
 
     def command(self, action: Floats, state: RobotState) -> Array:
         """Joint positions [rad] and gripper width [m]. Shape: (n, 7)."""

@@ -9,6 +9,7 @@ from bam_envs.core.robot import EnvIds, Initial, RobotState
 from bam_envs.core.task import Array, Floats, Label, Score, limited
 from bam_envs.robots.ur5e import GRIPPER_OPEN
 from bam_envs.tasks.pick import CUBE_AREA, CUBE_EDGE, NEAR, TABLE_EDGE, CubeSense, PickTask
+from bam_envs.tasks.tool_control import HALF, MIDDLE
 
 GOAL_RADIUS = 0.02  # the object lies at the goal within this distance [m]
 GOAL_DISTANCE = 0.10  # least distance of a goal from the start of the cube [m]
@@ -56,6 +57,11 @@ class PickPlaceTask(PickTask):
 
     memory: Mapping[str, str] = {**PickTask.memory, "goal": "goal", "picked": "picked"}
     observation_labels = PickTask.observation_labels + GOAL_LABELS
+    robot_labels = (
+        *PickTask.robot_labels,
+        Label("goal_x", "goal, forward", "m", "(x - 0.5) / 0.2", -2, 2),
+        Label("goal_y", "goal, to the left", "m", "y / 0.25", -2, 2),
+    )
 
     def __init__(self, num_envs: int = 1) -> None:
         super().__init__(num_envs)
@@ -82,6 +88,10 @@ class PickPlaceTask(PickTask):
     def _columns(self, state: RobotState) -> list[Array]:
         offset = self.goal - self.sense(state).object[:, :2]
         return [*super()._columns(state), offset / 0.2, offset / 0.04, np.where(self.picked, 1.0, -1.0)[:, None]]
+
+    def robot_columns(self, state: RobotState) -> list[Array]:
+        """As for picking, and the goal, which the task gives."""
+        return [*super().robot_columns(state), (self.goal - MIDDLE[:2]) / HALF[:2]]
 
     def goal_distance(self, sense: CubeSense) -> Array:
         """Distance of the object from where it would lie at the goal [m]. Shape: (n,)."""

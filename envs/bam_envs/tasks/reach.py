@@ -56,6 +56,8 @@ class ReachTask(Memory):
         *(Label(f"goal_near_d{axis}", f"goal from the tool, {axis}, near", "m", "/ 0.05, clipped") for axis in "xyz"),
     )
 
+    robot_labels = observation_labels  # no tracker is needed, and the task gives the goal
+
     def __init__(self, num_envs: int = 1) -> None:
         self.num_envs = num_envs
         self.action_space: spaces.Box = labelled_box(self.action_labels)
@@ -75,18 +77,21 @@ class ReachTask(Memory):
 
     def observe(self, state: RobotState) -> Floats:
         """See `observation_labels`. Shape: (n, 21) float32."""
+        observation = np.concatenate(self.robot_columns(state), axis=1).astype(np.float32)
+        return limited(observation, self.observation_space.low, self.observation_space.high)
+
+    def robot_columns(self, state: RobotState) -> list[Array]:
+        """See `robot_labels`: the observation, not clipped. Shape: (n, k) each."""
         joints = state.signals["joint_position"]
         tool = GEOMETRY.tool_position(joints)
         offset = self.goal - tool
-        columns = [
+        return [
             joints - HOME,
             (state.command[:, :6] - joints) / LEASH,
             (tool - GOAL_AREA.mean(axis=0)) / 0.3,
             offset / 0.3,
             offset / 0.05,
         ]
-        observation = np.concatenate(columns, axis=1).astype(np.float32)
-        return limited(observation, self.observation_space.low, self.observation_space.high)
 
     def command(self, action: Floats, state: RobotState) -> Array:
         """Joint positions [rad] within `TOOL_STEP` and `JOINT_STEP`, and the open gripper [m]. Shape: (n, 7)."""

@@ -13,7 +13,7 @@ import numpy as np
 
 from bam_envs.core.robot import EnvIds, RobotState
 from bam_envs.core.task import Array, Floats, Label, Memory, limited
-from bam_envs.robots.ur5e import GEOMETRY, GRIPPER_OPEN
+from bam_envs.robots.ur5e import GEOMETRY, GRIPPER_OPEN, JOINTS
 
 TOOL_STEP = 0.0124
 """Maximum motion of the tool target in 0.05 s [m]; the tool stays below 0.25 m/s, as in a UR's recovery mode."""
@@ -48,6 +48,7 @@ HAND_LABELS = (
     Label("gripper_width", "opening of the gripper", "m", "/ 0.0425 - 1", -2, 2),
     Label("grip", "1 when the gripper was told to close, else -1", "1"),
 )
+JOINT_LABELS = tuple(Label(joint, "joint position", "rad", "/ pi", -2, 2) for joint in JOINTS)
 
 
 class ToolControl(Memory):

@@ -206,7 +206,10 @@ class RobotContract:
 
 def _check_state(robot: Robot, state: RobotState) -> None:
     n, spec = robot.num_robots, robot.spec
-    assert list(state.signals) == [signal.name for signal in spec.signals]
+    images = {name: box for camera in spec.cameras for name, box in camera.spaces().items()}
+    assert list(state.signals) == [*(signal.name for signal in spec.signals), *images]
+    for name, box in images.items():
+        assert all(box.contains(image) for image in state.signals[name]), f"{name} is not in {box}"
     for signal in spec.signals:
         array = state.signals[signal.name]
         assert array.shape == (n, len(signal.labels)), f"{signal.name} has shape {array.shape}"

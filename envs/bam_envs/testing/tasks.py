@@ -195,14 +195,17 @@ class TaskContract(AnyTaskContract):
             yield action
 
     def test_spaces_have_a_label_for_each_number(self) -> None:
-        """One-dimensional float32 boxes; names differ; the limits are those of the labels."""
+        """One-dimensional float32 boxes; names differ; the limits are those of the labels. Images have a label each."""
         task = self.make(2)
         assert isinstance(task, Task), f"{type(task).__name__} lacks a member of the Task protocol"
         assert task.num_envs == 2
-        for space, labels in (
-            (task.observation_space, task.observation_labels),
-            (task.action_space, task.action_labels),
-        ):
+        seen, images = task.observation_space, dict[str, spaces.Space[Any]]()
+        if isinstance(seen, spaces.Dict):
+            images = {name: one for name, one in seen.items() if len(one.shape or ()) == 3}
+            (seen,) = (one for name, one in seen.items() if name not in images)
+        assert images.keys() <= {label.name for label in task.observation_labels}
+        numbers = tuple(label for label in task.observation_labels if label.name not in images)
+        for space, labels in ((seen, numbers), (task.action_space, task.action_labels)):
             assert isinstance(space, spaces.Box)
             assert space.dtype == np.float32
             assert space.shape == (len(labels),), f"{len(labels)} labels for a space of shape {space.shape}"

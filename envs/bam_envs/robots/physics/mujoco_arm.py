@@ -11,11 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bam_envs.core.errors import InvalidValue, PhysicsDiverged, ResetNeeded
-from bam_envs.core.robot import EnvIds, Initial, RobotState, checked_command
+from bam_envs.core.robot import CameraSpec, EnvIds, Initial, RobotState, checked_command
 from bam_envs.robots.physics.shapes import marked
 from bam_envs.robots.ur5e import COMMAND, GRIPPER_OPEN, GRIPPER_SPEED, arm_spec
 
 if TYPE_CHECKING:
+    from bam_envs.robots.physics.cameras import Cameras
     from bam_envs.robots.physics.domain_randomization import Imperfection
     from bam_envs.robots.physics.mujoco_batch import Physics
     from bam_envs.robots.physics.rendering import OffScreen, Window
@@ -40,16 +41,27 @@ class SimulatedArm:
         num_robots: Number of arms stepped together.
         with_object: Whether there is a cube, measured by a tracker.
         randomize: Masses, friction, sizes and gains that differ each episode, a noisy tracker and delayed commands.
+        cameras: Its cameras, ``front`` and ``wrist``, whose images are signals.
+        looks: ``"random"`` for light, colours, texture and poses of cameras that differ each episode, or ``"fixed"``.
     """
 
-    def __init__(self, num_robots: int = 1, *, with_object: bool = True, randomize: bool = False) -> None:
+    def __init__(
+        self,
+        num_robots: int = 1,
+        *,
+        with_object: bool = True,
+        randomize: bool = False,
+        cameras: tuple[CameraSpec, ...] = (),
+        looks: str = "fixed",
+    ) -> None:
         self.num_robots = num_robots
-        self.randomize = randomize
-        self.spec = replace(arm_spec("ur5e", with_object=with_object), lag=LAG)
+        self.randomize, self._looks = randomize, looks
+        self.spec = replace(arm_spec("ur5e", with_object=with_object), lag=LAG, cameras=cameras)
         self._with_object = with_object
         self._scene = "ur5e_cube.xml" if with_object else "ur5e_gripper.xml"
         self._physics: Physics | None = None
         self._imperfection: Imperfection | None = None
+        self._cameras: Cameras | None = None
         self._view: OffScreen | Window | None = None
         self._all = np.arange(num_robots)
         self._setpoint = np.zeros((num_robots, 7))
@@ -65,6 +77,10 @@ class SimulatedArm:
 
         self._physics = Physics(self._scene, self.num_robots, varied=self.randomize)
         self._imperfection = Imperfection(self._physics) if self.randomize else None
+        if self.spec.cameras:
+            from bam_envs.robots.physics.cameras import Cameras
+
+            self._cameras = Cameras(self._scene, self._physics, self.spec.cameras, random=self._looks == "random")
 
     @property
     def physics(self) -> Physics:
@@ -111,6 +127,8 @@ class SimulatedArm:
         if self._imperfection is not None:
             for env, seed in zip(env_ids, seeds, strict=True):
                 self._imperfection.reset(int(env), int(seed), self._command[env])
+        if self._cameras is not None:
+            self._cameras.begin(env_ids, seeds)
         if pose is not None:
             qpos, geom, half = physics.qpos, physics.model.geom("object").id, pose[:, 2] / 2
             qpos[env_ids, 8:10] = pose[:, :2]
@@ -161,7 +179,7 @@ class SimulatedArm:
             yield self._measure(self._all if last else self._all[:0])
 
     def _measure(self, fresh: EnvIds) -> RobotState:
-        """The state of all environments; a noisy tracker measures only the `fresh` ones again."""
+        """The state of all environments; a noisy tracker and cameras measure only the `fresh` ones again."""
         physics = self.physics
         qpos, qvel = physics.qpos, physics.qvel
         if not np.isfinite(physics.state.sum()):
@@ -175,6 +193,8 @@ class SimulatedArm:
                 self._imperfection.look(fresh, pose[fresh])
                 pose = self._imperfection.seen.copy()
             signals |= {"object_position": pose[:, :3], "object_quaternion": pose[:, 3:]}
+        if self._cameras is not None:
+            signals |= self._cameras.look(fresh)
         return RobotState(signals, physics.time, self._command)
 
     def halt(self) -> None:
@@ -192,9 +212,11 @@ class SimulatedArm:
         self.halt()
         if self._view is not None:
             self._view.close()
+        if self._cameras is not None:
+            self._cameras.close()
         if self._physics is not None:
             self._physics.close()
-        self._view = self._physics = self._imperfection = None
+        self._view = self._physics = self._imperfection = self._cameras = None
 
     def render(
         self, mode: str, marks: list[tuple[Array, tuple[float, float, float, float]]]
@@ -203,7 +225,7 @@ class SimulatedArm:
         from bam_envs.robots.physics.rendering import open_view
 
         if self._view is None:
-            self._view = open_view(self.physics.model_of(0), mode, camera="front")
+            self._view = open_view(self.physics.model_of(0), mode, camera="overview")
         return self._view.show(self.physics.data_of(0), marked(marks))
 
     def show(self, state: RobotState) -> None:
@@ -216,7 +238,9 @@ class SimulatedArm:
     def state_dict(self) -> dict[str, Any]:
         """The complete state of the simulated robots."""
         arrays = {"physics": self.physics.state, "setpoint": self._setpoint, "command": self._command}
-        extra = {} if self._imperfection is None else {"imperfection": self._imperfection.state_dict()}
+        extra: dict[str, Any] = {} if self._imperfection is None else {"imperfection": self._imperfection.state_dict()}
+        if self._cameras is not None:
+            extra["looks"] = self._cameras.draws.copy()
         return {name: array.copy() for name, array in arrays.items()} | extra
 
     def load_state_dict(self, state: dict[str, Any]) -> RobotState:
@@ -226,6 +250,9 @@ class SimulatedArm:
             self._imperfection.load_state_dict(state["imperfection"])
         self.physics.state = np.array(state["physics"])
         self._setpoint, self._command = np.array(state["setpoint"]), np.array(state["command"])
+        if self._cameras is not None:
+            self._cameras.draws = np.array(state["looks"])
+            self._cameras.look(self._all)
         return self._measure(self._all[:0])
 
 

@@ -42,14 +42,7 @@ class OffScreen:
 
     def __init__(self, model: Any) -> None:
         self._model = model
-        backend = find_backend()
-        try:
-            self._gl: Any = importlib.import_module(f"mujoco.{backend}").GLContext(WIDTH, HEIGHT)
-        except (ImportError, AttributeError, RuntimeError, mujoco.FatalError) as error:
-            raise RenderingUnavailable(
-                f"MUJOCO_GL={backend} does not work here: {error}. Unset it, or try egl."
-            ) from error
-        self._gl.make_current()
+        self._gl: Any = gl_context(find_backend(), WIDTH, HEIGHT)
         self._scene = mujoco.MjvScene(model, maxgeom=MOST_GEOMS)
         self._option = mujoco.MjvOption()
         self.camera: Any = mujoco.MjvCamera()  # to be set
@@ -105,6 +98,16 @@ class Window:
         self._viewer.close()
         for thread in self._threads:
             thread.join(timeout=5)
+
+
+def gl_context(backend: str, width: int, height: int) -> Any:
+    """A new OpenGL context of `find_backend`, current in this thread; `RenderingUnavailable` if there is none."""
+    try:
+        context = importlib.import_module(f"mujoco.{backend}").GLContext(width, height)
+    except (ImportError, AttributeError, RuntimeError, mujoco.FatalError) as error:
+        raise RenderingUnavailable(f"MUJOCO_GL={backend} does not work here: {error}. Unset it, or try egl.") from error
+    context.make_current()
+    return context
 
 
 def open_view(model: Any, mode: str, camera: str | None = None) -> OffScreen | Window:
