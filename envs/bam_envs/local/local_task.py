@@ -7,7 +7,7 @@ import numpy as np
 from gymnasium import spaces
 
 from bam_envs.core.robot import EnvIds, Initial, RobotSpec, RobotState, SignalSpec
-from bam_envs.core.task import Array, Label, Memory, Score, draw_seeds
+from bam_envs.core.task import Array, Flags, Label, Memory, Score
 
 PERIOD = 0.1
 """Time of a step where one is asked for, such as between two pictures of a video [s]."""
@@ -88,7 +88,7 @@ class LocalTask(Memory):
     def sample_initial(self, env_ids: EnvIds, rngs: Sequence[np.random.Generator]) -> Initial:
         """Begin an episode in these environments."""
         self.begin(env_ids, rngs)
-        return Initial({}, draw_seeds(rngs))
+        return Initial({}, np.zeros(len(env_ids), np.int64))
 
     def on_reset(self, env_ids: EnvIds, state: RobotState) -> None:
         """Do nothing: the episode has begun."""
@@ -102,7 +102,7 @@ class LocalTask(Memory):
         return []
 
 
-def one_step(correct: Array, reward: Array, **info: Any) -> Score:
+def one_step(correct: Flags, reward: Array, **info: Any) -> Score:
     """The outcome of a step that ends every episode; `correct` (n,) bool tells where it was the best choice."""
     ended = np.ones(len(correct), dtype=bool)
-    return Score(np.asarray(reward, np.float64), ended, np.asarray(correct, dtype=bool), info)
+    return Score(np.asarray(reward, np.float64), ended, correct, info)

@@ -25,6 +25,12 @@ def test_the_table():
         "bam/ur-track-v0": (1000, 0.05),
         "bam/isaac-reach-v0": (600, 1 / 30),
         "bam/grid-world-v0": (100, 0.1),
+        "bam/classic-bandit-v0": (1, 0.1),
+        "bam/context-bandit-v0": (1, 0.1),
+        "bam/image-bandit-v0": (1, 0.1),
+        "bam/digits-v0": (1, 0.1),
+        "bam/mnist-v0": (1, 0.1),
+        "bam/grasp-xy-v0": (1, 0.1),
     }
     for key, entry in ENVIRONMENTS.items():
         assert entry.id == key

@@ -28,8 +28,8 @@ EACH = pytest.mark.parametrize("env_id", LOCAL)
 
 
 @pytest.fixture
-def options(env_id):
-    return OPTIONS.get(env_id, {})
+def options(env_id, mnist):
+    return {"data": str(mnist)} if "mnist" in env_id else OPTIONS.get(env_id, {})
 
 
 @EACH

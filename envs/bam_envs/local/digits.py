@@ -1,0 +1,139 @@
+"""Digits to read, one an episode: 8 x 8 pixels, which come with the package, or MNIST's 28 x 28 from your own files.
+
+``digits.npz`` holds the 1,797 pictures of scikit-learn's `load_digits` (BSD-3-Clause), a copy of the test set of the
+UCI Machine Learning Repository's "Optical Recognition of Handwritten Digits" by E. Alpaydin and C. Kaynak (CC BY 4.0).
+"""
+
+import functools
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+
+from bam_envs.core.robot import EnvIds, RobotState
+from bam_envs.core.task import Label, Score
+from bam_envs.core.validation import NonEmpty, check
+from bam_envs.local.local_task import LocalTask, one_step
+from bam_envs.local.mnist_files import read_mnist
+
+Pictures = tuple[NDArray[np.uint8], NDArray[np.uint8]]
+"""Pictures (k, h, w), and which digits they are (k,)."""
+Split = Literal["train", "test"]
+_TRAIN = 1_438  # pictures of the file that are of the training split: the first ones
+
+
+@functools.cache
+def _shipped(split: str) -> Pictures:
+    """The shipped digits of a split; they are in random order, a fifth of each digit at the end."""
+    chosen = slice(_TRAIN, None) if split == "test" else slice(_TRAIN)
+    with np.load(Path(__file__).with_name("digits.npz")) as arrays:
+        return arrays["images"][chosen], arrays["labels"][chosen]
+
+
+class Digits(LocalTask):
+    """Tell which digit the picture shows, of 8 x 8 pixels.
+
+    Action:
+        The digit.
+
+    Start:
+        One of the pictures of the split, uniformly: 1,438 for training, and another 359 to test.
+
+    Reward:
+        1 if the picture shows the digit, else 0.
+
+    Success:
+        The picture shows the digit.
+
+    End:
+        Terminated after one step.
+
+    Info:
+        `label`, the digit that it shows.
+
+    Args:
+        split: ``"train"`` or ``"test"``.
+    """
+
+    memory: Mapping[str, str] = {"drawn": "drawn"}
+    side, white = 8, 16
+    """Pixels along each side, and the greatest value of a pixel."""
+
+    def __init__(self, num_envs: int = 1, *, split: Split = "train") -> None:
+        super().__init__(num_envs)
+        self.split = check(split, Split, "split")
+        self.observation_space: spaces.Space[Any] = spaces.Box(0, 1, (self.side, self.side), np.float32)
+        self.observation_labels = (Label("picture", "a digit, white on black", "", low=0),)
+        self.action_space = spaces.Discrete(10)
+        self.action_labels = (Label("digit", "which digit it is", "", low=0, high=9),)
+        self.drawn = np.zeros(num_envs, np.int64)
+        """Which picture of the split. Shape: (n,)."""
+
+    def pictures(self) -> Pictures:
+        """All pictures of the split, and their labels."""
+        return _shipped(self.split)
+
+    def begin(self, env_ids: EnvIds, rngs: Sequence[np.random.Generator]) -> None:
+        """Draw a picture."""
+        count = len(self.pictures()[1])
+        self.own_memory()
+        self.drawn[env_ids] = [int(rng.integers(count)) for rng in rngs]
+
+    def observe(self, state: RobotState) -> NDArray[np.float32]:
+        """The pictures. Shape: (n, h, w)."""
+        return np.asarray(self.pictures()[0][self.drawn] / np.float32(self.white), np.float32)
+
+    def score(self, state: RobotState, action: Any) -> Score:
+        """Compare the actions with the labels."""
+        labels = self.pictures()[1][self.drawn].astype(np.float64)
+        correct = labels == action
+        return one_step(correct, correct.astype(np.float64), label=labels)
+
+    def picture(self) -> NDArray[np.uint8]:
+        """The digit, 168 pixels or more along each side."""
+        grey = self.pictures()[0][self.drawn[0]] * (255.0 / self.white)
+        large = np.kron(grey, np.ones((-(-168 // self.side),) * 2)).astype(np.uint8)
+        return np.repeat(large[..., None], 3, axis=2)
+
+
+class Mnist(Digits):
+    """Tell which digit the picture shows, of 28 x 28 pixels: MNIST, from files of yours.
+
+    They are MNIST's own four, as they are or gzipped: `train-images-idx3-ubyte`, `train-labels-idx1-ubyte`,
+    `t10k-images-idx3-ubyte` and `t10k-labels-idx1-ubyte`. They are read when the first episode begins.
+
+    Action:
+        The digit.
+
+    Start:
+        One of the pictures of the split, uniformly: 60,000 for training, and another 10,000 to test.
+
+    Reward:
+        1 if the picture shows the digit, else 0.
+
+    Success:
+        The picture shows the digit.
+
+    End:
+        Terminated after one step.
+
+    Info:
+        `label`, the digit that it shows.
+
+    Args:
+        split: ``"train"`` or ``"test"``.
+        data: Folder of the files, here or in a bucket (``s3://bucket/mnist``).
+    """
+
+    side, white = 28, 255
+
+    def __init__(self, num_envs: int = 1, *, split: Split = "train", data: str = "mnist") -> None:
+        super().__init__(num_envs, split=split)
+        self.data = check(str(data), NonEmpty, "data")
+
+    def pictures(self) -> Pictures:
+        """All pictures of the split, and their labels."""
+        return read_mnist(self.data, self.split)
