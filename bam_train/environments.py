@@ -82,6 +82,7 @@ def require_env_kwargs(env: str, given: Mapping[str, Any]) -> None:
     entry = entry_of(env)
     if entry is None or not given:
         return
+    given = registry.own_options(env, given)
     options, theirs = entry.options(), ROBO_GYM.get(env.rpartition(":")[2])
     if theirs and limit is not None and not 1 <= limit <= entry.max_episode_steps:
         raise SettingsError(

@@ -46,13 +46,16 @@ def overview() -> list[dict[str, Any]]:
 
 def overview_lines(facts: list[dict[str, Any]]) -> list[str]:
     """The environments as a table, then robo-gym's names for them, two ids in a line."""
+    from bam_envs.local.names import BAM_NAMES
+
     keys = ("id", "observation", "action", "episode_steps", "rate_hz", "summary")
     cells = [[f"{env[key]:g}" if key == "rate_hz" else str(env[key]) for key in keys] for env in facts]
     table = aligned([["id", "observation", "action", "steps", "Hz", "what to do"], *cells])
     pairs = {name.replace("Sim-v0", "{Sim,Rob}-v0"): env["id"] for env in facts for name in env["robo_gym"][::2]}
     more = "Details: bam-envs ID. Training: bam-train --env ID --algo ppo; any Gymnasium id will do."
     theirs = "robo-gym's ids work too, with robo-gym's options; Rob is the one with a live robot:"
-    return [*table, "", theirs, *aligned(list(map(list, pairs.items()))), "", more]
+    bams = "BAM's ids work too: " + ", ".join(f"{name} is {alias.env_id}" for name, alias in BAM_NAMES.items()) + "."
+    return [*table, "", theirs, *aligned(list(map(list, pairs.items()))), "", bams, more]
 
 
 def aligned(table: list[list[str]]) -> list[str]:
@@ -78,7 +81,7 @@ def details(name: str) -> dict[str, Any]:
         return {
             "id": env_id,
             "summary": None if entry is None else entry.summary,
-            "same_as": None if theirs is None else theirs.env_id,
+            "same_as": None if entry is None or entry.id == env_id else entry.id,
             "is_live": theirs is not None and theirs.is_live,
             "episode_steps": getattr(env.spec, "max_episode_steps", None) if entry is None else steps,
             "rate_hz": None if period is None else 1 / period,
@@ -93,10 +96,12 @@ def details(name: str) -> dict[str, Any]:
 
 def detail_lines(facts: dict[str, Any]) -> list[str]:
     """The facts of `details` as lines for people."""
+    from bam_envs.local.names import BAM_NAMES
+
     lines = [facts["id"] if facts["summary"] is None else f"{facts['id']}: {facts['summary']}"]
     if facts["same_as"] is not None:
         live = ", with a live robot: rs_address='IP:PORT' or robot='ws://IP:PORT'" if facts["is_live"] else ""
-        lines.append(f"robo-gym's name of {facts['same_as']}{live}")
+        lines.append(f"{'BAM' if facts['id'] in BAM_NAMES else 'robo-gym'}'s name of {facts['same_as']}{live}")
     count = facts["episode_steps"]
     steps = "no time limit" if count is None else f"{count} step{'s' * (count > 1)} an episode"
     lines.append(f"{steps}, {'no rate given' if facts['rate_hz'] is None else format(facts['rate_hz'], 'g') + ' Hz'}")

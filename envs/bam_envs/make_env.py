@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
 
-from bam_envs.core.errors import InvalidValue
-from bam_envs.core.registry import ENVIRONMENTS, EnvEntry
+from bam_envs.core.errors import InvalidValue, UnknownName
+from bam_envs.core.registry import ENVIRONMENTS, EnvEntry, entry_of, own_options
 from bam_envs.core.validation import PositiveInt, check
 
 if TYPE_CHECKING:
@@ -42,7 +42,7 @@ def make_env(
     """One robot and its task; the entry point of `gymnasium.make`.
 
     Args:
-        env_id: Key of `ENVIRONMENTS`.
+        env_id: Key of `ENVIRONMENTS` or of `ALIASES`.
         render_mode: Render mode of the simulated robot.
         randomize: Whether the physics of the simulated robot is randomized.
         link: The link that the simulated robot is behind: ``"wifi"``, ``"lte"``, ``"bad"``, a JSON file or a table of
@@ -78,7 +78,7 @@ def make_env(
         return make_remote_env(env_id, transport, ca_file=ca_file, token_file=token_file, timeout=timeout)
     from bam_envs.core.robot_env import RobotEnv
 
-    entry = ENVIRONMENTS[env_id]
+    entry, task_options = _named(env_id, task_options)
     _require_robot(entry, robot=robot, randomize=randomize or None, link=link, action_delay=action_delay)
     task = entry.make_task(1, task_options)
     simulated = entry.make_robot(1, randomize, task_options)
@@ -104,6 +104,18 @@ def _refuse_for_simulations(profile: object, guards: object, trial: bool, shadow
     if trial or shadow:
         name = "trial" if trial else "shadow"
         raise InvalidValue(f"{name}=True is for a live robot; give its address with robot= too.")
+
+
+def _named(env_id: str, options: Mapping[str, Any]) -> tuple[EnvEntry, dict[str, Any]]:
+    """The entry of an environment and its options, under their own names.
+
+    Raises:
+        UnknownName: There is no such environment.
+    """
+    entry = entry_of(env_id)
+    if entry is None:
+        raise UnknownName("environment", env_id, ENVIRONMENTS)
+    return entry, own_options(env_id, options)
 
 
 def _require_robot(entry: EnvEntry, **given: object) -> None:
@@ -190,7 +202,7 @@ def make_vector_env(
         )
     from bam_envs.core.robot_env import RobotVectorEnv
 
-    entry = ENVIRONMENTS[env_id]
+    entry, task_options = _named(env_id, task_options)
     _require_robot(entry, randomize=randomize or None, link=link, action_delay=action_delay)
     return RobotVectorEnv(
         _behind(link, entry.make_robot(num_envs, randomize, task_options)),

@@ -128,6 +128,8 @@ class Alias:
     """Key of `ENVIRONMENTS`."""
     variant: str = ""
     """Variant of the environment that the other id names; "" for the environment itself."""
+    options: Mapping[str, str] = field(default_factory=dict)
+    """Other name of an option of the task -> its own."""
 
 
 _CAMERAS = ("front", "wrist")
@@ -282,10 +284,10 @@ def register() -> None:
         register_id(entry.id, "bam_envs.make_env", entry.time_limit)
 
 
-def register_alias(env_id: str, alias: Alias, module: str) -> None:
+def register_alias(env_id: str, alias: Alias, module: str, max_episode_steps: int | None = None) -> None:
     """Register an id of a plug-in, whose `module` has ``make_env`` and ``make_vector_env``."""
     ALIASES[env_id] = alias
-    register_id(env_id, module, None)
+    register_id(env_id, module, max_episode_steps)
 
 
 def register_id(env_id: str, module: str, max_episode_steps: int | None) -> None:
@@ -304,6 +306,12 @@ def entry_of(env_id: str) -> EnvEntry | None:
     """The entry of `env_id`, an id of the table or of a plug-in, with or without ``module:``; None if there is none."""
     bare = env_id.rpartition(":")[2]
     return ENVIRONMENTS.get(ALIASES[bare].env_id if bare in ALIASES else bare)
+
+
+def own_options(env_id: str, given: Mapping[str, Any]) -> dict[str, Any]:
+    """The options `given` to an environment, each under its own name."""
+    own = ALIASES[env_id].options if env_id in ALIASES else {}
+    return {own.get(name, name): value for name, value in given.items()}
 
 
 def are_same(one: str, other: str) -> bool:

@@ -45,8 +45,10 @@ import sys, bam_envs
 print(sorted(name for name in sys.modules if name.startswith("bam_envs.")))
 """
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    modules = [f"bam_envs.core.{name}" for name in ("env_options", "errors", "registry", "wording")]
-    assert done.stdout.strip() == str(["bam_envs.core", *modules, "bam_envs.robo_gym", "bam_envs.robo_gym.table"])
+    core = ("env_options", "errors", "registry", "robot", "validation", "wording")
+    others = ("local", "local.names", "robo_gym", "robo_gym.table")
+    modules = ["core", *(f"core.{name}" for name in core), *others]
+    assert done.stdout.strip() == str([f"bam_envs.{name}" for name in modules])
 
 
 def test_two_names_of_one_environment_are_the_same():

@@ -18,6 +18,7 @@ def test_table(run):
     assert lines[2].endswith("pick up a cube that lies anywhere in 30 x 40 cm with any yaw")
     start = lines.index("robo-gym's ids work too, with robo-gym's options; Rob is the one with a live robot:")
     assert lines[start + 1].split() == ["NoObstacleNavigationMir100{Sim,Rob}-v0", "bam/mir100-navigation-v0"]
+    assert lines[-2].startswith("BAM's ids work too: GridWorldEnv-v0 is bam/grid-world-v0, ClassicBandit-v0 is ")
     assert lines[-1] == "Details: bam-envs ID. Training: bam-train --env ID --algo ppo; any Gymnasium id will do."
 
 
