@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Any, get_type_hints
 
 from bam_envs.core.env_options import CAMERA_OPTIONS as IMAGES
-from bam_envs.core.registry import ENVIRONMENTS, EnvEntry, resolve
+from bam_envs.core.registry import ENVIRONMENTS, NO_ROBOT, EnvEntry, resolve
 from bam_envs.core.robot import SignalSpec
 from bam_envs.core.robot_env import describe
 from bam_envs.core.spaces import space_text
@@ -103,7 +103,7 @@ def environment(env_id: str) -> str:
     docs = sections(task.__doc__ or "")
     signals = describe(resolve(entry.robot)(1), resolve(entry.task)(1))
     limit, robot = entry.time_limit, entry.has_robot
-    time = f"One step is {entry.period:g} s of robot time." if robot else "There is no robot."
+    time = "There is no robot." if entry.robot == NO_ROBOT else f"One step is {entry.period:g} s of robot time."
     parts = [f"{entry.summary[0].upper()}{entry.summary[1:]}. {time}"]
     if limit is not None:
         docs["End"] += f" Truncated after {limit} steps{f' ({limit * entry.period:g} s)' * robot}."

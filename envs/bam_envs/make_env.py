@@ -120,9 +120,10 @@ def _named(env_id: str, options: Mapping[str, Any]) -> tuple[EnvEntry, dict[str,
 
 def _require_robot(entry: EnvEntry, **given: object) -> None:
     """Refuse the options of a robot where there is none."""
-    names = [name for name, value in given.items() if value is not None]
+    kind, differs = ("live robot", "randomize") if entry.simulated_only else ("robot", "")
+    names = [name for name, value in given.items() if value is not None and name != differs]
     if names and not entry.has_robot:
-        raise InvalidValue(f"{entry.id} has no robot; leave out what is for one: {', '.join(names)}.")
+        raise InvalidValue(f"{entry.id} has no {kind}; leave out what is for one: {', '.join(names)}.")
 
 
 def _behind(link: Any, robot: Robot) -> Robot:

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from bam_envs.core.registry import ENVIRONMENTS
+from bam_envs.core.registry import ENVIRONMENTS, NO_ROBOT
 from bam_envs.core.robot import RobotState
 from bam_envs.ros.codec import encode_sink
 
@@ -17,7 +17,7 @@ def each(ids):
 
 
 ROBOTS = [env_id for env_id, entry in ENVIRONMENTS.items() if entry.has_robot]
-LOCAL = [env_id for env_id, entry in ENVIRONMENTS.items() if not entry.has_robot]
+LOCAL = [env_id for env_id, entry in ENVIRONMENTS.items() if entry.robot == NO_ROBOT]
 """The environments without a robot."""
 EACH = each(ROBOTS)
 

@@ -63,6 +63,8 @@ class EnvEntry:
     """Arguments of the task that its robot takes too."""
     cameras: tuple[str, ...] = ()
     """Cameras of its robot, whose images its observations can have."""
+    simulated_only: bool = False
+    """Whether no live robot can take the place of its simulated one."""
     variants: dict[str, str] = field(default_factory=dict)
     """Flags that plug-ins add, such as ``parity`` -> ``"module:Class"`` of the task with that flag."""
 
@@ -73,8 +75,8 @@ class EnvEntry:
 
     @property
     def has_robot(self) -> bool:
-        """Whether it moves a robot."""
-        return self.robot != NO_ROBOT
+        """Whether it moves a robot, which may be a live one."""
+        return self.robot != NO_ROBOT and not self.simulated_only
 
     def options(self) -> dict[str, Any]:
         """The options of the task, flags of variants and cameras among them, with their defaults."""
@@ -271,6 +273,23 @@ _ENTRIES = (
         NO_ROBOT,
         max_episode_steps=1,
         period=0.1,
+    ),
+    *(
+        EnvEntry(
+            f"bam/grasp-{name}-v0",
+            summary,
+            f"bam_envs.tasks.grasping.grasp_tasks:{task}",
+            "bam_envs.robots.physics.grasp_cell:GraspCell",
+            max_episode_steps=1,
+            period=1.0,
+            robot_options=("objects", "grasps", "size"),
+            simulated_only=True,
+        )
+        for name, task, summary in (
+            ("xyr", "GraspXYR", "grasp an object: choose a place of a picture from above, and a rotation"),
+            ("xyrw", "GraspXYRW", "grasp an object: choose place, rotation and width of the gripper from a picture"),
+            ("6d", "Grasp6D", "grasp an object from any direction: choose the gripper's pose and width from a picture"),
+        )
     ),
 )
 ENVIRONMENTS: dict[str, EnvEntry] = {entry.id: entry for entry in _ENTRIES}

@@ -31,10 +31,11 @@ MODELS = Path(__file__).parent / "models"
 
 
 class Physics:
-    """Environments of one MJCF model in ``models/``; `varied`: each has its own copy of the model, to be changed."""
+    """Environments of one model, or MJCF file in ``models/``; `varied`: each has its own copy of it, to be changed."""
 
-    def __init__(self, scene: str, num_envs: int, *, varied: bool = False) -> None:
-        self.model: Any = mujoco.MjModel.from_xml_path(str(MODELS / scene))
+    def __init__(self, scene: Any, num_envs: int, *, varied: bool = False) -> None:
+        is_file = isinstance(scene, str)
+        self.model: Any = mujoco.MjModel.from_xml_path(str(MODELS / scene)) if is_file else scene
         self.num_envs = num_envs
         self._models = [copy.copy(self.model) if varied else self.model for _ in range(num_envs)]
         cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
@@ -70,6 +71,10 @@ class Physics:
     def model_of(self, env: int) -> Any:
         """The model of `env`, a copy if models are varied."""
         return self._models[env]
+
+    def replace(self, env: int, model: Any) -> None:
+        """Give `env` another model, with as many joints, geoms and actuators."""
+        self._models[env] = model
 
     def recompute(self, env: int) -> None:
         """Update the quantities that MuJoCo derives from masses and sizes, after a change of `model_of(env)`."""

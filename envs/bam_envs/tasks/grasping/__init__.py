@@ -1,0 +1,1 @@
+"""Grasps from a picture: the tasks, and a policy written by hand."""
