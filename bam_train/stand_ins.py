@@ -147,7 +147,9 @@ class _StandIn:
         return None
 
     def _files(self) -> list[Path]:
-        return [path for path in sorted(self.folder.rglob("*")) if path.is_file() and not path.name.startswith(".")]
+        """What is there, without what is being written, which has a name with a dot at its beginning."""
+        found = (path for path in sorted(self.folder.rglob("*")) if path.is_file())
+        return [one for one in found if not any(p.startswith(".") for p in one.relative_to(self.folder).parts)]
 
 
 def _state(path: Path) -> tuple[int, int]:

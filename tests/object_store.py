@@ -4,6 +4,7 @@ import contextlib
 import logging
 import socket
 import threading
+import urllib.request
 
 import pytest
 
@@ -30,6 +31,7 @@ def bucket_fixture():
     host, port = server.get_host_and_port()
     endpoint = f"http://{host}:{port}"
     try:
+        urllib.request.urlopen(f"{endpoint}/moto-api/reset", data=b"").close()  # other modules' buckets in this process
         with environment(endpoint):
             fs.S3FileSystem(endpoint_override=endpoint, allow_bucket_creation=True).create_dir("bam-lab")
             yield "s3://bam-lab"

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from collections import Counter
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from bam_train.cli.console import count, duration, number, percent, tell
@@ -19,11 +18,10 @@ def export_data(config: flags.ExportDataConfig) -> None:
     from bam_train.data import DataSet
     from bam_train.data.export import export
     from bam_train.data.selection import choose
-    from bam_train.place import Place
 
     data = DataSet.open(config.place)
     chosen = choose(data, config.where)
-    opened = export(data, config.to, Path(Place(config.out)), chosen)
+    opened = export(data, config.to, config.out, chosen)
     tell(f"{config.out}: {_episodes(len(chosen))} as {config.to}", f"  open it with  {opened}")
 
 

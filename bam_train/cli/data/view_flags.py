@@ -26,7 +26,7 @@ class ExportDataConfig:
     to: Annotated[Format, tyro.conf.arg(metavar="FORMAT")]
     """minari (folder), d3rlpy (file .h5), lerobot (folder), rllib (folder of Parquet), hdf5 (file, as robomimic has it)
     or mcap (file, for Foxglove)."""
-    out: Target
+    out: Annotated[Path, tyro.conf.arg(metavar="PLACE")]
     """Where it goes; nothing may be there yet."""
     where: Conditions = ()
     """Only episodes for which this holds, any number of times: success=true, "return>=10", policy~1f3a."""

@@ -9,6 +9,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
+from bam_train.cli.data.bam_data import main
 from bam_train.data import DataSet, DataSetInfo, DataSetWriter, Episode
 from bam_train.data.layout import LOCK
 from bam_train.errors import BadDataSet, PlaceError
@@ -82,3 +83,13 @@ def test_a_connection_that_is_cut_while_episodes_are_read(bucket):
 def test_nothing_at_a_place(bucket):
     with pytest.raises(BadDataSet, match=r"is no data set: it has no meta/info\.json"):
         DataSet.open(f"{bucket}/nothing")
+
+
+def test_an_export_goes_to_a_bucket_whole_and_alone(bucket, tmp_path):
+    write(f"{bucket}/exported/from", range(3))
+    for place in (f"{bucket}/exported/to", str(tmp_path / "to")):
+        with pytest.raises(SystemExit) as ended:
+            main(["export", f"{bucket}/exported/from", "--to", "lerobot", "--out", place])
+        assert ended.value.code == 0
+    assert sorted(one.name for one in (Place(bucket) / "exported").list()) == ["from", "to"]
+    assert DataSet.open(f"{bucket}/exported/to").digests == DataSet.open(tmp_path / "to").digests
