@@ -45,7 +45,7 @@ class TrainSettings:
     algo: str
     """Algorithm: ppo, a2c, sac, td3, ddpg, dqn, tqc, trpo, qrdqn, crossq or recurrent-ppo.
     With --trainer rllib: ppo, appo, impala, sac, tqc, dqn, bc, marwil, cql or iql. With --data: bc, iql, cql, td3bc,
-    awac, cal-ql, plas or rebrac."""
+    awac, cal-ql, plas or rebrac. With --teacher: dagger."""
     steps: _Steps = 100_000
     """Environment steps of the whole run, also after --resume; with --data, updates."""
     seed: Annotated[int, Meta(ge=0, le=10**15)] = 0
@@ -57,9 +57,11 @@ class TrainSettings:
     threads: Annotated[int, Meta(ge=1, le=1024)] = 1
     """Threads that torch computes with (default 1: more is slower on small networks)."""
     trainer: str = "sb3"
-    """Library that trains: sb3 (default), rllib, or offline (default with --data)."""
+    """Library that trains: sb3 (default), rllib, offline (default with --data) or imitation (default for dagger)."""
     start: str | None = None
     """Checkpoint whose weights a new run of sb3 begins with: to harden a policy with env_kwargs.randomize, say."""
+    teacher: str | None = None
+    """Whom dagger imitates: a checkpoint of the same environment, with or without its cameras, or scripted."""
     until_success: _Share | None = None
     """Stop once this share of evaluation episodes succeeds, such as 0.99."""
     trial_threshold: Annotated[float, Meta(gt=0, lt=1, description="a share above 0 and below 1, such as 0.9")] = 0.9
@@ -255,8 +257,9 @@ def differences(wanted: Mapping[str, Any], found: Mapping[str, Any], prefix: str
 def file_stem(env: str, algo: str, trainer: str = "sb3") -> str:
     """A run's name in file names: ``bam/pick-v0`` and ppo make ``pick-ppo``; a foreign id keeps its version.
 
-    Another trainer than sb3 is named: ``pick-rllib-ppo``.
+    A trainer whose algorithms others have too is named: ``pick-rllib-ppo``.
     """
     match = re.fullmatch(r"bam/(.+)-v\d+", env)
     name = match[1] if match else env
-    return re.sub(r"[^\w.-]+", "-", f"{name}-{algo if trainer == 'sb3' else f'{trainer}-{algo}'}").strip("-.")
+    run = algo if trainer in ("sb3", "imitation") else f"{trainer}-{algo}"
+    return re.sub(r"[^\w.-]+", "-", f"{name}-{run}").strip("-.")

@@ -44,6 +44,7 @@ _METAVARS = {
     "address": "auto|HOST:PORT",
     "data": "PLACE",
     "start": "CHECKPOINT",
+    "teacher": "PLACE|scripted",
     "transport": "URL,...",
     "ca_file": "FILE",
     "token_file": "FILE",

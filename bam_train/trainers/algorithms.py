@@ -16,13 +16,14 @@ if TYPE_CHECKING:
     from bam_train.trainers.base import Trainer
 
 TRAINERS: dict[str, str] = {
+    "imitation": "bam_train.trainers.imitation.dagger_trainer:DaggerTrainer",
     "offline": "bam_train.trainers.offline.offline_trainer:OfflineTrainer",
     "rllib": "bam_train.trainers.rllib.rllib_trainer:RLlibTrainer",
     "sb3": "bam_train.trainers.sb3.sb3_trainer:SB3Trainer",
 }
 """``"module:Class"`` of each trainer, by name."""
 
-EXTRAS: dict[str, str] = {"offline": "offline", "rllib": "rllib", "sb3": "train"}
+EXTRAS: dict[str, str] = {"imitation": "train", "offline": "offline", "rllib": "rllib", "sb3": "train"}
 """Extra of bam-train that installs the packages of each trainer, by name."""
 
 
@@ -100,10 +101,17 @@ _OFFLINE = (
     Algorithm("rebrac", "d3rlpy.algos:ReBRACConfig", _BOX, offline=True),
     Algorithm("td3bc", "d3rlpy.algos:TD3PlusBCConfig", _BOX, offline=True),
 )
+_IMITATION = (Algorithm("dagger", "bam_train.trainers.imitation.dagger:Dagger", ("Box", "Discrete")),)
+IMITATION_ALGORITHMS = {algorithm.name: algorithm for algorithm in _IMITATION}
 SB3_ALGORITHMS = {algorithm.name: algorithm for algorithm in _SB3}
 RLLIB_ALGORITHMS = {algorithm.name: algorithm for algorithm in _RLLIB}
 OFFLINE_ALGORITHMS = {algorithm.name: algorithm for algorithm in _OFFLINE}
-ALGORITHMS = {"offline": OFFLINE_ALGORITHMS, "rllib": RLLIB_ALGORITHMS, "sb3": SB3_ALGORITHMS}
+ALGORITHMS = {
+    "imitation": IMITATION_ALGORITHMS,
+    "offline": OFFLINE_ALGORITHMS,
+    "rllib": RLLIB_ALGORITHMS,
+    "sb3": SB3_ALGORITHMS,
+}
 """Algorithms by trainer and name."""
 
 

@@ -14,17 +14,18 @@ from bam_train.environments import environment_of, require_env_kwargs
 from bam_train.errors import CheckpointMismatch, SettingsError
 from bam_train.settings import TrainSettings, check_names, differences, file_stem, merge, parse_config
 from bam_train.trainers import load_trainer, require_algorithm
+from bam_train.trainers.algorithms import IMITATION_ALGORITHMS
 
 PRESETS = Path(__file__).parent / "presets"
 """Tuned settings, laid out like a ``--config`` file: ``<environment>-<algorithm>.toml`` is for sb3,
 ``<environment>-<trainer>-<algorithm>.toml`` for any other trainer."""
 
 CHANGEABLE = frozenset(
-    {"steps", "until_success", "eval_every", "eval_episodes", "device", "threads", "transport", "ca_file", "token_file"}
-    | {"num_env_runners", "num_learners", "num_gpus", "address"}
+    {"steps", "teacher", "until_success", "eval_every", "eval_episodes", "device", "threads"}
+    | {"transport", "ca_file", "token_file", "num_env_runners", "num_learners", "num_gpus", "address"}
 )
-"""Settings that may change in a resumed run: when to stop, how to evaluate, where to compute and where the environment
-runs; not what to learn."""
+"""Settings that may change in a resumed run: when to stop, how to evaluate, where to compute, where the environment
+runs and where the teacher lies; not what to learn."""
 
 OF_RLLIB = ("num_env_runners", "num_learners", "num_gpus", "address")
 """Settings of the rllib trainer only."""
@@ -44,7 +45,7 @@ def resolve(given: Mapping[str, Any]) -> TrainSettings:
 
     Raises UnknownName for an unknown environment, SettingsError for any other setting that is unknown or does not fit.
     """
-    given = {**_of_data(given), **given}
+    given = {**_of_data(given), **_of_algorithm(given), **given}
     asked = TrainSettings.from_mapping(given)
     env = _resolve_env(asked.env, elsewhere=bool(asked.transport or asked.data))
     require_algorithm(asked.trainer, asked.algo)
@@ -84,6 +85,11 @@ def _of_data(given: Mapping[str, Any]) -> dict[str, Any]:
     return {"trainer": trainer, "env": info.env, **({"env_kwargs": info.env_kwargs} if info.env_kwargs else {})}
 
 
+def _of_algorithm(given: Mapping[str, Any]) -> dict[str, Any]:
+    """The trainer of an algorithm that no other one has."""
+    return {"trainer": "imitation"} if given.get("algo") in IMITATION_ALGORITHMS else {}
+
+
 def _require_of_trainer(settings: TrainSettings) -> None:
     """Refuse settings that belong to the other trainer."""
     if settings.trainer == "sb3" and settings.data is not None:
@@ -95,6 +101,8 @@ def _require_of_trainer(settings: TrainSettings) -> None:
                 raise SettingsError(f"{field.name}: {text}")
     if settings.trainer != "sb3" and settings.start is not None:
         raise SettingsError(f"start: the {settings.trainer} trainer has no use for it; leave it out")
+    if settings.trainer != "imitation" and settings.teacher is not None:
+        raise SettingsError(f"teacher: {settings.algo} has none; leave it out, or give --algo dagger")
 
 
 def own_settings(checkpoint: Checkpoint, env: str | None = None, *, elsewhere: bool = False) -> dict[str, Any]:

@@ -1,0 +1,1 @@
+"""Imitation of a teacher that acts in the environment: DAgger."""

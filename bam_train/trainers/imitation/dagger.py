@@ -1,0 +1,202 @@
+"""DAgger: the learner acts, a teacher says what it should have done, and all of it is learnt from.
+
+S. Ross, G. Gordon, D. Bagnell: A reduction of imitation learning and structured prediction to no-regret online learning
+(AISTATS 2011).
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+from typing import Annotated, Any
+
+import numpy as np
+import torch
+from gymnasium import spaces
+from msgspec import Meta
+from torch.nn import functional
+
+from bam_train.trainers.base import Statistics
+from bam_train.trainers.frozen_network import leaves
+from bam_train.trainers.imitation.imitation_network import ImitationNetwork
+from bam_train.trainers.imitation.teacher import Teacher
+from bam_train.trainers.offline.training_data import ActionCode
+
+_Count = Annotated[int, Meta(ge=1, le=10_000_000)]
+_Positive = Annotated[float, Meta(gt=0, le=1e6)]
+_Share = Annotated[float, Meta(ge=0, le=1)]
+_RECENT = 100  # episodes of the statistics
+_KNEE = 0.1  # errors above are punished in proportion, below by their square
+_LAST_RATE = 0.02  # of the learning rate, at the end of the run
+
+
+@dataclass(frozen=True)
+class Dagger:
+    """Hyperparameters of DAgger."""
+
+    learning_rate: _Positive = 1e-3
+    """At the beginning; it falls to a fiftieth over the run."""
+    batch_size: _Count = 128
+    passes: _Positive = 16.0
+    """How many times each step is learnt from, on average."""
+    teacher_share: _Share = 0.25
+    """Share of the run over which the teacher acts in fewer and fewer episodes, from all of them to none."""
+    memory: _Count = 50_000
+    """Newest steps that are learnt from."""
+    guess_weight: Annotated[float, Meta(ge=0, le=1e6)] = 1.0
+    """Weight of guessing the state that the teacher sees, where the learner sees images instead."""
+    channels: _Count = 16
+    """Channels of the first convolution; the others have twice as many."""
+    width: _Count = 256
+    """Units of each of the two hidden layers."""
+
+
+class Experience:
+    """The newest steps: observations, codes of the teacher's actions, and the states that it saw."""
+
+    def __init__(self, space: spaces.Space[Any], size: int, codes: int, states: int) -> None:
+        self._keys, self._size, self.added = list(leaves(space)), size, 0
+        arrays = [np.zeros((size, *leaf.shape), leaf.dtype) for leaf in leaves(space).values()]  # pages come with use
+        self._observed = [torch.from_numpy(array) for array in arrays]
+        self._codes, self._states = torch.zeros(size, codes), torch.zeros(size, states)
+
+    def __len__(self) -> int:
+        return min(self.added, self._size)
+
+    def add(self, observed: list[torch.Tensor], codes: torch.Tensor, states: Any) -> None:
+        """Add n steps in place of the oldest."""
+        rows = (torch.arange(len(codes)) + self.added) % self._size
+        for column, new in zip(self._observed, observed, strict=True):
+            column[rows] = new
+        self._codes[rows] = codes
+        if states is not None:
+            self._states[rows] = torch.as_tensor(states)
+        self.added += len(codes)
+
+    def drawn(self, count: int) -> tuple[list[torch.Tensor], torch.Tensor, torch.Tensor]:
+        """Random steps: observations by key, codes, states."""
+        rows = torch.randint(len(self), (count,))
+        return [column[rows] for column in self._observed], self._codes[rows], self._states[rows]
+
+
+class DaggerLearner:
+    """The learner, its teacher, and the environments that both act in."""
+
+    def __init__(self, values: Dagger, seed: int, envs: Any, teacher: Teacher) -> None:
+        self.values, self.envs, self.teacher = values, envs, teacher
+        seen, acts = envs.single_observation_space, envs.single_action_space
+        self._keys, self._code = list(leaves(seen)), ActionCode(acts)
+        sizes = self._code.size, teacher.state_size
+        self.network = ImitationNetwork(seen, *sizes, values.channels, values.width)
+        self._optimiser = torch.optim.Adam(self.network.parameters(), lr=values.learning_rate)
+        self._experience = Experience(seen, values.memory, *sizes)
+        self._rng = np.random.default_rng(seed)
+        self._observation: Any = None
+        self._taught = np.ones(envs.num_envs, bool)  # environments in which the teacher acts in this episode
+        self._running = np.zeros((2, envs.num_envs))  # return and length of the running episodes
+        self._ended: deque[tuple[float, float, bool | None]] = deque(maxlen=_RECENT)
+        self._due, self._seed, self._refill = 0.0, seed, 0
+        self.metrics: dict[str, float] = {}
+
+    def _tensors(self, observation: Any) -> list[torch.Tensor]:
+        each = [observation[key] if key else observation for key in self._keys]
+        return [torch.as_tensor(np.ascontiguousarray(one)) for one in each]
+
+    def step(self, done: float) -> int:
+        """Step every environment once, when a share `done` of the run is over; returns the number of steps."""
+        if self._observation is None:
+            self._observation, _ = self.envs.reset(seed=self._seed)
+            self.teacher.reset()
+        observed = self._tensors(self._observation)
+        wanted, states = self.teacher(self._observation)
+        codes = self._code.encode(wanted)
+        self.network.learn_moments(dict(zip(self._keys, observed, strict=True)))
+        if states is not None:
+            self.network.seen.learn(torch.as_tensor(states))
+        self._experience.add(observed, codes, states)
+        actions = wanted if self._taught.all() else self._mixed(wanted, observed)
+        self._observation, rewards, terminated, truncated, infos = self.envs.step(actions)
+        self._count(rewards, terminated | truncated, infos, done)
+        self._due += len(rewards) * self.values.passes / self.values.batch_size
+        return len(rewards)
+
+    def _mixed(self, wanted: Any, observed: list[torch.Tensor]) -> Any:
+        """The learner's actions, and the teacher's in the episodes that it acts in."""
+        with torch.no_grad():
+            scores = self.network.actor(self.network.features(*observed))
+        scores = scores if self._code.is_discrete else scores.clamp(-1, 1)
+        own = self._code.decode(scores, self.envs.single_action_space)
+        return np.where(self._taught.reshape(-1, *[1] * (own.ndim - 1)), wanted, own).astype(own.dtype)
+
+    def _count(self, rewards: Any, ended: Any, infos: Any, done: float) -> None:
+        """Note the episodes that ended, and draw who acts in the next ones; the learner's own count."""
+        self._running += [rewards, np.ones(len(rewards))]
+        rows = np.flatnonzero(ended)
+        success = infos.get("final_info", {}).get("is_success")
+        for row in rows.tolist():
+            if not self._taught[row]:
+                total, length = self._running[:, row].tolist()
+                self._ended.append((total, length, None if success is None else bool(success[row])))
+        self._running[:, rows] = 0.0
+        if rows.size:
+            share = max(0.0, 1 - done / self.values.teacher_share) if self.values.teacher_share else 0.0
+            self._taught[rows] = self._rng.random(rows.size) < share
+            self.teacher.reset(rows)
+
+    def learn(self, done: float) -> None:
+        """Do the updates that are due."""
+        if len(self._experience) < max(2 * self.values.batch_size, self._refill):
+            self._due = 0.0
+        for group in self._optimiser.param_groups:
+            group["lr"] = self.values.learning_rate * max(_LAST_RATE, 1 - done)
+        while self._due >= 1:
+            self._due -= 1
+            self._update()
+
+    def _update(self) -> None:
+        observed, codes, states = self._experience.drawn(self.values.batch_size)
+        features = self.network.features(*observed)
+        scores = self.network.actor(features)
+        if self._code.is_discrete:
+            loss = functional.cross_entropy(scores, codes.argmax(1))
+        else:
+            loss = functional.smooth_l1_loss(scores, codes, beta=_KNEE)
+        self.metrics = {"train/loss": loss.item()}
+        if states.shape[1] and self.values.guess_weight:
+            guess = functional.smooth_l1_loss(self.network.guess(features), self.network.seen(states), beta=_KNEE)
+            self.metrics["train/guess_loss"] = guess.item()
+            loss = loss + self.values.guess_weight * guess
+        self._optimiser.zero_grad()
+        loss.backward()
+        self._optimiser.step()
+
+    def statistics(self) -> Statistics:
+        """Means over the learner's last episodes."""
+        totals, lengths = [one[0] for one in self._ended], [one[1] for one in self._ended]
+        known = [success for _, _, success in self._ended if success is not None]
+        return Statistics(
+            episodes=len(totals),
+            return_mean=float(np.mean(totals)) if totals else None,
+            length_mean=float(np.mean(lengths)) if lengths else None,
+            success_rate=float(np.mean(known)) if known else None,
+            metrics=dict(self.metrics),
+        )
+
+    def state_dict(self) -> dict[str, Any]:
+        """Weights, optimiser and random numbers; the experience is collected anew."""
+        return {
+            "network": self.network.state_dict(),
+            "optimiser": self._optimiser.state_dict(),
+            "rng": dict(self._rng.bit_generator.state),
+            "steps": len(self._experience),
+        }
+
+    def load_state_dict(self, state: dict[str, Any], done: float) -> None:
+        """Restore the result of `state_dict`; new episodes begin, and some of them end before the first update."""
+        self.network.load_state_dict(state["network"])
+        self._optimiser.load_state_dict(state["optimiser"])
+        self._rng.bit_generator.state = state["rng"]
+        self._seed, self._refill = int(self._rng.integers(2**31)), min(int(state["steps"]), self.values.memory)
+        self._refill = min(self._refill, 100 * self.envs.num_envs)
+        share = max(0.0, 1 - done / self.values.teacher_share) if self.values.teacher_share else 0.0
+        self._taught = self._rng.random(self.envs.num_envs) < share
