@@ -88,7 +88,7 @@ class ImitationNetwork(Layer):
             self.encoders.append(encoder)
             inputs += outputs
         self.body = nn.Sequential(nn.Linear(inputs, width), nn.ReLU(), nn.Linear(width, width), nn.ReLU())
-        self.actor, self.guess = nn.Linear(width, scores), nn.Linear(width, guesses)
+        self.actor, self.guess = nn.Linear(width, scores), nn.Linear(width, max(1, guesses))
         self.seen = Numbers((guesses,))
         """Moments of what the teacher sees."""
 

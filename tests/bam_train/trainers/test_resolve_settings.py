@@ -103,7 +103,7 @@ def test_a_link_is_kept_without_its_file(tmp_path):
 
 
 def test_the_table_of_trainers():
-    with pytest.raises(SettingsError, match=r"^Unknown trainer 'x'\. Choose from: offline, rllib, sb3\.$"):
+    with pytest.raises(SettingsError, match=r"^Unknown trainer 'x'\. Choose from: imitation, offline, rllib, sb3\.$"):
         load_trainer("x")
     require_algorithm("sb3", "recurrent-ppo")
     assert load_trainer("sb3").__name__ == "SB3Trainer"
@@ -118,7 +118,9 @@ def test_every_preset_is_complete_and_of_an_environment_of_ours(name):
     assert read_preset(env, algo, trainer)
     needs_data = pytest.raises(SettingsError, match=r"^data: \w+ learns from a data set, found none")
     with needs_data if trainer == "offline" else contextlib.nullcontext():
-        resolve({"env": env, "algo": algo, "trainer": trainer})
+        resolve(
+            {"env": env, "algo": algo, "trainer": trainer, "teacher": "scripted" if trainer == "imitation" else None}
+        )
     assert read_preset("CartPole-v1", "ppo") == {}
 
 
