@@ -37,6 +37,7 @@ class Dagger:
     learning_rate: _Positive = 1e-3
     """At the beginning; it falls to a fiftieth over the run."""
     batch_size: _Count = 128
+    """Steps that one update learns from."""
     passes: _Positive = 16.0
     """How many times each step is learnt from, on average."""
     teacher_share: _Share = 0.25
