@@ -243,6 +243,8 @@ def make_detector(rollouts: Iterable[Rollout], *, seed: int = 0) -> Detector:
     if ticks < LEAST_TICKS or len(used) < LEAST_EPISODES:
         expected = f"at least {LEAST_EPISODES} successful episodes of {LEAST_TICKS} steps in all"
         raise NoDetector(f"a detector needs {expected}, found {len(used)} of {ticks}")
+    if max(len(one.actions) for one in used) < 2:
+        raise NoDetector("a detector compares a step with the next one, and these episodes have one step")
     sizes = [max(1, math.prod(part.shape[1:])) for part in used[0][:2]]
     if max(sizes) > MOST_NUMBERS:
         raise NoDetector(f"a detector takes at most {MOST_NUMBERS} numbers, found {sizes[0]} in an observation")

@@ -3,7 +3,8 @@
 Command, seed and steps come from each checkpoint's manifest, wall time from the run that made it (`--runs`) or, without
 that, from the table as it is; the success rate is measured here, over episodes that neither training nor its
 evaluations have seen: those of ``bam-eval --episodes 1000``. A policy that was trained with randomised physics, late
-actions or a link is evaluated without them here; ``scripts/evaluate_links.py`` evaluates all with them.
+actions or a link is evaluated without them here; ``scripts/evaluate_links.py`` evaluates all with them. Where there is
+a training and a test split, it is the test split that counts.
 """
 
 from __future__ import annotations
@@ -88,7 +89,8 @@ def row(path: Path, episodes: int, runs: Path, known: dict[tuple[str, ...], str]
     checkpoint = Checkpoint.open(path)
     manifest = checkpoint.manifest
     policy = FrozenPolicy.from_checkpoint(checkpoint)
-    plain = SIMULATED if entry_of(manifest.env) is not None else {}
+    entry = entry_of(manifest.env)
+    plain = {} if entry is None else {**SIMULATED, **({"split": "test"} if "split" in entry.options() else {})}
     report = evaluate(policy, manifest.env, {**manifest.env_kwargs, **plain}, episodes=episodes, seed=FIRST_SEED)
     made = [f"`{command(manifest, path.name)}`", str(manifest.seed), f"{manifest.steps:,}"]
     first = [f"[{path.name}]({path.name})", *made]

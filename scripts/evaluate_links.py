@@ -57,15 +57,21 @@ def row(path: Path, episodes: int) -> list[str]:
     return cells
 
 
+def of_robots() -> list[Path]:
+    """The committed checkpoints whose environment has a robot."""
+    entries = ((path, entry_of(Checkpoint.open(path, members=False).manifest.env)) for path in FOLDER.glob("*.zip"))
+    return sorted(path for path, entry in entries if entry is None or entry.has_robot)
+
+
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("checkpoints", nargs="*", type=Path, help="default: every .zip in checkpoints/")
+    parser.add_argument("checkpoints", nargs="*", type=Path, help="default: those in checkpoints/ of robots")
     parser.add_argument("--episodes", type=int, default=300, help="episodes in each column (default 300)")
     arguments = parser.parse_args()
     header = ["checkpoint", *columns(1.0)]
     print(f"| {' | '.join(header)} |\n| {' | '.join(['---'] * len(header))} |", flush=True)
     try:
-        for path in arguments.checkpoints or sorted(FOLDER.glob("*.zip")):
+        for path in arguments.checkpoints or of_robots():
             print(f"| {' | '.join(row(path, arguments.episodes))} |", flush=True)
     except (BamTrainError, BamEnvsError) as error:
         parser.error(str(error))

@@ -97,6 +97,9 @@ def test_too_few_episodes_or_too_many_numbers_are_refused():
     text = "a detector needs at least 20 successful episodes of 1000 steps in all, found 19 of 950"
     with pytest.raises(NoDetector, match=f"^{text}$"):
         make_detector(rollouts(19, 0))
+    short = [Rollout(np.zeros((1, 4)), np.zeros((1, 2))) for _ in range(2000)]
+    with pytest.raises(NoDetector, match=r"^a detector compares a step with the next one, and these episodes have one"):
+        make_detector(short)
     wide = [Rollout(np.zeros((50, 65)), np.zeros((50, 2))) for _ in range(30)]
     with pytest.raises(NoDetector, match=r"^a detector takes at most 64 numbers, found 65 in an observation$"):
         make_detector(wide)
@@ -117,6 +120,9 @@ def test_a_checkpoint_keeps_it(tmp_path, detector):
 def test_one_of_another_environment_or_a_broken_one_is_refused(tmp_path):
     path = tmp_path / "policy.zip"
     shutil.copy(POINT, path)
+    short = [Rollout(np.zeros((1, 4)), np.zeros((1, 2))) for _ in range(2000)]
+    with pytest.raises(NoDetector, match=r"^a detector compares a step with the next one, and these episodes have one"):
+        make_detector(short)
     wide = [Rollout(one.observations[:, :3], one.actions) for one in rollouts(60, 0)]
     text = rf"{DETECTOR}: expected \(4, 2\) numbers in observation and action, found \(3, 2\). Make it again$"
     add_detector(path, wide)

@@ -62,6 +62,8 @@ _Noise = Annotated[
 ]
 
 _EXPLORATION = ("exploration_fraction", "exploration_initial_eps", "exploration_final_eps")
+SMALLEST_IMAGE = 36
+"""Pixels along the shorter side from which on an image fits stable-baselines3's network of convolutions."""
 _COUNTS = ("n_steps", "batch_size", "n_epochs", "buffer_size", "train_freq", "target_update_interval", "policy_delay")
 _RANGES = {
     **dict.fromkeys(("gamma", "gae_lambda", "tau", *_EXPLORATION), Fraction),
@@ -94,7 +96,8 @@ def complete(algorithm: Algorithm, given: Mapping[str, Any], observation_space: 
 def default_policy(algorithm: Algorithm, observation_space: spaces.Space[Any]) -> str:
     """Name of the policy for an observation space of several inputs, images, or numbers."""
     several = isinstance(observation_space, spaces.Dict)
-    kind = "MultiInput" if several else "Cnn" if is_image_space(observation_space) else "Mlp"
+    is_image = is_image_space(observation_space) and sorted(observation_space.shape or ())[1] >= SMALLEST_IMAGE
+    kind = "MultiInput" if several else "Cnn" if is_image else "Mlp"
     return f"{kind}{'Lstm' if algorithm.recurrent else ''}Policy"
 
 

@@ -293,13 +293,24 @@ _ENTRIES = (
     ),
 )
 ENVIRONMENTS: dict[str, EnvEntry] = {entry.id: entry for entry in _ENTRIES}
+NEED_DATA = {
+    "bam/dataset-v0": EnvEntry(
+        "bam/dataset-v0",
+        "do what was done in one step of a data set",
+        "bam_train.data.data_set_task:DataSetTask",
+        NO_ROBOT,
+        max_episode_steps=1,
+        period=0.1,
+    )
+}
+"""Environments that cannot be made without an option, since their spaces are those of a data set."""
 ALIASES: dict[str, Alias] = {}
 """Ids of plug-ins."""
 
 
 def register() -> None:
     """Register every environment with Gymnasium; idempotent. Plug-ins must add their variants before."""
-    for entry in ENVIRONMENTS.values():
+    for entry in (*ENVIRONMENTS.values(), *NEED_DATA.values()):
         register_id(entry.id, "bam_envs.make_env", entry.time_limit)
 
 
@@ -324,7 +335,7 @@ def register_id(env_id: str, module: str, max_episode_steps: int | None) -> None
 def entry_of(env_id: str) -> EnvEntry | None:
     """The entry of `env_id`, an id of the table or of a plug-in, with or without ``module:``; None if there is none."""
     bare = env_id.rpartition(":")[2]
-    return ENVIRONMENTS.get(ALIASES[bare].env_id if bare in ALIASES else bare)
+    return ENVIRONMENTS.get(ALIASES[bare].env_id if bare in ALIASES else bare, NEED_DATA.get(bare))
 
 
 def own_options(env_id: str, given: Mapping[str, Any]) -> dict[str, Any]:

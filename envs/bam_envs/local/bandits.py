@@ -173,7 +173,7 @@ class ImageBandit(Bandit):
     draws = "standard_normal"
 
     def __init__(
-        self, num_envs: int = 1, *, n_arms: int = 5, height: int = 3, width: int = 3, table_seed: int = 0
+        self, num_envs: int = 1, *, n_arms: int = 5, height: int = 2, width: int = 2, table_seed: int = 0
     ) -> None:
         self.shape = (check(height, PositiveInt, "height"), check(width, PositiveInt, "width"), 1)
         pixels = self.shape[0] * self.shape[1]
