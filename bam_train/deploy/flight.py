@@ -95,7 +95,8 @@ def deployment_facts(checkpoint: Checkpoint, env: gym.Env[Any, Any]) -> dict[str
 def watch_cameras(recorder: Recorder, place: Place) -> list[str]:
     """Connect and record the cameras of the live robot's profile; returns a warning for each camera left out."""
     left_out = []
-    for source in load_profile(place.profile).cameras if place.robot and place.profile else ():
+    cameras = load_profile(place.profile).cameras if place.robot and place.profile else ()
+    for source in (one for one in cameras if not one.optional):
         endpoint = Endpoint.with_token_file(place.robot or "", ca_file=place.ca_file, token_file=place.token_file)
         camera = LiveCamera(endpoint, source)
         try:

@@ -355,7 +355,7 @@ class FrontProcess:
         """The cameras of the robot's profile by name; not connected yet."""
         options = self.options
         endpoint = Endpoint.with_token_file(options.robot, ca_file=options.ca_file, token_file=options.robot_token_file)
-        return {one.name: LiveCamera(endpoint, one) for one in self.shadow.profile.cameras}
+        return {one.name: LiveCamera(endpoint, one) for one in self.shadow.profile.cameras if not one.optional}
 
     def _on_halt(self, message: Fields, caller: Caller) -> None:
         """Stop the policy; the halt of whoever drives, or has just handed back, over another connection does not."""

@@ -10,11 +10,12 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from gymnasium import spaces
 from numpy.typing import NDArray
 
 from bam_envs.core.errors import ProtocolError, ResetNeeded, StaleState
 from bam_envs.live.state import Mailbox, SourceAge
-from bam_envs.ros.images import SIGNATURES, message_bytes, read_color_message, read_depth_message
+from bam_envs.ros.images import SIGNATURES, message_bytes, read_color_message, read_depth_message, resized
 from bam_envs.ros.profile_tables import CameraSource
 from bam_envs.rosbridge.client import RosbridgeLink
 from bam_envs.rosbridge.endpoint import Endpoint
@@ -123,6 +124,29 @@ class LiveCamera:
         link, self._link = self._link, None
         if link is not None:
             link.close()
+
+
+def fitted(pixels: Pixels, box: spaces.Box) -> Pixels:
+    """An image as a task sees it: the middle square, in the size and kind of `box` (size, size, channels); a copy.
+
+    Colours are averaged; distances and ids are not.
+
+    Raises:
+        ProtocolError: Colours are expected and it is grey, or the other way round.
+        MissingExtra: It has another size, and Pillow is not installed.
+    """
+    size, channels = box.shape[0], box.shape[2]
+    image = pixels[:, :, None] if pixels.ndim == 2 else pixels[:, :, :channels]
+    if image.shape[2] != channels or image.dtype != box.dtype:
+        found = f"{image.dtype} with {image.shape[2]} channels"
+        raise ProtocolError(f"An image must be {box.dtype} with {channels} channels, not {found}.")
+    height, width = image.shape[:2]
+    if (height, width) != (size, size):
+        edge = min(height, width)
+        top, left = (height - edge) // 2, (width - edge) // 2
+        image = resized(image[top : top + edge, left : left + edge], size, smooth=channels == 3)
+    fit: Pixels = np.clip(image, box.low, box.high)
+    return fit
 
 
 def decode_pixels(message: Mapping[str, Any], where: str) -> Pixels:

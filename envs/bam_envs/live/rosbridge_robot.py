@@ -30,6 +30,7 @@ from bam_envs.core.errors import (
 from bam_envs.core.robot import EnvIds, Initial, RobotSpec, RobotState
 from bam_envs.core.timing import Pacer
 from bam_envs.live import bringup
+from bam_envs.live.camera import LiveCamera, fitted
 from bam_envs.live.state import Letter, LiveState
 from bam_envs.live.take_over import TakeOver
 from bam_envs.ros.codec import (
@@ -100,6 +101,8 @@ class RosbridgeRobot:
         self._describes_itself = False  # such a robot takes halts and has sessions
         self._clock, self._state = clock, LiveState(self.profile, self.spec, clock)
         self._readiness: bringup.LiveReadiness | None = None  # of a robot that is real
+        images = {name: box for camera in self.spec.cameras for name, box in camera.spaces().items()}
+        self._cameras = {name: (LiveCamera(endpoint, profile.camera(name)), box) for name, box in images.items()}
         self._pacer, self._session = Pacer(self.spec.period, now=clock), bringup.DrivingSession()
         self._ended_at, self._lead = clock(), 0.0  # of the last step; how long before its deadline the next one ends
         self._command_life = profile.command_life(self.spec.period)
@@ -131,7 +134,7 @@ class RosbridgeRobot:
         return self._info
 
     def connect(self) -> None:
-        """Open both connections, read the robot's description, and check every topic against the profile.
+        """Open both connections, and one for each camera; check every topic against the profile.
 
         The robot is closed, and so halted, when Python ends.
 
@@ -148,8 +151,12 @@ class RosbridgeRobot:
         try:
             self._open(control, halting)
             self._begin(control)
+            for camera, _ in self._cameras.values():
+                camera.connect()
             self._control, self._halting = control, halting
         except BaseException:
+            for camera, _ in self._cameras.values():
+                camera.close()
             halting.close()
             control.close()
             raise
@@ -398,6 +405,8 @@ class RosbridgeRobot:
         """The newest state, with the command that was sent last. Raises the errors of `step`."""
         self._connected()
         signals, stamp = self._state.read()
+        for name, (camera, box) in self._cameras.items():
+            signals[name] = fitted(camera.latest().pixels, box)[None]
         command = self._at_rest(signals) if self._sent is None else self._sent
         return RobotState(signals, np.array([stamp]), command[None].copy())
 
@@ -490,6 +499,8 @@ class RosbridgeRobot:
         self._commanded = False
         self._cut.set()
         self._woken.set()
+        for camera, _ in self._cameras.values():
+            camera.close()
         for link in (control, halting):
             if link is not None:
                 link.close()

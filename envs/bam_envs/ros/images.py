@@ -96,6 +96,25 @@ def read_depth_message(message: Mapping[str, Any]) -> NDArray[np.float32] | None
     return np.nan_to_num(metres, copy=False, nan=0.0, posinf=0.0, neginf=0.0)
 
 
+def depth_message(
+    depth: NDArray[np.float32], frame_id: str = "", stamp: Mapping[str, int] | None = None
+) -> dict[str, Any]:
+    """sensor_msgs/Image, 32FC1, of `depth` [m]. Shape: (height, width)."""
+    header = {"stamp": dict(stamp or {"sec": 0, "nanosec": 0}), "frame_id": frame_id}
+    height, width = depth.shape
+    raw = {"height": height, "width": width, "encoding": "32FC1", "is_bigendian": 0, "step": 4 * width}
+    return {"header": header, **raw, "data": depth.astype("<f4").tobytes()}
+
+
+def resized(image: NDArray[Any], size: int, *, smooth: bool) -> NDArray[Any]:
+    """A square image (height, width, channels) in another size; `smooth` averages pixels, else the nearest counts."""
+    if not smooth:
+        places = (np.arange(size) * len(image)) // size
+        return np.asarray(image[places][:, places])
+    pillow = _pillow()
+    return np.asarray(pillow.fromarray(np.ascontiguousarray(image)).resize((size, size), pillow.Resampling.BOX))
+
+
 def message_bytes(message: Mapping[str, Any]) -> bytes:
     """The data of an image message, `bytes` or base64 text; `ProtocolError` for anything else."""
     data = message.get("data", b"")

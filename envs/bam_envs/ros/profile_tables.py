@@ -145,6 +145,8 @@ class CameraSource:
     """One of `IMAGE_TYPES`."""
     max_age: Positive = 0.5
     """Maximum age of an image [s]."""
+    optional: bool = False
+    """Whether it is subscribed only if a task needs it."""
 
 
 @dataclass(frozen=True)
@@ -234,7 +236,8 @@ class RobotProfile:
     def spec(self, wanted: RobotSpec | None = None, mode: str | None = None) -> RobotSpec:
         """The spec of this robot; with `wanted`, only the signals, command and period of that spec.
 
-        For `mode` and errors see `narrowed`; `InvalidValue` also for a signal that it does not measure.
+        For `mode` and errors see `narrowed`; `InvalidValue` also for a signal that it does not measure, `UnknownName`
+        for images of a camera that it does not have.
         """
         period = self.period if wanted is None else wanted.period
         # A trajectory that takes longer than a period adds to the lag.
@@ -243,6 +246,8 @@ class RobotProfile:
         if wanted is None:
             signals = tuple(signal for signal in self.signals if not self.source(signal.name).optional)
             return RobotSpec(self.name, signals, self.command, period, lag, self.body)
+        for name in (name for camera in wanted.cameras for name in camera.spaces()):
+            self.camera(name)
         known = {signal.name: signal for signal in self.signals}
         for signal in wanted.signals:
             if signal.name not in known:
@@ -255,7 +260,7 @@ class RobotProfile:
                 raise InvalidValue(f"{signal.name} must be {', '.join(signal.labels)}; that of {self.name} is {found}.")
         signals = tuple(known[signal.name] for signal in wanted.signals)
         command = self.narrowed(wanted.command.labels, mode).command
-        return RobotSpec(self.name, signals, command, period, lag, self.body)
+        return RobotSpec(self.name, signals, command, period, lag, self.body, wanted.cameras)
 
 
 def _missing(sink: Sink, labels: tuple[str, ...]) -> list[str]:

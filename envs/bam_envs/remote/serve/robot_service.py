@@ -10,7 +10,7 @@ it.
 import logging
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
@@ -18,11 +18,21 @@ from typing import Any
 import numpy as np
 
 from bam_envs.core.errors import LinkLost, ProtocolError, RemoteError, RobotFault
+from bam_envs.core.robot import RobotState
 from bam_envs.core.timing import Ticker
 from bam_envs.remote.serve.command_lease import CommandLease
 from bam_envs.remote.serve.served_robot import ServedRobot
-from bam_envs.ros.codec import HALT_TOPIC, INFO_SERVICE, SCENE_TOPIC, RobotInfo, decode_command, encode_state
+from bam_envs.ros.codec import (
+    HALT_TOPIC,
+    INFO_SERVICE,
+    SCENE_TOPIC,
+    Envelope,
+    RobotInfo,
+    decode_command,
+    encode_state,
+)
 from bam_envs.ros.freshness import read_tag
+from bam_envs.ros.images import color_message, depth_message
 from bam_envs.ros.messages import numbers, write_stamp
 from bam_envs.ros.profile_tables import RobotProfile
 from bam_envs.rosbridge.bus import Bus, Caller, Listener, Message
@@ -111,6 +121,9 @@ class RobotService:
         self._low, self._high = np.array(robot.spec.command.low), np.array(robot.spec.command.high)
         self._answered = ""  # `Tag.echo` of the last command that was executed
         self._connected = True
+        images = {name for camera in robot.spec.cameras for name in camera.spaces()}
+        self._cameras = [camera for camera in profile.cameras if camera.name in images]
+        self._shown: dict[str, Any] = {}  # the images that were published last
         self._moving = threading.Lock()  # an order is begun before a halt, or not at all
         self._unsubscribe: list[Callable[[], None]] = []
         self._scene = StringRpcService(bus, namespace + SCENE_TOPIC, self._set_scene, self.sessions)
@@ -122,6 +135,8 @@ class RobotService:
         measured = {signal.name for signal in self._robot.spec.signals}
         for topic, kind in {(one.topic, one.type) for one in self._profile.state if one.signal in measured}:
             self._bus.advertise(self._namespace + topic, kind)
+        for camera in self._cameras:
+            self._bus.advertise(self._namespace + camera.topic, camera.type)
         for topic, kind in {(sink.topic, sink.type) for mode in self._profile.commands.values() for sink in mode}:
             self._listen(topic, kind, partial(self._on_command, topic))
         self._listen(HALT_TOPIC, "std_msgs/Empty", self._on_halt)
@@ -251,13 +266,25 @@ class RobotService:
             return
         stamp: Callable[[float], Mapping[str, int]] = getattr(self._bus, "stamp", write_stamp)
         try:
-            envelopes = encode_state(self._profile, state, 0, stamp(time.time()), self._answered)
+            now = stamp(time.time())
+            envelopes = [*self._images(state, now), *encode_state(self._profile, state, 0, now, self._answered)]
             self._bus.publish_all([(self._namespace + topic, message) for topic, _, message in envelopes])
             self._connected = True
         except LinkLost as error:  # the command timeout holds the robot
             if self._connected:
                 _log.warning("%s: %s", self._profile.name, error)
             self._connected = False
+
+    def _images(self, state: RobotState, stamp: Mapping[str, int]) -> Iterator[Envelope]:
+        """The messages of images; in real time only of new ones, of which there is one a period."""
+        for camera in self._cameras:
+            images = state.signals[camera.name]
+            if images is self._shown.get(camera.name) and not self.info.lockstep:
+                continue
+            self._shown[camera.name] = images
+            raw = camera.type == "sensor_msgs/Image"
+            message = depth_message(images[0, :, :, 0], stamp=stamp) if raw else color_message(images[0], stamp=stamp)
+            yield camera.topic, camera.type, message
 
 
 def _only_one(value: object) -> object:

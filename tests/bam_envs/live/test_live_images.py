@@ -1,0 +1,73 @@
+"""Tasks that look through the cameras of a live robot."""
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium import spaces
+
+from bam_envs.core.errors import ProtocolError, StaleState, UnknownName
+from bam_envs.live.camera import fitted
+from bam_envs.remote.serve.serve_options import ServeOptions
+from bam_envs.remote.serve.served_environment import ServedEnvironment
+from bam_envs.robots.physics.rendering import RenderingUnavailable, find_backend
+
+OPTIONS = {"camera": ["front", "wrist"], "image_size": 16, "depth": True}
+
+
+@pytest.fixture(scope="module")
+def served():
+    """The simulated arm and its cameras, in lockstep."""
+    try:
+        find_backend()
+    except RenderingUnavailable as error:
+        pytest.skip(str(error))
+    env = gym.make("bam/pick-v0", disable_env_checker=True, **OPTIONS)
+    with ServedEnvironment(env, ServeOptions(port=0, fast=True)) as one:
+        yield one
+
+
+def test_images_of_a_live_robot_are_those_of_its_cameras(served, make):
+    env = make("bam/pick-v0", robot=served.bus.url, **OPTIONS)
+    observation, _ = env.reset(seed=3)
+    simulated = gym.make("bam/pick-v0", disable_env_checker=True, **OPTIONS)
+    simulated.reset(seed=3)
+    for _ in range(3):
+        observation, *_ = env.step(np.zeros(5, np.float32))
+        expected, *_ = simulated.step(np.zeros(5, np.float32))
+    assert env.observation_space.contains(observation)
+    # A picture may be one step older than the state.
+    for name in ("front", "wrist"):
+        assert np.abs(observation[name].astype(int) - expected[name]).mean() < 5
+        assert np.abs(observation[f"{name}_depth"] - expected[f"{name}_depth"]).mean() < 0.02
+    simulated.close()
+
+
+def test_a_camera_that_falls_silent_is_a_stale_state(served, make, monkeypatch):
+    env = make("bam/pick-v0", robot=served.bus.url, camera="wrist", image_size=16)
+    env.reset(seed=0)
+    monkeypatch.setattr(served.robot_service, "_cameras", [])
+    text = r"^/wrist_camera/color/image_raw/compressed: the newest image is 0\.\d+ s old"
+    with pytest.raises(StaleState, match=text):
+        step_for_long(env)
+
+
+def step_for_long(env):
+    for _ in range(10_000):
+        env.step(np.zeros(5, np.float32))
+
+
+def test_images_that_the_profile_does_not_have_are_refused(make):
+    with pytest.raises(UnknownName, match=r"^Unknown camera of ur5e 'front_segmentation'\."):
+        make("bam/pick-v0", robot="ws://127.0.0.1:1", camera="front", segmentation=True)
+
+
+def test_images_are_cut_to_a_square_and_made_smaller():
+    pixels = np.zeros((8, 16, 3), np.uint8)
+    pixels[:, 4:8] = 100
+    small = fitted(pixels, spaces.Box(0, 255, (4, 4, 3), np.uint8))
+    assert small[:, :, 0].tolist() == [[100, 100, 0, 0]] * 4
+    metres = np.arange(16, dtype=np.float32).reshape(4, 4)
+    depth = fitted(metres, spaces.Box(0.0, 4.0, (2, 2, 1), np.float32))
+    assert depth[:, :, 0].tolist() == [[0.0, 2.0], [4.0, 4.0]]
+    with pytest.raises(ProtocolError, match=r"^An image must be uint8 with 3 channels, not uint8 with 1 channels\.$"):
+        fitted(pixels[:, :, 0], spaces.Box(0, 255, (4, 4, 3), np.uint8))
