@@ -18,6 +18,7 @@
     ├── PolicyError                a frozen policy that cannot run, or an observation that does not fit it
     ├── NoDetector                 episodes of which no detector of unusual observations can be made, or none is there
     ├── SettingsError              a setting or option that does not exist or does not fit
+    │   └── NoTerminal             a program that reads keys has neither a terminal nor a window
     ├── LoopError                  the interaction loop
     │   ├── UnknownVariable        a variable that no agent wrote
     │   ├── TimeNotWritten         a time at which the variable is not written, or that has left the window
@@ -124,6 +125,12 @@ class NoDetector(BamTrainError, ValueError):  # noqa: N818 - named for the cause
 
 class SettingsError(BamTrainError, ValueError):
     """A setting or option that does not exist or does not fit."""
+
+
+class NoTerminal(SettingsError):  # noqa: N818
+    """A program that reads keys has neither a terminal nor a window."""
+
+    exit_status = 2
 
 
 class LoopError(BamTrainError):

@@ -41,6 +41,7 @@ ORDER = {
             "trainers",
             "estimation",
             "compat",
+            "play",
             "cli",
         ),
     ],

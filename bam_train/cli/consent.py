@@ -25,30 +25,30 @@ from bam_train.signals import SignalMemory
 
 
 def connected_env(
-    checkpoint: Checkpoint,
+    checkpoint: Checkpoint | None,
     place: Place,
     signals: SignalMemory,
     *,
     who: str,
     episodes: int,
     yes: bool = False,
-    render: bool = False,
+    render: bool | str = False,
     named: str | None = None,
     env_kwargs: Mapping[str, Any] | None = None,
     admit: Callable[[gym.Env[Any, Any], Place], Sequence[str]] = lambda env, place: (),
     motion: Path | None = None,
     wiggle: bool = False,
 ) -> gym.Env[Any, Any]:
-    """Make the environment of a checkpoint, connect its robot, and obtain consent to move it.
+    """Make the environment of a checkpoint, or of a person, connect its robot, and obtain consent to move it.
 
     Args:
-        checkpoint: The checkpoint of the policy that will act.
+        checkpoint: The checkpoint of the policy that will act; None: a person acts, in `named`.
         place: The place of the environment.
         signals: Raises a signal whose exception Python discarded again, before the robot moves.
         who: The program that will move the robot, for the question to the operator.
-        episodes: Number of planned episodes.
+        episodes: Number of planned episodes; 0 if a person begins each.
         yes: Whether to skip the question before a real robot moves.
-        render: Whether to show the simulation in a window.
+        render: Whether to show the simulation in a window; or the render mode.
         named: The environment that the user expects.
         env_kwargs: Arguments of the environment, which override the checkpoint's.
         admit: Called with the connected environment and its place before the question; returns lines for the operator.
@@ -59,11 +59,14 @@ def connected_env(
         ContractRefused: The live robot does not fit the checkpoint.
         CheckpointMismatch: An environment without a live robot does not fit.
     """
-    env_id, saved = environment_of(checkpoint, named, elsewhere=bool(place.transport))
-    make = partial(make_env, env_id, {**saved, **(env_kwargs or {})}, render_mode="human" if render else None)
+    env_id, saved = named or "", dict[str, Any]()
+    if checkpoint is not None:
+        env_id, saved = environment_of(checkpoint, named, elsewhere=bool(place.transport))
+    mode = "human" if render is True else render or None
+    make = partial(make_env, env_id, {**saved, **(env_kwargs or {})}, render_mode=mode)
     env = make(place=place)
     try:
-        contract = required_contract(checkpoint, env, place, motion)
+        contract = Contract(()) if checkpoint is None else required_contract(checkpoint, env, place, motion)
         signals.raise_again()
         _connect(env, signals)
         if place.robot is not None and place.trial is None and not place.shadow and has_real_robot(env):
@@ -74,10 +77,11 @@ def connected_env(
         plan = [*plan_lines(env, env_id, place.text, episodes, wiggle=wiggle), *admit(env, place)]
         signals.raise_again()
         if not place.shadow:
-            require_consent(env, f"{who}: {checkpoint.path}", yes=yes, plan=plan)
+            actor = "a person" if checkpoint is None else checkpoint.path
+            require_consent(env, f"{who}: {actor}", yes=yes, plan=plan)
         signals.raise_again()
         if wiggle and contract.inspection is not None and not place.shadow:
-            require_motion(env, f"{checkpoint.path} and the robot at {place.text}", contract.inspection)
+            require_motion(env, f"{actor} and the robot at {place.text}", contract.inspection)
             signals.raise_again()
     except BaseException:
         env.close()  # type: ignore[no-untyped-call]
@@ -143,7 +147,13 @@ def guards_of(env: Any) -> dict[str, dict[str, Any]]:
 def plan_lines(env: Any, env_id: str, address: str, episodes: int, *, wiggle: bool = False) -> list[str]:
     """Lines for the operator about the planned episodes."""
     spec = getattr(getattr(env.unwrapped, "robot", None), "spec", None)
-    planned = "1 episode" if episodes == 1 else f"{episodes} episodes, one after the other without a pause"
+    planned = (
+        "a person begins each episode"
+        if not episodes
+        else "1 episode"
+        if episodes == 1
+        else f"{episodes} episodes, one after the other without a pause"
+    )
     begin = "where the base stands"
     if isinstance(spec, RobotSpec) and not is_base(spec):
         gripper = "opening the gripper and " if "m" in spec.command.units else ""

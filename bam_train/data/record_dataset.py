@@ -170,6 +170,15 @@ class Tracks:
         self._start[list(env_ids)] = -1
         return episodes
 
+    def rewind(self, steps: int, observations: Any) -> None:
+        """Forget the last `steps`, all of episodes that run; `observations` (n, ...) are those before them."""
+        del self._steps[len(self._steps) - steps :]
+        self._observe(observations)
+
+    def discard(self, env_ids: Iterable[int]) -> None:
+        """Forget the episodes that run in `env_ids`."""
+        self._start[list(env_ids)] = -1
+
     def _fits(self, name: str, values: Array) -> bool:
         """Whether a column is of the kind it was before; None stands for texts."""
         kind = None if values.dtype.kind in "UO" else values.shape[1:]
@@ -299,6 +308,14 @@ class RecordDataset(gym.Wrapper[Any, Any, Any, Any]):
         columns = info_columns(values, 1) | self.extra
         self._add(self._tracks.step(_batched(action), _batched(observation), [reward], *ends, columns))
         return observation, reward, terminated, truncated, info
+
+    def rewind(self, steps: int, observation: Any) -> None:
+        """Forget the last `steps` of the episode that runs, which goes on from `observation`."""
+        self._tracks.rewind(steps, _batched(observation))
+
+    def discard(self) -> None:
+        """Forget the episode that runs: it is not recorded."""
+        self._tracks.discard([0])
 
     def close(self) -> None:
         """Write what is left, and close the environment."""

@@ -3,23 +3,10 @@
 
 const PERIOD = 50; // between two twists [ms]
 const FROZEN = 250; // a gap between two looks from which on everything counts as released [ms]
-const TURN = 0.4; // [rad/s]
-const DEAD = 0.15; // least deflection of a stick that counts
-const ENABLE = 5, STOP = 1, CLOSE = 0, OPEN = 3; // buttons of a gamepad: right shoulder, and the four on its right side
-
-// name: [keys, vx, vy, vz, wz, gripper, whether a base has it]
-const MOVES = {
-  "Forward": [["KeyW", "ArrowUp"], 1, 0, 0, 0, 0, true],
-  "Back": [["KeyS", "ArrowDown"], -1, 0, 0, 0, 0, true],
-  "Left": [["KeyA", "ArrowLeft"], 0, 1, 0, 0, 0, false],
-  "Right": [["KeyD", "ArrowRight"], 0, -1, 0, 0, 0, false],
-  "Up": [["KeyR", "PageUp"], 0, 0, 1, 0, 0, false],
-  "Down": [["KeyF", "PageDown"], 0, 0, -1, 0, 0, false],
-  "Turn left": [["KeyQ"], 0, 0, 0, 1, 0, true],
-  "Turn right": [["KeyE"], 0, 0, 0, -1, 0, true],
-  "Open gripper": [["KeyO"], 0, 0, 0, 0, -1, false],
-  "Close gripper": [["KeyC"], 0, 0, 0, 0, 1, false],
-};
+// The keys, for bam-play too; moves: name: [keys, vx, vy, vz, wz, gripper, whether a base has it]; speeds in m/s, rad/s.
+export const KEYS = await (await fetch("keys.json")).json();
+const { moves: MOVES, turn: TURN } = KEYS;
+const { dead: DEAD, enable: ENABLE, stop: STOP, close: CLOSE, open: OPEN } = KEYS.gamepad;
 const BY_KEY = new Map(Object.entries(MOVES).flatMap(([name, [keys]]) => keys.map((key) => [key, name])));
 
 export class Jogging {
@@ -29,7 +16,7 @@ export class Jogging {
     this.held = new Map(); // how it is held (a key, a pointer) -> name of the move
     this.active = false;
     this.isBase = false;
-    this.speed = 0.1;
+    this.speed = KEYS.speed;
     this.seq = 0;
     this.moved = false;
     this.stopHeld = false;
@@ -139,7 +126,7 @@ export class Jogging {
   }
 
   sendTwist(twist, gripper) {
-    const length = Math.hypot(twist[0], twist[1], twist[2]);
+    const length = Math.sqrt(twist[0] * twist[0] + twist[1] * twist[1] + twist[2] * twist[2]); // as Python's, bit for bit
     const share = length > this.speed ? this.speed / length : 1;
     const limited = this.isBase ? [twist[0], 0, 0, twist[3]] : [...twist.slice(0, 3).map((v) => v * share), twist[3]];
     this.send({ op: "jog", seq: this.seq++, sent: performance.now() / 1000, twist: limited, gripper });

@@ -2,13 +2,12 @@
 
 import { showCameras } from "./cameras.js";
 import { Connection } from "./connection.js";
-import { Jogging } from "./jogging.js";
+import { Jogging, KEYS } from "./jogging.js";
 import { say, showAudit, showNear, showStatus, showTelemetry, showVersions } from "./panels.js";
 import { Picture } from "./picture.js";
 import { Plots } from "./plots.js";
 
 const byId = (id) => document.getElementById(id);
-const SPEEDS = [0.05, 0.1, 0.25]; // [m/s]
 const LOOK = 2000; // time between two looks at versions and log [ms]
 const OLD = 1000; // age of the newest state from which on the page says that it is old [ms]
 const WRITE = 250; // least time between two sets of plots and numbers [ms]
@@ -237,7 +236,7 @@ function held(names) {
 }
 
 byId("speed").onclick = () => {
-  jogging.speed = SPEEDS[(SPEEDS.indexOf(jogging.speed) + 1) % SPEEDS.length];
+  jogging.speed = KEYS.speeds[(KEYS.speeds.indexOf(jogging.speed) + 1) % KEYS.speeds.length];
   byId("speed").textContent = `Speed ${jogging.speed.toFixed(2)} m/s`;
 };
 addEventListener("gamepadconnected", () => say("gamepad", "Gamepad: hold the right shoulder button and move the sticks; A closes, Y opens, B stops."));

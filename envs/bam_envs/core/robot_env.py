@@ -163,6 +163,21 @@ class RobotEnv(_RobotAndTask, gym.Env[Any, Any]):
             self.render()
         return observation, float(score.reward[0]), terminated, False, plain_info(score)
 
+    def state_dict(self) -> dict[str, Any]:
+        """The complete state of a simulated robot, its task and its generator; plain arrays and values."""
+        robot: Any = self.robot
+        rng = self.np_random.bit_generator.state
+        return {"robot": robot.state_dict(), "task": copy.deepcopy(self.task.state_dict()), "rng": rng}
+
+    def load_state_dict(self, state: dict[str, Any]) -> Any:
+        """Restore the result of `state_dict`; returns the observation."""
+        robot: Any = self.robot
+        self.state = self.last_state = robot.load_state_dict(state["robot"])
+        self.task.load_state_dict(state["task"])
+        self.np_random.bit_generator.state = state["rng"]
+        self._observed = first_of(self.task.observe(self.state))
+        return self._observed
+
     def render(self) -> NDArray[np.uint8] | None:  # type: ignore[override]
         """An image (480, 640, 3) for ``rgb_array``, None for ``human``."""
         return self._draw()

@@ -170,6 +170,11 @@ class IsaacReachTask(UrTask):
         self._last_action = cut.astype(np.float64)
         return self.toward(limited(self._default + self.scale * self._last_action, *self.model.joint_limits), state)
 
+    def action_to(self, joints: Array) -> Floats:
+        """The action whose targets are `joints` (n, 6) [rad]. Shape: (n, 6)."""
+        share = (joints - self._default) / self.scale
+        return limited(share, self.action_space.low, self.action_space.high).astype(np.float32)
+
     def score(self, state: RobotState, action: Floats) -> Score:
         """Reward proximity and alignment."""
         self.elapsed = self.elapsed + 1

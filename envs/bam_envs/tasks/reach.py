@@ -111,6 +111,12 @@ class ReachTask(Memory):
         joints = sent + np.where(sinks[:, None], 0.0, travel)
         return np.concatenate([joints, np.full((self.num_envs, 1), GRIPPER_OPEN)], axis=1)
 
+    def action_for(self, command: Array, state: RobotState) -> Floats:
+        """The action that leads to `command` (n, 7), or as far that way as it can. Shape: (n, 6)."""
+        turn = (command[:, :6] - state.command[:, :6]) / JOINT_STEP
+        action: Floats = (turn / np.maximum(1.0, np.abs(turn).max(axis=1, keepdims=True))).astype(np.float32)
+        return action
+
     def score(self, state: RobotState, action: Floats) -> Score:
         """Reward proximity; success pays as much as staying at the goal."""
         offset = self.goal - GEOMETRY.tool_position(state.signals["joint_position"])

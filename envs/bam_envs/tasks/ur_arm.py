@@ -111,13 +111,21 @@ class UrTask(Memory):
 
     def toward(self, target: Array, state: RobotState) -> Array:
         """The set points after one period on the way from those in `state` to `target`. Shape: (n, 6) [rad] both."""
-        measured, sent = state.signals["joint_position"], state.command
-        joints = np.where(np.abs(sent - measured).max(axis=1, keepdims=True) <= LEASH, sent, measured)
+        joints = _begin(state)
         way = target - joints
         duration = np.maximum((np.abs(way) / self.speed).max(axis=1), SHORTEST)
         step = way * ((1.0 / self.rate) / duration)[:, None]
         command: Array = limited(joints + step, *self.model.joint_limits)
         return command
+
+    def action_for(self, command: Array, state: RobotState) -> Floats:
+        """The action that leads to `command` (n, 6), or that way as far as it can. Shape: (n, a)."""
+        begin = _begin(state)
+        return self.action_to(begin + (command - begin) * (SHORTEST * self.rate))
+
+    def action_to(self, joints: Array) -> Floats:
+        """The action whose targets are `joints` (n, 6) [rad]; fixed ones do not count. Shape: (n, a)."""
+        return limited(joints / self.model.joint_limits[1], -1.0, 1.0)[:, self.free].astype(np.float32)
 
     def initial(self, joints: Array, rngs: Sequence[np.random.Generator], **signals: Array) -> Initial:
         """Start at `joints` (k, 6) [rad]; each generator draws the seed of its robot now."""
@@ -144,6 +152,12 @@ class UrTask(Memory):
     def marks(self) -> list[tuple[Array, tuple[float, float, float, float]]]:
         """None beyond the scene."""
         return []
+
+
+def _begin(state: RobotState) -> Array:
+    """Where a motion begins: at the last command, or at an arm that was halted or held. Shape: (n, 6) [rad]."""
+    measured, sent = state.signals["joint_position"], state.command
+    return np.where(np.abs(sent - measured).max(axis=1, keepdims=True) <= LEASH, sent, measured)
 
 
 def collisions(state: RobotState) -> Flags:

@@ -13,7 +13,7 @@ import numpy as np
 
 from bam_envs.core.env_options import finite_numbers
 from bam_envs.core.robot import EnvIds, Initial, RobotState
-from bam_envs.core.task import Array, Flags, Floats, Label, Score
+from bam_envs.core.task import Array, Flags, Floats, Label, Score, limited
 from bam_envs.robots.physics.obstacles import wave_signals
 from bam_envs.tasks.ur_arm import (
     FOREARM,
@@ -136,6 +136,11 @@ class UrObstacleTask(UrTask):
     def command(self, action: Floats, state: RobotState) -> Array:
         """One period on the way to the reference plus `action` [rad]; fixed joints keep to it. Shape: (n, 6)."""
         return self.toward(self.reference + self.full_action(action), state)
+
+    def action_to(self, joints: Array) -> Floats:
+        """The action whose targets are `joints` (n, 6) [rad]. Shape: (n, a)."""
+        action: Floats = limited(joints - self.reference, -1.0, 1.0)[:, self.free].astype(np.float32)
+        return action
 
     def effort(self, action: Floats, weight: float, rapid: float) -> Array:
         """Reward for small actions (n,), less for each joint whose action jumps by more than `rapid`."""

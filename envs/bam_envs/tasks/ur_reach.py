@@ -181,6 +181,14 @@ class UrReachTask(UrTask):
             goal[:, _WRIST_1] = (full[:, _WRIST_1] + 1.0) * (high - low) / 2.0 + low
         return self.toward(goal, state)
 
+    def action_to(self, joints: Array) -> Floats:
+        """The action whose targets are `joints` (n, 6) [rad]. Shape: (n, a)."""
+        goal = joints.copy()
+        if self._restrict:
+            low, high = WRIST_1_RANGE
+            goal[:, _WRIST_1] = ((goal[:, _WRIST_1] - low) * 2.0 / (high - low) - 1.0) * self.model.joint_limits[1, 3]
+        return super().action_to(goal)
+
     def score(self, state: RobotState, action: Floats) -> Score:
         """Reward proximity; success and a collision end the episode."""
         self.elapsed = self.elapsed + 1

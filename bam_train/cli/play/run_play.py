@@ -1,0 +1,167 @@
+"""`bam-play`: a person drives an environment, simulated, elsewhere or live, from a terminal or a window."""
+
+from __future__ import annotations
+
+import sys
+from contextlib import closing
+from functools import partial
+from time import monotonic
+from typing import TYPE_CHECKING, Any
+
+from bam_train.cli.console import say, tell
+from bam_train.cli.program import run_program
+from bam_train.errors import NoTerminal, SettingsError
+from bam_train.signals import SignalMemory
+
+if TYPE_CHECKING:
+    from bam_train.checkpoint import Checkpoint
+    from bam_train.cli.play.gamepad import Gamepad
+    from bam_train.cli.play.play_flags import PlayConfig
+    from bam_train.env_location import Place
+    from bam_train.play.session import Session
+
+DRAWN = 0.1
+"""Time between two drawings of the screen [s]."""
+
+
+def play(config: PlayConfig, signals: SignalMemory) -> int:
+    """Run the program with its parsed flags."""
+    if not config.render and not sys.stdin.isatty():
+        raise NoTerminal("standard input is no terminal: run it in one, or in a window with --render")
+    place = _checked_place(config)
+    from bam_envs.core.errors import BamEnvsError
+    from bam_train.checkpoint import Checkpoint
+    from bam_train.cli.play.gamepad import Gamepad
+    from bam_train.deploy.deployment import ending_of
+    from bam_train.play.hands import hand_for
+    from bam_train.play.session import Session
+
+    checkpoint = None if config.policy is None else Checkpoint.open(config.policy)
+    env, policy = _connected(config, place, checkpoint, signals)
+    try:
+        hand = hand_for(env, is_live=place.robot is not None)
+        env_id = env.spec.id if env.spec is not None else config.env or "environment"
+        if config.record is not None:
+            env = _recorded(config, env, env_id, checkpoint)
+        options: Any = {"policy": policy, "is_live": place.robot is not None, "speed": float(config.speed)}
+        session = Session(env, hand, seed=config.seed, **options)
+        with _screen(config, env_id) as screen, closing(Gamepad()) as pad:
+            session.begin()
+            _drive(session, screen, pad, f"{env_id}{place.text and f' at {place.text}'}", config.episodes)
+    except BamEnvsError as error:
+        ending = ending_of(error)
+        say(f"bam-play: {ending.reason}")
+        return ending.status
+    finally:
+        if config.record is not None and hasattr(env, "discard"):
+            env.discard()  # what is not whole
+        env.close()
+    recorded = f", recorded in {config.record}" if config.record is not None else ""
+    tell(f"{session.episodes} episode{'' if session.episodes == 1 else 's'}, {session.successes} succeeded{recorded}")
+    return 0
+
+
+def _checked_place(config: PlayConfig) -> Place:
+    """The place of the environment by the flags."""
+    from bam_train.env_location import Place, addresses, read_guards
+
+    ca_file, token_file = (None if path is None else str(path) for path in (config.ca_file, config.token_file))
+    trial = None if config.stage is None else config.stage == "trial"
+    link = (config.robot, addresses(config.transport), config.profile, ca_file, token_file, config.timeout)
+    place = Place(*link, read_guards(config.guard), trial=trial)
+    place.require_sane()
+    if config.env is None and config.policy is None and not place.transport:
+        raise SettingsError(
+            "which environment? Give its id, such as bam-play bam/reach, or --policy; bam-envs lists them"
+        )
+    if config.stage is not None and config.robot is None:
+        raise SettingsError("--stage is for a live robot; give its address with --robot too")
+    if config.render:
+        from bam_train.cli.consent import require_screen
+
+        require_screen(remote=place.is_remote)
+    return place
+
+
+def _connected(config: PlayConfig, place: Place, checkpoint: Checkpoint | None, signals: SignalMemory) -> Any:
+    """The environment, connected and with consent, and the policy, if there is one."""
+    from bam_envs.core.registry import resolve_id
+    from bam_train.cli.consent import connected_env
+    from bam_train.deploy.checkpoint_admission import Admission
+    from bam_train.environments import require_env_kwargs
+    from bam_train.settings import read_env_kwargs
+
+    kwargs = read_env_kwargs(config.set)
+    named = None if config.env is None else resolve_id(config.env)
+    if named is not None:
+        require_env_kwargs(named, kwargs)
+    options: Any = {"who": "bam-play", "episodes": 0, "yes": config.yes, "named": named, "env_kwargs": kwargs}
+    options["render"] = "rgb_array" if config.render else False
+    if checkpoint is None:
+        return connected_env(None, place, signals, **options), None
+    admission = Admission(checkpoint, config.keys, config.allow_unsigned)
+    env = connected_env(checkpoint, place, signals, admit=admission, **options)
+    return env, admission.policy
+
+
+def _recorded(config: PlayConfig, env: Any, env_id: str, checkpoint: Checkpoint | None) -> Any:
+    """The environment, whose whole episodes go into the data set."""
+    from bam_train.data.record_dataset import RecordDataset, info_of
+
+    facts = {"policy": "person" if checkpoint is None else f"person and {checkpoint.digest}"}
+    return RecordDataset(env, str(config.record), info_of(env, env_id), facts)
+
+
+def _screen(config: PlayConfig, title: str) -> Any:
+    if not config.render:
+        from bam_train.cli.play.terminal import Terminal
+
+        return Terminal()
+    try:
+        from bam_train.cli.play.window import Window
+    except ImportError as error:
+        raise SettingsError("--render needs tkinter, which this Python lacks: apt-get install python3-tk") from error
+    return Window(f"bam-play: {title}")
+
+
+def _drive(session: Session, screen: Any, pad: Gamepad, title: str, episodes: int | None) -> None:
+    """Tick at the session's pace until it is done; keys are read between two ticks."""
+    from bam_envs.core.timing import Pacer
+    from bam_train.play.readout import screen_lines
+
+    pacer, drawn = Pacer(session.pace, sleep=screen.wait), -DRAWN
+    pacer.start()
+    while not session.done and not (session.status == "ended" and session.episodes == episodes):
+        pacer.period = session.pace
+        pacer.wait()
+        screen.wait(0.0)  # a late tick has not waited
+        for key, at, until_let in screen.take():
+            session.press(key, at, until_let=until_let)
+        for key in screen.let:
+            session.let(key) if key else session.release()
+        screen.let.clear()
+        _poll(session, pad)
+        now = monotonic()
+        session.tick(now)
+        if now - drawn >= DRAWN:
+            drawn = now
+            picture = session.env.render() if session.env.render_mode == "rgb_array" else None
+            screen.show(screen_lines(session, title, *screen.size), picture)
+
+
+def _poll(session: Session, pad: Gamepad) -> None:
+    """What the gamepad says: one that is pulled out in mid-motion stops the motion."""
+    what = pad.poll()
+    if what == "gone":
+        session.release("the gamepad is gone: nothing moves until a key is held")
+    elif what == "came":
+        session.note = "gamepad: hold the right shoulder button and move the sticks; A closes, Y opens, B pauses"
+    session.pad = pad.state
+    if pad.stops and session.status == "running":
+        session.press("Space", monotonic())
+
+
+main = partial(run_program, "bam-play", "bam_train.cli.play.play_flags:PlayConfig", play)
+
+if __name__ == "__main__":
+    main()
