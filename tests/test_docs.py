@@ -43,6 +43,7 @@ FLAGS_OF = {
     "bam-agent": "live-agent.md",
     "bam-push": "live-agent.md",
     "bam-gate": "data.md",
+    "bam-play": "play.md",
 }
 EXAMPLES = {"PYTHONPATH": os.pathsep.join([str(ROOT), str(ROOT / "envs")]), "OMP_NUM_THREADS": "1"}
 

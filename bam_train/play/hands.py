@@ -115,7 +115,15 @@ class JointHand:
         self._env, model, spec = inner, getattr(inner.task, "model", None), inner.robot.spec
         self._now, self._count, self._period = 0.0, 0, spec.period
         self._jogger = Jogger(spec, spec.period, geometry=getattr(model, "geometry", None), clock=lambda: self._now)
-        self.memory = None
+
+    @property
+    def memory(self) -> Any:
+        """The command from which the motion goes on; None at rest."""
+        return self._jogger.sent
+
+    @memory.setter
+    def memory(self, sent: Any) -> None:
+        self._jogger.sent = sent
 
     def press(self, key: str) -> bool:
         """Nothing: it counts what is held."""

@@ -201,7 +201,7 @@ class Session:
         if self._saves:
             self._undo.append((self._saved(), copy.copy(self.hand.memory), self.observation, self.total))
         if self._recorder is not None and self.policy is not None:
-            self._recorder.extra = {"person": np.array([float(driver == "person")])}
+            self._recorder.extra = {"intervention": np.array([float(driver == "person")])}
         self.observation, reward, terminated, truncated, self.info = self.env.step(action)
         if driver == "policy":
             self.hand.took(action)

@@ -75,7 +75,8 @@ class Jogger:
     def release(self) -> None:
         """Forget the twist, the motion and the sequence: another person, or another connection, drives from now on."""
         self._newest, self._delay = _Twist(-1, -math.inf, (0.0,) * 4, 0), math.inf
-        self._sent: Array | None = None  # command of the tick before (m,); None if nothing was sent
+        self.sent: Array | None = None
+        """Command of the tick before, from which a motion goes on (m,); None if nothing was sent."""
 
     def put(self, message: Mapping[str, Any]) -> bool:
         """Take a twist; False if it came late or out of order, and has no effect.
@@ -117,11 +118,11 @@ class Jogger:
         """
         newest = self._newest
         if self._clock() - newest.at > FRESH:
-            self._sent = None
+            self.sent = None
             return None
-        if self._sent is None and not (any(newest.twist) or newest.grip):  # nothing moves, nothing is to move
+        if self.sent is None and not (any(newest.twist) or newest.grip):  # nothing moves, nothing is to move
             return None
-        self._sent = command = self._drive() if is_base(self._spec) else self._reach(state)
+        self.sent = command = self._drive() if is_base(self._spec) else self._reach(state)
         return np.array([command])
 
     def _drive(self) -> Array:
@@ -131,11 +132,11 @@ class Jogger:
 
     def _reach(self, state: RobotState) -> Array:
         """Joints and gripper of an arm, one step on (m,): from the last command, or from where the arm is."""
-        goal, joints = (state.command[0] if self._sent is None else self._sent).copy(), self._joints
+        goal, joints = (state.command[0] if self.sent is None else self.sent).copy(), self._joints
         here = goal.copy()
         for place, signal, column in self._measured:
             here[place] = state.signals[signal][0, column]
-        if self._gap(goal, here) > (_SAG if self._sent is None else 2 * LEASH):  # it was halted, or is held
+        if self._gap(goal, here) > (_SAG if self.sent is None else 2 * LEASH):  # it was halted, or is held
             goal[joints] = here[joints]
         ahead = goal.copy()
         ahead[joints] += self._step(goal[joints])

@@ -99,11 +99,9 @@ class Terminal:
 
     @property
     def size(self) -> tuple[int, int]:
-        """Columns and lines."""
-        try:
-            return os.get_terminal_size(self._out)
-        except OSError:
-            return 100, 40
+        """Columns and lines; a terminal may say 0 for both."""
+        columns, lines = os.get_terminal_size(self._out) if self._draws else (0, 0)
+        return columns or 100, lines or 40
 
     def show(self, lines: Sequence[str], picture: object = None) -> None:
         """Draw the screen, unless the terminal has not taken the last one yet."""

@@ -1,0 +1,213 @@
+"""`bam-play` with a terminal, a window and a gamepad: the same keys give the same commands, and all ends well."""
+
+import os
+import pty
+import select
+import shutil
+import signal
+import struct
+import subprocess
+import sys
+import termios
+import time
+from types import SimpleNamespace
+
+import pytest
+
+from bam_train.cli.play import run_play, terminal
+from bam_train.cli.play.gamepad import Gamepad
+from bam_train.cli.play.terminal import Terminal, keys_in
+from bam_train.data import DataSet
+from bam_train.play.key_map import is_move, moved
+
+PRESSES = (*"wsadrfqeoc", "ArrowUp", "ArrowDown", "ArrowLeft", "ArrowRight", "PageUp", "PageDown", *"wdrc")
+"""Twenty keys that a person presses, one after the other."""
+CODES = [f"Key{key.upper()}" if len(key) == 1 else key for key in PRESSES]
+COMMANDS = [moved({code}, 0.1) for code in CODES]
+SEQUENCES = {"ArrowUp": b"\x1b[A", "ArrowDown": b"\x1b[B", "ArrowLeft": b"\x1b[D", "ArrowRight": b"\x1bOC"}
+SEQUENCES |= {"PageUp": b"\x1b[5~", "PageDown": b"\x1b[6~"}
+LONGEST = 60.0
+
+
+def commands_of(taken):
+    return [moved({code}, 0.1) for code, *_ in taken if is_move(code)]
+
+
+@pytest.fixture
+def tty():
+    """Both ends of a terminal."""
+    ours, theirs = pty.openpty()
+    yield ours, theirs
+    os.close(ours)
+    os.close(theirs)
+
+
+def test_a_terminal_gives_the_commands_of_twenty_keys_and_its_settings_come_back(tty, monkeypatch):
+    ours, theirs = tty
+    standard = SimpleNamespace(fileno=lambda: theirs, isatty=lambda: True)
+    monkeypatch.setattr(terminal.sys, "stdin", standard)
+    monkeypatch.setattr(terminal.sys, "stderr", standard)
+    before = termios.tcgetattr(theirs)
+    with Terminal() as screen:
+        assert termios.tcgetattr(theirs)[3] & (termios.ICANON | termios.ECHO) == 0
+        assert termios.tcgetattr(theirs)[3] & termios.ISIG  # Ctrl-C is still a signal
+        for key in PRESSES:
+            os.write(ours, SEQUENCES.get(key, key.encode()))
+        taken = []
+        while len(taken) < len(PRESSES):
+            screen.wait(0.01)
+            taken += screen.take()
+        assert commands_of(taken) == COMMANDS
+        screen.show(["one", "\x1b[2Jtwo"])
+    assert termios.tcgetattr(theirs) == before
+    shown = os.read(ours, 4096)
+    assert shown.startswith(b"\x1b[?1049h\x1b[?25l")
+    assert rb"one\x1b[K" not in shown
+    assert rb"\x1b[2Jtwo" in shown
+    assert shown.endswith(b"\x1b[?25h\x1b[?1049l")
+
+
+def test_what_a_terminal_sends_in_pieces_or_nobody_knows():
+    assert keys_in(b"W\x1b[5") == (["KeyW"], b"\x1b[5")
+    assert keys_in(b"\x1b[5~ 7?+\x7f\r") == (["PageUp", "Space", "Digit7", "Slash", "Equal", "Backspace", "Enter"], b"")
+    assert keys_in(b"\x1b[1;5A\x1b[H\xc3\xa9") == ([], b"")
+
+
+@pytest.fixture
+def display(monkeypatch):
+    """A display without a screen."""
+    if shutil.which("Xvfb") is None:
+        pytest.skip("no Xvfb: apt-get install xvfb")
+    pytest.importorskip("tkinter")
+    reader, writer = os.pipe()
+    server = subprocess.Popen(["Xvfb", "-displayfd", str(writer), "-nolisten", "tcp"], pass_fds=[writer], stderr=-3)
+    os.close(writer)
+    with os.fdopen(reader) as number:
+        monkeypatch.setenv("DISPLAY", f":{number.readline().strip()}")
+    yield
+    server.terminate()
+    server.wait()
+
+
+def test_a_window_gives_the_commands_of_twenty_keys_and_sees_them_go_up(display):
+    import numpy as np
+
+    from bam_train.cli.play.window import Window
+
+    names = {"ArrowUp": "Up", "ArrowDown": "Down", "ArrowLeft": "Left", "ArrowRight": "Right"}
+    names |= {"PageUp": "Prior", "PageDown": "Next"}
+    with Window("test") as window:
+        window.wait(0.05)
+        window._root.focus_force()
+        window.wait(0.05)
+        for key in PRESSES:
+            window._root.event_generate("<KeyPress>", keysym=names.get(key, key))
+            window._root.event_generate("<KeyRelease>", keysym=names.get(key, key))
+        window.wait(0.1)
+        taken = window.take()
+        assert commands_of(taken) == COMMANDS
+        assert {until_let for *_, until_let in taken} == {True}
+        assert set(window.let) - {""} == set(CODES)
+        window.let.clear()
+        for kind in ("KeyPress", "KeyRelease", "KeyPress"):  # X repeats a key that is held
+            window._root.event_generate(f"<{kind}>", keysym="w")
+        window.wait(0.1)
+        assert (len(window.take()), window.let) == (2, [])
+        window.show(["text"], np.zeros((48, 64, 3), np.uint8))
+        window.wait(0.01)
+        assert (window._image.width(), window._image.height()) == (64, 48)
+
+
+def test_a_gamepad_that_is_pulled_out_in_mid_motion_lets_go(tmp_path):
+    pad = Gamepad(tmp_path)
+    assert pad.poll() == ""
+    os.mkfifo(tmp_path / "js0")
+    keep = os.open(tmp_path / "js0", os.O_RDWR)
+    assert pad.poll() == "came"
+    events = [(0, 1, 0x81, 5), (0, -32767, 0x02, 1), (0, 16384, 0x02, 3), (0, 1, 0x01, 0)]
+    os.write(keep, b"".join(struct.pack("IhBB", *event) for event in events))
+    assert pad.poll() == ""
+    axes, buttons = pad.state
+    assert (axes, buttons[0], pad.stops) == ([0.0, -1.0, 16384 / 32767, 0.0], True, False)
+    session = SimpleNamespace(release=lambda why: setattr(session, "said", why), status="running", pad=None)
+    run_play._poll(session, pad)
+    assert session.pad[0] == axes
+    os.close(keep)
+    (tmp_path / "js0").unlink()
+    run_play._poll(session, pad)
+    assert (session.pad, session.said) == (None, "the gamepad is gone: nothing moves until a key is held")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "status", "said"),
+    [
+        (["bam/reach"], 2, "standard input is no terminal: run it in one, or in a window with --render"),
+        (["bam/reach", "--recrod", "x"], 2, "unknown option --recrod, did you mean --record? Run bam-play --help"),
+        (["--speed", "9"], 2, "--speed: expected 0.05, 0.1 or 0.25, found '9'. Run bam-play --help"),
+    ],
+)
+def test_what_it_refuses(run, monkeypatch, arguments, status, said):
+    monkeypatch.setattr(sys, "stdin", SimpleNamespace(isatty=lambda: False))
+    assert run(run_play.main, *arguments) == (status, "", f"bam-play: {said}\n")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        ([], "which environment? Give its id, such as bam-play bam/reach, or --policy; bam-envs lists them"),
+        (["bam/rech"], "Unknown environment 'bam/rech'. Did you mean 'bam/reach-v0'?"),
+        (["bam/reach", "--stage", "full"], "--stage is for a live robot; give its address with --robot too"),
+        (
+            ["bam/reach", "--set", "max_episode_stesp=3"],
+            "env_kwargs: unknown setting 'max_episode_stesp' of bam",
+        ),
+    ],
+)
+def test_what_does_not_exist(run, monkeypatch, arguments, said):
+    monkeypatch.setattr(sys, "stdin", SimpleNamespace(isatty=lambda: True))
+    status, out, err = run(run_play.main, *arguments)
+    assert (status, out) == (1, "")
+    assert err.startswith(f"bam-play: {said}")
+
+
+def played(tty, folder, keys, *arguments):
+    """Run the program in a terminal and press `keys` (after s, bytes) from its first picture on; status and output."""
+    ours, theirs = tty
+    command = [sys.executable, "-m", "bam_train.cli.play.run_play", *arguments]
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
+    options = {"stdin": theirs, "stderr": theirs, "stdout": subprocess.PIPE, "cwd": folder, "env": environment}
+    with subprocess.Popen(command, **options) as process:
+        shown, begun, end = b"", None, time.monotonic() + LONGEST
+        while process.poll() is None and time.monotonic() < end:
+            if select.select([ours], [], [], 0.02)[0]:
+                shown += os.read(ours, 65536)
+            if begun is None and b"seed 0" in shown:
+                begun = time.monotonic()
+            while begun and keys and time.monotonic() - begun >= keys[0][0]:
+                (key,) = keys.pop(0)[1:]
+                process.send_signal(signal.SIGINT) if key == b"\x03" else os.write(ours, key)
+        process.kill()
+        return process.returncode, process.stdout.read().decode(), shown.decode()
+
+
+def test_it_runs_in_a_terminal_and_records(tty, tmp_path):
+    before = termios.tcgetattr(tty[1])
+    keys = [(0.1 * k, b"\x1b[C") for k in range(12)] + [(2.5, b"?"), (3.0, b"x")]
+    arguments = ("bam/grid-world", "--set", "max_episode_steps=5", "--record", "demos")
+    status, out, shown = played(tty, tmp_path, keys, *arguments)
+    assert (status, "no success, time limit after 5 steps" in shown, "X       quit" in shown) == (0, True, True)
+    episodes = list(DataSet.open(tmp_path / "demos"))
+    assert (
+        out == f"{len(episodes)} episodes, {sum(bool(one.success) for one in episodes)} succeeded, recorded in demos\n"
+    )
+    assert {int(action) for one in episodes for action in one.actions} == {0}
+    assert termios.tcgetattr(tty[1]) == before
+
+
+def test_ctrl_c_gives_the_terminal_back(tty, tmp_path):
+    before = termios.tcgetattr(tty[1])
+    keys = [(0.2, b"w"), (0.5, b"\x03")]
+    status, out, shown = played(tty, tmp_path, keys, "bam/mir100-navigation")
+    assert (status, out) == (130, "")
+    assert "\x1b[?25h\x1b[?1049lbam-play: interrupted" in shown
+    assert termios.tcgetattr(tty[1]) == before
