@@ -81,7 +81,7 @@ class Tap:
         """Step the robot."""
         asked = np.array(command)
         state = self._robot.step(command)
-        self.commands = {"raw_command": asked, "command": np.array(state.command)}
+        self.commands = {"raw_command": asked, "command": np.array(state.command)} if asked.size else {}
         return state
 
 

@@ -106,5 +106,5 @@ class Terminal:
     def show(self, lines: Sequence[str], picture: object = None) -> None:
         """Draw the screen, unless the terminal has not taken the last one yet."""
         if self._draws and select.select([], [self._out], [], 0.0)[1]:
-            text = "".join(f"{shown(line)}\x1b[K\r\n" for line in lines[:-1]) + f"{shown(lines[-1])}\x1b[K"
+            text = "".join(f"{shown(line)}\x1b[K\n" for line in lines[:-1]) + f"{shown(lines[-1])}\x1b[K"
             os.write(self._out, b"\x1b[H" + text.encode(errors="replace") + b"\x1b[J")

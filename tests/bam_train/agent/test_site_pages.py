@@ -12,14 +12,14 @@ PAGES = {path: page.body.decode() for path, page in console_pages().items()}
 def test_the_pages():
     scripts = {path for path in PAGES if path.endswith(".js")}
     assert scripts >= {"/main.js", "/connection.js", "/jogging.js"}
-    assert set(PAGES) - scripts == {"/", "/index.html", "/console.css", "/icon.svg"}
+    assert set(PAGES) - scripts == {"/", "/index.html", "/console.css", "/icon.svg", "/keys.json"}
     assert PAGES["/"] == PAGES["/index.html"]
     assert sum(map(len, PAGES.values())) < 80_000
 
 
 def test_every_file_that_a_page_names_is_there():
     named = re.findall(r'(?:href|src)="([^"]+)"', PAGES["/"])
-    named += [name for text in PAGES.values() for name in re.findall(r'from "\./([^"]+)"', text)]
+    named += [name for text in PAGES.values() for name in re.findall(r'(?:from "\./|fetch\(")([^"]+)"', text)]
     assert {f"/{name}" for name in named} == set(PAGES) - {"/", "/index.html"}
 
 

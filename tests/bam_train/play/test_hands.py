@@ -131,9 +131,8 @@ def test_other_numbers_are_chosen_and_changed():
     assert hand.action(STILL, 0).dtype == np.float32
     assert hand.lines()[0] == "0 to 3  choose a number (↑ ↓ too), now number 0"
     pixels = hand_for(Numbers(spaces.MultiDiscrete([4, 256])))
-    assert [pixels.press(key) for key in ("Digit1", "PageUp", "Equal", "Digit0", "Minus", "Enter")] == [False] * 5 + [
-        True
-    ]
+    pressed = [pixels.press(key) for key in ("Digit1", "PageUp", "Equal", "Digit0", "Minus", "Enter")]
+    assert pressed == [False] * 5 + [True]
     assert pixels.action(STILL, 0).tolist() == [0, 11]
 
 
