@@ -12,6 +12,7 @@ import termios
 import time
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 
 from bam_train.cli.play import run_play, terminal
@@ -89,8 +90,6 @@ def display(monkeypatch):
 
 
 def test_a_window_gives_the_commands_of_twenty_keys_and_sees_them_go_up(display):
-    import numpy as np
-
     from bam_train.cli.play.window import Window
 
     names = {"ArrowUp": "Up", "ArrowDown": "Down", "ArrowLeft": "Left", "ArrowRight": "Right"}
@@ -169,21 +168,20 @@ def test_what_does_not_exist(run, monkeypatch, arguments, said):
     assert err.startswith(f"bam-play: {said}")
 
 
-def played(tty, folder, keys, *arguments):
-    """Run the program in a terminal and press `keys` (after s, bytes) from its first picture on; status and output."""
+def played(tty, folder, script, *arguments):
+    """Run the program in a terminal; each key of `script` (text, bytes) follows a text. Its status and its output."""
     ours, theirs = tty
     command = [sys.executable, "-m", "bam_train.cli.play.run_play", *arguments]
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
     options = {"stdin": theirs, "stderr": theirs, "stdout": subprocess.PIPE, "cwd": folder, "env": environment}
     with subprocess.Popen(command, **options) as process:
-        shown, begun, end = b"", None, time.monotonic() + LONGEST
+        shown, end = b"", time.monotonic() + LONGEST
         while process.poll() is None and time.monotonic() < end:
             if select.select([ours], [], [], 0.02)[0]:
                 shown += os.read(ours, 65536)
-            if begun is None and b"seed 0" in shown:
-                begun = time.monotonic()
-            while begun and keys and time.monotonic() - begun >= keys[0][0]:
-                (key,) = keys.pop(0)[1:]
+            if script and script[0][0].encode() in shown:
+                _, key = script.pop(0)
+                shown = b""
                 process.send_signal(signal.SIGINT) if key == b"\x03" else os.write(ours, key)
         process.kill()
         return process.returncode, process.stdout.read().decode(), shown.decode()
@@ -191,21 +189,20 @@ def played(tty, folder, keys, *arguments):
 
 def test_it_runs_in_a_terminal_and_records(tty, tmp_path):
     before = termios.tcgetattr(tty[1])
-    keys = [(0.1 * k, b"\x1b[C") for k in range(12)] + [(2.5, b"?"), (3.0, b"x")]
-    arguments = ("bam/grid-world", "--set", "max_episode_steps=5", "--record", "demos")
-    status, out, shown = played(tty, tmp_path, keys, *arguments)
-    assert (status, "no success, time limit after 5 steps" in shown, "X       quit" in shown) == (0, True, True)
-    episodes = list(DataSet.open(tmp_path / "demos"))
-    successes = sum(bool(one.success) for one in episodes)
-    assert out == f"{len(episodes)} episodes, {successes} succeeded, recorded in demos\n"
-    assert {int(action) for one in episodes for action in one.actions} == {0}
+    right, left = b"\x1b[C", b"\x1b[D"
+    script = [("seed 2", right), ("step 1 ", left), ("step 2 ", right), ("step 3 ", left), ("step 4 ", right)]
+    script += [("no success, time limit after 5 steps", b"?"), ("X       quit", b"x")]
+    arguments = ("bam/grid-world", "--seed", "2", "--set", "max_episode_steps=5", "--record", "demos")
+    status, out, _ = played(tty, tmp_path, script, *arguments)
+    assert (status, script, out) == (0, [], "1 episode, 0 succeeded, recorded in demos\n")
+    (episode,) = DataSet.open(tmp_path / "demos")
+    assert np.ravel(episode.actions).tolist() == [0, 2, 0, 2, 0]
     assert termios.tcgetattr(tty[1]) == before
 
 
 def test_ctrl_c_gives_the_terminal_back(tty, tmp_path):
     before = termios.tcgetattr(tty[1])
-    keys = [(0.2, b"w"), (0.5, b"\x03")]
-    status, out, shown = played(tty, tmp_path, keys, "bam/mir100-navigation")
+    status, out, shown = played(tty, tmp_path, [("ready", b"w"), ("running", b"\x03")], "bam/mir100-navigation")
     assert (status, out) == (130, "")
     assert "\x1b[?25h\x1b[?1049lbam-play: interrupted" in shown
     assert termios.tcgetattr(tty[1]) == before
