@@ -43,9 +43,12 @@ def command(manifest: Manifest, name: str) -> str:
     own = manifest.settings
     env = manifest.env.rpartition("-v")[0] if manifest.env.startswith("bam/") else manifest.env
     words = ["bam-train", "--env", env, "--algo", manifest.algorithm]
-    if manifest.trainer != "sb3":
+    if manifest.trainer not in ("sb3", "imitation"):
         words += ["--trainer", manifest.trainer]
     asked = {"env": manifest.env, "algo": manifest.algorithm, "trainer": manifest.trainer}
+    if own.get("teacher"):
+        asked["teacher"] = own["teacher"]
+        words += ["--teacher", own["teacher"]]
     for setting, value, _ in differences(own, resolve(asked).to_mapping()):
         words += _words(setting, value)
     if name != f"{file_stem(manifest.env, manifest.algorithm, manifest.trainer)}.zip":
