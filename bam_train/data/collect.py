@@ -49,6 +49,21 @@ class RandomPolicy:
         return self._space.sample()
 
 
+class StatePolicy:
+    """A policy that sees the state of the environments, whatever is observed: images, say."""
+
+    def __init__(self, policy: BatchPolicy, envs: Any) -> None:
+        self._policy, self._envs = policy, envs
+
+    def reset(self, env_ids: Any = None) -> None:
+        """Forget what it remembers of these environments."""
+        self._policy.reset(env_ids)
+
+    def act_batch(self, observations: Any) -> Any:
+        """Actions for the states in which the environments are."""
+        return self._policy.act_batch(self._envs.task.state_observation(self._envs.state))
+
+
 def collect(
     place: str | Path | Place,
     policy: str,
@@ -97,7 +112,7 @@ def collect(
             require_fit(checkpoint, envs)
         name = policy if checkpoint is None else checkpoint.digest
         told = {"policy": name, "noise": noise, "random": random, "num_envs": envs.num_envs, **(facts or {})}
-        actor = _policy(policy, checkpoint, env_id, envs.action_space, seed)
+        actor = _policy(policy, checkpoint, env_id, envs, seed)
         disturb = Disturbance(envs.single_action_space, noise, 1.0 if policy == RANDOM else random, envs.num_envs, seed)
         recorded = RecordVectorDataset(
             envs, place, info_of(envs, env_id, kwargs), told, keep=lambda number, _: number < episodes
@@ -105,10 +120,14 @@ def collect(
         return _run(recorded, actor, disturb, episodes, seed, on_progress)
 
 
-def _policy(policy: str, checkpoint: Checkpoint | None, env_id: str, space: gym.Space[Any], seed: int) -> BatchPolicy:
+def _policy(policy: str, checkpoint: Checkpoint | None, env_id: str, envs: Any, seed: int) -> BatchPolicy:
     if checkpoint is not None:
         return FrozenPolicy.from_checkpoint(checkpoint)
-    return RandomPolicy(space, seed) if policy == RANDOM else scripted_policy(env_id)
+    if policy == RANDOM:
+        return RandomPolicy(envs.action_space, seed)
+    scripted: Any = scripted_policy(env_id)
+    has_images = hasattr(getattr(envs.unwrapped, "task", None), "state_observation")
+    return StatePolicy(scripted, envs.unwrapped) if has_images else scripted
 
 
 def _run(

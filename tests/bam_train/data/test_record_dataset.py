@@ -6,6 +6,7 @@ import pytest
 from gymnasium.vector import AutoresetMode
 
 import bam_envs  # noqa: F401
+from bam_envs.robots.physics.rendering import RenderingUnavailable, find_backend
 from bam_train.data import DataSet, RecordDataset
 from bam_train.data.collect import collect
 from bam_train.errors import BadDataSet, SettingsError
@@ -102,6 +103,24 @@ def test_other_restarts_are_refused(tmp_path, counting):
     envs = gym.make_vec(counting, 2, vectorization_mode="sync")
     with pytest.raises(BadDataSet, match="side by side are recorded in autoreset mode SAME_STEP"):
         RecordDataset(envs, tmp_path / "d")
+
+
+def test_a_script_that_sees_the_state_collects_images(tmp_path):
+    try:
+        find_backend()
+    except RenderingUnavailable as error:
+        pytest.skip(str(error))
+    options = {"camera": ["front", "wrist"], "image_size": 16, "depth": True}
+    found = collect(tmp_path / "d", "scripted", "bam/pick", options, episodes=1, num_envs=1, seed=3)
+    assert (found.episodes, found.successes) == (1, 1)
+    episode = DataSet.open(tmp_path / "d")[0]
+    env = gym.make("bam/pick-v0", disable_env_checker=True, **options)
+    observation, _ = env.reset(seed=3)
+    for step, action in enumerate(episode.actions):
+        for name, value in observation.items():
+            np.testing.assert_array_equal(episode.observations[name][step], value)
+        observation, *_ = env.step(action)
+    env.close()
 
 
 def test_collect(tmp_path):
