@@ -274,7 +274,8 @@ class Mir100NavigationParity(DriveParity, Mir100NavigationTask):
     def failed(self, state: RobotState) -> Flags:
         """Whether the base left the floor; robo-gym's misplaced parenthesis ignores a low y. Shape: (n,)."""
         x, y = state.signals["base_pose"][:, 0], state.signals["base_pose"][:, 1]
-        return (np.abs(x) > BOUNDARY) | (y > BOUNDARY)
+        failed: Flags = (np.abs(x) > BOUNDARY) | (y > BOUNDARY)
+        return failed
 
 
 class Mir100AvoidanceParity(DriveParity, Mir100AvoidanceTask):

@@ -130,7 +130,8 @@ class DriveTask(Memory):
         """Distance of the target [m]. Shape: (n,)."""
         pose = state.signals["base_pose"]
         dx, dy = self.target[:, 0] - pose[:, 0], self.target[:, 1] - pose[:, 1]
-        return np.sqrt(dx * dx + dy * dy)
+        distance: Array = np.sqrt(dx * dx + dy * dy)
+        return distance
 
     def bearing(self, state: RobotState) -> Array:
         """Bearing of the target, seen from the base, from -pi to pi [rad]. Shape: (n,)."""
