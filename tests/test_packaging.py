@@ -54,6 +54,7 @@ def test_the_wheel_holds_two_packages_and_nothing_else(wheel):
         "bam_train/agent/console/index.html",
         "bam_train/agent/console/console.css",
         "bam_train/agent/console/main.js",
+        "bam_train/agent/console/keys.json",
     ],
 )
 def test_the_wheel_holds_types_models_presets_and_the_service(wheel, name):

@@ -11,6 +11,7 @@ from bam_envs.rosbridge.tokens import Tokens
 from bam_train.agent.front.jog import FRESH
 from tests.bam_train.agent.browsers import LEAVINGS, browser, page, until
 from tests.bam_train.agent.fake_agent import FakeAgent
+from tests.bam_train.cli.test_play import CODES, COMMANDS
 
 __all__ = ["browser", "page"]  # fixtures from elsewhere
 ROLES = Tokens({"watching": "watch", "driving": "drive", "secret": "administer"})
@@ -138,6 +139,18 @@ def test_the_robot_moves_only_while_a_key_is_held(driven, agent):
     assert agent.twists[-1][1]["twist"] == [0, 0, 0, 0]
     driven.shows("jog-state", "Hold a key or button")
     driven.shows("guards", "tool speed")
+
+
+def test_twenty_keys_give_the_commands_of_bam_play_bit_for_bit(driven, agent):
+    commands = []
+    for code in CODES:
+        sent = len(agent.twists)
+        driven.cdp("Input.dispatchKeyEvent", type="rawKeyDown", key=code, code=code)
+        until(lambda sent=sent: len(agent.twists) > sent, "the command")
+        driven.cdp("Input.dispatchKeyEvent", type="keyUp", key=code, code=code)
+        until(lambda: not any(agent.twists[-1][1]["twist"]) and not agent.twists[-1][1]["gripper"], "its end")
+        commands.append((tuple(agent.twists[sent][1]["twist"]), agent.twists[sent][1]["gripper"]))
+    assert commands == COMMANDS
 
 
 def test_a_button_moves_the_robot_while_it_is_held_and_a_key_with_a_modifier_does_not(driven, agent):

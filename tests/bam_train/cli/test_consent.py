@@ -68,6 +68,7 @@ def test_before_a_real_robot_moves_its_limits_are_shown_and_somebody_asked(monke
             "  bam/pick-v0: 1 episode\n  each begins by going to the start pose\n",
         ),
         (base_spec("mir100"), 1, "  bam/pick-v0: 1 episode\n  each begins where the base stands\n"),
+        (base_spec("mir100"), 0, "  bam/pick-v0: a person begins each episode\n  each begins where the base stands\n"),
     ],
 )
 def test_what_it_will_do_is_shown(monkeypatch, capsys, spec, episodes, expected):

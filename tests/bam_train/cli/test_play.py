@@ -10,16 +10,26 @@ import subprocess
 import sys
 import termios
 import time
+from contextlib import closing
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+from bam_envs.core.timing import Pacer
+from bam_envs.remote.serve.serve_options import ServeOptions
+from bam_envs.remote.serve.served_environment import ServedEnvironment
+from bam_train.cli.consent import connected_env, guards_of
 from bam_train.cli.play import run_play, terminal
 from bam_train.cli.play.gamepad import Gamepad
 from bam_train.cli.play.terminal import Terminal, keys_in
 from bam_train.data import DataSet
+from bam_train.env_location import Place
+from bam_train.environments import make_env
+from bam_train.play.hands import hand_for
 from bam_train.play.key_map import is_move, moved
+from bam_train.play.session import Session
+from bam_train.signals import SignalMemory
 
 PRESSES = (*"wsadrfqeoc", "ArrowUp", "ArrowDown", "ArrowLeft", "ArrowRight", "PageUp", "PageDown", *"wdrc")
 """Twenty keys that a person presses, one after the other."""
@@ -206,3 +216,24 @@ def test_ctrl_c_gives_the_terminal_back(tty, tmp_path):
     assert (status, out) == (130, "")
     assert "\x1b[?25h\x1b[?1049lbam-play: interrupted" in shown
     assert termios.tcgetattr(tty[1]) == before
+
+
+def test_a_live_robot_moves_through_its_guards_while_a_key_is_fresh_and_else_holds():
+    with ServedEnvironment(make_env("bam/pick-v0", {}), ServeOptions(port=0)) as served, SignalMemory() as signals:
+        place = Place(served.bus.url, trial=None)
+        env = connected_env(None, place, signals, who="bam-play", episodes=0, named="bam/pick-v0")
+        with closing(env):
+            session = Session(env, hand_for(env, is_live=True), is_live=True)
+            session.begin()
+            places, pacer = [], Pacer(session.pace)
+            session.press("KeyW", time.monotonic())
+            pacer.start()
+            for _ in range(14):
+                pacer.wait()
+                session.tick(time.monotonic())
+                places.append(env.unwrapped.task.control.target[0, 0])
+            assert 0.01 < places[-1] - places[0] < 0.03
+            assert len(set(places[8:])) == 1
+            assert guards_of(env)["joint speed"]["number"] == "G8"
+            session.press("Backspace", time.monotonic())
+            assert session.note == "undo the last second: not with a live robot, whose time cannot be stopped"

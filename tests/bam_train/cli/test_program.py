@@ -146,7 +146,8 @@ def test_help_imports_nothing_heavy():
     code = """
 import sys
 from bam_train.cli import deploy, envs, eval, export, serve, train
-for program in (deploy, envs, eval, export, serve, train):
+from bam_train.cli.play import run_play
+for program in (deploy, envs, eval, export, run_play, serve, train):
     try: program.main(['--help'])
     except SystemExit: pass
 print(*{'torch', 'stable_baselines3', 'gymnasium', 'mujoco', 'numpy', 'rich'} & set(sys.modules), file=sys.stderr)
