@@ -2,7 +2,7 @@
 
 import re
 from collections.abc import Mapping, Sequence
-from typing import Any, Protocol
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -19,25 +19,29 @@ AXES = {"dx": 0, "dy": 1, "dz": 2, "dyaw": 3, "forward": 0, "turn": 3}
 GRIP = "grip"
 
 
-class Hand(Protocol):
-    """What a person does, as actions; from one action to the next it remembers `memory`."""
+class Hand:
+    """What a person does, as actions; this base class counts what is held, and chooses nothing."""
 
-    waits: bool
+    waits = False
     """Whether time passes with presses only."""
-    is_base: bool
-    memory: Any
+    is_base = False
+    memory: Any = None
+    """What it goes on from, such as whether the gripper is closed."""
 
     def press(self, key: str) -> bool:
         """Take a key that was pressed; whether an action is complete with it."""
+        return False
 
     def action(self, twist: Twist, grip: int) -> Any:
         """The action for what is held now: a motion, and 1 to close the gripper, -1 to open it."""
+        raise NotImplementedError
 
     def took(self, action: Any) -> None:
         """Go on from an action of somebody else, as a policy."""
 
     def lines(self) -> list[str]:
         """The keys, for the screen."""
+        return move_lines(is_base=self.is_base)
 
 
 def hand_for(env: gym.Env[Any, Any], *, is_live: bool = False) -> Hand:
@@ -62,10 +66,8 @@ def hand_for(env: gym.Env[Any, Any], *, is_live: bool = False) -> Hand:
     raise SettingsError(f"a person can press actions of Box, Discrete and MultiDiscrete spaces, not of {brief(space)}")
 
 
-class MotionHand:
+class MotionHand(Hand):
     """Steps of a tool, or speeds of a base, as the numbers of the action are called."""
-
-    waits = False
 
     def __init__(self, labels: Sequence[Mapping[str, Any]], period: float) -> None:
         self.is_base = any(label["name"] == "forward" for label in labels)
@@ -75,10 +77,6 @@ class MotionHand:
         self._ends = [(float(label["low"]), float(label["high"])) for label in labels]
         self.memory = False
         """Whether the gripper is to be closed; it keeps what it was told last."""
-
-    def press(self, key: str) -> bool:
-        """Nothing: it counts what is held."""
-        return False
 
     def action(self, twist: Twist, grip: int) -> Any:
         """The motion of one period. Shape: (a,) float32."""
@@ -94,10 +92,6 @@ class MotionHand:
         if -1 in self._axes:
             self.memory = bool(action[self._axes.index(-1)] > 0)
 
-    def lines(self) -> list[str]:
-        """The keys of the motions."""
-        return move_lines(is_base=self.is_base)
-
 
 def _scale(label: Mapping[str, Any]) -> float:
     """The quantity that is 1 in an action."""
@@ -105,10 +99,8 @@ def _scale(label: Mapping[str, Any]) -> float:
     return float(found[1]) if found else 1.0
 
 
-class JointHand:
+class JointHand(Hand):
     """Motions of the tool for a task whose actions are joints: the keys jog it as `bam-agent` does."""
-
-    waits = is_base = False
 
     def __init__(self, env: gym.Env[Any, Any]) -> None:
         inner: Any = env.unwrapped
@@ -125,10 +117,6 @@ class JointHand:
     def memory(self, sent: Any) -> None:
         self._jogger.sent = sent
 
-    def press(self, key: str) -> bool:
-        """Nothing: it counts what is held."""
-        return False
-
     def action(self, twist: Twist, grip: int) -> Any:
         """The joints' action that moves the tool for one period, or holds the arm. Shape: (a,) float32."""
         state = self._env.state
@@ -143,15 +131,11 @@ class JointHand:
         """The next motion begins where the arm is then."""
         self._jogger.release()
 
-    def lines(self) -> list[str]:
-        """The keys of the motions."""
-        return move_lines(is_base=False)
 
-
-class ChoiceHand:
+class ChoiceHand(Hand):
     """One of n actions: its digit, or an arrow where the environment says which way an action goes."""
 
-    waits, is_base = True, False
+    waits = True
 
     def __init__(self, space: spaces.Discrete[Any], labels: Sequence[Mapping[str, Any]]) -> None:
         last = int(space.start) + int(space.n) - 1
@@ -171,19 +155,14 @@ class ChoiceHand:
         """The last choice."""
         return self._kind(self.memory)
 
-    def took(self, action: Any) -> None:
-        """Nothing: every press is a choice of its own."""
-
     def lines(self) -> list[str]:
         """The keys of the choices."""
         keys = [f"{short(key):<7} action {one}" for key, one in self._keys.items()]
         return [self._meaning, *keys] if self._meaning else keys
 
 
-class NumberHand:
+class NumberHand(Hand):
     """Any numbers: a digit or ↑, ↓ chooses one, + and - change it; whole numbers are sent by Enter."""
-
-    is_base = False
 
     def __init__(self, space: gym.Space[Any], labels: Sequence[Mapping[str, Any]]) -> None:
         self._space: Any = space

@@ -55,8 +55,8 @@ def _numbers(session: Session) -> list[str]:
     """The numbers of action, info and observation; what a policy would do stands beside the action."""
     describe = getattr(session.env.unwrapped, "describe", None)
     signals: Mapping[str, Any] = {} if describe is None else describe()
-    acted = [] if session.action is None else flat_numbers(session.action)
-    wanted = [] if session.suggestion is None else flat_numbers(session.suggestion)
+    acted = [] if session.action is None else np.ravel(session.action).tolist()
+    wanted = [] if session.suggestion is None else np.ravel(session.suggestion).tolist()
     lines = [
         "action" + (f", and what the policy {'does' if session.driver == 'policy' else 'would do'}" if wanted else "")
     ]

@@ -228,7 +228,8 @@ class Session:
 
     def numbers(self) -> dict[str, float]:
         """The numbers that are plotted: the observation's first ones, the reward, and those of the info."""
-        values = {f"observation {at}": float(one) for at, one in enumerate(flat_numbers(self.observation)[:64])}
+        seen = [(at, one) for at, one in enumerate(flat_numbers(self.observation)) if not isinstance(one, str)]
+        values = {f"observation {at}": float(one) for at, one in seen[:64]}
         info = {f"info {key}": float(one) for key, one in self.info.items() if isinstance(one, (bool, int, float))}
         return {**values, **info, "reward": self.reward}
 
@@ -280,10 +281,9 @@ def _layers(env: Any) -> list[Any]:
 
 
 def flat_numbers(value: Any) -> list[Any]:
-    """The numbers of an observation or action in order; an image is left out."""
-    if isinstance(value, dict):
-        return [one for part in value.values() for one in flat_numbers(part)]
-    if isinstance(value, tuple):
-        return [one for part in value for one in flat_numbers(part)]
+    """The numbers of an observation in order; in the place of a picture, its size as a text."""
+    if isinstance(value, (dict, tuple)):
+        parts = value.values() if isinstance(value, dict) else value
+        return [one for part in parts for one in flat_numbers(part)]
     array = np.asarray(value)
-    return [] if array.ndim > 1 and array.size > 256 else np.ravel(array).tolist()
+    return [" x ".join(map(str, array.shape))] if array.ndim > 1 else np.ravel(array).tolist()

@@ -29,6 +29,8 @@ def play(config: PlayConfig, signals: SignalMemory) -> int:
     if not config.render and not sys.stdin.isatty():
         raise NoTerminal("standard input is no terminal: run it in one, or in a window with --render")
     place = _checked_place(config)
+    from gymnasium.error import DependencyNotInstalled
+
     from bam_envs.core.errors import BamEnvsError
     from bam_train.checkpoint import Checkpoint
     from bam_train.cli.play.gamepad import Gamepad
@@ -48,6 +50,8 @@ def play(config: PlayConfig, signals: SignalMemory) -> int:
         with _screen(config, env_id) as screen, closing(Gamepad()) as pad:
             session.begin()
             _drive(session, screen, pad, f"{env_id}{place.text and f' at {place.text}'}", config.episodes)
+    except DependencyNotInstalled as error:  # of Gymnasium's own environments, at the first picture
+        raise SettingsError(f"--render: {error}") from error
     except BamEnvsError as error:
         ending = ending_of(error)
         say(f"bam-play: {ending.reason}")

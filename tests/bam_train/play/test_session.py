@@ -207,6 +207,13 @@ def test_the_screen_shows_every_number_with_name_unit_and_limits():
     driven.env.close()
 
 
+def test_a_picture_is_shown_by_its_size():
+    driven = Driven("bam/digits-v0")
+    lines = screen_lines(driven.session, "bam/digits-v0")
+    assert [line.split() for line in lines][-1][:4] == ["picture", "8", "x", "8"]
+    driven.env.close()
+
+
 def test_a_plot_goes_from_the_lowest_value_to_the_highest():
     assert sparkline([0, 1, 2, 7]) == "▁▂▃█"
     assert sparkline([3, 3]) == "▁▁"
