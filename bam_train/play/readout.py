@@ -6,18 +6,18 @@ from typing import Any
 import numpy as np
 
 from bam_train.play.key_map import control_lines
-from bam_train.play.session import Session, flat_numbers
+from bam_train.play.session import PLOTTED, Session, flat_numbers
 
 _BARS = "▁▂▃▄▅▆▇█"
 
 
 def sparkline(values: Iterable[float]) -> str:
-    """A plot in one line, from the lowest value to the highest: ``▁▃▅█``."""
+    """A plot in one line, from the lowest value to the highest: ``▁▃▅█``; what reads equal (0.001) is flat."""
     numbers = np.array(list(values), np.float64)
     finite = numbers[np.isfinite(numbers)]
     if not finite.size:
         return ""
-    low, span = finite.min(), max(float(np.ptp(finite)), 1e-12)
+    low, span = finite.min(), max(float(np.ptp(finite)), 1e-3)
     heights = np.nan_to_num((numbers - low) / span * (len(_BARS) - 1), posinf=len(_BARS) - 1, neginf=0)
     return "".join(_BARS[int(height)] for height in np.clip(heights, 0, len(_BARS) - 1))
 
@@ -72,7 +72,8 @@ def _numbers(session: Session) -> list[str]:
     rows = signals.get("observation", ())
     lines += ["", "observation"]
     for at, one in enumerate(flat_numbers(session.observation)):
-        lines.append(f"  {_name(rows, at)} {_text(one):>9}  {_limits(rows, at)}  {_plot(session, f'observation {at}')}")
+        plot = f"{_plot(session, f'observation {at}'):<{PLOTTED}}"
+        lines.append(f"  {_name(rows, at)} {_text(one):>9}  {_limits(rows, at, plot)}")
     return lines
 
 
@@ -89,11 +90,11 @@ def _name(rows: Sequence[Mapping[str, Any]], at: int) -> str:
     return f"{name:<24.24}"
 
 
-def _limits(rows: Sequence[Mapping[str, Any]], at: int) -> str:
-    """Such as ``rad / 0.05 [-1, 1]  turn shoulder_pan_joint``."""
+def _limits(rows: Sequence[Mapping[str, Any]], at: int, plot: str = "") -> str:
+    """Such as ``rad / 0.05 [-1, 1]  turn shoulder_pan_joint``, with the plot before the meaning."""
     if at >= len(rows):
-        return ""
+        return plot
     row = rows[at]
     unit = f"{row['unit']} {'' if row['scale'] == '1' else row['scale']}".strip()
     limits = f"[{float(row['low']):.4g}, {float(row['high']):.4g}]"
-    return f"{unit:<12.24} {limits:<10} {row['meaning'][:36]:<36}"
+    return f"{unit:<18.24} {limits:<8} {plot and plot + ' '}{row['meaning']}"

@@ -18,7 +18,8 @@ UNDO = 1.0
 """Time that an undo goes back [s]."""
 _AGAIN = 0.7  # time after which the key of a control counts as pressed anew; a terminal sends repetitions only [s]
 _KEPT = 1200  # steps that can be undone
-_SHOWN = 32  # steps that are plotted
+PLOTTED = 20
+"""Steps that are plotted."""
 
 
 class HeldKeys:
@@ -85,7 +86,7 @@ class Session:
         self.suggestion: Any = None
         """What the policy would do now."""
         self.reward, self.info = 0.0, dict[str, Any]()
-        self.past: deque[dict[str, float]] = deque(maxlen=_SHOWN)
+        self.past: deque[dict[str, float]] = deque(maxlen=PLOTTED)
         """The numbers of the last steps, by name."""
         self._armed: set[str] = set()
         self._undo: deque[tuple[Any, ...]] = deque(maxlen=_KEPT)
@@ -265,7 +266,11 @@ class Session:
             self._recorder.rewind(count, self.observation)
         self.episodes -= was_over
         self.successes -= was_over and bool(self.info.get("is_success"))
-        self.steps, self.status, self.note = self.steps - count, "paused", f"{count} steps undone"
+        self.steps, self.status, self.note = (
+            self.steps - count,
+            "paused",
+            f"{count} step{'s' if count > 1 else ''} undone",
+        )
         self.keys.release()
         if self.policy is not None:
             self.policy.reset()

@@ -144,7 +144,7 @@ def test_every_press_is_a_step_where_actions_are_choices():
     driven.tap("ArrowRight" if x < 4 else "ArrowLeft")
     assert session.observation["agent"].tolist() == [x + (1 if x < 4 else -1), y]
     driven.tap("Backspace")
-    assert (session.observation["agent"].tolist(), session.note) == ([x, y], "1 steps undone")
+    assert (session.observation["agent"].tolist(), session.note) == ([x, y], "1 step undone")
     while session.episodes == 0:
         (x, y), (to_x, to_y) = session.observation["agent"], session.observation["target"]
         driven.tap("ArrowRight" if x < to_x else "ArrowLeft" if x > to_x else "ArrowUp" if y < to_y else "ArrowDown")
@@ -196,7 +196,7 @@ def test_the_screen_shows_every_number_with_name_unit_and_limits():
     assert lines[1] == "[running, person drives, 0.10 m/s]  ? shows the keys"
     assert lines[3:5] == [
         "action, and what the policy would do",
-        "  dx                          +0.403  policy  +0.000  m / 0.0124   [-1, 1]    move the tool target forward",
+        "  dx                          +0.403  policy  +0.000  m / 0.0124         [-1, 1]  move the tool target forward",
     ]
     assert [line.split()[0] for line in lines if line.startswith("  ")][-18:] == [
         row["name"] for row in driven.env.unwrapped.describe()["observation"]
