@@ -45,7 +45,7 @@ class TrainSettings:
     algo: str
     """Algorithm: ppo, a2c, sac, td3, ddpg, dqn, tqc, trpo, qrdqn, crossq or recurrent-ppo.
     With --trainer rllib: ppo, appo, impala, sac, tqc, dqn, bc, marwil, cql or iql. With --data: bc, iql, cql, td3bc,
-    awac, cal-ql, plas or rebrac. With --teacher: dagger."""
+    awac, cal-ql, plas or rebrac. With --teacher: dagger. For grasps from a picture: grasp-q."""
     steps: _Steps = 100_000
     """Environment steps of the whole run, also after --resume; with --data, updates."""
     seed: Annotated[int, Meta(ge=0, le=10**15)] = 0
@@ -57,7 +57,8 @@ class TrainSettings:
     threads: Annotated[int, Meta(ge=1, le=1024)] = 1
     """Threads that torch computes with (default 1: more is slower on small networks)."""
     trainer: str = "sb3"
-    """Library that trains: sb3 (default), rllib, offline (default with --data) or imitation (default for dagger)."""
+    """Library that trains: sb3 (default), rllib, offline (default with --data), imitation (default for dagger) or
+    bandit (default for grasp-q)."""
     start: str | None = None
     """Checkpoint whose weights a new run of sb3 begins with: to harden a policy with env_kwargs.randomize, say."""
     teacher: str | None = None
@@ -261,5 +262,5 @@ def file_stem(env: str, algo: str, trainer: str = "sb3") -> str:
     """
     match = re.fullmatch(r"bam/(.+)-v\d+", env)
     name = match[1] if match else env
-    run = algo if trainer in ("sb3", "imitation") else f"{trainer}-{algo}"
+    run = algo if trainer in ("sb3", "imitation", "bandit") else f"{trainer}-{algo}"
     return re.sub(r"[^\w.-]+", "-", f"{name}-{run}").strip("-.")

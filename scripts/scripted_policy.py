@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from bam_envs.core.errors import BamEnvsError
 from bam_envs.core.registry import ENVIRONMENTS, resolve_id
-from bam_envs.tasks.scripted import SCRIPTED, scripted_policy
+from bam_envs.tasks.scripted import GRASP, SCRIPTED, scripted_policy
 
 ROWS = 64
 
@@ -39,8 +39,8 @@ def run_episodes(env_id: str, episodes: int, seed: int, *, randomize: bool) -> t
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
-    known = ", ".join(SCRIPTED)
-    parser.add_argument("--env", action="append", help=f"one of {known}; may be repeated; default: all of these")
+    known = ", ".join((*SCRIPTED, GRASP))
+    parser.add_argument("--env", action="append", help=f"one of {known}; may be repeated; default: those of arms")
     parser.add_argument("--episodes", type=int, default=1000, help="episodes each (default 1000)")
     parser.add_argument("--seed", type=int, default=0, help="episode k is seeded seed + k (default 0)")
     parser.add_argument("--randomize", action="store_true", help="with domain randomisation")

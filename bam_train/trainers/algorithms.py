@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from bam_train.trainers.base import Trainer
 
 TRAINERS: dict[str, str] = {
+    "bandit": "bam_train.trainers.bandit.grasp_trainer:GraspTrainer",
     "imitation": "bam_train.trainers.imitation.dagger_trainer:DaggerTrainer",
     "offline": "bam_train.trainers.offline.offline_trainer:OfflineTrainer",
     "rllib": "bam_train.trainers.rllib.rllib_trainer:RLlibTrainer",
@@ -23,7 +24,13 @@ TRAINERS: dict[str, str] = {
 }
 """``"module:Class"`` of each trainer, by name."""
 
-EXTRAS: dict[str, str] = {"imitation": "train", "offline": "offline", "rllib": "rllib", "sb3": "train"}
+EXTRAS: dict[str, str] = {
+    "bandit": "train",
+    "imitation": "train",
+    "offline": "offline",
+    "rllib": "rllib",
+    "sb3": "train",
+}
 """Extra of bam-train that installs the packages of each trainer, by name."""
 
 
@@ -101,12 +108,15 @@ _OFFLINE = (
     Algorithm("rebrac", "d3rlpy.algos:ReBRACConfig", _BOX, offline=True),
     Algorithm("td3bc", "d3rlpy.algos:TD3PlusBCConfig", _BOX, offline=True),
 )
+_BANDIT = (Algorithm("grasp-q", "bam_train.trainers.bandit.grasp_trainer:GraspQ", ("MultiDiscrete",)),)
+BANDIT_ALGORITHMS = {algorithm.name: algorithm for algorithm in _BANDIT}
 _IMITATION = (Algorithm("dagger", "bam_train.trainers.imitation.dagger:Dagger", ("Box", "Discrete")),)
 IMITATION_ALGORITHMS = {algorithm.name: algorithm for algorithm in _IMITATION}
 SB3_ALGORITHMS = {algorithm.name: algorithm for algorithm in _SB3}
 RLLIB_ALGORITHMS = {algorithm.name: algorithm for algorithm in _RLLIB}
 OFFLINE_ALGORITHMS = {algorithm.name: algorithm for algorithm in _OFFLINE}
 ALGORITHMS = {
+    "bandit": BANDIT_ALGORITHMS,
     "imitation": IMITATION_ALGORITHMS,
     "offline": OFFLINE_ALGORITHMS,
     "rllib": RLLIB_ALGORITHMS,

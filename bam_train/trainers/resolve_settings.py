@@ -14,7 +14,7 @@ from bam_train.environments import environment_of, require_env_kwargs
 from bam_train.errors import CheckpointMismatch, SettingsError
 from bam_train.settings import TrainSettings, check_names, differences, file_stem, merge, parse_config
 from bam_train.trainers import load_trainer, require_algorithm
-from bam_train.trainers.algorithms import IMITATION_ALGORITHMS
+from bam_train.trainers.algorithms import ALGORITHMS
 
 PRESETS = Path(__file__).parent / "presets"
 """Tuned settings, laid out like a ``--config`` file: ``<environment>-<algorithm>.toml`` is for sb3,
@@ -87,7 +87,8 @@ def _of_data(given: Mapping[str, Any]) -> dict[str, Any]:
 
 def _of_algorithm(given: Mapping[str, Any]) -> dict[str, Any]:
     """The trainer of an algorithm that no other one has."""
-    return {"trainer": "imitation"} if given.get("algo") in IMITATION_ALGORITHMS else {}
+    trainers = [trainer for trainer in ("imitation", "bandit") if given.get("algo") in ALGORITHMS[trainer]]
+    return {"trainer": trainers[0]} if trainers else {}
 
 
 def _require_of_trainer(settings: TrainSettings) -> None:

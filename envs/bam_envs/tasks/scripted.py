@@ -11,6 +11,7 @@ from bam_envs.core.errors import InvalidValue, UnknownName
 from bam_envs.core.registry import ENVIRONMENTS
 from bam_envs.core.task import Array, Flags, Floats, Label
 from bam_envs.robots.ur5e import GEOMETRY, JOINTS
+from bam_envs.tasks.grasping.scripted_grasps import ScriptedGrasps
 from bam_envs.tasks.pick import PickTask
 from bam_envs.tasks.pick_place import CARRY, PickPlaceTask
 from bam_envs.tasks.reach import HOME, ReachTask
@@ -121,14 +122,18 @@ SCRIPTED: dict[str, tuple[type[ReachTask | PickTask], Callable[[Take], Floats]]]
     "bam/pick-v0": (PickTask, pick),
     "bam/pick-place-v0": (PickPlaceTask, pick_place),
 }
-"""Task and action function of each environment that has a scripted policy."""
+"""Task and action function of each arm's environment that has a scripted policy."""
+GRASP = "bam/grasp-xyr-v0"
 
 
-def scripted_policy(env_id: str) -> ScriptedPolicy:
+def scripted_policy(env_id: str) -> ScriptedPolicy | ScriptedGrasps:
     """The scripted policy for `env_id`; `InvalidValue` if it has none, `UnknownName` if it is no environment."""
-    if env_id in ENVIRONMENTS and env_id not in SCRIPTED:
-        raise InvalidValue(f"{env_id} has no scripted policy. These have one: {', '.join(SCRIPTED)}.")
-    if env_id not in SCRIPTED:
-        raise UnknownName("scripted policy", env_id, SCRIPTED)
+    known = (*SCRIPTED, GRASP)
+    if env_id in ENVIRONMENTS and env_id not in known:
+        raise InvalidValue(f"{env_id} has no scripted policy. These have one: {', '.join(known)}.")
+    if env_id not in known:
+        raise UnknownName("scripted policy", env_id, known)
+    if env_id == GRASP:
+        return ScriptedGrasps()
     task, act = SCRIPTED[env_id]
     return ScriptedPolicy(task.observation_labels, act)

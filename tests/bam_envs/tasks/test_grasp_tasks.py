@@ -11,6 +11,8 @@ from bam_envs.core.errors import InvalidValue, ResetNeeded
 from bam_envs.robots.grasping import CAMERA_HEIGHT, MIDDLE, VIEW
 from bam_envs.robots.physics.grasp_cell import GraspCell
 from bam_envs.tasks.grasping.grasp_tasks import DEEP, LOWEST, Grasp6D, GraspXYR, GraspXYRW
+from bam_envs.tasks.grasping.scripted_grasps import ScriptedGrasps
+from bam_envs.tasks.scripted import scripted_policy
 from bam_envs.testing.assertions import assert_same_value
 from bam_envs.testing.tasks import AnyTaskContract
 from tests.bam_envs.making import make_task
@@ -202,3 +204,21 @@ def test_options_are_checked(options, text):
 def test_a_gripper_that_is_not_connected():
     with pytest.raises(ResetNeeded, match="Call reset"):
         GraspCell(1).step(np.zeros((1, 8)))
+
+
+def test_the_scripted_policy_grasps_across_the_narrowest_blob(make):
+    """Here a bar at 45 degrees, with its long side upwards and to the right in the picture."""
+    env = placed(make, BAR, (0.52, 0.04, np.pi / 4))
+    observation = env.unwrapped.task.observe(env.unwrapped.state)
+    policy = scripted_policy("bam/grasp-xyr-v0")
+    ((column, row, rotation),) = policy.act_batch(observation)
+    scale = VIEW / 100 * (1 - 2 * BAR[2] / CAMERA_HEIGHT)
+    np.testing.assert_allclose([column + 0.5, row + 0.5], [50 + 0.02 / scale, 50 - 0.04 / scale], atol=1.5)
+    assert rotation in (11, 12, 13)
+    _, reward, *_ = env.step(np.array([column, row, rotation]))
+    assert reward == 1.0
+
+
+def test_the_scripted_policy_sees_an_empty_table():
+    depth = np.full((2, 40, 40, 1), CAMERA_HEIGHT, np.float32)
+    assert ScriptedGrasps((20, 20, 8)).act_batch({"depth": depth}).tolist() == [[10, 10, 0]] * 2

@@ -5,7 +5,7 @@ import pytest
 
 from bam_envs.core.errors import InvalidValue, UnknownName
 from bam_envs.core.registry import ENVIRONMENTS
-from bam_envs.tasks.scripted import SCRIPTED, scripted_policy
+from bam_envs.tasks.scripted import GRASP, SCRIPTED, scripted_policy
 
 IDS = tuple(SCRIPTED)
 
@@ -31,10 +31,11 @@ def test_no_policy_for_other_environments():
     assert str(caught.value) == "Unknown scripted policy 'bam/pik-v0'. Did you mean 'bam/pick-v0'?"
 
 
-@pytest.mark.parametrize("env_id", sorted(set(ENVIRONMENTS) - set(SCRIPTED)))
+@pytest.mark.parametrize("env_id", sorted(set(ENVIRONMENTS) - {*SCRIPTED, GRASP}))
 def test_environments_without_one_say_which_have_one(env_id):
     with pytest.raises(InvalidValue) as caught:
         scripted_policy(env_id)
     assert str(caught.value) == (
-        f"{env_id} has no scripted policy. These have one: bam/reach-v0, bam/pick-v0, bam/pick-place-v0."
+        f"{env_id} has no scripted policy. "
+        "These have one: bam/reach-v0, bam/pick-v0, bam/pick-place-v0, bam/grasp-xyr-v0."
     )

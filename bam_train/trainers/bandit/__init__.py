@@ -1,0 +1,1 @@
+"""Contextual bandits: one decision at a time, such as a grasp from a picture."""
