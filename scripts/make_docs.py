@@ -117,7 +117,8 @@ def environment(env_id: str) -> str:
         parts.append(f"**Options**: arguments of `gym.make`\n\n{table(['name', 'default', 'meaning'], named)}")
     if entry.cameras:
         both = " and ".join(f"`{name}`" for name in entry.cameras)
-        parts.append(f"**Images**: with `camera=` of {both}; see [images](index.md#images).")
+        shown = f"of {both}, or of those in" if entry.shows else f"with `camera=` of {both};"
+        parts.append(f"**Images**: {shown}{' `camera=`;' * bool(entry.shows)} see [images](index.md#images).")
     for kind in ("observation", "action"):
         rows = signals[kind]
         lines = [[where, *line] for where, line in _joined(rows)]

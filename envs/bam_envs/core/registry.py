@@ -63,6 +63,8 @@ class EnvEntry:
     """Arguments of the task that its robot takes too."""
     cameras: tuple[str, ...] = ()
     """Cameras of its robot, whose images its observations can have."""
+    shows: tuple[str, ...] = ()
+    """Those that they have unless the option ``camera`` says otherwise."""
     simulated_only: bool = False
     """Whether no live robot can take the place of its simulated one."""
     variants: dict[str, str] = field(default_factory=dict)
@@ -80,11 +82,12 @@ class EnvEntry:
 
     def options(self) -> dict[str, Any]:
         """The options of the task, flags of variants and cameras among them, with their defaults."""
-        images = CAMERA_OPTIONS if self.cameras else {}
+        images = {**CAMERA_OPTIONS, "camera": list(self.shows) or None} if self.cameras else {}
         return constructor_options(resolve(self.task)) | images | dict.fromkeys(self.variants, False)
 
     def read_cameras(self, given: Mapping[str, Any]) -> tuple[CameraSpec, ...]:
         """The cameras that these options ask for; raises the errors of `bam_envs.core.env_options.read_cameras`."""
+        given = {"camera": list(self.shows) or None, **given}
         return read_cameras(self.id, self.cameras, given) if self.cameras else ()
 
     def make_task(self, num_envs: int, given: Mapping[str, Any]) -> Task:
@@ -273,6 +276,16 @@ _ENTRIES = (
         NO_ROBOT,
         max_episode_steps=1,
         period=0.1,
+    ),
+    EnvEntry(
+        "bam/obs-v0",
+        "look through the cameras of a UR5e; nothing moves",
+        "bam_envs.tasks.observe:ObserveTask",
+        "bam_envs.robots.physics.mujoco_arm:cube_scene",
+        max_episode_steps=100,
+        cameras=_CAMERAS,
+        shows=_CAMERAS,
+        simulated_only=True,
     ),
     *(
         EnvEntry(

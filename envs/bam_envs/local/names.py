@@ -9,6 +9,7 @@ BAM_NAMES = {
     "ContextBandit-v0": Alias("bam/context-bandit-v0", options=_SEED),
     "MNISTEnv-v0": Alias("bam/mnist-v0"),
     "GraspXY-v0": Alias("bam/grasp-xy-v0"),
+    "ObsEnv-v0": Alias("bam/obs-v0"),
     "GraspXYR-v0": Alias("bam/grasp-xyr-v0"),
 }
 

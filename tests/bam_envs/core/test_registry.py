@@ -31,6 +31,7 @@ def test_the_table():
         "bam/digits-v0": (1, 0.1),
         "bam/mnist-v0": (1, 0.1),
         "bam/grasp-xy-v0": (1, 0.1),
+        "bam/obs-v0": (100, 0.05),
         "bam/grasp-xyr-v0": (1, 1.0),
         "bam/grasp-xyrw-v0": (1, 1.0),
         "bam/grasp-6d-v0": (1, 1.0),

@@ -103,7 +103,9 @@ def test_a_link_is_kept_without_its_file(tmp_path):
 
 
 def test_the_table_of_trainers():
-    with pytest.raises(SettingsError, match=r"^Unknown trainer 'x'\. Choose from: bandit, imitation, offline, rllib, sb3\.$"):
+    with pytest.raises(
+        SettingsError, match=r"^Unknown trainer 'x'\. Choose from: bandit, imitation, offline, rllib, sb3\.$"
+    ):
         load_trainer("x")
     require_algorithm("sb3", "recurrent-ppo")
     assert load_trainer("sb3").__name__ == "SB3Trainer"
