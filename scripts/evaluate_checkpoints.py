@@ -43,7 +43,7 @@ def command(manifest: Manifest, name: str) -> str:
     own = manifest.settings
     env = manifest.env.rpartition("-v")[0] if manifest.env.startswith("bam/") else manifest.env
     words = ["bam-train", "--env", env, "--algo", manifest.algorithm]
-    if manifest.trainer not in ("sb3", "imitation"):
+    if manifest.trainer not in ("sb3", "imitation", "bandit"):
         words += ["--trainer", manifest.trainer]
     asked = {"env": manifest.env, "algo": manifest.algorithm, "trainer": manifest.trainer}
     if own.get("teacher"):

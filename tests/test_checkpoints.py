@@ -23,10 +23,11 @@ LEAST = {
     "context-bandit-ppo": 0.99,
     "image-bandit-dqn": 0.99,
     "digits-dqn": 0.97,
+    "grasp-xyr-grasp-q": 0.95,
 }
-WIDE = {"mir100-avoidance-ppo", "ur-reach-ppo", "pick-place-ppo", "digits-dqn"}
-"""Two layers of 128 instead of 64, so four times the weights, and their optimiser's; a replay buffer; or messages
-that were on their way through the links of 64 robots."""
+WIDE = {"mir100-avoidance-ppo", "ur-reach-ppo", "pick-place-ppo", "digits-dqn", "grasp-xyr-grasp-q"}
+"""Two layers of 128 instead of 64, so four times the weights, and their optimiser's; a replay buffer; pictures; or
+messages that were on their way through the links of 64 robots."""
 
 
 SEEING = {"pick-dagger"}

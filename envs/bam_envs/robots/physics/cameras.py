@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from bam_envs.core.robot import FARTHEST, SEGMENTS, Array, CameraSpec, EnvIds
 from bam_envs.robots.physics.mujoco_batch import MODELS, Physics, mujoco
-from bam_envs.robots.physics.rendering import find_backend, gl_context
+from bam_envs.robots.physics.rendering import FastCamera
 
 Images = dict[str, NDArray[Any]]
 SALT = 0xCA3E4A
@@ -39,7 +39,6 @@ _FAR_AWAY = ((0.1, 0.1, 0.1), (0.9, 0.9, 0.9))
 _CAMERA_MOVES = {"front": (0.01, 0.02), "wrist": (0.003, 0.015)}
 """Greatest differences of each camera's position along each axis [m], and of its rotation about each [rad]."""
 _FEW = 8  # robots that are no work for a further thread
-_OFF = ("mjRND_SHADOW", "mjRND_REFLECTION", "mjRND_SKYBOX", "mjRND_HAZE", "mjRND_FOG")
 
 
 class Cameras:
@@ -87,10 +86,9 @@ class Cameras:
         """Create a thread for each core, as an OpenGL context belongs to a thread; one is enough for few robots."""
         if not self._painters:
             cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-            backend = find_backend()
             for _ in range(min(cores, -(-self._physics.num_envs // _FEW))):
                 thread = ThreadPoolExecutor(1, "bam-camera")
-                self._painters.append((thread, thread.submit(_Painter, self._scene, self._specs, backend).result()))
+                self._painters.append((thread, thread.submit(_Painter, self._scene, self._specs).result()))
 
     def _draw(self, painter: _Painter, env_ids: EnvIds) -> None:
         for env in env_ids.tolist():
@@ -134,20 +132,12 @@ def _visual_model(scene: str, size: int) -> Any:
 class _Painter:
     """An OpenGL context of the thread that makes it, and a model of its own, for one environment after the other."""
 
-    def __init__(self, scene: str, specs: Sequence[CameraSpec], backend: str) -> None:
+    def __init__(self, scene: str, specs: Sequence[CameraSpec]) -> None:
         self._specs, size = specs, specs[0].size
         self._model: Any = _visual_model(scene, size)
         self._nominal = copy.copy(self._model)
         self._data = mujoco.MjData(self._model)
-        self._gl = gl_context(backend, size, size)
-        self._context = mujoco.MjrContext(self._model, mujoco.mjtFontScale.mjFONTSCALE_50.value)
-        mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, self._context)
-        self._context.readDepthMap = mujoco.mjtDepthMap.mjDEPTH_ZEROFAR
-        self._view, self._option = mujoco.MjrRect(0, 0, size, size), mujoco.MjvOption()
-        self._scene = mujoco.MjvScene(self._model, maxgeom=100)
-        self._camera = mujoco.MjvCamera()
-        self._camera.type = mujoco.mjtCamera.mjCAMERA_FIXED
-        self._pixels, self._depth = np.empty((size, size, 3), np.uint8), np.empty((size, size), np.float32)
+        self._camera = FastCamera(self._model, size)
         self._object = mujoco.mj_name2id(self._model, mujoco.mjtObj.mjOBJ_GEOM, "object")  # -1: there is none
 
     def pose(self, model: Any, qpos: Array, draws: Array | None) -> None:
@@ -183,40 +173,27 @@ class _Painter:
 
     def draw(self, images: Images) -> None:
         """Draw every camera's images into these arrays."""
-        self._gl.make_current()
         for spec in self._specs:
-            self._camera.fixedcamid = self._model.camera(spec.name).id
-            everything = mujoco.mjtCatBit.mjCAT_ALL.value
-            mujoco.mjv_updateScene(self._model, self._data, self._option, None, self._camera, everything, self._scene)
-            for flag in _OFF:
-                self._scene.flags[getattr(mujoco.mjtRndFlag, flag)] = 0
-            mujoco.mjr_render(self._view, self._scene, self._context)
-            mujoco.mjr_readPixels(self._pixels, self._depth if spec.depth else None, self._view, self._context)
-            images[spec.name][:] = self._pixels[::-1]  # OpenGL's first line is the lowest
+            images[spec.name][:] = self._camera.look(self._model, self._data, spec.name)
             if spec.depth:
-                images[f"{spec.name}_depth"][:, :, 0] = self._metres()[::-1]
+                images[f"{spec.name}_depth"][:, :, 0] = np.minimum(
+                    self._camera.depth(self._model), np.float32(FARTHEST)
+                )
             if spec.segmentation:
-                images[f"{spec.name}_segmentation"][:, :, 0] = self._segments()[::-1]
-
-    def _metres(self) -> NDArray[np.float32]:
-        """Distances from the camera's plane: 1 in the buffer is the near clipping plane, 0 the far one."""
-        extent, planes = self._model.stat.extent, self._model.vis.map
-        near, far = planes.znear * extent, planes.zfar * extent
-        metres = near * far / (near + self._depth * np.float32(far - near))
-        seen: NDArray[np.float32] = np.minimum(metres, np.float32(FARTHEST))
-        return seen
+                images[f"{spec.name}_segmentation"][:, :, 0] = self._segments()
 
     def _segments(self) -> NDArray[np.uint8]:
         """Indices of `SEGMENTS`; geoms are drawn again, in colours that are their numbers."""
-        flags = self._scene.flags
-        flags[mujoco.mjtRndFlag.mjRND_SEGMENT] = flags[mujoco.mjtRndFlag.mjRND_IDCOLOR] = 1
-        mujoco.mjr_render(self._view, self._scene, self._context)
-        mujoco.mjr_readPixels(self._pixels, None, self._view, self._context)
-        flags[mujoco.mjtRndFlag.mjRND_SEGMENT] = flags[mujoco.mjtRndFlag.mjRND_IDCOLOR] = 0
-        kinds = np.zeros(self._scene.ngeom + 1, np.uint8)
-        for geom in self._scene.geoms[: self._scene.ngeom]:
+        scene = self._camera.scene
+        for flag in (mujoco.mjtRndFlag.mjRND_SEGMENT, mujoco.mjtRndFlag.mjRND_IDCOLOR):
+            scene.flags[flag] = 1
+        pixels = self._camera.draw()
+        for flag in (mujoco.mjtRndFlag.mjRND_SEGMENT, mujoco.mjtRndFlag.mjRND_IDCOLOR):
+            scene.flags[flag] = 0
+        kinds = np.zeros(scene.ngeom + 1, np.uint8)
+        for geom in scene.geoms[: scene.ngeom]:
             kinds[geom.segid + 1] = self._kind(geom.objid)
-        return kinds[self._pixels[:, :, 0]]
+        return kinds[pixels[:, :, 0]]
 
     def _kind(self, geom: int) -> int:
         """The index of `SEGMENTS` of a geom of the model, by its name or group."""
@@ -227,9 +204,7 @@ class _Painter:
 
     def close(self) -> None:
         """Free the context."""
-        self._gl.make_current()
-        self._context.free()
-        self._gl.free()
+        self._camera.close()
 
 
 def _between(low: Sequence[float], high: Sequence[float], draw: Array) -> Array:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import atexit
+import copy
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -14,7 +16,7 @@ from bam_envs.robots.physics.shapes import marked
 
 if TYPE_CHECKING:
     from bam_envs.robots.physics.mujoco_batch import Physics
-    from bam_envs.robots.physics.rendering import DepthCamera, OffScreen, Window
+    from bam_envs.robots.physics.rendering import FastCamera, OffScreen, Window
 
 BACK = 0.12
 """Distance from which the open gripper comes, against its fingers [m]."""
@@ -60,7 +62,7 @@ class GraspCell:
         self._objects, self._grasps, self._size = objects, grasps, size
         self._physics: Physics | None = None
         self._cell: Any = None
-        self._camera: DepthCamera | None = None
+        self._camera: FastCamera | None = None
         self._view: OffScreen | Window | None = None
         self._drawn: Any = None  # the model of `_view`
         self._seeds = np.zeros(num_robots, np.int64)
@@ -179,13 +181,15 @@ class GraspCell:
         """The state, with new pictures of the `fresh` environments."""
         physics = self.physics
         if self._camera is None:
-            from bam_envs.robots.physics.rendering import DepthCamera
+            from bam_envs.robots.physics.rendering import FastCamera
 
-            self._camera = DepthCamera(physics.model, "above", self._size, hidden=(_GRIPPER,))
+            self._camera = FastCamera(physics.model, self._size, hidden=(_GRIPPER,))
+            atexit.register(self._camera.close)  # while OpenGL is still there
         self._color, self._depth = self._color.copy(), self._depth.copy()
         for env in fresh.tolist():
-            data = physics.data_of(env)
-            self._camera.look(physics.model_of(env), data, self._color[env], self._depth[env, :, :, 0])
+            model = physics.model_of(env)
+            self._color[env] = self._camera.look(model, physics.data_of(env), "above")
+            self._depth[env, :, :, 0] = self._camera.depth(model)
             if self.randomize:
                 rng = np.random.default_rng([int(self._seeds[env]), round(1e3 * physics.time[env])])
                 self._depth[env] += rng.normal(0.0, _NOISE, self._depth[env].shape).astype(np.float32)
@@ -198,6 +202,8 @@ class GraspCell:
 
     def close(self) -> None:
         """Drop the physics, the camera and the window."""
+        if self._camera is not None:
+            atexit.unregister(self._camera.close)
         for part in (self._view, self._camera, self._physics):
             if part is not None:
                 part.close()
@@ -207,8 +213,6 @@ class GraspCell:
         self, mode: str, marks: list[tuple[Array, tuple[float, float, float, float]]]
     ) -> NDArray[np.uint8] | None:
         """Show environment 0 and `marks`: an image (480, 640, 3) for ``rgb_array``, a window for ``human``."""
-        import copy
-
         from bam_envs.robots.physics.rendering import open_view
 
         if self._view is None:

@@ -72,16 +72,16 @@ class OffScreen:
         self._gl = None
 
 
-class DepthCamera:
-    """Small colour and depth images through one camera of models that differ in shapes, poses and colours only.
+class FastCamera:
+    """Small images of models that differ in shapes, poses and colours only, in the thread that makes it.
 
-    It leaves out what makes images slow without a GPU: several samples a pixel, shadows, reflections and the sky. Geoms
-    of `hidden` groups are not drawn.
+    It leaves out what makes small images slow without a GPU: several samples a pixel, shadows, reflections and the sky.
+    Geoms of `hidden` groups are not drawn.
     """
 
     _OFF = ("mjRND_SHADOW", "mjRND_REFLECTION", "mjRND_SKYBOX", "mjRND_HAZE", "mjRND_FOG")
 
-    def __init__(self, model: Any, camera: str, size: int, hidden: Sequence[int]) -> None:
+    def __init__(self, model: Any, size: int, hidden: Sequence[int] = ()) -> None:
         self._gl: Any = gl_context(find_backend(), size, size)
         quality, screen = model.vis.quality, model.vis.global_
         before = quality.offsamples, screen.offwidth, screen.offheight
@@ -90,37 +90,43 @@ class DepthCamera:
         quality.offsamples, screen.offwidth, screen.offheight = before
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, self._context)
         self._context.readDepthMap = mujoco.mjtDepthMap.mjDEPTH_ZEROFAR
-        self._scene, self._option = mujoco.MjvScene(model, maxgeom=100), mujoco.MjvOption()
+        self.scene: Any = mujoco.MjvScene(model, maxgeom=100)
+        """What the last `look` saw."""
+        self._option, self._camera = mujoco.MjvOption(), mujoco.MjvCamera()
         self._option.geomgroup[list(hidden)] = 0
-        self._camera = mujoco.MjvCamera()
-        self._camera.type, self._camera.fixedcamid = mujoco.mjtCamera.mjCAMERA_FIXED, model.camera(camera).id
+        self._camera.type = mujoco.mjtCamera.mjCAMERA_FIXED
         self._view = mujoco.MjrRect(0, 0, size, size)
-        near, far = model.vis.map.znear * model.stat.extent, model.vis.map.zfar * model.stat.extent
-        self._planes = np.float32(near), np.float32(far)
-        atexit.register(self.close)  # while OpenGL is still there
+        self._pixels, self._buffer = np.empty((size, size, 3), np.uint8), np.empty((size, size), np.float32)
 
-    def look(self, model: Any, data: Any, colour: NDArray[np.uint8], depth: NDArray[np.float32]) -> None:
-        """Draw into `colour` (size, size, 3) and `depth` (size, size), the distance from the camera's plane [m]."""
+    def look(self, model: Any, data: Any, camera: str) -> NDArray[np.uint8]:
+        """The colours that a camera sees. Shape: (size, size, 3)."""
         self._gl.make_current()
+        self._camera.fixedcamid = model.camera(camera).id
         everything = mujoco.mjtCatBit.mjCAT_ALL.value
-        mujoco.mjv_updateScene(model, data, self._option, None, self._camera, everything, self._scene)
+        mujoco.mjv_updateScene(model, data, self._option, None, self._camera, everything, self.scene)
         for flag in self._OFF:
-            self._scene.flags[getattr(mujoco.mjtRndFlag, flag)] = 0
-        mujoco.mjr_render(self._view, self._scene, self._context)
-        pixels, buffer = np.empty(colour.shape, np.uint8), np.empty(depth.shape, np.float32)
-        mujoco.mjr_readPixels(pixels, buffer, self._view, self._context)
-        near, far = self._planes
-        colour[:], depth[:] = pixels[::-1], (near * far / (near + buffer * (far - near)))[::-1]  # OpenGL begins below
+            self.scene.flags[getattr(mujoco.mjtRndFlag, flag)] = 0
+        return self.draw()
+
+    def draw(self) -> NDArray[np.uint8]:
+        """Draw the scene again; a view of the pixels, which the next picture overwrites."""
+        mujoco.mjr_render(self._view, self.scene, self._context)
+        mujoco.mjr_readPixels(self._pixels, None, self._view, self._context)
+        return self._pixels[::-1]  # OpenGL's first line is the lowest
+
+    def depth(self, model: Any) -> NDArray[np.float32]:
+        """Distances of the last picture from the camera's plane [m]. Shape: (size, size)."""
+        mujoco.mjr_readPixels(None, self._buffer, self._view, self._context)
+        # 1 in the buffer is the near clipping plane, 0 the far one.
+        near, far = model.vis.map.znear * model.stat.extent, model.vis.map.zfar * model.stat.extent
+        metres: NDArray[np.float32] = near * far / (near + self._buffer[::-1] * np.float32(far - near))
+        return metres
 
     def close(self) -> None:
-        """Free the context; idempotent."""
-        if self._gl is None:
-            return
-        atexit.unregister(self.close)
+        """Free the context."""
         self._gl.make_current()
         self._context.free()
         self._gl.free()
-        self._gl = None
 
 
 class Window:
