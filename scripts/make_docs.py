@@ -211,6 +211,8 @@ def topics_of(name: str) -> str:
         text = f"{source.signal} [{units}]" if units else source.signal
         published.setdefault((source.topic, source.type), []).append(text)
     rows = [[f"`{topic}`", f"`{kind}`", "from the robot", ", ".join(what)] for (topic, kind), what in published.items()]
+    seen = ((one.topic, one.type, one.name) for one in profile.cameras)
+    rows += [[f"`{topic}`", f"`{kind}`", "from the robot", f"camera {name}"] for topic, kind, name in seen]
     rows += [
         [f"`{one.topic}`", f"`{one.type}`", "from the robot, if it has it", "readiness"] for one in profile.readiness
     ]

@@ -14,8 +14,9 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from bam_envs.core.errors import ProtocolError, ResetNeeded, StaleState
-from bam_envs.live.state import Mailbox, SourceAge
+from bam_envs.live.state import Letter, Mailbox, SourceAge
 from bam_envs.ros.images import SIGNATURES, message_bytes, read_color_message, read_depth_message, resized
+from bam_envs.ros.messages import read_stamp
 from bam_envs.ros.profile_tables import CameraSource
 from bam_envs.rosbridge.client import RosbridgeLink
 from bam_envs.rosbridge.endpoint import Endpoint
@@ -106,6 +107,15 @@ class LiveCamera:
             pixels = decode_pixels(letter.message, self._topic)
             self._decoded = CameraImage(pixels, self._age.stamp, letter.number)
         return self._decoded
+
+    def await_stamp(self, stamp: float) -> None:
+        """Wait until an image with this stamp or a later one has come, for as long as one is fresh."""
+
+        def came(slots: Mapping[str, Letter]) -> bool:
+            taken = None if _SLOT not in slots else read_stamp(slots[_SLOT].message, self._topic)
+            return taken is not None and taken >= stamp
+
+        self._mailbox.wait_for(came, self.source.max_age)
 
     def file(self) -> tuple[int, str, bytes] | None:
         """Number, ``"png"`` or ``"jpeg"``, and bytes of the newest image, as they arrived; None for anything else."""
