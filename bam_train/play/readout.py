@@ -8,6 +8,7 @@ import numpy as np
 from bam_train.play.key_map import control_lines
 from bam_train.play.session import PLOTTED, Session, flat_numbers
 
+_FEW = 8  # most numbers of an info that are shown
 _BARS = "▁▂▃▄▅▆▇█"
 
 
@@ -65,10 +66,13 @@ def _numbers(session: Session) -> list[str]:
         value = _text(acted[at]) if at < len(acted) else ""
         policy = f"  policy {_text(wanted[at]):>7}" if at < len(wanted) else ""
         lines.append(f"  {_name(rows, at)} {value:>9}{policy}  {_limits(rows, at)}")
-    infos = {f"info {key}": float(one) for key, one in session.info.items() if isinstance(one, (bool, int, float))}
-    if infos:
-        lines += ["", "info"]
-        lines += [f"  {name[5:]:<24.24} {_text(one):>9}  {_plot(session, name)}" for name, one in infos.items()]
+    lines += ["", "info"]
+    for name, one in session.info.items():
+        number = float(one) if isinstance(one, (bool, int, float)) else one
+        if isinstance(number, (float, str)):
+            lines.append(f"  {name:<24.24} {_text(number):>9}  {_plot(session, f'info {name}')}")
+        elif isinstance(number, np.ndarray) and number.size <= _FEW:
+            lines.append(f"  {name:<24.24} {' '.join(map(_text, np.ravel(number).tolist()))}")
     rows = signals.get("observation", ())
     lines += ["", "observation"]
     for at, one in enumerate(flat_numbers(session.observation)):

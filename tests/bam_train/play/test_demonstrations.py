@@ -43,11 +43,13 @@ def demonstrate(place, episodes):
 
 
 @pytest.mark.training
-def test_twenty_episodes_of_key_presses_teach_a_policy(run, tmp_path, monkeypatch):
+def test_twenty_episodes_of_key_presses_teach_a_policy(tmp_path, monkeypatch):
     from bam_train.cli import train
 
     monkeypatch.chdir(tmp_path)
     assert demonstrate("demos", 20) == 20
-    assert run(train.main, "--data", "demos", "--algo", "bc", "--set", "eval_episodes=1", "--out", "reach.zip")[0] == 0
+    with pytest.raises(SystemExit) as done:
+        train.main(["--data", "demos", "--algo", "bc", "--set", "eval_episodes=1", "--out", "reach.zip"])
+    assert done.value.code == 0
     result = evaluate(FrozenPolicy.load("reach.zip"), "bam/reach-v0", {}, episodes=300)
     assert result.successes >= 270  # 280 were measured
