@@ -79,6 +79,7 @@ def test_console_scripts(wheel):
         "bam-eval = bam_train.cli.eval:main",
         "bam-export = bam_train.cli.export:main",
         "bam-gate = bam_train.cli.data.run_gate:main",
+        "bam-play = bam_train.cli.play.run_play:main",
         "bam-push = bam_train.cli.live.push:main",
         "bam-replay = bam_train.cli.live.replay:main",
         "bam-serve = bam_train.cli.serve:main",
