@@ -40,6 +40,9 @@ _TABLE = re.compile(r"(<!-- generated -->\n).*?(<!-- /generated -->)", re.DOTALL
 
 def command(manifest: Manifest, name: str) -> str:
     """What trains this checkpoint again: the preset, and what the run had otherwise."""
+    if manifest.trainer == "script":
+        script = f"scripts/{manifest.algorithm.replace('-', '_')}.py"
+        return shlex.join(["python", script, "--checkpoint", f"checkpoints/{name}"])
     own = manifest.settings
     env = manifest.env.rpartition("-v")[0] if manifest.env.startswith("bam/") else manifest.env
     words = ["bam-train", "--env", env, "--algo", manifest.algorithm]

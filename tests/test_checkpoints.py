@@ -24,6 +24,7 @@ LEAST = {
     "image-bandit-dqn": 0.99,
     "digits-dqn": 0.97,
     "grasp-xyr-grasp-q": 0.95,
+    "grasp-xy-pixel-q": 0.99,
 }
 WIDE = {"mir100-avoidance-ppo", "ur-reach-ppo", "pick-place-ppo", "digits-dqn", "grasp-xyr-grasp-q"}
 """Two layers of 128 instead of 64, so four times the weights, and their optimiser's; a replay buffer; pictures; or
