@@ -135,7 +135,7 @@ def _drive(session: Session, screen: Any, pad: Gamepad, title: str, episodes: in
 
     pacer, drawn = Pacer(session.pace, sleep=screen.wait), -DRAWN
     pacer.start()
-    while not session.done and not (session.status == "ended" and session.episodes == episodes):
+    while not session.done and session.episodes != episodes:
         pacer.period = session.pace
         pacer.wait()
         screen.wait(0.0)  # a late tick has not waited

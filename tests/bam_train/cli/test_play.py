@@ -11,12 +11,12 @@ import sys
 import termios
 import time
 from contextlib import closing
+from itertools import pairwise
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from bam_envs.core.timing import Pacer
 from bam_envs.remote.serve.serve_options import ServeOptions
 from bam_envs.remote.serve.served_environment import ServedEnvironment
 from bam_train.cli.consent import connected_env, guards_of
@@ -210,6 +210,12 @@ def test_it_runs_in_a_terminal_and_records(tty, tmp_path):
     assert termios.tcgetattr(tty[1]) == before
 
 
+def test_it_ends_after_so_many_episodes(tty, tmp_path):
+    script = [("seed 0", b"1"), ("seed 1", b"1")]
+    status, out, _ = played(tty, tmp_path, script, "bam/classic-bandit", "--episodes", "2")
+    assert (status, script, out.partition(",")[0]) == (0, [], "2 episodes")
+
+
 def test_ctrl_c_gives_the_terminal_back(tty, tmp_path):
     before = termios.tcgetattr(tty[1])
     status, out, shown = played(tty, tmp_path, [("ready", b"w"), ("running", b"\x03")], "bam/mir100-navigation")
@@ -219,21 +225,19 @@ def test_ctrl_c_gives_the_terminal_back(tty, tmp_path):
 
 
 def test_a_live_robot_moves_through_its_guards_while_a_key_is_fresh_and_else_holds():
-    with ServedEnvironment(make_env("bam/pick-v0", {}), ServeOptions(port=0)) as served, SignalMemory() as signals:
+    options = ServeOptions(port=0, fast=True)
+    with ServedEnvironment(make_env("bam/pick-v0", {}), options) as served, SignalMemory() as signals:
         place = Place(served.bus.url, trial=None)
         env = connected_env(None, place, signals, who="bam-play", episodes=0, named="bam/pick-v0")
         with closing(env):
             session = Session(env, hand_for(env, is_live=True), is_live=True)
             session.begin()
-            places, pacer = [], Pacer(session.pace)
-            session.press("KeyW", time.monotonic())
-            pacer.start()
-            for _ in range(14):
-                pacer.wait()
-                session.tick(time.monotonic())
-                places.append(env.unwrapped.task.control.target[0, 0])
-            assert 0.01 < places[-1] - places[0] < 0.03
-            assert len(set(places[8:])) == 1
+            sent = [env.unwrapped.state.command[0].tolist()]
+            session.press("KeyW", 0.0)
+            for tick in range(8):
+                session.tick(tick * session.period)
+                sent.append(env.unwrapped.state.command[0].tolist())
+            assert [one != other for one, other in pairwise(sent)] == [True] * 4 + [False] * 4
             assert guards_of(env)["joint speed"]["number"] == "G8"
-            session.press("Backspace", time.monotonic())
+            session.press("Backspace", 1.0)
             assert session.note == "undo the last second: not with a live robot, whose time cannot be stopped"
