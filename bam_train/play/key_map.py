@@ -80,11 +80,6 @@ def _sign(value: int) -> int:
     return (value > 0) - (value < 0)
 
 
-def is_move(key: str) -> bool:
-    """Whether a key moves tool or base."""
-    return key in _move_of()
-
-
 def next_speed(speed: float) -> float:
     """The speed after this one [m/s]."""
     speeds: list[float] = table()["speeds"]

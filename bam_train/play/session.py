@@ -10,7 +10,7 @@ import numpy as np
 from bam_train.agent.front.jog import FRESH
 from bam_train.environments import control_period
 from bam_train.play.hands import Hand
-from bam_train.play.key_map import is_move, moved, next_speed, stick_moved, table
+from bam_train.play.key_map import moved, next_speed, stick_moved, table
 
 USUAL_PERIOD = 0.05
 """Period of an environment that does not say one [s]."""
@@ -131,7 +131,7 @@ class Session:
             self.note = "the episode has ended: N begins the next one, Z the same one again"
         elif self.hand.press(key):
             self._step(self.hand.action((0.0,) * 4, 0), "person")
-        elif is_move(key) and not self.hand.waits:
+        elif not self.hand.waits:
             self._armed.add(key)
             self.status = "running" if self.status == "ready" else self.status
 

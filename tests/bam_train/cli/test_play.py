@@ -27,7 +27,7 @@ from bam_train.data import DataSet
 from bam_train.env_location import Place
 from bam_train.environments import make_env
 from bam_train.play.hands import hand_for
-from bam_train.play.key_map import is_move, moved
+from bam_train.play.key_map import moved
 from bam_train.play.session import Session
 from bam_train.signals import SignalMemory
 
@@ -41,7 +41,7 @@ LONGEST = 60.0
 
 
 def commands_of(taken):
-    return [moved({code}, 0.1) for code, *_ in taken if is_move(code)]
+    return [moved({code}, 0.1) for code, *_ in taken]
 
 
 @pytest.fixture

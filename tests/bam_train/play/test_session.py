@@ -136,6 +136,14 @@ def test_the_end_is_said_and_nothing_moves_after_it():
     driven.env.close()
 
 
+def test_other_numbers_begin_with_the_first_key_too():
+    driven = Driven("Pendulum-v1")
+    driven.tap("Equal")
+    assert driven.tick(2).action == np.array([0.2], np.float32)
+    assert driven.tap("Backspace").note == "undo: this environment cannot go back; its state cannot be saved"
+    driven.env.close()
+
+
 def test_every_press_is_a_step_where_actions_are_choices():
     driven = Driven("bam/grid-world-v0", seed=2)
     session = driven.session
