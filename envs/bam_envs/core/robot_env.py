@@ -331,7 +331,7 @@ class RobotVectorEnv(_RobotAndTask, gym.vector.VectorEnv[Any, Any, NDArray[Any]]
         array = np.asarray(actions)
         if array.shape != self.action_space.shape:
             raise InvalidValue(f"The actions must have shape {self.action_space.shape}, not {array.shape}.")
-        if not isinstance(self.action_space, gym.spaces.Box):
+        if not isinstance(self.single_action_space, gym.spaces.Box):
             if array.dtype.kind not in "iu" or not self.action_space.contains(array.astype(self.action_space.dtype)):
                 raise InvalidValue(f"The actions must be in {self.single_action_space}, not {brief(array.tolist())}.")
             return array

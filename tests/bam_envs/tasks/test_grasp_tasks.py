@@ -222,3 +222,17 @@ def test_the_scripted_policy_grasps_across_the_narrowest_blob(make):
 def test_the_scripted_policy_sees_an_empty_table():
     depth = np.full((2, 40, 40, 1), CAMERA_HEIGHT, np.float32)
     assert ScriptedGrasps((20, 20, 8)).act_batch({"depth": depth}).tolist() == [[10, 10, 0]] * 2
+
+
+def test_randomized_grasps_stay_finite_and_differ(make_rows):
+    """Masses and friction differ with the seed, and the depth has noise; colours have none."""
+    rows, plain = (make_rows("bam/grasp-xyr-v0", 32, randomize=randomize, size=40) for randomize in (True, False))
+    observation, _ = rows.reset(seed=0)
+    policy = ScriptedGrasps((100, 100, 16))
+    depth = plain.reset(seed=0)[0]["depth"]
+    off = np.median(np.abs(observation["depth"] - depth))  # most of it is table
+    assert off == pytest.approx(0.6745 * 0.002, rel=0.3)
+    _, rewards, *_ = rows.step(policy.act_batch(observation))
+    assert 0.3 < rewards.mean() <= 1.0
+    models = [rows.unwrapped.robot.physics.model_of(env) for env in range(32)]
+    assert len({model.geom("hand_left_pad").friction[0] for model in models}) == 32

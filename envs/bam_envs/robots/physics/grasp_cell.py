@@ -110,11 +110,7 @@ class GraspCell:
         from bam_envs.robots.physics import grasp_scene
 
         physics, rng = self.physics, np.random.default_rng(int(self._seeds[env]))
-        model, qpos = grasp_scene.draw(self._cell, self._objects, rng)
-        if self.randomize:
-            model.body_mass[:] *= (factor := rng.uniform(0.5, 2.0))
-            model.body_inertia[:] *= factor
-            model.geom_friction[:, 0] *= rng.uniform(0.7, 1.3)
+        model, qpos = grasp_scene.draw(self._cell, self._objects, rng, randomize=self.randomize)
         physics.replace(env, model)
         physics.time[env], physics.qvel[env], physics.qpos[env] = 0.0, 0.0, qpos
         physics.qpos[env, 1] = -BACK
@@ -217,7 +213,7 @@ class GraspCell:
 
         if self._view is None:
             self._drawn = copy.copy(self.physics.model)
-            self._view = open_view(self._drawn, mode, camera="front")
+            self._view = open_view(self._drawn, mode, camera="overview")
         for name in _DRAWN:  # a view keeps its model
             getattr(self._drawn, name)[:] = getattr(self.physics.model_of(0), name)
         return self._view.show(self.physics.data_of(0), marked(marks))

@@ -19,6 +19,7 @@ _SPREAD = 0.09  # farthest distance of an object from the middle of the table al
 _GAP = 0.002  # least distance between two objects [m]
 _TRIES = 40  # places that are tried for an object
 _DENSITY = 450.0  # [kg/m^3], a light wood
+_FRICTION, _GRIP = 0.6, 1.2  # sliding friction of the objects, and of the pads with anything
 _FORCE = 60.0  # of the slides [N]
 _BEYOND = 2.0  # x of objects that are not on the table [m]
 _BOX, _CYLINDER = mujoco.mjtGeom.mjGEOM_BOX, mujoco.mjtGeom.mjGEOM_CYLINDER
@@ -35,6 +36,7 @@ def build(objects: int) -> Any:
     cell.visual.headlight.diffuse = [0.25] * 3  # both lights are above
     table = cell.geom("table")
     table.type, table.pos, table.size = mujoco.mjtGeom.mjGEOM_PLANE, [*MIDDLE, 0.0], [0.6, 0.6, 0.02]
+    cell.camera("overview").pos = [0.94, -0.43, 0.42]
     opening = math.degrees(2 * math.atan2(VIEW / 2, CAMERA_HEIGHT))
     cell.worldbody.add_camera(name="above", pos=[*MIDDLE, CAMERA_HEIGHT], fovy=opening)
     body = cell.worldbody
@@ -52,16 +54,23 @@ def build(objects: int) -> Any:
         body = cell.worldbody.add_body(name=f"object{index}")
         body.add_freejoint()
         for part in range(PARTS):
-            body.add_geom(name=f"object{index}_{part}", density=_DENSITY, friction=[0.6, 0.005, 0.0001])
+            body.add_geom(name=f"object{index}_{part}")
         _shape(body, np.random.default_rng(index))
     return cell
 
 
-def draw(spec: Any, objects: int, rng: np.random.Generator) -> tuple[Any, np.ndarray]:
+def draw(spec: Any, objects: int, rng: np.random.Generator, *, randomize: bool) -> tuple[Any, np.ndarray]:
     """A model with new shapes and colours, and its generalised positions: the objects at rest, apart from each other.
 
-    An object that finds no place lies far from the table.
+    An object that finds no place lies far from the table. `randomize` varies the density of the objects, and their
+    friction and that of the pads.
     """
+    density, friction = (rng.uniform(0.5, 2.0), rng.uniform(0.7, 1.3)) if randomize else (1.0, 1.0)
+    for name in ("hand_left_pad", "hand_right_pad"):
+        spec.geom(name).friction[0] = _GRIP * friction
+    for index in range(objects):
+        for geom in spec.body(f"object{index}").geoms:
+            geom.density, geom.friction[0] = _DENSITY * density, _FRICTION * friction
     rests = [_shape(spec.body(f"object{index}"), rng) for index in range(objects)]
     model = spec.compile()
     data = mujoco.MjData(model)

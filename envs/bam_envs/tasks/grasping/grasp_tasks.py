@@ -132,7 +132,7 @@ class GraspXYR(GraspTask):
         its pose), "missed" (it closed on nothing) or "dropped".
 
     Args:
-        objects: Number of objects on the table.
+        objects: Number of objects on the table; one that finds no place in 40 tries is left out.
         grasps: Grasps of an action, executed one after the other; what one lifts is gone for the next.
         size: Width and height of the pictures [pixels].
         bins: Numbers of columns, rows and rotations of an action.
@@ -255,7 +255,7 @@ class Grasp6D(GraspTask):
         As `bam/grasp-xyr`.
 
     Args:
-        objects: Number of objects on the table.
+        objects: Number of objects on the table; one that finds no place in 40 tries is left out.
         grasps: Grasps of an action, executed one after the other; what one lifts is gone for the next.
         size: Width and height of the pictures [pixels].
     """
