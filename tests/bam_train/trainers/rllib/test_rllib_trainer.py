@@ -218,6 +218,15 @@ def test_observations_that_rllib_takes_as_a_vector_alone(space, normalize, sampl
         assert trainer.exploring().act(space.sample()) in (-1, 0)
 
 
+@pytest.mark.parametrize("env_id", ["bam/context-bandit-v0", "bam/grid-world-v0"])
+def test_environments_without_a_robot(env_id, tmp_path):
+    env = gym.make(env_id)
+    with made(env=env_id) as trainer:
+        train(trainer, 64)
+        trainer.save(tmp_path / "a.zip", {}, {"best": None})
+    assert env.action_space.contains(FrozenPolicy.load(tmp_path / "a.zip").act(env.observation_space.sample()))
+
+
 @pytest.mark.parametrize(
     ("spaces", "hyper", "text"),
     [
