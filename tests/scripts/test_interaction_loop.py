@@ -63,9 +63,10 @@ def test_ctrl_c_is_one_line():
     assert process.returncode in (130, -signal.SIGINT)
 
 
-def test_the_notebook_is_the_script_executed(make_notebook):
+@pytest.mark.parametrize("script", [SCRIPT, SCRIPTS / "tour.py"])
+def test_the_notebook_is_the_script_executed(make_notebook, script):
     pytest.importorskip("nbformat")
-    assert make_notebook.is_current(SCRIPT, SCRIPT.with_suffix(".ipynb")), "run: python scripts/make_notebook.py"
+    assert make_notebook.is_current(script, script.with_suffix(".ipynb")), f"run: make_notebook.py {script}"
 
 
 def test_only_imports_differ_from_bbrl():
