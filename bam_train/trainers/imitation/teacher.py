@@ -46,7 +46,7 @@ class Teacher:
             _require_same(checkpoint, "action_space", checkpoint.manifest.action_space, envs.single_action_space)
             self._policy = FrozenPolicy.from_checkpoint(checkpoint)
         if self._observe is not None and wanted != space_to_json(envs.single_observation_space):
-            state_space = task.task.observation_space  # type: ignore[union-attr]
+            state_space = task.state_space  # type: ignore[union-attr]
             self.state_size = int(np.prod(state_space.shape))
         else:
             state_space, self._observe = envs.single_observation_space, None

@@ -26,6 +26,8 @@ class CameraTask:
 
     def __init__(self, task: Any, cameras: Sequence[CameraSpec]) -> None:
         self.task = task
+        self.state_space: spaces.Box = self.task.observation_space
+        """Space of `state_observation`."""
         self._vector = labelled_box(self.task.robot_labels)
         self._images = {name: box for camera in cameras for name, box in camera.spaces().items()}
         self.observation_space = spaces.Dict({**self._images, VECTOR: self._vector})

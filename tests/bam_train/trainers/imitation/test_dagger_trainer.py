@@ -22,7 +22,7 @@ from bam_train.trainers.imitation.dagger import Dagger, DaggerLearner
 from bam_train.trainers.imitation.imitation_network import ImitationPolicy
 
 PICK_PPO = Path(__file__).parents[4] / "checkpoints" / "pick-ppo.zip"
-TINY = ("width=16", "channels=2", "batch_size=16", "env_kwargs.image_size=16", "env_kwargs.looks=fixed")
+TINY = ("width=16", "channels=2", "batch_size=16", "env_kwargs.image_size=16", "env_kwargs.action_delay=1")
 
 
 @pytest.fixture(autouse=True)
