@@ -8,6 +8,7 @@ import pytest
 
 from bam_envs.core.errors import InvalidValue
 from bam_envs.local.digits import Digits, Mnist
+from tests.object_store import bucket_fixture  # noqa: F401
 
 
 def test_the_splits_of_the_digits_never_mix():
@@ -71,6 +72,19 @@ def test_mnist_from_an_address(mnist):
         Mnist(1, data="ftp://a/b").pictures()
     with pytest.raises(InvalidValue, match=r": there is no train-images-idx3-ubyte or train-images-idx3-ubyte\.gz\."):
         Mnist(1, data=f"file://{mnist.parent}").pictures()
+
+
+def test_mnist_from_a_bucket(mnist, bucket):
+    from pyarrow import fs
+
+    system, root = fs.FileSystem.from_uri(f"{bucket}/mnist")
+    for path in mnist.iterdir():
+        with system.open_output_stream(f"{root}/{path.name}", compression=None) as stream:
+            stream.write(path.read_bytes())
+    for ours, theirs in zip(Mnist(1, data=f"{bucket}/mnist").pictures(), Mnist(1, data=mnist).pictures(), strict=True):
+        np.testing.assert_array_equal(ours, theirs)
+    with pytest.raises(InvalidValue, match=r"^s3://bam-lab/none: there is no train-images-idx3-ubyte or "):
+        Mnist(1, data=f"{bucket}/none").pictures()
 
 
 def test_a_split_that_does_not_exist():
