@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import contextlib
 import copy
-import os
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
@@ -38,11 +37,12 @@ _OBJECT = ((0.65, 0.1, 0.05), (1.0, 0.4, 0.35))
 _FAR_AWAY = ((0.1, 0.1, 0.1), (0.9, 0.9, 0.9))
 _CAMERA_MOVES = {"front": (0.01, 0.02), "wrist": (0.003, 0.015)}
 """Greatest differences of each camera's position along each axis [m], and of its rotation about each [rad]."""
-_FEW = 8  # robots that are no work for a further thread
 
 
 class Cameras:
-    """Draws the images of the robots of one `Physics`, on all cores.
+    """Draws the images of the robots of one `Physics`, in a thread of its own, to which its OpenGL context belongs.
+
+    More threads are no faster: they wait for each other in OpenGL.
 
     Args:
         scene: The MJCF model in ``models/``.
@@ -56,7 +56,8 @@ class Cameras:
         self.draws: Array = np.full((physics.num_envs, _DRAWS), 0.5)
         """Random numbers in [0, 1) that decide the looks of each environment. Shape: (n, 64)."""
         self._images: Images = {}
-        self._painters: list[tuple[ThreadPoolExecutor, _Painter]] = []
+        self._painter: _Painter | None = None
+        self._thread: Any = None
 
     def begin(self, env_ids: EnvIds, seeds: NDArray[np.int64]) -> None:
         """Draw the looks of new episodes."""
@@ -73,22 +74,11 @@ class Cameras:
             self._images = {name: np.zeros((n, *box.shape), box.dtype) for name, box in boxes.items()}
         elif len(env_ids):  # images that were handed out keep their pixels
             self._images = {name: images.copy() for name, images in self._images.items()}
-        self._open()
-        parts = np.array_split(env_ids, len(self._painters))
-        running = [
-            thread.submit(self._draw, one, part) for (thread, one), part in zip(self._painters, parts, strict=True)
-        ]
-        for done in running:
-            done.result()
+        if self._painter is None:
+            self._thread = ThreadPoolExecutor(1, "bam-camera")
+            self._painter = self._thread.submit(_Painter, self._scene, self._specs).result()
+        self._thread.submit(self._draw, self._painter, env_ids).result()
         return dict(self._images)
-
-    def _open(self) -> None:
-        """Create a thread for each core, as an OpenGL context belongs to a thread; one is enough for few robots."""
-        if not self._painters:
-            cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-            for _ in range(min(cores, -(-self._physics.num_envs // _FEW))):
-                thread = ThreadPoolExecutor(1, "bam-camera")
-                self._painters.append((thread, thread.submit(_Painter, self._scene, self._specs).result()))
 
     def _draw(self, painter: _Painter, env_ids: EnvIds) -> None:
         for env in env_ids.tolist():
@@ -98,15 +88,15 @@ class Cameras:
 
     def close(self) -> None:
         """Free the OpenGL contexts. Idempotent."""
-        while self._painters:
-            thread, painter = self._painters.pop()
-            with contextlib.suppress(RuntimeError):  # Python ends, and has ended its threads and their contexts
-                thread.submit(painter.close).result()
-            thread.shutdown()
+        painter, self._painter = self._painter, None
+        if painter is not None:
+            with contextlib.suppress(RuntimeError):  # Python ends, and has ended the thread and its context
+                self._thread.submit(painter.close).result()
+            self._thread.shutdown()
 
     def __getstate__(self) -> dict[str, Any]:
-        """The state without the threads, which belong to this process."""
-        return {**self.__dict__, "_painters": []}
+        """The state without the thread, which belongs to this process."""
+        return {**self.__dict__, "_painter": None, "_thread": None}
 
 
 def _visual_model(scene: str, size: int) -> Any:
