@@ -100,7 +100,7 @@ def environment(env_id: str) -> str:
     """Everything about one environment."""
     entry = ENVIRONMENTS[env_id]
     task = resolve(entry.task)
-    docs = sections(task.__doc__ or "")
+    docs = {name: text for kind in reversed(task.__mro__[:-1]) for name, text in sections(kind.__doc__ or "").items()}
     signals = describe(resolve(entry.robot)(1), resolve(entry.task)(1))
     limit, robot = entry.time_limit, entry.has_robot
     time = "There is no robot." if entry.robot == NO_ROBOT else f"One step is {entry.period:g} s of robot time."
@@ -108,7 +108,7 @@ def environment(env_id: str) -> str:
     if limit is not None:
         docs["End"] += f" Truncated after {limit} steps{f' ({limit * entry.period:g} s)' * robot}."
     docs["Info"] += " `is_success`, as everywhere."
-    names = [name for name in docs if name in (*SECTIONS, *OPTIONAL)]
+    names = [name for name in (*OPTIONAL, *SECTIONS) if name in docs]
     parts += [f"**{name}.** {docs[name]}" for name in names]
     for variant in entry.variants.values():
         parts += [f"**Parity.** {text}" for text in _paragraphs(resolve(variant), "With ``parity=True``")]

@@ -28,7 +28,30 @@ _MOST_PIXELS = 512
 class GraspTask(Memory):
     """What the grasp tasks share: the pictures, and the reward for what was lifted.
 
-    A subclass defines `numbers`, the labels of one grasp, and `poses`, which turns actions into grasps.
+    A subclass defines `numbers`, the labels of one grasp, `action_space`, and `poses`, which turns actions into grasps.
+
+    Start:
+        Boxes, cylinders and corners of random sizes, colours and poses, 2 mm apart or more, their middles within 9 cm
+        of that of the picture along x and y. Some are too wide for the gripper in one direction or in all.
+
+    Reward:
+        The share of the grasps that lifted an object.
+
+    Success:
+        Every grasp lifted an object: at the end, 10 cm higher, the fingers hold it.
+
+    End:
+        Terminated after every step.
+
+    Info:
+        `lifted`: number of grasps that lifted an object; `object`: index of the lifted object, or -1, of each grasp;
+        `rise` of the object that rose most [m]; `reason` of the first failure: "blocked" (the gripper did not get to
+        its pose), "missed" (it closed on nothing) or "dropped".
+
+    Args:
+        objects: Number of objects on the table; one that finds no place in 40 tries is left out.
+        grasps: Grasps of an action, executed one after the other; what one lifts is gone for the next.
+        size: Width and height of the pictures [pixels].
     """
 
     numbers: tuple[Label, ...]
@@ -113,62 +136,25 @@ class GraspXYR(GraspTask):
         anticlockwise in the picture, from along its rows, by half a turn in all. The depth at the place decides how
         deep the gripper goes.
 
-    Start:
-        Boxes, cylinders and corners of random sizes, colours and poses, 2 mm apart or more, their middles within 9 cm
-        of that of the picture along x and y. Some are too wide for the gripper in one direction or in all.
-
-    Reward:
-        The share of the grasps that lifted an object.
-
-    Success:
-        Every grasp lifted an object: at the end, 10 cm higher, the fingers hold it.
-
-    End:
-        Terminated after every step.
-
-    Info:
-        `lifted`: number of grasps that lifted an object; `object`: index of the lifted object, or -1, of each grasp;
-        `rise` of the object that rose most [m]; `reason` of the first failure: "blocked" (the gripper did not get to
-        its pose), "missed" (it closed on nothing) or "dropped".
-
     Args:
-        objects: Number of objects on the table; one that finds no place in 40 tries is left out.
-        grasps: Grasps of an action, executed one after the other; what one lifts is gone for the next.
-        size: Width and height of the pictures [pixels].
         bins: Numbers of columns, rows and rotations of an action.
     """
 
-    def __init__(
-        self,
-        num_envs: int = 1,
-        *,
-        objects: int = 5,
-        grasps: int = 1,
-        size: int = 100,
-        bins: Sequence[int] = (100, 100, 16),
-    ) -> None:
-        super().__init__(num_envs, objects=objects, grasps=grasps, size=size)
-        self.bins = self._checked_bins(bins, 3)
-        self._set_space()
+    labels: tuple[tuple[str, str], ...] = (
+        ("column", "place from the left edge of the picture"),
+        ("row", "place from the upper edge of the picture"),
+        ("rotation", "direction in which the gripper closes, in steps of half a turn by the number of rotations"),
+    )
 
-    def _checked_bins(self, bins: Sequence[int], count: int) -> tuple[int, ...]:
-        checked = tuple(check(list(bins), list[PositiveInt], "bins"))
-        if len(checked) != count:
-            raise InvalidValue(f"bins must be {count} numbers, not {len(checked)}.")
-        return checked
-
-    def _set_space(self) -> None:
+    def __init__(self, num_envs: int = 1, *, bins: Sequence[int] = (100, 100, 16), **options: Any) -> None:
+        super().__init__(num_envs, **options)
+        self.bins = tuple(check(list(bins), list[PositiveInt], "bins"))
+        if len(self.bins) != len(self.labels):
+            raise InvalidValue(f"bins must be {len(self.labels)} numbers, not {len(self.bins)}.")
         self.action_space = spaces.MultiDiscrete(np.tile(self.bins, self.grasps))
-        names = ("column", "row", "rotation", "width")
-        meanings = (
-            "place from the left edge of the picture",
-            "place from the upper edge of the picture",
-            "direction in which the gripper closes, in steps of half a turn by the number of rotations",
-            "width of the gripper before it closes, from the smallest to fully open",
-        )
         self.numbers = tuple(
             Label(name, meaning, "bins", low=0, high=count - 1)
-            for name, meaning, count in zip(names, meanings, self.bins, strict=False)
+            for (name, meaning), count in zip(self.labels, self.bins, strict=True)
         )
 
     def poses(self, grasps: NDArray[Any], depth: Array) -> Array:
@@ -194,37 +180,14 @@ class GraspXYRW(GraspXYR):
         Column, row, rotation and width, for each grasp. The last width is the open gripper, the others are equal steps
         below it.
 
-    Start:
-        As `bam/grasp-xyr`.
-
-    Reward:
-        The share of the grasps that lifted an object.
-
-    Success:
-        Every grasp lifted an object: at the end, 10 cm higher, the fingers hold it.
-
-    End:
-        Terminated after every step.
-
-    Info:
-        As `bam/grasp-xyr`.
-
     Args:
         bins: Numbers of columns, rows, rotations and widths of an action.
     """
 
-    def __init__(
-        self,
-        num_envs: int = 1,
-        *,
-        objects: int = 5,
-        grasps: int = 1,
-        size: int = 100,
-        bins: Sequence[int] = (100, 100, 16, 8),
-    ) -> None:
-        GraspTask.__init__(self, num_envs, objects=objects, grasps=grasps, size=size)
-        self.bins = self._checked_bins(bins, 4)
-        self._set_space()
+    labels = (*GraspXYR.labels, ("width", "width of the gripper before it closes, from the smallest to fully open"))
+
+    def __init__(self, num_envs: int = 1, *, bins: Sequence[int] = (100, 100, 16, 8), **options: Any) -> None:
+        super().__init__(num_envs, bins=bins, **options)
 
     def widths(self, grasps: NDArray[Any]) -> Array:
         """Width of the gripper before it closes [m]. Shape: (n, k, 4) -> (n, k)."""
@@ -238,26 +201,6 @@ class Grasp6D(GraspTask):
     Action:
         Position of the middle of the pads, orientation as a quaternion of any length, and width, for each grasp. The
         gripper comes along its fingers from 12 cm away. The quaternion (0, 1, 0, 0) points down and closes along x.
-
-    Start:
-        As `bam/grasp-xyr`.
-
-    Reward:
-        The share of the grasps that lifted an object.
-
-    Success:
-        Every grasp lifted an object: at the end, 10 cm higher, the fingers hold it.
-
-    End:
-        Terminated after every step.
-
-    Info:
-        As `bam/grasp-xyr`.
-
-    Args:
-        objects: Number of objects on the table; one that finds no place in 40 tries is left out.
-        grasps: Grasps of an action, executed one after the other; what one lifts is gone for the next.
-        size: Width and height of the pictures [pixels].
     """
 
     numbers = (
@@ -266,9 +209,9 @@ class Grasp6D(GraspTask):
         Label("width", "width of the gripper before it closes", "m", scale="limits of the command"),
     )
 
-    def __init__(self, num_envs: int = 1, *, objects: int = 5, grasps: int = 1, size: int = 100) -> None:
-        super().__init__(num_envs, objects=objects, grasps=grasps, size=size)
-        self.action_space = spaces.Box(-1.0, 1.0, (NUMBERS * grasps,), np.float32)
+    def __init__(self, num_envs: int = 1, **options: Any) -> None:
+        super().__init__(num_envs, **options)
+        self.action_space = spaces.Box(-1.0, 1.0, (NUMBERS * self.grasps,), np.float32)
 
     def poses(self, grasps: NDArray[Any], depth: Array) -> Array:
         """See `GraspTask.poses`; -1 and 1 are the limits of the command."""
