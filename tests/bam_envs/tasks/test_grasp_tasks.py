@@ -2,6 +2,7 @@
 
 import json
 import pickle
+from concurrent.futures import ThreadPoolExecutor
 
 import gymnasium as gym
 import numpy as np
@@ -240,3 +241,14 @@ def test_a_randomized_camera_is_noisy(make):
     table = off[np.abs(off) < 0.008]
     assert len(table) > 8_000
     assert (table.mean(), table.std()) == pytest.approx((0.0, 0.002), abs=1e-4)
+
+
+def test_another_thread_may_step_and_close(make):
+    """As a server's does: a picture belongs to the thread that drew the first one."""
+    env = make("bam/grasp-xyr-v0", **SMALL)
+    first, _ = env.reset(seed=0)
+    with ThreadPoolExecutor(1) as other:
+        other.submit(env.step, np.array([0, 0, 0])).result()
+        assert_same_value(other.submit(env.reset, seed=0).result()[0], first)
+        other.submit(env.close).result()
+    assert_same_value(env.reset(seed=0)[0], first)

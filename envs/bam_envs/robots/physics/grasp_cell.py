@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-import atexit
+import contextlib
 import copy
+from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -63,6 +64,7 @@ class GraspCell:
         self._physics: Physics | None = None
         self._cell: Any = None
         self._camera: FastCamera | None = None
+        self._thread: Any = None
         self._view: OffScreen | Window | None = None
         self._drawn: Any = None  # the model of `_view`
         self._seeds = np.zeros(num_robots, np.int64)
@@ -179,19 +181,24 @@ class GraspCell:
         if self._camera is None:
             from bam_envs.robots.physics.rendering import FastCamera
 
-            self._camera = FastCamera(physics.model, self._size, hidden=(_GRIPPER,))
-            atexit.register(self._camera.close)  # while OpenGL is still there
+            self._thread = ThreadPoolExecutor(1, "bam-camera")  # an OpenGL context belongs to a thread
+            self._camera = self._thread.submit(FastCamera, physics.model, self._size, (_GRIPPER,)).result()
         self._color, self._depth = self._color.copy(), self._depth.copy()
-        for env in fresh.tolist():
-            model = physics.model_of(env)
-            self._color[env] = self._camera.look(model, physics.data_of(env), "above")
-            self._depth[env, :, :, 0] = self._camera.depth(model)
-            if self.randomize:
-                rng = np.random.default_rng([int(self._seeds[env]), round(1e3 * physics.time[env])])
-                self._depth[env] += rng.normal(0.0, _NOISE, self._depth[env].shape).astype(np.float32)
+        self._thread.submit(self._look, self._camera, fresh.tolist()).result()
         width = physics.qpos[:, 2:3] + physics.qpos[:, 3:4]
         signals: dict[str, Any] = {"gripper_width": width, "color": self._color, "depth": self._depth}
         return RobotState(signals, physics.time, self._command, dict(self._truth))
+
+    def _look(self, camera: FastCamera, env_ids: list[int]) -> None:
+        """Draw the pictures of these environments."""
+        physics = self.physics
+        for env in env_ids:
+            model = physics.model_of(env)
+            self._color[env] = camera.look(model, physics.data_of(env), "above")
+            self._depth[env, :, :, 0] = camera.depth(model)
+            if self.randomize:
+                rng = np.random.default_rng([int(self._seeds[env]), round(1e3 * physics.time[env])])
+                self._depth[env] += rng.normal(0.0, _NOISE, self._depth[env].shape).astype(np.float32)
 
     def halt(self) -> None:
         """Do nothing: between two commands, it rests."""
@@ -199,8 +206,10 @@ class GraspCell:
     def close(self) -> None:
         """Drop the physics, the camera and the window."""
         if self._camera is not None:
-            atexit.unregister(self._camera.close)
-        for part in (self._view, self._camera, self._physics):
+            with contextlib.suppress(RuntimeError):  # Python ends, and has ended its threads and their contexts
+                self._thread.submit(self._camera.close).result()
+            self._thread.shutdown()
+        for part in (self._view, self._physics):
             if part is not None:
                 part.close()
         self._view = self._camera = self._physics = self._cell = None
@@ -235,7 +244,7 @@ class GraspCell:
 
     def __getstate__(self) -> dict[str, Any]:
         """The state without what belongs to this process, or is made again."""
-        return {**self.__dict__, "_cell": None, "_camera": None, "_view": None, "_drawn": None}
+        return {**self.__dict__, **dict.fromkeys(("_cell", "_camera", "_thread", "_view", "_drawn"))}
 
 
 def _unit(quaternion: Array) -> Array:
