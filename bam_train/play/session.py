@@ -2,6 +2,7 @@
 
 import copy
 from collections import deque
+from collections.abc import Callable
 from typing import Any
 
 import gymnasium as gym
@@ -130,7 +131,7 @@ class Session:
         elif self.status == "ended":
             self.note = "the episode has ended: N begins the next one, Z the same one again"
         elif self.hand.press(key):
-            self._step(self.hand.action((0.0,) * 4, 0), "person")
+            self._step(lambda: self.hand.action((0.0,) * 4, 0), "person")
         elif not self.hand.waits:
             self._armed.add(key)
             self.status = "running" if self.status == "ready" else self.status
@@ -191,16 +192,17 @@ class Session:
         if self.status == "one step":
             keys, self.status = keys | self._armed, "paused"
         self._armed.clear()
-        self._step(self.suggestion if by_policy else self._persons(keys, holds=holds), self.driver)
+        self._step(lambda: self.suggestion if by_policy else self._persons(keys, holds=holds), self.driver)
 
     def _persons(self, keys: set[str], *, holds: bool) -> Any:
         if self.pad is None or holds:
             return self.hand.action(*moved(keys, self.speed, is_base=self.hand.is_base))
         return self.hand.action(*stick_moved(*self.pad, self.speed, is_base=self.hand.is_base))
 
-    def _step(self, action: Any, driver: str) -> None:
+    def _step(self, choose: Callable[[], Any], driver: str) -> None:
         if self._saves:
             self._undo.append((self._saved(), copy.copy(self.hand.memory), self.observation, self.total))
+        action = choose()
         if self._recorder is not None and self.policy is not None:
             self._recorder.extra = {"intervention": np.array([float(driver == "person")])}
         self.observation, reward, terminated, truncated, self.info = self.env.step(action)

@@ -85,7 +85,9 @@ def test_pause_single_steps_and_slow_motion(driven):
     assert driven.tick().steps == 6
 
 
-def test_an_undone_second_comes_again_bit_for_bit(driven):
+@pytest.mark.parametrize("env", ["bam/pick-v0", "bam/reach-v0"])
+def test_an_undone_second_comes_again_bit_for_bit(env):
+    driven = Driven(env)
     session = driven.tick(30, "KeyW")
     seen = session.observation
     assert driven.tap("Backspace").note == "20 steps undone"
@@ -97,6 +99,7 @@ def test_an_undone_second_comes_again_bit_for_bit(driven):
     driven.tap("Backspace")
     driven.tap("Backspace")
     assert driven.tap("Backspace").note == "undo: this is the start"
+    driven.env.close()
 
 
 def test_person_and_policy_hand_over_without_a_jump():
