@@ -93,7 +93,7 @@ class DaggerLearner:
         self._experience = Experience(seen, values.memory, *sizes)
         self._rng = np.random.default_rng(seed)
         self._observation: Any = None
-        self._taught = np.ones(envs.num_envs, bool)  # environments in which the teacher acts in this episode
+        self._taught = self._draw_taught(envs.num_envs, 0.0)  # where the teacher acts in this episode
         self._running = np.zeros((2, envs.num_envs))  # return and length of the running episodes
         self._ended: deque[tuple[float, float, bool | None]] = deque(maxlen=_RECENT)
         self._due, self._seed, self._refill = 0.0, seed, 0
@@ -140,9 +140,13 @@ class DaggerLearner:
                 self._ended.append((total, length, None if success is None else bool(success[row])))
         self._running[:, rows] = 0.0
         if rows.size:
-            share = max(0.0, 1 - done / self.values.teacher_share) if self.values.teacher_share else 0.0
-            self._taught[rows] = self._rng.random(rows.size) < share
+            self._taught[rows] = self._draw_taught(rows.size, done)
             self.teacher.reset(rows)
+
+    def _draw_taught(self, episodes: int, done: float) -> Any:
+        """In which of these new episodes the teacher acts: in all at first, in none after its share of the run."""
+        share = max(0.0, 1 - done / self.values.teacher_share) if self.values.teacher_share else 0.0
+        return self._rng.random(episodes) < share
 
     def learn(self, done: float) -> None:
         """Do the updates that are due."""
@@ -197,7 +201,6 @@ class DaggerLearner:
         self.network.load_state_dict(state["network"])
         self._optimiser.load_state_dict(state["optimiser"])
         self._rng.bit_generator.state = state["rng"]
-        self._seed, self._refill = int(self._rng.integers(2**31)), min(int(state["steps"]), self.values.memory)
-        self._refill = min(self._refill, 100 * self.envs.num_envs)
-        share = max(0.0, 1 - done / self.values.teacher_share) if self.values.teacher_share else 0.0
-        self._taught = self._rng.random(self.envs.num_envs) < share
+        self._seed = int(self._rng.integers(2**31))
+        self._refill = min(int(state["steps"]), 100 * self.envs.num_envs)
+        self._taught = self._draw_taught(self.envs.num_envs, done)
