@@ -173,6 +173,7 @@ def make_model(settings: TrainSettings, venv: VecEnv) -> tuple[Any, list[str]]:
 
     Raises SettingsError if the library refuses the settings, or the device does not exist.
     """
+    about_pictures = check_pictures(venv.observation_space)
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", UserWarning)
         try:
@@ -193,7 +194,31 @@ def make_model(settings: TrainSettings, venv: VecEnv) -> tuple[Any, list[str]]:
             f"batch_size {batch} does not divide a rollout of n_steps {model.n_steps} x num_envs {model.n_envs} = "
             f"{steps} steps: its last batch has {steps % batch}"
         ]
-    return model, notices
+    return model, [*about_pictures, *notices]
+
+
+def check_pictures(observed: spaces.Space[Any]) -> list[str]:
+    """Messages about observations that look like pictures and are learnt as plain numbers.
+
+    Raises:
+        SettingsError: A picture has its channels between height and width.
+    """
+    told = []
+    for key, leaf in leaves(observed).items():
+        if not isinstance(leaf, spaces.Box) or len(leaf.shape) != 3:
+            continue
+        name = f"observation {key!r}" if key else "the observation"
+        if is_image_space(leaf) and leaf.shape[1] < min(leaf.shape[0], leaf.shape[2]):
+            raise SettingsError(
+                f"{name} is a picture of shape {leaf.shape}: expected (height, width, channels) or (channels, height, "
+                "width); turn it in the environment, with np.moveaxis"
+            )
+        if not is_image_space(leaf):
+            told.append(
+                f"{name}, {leaf.dtype} of shape {leaf.shape}, is learnt as plain numbers: a picture for a convolutional "
+                "network is uint8 from 0 to 255"
+            )
+    return told
 
 
 def _normalised(venv: VecEnv, given: bool | dict[str, Any]) -> VecNormalize:

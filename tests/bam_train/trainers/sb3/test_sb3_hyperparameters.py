@@ -13,7 +13,13 @@ from stable_baselines3.common.noise import NormalActionNoise, OrnsteinUhlenbeckA
 
 from bam_train.errors import SettingsError
 from bam_train.trainers.algorithms import SB3_ALGORITHMS
-from bam_train.trainers.sb3.sb3_hyperparameters import build, complete, complete_normalize, default_policy
+from bam_train.trainers.sb3.sb3_hyperparameters import (
+    build,
+    check_pictures,
+    complete,
+    complete_normalize,
+    default_policy,
+)
 
 NUMBERS = gym.spaces.Box(-1, 1, (3,))
 IMAGE = gym.spaces.Box(0, 255, (36, 36, 3), np.uint8)
@@ -133,3 +139,18 @@ def test_the_line_about_actions_names_what_fits():
 def test_schedules_and_auto_are_in_range():
     values = complete(SB3_ALGORITHMS["sac"], {"learning_rate": "lin_1e-3", "ent_coef": "auto_0.1"}, NUMBERS)
     assert (values["learning_rate"], values["ent_coef"]) == ("lin_1e-3", "auto_0.1")
+
+
+def picture(dtype, *shape):
+    return gym.spaces.Box(0, 255 if dtype == np.uint8 else 1, shape, dtype)
+
+
+def test_pictures_that_are_none_for_the_library():
+    fine = gym.spaces.Dict(front=picture(np.uint8, 64, 48, 3), wrist=picture(np.uint8, 3, 48, 64))
+    assert check_pictures(fine) == []
+    told = "is learnt as plain numbers: a picture for a convolutional network is uint8 from 0 to 255"
+    assert check_pictures(picture(np.float32, 64, 48, 3)) == [f"the observation, float32 of shape (64, 48, 3), {told}"]
+    odd = gym.spaces.Dict(front=picture(np.uint8, 64, 3, 48))
+    expected = r"observation 'front' is a picture of shape \(64, 3, 48\): expected \(height, width, channels\) or "
+    with pytest.raises(SettingsError, match=expected):
+        check_pictures(odd)
