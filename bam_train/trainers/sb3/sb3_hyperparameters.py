@@ -215,8 +215,8 @@ def check_pictures(observed: spaces.Space[Any]) -> list[str]:
             )
         if not is_image_space(leaf):
             told.append(
-                f"{name}, {leaf.dtype} of shape {leaf.shape}, is learnt as plain numbers: a picture for a convolutional "
-                "network is uint8 from 0 to 255"
+                f"{name}, {leaf.dtype} of shape {leaf.shape}, is learnt as plain numbers: a picture for a "
+                "convolutional network is uint8 from 0 to 255"
             )
     return told
 
