@@ -151,7 +151,8 @@ class FrontProcess:
 
     def __init__(self, options: Front, send: Callable[[Message], None]) -> None:
         self.options, self.send = options, send
-        self.status: dict[str, Any] = {"state": "waiting for the robot", "active": None, "owner": None}
+        self.status: dict[str, Any] = {"state": "waiting for the robot", "why": "it starts", "active": None}
+        self.status |= {"owner": None, "names": {}}
         """The last report of the resident."""
         place = Place(
             options.robot,
