@@ -93,6 +93,7 @@ class Session:
         self._undo: deque[tuple[Any, ...]] = deque(maxlen=_KEPT)
         self._recorder: Any = env if hasattr(env, "rewind") else None
         self._limit = next((one for one in _layers(env) if isinstance(one, gym.wrappers.TimeLimit)), None)
+        self._at_rest = copy.copy(hand.memory)
         self._saves = hasattr(env.unwrapped, "load_state_dict") and not is_live
 
     @property
@@ -107,6 +108,7 @@ class Session:
         if self._recorder is not None:
             self._recorder.discard()
         self.observation, self.info = self.env.reset(seed=self.seed)
+        self.hand.memory = copy.copy(self._at_rest)  # the gripper is open again, and a motion begins anew
         self.status = "running" if self.is_live else "ready"
         self.steps, self.total, self.reward, self.action = 0, 0.0, 0.0, None
         self._undo.clear()
@@ -126,7 +128,8 @@ class Session:
         is_new = self.keys.press(key, now, until_let=until_let)
         control = table()["controls"].get(key)
         if control is not None:
-            if is_new or control == "one step":
+            stops = control == "pause" and self.is_live and self.status == "running"  # however soon after the last
+            if is_new or control == "one step" or stops:
                 self._control(control)
         elif self.status == "ended":
             self.note = "the episode has ended: N begins the next one, Z the same one again"
@@ -144,6 +147,11 @@ class Session:
         """Nothing is held any more, as the gamepad is gone or the window is left."""
         self.keys.release()
         self.pad, self.note = None, why or self.note
+
+    def pause(self) -> None:
+        """Pause now, whatever was pressed before."""
+        if self.status == "running":
+            self._control("pause")
 
     def _control(self, control: str) -> None:
         if control == "pause":
@@ -192,7 +200,8 @@ class Session:
         if self.status == "one step":
             keys, self.status = keys | self._armed, "paused"
         self._armed.clear()
-        self._step(lambda: self.suggestion if by_policy else self._persons(keys, holds=holds), self.driver)
+        driver = "policy" if by_policy else "person"
+        self._step(lambda: self.suggestion if by_policy else self._persons(keys, holds=holds), driver)
 
     def _persons(self, keys: set[str], *, holds: bool) -> Any:
         if self.pad is None or holds:

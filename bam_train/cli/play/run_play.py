@@ -48,8 +48,12 @@ def play(config: PlayConfig, signals: SignalMemory) -> int:
         options: Any = {"policy": policy, "is_live": place.robot is not None, "speed": float(config.speed)}
         session = Session(env, hand, seed=config.seed, **options)
         with _screen(config, env_id) as screen, closing(Gamepad()) as pad:
-            session.begin()
-            _drive(session, screen, pad, f"{env_id}{place.text and f' at {place.text}'}", config.episodes)
+            try:
+                session.begin()
+                _drive(session, screen, pad, f"{env_id}{place.text and f' at {place.text}'}", config.episodes)
+            finally:
+                if place.robot is not None:
+                    env.unwrapped.robot.halt()  # first of all: a terminal or a data set may be slow to close
     except DependencyNotInstalled as error:  # of Gymnasium's own environments, at the first picture
         raise SettingsError(f"--render: {error}") from error
     except BamEnvsError as error:
@@ -122,25 +126,37 @@ def _screen(config: PlayConfig, title: str) -> Any:
 
         return Terminal()
     try:
+        from tkinter import TclError
+
         from bam_train.cli.play.window import Window
     except ImportError as error:
         raise SettingsError("--render needs tkinter, which this Python lacks: apt-get install python3-tk") from error
-    return Window(f"bam-play: {title}")
+    try:
+        return Window(f"bam-play: {title}")
+    except TclError as error:
+        raise SettingsError(f"--render: the window cannot be opened: {error}; check DISPLAY") from error
 
 
 def _drive(session: Session, screen: Any, pad: Gamepad, title: str, episodes: int | None) -> None:
     """Tick at the session's pace until it is done; keys are read between two ticks."""
     from bam_envs.core.timing import Pacer
+    from bam_train.agent.front.jog import FRESH
     from bam_train.play.readout import screen_lines
 
     pacer, drawn = Pacer(session.pace, sleep=screen.wait), -DRAWN
     pacer.start()
+    looked = monotonic()
     while not session.done and session.episodes != episodes:
         pacer.period = session.pace
+        is_old = session.is_live and monotonic() - looked > FRESH  # what waited while the robot went to its start
         pacer.wait()
         screen.wait(0.0)  # a late tick has not waited
+        looked = monotonic()
         for key, at, until_let in screen.take():
-            session.press(key, at, until_let=until_let)
+            if key == "Space" and is_old:
+                session.pause()
+            elif key == "KeyX" or not is_old:
+                session.press(key, at, until_let=until_let)
         for key in screen.let:
             session.let(key) if key else session.release()
         screen.let.clear()
@@ -161,8 +177,10 @@ def _poll(session: Session, pad: Gamepad) -> None:
     elif what == "came":
         session.note = "gamepad: hold the right shoulder button and move the sticks; A closes, Y opens, B pauses"
     session.pad = pad.state
-    if pad.stops and session.status == "running":
-        session.press("Space", monotonic())
+    if pad.stops:
+        session.pause()
+    elif session.pad is not None and session.status == "ready" and not session.hand.waits:
+        session.status = "running"
 
 
 main = partial(run_program, "bam-play", "bam_train.cli.play.play_flags:PlayConfig", play)

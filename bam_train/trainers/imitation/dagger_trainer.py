@@ -68,6 +68,10 @@ class DaggerTrainer:
         with contextlib.closing(make_env(settings.env, settings.env_kwargs)) as env:
             IMITATION_ALGORITHMS[settings.algo].require_actions(settings.env, type(env.action_space).__name__)
         values = read_table(Dagger, settings.hyperparameters, "hyperparameters", SettingsError)
+        least = 2 * values.batch_size
+        for name, steps in (("steps", settings.steps), ("memory", values.memory)):
+            if steps < least:
+                raise SettingsError(f"{name}: dagger learns from {least} steps on, twice batch_size, found {steps}")
         every = settings.eval_every or max(1000, settings.steps // 5)
         return dataclasses.replace(settings, hyperparameters=dataclasses.asdict(values), eval_every=every)
 

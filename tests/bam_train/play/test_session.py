@@ -229,3 +229,25 @@ def test_a_plot_goes_from_the_lowest_value_to_the_highest():
     assert sparkline([3, 3]) == "▁▁"
     assert sparkline([float("nan"), 1, float("inf"), 2]) == "▁▁██"
     assert sparkline([]) == ""
+
+
+def test_a_new_episode_begins_with_an_open_gripper():
+    driven = Driven(is_live=True)
+    assert driven.tick(2, "KeyC").action[-1] == 1
+    driven.tap("KeyN")
+    driven.now += 1.0
+    assert driven.tick().action.tolist() == [0, 0, 0, 0, -1]
+    driven.env.close()
+
+
+def test_a_live_robot_pauses_however_soon_after_it_went_on():
+    driven = Driven(is_live=True)
+    for status in ("paused", "running"):
+        assert driven.tap("Space").status == status
+    driven.session.press("Space", driven.now + 0.1)
+    assert driven.session.status == "paused"
+    driven.tap("Space")
+    driven.session.pause()
+    driven.session.pause()
+    assert driven.session.status == "paused"
+    driven.env.close()
