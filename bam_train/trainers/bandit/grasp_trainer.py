@@ -9,34 +9,26 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import json
 import math
 from collections import deque
-from collections.abc import Iterator, Mapping
-from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
 import torch
-from gymnasium.vector import VectorEnv
 from msgspec import Meta
 from torch.nn import functional
 
-from bam_envs.core.spaces import space_to_json
 from bam_envs.core.validation import read_table
-from bam_train.checkpoint import GOLDEN, POLICY, Checkpoint, write_checkpoint
-from bam_train.checkpoint.safetensors_file import pack
+from bam_train.checkpoint import Checkpoint
 from bam_train.environments import make_env, make_vector_env, require_fit
 from bam_train.errors import SettingsError, TrainingFailed
-from bam_train.policy import FrozenPolicy
 from bam_train.settings import TrainSettings
 from bam_train.trainers.algorithms import BANDIT_ALGORITHMS
 from bam_train.trainers.bandit.grasp_network import EDGE, HEIGHT_UNIT, Bytes, GraspNetwork, GraspPolicy, Grid
-from bam_train.trainers.base import OnProgress, Progress, Statistics, manifest
+from bam_train.trainers.base import OnProgress, Progress, Statistics
 from bam_train.trainers.resolve_settings import own_settings
-from bam_train.trainers.tensorboard_files import TensorBoardFiles
+from bam_train.trainers.torch_trainer import STATE, TorchTrainer
 
-STATE, NOTES = "bam/resume/state", "bam/resume/notes.json"
 _Count = Annotated[int, Meta(ge=1, le=100_000)]
 _RECENT = 200  # grasps of the statistics
 _ABOVE = 20  # least height of a place that is tried, in units of `HEIGHT_UNIT`
@@ -64,30 +56,25 @@ class GraspQ:
     """Share of random grasps after that."""
 
 
-class GraspTrainer:
+class GraspTrainer(TorchTrainer):
     """Made by `create` or `load`."""
 
     def __init__(self, settings: TrainSettings) -> None:
-        torch.set_num_threads(settings.threads)
-        torch.manual_seed(settings.seed)
-        self.settings = settings
-        self.notices: list[str] = []
-        self.evaluations = "choose"
+        super().__init__(settings)
         self.options = read_table(GraspQ, settings.hyperparameters, "hyperparameters", SettingsError)
         self.envs: Any = make_vector_env(settings.env, settings.env_kwargs, settings.num_envs, settings.place)
-        self._spaces: Any = (self.envs.single_observation_space, self.envs.single_action_space)
-        self._grid = Grid.of(*self._spaces)
+        self.spaces = self.envs.single_observation_space, self.envs.single_action_space
+        self._grid = Grid.of(*self.spaces)
         self.network = GraspNetwork(self.options.channels, self._grid.widths)
         self._optimiser = torch.optim.Adam(self.network.parameters(), lr=self.options.learning_rate)
         self._rng = np.random.default_rng(settings.seed)
         self._patches: Bytes = np.zeros((0, EDGE, EDGE), np.uint8)
         self._widths, self._rewards = np.zeros(0, np.int64), np.zeros(0, np.float32)
-        self._count, self._due, self._logged = 0, 0.0, 0
+        self._due = 0.0
         self._recent: deque[tuple[float, bool]] = deque(maxlen=_RECENT)
         self._metrics: dict[str, float] = {}
         self._observation: Any = None
         self._table = 0.0  # depth of the table [m]
-        self._board: TensorBoardFiles | None = None
 
     @classmethod
     def complete(cls, settings: TrainSettings) -> TrainSettings:
@@ -119,33 +106,23 @@ class GraspTrainer:
             trainer._patches, trainer._widths, trainer._rewards = (np.array(one) for one in state["grasps"])
             trainer._rng.bit_generator.state = state["rng"]
             torch.set_rng_state(state["torch"])
-            trainer._table, trainer._due, trainer._count = state["table"], state["due"], len(trainer._rewards)
+            trainer._table, trainer._due, trainer._steps = state["table"], state["due"], len(trainer._rewards)
             trainer._recent.extend((reward, bool(success)) for reward, success in state["recent"])
             if state["envs"] is not None:
                 trainer._observation = trainer.envs.unwrapped.load_state_dict(state["envs"])
         return trainer
 
-    def log_to(self, folder: Path) -> None:
-        """Write TensorBoard files into a folder from now on."""
-        self._board = TensorBoardFiles(folder)
-
-    @property
-    def steps(self) -> int:
-        """Grasps since the start of the run."""
-        return self._count
-
     def train(self, steps: int, on_progress: OnProgress) -> None:
         """Train until the run has at least `steps` grasps, or `on_progress` returns False."""
-        while self._count < steps:
+        while self._steps < steps:
             self._try_grasps()
             self._due += len(self._observation["depth"]) * self.options.reuse / self.options.batch_size
             while self._due >= 1:
                 self._due -= 1
-                self._update(min(1.0, self._count / steps))
-            if self._count - self._logged >= steps // 200:
-                self._logged = self._count
+                self._update(min(1.0, self._steps / steps))
+            if self.logs(steps):
                 self.log(self._metrics)
-            if not on_progress(Progress(self._count, steps, self._statistics)):
+            if not on_progress(Progress(self._steps, steps, self._statistics)):
                 return
 
     def _try_grasps(self) -> None:
@@ -158,19 +135,24 @@ class GraspTrainer:
         heights = ((self._table - depth) / HEIGHT_UNIT).round().clip(0, 255).astype(np.uint8)
         tried = self._choose(heights)
         patches = self._grid.patches(heights, *tried[:3])
-        actions = self._grid.actions(*tried).astype(self._spaces[1].dtype)
+        actions = self._grid.actions(*tried).astype(self.spaces[1].dtype)
         self._observation, rewards, _, _, infos = self.envs.step(actions)
+        if not ((rewards >= 0) & (rewards <= 1)).all():
+            raise TrainingFailed(
+                f"a grasp was rewarded with {rewards.min():g} to {rewards.max():g}: grasp-q learns the probability of "
+                "success, from rewards between 0 and 1"
+            )
         success = infos.get("final_info", {}).get("is_success", rewards > 0)
         self._recent.extend(zip(rewards.tolist(), success.tolist(), strict=True))
         self._patches = np.concatenate([self._patches, patches])
         self._widths = np.concatenate([self._widths, tried[3]])
         self._rewards = np.concatenate([self._rewards, rewards.astype(np.float32)])
-        self._count += len(rewards)
+        self._steps += len(rewards)
 
     def _choose(self, heights: Bytes) -> tuple[Any, Any, Any, Any]:
         """Column, row, rotation and width of the grasp to try in each picture (n, h, w). Shape: (n,) each."""
         n, rng, options = len(heights), self._rng, self.options
-        k = options.candidates if self._count >= options.random_grasps else 1
+        k = options.candidates if self._steps >= options.random_grasps else 1
         place = rng.integers(heights[0].size, size=(n, k))
         for env, picture in enumerate(heights):
             high = np.flatnonzero(picture > _ABOVE)
@@ -216,58 +198,26 @@ class GraspTrainer:
         length = 1.0 if len(known) else None
         return Statistics(len(known), mean, length, success, dict(self._metrics))
 
-    def _policy(self) -> GraspPolicy:
-        return GraspPolicy(self.network, self._grid, self._table, self._spaces[0])
+    def policy(self) -> GraspPolicy:
+        """A copy of the network, which looks at whole pictures."""
+        return GraspPolicy(self.network, self._grid, self._table, self.spaces[0])
 
-    def save(self, path: Path, scores: Mapping[str, Any], notes: Mapping[str, Any]) -> Checkpoint:
-        """Write a checkpoint that can be resumed and deployed."""
-        onnx, golden = self._policy().members(self._observation, _GOLDEN)
-        grasps = self._patches, self._widths, self._rewards
-        envs = getattr(self.envs.unwrapped, "state_dict", lambda: None)()
-        state = {
+    def members(self) -> tuple[bytes, bytes]:
+        """The policy's ONNX file, and its golden actions for pictures of the environments."""
+        return self.policy().members(self._observation, _GOLDEN)
+
+    def state(self) -> dict[str, Any]:
+        """The network, all grasps, and the environments, if they can be saved."""
+        return {
             "network": self.network.state_dict(),
             "optimiser": self._optimiser.state_dict(),
-            "grasps": grasps,
+            "grasps": (self._patches, self._widths, self._rewards),
             "rng": dict(self._rng.bit_generator.state),
-            "torch": torch.get_rng_state(),
             "table": self._table,
             "due": self._due,
             "recent": [list(one) for one in self._recent],
-            "envs": envs,
+            "envs": getattr(self.envs.unwrapped, "state_dict", lambda: None)(),
         }
-        members = {POLICY: onnx, GOLDEN: golden, NOTES: json.dumps(dict(notes)).encode(), **pack(STATE, state)}
-        batch = self.envs.unwrapped
-        known = {"signals": batch.describe(), "period": batch.period, "steps": self.steps, "scores": scores}
-        return write_checkpoint(path, manifest(self.settings, self._spaces, known), members)
-
-    def freeze(self) -> FrozenPolicy:
-        """Freeze the current policy."""
-        return FrozenPolicy.from_graph(self._policy().onnx_file(), *map(space_to_json, self._spaces))
-
-    @contextlib.contextmanager
-    def undisturbed(self) -> Iterator[None]:
-        """Restore torch's random number generator after the ``with`` block."""
-        before = torch.get_rng_state()
-        try:
-            yield
-        finally:
-            torch.set_rng_state(before)
-
-    @contextlib.contextmanager
-    def evaluation_envs(self) -> Iterator[VectorEnv[Any, Any, Any] | None]:
-        """None: others are made."""
-        yield None
-
-    def log(self, metrics: Mapping[str, float]) -> None:
-        """Write numbers into TensorBoard's files."""
-        if self._board is not None:
-            self._board.write(dict(metrics), self.steps)
-
-    def close(self) -> None:
-        """Close environments and log files."""
-        if self._board is not None:
-            self._board.close()
-        self.envs.close()
 
 
 def _metres(patches: Bytes) -> torch.Tensor:

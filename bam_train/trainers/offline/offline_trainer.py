@@ -9,54 +9,44 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import functools
-import json
 import random
-from collections.abc import Iterator, Mapping
-from pathlib import Path
+from collections.abc import Iterator
 from typing import Any
 
 import torch
 from gymnasium import spaces
-from gymnasium.vector import VectorEnv
 
 from bam_envs.core.errors import BamEnvsError
 from bam_envs.core.registry import are_same
-from bam_envs.core.spaces import space_to_json
 from bam_envs.core.validation import read_table
-from bam_train.checkpoint import GOLDEN, POLICY, Checkpoint, write_checkpoint
-from bam_train.checkpoint.safetensors_file import pack
+from bam_train.checkpoint import Checkpoint
 from bam_train.data import DataSet
 from bam_train.detection import WANTED
 from bam_train.detector import Rollout
 from bam_train.environments import control_period, make_env, require_fit
 from bam_train.errors import CheckpointMismatch, SettingsError
-from bam_train.policy import FrozenPolicy
 from bam_train.settings import TrainSettings, differences
 from bam_train.trainers.algorithms import OFFLINE_ALGORITHMS
-from bam_train.trainers.base import OnProgress, Progress, Statistics, manifest
+from bam_train.trainers.base import OnProgress, Progress, Statistics
 from bam_train.trainers.offline.implicit_q import Cloning, ImplicitQ, ImplicitQLearner
 from bam_train.trainers.offline.offline_policy import OfflinePolicy
 from bam_train.trainers.offline.online_phase import OnlinePhase
 from bam_train.trainers.offline.training_data import ActionCode, Normaliser, read_batch
 from bam_train.trainers.resolve_settings import own_settings
-from bam_train.trainers.tensorboard_files import TensorBoardFiles
+from bam_train.trainers.torch_trainer import STATE, TorchTrainer
 
-STATE, NOTES = "bam/resume/state", "bam/resume/notes.json"
 _OWN: dict[str, type[Cloning]] = {"bc": Cloning, "iql": ImplicitQ}
 _REPORT_EVERY = 50  # updates between two reports of progress
-_LOGGED = 200  # entries of TensorBoard in a run
 
 
-class OfflineTrainer:
+class OfflineTrainer(TorchTrainer):
     """Made by `create` or `load`; `indices` are those of the training episodes."""
 
     def __init__(self, settings: TrainSettings, data: DataSet, indices: list[int]) -> None:
-        torch.set_num_threads(settings.threads)
-        torch.manual_seed(settings.seed)
-        self.settings, self._data, self._indices = settings, data, indices
-        self.notices: list[str] = []
-        self._spaces = data.info.observation_space, data.info.action_space
-        self._code, self._normaliser = ActionCode(self._spaces[1]), Normaliser(self._spaces[0])
+        super().__init__(settings)
+        self._data, self._indices = data, indices
+        self.spaces = data.info.observation_space, data.info.action_space
+        self._code, self._normaliser = ActionCode(self.spaces[1]), Normaliser(self.spaces[0])
         batch, self._reward_scale = read_batch(data, indices, self._normaliser, self._code, fit=True)
         self._manifest_data = {
             "digest": data.digest,
@@ -73,11 +63,10 @@ class OfflineTrainer:
             self.learner = D3rlpyLearner(
                 settings.algo, settings.hyperparameters, self._normaliser.inputs, self._code, batch, settings.seed
             )
-        self._steps = self._logged = 0
-        self._board: TensorBoardFiles | None = None
         self._online: OnlinePhase | None = None
         if settings.hyperparameters.get("online_from") is not None:
             self._online = OnlinePhase(settings, self._normaliser, self._code, self._reward_scale)
+            self.envs = self._online.envs
         self.evaluations = "choose" if self._online else "report"
         if self._online is None and not _is_here(settings):
             self.evaluations = "none"
@@ -139,15 +128,6 @@ class OfflineTrainer:
         trainer._steps = checkpoint.manifest.steps
         return trainer
 
-    def log_to(self, folder: Path) -> None:
-        """Write TensorBoard files into a folder from now on."""
-        self._board = TensorBoardFiles(folder)
-
-    @property
-    def steps(self) -> int:
-        """Updates, and online steps of the environments, since the start of the run."""
-        return self._steps
-
     def train(self, steps: int, on_progress: OnProgress) -> None:
         """Train until the run has at least `steps` steps, or `on_progress` returns False."""
         while self._steps < steps:
@@ -157,8 +137,7 @@ class OfflineTrainer:
                     self._steps += 1
             else:
                 self._steps += self._online.step(self.learner)
-            if self._steps - self._logged >= steps // _LOGGED:
-                self._logged = self._steps
+            if self.logs(steps):
                 self.log(self.learner.metrics)
             if not on_progress(Progress(self._steps, steps, self._statistics)):
                 return
@@ -170,7 +149,7 @@ class OfflineTrainer:
         return Statistics(episodes=0, return_mean=None, length_mean=None, success_rate=None, metrics=metrics)
 
     @functools.cached_property
-    def _described(self) -> tuple[dict[str, Any], float | None]:
+    def described(self) -> tuple[dict[str, Any], float | None]:
         """Signals and period [s]: the environment's, or those of the data set where it is not here."""
         info = self._data.info
         with contextlib.suppress(SettingsError, BamEnvsError), contextlib.closing(_make(self.settings)) as env:
@@ -178,25 +157,22 @@ class OfflineTrainer:
             return describe() if describe else {}, control_period(env)
         return info.contract, info.period
 
-    def _policy(self) -> OfflinePolicy:
-        learner = self.learner
-        return OfflinePolicy(learner.network(), self._normaliser, *self._spaces, tanh=learner.tanh)
+    def policy(self) -> OfflinePolicy:
+        """A copy of the learner's actor."""
+        return OfflinePolicy(self.learner.network(), self._normaliser, *self.spaces, tanh=self.learner.tanh)
 
-    def save(self, path: Path, scores: Mapping[str, Any], notes: Mapping[str, Any]) -> Checkpoint:
-        """Write a checkpoint that can be resumed and deployed."""
-        with self.undisturbed():
-            onnx, golden = self._policy().members()
+    def state(self) -> dict[str, Any]:
+        """The learner, and the environments of a run online."""
         online = None if self._online is None else self._online.state_dict()
-        state = {"learner": self.learner.state_dict(), "online": online, "torch": torch.get_rng_state()}
-        members = {POLICY: onnx, GOLDEN: golden, NOTES: json.dumps(dict(notes)).encode(), **pack(STATE, state)}
-        signals, period = self._described
-        known = {"signals": signals, "period": period, "steps": self.steps, "scores": scores}
-        fields = {**manifest(self.settings, self._spaces, known), "data": self._manifest_data}
-        return write_checkpoint(path, fields, members)
+        return {"learner": self.learner.state_dict(), "online": online}
+
+    def facts(self) -> dict[str, Any]:
+        """The data that were learnt from."""
+        return {"data": self._manifest_data}
 
     def rollouts(self) -> Iterator[Rollout]:
         """Some of the training episodes in random order, for the detector of unusual observations."""
-        if not isinstance(self._spaces[0], spaces.Box) or self._spaces[0].dtype == "uint8":
+        if not isinstance(self.spaces[0], spaces.Box) or self.spaces[0].dtype == "uint8":
             return
         ticks, order = 0, list(self._indices)
         random.Random(self.settings.seed).shuffle(order)
@@ -206,38 +182,6 @@ class OfflineTrainer:
             ticks += len(episode)
             if ticks >= WANTED:
                 return
-
-    def freeze(self) -> FrozenPolicy:
-        """Freeze the current policy."""
-        with self.undisturbed():
-            graph = self._policy().onnx_file()
-        return FrozenPolicy.from_graph(graph, *map(space_to_json, self._spaces))
-
-    @contextlib.contextmanager
-    def undisturbed(self) -> Iterator[None]:
-        """Restore the random number generator of training after the ``with`` block."""
-        before = torch.get_rng_state()
-        try:
-            yield
-        finally:
-            torch.set_rng_state(before)
-
-    @contextlib.contextmanager
-    def evaluation_envs(self) -> Iterator[VectorEnv[Any, Any, Any] | None]:
-        """None: others are made."""
-        yield None
-
-    def log(self, metrics: Mapping[str, float]) -> None:
-        """Write numbers into TensorBoard's files."""
-        if self._board is not None:
-            self._board.write(dict(metrics), self.steps)
-
-    def close(self) -> None:
-        """Close environments and log files."""
-        if self._board is not None:
-            self._board.close()
-        if self._online is not None:
-            self._online.envs.close()
 
 
 def _open(settings: TrainSettings) -> DataSet:

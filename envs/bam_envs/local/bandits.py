@@ -112,23 +112,8 @@ class ClassicBandit(ContextBandit):
     The arms' chances are drawn once from `table_seed`: Pareto(2) draws, cut to at most 5 and divided by the greatest,
     so that one arm always wins.
 
-    Action:
-        Which arm to pull.
-
     Start:
         The observation is always 0.
-
-    Reward:
-        1 with the arm's chance, else -1.
-
-    Success:
-        No arm has a better chance.
-
-    End:
-        Terminated after one step.
-
-    Info:
-        `threshold`, the arm's chance, and `random_value`: it wins if that is smaller.
 
     Args:
         n_arms: Arms.

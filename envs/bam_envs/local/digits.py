@@ -105,23 +105,8 @@ class Mnist(Digits):
     They are MNIST's own four, as they are or gzipped: `train-images-idx3-ubyte`, `train-labels-idx1-ubyte`,
     `t10k-images-idx3-ubyte` and `t10k-labels-idx1-ubyte`. They are read when the first episode begins.
 
-    Action:
-        The digit.
-
     Start:
         One of the pictures of the split, uniformly: 60,000 for training, and another 10,000 to test.
-
-    Reward:
-        1 if the picture shows the digit, else 0.
-
-    Success:
-        The picture shows the digit.
-
-    End:
-        Terminated after one step.
-
-    Info:
-        `label`, the digit that it shows.
 
     Args:
         split: ``"train"`` or ``"test"``.
