@@ -147,13 +147,8 @@ def guards_of(env: Any) -> dict[str, dict[str, Any]]:
 def plan_lines(env: Any, env_id: str, address: str, episodes: int, *, wiggle: bool = False) -> list[str]:
     """Lines for the operator about the planned episodes."""
     spec = getattr(getattr(env.unwrapped, "robot", None), "spec", None)
-    planned = (
-        "a person begins each episode"
-        if not episodes
-        else "1 episode"
-        if episodes == 1
-        else f"{episodes} episodes, one after the other without a pause"
-    )
+    few = {0: "a person begins each episode", 1: "1 episode"}
+    planned = few.get(episodes, f"{episodes} episodes, one after the other without a pause")
     begin = "where the base stands"
     if isinstance(spec, RobotSpec) and not is_base(spec):
         gripper = "opening the gripper and " if "m" in spec.command.units else ""

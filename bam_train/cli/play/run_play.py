@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 from contextlib import closing
 from functools import partial
+from math import inf
 from time import monotonic
 from typing import TYPE_CHECKING, Any
 
@@ -145,14 +146,15 @@ def _drive(session: Session, screen: Any, pad: Gamepad, title: str, episodes: in
 
     pacer, drawn = Pacer(session.pace, sleep=screen.wait), -DRAWN
     pacer.start()
-    looked = monotonic()
+    looked, limit = -inf, max(FRESH, 1.5 * session.period) if session.is_live else inf
     while not session.done and session.episodes != episodes:
         pacer.period = session.pace
-        is_old = session.is_live and monotonic() - looked > FRESH  # what waited while the robot went to its start
+        waited = monotonic() - looked  # keys that came meanwhile, as while a robot went to its start, are old
         pacer.wait()
         screen.wait(0.0)  # a late tick has not waited
         looked = monotonic()
         for key, at, until_let in screen.take():
+            is_old = max(waited, monotonic() - looked) > limit
             if key == "Space" and is_old:
                 session.pause()
             elif key == "KeyX" or not is_old:

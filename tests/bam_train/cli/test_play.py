@@ -14,6 +14,7 @@ from contextlib import closing
 from itertools import pairwise
 from types import SimpleNamespace
 
+import gymnasium as gym
 import numpy as np
 import pytest
 
@@ -178,6 +179,13 @@ def test_what_does_not_exist(run, monkeypatch, arguments, said):
     assert err.startswith(f"bam-play: {said}")
 
 
+def test_a_display_that_cannot_be_opened_is_one_line(run, monkeypatch):
+    pytest.importorskip("tkinter")
+    monkeypatch.setenv("DISPLAY", ":4711")
+    said = '--render: the window cannot be opened: couldn\'t connect to display ":4711"; check DISPLAY'
+    assert run(run_play.main, "bam/reach", "--render") == (1, "", f"bam-play: {said}\n")
+
+
 def played(tty, folder, script, *arguments):
     """Run the program in a terminal; each key of `script` (text, bytes) follows a text. Its status and its output."""
     ours, theirs = tty
@@ -241,3 +249,50 @@ def test_a_live_robot_moves_through_its_guards_while_a_key_is_fresh_and_else_hol
             assert guards_of(env)["joint speed"]["number"] == "G8"
             session.press("Backspace", 1.0)
             assert session.note == "undo the last second: not with a live robot, whose time cannot be stopped"
+
+
+class Typed:
+    """A screen on which these keys are typed, some at each look."""
+
+    size, let = (100, 40), []
+
+    def __init__(self, *looks):
+        self.looks = list(looks)
+
+    def wait(self, seconds):
+        pass
+
+    def take(self):
+        return [(key, time.monotonic(), False) for key in (self.looks.pop(0) if self.looks else ["KeyX"])]
+
+    def show(self, lines, picture=None):
+        pass
+
+
+class SlowStart(gym.Wrapper):
+    """Needs 0.8 s to its start, and keeps what it was sent: of each action, motion forward and gripper."""
+
+    def __init__(self, env):
+        super().__init__(env)
+        self.sent = []
+
+    def reset(self, **options):
+        self.sent.append("reset")
+        time.sleep(0.8)
+        return super().reset(**options)
+
+    def step(self, action):
+        self.sent.append((bool(action[0] > 0), bool(action[-1] > 0)))
+        return super().step(action)
+
+
+def test_keys_that_waited_while_a_live_robot_went_to_its_start_do_not_count(tmp_path):
+    looks = [["KeyW"], ["KeyW"], [], ["KeyN", "KeyW", "KeyC"], ["KeyC"], ["KeyW"], ["KeyN", "Space"], ["KeyW"], []]
+    with closing(SlowStart(make_env("bam/pick-v0"))) as env:
+        session = Session(env, hand_for(env, is_live=True), is_live=True, speed=0.25)
+        session.begin()
+        run_play._drive(session, Typed(*looks), Gamepad(tmp_path), "pick", None)
+    rests, forward = (False, False), (True, False)
+    expected = ["reset", rests, forward, forward, "reset", rests, rests, forward, "reset", rests, rests, rests, rests]
+    assert env.sent == expected
+    assert session.status == "paused"
