@@ -139,7 +139,8 @@ class LiveCamera:
 def fitted(pixels: Pixels, box: spaces.Box) -> Pixels:
     """An image as a task sees it: the middle square, in the size and kind of `box` (size, size, channels); a copy.
 
-    Colours are averaged; distances and ids are not.
+    Colours are averaged; distances and ids are not. A distance of 0, which stands for no measurement, counts as the
+    farthest, as where a simulation sees nothing.
 
     Raises:
         ProtocolError: Colours are expected and it is grey, or the other way round.
@@ -155,6 +156,8 @@ def fitted(pixels: Pixels, box: spaces.Box) -> Pixels:
         edge = min(height, width)
         top, left = (height - edge) // 2, (width - edge) // 2
         image = resized(image[top : top + edge, left : left + edge], size, smooth=channels == 3)
+    if image.dtype == np.float32:
+        image = np.where(image == 0.0, box.high.flat[0], image)
     fit: Pixels = np.clip(image, box.low, box.high)
     return fit
 

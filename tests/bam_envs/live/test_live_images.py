@@ -62,8 +62,8 @@ def test_images_are_cut_to_a_square_and_made_smaller():
     pixels[:, 4:8] = 100
     small = fitted(pixels, spaces.Box(0, 255, (4, 4, 3), np.uint8))
     assert small[:, :, 0].tolist() == [[100, 100, 0, 0]] * 4
-    metres = np.arange(16, dtype=np.float32).reshape(4, 4)
-    depth = fitted(metres, spaces.Box(0.0, 4.0, (2, 2, 1), np.float32))
-    assert depth[:, :, 0].tolist() == [[0.0, 2.0], [4.0, 4.0]]
+    metres = np.arange(16, dtype=np.float32).reshape(4, 4) / 4
+    depth = fitted(metres, spaces.Box(0.0, 3.0, (2, 2, 1), np.float32))
+    assert depth[:, :, 0].tolist() == [[3.0, 0.5], [2.0, 2.5]]  # the first pixel has no measurement
     with pytest.raises(ProtocolError, match=r"^An image must be uint8 with 3 channels, not uint8 with 1 channels\.$"):
         fitted(pixels[:, :, 0], spaces.Box(0, 255, (4, 4, 3), np.uint8))
