@@ -10,7 +10,7 @@ export function showCameras(parent) {
     token: () => {}, // the other socket asks for it
     event: (message) => {
       if (message instanceof ArrayBuffer) draw(message);
-      else if (message.cameras) list(message.cameras);
+      else if (message.cameras) list(message.cameras, message.seen);
       else if (message.camera !== undefined && shown[message.camera]) {
         shown[message.camera].text.textContent = message.error;
         shown[message.camera].at = -Infinity;
@@ -18,16 +18,16 @@ export function showCameras(parent) {
     },
   });
 
-  function list(names) {
+  function list(names, seen) {
     shown = names.map((name) => {
       const figure = document.createElement("figure"), caption = document.createElement("figcaption");
-      const canvas = document.createElement("canvas"), text = document.createElement("span");
+      const canvas = document.createElement("canvas"), text = document.createElement("span"), sees = document.createElement("span");
       canvas.setAttribute("role", "img");
       canvas.setAttribute("aria-label", `Camera ${name}`);
-      caption.append(`${name} `, text);
+      caption.append(`${name} `, sees, text);
       figure.append(canvas, caption);
       canvas.drawn = 0;
-      return { figure, canvas, text, at: -Infinity };
+      return { figure, canvas, text, sees, size: seen[name], at: -Infinity };
     });
     parent.replaceChildren(...shown.map(({ figure }) => figure));
   }
@@ -38,6 +38,7 @@ export function showCameras(parent) {
     try {
       const picture = await createImageBitmap(new Blob([new Uint8Array(data, 1)]));
       if (place.canvas.width !== picture.width) Object.assign(place.canvas, { width: picture.width, height: picture.height });
+      if (place.size) place.sees.textContent = `– the policy sees ${picture.width === picture.height ? "it" : "its middle square"} in ${place.size} × ${place.size} pixels `;
       place.canvas.getContext("2d").drawImage(picture, 0, 0);
       picture.close();
       place.at = performance.now();

@@ -29,6 +29,7 @@ const jogging = new Jogging(byId("pads"), jog, held, stop);
 
 function connected() {
   connection.request("watch", { on: true }).then(entered, fault);
+  connection.request("status").then(show, fault); // the first event may come later than the first image
 }
 
 function entered() {
@@ -43,8 +44,7 @@ function entered() {
 
 function lost(reason) {
   endDriving();
-  status = { ...status, state: "not connected" };
-  say("state", "○ not connected");
+  show({ ...status, state: "not connected", why: "", owner: null });
   say("link", `⚠ No connection to the robot${reason ? ` (${reason})` : ""}; trying again. STOP does not reach it now.`);
   enable();
 }
@@ -72,13 +72,7 @@ function event(message) {
   if (message.event === "hello") {
     role = message.role;
   } else if (message.event === "status") {
-    const before = status;
-    status = message.status;
-    if (owner === "" && status.state === "taken over") owner = status.owner;
-    if (owner && (status.state !== "taken over" || status.owner !== owner)) endDriving();
-    showStatus(status, owner !== null);
-    enable();
-    if (before.active !== status.active || before.state !== status.state) look();
+    show(message.status);
   } else if (message.event === "telemetry") {
     telemetry = message;
     heard = performance.now();
@@ -87,6 +81,16 @@ function event(message) {
   } else if (message.ok === false) {
     fault(message.error); // of a twist
   }
+}
+
+function show(newest) {
+  const before = status;
+  status = newest;
+  if (owner === "" && status.state === "taken over") owner = status.owner;
+  if (owner && (status.state !== "taken over" || status.owner !== owner)) endDriving();
+  showStatus(status, owner !== null);
+  enable();
+  if (before.active !== status.active || before.state !== status.state) look();
 }
 
 function draw() {

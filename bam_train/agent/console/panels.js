@@ -28,12 +28,15 @@ function rows(table, head, lines) {
 const duration = (seconds) => (seconds < 90 ? `${Math.round(seconds)} s` : `${Math.round(seconds / 60)} min`);
 
 export function showStatus(status, mine) {
-  say("robot", status.robot || "Robot console");
+  const kind = status.simulated == null ? "" : status.simulated ? "simulated" : "real";
+  say("name", status.name || "Robot console");
+  say("robot", [kind, status.robot, status.address].filter((text, at, all) => text && all.indexOf(text) === at).join(" · "));
   say("state", `${ICONS[status.state] ?? "○"} ${status.state}`);
+  document.body.dataset.state = status.state;
   say("why", status.why ? `${status.why}` : "");
   const until = status.owner_until == null ? "" : `; the lease ends in ${status.owner_until.toFixed(0)} s unless it is used`;
   say("owner", mine ? `You drive${until}.` : status.owner ? `${status.owner} drives${until}.` : "");
-  document.title = `${status.state} - robot console`;
+  document.title = `${status.state} - ${status.name || "robot console"}`;
   showRun(status);
   showGuardTable(status.guards ?? {});
   byId("warnings").replaceChildren(...(status.warnings ?? []).map((text) => element("li", `⚠ ${text}`)));
@@ -47,7 +50,6 @@ function showRun(status) {
     "Active version": `${nameOf(status)}${short(status.active)}`,
     "Stage": [...new Set([status.stage ?? "-", ...(status.marks ?? [])])].join(", "),
     "Environment": status.env ?? "-",
-    "Robot": status.simulated == null ? "-" : status.simulated ? "simulated" : "real",
     "Success, last 20 episodes": rate,
     "Episodes": `${status.episodes ?? 0}, step ${status.steps ?? 0} of this one`,
     "Link latency": ms(status.link_ms),
@@ -84,22 +86,24 @@ export function showNear(near, guards) {
       const bar = element("progress", null);
       bar.max = 1;
       bar.setAttribute("aria-label", name);
-      return element("li", null, [element("span", ""), bar]);
+      return element("li", null, [element("span", ""), element("span", ""), bar, element("small", "")]);
     }));
   }
   names.forEach((name, at) => {
     const { value, limit, unit, share } = near[name], counts = guards[name];
-    const word = share >= 1 ? "✖ at its limit" : share >= NEAR ? "⚠ near" : "✓ clear";
-    const acted = counts ? `; altered ${counts.altered}, held ${counts.held}, stopped ${counts.stopped}` : "";
-    const [text, bar] = list.children[at].children;
-    text.textContent = `${word}: ${name} ${value.toPrecision(3)} ${unit}, limit ${Number(limit.toPrecision(3))}${acted}`;
+    const [title, number, bar, acted] = list.children[at].children;
+    title.textContent = `${share >= 1 ? "✖ at its limit:" : share >= NEAR ? "⚠ near:" : "✓"} ${name}`;
+    number.textContent = `${value.toPrecision(3)} ${unit}, limit ${Number(limit.toPrecision(3))}`;
+    acted.textContent = ["altered", "held", "stopped"].filter((did) => counts?.[did]).map((did) => `${did} ${counts[did]}`).join(", ");
+    list.children[at].classList.toggle("near", share >= NEAR);
     bar.value = share;
   });
 }
 
-export function showTelemetry({ tool, base }) {
+export function showTelemetry({ tool, base, state }) {
   const at = (values, unit) => values.map((value) => value.toFixed(3)).join(", ") + ` ${unit}`;
-  say("tool", tool ? `Tool at x, y, z: ${at(tool, "m")}` : base ? `Base at x, y: ${at(base.slice(0, 2), "m")}, yaw ${base[2].toFixed(2)} rad` : "");
+  const width = state.gripper_width?.gripper_width, gripper = width == null ? "" : `; gripper open by ${(1000 * width).toFixed(0)} mm`;
+  say("tool", tool ? `Tool at x, y, z: ${at(tool, "m")}${gripper}` : base ? `Base at x, y: ${at(base.slice(0, 2), "m")}, yaw ${base[2].toFixed(2)} rad` : "");
 }
 
 export function showVersions(versions, status) {

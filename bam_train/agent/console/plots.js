@@ -1,75 +1,62 @@
-// Plots of the last 30 s. Lines differ by their dashes and by a number at their end, not by their colour alone.
-
-import { cleared } from "./picture.js";
+// Charts of the last 30 s, by uPlot. Lines differ by their dashes, not by their colour alone.
 
 const SPAN = 30; // [s]
-const DASHES = [[], [8, 4], [2, 3], [10, 3, 2, 3], [14, 6], [4, 8]];
-const HUES = [212, 28, 130, 285, 0, 175];
+const HEIGHT = 150; // of a chart, without its legend [pixels]
+const LINES = [ // colour, dashes, and the dashes in the legend
+  ["#2b7de9", [], "──"], ["#c25a10", [8, 4], "╌╌"], ["#1c8a4a", [2, 3], "···"],
+  ["#b541b0", [10, 3, 2, 3], "─·"], ["#0f8797", [16, 3, 2, 3, 2, 3], "─··"], ["#d64550", [2, 8], "· · "],
+];
 
 export class Plots {
   constructor(parent) {
     this.parent = parent;
-    this.rows = []; // [time, {name of the plot: [values]}]
-    this.plots = new Map(); // name -> {canvas, text, labels, unit}
+    this.charts = new Map(); // name of a signal -> {chart, rows: [time, values…]}
+    this.end = -Infinity;
+    if (!window.uPlot) parent.textContent = "The library that draws the charts is missing: install bam-train again, with a link to the npm registry.";
   }
 
   add({ t, state, units, tool }) {
-    const values = {};
-    if (tool) values.tool = this.plot("tool", ["x", "y", "z"], "m") && tool;
-    for (const [signal, numbers] of Object.entries(state)) {
-      const labels = Object.keys(numbers);
-      if (labels.length > DASHES.length) continue;
-      this.plot(signal, labels, [...new Set(Object.values(units[signal]))].join(", "));
-      values[signal] = Object.values(numbers);
+    if (!window.uPlot) return;
+    if (t <= this.end) for (const { rows } of this.charts.values()) rows.length = 0; // another robot, or its clock was set
+    this.end = t;
+    const [x, y, z] = tool ?? [];
+    for (const [name, values] of Object.entries({ ...(tool && { tool: { x, y, z } }), ...state })) {
+      const labels = Object.keys(values);
+      if (labels.length > LINES.length) continue;
+      if (!this.charts.has(name)) this.charts.set(name, this.chart(name, labels, [...new Set(Object.values(units[name] ?? { x: "m" }))]));
+      const { rows } = this.charts.get(name);
+      rows.push([t, ...Object.values(values)]);
+      while (rows[0][0] < t - SPAN) rows.shift();
     }
-    if (this.rows.length && t <= this.rows.at(-1)[0]) this.rows = []; // another robot, or its clock was set
-    this.rows.push([t, values]);
-    while (this.rows[0][0] < t - SPAN) this.rows.shift();
   }
 
-  plot(name, labels, unit) {
-    if (this.plots.has(name)) return true;
+  chart(name, labels, units) {
     const figure = document.createElement("figure"), caption = document.createElement("figcaption");
-    const canvas = document.createElement("canvas"), text = document.createElement("span");
-    canvas.setAttribute("role", "img");
-    canvas.setAttribute("aria-label", `${name} over the last ${SPAN} s`);
-    caption.append(`${name.replaceAll("_", " ")} [${unit}] `, text);
-    figure.append(caption, canvas);
+    const style = getComputedStyle(document.documentElement), colour = (variable) => () => style.getPropertyValue(variable);
+    const axis = { stroke: colour("--quiet"), grid: { stroke: colour("--hair"), width: 1 }, ticks: { show: false }, font: "12px system-ui, sans-serif", size: 26 };
+    const room = (chart, low, high) => [low - Math.max(0.05 * (high - low), 0.01), high + Math.max(0.05 * (high - low), 0.01)];
+    const value = (chart, number) => number?.toFixed(3) ?? "-";
+    const lines = labels.map((label, at) => ({ label: `${LINES[at][2]} ${label.replace(/_joint$|^object_/, "")}`, stroke: LINES[at][0], dash: LINES[at][1], width: 2, points: { show: false }, value }));
+    caption.textContent = `${name.replaceAll("_", " ")} [${units.join(", ")}]`;
+    figure.append(caption);
     this.parent.append(figure);
-    this.plots.set(name, { canvas, text, labels });
-    return true;
+    const chart = new uPlot({
+      width: figure.clientWidth, height: HEIGHT,
+      cursor: { drag: { x: false, y: false }, sync: { key: "charts" }, y: false },
+      scales: { x: { time: false, range: [-SPAN, 0] }, y: { range: room } },
+      axes: [{ ...axis, values: (_, at) => at.map((one) => `${one} s`) }, { ...axis, size: 52 }],
+      series: [{}, ...lines],
+    }, [[], ...labels.map(() => [])], figure);
+    chart.ctx.canvas.setAttribute("role", "img");
+    chart.ctx.canvas.ariaLabel = `${name} over the last ${SPAN} s`;
+    new ResizeObserver(() => chart.setSize({ width: figure.clientWidth, height: HEIGHT })).observe(figure);
+    return { chart, rows: [] };
   }
 
   draw() {
-    const end = this.rows.at(-1)?.[0];
-    if (end === undefined) return;
-    const captions = []; // written last: a written text makes the next look at a size slow
-    for (const [name, { canvas, text, labels }] of this.plots) {
-      const rows = this.rows.filter(([, values]) => values[name]).map(([t, values]) => [t, values[name]]);
-      const [context, width, height] = cleared(canvas);
-      if (!rows.length || width === 0) continue;
-      const every = rows.flatMap(([, values]) => values).filter((value) => value !== null);
-      const low = Math.min(...every), high = Math.max(...every), room = Math.max(0.05 * (high - low), 0.01);
-      const y = (value) => height - 6 - ((value - low + room) / (high - low + 2 * room)) * (height - 12);
-      const x = (t) => (width - 22) * (1 - (end - t) / SPAN);
-      context.font = "12px system-ui, sans-serif";
-      context.fillStyle = getComputedStyle(canvas).color;
-      context.fillText(high.toFixed(2), 2, 12);
-      context.fillText(low.toFixed(2), 2, height - 3);
-      labels.forEach((label, at) => {
-        context.strokeStyle = `hsl(${HUES[at]} 70% 50%)`;
-        context.lineWidth = 2;
-        context.setLineDash(DASHES[at]);
-        context.beginPath();
-        for (const [t, values] of rows) if (values[at] !== null) context.lineTo(x(t), y(values[at]));
-        context.stroke();
-        const last = rows.at(-1)[1][at];
-        if (last !== null) context.fillText(at + 1, width - 18 + 9 * (at % 2), y(last) + 4);
-      });
-      const newest = rows.at(-1)[1];
-      const numbers = labels.map((label, at) => `${at + 1} ${label.replace("_joint", "")} ${newest[at]?.toFixed(3) ?? "-"}`);
-      captions.push([text, numbers.join(" · ")]);
+    for (const { chart, rows } of this.charts.values()) {
+      chart.setData(chart.series.map((_, at) => rows.map((row) => (at ? row[at] : row[0] - this.end))));
+      if (chart.cursor.idx == null) chart.setLegend({ idx: rows.length - 1 });
     }
-    for (const [text, caption] of captions) text.textContent = caption;
   }
 }

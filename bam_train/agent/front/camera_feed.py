@@ -46,13 +46,18 @@ class Camera(Protocol):
 class CameraFeed:
     """Serves the pictures of `cameras`, by their names; `serve` is a handler of a `Site`.
 
-    A page gets ``{"cameras": [names]}``, and then binary messages: the number of the camera (one byte) and a JPEG or
-    PNG. It answers each with ``{"op": "next", "camera": number}``. ``{"camera": number, "error": text}`` says why there
-    are no pictures.
+    A page gets ``{"cameras": [names], "seen": sizes}``, and then binary messages: the number of the camera (one byte)
+    and a JPEG or PNG. It answers each with ``{"op": "next", "camera": number}``. ``{"camera": number, "error": text}``
+    says why there are no pictures.
+
+    Args:
+        cameras: The cameras by name.
+        seen: Width and height of the images that the policy sees [pixels], by the camera's name.
     """
 
-    def __init__(self, cameras: Mapping[str, Camera]) -> None:
+    def __init__(self, cameras: Mapping[str, Camera], seen: Mapping[str, int] | None = None) -> None:
         self._names, self._readers = list(cameras), [_Reader(one) for one in cameras.values()]
+        self._seen = dict(seen or {})
         self._viewers = 0
 
     async def serve(self, connection: BridgeConnection, caller: Caller) -> None:
@@ -75,7 +80,7 @@ class CameraFeed:
 
     async def _show(self, connection: BridgeConnection) -> None:
         ready, shown, told = set(range(len(self._names))), [0] * len(self._names), [""] * len(self._names)
-        await connection.send(json.dumps({"cameras": self._names}))
+        await connection.send(json.dumps({"cameras": self._names, "seen": self._seen}))
         listening = asyncio.create_task(_listen(connection, ready, len(self._names)))
         silent = 0.0
         try:

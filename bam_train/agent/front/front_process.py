@@ -353,10 +353,15 @@ class FrontProcess:
             self.hub.tell_step(load_json(message.get("data"), AGENT_STEP_TOPIC), self._episode)
 
     def cameras(self) -> dict[str, LiveCamera]:
-        """The cameras of the robot's profile by name; not connected yet."""
-        options = self.options
+        """The cameras of the robot's profile that are not optional, or that the task sees; not connected yet."""
+        options, seen = self.options, self.seen()
         endpoint = Endpoint.with_token_file(options.robot, ca_file=options.ca_file, token_file=options.robot_token_file)
-        return {one.name: LiveCamera(endpoint, one) for one in self.shadow.profile.cameras if not one.optional}
+        shown = [one for one in self.shadow.profile.cameras if one.name in seen or not one.optional]
+        return {one.name: LiveCamera(endpoint, one) for one in shown}
+
+    def seen(self) -> dict[str, int]:
+        """The cameras that the task sees: width and height of its images [pixels], by name."""
+        return {name: camera.size for camera in self.shadow.spec.cameras for name in camera.spaces()}
 
     def _on_halt(self, message: Fields, caller: Caller) -> None:
         """Stop the policy; the halt of whoever drives, or has just handed back, over another connection does not."""
@@ -375,7 +380,7 @@ def main() -> None:
     try:
         front = FrontProcess(options, channel.send)
         console = AgentSocket(front.hub)
-        pictures = CameraFeed(front.cameras())
+        pictures = CameraFeed(front.cameras(), front.seen())
         site = Site(console_pages(), {**console.sockets, "/camera": pictures.serve})
         tokens = Tokens(otherwise="administer") if options.token_file is None else TokenFile(options.token_file)
         network = ServerOptions(open_timeout=2.0, max_clients=64)

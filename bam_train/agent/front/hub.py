@@ -15,6 +15,7 @@ from bam_envs.core.robot import RobotState
 from bam_envs.core.timing import Ticker
 from bam_envs.ros.codec import AGENT_STEP_TOPIC
 from bam_envs.rosbridge.bus import Caller
+from bam_envs.tasks.tool_control import WORKSPACE, ToolControl
 from bam_train.agent.agent_messages import Ask, Drive, Halt
 from bam_train.agent.audit import tail
 from bam_train.agent.front.agent_socket import Person
@@ -50,7 +51,8 @@ class AgentHub:
         shadow = front.shadow
         model = getattr(front.task, "model", None)  # of a Universal Robots arm of any size
         geometry = None if model is None else model.geometry
-        self._telemetry = Telemetry(shadow.spec, shadow.limits, geometry=geometry)
+        workspace = WORKSPACE if isinstance(getattr(front.task, "control", None), ToolControl) else None
+        self._telemetry = Telemetry(shadow.spec, shadow.limits, geometry=geometry, workspace=workspace)
         try:
             self._jogger: Jogger | None = Jogger(shadow.spec, shadow.spec.period, geometry=geometry)
         except InvalidValue:  # its kinematics are not known
@@ -154,10 +156,11 @@ class AgentHub:
             self.tell(EVENT, encode(rows))
 
     def status(self) -> dict[str, Any]:
-        """The last status of the resident, with the lease."""
-        lease = self._front.lease
-        owner = lease.owner
-        return {**self._front.status, "owner": owner, "owner_until": None if owner is None else round(lease.left, 1)}
+        """The last status of the resident, with the name and the address of the robot, and the lease."""
+        front, lease = self._front, self._front.lease
+        owner, robot = lease.owner, {"name": front.shadow.profile.name, "address": front.options.robot}
+        until = None if owner is None else round(lease.left, 1)
+        return {**front.status, **robot, "owner": owner, "owner_until": until}
 
     def tell(self, kind: str, event: dict[str, Any]) -> None:
         """Give an event to those who listen."""

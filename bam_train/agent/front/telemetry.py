@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bam_envs.core.kinematics import UR5E_GRIPPER, UR_JOINTS, ArmGeometry, turned
+from bam_envs.core.kinematics import UR5E_GRIPPER, UR_JOINTS, ArmGeometry, quaternions, turned
 from bam_envs.core.robot import RobotSpec, RobotState, SignalSpec
 from bam_envs.safety.arm_tubes import ArmTubes
 from bam_envs.safety.base_guards import LaserZones
@@ -30,13 +30,21 @@ class Telemetry:
         spec: The robot.
         limits: The limits of its guards.
         geometry: Kinematics of an arm; None: those of a UR5e with a gripper, if its joints have their names.
+        workspace: Where the task moves the tool: lowest and highest x, y, z [m]; None: anywhere. Shape: (2, 3).
     """
 
-    def __init__(self, spec: RobotSpec, limits: Limits, *, geometry: ArmGeometry | None = None) -> None:
+    def __init__(
+        self,
+        spec: RobotSpec,
+        limits: Limits,
+        *,
+        geometry: ArmGeometry | None = None,
+        workspace: Array | None = None,
+    ) -> None:
         self._spec, self._signals = spec, [one for one in spec.signals if len(one.labels) <= _MOST]
         self._units = {one.name: dict(zip(one.labels, one.units, strict=True)) for one in self._signals}
         self._most_age = limits.max_age or (0.5 if is_base(spec) else 0.1)
-        self._body = _Base(spec, limits) if is_base(spec) else _Arm(spec, limits, geometry)
+        self._body = _Base(spec, limits) if is_base(spec) else _Arm(spec, limits, geometry, workspace)
 
     def message(self, state: RobotState, t: float, *, command: Array | None = None, age: float = 0.0) -> dict[str, Any]:
         """The message about a state.
@@ -50,9 +58,11 @@ class Telemetry:
         Returns:
             ``event``; ``t``; ``state`` and ``units``: a mapping by label for each signal; ``command``: number by label;
             ``tool``: x, y, z [m], of an arm; ``near``: by the name of a guard, ``value``, ``limit``, ``unit`` and
-            ``share`` (0: far from it, 1: it acts); and to draw, ``tubes`` of an arm (x, y, z of two ends and a radius
-            [m] each), or ``base`` (x, y [m], yaw [rad]), ``outline`` (front, back, side [m]) and ``scan`` (points x, y
-            in the base's frame [m]). What is not known, or not finite, is None or left out.
+            ``share`` (0: far from it, 1: it acts); and to draw, ``tubes`` of an arm up to its flange (x, y, z of two
+            ends and a radius [m] each), ``hand`` (pose of the flange with a gripper: x, y, z [m] and a quaternion x, y,
+            z, w), ``object`` (pose of the tracked object), ``box`` (lowest and highest x, y, z of the tool [m]) and
+            ``table`` (its height [m]); or ``base`` (x, y [m], yaw [rad]), ``outline`` (front, back, side [m]) and
+            ``scan`` (points x, y in the base's frame [m]). What is not known, or not finite, is None or left out.
         """
         near = {"state age": _below(age, self._most_age, "s")} | self._body.near(state)
         return {
@@ -70,13 +80,16 @@ class Telemetry:
 class _Arm:
     """An arm, whose kinematics may be unknown."""
 
-    def __init__(self, spec: RobotSpec, limits: Limits, geometry: ArmGeometry | None) -> None:
+    def __init__(self, spec: RobotSpec, limits: Limits, geometry: ArmGeometry | None, workspace: Array | None) -> None:
         self._limits, self._joints = limits, columns_in(spec.command, "rad")
         if geometry is None and tuple(spec.command.labels[at] for at in self._joints) == UR_JOINTS:
             geometry = UR5E_GRIPPER
-        self._geometry, has_gripper = geometry, "m" in spec.command.units
+        self._geometry, self._has_gripper = geometry, (has_gripper := "m" in spec.command.units)
         outline = None if geometry is None else geometry.outline
-        self._tubes = None if geometry is None or outline is None else ArmTubes(geometry, outline, tool=has_gripper)
+        self._tubes = self._drawn = None
+        if geometry is not None and outline is not None:
+            self._tubes = ArmTubes(geometry, outline, tool=has_gripper)
+            self._drawn = ArmTubes(geometry, outline, tool=False)
         self._positions = [row for row in measured_places(spec, spec.command.units) if row[0] in self._joints]
         speeds = measured_places(spec, [f"{unit}/s" for unit in spec.command.units])
         self._speeds = [row for row in speeds if row[0] in self._joints]
@@ -85,18 +98,26 @@ class _Arm:
         floor = limits.table_height if has_gripper else -math.inf
         self._low = limits.box_x_min, limits.box_y_min, floor if limits.box_z_min is None else limits.box_z_min
         self._high = limits.box_x_max, limits.box_y_max, limits.box_z_max
+        low, high = (self._low, self._high) if workspace is None else workspace
+        self._box = _plain([*np.maximum(self._low, low), *np.minimum(self._high, high)])
 
     def picture(self, state: RobotState) -> dict[str, Any]:
-        q = _numbers(state, self._positions)
-        tool = {} if self._geometry is None else {"tool": _plain(self._geometry.tool_point(q))}
-        if self._tubes is None:
-            return tool
-        tubes = self._tubes.tubes(q)
+        q, geometry = _numbers(state, self._positions), self._geometry
+        if geometry is None:
+            return {}
+        shown: dict[str, Any] = {"tool": _plain(geometry.tool_point(q))}
+        if self._drawn is None:
+            return shown
+        tubes = self._drawn.tubes(q)
         ends = turned(np.array([[[start, end] for start, end, _ in tubes]]), np.cos(q[:1]), np.sin(q[:1]))[0]
-        return {
-            **tool,
-            "tubes": [_plain([*two.ravel(), radius]) for two, (*_, radius) in zip(ends, tubes, strict=True)],
-        }
+        shown["tubes"] = [_plain([*two.ravel(), radius]) for two, (*_, radius) in zip(ends, tubes, strict=True)]
+        if self._has_gripper:
+            position, rotation = geometry.flange_pose(np.array([q]))
+            shown["hand"] = _plain([*position[0], *quaternions(rotation)[0]])
+        if {"object_position", "object_quaternion"} <= state.signals.keys():
+            w, *xyz = state.signals["object_quaternion"][0]
+            shown["object"] = _plain([*state.signals["object_position"][0], *xyz, w])
+        return {**shown, "box": self._box, "table": self._limits.table_height}
 
     def near(self, state: RobotState) -> dict[str, Row | None]:
         limits, geometry = self._limits, self._geometry

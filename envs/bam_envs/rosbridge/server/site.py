@@ -1,9 +1,11 @@
 """A site on the port of a rosbridge server: pages, WebSocket paths of its own, and who may open them."""
 
+import gzip
 import ipaddress
 import re
 from collections.abc import Awaitable, Callable, Mapping
 from dataclasses import dataclass, field
+from functools import lru_cache
 from http import HTTPStatus
 from pathlib import Path
 from typing import NamedTuple
@@ -25,6 +27,7 @@ _TYPES = {
     ".svg": "image/svg+xml",
     ".png": "image/png",
     ".ico": "image/x-icon",
+    ".txt": "text/plain; charset=utf-8",
     ".woff2": "font/woff2",
 }
 _HEADERS = {
@@ -40,6 +43,8 @@ _HEADERS = {
     "Cache-Control": "no-store",
 }
 """What keeps a page to its own server; scripts and styles stand in files, not in the page."""
+_GZIP = re.compile(r"\bgzip\b(?!\s*;\s*q=0(\.0*)?\s*(,|$))", re.IGNORECASE)
+"""Finds gzip in a header Accept-Encoding that does not refuse it."""
 _IN_ADDRESS = "A token never stands in an address, which is logged: send the header 'Authorization: Bearer TOKEN'."
 
 Handler = Callable[[BridgeConnection, Caller], Awaitable[None]]
@@ -89,14 +94,22 @@ class Site:
         return None
 
     def response(self, request: Request) -> Response:
-        """The page that a request asks for."""
-        page = self.pages[_path(request)]
-        length = {"Content-Type": page.kind, "Content-Length": str(len(page.body)), "Connection": "close"}
-        return Response(HTTPStatus.OK.value, HTTPStatus.OK.phrase, Headers({**length, **_HEADERS}), page.body)
+        """The page that a request asks for, compressed if the client takes that and it is shorter."""
+        kind, body = self.pages[_path(request)]
+        headers = {"Content-Type": kind, "Connection": "close", "Vary": "Accept-Encoding", **_HEADERS}
+        if _GZIP.search(",".join(request.headers.get_all("Accept-Encoding"))) and len(_packed(body)) < len(body):
+            body, headers["Content-Encoding"] = _packed(body), "gzip"
+        headers["Content-Length"] = str(len(body))
+        return Response(HTTPStatus.OK.value, HTTPStatus.OK.phrase, Headers(headers), body)
 
     def socket(self, request: Request | None) -> Handler | None:
         """What serves the WebSocket of a request; None for that of rosbridge."""
         return None if request is None else self.sockets.get(_path(request))
+
+
+@lru_cache(maxsize=64)
+def _packed(body: bytes) -> bytes:
+    return gzip.compress(body, mtime=0)
 
 
 def is_websocket(request: Request) -> bool:
