@@ -24,7 +24,7 @@ export function showCameras(parent) {
       const canvas = document.createElement("canvas"), text = document.createElement("span"), sees = document.createElement("span");
       canvas.setAttribute("role", "img");
       canvas.setAttribute("aria-label", `Camera ${name}`);
-      caption.append(`${name} `, sees, text);
+      caption.append(name, sees, text);
       figure.append(canvas, caption);
       canvas.drawn = 0;
       return { figure, canvas, text, sees, size: seen[name], at: -Infinity };
@@ -38,7 +38,7 @@ export function showCameras(parent) {
     try {
       const picture = await createImageBitmap(new Blob([new Uint8Array(data, 1)]));
       if (place.canvas.width !== picture.width) Object.assign(place.canvas, { width: picture.width, height: picture.height });
-      if (place.size) place.sees.textContent = `– the policy sees ${picture.width === picture.height ? "it" : "its middle square"} in ${place.size} × ${place.size} pixels `;
+      if (place.size) place.sees.textContent = `: the policy sees ${picture.width === picture.height ? "it" : "its middle square"}, ${place.size} by ${place.size} pixels`;
       place.canvas.getContext("2d").drawImage(picture, 0, 0);
       picture.close();
       place.at = performance.now();
@@ -52,7 +52,7 @@ export function showCameras(parent) {
     for (const { figure, text, at } of shown) {
       const age = (performance.now() - at) / 1000;
       figure.classList.toggle("old", age > 1);
-      if (Number.isFinite(age)) text.textContent = age > 1 ? `(old: ${age.toFixed(0)} s)` : "";
+      if (Number.isFinite(age)) text.textContent = age > 1 ? ` (old: ${age.toFixed(0)} s)` : "";
     }
   }, 500);
   return connection;

@@ -46,7 +46,11 @@ export class Connection {
       else this.on.token(ASKED);
       return;
     }
-    if (!this.ready) this.begin();
+    if (!this.ready) { // the server has let this page in: it says hello
+      this.ready = true;
+      this.delay = 250;
+      this.on.open();
+    }
     const waiting = this.waiting.get(message.id);
     if (waiting === undefined) {
       this.on.event(message);
@@ -55,13 +59,6 @@ export class Connection {
       if (message.ok) waiting.resolve(message.result);
       else waiting.reject(Object.assign(new Error(message.error), { kind: message.kind }));
     }
-  }
-
-  // The server has let this page in: it says hello.
-  begin() {
-    this.ready = true;
-    this.delay = 250;
-    this.on.open();
   }
 
   enter(token) {

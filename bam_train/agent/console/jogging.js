@@ -22,7 +22,7 @@ export class Jogging {
     this.stopHeld = false;
     this.look = performance.now();
     addEventListener("keydown", (event) => this.down(event));
-    addEventListener("keyup", (event) => this.up(event));
+    addEventListener("keyup", (event) => this.let(event.code));
     for (const name of ["blur", "pagehide", "freeze"]) addEventListener(name, () => this.release());
     document.addEventListener("visibilitychange", () => this.release());
     document.addEventListener("freeze", () => this.release());
@@ -65,10 +65,6 @@ export class Jogging {
       event.preventDefault();
       if (!event.repeat) this.hold(event.code, name);
     }
-  }
-
-  up(event) {
-    this.let(event.code);
   }
 
   hold(how, name) {

@@ -3,11 +3,10 @@
 import { showCameras } from "./cameras.js";
 import { Connection } from "./connection.js";
 import { Jogging, KEYS } from "./jogging.js";
-import { say, showAudit, showNear, showStatus, showTelemetry, showVersions } from "./panels.js";
+import { byId, say, showAudit, showNear, showStatus, showTelemetry, showVersions } from "./panels.js";
 import { Picture } from "./picture.js";
 import { Plots } from "./plots.js";
 
-const byId = (id) => document.getElementById(id);
 const LOOK = 2000; // time between two looks at versions and log [ms]
 const OLD = 1000; // age of the newest state from which on the page says that it is old [ms]
 const WRITE = 250; // least time between two sets of plots and numbers [ms]
@@ -23,13 +22,16 @@ let cameras = null;
 const connection = new Connection("/agent", { open: connected, lost, event, token: askToken });
 const picture = new Picture(byId("picture"));
 const plots = new Plots(byId("plots"));
-const jogging = new Jogging(byId("pads"), jog, held, stop);
+// A twist is not sent while the network is stuck: it would arrive too late.
+const jogging = new Jogging(byId("pads"), (twist) => connection.backlog > 2000 || connection.send(twist), held, stop);
 
 // ---- the connection
 
 function connected() {
   connection.request("watch", { on: true }).then(entered, fault);
-  connection.request("status").then(show, fault); // the first event may come later than the first image
+  connection.request("status").then((newest) => {
+    if (status.state === "not connected") show(newest); // the first event may come later than the first image
+  }, fault);
 }
 
 function entered() {
@@ -105,12 +107,11 @@ function draw() {
   showNear(newest.near ?? {}, status.guards ?? {});
 }
 
-function age() {
+setInterval(() => {
   const old = performance.now() - heard;
   byId("picture").classList.toggle("old", old > OLD);
   if (old > OLD) say("tool", Number.isFinite(old) ? `⚠ Old: no state of the robot came for ${Math.round(old / 1000)} s.` : "");
-}
-setInterval(age, 500);
+}, 500);
 
 function look() {
   if (!connection.ready || document.visibilityState !== "visible") return;
@@ -141,10 +142,7 @@ function stop() {
   const sent = performance.now();
   say("stop-note", "Stop sent …");
   connection.request("stop").then(
-    () => {
-      say("stop-note", `Stopped. The robot's side answered after ${(performance.now() - sent).toFixed(0)} ms.`);
-      byId("stop").dataset.answered = Number(byId("stop").dataset.answered ?? 0) + 1;
-    },
+    () => say("stop-note", `Stopped. The robot's side answered after ${(performance.now() - sent).toFixed(0)} ms.`),
     (error) => say("stop-note", `⚠ STOP did not arrive: ${error.message} Use the emergency stop.`),
   );
 }
@@ -168,17 +166,20 @@ for (const name of ["keydown", "keyup"]) {
   }, { capture: true });
 }
 
-byId("pause").onclick = () => order("pause", { why: "console" });
-byId("resume").onclick = () => order("resume", { why: "console" });
-byId("back-run").onclick = () => handBack(true);
-byId("back-pause").onclick = () => handBack(false);
+for (const op of ["pause", "resume"]) byId(op).onclick = () => order(op, { why: "console" });
+for (const [id, resume] of [["back-run", true], ["back-pause", false]]) {
+  byId(id).onclick = () => {
+    endDriving();
+    order("hand_back", { resume });
+  };
+}
 byId("take").onclick = async () => {
   const force = Boolean(status.owner) && owner === null;
   if (force && !(await ask(`${status.owner} drives this robot. Take it by force?`))) return;
   const result = await order("take", { force });
   if (result === null) return;
   owner = result.owner ?? "";
-  jogging.start(telemetryIsOfBase());
+  jogging.start(Boolean(picture.shown?.base));
   byId("jog").hidden = false;
   showStatus(status, true);
   enable();
@@ -187,11 +188,6 @@ byId("roll-back").onclick = async () => {
   if (await ask("Roll back to the previous version?")) await order("rollback", { why: "console" });
   look();
 };
-
-function handBack(resume) {
-  endDriving();
-  order("hand_back", { resume });
-}
 
 function ask(text) {
   const dialog = byId("question");
@@ -206,33 +202,25 @@ function ask(text) {
 }
 
 function enable() {
-  const { state } = status, mine = owner !== null, here = state !== "not connected" && role !== "watch";
+  const { state, active, names: { champion, previous } = {} } = status;
+  const mine = owner !== null, here = state !== "not connected" && role !== "watch";
   const may = {
     "pause": here && (state === "running" || state === "trial" || mine || state === "stopped by a guard"),
     "resume": here && !mine && (state === "paused" || state === "stopped by a guard"),
     "take": here && !mine && !["waiting for the robot", "stopped by a guard"].includes(state),
     "back-run": mine,
     "back-pause": mine,
-    "roll-back": here && role === "administer" && Boolean(status.names?.previous),
+    "roll-back": here && role === "administer" && Boolean(previous || (champion && champion !== active)), // from a candidate, to the champion
   };
   for (const [id, enabled] of Object.entries(may)) byId(id).disabled = !enabled;
 }
 
 // ---- driving
 
-function telemetryIsOfBase() {
-  return Boolean(picture.shown?.base);
-}
-
 function endDriving() {
   owner = null;
   jogging.end();
   byId("jog").hidden = true;
-}
-
-function jog(message) {
-  if (connection.backlog > 2000) return; // the network is stuck: what waits would arrive too late
-  connection.send(message);
 }
 
 function held(names) {
@@ -243,7 +231,7 @@ byId("speed").onclick = () => {
   jogging.speed = KEYS.speeds[(KEYS.speeds.indexOf(jogging.speed) + 1) % KEYS.speeds.length];
   byId("speed").textContent = `Speed ${jogging.speed.toFixed(2)} m/s`;
 };
-addEventListener("gamepadconnected", () => say("gamepad", "Gamepad: hold the right shoulder button and move the sticks; A closes, Y opens, B stops."));
+addEventListener("gamepadconnected", () => say("gamepad", "Gamepad: hold the right shoulder button, move the sticks; A closes, Y opens, B stops."));
 addEventListener("gamepaddisconnected", () => { jogging.release(); say("gamepad", "Gamepad: none."); });
 
 enable();

@@ -3,7 +3,7 @@
 const ICONS = {
   "waiting for the robot": "…", "paused": "❚❚", "running": "▶", "trial": "◔", "taken over": "⇄", "stopped by a guard": "✖",
 };
-const byId = (id) => document.getElementById(id);
+export const byId = (id) => document.getElementById(id);
 const short = (digest) => (digest ? digest.slice(0, 12) : "-");
 const NEAR = 0.8; // share of a limit from which on a guard is said to be near
 
@@ -47,7 +47,7 @@ function showRun(status) {
   const rate = judged.length ? `${good} of ${judged.length} (${Math.round((100 * good) / judged.length)} %)` : "none judged yet";
   const ms = (value) => (value == null ? "-" : `${value.toFixed(1)} ms`);
   const facts = {
-    "Active version": `${nameOf(status)}${short(status.active)}`,
+    "Active version": [Object.keys(status.names ?? {}).filter((name) => status.names[name] === status.active).join(", "), short(status.active)].join(" "),
     "Stage": [...new Set([status.stage ?? "-", ...(status.marks ?? [])])].join(", "),
     "Environment": status.env ?? "-",
     "Success, last 20 episodes": rate,
@@ -62,11 +62,6 @@ function showRun(status) {
   byId("run").replaceChildren(...Object.entries(facts).flatMap(([name, text]) => [element("dt", name), element("dd", text)]));
   const signs = recent.map((one) => (one === null ? "·" : one ? "✓" : "✗")).join(" ");
   say("recent", recent.length ? `Oldest to newest: ${signs}  (✓ success, ✗ none, · not judged)` : "");
-}
-
-function nameOf(status) {
-  const names = Object.entries(status.names ?? {}).filter(([, digest]) => digest === status.active).map(([name]) => name);
-  return names.length ? `${names.join(", ")} ` : "";
 }
 
 function showGuardTable(guards) {
@@ -107,13 +102,8 @@ export function showTelemetry({ tool, base, state }) {
 }
 
 export function showVersions(versions, status) {
-  const lines = versions.map((one) => [
-    one.digest === status.active ? "▶ acts" : "",
-    [].concat(one.names ?? []).join(", ") || "-",
-    short(one.digest),
-    time(one.added),
-    one.env ?? "-",
-    one.algorithm ?? "-",
+  const lines = versions.map(({ digest, names, added, env, algorithm }) => [
+    digest === status.active ? "▶ acts" : "", names?.join(", ") || "-", short(digest), time(added), env ?? "-", algorithm ?? "-",
   ]);
   rows(byId("versions"), ["", "names", "digest", "added", "environment", "algorithm"], lines);
 }

@@ -38,13 +38,13 @@ export class Picture {
 
   draw(telemetry) {
     const { canvas } = this, scale = devicePixelRatio || 1, width = canvas.clientWidth, height = canvas.clientHeight;
+    if (telemetry.tool && telemetry !== this.shown) this.trail = [...this.trail.slice(1 - TRAIL), telemetry.tool];
     this.shown = telemetry;
     if (width === 0) return;
-    for (const [name, size] of [["width", width], ["height", height]]) if (canvas[name] !== Math.round(size * scale)) canvas[name] = Math.round(size * scale);
     const style = getComputedStyle(canvas), context = canvas.getContext("2d");
     Object.assign(this, { context, width, height, solids: [], colour: (name) => style.getPropertyValue(`--${name}`) });
-    context.setTransform(scale, 0, 0, scale, 0, 0);
-    context.clearRect(0, 0, width, height);
+    Object.assign(canvas, { width: width * scale, height: height * scale }); // which clears it
+    context.scale(scale, scale);
     context.lineCap = context.lineJoin = "round";
     context.font = "13px system-ui, sans-serif";
     if (telemetry.tubes) this.arm(telemetry);
@@ -111,7 +111,7 @@ export class Picture {
     }]);
   }
 
-  arm({ tubes, tool, hand, object, box, table, state }) {
+  arm({ tubes, hand, object, box, table, state }) {
     const size = tubes.reduce((all, [x, y, z, u, v, w]) => all + Math.hypot(u - x, v - y, w - z), 0); // all its links [m]
     const floor = table ?? 0, half = 0.1 * Math.ceil(3.6 * size), onFloor = ([x, y]) => [x, y, floor];
     this.look([0.2 * size, 0, 0.19 * size], 1.75 * size);
@@ -141,8 +141,6 @@ export class Picture {
       this.box(object.slice(0, 3), turned, [EDGE / 2, EDGE / 2, EDGE / 2], RED);
     }
     this.paint();
-    if (!tool) return;
-    this.trail = [...this.trail.slice(1 - TRAIL), tool];
     this.path(this.trail, this.colour("act"), 1.5);
   }
 

@@ -31,6 +31,8 @@ FACTS = {
     "why": "because a test says so",
     "stage": "full",
     "robot": "a fake arm",
+    "name": "arm 7",
+    "address": "ws://10.0.0.9:9090",
     "simulated": True,
     "env": "bam/pick-v0",
     "period": 0.05,
@@ -71,8 +73,8 @@ class FakeAgent:
     `commands` that moved the arm.
     """
 
-    def __init__(self, tokens=None, cameras=None, port=0):
-        self.feed = CameraFeed(cameras or {})
+    def __init__(self, tokens=None, cameras=None, port=0, seen=None):
+        self.feed = CameraFeed(cameras or {}, seen)
         self._folder = tempfile.TemporaryDirectory()
         self.incoming = Path(self._folder.name)
         self._socket = AgentSocket(self)
@@ -83,7 +85,7 @@ class FakeAgent:
         self.joints = np.array([[*ARM_HOME, 0.085]])
         self.state, self.owner, self.active = "running", None, "a" * 64
         self.orders, self.commands, self.twists = [], [], []
-        self.measures = True  # whether the robot sends states
+        self.measures = self.reports = True  # whether the robot sends states, and the agent its status
         self.refusal = ""  # the answer to every request but a stop
         self.driver = None  # the socket that has taken over
         self._listeners = {}
@@ -140,8 +142,6 @@ class FakeAgent:
 
     def listen(self, kind, listener):
         self._listeners.setdefault(kind, []).append(listener)
-        if kind == "status":
-            listener({"event": "status", "status": self.status()})
         return lambda: self._listeners[kind].remove(listener)
 
     def tell(self, kind, event):
@@ -155,7 +155,7 @@ class FakeAgent:
                 return
             if self.measures:
                 self.tell("telemetry", self.telemetry.message(self.robot_state(), time.time(), command=self.joints))
-            if number % 5 == 0:
+            if self.reports and number % 5 == 0:
                 self.tell("status", {"status": self.status()})
 
     def left(self, person):
@@ -179,6 +179,8 @@ class FakeAgent:
     def ask(self, op, arguments, person, progress):
         if self.refusal:
             raise RequestRefused(self.refusal)
+        if op == "status":
+            return self.status()
         if op == "versions":
             return {"versions": VERSIONS}
         if op == "audit":

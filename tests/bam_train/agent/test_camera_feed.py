@@ -48,7 +48,7 @@ def look():
     servers = []
 
     def open_socket(**cameras):
-        feed = CameraFeed(cameras)
+        feed = CameraFeed(cameras, {"wrist": 64})
         servers.append(
             BridgeServer(port=0, tokens=Tokens(otherwise="administer"), site=Site({}, {"/camera": feed.serve}))
         )
@@ -77,7 +77,7 @@ def until(condition):
 def test_a_picture_comes_when_the_one_before_was_drawn_and_it_is_the_newest(look):
     wrist, cell = Camera(), Camera()
     with look(wrist=wrist, cell=cell) as client:
-        assert json.loads(client.recv(DEADLINE)) == {"cameras": ["wrist", "cell"]}
+        assert json.loads(client.recv(DEADLINE)) == {"cameras": ["wrist", "cell"], "seen": {"wrist": 64}}
         first = {message[0]: int(message[1:]) for message in (pictures(client), pictures(client))}
         assert set(first) == {0, 1}
         seen = wrist.number

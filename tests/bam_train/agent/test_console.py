@@ -2,18 +2,21 @@
 
 import io
 import time
+from pathlib import Path
 
 import pytest
 from PIL import Image
 
 from bam_envs.live.camera import CameraImage
 from bam_envs.rosbridge.tokens import Tokens
+from bam_train.agent.agent_states import State
 from bam_train.agent.front.jog import FRESH
 from tests.bam_train.agent.browsers import LEAVINGS, browser, page, until
 from tests.bam_train.agent.fake_agent import FakeAgent
 from tests.bam_train.cli.test_play import CODES, COMMANDS
 
 __all__ = ["browser", "page"]  # fixtures from elsewhere
+DRAWINGS, LEGIBILITY = (Path(__file__).with_name(f"{name}.js").read_text() for name in ("drawings", "legibility"))
 ROLES = Tokens({"watching": "watch", "driving": "drive", "secret": "administer"})
 
 
@@ -34,8 +37,12 @@ def driven(page, agent):
 def test_the_page_shows_everything_and_asks_nobody_else(page, agent):
     page.requested()
     page.open(agent.url).shows("state", "▶ running")
-    page.shows("tool", "Tool at x, y, z:")
-    page.shows("guards", "✓ clear: joint speed 0.00 rad/s, limit 1; altered 3, held 0, stopped 0")
+    assert (page.text("name"), page.text("robot")) == ("arm 7", "simulated · a fake arm · ws://10.0.0.9:9090")
+    page.shows("tool", "; gripper open by 85 mm")
+    page.shows(
+        "guards", "✓ joint speed\n0.00 rad/s, limit 1\naltered 3\n✓ tool speed\n0.00 m/s, limit 0.25\nheld 1, stopped 2"
+    )
+    page.shows("plots", "gripper width [m]\n── gripper_width0.085")
     page.shows("versions", "champion")
     page.shows("audit", "running -> paused: paused by anna (anna at 10.0.0.7:4242)")
     for text in ("4 of 5 (80 %)", "1.3 ms", "0.5 ms of 50.0 ms", "2 of 1000", "champion aaaaaaaaaaaa"):
@@ -48,6 +55,37 @@ def test_the_page_shows_everything_and_asks_nobody_else(page, agent):
         until(lambda canvas=canvas: page.run(drawn, canvas), f"a drawing on {canvas}")
     assert {url.split("/")[2] for url in page.requested()} == {f"127.0.0.1:{agent.server.port}"}
     assert page.complaints() == []
+
+
+def test_a_page_knows_the_state_before_the_agent_reports_again(page, agent):
+    agent.reports = False
+    page.open(agent.url).shows("state", "▶ running")
+    page.shows("why", "because a test says so")
+
+
+def test_without_the_library_of_the_charts_the_page_says_so_and_everything_else_works(page, agent):
+    page.cdp("Network.enable")
+    page.cdp("Network.setBlockedURLs", urls=["*uPlot*"])
+    page.open(agent.url).shows("plots", "The library that draws the charts is missing: install bam-train again")
+    page.shows("tool", "Tool at x, y, z:")
+    page.click("stop")
+    page.shows("state", "❚❚ paused")
+    page.cdp("Network.setBlockedURLs", urls=[])
+    page.complaints()  # of the blocked files
+
+
+def test_the_picture_has_the_gripper_as_it_is_open_and_the_object_where_it_is(page, agent):
+    page.open(agent.url).shows("tool", "Tool at x, y, z:")
+    message = agent.telemetry.message(agent.robot_state(), 0.0)
+    cube = [0.45, -0.3, 0.02, 0, 0, 0, 1]
+    half, shut = ({**message, "state": {"gripper_width": {"gripper_width": width}}} for width in (0.04, 0.0))
+    others = message, half, shut, {**shut, "object": cube}, {**shut, "object": [None, *cube[1:]]}
+    shown = page.browser.execute_async_script(DRAWINGS, [{**message, "hand": None}, *others])
+    nothing, wide, narrow, closed, with_cube, unknown = shown
+    assert nothing == 0
+    assert wide > narrow > closed > 100
+    assert with_cube > closed + 100
+    assert unknown == closed
 
 
 def test_the_stop_button_and_the_space_bar_stop_whatever_has_the_focus(page, agent):
@@ -246,6 +284,21 @@ def test_a_phone_shows_state_and_stop_without_scrolling_sideways(page, agent):
     page.shows("state", "paused")
 
 
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_every_text_and_control_is_legible_in_every_state(page, agent, scheme):
+    page.cdp("Emulation.setEmulatedMedia", features=[{"name": "prefers-color-scheme", "value": scheme}])
+    page.open(agent.url).shows("versions", "champion")
+    page.run("document.querySelectorAll('details').forEach((one) => { one.open = true; })")
+    page.shows("plots", "gripper_width")
+    for state in (*(one.value for one in State), "not connected"):
+        page.run("document.body.dataset.state = arguments[0]", state)
+        assert page.run(LEGIBILITY) == []
+    page.click("take")
+    page.shows("owner", "You drive")
+    assert page.run(LEGIBILITY) == []
+    page.cdp("Emulation.setEmulatedMedia", features=[])
+
+
 def test_the_page_is_there_for_a_keyboard_and_a_screen_reader(page, agent):
     page.open(agent.url).shows("state", "running")
     names, focused = set(), "return document.activeElement.id || document.activeElement.tagName"
@@ -356,7 +409,7 @@ class FakeCamera:
 
 
 def test_pictures_of_cameras(page):
-    with FakeAgent(cameras={"wrist": FakeCamera("red"), "cell": FakeCamera("blue")}) as agent:
+    with FakeAgent(cameras={"wrist": FakeCamera("red"), "cell": FakeCamera("blue")}, seen={"wrist": 64}) as agent:
         page.open(agent.url)
         drawn = "return [...document.querySelectorAll('#cameras canvas')].map((one) => one.drawn)"
         until(lambda: page.run(drawn) and min(page.run(drawn)) > 5, "pictures")
@@ -364,7 +417,7 @@ def test_pictures_of_cameras(page):
         middle += "return [...c.getContext('2d').getImageData(320, 240, 1, 1).data]"
         assert page.run(middle, 0)[0] > 240
         assert page.run(middle, 1)[2] > 240
-        assert page.text("cameras").split() == ["wrist", "cell"]
+        assert page.text("cameras") == "wrist: the policy sees its middle square, 64 by 64 pixels\ncell"
         page.click("stop")
         page.shows("state", "paused")
         assert page.complaints() == []

@@ -10,6 +10,7 @@ import pytest
 from bam_envs.core.kinematics import UR10E
 from bam_envs.core.robot import RobotState
 from bam_envs.robots.mir100 import base_spec
+from bam_envs.robots.ur import ur_model, ur_spec
 from bam_envs.robots.ur5e import GEOMETRY, arm_spec
 from bam_envs.safety.guard import Limits
 from bam_envs.testing import ARM_HOME
@@ -33,7 +34,8 @@ def base_state(distance=5.0, speeds=(0.25, 0.0)):
 
 def test_the_message_of_an_arm():
     message = Telemetry(ARM, Limits()).message(arm_state(), 12.5, command=np.array([[*ARM_HOME, 0.08]]), age=0.02)
-    assert list(message) == ["event", "t", "state", "units", "command", "tool", "near", "tubes"]
+    picture = ["tubes", "hand", "box", "table"]
+    assert list(message) == ["event", "t", "state", "units", "command", "tool", "near", *picture]
     assert (message["event"], message["t"]) == ("telemetry", 12.5)
     assert message["state"]["joint_position"]["elbow_joint"] == ARM_HOME[2]
     assert message["state"]["joint_velocity"]["elbow_joint"] == 0.0
@@ -44,11 +46,28 @@ def test_the_message_of_an_arm():
     assert message["near"]["state age"] == {"value": 0.02, "limit": 0.1, "unit": "s", "share": 0.2}
 
 
-def test_the_picture_of_an_arm_begins_at_its_base_and_ends_at_its_tool():
+def test_the_picture_of_an_arm_begins_at_its_base_and_ends_at_the_flange_on_which_the_gripper_is():
     message = Telemetry(ARM, Limits()).message(arm_state(), 0.0)
     assert [len(tube) for tube in message["tubes"]] == [7] * 8
     assert message["tubes"][0] == [0.0, 0.0, 0.0, 0.0, 0.0, 0.1625, 0.07]
-    np.testing.assert_allclose(message["tubes"][6][3:6], message["tool"], atol=2e-5)
+    np.testing.assert_allclose(message["tubes"][6][3:6], message["hand"][:3], atol=2e-5)
+    x, y, z, w = message["hand"][3:]
+    way = np.array([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)])  # the z axis
+    np.testing.assert_allclose(message["hand"][:3] + GEOMETRY.tool * way, message["tool"], atol=2e-5)
+    assert "hand" not in Telemetry(ur_spec(ur_model("ur5e"), 0.05, False), Limits()).message(arm_state(), 0.0)
+
+
+def test_the_picture_has_the_object_the_table_and_the_box_in_which_the_tool_works():
+    state, limits = arm_state(), Limits(box_x_max=0.6, table_height=-0.1)
+    state.signals |= {"object_position": np.array([[0.5, 0.1, 0.02]])}
+    state.signals |= {"object_quaternion": np.array([[math.cos(0.2), 0.0, 0.0, math.sin(0.2)]])}
+    workspace = np.array([[0.3, -0.25, 0.016], [0.7, 0.25, 0.35]])
+    message = Telemetry(arm_spec("ur5e", with_object=True), limits, workspace=workspace).message(state, 0.0)
+    assert message["object"] == [0.5, 0.1, 0.02, 0.0, 0.0, 0.19867, 0.98007]
+    assert (message["box"], message["table"]) == ([0.3, -0.25, 0.016, 0.6, 0.25, 0.35], -0.1)
+    anywhere = Telemetry(ARM, limits).message(arm_state(), 0.0)
+    assert anywhere["box"] == [-2.0, -2.0, -0.1, 0.6, 2.0, 2.0]
+    assert "object" not in anywhere
 
 
 def test_the_speed_of_the_tool_is_that_of_its_joints():
