@@ -9,7 +9,6 @@ from __future__ import annotations
 import hashlib
 import shutil
 import subprocess
-import sys
 import tarfile
 import tempfile
 from pathlib import Path
@@ -60,7 +59,7 @@ class CustomBuildHook(BuildHookInterface[Any]):
 
     def _fetch(self) -> None:
         with tempfile.TemporaryDirectory() as work:
-            _run_npm("pack", RELEASE, "--silent", "--ignore-scripts", cwd=work)
+            _run_npm("pack", RELEASE, "--loglevel=error", "--ignore-scripts", cwd=work)
             with tarfile.open(next(Path(work).glob("*.tgz"))) as archive:
                 members = {name: archive.extractfile(f"package/{member}") for name, (member, _) in FILES.items()}
                 content = {name: b"" if member is None else member.read() for name, member in members.items()}
@@ -75,7 +74,12 @@ class CustomBuildHook(BuildHookInterface[Any]):
 
 def _run_npm(*arguments: str, cwd: str) -> None:
     """Run the npm of this computer, or the one that `CustomBuildHook.dependencies` brought."""
-    options: dict[str, Any] = {"cwd": cwd, "stdin": subprocess.DEVNULL, "stdout": sys.stderr, "timeout": _LONGEST}
+    options: dict[str, Any] = {
+        "cwd": cwd,
+        "stdin": subprocess.DEVNULL,
+        "stdout": subprocess.DEVNULL,
+        "timeout": _LONGEST,
+    }
     if found := shutil.which("npm"):
         subprocess.run([found, *arguments], check=True, **options)
     else:

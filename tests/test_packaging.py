@@ -2,6 +2,7 @@
 
 import email
 import importlib.metadata
+import importlib.util
 import os
 import re
 import subprocess
@@ -12,6 +13,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parent.parent
+NPM = '#!/bin/sh\n[ "$1 $2" = "pack uplot@1.6.32" ] && tar -czf it.tgz -C {0} package\n'
 
 
 @pytest.fixture(scope="module")
@@ -55,10 +57,63 @@ def test_the_wheel_holds_two_packages_and_nothing_else(wheel):
         "bam_train/agent/console/console.css",
         "bam_train/agent/console/main.js",
         "bam_train/agent/console/keys.json",
+        "bam_train/agent/console/uplot/uPlot.iife.min.js",
+        "bam_train/agent/console/uplot/uPlot.min.css",
+        "bam_train/agent/console/uplot/uPlot.LICENSE.txt",
     ],
 )
 def test_the_wheel_holds_types_models_presets_and_the_service(wheel, name):
     assert name in wheel.namelist()
+
+
+@pytest.fixture
+def build(tmp_path, monkeypatch):
+    """Runs the build hook in an empty tree, with an npm that has what is installed, with `change` at its end."""
+    spec = importlib.util.spec_from_file_location("hatch_build", ROOT / "hatch_build.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    tree, programs = tmp_path / "tree", tmp_path / "programs"
+    for folder in ((tree / module.FOLDER).parent, programs, tmp_path / "package" / "dist"):
+        folder.mkdir(parents=True)
+
+    def run(version, change=b"", npm=NPM):
+        for name, (member, _) in module.FILES.items():
+            (tmp_path / "package" / member).write_bytes((ROOT / module.FOLDER / name).read_bytes() + change)
+        (programs / "npm").write_text(npm.format(tmp_path))
+        (programs / "npm").chmod(0o755)
+        monkeypatch.setenv("PATH", f"{programs}:{os.environ['PATH']}")
+        data = {"artifacts": []}
+        module.CustomBuildHook(str(tree), {}, None, None, "", "wheel").initialize(version, data)
+        assert data == {"artifacts": ["/bam_train/agent/console/uplot/"]}
+        return sorted(path.name for path in (tree / module.FOLDER).glob("*"))
+
+    return run
+
+
+def test_the_chart_library_comes_from_npm_once(build):
+    names = ["uPlot.LICENSE.txt", "uPlot.iife.min.js", "uPlot.min.css"]
+    assert build("standard") == names
+    assert build("standard", npm="#!/bin/sh\nexit 1\n") == names
+
+
+@pytest.mark.parametrize(
+    ("options", "reason"),
+    [
+        ({"change": b" "}, "its uPlot.iife.min.js has another SHA-256 than the release had."),
+        ({"npm": "#!/bin/sh\nexit 7\n"}, "returned non-zero exit status 7."),
+    ],
+)
+def test_without_the_chart_library_there_is_no_wheel_but_an_editable_install_with_a_warning(
+    build, capsys, options, reason
+):
+    text = "uplot@1.6.32, the chart library of the console, could not be fetched with npm: "
+    with pytest.raises(RuntimeError) as error:
+        build("standard", **options)
+    assert str(error.value).startswith(text)
+    assert str(error.value).endswith(reason)
+    assert build("editable", **options) == []
+    said = "".join(capsys.readouterr())
+    assert f"{reason} Install again when the npm registry can be reached." in said
 
 
 def test_every_source_file_is_in_the_wheel(wheel):

@@ -84,7 +84,11 @@ def driven(shown):
 def test_what_it_shows(shown, agent):
     agent.run()
     shown.shows("state", "▶ running")
-    for text in ("champion", "full", "bam/pick-v0", "simulated", "ms of 50.0 ms"):
+    assert shown.text("name") == "ur5e"
+    assert shown.text("robot").startswith(
+        "simulated · ur5e, served in real time; it rests 0.1 s after the last command · ws://"
+    )
+    for text in ("champion", "full", "bam/pick-v0", "ms of 50.0 ms"):
         shown.shows("run", text)
     for text in ("joint speed", "tool speed", "workspace box", "state age", "held"):
         shown.shows("guards", text)

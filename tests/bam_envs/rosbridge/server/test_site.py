@@ -2,6 +2,7 @@
 
 import asyncio
 import contextlib
+import gzip
 import json
 import socket
 import ssl
@@ -57,7 +58,10 @@ def get(server, path, **headers):
     connection.request("GET", path, headers=headers)
     response = connection.getresponse()
     with contextlib.closing(connection):
-        return response.status, dict(response.getheaders()), response.read().decode()
+        body = response.read()
+        if response.headers["Content-Encoding"] == "gzip":
+            body = gzip.decompress(body)
+        return response.status, dict(response.getheaders()), body.decode()
 
 
 def opened(server, path="/echo", token=None, **headers):
@@ -93,6 +97,25 @@ def test_a_page_is_one_of_a_table_or_none(new_server, path, caplog):
     status, _, body = get(new_server(), path)
     assert (status, body) == (404, f"There is no {path!r} here.\n")
     assert messages(caplog) == [f"127.0.0.1 was refused: There is no {path!r} here."]
+
+
+@pytest.mark.parametrize(
+    ("accepts", "encoding"),
+    [
+        ("gzip, deflate", "gzip"),
+        ("br;q=1, GZIP;q=0.5", "gzip"),
+        ("gzip;q=0, deflate", None),
+        ("xgzip", None),
+        ("", None),
+    ],
+)
+def test_a_page_is_compressed_for_who_takes_that(new_server, accepts, encoding):
+    site = Site({"/": Page("text/plain", b"hello " * 99), "/short": Page("text/plain", b"hello")})
+    server, accept = new_server(site=site), {"Accept-Encoding": accepts}
+    status, headers, body = get(server, "/", **accept)
+    assert (status, headers.get("Content-Encoding"), body) == (200, encoding, "hello " * 99)
+    assert (int(headers["Content-Length"]) < 99, headers["Vary"]) == (encoding is not None, "Accept-Encoding")
+    assert get(server, "/short", **accept)[2] == "hello"
 
 
 def test_the_pages_of_a_folder(tmp_path):
