@@ -46,12 +46,12 @@ site: $(VENV)/.dev
 clean:
 	rm -rf $(VENV) build dist runs .pytest_cache .mypy_cache .ruff_cache .hypothesis
 
-$(VENV)/.run: pyproject.toml constraints.txt | $(BIN)/python
+$(VENV)/.run: pyproject.toml hatch_build.py constraints.txt | $(BIN)/python
 	@echo "Installing bam-train with simulation and training in $(VENV); the first time takes a few minutes."
 	$(PIP_INSTALL) -e ".[sim,train]"
 	@touch $@
 
-$(VENV)/.dev: pyproject.toml constraints.txt | $(BIN)/python
+$(VENV)/.dev: pyproject.toml hatch_build.py constraints.txt | $(BIN)/python
 	@echo "Installing bam-train and the tools of its tests in $(VENV); the first time takes a few minutes."
 	$(PIP_INSTALL) -e ".[dev]"
 	@touch $@ $(VENV)/.run

@@ -5,10 +5,7 @@ import { Connection } from "./connection.js";
 export function showCameras(parent) {
   let shown = [];
   const connection = new Connection("/camera", {
-    open: () => {},
-    lost: () => {},
-    token: () => {}, // the other socket asks for it
-    event: (message) => {
+    event: (message) => { // the other socket asks for a token
       if (message instanceof ArrayBuffer) draw(message);
       else if (message.cameras) list(message.cameras, message.seen);
       else if (message.camera !== undefined && shown[message.camera]) {
@@ -38,7 +35,7 @@ export function showCameras(parent) {
     try {
       const picture = await createImageBitmap(new Blob([new Uint8Array(data, 1)]));
       if (place.canvas.width !== picture.width) Object.assign(place.canvas, { width: picture.width, height: picture.height });
-      if (place.size) place.sees.textContent = `: the policy sees ${picture.width === picture.height ? "it" : "its middle square"}, ${place.size} by ${place.size} pixels`;
+      if (place.size) place.sees.textContent = `: ${picture.width === picture.height ? "as the policy sees it" : "the policy sees its middle square"}, ${place.size} by ${place.size} pixels`;
       place.canvas.getContext("2d").drawImage(picture, 0, 0);
       picture.close();
       place.at = performance.now();

@@ -5,10 +5,10 @@ const REFUSED = 1008; // close code for a client without a right token
 const ASKED = "This robot asks for a token.";
 
 export class Connection {
-  // on: {open, lost(reason), event(message), token(reason)}; `token` asks for a token, which is given to `enter`.
+  // on: {open, lost(reason), event(message), token(reason)} or some of them; `token` asks for a token, for `enter`.
   constructor(path, on) {
     this.url = `${location.protocol === "https:" ? "wss" : "ws"}://${location.host}${path}`;
-    this.on = on;
+    this.on = { open() {}, lost() {}, token() {}, ...on };
     this.waiting = new Map();
     this.number = 0;
     this.wantsToken = false;
@@ -120,9 +120,5 @@ export class Connection {
         reject(new Error("There is no connection to the robot."));
       }
     });
-  }
-
-  get backlog() {
-    return this.socket.bufferedAmount || 0;
   }
 }

@@ -23,7 +23,9 @@ const connection = new Connection("/agent", { open: connected, lost, event, toke
 const picture = new Picture(byId("picture"));
 const plots = new Plots(byId("plots"));
 // A twist is not sent while the network is stuck: it would arrive too late.
-const jogging = new Jogging(byId("pads"), (twist) => connection.backlog > 2000 || connection.send(twist), held, stop);
+const send = (twist) => connection.socket.bufferedAmount > 2000 || connection.send(twist);
+const held = (names) => say("jog-state", names.length ? `Moving: ${names.join(", ")}` : "Hold a key or button to move the robot.");
+const jogging = new Jogging(byId("pads"), send, held, stop);
 
 // ---- the connection
 
@@ -127,14 +129,10 @@ function fault(error) {
 
 // ---- orders
 
-async function order(op, fields) {
-  try {
-    fault("");
-    return await connection.request(op, fields);
-  } catch (error) {
-    fault(error);
-    return null;
-  }
+// The result of a request, or undefined if it was refused, which the page says.
+function order(op, fields) {
+  fault("");
+  return connection.request(op, fields).catch(fault);
 }
 
 function stop() {
@@ -177,7 +175,7 @@ byId("take").onclick = async () => {
   const force = Boolean(status.owner) && owner === null;
   if (force && !(await ask(`${status.owner} drives this robot. Take it by force?`))) return;
   const result = await order("take", { force });
-  if (result === null) return;
+  if (result === undefined) return;
   owner = result.owner ?? "";
   jogging.start(Boolean(picture.shown?.base));
   byId("jog").hidden = false;
@@ -221,10 +219,6 @@ function endDriving() {
   owner = null;
   jogging.end();
   byId("jog").hidden = true;
-}
-
-function held(names) {
-  say("jog-state", names.length ? `Moving: ${names.join(", ")}` : "Hold a key or button to move the robot.");
 }
 
 byId("speed").onclick = () => {

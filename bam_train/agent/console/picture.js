@@ -82,9 +82,10 @@ export class Picture {
   // A square of ground with lines every `step` [m].
   ground([x, y, z], half, step) {
     this.path([[-1, -1], [1, -1], [1, 1], [-1, 1]].map(([u, v]) => [x + u * half, y + v * half, z]), this.colour("wood"), 0, true);
+    const grid = this.colour("grid");
     for (let at = -half; at <= half + 1e-9; at += step) {
-      this.path([[x + at, y - half, z], [x + at, y + half, z]], this.colour("grid"), 1);
-      this.path([[x - half, y + at, z], [x + half, y + at, z]], this.colour("grid"), 1);
+      this.path([[x + at, y - half, z], [x + at, y + half, z]], grid, 1);
+      this.path([[x - half, y + at, z], [x + half, y + at, z]], grid, 1);
     }
   }
 
@@ -114,7 +115,7 @@ export class Picture {
   arm({ tubes, hand, object, box, table, state }) {
     const size = tubes.reduce((all, [x, y, z, u, v, w]) => all + Math.hypot(u - x, v - y, w - z), 0); // all its links [m]
     const floor = table ?? 0, half = 0.1 * Math.ceil(3.6 * size), onFloor = ([x, y]) => [x, y, floor];
-    this.look([0.2 * size, 0, 0.19 * size], 1.75 * size);
+    this.look([0.2 * size, 0, 0.16 * size], 1.75 * size);
     this.ground([0.22 * size, 0, floor], half, 0.1);
     if (box?.every((value) => value !== null && Math.abs(value) < size)) {
       const [x, y, z, u, v, w] = box;

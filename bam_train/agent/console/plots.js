@@ -23,7 +23,7 @@ export class Plots {
     for (const [name, values] of Object.entries({ ...(tool && { tool: { x, y, z } }), ...state })) {
       const labels = Object.keys(values);
       if (labels.length > LINES.length) continue;
-      if (!this.charts.has(name)) this.charts.set(name, this.chart(name, labels, [...new Set(Object.values(units[name] ?? { x: "m" }))]));
+      if (!this.charts.has(name)) this.charts.set(name, this.chart(name, labels, [...new Set(Object.values(units[name] ?? ["m"]))]));
       const { rows } = this.charts.get(name);
       rows.push([t, ...Object.values(values)]);
       while (rows[0][0] < t - SPAN) rows.shift();
@@ -47,8 +47,7 @@ export class Plots {
       axes: [{ ...axis, values: (_, at) => at.map((one) => `${one} s`) }, { ...axis, size: 52 }],
       series: [{}, ...lines],
     }, [[], ...labels.map(() => [])], figure);
-    chart.ctx.canvas.setAttribute("role", "img");
-    chart.ctx.canvas.ariaLabel = `${name} over the last ${SPAN} s`;
+    Object.assign(chart.ctx.canvas, { role: "img", ariaLabel: `${name} over the last ${SPAN} s` });
     new ResizeObserver(() => chart.setSize({ width: figure.clientWidth, height: HEIGHT })).observe(figure);
     return { chart, rows: [] };
   }

@@ -98,8 +98,10 @@ class _Arm:
         floor = limits.table_height if has_gripper else -math.inf
         self._low = limits.box_x_min, limits.box_y_min, floor if limits.box_z_min is None else limits.box_z_min
         self._high = limits.box_x_max, limits.box_y_max, limits.box_z_max
-        low, high = (self._low, self._high) if workspace is None else workspace
-        self._box = _plain([*np.maximum(self._low, low), *np.minimum(self._high, high)])
+        box = np.array([self._low, self._high])
+        if workspace is not None:
+            box = np.stack([np.maximum(box[0], workspace[0]), np.minimum(box[1], workspace[1])])
+        self._box = _plain(box.ravel())
 
     def picture(self, state: RobotState) -> dict[str, Any]:
         q, geometry = _numbers(state, self._positions), self._geometry

@@ -90,7 +90,7 @@ def test_what_it_shows(shown, agent):
     )
     for text in ("champion", "full", "bam/pick-v0", "ms of 50.0 ms"):
         shown.shows("run", text)
-    for text in ("joint speed", "tool speed", "workspace box", "state age", "held"):
+    for text in ("joint speed", "tool speed", "workspace box", "state age", "m/s, limit 0.25"):
         shown.shows("guards", text)
     shown.shows("versions", "▶ acts")
     shown.shows("audit", "-> running: resumed by anna@laptop (anna@laptop at 127.0.0.1:")
