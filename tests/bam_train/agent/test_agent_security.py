@@ -400,7 +400,7 @@ def test_deep_json(agent, refusals):
 def test_nonsense_on_the_socket_of_the_cameras(agent):
     """Which is passed over: nothing is asked for there but the next picture."""
     with agent.open("/camera", token="www") as client:
-        assert receive(client) == {"cameras": []}
+        assert receive(client) == {"cameras": [], "seen": {}}
         for text in (
             "[" * 60_000,
             '{"op": "next", "camera": [' + "[" * 60_000,
