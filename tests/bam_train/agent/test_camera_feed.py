@@ -13,7 +13,9 @@ from bam_envs.core.errors import StaleState
 from bam_envs.live.camera import CameraImage
 from bam_envs.rosbridge.server import BridgeServer, Site
 from bam_envs.rosbridge.tokens import Tokens
+from bam_train.agent.agent_messages import Front
 from bam_train.agent.front.camera_feed import CameraFeed, jpeg
+from bam_train.agent.front.front_process import FrontProcess
 
 DEADLINE = 10.0
 
@@ -134,3 +136,22 @@ def test_greys_distances_and_what_is_transparent():
     assert abs(int(near[4, 1]) - 127) < 12
     assert near[4, 6] > 240
     assert np.asarray(Image.open(io.BytesIO(jpeg(np.zeros((8, 8, 4), np.uint8))))).shape == (8, 8, 3)
+
+
+@pytest.mark.parametrize(
+    ("env_kwargs", "seen"),
+    [
+        ({}, {}),
+        ({"camera": ["wrist"]}, {"wrist": 64}),
+        ({"camera": "front", "image_size": 32, "depth": True}, {"front": 32, "front_depth": 32}),
+    ],
+)
+def test_the_console_shows_the_cameras_that_the_policy_sees(tmp_path, env_kwargs, seen):
+    where = {"robot": "ws://127.0.0.1:9090", "bind": "127.0.0.1", "port": 0, "folder": str(tmp_path)}
+    files = dict.fromkeys(("profile", "ca_file", "robot_token_file", "cert", "key", "token_file"))
+    options = Front("bam/pick-v0", env_kwargs, **where, **files, lease=30.0, command_timeout=0.2)
+    front = FrontProcess(options, lambda message: None)
+    assert front.seen() == seen
+    assert {name: camera.source.name for name, camera in front.cameras().items()} == dict(zip(seen, seen, strict=True))
+    assert front.hub.status()["name"] == "ur5e"
+    assert front.hub.status()["address"] == "ws://127.0.0.1:9090"
