@@ -86,6 +86,7 @@ class FakeAgent:
         self.state, self.owner, self.active = "running", None, "a" * 64
         self.orders, self.commands, self.twists = [], [], []
         self.measures = self.reports = True  # whether the robot sends states, and the agent its status
+        self.names = None  # of versions; None: the active one is the champion, and there was one before it
         self.refusal = ""  # the answer to every request but a stop
         self.driver = None  # the socket that has taken over
         self._listeners = {}
@@ -126,7 +127,7 @@ class FakeAgent:
 
     def status(self):
         names = {"champion": self.active, "previous": "b" * 64}
-        changing = {"state": self.state, "active": self.active, "names": names, "owner": self.owner}
+        changing = {"state": self.state, "active": self.active, "names": self.names or names, "owner": self.owner}
         return {**FACTS, **changing, "since": time.time() - 5, "owner_until": 20.0 if self.owner else None}
 
     def _drive(self):

@@ -132,6 +132,15 @@ def test_the_buttons(page, agent):
     assert orders == [(*order, "console") for order in expected]
 
 
+def test_a_first_candidate_can_be_rolled_back_and_a_first_champion_cannot(page, agent):
+    agent.names = {"champion": agent.active}
+    page.open(agent.url).shows("state", "▶ running")
+    assert not page.element("roll-back").is_enabled()
+    agent.names, agent.state = {"champion": "b" * 64, "candidate": agent.active}, "trial"
+    page.shows("state", "◔ trial")
+    assert page.element("roll-back").is_enabled()
+
+
 def enter(page, agent, token):
     """Open the page and show a token."""
     page.open(agent.url).shows("entry-reason", "This robot asks for a token.")
