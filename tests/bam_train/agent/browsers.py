@@ -84,6 +84,17 @@ class Page:
         if kind == "rawKeyDown" and key == "Enter":
             self.cdp("Input.dispatchKeyEvent", type="char", key=key, text="\r")
 
+    def move(self, key, moves):
+        """Hold a key until the robot moves; a page that stood still on a busy computer has let go of it: press again."""
+
+        def is_held():
+            if self.text("jog-state").startswith("Hold a key"):
+                self.let(key)
+                self.press(key)
+            return moves()
+
+        until(is_held, "a motion")
+
     def tap(self, key):
         self.press(key)
         self.let(key)

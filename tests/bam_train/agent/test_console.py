@@ -174,8 +174,7 @@ def test_a_robot_that_somebody_else_drives_is_taken_by_force_only(page):
 def test_the_robot_moves_only_while_a_key_is_held(driven, agent):
     for key, axis, way in (("w", 0, 1), ("a", 1, 1), ("f", 2, -1)):
         before = agent.telemetry.message(agent.robot_state(), 0.0)["tool"]
-        driven.press(key)
-        until(lambda: agent.moves, "a motion")
+        driven.move(key, lambda: agent.moves)
         driven.let(key)
         until(lambda: not agent.moves, "the end of the motion")
         after = agent.telemetry.message(agent.robot_state(), 0.0)["tool"]
@@ -220,8 +219,7 @@ def test_a_button_moves_the_robot_while_it_is_held_and_a_key_with_a_modifier_doe
 
 @pytest.mark.parametrize("leave", LEAVINGS)
 def test_a_page_that_is_left_in_mid_jog_leaves_the_robot_at_rest(driven, agent, leave):
-    driven.press("w")
-    until(lambda: agent.moves, "a motion")
+    driven.move("w", lambda: agent.moves)
     leave(driven)
     until(lambda: not agent.moves, "the end of the motion")
     last, joints = agent.twists[-1][0], agent.joints
@@ -231,8 +229,7 @@ def test_a_page_that_is_left_in_mid_jog_leaves_the_robot_at_rest(driven, agent, 
 
 
 def test_a_page_that_is_frozen_in_mid_jog_leaves_the_robot_at_rest_also_when_it_thaws(driven, agent):
-    driven.press("w")
-    until(lambda: agent.moves, "a motion")
+    driven.move("w", lambda: agent.moves)
     with driven.frozen():
         until(lambda: not agent.moves, "the end of the motion")
         last, joints = agent.twists[-1][0], agent.joints

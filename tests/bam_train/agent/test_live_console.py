@@ -114,8 +114,7 @@ def test_stop_reaches_the_robot_and_the_policy_goes_on_only_when_it_is_told(show
 
 def test_jogging_moves_the_tool_along_the_key_and_no_farther(driven, robot):
     start = robot.tool
-    driven.press("r")
-    until(lambda: robot.tool[2] > start[2] + 0.03, "a motion")
+    driven.move("r", lambda: robot.tool[2] > start[2] + 0.03)
     driven.let("r")
     until(lambda: not robot.moves, "rest")
     moved = robot.tool - start
@@ -128,8 +127,7 @@ def test_jogging_moves_the_tool_along_the_key_and_no_farther(driven, robot):
 
 @pytest.mark.parametrize("leave", LEAVINGS[:3])
 def test_a_page_that_is_left_in_mid_jog_leaves_the_robot_at_rest(driven, agent, robot, leave):
-    driven.press("r")
-    until(lambda: robot.moves, "a motion")
+    driven.move("r", lambda: robot.moves)
     robot.halts.clear()
     leave(driven)
     until(lambda: not robot.moves, "rest")
@@ -141,8 +139,7 @@ def test_a_page_that_is_left_in_mid_jog_leaves_the_robot_at_rest(driven, agent, 
 
 
 def test_a_frozen_page_leaves_the_robot_at_rest_and_the_policy_does_not_go_on(driven, agent, robot):
-    driven.press("r")
-    until(lambda: robot.moves, "a motion")
+    driven.move("r", lambda: robot.moves)
     with driven.frozen():
         until(lambda: not robot.moves, "rest")
         until(lambda: robot.halts, "the halt")
