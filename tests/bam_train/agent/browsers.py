@@ -62,7 +62,7 @@ class Page:
         return self.element(name).text
 
     def click(self, name):
-        until(lambda: self.element(name).is_enabled(), f"the button {name}")
+        until(lambda: self.element(name).is_displayed() and self.element(name).is_enabled(), f"the button {name}")
         self.run("arguments[0].scrollIntoView({block: 'center'})", self.element(name))
         self.element(name).click()
 
@@ -85,7 +85,7 @@ class Page:
             self.cdp("Input.dispatchKeyEvent", type="char", key=key, text="\r")
 
     def move(self, key, moves):
-        """Hold a key until the robot moves; a page that stood still on a busy computer has let go of it: press again."""
+        """Hold a key until the robot moves; a page that stood still on a busy computer lets go of it: pressed again."""
 
         def is_held():
             if self.text("jog-state").startswith("Hold a key"):
