@@ -22,6 +22,7 @@ from typing import Annotated, Any, Literal
 import msgspec
 from msgspec import Meta
 
+from bam_envs.core.config_folder import config_folder
 from bam_train.atomic_file import replacing
 from bam_train.checkpoint.checkpoint import Checkpoint
 from bam_train.checkpoint.manifest import AGAIN, MANIFEST
@@ -62,11 +63,6 @@ class PublicKey:
     def line(self) -> str:
         """The content of a ``.pub`` file."""
         return f"ed25519 {self.text} {self.name}\n"
-
-
-def config_folder() -> Path:
-    """This user's configuration folder: ``bam-train`` below ``$XDG_CONFIG_HOME`` or ``~/.config``."""
-    return Path(os.environ.get("XDG_CONFIG_HOME") or "~/.config").expanduser() / "bam-train"
 
 
 def trusted_folder() -> Path:

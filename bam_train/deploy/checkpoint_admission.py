@@ -6,6 +6,7 @@ from typing import Any
 
 import gymnasium as gym
 
+from bam_envs.core.config_folder import config_folder
 from bam_envs.safety.guard import TRIAL_SPEED
 from bam_train.checkpoint import Checkpoint
 from bam_train.deploy.agreement import Shadow
@@ -102,8 +103,6 @@ class Admission:
 
 def trials_of(checkpoint: Checkpoint, record: Path | None, address: str, *, simulated: bool) -> Trials:
     """The trials of a checkpoint on the robot at `address`, in the file `record` (None: `TRIALS`)."""
-    from bam_train.checkpoint.signature import config_folder
-
     manifest = checkpoint.manifest
     book = TrialRecord((record or TRIALS).expanduser(), config_folder() / "trials")
     subject = Subject(checkpoint.digest, address.rstrip("/"), simulated)

@@ -225,3 +225,8 @@ def _commands(inspection: Inspection) -> Iterator[Check]:
         found = "unknown" if kind is None else bare_type(kind) or "nobody listens"
         fits = None if kind is None else bare_type(kind) == bare_type(sink.type)
         yield check(f"command {sink.topic}", sink.type, found, fits=fits)
+    proof = inspection.proof
+    if proof is not None:
+        found = proof.fault or (f"proved on {proof.since}" if proof.is_known else "to be proved in the first motion")
+        fits = False if proof.fault else True if proof.is_known else None
+        yield check("joints of the commands", "those that are meant", found, fits=fits)

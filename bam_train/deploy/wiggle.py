@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from bam_envs.core.errors import SafetyStop
 from bam_envs.core.robot import Initial, RobotSpec, RobotState, SignalSpec
+from bam_envs.safety.first_motion import PROOF
 from bam_envs.safety.gate import SafeRobot
 from bam_envs.safety.guard import is_base, measured_places
 from bam_train.deploy.checkpoint_admission import SHADOW
@@ -20,10 +21,10 @@ from bam_train.deploy.robot_checks import FACTORS, driven
 from bam_train.recording.recording import Recording
 
 Array = NDArray[np.float64]
-FAR = {"rad": 0.03, "m": 0.01, "m/s": 0.05, "rad/s": 0.1}
+FAR = {"rad": PROOF, "m": 0.01, "m/s": 0.05, "rad/s": 0.1}
 """Amplitude of the motion of each axis, a speed for a base, by the unit of its command."""
 MOVE_TIME, REST_TIME = 1.0, 0.5
-"""Duration of the motion in each direction, and of the rest after it [s]."""
+"""Duration of the motion of a gripper or base in each direction, and of the rest after it [s]."""
 _MAX_LAG = 0.5  # maximum delay of the measured motion behind the commands [s]
 _MOVED, _LEAST, _MOST = 0.3, 0.6, 1.6
 """Shares of the commanded motion: minimum that counts as motion, minimum and maximum of a correct motion."""
@@ -40,22 +41,22 @@ def wiggle(robot: SafeRobot, joints: Array | None) -> Iterator[Check]:
         robot: A connected robot; the operator has allowed the motion.
         joints: The measured joints of an arm (k,) [rad]; None for a base.
     """
-    spec, command = robot.spec, robot.spec.command
-    signals, label = {} if joints is None else {"joint_position": joints[None]}, "the axes"
+    spec, command, is_arm = robot.spec, robot.spec.command, joints is not None
+    initial = Initial({} if joints is None else {"joint_position": joints[None]}, np.zeros(1, np.int64))
+    label, states = "the joints" if is_arm else "the axes", list[RobotState]()
     try:
-        state = robot.reset(np.zeros(1, np.int64), Initial(signals, np.zeros(1, np.int64)))
-        commanded, measured = [state.command[0]], [_measured(spec, state)]
-        for axis, goal in _goals(command, state.command[0], spec.period):
-            label = axis
-            state = robot.step(goal[None])
-            commanded.append(goal)
-            measured.append(_measured(spec, state))
+        proves = is_arm and robot.is_unproved  # and `reset` would do it with one joint only, if it was done before
+        states += robot.prove(anew=True) if proves else []
+        state = robot.reset(np.zeros(1, np.int64), initial)
+        states += robot.prove(anew=True) if is_arm and not proves else [state]
+        for label, goal in _goals(command, states[-1].command[0], spec.period):
+            states.append(robot.step(goal[None]))
     except SafetyStop as stop:
         yield check(f"motion of {label}", "as commanded", str(stop), fits=False)
         return
     finally:
         robot.halt()
-    yield from _compared(spec, commanded, measured)
+    yield from _compared(spec, [state.command[0] for state in states], [_measured(spec, state) for state in states])
 
 
 def recorded_motion(path: Path, spec: RobotSpec, address: str) -> Iterator[Check]:
@@ -153,12 +154,14 @@ def _best_fit(commanded: Array, measured: Array, most_lag: int) -> tuple[float, 
 
 
 def _goals(command: SignalSpec, start: Array, period: float) -> Iterator[tuple[str, Array]]:
-    """Yield the label of the moving axis and the command (m,) of each period; axes move one after the other."""
+    """Yield label and command (m,) of each period of gripper or base; axes move one after the other."""
     moving, resting = math.ceil(MOVE_TIME / period), math.ceil(REST_TIME / period)
     path = (1 - np.cos(np.pi * np.arange(1, moving + 1) / moving)) / 2
     shares = np.concatenate([path, np.ones(resting), path[::-1], np.zeros(resting)])
     speeds = np.concatenate([np.ones(moving), np.zeros(resting), -np.ones(moving), np.zeros(resting)])
     for i, unit in enumerate(command.units):
+        if unit == "rad":
+            continue  # `SafeRobot.prove` moves the joints
         middle = (command.low[i] + command.high[i]) / 2
         far = FAR[unit] if start[i] <= middle or unit.endswith("/s") else -FAR[unit]
         for share in speeds if unit.endswith("/s") else shares:

@@ -9,6 +9,7 @@ from bam_envs.core.errors import LinkLost
 from bam_envs.core.robot import RobotSpec
 from bam_envs.core.timing import Deadline
 from bam_envs.live.bringup import TIMEOUT, TopicTypes, ask, tagged_sinks
+from bam_envs.live.command_proof import CommandProof, needed_proof
 from bam_envs.live.state import Letter
 from bam_envs.ros.codec import INFO_SERVICE, RobotInfo, read_info
 from bam_envs.ros.messages import same_type
@@ -49,6 +50,8 @@ class Inspection:
     """The local wall clock minus the local monotonic clock [s]."""
     server_offset: float | None = None
     """The local wall clock minus the server's [s]; None if the server does not report its time."""
+    proof: CommandProof | None = None
+    """The proof of the commands of a real arm; None for any other robot."""
 
 
 @dataclass
@@ -102,6 +105,7 @@ def inspect_robot(
         needed = {entry.topic: entry.type for entry in (*required, *sinks)}
         wanted = {**needed, **{source.topic: source.type for source in extra}, DESCRIPTION: DESCRIPTION_TYPE}
         types = _types(link, TopicTypes(link, profile, timeout), wanted, needed, timeout)
+        proof = needed_proof(link, info, narrowed, sinks, endpoint.url)
         inbox = _Inbox()
         start = _listen(link, inbox, wanted, {sink.topic for sink in sinks}, types)
         awaited = {source.topic for source in required} & inbox.letters.keys()
@@ -113,7 +117,8 @@ def inspect_robot(
             raise LinkLost(f"{link.url}: the link dropped while the robot's topics were checked.")
         seconds = time.monotonic() - start
         ahead = time.time() - time.monotonic()
-        return Inspection(info, (*required, *extra), sinks, types, letters, seconds, ahead, link.clock_offset)
+        every = (*required, *extra)
+        return Inspection(info, every, sinks, types, letters, seconds, ahead, link.clock_offset, proof)
     finally:
         link.close()
 

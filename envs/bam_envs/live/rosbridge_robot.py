@@ -31,6 +31,7 @@ from bam_envs.core.robot import EnvIds, Initial, RobotSpec, RobotState
 from bam_envs.core.timing import Pacer
 from bam_envs.live import bringup
 from bam_envs.live.camera import LiveCamera, fitted
+from bam_envs.live.command_proof import CommandProof, needed_proof
 from bam_envs.live.state import Letter, LiveState
 from bam_envs.live.take_over import TakeOver
 from bam_envs.ros.codec import (
@@ -49,6 +50,7 @@ from bam_envs.rosbridge.client_connection import bare_reason
 from bam_envs.rosbridge.endpoint import Endpoint
 from bam_envs.rosbridge.sessions import is_over
 from bam_envs.rosbridge.string_rpc import StringRpc
+from bam_envs.safety.first_motion import REST_REACH
 from bam_envs.safety.gate import ClearedCommand
 from bam_envs.safety.guard import measured_places
 
@@ -101,6 +103,10 @@ class RosbridgeRobot:
         self._describes_itself = False  # such a robot takes halts and has sessions
         self._clock, self._state = clock, LiveState(self.profile, self.spec, clock)
         self._readiness: bringup.LiveReadiness | None = None  # of a robot that is real
+        self.proof: CommandProof | None = None
+        """The proof of the commands of a real arm, which this connection needs before it moves; None: it needs none."""
+        self.reach: float | None = None
+        """Time in which the next commands are to be reached [s], where they say it; None: as in the profile."""
         images = {name: box for camera in self.spec.cameras for name, box in camera.spaces().items()}
         self._cameras = {name: (LiveCamera(endpoint, profile.camera(name)), box) for name, box in images.items()}
         self._pacer, self._session = Pacer(self.spec.period, now=clock), bringup.DrivingSession()
@@ -222,12 +228,21 @@ class RosbridgeRobot:
         if self._readiness is not None:
             self._readiness.begin(control)
             self._info = bringup.info_by_profile(self.url, self.profile, self._readiness.unknown)
+        self.proof = self._needed_proof(control)
         self._open_session(control)
         if self._take_over is not None:
             self._take_over.look()
         self._refusals.clear()
         self._state.read()
         self._sent = None
+
+    def _needed_proof(self, control: RosbridgeLink) -> CommandProof | None:
+        return needed_proof(control, self.info, self.profile, self._sinks, self.url)
+
+    def tell_proved(self, lag: float) -> None:
+        """Take that the commands of this connection are proved, with the measured `lag` of the arm [s]."""
+        if self.proof is not None:
+            self.proof.done(lag)
 
     def _open_session(self, control: RosbridgeLink) -> None:
         """Sign commands for a new session from now on, if the robot's side has sessions."""
@@ -374,7 +389,8 @@ class RosbridgeRobot:
         its tag, others would execute it. The gate finds the pause with the next command.
         """
         ros1, sign = control.ros == "ros1", self._session.tagger.sign
-        envelopes = [encode_sink(sink, self.spec, command, tag, sign=sign, ros1=ros1) for sink in self._sinks]
+        options: Any = {"sign": sign, "ros1": ros1, "reach": self.reach}
+        envelopes = [encode_sink(sink, self.spec, command, tag, **options) for sink in self._sinks]
         with self._sending:
             if self._clock() > until:
                 _LOG.warning("%s: a command waited too long in this process, and was not sent.", self.url)
@@ -453,7 +469,11 @@ class RosbridgeRobot:
                 self._sending.release()
 
     def _publish_hold(self, halting: RosbridgeLink) -> None:
-        """Send a robot without a halt topic a command to hold; unknown numbers are not commanded."""
+        """Send a robot without a halt topic a command to hold; unknown numbers are not commanded.
+
+        An arm whose commands are not proved might take that for another position: it gets it so slowly that it rests.
+        """
+        unproved = self.proof is not None and not self.proof.is_done
         try:
             # Returning to an outdated position would be a motion.
             signals = self._state.read()[0] if self._state.age() <= self.profile.max_age else {}
@@ -470,8 +490,9 @@ class RosbridgeRobot:
                 hold[joints] = sent[joints]
         tag = self._session.tagger.next(self._epoch, self._command_life)
         for sink in self._sinks:
-            if np.isfinite(hold[self._places(sink)]).all():
-                topic, _, message = encode_sink(sink, self.spec, hold, tag, ros1=halting.ros == "ros1")
+            if np.isfinite(hold[self._places(sink)]).all() and (sink.is_timed or not unproved):
+                reach, ros1 = REST_REACH if unproved else None, halting.ros == "ros1"
+                topic, _, message = encode_sink(sink, self.spec, hold, tag, ros1=ros1, reach=reach)
                 halting.publish(self.namespace + topic, message)
 
     def _at_rest(self, signals: Mapping[str, Array]) -> Array:

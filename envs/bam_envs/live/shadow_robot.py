@@ -37,6 +37,9 @@ class ShadowRobot(RosbridgeRobot):
     def _advertise(self, control: RosbridgeLink, halting: RosbridgeLink, types: bringup.TopicTypes) -> None:
         """Do nothing: no command is sent."""
 
+    def _needed_proof(self, control: RosbridgeLink) -> None:
+        """Return None: nothing is sent."""
+
     def _open_session(self, control: RosbridgeLink) -> None:
         """Do nothing: a session is for the program that drives."""
 

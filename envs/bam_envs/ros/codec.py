@@ -145,20 +145,31 @@ def encode_state(
 
 
 def encode_sink(
-    sink: Sink, spec: RobotSpec, command: Array, tag: Tag | None, *, sign: Sign | None = None, ros1: bool = False
+    sink: Sink,
+    spec: RobotSpec,
+    command: Array,
+    tag: Tag | None,
+    *,
+    sign: Sign | None = None,
+    ros1: bool = False,
+    reach: float | None = None,
 ) -> Envelope:
-    """The message with the part of `command` (m,) [SI] for `sink`, with `tag`, which `sign` signs."""
+    """The message with the part of `command` (m,) [SI] for `sink`, with `tag`, which `sign` signs.
+
+    `reach` is the time in which a trajectory's point is to be reached [s]; None: that of the sink.
+    """
+    reach = sink.reach_at(spec.period) if reach is None else reach
     raw, text = _from_si(sink, command[_places(sink, spec)]), ""
     if tag is not None and sink.tag:
         content: list[float] | Array = raw
         if any("(" in path for path in sink.fields):  # an angle is written as a quaternion, and read with rounding
-            content = _read_command(sink, _write_command(sink, raw, "", spec.period))
+            content = _read_command(sink, _write_command(sink, raw, "", reach))
         text = tag.to_text() if sign is None else sign(tag, sink.topic, _signed(content))
-    return sink.topic, sink.type, _write_command(sink, raw, text, spec.period, ros1=ros1)
+    return sink.topic, sink.type, _write_command(sink, raw, text, reach, ros1=ros1)
 
 
-def _write_command(sink: Sink, values: list[float], text: str, period: float, *, ros1: bool = False) -> dict[str, Any]:
-    """The message that carries raw numbers, in the order of the sink's labels, and the `text` of a tag."""
+def _write_command(sink: Sink, values: list[float], text: str, reach: float, *, ros1: bool = False) -> dict[str, Any]:
+    """The message that carries raw numbers, in the order of the sink's labels, the `text` of a tag, and `reach` [s]."""
     header = {"stamp": write_stamp(0.0, ros1=ros1), "frame_id": text}  # the stamp 0 means at once
     names = list(sink.names)
     if sink.fields:
@@ -175,7 +186,7 @@ def _write_command(sink: Sink, values: list[float], text: str, period: float, *,
         return {"layout": {"dim": [dimension], "data_offset": 0}, "data": values}
     if sink.type == _JOINTS:
         return {"header": header, "name": names, "position": values, "velocity": [], "effort": []}
-    reached = write_stamp(sink.reach_at(period), ros1=ros1)
+    reached = write_stamp(reach, ros1=ros1)
     point = {"positions": values, "velocities": [], "accelerations": [], "effort": [], "time_from_start": reached}
     return {"header": header, "joint_names": names, "points": [point]}
 

@@ -91,6 +91,16 @@ class Sink(Content):
     """The controller of ros2_control that takes it, which must be active; not checked if empty, or if the topic is
     renamed."""
 
+    @property
+    def is_timed(self) -> bool:
+        """Whether its messages say in which time a position is to be reached; others are executed at once."""
+        return self.type == _TRAJECTORY
+
+    @property
+    def is_named(self) -> bool:
+        """Whether its messages, or its topic, tell which number is whose; others depend on an order."""
+        return self.type in (_TRAJECTORY, "sensor_msgs/JointState") or len(self.labels) == 1
+
     def reach_at(self, period: float) -> float:
         """Time in which a trajectory's point is to be reached [s], for a command every `period` [s]."""
         return period * self.reach_periods if self.reach is None else self.reach

@@ -1,8 +1,8 @@
 """Following (G23): a robot that does not follow its commands is held in place, and stopped if that continues.
 
-A joint follows if it is behind its commands by no more than its known lag at its measured speed. The rest of the gap is
-the distance that it would jump when released. At rest that is at most the joint's limit for one period, so that a
-released joint never moves faster than its limit.
+A joint follows if it is behind its commands by no more than its lag at its measured speed. The rest of the gap is the
+distance that it would jump when released: at most the joint's limit for one period, so that a released joint never moves
+faster than its limit. A joint that moves away from its commands is stopped at once: what moves is not what was commanded.
 """
 
 import math
@@ -30,6 +30,10 @@ STRIKES = 3
 """Number of times that a robot does not follow until it is stopped; fewer hold it."""
 FORGIVEN = 2.0
 """Time of following after which that count is reset to 0 [s]."""
+STUCK, STUCK_TIME = 0.002, 2.0
+"""An arm none of whose joints moves by so much [rad] for so long [s], although its commands go on, is stopped."""
+SLOWEST_GAIN, GAIN_TIME = 0.25, 0.4
+"""Least acceleration of a base that follows its commands [m/s^2, rad/s^2], and the time over which it is measured [s]."""
 LIKELY = (
     "look for a protective stop, a paused program, an inactive controller, a low speed slider, or something in its way"
 )
@@ -72,14 +76,14 @@ class Following(Guard):
             off[at] = low - value if value < low else high - value if value > high else 0.0  # NaN: it is not measured
         return off
 
-    def is_struck(self, over: bool) -> bool:
-        """Count a tick whose gap is `over` the limit; after `STRIKES` of them the robot is stopped."""
+    def is_struck(self, over: bool, *, at_once: bool = False) -> bool:
+        """Count a tick whose gap is `over` the limit; after `STRIKES` of them, or `at_once`, the robot is stopped."""
         if not over:
             self._good += 1
             self._strikes = 0 if self._good >= self._forgiven else self._strikes
             return False
         self._strikes, self._good = self._strikes + 1, 0
-        self.patience = 1 if self._strikes >= STRIKES else math.inf
+        self.patience = 1 if at_once or self._strikes >= STRIKES else math.inf
         self._sent.clear()
         return True
 
@@ -105,10 +109,28 @@ class JointFollowing(Following):
         self._allowed = [SHARE * reach for reach in self._reach]
         self._slow_allowed = [SHARE * reach for reach in self._slow_reach]
         self.limit_value = max(fastest) * (self._lag + self._period)
+        self._known_lag = math.inf  # as measured
+        self._stuck, self._stuck_ticks, self._place = 0, ticks_of(STUCK_TIME, spec), list[float]()
+        self._moved: Numbers = []  # in the period before [rad]
+        self._change = limits.joint_acceleration * spec.period**2
+
+    def measured(self, lag: float) -> None:
+        """Take the measured `lag` of this arm [s]: a gap that it does not explain is one that the arm may jump."""
+        self._known_lag = lag
+
+    def restart(self) -> None:
+        """Forget the motion."""
+        super().restart()
+        self._stuck, self._moved = 0, list[float]()
 
     def fault(self, tick: Tick) -> str | None:
         """Report the joint, the gap, and likely causes."""
+        if tick.proving:
+            return None
         sent, measured = self._pick(tick.last), self._pick(tick.measured)
+        if self._stuck > self._stuck_ticks:
+            self._stuck, self.patience = 0, 1
+            return f"no joint has moved for {STUCK_TIME:g} s, and the arm was commanded to move: {LIKELY}"
         off = self.off(sent, measured)
         # The farthest that a command may be from a joint at rest.
         allowed, farthest, over = self._slow_allowed if tick.approach else self._allowed, 0.0, False
@@ -119,9 +141,18 @@ class JointFollowing(Following):
         if not over and self._tool is not None and farthest > self._tolerance:
             explained = [value + gap for value, gap in zip(measured, off, strict=True)]
             over = math.dist(self._tool(measured), self._tool(explained)) > SHARE * self._tool_reach
-        if not self.is_struck(over):
+        if not over:
+            self.is_struck(over)
             return None
         at = max(range(len(off)), key=lambda column: abs(off[column]) / allowed[column])
+        moved = measured[at] - self._pick(tick.before)[at]  # NaN in a first tick
+        away = moved * off[at] < 0.0 and abs(moved) > allowed[at] / 2
+        self.is_struck(over, at_once=away)
+        if away:
+            return (
+                f"{self._labels[at]} moved {moved:+.3f} rad within a period, away from its commands: what moves is not "
+                f"what was commanded, or something pushes the arm"
+            )
         return (
             f"{self._labels[at]} does not follow its commands: it is {measured[at] - sent[at]:+.3f} rad from the last "
             f"one, and beyond a lag of {self._lag:g} s it may be {allowed[at]:.3f} rad, and the tool "
@@ -136,33 +167,42 @@ class JointFollowing(Following):
 
     def limit(self, tick: Tick) -> bool:
         """Bring the command within one step of the explained position, so that a released joint cannot jump."""
-        command, pick, reaches = tick.command, self._pick, self._slow_reach if tick.approach else self._reach
-        explained, near, farther, changed = [], [], False, False
-        rows = pick(command), pick(tick.last), pick(tick.measured), pick(tick.velocity), self._fastest, reaches
-        for wanted, last, measured, reach in zip(*rows[:3], reaches, strict=True):
-            gap = abs(wanted - measured)
-            if not (gap <= reach and gap <= abs(wanted - last) + self._tolerance):
-                break
-        else:  # near enough even if the lag explains none of the gap
+        if tick.proving:
             return False
-        for wanted, last, measured, speed, fastest, reach in zip(*rows, strict=True):
-            gap = wanted - measured
-            ahead = min(max(speed, -fastest), fastest) * self._lag
+        command, pick, reaches = tick.command, self._pick, self._slow_reach if tick.approach else self._reach
+        wanted, last, measured = pick(command), pick(tick.last), pick(tick.measured)
+        before, self._moved = self._moved or [math.inf] * len(last), []
+        lag, places, near, farther = min(self._lag, self._known_lag), [], [], False
+        rows = zip(wanted, last, measured, pick(tick.before), pick(tick.velocity), self._fastest, reaches, before)
+        for goal, sent, here, was, speed, fastest, reach, moved_before in rows:
+            gap, moved = sent - here, abs(here - was) if was == was else math.inf  # NaN in a first tick
+            ahead = min(max(speed, -fastest), fastest) * lag
             # The lag explains a gap in the direction of the motion; NaN: the speed is not measured.
-            part = (gap if abs(gap) < abs(ahead) else ahead) if gap * ahead > 0.0 else 0.0
-            place = measured + part
-            allowed = place - reach if wanted < place - reach else place + reach if wanted > place + reach else wanted
-            changed = changed or allowed != wanted
-            farther = farther or abs(wanted - place) > abs(wanted - last) + self._tolerance
-            explained.append(place)
-            near.append(allowed)
+            place = here + ((gap if abs(gap) < abs(ahead) else ahead) if gap * ahead > 0.0 else 0.0)
+            # A joint that has just made up for a gap, faster than it may speed up, makes a step that much shorter.
+            sudden = moved - moved_before - self._change if moved_before < math.inf else 0.0
+            step = reach - min(reach, max(sudden, 0.0))
+            low, high = max(place - reach, min(sent, place) - step), min(place + reach, max(sent, place) + step)
+            self._moved.append(moved)
+            near.append(low if goal < low else high if goal > high else goal)
+            farther = farther or abs(goal - place) > abs(goal - sent) + self._tolerance
+            places.append(place)
+        changed = near != wanted
         if farther and self._tool is not None:  # at most the tool's limit for one period from there
-            reached = within_reach(self._tool, explained, near, self._tool_reach)
+            reached = within_reach(self._tool, places, near, self._tool_reach)
             changed, near = changed or reached is not near, reached
         if not changed:
+            self._stuck = 0
             return False
+        self._count_stuck(measured)
         self._go_near(tick, near, command)
         return True
+
+    def _count_stuck(self, measured: Numbers) -> None:
+        """Count the commands in a row that were held back because the arm does not follow, while no joint moves."""
+        if not self._stuck or any(abs(now - at) > STUCK for now, at in zip(measured, self._place, strict=True)):
+            self._stuck, self._place = 0, measured
+        self._stuck += 1
 
     def _go_near(self, tick: Tick, wanted: Numbers, command: Numbers) -> None:
         """Set the joints of `command` as near to `wanted` as the limits of joints and tool allow from the last command.
@@ -199,12 +239,15 @@ class BaseFollowing(Following):
         self.limit_value = max(self._ahead)
         self._change = [speed * spec.period for speed in fastest]
         self._allowed = [SHARE * change for change in self._change]
+        self._expected, self._acceleration = fastest, name.replace("following", "acceleration").replace(" ", "_")
         self._reached: Numbers | None = None  # speed of a base that follows as well as its acceleration allows
+        self._speeds: deque[Numbers] = deque(maxlen=1 + ticks_of(GAIN_TIME, spec))  # as measured
 
     def restart(self) -> None:
         """Forget the reached speed as well: the base may still be moving."""
         super().restart()
         self._reached = None
+        self._speeds.clear()
 
     def fault(self, tick: Tick) -> str | None:
         """Report the measured speed and the commanded one."""
@@ -212,14 +255,38 @@ class BaseFollowing(Following):
         rows = zip(sent, self._reached or measured, self._change, strict=True)
         self._reached = [min(max(value, before - change), before + change) for value, before, change in rows]
         off = [abs(gap) for gap in self.off(self._reached, measured)]
-        if not self.is_struck(any(gap > most for gap, most in zip(off, self._allowed, strict=True))):
-            return None
+        self._speeds.append(measured)
+        over = any(gap > most for gap, most in zip(off, self._allowed, strict=True))
         at = off.index(max(off))
+        if over and self._is_gaining(at, sent[at], measured):
+            over = False
+        if not self.is_struck(over):
+            return None
         return (
             f"the base does not follow its commands: it goes at {measured[at]:.3f} {self.unit}, and was sent "
             f"{sent[at]:.3f} {self.unit}; beyond a lag of {self._lag:g} s it may be off by {self._allowed[at]:.3f} "
             f"{self.unit}: {LIKELY}"
         )
+
+    def _is_gaining(self, at: int, sent: float, measured: Numbers) -> bool:
+        """Whether a base that is behind goes towards what it was sent, with less acceleration than expected.
+
+        From then on its measured acceleration is expected.
+        """
+        if len(self._speeds) < (self._speeds.maxlen or 0):
+            return False
+        seconds = (len(self._speeds) - 1) * self._spec.period
+        gain = (measured[at] - self._speeds[0][at]) / seconds * math.copysign(1.0, sent - measured[at])
+        if gain < SLOWEST_GAIN or gain * self._spec.period >= self._change[at]:
+            return False
+        self._change[at] = gain * self._spec.period
+        self.warning = (
+            f"the base accelerates at {gain:.2g} {self.unit}^2, and {self._expected[at]:.2g} {self.unit}^2 were expected; "
+            f"set the limit {self._acceleration} to that, so that it follows its commands"
+        )
+        self._reached = measured
+        self._sent.clear()
+        return True
 
     def limit(self, tick: Tick) -> bool:
         """Clip the speed around the measured one; slower is always allowed."""

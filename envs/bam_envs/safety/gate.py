@@ -19,7 +19,8 @@ from numpy.typing import NDArray
 
 from bam_envs.core.errors import InvalidValue, ResetNeeded, SafetyStop, StaleState, StartNotReached
 from bam_envs.core.robot import EnvIds, Initial, Robot, RobotSpec, RobotState
-from bam_envs.safety.following import Following
+from bam_envs.safety.first_motion import FirstMotion, NotAsCommanded, ProofMotion
+from bam_envs.safety.following import Following, JointFollowing
 from bam_envs.safety.guard import (
     Guard,
     Limits,
@@ -339,13 +340,16 @@ class SafeRobot(metaclass=Sealed):
             StaleState: The same, because there was no fresh state.
         """
         self._require_free()
+        if self.is_unproved:
+            raise ResetNeeded(f"Nothing shows yet that commands reach the joints of {self.spec.name}. Call reset() first.")
         return self._advance(self._shape.numbers(command))
 
-    def _advance(self, goal: Numbers, *, approach: bool = False) -> RobotState:
+    def _advance(self, goal: Numbers, *, approach: bool = False, proving: bool = False) -> RobotState:
         """One tick towards `goal` (m,)."""
         halts = self._halts
         try:
             tick = self._tick(goal, approach)
+            tick.proving = proving
             fault = self._fault(tick)
             if fault is None:
                 self._limit(tick)
@@ -570,6 +574,8 @@ class SafeRobot(metaclass=Sealed):
             self.halt()
         self._restart(forgive=True)
         state = self._take(self._robot.reset(env_ids, initial))
+        if self.is_unproved:
+            self.prove()
         if start is not None and (self._joints_off(start) or not self._is_open()):
             self._approach(start)
             state = self._take(self._robot.reset(env_ids, initial))  # put back objects that the arm may have pushed
@@ -577,6 +583,68 @@ class SafeRobot(metaclass=Sealed):
         begin = self._begin_at(self._pause())
         self._sent_at = None  # the first command may come at any time
         return RobotState(_copied(state).signals, state.stamp, np.array([begin]), state.truth)
+
+    @property
+    def is_unproved(self) -> bool:
+        """Whether `reset` will first prove the commands of a live arm; see `prove`."""
+        proof = getattr(self._live, "proof", None)
+        return proof is not None and not proof.is_done
+
+    def prove(self, *, anew: bool = False) -> list[RobotState]:
+        """Move each joint a little and back, to prove that commands reach the joints that are meant.
+
+        An arm whose commands were proved before, in this configuration, moves its last joint only, unless `anew` is set.
+        `reset` does this by itself with a live arm, once a connection. Returns the states of the motion.
+
+        Raises:
+            NotReady: The commands cannot be proved without a motion that may be large; nothing has moved.
+            ResetNeeded: No state is known yet.
+            SafetyStop: The arm did not move as commanded.
+        """
+        self._require_free()
+        proof, columns = getattr(self._live, "proof", None), columns_in(self.spec.command, "rad")
+        if proof is not None:
+            proof.require_provable()
+        if self._state is None and self._live is not None:
+            self._take(self._fresh_state())
+        rest = self._begin_at(0.0).copy()
+        low, high = position_range(self.spec, self.limits)
+        motion = ProofMotion(
+            [self.spec.command.labels[at] for at in columns],
+            [self._measured(self._places)[at] for at in columns],
+            [(low[at] + high[at]) / 2 for at in columns],
+            self.spec.period,
+            self.spec.lag if self.limits.lag is None else self.limits.lag,
+            is_timed=proof is not None and proof.is_timed,
+        )
+        states: list[RobotState] = []
+        moves = motion.moves(every=anew or proof is None or not proof.is_known)
+        try:
+            joints, reach = next(moves)
+            while True:
+                for at, value in zip(columns, joints, strict=True):
+                    rest[at] = value
+                if proof is not None:
+                    self._live.reach = reach
+                states.append(self._advance(rest.copy(), approach=True, proving=True))
+                measured = self._measured(self._places)
+                joints, reach = moves.send([measured[at] for at in columns])
+        except StopIteration:
+            pass
+        except NotAsCommanded as error:
+            self._stop(next(one for one in self._guards if isinstance(one, FirstMotion)), f"{error}")
+        finally:
+            if proof is not None:
+                self._live.reach = None
+        self._know_lag(motion.measured_lag)
+        if proof is not None:
+            self._live.tell_proved(motion.measured_lag)
+        return states
+
+    def _know_lag(self, lag: float) -> None:
+        for guard in self._guards:
+            if isinstance(guard, JointFollowing):
+                guard.measured(lag)
 
     def _take(self, state: RobotState) -> RobotState:
         """Restart from `state`."""

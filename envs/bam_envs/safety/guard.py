@@ -301,6 +301,8 @@ class Tick:
     """Time since the oldest unanswered command was sent [s]; 0 if there is none, or the robot never answers."""
     approach: bool = False
     """Whether the robot is on its way to a start pose."""
+    proving: bool = False
+    """Whether the command belongs to the motion that proves the commands, which judges itself how the arm follows."""
     action_age: float = 0.0
     """Time from the state to the command computed from it [s]; 0 for a first command, and in lockstep."""
     kept_out: bool = False

@@ -17,6 +17,7 @@ from bam_envs.core.robot import RobotSpec, RobotState, SignalSpec
 from bam_envs.safety import arm_guards as arm
 from bam_envs.safety.arm_tubes import ArmTubes
 from bam_envs.safety.base_guards import LaserZones
+from bam_envs.safety.first_motion import FirstMotion
 from bam_envs.safety.following import BaseFollowing, JointFollowing
 from bam_envs.safety.guard import (
     Guard,
@@ -278,7 +279,8 @@ def default_guards(
     counting = [LateTicks(spec, limits), LinkQuality(spec, limits), ChangedCommands(limits)]
     first = [Finite(spec, limits), Freshness(spec, limits), Pace(spec, limits), ActionAge(limits)]
     watched = [Answers(spec, limits), Watchdog(spec, limits)]
-    return [Shape(spec), *counting, *first, *watched, *moving, UnusualObservations(), MeasuredLimits(spec)]
+    last = [UnusualObservations(), FirstMotion(spec), MeasuredLimits(spec)]
+    return [Shape(spec), *counting, *first, *watched, *moving, *last]
 
 
 def _arm_guards(spec: RobotSpec, limits: Limits, tool_position: ToolPosition | None, straight: bool) -> list[Guard]:

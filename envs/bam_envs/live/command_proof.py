@@ -1,0 +1,223 @@
+"""What shows that the commands of a live arm reach the joints that are meant, before anything moves.
+
+A message either names its joints, or depends on the order in which a controller lists them, which the robot's side is
+asked for. Sign, offset and unit show in a small motion only (`SafeRobot.prove`), which is safe where a message says in
+which time a position is to be reached. What was proved is remembered for the same robot with the same controllers.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import logging
+import os
+import tempfile
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from bam_envs.core.config_folder import config_folder
+from bam_envs.core.errors import BamEnvsError, LinkLost, NotReady
+from bam_envs.ros.codec import RobotInfo
+from bam_envs.ros.profile_tables import RobotProfile, Sink
+from bam_envs.rosbridge.client import RosbridgeLink
+
+_LOG = logging.getLogger(__name__)
+ANSWER_WITHIN = 2.0
+"""Longest wait for the answer of a service of the robot's side [s]."""
+
+
+@dataclass(frozen=True)
+class Controllers:
+    """What a robot's side tells of the controllers that take its commands."""
+
+    listed: tuple[Mapping[str, Any], ...]
+    """The controllers by the service of `RobotProfile.controllers`; empty if it does not answer."""
+    joints: Mapping[str, tuple[str, ...] | None]
+    """Topic of a command whose numbers have no names -> its joints in the order of its controller; None: not told."""
+
+    def fault(self, profile: RobotProfile, sinks: Sequence[Sink]) -> str:
+        """Why a command of `sinks` might reach another joint than is meant; empty if it cannot."""
+        for sink in sinks:
+            if sink.topic not in self.joints:
+                continue
+            joints, sent = self.joints[sink.topic], ", ".join(sink.names)
+            if joints is None:
+                return (
+                    f"nothing tells in which order {sink.topic} takes {sent}: {_controller(sink)} has no parameter joints "
+                    f"that can be read here{_remedy(profile)}"
+                )
+            if joints != sink.names:
+                return (
+                    f"{_controller(sink)} takes the joints in the order {', '.join(joints)}, and the profile "
+                    f"{profile.name} sends {sent}: give the labels of {sink.topic} in that order"
+                )
+        return ""
+
+
+def ask_controllers(link: RosbridgeLink, profile: RobotProfile, sinks: Sequence[Sink]) -> Controllers:
+    """Ask the robot's side for the joints of the controllers that take the commands of `sinks`. Moves nothing."""
+    answer = _ask(link, link.namespace + profile.controllers, "", {}) if profile.controllers else {}
+    rows: Any = answer.get("controller")
+    listed = tuple(one for one in rows if isinstance(one, Mapping)) if isinstance(rows, list) else ()
+    unnamed = [sink for sink in sinks if not sink.is_named]
+    return Controllers(listed, {sink.topic: _joints(link, listed, _controller(sink)) for sink in unnamed})
+
+
+def _controller(sink: Sink) -> str:
+    """The controller of `sink`: as the profile says, or as its topic is called."""
+    return sink.controller or sink.topic.strip("/").rpartition("/")[0]
+
+
+def _joints(link: RosbridgeLink, listed: Sequence[Mapping[str, Any]], controller: str) -> tuple[str, ...] | None:
+    """The joints of `controller` in its own order: by its interfaces, by its parameter, or by rosapi; None: unknown."""
+    if not controller:
+        return None
+    for row in listed:
+        interfaces = row.get("required_command_interfaces")
+        if row.get("name") == controller and isinstance(interfaces, list) and interfaces:
+            return tuple(str(one).rpartition("/")[0] for one in interfaces)
+    request = {"names": ["joints"]}
+    service = f"{link.namespace}/{controller}/get_parameters"
+    values: Any = _ask(link, service, "rcl_interfaces/srv/GetParameters", request).get("values")
+    found: Any = values[0] if isinstance(values, list) and values else None
+    if not isinstance(found, Mapping):
+        separator = "/" if link.ros == "ros1" else ":"
+        name = {"name": f"{link.namespace}/{controller}{separator}joints"}
+        text: Any = _ask(link, "/rosapi/get_param", "rosapi/GetParam", name).get("value")
+        try:
+            found = {"string_array_value": json.loads(text)} if isinstance(text, str) else {}
+        except ValueError:
+            found = {}
+    joints = found.get("string_array_value")
+    return tuple(map(str, joints)) if isinstance(joints, list) and joints else None
+
+
+def _ask(link: RosbridgeLink, service: str, kind: str, request: Mapping[str, Any]) -> Mapping[str, Any]:
+    """The answer of a service of the robot's side; empty if it does not exist or cannot be read."""
+    try:
+        return link.call(service, kind, request, ANSWER_WITHIN)
+    except LinkLost:
+        if not link.is_up:
+            raise
+        return {}
+    except BamEnvsError:
+        return {}
+
+
+def _remedy(profile: RobotProfile) -> str:
+    named = [mode for mode, sinks in profile.commands.items() if all(sink.is_named for sink in sinks)]
+    return f"; the mode {named[0]} of the profile {profile.name} names the joints" if named else ""
+
+
+def needed_proof(
+    link: RosbridgeLink, info: RobotInfo | None, profile: RobotProfile, sinks: Sequence[Sink], robot: str
+) -> CommandProof | None:
+    """The proof that a real arm needs before it moves; None for others, and for an arm of a live agent, which has it.
+
+    Args:
+        link: A connection to the robot's side, which is asked for its controllers.
+        info: The robot's description of itself, if it has one.
+        profile: The profile of the robot, narrowed to the commands of the task.
+        sinks: The topics of its commands.
+        robot: The name by which the robot is known.
+    """
+    if (info is not None and (info.simulated or info.agent)) or not _joint_labels(profile):
+        return None
+    return CommandProof(profile, sinks, ask_controllers(link, profile, sinks), robot)
+
+
+class CommandProof:
+    """The proof of one arm's commands; `SafeRobot.prove` makes it once a connection.
+
+    Args:
+        profile: The profile of the arm, narrowed to the commands of the task.
+        sinks: The topics of its commands.
+        controllers: What its side tells of the controllers.
+        robot: The name by which the robot is known.
+    """
+
+    def __init__(self, profile: RobotProfile, sinks: Sequence[Sink], controllers: Controllers, robot: str) -> None:
+        arm = [sink for sink in sinks if set(sink.labels) & set(_joint_labels(profile))]
+        self.is_timed = all(sink.is_timed for sink in arm)
+        """Whether a command says in which time it is to be reached."""
+        self.is_done = False
+        """Whether the commands were proved in this connection."""
+        self.order_fault = controllers.fault(profile, arm)
+        """Why a command might reach another joint than is meant; empty if it cannot."""
+        self._robot, self._topics = robot, ", ".join(sink.topic for sink in arm)
+        self._remedy, self.key = _timed_remedy(profile), _key(profile, arm, controllers, robot)
+        """Digest of everything that a proof is about."""
+        self._file = config_folder() / "proofs" / f"{self.key}.json"
+        self.since = _remembered(self._file)
+        """When the commands were proved, as text; empty if they were not."""
+
+    @property
+    def is_known(self) -> bool:
+        """Whether the commands were proved before, of this robot with these controllers."""
+        return bool(self.since)
+
+    @property
+    def fault(self) -> str:
+        """Why the commands cannot be proved without a motion that may be large; empty if they can, or were."""
+        if self.order_fault or self.is_timed or self.is_known:
+            return self.order_fault
+        return (
+            f"{self._topics} executes a position at once, so that a wrong sign or offset would swing the arm, and nothing "
+            f"has shown them yet{self._remedy}"
+        )
+
+    def require_provable(self) -> None:
+        """`NotReady` if nothing may be sent."""
+        if self.fault:
+            raise NotReady(f"The commands of {self._robot} are not proved: {self.fault}. Nothing has moved.")
+
+    def done(self, lag: float) -> None:
+        """Remember that the commands are proved; `lag` is the measured delay of the arm behind them [s]."""
+        self.is_done = True
+        if self.is_known:
+            return
+        self.since = time.strftime("%Y-%m-%d %H:%M")
+        try:
+            _write(self._file, {"robot": self._robot, "topics": self._topics, "proved": self.since, "lag": round(lag, 4)})
+        except OSError as error:
+            _LOG.warning("That the commands are proved is not remembered: %s: %s.", self._file, error.strerror or error)
+
+
+def _joint_labels(profile: RobotProfile) -> list[str]:
+    return [label for label, unit in zip(profile.command.labels, profile.command.units, strict=True) if unit == "rad"]
+
+
+def _timed_remedy(profile: RobotProfile) -> str:
+    timed = [mode for mode, sinks in profile.commands.items() if any(sink.is_timed for sink in sinks)]
+    if timed:
+        return f": drive it once in the mode {timed[0]} of the profile {profile.name}, which proves them in a small motion"
+    return ": give the profile a mode with trajectory_msgs/JointTrajectory, and drive it once in that mode"
+
+
+def _key(profile: RobotProfile, arm: Sequence[Sink], controllers: Controllers, robot: str) -> str:
+    """Digest of the robot, its controllers, and how the profile reads its joints and writes its commands."""
+    source = next((asdict(one) for one in profile.state if one.signal == "joint_position"), {})
+    numbers = sorted(row for one in arm for row in zip(one.labels, one.names, one.scale, one.offset, strict=True))
+    rows = ("name", "type", "required_command_interfaces")
+    listed = sorted(json.dumps([row.get(key) for key in rows], default=str) for row in controllers.listed)
+    text = json.dumps([robot, source, numbers, listed], default=str)
+    return hashlib.sha256(text.encode()).hexdigest()[:32]
+
+
+def _remembered(file: Path) -> str:
+    try:
+        found: Any = json.loads(file.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return ""
+    return str(found.get("proved", "")) if isinstance(found, dict) else ""
+
+
+def _write(file: Path, row: Mapping[str, Any]) -> None:
+    file.parent.mkdir(parents=True, exist_ok=True)
+    descriptor, name = tempfile.mkstemp(dir=file.parent)
+    with os.fdopen(descriptor, "w", encoding="utf-8") as stream:
+        json.dump(row, stream)
+    os.replace(name, file)
