@@ -36,4 +36,5 @@ def arm_state(joints, velocity=(0.0,) * 6, collision=False, obstacle=(0.0, 0.0, 
 
 def encode_command(profile, spec, command, tag, mode=None, **options):
     """The messages that send `command` in `mode`, in the order in which they must be sent."""
+    mode = "position" if mode is None and "position" in profile.commands else mode
     return [encode_sink(sink, spec, command, tag, **options) for sink in profile.sinks(mode)]

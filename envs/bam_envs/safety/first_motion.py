@@ -78,10 +78,11 @@ class ProofMotion:
             NotAsCommanded: The arm does not move as commanded.
         """
         yield from self._stay(GAP if every else KNOWN_GAP)
-        measured = yield from self._together() if every else self._ramp(self._all(TINY), self._rest, 0.0)
+        yield from self._together() if every else self._ramp(self._all(TINY), self._rest, 0.0)
+        there = self._rest
         for joint in range(len(self._labels)) if every else [len(self._labels) - 1]:
-            measured = yield from self._alone(joint)
-        return measured
+            there = yield from self._alone(joint, there)
+        return (yield from self._ramp(there, self._rest, MOST_GAIN * PROOF / SLOW))
 
     def _all(self, amount: float) -> Numbers:
         return [sign * amount for sign in self._signs]
@@ -131,16 +132,16 @@ class ProofMotion:
             raise NotAsCommanded(f"all joints were commanded to move, and none moved: {LIKELY}")
         return (yield from self._ramp(before, self._rest, WAIT))
 
-    def _alone(self, joint: int) -> Moves:
-        """Move one joint and back; it moves as far as commanded."""
-        name, there, seconds = self._labels[joint], self._rest.copy(), MOST_GAIN * PROOF / SLOW
+    def _alone(self, joint: int, before: Numbers) -> Generator[Step, Numbers, Numbers]:
+        """Move one joint, which moves as far as commanded, from `before`; returns where the arm is then."""
+        name, there = self._labels[joint], before.copy()
         there[joint] = self._signs[joint] * PROOF
-        measured = yield from self._ramp(self._rest, there, seconds)
+        measured = yield from self._ramp(before, there, MOST_GAIN * PROOF / SLOW)
         moved = measured[joint] - self._base[joint]
         if not LEAST_GAIN <= moved / there[joint] <= MOST_GAIN:
             did = "did not move" if abs(moved) < OTHERS * PROOF else f"moved {moved:+.3f} rad"
             raise NotAsCommanded(f"{name} was commanded to move {there[joint]:+.3f} rad, and {did}: {LIKELY}")
-        return (yield from self._ramp(there, self._rest, seconds))
+        return there
 
     def _ramp(self, begin: Numbers, end: Numbers, seconds: float) -> Moves:
         """Go from `begin` to `end` (k,), relative to the start, and rest there."""

@@ -14,6 +14,7 @@ from websockets.exceptions import ConnectionClosed
 
 from bam_envs.core.errors import LinkLost
 from bam_envs.core.robot import Initial, RobotState
+from bam_envs.live import rosbridge_robot
 from bam_envs.robots.profile import load_profile
 from bam_envs.ros.codec import HALT_TOPIC, INFO_SERVICE, RobotInfo, decode_command, encode_state
 from bam_envs.ros.messages import write_stamp
@@ -141,7 +142,7 @@ class ScriptedRobot:
         self.stamp = lambda: write_stamp(time.time())
         self._bus, self._namespace, self._info = bus, namespace, info
         self._lock, self._changed = threading.RLock(), threading.Condition()
-        self._told = {}
+        self._told, self._moved_at = {}, 0.0
         self.tag = ""
         """Echo of the last complete command."""
         self._stopped, self._thread = threading.Event(), None
@@ -205,11 +206,16 @@ class ScriptedRobot:
     def _move(self):
         if self.frozen:
             return
+        before, now_is = self.signals.get("joint_position"), time.monotonic()
         names = [one for one in ("base_velocity", "joint_position", "gripper_width") if one in self.signals]
         now = np.concatenate([self.signals[name] for name in names])
         now[list(self._told)] = list(self._told.values())
         ends = np.cumsum([len(self.signals[name]) for name in names])
         self.signals |= dict(zip(names, np.split(now, ends[:-1]), strict=True))
+        if "joint_velocity" in self.signals:
+            speed = (self.signals["joint_position"] - before) / max(now_is - self._moved_at, 0.02)
+            self.signals["joint_velocity"] = np.clip(speed, -3.0, 3.0)
+        self._moved_at = now_is
 
     def publish(self):
         with self._lock:
@@ -224,6 +230,14 @@ class ScriptedRobot:
         while not self._stopped.wait(0.01):
             with contextlib.suppress(LinkLost):  # the server was closed
                 self.publish()
+
+
+@pytest.fixture(autouse=True)
+def commands_are_proved(request, monkeypatch, tmp_path_factory):
+    """Leave the motion that proves commands out, where a test is not about it."""
+    monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path_factory.mktemp("config")))
+    if request.node.get_closest_marker("proves") is None:
+        monkeypatch.setattr(rosbridge_robot, "needed_proof", lambda *arguments: None)
 
 
 @pytest.fixture

@@ -226,10 +226,10 @@ def test_a_server_that_passes_no_message_on_and_whose_clock_is_apart(lax, robot_
 @pytest.mark.slow
 def test_nobody_takes_commands(server, robot_on, patient):
     robot_on(server)
-    profile = patient('\n[rename]\n"/forward_position_controller/commands" = "/other/commands"\n')
+    profile = patient('\n[rename]\n"/scaled_joint_trajectory_controller/joint_trajectory" = "/other/commands"\n')
     name, why = failure(diagnose(server.url, profile=profile)[1])
     assert name == "command path"
-    assert why.startswith("Nobody listens to /other/commands (std_msgs/Float64MultiArray), which takes shoulder_pan")
+    assert why.startswith("Nobody listens to /other/commands (trajectory_msgs/JointTrajectory), which takes shoulder_pan")
 
 
 def test_a_robot_in_a_protective_stop(server, robot_on, patient):

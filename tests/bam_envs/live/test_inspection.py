@@ -14,7 +14,7 @@ from bam_envs.rosbridge.endpoint import Endpoint
 
 SPEC, PROFILE = arm_spec("ur5e", with_object=True), load_profile("ur5e")
 STATES = ["/joint_states", "/gripper/joint_states", "/object_pose"]
-COMMANDS = ["/gripper/commands", "/forward_position_controller/commands"]
+COMMANDS = ["/gripper/commands", "/scaled_joint_trajectory_controller/joint_trajectory"]
 TOOL = "/tcp_pose_broadcaster/pose"
 
 

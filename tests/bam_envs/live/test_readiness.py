@@ -9,6 +9,7 @@ from bam_envs.core.errors import NotReady, SafetyStop
 from bam_envs.core.timing import Deadline
 from bam_envs.live.building import live_robot
 from bam_envs.robots.profile import load_profile
+from bam_envs.robots.ur5e import JOINTS
 from bam_envs.ros.codec import RobotInfo
 
 ROW = np.zeros(1, np.int64)
@@ -18,7 +19,7 @@ SAFETY, MODE, PROGRAM = (
 SPEED = "/speed_scaling_state_broadcaster/speed_scaling"
 LIST = "/controller_manager/list_controllers"
 TYPES = {one.topic: one.type for name in ("ur5e", "mir100") for one in load_profile(name).readiness}
-ACTIVE = {"forward_position_controller": "active", "scaled_joint_trajectory_controller": "inactive"}
+ACTIVE = {"scaled_joint_trajectory_controller": "active", "forward_position_controller": "inactive"}
 
 
 class Driver:
@@ -132,7 +133,7 @@ def test_two_programs_do_not_drive_one_robot(server, robot_on, connected, start_
     first.step(command)
     until(lambda: second.not_ready() is not None)
     assert second.not_ready() == (
-        "somebody else commands the robot on /forward_position_controller/commands; end the other program first"
+        "somebody else commands the robot on /scaled_joint_trajectory_controller/joint_trajectory; end the other program first"
     )
     with pytest.raises(NotReady, match="somebody else commands the robot"):
         second.reset(ROW, start_pose)
@@ -146,10 +147,11 @@ def test_a_command_of_somebody_else_stops_a_robot_in_motion(server, connected, s
     robot = connected()
     command = robot.reset(ROW, start_pose).command
     robot.step(command)
-    server.advertise("/forward_position_controller/commands", "std_msgs/Float64MultiArray")
-    server.publish("/forward_position_controller/commands", {"data": command[0, :6].tolist()})
+    server.advertise("/scaled_joint_trajectory_controller/joint_trajectory", "trajectory_msgs/JointTrajectory")
+    point = {"positions": command[0, :6].tolist()}
+    server.publish("/scaled_joint_trajectory_controller/joint_trajectory", {"joint_names": list(JOINTS), "points": [point]})
     until(lambda: robot.not_ready() is not None)
-    with pytest.raises(NotReady, match="somebody else commands the robot on /forward_position_controller/commands"):
+    with pytest.raises(NotReady, match="somebody else commands the robot on /scaled_joint_trajectory_controller/joint_trajectory"):
         robot.step(command)
 
 
@@ -194,11 +196,11 @@ def test_what_follows_from_it_is_told_with_it(driver, connected, start_pose):
 @pytest.mark.parametrize(
     ("change", "way", "text"),
     [
-        ({}, "position", None),
-        ({}, "trajectory", "the controller scaled_joint_trajectory_controller is inactive"),
+        ({}, "trajectory", None),
+        ({}, "position", "the controller forward_position_controller is inactive"),
         ({"forward_position_controller": "unconfigured"}, "position", "forward_position_controller is unconfigured"),
-        ({"forward_position_controller": "running"}, "position", None),  # as ROS 1 calls it
-        (None, "position", "the controller forward_position_controller is not loaded: ros2 control switch_controllers"),
+        ({"scaled_joint_trajectory_controller": "running"}, "trajectory", None),  # as ROS 1 calls it
+        (None, "trajectory", "the controller scaled_joint_trajectory_controller is not loaded: ros2 control switch_"),
     ],
 )
 def test_controllers(driver, connected, start_pose, change, way, text):

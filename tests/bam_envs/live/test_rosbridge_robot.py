@@ -48,7 +48,7 @@ class OpenGate:
         return self.robot.step(_clear(self.robot, np.array(command)))
 
 
-def robot_at(url, profile="ur5e", **options):
+def robot_at(url, profile="ur5e_position", **options):
     return RosbridgeRobot(url, load_profile(profile), **options)
 
 
@@ -57,7 +57,7 @@ def connect():
     """Connect to a robot; the robot, and an open gate before it."""
     robots = []
 
-    def start(url, profile="ur5e", **options):
+    def start(url, profile="ur5e_position", **options):
         robots.append(robot_at(url, profile, **options))
         robots[-1].connect()
         return robots[-1], OpenGate(robots[-1])
@@ -133,7 +133,7 @@ def test_only_a_gate_sends_commands(server, robot_on, connect):
 def test_before_connect_and_after_close(server, robot_on, connect):
     robot = robot_at("ws://127.0.0.1:9/cell_1")
     assert raised(ResetNeeded, robot.measure) == (
-        "ur5e at ws://127.0.0.1:9/cell_1 is not connected. Call connect() first."
+        "ur5e_position at ws://127.0.0.1:9/cell_1 is not connected. Call connect() first."
     )
     assert robot.age() == np.inf
     robot_on(server)
@@ -459,7 +459,7 @@ def test_a_controller_that_is_not_there(server):
     robot = robot_at(Endpoint(server.url, timeout=0.3))
     assert raised(ProtocolError, robot.connect) == (
         f"Nobody listens to {JOINT_COMMANDS} (std_msgs/Float64MultiArray), which takes {', '.join(JOINTS)}. Is the "
-        "controller active, and is the topic called so? Topics are in the profile of ur5e; this may be another "
+        "controller active, and is the topic called so? Topics are in the profile of ur5e_position; this may be another "
         "robot than it describes."
     )
 
@@ -470,7 +470,7 @@ def test_a_silent_topic(server, robot_on):
     robot = robot_at(Endpoint(server.url, timeout=0.5))
     assert raised(StaleState, robot.connect) == (
         "/object_pose (geometry_msgs/PoseStamped): no message in 0.5 s. Does it run, and is the topic called so? "
-        "Topics are in the profile of ur5e."
+        "Topics are in the profile of ur5e_position."
     )
 
 
@@ -541,13 +541,13 @@ def test_ros_1(lax, robot_on, connect):
     scripted = robot_on(server)
     seconds = iter(range(1_700_000_000, 1_800_000_000))
     scripted.stamp = lambda: {"secs": next(seconds), "nsecs": 5}
-    _, gate = connect(server.url, command="trajectory")
+    _, gate = connect(server.url, "ur5e")
     assert gate.state.stamp[0] >= 1_700_000_000
     gate.step(gate.state.command)
     scripted.wait_for(lambda: len(scripted.commands) == 2)
     message = scripted.commands[1][2]
     assert message["header"]["stamp"] == {"secs": 0, "nsecs": 0}
-    assert message["points"][0]["time_from_start"] == {"secs": 0, "nsecs": 50_000_000}
+    assert message["points"][0]["time_from_start"] == {"secs": 0, "nsecs": 75_000_000}
 
 
 def test_two_robots_behind_one_server(server, robot_on, connect):
@@ -611,7 +611,7 @@ def test_states_are_asked_for_throttled_and_the_newest_alone(lax, robot_on, conn
         "/joint_states": expected,
         "/object_pose": expected,
         "/gripper/joint_states": (0, 0),  # shared by several publishers, it comes whole
-        "/forward_position_controller/commands": (0, 0),  # to see whether somebody else commands the robot
+        "/scaled_joint_trajectory_controller/joint_trajectory": (0, 0),  # to see whether somebody else commands the robot
         "/gripper/commands": (0, 0),
     }
     assert all(type(number) is int for pair in subscriptions(server).values() for number in pair)

@@ -18,7 +18,7 @@ from bam_envs.robots.ur import ur_model, ur_spec
 from bam_envs.rosbridge.server import BridgeServer
 from bam_envs.tasks.ur_reach import START
 
-ARM, GRIPPER = "/forward_position_controller/commands", "/gripper/commands"
+ARM, GRIPPER = "/scaled_joint_trajectory_controller/joint_trajectory", "/gripper/commands"
 SIX = ur_spec(ur_model("ur5e"), 0.1, with_object=False)
 ACTION = np.array([0.1, -0.4, 0.4, 0.1, -0.2], np.float32)
 HELD = 0.037

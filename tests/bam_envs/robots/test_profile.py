@@ -67,7 +67,7 @@ def refusal(path):
 
 
 def test_the_ur5e_whose_controller_interpolates():
-    assert shipped_profiles() == ["mir100", "ur5e", "ur5e_trajectory"]
+    assert shipped_profiles() == ["mir100", "ur5e", "ur5e_position", "ur5e_trajectory"]
     profile, held = load_profile("ur5e_trajectory"), load_profile("ur5e")
     assert profile.spec() == replace(held.spec(), name="ur5e_trajectory")
     assert (profile.state, profile.readiness, profile.limits) == (held.state, held.readiness, held.limits)
@@ -85,7 +85,10 @@ def test_the_ur5e_is_the_simulated_arm():
     assert [signal.name for signal in profile.signals[5:]] == ["tool_position", "tool_quaternion"]
     assert profile.source("joint_velocity").names == JOINTS
     position, trajectory = profile.sinks("position"), profile.sinks("trajectory")
-    assert profile.sinks() == position
+    assert profile.sinks() == trajectory
+    assert load_profile("ur5e_position").sinks() == position
+    assert [sink.is_timed for sink in (position[1], trajectory[1])] == [False, True]
+    assert [sink.is_named for sink in (position[0], position[1], trajectory[1])] == [True, False, True]
     assert [sink.topic for sink in position] == ["/gripper/commands", "/forward_position_controller/commands"]
     assert trajectory[1].topic == "/scaled_joint_trajectory_controller/joint_trajectory"
     assert [sink.hold for sink in position] == ["last", "measured"]
@@ -123,10 +126,10 @@ def test_a_task_may_take_a_part_of_the_commands():
     assert spec.command.labels == JOINTS
     assert spec.command.max_rate == (np.pi,) * 6
     assert spec.period == 0.1
-    (_, arm), (_, trajectory) = profile.commands.values()
-    assert dict(narrow.commands) == {"position": (arm,), "trajectory": (trajectory,)}
-    assert narrow.sinks() == (arm,)
-    assert list(narrow.sinks_by_topic) == [trajectory.topic, arm.topic]
+    (_, trajectory), (_, arm) = profile.commands.values()
+    assert dict(narrow.commands) == {"trajectory": (trajectory,), "position": (arm,)}
+    assert narrow.sinks() == (trajectory,)
+    assert list(narrow.sinks_by_topic) == [arm.topic, trajectory.topic]
     assert replace(narrow, command=profile.command, commands=profile.commands) == profile
     assert profile.narrowed(profile.command.labels) is profile
     assert profile_for(wanted) == narrow
@@ -277,7 +280,7 @@ def test_files(write, tmp_path):
     missing = tmp_path / "other.toml"
     (tmp_path / "folder.toml").mkdir()
     assert refusal(missing) == (
-        "There is no robot profile FILE. Give the path of a file, or one of: mir100, ur5e, ur5e_trajectory."
+        "There is no robot profile FILE. Give the path of a file, or one of: mir100, ur5e, ur5e_position, ur5e_trajectory."
     )
     assert refusal(write("name =")).startswith("FILE is not TOML: ")
     for text in ("a: [", "a: 2020-13-45", "a: !!int b", "[" * 1000):
@@ -291,7 +294,7 @@ def test_files(write, tmp_path):
         load_profile(write('extends = "ur5"'))
     assert refusal(write("extends = 3")) == "FILE: extends: expected non-empty text, found 3"
     assert refusal(write('extends = "b.toml"')) == (
-        "FILE: extends must be a shipped profile (mir100, ur5e, ur5e_trajectory), not 'b.toml'."
+        "FILE: extends must be a shipped profile (mir100, ur5e, ur5e_position, ur5e_trajectory), not 'b.toml'."
     )
     assert refusal(tmp_path / "folder.toml") == (
         "The robot profile FILE cannot be read: [Errno 21] Is a directory: 'FILE'."
@@ -321,8 +324,8 @@ def test_a_frame_of_another_name(write):
 @pytest.mark.parametrize(
     ("name", "mode", "period", "lag"),
     [
-        ("ur5e", None, 0.05, 0.1),
-        ("ur5e", "trajectory", 0.05, 0.1),
+        ("ur5e", None, 0.05, 0.125),
+        ("ur5e", "position", 0.05, 0.1),
         ("ur5e_trajectory", None, 0.05, 0.125),
         ("ur5e_trajectory", None, 0.1, 0.15),
         ("mir100", None, 0.1, 0.3),
@@ -334,15 +337,15 @@ def test_what_takes_longer_is_farther_behind(name, mode, period, lag):
 
 
 def test_a_renamed_command_is_another_controllers(write):
-    topic = "/forward_position_controller/commands"
+    topic = "/scaled_joint_trajectory_controller/joint_trajectory"
     profile = load_profile(write(f'extends = "ur5e"\nreadiness = []\n[rename]\n"{topic}" = "/left/commands"\n'))
     assert [(sink.topic, sink.controller) for sink in profile.sinks()] == [
         ("/gripper/commands", ""),
         ("/left/commands", ""),
     ]
-    assert profile.sinks("trajectory")[1].controller == "scaled_joint_trajectory_controller"
+    assert profile.sinks("position")[1].controller == "forward_position_controller"
     assert profile.readiness == ()
-    assert [sink.controller for sink in load_profile("ur5e").sinks()] == ["", "forward_position_controller"]
+    assert [sink.controller for sink in load_profile("ur5e").sinks()] == ["", "scaled_joint_trajectory_controller"]
 
 
 def test_the_former_name_of_the_command_timeout(write):

@@ -271,7 +271,7 @@ def test_commands_of_an_arm():
                 "velocities": [],
                 "accelerations": [],
                 "effort": [],
-                "time_from_start": {"secs": 0, "nsecs": 50_000_000},
+                "time_from_start": {"secs": 0, "nsecs": 75_000_000},
             }
         ],
     }
@@ -396,7 +396,7 @@ def test_info_of_the_wrong_kind_is_not_believed(field, value, text):
 def test_a_trajectory_that_reaches_over_more_than_a_period(period, nanoseconds):
     profile = load_profile("ur5e_trajectory")
     spec = replace(profile.spec(), period=period)
-    _, (_, _, message) = encode_command(profile, spec, np.arange(7.0) / 100, None)
+    _, (_, _, message) = encode_command(profile, spec, np.arange(7.0) / 100, None, "trajectory")
     assert message["points"][0]["time_from_start"] == {"sec": 0, "nanosec": nanoseconds}
 
 

@@ -66,13 +66,15 @@ def test_a_watcher_takes_no_robot_over_from_a_running_policy(serve_env, watcher,
     live.step(ACTION)
     thief.wait_for(lambda: thief.heard and thief.states and read_echo(thief.states[-1]["header"]["frame_id"]))
     arm, heard = next((topic, message) for topic, message in thief.heard if topic == UR5E.sinks()[-1].topic)
+    joints = np.array(heard["points"][0]["positions"])
     tag = read_tag(tag_text(heard))
     assert read_echo(thief.states[-1]["header"]["frame_id"])[0] == tag.session
-    spec, far = live.unwrapped.robot.spec, np.append(np.array(heard["data"]) + 1.0, 0.085)
+    spec, far = live.unwrapped.robot.spec, np.append(joints + 1.0, 0.085)
     ahead = replace(tag, sequence=tag.sequence + 10**6, mac="")
     forger = Tagger(session=tag.session, key=bytes(32))
-    forged = [encode_command(UR5E, spec, far, ahead, sign=sign)[-1][2] for sign in (None, forger.sign)]
-    forged += [heard, {**heard, "data": far[:6].tolist()}, {"data": far[:6].tolist()}]
+    forged = [encode_command(UR5E, spec, far, ahead, "trajectory", sign=sign)[-1][2] for sign in (None, forger.sign)]
+    point = {**heard["points"][0], "positions": far[:6].tolist()}
+    forged += [heard, {**heard, "points": [point]}, {"joint_names": heard["joint_names"], "points": [point]}]
     for message in forged:
         thief.link.publish(arm, message)
     thief.wait_for(lambda: len(thief.refusals) == len(forged))
@@ -82,7 +84,7 @@ def test_a_watcher_takes_no_robot_over_from_a_running_policy(serve_env, watcher,
     assert "is in command, not " in thief.refusals[4]
     for _ in range(3):
         live.step(ACTION)
-        assert np.abs(live.unwrapped.state.signals["joint_position"][0] - heard["data"]).max() < 0.5
+        assert np.abs(live.unwrapped.state.signals["joint_position"][0] - joints).max() < 0.5
 
 
 def test_a_reset_opens_a_session_where_the_old_one_is_not_known_any_more(serve_env, make):
