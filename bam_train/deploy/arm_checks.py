@@ -47,7 +47,7 @@ def geometry_of(env: Any) -> ArmGeometry | None:
 
 
 def arm_checks(spec: RobotSpec, geometry: ArmGeometry, margin: float, inspection: Inspection) -> Iterator[Check]:
-    """Lines about limits, kinematics and sense of the joints of an arm.
+    """Lines about limits, kinematics and sense of the measured joints of an arm.
 
     Args:
         spec: Signals and commands of the task.
@@ -68,7 +68,7 @@ def arm_checks(spec: RobotSpec, geometry: ArmGeometry, margin: float, inspection
         pose, why = None, "the arm moves"
     if pose is None:
         yield check("tool pose", expected, why, fits=None)
-        yield check("sense of the joints", "as commanded", "not shown without the tool's pose", fits=None)
+        yield check("sense of the joints", "as the arm has it", "not shown without the tool's pose", fits=None)
         return
     q = np.median(joints, axis=0)
     beside, along, turned = _gap(geometry, q, pose)
@@ -138,8 +138,11 @@ def _tool_length(geometry: ArmGeometry, along: float) -> Check:
     else:
         fits = min(abs(along - geometry.tool), abs(along)) <= OFF_AXIS
         expected = f"{geometry.tool:g} m, or 0 for the flange"
-    hint = "" if fits else ": set the tool centre point (TCP) of the robot so"
-    return check("tool length", expected, f"{along:.3f} m{hint}", fits=fits)
+    hint = (
+        f": if its gripper is that of the policy, set the tool centre point (TCP) to {geometry.tool:g} m; for another "
+    )
+    hint += "gripper, train a policy with its length"
+    return check("tool length", expected, f"{along:.3f} m{'' if fits else hint}", fits=fits)
 
 
 def _senses(geometry: ArmGeometry, q: Array, pose: Pose) -> Check:
@@ -148,9 +151,9 @@ def _senses(geometry: ArmGeometry, q: Array, pose: Pose) -> Check:
     found = (
         "shown by the tool's pose"
         if not hidden
-        else f"not shown at 0 or 180 degrees: {', '.join(hidden)}; give --wiggle"
+        else f"not shown at 0 or 180 degrees: {', '.join(hidden)}; move it a little and try again"
     )
-    return check("sense of the joints", "as commanded", found, fits=None if hidden else True)
+    return check("sense of the joints", "as the arm has it", found, fits=None if hidden else True)
 
 
 def _explained(geometry: ArmGeometry, q: Array, pose: Pose) -> str:

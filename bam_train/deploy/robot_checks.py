@@ -13,9 +13,9 @@ from numpy.typing import ArrayLike, NDArray
 from bam_envs.core.errors import ProtocolError
 from bam_envs.core.robot import RobotSpec, SignalSpec
 from bam_envs.live.inspection import Inspection
-from bam_envs.live.state import Letter, SourceAge, concerns
+from bam_envs.live.state import SIMULATED_BEFORE, Letter, SourceAge, concerns
 from bam_envs.ros.codec import decode_source
-from bam_envs.ros.messages import Message, bare_type, number_at, same_type
+from bam_envs.ros.messages import Message, bare_type, has_header, number_at, read_stamp, same_type
 from bam_envs.ros.profile_tables import RobotProfile, Source
 from bam_envs.safety.guards import MeasuredLimits
 from bam_train.deploy.contract_table import Check, check
@@ -29,6 +29,8 @@ FACTORS = {"rad": {"degrees": math.degrees(1)}, "m": {"millimetres": 1000.0, "ce
 """SI unit to other units and the factor by which numbers are greater in them."""
 RATE_OFF = 0.1
 """Tolerance of a measured speed against the change of the measured position [unit/s], and as a share of it."""
+AHEAD = 0.5
+"""Least time by which a stamp is before its arrival that is reported [s]; clocks of a network differ by less."""
 SPEED_OF = {"joint_velocity": "joint_position", "base_velocity": "base_pose"}
 _SCAN_OFF, _RANGE_OFF = 0.02, 10.0  # relative tolerance of an angle, factor of tolerance of a range
 _SHORTEST = 0.05  # minimum time over which a speed is compared [s]
@@ -112,6 +114,25 @@ def _timing(profile: RobotProfile, spec: RobotSpec, inspection: Inspection, sour
     if rate >= least:
         age = statistics.median(ages)
         yield check(f"age of {source.topic}", f"at most {allowed:g} s", f"{age:.3f} s", fits=age <= allowed)
+    yield from _stamps(inspection, source, letters)
+
+
+def _stamps(inspection: Inspection, source: Source, letters: Sequence[Letter]) -> Iterator[Check]:
+    """A line about stamps that do not tell when a message was measured, from which its age would be judged."""
+    stamps = [read_stamp(letter.message, source.topic) for letter in letters]
+    found = ""
+    if has_header(source.type) and None in stamps:
+        found = "0: ages are judged by arrival alone, and a driver that repeats old states is not noticed"
+    offset, clock = (
+        inspection.server_offset or 0.0,
+        "this computer" if inspection.server_offset is None else "the bridge",
+    )
+    rows = zip(stamps, letters, strict=True)
+    ahead = [at - (one.arrived + inspection.wall_ahead - offset) for at, one in rows if at and at >= SIMULATED_BEFORE]
+    if ahead and statistics.median(ahead) > AHEAD:
+        found = f"{statistics.median(ahead):.1f} s ahead of the clock of {clock}: set the clock of the robot"
+    if found:
+        yield check(f"stamps of {source.topic}", "the time of the measurement", found, fits=None)
 
 
 def _new_and_ages(inspection: Inspection, source: Source, letters: Sequence[Letter]) -> tuple[list[float], list[float]]:

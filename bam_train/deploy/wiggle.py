@@ -49,7 +49,8 @@ def wiggle(robot: SafeRobot, joints: Array | None) -> Iterator[Check]:
         states += robot.prove(anew=True) if proves else []
         state = robot.reset(np.zeros(1, np.int64), initial)
         states += robot.prove(anew=True) if is_arm and not proves else [state]
-        for label, goal in _goals(command, states[-1].command[0], spec.period):
+        for axis, goal in _goals(command, states[-1].command[0], spec.period):
+            label = axis
             states.append(robot.step(goal[None]))
     except SafetyStop as stop:
         yield check(f"motion of {label}", "as commanded", str(stop), fits=False)

@@ -46,8 +46,8 @@ class Controllers:
             joints, sent = self.joints[sink.topic], ", ".join(sink.names)
             if joints is None:
                 return (
-                    f"nothing tells in which order {sink.topic} takes {sent}: {_controller(sink)} has no parameter joints "
-                    f"that can be read here{_remedy(profile)}"
+                    f"nothing tells in which order {sink.topic} takes {sent}: the parameter joints of "
+                    f"{_controller(sink)} cannot be read here{_remedy(profile)}"
                 )
             if joints != sink.names:
                 return (
@@ -165,8 +165,8 @@ class CommandProof:
         if self.order_fault or self.is_timed or self.is_known:
             return self.order_fault
         return (
-            f"{self._topics} executes a position at once, so that a wrong sign or offset would swing the arm, and nothing "
-            f"has shown them yet{self._remedy}"
+            f"{self._topics} executes a position at once, so that a wrong sign or offset would swing the arm, and "
+            f"nothing has shown them yet{self._remedy}"
         )
 
     def require_provable(self) -> None:
@@ -181,7 +181,9 @@ class CommandProof:
             return
         self.since = time.strftime("%Y-%m-%d %H:%M")
         try:
-            _write(self._file, {"robot": self._robot, "topics": self._topics, "proved": self.since, "lag": round(lag, 4)})
+            _write(
+                self._file, {"robot": self._robot, "topics": self._topics, "proved": self.since, "lag": round(lag, 4)}
+            )
         except OSError as error:
             _LOG.warning("That the commands are proved is not remembered: %s: %s.", self._file, error.strerror or error)
 
@@ -193,7 +195,9 @@ def _joint_labels(profile: RobotProfile) -> list[str]:
 def _timed_remedy(profile: RobotProfile) -> str:
     timed = [mode for mode, sinks in profile.commands.items() if any(sink.is_timed for sink in sinks)]
     if timed:
-        return f": drive it once in the mode {timed[0]} of the profile {profile.name}, which proves them in a small motion"
+        return (
+            f": drive it once in the mode {timed[0]} of the profile {profile.name}, which proves them in a small motion"
+        )
     return ": give the profile a mode with trajectory_msgs/JointTrajectory, and drive it once in that mode"
 
 

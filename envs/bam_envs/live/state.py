@@ -25,7 +25,7 @@ from bam_envs.ros.profile_tables import RobotProfile, Source
 from bam_envs.rosbridge.bus import Caller, Listener, Message
 
 Array = NDArray[np.float64]
-_SIMULATED_BEFORE = 1e8
+SIMULATED_BEFORE = 1e8
 """An earlier stamp [s since 1970] comes from a simulator's clock, which may have any speed but must advance."""
 _OTHER_CLOCK = 60.0
 """A stamp farther than this [s] from the server's clock comes from a clock that was never set."""
@@ -110,7 +110,7 @@ class SourceAge:
             self._measured = arrived
         elif stamp != self._newest:  # a repeated stamp is stale, however many messages repeat it
             delay = 0.0
-            if stamp >= _SIMULATED_BEFORE:
+            if stamp >= SIMULATED_BEFORE:
                 delay = self._quickest.age(stamp, arrived)
                 absolute = math.inf if server_offset is None else arrived + self._wall_ahead - stamp - server_offset
                 if abs(absolute) < _OTHER_CLOCK:

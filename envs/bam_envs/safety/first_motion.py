@@ -1,8 +1,8 @@
 """First motion (G25): what a robot at rest cannot show is checked in its first motion, and stops it.
 
-`proof_motion` is the motion that proves that commands reach the joints that are meant: an arm that is commanded in
-another order, or with another sign, offset or unit, is stopped before a joint has moved `MOST` or faster than `FASTEST`.
-`FirstMotion` compares the measurements with each other while the robot moves for the first time.
+`ProofMotion` proves that commands reach the joints that are meant: an arm that is commanded in another order, or with
+another sign, offset or unit, is stopped before a joint has moved by `MOST` or faster than `FASTEST`. `FirstMotion`
+compares the measurements with each other while the robot moves for the first time.
 """
 
 import math
@@ -15,13 +15,13 @@ from bam_envs.safety.guard import Guard, Numbers, Tick, columns_in, ticks_of
 MOST, FASTEST = 0.05, 0.1
 """Farthest motion [rad] and highest speed [rad/s] of a joint before its commands are proved."""
 REST_REACH = 1e6
-"""Time in which an arm whose commands are not proved is to reach the position of a halt [s]: it stays where it is."""
+"""Time in which an arm is to reach the position of a halt before its commands are proved [s]: it stays where it is."""
 PROOF, SLOW = 0.02, 0.09
 """Motion of each joint that proves its commands [rad], and the highest speed of a correct or wrong joint [rad/s]."""
 SETTLE, WAIT = 0.55, 0.2
 """Duration of the last stage in which the arm is commanded to stay, and least rest after a motion [s]."""
 GAP, KNOWN_GAP = 1e4, 4 * math.pi
-"""Greatest distance of a command from the measured joint [rad]: whatever its unit, and if its unit was proved before."""
+"""Greatest distance of a command from the measured joint [rad]: in any unit, and in one that was proved before."""
 STILL, SAG = 0.002, 0.03
 """Motion of a joint commanded to stay that counts as none, and that its load explains: a weak servo sags [rad]."""
 TINY = 0.0005
@@ -167,7 +167,7 @@ class ProofMotion:
         if high == low and begin != end:
             moving = next(self._labels[i] for i in range(len(begin)) if begin[i] != end[i])
             raise NotAsCommanded(
-                f"{name} moved {place:+.3f} rad when {moving} was commanded: the joints are commanded in another order"
+                f"{name} moved {place:+.3f} rad when {moving} was commanded: the commands have another order of joints"
             )
         raise NotAsCommanded(
             f"{name} was commanded to move {other - one:+.4f} rad, and moved {place - one:+.4f} rad: its commands have "
@@ -179,7 +179,7 @@ class ProofMotion:
 
 
 class FirstMotion(Guard):
-    """In the first motion, measured speeds fit the measured positions, and the gripper opens when it is commanded to."""
+    """In the first motion, measured speeds fit measured positions, and the gripper opens when it is commanded to."""
 
     number, name, unit, limit_value = "G25", "first motion", "share of the measured motion", MOST_GAIN
 
@@ -246,9 +246,9 @@ class FirstMotion(Guard):
                 self._opening += 1
                 if self._opening > self._longest:
                     return (
-                        f"{name} was commanded to open to {tick.last[at]:.3f} m and is measured at {measured:.3f} m: it is "
-                        "inverted, in another unit such as the angle of a finger, or blocked; correct its scale and offset "
-                        "in the profile, or free it"
+                        f"{name} was commanded to open to {tick.last[at]:.3f} m and is measured at {measured:.3f} m: "
+                        "inverted, in another unit such as the angle of a finger, or blocked; correct its scale and "
+                        "offset in the profile, or free it"
                     )
         return None
 
@@ -284,6 +284,6 @@ class _Way:
             return None
         return (
             f"{self._speed} adds up to {told:+.3f} {self._unit} while {self._position} changed by {measured:+.3f} "
-            f"{self._unit}: one of them is not measured, mirrored, or in another unit; correct the driver, or the scale in "
-            "the profile"
+            f"{self._unit}: one of them is not measured, mirrored, or in another unit; correct the driver, or the "
+            "scale in the profile"
         )

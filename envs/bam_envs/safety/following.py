@@ -1,8 +1,8 @@
 """Following (G23): a robot that does not follow its commands is held in place, and stopped if that continues.
 
 A joint follows if it is behind its commands by no more than its lag at its measured speed. The rest of the gap is the
-distance that it would jump when released: at most the joint's limit for one period, so that a released joint never moves
-faster than its limit. A joint that moves away from its commands is stopped at once: what moves is not what was commanded.
+distance that it would jump when released: at most its limit for one period, so that a released joint never moves faster
+than that. A joint that moves away from its commands stops the robot at once: what moves is not what was commanded.
 """
 
 import math
@@ -33,7 +33,7 @@ FORGIVEN = 2.0
 STUCK, STUCK_TIME = 0.002, 2.0
 """An arm none of whose joints moves by so much [rad] for so long [s], although its commands go on, is stopped."""
 SLOWEST_GAIN, GAIN_TIME = 0.25, 0.4
-"""Least acceleration of a base that follows its commands [m/s^2, rad/s^2], and the time over which it is measured [s]."""
+"""Least acceleration of a base that follows [m/s^2, rad/s^2], and the time over which it is measured [s]."""
 LIKELY = (
     "look for a protective stop, a paused program, an inactive controller, a low speed slider, or something in its way"
 )
@@ -173,7 +173,8 @@ class JointFollowing(Following):
         wanted, last, measured = pick(command), pick(tick.last), pick(tick.measured)
         before, self._moved = self._moved or [math.inf] * len(last), []
         lag, places, near, farther = min(self._lag, self._known_lag), [], [], False
-        rows = zip(wanted, last, measured, pick(tick.before), pick(tick.velocity), self._fastest, reaches, before)
+        measured_before, speeds = pick(tick.before), pick(tick.velocity)
+        rows = zip(wanted, last, measured, measured_before, speeds, self._fastest, reaches, before, strict=True)
         for goal, sent, here, was, speed, fastest, reach, moved_before in rows:
             gap, moved = sent - here, abs(here - was) if was == was else math.inf  # NaN in a first tick
             ahead = min(max(speed, -fastest), fastest) * lag
@@ -281,8 +282,8 @@ class BaseFollowing(Following):
             return False
         self._change[at] = gain * self._spec.period
         self.warning = (
-            f"the base accelerates at {gain:.2g} {self.unit}^2, and {self._expected[at]:.2g} {self.unit}^2 were expected; "
-            f"set the limit {self._acceleration} to that, so that it follows its commands"
+            f"the base accelerates at {gain:.2g} {self.unit}^2, and {self._expected[at]:.2g} {self.unit}^2 were "
+            f"expected; set the limit {self._acceleration} to that, so that it follows its commands"
         )
         self._reached = measured
         self._sent.clear()

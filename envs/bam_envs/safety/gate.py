@@ -341,7 +341,9 @@ class SafeRobot(metaclass=Sealed):
         """
         self._require_free()
         if self.is_unproved:
-            raise ResetNeeded(f"Nothing shows yet that commands reach the joints of {self.spec.name}. Call reset() first.")
+            raise ResetNeeded(
+                f"Nothing shows yet that commands reach the joints of {self.spec.name}. Call reset() first."
+            )
         return self._advance(self._shape.numbers(command))
 
     def _advance(self, goal: Numbers, *, approach: bool = False, proving: bool = False) -> RobotState:
@@ -593,8 +595,8 @@ class SafeRobot(metaclass=Sealed):
     def prove(self, *, anew: bool = False) -> list[RobotState]:
         """Move each joint a little and back, to prove that commands reach the joints that are meant.
 
-        An arm whose commands were proved before, in this configuration, moves its last joint only, unless `anew` is set.
-        `reset` does this by itself with a live arm, once a connection. Returns the states of the motion.
+        An arm whose commands were proved before, with these controllers, moves its last joint only, unless `anew` is
+        set. `reset` does this by itself with a live arm, once a connection. Returns the states of the motion.
 
         Raises:
             NotReady: The commands cannot be proved without a motion that may be large; nothing has moved.

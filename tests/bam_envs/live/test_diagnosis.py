@@ -229,7 +229,9 @@ def test_nobody_takes_commands(server, robot_on, patient):
     profile = patient('\n[rename]\n"/scaled_joint_trajectory_controller/joint_trajectory" = "/other/commands"\n')
     name, why = failure(diagnose(server.url, profile=profile)[1])
     assert name == "command path"
-    assert why.startswith("Nobody listens to /other/commands (trajectory_msgs/JointTrajectory), which takes shoulder_pan")
+    assert why.startswith(
+        "Nobody listens to /other/commands (trajectory_msgs/JointTrajectory), which takes shoulder_pan"
+    )
 
 
 def test_a_robot_in_a_protective_stop(server, robot_on, patient):

@@ -19,6 +19,7 @@ SAFETY, MODE, PROGRAM = (
 SPEED = "/speed_scaling_state_broadcaster/speed_scaling"
 LIST = "/controller_manager/list_controllers"
 TYPES = {one.topic: one.type for name in ("ur5e", "mir100") for one in load_profile(name).readiness}
+JOINTS_TOPIC = "/scaled_joint_trajectory_controller/joint_trajectory"
 ACTIVE = {"scaled_joint_trajectory_controller": "active", "forward_position_controller": "inactive"}
 
 
@@ -132,9 +133,7 @@ def test_two_programs_do_not_drive_one_robot(server, robot_on, connected, start_
     command = first.reset(ROW, start_pose).command
     first.step(command)
     until(lambda: second.not_ready() is not None)
-    assert second.not_ready() == (
-        "somebody else commands the robot on /scaled_joint_trajectory_controller/joint_trajectory; end the other program first"
-    )
+    assert second.not_ready() == (f"somebody else commands the robot on {JOINTS_TOPIC}; end the other program first")
     with pytest.raises(NotReady, match="somebody else commands the robot"):
         second.reset(ROW, start_pose)
     second.halt()
@@ -147,11 +146,13 @@ def test_a_command_of_somebody_else_stops_a_robot_in_motion(server, connected, s
     robot = connected()
     command = robot.reset(ROW, start_pose).command
     robot.step(command)
-    server.advertise("/scaled_joint_trajectory_controller/joint_trajectory", "trajectory_msgs/JointTrajectory")
+    server.advertise(JOINTS_TOPIC, "trajectory_msgs/JointTrajectory")
     point = {"positions": command[0, :6].tolist()}
-    server.publish("/scaled_joint_trajectory_controller/joint_trajectory", {"joint_names": list(JOINTS), "points": [point]})
+    server.publish(
+        "/scaled_joint_trajectory_controller/joint_trajectory", {"joint_names": list(JOINTS), "points": [point]}
+    )
     until(lambda: robot.not_ready() is not None)
-    with pytest.raises(NotReady, match="somebody else commands the robot on /scaled_joint_trajectory_controller/joint_trajectory"):
+    with pytest.raises(NotReady, match=f"somebody else commands the robot on {JOINTS_TOPIC}"):
         robot.step(command)
 
 

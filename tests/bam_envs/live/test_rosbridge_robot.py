@@ -459,8 +459,8 @@ def test_a_controller_that_is_not_there(server):
     robot = robot_at(Endpoint(server.url, timeout=0.3))
     assert raised(ProtocolError, robot.connect) == (
         f"Nobody listens to {JOINT_COMMANDS} (std_msgs/Float64MultiArray), which takes {', '.join(JOINTS)}. Is the "
-        "controller active, and is the topic called so? Topics are in the profile of ur5e_position; this may be another "
-        "robot than it describes."
+        "controller active, and is the topic called so? Topics are in the profile of ur5e_position; this may be "
+        "another robot than it describes."
     )
 
 
@@ -611,7 +611,10 @@ def test_states_are_asked_for_throttled_and_the_newest_alone(lax, robot_on, conn
         "/joint_states": expected,
         "/object_pose": expected,
         "/gripper/joint_states": (0, 0),  # shared by several publishers, it comes whole
-        "/scaled_joint_trajectory_controller/joint_trajectory": (0, 0),  # to see whether somebody else commands the robot
+        "/scaled_joint_trajectory_controller/joint_trajectory": (
+            0,
+            0,
+        ),  # to see whether somebody else commands the robot
         "/gripper/commands": (0, 0),
     }
     assert all(type(number) is int for pair in subscriptions(server).values() for number in pair)

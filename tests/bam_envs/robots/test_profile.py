@@ -280,7 +280,8 @@ def test_files(write, tmp_path):
     missing = tmp_path / "other.toml"
     (tmp_path / "folder.toml").mkdir()
     assert refusal(missing) == (
-        "There is no robot profile FILE. Give the path of a file, or one of: mir100, ur5e, ur5e_position, ur5e_trajectory."
+        "There is no robot profile FILE. Give the path of a file, or one of: mir100, ur5e, ur5e_position, "
+        "ur5e_trajectory."
     )
     assert refusal(write("name =")).startswith("FILE is not TOML: ")
     for text in ("a: [", "a: 2020-13-45", "a: !!int b", "[" * 1000):
