@@ -107,6 +107,8 @@ class RosbridgeRobot:
         """The proof of the commands of a real arm, which this connection needs before it moves; None: it needs none."""
         self.reach: float | None = None
         """Time in which the next commands are to be reached [s], where they say it; None: as in the profile."""
+        self.joints_only = False
+        """Whether the gripper is not commanded, but the joints of the arm alone."""
         images = {name: box for camera in self.spec.cameras for name, box in camera.spaces().items()}
         self._cameras = {name: (LiveCamera(endpoint, profile.camera(name)), box) for name, box in images.items()}
         self._pacer, self._session = Pacer(self.spec.period, now=clock), bringup.DrivingSession()
@@ -390,7 +392,8 @@ class RosbridgeRobot:
         """
         ros1, sign = control.ros == "ros1", self._session.tagger.sign
         options: Any = {"sign": sign, "ros1": ros1, "reach": self.reach}
-        envelopes = [encode_sink(sink, self.spec, command, tag, **options) for sink in self._sinks]
+        sinks = [sink for sink in self._sinks if not (self.joints_only and sink.hold == "last")]
+        envelopes = [encode_sink(sink, self.spec, command, tag, **options) for sink in sinks]
         with self._sending:
             if self._clock() > until:
                 _LOG.warning("%s: a command waited too long in this process, and was not sent.", self.url)

@@ -200,6 +200,11 @@ class FirstMotion(Guard):
         self._opening, self._longest = 0, ticks_of(OPENS_WITHIN, spec)
         self._pose: Numbers | None = None
 
+    @property
+    def opens(self) -> bool:
+        """Whether the gripper has shown that it opens when it is commanded to, or there is none."""
+        return not self._grippers
+
     def restart(self) -> None:
         """Forget the motion so far: time may have passed without commands."""
         self._opening, self._pose = 0, None
@@ -238,7 +243,9 @@ class FirstMotion(Guard):
         """Report a gripper that was commanded to open and is not measured open."""
         for at, name, widest in self._grippers:
             measured = tick.measured[at]
-            if math.isnan(measured) or tick.last[at] < OPEN * widest:
+            if math.isnan(measured):
+                self._grippers = []
+            elif tick.last[at] < OPEN * widest:
                 self._opening = 0
             elif measured >= (1.0 - OTHERS) * widest:
                 self._grippers = []

@@ -32,7 +32,7 @@ FORGIVEN = 2.0
 """Time of following after which that count is reset to 0 [s]."""
 STUCK, STUCK_TIME = 0.002, 2.0
 """An arm none of whose joints moves by so much [rad] for so long [s], although its commands go on, is stopped."""
-SLOWEST_GAIN, GAIN_TIME = 0.25, 0.4
+SLOWEST_GAIN, GAIN_TIME = 0.25, 0.2
 """Least acceleration of a base that follows [m/s^2, rad/s^2], and the time over which it is measured [s]."""
 LIKELY = (
     "look for a protective stop, a paused program, an inactive controller, a low speed slider, or something in its way"
@@ -274,17 +274,18 @@ class BaseFollowing(Following):
 
         From then on its measured acceleration is expected.
         """
+        seconds = (len(self._speeds) - 1) * self._spec.period
         if len(self._speeds) < (self._speeds.maxlen or 0):
             return False
-        seconds = (len(self._speeds) - 1) * self._spec.period
         gain = (measured[at] - self._speeds[0][at]) / seconds * math.copysign(1.0, sent - measured[at])
-        if gain < SLOWEST_GAIN or gain * self._spec.period >= self._change[at]:
+        if gain < SLOWEST_GAIN:
             return False
-        self._change[at] = gain * self._spec.period
-        self.warning = (
-            f"the base accelerates at {gain:.2g} {self.unit}^2, and {self._expected[at]:.2g} {self.unit}^2 were "
-            f"expected; set the limit {self._acceleration} to that, so that it follows its commands"
-        )
+        if gain < self._expected[at]:
+            self._change[at] = gain * self._spec.period
+            self.warning = (
+                f"the base accelerates at {gain:.2g} {self.unit}^2, and {self._expected[at]:.2g} {self.unit}^2 were "
+                f"expected; set the limit {self._acceleration} to that, so that it follows its commands"
+            )
         self._reached = measured
         self._sent.clear()
         return True

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from bam_envs.core.errors import InvalidValue, ResetNeeded, SafetyStop, StaleState, StartNotReached
 from bam_envs.core.robot import EnvIds, Initial, Robot, RobotSpec, RobotState
-from bam_envs.safety.first_motion import FirstMotion, NotAsCommanded, ProofMotion
+from bam_envs.safety.first_motion import OPENS_WITHIN, FirstMotion, NotAsCommanded, ProofMotion
 from bam_envs.safety.following import Following, JointFollowing
 from bam_envs.safety.guard import (
     Guard,
@@ -627,21 +627,25 @@ class SafeRobot(metaclass=Sealed):
                 for at, value in zip(columns, joints, strict=True):
                     rest[at] = value
                 if proof is not None:
-                    self._live.reach = reach
+                    self._live.reach, self._live.joints_only = reach, True
                 states.append(self._advance(rest.copy(), approach=True, proving=True))
                 measured = self._measured(self._places)
                 joints, reach = moves.send([measured[at] for at in columns])
         except StopIteration:
             pass
         except NotAsCommanded as error:
-            self._stop(next(one for one in self._guards if isinstance(one, FirstMotion)), f"{error}")
+            self._stop(self._first_motion, f"{error}")
         finally:
             if proof is not None:
-                self._live.reach = None
+                self._live.reach, self._live.joints_only = None, False
         self._know_lag(motion.measured_lag)
         if proof is not None:
             self._live.tell_proved(motion.measured_lag)
         return states
+
+    @property
+    def _first_motion(self) -> FirstMotion:
+        return next(one for one in self._guards if isinstance(one, FirstMotion))
 
     def _know_lag(self, lag: float) -> None:
         for guard in self._guards:
@@ -695,7 +699,9 @@ class SafeRobot(metaclass=Sealed):
         opened = self._begin_at(0.0).copy()
         for at in grippers:
             opened[at] = start[at]
-        goals = (opened, GRIPPER_TIME, self._is_open), (start, self.limits.reset_timeout, is_reached)
+        # In its first motion a gripper shows that it opens when it is commanded to, or the robot is stopped.
+        opens = GRIPPER_TIME if self._first_motion.opens else 2 * OPENS_WITHIN
+        goals = (opened, opens, self._is_open), (start, self.limits.reset_timeout, is_reached)
         for goal, longest, done in goals:
             for _ in range(math.ceil(longest / self.spec.period)):
                 if done():

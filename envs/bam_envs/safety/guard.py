@@ -260,16 +260,16 @@ def require_bounded(limits: Limits, spec: RobotSpec) -> None:
     if type(limits) is not Limits:
         raise InvalidValue(f"The limits of a live robot must be Limits, not {type(limits).__name__}. Give Limits(...).")
     limits.require_bounded()
+    if not 0.0 < spec.period <= LONGEST_PERIOD:
+        raise InvalidValue(
+            f"The period of {spec.name} must be above 0 and at most {LONGEST_PERIOD:g} s, not {spec.period:g} s: the "
+            "robot moves for that long without a check. Command it more often."
+        )
     most = BOUNDS["lag"][1]
     if limits.lag is None and not 0.0 <= spec.lag <= most:
         raise InvalidValue(
             f"{spec.name} may be 0 to {most:g} s behind its commands, not {spec.lag:g} s. Let its trajectories reach "
             "their points sooner, or give the limit lag."
-        )
-    if not 0.0 < spec.period <= LONGEST_PERIOD:
-        raise InvalidValue(
-            f"The period of {spec.name} must be above 0 and at most {LONGEST_PERIOD:g} s, not {spec.period:g} s: the "
-            "robot moves for that long without a check. Command it more often."
         )
 
 

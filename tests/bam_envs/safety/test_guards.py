@@ -93,6 +93,7 @@ def test_the_list_of_an_arm():
         ("G10", "workspace box", 4.0, "m"),
         ("G24", "collision", 0.005, "m"),
         ("G19", "unusual observations", 1.0, "of the bound"),
+        ("G25", "first motion", 1.6, "share of the measured motion"),
         ("G7", "measured limits", 0.0, "beyond the data sheet"),
     ]
 
@@ -121,6 +122,7 @@ def test_the_list_of_a_base():
         ("G23", "turn following", 0.25, "rad/s"),
         ("G12", "laser zones", math.inf, "m"),  # no scans are measured
         ("G19", "unusual observations", 1.0, "of the bound"),
+        ("G25", "first motion", 1.6, "share of the measured motion"),
         ("G7", "measured limits", 0.0, "beyond the data sheet"),
     ]
 

@@ -63,9 +63,9 @@ def swap(change):
 @pytest.mark.parametrize(
     ("alter", "axis", "found"),
     [
-        (mirror, "shoulder_lift_joint", "(G23)"),
-        (swap, "wrist_1_joint", "wrist_1_joint does not follow its commands"),
-        (lambda change: change * (1, 1, 1, 1, 1, 0, 1), "wrist_3_joint", "it did not move"),
+        (mirror, "the joints", "first motion (G25): shoulder_lift_joint was commanded to move"),
+        (swap, "the joints", "wrist_2_joint moved"),
+        (lambda change: change * (1, 1, 1, 1, 1, 0, 1), "the joints", "wrist_3_joint was commanded to move"),
         (lambda change: change * (1, 1, 1, 1, 1, 1, -1), "gripper_width", "it did not move"),
     ],
 )

@@ -1,0 +1,211 @@
+"""A live arm behind a rosbridge server: nothing moves far before its commands are proved, in real time."""
+
+import json
+import time
+
+import numpy as np
+import pytest
+
+from bam_envs.core.errors import NotReady, SafetyStop
+from bam_envs.live import rosbridge_robot
+from bam_envs.live.building import live_robot
+from bam_envs.live.command_proof import Controllers, ask_controllers
+from bam_envs.robots.profile import load_profile
+from bam_envs.robots.ur5e import JOINTS
+from bam_envs.ros.codec import RobotInfo
+from bam_envs.rosbridge.client import RosbridgeLink
+from tests.bam_envs.live.conftest import HOME, ScriptedRobot
+
+pytestmark = pytest.mark.proves
+ROW = np.zeros(1, np.int64)
+ARM, TRAJECTORY = "/forward_position_controller/commands", "/scaled_joint_trajectory_controller/joint_trajectory"
+SWAPPED = ("shoulder_lift_joint", "shoulder_pan_joint", *JOINTS[2:])
+
+
+class TimedArm(ScriptedRobot):
+    """Goes to a trajectory's point in its time; `wiring` is what its driver makes of the joints."""
+
+    def __init__(self, bus, wiring=lambda joints: joints, **options):
+        super().__init__(bus, **options)
+        self.wiring, self.goal, self.ends, self.at = wiring, None, 0.0, time.monotonic()
+        self.farthest = 0.0
+
+    def _move(self):
+        message = self.last
+        point = message["points"][0]
+        reach = point["time_from_start"]["sec"] + 1e-9 * point["time_from_start"]["nanosec"]
+        self.goal, self.ends = self.wiring(np.array(point["positions"])), time.monotonic() + reach
+
+    def _listener(self, topic):
+        listen = super()._listener(topic)
+
+        def keep(message, caller):
+            self.last = message
+            listen(message, caller)
+
+        return keep
+
+    def publish(self):
+        with self._lock:
+            now, before = time.monotonic(), self.signals["joint_position"].copy()
+            if self.goal is not None:
+                left = max(self.ends - self.at, 1e-9)
+                share = min(1.0, (now - self.at) / left)
+                self.signals["joint_position"] = before + (self.goal - before) * share
+            self.signals["joint_velocity"] = (self.signals["joint_position"] - before) / max(now - self.at, 1e-3)
+            self.at = now
+            self.farthest = max(self.farthest, np.abs(self.signals["joint_position"] - HOME).max())
+        super().publish()
+
+
+@pytest.fixture
+def arm_on(server):
+    arms = []
+
+    def start(*arguments, **options):
+        arms.append(TimedArm(server, *arguments, **options).start())
+        return arms[-1]
+
+    yield start
+    for one in arms:
+        one.stop()
+
+
+@pytest.fixture
+def connected(server):
+    robots = []
+
+    def connect(profile="ur5e", **options):
+        # On a busy computer, too.
+        robots.append(live_robot(server.url, profile=profile, guards={"max_age": 1.0, "action_age": 1.0}, **options))
+        robots[-1].connect()
+        return robots[-1]
+
+    yield connect
+    for robot in robots:
+        robot.close()
+
+
+@pytest.mark.parametrize(
+    "wiring",
+    [
+        lambda joints: joints[[1, 0, 2, 3, 4, 5]],
+        lambda joints: joints * (1, 1, -1, 1, 1, 1),
+        lambda joints: joints + 0.41,
+    ],
+    ids=["swapped", "mirrored", "offset"],
+)
+def test_a_wrong_arm_hardly_moves_and_rests_after_the_stop(arm_on, connected, start_pose, wiring):
+    arm = arm_on(wiring)
+    robot = connected()
+    assert robot.is_unproved
+    with pytest.raises(SafetyStop, match=r"first motion \(G25\): \w+ was commanded to stay where it is measured, and"):
+        robot.reset(ROW, start_pose)
+    arm.wait_for(lambda: arm.on(TRAJECTORY)[-1]["points"][0]["time_from_start"]["sec"] == 1_000_000)
+    assert arm.farthest < 0.05
+    rests = arm.signals["joint_position"].copy()
+    robot.close()
+    np.testing.assert_allclose(arm.signals["joint_position"], rests, atol=1e-4)
+    assert arm.on("/gripper/commands") == []
+
+
+@pytest.mark.slow
+def test_a_right_arm_is_proved_once(arm_on, connected, start_pose, monkeypatch):
+    arm = arm_on()
+    robot = connected()
+    robot.reset(ROW, start_pose)
+    assert not robot.is_unproved
+    assert arm.farthest < 0.05
+    robot.close()
+    arm.commands.clear()
+    again = connected()
+    began = time.monotonic()
+    again.reset(ROW, start_pose)
+    assert {tuple(one["points"][0]["positions"][:5]) for one in arm.on(TRAJECTORY)[40:]}  # the last joint alone
+    assert time.monotonic() - began < 60.0
+    assert not again.is_unproved
+
+
+def test_positions_in_an_order_that_nothing_tells_are_not_sent(server, robot_on, connected, start_pose):
+    scripted = robot_on(server)
+    robot = connected("ur5e_position")
+    with pytest.raises(NotReady) as caught:
+        robot.reset(ROW, start_pose)
+    assert str(caught.value) == (
+        f"The commands of {server.url} are not proved: nothing tells in which order {ARM} takes {', '.join(JOINTS)}: the "
+        "parameter joints of forward_position_controller cannot be read here. Nothing has moved."
+    )
+    robot.halt()
+    assert scripted.on(ARM) == []
+
+
+def answering(name, value):
+    return lambda request, caller: value if request["names"] == ["joints"] else {"values": []}
+
+
+@pytest.mark.parametrize("order", [JOINTS, SWAPPED])
+@pytest.mark.parametrize("way", ["interfaces", "parameter", "rosapi"])
+def test_the_order_of_a_controller_is_read(server, robot_on, way, order):
+    robot_on(server)
+    rows = [{"name": "forward_position_controller", "state": "active", "type": "position_controllers/X"}]
+    if way == "interfaces":
+        rows[0]["required_command_interfaces"] = [f"{name}/position" for name in order]
+    server.serve("/controller_manager/list_controllers", "x/X", lambda request, caller: {"controller": rows})
+    if way == "parameter":
+        answer = {"values": [{"type": 9, "string_array_value": list(order)}]}
+        server.serve("/forward_position_controller/get_parameters", "x/X", lambda request, caller: answer)
+    if way == "rosapi":
+        asked = "/forward_position_controller:joints"
+        server.serve(
+            "/rosapi/get_param",
+            "x/X",
+            lambda request, caller: {"value": json.dumps(list(order)) if request["name"] == asked else ""},
+        )
+    profile, link = load_profile("ur5e_position"), RosbridgeLink(server.url)
+    link.connect()
+    try:
+        controllers = ask_controllers(link, profile, profile.sinks())
+    finally:
+        link.close()
+    assert controllers.joints == {ARM: order}
+    assert controllers.fault(profile, profile.sinks()) == (
+        ""
+        if order == JOINTS
+        else f"forward_position_controller takes the joints in the order {', '.join(SWAPPED)}, and the profile "
+        f"ur5e_position sends {', '.join(JOINTS)}: give the labels of {ARM} in that order"
+    )
+
+
+def test_whose_commands_need_no_proof(server):
+    profile = load_profile("ur5e")
+    link = RosbridgeLink(server.url)
+    link.connect()
+    try:
+        for info in (RobotInfo("x", simulated=True), RobotInfo("x", agent=True)):
+            assert rosbridge_robot.needed_proof(link, info, profile, profile.sinks(), "x") is None
+        base = load_profile("mir100")
+        assert rosbridge_robot.needed_proof(link, None, base, base.sinks(), "x") is None
+        proof = rosbridge_robot.needed_proof(link, RobotInfo("x"), profile, profile.sinks(), "x")
+        assert (proof.fault, proof.is_timed, proof.is_known) == ("", True, False)
+    finally:
+        link.close()
+
+
+def test_a_proof_belongs_to_a_robot_with_its_controllers(tmp_path, monkeypatch):
+    from bam_envs.live.command_proof import CommandProof
+
+    profile = load_profile("ur5e")
+    row = {"name": "scaled_joint_trajectory_controller", "type": "x/X", "required_command_interfaces": ["a/position"]}
+    keys = {
+        CommandProof(one, one.sinks(), Controllers(rows, {}), name).key
+        for one, rows, name in (
+            (profile, (), "cell 7"),
+            (profile, (), "cell 8"),
+            (profile, (row,), "cell 7"),
+            (profile, ({**row, "required_command_interfaces": ["b/position"]},), "cell 7"),
+            (profile, ({**row, "type": "y/Y"},), "cell 7"),
+        )
+    }
+    assert len(keys) == 5
+    states = [CommandProof(profile, profile.sinks(), Controllers(({**row, "state": s},), {}), "x").key for s in "ab"]
+    assert states[0] == states[1]
