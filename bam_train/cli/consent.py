@@ -153,7 +153,10 @@ def plan_lines(env: Any, env_id: str, address: str, episodes: int, *, wiggle: bo
     if isinstance(spec, RobotSpec) and not is_base(spec):
         gripper = "opening the gripper and " if "m" in spec.command.units else ""
         begin = f"by {gripper}going to the start pose"
-    first = ["  first each axis moves a little and back, to check that it moves as commanded"] if wiggle else []
+    proof = getattr(getattr(env.unwrapped, "robot", None), "proof_plan", "")
+    first = [f"  first {proof}"] if proof else []
+    if wiggle:
+        first = ["  first each axis moves a little and back, to check that it moves as commanded"]
     return [f"  address: {address}", *first, f"  {env_id}: {planned}", f"  each begins {begin}"]
 
 

@@ -53,7 +53,7 @@ class Robot:
         self.node, self.lock = node, threading.Lock()
         self.position, self.velocity = list(HOME), [0.0] * 6
         self.target, self.gripper, self.gripper_target = list(HOME), 0.085, 0.085
-        self.commanded_at, self.received, self.holds, self.halts = 0.0, [], 0, 0
+        self.commanded_at, self.reached_at, self.received, self.holds, self.halts = 0.0, 0.0, [], 0, 0
         self.joint_states = node.create_publisher(JointState, "/joint_states", 10)
         self.gripper_states = node.create_publisher(JointState, "/gripper/joint_states", 10)
         self.objects = node.create_publisher(PoseStamped, "/object_pose", 10)
@@ -85,11 +85,15 @@ class Robot:
         last = message.points[-1].positions if message.points else []
         self.record("trajectory", last)
         if sorted(message.joint_names) == sorted(JOINTS):
-            self.move([last[message.joint_names.index(joint)] for joint in JOINTS])
+            reach = message.points[-1].time_from_start
+            seconds = reach.sec + 1e-9 * reach.nanosec
+            self.move([last[message.joint_names.index(joint)] for joint in JOINTS], seconds)
 
-    def move(self, positions):
+    def move(self, positions, seconds=0.0):
+        """Go to `positions` in so many seconds, as a trajectory controller does, or at once."""
         if len(positions) == len(JOINTS) and all(map(math.isfinite, positions)):
             self.target, self.commanded_at = list(positions), time.monotonic()
+            self.reached_at = self.commanded_at + seconds
 
     def on_gripper(self, message):
         self.record("gripper", message.data)
@@ -113,8 +117,9 @@ class Robot:
         if self.target != self.position and time.monotonic() - self.commanded_at > COMMAND_TIMEOUT:
             self.holds += 1
             self.target, self.gripper_target = list(self.position), self.gripper
-        before = self.position
-        moved = [approach(*pair, MAX_SPEED * PERIOD) for pair in zip(before, self.target, strict=True)]
+        before, share = self.position, min(1.0, PERIOD / max(self.reached_at - time.monotonic(), PERIOD))
+        goals = [old + (goal - old) * share for old, goal in zip(before, self.target, strict=True)]
+        moved = [approach(*pair, MAX_SPEED * PERIOD) for pair in zip(before, goals, strict=True)]
         self.velocity = [(new - old) / PERIOD for new, old in zip(moved, before, strict=True)]
         self.position = moved
         self.gripper = approach(self.gripper, self.gripper_target, MAX_GRIPPER_SPEED * PERIOD)
@@ -171,6 +176,9 @@ def main():
     robot = Robot(node)
     executor = SingleThreadedExecutor()
     executor.add_node(node)
+    controller = rclpy.create_node("forward_position_controller")  # whose parameters say in which order it takes joints
+    controller.declare_parameter("joints", list(JOINTS))
+    executor.add_node(controller)
     thread = threading.Thread(target=spin, args=(executor,), daemon=True)
     thread.start()
     print("ready", flush=True)

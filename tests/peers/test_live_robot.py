@@ -35,6 +35,14 @@ def live(server, spec=SPEC, **options):
         robot.close()
 
 
+@pytest.fixture(scope="module", autouse=True)
+def own_proofs(tmp_path_factory):
+    """What is proved of the node's commands is remembered for the next test."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("XDG_CONFIG_HOME", str(tmp_path_factory.mktemp("config")))
+        yield
+
+
 def start(robot, position=HOME):
     return robot.reset(ROW, Initial({"joint_position": position}, np.zeros(1, np.int64)))
 
@@ -53,7 +61,7 @@ def test_its_state_is_what_the_node_publishes_by_name(rosbridge, robot_node):
         assert robot.age() < 0.1
 
 
-@pytest.mark.parametrize("command", ["position", "trajectory"])
+@pytest.mark.parametrize("command", ["trajectory", "position"])  # the first proves what the second needs
 def test_it_moves_where_it_is_told(command, rosbridge, robot_node):
     with live(rosbridge, command=command) as robot:
         target = start(robot).command.copy()
@@ -72,7 +80,7 @@ def test_the_start_pose_is_reached_slowly(rosbridge, robot_node):
     away = HOME + 0.1
     with live(rosbridge) as robot:
         np.testing.assert_allclose(start(robot, away).signals["joint_position"], away, atol=0.02)
-        steps = np.diff(received(robot_node, POSITIONS), axis=0)
+        steps = np.diff(received(robot_node, TRAJECTORY), axis=0)
         assert np.abs(steps).max() <= robot.limits.reset_speed * SPEC.period + 1e-9
         np.testing.assert_allclose(start(robot).signals["joint_position"], HOME, atol=0.02)
 
@@ -86,7 +94,7 @@ def test_no_number_that_is_not_finite_reaches_the_node(rosbridge, robot_node):
             np.testing.assert_array_equal(robot.step(bad).command, command)
         with pytest.raises(SafetyStop):
             robot.step(bad)
-        values = [value for kind in (POSITIONS, GRIPPER) for row in received(robot_node, kind) for value in row]
+        values = [value for kind in (TRAJECTORY, GRIPPER) for row in received(robot_node, kind) for value in row]
         assert values
         assert all(isinstance(value, float) for value in values)
 
@@ -108,7 +116,7 @@ def test_a_hundred_commands_a_second_arrive(rosbridge, robot_node, wait_until):
         command = start(robot).command
         robot_node.ask("forget")
         stamps = [robot.step(command).stamp[0] for _ in range(count)]
-        wait_until(lambda: len(received(robot_node, POSITIONS)) >= 0.95 * count, True)
+        wait_until(lambda: len(received(robot_node, TRAJECTORY)) >= 0.95 * count, True)
         assert (np.diff(stamps) >= 0).all()
         assert stamps[-1] - stamps[0] >= 0.9 * 0.01 * count  # no quicker than its clock
 
@@ -219,7 +227,9 @@ def test_the_contract_is_compared_without_a_command(rosbridge, robot_node):
     assert [(one.what, one.found) for one in contract.refused] == []
     verdicts = {one.what: one.verdict for one in contract.checks}
     assert [verdicts[f"rate of {topic}"] for topic in STATES] == ["ok"] * 3
-    assert verdicts["command /forward_position_controller/commands"] == "unknown"  # this bridge has no rosapi
+    assert (
+        verdicts["command /scaled_joint_trajectory_controller/joint_trajectory"] == "unknown"
+    )  # this bridge has no rosapi
     assert robot_node.ask("report")["received"] == []
     elsewhere = check_contract(Checkpoint.open(PICK), env, Place(robot=f"{rosbridge.url}/cell"), timeout=0.5)
     assert [one.what for one in elsewhere.refused] == [f"topic {topic}" for topic in STATES]

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from bam_envs.core.errors import InvalidValue, ResetNeeded, SafetyStop, StaleState, StartNotReached
 from bam_envs.core.robot import EnvIds, Initial, Robot, RobotSpec, RobotState
-from bam_envs.safety.first_motion import OPENS_WITHIN, FirstMotion, NotAsCommanded, ProofMotion
+from bam_envs.safety.first_motion import OPENS_WITHIN, PROOF, FirstMotion, NotAsCommanded, ProofMotion
 from bam_envs.safety.following import Following, JointFollowing
 from bam_envs.safety.guard import (
     Guard,
@@ -591,6 +591,17 @@ class SafeRobot(metaclass=Sealed):
         """Whether `reset` will first prove the commands of a live arm; see `prove`."""
         proof = getattr(self._live, "proof", None)
         return proof is not None and not proof.is_done
+
+    @property
+    def proof_plan(self) -> str:
+        """What `reset` will first move to prove the commands of a live arm; empty for nothing."""
+        if not self.is_unproved:
+            return ""
+        last = self.spec.command.labels[columns_in(self.spec.command, "rad")[-1]]
+        which, since = "each joint moves", ""
+        if self._live.proof.is_known:
+            which, since = f"{last} moves", f"; all were proved on {self._live.proof.since}"
+        return f"{which} {PROOF:g} rad and back, to prove that commands reach the joints that are meant{since}"
 
     def prove(self, *, anew: bool = False) -> list[RobotState]:
         """Move each joint a little and back, to prove that commands reach the joints that are meant.

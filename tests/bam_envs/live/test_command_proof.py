@@ -132,8 +132,8 @@ def test_positions_in_an_order_that_nothing_tells_are_not_sent(server, robot_on,
     with pytest.raises(NotReady) as caught:
         robot.reset(ROW, start_pose)
     assert str(caught.value) == (
-        f"The commands of {server.url} are not proved: nothing tells in which order {ARM} takes {', '.join(JOINTS)}: the "
-        "parameter joints of forward_position_controller cannot be read here. Nothing has moved."
+        f"The commands of {server.url} are not proved: nothing tells in which order {ARM} takes {', '.join(JOINTS)}: "
+        "the parameter joints of forward_position_controller cannot be read here. Nothing has moved."
     )
     robot.halt()
     assert scripted.on(ARM) == []

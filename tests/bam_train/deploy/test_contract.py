@@ -173,7 +173,7 @@ def test_the_table_of_a_correct_arm():
         *("topic /object_pose", "rate of /object_pose", "age of /object_pose"),
         *("joint_position", "joint_velocity", "gripper_width", "object_position", "object_quaternion"),
         *("length of object_quaternion", "joint_velocity against joint_position"),
-        *("command /gripper/commands", "command /forward_position_controller/commands"),
+        *("command /gripper/commands", "command /scaled_joint_trajectory_controller/joint_trajectory"),
         *(f"limits of {name}" for name in UR_JOINTS),
         *("kinematics in /robot_description", "tool pose", "tool length", "sense of the joints"),
     ]
@@ -304,7 +304,12 @@ ARMS = [
     (of_kind("ur10e"), "tool pose", "the kinematics of a ur10e"),
     (of_kind("ur5"), "tool pose", "the kinematics of a ur5"),
     (of_kind("ur3e"), "tool pose", "the kinematics of a ur3e"),
-    (having(tool=0.25), "tool length", "0.250 m: set the tool centre point (TCP) of the robot so"),
+    (
+        having(tool=0.25),
+        "tool length",
+        "0.250 m: if its gripper is that of the policy, set the tool centre point (TCP) to 0.16 m; for another "
+        "gripper, train a policy with its length",
+    ),
     (altered(gripper_width=lambda x: 1000 * x), "gripper_width", "gripper_width at 85 (millimetres?)"),
     (altered(gripper_width=lambda x: 0 * x + 0.14), "gripper_width", "gripper_width at 0.14"),
     (altered(object_position=lambda x: 1000 * x), "object_position", "object_x at 500 (millimetres?)"),
@@ -330,7 +335,11 @@ ARMS = [
         f"topic {JOINT_TOPIC}",
         "position of shoulder_pan_joint must be a finite number, not None",
     ),
-    (typed("/forward_position_controller/commands", ""), "command /forward_position_controller/commands", None),
+    (
+        typed("/scaled_joint_trajectory_controller/joint_trajectory", ""),
+        "command /scaled_joint_trajectory_controller/joint_trajectory",
+        None,
+    ),
     (typed("/gripper/commands", "std_msgs/Float64"), "command /gripper/commands", "std_msgs/Float64"),
     (having(urdf=urdf_of(UR5E_GRIPPER, travel=3.14)), "limits of shoulder_pan_joint", "-3.14 to 3.14"),
     (having(urdf=urdf_of(UR5E_GRIPPER, 360.0, 180.0)), "limits of shoulder_pan_joint", "-360 to 360 (degrees?)"),
@@ -398,7 +407,10 @@ def test_a_simulated_gripper_that_chatters_on_an_object_is_no_wrong_speed():
 def test_a_joint_at_zero_does_not_show_its_sense():
     arm = Arm(joints=JOINTS * (1, 1, 1, 1, 1, 0))
     last = arm.contract().checks[-1]
-    assert (last.verdict, last.found) == ("unknown", "not shown at 0 or 180 degrees: wrist_3_joint; give --wiggle")
+    assert (last.verdict, last.found) == (
+        "unknown",
+        "not shown at 0 or 180 degrees: wrist_3_joint; move it a little and try again",
+    )
 
 
 def test_the_tool_pose_in_a_frame_that_the_profile_does_not_name_is_not_compared():
