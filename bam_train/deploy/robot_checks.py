@@ -251,3 +251,6 @@ def _commands(inspection: Inspection) -> Iterator[Check]:
         found = proof.fault or (f"proved on {proof.since}" if proof.is_known else "to be proved in the first motion")
         fits = False if proof.fault else True if proof.is_known else None
         yield check("joints of the commands", "those that are meant", found, fits=fits)
+        for name in proof.from_measured:
+            found = "where the arm is measured: jerky; set interpolate_from_desired_state of the controller to true"
+            yield check(f"trajectories of {name}", "begin at the last set point", found, fits=None)

@@ -25,6 +25,8 @@ from bam_envs.ros.profile_tables import RobotProfile, Sink
 from bam_envs.rosbridge.client import RosbridgeLink
 
 _LOG = logging.getLogger(__name__)
+BOOL = 1
+"""`type` of a boolean in rcl_interfaces/ParameterValue."""
 ANSWER_WITHIN = 2.0
 """Longest wait for the answer of a service of the robot's side [s]."""
 
@@ -37,6 +39,8 @@ class Controllers:
     """The controllers by the service of `RobotProfile.controllers`; empty if it does not answer."""
     joints: Mapping[str, tuple[str, ...] | None]
     """Topic of a command whose numbers have no names -> its joints in the order of its controller; None: not told."""
+    from_measured: tuple[str, ...] = ()
+    """Controllers that begin each trajectory where the arm is measured, and so jerk it back with every command."""
 
     def fault(self, profile: RobotProfile, sinks: Sequence[Sink]) -> str:
         """Why a command of `sinks` might reach another joint than is meant; empty if it cannot."""
@@ -62,13 +66,29 @@ def ask_controllers(link: RosbridgeLink, profile: RobotProfile, sinks: Sequence[
     answer = _ask(link, link.namespace + profile.controllers, "", {}) if profile.controllers else {}
     rows: Any = answer.get("controller")
     listed = tuple(one for one in rows if isinstance(one, Mapping)) if isinstance(rows, list) else ()
-    unnamed = [sink for sink in sinks if not sink.is_named]
-    return Controllers(listed, {sink.topic: _joints(link, listed, _controller(sink)) for sink in unnamed})
+    joints = {sink.topic: _joints(link, listed, _controller(sink)) for sink in sinks if not sink.is_named}
+    timed = [_controller(sink) for sink in sinks if sink.is_timed]
+    return Controllers(listed, joints, tuple(name for name in timed if _begins_where_measured(link, name)))
 
 
 def _controller(sink: Sink) -> str:
     """The controller of `sink`: as the profile says, or as its topic is called."""
     return sink.controller or sink.topic.strip("/").rpartition("/")[0]
+
+
+def _parameters(link: RosbridgeLink, controller: str, *names: str) -> list[Any]:
+    """The parameters of a controller of ROS 2 (rcl_interfaces/ParameterValue), in their order; empty if unknown."""
+    service = f"{link.namespace}/{controller}/get_parameters"
+    values: Any = _ask(link, service, "rcl_interfaces/srv/GetParameters", {"names": list(names)}).get("values")
+    readable = isinstance(values, list) and all(isinstance(one, Mapping) for one in values)
+    return values if readable else []
+
+
+def _begins_where_measured(link: RosbridgeLink, controller: str) -> bool:
+    """Whether it is known that a trajectory controller does not begin at its last set point."""
+    found = _parameters(link, controller, "interpolate_from_desired_state", "open_loop_control")
+    known = [one.get("bool_value") for one in found if one.get("type") == BOOL]
+    return bool(known) and not any(known)
 
 
 def _joints(link: RosbridgeLink, listed: Sequence[Mapping[str, Any]], controller: str) -> tuple[str, ...] | None:
@@ -79,11 +99,9 @@ def _joints(link: RosbridgeLink, listed: Sequence[Mapping[str, Any]], controller
         interfaces = row.get("required_command_interfaces")
         if row.get("name") == controller and isinstance(interfaces, list) and interfaces:
             return tuple(str(one).rpartition("/")[0] for one in interfaces)
-    request = {"names": ["joints"]}
-    service = f"{link.namespace}/{controller}/get_parameters"
-    values: Any = _ask(link, service, "rcl_interfaces/srv/GetParameters", request).get("values")
-    found: Any = values[0] if isinstance(values, list) and values else None
-    if not isinstance(found, Mapping):
+    values = _parameters(link, controller, "joints")
+    found: Any = values[0] if values else {}
+    if not values:
         separator = "/" if link.ros == "ros1" else ":"
         name = {"name": f"{link.namespace}/{controller}{separator}joints"}
         text: Any = _ask(link, "/rosapi/get_param", "rosapi/GetParam", name).get("value")
@@ -148,6 +166,8 @@ class CommandProof:
         self.order_fault = controllers.fault(profile, arm)
         """Why a command might reach another joint than is meant; empty if it cannot."""
         self._robot, self._topics = robot, ", ".join(sink.topic for sink in arm)
+        self.from_measured = controllers.from_measured
+        """See `Controllers.from_measured`."""
         self._remedy, self.key = _timed_remedy(profile), _key(profile, arm, controllers, robot)
         """Digest of everything that a proof is about."""
         self._file = config_folder() / "proofs" / f"{self.key}.json"

@@ -139,10 +139,6 @@ def test_positions_in_an_order_that_nothing_tells_are_not_sent(server, robot_on,
     assert scripted.on(ARM) == []
 
 
-def answering(name, value):
-    return lambda request, caller: value if request["names"] == ["joints"] else {"values": []}
-
-
 @pytest.mark.parametrize("order", [JOINTS, SWAPPED])
 @pytest.mark.parametrize("way", ["interfaces", "parameter", "rosapi"])
 def test_the_order_of_a_controller_is_read(server, robot_on, way, order):
@@ -174,6 +170,20 @@ def test_the_order_of_a_controller_is_read(server, robot_on, way, order):
         else f"forward_position_controller takes the joints in the order {', '.join(SWAPPED)}, and the profile "
         f"ur5e_position sends {', '.join(JOINTS)}: give the labels of {ARM} in that order"
     )
+
+
+@pytest.mark.parametrize(("state", "loop", "jerks"), [(False, None, True), (True, None, False), (False, True, False)])
+def test_a_controller_that_begins_where_the_arm_is_measured_is_known(server, robot_on, state, loop, jerks):
+    robot_on(server)
+    values = [{"type": 0 if value is None else 1, "bool_value": bool(value)} for value in (state, loop)]
+    name = "scaled_joint_trajectory_controller"
+    server.serve(f"/{name}/get_parameters", "x/X", lambda request, caller: {"values": values})
+    profile, link = load_profile("ur5e"), RosbridgeLink(server.url)
+    link.connect()
+    try:
+        assert ask_controllers(link, profile, profile.sinks()).from_measured == ((name,) if jerks else ())
+    finally:
+        link.close()
 
 
 def test_whose_commands_need_no_proof(server):
