@@ -14,7 +14,7 @@ from tests.bam_train.agent.browsers import LEAVINGS, browser, page, until
 from tests.bam_train.agent.test_live_agent import PICK, Program
 
 __all__ = ["browser", "page"]  # fixtures from elsewhere
-COMMANDS = "/forward_position_controller/commands"
+COMMANDS = "/scaled_joint_trajectory_controller/joint_trajectory"
 REST = 0.5
 """Time without a new command after which the robot rests [s]."""
 
@@ -29,7 +29,7 @@ class Robot:
     def __enter__(self):
         self.served.__enter__()
         bus = self.served.bus
-        bus.subscribe(COMMANDS, "std_msgs/Float64MultiArray", self._note)
+        bus.subscribe(COMMANDS, "trajectory_msgs/JointTrajectory", self._note)
         bus.subscribe(HALT_TOPIC, "std_msgs/Empty", lambda message, caller: self.halts.append(time.monotonic()))
         return self
 
@@ -37,7 +37,7 @@ class Robot:
         self.served.close()
 
     def _note(self, message, caller):
-        self.commands.append((time.monotonic(), list(message["data"])))
+        self.commands.append((time.monotonic(), list(message["points"][0]["positions"])))
 
     @property
     def moves(self):

@@ -118,7 +118,7 @@ def test_a_policy_drives_a_robot_over_its_topics(serve, run, tmp_path, monkeypat
     report = json.loads(out)
     assert (status, report["stop_reason"], report["successes"]) == (0, "episodes done", 1), err
     assert report["robot"] == served.bus.url
-    numbers = {f"G{number}" for number in (2, 3, 4, 5, 7, 8, 9, 10, 13, 14, 15, 16, 18, 19, 23, 24)}
+    numbers = {f"G{number}" for number in (2, 3, 4, 5, 7, 8, 9, 10, 13, 14, 15, 16, 18, 19, 23, 24, 25)}
     assert {row["number"] for row in report["guards"].values()} == numbers
     assert all(row["stopped"] == 0 for row in report["guards"].values())
     assert "will move" not in err  # it said that it is simulated
@@ -203,8 +203,9 @@ def test_a_real_robot_is_shown_and_does_not_move_unasked(serve, run, monkeypatch
     assert (status, out) == (1, "")
     lines = err.splitlines()
     assert lines[0].startswith(f"bam-deploy: {PICK} will move ur5e")
-    assert lines[1:7] == [
+    assert lines[1:8] == [
         f"  address: {served.bus.url}",
+        "  first each joint moves 0.02 rad and back, to prove that commands reach the joints that are meant",
         "  bam/pick-v0: 2 episodes, one after the other without a pause",
         "  each begins by opening the gripper and going to the start pose",
         f"  UNSIGNED: {unsigned}",
@@ -224,8 +225,11 @@ def commands_to():
 
     def count(served):
         sent = []
-        for topic in ("/gripper/commands", "/forward_position_controller/commands"):
-            served.bus.subscribe(topic, "std_msgs/Float64MultiArray", lambda message, caller: sent.append(message))
+        for topic, kind in (
+            ("/gripper/commands", "std_msgs/Float64MultiArray"),
+            ("/scaled_joint_trajectory_controller/joint_trajectory", "trajectory_msgs/JointTrajectory"),
+        ):
+            served.bus.subscribe(topic, kind, lambda message, caller: sent.append(message))
         return sent
 
     return count
@@ -254,7 +258,7 @@ def test_each_axis_is_wiggled_first_or_shown_by_a_recording(serve, run, commands
     assert status == 0, err
     assert [line.split()[2] for line in lines[1:8]] == [*UR_JOINTS, "gripper_width"]
     assert all(line.endswith("  ok") for line in lines[1:8])
-    assert len(sent) > 2 * 7 * 60  # of seven axes, each for 3 s at 20 Hz, on two topics
+    assert len(sent) > 2 * (60 + 6 * 10 + 60)  # of seven axes at 20 Hz, on two topics
     status, _, err = run(deploy, PICK, "--episodes", 1, *live, "--motion", file, "--no-record")
     lines = [line.split("  ") for line in err.splitlines()]
     assert status == 0, err

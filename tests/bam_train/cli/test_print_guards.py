@@ -23,7 +23,7 @@ def test_every_guard_has_a_number_a_name_a_limit_and_says_what_it_does(run, name
         assert guard["does"].endswith(".")
         assert all(one in BOUNDS for one in guard["setting"].split(", ") if one)
     assert set(table["limits"]) == set(BOUNDS)
-    left_to_the_robot = {"reach-ppo.zip": (0.1, 0.1, 0.0), "mir100-navigation-ppo.zip": (0.3, 0.5, None)}
+    left_to_the_robot = {"reach-ppo.zip": (0.125, 0.1, 0.0), "mir100-navigation-ppo.zip": (0.3, 0.5, None)}
     assert tuple(table["limits"][limit] for limit in ("lag", "watchdog", "box_z_min")) == left_to_the_robot[name]
     without_guard = {"reach-ppo.zip": "base_speed", "mir100-navigation-ppo.zip": "joint_speed"}
     assert table["limits"][without_guard[name]] is None
@@ -46,9 +46,9 @@ def test_a_guard_that_is_changed_is_shown_so(run):
     does = "No joint is faster than the limit or its data sheet; the other joints slow down with it."
     assert f"G8 joint speed 0.3 rad/s joint_speed {does}" in lines
     assert "joint_speed 0.3 0.01 3.14159 rad/s" in lines
-    assert "lag 0.1 0.001 0.5 s" in lines
+    assert "lag 0.125 0.001 0.5 s" in lines
     assert any(line.startswith("G10 workspace box 4 m box_* The tool stays in a box") for line in lines)
-    numbers = {f"G{number}" for number in range(1, 25)}  # the others are of bases, or of straight lines
+    numbers = {f"G{number}" for number in range(1, 26)}  # the others are of bases, or of straight lines
     assert numbers - {line.split()[0] for line in lines if line} == {"G11", "G12", "G13"}
 
 
