@@ -16,7 +16,7 @@ from bam_envs.remote.serve.env_server import EnvServer
 from bam_envs.remote.serve.gymapi_service import GymApiService
 from bam_envs.rosbridge.client import RosbridgeLink
 from bam_envs.testing.transports import MirrorEnv
-from tests.gymapi_versions import JUNE_17, JUNE_22, RESET, STEP, VERSIONS, Client, Rack
+from tests.gymapi_versions import JUNE_22, RESET, STEP, VERSIONS, Client, Rack
 
 CAMERA = spaces.Box(0, 255, (8, 12, 3), np.uint8)
 NUMBER = spaces.Box(0, 1, (1,), np.float64)
@@ -62,9 +62,8 @@ def link(bridge):
 
 def test_a_client_of_others(bridge, link):
     server, version = bridge
-    flag = version if version == JUNE_17 else None  # this bridge has no rosapi that tells it from the next one
     env = Scene()
-    service = GymApiService(EnvServer(env, env_id="bam/pick-v0"), link, "ours", version=flag).start()
+    service = GymApiService(EnvServer(env, env_id="bam/pick-v0"), link, "ours").start()
     server.wait_for("/ours/gym_env/gym_api_request", TYPE)
     with contextlib.closing(service), connect(server.url) as socket:
         numbers = itertools.count()

@@ -3,18 +3,24 @@
 Where the types are compiled (ROS 2), a field that the version lacks is refused, not ignored.
 """
 
+import queue
 from collections.abc import Mapping
-from contextlib import suppress
+from contextlib import closing, suppress
 from dataclasses import dataclass
 from typing import Any
 
-from bam_envs.core.errors import InvalidValue, LinkLost, ProtocolError, RemoteError
+from bam_envs.core.errors import BamEnvsError, InvalidValue, LinkLost, ProtocolError, RemoteError
 from bam_envs.rosbridge.bus import Bus
+from bam_envs.rosbridge.client import RosbridgeLink
 
 _FEEDBACK = "bam_msgs/GymFeedback"
 _DETAILS = "/rosapi/message_details"
 _LOOK = 1.0
 """Longest wait for an answer of rosapi [s]."""
+_ECHO = "/bam/gymapi_fields"
+"""Topic on which an empty message comes back with the fields that a server without rosapi was compiled with."""
+_TRIES, _AGAIN = 10, 0.2
+"""Number of such messages, and time between two [s]: a ROS graph takes a while to connect both ends of a topic."""
 
 
 @dataclass(frozen=True)
@@ -78,11 +84,29 @@ def version_of_bus(bus: Bus) -> Version | None:
     elif hasattr(bus, "call"):  # a link to a rosbridge server
         with suppress(RemoteError, LinkLost, ProtocolError):  # no rosapi there
             fields = _read_fields(bus.call(_DETAILS, "", {"type": _FEEDBACK}, _LOOK))
+    if isinstance(bus, RosbridgeLink) and not fields:
+        with suppress(BamEnvsError):
+            fields = _echoed_fields(bus)
     if fields.get("color_img"):
         return JUNE_22
     if "duplicate_obs" in fields:
         return JUNE_17
     return MAY_24 if "duplicate_obs_ns" in fields else None
+
+
+def _echoed_fields(link: RosbridgeLink) -> dict[str, bool]:
+    """Whether each field is a list, by a message that the server of `link` completes; empty if none comes back."""
+    came: queue.SimpleQueue[Mapping[str, Any]] = queue.SimpleQueue()
+    own = RosbridgeLink(link.endpoint, name="gymapi")  # when it closes, the server forgets the topic
+    with closing(own):
+        own.connect()
+        own.subscribe(_ECHO, _FEEDBACK, lambda message, caller: came.put(message))
+        own.advertise(_ECHO, _FEEDBACK)
+        for _ in range(_TRIES):
+            own.publish(_ECHO, {})
+            with suppress(queue.Empty):
+                return {name: isinstance(value, list) for name, value in came.get(timeout=_AGAIN).items()}
+    return {}
 
 
 def _read_fields(details: Mapping[str, Any]) -> dict[str, bool]:

@@ -60,9 +60,9 @@ class RosbridgeLink(Declarations):
         lost_after: float = math.inf,
         max_message: int = 64 * 1024 * 1024,
     ) -> None:
-        self._endpoint = Endpoint(endpoint) if isinstance(endpoint, str) else endpoint
-        super().__init__(self._endpoint.address.url)
-        self.namespace, self.name = self._endpoint.address.namespace, name
+        self.endpoint = Endpoint(endpoint) if isinstance(endpoint, str) else endpoint
+        super().__init__(self.endpoint.address.url)
+        self.namespace, self.name = self.endpoint.address.namespace, name
         self.statuses: deque[dict[str, Any]] = deque(maxlen=_STATUSES_KEPT)
         """The last `status` messages of the server."""
         self.epoch = 0
@@ -99,7 +99,7 @@ class RosbridgeLink(Declarations):
         with self._connecting:
             self._require_open()
             if self._thread.was_started:
-                self.wait_up(self._endpoint.connect_timeout)
+                self.wait_up(self.endpoint.connect_timeout)
                 return
             try:
                 self._thread.start(self._main)
@@ -258,7 +258,7 @@ class RosbridgeLink(Declarations):
             task.cancel()
 
     async def _first(self) -> Connection:
-        timeout = self._endpoint.connect_timeout
+        timeout = self.endpoint.connect_timeout
         deadline, delay = time.monotonic() + timeout, _FIRST_DELAY
         while True:
             self._require_open()
@@ -283,7 +283,7 @@ class RosbridgeLink(Declarations):
                 await asyncio.sleep(delay)
                 delay = min(2 * delay, _LONGEST_DELAY)
                 try:
-                    connection = await self._open(self._endpoint.connect_timeout)
+                    connection = await self._open(self.endpoint.connect_timeout)
                 except BamEnvsError as error:
                     self._why = bare_reason(self.url, error)
                 except Exception as error:  # the link must keep trying
@@ -292,7 +292,7 @@ class RosbridgeLink(Declarations):
 
     async def _open(self, timeout: float) -> Connection:
         connection = Connection(
-            self._endpoint, self.epoch + 1, self._max_message, self._lost_after, self._take, self._note_end
+            self.endpoint, self.epoch + 1, self._max_message, self._lost_after, self._take, self._note_end
         )
         await connection.open(timeout)
         try:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import time
+from collections import Counter
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
@@ -23,7 +24,7 @@ from bam_envs.remote.gymapi_messages import (
     write_info,
     write_response,
 )
-from bam_envs.remote.gymapi_versions import JUNE_22, Version, version_named, version_of_bus, version_of_request
+from bam_envs.remote.gymapi_versions import JUNE_17, JUNE_22, Version, version_named, version_of_bus, version_of_request
 from bam_envs.remote.serve.env_server import EnvServer
 from bam_envs.remote.transport import spec_to_json
 from bam_envs.ros.freshness import FreshnessCheck
@@ -69,6 +70,7 @@ class GymApiService:
         self._clock = clock
         self._version = None if version is None else version_named(version)
         self._freshness = FreshnessCheck()
+        self._asked: Counter[str] = Counter()  # requests by the name of a caller whose version is not known
         self._leaving = ThreadPoolExecutor(1, "bam-gymapi-leaving")
         self._sessions = Sessions()
         # Every client can read published requests, so the tag in one proves nothing.
@@ -92,9 +94,12 @@ class GymApiService:
 
     def handle(self, message: Message, caller: Caller, *, published: bool = False) -> dict[str, Any]:
         """The response to a request; never raises: an error becomes the text of a failure."""
-        begun, version = time.monotonic(), version_of_request(message) or self._version or JUNE_22
+        begun, known = time.monotonic(), version_of_request(message) or self._version
+        version = known or JUNE_22
         try:
             request = read_request(message)
+            if caller.name and request.tag is None and known is None:
+                self._asked[caller.name] += 1
             if request.tag is not None and not published:  # `StringRpcService` has checked the tag of a published one
                 self._freshness.require(request.tag)
             deadline = None if request.tag is None else begun + request.tag.deadline - request.tag.sent
@@ -140,6 +145,14 @@ class GymApiService:
 
     def _on_leave(self, caller: Caller) -> None:
         self._sessions.left(caller)
+        if self._asked.pop(caller.name, 0) == 1:
+            _log.warning(
+                "%s left after the first answer. bam_gym's client of before %s, which cannot read it, needs "
+                "--gymapi-version %s here.",
+                caller.shown,
+                JUNE_22.name,
+                JUNE_17.name,
+            )
         # In another thread, because it waits for a running step, and this is the network thread.
         with suppress(RuntimeError):  # closed meanwhile
             self._leaving.submit(self.env.leave, connection=caller.name)

@@ -102,6 +102,23 @@ def test_on_the_wire(serve, version, given):
         assert service.env.env.given == [(3, None), (None, None)]
 
 
+def test_a_client_that_leaves_because_it_cannot_read_the_answer_is_explained(serve, caplog):
+    with BridgeServer(port=0) as server:
+        serve(server)
+        with on_websocket(server.url) as call, pytest.raises(AttributeError, match="'list' object has no attribute"):
+            Client(JUNE_17, call).ask(RESET)
+        with on_websocket(server.url) as call:
+            client = Client(JUNE_22, call)
+            client.ask(RESET)
+            client.ask(CLOSE)
+    [line] = [record.getMessage() for record in caplog.records]
+    assert re.fullmatch(
+        r"127\.0\.0\.1:\d+ left after the first answer\. bam_gym's client of before 2025-06-22, which cannot read it, "
+        r"needs --gymapi-version 2025-06-17 here\.",
+        line,
+    )
+
+
 def test_two_clients_with_one_name_and_without_what_they_need_not_say(serve):
     with BridgeServer(port=0) as server:
         serve(server)
