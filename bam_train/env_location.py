@@ -6,7 +6,7 @@ from typing import Any
 
 from bam_envs.core.errors import BamEnvsError
 from bam_envs.core.registry import entry_of
-from bam_envs.core.validation import Positive, check
+from bam_envs.core.validation import Positive, RobotName, check
 from bam_envs.safety.guard import TRIAL_SPEED, Limits
 from bam_train.errors import SettingsError
 
@@ -33,6 +33,8 @@ class Place:
     """Whether a live robot is on trial: slow, and in a box around its start; None: if it is real."""
     shadow: bool = False
     """Whether somebody else drives the live robot, and nothing is sent."""
+    robot_name: str = ""
+    """Name of the live robot, as the operator knows it; empty if the robot tells it itself."""
 
     def require_sane(self) -> None:
         """Refuse addresses and options that exclude each other.
@@ -48,6 +50,9 @@ class Place:
             raise SettingsError("--profile describes a live robot; give its address with --robot too")
         if self.guards and self.robot is None:
             raise SettingsError("--guard changes a limit of a live robot; give its address with --robot too")
+        if self.robot_name and self.robot is None:
+            raise SettingsError("--robot-name names a live robot; give its address with --robot too")
+        check(self.robot_name, RobotName, "--robot-name", SettingsError)
         for flag, value in (("--ca-file", self.ca_file), ("--token-file", self.token_file)):
             if value is not None and not self.is_remote:
                 raise SettingsError(

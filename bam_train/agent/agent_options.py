@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from pathlib import Path
 
-from bam_envs.remote.serve.serve_options import is_loopback
+from bam_envs.rosbridge.endpoint import is_loopback
 from bam_train.env_location import Place
 
 
@@ -39,6 +39,8 @@ class AgentOptions:
     unusual: str = "warn"
     """What unusual observations lead to: ``"warn"``, ``"hold"`` or ``"stop"``."""
     record: bool = True
+    robot_name: str = ""
+    """Name of the robot, where it does not tell its serial number or a name."""
     data: str | None = None
     """Data set to which the episodes of each recording are added at its end."""
 
@@ -58,4 +60,5 @@ class AgentOptions:
             token_file=self.robot_token_file,
             guards=self.guards,
             trial=trial,
+            robot_name=self.robot_name,
         )

@@ -284,8 +284,10 @@ class Resident:
             return
         session.deployment.trials = self.succession.trials()
         self._change(self._driving, THERE if self.state is State.WAITING else self.why)
-        seed, self._seed = self._seed, self._seed + 1
         try:
+            if (trials := session.deployment.trials) is not None:
+                self._seed = trials.next_seed(self._seed)
+            seed, self._seed = self._seed, self._seed + 1
             record = session.deployment.episode(self, seed=seed)
         except _Interrupted:
             self.halt()
@@ -599,6 +601,7 @@ class Resident:
             "stage": None if session is None else session.stage,
             "owner": None if self.driver is None else self.driver.who,
             "robot": self.options.robot if session is None else session.robot.info.text,
+            "identity": self.options.robot_name if session is None else session.identity,
             "simulated": None if session is None else not session.is_real,
             "env": self.succession.active.env,
             "period": None if session is None else session.robot.spec.period,

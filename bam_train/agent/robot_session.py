@@ -75,7 +75,8 @@ class RobotSession:
         place = options.place(trial=True if stage == "trial" else None)
         self._env = make_env(self.env_id, self.env_kwargs, place=place)
         try:
-            check_contract(checkpoint, self._env, place).require(f"{checkpoint.path} and the robot at {place.text}")
+            contract = check_contract(checkpoint, self._env, place)
+            contract.require(f"{checkpoint.path} and the robot at {place.text}")
             self.robot.connect()
             self.is_real = has_real_robot(self._env)
             if self.is_real and stage != "trial":
@@ -88,7 +89,9 @@ class RobotSession:
             admission = Admission(checkpoint, options.keys, options.allow_unsigned, record, options.i_know)
             if place.trial is None:
                 admission.record = None
-            lines = admission(self._env, place)
+            lines = admission(self._env, place, "" if contract.inspection is None else contract.inspection.identity)
+            self.identity = admission.identity
+            """Serial number or name of the robot; empty if neither is known."""
             admit(self._env, lines)
             self.policy, self.marks = admission.policy, admission.marks
             self.robot.react(options.unusual)
@@ -152,7 +155,8 @@ class RobotSession:
     def _start_recorder(self, options: AgentOptions, checkpoint: Checkpoint) -> Recorder | None:
         """The recorder, started; without room for a recording the agent goes on."""
         names = [options.folder / name for name in recording_names(self.env_id)]
-        facts = {**deployment_facts(checkpoint, self._env), "address": options.robot, "marks": ", ".join(self.marks)}
+        facts = {**deployment_facts(checkpoint, self._env), "address": options.robot, "identity": self.identity}
+        facts["marks"] = ", ".join(self.marks)
         recorder = flight_recorder(names[0], self._env, facts, names[1:])
         try:
             recorder.start()

@@ -189,13 +189,16 @@ class Succession:
         resident, digest = self._resident, version.digest
         session, policy = resident.session, self._policies.get(digest) or load_policy(version)
         stage, address = ask.arguments.get("stage", "auto"), resident.options.robot
+        identity = "" if session is None else session.identity
         is_real = session is not None and session.is_real
         checkpoint = Checkpoint.open(version.path, members=False)
         record = resident.options.folder / "trials.jsonl"
-        trials = trials_of(checkpoint, record, address, simulated=not is_real)
+        trials = trials_of(checkpoint, record, identity, address, simulated=not is_real)
         if stage == "full" and is_real and not (resident.options.i_know or trials.evidence.is_enough):
             evidence = trials.evidence.text
-            raise TrialsNeeded(f"--stage full: {digest[:12]} at {address}: {evidence}. Push it as a trial first")
+            raise TrialsNeeded(
+                f"--stage full: {digest[:12]} on {identity or address}: {evidence}. Push it as a trial first"
+            )
         at_once = ask.arguments.get("when", "episode") == "tick"
         why = f"{ask.op} by {ask.who}"
         champion = self.names[CHAMPION]

@@ -35,7 +35,7 @@ def connected_env(
     render: bool | str = False,
     named: str | None = None,
     env_kwargs: Mapping[str, Any] | None = None,
-    admit: Callable[[gym.Env[Any, Any], Place], Sequence[str]] = lambda env, place: (),
+    admit: Callable[[gym.Env[Any, Any], Place, str], Sequence[str]] = lambda env, place, told: (),
     motion: Path | None = None,
     wiggle: bool = False,
 ) -> gym.Env[Any, Any]:
@@ -51,7 +51,8 @@ def connected_env(
         render: Whether to show the simulation in a window; or the render mode.
         named: The environment that the user expects.
         env_kwargs: Arguments of the environment, which override the checkpoint's.
-        admit: Called with the connected environment and its place before the question; returns lines for the operator.
+        admit: Called before the question with the connected environment, its place, and the identity that its robot
+            tells; returns lines for the operator.
         motion: Recording of the live robot in which each axis must have moved as commanded.
         wiggle: Whether to move each axis of a live robot a little first, to check that it moves as commanded.
 
@@ -74,7 +75,8 @@ def connected_env(
             place = replace(place, trial=True)  # a robot's limits are fixed when it is made
             env = make(place=place)
             _connect(env, signals)
-        plan = [*plan_lines(env, env_id, place.text, episodes, wiggle=wiggle), *admit(env, place)]
+        told = "" if contract.inspection is None else contract.inspection.identity
+        plan = [*plan_lines(env, env_id, place.text, episodes, wiggle=wiggle), *admit(env, place, told)]
         signals.raise_again()
         if not place.shadow:
             actor = "a person" if checkpoint is None else checkpoint.path

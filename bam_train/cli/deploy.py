@@ -19,21 +19,25 @@ from bam_train.cli.program import run_program
 from bam_train.signals import SignalMemory
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     import gymnasium as gym
 
     from bam_train.checkpoint import Checkpoint
     from bam_train.cli.flags import DeployConfig
-    from bam_train.deploy.agreement import Shadow
+    from bam_train.deploy.checkpoint_admission import Admission
     from bam_train.deploy.deployment import Deployment
     from bam_train.env_location import Place
     from bam_train.recording.recorder import Recorder
 
 
 LIVE_ONLY = (
-    *("robot", "transport", "rate", "fast", "render", "wiggle", "motion", "stage", "i_know", "trials", "shadow"),
-    *("unusual", "record", "print_guards", "ca_file", "token_file", "timeout", "keys", "allow_unsigned"),
+    *("robot", "robot_name", "transport", "rate", "fast", "render", "wiggle", "motion", "stage", "i_know", "trials"),
+    *("shadow", "unusual", "record", "print_guards", "ca_file", "token_file", "timeout", "keys", "allow_unsigned"),
 )
 """Flags that a rehearsal has no use for."""
+FIRST_SEED = 1_000_000
+"""Seed of the first episode by default, as in bam-eval."""
 ANY_ROBOT = "ws://127.0.0.1:9090"
 """Address for showing the guards of a robot whose address is not given; nothing is connected."""
 
@@ -63,10 +67,14 @@ def deploy_checkpoint(config: DeployConfig, signals: SignalMemory) -> int:
     options |= {"wiggle": config.wiggle, "motion": config.motion}
     env = connected_env(checkpoint, place, signals, who="bam-deploy", admit=admission, **options)
     try:
+        seed = config.seed if config.seed is not None else FIRST_SEED
+        if config.seed is None and admission.trials is not None:
+            seed = admission.trials.next_seed(FIRST_SEED)
         pacer = Pacer(_period(config, checkpoint, env))
         if config.unusual is not None:
             env.unwrapped.robot.react(config.unusual)  # type: ignore[attr-defined]
-        recorder = _recorder(config, checkpoint, place, env, admission.marks)
+        facts = {"seed": seed, "address": place.text, "identity": admission.identity}
+        recorder = _recorder(config, checkpoint, place, env, {**facts, "marks": ", ".join(admission.marks)})
     except BaseException:
         env.close()  # type: ignore[no-untyped-call]
         raise
@@ -74,7 +82,7 @@ def deploy_checkpoint(config: DeployConfig, signals: SignalMemory) -> int:
         admission.trials.facts["recording"] = recorder.path.name
     journal = Journal(config.episodes, marks=admission.marks)
     deployment = Deployment(env, admission.policy, pacer, journal, recorder=recorder, trials=admission.trials)
-    return _run(config, checkpoint, place, deployment, signals, admission.shadow)
+    return _run(config, checkpoint, place, deployment, signals, admission, seed)
 
 
 def print_guards(config: DeployConfig, checkpoint: Checkpoint, place: Place) -> int:
@@ -114,7 +122,10 @@ def _rehearse(config: DeployConfig, link: str) -> int:
     limits: Any = {"profile": config.profile, "guards": dict(read_guards(config.guard))}
     with closing(Rehearsal(checkpoint, link, named=config.env, **limits)) as rehearsal:
         report = rehearsal.run(
-            policy, episodes=config.episodes, seed=config.seed, tell=lambda line: say(f"bam-deploy: {line}")
+            policy,
+            episodes=config.episodes,
+            seed=FIRST_SEED if config.seed is None else config.seed,
+            tell=lambda line: say(f"bam-deploy: {line}"),
         )
     tell(*([json_module.dumps(report.to_json(), allow_nan=False)] if config.json else report.lines()))
     return 0
@@ -126,7 +137,8 @@ def _run(
     place: Place,
     deployment: Deployment,
     signals: SignalMemory,
-    shadow: Shadow | None,
+    admission: Admission,
+    seed: int,
 ) -> int:
     """Run the deployment and report it, also after a signal; returns the exit status."""
     from bam_train.cli.consent import guards_of
@@ -139,13 +151,13 @@ def _run(
         deployment.switch.came += signals.came  # after a lost exception, the deployment ends before it begins
         plain = nullcontext(PlainDisplay(journal, say))
         with live_display(make_console(), env, title, journal) if sys.stderr.isatty() else plain as watcher:
-            ending = deployment.run(watcher, seed=config.seed)
+            ending = deployment.run(watcher, seed=seed)
         if ending.status:
             say(f"bam-deploy: {ending.reason}")
         where = place.text or "simulated here"
         facts: Any = {"guards": guards_of(env), "trials": deployment.trials, "recorder": deployment.recorder}
-        facts["shadow"] = shadow
-        report = DeployReport(checkpoint, config.seed, ending, journal, pacer, where, **facts)
+        facts |= {"shadow": admission.shadow, "identity": admission.identity}
+        report = DeployReport(checkpoint, seed, ending, journal, pacer, where, **facts)
         for warning in report.warnings():
             say(f"bam-deploy: warning: {warning}")
         tell(*([json_module.dumps(report.to_json(), allow_nan=False)] if config.json else report.lines()))
@@ -198,6 +210,7 @@ def _checked_place(config: DeployConfig) -> Place:
         read_guards(config.guard),
         trial=None if config.stage is None else config.stage == "trial",
         shadow=config.shadow,
+        robot_name=config.robot_name,
     )
     if config.record is not None and config.no_record:
         raise SettingsError("--record and --no-record exclude each other; give one of the two")
@@ -230,7 +243,7 @@ def _checked_place(config: DeployConfig) -> Place:
 
 
 def _recorder(
-    config: DeployConfig, checkpoint: Checkpoint, place: Place, env: gym.Env[Any, Any], marks: tuple[str, ...]
+    config: DeployConfig, checkpoint: Checkpoint, place: Place, env: gym.Env[Any, Any], facts: Mapping[str, Any]
 ) -> Recorder | None:
     """The recorder that the flags ask for, started; None for none."""
     if config.record is None and (config.no_record or place.robot is None):
@@ -243,8 +256,7 @@ def _recorder(
         path, *others = recording_names(checkpoint.manifest.env)
     else:
         path, others = Path(config.record).expanduser(), []
-    facts = {**deployment_facts(checkpoint, env), "seed": config.seed, "address": place.text, "marks": ", ".join(marks)}
-    recorder = flight_recorder(path, env, facts, others)
+    recorder = flight_recorder(path, env, {**deployment_facts(checkpoint, env), **facts}, others)
     recorder.start()
     if has_real_robot(env):
         recorder.event("nobody was asked before the robot moves (--yes)" if config.yes else "the operator lets it move")

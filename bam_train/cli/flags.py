@@ -148,12 +148,16 @@ class DeployConfig:
     """The checkpoint.zip that bam-train wrote, also at s3://bucket/pick.zip."""
     episodes: Count = 5
     """How many episodes."""
-    seed: Seed = 1_000_000
-    """Seed of the first episode; episode k gets seed + k, as in bam-eval."""
+    seed: Annotated[Seed | None, tyro.conf.arg(metavar="N")] = None
+    """Seed of the first episode; episode k gets seed + k. By default 1000000, as in bam-eval; on trial, the first one
+    that no trial of this checkpoint on this robot has had."""
     env: EnvId = None
     """Refuse the checkpoint unless it was trained on this environment; needed for some_module:Env-v0."""
     robot: Url = None
     """Live robot behind rosbridge, such as ws://10.0.0.5:9090; by default the simulated one here."""
+    robot_name: Annotated[str, tyro.conf.arg(metavar="NAME")] = ""
+    """Name of the live robot, where it does not tell its serial number or a name: trials count for the robot of that
+    name. A robot that tells another name is refused."""
     transport: Url = None
     """Whole environment that runs elsewhere: ws://10.0.0.5:9090/bam_001 (GymAPI), tcp://10.0.0.5:9091."""
     profile: Name = None
@@ -299,6 +303,8 @@ class ServeConfig:
     """Port of the rosbridge server; 0 takes a free one."""
     bind: str = "127.0.0.1"
     """Address to listen on; 127.0.0.1 is this computer alone, 0.0.0.0 every network it is in."""
+    name: str = ""
+    """Name that the robot tells its clients, to tell it from others: trials count for the robot of that name."""
     namespace: str = ""
     """Name before every topic and service, such as bam_001."""
     tcp: Annotated[Port | None, tyro.conf.arg(metavar="PORT")] = None
@@ -360,6 +366,9 @@ class AgentConfig:
     """The checkpoint.zip to begin with; started again with the same one or none, an agent goes on with its champion."""
     robot: Url = None
     """Live robot behind rosbridge, such as ws://127.0.0.1:9090; by default a simulated one."""
+    robot_name: Annotated[str, tyro.conf.arg(metavar="NAME")] = ""
+    """Name of the live robot, where it does not tell its serial number or a name: trials count for the robot of that
+    name. A robot that tells another name is refused."""
     port: Port = 9095
     """Port for people and programs; 0 takes a free one."""
     bind: str = "127.0.0.1"

@@ -7,6 +7,7 @@ from typing import Any
 import gymnasium as gym
 
 from bam_envs.core.config_folder import config_folder
+from bam_envs.rosbridge.endpoint import Endpoint, is_loopback
 from bam_envs.safety.guard import TRIAL_SPEED
 from bam_train.checkpoint import Checkpoint
 from bam_train.deploy.agreement import Shadow
@@ -45,22 +46,27 @@ class Admission:
     """Trials for `Deployment`, set by the call if the robot is on trial."""
     shadow: Shadow | None = None
     """Comparison with whoever drives the robot, set by the call for a shadow."""
+    identity: str = ""
+    """Serial number or name of the live robot, set by the call; empty if neither is known."""
     policy: FrozenPolicy = field(init=False)
     """The frozen policy, once it is admitted."""
 
-    def __call__(self, env: gym.Env[Any, Any], place: Place) -> list[str]:
+    def __call__(self, env: gym.Env[Any, Any], place: Place, told: str = "") -> list[str]:
         """Check signature and trials if the robot is real, and load the policy; returns lines for the operator.
 
-        A simulated robot needs no signature, and trials only if `place.trial` is set.
+        A simulated robot needs no signature, and trials only if `place.trial` is set. `told` is `Inspection.identity`.
 
         Raises:
             UntrustedCheckpoint: The robot is real, and the checkpoint has no trusted signature.
             AlteredCheckpoint: The checkpoint was changed after it was signed.
             TrialsNeeded: Full speed is requested without enough trials.
             BadTrials: The record of trials was edited, or cannot be read.
-            SettingsError: A record of trials is given for a simulated robot that is not on trial.
+            SettingsError: The robot is not the one that `place` names; it is not known which one it is; or a record of
+                trials is given for a simulated robot that is not on trial.
         """
-        lines = self._signature() if has_real_robot(env) else []
+        self.identity = identity_of(place, told)
+        lines = [f"  robot: {self.identity}"] if self.identity else []
+        lines += self._signature() if has_real_robot(env) else []
         if place.shadow:
             robot: Any = env.unwrapped.robot  # type: ignore[attr-defined]
             robot.watch = self.shadow = Shadow(robot.spec, robot.limits)
@@ -87,7 +93,7 @@ class Admission:
         return [f"  signed by {found.signer}, {found.created}"]
 
     def _stage(self, address: str, *, is_trial: bool, simulated: bool) -> list[str]:
-        trials = trials_of(self.checkpoint, self.record, address, simulated=simulated)
+        trials = trials_of(self.checkpoint, self.record, self.identity, address, simulated=simulated)
         evidence = trials.evidence
         if is_trial:
             self.marks, self.trials = (*self.marks, TRIAL), trials
@@ -96,16 +102,43 @@ class Admission:
             return [f"  stage full: {evidence.text}"]
         if not self.i_know:
             remedy = "Run more with --stage trial, or give --i-know"
-            raise TrialsNeeded(f"--stage full: {self.checkpoint.path} at {address}: {evidence.text}. {remedy}")
+            where = f"{self.identity} at {address}" if self.identity else address
+            raise TrialsNeeded(f"--stage full: {self.checkpoint.path} on {where}: {evidence.text}. {remedy}")
         self.marks = (*self.marks, UNPROVEN)
         return [f"  {UNPROVEN}: {evidence.text}"]
 
 
-def trials_of(checkpoint: Checkpoint, record: Path | None, address: str, *, simulated: bool) -> Trials:
-    """The trials of a checkpoint on the robot at `address`, in the file `record` (None: `TRIALS`)."""
+def identity_of(place: Place, told: str) -> str:
+    """Serial number or name of the live robot at `place`, which tells the one that is `told`; empty if none is known.
+
+    Raises:
+        SettingsError: The robot tells another one than the operator.
+    """
+    if told and place.robot_name not in ("", told):
+        raise SettingsError(
+            f"--robot-name {place.robot_name}: the robot at {place.text} says that it is {told}; correct the name, or "
+            "the address; nothing has moved"
+        )
+    return told or place.robot_name
+
+
+def trials_of(checkpoint: Checkpoint, record: Path | None, identity: str, address: str, *, simulated: bool) -> Trials:
+    """The trials of a checkpoint on the robot `identity` at `address`, in the file `record` (None: `TRIALS`).
+
+    A robot whose `identity` is not known is its address.
+
+    Raises:
+        SettingsError: Any robot may be at that address, as at the end of an SSH tunnel.
+    """
+    if not (identity or simulated) and is_loopback(Endpoint(address).address.host):
+        raise SettingsError(
+            f"the robot at {address} does not tell which one it is, and every tunnel ends at such an address, so that "
+            "its trials could count for another robot: name it with --robot-name NAME, always the same"
+        )
     manifest = checkpoint.manifest
     book = TrialRecord((record or TRIALS).expanduser(), config_folder() / "trials")
-    subject = Subject(checkpoint.digest, address.rstrip("/"), simulated)
+    address = address.rstrip("/")
+    subject = Subject(checkpoint.digest, identity or address, simulated, address)
     threshold = manifest.settings.get("trial_threshold")
     threshold = threshold if type(threshold) is float and 0 < threshold < 1 else 0.9
     return Trials(book, subject, threshold, {"env": manifest.env, "file": str(checkpoint.path)})

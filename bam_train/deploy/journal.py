@@ -144,6 +144,8 @@ class DeployReport:
     """The comparison with whoever drove the robot."""
     recorder: Recorder | None = None
     """The recorder, if the deployment was recorded."""
+    identity: str = ""
+    """Serial number or name of the robot; empty if neither is known."""
 
     def to_json(self) -> dict[str, Any]:
         """The report as JSON values; times in the unit of their name."""
@@ -164,6 +166,7 @@ class DeployReport:
             "algorithm": manifest.algorithm,
             "checkpoint": str(self.checkpoint.path),
             "robot": self.robot,
+            "identity": self.identity,
             "marks": list(journal.marks),
             "trials": None if self.trials is None else self.trials.evidence.to_json(),
             "shadow": None if self.shadow is None else self.shadow.agreement.to_json(),

@@ -26,7 +26,7 @@ import os
 import secrets
 import tempfile
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from datetime import datetime, timezone
 from pathlib import Path
 from typing import IO, Any
@@ -53,6 +53,10 @@ class Evidence:
     trials: int
     threshold: float
     """Success rate to exceed, between 0 and 1, exclusive."""
+    repeated: int = 0
+    """Trials that do not count, because they repeated the seed of another one."""
+    nameless: int = 0
+    """Trials at the same address that do not count, because their record does not say that the robot was this one."""
 
     @property
     def value(self) -> float:
@@ -86,9 +90,14 @@ class Evidence:
         """One line: ``18 of 19 trials succeeded; 30 more without a failure would show more than 90 %``."""
         done = f"{self.successes} of {self.trials} trial{'' if self.trials == 1 else 's'} succeeded"
         above = f"more than {100 * self.threshold:g} %"
+        if self.repeated:
+            done = f"{done} ({self.repeated} more repeated a seed, and a seed counts once)"
+        text = f"{done}; {self.missing} more without a failure would show {above}"
         if self.is_enough:
-            return f"{done}, which shows {above} (error probability at most {100 * ALPHA:g} %)"
-        return f"{done}; {self.missing} more without a failure would show {above}"
+            text = f"{done}, which shows {above} (error probability at most {100 * ALPHA:g} %)"
+        if self.nameless:
+            text = f"{text}; {self.nameless} at this address do not count: their record does not name this robot"
+        return text
 
 
 @dataclass(frozen=True)
@@ -98,9 +107,11 @@ class Subject:
     checkpoint: str
     """`Checkpoint.digest`."""
     robot: str
-    """Address of the robot."""
+    """The robot: its serial number, the name that its operator gave, or its address if neither is known."""
     simulated: bool = False
     """Whether the robot is simulated; such trials do not count for a real robot at the same address."""
+    address: str = field(default="", compare=False)
+    """Address of the robot, which may be another one in the next trial."""
 
 
 class TrialRecord:
@@ -121,9 +132,23 @@ class TrialRecord:
             BadTrials: A line was edited, removed, added or moved; the file or its key cannot be read.
         """
         lines = self._read().lines if self.path.exists() else []
-        begun = {row["begun"] for row in lines if "begun" in row and _subject_of(row) == subject}
         succeeded = {row.get("ended") for row in lines if row.get("success") is True}
-        return Evidence(len(begun & succeeded), len(begun), threshold)
+        starts: dict[Any, bool] = {}  # seed of each start -> whether every trial with it succeeded
+        begun = [row for row in lines if "begun" in row and _subject_of(row) == subject]
+        for row in begun:
+            start = row.get("seed", row["begun"])
+            starts[start] = starts.get(start, True) and row["begun"] in succeeded
+        nameless = 0
+        if subject.address not in ("", subject.robot):
+            elsewhere = Subject(subject.checkpoint, subject.address, subject.simulated)
+            nameless = sum("begun" in row and _subject_of(row) == elsewhere for row in lines)
+        return Evidence(sum(starts.values()), len(starts), threshold, len(begun) - len(starts), nameless)
+
+    def next_seed(self, subject: Subject, first: int) -> int:
+        """The least seed from `first` on that is above those of all trials of `subject`; raises as `evidence`."""
+        lines = self._read().lines if self.path.exists() else []
+        seeds = [row.get("seed") for row in lines if "begun" in row and _subject_of(row) == subject]
+        return max([first, *(seed + 1 for seed in seeds if isinstance(seed, int))])
 
     def begin(self, subject: Subject, **facts: Any) -> str:
         """Record the start of a trial, with further `facts` (JSON values), and return the name of the trial."""
@@ -294,6 +319,10 @@ class Trials:
     def evidence(self) -> Evidence:
         """The evidence of all trials so far, including earlier deployments; raises BadTrials."""
         return self.record.evidence(self.subject, self.threshold)
+
+    def next_seed(self, first: int) -> int:
+        """The least seed from `first` on that no trial had so far, nor any after it; raises BadTrials."""
+        return self.record.next_seed(self.subject, first)
 
     def begin(self, seed: int) -> None:
         """Record the start of a trial; raises BadTrials if that fails, and then the robot must not move."""

@@ -209,6 +209,7 @@ class FrontProcess:
             self._handing[ended] = None
             self.lease.release(ended)
         self.status = status
+        self._describe()
         drivable = state not in ("waiting for the robot", "stopped by a guard")
         self.robot.why_not = "" if drivable else f"the agent is {state}: {status.get('why')}"
         self.changed()
@@ -341,7 +342,8 @@ class FrontProcess:
         robot, period = self.shadow.info, self.shadow.spec.period
         watchdog, text = max(self.options.command_timeout, 1.5 * period), f"{robot.text or self.options.robot}"
         text = f"{text}, driven by a live agent, from which you take over"
-        return RobotInfo(self.shadow.profile.name, robot.simulated, False, period, text, watchdog, True)
+        identity = str(self.status.get("identity", ""))
+        return RobotInfo(self.shadow.profile.name, robot.simulated, False, period, text, watchdog, True, identity)
 
     def _describe(self) -> None:
         if self._service is not None:

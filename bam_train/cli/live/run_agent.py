@@ -108,7 +108,7 @@ def _admit(config: AgentConfig, signals: SignalMemory, env: Any, lines: Sequence
 
 def _options(config: AgentConfig) -> AgentOptions:
     """The options of the agent by its flags; invalid flags are refused."""
-    from bam_envs.remote.serve.serve_options import is_loopback
+    from bam_envs.rosbridge.endpoint import is_loopback
     from bam_train.agent.agent_options import AgentOptions
     from bam_train.env_location import read_guards
     from bam_train.errors import SettingsError
@@ -147,6 +147,7 @@ def _options(config: AgentConfig) -> AgentOptions:
         unusual=config.unusual or "warn",
         guard_stops=config.guard_stops,
         record=not config.no_record,
+        robot_name=config.robot_name,
         data=config.record,
     )
     options.place(trial=None).require_sane()

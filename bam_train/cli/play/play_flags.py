@@ -30,6 +30,9 @@ class PlayConfig:
     """One argument of the environment, any number of times: max_episode_steps=400."""
     robot: Url = None
     """Live robot behind rosbridge, such as ws://10.0.0.5:9090; by default the simulated one here."""
+    robot_name: Annotated[str, tyro.conf.arg(metavar="NAME")] = ""
+    """Name of the live robot, where it does not tell its serial number or a name: trials of --policy on the robot of
+    that name count. A robot that tells another name is refused."""
     transport: Url = None
     """Whole environment that runs elsewhere: ws://10.0.0.5:9090/bam_001 (GymAPI), tcp://10.0.0.5:9091."""
     profile: Name = None

@@ -77,7 +77,7 @@ def _checked_place(config: PlayConfig) -> Place:
     ca_file, token_file = (None if path is None else str(path) for path in (config.ca_file, config.token_file))
     trial = None if config.stage is None else config.stage == "trial"
     link = (config.robot, addresses(config.transport), config.profile, ca_file, token_file, config.timeout)
-    place = Place(*link, read_guards(config.guard), trial=trial)
+    place = Place(*link, read_guards(config.guard), trial=trial, robot_name=config.robot_name)
     place.require_sane()
     if config.env is None and config.policy is None and not place.transport:
         raise SettingsError(

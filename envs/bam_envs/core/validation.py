@@ -37,6 +37,14 @@ Fraction = Annotated[float, Meta(ge=0, le=1)]
 PositiveInt = Annotated[int, Meta(ge=1)]
 NonNegativeInt = Annotated[int, Meta(ge=0)]
 Port = Annotated[int, Meta(ge=0, le=65535)]
+RobotName = Annotated[
+    str,
+    Meta(
+        pattern=r"^(\w([\w .@-]{0,62}\w)?)?\Z",
+        description="at most 64 letters, digits, blanks and . _ @ -, with a letter or digit at both ends",
+    ),
+]
+"""What tells a robot from others: its serial number, or a name that its operator gave; empty if neither is known."""
 NonEmpty = Annotated[str, Meta(min_length=1, description="non-empty text")]
 
 

@@ -41,8 +41,10 @@ _ACTIVE = ("active", "running")
 """The states of a controller that takes commands, in ROS 2 and in ROS 1."""
 
 
-def ask(link: RosbridgeLink, service: str, tries: int = _TRIES) -> dict[str, Any] | None:
-    """Call `service`, which takes no arguments; None if it does not exist, `LinkLost` if it does not answer.
+def ask(
+    link: RosbridgeLink, service: str, tries: int = _TRIES, *, request: Mapping[str, Any] | None = None
+) -> dict[str, Any] | None:
+    """Call `service`; None if it does not exist, `LinkLost` if it does not answer.
 
     `RemoteError` if this client may only watch.
 
@@ -50,7 +52,7 @@ def ask(link: RosbridgeLink, service: str, tries: int = _TRIES) -> dict[str, Any
     client and service have discovered each other.
     """
     try:
-        return link.call(service, "", {}, TIMEOUT / _TRIES)
+        return link.call(service, "", dict(request or {}), TIMEOUT / _TRIES)
     except RemoteError as error:
         if is_forbidden(error):
             raise
@@ -58,7 +60,7 @@ def ask(link: RosbridgeLink, service: str, tries: int = _TRIES) -> dict[str, Any
     except LinkLost:
         if tries == 1 or not link.is_up:
             raise
-        return ask(link, service, tries - 1)
+        return ask(link, service, tries - 1, request=request)
 
 
 def info_by_profile(url: str, profile: RobotProfile, unknown: Iterable[str] = ()) -> RobotInfo:
@@ -227,7 +229,7 @@ class LiveReadiness:
             if one.topic in letters and not (moving and one.at_least is not None):
                 trouble = one.trouble(letters[one.topic].message)
                 if trouble is not None:
-                    return f"{trouble} ({one.topic})"
+                    return trouble
         return None
 
     def not_ready(self, link: RosbridgeLink) -> str | None:

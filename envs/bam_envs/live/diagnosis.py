@@ -16,6 +16,7 @@ import numpy as np
 from bam_envs.core.errors import BamEnvsError, LinkLost, NotReady, ProtocolError, StaleState
 from bam_envs.live import bringup
 from bam_envs.live.building import live_robot, require_robot_address
+from bam_envs.live.inspection import ask_identity
 from bam_envs.live.link_measurement import PING_TOPIC, Array, LinkMeasurement, Reading, measure_link
 from bam_envs.live.state import LiveState
 from bam_envs.robots.profile import load_profile, profile_for, shipped_profiles
@@ -167,7 +168,7 @@ class Diagnosis:
                     f"there is no topic {link.namespace}{topic} ({kind}), which has {signals}. Does its driver "
                     f"run, and is its name right? Topics are in the profile of {profile.name} "
                     "(--profile); with --checkpoint only those of its task are needed."
-                    f"{namespaces_with(link, 'topics', topic)}{self._another_robot(profile)}"
+                    f"{namespaces_with(link, 'topics', topic, topics)}{self._another_robot(profile)}"
                 )
         findings.text.append(f"profile {profile.name}: {', '.join(topics)}")
         self._has_rosapi = types.answers
@@ -226,7 +227,7 @@ class Diagnosis:
         for reading in self.measurement.readings:
             key = (reading.source.topic, reading.source.names)
             limit = max(reading.source.max_age or 0.0, profile.max_age)
-            _require_states(reading, limit, self.seconds, profile)
+            _require_states(reading, limit, self.seconds, profile, self.measurement.round_trips)
             if key not in seen:
                 findings.text.append(f"{reading.source.topic} {reading.rate:.4g} Hz, age {_p50_p99(reading.ages)}")
                 _warn_about_states(reading, limit, period, findings.warnings)
@@ -280,7 +281,7 @@ class Diagnosis:
         robot.connect()  # checks types and listeners of all command topics and opens the connection that halts
         why = robot.not_ready()
         if why is not None:
-            raise NotReady(f"{why}; bring the robot into the state in which it takes commands, then run this again")
+            raise NotReady(f"{why}. Run this again when the robot takes commands")
         if self._has_rosapi:
             findings.text.append("the topics of commands have listeners")
         else:
@@ -288,8 +289,11 @@ class Diagnosis:
         findings.text.append("the connection that halts is open; ready; nothing was sent")
 
     def _guards(self, findings: _Findings) -> None:
-        robot, _ = self._robot_and_profile()
+        robot, profile = self._robot_and_profile()
         findings.text.append(f"{len(robot.report())} guards; bam-deploy --print-guards shows them")
+        # Last, as a service that does not answer may hold up everything behind it.
+        told = ask_identity(self._link, profile, {}) if self._info is None else self._info.identity
+        findings.text.append(f"the robot is {told}" if told else "the robot does not tell which one it is")
         findings.warnings.extend(robot.warnings)
         spec, newest = robot.spec, {reading.source.signal: reading.values for reading in self._measured().readings}
         low, high = (np.asarray(bound, float) for bound in position_range(spec, robot.limits))
@@ -314,7 +318,7 @@ class Diagnosis:
         return self.measurement
 
 
-def _require_states(reading: Reading, limit: float, seconds: float, profile: RobotProfile) -> None:
+def _require_states(reading: Reading, limit: float, seconds: float, profile: RobotProfile, round_trips: Array) -> None:
     """Raise an error unless a deployment could use these states; `limit` is their maximum age [s]."""
     topic, kind = reading.source.topic, reading.source.type
     if not reading.count:
@@ -327,11 +331,30 @@ def _require_states(reading: Reading, limit: float, seconds: float, profile: Rob
     p99 = float(np.percentile(reading.ages, 99)) if len(reading.ages) else math.inf
     if p99 > limit:
         raise StaleState(
-            f"{topic}: the newest state is up to {_ms(p99)} old (p99), and {_ms(limit)} is the limit, at "
-            f"{reading.rate:.3g} Hz. Raise the rate of its driver, or mend the network; max_age is in the profile.",
+            f"{topic}: the newest state is up to {_ms(p99)} old (p99), and {_ms(limit)} is the limit (max_age in the "
+            f"profile), at {reading.rate:.3g} Hz. {_why_old(reading, limit, round_trips)}",
             p99,
             limit,
         )
+
+
+def _why_old(reading: Reading, limit: float, round_trips: Array) -> str:
+    """The cause of states that are older than `limit` [s], and its remedy, in sentences."""
+    if reading.rate < 2 / limit:
+        return "They come too rarely: raise the rate of their driver."
+    late, way = float(np.median(reading.arrival)), float(np.median(round_trips)) / 2 if len(round_trips) else 0.0
+    if reading.arrival[-1] - reading.arrival[0] > len(reading.arrival) / reading.rate / 2:
+        return "Their stamp stands still: the driver repeats an old measurement. Start it again."
+    if late <= limit:
+        return "They come in bursts, with pauses between: the network, or a busy computer on the way, holds them back."
+    old = f"They are {_ms(late)} old when they arrive, so that a higher rate would change nothing"
+    if way > late / 2:
+        return f"{old}: the network takes {_ms(way)} one way. Use a cable, or a network that is less busy."
+    return (
+        f"{old}, and the network takes only {_ms(way)} one way. Either the clock of the driver's computer is behind, "
+        "and is to be set by the same NTP server as that of the bridge's; or driver or bridge are short of time: give "
+        "the bridge a core of its own, and send no raw images through it."
+    )
 
 
 def _warn_about_states(reading: Reading, limit: float, period: float, warnings: list[str]) -> None:

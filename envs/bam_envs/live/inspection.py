@@ -2,10 +2,12 @@
 
 import threading
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
+from typing import Any
 
-from bam_envs.core.errors import LinkLost
+from bam_envs.core.errors import LinkLost, RemoteError
 from bam_envs.core.robot import RobotSpec
 from bam_envs.core.timing import Deadline
 from bam_envs.live.bringup import TIMEOUT, TopicTypes, ask, tagged_sinks
@@ -52,6 +54,8 @@ class Inspection:
     """The local wall clock minus the server's [s]; None if the server does not report its time."""
     proof: CommandProof | None = None
     """The proof of the commands of a real arm; None for any other robot."""
+    identity: str = ""
+    """Serial number or name of the robot, as it tells it; empty if it does not."""
 
 
 @dataclass
@@ -104,6 +108,7 @@ def inspect_robot(
         sinks = (tagged_sinks(narrowed, None) if info is not None else None) or narrowed.sinks()
         needed = {entry.topic: entry.type for entry in (*required, *sinks)}
         wanted = {**needed, **{source.topic: source.type for source in extra}, DESCRIPTION: DESCRIPTION_TYPE}
+        wanted |= {source.topic: source.type for source in profile.identity if source.topic and info is None}
         types = _types(link, TopicTypes(link, profile, timeout), wanted, needed, timeout)
         proof = needed_proof(link, info, narrowed, sinks, endpoint.url)
         inbox = _Inbox()
@@ -117,10 +122,25 @@ def inspect_robot(
             raise LinkLost(f"{link.url}: the link dropped while the robot's topics were checked.")
         seconds = time.monotonic() - start
         ahead = time.time() - time.monotonic()
-        every = (*required, *extra)
-        return Inspection(info, every, sinks, types, letters, seconds, ahead, link.clock_offset, proof)
+        # Last: with a ROS 2 bridge, a service that does not answer holds up everything else on this connection.
+        identity = ask_identity(link, profile, letters) if info is None else info.identity
+        every, offset = (*required, *extra), link.clock_offset
+        return Inspection(info, every, sinks, types, letters, seconds, ahead, offset, proof, identity)
     finally:
         link.close()
+
+
+def ask_identity(link: RosbridgeLink, profile: RobotProfile, letters: Mapping[str, tuple[Letter, ...]]) -> str:
+    """The serial number or name that the robot tells, by the first source that has one; empty if none has."""
+    for source in profile.identity:
+        messages: Sequence[Any] = [letter.message for letter in letters.get(source.topic, ())[-1:]]
+        if source.service:
+            with suppress(LinkLost, RemoteError):
+                messages = [ask(link, link.namespace + source.service, request=source.request)]
+        for message in messages:
+            if found := source.identity(message):
+                return found
+    return ""
 
 
 def _types(

@@ -9,6 +9,7 @@ the keys against each other.
 """
 
 import importlib
+import re
 import sys
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
@@ -26,7 +27,16 @@ from bam_envs.robots.mir100 import base_spec
 from bam_envs.robots.ur5e import arm_spec
 from bam_envs.ros.codec import LISTED_TYPES
 from bam_envs.ros.messages import bare_type, has_header
-from bam_envs.ros.profile_tables import CameraSource, ImageType, Readiness, RobotProfile, Sink, Source, Topic
+from bam_envs.ros.profile_tables import (
+    CameraSource,
+    IdentitySource,
+    ImageType,
+    Readiness,
+    RobotProfile,
+    Sink,
+    Source,
+    Topic,
+)
 from bam_envs.safety.guard import BOUNDS, Limits
 
 tomllib: Any = importlib.import_module("tomllib" if sys.version_info >= (3, 11) else "tomli")
@@ -69,6 +79,7 @@ class _File:
     commands: dict[str, list[Table]] = field(default_factory=dict)
     cameras: tuple[Table, ...] = ()
     readiness: tuple[Table, ...] = ()
+    identity: tuple[Table, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -173,6 +184,7 @@ def _profile(where: str, table: Table) -> RobotProfile:
         readiness.append(entry := _topical(Readiness, row, at))
         if bool(entry.ready) == (entry.at_least is not None):
             raise InvalidValue(f"{at}: give either ready (the values with which it can move) or at_least.")
+    identity = [_identity(row, at) for row, at in _rows(f"{where}: identity", file.identity)]
     sinks = [sink for mode in commands.values() for sink in mode]
     entries: list[Source | Sink | CameraSource | Readiness] = [*state, *cameras, *readiness, *sinks]
     _require_known(f"{where}: rename", "topic", file.rename, [entry.topic for entry in entries])
@@ -197,10 +209,22 @@ def _profile(where: str, table: Table) -> RobotProfile:
         limits=file.limits,
         cameras=tuple(map(renamed, cameras)),
         readiness=tuple(map(renamed, readiness)),
+        identity=tuple(identity),
         controllers=file.controllers,
         watchdog=file.watchdog,
         body=spec.body,
     )
+
+
+def _identity(row: Table, where: str) -> IdentitySource:
+    source = _row(IdentitySource, row, where)
+    if bool(source.service) == bool(source.topic) or bool(source.topic) != bool(source.type):
+        raise InvalidValue(f"{where}: give either service, or topic and type.")
+    try:
+        re.compile(source.pattern)
+    except re.error as error:
+        raise InvalidValue(f"{where}: pattern is not a regular expression: {error}.") from error
+    return replace(source, type=bare_type(source.type))
 
 
 def _robot(where: str, file: _File) -> RobotSpec:

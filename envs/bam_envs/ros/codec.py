@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from bam_envs.core.errors import ProtocolError
 from bam_envs.core.robot import RobotSpec, RobotState
-from bam_envs.core.validation import NonNegative, Positive, read_table
+from bam_envs.core.validation import NonNegative, Positive, RobotName, read_table
 from bam_envs.core.wording import brief
 from bam_envs.ros.freshness import Tag, read_tag
 from bam_envs.ros.messages import (
@@ -66,6 +66,7 @@ class RobotInfo:
     text: str = ""  # one line for people
     watchdog: NonNegative | None = None  # time after which it stops by itself without a command [s], if known
     agent: bool = False  # whether a live agent drives it, from which a person takes over (`AGENT_TOPIC`)
+    identity: RobotName = ""  # its serial number, or the name that its operator gave; empty if neither is known
 
     def to_json(self) -> str:
         """The text for the answer of `INFO_SERVICE`."""

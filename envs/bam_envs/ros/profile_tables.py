@@ -1,6 +1,7 @@
 """The tables of a robot profile: sources of its signals, sinks of its commands, cameras, ages and limits."""
 
 import dataclasses
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
@@ -10,7 +11,7 @@ from msgspec import Meta
 
 from bam_envs.core.errors import InvalidValue, UnknownName
 from bam_envs.core.robot import BaseBody, RobotSpec, SignalSpec
-from bam_envs.core.validation import Finite, NonEmpty, NonNegativeInt, Positive
+from bam_envs.core.validation import Finite, NonEmpty, NonNegativeInt, Positive, RobotName, check
 
 Topic = Annotated[str, Meta(pattern=r"^(/[A-Za-z]\w*)+\Z", description="an absolute name such as /joint_states")]
 """A topic without its namespace."""
@@ -122,26 +123,62 @@ class Readiness:
     """Meanings of other values, e.g. ``3 = "protective stop"``."""
     otherwise: NonEmpty = ""
     """Meaning of all further values; ``{}`` stands for the value. Empty: the value itself is reported."""
+    remedy: NonEmpty = ""
+    """How people bring it into a state in which it can move, in one line; `remedies` has those of single values."""
+    remedies: Mapping[str, str] = dataclasses.field(default_factory=dict)
+    """The same for single values, as in `words`."""
 
     def value(self, message: Any) -> Any:
         """The value in `message`; None if it has none."""
-        for path in self.field:
-            value = message
-            for name in path.split("."):
-                value = value.get(name) if isinstance(value, Mapping) else None
-            if value is not None:
-                return value
-        return None
+        return next((value for path in self.field if (value := _value_in(message, path)) is not None), None)
 
     def trouble(self, message: Any) -> str | None:
-        """Why the robot cannot move according to `message`; None if it can, or the message has no value."""
+        """Why the robot cannot move according to `message`, and its remedy; None if it can, or there is no value."""
         value = self.value(message)
         number = isinstance(value, (int, float)) and not isinstance(value, bool)
         enough = self.at_least is not None and not (number and value < self.at_least)
         if value is None or value in self.ready or enough:
             return None
         text = f"{value:g}" if number else str(value).lower() if isinstance(value, bool) else str(value)
-        return self.words.get(text) or self.otherwise.replace("{}", text) or f"{self.field[0]} is {text}"
+        remedy = self.remedies.get(text) or self.remedy
+        what = self.words.get(text) or self.otherwise.replace("{}", text) or f"{self.field[0]} is {text}"
+        return f"{what} ({self.topic}){remedy and f': {remedy}'}"
+
+
+def _value_in(message: Any, path: str) -> Any:
+    """The value at `path` in a message; None if it has none."""
+    for name in path.split("."):
+        message = message.get(name) if isinstance(message, Mapping) else None
+    return message
+
+
+@dataclass(frozen=True)
+class IdentitySource:
+    """Where a robot tells its serial number or its name: a service, or a topic that repeats it. Nothing needs it."""
+
+    field: NonEmpty
+    """Path of it in the response, or in the message."""
+    service: Topic = ""
+    """The service; or `topic`."""
+    request: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+    """The request of the service."""
+    topic: Topic = ""
+    """The topic; or `service`."""
+    type: MessageType = ""
+    """Message type of the topic."""
+    pattern: NonEmpty = ".*"
+    """Regular expression that the whole of it must match; other text, such as that of an error, is ignored."""
+
+    def identity(self, message: Any) -> str:
+        """What `message` says; empty if it says nothing that can name a robot."""
+        value = _value_in(message, self.field)
+        text = str(value).strip() if isinstance(value, (str, int)) else ""
+        if re.fullmatch(self.pattern, text) is None:
+            return ""
+        try:
+            return str(check(text, RobotName, self.field))
+        except InvalidValue:
+            return ""
 
 
 @dataclass(frozen=True)
@@ -177,6 +214,7 @@ class RobotProfile:
     """Limits of the guards that differ from their defaults, by their names in `bam_envs.safety.guards`."""
     cameras: tuple[CameraSource, ...] = ()
     readiness: tuple[Readiness, ...] = ()  # topics that report whether it can move
+    identity: tuple[IdentitySource, ...] = ()  # where it tells which robot it is; the first that answers counts
     controllers: str = ""
     """The service that lists its controllers and their states (``list_controllers``); empty: there is none."""
     watchdog: float | None = None

@@ -6,7 +6,7 @@ Messages are plain dicts in the JSON form of rosbridge; a byte array is `bytes`.
 
 import logging
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal, Protocol, TypeVar
 
@@ -117,14 +117,21 @@ class Bus(Protocol):
         """Stop serving and release everything. Idempotent."""
 
 
-def namespaces_with(link: Any, kind: Literal["topics", "services"], name: str) -> str:
-    """A sentence about the namespaces in which the server of `link` has the topic or service `name`, if it has any."""
+def namespaces_with(link: Any, kind: Literal["topics", "services"], name: str, with_it: Collection[str] = ()) -> str:
+    """A sentence about the names on the server of `link` that end like the topic or service `name`, if there are any.
+
+    It names other addresses where all names `with_it` are, else the names themselves, but not those of `with_it`.
+    """
     try:
-        names = link.call(f"/rosapi/{kind}", f"rosapi/{kind.capitalize()}", {}, 1.0).get(kind) or []
+        listed_there = link.call(f"/rosapi/{kind}", f"rosapi/{kind.capitalize()}", {}, 1.0).get(kind) or []
     except (RemoteError, LinkLost):
         return ""
-    namespaces = [one.removesuffix(name) for one in names if isinstance(one, str) and one.endswith(name)]
-    if not namespaces:
+    names = {one for one in listed_there if isinstance(one, str)}
+    found = sorted(one for one in names - {f"{link.namespace}{one}" for one in with_it} if one.endswith(name))
+    whole = [space for one in found if {(space := one.removesuffix(name)) + other for other in with_it} <= names]
+    if whole:
+        return f" It is there at another address: {listed(f'ws://HOST:PORT{space}' for space in whole)}."
+    own = [one.removeprefix(link.namespace) for one in found if one.startswith(f"{link.namespace}/")]
+    if not own:
         return ""
-    addresses = listed(f"ws://HOST:PORT{namespace}" for namespace in sorted(namespaces))
-    return f" It is there at another address: {addresses}."
+    return f' Is it {listed(own)}? Then give a profile with [rename], and in it "{name}" = "{own[0]}".'

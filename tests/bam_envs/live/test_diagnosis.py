@@ -158,7 +158,22 @@ def test_a_robot_in_another_namespace(server, robot_on):
     robot_on(server, namespace="/cell_1")
     name, why = failure(diagnose(server.url, profile="ur5e")[1])
     assert name == "topics"
-    assert " It is there at another address: ws://HOST:PORT/cell_1, " in why
+    assert why.endswith(" It is there at another address: ws://HOST:PORT/cell_1.")
+
+
+@pytest.mark.parametrize("namespace", ["", "/cell_1"])
+def test_a_topic_of_another_name(server, robot_on, namespace):
+    for topic in ("/arm/joint_states", "/gripper/joint_states"):
+        server.advertise(f"{namespace}{topic}", "sensor_msgs/JointState")
+    server.advertise("/elsewhere/joint_states", "sensor_msgs/JointState")
+    server.advertise(f"{namespace}/object_pose", "geometry_msgs/PoseStamped")
+    name, why = failure(diagnose(f"{server.url}{namespace}", profile="ur5e")[1])
+    assert name == "topics"
+    elsewhere = "" if namespace else ", /elsewhere/joint_states"
+    assert why.endswith(
+        f' Is it /arm/joint_states{elsewhere}? Then give a profile with [rename], and in it "/joint_states" = '
+        '"/arm/joint_states".'
+    )
 
 
 def test_the_profile_is_found_in_another_namespace(server, robot_on):
@@ -183,7 +198,23 @@ def test_states_that_stay_the_same(server, robot_on):
     name, why = failure(diagnose(server.url)[1])
     assert name == "rates and ages"
     assert why.startswith("/joint_states: the newest state is up to ")
-    assert "and 100 ms is the limit" in why
+    assert " and 100 ms is the limit (max_age in the profile), at " in why
+    assert why.endswith("Hz. Their stamp stands still: the driver repeats an old measurement. Start it again.")
+
+
+def test_states_that_are_old_when_they_arrive(server, robot_on):
+    robot = robot_on(server)
+    robot.stamp = lambda: write_stamp(time.time() - 5.0)
+    why = failure(diagnose(server.url)[1])[1]
+    assert "They are 5.0 s old when they arrive, so that a higher rate would change nothing, and the network " in why
+    assert "Either the clock of the driver's computer is behind, and is to be set by the same NTP server" in why
+
+
+def test_states_that_come_too_rarely(server, robot_on):
+    robot, numbers = robot_on(server), iter(range(10**6))
+    robot.mangle = lambda topic, message: message if next(numbers) % 30 < 3 else None
+    why = failure(diagnose(server.url)[1])[1]
+    assert why.endswith("Hz. They come too rarely: raise the rate of their driver.")
 
 
 def without_elbow(message):
@@ -240,7 +271,11 @@ def test_a_robot_in_a_protective_stop(server, robot_on, patient):
     server.publish("/io_and_status_controller/safety_mode", {"mode": 3})
     name, why = failure(diagnose(server.url, profile=patient())[1])
     assert name == "command path"
-    assert why.startswith("protective stop (/io_and_status_controller/safety_mode); bring the robot into the state")
+    assert why == (
+        "protective stop (/io_and_status_controller/safety_mode): see what the arm ran into; 5 s after the stop unlock "
+        "it on the pendant, or by the service /dashboard_client/unlock_protective_stop, and start its program again. "
+        "Run this again when the robot takes commands"
+    )
     assert robot.commands == []
 
 

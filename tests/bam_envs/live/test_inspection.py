@@ -77,6 +77,34 @@ def test_a_server_without_rosapi_tells_no_types(lax, robot_on):
     assert kinds == {"call_service", "subscribe"}
 
 
+@pytest.mark.parametrize(
+    ("service", "response", "identity"),
+    [
+        ("get_serial_number", {"serial_number": 20195500123, "answer": "20195500123", "success": True}, "20195500123"),
+        ("get_serial_number", {"serial_number": 0, "answer": "no connection", "success": False}, ""),
+        ("raw_request", {"answer": "20195500123\n"}, "20195500123"),
+        ("raw_request", {"answer": "could not understand: 'get serial number'"}, ""),
+        ("get_robot_model", {"answer": "UR5"}, ""),
+    ],
+)
+def test_an_arm_tells_its_serial_number(lax, robot_on, service, response, identity):
+    running, asked = lax(), []
+    robot_on(running)
+    running.serve(f"/dashboard_client/{service}", "", lambda request, caller: asked.append(request) or response)
+    assert listened(running.url).identity == identity
+    assert asked == {"get_serial_number": [{}], "raw_request": [{"query": "get serial number"}]}.get(service, [])
+
+
+def test_a_base_tells_its_name_and_a_simulated_robot_the_one_that_it_was_given(server, robot_on, simulation):
+    scripted = robot_on(server, "mir100")
+    server.advertise("/robot_status", "mir_msgs/RobotStatus", latch=True)
+    server.publish("/robot_status", {"robot_name": "MiR_R1234", "state_id": 3})
+    base = load_profile("mir100")
+    assert inspect_robot(Endpoint(server.url), base, scripted.spec, listen=0.1).identity == "MiR_R1234"
+    robot_on(server, namespace="/cell", info=replace(simulation, identity="left arm"))
+    assert listened(f"{server.url}/cell").identity == "left arm"
+
+
 def test_the_longest_allowed_age_says_how_long_to_listen(server, robot_on):
     robot_on(server)
     assert listened(server.url, listen=None).seconds >= 0.5

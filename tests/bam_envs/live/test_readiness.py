@@ -21,6 +21,11 @@ LIST = "/controller_manager/list_controllers"
 TYPES = {one.topic: one.type for name in ("ur5e", "mir100") for one in load_profile(name).readiness}
 JOINTS_TOPIC = "/scaled_joint_trajectory_controller/joint_trajectory"
 ACTIVE = {"scaled_joint_trajectory_controller": "active", "forward_position_controller": "inactive"}
+CLEAR = (
+    "see what the arm ran into; 5 s after the stop unlock it on the pendant, or by the service "
+    "/dashboard_client/unlock_protective_stop, and start its program again"
+)
+BRAKES, PENDANT = "power the arm on and release its brakes on the pendant", "set it to 100 % on the pendant"
 
 
 class Driver:
@@ -91,18 +96,34 @@ def test_a_robot_that_is_ready_moves(driver, connected, start_pose):
     ("profile", "topic", "message", "text"),
     [
         ("ur5e", SAFETY, {"mode": 1}, None),
-        ("ur5e", SAFETY, {"mode": 3}, "protective stop"),
-        ("ur5e", SAFETY, {"mode": 7}, "robot emergency stop"),
-        ("ur5e", SAFETY, {"mode": 99}, "safety mode 99"),
+        ("ur5e", SAFETY, {"mode": 3}, f"protective stop ({SAFETY}): {CLEAR}"),
+        (
+            *("ur5e", SAFETY, {"mode": 7}),
+            f"robot emergency stop ({SAFETY}): release the emergency stop, then {BRAKES}",
+        ),
+        (
+            *("ur5e", SAFETY, {"mode": 99}),
+            f"safety mode 99 ({SAFETY}): the pendant shows what is wrong and how to clear it",
+        ),
         ("ur5e", SAFETY, [1], None),
-        ("ur5e", MODE, {"mode": 5}, "idle, brakes engaged"),
-        ("ur5e", MODE, {"mode": -1}, "no controller"),
-        ("ur5e", PROGRAM, {"data": False}, "the external control program is not running"),
-        ("ur5e", SPEED, {"data": 30.0}, "the speed slider is at 30 %"),
+        ("ur5e", MODE, {"mode": 5}, f"idle, brakes engaged ({MODE}): {BRAKES}"),
+        ("ur5e", MODE, {"mode": -1}, f"no controller ({MODE}): {BRAKES}"),
+        (
+            *("ur5e", PROGRAM, {"data": False}),
+            f"the external control program is not running ({PROGRAM}): start it on the pendant; in headless mode call "
+            "the service /io_and_status_controller/resend_robot_program",
+        ),
+        ("ur5e", SPEED, {"data": 30.0}, f"the speed slider is at 30 % ({SPEED}): {PENDANT}"),
         ("ur5e", SPEED, {"data": "fast"}, None),
         ("ur5e", SPEED, {}, None),
-        ("mir100", "/robot_state", {"robotState": 10}, "emergency stop"),
-        ("mir100", "/robot_state", {"robot_state": 10}, "emergency stop"),
+        (
+            *("mir100", "/robot_state", {"robotState": 10}),
+            "emergency stop (/robot_state): release the emergency stop, then press the reset button on the robot",
+        ),
+        (
+            *("mir100", "/robot_state", {"robot_state": 12}),
+            "error (/robot_state): its web page shows what is wrong and how to clear it",
+        ),
     ],
 )
 def test_what_a_message_says(profile, topic, message, text):
@@ -112,17 +133,20 @@ def test_what_a_message_says(profile, topic, message, text):
 
 @pytest.mark.parametrize(
     ("topic", "message", "text"),
-    [(SAFETY, {"mode": 3}, "protective stop"), (SPEED, {"data": 30.0}, "the speed slider is at 30 %")],
+    [
+        (SAFETY, {"mode": 3}, f"protective stop ({SAFETY}): {CLEAR}"),
+        (SPEED, {"data": 30.0}, f"the speed slider is at 30 % ({SPEED}): {PENDANT}"),
+    ],
 )
 def test_an_arm_that_is_not_ready_does_not_begin(driver, connected, start_pose, topic, message, text):
     driver.say_ready()
     driver.say(topic, **message)
     robot = connected()
-    assert robot.not_ready() == f"{text} ({topic})"
+    assert robot.not_ready() == text
     with pytest.raises(NotReady) as caught:
         robot.reset(ROW, start_pose)
     assert str(caught.value) == (
-        f"{driver.server.url}: not ready: {text} ({topic}). Nothing moves before it is ready and reset() is called."
+        f"{driver.server.url}: not ready: {text}. Nothing moves before it is ready and reset() is called."
     )
 
 
@@ -190,7 +214,7 @@ def test_what_follows_from_it_is_told_with_it(driver, connected, start_pose):
         go_on()
     assert str(caught.value).startswith(
         f"The robot was stopped by following (G23): not ready: the speed slider is at 30 % ({SPEED}): "
-        "shoulder_pan_joint "
+        f"{PENDANT}: shoulder_pan_joint "
     )
 
 

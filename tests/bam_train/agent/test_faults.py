@@ -16,7 +16,7 @@ PICK = Path(__file__).parents[3] / "checkpoints" / "pick-ppo.zip"
 class Session:
     """A connected robot whose episode fails."""
 
-    stage, is_real, marks, recorder = "full", False, (), None
+    stage, is_real, marks, recorder, identity = "full", False, (), None, ""
 
     def __init__(self, error, stopped):
         info = SimpleNamespace(text="a robot")

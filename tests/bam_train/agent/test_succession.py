@@ -26,7 +26,8 @@ class Agent:
         self.options = AgentOptions("ws://127.0.0.1:9090", folder)
         versions = Versions(folder / "versions")
         env = versions.first(given).env
-        self.session = SimpleNamespace(env_id=env, env_kwargs={}, interface=interface_of(make_env(env)), is_real=False)
+        interface = interface_of(make_env(env))
+        self.session = SimpleNamespace(env_id=env, env_kwargs={}, interface=interface, is_real=False, identity="")
         self.succession, self.sent, self.notes = Succession(self, versions), [], []
         self.answered = threading.Event()
 

@@ -1,6 +1,7 @@
 """Stages of a roll-out: on trial, slow and in a box, until trials have shown enough for full speed."""
 
 import json
+from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -50,8 +51,8 @@ def admission(corridor_checkpoint, tmp_path):
 
 
 def try_it(trials, *outcomes):
-    for seed, outcome in enumerate(outcomes):
-        trials.begin(seed)
+    for outcome in outcomes:
+        trials.begin(trials.next_seed(0))
         trials.end(outcome, "terminated")
 
 
@@ -67,7 +68,7 @@ def test_on_trial_until_trials_show_enough_for_full_speed(admission):
     with pytest.raises(TrialsNeeded) as caught:
         early(SIMULATED, FULL)
     assert str(caught.value) == (
-        f"--stage full: {early.checkpoint.path} at {URL}/: 32 of 32 trials succeeded; 1 more without a failure would "
+        f"--stage full: {early.checkpoint.path} on {URL}/: 32 of 32 trials succeeded; 1 more without a failure would "
         "show more than 90 %. Run more with --stage trial, or give --i-know"
     )
     assert not hasattr(early, "policy")
@@ -220,18 +221,33 @@ def test_flags_that_do_not_fit(run, flags, text):
 
 
 @pytest.fixture
-def served():
-    options = ServeOptions(port=0, fast=True)
-    with ServedEnvironment(gym.make("bam/reach-v0", disable_env_checker=True), options) as served:
-        yield served
-
-
-def test_a_real_robot_is_on_trial_unless_something_else_is_asked_for(served, run, monkeypatch, tmp_path):
+def served(monkeypatch, tmp_path):
+    """Serves an arm of that name that seems to be real."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(rosbridge_robot, "read_info", lambda *said: replace(read_info(*said), simulated=False))
-    flags = ("--robot", served.bus.url, "--allow-unsigned", "--no-record")
+    with ExitStack() as stack:
+
+        def serve(name=""):
+            env = gym.make("bam/reach-v0", disable_env_checker=True)
+            options = ServeOptions(port=0, fast=True, name=name)
+            return stack.enter_context(ServedEnvironment(env, options)).bus.url
+
+        yield serve
+
+
+def test_a_real_robot_is_on_trial_unless_something_else_is_asked_for(served, run):
+    url = served()
+    flags = ("--robot", url, "--allow-unsigned", "--no-record")
+    assert run(deploy, REACH, *flags) == (
+        1,
+        "",
+        f"bam-deploy: the robot at {url} does not tell which one it is, and every tunnel ends at such an address, so "
+        "that its trials could count for another robot: name it with --robot-name NAME, always the same\n",
+    )
+    flags = (*flags, "--robot-name", "left arm")
     status, _, err = run(deploy, REACH, *flags)
     assert status == 1  # there is nobody to ask
+    assert "  robot: left arm\n" in err
     assert "  stage trial, at 25 % of the speed limits: 0 of 0 trials succeeded; " in err
     assert "  joint speed (G8): 0.25 rad/s\n" in err
     status, _, err = run(deploy, REACH, *flags, "--stage", "full")
@@ -242,18 +258,42 @@ def test_a_real_robot_is_on_trial_unless_something_else_is_asked_for(served, run
     assert "  joint speed (G8): 1 rad/s\n" in err
 
 
+def test_a_robot_of_another_name_is_refused(served, run):
+    url = served("left arm")
+    assert run(deploy, REACH, "--robot", url, "--allow-unsigned", "--robot-name", "right arm") == (
+        1,
+        "",
+        f"bam-deploy: --robot-name right arm: the robot at {url} says that it is left arm; correct the name, or the "
+        "address; nothing has moved\n",
+    )
+    assert run(deploy, REACH, "--robot", url, "--robot-name", "left/arm") == (
+        1,
+        "",
+        "bam-deploy: --robot-name: expected at most 64 letters, digits, blanks and . _ @ -, with a letter or digit at "
+        "both ends, found 'left/arm'\n",
+    )
+
+
 @pytest.mark.slow
-def test_trials_are_run_recorded_and_reported(served, run, monkeypatch, tmp_path):
-    monkeypatch.setattr(rosbridge_robot, "read_info", lambda *said: replace(read_info(*said), simulated=False))
-    record, recording = tmp_path / "trials.jsonl", tmp_path / "one.mcap"
-    flags = ("--robot", served.bus.url, "--trials", record, "--episodes", 1, "--record", recording, "--json")
-    status, out, err = run(deploy, REACH, *flags, "--yes", "--allow-unsigned")
+def test_trials_are_run_recorded_and_reported(served, run, tmp_path):
+    url, record, recording = served("left arm"), tmp_path / "trials.jsonl", tmp_path / "one.mcap"
+    flags = ("--trials", record, "--episodes", 1, "--json", "--yes", "--allow-unsigned")
+    status, out, err = run(deploy, REACH, *flags, "--robot", url, "--record", recording)
     report = json.loads(out)
     assert (status, report["marks"]) == (0, ["UNSIGNED", "trial"]), err
     assert Recording.open(recording).metadata["marks"] == "UNSIGNED, trial"
-    assert report["trials"] == {"successes": 1, "trials": 1, "threshold": 0.9, "is_enough": False}
+    counted = {"successes": 1, "trials": 1, "repeated": 0, "nameless": 0}
+    assert report["trials"] == {**counted, "threshold": 0.9, "is_enough": False}
+    assert (report["identity"], report["seed"]) == ("left arm", 1_000_000)
+    assert Recording.open(recording).metadata["identity"] == "left arm"
     assert ", UNSIGNED, trial\n" in err
     assert report["guards"]["joint speed"]["limit"] == 0.25
     assert report["guards"]["trial box"]["limit"] == 0.35
     begun = json.loads(record.read_text().splitlines()[1])
-    assert (begun["robot"], begun["recording"]) == (served.bus.url, "one.mcap")
+    assert (begun["robot"], begun["address"], begun["recording"]) == ("left arm", url, "one.mcap")
+    again = served("left arm")  # at another address
+    report = json.loads(run(deploy, REACH, *flags, "--robot", again, "--no-record")[1])
+    assert (report["seed"], report["trials"]["trials"], report["trials"]["repeated"]) == (1_000_001, 2, 0)
+    report = json.loads(run(deploy, REACH, *flags, "--robot", again, "--no-record", "--seed", 1_000_001)[1])
+    assert (report["seed"], report["trials"]["trials"], report["trials"]["repeated"]) == (1_000_001, 2, 1)
+    assert "0 of 0 trials" in run(deploy, REACH, *flags, "--robot", served("right arm"), "--stage", "full")[2]

@@ -80,8 +80,8 @@ def record(tmp_path):
 
 def try_it(record, *outcomes, subject=PICK):
     trials = Trials(record, subject, 0.9, {"env": "bam/pick-v0"})
-    for seed, outcome in enumerate(outcomes):
-        trials.begin(seed)
+    for outcome in outcomes:
+        trials.begin(trials.next_seed(0))
         trials.end(outcome, "terminated")
 
 
@@ -101,11 +101,40 @@ def test_trials_count_for_one_checkpoint_on_one_robot(record):
     rows = [json.loads(line) for line in record.path.read_text().splitlines()]
     assert [sorted(row) for row in rows[:3]] == [
         ["created", "format", "hmac", "record"],
-        ["begun", "checkpoint", "env", "hmac", "robot", "seed", "simulated"],
+        ["address", "begun", "checkpoint", "env", "hmac", "robot", "seed", "simulated"],
         ["ended", "hmac", "reason", "success", "time"],
     ]
     (state,) = (record.path.parents[1] / "private").iterdir()
     assert state.stat().st_mode & 0o777 == 0o600
+
+
+def test_a_start_counts_once_and_as_failed_if_one_of_its_trials_failed(record):
+    trials = Trials(record, PICK, 0.9, {})
+    for seed, outcome in [(1_000_000, True)] * 33 + [(7, True), (7, False), (8, True)]:
+        trials.begin(seed)
+        trials.end(outcome, "terminated")
+    assert trials.evidence == Evidence(2, 3, 0.9, repeated=33)
+    assert trials.evidence.text == (
+        "2 of 3 trials succeeded (33 more repeated a seed, and a seed counts once); 55 more without a failure would "
+        "show more than 90 %"
+    )
+    assert (trials.next_seed(0), trials.next_seed(2_000_000)) == (1_000_001, 2_000_000)
+    assert record.next_seed(Subject("cd34", PICK.robot), 5) == 5
+
+
+def test_trials_count_for_a_robot_at_whatever_address_and_not_for_another_one_at_that_address(record):
+    old = Subject("ab12", "ws://127.0.0.1:9090")  # of the time when a robot was its address
+    try_it(record, True, True, subject=old)
+    left, right = (Subject("ab12", name, address=old.robot) for name in ("left arm", "right arm"))
+    try_it(record, True, True, True, subject=left)
+    try_it(record, False, subject=Subject("ab12", "left arm", address="ws://10.0.0.5:9090"))
+    assert record.evidence(old, 0.9) == Evidence(2, 2, 0.9)
+    assert record.evidence(left, 0.9) == Evidence(3, 4, 0.9, nameless=2)
+    assert record.evidence(right, 0.9).text == (
+        "0 of 0 trials succeeded; 33 more without a failure would show more than 90 %; 2 at this address do not count: "
+        "their record does not name this robot"
+    )
+    assert record.evidence(Subject("ab12", "left arm", address="ws://10.0.0.5:9090"), 0.9) == Evidence(3, 4, 0.9)
 
 
 def test_another_program_may_add_a_trial_while_the_record_is_read(record, monkeypatch):

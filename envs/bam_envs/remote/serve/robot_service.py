@@ -92,6 +92,7 @@ class RobotService:
         bus: The bus of its topics.
         lease: The lease on command; shared with everything else that moves the robot.
         namespace: Prefix of every topic, such as ``/cell_1``; or empty.
+        identity: The name that tells it from other robots; or empty.
         info: Its description for clients; None: that of a simulated robot.
     """
 
@@ -103,6 +104,7 @@ class RobotService:
         lease: CommandLease,
         *,
         namespace: str = "",
+        identity: str = "",
         info: RobotInfo | None = None,
     ) -> None:
         profile = profile.narrowed(robot.spec.command.labels)
@@ -111,7 +113,9 @@ class RobotService:
         text = f"{profile.name}, served in real time; it rests {robot.command_timeout:g} s after the last command"
         if lockstep:
             text = f"{profile.name}, served in lockstep: its time advances with commands, {robot.spec.period:g} s each"
-        self.info = info or RobotInfo(profile.name, True, lockstep, robot.spec.period, text, robot.command_timeout)
+        self.info = info or RobotInfo(
+            profile.name, True, lockstep, robot.spec.period, text, robot.command_timeout, identity=identity
+        )
         """Its description for clients."""
         self._at_once = lockstep or getattr(robot, "at_once", False)  # whether a command does not wait for the clock
         self._slot = CommandSlot()

@@ -1,14 +1,14 @@
 """The options of a served environment: its addresses and how its time passes; imports no server."""
 
-import ipaddress
 import re
 from dataclasses import dataclass
 
 from bam_envs.core.errors import InvalidValue
-from bam_envs.core.validation import Port, Positive, check_fields
+from bam_envs.core.validation import Port, Positive, RobotName, check_fields
 from bam_envs.core.wording import as_flag
 from bam_envs.remote.gymapi_versions import version_named
 from bam_envs.remote.serve.command_lease import LEASE_SECONDS
+from bam_envs.rosbridge.endpoint import is_loopback
 
 _NAMESPACE = re.compile(r"(/[A-Za-z]\w*)*")
 _EXCLUDE = (("realtime", "fast"), ("via", "rclpy"), ("via", "cert"), ("rclpy", "cert"), ("no_token", "token_file"))
@@ -24,6 +24,8 @@ class ServeOptions:
     """Address to listen on; 127.0.0.1 is this computer only, 0.0.0.0 all its networks."""
     namespace: str = ""
     """Prefix of every topic and service, such as bam_001."""
+    name: RobotName = ""
+    """Name that the robot tells its clients, to tell it from others: trials count for the robot of that name."""
     tcp: Port | None = None
     """Serve the environment on this TCP port too, which is faster; 0 takes a free one."""
     via: str | None = None
@@ -110,11 +112,3 @@ class ServeOptions:
         """The prefix of every name: ``/bam_001``, or an empty text."""
         stripped = self.namespace.strip("/")
         return f"/{stripped}" if stripped else ""
-
-
-def is_loopback(address: str) -> bool:
-    """Whether only this computer reaches a server at `address`."""
-    try:
-        return ipaddress.ip_address(address).is_loopback
-    except ValueError:  # a name: only this one is sure to stay on this computer
-        return address == "localhost"

@@ -87,6 +87,8 @@ class ServedEnvironment:
 
     def _start(self, started: ExitStack) -> None:
         options, profile = self.options, _profile_of(self.env)
+        if options.name and profile is None:
+            raise InvalidValue("--name is the name of a robot, and no robot is served here; leave it out.")
         realtime = options.realtime or (profile is not None and not options.fast)
         robot = None if profile is None else _take_robot(self.env, profile, realtime)
         server = EnvServer(self.env, lease=self.lease, realtime=realtime and robot is None)
@@ -100,7 +102,9 @@ class ServedEnvironment:
         if robot is not None and profile is not None:
             if isinstance(bus, RosbridgeLink):
                 self._require_own_names(bus)
-            self.robot_service = RobotService(robot, profile, bus, self.lease, namespace=self.prefix)
+            self.robot_service = RobotService(
+                robot, profile, bus, self.lease, namespace=self.prefix, identity=options.name
+            )
             started.callback(self.robot_service.close)
             self.robot_service.start()
         started.callback(server.end)  # while the robot's clock still ticks: a step that runs waits for it

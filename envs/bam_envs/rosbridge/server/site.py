@@ -1,7 +1,6 @@
 """A site on the port of a rosbridge server: pages, WebSocket paths of its own, and who may open them."""
 
 import gzip
-import ipaddress
 import re
 from collections.abc import Awaitable, Callable, Mapping
 from dataclasses import dataclass, field
@@ -17,6 +16,7 @@ from websockets.http11 import Request, Response
 from bam_envs.core.errors import InvalidValue
 from bam_envs.core.wording import brief
 from bam_envs.rosbridge.bus import Caller
+from bam_envs.rosbridge.endpoint import is_loopback
 from bam_envs.rosbridge.server.server_connection import BridgeConnection
 
 _TYPES = {
@@ -82,7 +82,7 @@ class Site:
                 HTTPStatus.FORBIDDEN,
                 f"The page {brief(', '.join(origins))} is not of this server, which is {brief(own)}.",
             )
-        if not tokens and not _is_loopback(hosts[0]):
+        if not tokens and not is_loopback(re.sub(r":\d*$", "", hosts[0]).strip("[]").lower()):
             reason = f"Without tokens this server is there for 127.0.0.1 and localhost only, not for {brief(hosts[0])}."
             return HTTPStatus.FORBIDDEN, reason
         path, query = _path(request), request.path.partition("?")[2]
@@ -129,11 +129,3 @@ def read_pages(folder: Path) -> dict[str, Page]:
             raise InvalidValue(f"{path}: expected a page with one of {', '.join(_TYPES)}.")
         pages[f"/{path.name}"] = Page(_TYPES[path.suffix], path.read_bytes())
     return {**pages, "/": pages["/index.html"]} if "/index.html" in pages else pages
-
-
-def _is_loopback(host: str) -> bool:
-    name = re.sub(r":\d*$", "", host).strip("[]").lower()
-    try:
-        return name == "localhost" or ipaddress.ip_address(name).is_loopback
-    except ValueError:
-        return False
