@@ -173,10 +173,13 @@ def manifest_bytes(path: Path, values: Mapping[str, Any]) -> bytes:
 
 
 def require_no_place(env_kwargs: Mapping[str, Any]) -> None:
-    """Raise ValueError for arguments that determine where an environment runs, or which one it is."""
+    """Raise ValueError for arguments that determine where an environment runs or which one it is, or name a file."""
     for name in sorted(env_kwargs.keys() & (WHERE | {"env_id", "id"})):
         what = "where the environment runs" if name in WHERE else "which environment it is"
         raise ValueError(f"env_kwargs.{name} says {what}: flags such as --robot say that, never a file")
+    link = env_kwargs.get("link")
+    if isinstance(link, str) and link.endswith(".json"):
+        raise ValueError(f"env_kwargs.link names the file {link}, of which a checkpoint holds the content instead")
 
 
 def _parse(path: Path, data: bytes) -> Manifest:

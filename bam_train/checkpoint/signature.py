@@ -23,6 +23,7 @@ import msgspec
 from msgspec import Meta
 
 from bam_envs.core.config_folder import config_folder
+from bam_envs.core.ownership import who_else
 from bam_train.atomic_file import replacing
 from bam_train.checkpoint.checkpoint import Checkpoint
 from bam_train.checkpoint.manifest import AGAIN, MANIFEST
@@ -182,14 +183,14 @@ def trusted_keys(folder: Path) -> list[PublicKey]:
     """The keys in a folder; none if there is no such folder.
 
     Raises:
-        BadKey: A file there is no key, or others than its owner can change the folder or a key; `folder` is a file.
+        BadKey: A file there is no key, or another user could change the folder or a key; `folder` is a file.
     """
     if folder.is_file():
         raise BadKey(f"{folder}: a file, and a folder of public keys is expected. Give its folder")
     paths = sorted(folder.glob("*.pub"))
-    for path in (folder, *paths) if os.name == "posix" and paths else ():
-        if path.stat().st_mode & 0o022:
-            raise BadKey(f"{path}: others can change whom this computer trusts. Run: chmod go-w {path}")
+    for path in (folder, *paths) if paths else ():
+        if why := who_else(path):
+            raise BadKey(f"{path}: another user can change whom this computer trusts: {why}")
     return [read_public_key(path) for path in paths]
 
 

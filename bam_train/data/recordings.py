@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from bam_train.checkpoint.manifest import require_no_place
 from bam_train.data.data_set import DataSet
 from bam_train.data.data_set_writer import DataSetWriter
 from bam_train.data.episode import Array, DataSetInfo, Episode, joined, leaves_of
@@ -45,6 +46,10 @@ def info_of_recording(recording: Recording, env: str | None = None) -> DataSetIn
     if must_be_named(named) and env is None:
         raise BadRecording(f"{recording.path}: is of {named}, whose module is imported only if you add --env {named}")
     kwargs = json.loads(recording.metadata.get("env_kwargs", "{}"))
+    try:
+        require_no_place(kwargs)
+    except ValueError as error:
+        raise BadRecording(f"{recording.path}: {error}. Ask whoever made it") from error
     period = json.loads(recording.metadata.get("period_s", "null"))
     with closing(make_env(env or named, kwargs)) as made:
         return info_of(made, env or named, kwargs, period)

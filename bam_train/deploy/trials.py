@@ -31,6 +31,7 @@ from datetime import datetime, timezone
 from pathlib import Path
 from typing import IO, Any
 
+from bam_envs.core.ownership import who_else
 from bam_train.errors import BadTrials
 
 try:
@@ -225,6 +226,8 @@ class TrialRecord:
     def _state(self, name: str) -> tuple[bytes, int, str]:
         """Saved key, number of lines and last HMAC of the record `name`."""
         path = self._private / f"{name}.json"
+        if why := who_else(path):
+            raise BadTrials(f"{path}: another user can forge trials with this key: {why}")
         state = _json(path.read_bytes())
         try:
             return bytes.fromhex(state["key"]), int(state["lines"]), str(state["last"])

@@ -128,7 +128,8 @@ def namespaces_with(link: Any, kind: Literal["topics", "services"], name: str, w
         return ""
     names = {one for one in listed_there if isinstance(one, str)}
     found = sorted(one for one in names - {f"{link.namespace}{one}" for one in with_it} if one.endswith(name))
-    whole = [space for one in found if {(space := one.removesuffix(name)) + other for other in with_it} <= names]
+    spaces = [one.removesuffix(name) for one in found]
+    whole = [space for space in spaces if {f"{space}{other}" for other in with_it} <= names]
     if whole:
         return f" It is there at another address: {listed(f'ws://HOST:PORT{space}' for space in whole)}."
     own = [one.removeprefix(link.namespace) for one in found if one.startswith(f"{link.namespace}/")]

@@ -26,10 +26,10 @@ _LATELY = 60.0
 _MOST_ADDRESSES = 4096
 
 
-def read_token(path: str | Path, *, private: bool = False) -> str:
-    """The secret in a file, without white space around it; with `private`, no other user may read the file."""
+def read_token(path: str | Path) -> str:
+    """The secret in a file that no other user may read, without white space around it."""
     try:
-        if private and os.name == "posix" and os.stat(path).st_mode & (stat.S_IRWXG | stat.S_IRWXO):
+        if os.name == "posix" and os.stat(path).st_mode & (stat.S_IRWXG | stat.S_IRWXO):
             raise InvalidValue(f"The token file {path} is open to other users of this computer. Run: chmod 600 {path}")
         token = Path(path).read_text(encoding="utf-8").strip()
     except (OSError, UnicodeDecodeError) as error:
@@ -48,7 +48,7 @@ def read_tokens(path: str | Path) -> dict[str, Role]:
     The file holds one secret, which administers, or lines of a role and a secret: ``drive 2Yb7...``. Empty lines and
     those that begin with # are skipped. `InvalidValue` for another file; the text shows no secret.
     """
-    numbered = enumerate(read_token(path, private=True).splitlines(), 1)
+    numbered = enumerate(read_token(path).splitlines(), 1)
     lines = {number: line.split() for number, line in numbered if line.strip() and not line.strip().startswith("#")}
     if len(lines) == 1 and len(words := next(iter(lines.values()))) == 1:
         return {words[0]: "administer"}

@@ -220,6 +220,7 @@ def test_its_token(tmp_path, robot_on, start_pose):
     path = tmp_path / "token"
     with pytest.raises(InvalidValue, match=r"^The token file .* cannot be read: "):
         live_robot("ws://robot", token_file=str(path))
+    path.touch(0o600)
     path.write_text("secret\n")
     with BridgeServer(port=0, token="secret") as server:
         robot_on(server)

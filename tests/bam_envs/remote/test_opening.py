@@ -67,6 +67,7 @@ def test_how_long_an_answer_is_waited_for(url):
 
 def test_a_token_file(tmp_path):
     path = tmp_path / "token"
+    path.touch(0o600)
     path.write_text("geheim\n")
     assert open_transport("tcp://x:1", token_file=str(path)).endpoint.token == "geheim"
     with pytest.raises(InvalidValue) as caught:

@@ -233,6 +233,7 @@ def test_what_does_not_fit_the_address_is_refused(options, text):
 
 
 def test_a_token_from_a_file_is_not_shown(tmp_path):
+    (tmp_path / "token").touch(0o600)
     (tmp_path / "token").write_text("hush\n")
     endpoint = Endpoint.with_token_file("tcp://a:1", token_file=tmp_path / "token")
     assert (endpoint.token, "hush" in repr(endpoint)) == ("hush", False)

@@ -3,6 +3,7 @@ import os
 import pytest
 
 from bam_envs.core.errors import InvalidValue
+from bam_envs.rosbridge.endpoint import Endpoint
 from bam_envs.rosbridge.tokens import Guesses, TokenFile, Tokens, read_token, read_tokens
 
 
@@ -18,6 +19,7 @@ def test_a_token_file_that_is_none(tmp_path, content, text):
     path = tmp_path / "token"
     if content is not None:
         path.write_bytes(content)
+        path.chmod(0o600)
     with pytest.raises(InvalidValue) as error:
         read_token(str(path))
     assert str(error.value) == f"The token file {path} {text}"
@@ -25,16 +27,15 @@ def test_a_token_file_that_is_none(tmp_path, content, text):
 
 @pytest.mark.skipif(os.name != "posix", reason="elsewhere a mode says nothing")
 @pytest.mark.parametrize("mode", [0o640, 0o604, 0o620, 0o666])
-def test_a_servers_token_file_is_its_users_alone(tmp_path, mode):
+def test_a_token_file_is_its_users_alone(tmp_path, mode):
     path = tmp_path / "token"
     path.write_text("secret")
     path.chmod(mode)
-    assert read_token(path) == "secret"
     with pytest.raises(InvalidValue) as error:
-        read_token(path, private=True)
+        Endpoint.with_token_file("ws://10.0.0.5:9090", token_file=path)
     assert str(error.value) == f"The token file {path} is open to other users of this computer. Run: chmod 600 {path}"
     path.chmod(0o600)
-    assert read_token(path, private=True) == "secret"
+    assert Endpoint.with_token_file("ws://10.0.0.5:9090", token_file=path).token == "secret"
 
 
 def test_roles():

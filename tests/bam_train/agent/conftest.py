@@ -160,6 +160,7 @@ def new_agent(server, tmp_path):
 
         def make(token="a", url=None, **more):
             path = tmp_path / f"token-{token}"
+            path.touch(0o600)
             path.write_text(f"{token}\n")
             return stack.enter_context(AgentClient(url or server.url, token_file=path, name="anna@laptop", **more))
 

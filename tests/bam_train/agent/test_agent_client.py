@@ -150,6 +150,7 @@ def test_nothing_listens():
 
 
 def test_a_wrong_token(server, tmp_path):
+    (tmp_path / "token").touch(0o600)
     (tmp_path / "token").write_text("x")
     text = "the token was refused (HTTP 401). Give the server's token (--token-file)."
     assert refused(server.url, token_file=tmp_path / "token") == f"{server.url}: {text}"
@@ -186,6 +187,7 @@ def test_an_agent_of_another_version(greeting, number, age):
 def test_tls(new_server, tmp_path, certificates):
     cert, _ = certificates("127.0.0.1")
     server = new_server(cert=cert, key=cert.replace("cert.pem", "key.pem"))
+    (tmp_path / "token").touch(0o600)
     (tmp_path / "token").write_text("d")
     with AgentClient(server.url, token_file=tmp_path / "token", ca_file=cert) as agent:
         assert agent.ask("status")["state"] == "paused"

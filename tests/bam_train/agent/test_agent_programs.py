@@ -69,6 +69,7 @@ def run(capsys, tmp_path, server):
 
     def run(main, *arguments, token="a"):
         path = tmp_path / f"token-{token}"
+        path.touch(0o600)
         path.write_text(token)
         with pytest.raises(SystemExit) as done:
             main([*map(str, arguments), "--token-file", str(path)])

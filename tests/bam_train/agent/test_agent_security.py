@@ -446,6 +446,7 @@ def test_a_watcher_of_the_topics_sends_nothing(agent, refusals):
 
 def test_a_watcher_who_would_drive_by_a_program(agent, refusals, tmp_path):
     path = tmp_path / "token"
+    path.touch(0o600)
     path.write_text("www")
     env = gym.make("bam/pick-v0", robot=f"ws://127.0.0.1:{agent.port}", token_file=str(path))
     with contextlib.closing(env), pytest.raises(RemoteError) as error:

@@ -5,6 +5,7 @@ import os
 import re
 import resource
 import signal
+import stat
 import time
 import zipfile
 from types import SimpleNamespace
@@ -325,13 +326,33 @@ def test_a_signer_needs_a_name(tmp_path, name):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_others_must_not_decide_whom_this_computer_trusts(signed, keys):
-    for path in (keys, keys / "alice.pub"):
+def test_others_must_not_decide_whom_this_computer_trusts(signed, keys, tmp_path, monkeypatch):
+    change = "another user can change whom this computer trusts"
+    (tmp_path / "open").mkdir()
+    keys = keys.rename(tmp_path / "open" / "keys")
+    (tmp_path / "link").symlink_to(keys)
+    for path, bits in ((keys, 0o020), (keys / "alice.pub", 0o002), (tmp_path / "open", 0o002)):
         mode = path.stat().st_mode
-        path.chmod(mode | 0o020)
-        with pytest.raises(BadKey, match=rf"others can change whom this computer trusts\. Run: chmod go-w {path}$"):
+        path.chmod(mode | bits)
+        for folder in (keys, tmp_path / "link"):
+            with pytest.raises(
+                BadKey, match=rf": {change}: others can write to \S+/{path.name}\. Run: chmod go-w \S+$"
+            ):
+                verify(Checkpoint.open(signed), folder)
+        path.chmod(mode | bits | stat.S_ISVTX)
+        if path == tmp_path / "open":  # as in /tmp, others cannot replace what is not theirs
             verify(Checkpoint.open(signed), keys)
         path.chmod(mode)
+    with monkeypatch.context() as patch:
+        owner = 12345
+        if os.geteuid() == 0:
+            os.chown(keys, owner, -1)
+        else:
+            owner = os.geteuid()
+            patch.setattr(os, "geteuid", lambda: owner + 1)
+        with pytest.raises(BadKey, match=rf"{keys}: {change}: {keys} belongs to \S+\. Run: chown \S+ {keys}$"):
+            verify(Checkpoint.open(signed), keys)
+    os.chown(keys, os.geteuid(), -1)
     (keys / "broken.pub").write_text("nonsense")
     with pytest.raises(BadKey, match=r"broken\.pub: expected one line"):
         verify(Checkpoint.open(signed), keys)

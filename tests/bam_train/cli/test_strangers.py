@@ -49,6 +49,7 @@ def refused(request, capsys, tmp_path, monkeypatch):
             for name in ("transport", "token_file", "ca_file", "profile", "rs_address")
         ),
         ({"env_kwargs": {"env_id": "x"}}, "env_kwargs.env_id says which environment it is"),
+        ({"env_kwargs": {"link": "any.json"}}, "env_kwargs.link names the file any.json, of which a checkpoint holds"),
         ({"env_kwargs": {TITLE: 1, "robot": TITLE}}, "env_kwargs.robot says where"),
         ({"env": ":"}, "env ':' is no environment id"),
         ({"env": ""}, "env '' is no environment id"),

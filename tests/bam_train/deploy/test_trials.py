@@ -137,6 +137,18 @@ def test_trials_count_for_a_robot_at_whatever_address_and_not_for_another_one_at
     assert record.evidence(Subject("ab12", "left arm", address="ws://10.0.0.5:9090"), 0.9) == Evidence(3, 4, 0.9)
 
 
+@pytest.mark.skipif(os.name != "posix", reason="elsewhere a mode says nothing")
+def test_a_key_that_others_can_replace_proves_nothing(record):
+    try_it(record, True)
+    private = record.path.parents[1] / "private"
+    private.chmod(0o777)
+    why = rf"another user can forge trials with this key: others can write to {private}\."
+    with pytest.raises(BadTrials, match=why):
+        counts(record)
+    private.chmod(0o700)
+    assert counts(record) == (1, 1)
+
+
 def test_another_program_may_add_a_trial_while_the_record_is_read(record, monkeypatch):
     try_it(record, True)
     read = Path.read_bytes

@@ -62,8 +62,7 @@ class ServedEnvironment:
         """The topics of its robot, if it has any."""
         self._refusals: dict[str, str] = {}  # id of a declaration -> why the server of `via` does not carry it
         self._token, self._operator_token = (
-            None if path is None else read_token(path, private=private)
-            for path, private in ((options.token_file, options.listens), (options.operator_token_file, True))
+            None if path is None else read_token(path) for path in (options.token_file, options.operator_token_file)
         )
 
     def __enter__(self) -> ServedEnvironment:

@@ -66,6 +66,7 @@ class Learning(threading.Thread):
         super().__init__(daemon=True)
         self.url, self.folder, self.checkpoint = url, folder, checkpoint
         folder.mkdir(exist_ok=True)
+        (folder / "token").touch(0o600)
         (folder / "token").write_text("secret\n")
         given["token_file"] = str(folder / "token")
         self.given = {"env": ENV, "hyperparameters": SMALL, **given} if checkpoint is None else given
