@@ -12,6 +12,7 @@ from typing import Any
 import gymnasium as gym
 
 from bam_envs.core.robot import RobotSpec
+from bam_envs.core.wording import listed
 from bam_envs.live.inspection import Inspection
 from bam_envs.safety.guard import is_base
 from bam_train.checkpoint import Checkpoint
@@ -100,7 +101,7 @@ def _connect(env: Any, signals: SignalMemory) -> None:
 
 
 def required_contract(checkpoint: Checkpoint, env: Any, place: Place, motion: Path | None = None) -> Contract:
-    """The contract of a checkpoint with a live robot, shown if the robot is real or refused; moves nothing.
+    """The contract of a checkpoint with a live robot, shown in short if it is real or refused; moves nothing.
 
     For any other environment, only spaces and signals are compared, and the contract is empty.
 
@@ -114,15 +115,16 @@ def required_contract(checkpoint: Checkpoint, env: Any, place: Place, motion: Pa
     from bam_train.deploy.contract import check_contract  # only for live robots
 
     contract = check_contract(checkpoint, env, place)
+    info = None if contract.inspection is None else contract.inspection.info
+    shown = contract.lines(whole=False) if contract.refused or info is None or not info.simulated else []
     if motion is not None:
         from bam_train.deploy.wiggle import recorded_motion
 
-        lines = recorded_motion(motion, env.unwrapped.robot.spec, place.robot)
-        contract = replace(contract, checks=(*contract.checks, *lines))
-    info = None if contract.inspection is None else contract.inspection.info
-    if contract.refused or info is None or not info.simulated or motion is not None:
-        for line in contract.lines():
-            say(line)
+        moved = Contract(tuple(recorded_motion(motion, env.unwrapped.robot.spec, place.robot)))
+        contract = replace(contract, checks=(*contract.checks, *moved.checks))
+        shown += moved.lines()
+    for line in shown:
+        say(line)
     contract.require(f"{checkpoint.path} and the robot at {place.text}")
     return contract
 
@@ -138,6 +140,10 @@ def require_motion(env: Any, who: str, inspection: Inspection) -> None:
     for line in moved.lines():
         say(line)
     moved.require(who, "the robot has moved a little, and was halted")
+
+
+_MOTION = ("joint speed", "tool speed", "gripper speed", "base speed", "turn speed", "trial box")
+"""Guards whose limits the operator sees before the robot moves."""
 
 
 def guards_of(env: Any) -> dict[str, dict[str, Any]]:
@@ -177,13 +183,14 @@ def require_consent(env: Any, who: str, *, yes: bool, plan: Sequence[str] = ()) 
     if not has_real_robot(env):
         return
     robot: Any = env.unwrapped.robot
-    begin = f"{who} will move {robot.info.text}"
-    for line in [f"{begin}:", *plan, "within"] if plan else [f"{begin}, within"]:
+    guards = guards_of(env)
+    limits = [f"{name} {guards[name]['limit']:.3g} {guards[name]['unit']}" for name in _MOTION if name in guards]
+    off = [name for name, guard in guards.items() if guard["limit"] == math.inf]
+    say(f"{who} will move {robot.info.text}:")
+    for line in (*plan, f"  at most {', '.join(limits)}"):
         say(line)
-    for name, guard in guards_of(env).items():
-        if guard["limit"] not in (None, ""):
-            limit = "off" if guard["limit"] == math.inf else f"{guard['limit']:.3g} {guard['unit']}"
-            say(f"  {name} ({guard['number']}): {limit}")
+    without = f", of which {listed(off)} {'is' if len(off) == 1 else 'are'} off" if off else ""
+    say(f"  behind {len(guards)} guards{without}; bam-deploy --print-guards shows them")
     for warning in getattr(robot, "warnings", ()):
         say(f"  warning: {warning}")
     if (why := robot.not_ready()) is not None:

@@ -33,7 +33,8 @@ if TYPE_CHECKING:
 
 LIVE_ONLY = (
     *("robot", "robot_name", "transport", "rate", "fast", "render", "wiggle", "motion", "stage", "i_know", "trials"),
-    *("shadow", "unusual", "record", "print_guards", "ca_file", "token_file", "timeout", "keys", "allow_unsigned"),
+    *("shadow", "unusual", "record", "print_guards", "print_contract", "ca_file", "token_file", "timeout", "keys"),
+    "allow_unsigned",
 )
 """Flags that a rehearsal has no use for."""
 FIRST_SEED = 1_000_000
@@ -59,6 +60,8 @@ def deploy_checkpoint(config: DeployConfig, signals: SignalMemory) -> int:
     checkpoint = Checkpoint.open(config.checkpoint)
     if config.print_guards:
         return print_guards(config, checkpoint, place)
+    if config.print_contract:
+        return _print_contract(config, checkpoint, place)
     if config.unusual is not None and not checkpoint.has(DETECTOR):
         remedy = f"Add one: bam-eval {checkpoint.path} --add-detector"
         raise NoDetector(f"--unusual: {checkpoint.path} has no detector of unusual observations. {remedy}")
@@ -103,6 +106,18 @@ def print_guards(config: DeployConfig, checkpoint: Checkpoint, place: Place) -> 
     tell(*([json_module.dumps(table)] if config.json else guard_lines(guards, limits)))
     env.close()  # type: ignore[no-untyped-call]
     return 0
+
+
+def _print_contract(config: DeployConfig, checkpoint: Checkpoint, place: Place) -> int:
+    """Print the whole contract of `checkpoint` with the live robot at `place`; nothing moves."""
+    from bam_train.deploy.contract import check_contract
+    from bam_train.environments import environment_of, make_env
+    from bam_train.errors import ContractRefused
+
+    with closing(make_env(*environment_of(checkpoint, config.env), place=place)) as env:
+        contract = check_contract(checkpoint, env, place)
+    tell(*([json_module.dumps(contract.to_json())] if config.json else contract.lines()))
+    return ContractRefused.exit_status if contract.refused else 0
 
 
 def _rehearse(config: DeployConfig, link: str) -> int:
@@ -197,6 +212,10 @@ def _checked_place(config: DeployConfig) -> Place:
     ca_file, token_file = (None if path is None else str(path) for path in (config.ca_file, config.token_file))
     if config.print_guards and config.transport is not None:
         raise SettingsError("--print-guards shows the guards of a live robot, and --transport has none; leave it out")
+    if config.print_contract and (config.robot is None or config.print_guards):
+        raise SettingsError(
+            "--print-contract is about a live robot: give its address with --robot, and not --print-guards"
+        )
     if config.print_guards and config.shadow:
         raise SettingsError("--print-guards shows what limits commands, and --shadow sends none; give one of the two")
     robot = ANY_ROBOT if config.print_guards and config.robot is None else config.robot

@@ -166,6 +166,8 @@ class DeployConfig:
     """One limit of the live robot's guards, any number of times: joint_speed=0.3; --print-guards has their names."""
     print_guards: bool = False
     """Print the guards that a live robot would have, with their limits and what they do; connect and move nothing."""
+    print_contract: bool = False
+    """Print every line of the contract with the live robot, and move nothing; status 3 if one is refused."""
     ca_file: File = None
     """Certificates that wss:// trusts instead of the system's."""
     token_file: File = None

@@ -65,8 +65,11 @@ class Admission:
                 trials is given for a simulated robot that is not on trial.
         """
         self.identity = identity_of(place, told)
+        is_real = has_real_robot(env)
         lines = [f"  robot: {self.identity}"] if self.identity else []
-        lines += self._signature() if has_real_robot(env) else []
+        if is_real and not self.identity:
+            lines = ["  robot: it does not tell which one it is; --robot-name NAME names it"]
+        lines += self._signature() if is_real else []
         if place.shadow:
             robot: Any = env.unwrapped.robot  # type: ignore[attr-defined]
             robot.watch = self.shadow = Shadow(robot.spec, robot.limits)

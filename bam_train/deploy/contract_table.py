@@ -40,18 +40,29 @@ class Contract:
         """The lines that do not fit; a robot moves only if there are none."""
         return tuple(line for line in self.checks if line.verdict == "refused")
 
-    def lines(self) -> list[str]:
-        """The table as text, with a header; only refused lines are never shortened."""
-        rows = [("what", "expected", "found", "verdict")]
-        rows += [(line.what, line.expected, line.found, line.verdict) for line in self.checks]
+    def lines(self, *, whole: bool = True) -> list[str]:
+        """The table as text, with a header.
+
+        With `whole`, only refused lines are never shortened. Without, lines that fit are counted, and no other is
+        shortened.
+        """
+        shown = [line for line in self.checks if whole or line.verdict != "ok"]
+        rows = [("what", "expected", "found", "verdict")] if shown else []
+        rows += [(line.what, line.expected, line.found, line.verdict) for line in shown]
+        fit = len(self.checks) - len(shown)
+        rest = [f"{fit} lines fit; bam-deploy --print-contract shows them"] if fit else []
+        if not rows:
+            return rest
         widths = [min(_WIDEST, max(len(row[column]) for row in rows)) for column in range(3)]
 
         def cell(text: str, width: int, *, whole: bool) -> str:
             return text.ljust(width) if len(text) <= width or whole else f"{text[: width - 3]}..."
 
-        return [
-            "  ".join([*(cell(row[i], widths[i], whole=row[3] == "refused") for i in range(3)), row[3]]) for row in rows
+        never = ("refused",) if whole else ("refused", "unknown")
+        lines = [
+            "  ".join([*(cell(row[i], widths[i], whole=row[3] in never) for i in range(3)), row[3]]) for row in rows
         ]
+        return [*lines, *rest]
 
     def to_json(self) -> list[dict[str, Any]]:
         """The lines as plain values."""

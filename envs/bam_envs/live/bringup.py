@@ -67,10 +67,9 @@ def info_by_profile(url: str, profile: RobotProfile, unknown: Iterable[str] = ()
     """A description of a robot at `url` that does not describe itself; `unknown` names its silent topics."""
     silent = ", ".join(name.rpartition("/")[2] for name in unknown)
     rest = f"; it does not report {silent}" if silent else ""
-    known = f"profile {profile.name}: {', '.join(profile.command.labels)}"
     return RobotInfo(
         profile.name,
-        text=f"the robot at {url}, which does not describe itself ({known}{rest})",
+        text=f"the robot at {url}, which does not describe itself (profile {profile.name}{rest})",
         watchdog=profile.watchdog,
     )
 

@@ -155,23 +155,26 @@ class Watchdog(Guard):
 
     def __init__(self, spec: RobotSpec, limits: Limits) -> None:
         self.limit_value = limits.watchdog or max(0.5 if is_base(spec) else 0.1, 2.0 * spec.period)
-        self._rest = "keeps driving" if is_base(spec) else "continues to its last command"
+        self._holds = not any(unit.endswith("/s") for unit in spec.command.units)
 
     def connected(self, watchdog: float | None) -> None:
-        """Set the warning from the time after which the robot stops by itself [s]; 0: never; None: unknown."""
+        """Set the warning from the time after which the robot stops by itself [s]; 0: never; None: unknown.
+
+        An arm that takes positions needs no watchdog: it moves to the last position that it was sent, and holds it.
+        """
+        self.warning = ""
         if watchdog is None or watchdog == 0.0:
             known = "is not known to stop" if watchdog is None else "does not stop"
-            self.warning = (
-                f"the robot {known} by itself: when this computer or the link fails it {self._rest}; keep a hand on "
-                "its emergency stop, and set the time after which it stops in its profile (watchdog = 0.1)"
-            )
+            if not self._holds:
+                self.warning = (
+                    f"the robot {known} by itself: when this computer or the link fails it keeps driving; keep a hand "
+                    "on its emergency stop, and set the time after which it stops in its profile (watchdog = 0.1)"
+                )
         elif not watchdog <= self.limit_value:
             self.warning = (
                 f"the robot stops by itself only {watchdog:g} s after the last command, and {self.limit_value:g} s "
                 "are expected: shorten its time-out"
             )
-        else:
-            self.warning = ""
 
 
 class RampAfterStop(Guard):

@@ -285,11 +285,11 @@ def test_a_joint_beyond_its_limits_is_a_warning(server, robot_on, patient):
     assert warnings[-1].startswith("elbow_joint is at 3.100 rad, beyond -3.042 to 3.042 rad: jog it back")
 
 
-def test_a_robot_without_a_watchdog_is_a_warning(server, robot_on, patient):
+def test_a_robot_that_stops_late_is_a_warning(server, robot_on, patient):
     robot_on(server)
-    warnings = diagnose(server.url, profile=patient("watchdog = 0\n"))[1]["guards"].warnings
+    warnings = diagnose(server.url, profile=patient("watchdog = 0.3\n"))[1]["guards"].warnings
     assert len(warnings) == 1
-    assert warnings[0].startswith("robot's watchdog (G5): the robot does not stop ")
+    assert warnings[0].startswith("robot's watchdog (G5): the robot stops by itself only 0.3 s after the last command")
 
 
 # What is measured

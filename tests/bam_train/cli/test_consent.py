@@ -46,9 +46,9 @@ def test_before_a_real_robot_moves_its_limits_are_shown_and_somebody_asked(monke
     robot.report = lambda: {**GUARDS, "laser zones": {"number": "G12", "limit": math.inf, "unit": "m"}}
     consent(monkeypatch, robot, "yes\n")
     assert capsys.readouterr().err == (
-        "bam-deploy: pick.zip will move ur5e at ws://10.0.0.5:9090, within\n"
-        "  joint speed (G8): 3.14 rad/s\n"
-        "  laser zones (G12): off\n"
+        "bam-deploy: pick.zip will move ur5e at ws://10.0.0.5:9090:\n"
+        "  at most joint speed 3.14 rad/s\n"
+        "  behind 3 guards, of which laser zones is off; bam-deploy --print-guards shows them\n"
         "Is the robot clear of people, and a hand on its emergency stop? Type yes to go on: "
     )
 
@@ -79,7 +79,8 @@ def test_what_it_will_do_is_shown(monkeypatch, capsys, spec, episodes, expected)
     consent(monkeypatch, robot, yes=True, plan=plan)
     assert capsys.readouterr().err == (
         "bam-deploy: pick.zip will move ur5e at ws://10.0.0.5:9090:\n"
-        f"  address: ws://10.0.0.5:9090\n{expected}within\n  joint speed (G8): 3.14 rad/s\n"
+        f"  address: ws://10.0.0.5:9090\n{expected}  at most joint speed 3.14 rad/s\n"
+        "  behind 2 guards; bam-deploy --print-guards shows them\n"
     )
 
 

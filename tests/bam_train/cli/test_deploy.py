@@ -42,6 +42,7 @@ def test_report_for_programs(corridor_checkpoint, starting_cell, run):
         "algorithm": "ppo",
         "checkpoint": str(path),
         "robot": "simulated here",
+        "identity": "",
         "marks": [],
         "trials": None,
         "shadow": None,

@@ -199,24 +199,24 @@ def test_a_real_robot_is_shown_and_does_not_move_unasked(serve, run, monkeypatch
     unsigned = f"{PICK}: is not signed. Sign it with bam-sign sign {PICK} --key FILE"
     status, out, err = run(deploy, PICK, "--robot", served.bus.url, "--yes")
     assert (status, out, err) == (1, "", f"bam-deploy: {unsigned}, or give --allow-unsigned\n")
-    status, out, err = run(deploy, PICK, "--episodes", 2, "--robot", served.bus.url, "--allow-unsigned")
+    named = ("--robot", served.bus.url, "--robot-name", "cell 7")
+    status, out, err = run(deploy, PICK, "--episodes", 2, *named, "--allow-unsigned")
     assert (status, out) == (1, "")
     lines = err.splitlines()
     assert lines[0].startswith(f"bam-deploy: {PICK} will move ur5e")
-    assert lines[1:8] == [
+    assert lines[1:] == [
         f"  address: {served.bus.url}",
         "  first each joint moves 0.02 rad and back, to prove that commands reach the joints that are meant",
         "  bam/pick-v0: 2 episodes, one after the other without a pause",
         "  each begins by opening the gripper and going to the start pose",
+        "  robot: cell 7",
         f"  UNSIGNED: {unsigned}",
         "  stage trial, at 25 % of the speed limits: 0 of 0 trials succeeded; 33 more without a failure would show "
         "more than 90 %",
-        "within",
+        "  at most joint speed 0.25 rad/s, tool speed 0.0625 m/s, gripper speed 0.15 m/s, trial box 0.35 m",
+        "  behind 28 guards; bam-deploy --print-guards shows them",
+        "bam-deploy: a real robot would move, and there is nobody to ask; give --yes to go on without asking",
     ]
-    assert "  tool speed (G10): 0.0625 m/s" in lines
-    assert lines[-1] == (
-        "bam-deploy: a real robot would move, and there is nobody to ask; give --yes to go on without asking"
-    )
 
 
 @pytest.fixture
@@ -239,10 +239,15 @@ def test_a_robot_that_does_not_fit_is_refused_by_its_line_and_gets_no_command(se
     served = serve(gym.make("bam/reach-v0", disable_env_checker=True), fast=True)  # an arm without a cube to pick
     sent = commands_to(served)
     status, out, err = run(deploy, PICK, "--robot", served.bus.url)
-    *table, last = err.splitlines()
+    *table, rest, last = err.splitlines()
     assert (status, out, sent) == (3, "", [])
     assert table[0].split() == ["what", "expected", "found", "verdict"]
     assert [line.split()[:2] for line in table if line.endswith("refused")] == [["topic", "/object_pose"]]
+    assert {line.split()[-1] for line in table[1:]} == {"refused", "unknown"}
+    status, out, err = run(deploy, PICK, "--robot", served.bus.url, "--print-contract")
+    rows = [line.split()[-1] for line in out.splitlines()[1:]]
+    assert (status, err, rows.count("refused")) == (3, "", 1)
+    assert rest == f"{rows.count('ok')} lines fit; bam-deploy --print-contract shows them"
     assert last == (
         f"bam-deploy: {PICK} and the robot at {served.bus.url} do not fit: topic /object_pose: expected "
         "geometry_msgs/PoseStamped, found nobody publishes it; correct the robot or its profile; nothing has moved"

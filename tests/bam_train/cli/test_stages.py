@@ -249,13 +249,13 @@ def test_a_real_robot_is_on_trial_unless_something_else_is_asked_for(served, run
     assert status == 1  # there is nobody to ask
     assert "  robot: left arm\n" in err
     assert "  stage trial, at 25 % of the speed limits: 0 of 0 trials succeeded; " in err
-    assert "  joint speed (G8): 0.25 rad/s\n" in err
+    assert "  at most joint speed 0.25 rad/s, tool speed 0.0625 m/s, " in err
     status, _, err = run(deploy, REACH, *flags, "--stage", "full")
     assert status == 1
     assert err.endswith("more than 90 %. Run more with --stage trial, or give --i-know\n")
     status, _, err = run(deploy, REACH, *flags, "--stage", "full", "--i-know")
     assert "  UNPROVEN: 0 of 0 trials" in err
-    assert "  joint speed (G8): 1 rad/s\n" in err
+    assert "  at most joint speed 1 rad/s, tool speed 0.25 m/s, " in err
 
 
 def test_a_robot_of_another_name_is_refused(served, run):
