@@ -2,12 +2,14 @@
 
 Each column has the same episodes: plain; with domain randomisation; with actions that reach the task two steps late,
 like those of a slow policy; with commands that reach the robot two steps late; and with each link profile. The ratio to
-the plain success rate is in brackets.
+the plain success rate is in brackets. With --guarded, the columns are the links behind the guards of a live robot, as
+``bam-deploy --rehearse`` has them, and a link without delay first.
 """
 
 from __future__ import annotations
 
 import argparse
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +17,7 @@ from bam_envs.core.errors import BamEnvsError
 from bam_envs.core.registry import entry_of
 from bam_envs.robots.linked import PROFILES
 from bam_train.checkpoint import Checkpoint
+from bam_train.deploy.rehearsal import Rehearsal
 from bam_train.env_location import SIMULATED
 from bam_train.errors import BamTrainError
 from bam_train.evaluation import evaluate
@@ -23,6 +26,9 @@ from bam_train.policy import FrozenPolicy
 FOLDER = Path(__file__).resolve().parents[1] / "checkpoints"
 SEED = 3_000_000
 """Seed of the first episode; neither training nor `bam-eval` uses it."""
+NO_DELAY = {"command_delay": [0.0, 0.0], "state_delay": [0.0, 0.0]}
+GUARDED: dict[str, Any] = {"no delay": NO_DELAY, **{name: name for name in PROFILES}}
+"""Links behind which the guards of a live robot are shown."""
 STEPS = 2
 """Delay of late actions and commands [steps]."""
 
@@ -57,6 +63,19 @@ def row(path: Path, episodes: int) -> list[str]:
     return cells
 
 
+def guarded_row(path: Path, episodes: int) -> list[str]:
+    """The success of one checkpoint behind each link and the guards of a live robot."""
+    checkpoint = Checkpoint.open(path)
+    policy, cells = FrozenPolicy.from_checkpoint(checkpoint), [path.name]
+    for link in GUARDED.values():
+        with closing(Rehearsal(checkpoint, link)) as rehearsal:
+            report = rehearsal.run(policy, episodes=episodes, seed=SEED, tell=lambda line: None)
+        stopped = sum(record.end == "stopped" for record in report.records)
+        successes = sum(record.success is True for record in report.records)
+        cells.append(f"{successes / episodes:.1%} ({stopped / episodes:.1%})")
+    return cells
+
+
 def of_robots() -> list[Path]:
     """The committed checkpoints whose environment has a robot."""
     entries = ((path, entry_of(Checkpoint.open(path, members=False).manifest.env)) for path in FOLDER.glob("*.zip"))
@@ -67,12 +86,14 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("checkpoints", nargs="*", type=Path, help="default: those in checkpoints/ of robots")
     parser.add_argument("--episodes", type=int, default=300, help="episodes in each column (default 300)")
+    parser.add_argument("--guarded", action="store_true", help="behind the guards of a live robot")
     arguments = parser.parse_args()
-    header = ["checkpoint", *columns(1.0)]
+    header = ["checkpoint", *(GUARDED if arguments.guarded else columns(1.0))]
     print(f"| {' | '.join(header)} |\n| {' | '.join(['---'] * len(header))} |", flush=True)
     try:
         for path in arguments.checkpoints or of_robots():
-            print(f"| {' | '.join(row(path, arguments.episodes))} |", flush=True)
+            cells = (guarded_row if arguments.guarded else row)(path, arguments.episodes)
+            print(f"| {' | '.join(cells)} |", flush=True)
     except (BamTrainError, BamEnvsError) as error:
         parser.error(str(error))
     return 0

@@ -5,6 +5,7 @@ Time is simulated: it advances by one period with each command, and the ages of 
 
 import math
 from collections.abc import Mapping
+from dataclasses import replace
 
 from bam_envs.core.errors import InvalidValue
 from bam_envs.core.robot import EnvIds, Initial, RobotState
@@ -26,12 +27,13 @@ class RehearsedRobot:
 
     Args:
         robot: The robot behind the link.
+        lag: Time by which its live counterpart is behind its commands [s], which the guards expect.
     """
 
     needs_clearance = True
 
-    def __init__(self, robot: LinkedRobot) -> None:
-        self.robot, self.spec, self.num_robots = robot, robot.spec, robot.num_robots
+    def __init__(self, robot: LinkedRobot, lag: float) -> None:
+        self.robot, self.spec, self.num_robots = robot, replace(robot.spec, lag=lag), robot.num_robots
         text = f"{robot.spec.name}, simulated behind a link; its time advances with commands"
         self.info = RobotInfo(robot.spec.name, simulated=True, lockstep=True, period=robot.spec.period, text=text)
 
@@ -82,7 +84,7 @@ def rehearsed_robot(
     guards: Mapping[str, float] | None = None,
     straight: bool = False,
 ) -> SafeRobot:
-    """A `SafeRobot` around `robot`, with the limits of a live robot.
+    """A `SafeRobot` around `robot`, with the limits and the lag of a live robot.
 
     Args:
         robot: One simulated robot behind a link.
@@ -98,7 +100,8 @@ def rehearsed_robot(
     chosen = profile_for(robot.spec) if profile is None else load_profile(profile).narrowed(labels)
     tool = getattr(robot.robot, "tool_position", None)  # forward kinematics of an arm that is no UR5e
     limits = profile_limits(chosen).changed({} if guards is None else guards)
-    safe = SafeRobot(RehearsedRobot(robot), limits=limits, tool_position=tool, straight=straight)
+    lag = replace(chosen, period=robot.spec.period).spec().lag
+    safe = SafeRobot(RehearsedRobot(robot, lag), limits=limits, tool_position=tool, straight=straight)
     require_effect(safe, guards or {})
     return safe
 

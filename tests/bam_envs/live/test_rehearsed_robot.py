@@ -7,6 +7,7 @@ import pytest
 
 from bam_envs.core.errors import InvalidValue, StaleState
 from bam_envs.core.robot import Initial
+from bam_envs.live.building import live_robot
 from bam_envs.live.rehearsed_robot import RehearsedRobot, rehearsed_robot, time_to_stop
 from bam_envs.robots.fake import FakeRobot
 from bam_envs.robots.linked import PROFILES, LinkedRobot, LinkProfile
@@ -41,7 +42,7 @@ class TestContract(RobotContract):
 
 
 def test_it_takes_cleared_commands_only():
-    robot = RehearsedRobot(LinkedRobot(FakeRobot(), PROFILES["wifi"]))
+    robot = RehearsedRobot(LinkedRobot(FakeRobot(), PROFILES["wifi"]), lag=0.1)
     robot.connect()
     state = robot.reset(np.arange(1), START)
     with pytest.raises(InvalidValue, match=r"^Commands to fake must be cleared by a SafeRobot: use rehearsed_robot"):
@@ -51,6 +52,9 @@ def test_it_takes_cleared_commands_only():
 def test_its_limits_are_those_of_a_profile(tmp_path):
     linked = LinkedRobot(FakeRobot(), PROFILES["wifi"])
     assert rehearsed_robot(linked).limits.joint_speed == 1.0
+    assert linked.spec.lag == 0.0  # the simulated arm follows better than a live one
+    assert rehearsed_robot(linked).spec.lag == live_robot("ws://robot", linked.spec).spec.lag == 0.1
+    assert rehearsed_robot(LinkedRobot(open_floor(1), PROFILES["wifi"])).spec.lag == 0.3
     path = tmp_path / "cell.toml"
     path.write_text('extends = "ur5e"\n[limits]\njoint_speed = 0.5\n')
     assert rehearsed_robot(linked, profile=str(path)).limits.joint_speed == 0.5

@@ -112,7 +112,7 @@ def start():
 
 @pytest.fixture(scope="module")
 def running(tmp_path_factory):
-    program = Program(tmp_path_factory.mktemp("agent"), "--policy", str(PICK))
+    program = Program(tmp_path_factory.mktemp("agent"), "--policy", str(PICK), "--robot-name", "left arm")
     yield program
     program.end()
 
@@ -156,6 +156,7 @@ def test_a_program_takes_over_and_hands_back(running):
     observation, _ = begun(env)
     status = running.state()
     assert status["state"] == "taken over"
+    assert env.unwrapped.robot.info.identity == status["identity"] == "left arm"
     assert re.fullmatch(r".+@.+ \(127\.0\.0\.1:\d+\)", status["owner"])
     other = taken(running.url)
     with pytest.raises(NotInCommand, match=r"drives this robot; the lease ends .* s after its last use\. Ask for it"):
