@@ -44,7 +44,7 @@ FREEZE, RESTART = 5.0, 10.0
 """Duration of a frozen network, and time until a bridge is restarted [s]."""
 LONGEST = 120.0
 """Maximum duration of a deployment [s]."""
-PLAIN = ("--allow-unsigned", "--stage", "full", "--i-know")
+PLAIN = ("--allow-unsigned", "--stage", "full", "--i-know", "--robot-name", "cell")
 """Flags for a robot without a description, which counts as real."""
 LOST = 1.0
 """Maximum loss of a recording before a fault [s]."""

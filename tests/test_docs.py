@@ -224,7 +224,7 @@ def test_commands_exist(page):
         elif words[0] == "python":
             assert (ROOT / words[1]).exists() or f"`{words[1]}`" in page.read_text()
         else:
-            assert words[0] in {*PROGRAMS, "pip", "pytest", "python3", "ray", "ros2", "source"}
+            assert words[0] in {*PROGRAMS, "pip", "pytest", "python3", "ray", "ros2", "source", "ssh"}
 
 
 def test_the_workflow_for_ci_has_commands_that_exist():

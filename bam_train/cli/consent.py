@@ -120,7 +120,9 @@ def required_contract(checkpoint: Checkpoint, env: Any, place: Place, motion: Pa
     if motion is not None:
         from bam_train.deploy.wiggle import recorded_motion
 
-        moved = Contract(tuple(recorded_motion(motion, env.unwrapped.robot.spec, place.robot)))
+        told = "" if contract.inspection is None else contract.inspection.identity
+        lines = recorded_motion(motion, env.unwrapped.robot.spec, place.robot, told or place.robot_name)
+        moved = Contract(tuple(lines))
         contract = replace(contract, checks=(*contract.checks, *moved.checks))
         shown += moved.lines()
     for line in shown:

@@ -67,7 +67,7 @@ class Admission:
         self.identity = identity_of(place, told)
         is_real = has_real_robot(env)
         lines = [f"  robot: {self.identity}"] if self.identity else []
-        if is_real and not self.identity:
+        if is_real and place.robot is not None and not self.identity:
             lines = ["  robot: it does not tell which one it is; --robot-name NAME names it"]
         lines += self._signature() if is_real else []
         if place.shadow:

@@ -60,10 +60,11 @@ def wiggle(robot: SafeRobot, joints: Array | None) -> Iterator[Check]:
     yield from _compared(spec, [state.command[0] for state in states], [_measured(spec, state) for state in states])
 
 
-def recorded_motion(path: Path, spec: RobotSpec, address: str) -> Iterator[Check]:
+def recorded_motion(path: Path, spec: RobotSpec, address: str, identity: str = "") -> Iterator[Check]:
     """Lines about the motion of each axis in the longest episode of a recording of the live robot at `address`.
 
-    A recording of another robot, of a simulation, or of a shadow, which sends nothing, is refused.
+    Robots are told apart by their `identity`, if that of both is known, else by their address. A recording of another
+    robot, of a simulation, or of a shadow, which sends nothing, is refused.
 
     Raises:
         BadRecording: There is no such recording, or it is of another robot.
@@ -71,10 +72,13 @@ def recorded_motion(path: Path, spec: RobotSpec, address: str) -> Iterator[Check
     recording = Recording.open(path)
     metadata = recording.metadata
     found = metadata.get("address", "") if metadata.get("robot") else "a simulation"
+    wanted = address
+    if found != "a simulation" and identity and metadata.get("identity"):
+        wanted, found = identity, metadata["identity"]
     if SHADOW in metadata.get("marks", ""):
         found = "a shadow, which sends nothing"
-    fits = found.rstrip("/") == address.rstrip("/")
-    yield check(f"recording {path.name}", address, found, fits=fits)
+    fits = found.rstrip("/") == wanted.rstrip("/")
+    yield check(f"recording {path.name}", wanted, found, fits=fits)
     episodes = recording.episodes()
     if not fits or not episodes:
         return

@@ -291,8 +291,8 @@ class Diagnosis:
     def _guards(self, findings: _Findings) -> None:
         robot, profile = self._robot_and_profile()
         findings.text.append(f"{len(robot.report())} guards; bam-deploy --print-guards shows them")
-        # Last, as a service that does not answer may hold up everything behind it.
-        told = ask_identity(self._link, profile, {}) if self._info is None else self._info.identity
+        types = bringup.TopicTypes(self._link, profile, self._timeout)
+        told = ask_identity(self._link, profile, types) if self._info is None else self._info.identity
         findings.text.append(f"the robot is {told}" if told else "the robot does not tell which one it is")
         findings.warnings.extend(robot.warnings)
         spec, newest = robot.spec, {reading.source.signal: reading.values for reading in self._measured().readings}

@@ -1,8 +1,9 @@
 """Inspect a live robot by listening only: its description, topics, types and messages. No command is sent."""
 
+import queue
 import threading
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Any
@@ -26,6 +27,8 @@ DESCRIPTION, DESCRIPTION_TYPE = "/robot_description", "std_msgs/String"
 """The topic on which a robot publishes its URDF, latched."""
 TOOL_POSE = ("tool_position", "tool_quaternion")
 """Optional signals of an arm: the pose of its tool, as its controller measures it."""
+IDENTITY = 1.5
+"""Longest wait for the topic on which a robot repeats its name [s]."""
 _RETRY = 0.1
 """Time between two questions for the type of a topic [s]."""
 _AGES = 3
@@ -108,8 +111,8 @@ def inspect_robot(
         sinks = (tagged_sinks(narrowed, None) if info is not None else None) or narrowed.sinks()
         needed = {entry.topic: entry.type for entry in (*required, *sinks)}
         wanted = {**needed, **{source.topic: source.type for source in extra}, DESCRIPTION: DESCRIPTION_TYPE}
-        wanted |= {source.topic: source.type for source in profile.identity if source.topic and info is None}
-        types = _types(link, TopicTypes(link, profile, timeout), wanted, needed, timeout)
+        known = TopicTypes(link, profile, timeout)
+        types = _types(link, known, wanted, needed, timeout)
         proof = needed_proof(link, info, narrowed, sinks, endpoint.url)
         inbox = _Inbox()
         start = _listen(link, inbox, wanted, {sink.topic for sink in sinks}, types)
@@ -122,25 +125,40 @@ def inspect_robot(
             raise LinkLost(f"{link.url}: the link dropped while the robot's topics were checked.")
         seconds = time.monotonic() - start
         ahead = time.time() - time.monotonic()
-        # Last: with a ROS 2 bridge, a service that does not answer holds up everything else on this connection.
-        identity = ask_identity(link, profile, letters) if info is None else info.identity
+        identity = ask_identity(link, profile, known) if info is None else info.identity
         every, offset = (*required, *extra), link.clock_offset
         return Inspection(info, every, sinks, types, letters, seconds, ahead, offset, proof, identity)
     finally:
         link.close()
 
 
-def ask_identity(link: RosbridgeLink, profile: RobotProfile, letters: Mapping[str, tuple[Letter, ...]]) -> str:
-    """The serial number or name that the robot tells, by the first source that has one; empty if none has."""
+def ask_identity(link: RosbridgeLink, profile: RobotProfile, types: TopicTypes) -> str:
+    """The serial number or name that the robot tells, by the first source that has one; empty if none has.
+
+    To be asked last: with a ROS 2 bridge, a service that does not answer holds up everything else on the connection.
+    """
     for source in profile.identity:
-        messages: Sequence[Any] = [letter.message for letter in letters.get(source.topic, ())[-1:]]
-        if source.service:
+        message: Any = None
+        if source.topic and types.may_be(link.namespace + source.topic, source.type):
+            message = _first(link, link.namespace + source.topic, source.type)
+        elif source.service:
             with suppress(LinkLost, RemoteError):
-                messages = [ask(link, link.namespace + source.service, request=source.request)]
-        for message in messages:
-            if found := source.identity(message):
-                return found
+                message = ask(link, link.namespace + source.service, request=source.request)
+        if found := source.identity(message):
+            return found
     return ""
+
+
+def _first(link: RosbridgeLink, topic: str, kind: str) -> Message | None:
+    """The first message on `topic` within `IDENTITY`; None if there is none."""
+    came: queue.SimpleQueue[Message] = queue.SimpleQueue()
+    end = link.subscribe(topic, kind, lambda message, caller: came.put(message))
+    try:
+        return came.get(timeout=IDENTITY)
+    except queue.Empty:
+        return None
+    finally:
+        end()
 
 
 def _types(

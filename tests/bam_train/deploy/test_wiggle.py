@@ -182,3 +182,17 @@ def test_a_recording_of_another_robot_or_of_a_shadow_is_refused(tmp_path, told, 
     assert recorder.close() == ""
     [line] = recorded_motion(recorder.path, SPEC, "ws://10.0.0.5:9090/")
     assert (line.what, line.found, line.verdict) == ("recording a.mcap", found, "refused")
+
+
+def test_robots_are_told_apart_by_their_names_where_both_are_known(tmp_path):
+    told = {"robot": "ur5e", "address": "ws://127.0.0.1:9090", "marks": "", "identity": "left arm"}
+    recorder = Recorder(tmp_path / "a.mcap", told)
+    recorder.start()
+    assert recorder.close() == ""
+    for address, identity, verdict in [
+        ("ws://10.0.0.5:9090", "left arm", "ok"),
+        ("ws://127.0.0.1:9090", "right arm", "refused"),
+        ("ws://127.0.0.1:9090", "", "ok"),
+        ("ws://10.0.0.5:9090", "", "refused"),
+    ]:
+        assert [line.verdict for line in recorded_motion(recorder.path, SPEC, address, identity)] == [verdict]
