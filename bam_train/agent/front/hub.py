@@ -158,7 +158,8 @@ class AgentHub:
     def status(self) -> dict[str, Any]:
         """The last status of the resident, with the name and the address of the robot, and the lease."""
         front, lease = self._front, self._front.lease
-        owner, robot = lease.owner, {"name": front.shadow.profile.name, "address": front.options.robot}
+        name = front.status.get("identity") or front.shadow.profile.name
+        owner, robot = lease.owner, {"name": name, "address": front.options.robot}
         until = None if owner is None else round(lease.left, 1)
         return {**front.status, **robot, "owner": owner, "owner_until": until}
 

@@ -156,7 +156,7 @@ def test_a_program_takes_over_and_hands_back(running):
     observation, _ = begun(env)
     status = running.state()
     assert status["state"] == "taken over"
-    assert env.unwrapped.robot.info.identity == status["identity"] == "left arm"
+    assert env.unwrapped.robot.info.identity == status["identity"] == status["name"] == "left arm"
     assert re.fullmatch(r".+@.+ \(127\.0\.0\.1:\d+\)", status["owner"])
     other = taken(running.url)
     with pytest.raises(NotInCommand, match=r"drives this robot; the lease ends .* s after its last use\. Ask for it"):
