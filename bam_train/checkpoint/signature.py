@@ -23,10 +23,10 @@ import msgspec
 from msgspec import Meta
 
 from bam_envs.core.config_folder import config_folder
-from bam_envs.core.ownership import who_else
 from bam_train.atomic_file import replacing
 from bam_train.checkpoint.checkpoint import Checkpoint
 from bam_train.checkpoint.manifest import AGAIN, MANIFEST
+from bam_train.checkpoint.ownership import who_else
 from bam_train.checkpoint.zip_members import RESUME, SIGNATURE, chunks, list_members, open_zip
 from bam_train.errors import AlteredCheckpoint, BadKey, OutputError, UntrustedCheckpoint
 

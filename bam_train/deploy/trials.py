@@ -31,7 +31,7 @@ from datetime import datetime, timezone
 from pathlib import Path
 from typing import IO, Any
 
-from bam_envs.core.ownership import who_else
+from bam_train.checkpoint.ownership import who_else
 from bam_train.errors import BadTrials
 
 try:
