@@ -103,7 +103,8 @@ class Place:
         if self.trial:  # more steps in proportion to the lower speed
             steps = kwargs.get("max_episode_steps") or entry.max_episode_steps
             trial = {"trial": True, "max_episode_steps": -1 if steps == -1 else round(steps / TRIAL_SPEED)}
-        shadow = {"shadow": True} if self.shadow else {}
+        shadow: dict[str, Any] = {"shadow": True} if self.shadow else {}
+        shadow |= {"robot_name": self.robot_name} if self.robot_name else {}
         return {**kwargs, "robot": self.robot, "profile": self.profile, **guards, **link, **trial, **shadow}
 
 

@@ -22,7 +22,9 @@ MOST_MANIFEST = 8 * 2**20
 """Maximum bytes of a manifest, which is read before anything is verified."""
 MOST_NUMBERS = 2**26
 """Maximum numbers of an observation or action; a colour picture of 3840 x 2160 pixels has 25 million."""
-WHERE = frozenset({"robot", "transport", "profile", "guards", "trial", "shadow", "ca_file", "token_file", "rs_address"})
+WHERE = frozenset(
+    {"robot", "robot_name", "transport", "profile", "guards", "trial", "shadow", "ca_file", "token_file", "rs_address"}
+)
 """Arguments of an environment that determine where it runs, and how far a live robot may go there; only a person gives
 them, never a file."""
 

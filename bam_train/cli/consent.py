@@ -36,7 +36,7 @@ def connected_env(
     render: bool | str = False,
     named: str | None = None,
     env_kwargs: Mapping[str, Any] | None = None,
-    admit: Callable[[gym.Env[Any, Any], Place, str], Sequence[str]] = lambda env, place, told: (),
+    admit: Callable[[gym.Env[Any, Any], Place, str], Sequence[str]] = lambda env, place, identity: (),
     motion: Path | None = None,
     wiggle: bool = False,
 ) -> gym.Env[Any, Any]:
@@ -52,8 +52,8 @@ def connected_env(
         render: Whether to show the simulation in a window; or the render mode.
         named: The environment that the user expects.
         env_kwargs: Arguments of the environment, which override the checkpoint's.
-        admit: Called before the question with the connected environment, its place, and the identity that its robot
-            tells; returns lines for the operator.
+        admit: Called before the question with the connected environment, its place, and the identity of its robot
+            (`Inspection.identity`); returns lines for the operator.
         motion: Recording of the live robot in which each axis must have moved as commanded.
         wiggle: Whether to move each axis of a live robot a little first, to check that it moves as commanded.
 
@@ -76,8 +76,8 @@ def connected_env(
             place = replace(place, trial=True)  # a robot's limits are fixed when it is made
             env = make(place=place)
             _connect(env, signals)
-        told = "" if contract.inspection is None else contract.inspection.identity
-        plan = [*plan_lines(env, env_id, place.text, episodes, wiggle=wiggle), *admit(env, place, told)]
+        known = "" if contract.inspection is None else contract.inspection.identity
+        plan = [*plan_lines(env, env_id, place.text, episodes, wiggle=wiggle), *admit(env, place, known)]
         signals.raise_again()
         if not place.shadow:
             actor = "a person" if checkpoint is None else checkpoint.path
@@ -120,8 +120,8 @@ def required_contract(checkpoint: Checkpoint, env: Any, place: Place, motion: Pa
     if motion is not None:
         from bam_train.deploy.wiggle import recorded_motion
 
-        told = "" if contract.inspection is None else contract.inspection.identity
-        lines = recorded_motion(motion, env.unwrapped.robot.spec, place.robot, told or place.robot_name)
+        known = "" if contract.inspection is None else contract.inspection.identity
+        lines = recorded_motion(motion, env.unwrapped.robot.spec, place.robot, known)
         moved = Contract(tuple(lines))
         contract = replace(contract, checks=(*contract.checks, *moved.checks))
         shown += moved.lines()

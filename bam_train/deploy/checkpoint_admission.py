@@ -7,7 +7,8 @@ from typing import Any
 import gymnasium as gym
 
 from bam_envs.core.config_folder import config_folder
-from bam_envs.rosbridge.endpoint import Endpoint, is_loopback
+from bam_envs.live.robot_identity import is_one_robot
+from bam_envs.rosbridge.endpoint import Endpoint
 from bam_envs.safety.guard import TRIAL_SPEED
 from bam_train.checkpoint import Checkpoint
 from bam_train.deploy.agreement import Shadow
@@ -51,20 +52,20 @@ class Admission:
     policy: FrozenPolicy = field(init=False)
     """The frozen policy, once it is admitted."""
 
-    def __call__(self, env: gym.Env[Any, Any], place: Place, told: str = "") -> list[str]:
+    def __call__(self, env: gym.Env[Any, Any], place: Place, identity: str = "") -> list[str]:
         """Check signature and trials if the robot is real, and load the policy; returns lines for the operator.
 
-        A simulated robot needs no signature, and trials only if `place.trial` is set. `told` is `Inspection.identity`.
+        A simulated robot needs no signature, and trials only if `place.trial` is set. For `identity` see `Inspection`.
 
         Raises:
             UntrustedCheckpoint: The robot is real, and the checkpoint has no trusted signature.
             AlteredCheckpoint: The checkpoint was changed after it was signed.
             TrialsNeeded: Full speed is requested without enough trials.
             BadTrials: The record of trials was edited, or cannot be read.
-            SettingsError: The robot is not the one that `place` names; it is not known which one it is; or a record of
-                trials is given for a simulated robot that is not on trial.
+            SettingsError: It is not known which robot it is; or a record of trials is given for a simulated robot that
+                is not on trial.
         """
-        self.identity = identity_of(place, told)
+        self.identity = identity
         is_real = has_real_robot(env)
         lines = [f"  robot: {self.identity}"] if self.identity else []
         if is_real and place.robot is not None and not self.identity:
@@ -111,20 +112,6 @@ class Admission:
         return [f"  {UNPROVEN}: {evidence.text}"]
 
 
-def identity_of(place: Place, told: str) -> str:
-    """Serial number or name of the live robot at `place`, which tells the one that is `told`; empty if none is known.
-
-    Raises:
-        SettingsError: The robot tells another one than the operator.
-    """
-    if told and place.robot_name not in ("", told):
-        raise SettingsError(
-            f"--robot-name {place.robot_name}: the robot at {place.text} says that it is {told}; correct the name, or "
-            "the address; nothing has moved"
-        )
-    return told or place.robot_name
-
-
 def trials_of(checkpoint: Checkpoint, record: Path | None, identity: str, address: str, *, simulated: bool) -> Trials:
     """The trials of a checkpoint on the robot `identity` at `address`, in the file `record` (None: `TRIALS`).
 
@@ -133,7 +120,7 @@ def trials_of(checkpoint: Checkpoint, record: Path | None, identity: str, addres
     Raises:
         SettingsError: Any robot may be at that address, as at the end of an SSH tunnel.
     """
-    if not (identity or simulated) and is_loopback(Endpoint(address).address.host):
+    if not simulated and not is_one_robot(Endpoint(address), identity):
         raise SettingsError(
             f"the robot at {address} does not tell which one it is, and every tunnel ends at such an address, so that "
             "its trials could count for another robot: name it with --robot-name NAME, always the same"

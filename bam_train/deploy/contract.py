@@ -36,10 +36,13 @@ def check_contract(
     Raises:
         NoServer: There is no usable server at the address.
         LinkLost: The link dropped.
+        InvalidValue: The robot is another one than `place` names.
     """
     spec: RobotSpec = env.unwrapped.robot.spec
     profile = profile_for(spec) if place.profile is None else load_profile(place.profile)
-    endpoint = Endpoint.with_token_file(place.robot or "", ca_file=place.ca_file, token_file=place.token_file)
+    endpoint = Endpoint.with_token_file(
+        place.robot or "", ca_file=place.ca_file, token_file=place.token_file, robot_name=place.robot_name
+    )
     inspection = inspect_robot(endpoint, profile, spec, listen=listen, timeout=timeout)
     return Contract((*fit_checks(checkpoint, env), *live_checks(env, profile, inspection)), inspection)
 

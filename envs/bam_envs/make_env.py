@@ -34,6 +34,7 @@ def make_env(
     guards: Mapping[str, float] | None = None,
     trial: bool = False,
     shadow: bool = False,
+    robot_name: str = "",
     ca_file: str | None = None,
     token_file: str | None = None,
     timeout: float | None = None,
@@ -57,6 +58,7 @@ def make_env(
         guards: Limits of the live robot's guards that differ from its profile's, such as ``{"joint_speed": 0.3}``.
         trial: Whether the live robot is on trial: slow, and in a box around its start.
         shadow: Whether somebody else drives the live robot: its states are read, and nothing is sent.
+        robot_name: Name of the live robot, where it does not tell its serial number or a name.
         ca_file: Certificates that ``wss://`` trusts instead of the system's.
         token_file: File with the server's token.
         timeout: Longest wait for an answer of `transport` [s]; 30 by default.
@@ -68,7 +70,7 @@ def make_env(
     if robot is not None and transport is not None:
         raise InvalidValue("robot= and transport= exclude each other: the task runs here, or with the robot elsewhere.")
     if robot is None:
-        _refuse_for_simulations(profile, guards, trial, shadow)
+        _refuse_for_simulations(profile, guards, trial, shadow, robot_name)
     if trial and shadow:
         raise InvalidValue("trial=True and shadow=True exclude each other: a shadow sends nothing. Give one of them.")
     _check_place(robot, transport, timeout, render_mode, randomize, link, action_delay, task_options)
@@ -87,6 +89,7 @@ def make_env(
     from bam_envs.live.building import live_robot, shadow_robot
 
     where: dict[str, Any] = {"profile": profile, "guards": guards, "ca_file": ca_file, "token_file": token_file}
+    where["robot_name"] = robot_name
     if shadow:
         return RobotEnv(shadow_robot(robot, simulated.spec, **where), task, render_mode=render_mode)
     tool = getattr(simulated, "tool_position", None)  # forward kinematics of an arm that is no UR5e
@@ -95,10 +98,12 @@ def make_env(
     return RobotEnv(live, task, render_mode=render_mode)
 
 
-def _refuse_for_simulations(profile: object, guards: object, trial: bool, shadow: bool) -> None:
+def _refuse_for_simulations(profile: object, guards: object, trial: bool, shadow: bool, robot_name: object) -> None:
     """Refuse options that only a live robot has."""
     if profile is not None:
         raise InvalidValue(f"profile={profile!r} describes a live robot; give its address with robot= too.")
+    if robot_name:
+        raise InvalidValue(f"robot_name={robot_name!r} names a live robot; give its address with robot= too.")
     if guards is not None:
         raise InvalidValue("guards= changes the limits of a live robot; give its address with robot= too.")
     if trial or shadow:

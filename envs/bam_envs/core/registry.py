@@ -32,6 +32,7 @@ MAKE_OPTIONS = (
     "guards",
     "trial",
     "shadow",
+    "robot_name",
     "ca_file",
     "token_file",
     "timeout",

@@ -27,6 +27,7 @@ def live_robot(
     command: str | None = None,
     ca_file: str | None = None,
     token_file: str | None = None,
+    robot_name: str = "",
 ) -> SafeRobot:
     """A live robot behind its guards. Nothing is connected yet.
 
@@ -42,6 +43,8 @@ def live_robot(
         command: Command mode, such as ``"trajectory"``; None: the profile's default.
         ca_file: PEM file of the authorities to trust instead of the system's.
         token_file: File with the server's shared secret.
+        robot_name: Name of the robot, where it does not tell its serial number or a name; connecting to a robot that
+            tells another one is refused.
 
     Raises:
         InvalidValue: The address is not that of a robot, a file cannot be read, or the profile lacks a signal or
@@ -49,7 +52,7 @@ def live_robot(
         UnknownName: There is no such profile, command mode or limit.
     """
     require_robot_address(url)
-    endpoint = Endpoint.with_token_file(url, ca_file=ca_file, token_file=token_file)
+    endpoint = Endpoint.with_token_file(url, ca_file=ca_file, token_file=token_file, robot_name=robot_name)
     chosen = _chosen(profile, spec)
     robot = RosbridgeRobot(endpoint, chosen, spec=spec, command=command)
     chosen_limits = limits or profile_limits(chosen)
@@ -70,10 +73,12 @@ def shadow_robot(
     guards: Mapping[str, float] | None = None,
     ca_file: str | None = None,
     token_file: str | None = None,
+    robot_name: str = "",
 ) -> ShadowRobot:
     """A live robot that somebody else drives: its states are read, and nothing is sent. Arguments: see `live_robot`."""
     require_robot_address(url)
-    endpoint, chosen = Endpoint.with_token_file(url, ca_file=ca_file, token_file=token_file), _chosen(profile, spec)
+    endpoint = Endpoint.with_token_file(url, ca_file=ca_file, token_file=token_file, robot_name=robot_name)
+    chosen = _chosen(profile, spec)
     limits = profile_limits(chosen).changed({} if guards is None else guards)
     return ShadowRobot(endpoint, chosen, spec=spec, limits=limits)
 

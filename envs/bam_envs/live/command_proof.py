@@ -20,9 +20,11 @@ from typing import Any
 
 from bam_envs.core.config_folder import config_folder
 from bam_envs.core.errors import BamEnvsError, LinkLost, NotReady
+from bam_envs.live.robot_identity import is_one_robot, robot_identity
 from bam_envs.ros.codec import RobotInfo
 from bam_envs.ros.profile_tables import RobotProfile, Sink
 from bam_envs.rosbridge.client import RosbridgeLink
+from bam_envs.rosbridge.endpoint import Endpoint
 
 _LOG = logging.getLogger(__name__)
 BOOL = 1
@@ -131,7 +133,12 @@ def _remedy(profile: RobotProfile) -> str:
 
 
 def needed_proof(
-    link: RosbridgeLink, info: RobotInfo | None, profile: RobotProfile, sinks: Sequence[Sink], robot: str
+    link: RosbridgeLink,
+    info: RobotInfo | None,
+    profile: RobotProfile,
+    sinks: Sequence[Sink],
+    endpoint: Endpoint,
+    identity: str | None = None,
 ) -> CommandProof | None:
     """The proof that a real arm needs before it moves; None for others, and for an arm of a live agent, which has it.
 
@@ -140,11 +147,14 @@ def needed_proof(
         info: The robot's description of itself, if it has one.
         profile: The profile of the robot, narrowed to the commands of the task.
         sinks: The topics of its commands.
-        robot: The name by which the robot is known.
+        endpoint: The address of the robot.
+        identity: Its serial number or name, empty if neither is known; None: it is asked for.
     """
     if (info is not None and (info.simulated or info.agent)) or not _joint_labels(profile):
         return None
-    return CommandProof(profile, sinks, ask_controllers(link, profile, sinks), robot)
+    identity = robot_identity(endpoint, profile, info) if identity is None else identity
+    is_one = is_one_robot(endpoint, identity)
+    return CommandProof(profile, sinks, ask_controllers(link, profile, sinks), identity or endpoint.url, is_one)
 
 
 class CommandProof:
@@ -155,9 +165,17 @@ class CommandProof:
         sinks: The topics of its commands.
         controllers: What its side tells of the controllers.
         robot: The name by which the robot is known.
+        is_one: Whether one robot only is known by that name; otherwise nothing is remembered.
     """
 
-    def __init__(self, profile: RobotProfile, sinks: Sequence[Sink], controllers: Controllers, robot: str) -> None:
+    def __init__(
+        self,
+        profile: RobotProfile,
+        sinks: Sequence[Sink],
+        controllers: Controllers,
+        robot: str,
+        is_one: bool = True,
+    ) -> None:
         arm = [sink for sink in sinks if set(sink.labels) & set(_joint_labels(profile))]
         self.is_timed = all(sink.is_timed for sink in arm)
         """Whether a command says in which time it is to be reached."""
@@ -170,8 +188,8 @@ class CommandProof:
         """See `Controllers.from_measured`."""
         self._remedy, self.key = _timed_remedy(profile), _key(profile, arm, controllers, robot)
         """Digest of everything that a proof is about."""
-        self._file = config_folder() / "proofs" / f"{self.key}.json"
-        self.since = _remembered(self._file)
+        self._file = config_folder() / "proofs" / f"{self.key}.json" if is_one else None
+        self.since = "" if self._file is None else _remembered(self._file)
         """When the commands were proved, as text; empty if they were not."""
 
     @property
@@ -184,9 +202,10 @@ class CommandProof:
         """Why the commands cannot be proved without a motion that may be large; empty if they can, or were."""
         if self.order_fault or self.is_timed or self.is_known:
             return self.order_fault
+        named = "" if self._file is not None else ", and name it with --robot-name, or that is not remembered"
         return (
             f"{self._topics} executes a position at once, so that a wrong sign or offset would swing the arm, and "
-            f"nothing has shown them yet{self._remedy}"
+            f"nothing has shown them yet{self._remedy}{named}"
         )
 
     def require_provable(self) -> None:
@@ -197,7 +216,7 @@ class CommandProof:
     def done(self, lag: float) -> None:
         """Remember that the commands are proved; `lag` is the measured delay of the arm behind them [s]."""
         self.is_done = True
-        if self.is_known:
+        if self.is_known or self._file is None:
             return
         self.since = time.strftime("%Y-%m-%d %H:%M")
         try:

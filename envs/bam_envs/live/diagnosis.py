@@ -16,8 +16,8 @@ import numpy as np
 from bam_envs.core.errors import BamEnvsError, LinkLost, NotReady, ProtocolError, StaleState
 from bam_envs.live import bringup
 from bam_envs.live.building import live_robot, require_robot_address
-from bam_envs.live.inspection import ask_identity
 from bam_envs.live.link_measurement import PING_TOPIC, Array, LinkMeasurement, Reading, measure_link
+from bam_envs.live.robot_identity import robot_identity
 from bam_envs.live.state import LiveState
 from bam_envs.robots.profile import load_profile, profile_for, shipped_profiles
 from bam_envs.ros.codec import INFO_SERVICE, RobotInfo, read_info
@@ -291,8 +291,7 @@ class Diagnosis:
     def _guards(self, findings: _Findings) -> None:
         robot, profile = self._robot_and_profile()
         findings.text.append(f"{len(robot.report())} guards; bam-deploy --print-guards shows them")
-        types = bringup.TopicTypes(self._link, profile, self._timeout)
-        told = ask_identity(self._link, profile, types) if self._info is None else self._info.identity
+        told = robot_identity(self.endpoint, profile, self._info)
         findings.text.append(f"the robot is {told}" if told else "the robot does not tell which one it is")
         findings.warnings.extend(robot.warnings)
         spec, newest = robot.spec, {reading.source.signal: reading.values for reading in self._measured().readings}

@@ -1,18 +1,16 @@
 """Inspect a live robot by listening only: its description, topics, types and messages. No command is sent."""
 
-import queue
 import threading
 import time
 from collections.abc import Mapping
-from contextlib import suppress
 from dataclasses import dataclass, field
-from typing import Any
 
-from bam_envs.core.errors import LinkLost, RemoteError
+from bam_envs.core.errors import LinkLost
 from bam_envs.core.robot import RobotSpec
 from bam_envs.core.timing import Deadline
 from bam_envs.live.bringup import TIMEOUT, TopicTypes, ask, tagged_sinks
 from bam_envs.live.command_proof import CommandProof, needed_proof
+from bam_envs.live.robot_identity import robot_identity
 from bam_envs.live.state import Letter
 from bam_envs.ros.codec import INFO_SERVICE, RobotInfo, read_info
 from bam_envs.ros.messages import same_type
@@ -27,8 +25,6 @@ DESCRIPTION, DESCRIPTION_TYPE = "/robot_description", "std_msgs/String"
 """The topic on which a robot publishes its URDF, latched."""
 TOOL_POSE = ("tool_position", "tool_quaternion")
 """Optional signals of an arm: the pose of its tool, as its controller measures it."""
-IDENTITY = 1.5
-"""Longest wait for the topic on which a robot repeats its name [s]."""
 _RETRY = 0.1
 """Time between two questions for the type of a topic [s]."""
 _AGES = 3
@@ -58,7 +54,7 @@ class Inspection:
     proof: CommandProof | None = None
     """The proof of the commands of a real arm; None for any other robot."""
     identity: str = ""
-    """Serial number or name of the robot, as it tells it; empty if it does not."""
+    """Serial number or name of the robot; empty if neither is known."""
 
 
 @dataclass
@@ -96,6 +92,7 @@ def inspect_robot(
         NoServer: There is no usable server.
         LinkLost: The link dropped.
         ProtocolError: The robot's description of itself cannot be read.
+        InvalidValue: The robot is another one than the endpoint names.
     """
     narrowed = profile.narrowed(spec.command.labels)
     required = tuple(profile.source(signal.name) for signal in spec.signals)
@@ -111,9 +108,9 @@ def inspect_robot(
         sinks = (tagged_sinks(narrowed, None) if info is not None else None) or narrowed.sinks()
         needed = {entry.topic: entry.type for entry in (*required, *sinks)}
         wanted = {**needed, **{source.topic: source.type for source in extra}, DESCRIPTION: DESCRIPTION_TYPE}
-        known = TopicTypes(link, profile, timeout)
-        types = _types(link, known, wanted, needed, timeout)
-        proof = needed_proof(link, info, narrowed, sinks, endpoint.url)
+        types = _types(link, TopicTypes(link, profile, timeout), wanted, needed, timeout)
+        identity = robot_identity(endpoint, profile, info)
+        proof = needed_proof(link, info, narrowed, sinks, endpoint, identity)
         inbox = _Inbox()
         start = _listen(link, inbox, wanted, {sink.topic for sink in sinks}, types)
         awaited = {source.topic for source in required} & inbox.letters.keys()
@@ -125,40 +122,10 @@ def inspect_robot(
             raise LinkLost(f"{link.url}: the link dropped while the robot's topics were checked.")
         seconds = time.monotonic() - start
         ahead = time.time() - time.monotonic()
-        identity = ask_identity(link, profile, known) if info is None else info.identity
         every, offset = (*required, *extra), link.clock_offset
         return Inspection(info, every, sinks, types, letters, seconds, ahead, offset, proof, identity)
     finally:
         link.close()
-
-
-def ask_identity(link: RosbridgeLink, profile: RobotProfile, types: TopicTypes) -> str:
-    """The serial number or name that the robot tells, by the first source that has one; empty if none has.
-
-    To be asked last: with a ROS 2 bridge, a service that does not answer holds up everything else on the connection.
-    """
-    for source in profile.identity:
-        message: Any = None
-        if source.topic and types.may_be(link.namespace + source.topic, source.type):
-            message = _first(link, link.namespace + source.topic, source.type)
-        elif source.service:
-            with suppress(LinkLost, RemoteError):
-                message = ask(link, link.namespace + source.service, request=source.request)
-        if found := source.identity(message):
-            return found
-    return ""
-
-
-def _first(link: RosbridgeLink, topic: str, kind: str) -> Message | None:
-    """The first message on `topic` within `IDENTITY`; None if there is none."""
-    came: queue.SimpleQueue[Message] = queue.SimpleQueue()
-    end = link.subscribe(topic, kind, lambda message, caller: came.put(message))
-    try:
-        return came.get(timeout=IDENTITY)
-    except queue.Empty:
-        return None
-    finally:
-        end()
 
 
 def _types(

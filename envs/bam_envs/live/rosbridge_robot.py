@@ -239,7 +239,7 @@ class RosbridgeRobot:
         self._sent = None
 
     def _needed_proof(self, control: RosbridgeLink) -> CommandProof | None:
-        return needed_proof(control, self.info, self.profile, self._sinks, self.url)
+        return needed_proof(control, self.info, self.profile, self._sinks, self._endpoint)
 
     def tell_proved(self, lag: float) -> None:
         """Take that the commands of this connection are proved, with the measured `lag` of the arm [s]."""

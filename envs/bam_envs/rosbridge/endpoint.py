@@ -10,6 +10,7 @@ from typing import NamedTuple
 from urllib.parse import urlsplit
 
 from bam_envs.core.errors import InvalidValue
+from bam_envs.core.validation import RobotName, check
 from bam_envs.rosbridge.tokens import read_token
 
 _DEFAULT_PORT = 9090
@@ -44,7 +45,7 @@ def is_loopback(host: str) -> bool:
 class Endpoint:
     """The address of a rosbridge server (``ws://``, ``wss://``) or of a whole environment (``tcp://``, …).
 
-    `InvalidValue` for an address, a token or a timeout that is not valid, and for `ca_file` without TLS.
+    `InvalidValue` for an address, a token, a name or a timeout that is not valid, and for `ca_file` without TLS.
     """
 
     url: str
@@ -57,6 +58,8 @@ class Endpoint:
     """Longest time to connect [s]."""
     timeout: float | None = None
     """Longest time to wait for an answer [s]; None: the default of the caller."""
+    robot_name: str = ""
+    """Name of the robot there, as its operator knows it; empty if the robot tells it, or none is known."""
 
     def __post_init__(self) -> None:
         if self.url.startswith(("ws://", "wss://")):
@@ -70,17 +73,23 @@ class Endpoint:
             raise InvalidValue(
                 f"{self.url}: ca_file is for wss:// only, and this address is without TLS; leave it out."
             )
+        check(self.robot_name, RobotName, "robot_name")
         for name, value in (("connect_timeout", self.connect_timeout), ("timeout", self.timeout)):
             if value is not None and not value > 0:
                 raise InvalidValue(f"{name}: expected a time above 0 s, found {value!r}.")
 
     @classmethod
     def with_token_file(
-        cls, url: str, *, ca_file: str | Path | None = None, token_file: str | Path | None = None
+        cls,
+        url: str,
+        *,
+        ca_file: str | Path | None = None,
+        token_file: str | Path | None = None,
+        robot_name: str = "",
     ) -> "Endpoint":
         """An endpoint with the token in `token_file`, as command lines and ``gym.make`` take it."""
         token = None if token_file is None else read_token(token_file)
-        return cls(url, None if ca_file is None else str(ca_file), token)
+        return cls(url, None if ca_file is None else str(ca_file), token, robot_name=robot_name)
 
     @cached_property
     def address(self) -> Address:

@@ -6,7 +6,7 @@ import time
 import numpy as np
 import pytest
 
-from bam_envs.core.errors import NotReady, SafetyStop
+from bam_envs.core.errors import InvalidValue, NotReady, SafetyStop
 from bam_envs.live import rosbridge_robot
 from bam_envs.live.building import live_robot
 from bam_envs.live.command_proof import Controllers, ask_controllers
@@ -14,6 +14,7 @@ from bam_envs.robots.profile import load_profile
 from bam_envs.robots.ur5e import JOINTS
 from bam_envs.ros.codec import RobotInfo
 from bam_envs.rosbridge.client import RosbridgeLink
+from bam_envs.rosbridge.endpoint import Endpoint
 from tests.bam_envs.live.conftest import HOME, ScriptedRobot
 
 pytestmark = pytest.mark.proves
@@ -187,16 +188,39 @@ def test_a_controller_that_begins_where_the_arm_is_measured_is_known(server, rob
 
 
 def test_whose_commands_need_no_proof(server):
-    profile = load_profile("ur5e")
+    profile, at = load_profile("ur5e"), Endpoint(server.url)
     link = RosbridgeLink(server.url)
     link.connect()
     try:
         for info in (RobotInfo("x", simulated=True), RobotInfo("x", agent=True)):
-            assert rosbridge_robot.needed_proof(link, info, profile, profile.sinks(), "x") is None
+            assert rosbridge_robot.needed_proof(link, info, profile, profile.sinks(), at) is None
         base = load_profile("mir100")
-        assert rosbridge_robot.needed_proof(link, None, base, base.sinks(), "x") is None
-        proof = rosbridge_robot.needed_proof(link, RobotInfo("x"), profile, profile.sinks(), "x")
+        assert rosbridge_robot.needed_proof(link, None, base, base.sinks(), at) is None
+        proof = rosbridge_robot.needed_proof(link, RobotInfo("x"), profile, profile.sinks(), at)
         assert (proof.fault, proof.is_timed, proof.is_known) == ("", True, False)
+    finally:
+        link.close()
+
+
+def test_a_proof_is_remembered_for_a_robot_that_is_known_and_not_for_the_end_of_a_tunnel(server):
+    profile, link = load_profile("ur5e"), RosbridgeLink(server.url)
+    link.connect()
+
+    def proof(info=None, name=""):
+        endpoint = Endpoint(server.url, robot_name=name)
+        return rosbridge_robot.needed_proof(link, info, profile, profile.sinks(), endpoint)
+
+    left = RobotInfo("ur5e", identity="left arm")
+    try:
+        proof().done(0.1)
+        assert not proof().is_known
+        proof(name="left arm").done(0.1)
+        assert [proof(left).is_known, proof(name="left arm").is_known, proof(name="right arm").is_known] == [1, 1, 0]
+        with pytest.raises(InvalidValue, match=r"says that it is left arm, not right arm: correct the name, or the "):
+            proof(left, name="right arm")
+        server.serve("/dashboard_client/get_serial_number", "x/X", lambda *asked: {"serial_number": 2019550123})
+        proof().done(0.1)
+        assert proof(name="2019550123").is_known
     finally:
         link.close()
 

@@ -53,7 +53,7 @@ def test_its_limits_are_those_of_a_profile(tmp_path):
     linked = LinkedRobot(FakeRobot(), PROFILES["wifi"])
     assert rehearsed_robot(linked).limits.joint_speed == 1.0
     assert linked.spec.lag == 0.0  # the simulated arm follows better than a live one
-    assert rehearsed_robot(linked).spec.lag == live_robot("ws://robot", linked.spec).spec.lag == 0.1
+    assert rehearsed_robot(linked).spec.lag == live_robot("ws://robot", linked.spec).spec.lag == 0.125
     assert rehearsed_robot(LinkedRobot(open_floor(1), PROFILES["wifi"])).spec.lag == 0.3
     path = tmp_path / "cell.toml"
     path.write_text('extends = "ur5e"\n[limits]\njoint_speed = 0.5\n')

@@ -214,7 +214,7 @@ def test_a_real_robot_is_shown_and_does_not_move_unasked(serve, run, monkeypatch
         "  stage trial, at 25 % of the speed limits: 0 of 0 trials succeeded; 33 more without a failure would show "
         "more than 90 %",
         "  at most joint speed 0.25 rad/s, tool speed 0.0625 m/s, gripper speed 0.15 m/s, trial box 0.35 m",
-        "  behind 28 guards; bam-deploy --print-guards shows them",
+        "  behind 29 guards; bam-deploy --print-guards shows them",
         "bam-deploy: a real robot would move, and there is nobody to ask; give --yes to go on without asking",
     ]
 

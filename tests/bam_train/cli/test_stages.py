@@ -263,8 +263,8 @@ def test_a_robot_of_another_name_is_refused(served, run):
     assert run(deploy, REACH, "--robot", url, "--allow-unsigned", "--robot-name", "right arm") == (
         1,
         "",
-        f"bam-deploy: --robot-name right arm: the robot at {url} says that it is left arm; correct the name, or the "
-        "address; nothing has moved\n",
+        f"bam-deploy: The robot at {url} says that it is left arm, not right arm: correct the name, or the address. "
+        "Nothing has moved.\n",
     )
     assert run(deploy, REACH, "--robot", url, "--robot-name", "left/arm") == (
         1,
