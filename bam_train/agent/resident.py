@@ -64,6 +64,8 @@ class Driver:
     """Name of the lease's owner on the port."""
     who: str
     """The same for people."""
+    ran: bool
+    """Whether the policy drove before."""
 
 
 class _Boundary(Agent):
@@ -126,7 +128,8 @@ class Resident:
         self._hurry = threading.Event()  # a request that ends the tick
         self._requests: deque[tuple[Callable[[], dict[str, Any] | None], int]] = deque()
         self._command: Drive | None = None
-        self._is_running, self._stopped, self._quitting = is_running, "", False
+        self._is_running, self._quitting = is_running, False
+        self._stopped = self._paused = ""  # why, once a guard stopped the robot, and once a person or a fault paused it
         self._was_connected = self._holds = self._was_cut_short = False
         self._seed, self._reported = options.seed, 0.0
         self._episodes: deque[int | None] = deque(maxlen=_RECENT)
@@ -231,7 +234,9 @@ class Resident:
     def _turn(self) -> None:
         """One episode, one look at a resting robot, or one command of a person."""
         self._execute()
-        if self.session is None:
+        if (stop := self._unnoticed_stop) is not None:
+            self._failed(stop)
+        elif self.session is None:
             self._reach_robot()
         elif self.driver is not None:
             self._drive()
@@ -254,6 +259,15 @@ class Resident:
             if number:
                 self.send(answer)
 
+    @property
+    def _unnoticed_stop(self) -> SafetyStop | None:
+        """The stop of a guard that came while a request was executed, whose sender alone has heard of it."""
+        stopped = None if self.session is None else self.session.robot.stopped
+        if stopped is None:
+            return None
+        text = f"The robot was stopped by {stopped}. When it is safe, call resume()."
+        return SafetyStop(stopped.partition(" (")[0], text)
+
     def between_ticks(self) -> bool:
         """Called by the chain between a deadline and the policy: whether the episode ends here."""
         deployment = self._connected.deployment
@@ -271,7 +285,7 @@ class Resident:
 
     def _plays(self) -> bool:
         """Whether the episode that runs goes on."""
-        waits = self._chosen is not None and self._chosen.at_once
+        waits = (self._chosen is not None and self._chosen.at_once) or self._unnoticed_stop is not None
         return self._is_running and self.driver is None and not waits and not self._quitting
 
     def _play(self) -> None:
@@ -436,7 +450,7 @@ class Resident:
         if self._stopped:
             self._change(State.STOPPED, self._stopped)
         elif not self._is_running:
-            self._change(State.PAUSED, self.why if self.why.startswith("paused") else THERE)
+            self._change(State.PAUSED, self._paused or THERE)
 
     def _drop(self, why: str) -> None:
         """Halt the robot and drop the link."""
@@ -447,7 +461,7 @@ class Resident:
 
     def _failed(self, error: Exception) -> None:
         """What a fault while the robot moved leads to: waiting for the robot, stopped by a guard, or paused."""
-        text = fault_text(error)
+        text = fault_text(error).replace("call resume()", "resume the agent")
         session, driver = self.session, self.driver
         stopped = isinstance(error, SafetyStop) or (session is not None and session.robot.stopped is not None)
         self.halt()
@@ -457,7 +471,7 @@ class Resident:
         if stopped:  # also by the age of its state: only a person lets it move again
             self._stopped, self._is_running = text, False
             self._change(State.STOPPED, text)
-            if session is not None:
+            if session is not None and driver is None:
                 self.succession.guard_stopped(text)
         elif isinstance(error, (LinkLost, RemoteError, NotReady)):  # or somebody else drives: it goes on when it can
             self._change(State.WAITING, text)
@@ -467,18 +481,21 @@ class Resident:
             if isinstance(error, PolicyError) and self.succession.policy_failed(text):
                 self._change(State.WAITING, text)  # until the other version is connected
                 return
-            self._is_running = False
-            self._change(State.PAUSED, f"paused by a fault: {text}")
+            self._is_running, self._paused = False, f"paused by a fault: {text}"
+            self._change(State.PAUSED, self._paused)
 
     # ---- requests, in the main thread
 
     def _pause(self, who: str, address: str, why: str = "") -> dict[str, Any]:
         self.halt()
         self._is_running, self._stopped = False, ""
+        self._paused = f"paused by {who}{f': {why}' if why else ''}"
         if self.driver is not None:
             self._end_driving(self.driver, f"paused by {who}")
-        if self.session is not None:
-            self._change(State.PAUSED, f"paused by {who}{f': {why}' if why else ''}", who, address)
+        if self.session is None:
+            self.note("pause", self._paused, who, address)
+        else:
+            self._change(State.PAUSED, self._paused, who, address)
         return self.status()
 
     def _resume(self, who: str, address: str, why: str = "") -> dict[str, Any]:
@@ -488,9 +505,11 @@ class Resident:
             )
         if self._stopped:
             self.note("resume", f"{who} lets the robot move again after: {self._stopped}", who, address)
-        self._stopped, self._is_running = "", True
+        self._stopped, self._paused, self._is_running = "", "", True
         text = f"resumed by {who}{f': {why}' if why else ''}"
-        if self.session is not None:
+        if self.session is None:
+            self.note("resume", text, who, address)
+        else:
             self._change(self._driving, text, who, address)
         return self.status()
 
@@ -501,7 +520,8 @@ class Resident:
         self.halt()
         if self.driver is not None and self.driver.lease != lease:
             self.note("take over", f"{who} takes over from {self.driver.who}", who, address)
-        self.driver, self._command, self._is_running, self._holds = Driver(lease, who), None, False, True
+        ran = self._is_running if self.driver is None else self.driver.ran
+        self.driver, self._command, self._is_running, self._holds = Driver(lease, who, ran), None, False, True
         self._change(State.TAKEN_OVER, f"taken over by {who}", who, address)
         return self.status()
 
@@ -519,14 +539,16 @@ class Resident:
         if driver is None or driver.lease != lease:
             return self.status()
         self.halt()
-        goes_on = (self.options.resume if resume is None else resume) and not why
-        self._end_driving(driver, why or f"handed back by {who}")
-        self._is_running = goes_on
+        # A program goes back to what was before, whose pause a person lifts.
+        goes_on = (self.options.resume and driver.ran if resume is None else resume) and not why
         text = why or f"handed back by {who}"
+        self._end_driving(driver, text)
+        self._is_running = goes_on
         if goes_on:
+            self._paused = ""
             self._change(self._driving, text, who, address)
         else:
-            self._change(State.PAUSED, text, who, address)
+            self._change(State.PAUSED, "; ".join(filter(None, (text, self._paused))), who, address)
         return self.status()
 
     def _end_driving(self, driver: Driver, why: str) -> None:
