@@ -31,7 +31,7 @@ from bam_envs.rosbridge.threads import Workers
 from bam_envs.rosbridge.tokens import Role
 from bam_train.agent.front.upload import Upload, remove_leftovers
 from bam_train.agent.remote import agent_protocol as protocol
-from bam_train.errors import BamTrainError, RoleTooLow
+from bam_train.errors import BamTrainError, RequestRefused, RoleTooLow
 
 _log = logging.getLogger(__name__)
 _THREADS = 64
@@ -109,7 +109,7 @@ class AgentSocket:
 
     @property
     def sockets(self) -> dict[str, Handler]:
-        """For a `Site`."""
+        """For a `Site`, which lets them in always: a client without a place may stop the robot."""
         return {protocol.PATH: self.serve}
 
     async def serve(self, connection: BridgeConnection, caller: Caller) -> None:
@@ -242,6 +242,8 @@ class _Client:
         op, role = request.__struct_config__.tag, self._caller.role
         if not protocol.may(role, type(request)):
             raise RoleTooLow(f"{op} needs a token of the role {request.role}; the token shown has the role {role}.")
+        if self._caller.full and not isinstance(request, (protocol.Stop, protocol.Status)):
+            raise RequestRefused(f"{self._caller.full} This connection can stop the robot, and look at its status.")
         if isinstance(request, protocol.Take) and request.force and not self._caller.operator:
             raise RoleTooLow("Taking command by force needs a token of the role administer (bam-agent --token-file).")
 

@@ -383,7 +383,8 @@ def main() -> None:
         front = FrontProcess(options, channel.send)
         console = AgentSocket(front.hub)
         pictures = CameraFeed(front.cameras(), front.seen())
-        site = Site(console_pages(), {**console.sockets, "/camera": pictures.serve})
+        sockets = {**console.sockets, "/camera": pictures.serve}
+        site = Site(console_pages(), sockets, always=frozenset(console.sockets))
         tokens = Tokens(otherwise="administer") if options.token_file is None else TokenFile(options.token_file)
         network = ServerOptions(open_timeout=2.0, max_clients=64)
         where: Any = {"cert": options.cert, "key": options.key, "tokens": tokens, "site": site, "options": network}

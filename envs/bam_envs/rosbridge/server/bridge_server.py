@@ -89,9 +89,7 @@ class BridgeServer(Bus):
         self._sockets: set[BridgeConnection] = set()
         self._visitors: set[BridgeConnection] = set()  # on paths of the site
         tokens, self._site = tokens or Tokens.of_clients(token, operator_token), site
-        self._admission = Admission(
-            tokens, self.options, lambda: self.clients, self._refusals, site, secure=cert is not None
-        )
+        self._admission = Admission(tokens, self.options, self._sockets, self._refusals, site, secure=cert is not None)
         self._numbers = itertools.count(1)
         self._thread = LoopThread("bam-bridge-server")
         self._workers = Workers(_HANDLER_THREADS, "bam-bridge-handler")
@@ -168,6 +166,10 @@ class BridgeServer(Bus):
         """Answer `service` of type `kind`, even when the handler fails."""
         self._do(lambda: self._bridge.serve(service, kind, handler))
 
+    def reserve(self, topic: str, check: Callable[[Caller], None]) -> None:
+        """Refuse what a client publishes on `topic` if `check` raises a `BamEnvsError`, in the network thread."""
+        self._do(lambda: self._bridge.reserve(topic, check))
+
     def on_leave(self, callback: Callable[[Caller], None]) -> None:
         """Call `callback` in the network thread when a client's connection ends."""
         self._do(lambda: self._bridge.on_leave(callback))
@@ -240,6 +242,7 @@ class BridgeServer(Bus):
             f"{host}:{port}",
             operator=connection.role == "administer" and bool(connection.secret),
             role=connection.role,
+            full=connection.full,
             silence=lambda: time.monotonic() - connection.heard,
         )
         if self._site is not None and (handler := self._site.socket(connection.request)) is not None:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 
-from bam_envs.core.errors import LinkLost, PhysicsDiverged
+from bam_envs.core.errors import LinkLost, NotInCommand, PhysicsDiverged
 from bam_envs.core.robot import Initial
 from bam_envs.remote.serve.command_lease import CommandLease
 from bam_envs.remote.serve.env_server import EnvServer
@@ -422,6 +422,20 @@ def scene(bus, payload, caller="a", identity="1"):
     bus.say("/bam/scene/request", {"data": json.dumps({"id": identity, "payload": payload})}, caller)
     fits = f'"id":"{identity}"'
     return json.loads(bus.wait_for("/bam/scene/reply", lambda message: fits in message["data"])["data"])
+
+
+def test_only_the_client_in_command_tells_what_the_guards_did(serve, bus):
+    service, refusal = serve(namespace="/cell"), "Topic /cell/bam/status is for the client in command."
+    check = bus.reserved["/cell/bam/status"]
+    with pytest.raises(NotInCommand, match=refusal):
+        check(Caller("a", "a:1"))
+    service.lease.take("a:1", Caller("a", "a:1"))
+    check(Caller("a", "a:1"))
+    with pytest.raises(NotInCommand, match=refusal):
+        check(Caller("b", "b:1"))
+    service.lease.release("a:1")
+    with pytest.raises(NotInCommand, match=refusal):
+        check(Caller("a", "a:1"))
 
 
 def test_the_scene_can_be_set(serve, bus):
