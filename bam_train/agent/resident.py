@@ -48,6 +48,8 @@ FRESH = 0.2
 THERE = "the robot is there, and fits"
 """Why the agent no longer waits."""
 _RECENT = 20  # episodes in the status
+_BY_TIME = (3, 4, 15, 16)
+"""Codes of the guards that look at when states, answers and commands come, and not at what the robot does."""
 _AT_ONCE = ("pause", "take")
 """Requests for which the robot is halted before they are executed."""
 
@@ -133,7 +135,8 @@ class Resident:
         self._was_connected = self._holds = self._was_cut_short = False
         self._seed, self._reported = options.seed, 0.0
         self._episodes: deque[int | None] = deque(maxlen=_RECENT)
-        self._ticks = self._completed = self._successes = self._late = 0
+        self._ticks = self._completed = self._successes = 0
+        self._late = self._slow = 0  # late ticks of earlier connections, and those that a policy made late
         self._link_ms = self._loop_ms = 0.0
 
     # ---- what other threads call
@@ -298,6 +301,8 @@ class Resident:
             return
         session.deployment.trials = self.succession.trials()
         self._change(self._driving, THERE if self.state is State.WAITING else self.why)
+        journal = session.deployment.journal
+        begun = journal.begun
         try:
             if (trials := session.deployment.trials) is not None:
                 self._seed = trials.next_seed(self._seed)
@@ -308,6 +313,8 @@ class Resident:
             return
         except Exception as error:
             self._failed(error)
+            if journal.begun > begun:  # else the policy has not acted: the arm was on its way to its start pose
+                self._judge(session, journal.records[-1], error)
             return
         if record.end == "stopped":
             return
@@ -315,6 +322,14 @@ class Resident:
         self._successes += record.success is True
         self._episodes.append(None if record.success is None else int(record.success))
         self.succession.ended(record)
+
+    def _judge(self, session: RobotSession, record: EpisodeRecord, error: Exception) -> None:
+        """Judge the policy whose episode ended with `error`: by a stop of a guard, or by the loss of the link."""
+        if self._stopped:
+            excuse = session.deployment.times.excuse(by_time=session.robot.code in _BY_TIME)
+            self.succession.cut_short(record, self._stopped, excuse)
+        elif isinstance(error, LinkLost):
+            self.succession.cut_short(record, excuse="the link to the robot was lost")
 
     @property
     def _driving(self) -> State:
@@ -458,21 +473,21 @@ class Resident:
         if session is not None:
             session.event(f"the link is dropped: {why}")
             session.close()
+            self._late += session.deployment.times.late
+            self._slow += session.deployment.times.slow
 
     def _failed(self, error: Exception) -> None:
         """What a fault while the robot moved leads to: waiting for the robot, stopped by a guard, or paused."""
         text = fault_text(error).replace("call resume()", "resume the agent")
-        session, driver = self.session, self.driver
+        session = self.session
         stopped = isinstance(error, SafetyStop) or (session is not None and session.robot.stopped is not None)
         self.halt()
         self._drop(text)
-        if driver is not None:
-            self._end_driving(driver, text)
+        if self.driver is not None:
+            self._end_driving(self.driver, text)
         if stopped:  # also by the age of its state: only a person lets it move again
             self._stopped, self._is_running = text, False
             self._change(State.STOPPED, text)
-            if session is not None and driver is None:
-                self.succession.guard_stopped(text)
         elif isinstance(error, (LinkLost, RemoteError, NotReady)):  # or somebody else drives: it goes on when it can
             self._change(State.WAITING, text)
         else:
@@ -583,7 +598,7 @@ class Resident:
 
     def ticked(self, record: EpisodeRecord, action: Any, pacer: Any) -> None:
         """Called by the deployment after every step."""
-        self._ticks, self._late = self._ticks + 1, pacer.missed
+        self._ticks += 1
         self._report(_REPORT)
 
     def ended(self, record: EpisodeRecord) -> None:
@@ -633,7 +648,8 @@ class Resident:
             "episodes": self._completed,
             "successes": self._successes,
             "recent": list(self._episodes),
-            "late": self._late,
+            "late": self._late + (0 if session is None else session.deployment.times.late),
+            "slow": self._slow + (0 if session is None else session.deployment.times.slow),
             "link_ms": round(self._link_ms, 3),
             "loop_ms": round(self._loop_ms, 3),
             "recording": None if session is None or session.recorder is None else str(session.recorder.path),

@@ -273,12 +273,27 @@ class Succession:
                 evidence = choice.trials.evidence
             except BadTrials as error:
                 _log.warning("%s", error)
-        self._judged(self.probation.ended(record.success, trials=evidence))
+        judged = self.probation.ended(record.success, trials=evidence, slow=record.slow, ticks=record.length)
+        self._judged(judged)
 
-    def guard_stopped(self, text: str) -> None:
-        """Judge the active version after a guard stopped the robot."""
-        if self.probation is not None:
-            self._judged(self.probation.ended(None, stopped_by=text))
+    def cut_short(self, record: EpisodeRecord, stopped_by: str = "", excuse: str = "") -> None:
+        """Judge the active version after an episode that it could not end.
+
+        Args:
+            record: The episode.
+            stopped_by: The guard that stopped it, with its reason; "" for a lost link.
+            excuse: Why that is no fault of the policy, in one line; "" if it may be. Such a trial does not count.
+        """
+        if self.probation is None:
+            return
+        if excuse:
+            stopped_by = ""
+            whose = f"the episode that was cut short does not count against {self.active.digest[:12]}"
+            self._resident.note("trial", f"{whose}: {excuse}")
+            if (trials := self.trials()) is not None:
+                with contextlib.suppress(BadTrials):  # then it counts
+                    trials.end(False, excuse, void=True)
+        self._judged(self.probation.ended(None, stopped_by, slow=record.slow, ticks=record.length))
 
     def policy_failed(self, text: str) -> bool:
         """Judge the active version after a fault of its policy; whether another one acts now."""

@@ -20,6 +20,7 @@ from bam_envs.core.timing import Pacer
 from bam_envs.safety.guard import Tick
 from bam_train.deploy.flight import RecorderAgent, Stopwatch
 from bam_train.deploy.journal import Ending, EpisodeRecord, Journal
+from bam_train.deploy.tick_times import TickTimes
 from bam_train.deploy.trials import Trials
 from bam_train.errors import BamTrainError
 from bam_train.loop import Agent, Agents, PolicyAgent, RobotAgent, TemporalAgent, Workspace
@@ -129,7 +130,9 @@ class Deployment:
         self._workspace = Workspace(window=window, sink=None if sink is None else _silent_once_broken(sink))
         self._watch = watch = Stopwatch()
         names = self._robot.observation_names
-        self._policy = policy_agent = PolicyAgent(policy, names, single=True)
+        self._policy = policy_agent = _TimedPolicy(policy, names, watch)
+        self.times = TickTimes(pacer.period)
+        """Of the last ticks."""
         self._stop_variable = "env/done" if boundary is None else STOP
         chain: list[Agent] = [
             _StopAgent(self.switch, watch),
@@ -289,6 +292,22 @@ class _StopAgent(Agent):
         self._switch.raise_again()
 
 
+class _TimedPolicy(PolicyAgent):
+    """The policy's agent, which measures how long an action takes."""
+
+    def __init__(self, policy: Any, names: tuple[str, ...], watch: Stopwatch) -> None:
+        super().__init__(policy, names, single=True)
+        self._declare(_TimedPolicy, reads=(*names, self._timestep, self._done), writes=(self.output,))
+        self._watch = watch
+
+    def forward(self, t: int, seed: Any = None, **kwargs: Any) -> None:
+        watch, begun, computed = self._watch, time.perf_counter(), time.thread_time()
+        try:
+            super().forward(t, seed, **kwargs)
+        finally:
+            watch.acted, watch.computed = time.perf_counter() - begun, time.thread_time() - computed
+
+
 class _DetectorAgent(Agent):
     """Compares what the policy sees and does, and how the robot answers, with its training, if it has a detector."""
 
@@ -358,5 +377,16 @@ class _JournalAgent(Agent):
             watcher.ticked(record, self.get(("action", t - 1))[0], self._pacer)
             if end != "stopped":
                 watcher.ended(record)
-        self._watch.late = 0.0 if done else self._pacer.wait()
+        if done:
+            self._watch.late = 0.0
+        else:
+            self._wait(self._journal.records[-1], begins=t == 0)
         self._watch.waited = time.perf_counter()
+
+    def _wait(self, record: EpisodeRecord, *, begins: bool) -> None:
+        """Wait for the deadline of the next action."""
+        pacer, watch, missed = self._pacer, self._watch, self._pacer.missed
+        watch.late = pacer.wait()
+        if not begins:
+            missed = pacer.missed - missed
+            record.slow += self._deployment.times.add(watch.late, missed, watch.acted, watch.computed)

@@ -48,6 +48,8 @@ class Stopwatch:
     begun = stepped = waited = 0.0
     late = 0.0
     """Delay of the tick after its deadline [s]."""
+    acted = computed = 0.0
+    """Duration and CPU time of the last action [s]."""
     latency = 0.0
     """Time from the deadline of the tick before to its step [s]."""
 

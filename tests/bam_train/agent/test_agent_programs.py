@@ -23,6 +23,7 @@ STATUS = {
     "robot": "ur5e, served in real time",
     "ticks": 1200,
     "late": 3,
+    "slow": 2,
     "link_ms": 1.25,
     "loop_ms": 0.5,
     "episodes": 22,
@@ -36,7 +37,7 @@ LINES = [
     "  policy    3f2a91c0d7aa (candidate), stage trial, UNSIGNED",
     "  robot     ur5e, served in real time",
     "  episodes  22, 20 succeeded; 2 of the last 3",
-    "  ticks     1200, 3 late; link 1.25 ms, policy 0.5 ms",
+    "  ticks     1200, 3 late (2 because of the policy); link 1.25 ms, policy 0.5 ms",
     "  guard     G8 joint speed: altered 2, stopped 1",
     "  warning   the link is slow",
 ]

@@ -13,8 +13,11 @@ from bam_train.agent.agent_messages import Answer, Ask, Halt, Report
 from bam_train.agent.agent_options import AgentOptions
 from bam_train.agent.agent_states import State
 from bam_train.agent.resident import Resident
-from bam_train.agent.versions import Versions
-from bam_train.deploy.journal import EpisodeRecord, Journal
+from bam_train.agent.succession import Choice
+from bam_train.agent.versions import CANDIDATE, Versions
+from bam_train.checkpoint import Checkpoint
+from bam_train.deploy.journal import Journal
+from bam_train.deploy.tick_times import TickTimes
 
 PICK = Path(__file__).parents[3] / "checkpoints" / "pick-ppo.zip"
 DEADLINE = 20.0
@@ -30,6 +33,7 @@ class Session:
         self._agent, self._faults = agent, faults
         self.robot = SimpleNamespace(
             stopped=None,
+            code=23,
             info=SimpleNamespace(text="a robot"),
             spec=SimpleNamespace(period=0.05),
             halt=lambda: None,
@@ -39,11 +43,16 @@ class Session:
             reset=self._reset,
         )
         self.deployment = SimpleNamespace(
-            journal=Journal(0), episode=self._episode, swap=lambda policy: None, trials=None, latency=0.0
+            journal=Journal(0),
+            times=TickTimes(0.05),
+            episode=self._episode,
+            swap=lambda policy: None,
+            trials=None,
+            latency=0.0,
         )
 
     def _episode(self, watcher, seed):
-        record = EpisodeRecord(seed)
+        record = self.deployment.journal.begin(seed)
         while not self._agent.between_ticks():
             if self._faults:
                 self._fail(*self._faults.popleft())
@@ -55,7 +64,9 @@ class Session:
             SafetyStop("following", f"The robot was stopped by {STOPPED}. When it is safe, call resume()."), STOPPED
         )
 
-    def _fail(self, error, stopped):
+    def _fail(self, error, stopped, ticks=()):
+        for tick in ticks:
+            self.deployment.times.add(*tick)
         self.robot.stopped = stopped
         raise error
 
@@ -73,7 +84,7 @@ class Bench:
         versions = Versions(folder / "versions")
         versions.first(PICK)
         self.faults, self.events, self._answers = deque(), [], queue.Queue()
-        self._number, self._changed, self.status = 0, threading.Condition(), {}
+        self._number, self._changed, self._reports, self._seen = 0, threading.Condition(), [{}], 0
         self.agent = Resident(
             AgentOptions("ws://127.0.0.1:1", folder, **options),
             versions,
@@ -103,20 +114,33 @@ class Bench:
             self._answers.put(message)
         elif isinstance(message, Report):
             with self._changed:
-                self.status = message.status
+                self._reports.append(message.status)
                 self._changed.notify_all()
 
     def ask(self, op, who="anna", **arguments):
         """The answer to a request."""
-        self._number += 1
+        self._number, self._seen = self._number + 1, len(self._reports) - 1
         self.agent.take(Ask(self._number, op, arguments, who, "10.0.0.7"))
         return self._answers.get(timeout=DEADLINE)
 
+    def fail(self, *fault):
+        """Let the episode that runs end with a fault."""
+        self._seen = len(self._reports) - 1
+        self.faults.append(fault)
+
+    @property
+    def status(self):
+        return self._reports[-1]
+
     def state(self, state):
-        """The reason for a state, once the agent is in it."""
+        """The reason for a state, once the agent was in it after the last request or fault."""
+
+        def reached():
+            return next((one for one in self._reports[self._seen :] if one.get("state") == state.value), None)
+
         with self._changed:
-            assert self._changed.wait_for(lambda: self.status.get("state") == state.value, DEADLINE), self.status
-            return self.status["why"]
+            assert self._changed.wait_for(reached, DEADLINE), self.status
+            return reached()["why"]
 
     def changes(self):
         """What was written down: the changes of state, with their reason and who caused them."""
@@ -146,13 +170,13 @@ def bench(tmp_path):
 def test_a_fault_while_the_policy_drives(bench, error, stopped, state, goes_on):
     with bench() as running:
         running.state(State.RUNNING)
-        running.faults.append((error, stopped))
+        running.fail(error, stopped)
         running.state(state)
         if goes_on:
             running.state(State.RUNNING)
         else:
-            assert running.ask("status").kind == "RequestRefused"  # two more turns, at least
-            assert running.status["state"] == state.value
+            for _ in range(3):  # turns, at least
+                assert running.ask("transitions", on=False).error == ""
     after = [one for one, *_ in running.changes()]
     assert after[:2] == [State.RUNNING.value, state.value]
     assert (State.RUNNING.value in after[2:]) is goes_on
@@ -172,6 +196,70 @@ def test_a_stop_while_a_request_is_executed_is_a_state_and_is_written_down_once(
         (State.TAKEN_OVER.value, "taken over by a program", "a program"),
         (State.STOPPED.value, why, "the agent"),
     ]
+
+
+# Whose fault it is
+
+
+@pytest.fixture
+def candidate(forge, tmp_path):
+    """Lets another version act as a candidate."""
+
+    def act(running):
+        path = tmp_path / "candidate.zip"
+        path.write_bytes(PICK.read_bytes())
+        version = running.agent.succession.versions.add(Checkpoint.open(forge(path, seed=7)))
+        choice = Choice(version, None, {CANDIDATE: version.digest}, "push by anna", "anna")
+        running.agent.choose(choice)
+        assert choice.active.wait(DEADLINE)
+        return choice
+
+    return act
+
+
+IN_TIME, LATE, SLOW = (0.0, 0, 0.0003, 0.00002), (0.06, 1, 0.0003, 0.00002), (0.03, 1, 0.075, 0.02)
+STOP = SafetyStop("following", f"The robot was stopped by {STOPPED}.")
+
+
+@pytest.mark.parametrize(
+    ("stop", "is_back"),
+    [
+        ((STOP, STOPPED, [IN_TIME] * 20), True),
+        ((STOP, STOPPED, [LATE] * 20), False),
+        ((STOP, STOPPED, [*[SLOW] * 15, *[LATE] * 5]), True),
+        ((LinkLost("gone"), None, [IN_TIME] * 20), False),
+    ],
+    ids=["calm", "busy", "slow", "link"],
+)
+def test_a_candidate_is_rolled_back_for_its_own_stops_only(bench, candidate, stop, is_back):
+    with bench() as running:
+        running.state(State.RUNNING)
+        choice = candidate(running)
+        for _ in range(2):
+            running.state(State.TRIAL)
+            running.fail(*stop)
+            if stop[1]:
+                running.state(State.STOPPED)
+                running.ask("resume")
+            else:
+                running.state(State.WAITING)
+        running.state(State.RUNNING if is_back else State.TRIAL)
+        assert choice.outcome.is_set() is is_back
+    excused = [text for what, text, *_ in running.events if what == "trial"]
+    assert len(excused) == (0 if is_back else 2)
+
+
+def test_what_a_person_drives_into_is_not_the_candidates_fault(bench, candidate):
+    with bench() as running:
+        running.state(State.RUNNING)
+        choice = candidate(running)
+        for lease in ("1", "2"):
+            running.ask("take", lease=lease)
+            running.ask("scene", pose=None, seed=1)
+            running.state(State.STOPPED)
+            running.ask("resume")
+            running.state(State.TRIAL)
+        assert not choice.outcome.is_set()
 
 
 # A pause is lifted by a person only
@@ -210,7 +298,7 @@ def test_a_program_lifts_no_other_pause_either(bench, why):
         elif why == "the stop button":
             running.agent.take(Halt("anna", stop=True))
         elif why == "a fault":
-            running.faults.append((ProtocolError("a joint is missing"), None))
+            running.fail(ProtocolError("a joint is missing"), None)
         running.state(State.PAUSED)
         running.ask("take", who="a program", lease="2")
         running.ask("hand_back", who="a program", lease="2")
@@ -229,7 +317,7 @@ def test_a_pause_while_the_robot_is_away_holds_and_is_written_down(bench):
     with running:
         running.state(State.RUNNING)
         away.set()
-        running.faults.append((LinkLost("gone"), None))
+        running.fail(LinkLost("gone"), None)
         running.state(State.WAITING)
         running.ask("pause", why="hand in the cell")
         away.clear()

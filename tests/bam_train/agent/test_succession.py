@@ -107,6 +107,34 @@ def test_a_candidate_that_fails_is_rolled_back(agent, better):
     assert choice.result == f"rolled back: {why}"
 
 
+def test_an_episode_that_the_computer_cut_short_does_not_count(agent, better):
+    old, new = agent.succession.active.digest, Checkpoint.open(better).digest
+    agent.ask("push", path=str(better))
+    trials = agent.succession.trials()
+    for seed in range(4):
+        trials.begin(seed)
+        agent.succession.cut_short(EpisodeRecord(seed, length=50), "following (G23)", "the computer is busy")
+    assert agent.succession.active.digest == new
+    assert (trials.evidence.trials, trials.evidence.successes) == (0, 0)
+    text = f"the episode that was cut short does not count against {new[:12]}: the computer is busy"
+    assert agent.notes == [("trial", text)] * 4
+    for _ in range(2):
+        trials.begin(9)
+        agent.succession.cut_short(EpisodeRecord(9, length=50), "following (G23)")
+    assert agent.succession.active.digest == old
+    assert trials.evidence.trials == 2
+
+
+def test_a_candidate_that_is_too_slow_for_this_computer_is_rolled_back(agent, better):
+    old = agent.succession.active.digest
+    agent.ask("push", path=str(better))
+    choice = agent.succession.choice
+    agent.succession.ended(EpisodeRecord(0, success=True, length=300, end="terminated", slow=57))
+    assert agent.succession.active.digest == old
+    why = "its actions took so long that 57 of 300 ticks were late, and at most 5 % may be"
+    assert choice.result == f"rolled back: {why}"
+
+
 def test_a_refused_candidate_changes_nothing(agent, better):
     before = names(agent)
     better.write_bytes(better.read_bytes()[:-100])
