@@ -32,7 +32,7 @@ from bam_train.agent.versions import Versions
 from bam_train.checkpoint import Checkpoint
 from bam_train.deploy.deployment import STOP, StopSwitch, fault_text
 from bam_train.deploy.journal import EpisodeRecord
-from bam_train.errors import BamTrainError, PolicyError, RequestRefused
+from bam_train.errors import BamTrainError, ContractRefused, PolicyError, RequestRefused
 from bam_train.loop import Agent
 
 if TYPE_CHECKING:
@@ -448,7 +448,8 @@ class Resident:
                 sleep=self._hurry.wait,
             )
         except (BamEnvsError, BamTrainError) as error:
-            if not (self._was_connected or isinstance(error, BamEnvsError)):
+            may_pass = isinstance(error, BamEnvsError) or (isinstance(error, ContractRefused) and error.passes)
+            if not (self._was_connected or may_pass):
                 raise  # a setting, a file or a robot that is wrong when the program starts
             if not self._stopped:
                 self._change(State.WAITING, fault_text(error))

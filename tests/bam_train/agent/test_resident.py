@@ -18,6 +18,7 @@ from bam_train.agent.versions import CANDIDATE, Versions
 from bam_train.checkpoint import Checkpoint
 from bam_train.deploy.journal import Journal
 from bam_train.deploy.tick_times import TickTimes
+from bam_train.errors import ContractRefused
 
 PICK = Path(__file__).parents[3] / "checkpoints" / "pick-ppo.zip"
 DEADLINE = 20.0
@@ -84,7 +85,7 @@ class Bench:
         versions = Versions(folder / "versions")
         versions.first(PICK)
         self.faults, self.events, self._answers = deque(), [], queue.Queue()
-        self._number, self._changed, self._reports, self._seen = 0, threading.Condition(), [{}], 0
+        self._number, self._changed, self.reports, self._seen = 0, threading.Condition(), [{}], 0
         self.agent = Resident(
             AgentOptions("ws://127.0.0.1:1", folder, **options),
             versions,
@@ -114,29 +115,29 @@ class Bench:
             self._answers.put(message)
         elif isinstance(message, Report):
             with self._changed:
-                self._reports.append(message.status)
+                self.reports.append(message.status)
                 self._changed.notify_all()
 
     def ask(self, op, who="anna", **arguments):
         """The answer to a request."""
-        self._number, self._seen = self._number + 1, len(self._reports) - 1
+        self._number, self._seen = self._number + 1, len(self.reports) - 1
         self.agent.take(Ask(self._number, op, arguments, who, "10.0.0.7"))
         return self._answers.get(timeout=DEADLINE)
 
     def fail(self, *fault):
         """Let the episode that runs end with a fault."""
-        self._seen = len(self._reports) - 1
+        self._seen = len(self.reports) - 1
         self.faults.append(fault)
 
     @property
     def status(self):
-        return self._reports[-1]
+        return self.reports[-1]
 
     def state(self, state):
         """The reason for a state, once the agent was in it after the last request or fault."""
 
         def reached():
-            return next((one for one in self._reports[self._seen :] if one.get("state") == state.value), None)
+            return next((one for one in self.reports[self._seen :] if one.get("state") == state.value), None)
 
         with self._changed:
             assert self._changed.wait_for(reached, DEADLINE), self.status
@@ -180,6 +181,25 @@ def test_a_fault_while_the_policy_drives(bench, error, stopped, state, goes_on):
     after = [one for one, *_ in running.changes()]
     assert after[:2] == [State.RUNNING.value, state.value]
     assert (State.RUNNING.value in after[2:]) is goes_on
+
+
+def test_a_busy_robot_is_waited_for_also_at_the_start_and_a_wrong_one_is_refused(bench):
+    busy = ContractRefused("age", "age: expected at most 0.1 s, found 0.197 s", passes=True)
+    refusals = [busy, busy]
+
+    def connect(*arguments, **more):
+        if refusals:
+            raise refusals.pop()
+        return Session(running.agent, running.faults)
+
+    running = bench(connect=connect)
+    with running:
+        running.state(State.RUNNING)
+    assert {status.get("why") for status in running.reports} >= {"it starts", str(busy)}
+
+    refusals.append(ContractRefused("topic", "topic /joint_states: expected sensor_msgs/JointState"))
+    with pytest.raises(ContractRefused, match="topic"):
+        bench(connect=connect).agent.run()
 
 
 def test_a_stop_while_a_request_is_executed_is_a_state_and_is_written_down_once(bench):
