@@ -300,6 +300,7 @@ class Resident:
             self._drop(f"for the stage {self._stage}")
             return
         session.deployment.trials = self.succession.trials()
+        self._record_again()
         self._change(self._driving, THERE if self.state is State.WAITING else self.why)
         journal = session.deployment.journal
         begun = journal.begun
@@ -379,10 +380,15 @@ class Resident:
     def _rest(self) -> None:
         self._change(State.STOPPED if self._stopped else State.PAUSED, self.why)
         self._activate()
+        self._record_again()
         with self._news:
             self._news.wait_for(lambda: bool(self._requests) or bool(self.switch.came), _LOOK)
         self._require_link()
         self._report(_REPORT)
+
+    def _record_again(self) -> None:
+        if self.session is not None and (name := self.session.record_again()):
+            self.note("recording", f"the recording goes on in {name}")
 
     def _require_link(self) -> None:
         if self.session is not None and not self.session.is_up:
@@ -666,7 +672,7 @@ class Resident:
         found, session = [], self.session
         if session is not None:
             found = [f"{title}: {text}" for title, text in session.deployment.journal.warnings.items()]
-            found += [f"recording: {session.recorder.fault}"] if session.recorder and session.recorder.fault else []
+            found += [f"recording: {session.recording_fault}"] if session.recording_fault else []
         return [*found, *([f"audit: {self.audit.fault}"] if self.audit.fault else [])]
 
     def _report(self, least: float = 0.0) -> None:

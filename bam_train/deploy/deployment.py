@@ -143,8 +143,8 @@ class Deployment:
             *agents,
             _DetectorAgent(self, policy_agent),
         ]
-        self._flight = None if recorder is None else RecorderAgent(recorder, env, names, journal, watch)
-        chain += [] if self._flight is None else [self._flight]
+        self._flight = RecorderAgent(recorder, env, names, journal, watch)
+        chain.append(self._flight)
         self._loop = TemporalAgent(Agents(*chain))
 
     def connect(self) -> None:
@@ -187,17 +187,20 @@ class Deployment:
 
     def sent(self, tick: Tick, state: RobotState) -> None:
         """Take a command that a `SafeRobot` has sent, for the recording: `SafeRobot.observe` has one observer only."""
-        if self._flight is not None:
-            self._flight.sent(tick, state)
+        self._flight.sent(tick, state)
+
+    def record(self, recorder: Recorder) -> None:
+        """Record with another recorder, which has started, from the next episode on; the one before is not closed."""
+        self.recorder = recorder
+        self._flight.begin(recorder)
 
     def record_command(self) -> None:
         """Record the last command, if no tick has: that of a person who drives, or the one before a fault."""
-        if self._flight is not None:
-            self._flight.record_last_command()
+        self._flight.record_last_command()
 
     def _end_recording(self, ending: Ending | None) -> None:
         """Record how it ended; without an ending, leave the rest to the recorder's process, which outlives this one."""
-        if self.recorder is None or self._flight is None:
+        if self.recorder is None:
             return
         self.record_command()
         if ending is None:

@@ -12,7 +12,7 @@ import contextlib
 import logging
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, Protocol
@@ -57,6 +57,8 @@ class Person:
     role: Role
     connection: str
     """Unique name of the socket."""
+    silence: Callable[[], float] = field(default=lambda: 0.0, compare=False)
+    """Time since the last sign of life of the socket [s]."""
 
 
 Event = Mapping[str, Any]
@@ -163,7 +165,7 @@ class _Client:
 
     def __init__(self, owner: AgentSocket, connection: BridgeConnection, caller: Caller) -> None:
         self._owner, self._hub, self._connection, self._caller = owner, owner.hub, connection, caller
-        self._person = Person(caller.address, caller.address, caller.role, caller.name)
+        self._person = Person(caller.address, caller.address, caller.role, caller.name, caller.silence)
         self._loop = asyncio.get_running_loop()
         self._last = -1  # id of the last request
         self._running = 0  # requests that worker threads execute

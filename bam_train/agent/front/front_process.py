@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import itertools
 import logging
+import math
 import signal
 import sys
 import threading
@@ -60,6 +61,8 @@ from bam_train.errors import BamTrainError, CandidateRefused, RequestRefused, Tr
 _log = logging.getLogger(__name__)
 CUT = 2.0
 """Time for which the lease of an owner stays whose link was cut [s]."""
+SILENT = 3.0
+"""Time without a sign of life, of which there is one a second, after which the link of an owner counts as cut [s]."""
 _LOOK = 0.1  # time between two looks at the lease [s]
 _HALT_LATE = 1.0  # longest time for which a halt comes after the end of its sender's lease [s]
 _REFUSALS = {one.__name__: one for one in (NotInCommand, CandidateRefused, TrialsNeeded, UnknownVersion)}
@@ -122,6 +125,11 @@ class AgentLease(CommandLease):
     def cut(self, client: str, shown: str) -> None:
         """Keep the lease of a client whose link was cut for `CUT` [s]."""
         self._cut = client, shown, self._now() + CUT
+
+    @property
+    def is_silent(self) -> bool:
+        """Whether there is an owner without a sign of life: frozen, or behind a network that is gone."""
+        return self.holder is not None and SILENT < self.silence < math.inf
 
     @property
     def is_cut(self) -> bool:
@@ -271,7 +279,10 @@ class FrontProcess:
             self.lease.release(client)
 
     def _watch_lease(self) -> None:
-        """End leases that are over."""
+        """End leases that are over, or whose owner is silent."""
+        holder = self.lease.holder
+        if holder is not None and self.lease.is_silent:
+            self.cut(holder, "")
         over = self.lease.over()
         if over is not None:
             client, why = over
