@@ -1,9 +1,9 @@
 """Whether a policy on a live agent is promoted or rolled back: pure logic, which is told how each episode ended.
 
 A policy is promoted once its trials are enough (`bam_train.deploy.trials`). It is rolled back when guards stopped it
-too often, when it made too many ticks late (`bam_train.deploy.tick_times`), when it had a fault of its own, or when its
-success rate has been shown to be below a bound. That test is
-valid after every episode, as that of the trials, and for the same reason: it is a test martingale (J. Ville, 1939).
+too often, when it made too many ticks late (`bam_envs.core.timing.TickTimes`), when it had a fault of its own, or when
+its success rate has been shown to be below a bound. That test is valid after every episode, as that of the trials, and
+for the same reason: it is a test martingale (J. Ville, 1939).
 While the success rate is at least the bound b, each factor
 
     failure: m / (b + m (1 - b)),    success: 1 / (b + m (1 - b)),    for any m > 1,

@@ -364,7 +364,7 @@ class Resident:
         if choice is None:
             return
         before = self.succession.active
-        self.succession.activate(choice)
+        replaced = self.succession.activate(choice)
         if self.session is not None:
             self.session.deployment.swap(choice.policy)
         self._stage = choice.stage or self._stage
@@ -374,6 +374,8 @@ class Resident:
             self._change(self._driving, choice.why, choice.who)
         choice.active.set()
         self._report()
+        if replaced is not None:  # who waits for its outcome sees the state that it led to
+            replaced.close("replaced: another version acts")
 
     # ---- the robot rests, or a person drives it
 
@@ -642,6 +644,7 @@ class Resident:
             "since": self.since,
             "active": self.succession.active.digest,
             "names": dict(self.succession.names),
+            "trial": self.succession.progress,
             "stage": None if session is None else session.stage,
             "owner": None if self.driver is None else self.driver.who,
             "robot": self.options.robot if session is None else session.robot.info.text,

@@ -16,11 +16,10 @@ import gymnasium as gym
 
 from bam_envs.core.errors import BamEnvsError, LinkLost, SafetyStop
 from bam_envs.core.robot import RobotState
-from bam_envs.core.timing import Pacer
+from bam_envs.core.timing import Pacer, TickTimes
 from bam_envs.safety.guard import Tick
 from bam_train.deploy.flight import RecorderAgent, Stopwatch
 from bam_train.deploy.journal import Ending, EpisodeRecord, Journal
-from bam_train.deploy.tick_times import TickTimes
 from bam_train.deploy.trials import Trials
 from bam_train.errors import BamTrainError
 from bam_train.loop import Agent, Agents, PolicyAgent, RobotAgent, TemporalAgent, Workspace

@@ -78,6 +78,9 @@ class Hub(Protocol):
         afterwards if it is still there. Raises `BamTrainError` or `BamEnvsError`, of one line.
         """
 
+    def status(self) -> dict[str, Any]:
+        """The newest status, in the network thread: must return at once."""
+
     def stop(self, person: Person, why: str) -> dict[str, Any]:
         """Halt, in the network thread: must return at once."""
 
@@ -228,8 +231,7 @@ class _Client:
                     raise protocol.BadRequest(f"The id {number} is not above {self._last}: ids grow.", number)
                 self._last = number
             if request.name:
-                shown = "".join(one if one.isprintable() else "?" for one in request.name)
-                self._person = replace(self._person, name=shown)
+                self._person = replace(self._person, name=request.name)
             self._require_role(request)
             await self._do(request)
         except protocol.BadRequest as error:
@@ -257,6 +259,8 @@ class _Client:
                 self._hub.jog(_arguments(request), self._person)
             case protocol.Watch():
                 self._switch("watch", request.on)
+                if request.on:  # the next one may take its time
+                    self._send({"event": "status", "status": self._hub.status()})
                 self._answer(request.id, {"on": request.on})
             case protocol.Transitions():
                 self._learn(request.on)

@@ -53,10 +53,12 @@ from bam_train.agent.front.camera_feed import CameraFeed
 from bam_train.agent.front.hub import AgentHub
 from bam_train.agent.front.remote_robot import RemoteRobot
 from bam_train.agent.front.site_pages import console_pages
+from bam_train.agent.remote.agent_protocol import printable
 from bam_train.agent.transitions import EVENT
 from bam_train.env_location import Place
 from bam_train.environments import make_env
 from bam_train.errors import BamTrainError, CandidateRefused, RequestRefused, TrialsNeeded, UnknownVersion
+from bam_train.log_lines import begin_log
 
 _log = logging.getLogger(__name__)
 CUT = 2.0
@@ -293,7 +295,7 @@ class FrontProcess:
 
     def answer_client(self, request: Fields, caller: Caller) -> Fields:
         """A program's request on `AGENT_TOPIC`."""
-        do, who = request.get("do"), f"{str(request.get('who'))[:80]} ({caller.address or caller.shown})"
+        do, who = request.get("do"), f"{printable(str(request.get('who'))[:80])} ({caller.address or caller.shown})"
         if do == "look":
             owner = (
                 None if self.lease.holder in (None, caller.client) and self.lease.owner is None else self.lease.owner
@@ -385,7 +387,7 @@ class FrontProcess:
 def main() -> None:
     """Run the process; its argument is the number of the socket that the resident left open."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the resident ends it
-    logging.basicConfig(level=logging.WARNING, format="bam-agent: %(message)s")
+    begin_log("bam-agent")
     end = adopted(int(sys.argv[1]))
     options = msgspec.msgpack.decode(end.recv(2**20), type=Front)
     receivers: list[Callable[[Any], None]] = []

@@ -41,6 +41,18 @@ def test_without_a_name_a_person_is_the_address(hub, new_raw):
     assert hub.asked[1][2].name == "anna?[31m?"
 
 
+def test_texts_of_others_have_no_control_characters(hub, new_raw):
+    raw = new_raw("a")
+    raw.ask("rollback", why="slow\x1b[2J\n")
+    raw.ask("use", version="\x9bab")
+    refused = raw.ask("push", size=10**12, sha256="0" * 64, file="pick\x1b]0;.zip")
+    assert [arguments for _, arguments, _ in hub.asked] == [
+        {"why": "slow?[2J?"},
+        {"version": "?ab", "stage": "auto", "when": "episode", "why": ""},
+    ]
+    assert refused["error"].startswith("The upload has")
+
+
 def test_progress_comes_before_the_answer_and_holds_up_nothing(hub, new_raw):
     raw = new_raw()
     raw.send("pause", why="lunch")
@@ -210,7 +222,9 @@ def test_stop_waits_for_no_request(hub, new_raw):
 
 def test_events(hub, new_raw, until):
     raw, other = new_raw("w"), new_raw("w")
-    assert raw.ask("watch", on=True)["result"] == {"on": True}
+    raw.send("watch", on=True)
+    assert raw.receive() == {"event": "status", "status": hub.status()}
+    assert raw.receive()["result"] == {"on": True}
     hub.tell("status", status={"state": "running"})
     assert raw.receive() == {"event": "status", "status": {"state": "running"}}
     hub.tell("telemetry", t=np.float64(1.5), state={"x": np.array([1.0, np.nan])})

@@ -9,6 +9,7 @@ from types import SimpleNamespace
 import pytest
 
 from bam_envs.core.errors import LinkLost, NotReady, ProtocolError, SafetyStop, StaleState, StartNotReached
+from bam_envs.core.timing import TickTimes
 from bam_train.agent.agent_messages import Answer, Ask, Halt, Report
 from bam_train.agent.agent_options import AgentOptions
 from bam_train.agent.agent_states import State
@@ -17,7 +18,6 @@ from bam_train.agent.succession import Choice
 from bam_train.agent.versions import CANDIDATE, Versions
 from bam_train.checkpoint import Checkpoint
 from bam_train.deploy.journal import Journal
-from bam_train.deploy.tick_times import TickTimes
 from bam_train.errors import ContractRefused
 
 PICK = Path(__file__).parents[3] / "checkpoints" / "pick-ppo.zip"
@@ -267,6 +267,9 @@ def test_a_candidate_is_rolled_back_for_its_own_stops_only(bench, candidate, sto
             else:
                 running.state(State.WAITING)
         running.state(State.RUNNING if is_back else State.TRIAL)
+        if is_back:  # told once the champion acts
+            assert choice.outcome.wait(DEADLINE)
+            assert running.agent.state is State.RUNNING
         assert choice.outcome.is_set() is is_back
     excused = [text for what, text, *_ in running.events if what == "trial"]
     assert len(excused) == (0 if is_back else 2)

@@ -43,8 +43,10 @@ class Agent:
         self.notes.append((what, text))
 
     def choose(self, choice):
-        self.succession.activate(choice)
+        replaced = self.succession.activate(choice)
         choice.active.set()
+        if replaced is not None:
+            replaced.close("replaced: another version acts")
 
     def stage_of_champion(self):
         pass
@@ -85,11 +87,20 @@ def test_a_pushed_candidate_acts_and_is_promoted_by_its_trials(agent, better):
     assert not better.exists()
     assert agent.succession.active.digest == new
     assert agent.succession.names == {"champion": old, "given": old, "candidate": new}
+    assert agent.succession.rolls_back_to == old  # in its first trial, before which there was none
     trials = agent.succession.trials()
+    assert (agent.succession.progress["done"], agent.succession.progress["needed"]) == (0, 33)
     for seed in range(33):
         trials.begin(seed)
         trials.end(True, "terminated")
         agent.succession.ended(EpisodeRecord(seed, success=True, end="terminated"))
+        if seed == 4:
+            assert agent.succession.progress == {
+                "done": 5,
+                "needed": 33,
+                "text": "5 of 5 trials succeeded; 28 more without a failure would show more than 90 %",
+            }
+    assert (agent.succession.progress, agent.succession.rolls_back_to) == (None, old)
     assert agent.succession.names == {"champion": new, "given": old, "previous": old}
     text = "33 of 33 trials succeeded, which shows more than 90 % (error probability at most 5 %)"
     assert agent.notes[-1] == ("promoted", f"{new[:12]} is the champion: {text}")

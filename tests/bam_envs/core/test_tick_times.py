@@ -2,7 +2,7 @@
 
 import pytest
 
-from bam_train.deploy.tick_times import TickTimes
+from bam_envs.core.timing import TickTimes
 
 IN_TIME = (0.0001, 0, 0.0003, 0.00002)
 BUSY = (0.060, 1, 0.0003, 0.00002)  # it was not woken in time
