@@ -273,7 +273,7 @@ class RobotService:
         state = self._robot.state
         if state is None or self._robot.fault is not None:  # subscribers see that the state becomes stale
             return
-        if getattr(self._bus, "clients", 1) == 0:  # an embedded server without clients
+        if getattr(self._bus, "programs", 1) == 0:  # an embedded server whose topics nobody can hear
             return
         stamp: Callable[[float], Mapping[str, int]] = getattr(self._bus, "stamp", write_stamp)
         try:

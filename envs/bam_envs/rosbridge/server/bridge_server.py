@@ -108,6 +108,11 @@ class BridgeServer(Bus):
         return len(self._connections) + len(self._visitors)
 
     @property
+    def programs(self) -> int:
+        """Number of these that speak rosbridge, and not to the site."""
+        return len(self._connections)
+
+    @property
     def held(self) -> tuple[int, int]:
         """Size of unfinished messages in all sockets, and of messages that wait for slow clients [bytes]."""
         sockets = list(self._sockets)

@@ -530,7 +530,7 @@ def test_the_tag_of_the_last_command_stays_until_command_changes(serve, bus):
 
 
 def test_nothing_is_published_where_nobody_listens(serve, bus):
-    bus.clients = 0
+    bus.programs = 0
     service = serve()
     service.service.clock.stop()
     bus.published.clear()
