@@ -549,12 +549,12 @@ class Resident:
         self._change(State.TAKEN_OVER, f"taken over by {who}", who, address)
         return self.status()
 
-    def _cut(self, who: str, address: str, lease: str) -> None:
+    def _cut(self, who: str, address: str, lease: str, how: str) -> None:
         """The link of the owner was cut: hold; the front process ends the lease later."""
         if self.driver is not None and self.driver.lease == lease:
             self.halt()
             self._command = None
-            self._change(State.TAKEN_OVER, f"the link of {self.driver.who} was cut; the robot holds", who, address)
+            self._change(State.TAKEN_OVER, f"the link of {self.driver.who} {how}; the robot holds", who, address)
 
     def _hand_back(
         self, who: str, address: str, lease: str, resume: bool | None = None, why: str = ""

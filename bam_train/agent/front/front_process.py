@@ -83,6 +83,7 @@ class AgentLease(CommandLease):
         super().__init__(seconds, clock)
         self._now, self._used = clock, 0.0
         self._cut: tuple[str, str, float] | None = None  # owner, name for people, end of the lease
+        self._how = ""  # the link of that owner was lost
 
     def take(
         self, client: str, caller: Caller = UNKNOWN_CALLER, *, force: bool = False, shown: str | None = None
@@ -124,9 +125,9 @@ class AgentLease(CommandLease):
         """Begin the time without use anew."""
         self._used = self._now()
 
-    def cut(self, client: str, shown: str) -> None:
-        """Keep the lease of a client whose link was cut for `CUT` [s]."""
-        self._cut = client, shown, self._now() + CUT
+    def cut(self, client: str, shown: str, how: str = "was cut") -> None:
+        """Keep the lease of a client for `CUT` [s], as `how` it lost its link."""
+        self._cut, self._how = (client, shown, self._now() + CUT), how
 
     @property
     def is_silent(self) -> bool:
@@ -144,7 +145,7 @@ class AgentLease(CommandLease):
             client, shown, end = self._cut
             if self._now() >= end:
                 self._cut = None
-                return client, f"the lease of {shown} ended, {CUT:g} s after its link was cut"
+                return client, f"the lease of {shown} ended, {CUT:g} s after its link {self._how}"
         elif self.holder is not None and self._now() - self._used > self.seconds:
             client, shown = self.holder, self._shown or self.holder
             return client, f"the lease of {shown} ended: it was not used for {self.seconds:g} s"
@@ -272,19 +273,19 @@ class FrontProcess:
         if caller.name == self.lease.connection or caller.client == holder:
             self.cut(holder, caller.address)
 
-    def cut(self, client: str, address: str) -> None:
+    def cut(self, client: str, address: str, how: str = "was cut") -> None:
         """The link of `client` ended: if it has the lease, the robot holds, and the lease ends a little later."""
         if self.lease.holder == client and client not in self._handing:
             shown = self.lease.owner or client
-            self.send(Ask(0, "cut", {"lease": client}, shown, address))
-            self.lease.cut(client, shown)
+            self.send(Ask(0, "cut", {"lease": client, "how": how}, shown, address))
+            self.lease.cut(client, shown, how)
             self.lease.release(client)
 
     def _watch_lease(self) -> None:
         """End leases that are over, or whose owner is silent."""
         holder = self.lease.holder
         if holder is not None and self.lease.is_silent:
-            self.cut(holder, "")
+            self.cut(holder, "", f"was silent for {SILENT:g} s")
         over = self.lease.over()
         if over is not None:
             client, why = over

@@ -77,6 +77,9 @@ def test_after_a_full_disk_the_next_episode_is_recorded_once_there_is_room(sessi
     first = session.recorder
     resource.prlimit(first.pid, resource.RLIMIT_FSIZE, (1, 1))
     until(lambda: play(session) or session.recording_fault)
+    assert (
+        session.recording_fault == f"{first.path}: cannot be written: File too large; nothing is recorded from now on"
+    )
     with monkeypatch.context() as full:
         full.setattr(robot_session.shutil, "disk_usage", lambda folder: SimpleNamespace(free=robot_session.ROOM - 1))
         assert session.record_again() == ""
