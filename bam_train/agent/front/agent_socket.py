@@ -78,9 +78,6 @@ class Hub(Protocol):
         afterwards if it is still there. Raises `BamTrainError` or `BamEnvsError`, of one line.
         """
 
-    def status(self) -> dict[str, Any]:
-        """The newest status, in the network thread: must return at once."""
-
     def stop(self, person: Person, why: str) -> dict[str, Any]:
         """Halt, in the network thread: must return at once."""
 
@@ -259,8 +256,6 @@ class _Client:
                 self._hub.jog(_arguments(request), self._person)
             case protocol.Watch():
                 self._switch("watch", request.on)
-                if request.on:  # the next one may take its time
-                    self._send({"event": "status", "status": self._hub.status()})
                 self._answer(request.id, {"on": request.on})
             case protocol.Transitions():
                 self._learn(request.on)

@@ -50,9 +50,6 @@ class FakeHub:
             raise KeyError("a mistake")
         return dict(STATUS)
 
-    def status(self):
-        return dict(STATUS)
-
     def stop(self, person, why):
         self.threads.add(threading.current_thread().name)
         self._add(self.stops, (person, why))
