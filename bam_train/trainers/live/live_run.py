@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from bam_envs.core.registry import resolve_id
-from bam_envs.remote.serve.serve_options import is_loopback
+from bam_envs.rosbridge.endpoint import is_loopback
 from bam_train.agent.remote.agent_client import AgentClient
 from bam_train.checkpoint import Checkpoint
 from bam_train.environments import require_env_kwargs

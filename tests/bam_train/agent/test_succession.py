@@ -129,9 +129,9 @@ def test_an_episode_that_the_computer_cut_short_does_not_count(agent, better):
     assert (trials.evidence.trials, trials.evidence.successes) == (0, 0)
     text = f"the episode that was cut short does not count against {new[:12]}: the computer is busy"
     assert agent.notes == [("trial", text)] * 4
-    for _ in range(2):
-        trials.begin(9)
-        agent.succession.cut_short(EpisodeRecord(9, length=50), "following (G23)")
+    for seed in (9, 10):
+        trials.begin(seed)
+        agent.succession.cut_short(EpisodeRecord(seed, length=50), "following (G23)")
     assert agent.succession.active.digest == old
     assert trials.evidence.trials == 2
 
