@@ -212,12 +212,15 @@ class AgentRefused(BamTrainError):  # noqa: N818
 
 
 class ContractRefused(BamTrainError):  # noqa: N818
-    """A robot does not fit the checkpoint; `what` is the first line of the contract that does not."""
+    """A robot does not fit the checkpoint; `what` is the first line of the contract that does not.
+
+    `passes` says whether a busy computer or network may be the reason, so that another look may find that it fits.
+    """
 
     exit_status = 3
 
-    def __init__(self, what: str, message: str) -> None:
-        self.what = what
+    def __init__(self, what: str, message: str, *, passes: bool = False) -> None:
+        self.what, self.passes = what, passes
         super().__init__(message)
 
 

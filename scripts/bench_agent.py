@@ -79,7 +79,7 @@ def fast_session(url: str | None) -> Callable[..., Any]:
             self, options: Any, checkpoint: Any, stage: Any, *, boundary: Any, agents: Any, switch: Any, **rest: Any
         ) -> None:
             self.checkpoint, self.env_id, self.env_kwargs = checkpoint, checkpoint.manifest.env, {}
-            self._data = None
+            self._options = options
             self.stage, self.is_real, self.marks, self.recorder = "full", False, (), None
             spec = arm_spec("ur5e", with_object=True)
             live = url and live_robot(url, replace(spec, period=1 / RATE))

@@ -31,7 +31,7 @@ class AgentOptions:
     i_know: bool = False
     seed: int = 1_000_000
     resume: bool = False
-    """Whether the policy goes on when a person hands the robot back."""
+    """Whether a policy that ran before a take-over runs again when the robot is handed back."""
     lease: float = 30.0
     """Time without use after which a person loses the lease [s]."""
     guard_stops: int = 2

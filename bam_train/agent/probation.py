@@ -1,8 +1,9 @@
 """Whether a policy on a live agent is promoted or rolled back: pure logic, which is told how each episode ended.
 
 A policy is promoted once its trials are enough (`bam_train.deploy.trials`). It is rolled back when guards stopped it
-too often, when it had a fault of its own, or when its success rate has been shown to be below a bound. That test is
-valid after every episode, as that of the trials, and for the same reason: it is a test martingale (J. Ville, 1939).
+too often, when it made too many ticks late (`bam_envs.core.timing.TickTimes`), when it had a fault of its own, or when
+its success rate has been shown to be below a bound. That test is valid after every episode, as that of the trials, and
+for the same reason: it is a test martingale (J. Ville, 1939).
 While the success rate is at least the bound b, each factor
 
     failure: m / (b + m (1 - b)),    success: 1 / (b + m (1 - b)),    for any m > 1,
@@ -26,6 +27,8 @@ _ODDS = (2.0, 4.0, 16.0)
 """The alternatives m."""
 _SHOWN = 20
 """Number of the last episodes that a reason mentions."""
+SLOW_SHARE, _FEWEST = 0.05, 100
+"""Largest share of the ticks of these episodes that a policy may make late, and the fewest ticks that show it."""
 
 
 @dataclass(frozen=True)
@@ -87,16 +90,32 @@ class Probation:
         self._episodes = self._successes = 0
         self._recent: deque[bool] = deque(maxlen=_SHOWN)
         self._stops: deque[int] = deque(maxlen=guard_stops)  # number of the episode of each stop
+        self._ticks: deque[tuple[int, int]] = deque(maxlen=_SHOWN)  # late ones of the policy, and all
 
-    def ended(self, success: bool | None, stopped_by: str = "", trials: Evidence | None = None) -> Judgement | None:
+    def ended(
+        self,
+        success: bool | None,
+        stopped_by: str = "",
+        trials: Evidence | None = None,
+        *,
+        slow: int = 0,
+        ticks: int = 0,
+    ) -> Judgement | None:
         """Judge the policy after an episode.
 
         Args:
             success: Whether it succeeded; None if the environment does not say, which counts for nothing.
-            stopped_by: The guard that stopped it, such as ``"tool speed (G8)"``; "" if none did.
+            stopped_by: The guard that stopped it, such as ``"tool speed (G8)"``; "" if none did, or for no fault of it.
             trials: The evidence of the trials so far, if the policy is on trial.
+            slow: Number of ticks that it made late.
+            ticks: Number of all ticks.
         """
         self._episodes += 1
+        self._ticks.append((slow, ticks))
+        slow, ticks = map(sum, zip(*self._ticks, strict=True))
+        if ticks >= _FEWEST and slow > SLOW_SHARE * ticks:
+            most = f"at most {100 * SLOW_SHARE:g} % may be"
+            return self._back(f"its actions took so long that {slow} of {ticks} ticks were late, and {most}")
         if stopped_by:
             self._stops.append(self._episodes)
             if len(self._stops) == self._guard_stops and self._stops[0] > self._episodes - self._window:

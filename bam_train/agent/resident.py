@@ -32,7 +32,7 @@ from bam_train.agent.versions import Versions
 from bam_train.checkpoint import Checkpoint
 from bam_train.deploy.deployment import STOP, StopSwitch, fault_text
 from bam_train.deploy.journal import EpisodeRecord
-from bam_train.errors import BamTrainError, PolicyError, RequestRefused
+from bam_train.errors import BamTrainError, ContractRefused, PolicyError, RequestRefused
 from bam_train.loop import Agent
 
 if TYPE_CHECKING:
@@ -48,6 +48,8 @@ FRESH = 0.2
 THERE = "the robot is there, and fits"
 """Why the agent no longer waits."""
 _RECENT = 20  # episodes in the status
+_BY_TIME = (3, 4, 15, 16)
+"""Codes of the guards that look at when states, answers and commands come, and not at what the robot does."""
 _AT_ONCE = ("pause", "take")
 """Requests for which the robot is halted before they are executed."""
 
@@ -64,6 +66,8 @@ class Driver:
     """Name of the lease's owner on the port."""
     who: str
     """The same for people."""
+    ran: bool
+    """Whether the policy drove before."""
 
 
 class _Boundary(Agent):
@@ -126,11 +130,13 @@ class Resident:
         self._hurry = threading.Event()  # a request that ends the tick
         self._requests: deque[tuple[Callable[[], dict[str, Any] | None], int]] = deque()
         self._command: Drive | None = None
-        self._is_running, self._stopped, self._quitting = is_running, "", False
+        self._is_running, self._quitting = is_running, False
+        self._stopped = self._paused = ""  # why, once a guard stopped the robot, and once a person or a fault paused it
         self._was_connected = self._holds = self._was_cut_short = False
         self._seed, self._reported = options.seed, 0.0
         self._episodes: deque[int | None] = deque(maxlen=_RECENT)
-        self._ticks = self._completed = self._successes = self._late = 0
+        self._ticks = self._completed = self._successes = 0
+        self._late = self._slow = 0  # late ticks of earlier connections, and those that a policy made late
         self._link_ms = self._loop_ms = 0.0
 
     # ---- what other threads call
@@ -231,7 +237,9 @@ class Resident:
     def _turn(self) -> None:
         """One episode, one look at a resting robot, or one command of a person."""
         self._execute()
-        if self.session is None:
+        if (stop := self._unnoticed_stop) is not None:
+            self._failed(stop)
+        elif self.session is None:
             self._reach_robot()
         elif self.driver is not None:
             self._drive()
@@ -254,6 +262,15 @@ class Resident:
             if number:
                 self.send(answer)
 
+    @property
+    def _unnoticed_stop(self) -> SafetyStop | None:
+        """The stop of a guard that came while a request was executed, whose sender alone has heard of it."""
+        stopped = None if self.session is None else self.session.robot.stopped
+        if stopped is None:
+            return None
+        text = f"The robot was stopped by {stopped}. When it is safe, call resume()."
+        return SafetyStop(stopped.partition(" (")[0], text)
+
     def between_ticks(self) -> bool:
         """Called by the chain between a deadline and the policy: whether the episode ends here."""
         deployment = self._connected.deployment
@@ -271,7 +288,7 @@ class Resident:
 
     def _plays(self) -> bool:
         """Whether the episode that runs goes on."""
-        waits = self._chosen is not None and self._chosen.at_once
+        waits = (self._chosen is not None and self._chosen.at_once) or self._unnoticed_stop is not None
         return self._is_running and self.driver is None and not waits and not self._quitting
 
     def _play(self) -> None:
@@ -283,7 +300,10 @@ class Resident:
             self._drop(f"for the stage {self._stage}")
             return
         session.deployment.trials = self.succession.trials()
+        self._record_again()
         self._change(self._driving, THERE if self.state is State.WAITING else self.why)
+        journal = session.deployment.journal
+        begun = journal.begun
         try:
             if (trials := session.deployment.trials) is not None:
                 self._seed = trials.next_seed(self._seed)
@@ -294,6 +314,8 @@ class Resident:
             return
         except Exception as error:
             self._failed(error)
+            if journal.begun > begun:  # else the policy has not acted: the arm was on its way to its start pose
+                self._judge(session, journal.records[-1], error)
             return
         if record.end == "stopped":
             return
@@ -301,6 +323,14 @@ class Resident:
         self._successes += record.success is True
         self._episodes.append(None if record.success is None else int(record.success))
         self.succession.ended(record)
+
+    def _judge(self, session: RobotSession, record: EpisodeRecord, error: Exception) -> None:
+        """Judge the policy whose episode ended with `error`: by a stop of a guard, or by the loss of the link."""
+        if self._stopped:
+            excuse = session.deployment.times.excuse(by_time=session.robot.code in _BY_TIME)
+            self.succession.cut_short(record, self._stopped, excuse)
+        elif isinstance(error, LinkLost):
+            self.succession.cut_short(record, excuse="the link to the robot was lost")
 
     @property
     def _driving(self) -> State:
@@ -334,7 +364,7 @@ class Resident:
         if choice is None:
             return
         before = self.succession.active
-        self.succession.activate(choice)
+        replaced = self.succession.activate(choice)
         if self.session is not None:
             self.session.deployment.swap(choice.policy)
         self._stage = choice.stage or self._stage
@@ -344,16 +374,23 @@ class Resident:
             self._change(self._driving, choice.why, choice.who)
         choice.active.set()
         self._report()
+        if replaced is not None:  # who waits for its outcome sees the state that it led to
+            replaced.close("replaced: another version acts")
 
     # ---- the robot rests, or a person drives it
 
     def _rest(self) -> None:
         self._change(State.STOPPED if self._stopped else State.PAUSED, self.why)
         self._activate()
+        self._record_again()
         with self._news:
             self._news.wait_for(lambda: bool(self._requests) or bool(self.switch.came), _LOOK)
         self._require_link()
         self._report(_REPORT)
+
+    def _record_again(self) -> None:
+        if self.session is not None and (name := self.session.record_again()):
+            self.note("recording", f"the recording goes on in {name}")
 
     def _require_link(self) -> None:
         if self.session is not None and not self.session.is_up:
@@ -419,7 +456,8 @@ class Resident:
                 sleep=self._hurry.wait,
             )
         except (BamEnvsError, BamTrainError) as error:
-            if not (self._was_connected or isinstance(error, BamEnvsError)):
+            may_pass = isinstance(error, BamEnvsError) or (isinstance(error, ContractRefused) and error.passes)
+            if not (self._was_connected or may_pass):
                 raise  # a setting, a file or a robot that is wrong when the program starts
             if not self._stopped:
                 self._change(State.WAITING, fault_text(error))
@@ -436,7 +474,7 @@ class Resident:
         if self._stopped:
             self._change(State.STOPPED, self._stopped)
         elif not self._is_running:
-            self._change(State.PAUSED, self.why if self.why.startswith("paused") else THERE)
+            self._change(State.PAUSED, self._paused or THERE)
 
     def _drop(self, why: str) -> None:
         """Halt the robot and drop the link."""
@@ -444,21 +482,21 @@ class Resident:
         if session is not None:
             session.event(f"the link is dropped: {why}")
             session.close()
+            self._late += session.deployment.times.late
+            self._slow += session.deployment.times.slow
 
     def _failed(self, error: Exception) -> None:
         """What a fault while the robot moved leads to: waiting for the robot, stopped by a guard, or paused."""
-        text = fault_text(error)
-        session, driver = self.session, self.driver
+        text = fault_text(error).replace("call resume()", "resume the agent")
+        session = self.session
         stopped = isinstance(error, SafetyStop) or (session is not None and session.robot.stopped is not None)
         self.halt()
         self._drop(text)
-        if driver is not None:
-            self._end_driving(driver, text)
+        if self.driver is not None:
+            self._end_driving(self.driver, text)
         if stopped:  # also by the age of its state: only a person lets it move again
             self._stopped, self._is_running = text, False
             self._change(State.STOPPED, text)
-            if session is not None:
-                self.succession.guard_stopped(text)
         elif isinstance(error, (LinkLost, RemoteError, NotReady)):  # or somebody else drives: it goes on when it can
             self._change(State.WAITING, text)
         else:
@@ -467,18 +505,21 @@ class Resident:
             if isinstance(error, PolicyError) and self.succession.policy_failed(text):
                 self._change(State.WAITING, text)  # until the other version is connected
                 return
-            self._is_running = False
-            self._change(State.PAUSED, f"paused by a fault: {text}")
+            self._is_running, self._paused = False, f"paused by a fault: {text}"
+            self._change(State.PAUSED, self._paused)
 
     # ---- requests, in the main thread
 
     def _pause(self, who: str, address: str, why: str = "") -> dict[str, Any]:
         self.halt()
         self._is_running, self._stopped = False, ""
+        self._paused = f"paused by {who}{f': {why}' if why else ''}"
         if self.driver is not None:
             self._end_driving(self.driver, f"paused by {who}")
-        if self.session is not None:
-            self._change(State.PAUSED, f"paused by {who}{f': {why}' if why else ''}", who, address)
+        if self.session is None:
+            self.note("pause", self._paused, who, address)
+        else:
+            self._change(State.PAUSED, self._paused, who, address)
         return self.status()
 
     def _resume(self, who: str, address: str, why: str = "") -> dict[str, Any]:
@@ -488,9 +529,11 @@ class Resident:
             )
         if self._stopped:
             self.note("resume", f"{who} lets the robot move again after: {self._stopped}", who, address)
-        self._stopped, self._is_running = "", True
+        self._stopped, self._paused, self._is_running = "", "", True
         text = f"resumed by {who}{f': {why}' if why else ''}"
-        if self.session is not None:
+        if self.session is None:
+            self.note("resume", text, who, address)
+        else:
             self._change(self._driving, text, who, address)
         return self.status()
 
@@ -501,16 +544,17 @@ class Resident:
         self.halt()
         if self.driver is not None and self.driver.lease != lease:
             self.note("take over", f"{who} takes over from {self.driver.who}", who, address)
-        self.driver, self._command, self._is_running, self._holds = Driver(lease, who), None, False, True
+        ran = self._is_running if self.driver is None else self.driver.ran
+        self.driver, self._command, self._is_running, self._holds = Driver(lease, who, ran), None, False, True
         self._change(State.TAKEN_OVER, f"taken over by {who}", who, address)
         return self.status()
 
-    def _cut(self, who: str, address: str, lease: str) -> None:
+    def _cut(self, who: str, address: str, lease: str, how: str) -> None:
         """The link of the owner was cut: hold; the front process ends the lease later."""
         if self.driver is not None and self.driver.lease == lease:
             self.halt()
             self._command = None
-            self._change(State.TAKEN_OVER, f"the link of {self.driver.who} was cut; the robot holds", who, address)
+            self._change(State.TAKEN_OVER, f"the link of {self.driver.who} {how}; the robot holds", who, address)
 
     def _hand_back(
         self, who: str, address: str, lease: str, resume: bool | None = None, why: str = ""
@@ -519,14 +563,16 @@ class Resident:
         if driver is None or driver.lease != lease:
             return self.status()
         self.halt()
-        goes_on = (self.options.resume if resume is None else resume) and not why
-        self._end_driving(driver, why or f"handed back by {who}")
-        self._is_running = goes_on
+        # A program goes back to what was before, whose pause a person lifts.
+        goes_on = (self.options.resume and driver.ran if resume is None else resume) and not why
         text = why or f"handed back by {who}"
+        self._end_driving(driver, text)
+        self._is_running = goes_on
         if goes_on:
+            self._paused = ""
             self._change(self._driving, text, who, address)
         else:
-            self._change(State.PAUSED, text, who, address)
+            self._change(State.PAUSED, "; ".join(filter(None, (text, self._paused))), who, address)
         return self.status()
 
     def _end_driving(self, driver: Driver, why: str) -> None:
@@ -561,7 +607,7 @@ class Resident:
 
     def ticked(self, record: EpisodeRecord, action: Any, pacer: Any) -> None:
         """Called by the deployment after every step."""
-        self._ticks, self._late = self._ticks + 1, pacer.missed
+        self._ticks += 1
         self._report(_REPORT)
 
     def ended(self, record: EpisodeRecord) -> None:
@@ -598,6 +644,7 @@ class Resident:
             "since": self.since,
             "active": self.succession.active.digest,
             "names": dict(self.succession.names),
+            "trial": self.succession.progress,
             "stage": None if session is None else session.stage,
             "owner": None if self.driver is None else self.driver.who,
             "robot": self.options.robot if session is None else session.robot.info.text,
@@ -611,7 +658,8 @@ class Resident:
             "episodes": self._completed,
             "successes": self._successes,
             "recent": list(self._episodes),
-            "late": self._late,
+            "late": self._late + (0 if session is None else session.deployment.times.late),
+            "slow": self._slow + (0 if session is None else session.deployment.times.slow),
             "link_ms": round(self._link_ms, 3),
             "loop_ms": round(self._loop_ms, 3),
             "recording": None if session is None or session.recorder is None else str(session.recorder.path),
@@ -627,7 +675,7 @@ class Resident:
         found, session = [], self.session
         if session is not None:
             found = [f"{title}: {text}" for title, text in session.deployment.journal.warnings.items()]
-            found += [f"recording: {session.recorder.fault}"] if session.recorder and session.recorder.fault else []
+            found += [f"recording: {session.recording_fault}"] if session.recording_fault else []
         return [*found, *([f"audit: {self.audit.fault}"] if self.audit.fault else [])]
 
     def _report(self, least: float = 0.0) -> None:

@@ -3,7 +3,9 @@
 import contextlib
 import logging
 import math
+import shutil
 import threading
+import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
@@ -27,6 +29,8 @@ from bam_train.recording.recording import Recording
 _log = logging.getLogger(__name__)
 CONNECTED_WITHIN = 1.0
 """Age of the robot's newest state at rest from which the link counts as lost [s]."""
+RECORD_AGAIN, ROOM = 10.0, 32 * 2**20
+"""Time between two attempts to record again [s], and space on the disk that is needed for one [bytes]."""
 
 
 class HeldOpen(gym.Wrapper[Any, Any, Any, Any]):
@@ -56,6 +60,11 @@ class RobotSession:
         BamEnvsError: The robot cannot be reached.
     """
 
+    _not_recorded = ""  # why no recording could begin
+    _next: Recorder | None = None  # started, to be used from the next episode on
+    _tried, _closed = -math.inf, False
+    _starting = threading.Thread()
+
     def __init__(
         self,
         options: AgentOptions,
@@ -68,7 +77,7 @@ class RobotSession:
         admit: Callable[[Any, Sequence[str]], None],
         sleep: Callable[[float], bool],
     ) -> None:
-        self.checkpoint, self._data = checkpoint, options.data
+        self.checkpoint, self._options = checkpoint, options
         self.env_id, self.env_kwargs = environment_of(checkpoint)
         self.stage = stage or "full"
         """The stage at which the robot moves."""
@@ -96,7 +105,7 @@ class RobotSession:
             self.policy, self.marks = admission.policy, admission.marks
             self.robot.react(options.unusual)
             self.interface = interface_of(self._env)
-            self.recorder = self._start_recorder(options, checkpoint) if options.record else None
+            self.recorder = self._start_recorder() if options.record else None
             self.deployment = Deployment(
                 HeldOpen(self._env),
                 self.policy,
@@ -131,29 +140,66 @@ class RobotSession:
         if self.recorder is not None:
             self.recorder.event(text)
 
+    @property
+    def recording_fault(self) -> str:
+        """Why nothing is recorded; "" if it is, or is not to be."""
+        return self._not_recorded or ("" if self.recorder is None else self.recorder.fault)
+
+    def record_again(self) -> str:
+        """Begin a new recording, between two episodes, where none could begin or the last one ended early.
+
+        It starts in another thread, once the disk has room. A later call uses it, and returns its name, else "".
+        """
+        if not self.recording_fault:
+            return ""
+        if self._next is not None:
+            ended, self.recorder, self._next, self._not_recorded = self.recorder, self._next, None, ""
+            self.deployment.record(self.recorder)
+            self._end(ended)
+            return str(self.recorder.path)
+        now, folder = time.monotonic(), self._options.folder
+        if now - self._tried > RECORD_AGAIN and not self._starting.is_alive():
+            self._tried = now
+            if shutil.disk_usage(folder).free >= ROOM:
+                self._starting = threading.Thread(target=self._start_next, name="bam-recorder-start")
+                self._starting.start()
+        return ""
+
+    def _start_next(self) -> None:
+        self._next = recorder = self._start_recorder()
+        if self._closed:
+            self._end(recorder)
+
     def close(self) -> None:
         """Halt the robot and drop the link; the end of the recording is written in another thread."""
+        self._closed = True
         self.deployment.record_command()
         self._env.close()  # type: ignore[no-untyped-call]
-        if self.recorder is not None:
-            threading.Thread(target=self._end_recording, args=(self.recorder,), name="bam-recorder-end").start()
+        for recorder in (self.recorder, self._next):
+            self._end(recorder)
+
+    def _end(self, recorder: Recorder | None) -> None:
+        if recorder is not None:
+            threading.Thread(target=self._end_recording, args=(recorder,), name="bam-recorder-end").start()
 
     def _end_recording(self, recorder: Recorder) -> None:
         recorder.close()
-        if self._data is None:
+        data = self._options.data
+        if data is None:
             return
         from bam_train.data.record_dataset import info_of  # not above: the tick's process needs neither before
         from bam_train.data.recordings import add_recording
 
         try:
             info = info_of(self._env, self.env_id, self.env_kwargs, self.checkpoint.manifest.period)
-            for note in add_recording(Recording.open(recorder.path), self._data, info):
+            for note in add_recording(Recording.open(recorder.path), data, info):
                 _log.info("%s", note)
         except BamTrainError as error:
-            _log.warning("%s; run bam-data import %s %s", error, self._data, recorder.path)
+            _log.warning("%s; run bam-data import %s %s", error, data, recorder.path)
 
-    def _start_recorder(self, options: AgentOptions, checkpoint: Checkpoint) -> Recorder | None:
+    def _start_recorder(self) -> Recorder | None:
         """The recorder, started; without room for a recording the agent goes on."""
+        options, checkpoint = self._options, self.checkpoint
         names = [options.folder / name for name in recording_names(self.env_id)]
         facts = {**deployment_facts(checkpoint, self._env), "address": options.robot, "identity": self.identity}
         facts["marks"] = ", ".join(self.marks)
@@ -161,7 +207,9 @@ class RobotSession:
         try:
             recorder.start()
         except BamTrainError as error:
-            _log.warning("Nothing is recorded: %s", error)
+            if str(error) != self._not_recorded:
+                _log.warning("Nothing is recorded: %s", error)
+            self._not_recorded = str(error)
             return None
         with contextlib.suppress(BamTrainError):
             for warning in watch_cameras(recorder, options.place(trial=None)):

@@ -15,6 +15,7 @@ from bam_envs.remote.serve.served_environment import ServedEnvironment
 from bam_train.agent.agent_messages import child_environment
 from bam_train.environments import make_env
 from bam_train.errors import SettingsError
+from bam_train.log_lines import begin_log
 
 _PROGRAM = (  # without the folder it is started in, whose files could hide ours
     "import sys; sys.path[:] = filter(None, sys.path); import bam_train.agent.simulated_box as it; it.main()"
@@ -69,7 +70,7 @@ class SimulatedBox:
 def main() -> None:
     """Run the process until its standard input ends."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    logging.basicConfig(level=logging.ERROR, format="bam-agent: simulated robot: %(message)s")
+    begin_log("bam-agent: simulated robot", logging.ERROR)
     env_id, env_kwargs = json.loads(sys.argv[1])
     with ServedEnvironment(make_env(env_id, env_kwargs), ServeOptions(port=0)) as served:
         print(served.bus.url, flush=True)  # type: ignore[union-attr]  # noqa: T201 - read by the parent

@@ -24,7 +24,7 @@ from bam_train.agent.versions import CANDIDATE, CHAMPION, PREVIOUS, Version, Ver
 from bam_train.checkpoint import Checkpoint
 from bam_train.deploy.checkpoint_admission import trials_of
 from bam_train.deploy.journal import EpisodeRecord
-from bam_train.deploy.trials import Trials
+from bam_train.deploy.trials import Evidence, Trials
 from bam_train.errors import BadTrials, BamTrainError, CandidateRefused, RequestRefused, TrialsNeeded
 
 if TYPE_CHECKING:
@@ -51,11 +51,18 @@ class Choice:
     """Whether it acts from the next tick on, and not from the next episode."""
     trials: Trials | None = None
     """Its trials, if it is a candidate."""
+    progress: dict[str, Any] | None = None
+    """How many of them were done, and how many more are needed, if all succeed; see `_progress`."""
     active: threading.Event = field(default_factory=threading.Event)
     outcome: threading.Event = field(default_factory=threading.Event)
     """Set once it was promoted or rolled back."""
     result: str = ""
     """``"promoted"``, ``"rolled back"`` or ``"replaced"``, with the reason."""
+
+    def close(self, result: str) -> None:
+        """Tell whoever waits what became of it; the first result stands."""
+        self.result = self.result or result
+        self.outcome.set()
 
 
 class Succession:
@@ -82,6 +89,17 @@ class Succession:
     def is_candidate(self) -> bool:
         """Whether a candidate acts."""
         return self.names.get(CANDIDATE) == self.active.digest
+
+    @property
+    def rolls_back_to(self) -> str | None:
+        """Digest of the version that a roll-back leads to: from a candidate the champion, else the one before it."""
+        champion = self.names.get(CHAMPION)
+        return champion if self.active.digest != champion and champion is not None else self.names.get(PREVIOUS)
+
+    @property
+    def progress(self) -> dict[str, Any] | None:
+        """How far the trials of the active version are, if it is a candidate; see `_progress`."""
+        return self.choice.progress if self.choice is not None and self.is_candidate else None
 
     def policy(self) -> Any:
         """The policy of the active version; loaded if need be."""
@@ -208,13 +226,14 @@ class Succession:
             own = "full" if is_real and stage == "full" else resident.options.stage
             return Choice(version, policy, names, why, ask.who, own, at_once)
         slow = "trial" if is_real or stage == "trial" else None
-        return Choice(version, policy, {CANDIDATE: digest}, why, ask.who, slow, at_once, trials)
+        progress = _progress(trials.evidence)
+        return Choice(version, policy, {CANDIDATE: digest}, why, ask.who, slow, at_once, trials, progress)
 
     # ---- the main thread
 
-    def activate(self, choice: Choice) -> None:
-        """Make the chosen version the active one: the caller lets its policy act."""
-        self._close_choice("replaced: another version acts")
+    def activate(self, choice: Choice) -> Choice | None:
+        """Make the chosen version the active one: the caller lets its policy act, and closes the choice before it."""
+        before = self.choice
         self.active, self._policies[choice.version.digest] = choice.version, choice.policy
         for name, digest in choice.names.items():
             if digest is None:
@@ -226,6 +245,7 @@ class Succession:
         self.choice, self.probation = choice, Probation(bound, self._resident.options.guard_stops)
         kept = {self.active.digest, *self.names.values()}
         self._policies = {digest: policy for digest, policy in self._policies.items() if digest in kept}
+        return before
 
     def _save(self) -> None:
         """Save the names in the folder, in another thread: a tick does not wait for the disk."""
@@ -245,16 +265,14 @@ class Succession:
         Raises:
             RequestRefused: There is none.
         """
-        champion, previous = self.names.get(CHAMPION), self.names.get(PREVIOUS)
-        names: dict[str, str | None]
-        if self.active.digest != champion and champion is not None:
-            target, names = champion, {CANDIDATE: None}
-        elif previous is not None:
-            target, names = previous, {CHAMPION: previous, PREVIOUS: champion, CANDIDATE: None}
-        else:
+        champion, target = self.names.get(CHAMPION), self.rolls_back_to
+        names: dict[str, str | None] = {CANDIDATE: None}
+        if target is None:
             raise RequestRefused(
                 "There is no version to roll back to: the champion acts, and there was none before it."
             )
+        if target != champion:
+            names |= {CHAMPION: target, PREVIOUS: champion}
         version = self.versions.find(target)
         if not are_same(version.env, self.active.env):
             text = f"{target[:12]} was trained on {version.env}, and the agent runs {self.active.env}"
@@ -271,14 +289,30 @@ class Succession:
         if self.is_candidate and choice.trials is not None:
             try:
                 evidence = choice.trials.evidence
+                choice.progress = _progress(evidence)
             except BadTrials as error:
                 _log.warning("%s", error)
-        self._judged(self.probation.ended(record.success, trials=evidence))
+        judged = self.probation.ended(record.success, trials=evidence, slow=record.slow, ticks=record.length)
+        self._judged(judged)
 
-    def guard_stopped(self, text: str) -> None:
-        """Judge the active version after a guard stopped the robot."""
-        if self.probation is not None:
-            self._judged(self.probation.ended(None, stopped_by=text))
+    def cut_short(self, record: EpisodeRecord, stopped_by: str = "", excuse: str = "") -> None:
+        """Judge the active version after an episode that it could not end.
+
+        Args:
+            record: The episode.
+            stopped_by: The guard that stopped it, with its reason; "" for a lost link.
+            excuse: Why that is no fault of the policy, in one line; "" if it may be. Such a trial does not count.
+        """
+        if self.probation is None:
+            return
+        if excuse:
+            stopped_by = ""
+            whose = f"the episode that was cut short does not count against {self.active.digest[:12]}"
+            self._resident.note("trial", f"{whose}: {excuse}")
+            if (trials := self.trials()) is not None:
+                with contextlib.suppress(BadTrials):  # then it counts
+                    trials.end(False, excuse, void=True)
+        self._judged(self.probation.ended(None, stopped_by, slow=record.slow, ticks=record.length))
 
     def policy_failed(self, text: str) -> bool:
         """Judge the active version after a fault of its policy; whether another one acts now."""
@@ -299,7 +333,8 @@ class Succession:
             resident.note("trial", f"{self.active.digest[:12]} would be rolled back: {judgement.reason}. {error}")
             self.probation = None
             return False
-        self._close_choice(f"rolled back: {judgement.reason}")
+        if self.choice is not None:
+            self.choice.result = self.choice.result or f"rolled back: {judgement.reason}"
         resident.choose(choice)
         return True
 
@@ -312,15 +347,15 @@ class Succession:
         self._save()
         self._resident.note("promoted", f"{digest[:12]} is the champion: {reason}")
         self._resident.stage_of_champion()
-        self._close_choice(f"promoted: {reason}")
-
-    def _close_choice(self, result: str) -> None:
-        """Tell whoever waits what became of the candidate."""
-        choice = self.choice
-        if choice is not None and not choice.outcome.is_set():
-            choice.result = result
-            choice.outcome.set()
+        if self.choice is not None:
+            self.choice.close(f"promoted: {reason}")
 
     def trials(self) -> Trials | None:
         """The trials of the active version, if it is a candidate."""
         return self.choice.trials if self.choice is not None and self.is_candidate else None
+
+
+def _progress(evidence: Evidence) -> dict[str, Any]:
+    """Trials of a candidate: those ``done``, those ``needed`` in all if no further one fails, and both in words."""
+    missing = 0 if evidence.is_enough else evidence.missing
+    return {"done": evidence.trials, "needed": evidence.trials + missing, "text": evidence.text}

@@ -12,21 +12,11 @@ import sys
 import traceback
 from typing import TYPE_CHECKING, Any, TextIO
 
-from bam_train.stand_ins import with_addresses
+from bam_train.log_lines import ShownFormatter, shown
 
 if TYPE_CHECKING:
     from rich.console import Console
     from rich.text import Text
-
-
-def shown(text: str) -> str:
-    r"""One line of text with ``\x1b``, ``\n`` and the like instead of the characters.
-
-    Control characters (C0, C1), those that turn the direction of writing, line separators and halves of surrogate pairs
-    are shown as in Python's string literals.
-    """
-    text = with_addresses(text)
-    return text if text.isprintable() else "".join(one if one.isprintable() else repr(one)[1:-1] for one in text)
 
 
 def say(text: str = "") -> None:
@@ -59,16 +49,6 @@ def rich_text(text: str, style: str = "", **arguments: Any) -> Text:
     from rich.text import Text
 
     return Text(shown(text), style, **arguments)
-
-
-class ShownFormatter(logging.Formatter):
-    """Formats log records with `shown`."""
-
-    def formatMessage(self, record: logging.LogRecord) -> str:  # noqa: D102, N802 - logging's name
-        return shown(super().formatMessage(record))
-
-    def formatException(self, ei: Any) -> str:  # noqa: D102, N802
-        return "\n".join(map(shown, super().formatException(ei).split("\n")))
 
 
 def show_logs_and_tracebacks() -> None:

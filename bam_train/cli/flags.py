@@ -408,7 +408,7 @@ class AgentConfig:
     paused: bool = False
     """Start paused, as an agent does that ran before in its folder."""
     resume: bool = False
-    """Let the policy go on when a person hands the robot back; by default the agent stays paused."""
+    """Go back to what the agent did before a take-over when the robot is handed back; by default it stays paused."""
     lease: Annotated[Positive, tyro.conf.arg(metavar="S")] = 30.0
     """Time without a command after which a person who has taken over loses the robot again [s]."""
     unusual: Unusual = None

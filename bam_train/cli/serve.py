@@ -7,8 +7,9 @@ import threading
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
-from bam_train.cli.console import ShownFormatter, say
+from bam_train.cli.console import say
 from bam_train.cli.program import run_program
+from bam_train.log_lines import ShownFormatter
 from bam_train.signals import SignalMemory
 
 if TYPE_CHECKING:

@@ -1,6 +1,6 @@
 """The table of a contract: each line has its subject, the expected and the found value, and a verdict."""
 
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from typing import Any, Literal
 
 from bam_envs.live.inspection import Inspection
@@ -20,11 +20,13 @@ class Check:
     found: str
     verdict: Verdict
     """``"unknown"`` if the robot's messages do not decide the line, which then does not refuse the robot."""
+    passes: bool = False
+    """Whether a busy computer or network changes the line, so that another look may find another value."""
 
 
-def check(what: str, expected: str, found: str, *, fits: bool | None) -> Check:
+def check(what: str, expected: str, found: str, *, fits: bool | None, passes: bool = False) -> Check:
     """One line; `fits` is None for an unknown result."""
-    return Check(what, expected, found, "unknown" if fits is None else "ok" if fits else "refused")
+    return Check(what, expected, found, "unknown" if fits is None else "ok" if fits else "refused", passes)
 
 
 @dataclass(frozen=True)
@@ -66,7 +68,7 @@ class Contract:
 
     def to_json(self) -> list[dict[str, Any]]:
         """The lines as plain values."""
-        return [asdict(line) for line in self.checks]
+        return [{name: value for name, value in vars(line).items() if name != "passes"} for line in self.checks]
 
     def require(self, who: str, moved: str = "nothing has moved") -> None:
         """Raise `ContractRefused`, which names the first refused line, if a line is refused.
@@ -79,4 +81,5 @@ class Contract:
             first, *others = self.refused
             more = f" (and {len(others)} more)" if others else ""
             text = f"{first.what}: expected {first.expected}, found {first.found}{more}"
-            raise ContractRefused(first.what, f"{who} do not fit: {text}; correct the robot or its profile; {moved}")
+            text = f"{who} do not fit: {text}; correct the robot or its profile; {moved}"
+            raise ContractRefused(first.what, text, passes=all(line.passes for line in self.refused))

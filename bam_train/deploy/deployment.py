@@ -16,7 +16,7 @@ import gymnasium as gym
 
 from bam_envs.core.errors import BamEnvsError, LinkLost, SafetyStop
 from bam_envs.core.robot import RobotState
-from bam_envs.core.timing import Pacer
+from bam_envs.core.timing import Pacer, TickTimes
 from bam_envs.safety.guard import Tick
 from bam_train.deploy.flight import RecorderAgent, Stopwatch
 from bam_train.deploy.journal import Ending, EpisodeRecord, Journal
@@ -129,7 +129,9 @@ class Deployment:
         self._workspace = Workspace(window=window, sink=None if sink is None else _silent_once_broken(sink))
         self._watch = watch = Stopwatch()
         names = self._robot.observation_names
-        self._policy = policy_agent = PolicyAgent(policy, names, single=True)
+        self._policy = policy_agent = _TimedPolicy(policy, names, watch)
+        self.times = TickTimes(pacer.period)
+        """Of the last ticks."""
         self._stop_variable = "env/done" if boundary is None else STOP
         chain: list[Agent] = [
             _StopAgent(self.switch, watch),
@@ -140,8 +142,8 @@ class Deployment:
             *agents,
             _DetectorAgent(self, policy_agent),
         ]
-        self._flight = None if recorder is None else RecorderAgent(recorder, env, names, journal, watch)
-        chain += [] if self._flight is None else [self._flight]
+        self._flight = RecorderAgent(recorder, env, names, journal, watch)
+        chain.append(self._flight)
         self._loop = TemporalAgent(Agents(*chain))
 
     def connect(self) -> None:
@@ -184,17 +186,20 @@ class Deployment:
 
     def sent(self, tick: Tick, state: RobotState) -> None:
         """Take a command that a `SafeRobot` has sent, for the recording: `SafeRobot.observe` has one observer only."""
-        if self._flight is not None:
-            self._flight.sent(tick, state)
+        self._flight.sent(tick, state)
+
+    def record(self, recorder: Recorder) -> None:
+        """Record with another recorder, which has started, from the next episode on; the one before is not closed."""
+        self.recorder = recorder
+        self._flight.begin(recorder)
 
     def record_command(self) -> None:
         """Record the last command, if no tick has: that of a person who drives, or the one before a fault."""
-        if self._flight is not None:
-            self._flight.record_last_command()
+        self._flight.record_last_command()
 
     def _end_recording(self, ending: Ending | None) -> None:
         """Record how it ended; without an ending, leave the rest to the recorder's process, which outlives this one."""
-        if self.recorder is None or self._flight is None:
+        if self.recorder is None:
             return
         self.record_command()
         if ending is None:
@@ -289,6 +294,22 @@ class _StopAgent(Agent):
         self._switch.raise_again()
 
 
+class _TimedPolicy(PolicyAgent):
+    """The policy's agent, which measures how long an action takes."""
+
+    def __init__(self, policy: Any, names: tuple[str, ...], watch: Stopwatch) -> None:
+        super().__init__(policy, names, single=True)
+        self._declare(_TimedPolicy, reads=(*names, self._timestep, self._done), writes=(self.output,))
+        self._watch = watch
+
+    def forward(self, t: int, seed: Any = None, **kwargs: Any) -> None:
+        watch, begun, computed = self._watch, time.perf_counter(), time.thread_time()
+        try:
+            super().forward(t, seed, **kwargs)
+        finally:
+            watch.acted, watch.computed = time.perf_counter() - begun, time.thread_time() - computed
+
+
 class _DetectorAgent(Agent):
     """Compares what the policy sees and does, and how the robot answers, with its training, if it has a detector."""
 
@@ -358,5 +379,16 @@ class _JournalAgent(Agent):
             watcher.ticked(record, self.get(("action", t - 1))[0], self._pacer)
             if end != "stopped":
                 watcher.ended(record)
-        self._watch.late = 0.0 if done else self._pacer.wait()
+        if done:
+            self._watch.late = 0.0
+        else:
+            self._wait(self._journal.records[-1], begins=t == 0)
         self._watch.waited = time.perf_counter()
+
+    def _wait(self, record: EpisodeRecord, *, begins: bool) -> None:
+        """Wait for the deadline of the next action."""
+        pacer, watch, missed = self._pacer, self._watch, self._pacer.missed
+        watch.late = pacer.wait()
+        if not begins:
+            missed = pacer.missed - missed
+            record.slow += self._deployment.times.add(watch.late, missed, watch.acted, watch.computed)

@@ -48,6 +48,8 @@ class Stopwatch:
     begun = stepped = waited = 0.0
     late = 0.0
     """Delay of the tick after its deadline [s]."""
+    acted = computed = 0.0
+    """Duration and CPU time of the last action [s]."""
     latency = 0.0
     """Time from the deadline of the tick before to its step [s]."""
 
@@ -118,7 +120,7 @@ class RecorderAgent(Agent):
     robot's newest state when the command was sent; and ``record``, what recording the tick before took.
 
     Args:
-        recorder: The recorder, which has started.
+        recorder: The recorder, which has started; None: nothing is recorded until `begin`.
         env: The environment.
         names: The variables of the observation.
         journal: The journal.
@@ -128,23 +130,33 @@ class RecorderAgent(Agent):
     writes = ()
 
     def __init__(
-        self, recorder: Recorder, env: gym.Env[Any, Any], names: tuple[str, ...], journal: Journal, watch: Stopwatch
+        self,
+        recorder: Recorder | None,
+        env: gym.Env[Any, Any],
+        names: tuple[str, ...],
+        journal: Journal,
+        watch: Stopwatch,
     ) -> None:
         super().__init__()
-        self._recorder, self._env, self._journal, self._watch = recorder, env.unwrapped, journal, watch
+        self._env, self._journal, self._watch = env.unwrapped, journal, watch
         self._robot: Any = getattr(self._env, "robot", None)
         self._has_states = isinstance(self._env, RobotEnv)
         self._names, self.reads = names, (*names, "action", "env/reward")
         self._numbers: list[str] = []
         self._pictures: list[str] = []
-        self._declared = False  # the layout of /sent
-        self._warned = 0
+        self.begin(recorder)
         self._decided, self._took, self._age = 0.0, math.nan, math.nan
         self._sent: tuple[Sequence[float], RobotState] | None = None
         """The last command, and the state after it, until a tick records them."""
         observe = getattr(self._robot, "observe", None)
         if observe is not None:
             observe(self.sent)
+
+    def begin(self, recorder: Recorder | None) -> None:
+        """Record with this recorder from the next episode on."""
+        self._recorder: Any = recorder
+        self._declared = False  # the layout of /sent
+        self._warned = 0
 
     def sent(self, tick: Tick, state: RobotState) -> None:
         """Keep a command and the state that it led to; those on the way to a start pose are recorded at once."""
@@ -154,7 +166,7 @@ class RecorderAgent(Agent):
 
     def record_last_command(self) -> None:
         """Record the last command in /sent, if no tick has recorded it."""
-        if self._sent is None:
+        if self._sent is None or self._recorder is None:
             return
         (command, state), self._sent = self._sent, None
         signals = [signal for signal in self._robot.spec.signals if len(signal.labels) <= MAX_SENT_SIGNAL]
@@ -167,6 +179,8 @@ class RecorderAgent(Agent):
 
     def forward(self, t: int, seed: int, **kwargs: Any) -> None:
         """Record the tick."""
+        if self._recorder is None:
+            return
         begun, watch, record, self._sent = perf_counter(), self._watch, self._journal.records[-1], None
         state: Any = self._env.last_state if self._has_states else None  # type: ignore[attr-defined]
         get, action = self.get, self.get(("action", t))

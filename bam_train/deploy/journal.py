@@ -28,6 +28,8 @@ class EpisodeRecord:
     """`is_success` of the last info; None if the environment does not report it."""
     end: str = "stopped"
     """``"terminated"`` (the task's end), ``"truncated"`` (the time limit) or ``"stopped"`` (cut short)."""
+    slow: int = 0
+    """Number of ticks that its policy made late; see `TickTimes`."""
 
     def to_json(self) -> dict[str, Any]:
         """The record as JSON values; a return that is not finite is None."""

@@ -110,10 +110,11 @@ def _timing(profile: RobotProfile, spec: RobotSpec, inspection: Inspection, sour
         return
     rate = (len(new) - 1) / (new[-1] - new[0]) if len(new) > 1 and new[-1] > new[0] else 0.0
     what = f"{rate:.3g} Hz" if rate else f"{len(new)} new in {inspection.seconds:.1f} s"
-    yield check(f"rate of {source.topic}", f"at least {least:.3g} Hz", what, fits=rate >= least)
+    yield check(f"rate of {source.topic}", f"at least {least:.3g} Hz", what, fits=rate >= least, passes=True)
     if rate >= least:
         age = statistics.median(ages)
-        yield check(f"age of {source.topic}", f"at most {allowed:g} s", f"{age:.3f} s", fits=age <= allowed)
+        found = f"{age:.3f} s"
+        yield check(f"age of {source.topic}", f"at most {allowed:g} s", found, fits=age <= allowed, passes=True)
     yield from _stamps(inspection, source, letters)
 
 

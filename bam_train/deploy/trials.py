@@ -133,9 +133,10 @@ class TrialRecord:
             BadTrials: A line was edited, removed, added or moved; the file or its key cannot be read.
         """
         lines = self._read().lines if self.path.exists() else []
+        void = {row.get("ended") for row in lines if row.get("void") is True}
         succeeded = {row.get("ended") for row in lines if row.get("success") is True}
         starts: dict[Any, bool] = {}  # seed of each start -> whether every trial with it succeeded
-        begun = [row for row in lines if "begun" in row and _subject_of(row) == subject]
+        begun = [row for row in lines if "begun" in row and _subject_of(row) == subject and row["begun"] not in void]
         for row in begun:
             start = row.get("seed", row["begun"])
             starts[start] = starts.get(start, True) and row["begun"] in succeeded
@@ -157,9 +158,10 @@ class TrialRecord:
         self._append({"begun": name, **vars(subject), **facts})
         return name
 
-    def end(self, name: str, success: bool, reason: str) -> None:
-        """Record the end of the trial `name`."""
-        self._append({"ended": name, "success": success, "reason": reason, "time": _now()})
+    def end(self, name: str, success: bool, reason: str, *, void: bool = False) -> None:
+        """Record the end of the trial `name`; a `void` one does not count."""
+        row = {"ended": name, "success": success, "reason": reason, "time": _now()}
+        self._append({**row, "void": True} if void else row)
 
     def _append(self, row: dict[str, Any]) -> None:
         try:
@@ -331,11 +333,11 @@ class Trials:
         """Record the start of a trial; raises BadTrials if that fails, and then the robot must not move."""
         self._running = self.record.begin(self.subject, **self.facts, seed=seed)
 
-    def end(self, success: bool, reason: str) -> None:
-        """Record the end of the running trial, if there is one."""
+    def end(self, success: bool, reason: str, *, void: bool = False) -> None:
+        """Record the end of the running trial, if there is one; a `void` one does not count."""
         if self._running is not None:
             running, self._running = self._running, None
-            self.record.end(running, success, reason)
+            self.record.end(running, success, reason, void=void)
 
 
 def _now() -> str:

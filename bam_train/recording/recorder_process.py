@@ -212,11 +212,12 @@ def main() -> None:
         os.nice(5)
     ring, parent = Ring(int(sys.argv[1])), int(sys.argv[2])
     head = json.loads(ring.read() or b"{}")
-    last = head["paths"][-1]
+    made = last = head["paths"][-1]
     try:
         Path(last).parent.mkdir(parents=True, exist_ok=True)
         file = RecordingFile(head)
-        ring.begin(1 + head["paths"].index(file.file.name))
+        made = file.file.name
+        ring.begin(1 + head["paths"].index(made))
         drain(ring, file, parent)
         file.close()
         return
@@ -226,5 +227,5 @@ def main() -> None:
         if isinstance(error, FileExistsError) and error.filename == last:
             what = "a folder" if Path(last).is_dir() else "a recording"
             why = f"{what} is there already. Choose another file"
-        ring.fail(f"{last}: {why}")
+        ring.fail(f"{made}: {why}")
     os._exit(1)  # skips Python's attempt to write its buffer again

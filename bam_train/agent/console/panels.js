@@ -51,6 +51,7 @@ function showRun(status) {
     "Stage": [...new Set([status.stage ?? "-", ...(status.marks ?? [])])].join(", "),
     "Environment": status.env ?? "-",
     "Success, last 20 episodes": rate,
+    "Trials of the candidate": status.trial ? `${status.trial.done} of ${status.trial.needed}` : "-",
     "Episodes": `${status.episodes ?? 0}, step ${status.steps ?? 0} of this one`,
     "Link latency": ms(status.link_ms),
     "Loop latency": `${ms(status.loop_ms)} of ${ms(status.period == null ? null : 1000 * status.period)}`,

@@ -12,7 +12,7 @@ import contextlib
 import logging
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, Protocol
@@ -31,7 +31,7 @@ from bam_envs.rosbridge.threads import Workers
 from bam_envs.rosbridge.tokens import Role
 from bam_train.agent.front.upload import Upload, remove_leftovers
 from bam_train.agent.remote import agent_protocol as protocol
-from bam_train.errors import BamTrainError, RoleTooLow
+from bam_train.errors import BamTrainError, RequestRefused, RoleTooLow
 
 _log = logging.getLogger(__name__)
 _THREADS = 64
@@ -57,6 +57,8 @@ class Person:
     role: Role
     connection: str
     """Unique name of the socket."""
+    silence: Callable[[], float] = field(default=lambda: 0.0, compare=False)
+    """Time since the last sign of life of the socket [s]."""
 
 
 Event = Mapping[str, Any]
@@ -109,7 +111,7 @@ class AgentSocket:
 
     @property
     def sockets(self) -> dict[str, Handler]:
-        """For a `Site`."""
+        """For a `Site`, which lets them in always: a client without a place may stop the robot."""
         return {protocol.PATH: self.serve}
 
     async def serve(self, connection: BridgeConnection, caller: Caller) -> None:
@@ -163,7 +165,7 @@ class _Client:
 
     def __init__(self, owner: AgentSocket, connection: BridgeConnection, caller: Caller) -> None:
         self._owner, self._hub, self._connection, self._caller = owner, owner.hub, connection, caller
-        self._person = Person(caller.address, caller.address, caller.role, caller.name)
+        self._person = Person(caller.address, caller.address, caller.role, caller.name, caller.silence)
         self._loop = asyncio.get_running_loop()
         self._last = -1  # id of the last request
         self._running = 0  # requests that worker threads execute
@@ -226,8 +228,7 @@ class _Client:
                     raise protocol.BadRequest(f"The id {number} is not above {self._last}: ids grow.", number)
                 self._last = number
             if request.name:
-                shown = "".join(one if one.isprintable() else "?" for one in request.name)
-                self._person = replace(self._person, name=shown)
+                self._person = replace(self._person, name=request.name)
             self._require_role(request)
             await self._do(request)
         except protocol.BadRequest as error:
@@ -242,6 +243,8 @@ class _Client:
         op, role = request.__struct_config__.tag, self._caller.role
         if not protocol.may(role, type(request)):
             raise RoleTooLow(f"{op} needs a token of the role {request.role}; the token shown has the role {role}.")
+        if self._caller.full and not isinstance(request, (protocol.Stop, protocol.Status)):
+            raise RequestRefused(f"{self._caller.full} This connection can stop the robot, and look at its status.")
         if isinstance(request, protocol.Take) and request.force and not self._caller.operator:
             raise RoleTooLow("Taking command by force needs a token of the role administer (bam-agent --token-file).")
 

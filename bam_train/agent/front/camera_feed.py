@@ -1,7 +1,8 @@
 """Pictures of a robot's cameras for people who look: the newest of each camera, on a WebSocket of its own.
 
-A camera is connected only while somebody looks. A picture is sent when the one before it was drawn, so that a slow
-link gets fewer pictures, and never old ones; commands have another socket, and wait for none of them.
+A camera is connected only while somebody looks. A picture is sent when the one before it was drawn, and later if that
+took long: a slow link or a busy computer gets fewer pictures, never old ones, and the buttons of the page come first.
+Commands have another socket, and wait for no picture.
 """
 
 import asyncio
@@ -9,7 +10,8 @@ import contextlib
 import io
 import json
 import threading
-from collections.abc import Mapping
+import time
+from collections.abc import Callable, Mapping
 from typing import Protocol
 
 import msgspec
@@ -23,6 +25,8 @@ from bam_envs.rosbridge.server.server_connection import BridgeConnection
 
 _LOOK, _AGAIN, _ALIVE = 0.02, 2.0, 1.0
 """Times between two looks at a camera, two attempts to connect it, and two signs of life to a page [s]."""
+_QUICK, _LONGEST = 0.02, 0.5
+"""Time to draw a picture above which pictures give way, and longest pause between two of them [s]."""
 _QUALITY = 80
 """Quality of pictures that arrive uncompressed, and are sent as JPEG."""
 
@@ -79,30 +83,71 @@ class CameraFeed:
             reader.stop()
 
     async def _show(self, connection: BridgeConnection) -> None:
-        ready, shown, told = set(range(len(self._names))), [0] * len(self._names), [""] * len(self._names)
+        page, shown, told = PagePace(), [0] * len(self._names), [""] * len(self._names)
         await connection.send(json.dumps({"cameras": self._names, "seen": self._seen}))
-        listening = asyncio.create_task(_listen(connection, ready, len(self._names)))
-        silent = 0.0
+        listening = asyncio.create_task(_listen(connection, page, len(self._names)))
+        silent, turn = time.monotonic(), 0
         try:
             while not listening.done():
                 for number, reader in enumerate(self._readers):
                     if reader.error != told[number]:
                         told[number] = reader.error
                         await connection.send(json.dumps({"camera": number, "error": reader.error}))
-                    at, data = reader.newest
-                    if number in ready and at != shown[number]:
-                        ready.discard(number)
-                        shown[number], silent = at, 0.0
+                for number in (*range(turn, len(shown)), *range(turn)):
+                    at, data = self._readers[number].newest
+                    if page.is_free and at != shown[number]:
+                        shown[number], silent, turn = at, time.monotonic(), number + 1
+                        page.sent(number)
                         await connection.send(bytes([number]) + data)
-                await asyncio.sleep(_LOOK)
-                silent += _LOOK
-                if silent > _ALIVE:
+                await page.wait(_LOOK)
+                if time.monotonic() - silent > _ALIVE:
                     await connection.send('{"event": "alive"}')
-                    silent = 0.0
+                    silent = time.monotonic()
         finally:
             listening.cancel()
             with contextlib.suppress(asyncio.CancelledError, ConnectionClosed):
                 await listening
+
+
+class PagePace:
+    """Whether a page has time for a picture; it gets one at a time, of whichever camera.
+
+    After a picture it has as much time for something else as that took, and more if that was longer than `_QUICK`.
+
+    Args:
+        clock: Monotonic [s].
+    """
+
+    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
+        self._clock, self._drawn = clock, asyncio.Event()
+        self._camera, self._sent, self._free = -1, 0.0, 0.0
+
+    @property
+    def is_free(self) -> bool:
+        """Whether the next picture may be sent."""
+        return self._camera < 0 and self._clock() >= self._free
+
+    def sent(self, camera: int) -> None:
+        """A picture of a camera is on its way."""
+        self._camera, self._sent = camera, self._clock()
+        self._drawn.clear()
+
+    def drew(self, camera: int) -> None:
+        """The page drew it."""
+        if camera == self._camera:
+            now = self._clock()
+            took, self._camera = now - self._sent, -1
+            self._free = now + min(took * max(1.0, took / _QUICK), _LONGEST)
+            self._drawn.set()
+
+    async def wait(self, longest: float) -> None:
+        """Wait until the next picture may be sent; at most so long [s], also where it may be sent at once."""
+        if self._camera >= 0:
+            with contextlib.suppress(asyncio.TimeoutError):
+                await asyncio.wait_for(self._drawn.wait(), longest)
+        if self._camera < 0:
+            pause = self._free - self._clock()
+            await asyncio.sleep(min(pause, longest) if pause > 0 else longest)
 
 
 class _Next(msgspec.Struct):
@@ -110,13 +155,13 @@ class _Next(msgspec.Struct):
     camera: int = -1
 
 
-async def _listen(connection: BridgeConnection, ready: set[int], cameras: int) -> None:
+async def _listen(connection: BridgeConnection, page: PagePace, cameras: int) -> None:
     """Note which cameras' pictures were drawn, until the connection closes."""
     while True:
         with contextlib.suppress(msgspec.MsgspecError, RecursionError):  # also lists in lists in lists
             message = msgspec.json.decode(await connection.next_message(), type=_Next)
             if message.op == "next" and 0 <= message.camera < cameras:
-                ready.add(message.camera)
+                page.drew(message.camera)
 
 
 class _Reader:

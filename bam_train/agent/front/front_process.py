@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import itertools
 import logging
+import math
 import signal
 import sys
 import threading
@@ -52,14 +53,18 @@ from bam_train.agent.front.camera_feed import CameraFeed
 from bam_train.agent.front.hub import AgentHub
 from bam_train.agent.front.remote_robot import RemoteRobot
 from bam_train.agent.front.site_pages import console_pages
+from bam_train.agent.remote.agent_protocol import printable
 from bam_train.agent.transitions import EVENT
 from bam_train.env_location import Place
 from bam_train.environments import make_env
 from bam_train.errors import BamTrainError, CandidateRefused, RequestRefused, TrialsNeeded, UnknownVersion
+from bam_train.log_lines import begin_log
 
 _log = logging.getLogger(__name__)
 CUT = 2.0
 """Time for which the lease of an owner stays whose link was cut [s]."""
+SILENT = 3.0
+"""Time without a sign of life, of which there is one a second, after which the link of an owner counts as cut [s]."""
 _LOOK = 0.1  # time between two looks at the lease [s]
 _HALT_LATE = 1.0  # longest time for which a halt comes after the end of its sender's lease [s]
 _REFUSALS = {one.__name__: one for one in (NotInCommand, CandidateRefused, TrialsNeeded, UnknownVersion)}
@@ -78,6 +83,7 @@ class AgentLease(CommandLease):
         super().__init__(seconds, clock)
         self._now, self._used = clock, 0.0
         self._cut: tuple[str, str, float] | None = None  # owner, name for people, end of the lease
+        self._how = ""  # the link of that owner was lost
 
     def take(
         self, client: str, caller: Caller = UNKNOWN_CALLER, *, force: bool = False, shown: str | None = None
@@ -119,9 +125,14 @@ class AgentLease(CommandLease):
         """Begin the time without use anew."""
         self._used = self._now()
 
-    def cut(self, client: str, shown: str) -> None:
-        """Keep the lease of a client whose link was cut for `CUT` [s]."""
-        self._cut = client, shown, self._now() + CUT
+    def cut(self, client: str, shown: str, how: str = "was cut") -> None:
+        """Keep the lease of a client for `CUT` [s], as `how` it lost its link."""
+        self._cut, self._how = (client, shown, self._now() + CUT), how
+
+    @property
+    def is_silent(self) -> bool:
+        """Whether there is an owner without a sign of life: frozen, or behind a network that is gone."""
+        return self.holder is not None and SILENT < self.silence < math.inf
 
     @property
     def is_cut(self) -> bool:
@@ -134,7 +145,7 @@ class AgentLease(CommandLease):
             client, shown, end = self._cut
             if self._now() >= end:
                 self._cut = None
-                return client, f"the lease of {shown} ended, {CUT:g} s after its link was cut"
+                return client, f"the lease of {shown} ended, {CUT:g} s after its link {self._how}"
         elif self.holder is not None and self._now() - self._used > self.seconds:
             client, shown = self.holder, self._shown or self.holder
             return client, f"the lease of {shown} ended: it was not used for {self.seconds:g} s"
@@ -262,16 +273,19 @@ class FrontProcess:
         if caller.name == self.lease.connection or caller.client == holder:
             self.cut(holder, caller.address)
 
-    def cut(self, client: str, address: str) -> None:
+    def cut(self, client: str, address: str, how: str = "was cut") -> None:
         """The link of `client` ended: if it has the lease, the robot holds, and the lease ends a little later."""
         if self.lease.holder == client and client not in self._handing:
             shown = self.lease.owner or client
-            self.send(Ask(0, "cut", {"lease": client}, shown, address))
-            self.lease.cut(client, shown)
+            self.send(Ask(0, "cut", {"lease": client, "how": how}, shown, address))
+            self.lease.cut(client, shown, how)
             self.lease.release(client)
 
     def _watch_lease(self) -> None:
-        """End leases that are over."""
+        """End leases that are over, or whose owner is silent."""
+        holder = self.lease.holder
+        if holder is not None and self.lease.is_silent:
+            self.cut(holder, "", f"was silent for {SILENT:g} s")
         over = self.lease.over()
         if over is not None:
             client, why = over
@@ -282,7 +296,7 @@ class FrontProcess:
 
     def answer_client(self, request: Fields, caller: Caller) -> Fields:
         """A program's request on `AGENT_TOPIC`."""
-        do, who = request.get("do"), f"{str(request.get('who'))[:80]} ({caller.address or caller.shown})"
+        do, who = request.get("do"), f"{printable(str(request.get('who'))[:80])} ({caller.address or caller.shown})"
         if do == "look":
             owner = (
                 None if self.lease.holder in (None, caller.client) and self.lease.owner is None else self.lease.owner
@@ -374,7 +388,7 @@ class FrontProcess:
 def main() -> None:
     """Run the process; its argument is the number of the socket that the resident left open."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the resident ends it
-    logging.basicConfig(level=logging.WARNING, format="bam-agent: %(message)s")
+    begin_log("bam-agent")
     end = adopted(int(sys.argv[1]))
     options = msgspec.msgpack.decode(end.recv(2**20), type=Front)
     receivers: list[Callable[[Any], None]] = []
@@ -383,7 +397,8 @@ def main() -> None:
         front = FrontProcess(options, channel.send)
         console = AgentSocket(front.hub)
         pictures = CameraFeed(front.cameras(), front.seen())
-        site = Site(console_pages(), {**console.sockets, "/camera": pictures.serve})
+        sockets = {**console.sockets, "/camera": pictures.serve}
+        site = Site(console_pages(), sockets, always=frozenset(console.sockets))
         tokens = Tokens(otherwise="administer") if options.token_file is None else TokenFile(options.token_file)
         network = ServerOptions(open_timeout=2.0, max_clients=64)
         where: Any = {"cert": options.cert, "key": options.key, "tokens": tokens, "site": site, "options": network}

@@ -172,7 +172,7 @@ class AgentHub:
         front, client = self._front, _client(person)
         if force and not self._by_force:
             raise NotInCommand("Taking by force needs a token that administers, and this agent was started without.")
-        caller = Caller(client, person.address, operator=person.role == "administer", silence=lambda: 0.0)
+        caller = Caller(client, person.address, operator=person.role == "administer", silence=person.silence)
         front.lease.grant(client, caller, force=force, shown=f"{person.name} ({person.address})")
         with self._lock:
             if self._jogger is not None:

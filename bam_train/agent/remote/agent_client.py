@@ -80,7 +80,8 @@ class AgentClient:
     ) -> None:
         full = agent_url(url)
         self._endpoint = Endpoint.with_token_file(full, ca_file=ca_file, token_file=token_file)
-        self.url, self.timeout, self.name = self._endpoint.address.url, timeout, name or _whoami()
+        address = self._endpoint.address
+        self.url, self.host, self.timeout, self.name = address.url, address.host, timeout, name or _whoami()
         self.role, self.agent = "", ""
         """What this client may do, and the agent's version of bam-train; known once it is connected."""
         self.error: BamEnvsError | None = None

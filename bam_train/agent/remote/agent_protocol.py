@@ -159,7 +159,7 @@ _HEAD = msgspec.json.Decoder(_Head)
 
 
 def decode_request(data: bytes) -> Request:
-    """The request in a text frame; `BadRequest` says in one line what is wrong with it."""
+    """The request in a text frame, its texts printable; `BadRequest` says in one line what is wrong with it."""
     number = None
     if len(data) > LONGEST_TEXT:
         raise BadRequest(f"A request has at most {LONGEST_TEXT} bytes; this one has {len(data)}.")
@@ -168,10 +168,17 @@ def decode_request(data: bytes) -> Request:
         number = head.id
         if head.op not in _DECODERS:
             raise BadRequest(f"Unknown op {brief(head.op)}. {did_you_mean(head.op, OPS)}", number)
-        return _DECODERS[head.op].decode(data)
+        request = _DECODERS[head.op].decode(data)
+        texts = {name: value for name in request.__struct_fields__ if isinstance(value := getattr(request, name), str)}
+        return msgspec.structs.replace(request, **{name: printable(value) for name, value in texts.items()})
     except (msgspec.MsgspecError, RecursionError) as error:  # also lists in lists in lists
         reason = " ".join(str(error).split()) or "it is nested too deeply"
         raise BadRequest(f"This is no request: {reason}.", number) from error
+
+
+def printable(text: str) -> str:
+    """A text of somebody else for logs and screens: ? in place of control characters."""
+    return "".join(one if one.isprintable() else "?" for one in text)
 
 
 def may(role: Role, request: type[Request]) -> bool:

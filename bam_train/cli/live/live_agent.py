@@ -87,8 +87,12 @@ def status_lines(status: Mapping[str, Any]) -> Iterator[str]:
     if get("episodes") is not None:
         recent = [one for one in get("recent") or () if one is not None]
         yield f"  episodes  {get('episodes')}, {get('successes')} succeeded; {sum(recent)} of the last {len(recent)}"
+    if trial := get("trial"):
+        yield f"  trial     {trial['done']} of {trial['needed']}: {trial['text']}"
     if get("ticks") is not None:
-        yield f"  ticks     {get('ticks')}, {get('late')} late; link {get('link_ms')} ms, policy {get('loop_ms')} ms"
+        slow = f" ({get('slow')} because of the policy)" if get("slow") else ""
+        times = f"link {get('link_ms')} ms, policy {get('loop_ms')} ms"
+        yield f"  ticks     {get('ticks')}, {get('late')} late{slow}; {times}"
     for name, guard in (get("guards") or {}).items():
         did = [f"{did} {guard[did]}" for did in ("altered", "held", "stopped") if guard.get(did)]
         if did:

@@ -30,7 +30,7 @@ def push(config: PushConfig, signals: SignalMemory) -> int:
             _pass_gate(agent, path, config.gate)
         choice: dict[str, Any] = {"stage": config.stage, "when": config.when, "wait": config.wait, "why": config.why}
         result = agent.push(path, **choice, progress=_progress)
-        return {**agent.ask("status"), **result}
+        return {**result, **agent.ask("status")}
 
     result = with_agent(config, url, do)
     outcome = str(result.get("outcome") or "")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import os
 from collections.abc import Sequence
 from contextlib import ExitStack
@@ -12,16 +11,12 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from bam_train.cli.console import ShownFormatter, say
+from bam_train.log_lines import begin_log
 from bam_train.signals import SignalMemory
 
 if TYPE_CHECKING:
     from bam_train.agent.agent_options import AgentOptions
     from bam_train.cli.flags import AgentConfig
-
-
-def _tell(line: str) -> None:
-    say(f"bam-agent: {line}")
 
 
 def run_agent(config: AgentConfig, signals: SignalMemory) -> int:
@@ -38,9 +33,7 @@ def run_agent(config: AgentConfig, signals: SignalMemory) -> int:
     from bam_train.signals import handled
 
     options = _options(config)
-    handler = logging.StreamHandler()
-    handler.setFormatter(ShownFormatter("bam-agent: %(message)s"))
-    logging.basicConfig(level=logging.WARNING, handlers=[handler])
+    tell = begin_log("bam-agent")
     with ExitStack() as stack:
         versions = Versions(options.folder / "versions")
         stack.enter_context(versions.held())
@@ -70,7 +63,7 @@ def run_agent(config: AgentConfig, signals: SignalMemory) -> int:
             versions,
             audit,
             send=front.send,
-            tell=_tell,
+            tell=tell,
             admit=partial(_admit, config, signals),
             is_running=not (config.paused or ran_before),
         )
@@ -81,17 +74,17 @@ def run_agent(config: AgentConfig, signals: SignalMemory) -> int:
         stack.callback(audit.write, "ended", f"process {os.getpid()}", who="the agent")
         scheme = "wss" if options.cert else "ws"
         where = f"{options.bind}:{front.options.port}"
-        _tell(f"listens on {scheme}://{where}; the console is at {scheme.replace('ws', 'http')}://{where}")
+        tell(f"listens on {scheme}://{where}; the console is at {scheme.replace('ws', 'http')}://{where}")
         if options.warning is not None:
-            _tell(options.warning)
+            tell(options.warning)
         if ran_before and not config.paused:
-            _tell(f"it ran before in {options.folder}, so it starts paused")
+            tell(f"it ran before in {options.folder}, so it starts paused")
         with handled(resident.switch, ignored_too=True):
             resident.switch.came += signals.came
             try:
                 resident.run()
             except Stopped:
-                _tell("interrupted: the robot is halted, and nobody drives it")
+                tell("interrupted: the robot is halted, and nobody drives it")
                 return 128 + resident.switch.came[0]
     return 0
 

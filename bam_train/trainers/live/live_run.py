@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 from bam_envs.core.registry import resolve_id
+from bam_envs.rosbridge.endpoint import is_loopback
 from bam_train.agent.remote.agent_client import AgentClient
 from bam_train.checkpoint import Checkpoint
 from bam_train.environments import require_env_kwargs
@@ -20,6 +22,8 @@ from bam_train.trainers.run_folder import RunFolder, require_room
 
 STEPS = 20_000
 """Steps of the robot, unless ``--steps`` says otherwise."""
+_NICE = 10
+"""Added to the niceness of a learner on the computer of its agent."""
 _FIXED = ("env", "env_kwargs", "hyperparameters", "start")
 
 
@@ -73,7 +77,10 @@ def learn(
     """
     link = {name: given[name] for name in ("token_file", "ca_file") if name in given}
     connect = partial(AgentClient, url, **link)
-    connect()  # refuses a malformed address, before anything takes long
+    client = connect()  # refuses a malformed address, before anything takes long
+    if is_loopback(client.host) and hasattr(os, "nice"):
+        os.nice(_NICE)  # a late tick may stop the robot; a learner has time
+        tell(f"the agent runs on this computer too, and its ticks go first on the {os.cpu_count()} cores")
     settings = live_settings({name: value for name, value in given.items() if name not in link}, checkpoint)
     require_room(runs)
     output = choose_output(settings, out, force, checkpoint)

@@ -9,10 +9,12 @@ import queue
 import threading
 import time
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 from bam_envs.core.errors import BamEnvsError
+from bam_train.agent.agent_states import State
 from bam_train.agent.remote.agent_client import AgentClient
 from bam_train.agent.transitions import decode
 from bam_train.errors import AgentRefused, BamTrainError, OutputError, TrainingFailed
@@ -23,7 +25,11 @@ _UPDATES = 20  # updates between two looks at what came
 _LOOK = 0.2  # longest wait for transitions [s]
 _AGAIN = 2.0  # time between two attempts to reach the agent [s]
 _GHOST = 60.0  # time for which an agent may take this learner, whose link was cut, for another one [s]
-_SAVE_EVERY, _TELL_EVERY = 60.0, 15.0  # [s]
+_SAVE_EVERY = 60.0  # [s]
+TELL_EVERY = 15.0
+"""Time between two lines for the user [s]."""
+_RESTS = (State.PAUSED.value, State.STOPPED.value)
+"""States in which the agent waits for a person."""
 
 
 class LiveSession:
@@ -58,6 +64,7 @@ class LiveSession:
         self._pusher: threading.Thread | None = None
         self._pushed = len(learner.experience.outcomes)  # episodes at the last candidate
         self._saved = self._told = time.monotonic()
+        self._still = ""  # why no steps come, as it was told last
 
     def run(self) -> bool:
         """Learn until the steps are done (True), or the user wants to end (False); saves in both cases.
@@ -132,15 +139,34 @@ class LiveSession:
 
     def _update(self) -> None:
         self.learner.learn(_UPDATES)
-        if time.monotonic() - self._told > _TELL_EVERY:
+        if time.monotonic() - self._told > TELL_EVERY:
+            learns = self._learned_at is not None and self._learned_at > self._told
             self._told = time.monotonic()
-            figures = self.learner.statistics()
+            if not learns:
+                self._tell_why()
+                return
+            self._still, figures = "", self.learner.statistics()
             rate = figures["success_rate"]
             shown = "unknown" if rate is None else f"{rate:.0%}"
             self._tell(
                 f"{self.learner.steps} steps ({figures['interventions']} of a person), {figures['episodes']} episodes, "
                 f"{figures['updates']} updates; success of the last episodes {shown}"
             )
+
+    def _tell_why(self) -> None:
+        """Tell, once, why no steps come."""
+        client = self._client
+        if client is None:
+            return
+        with suppress(BamTrainError, BamEnvsError):  # `_take` learns of a lost link too
+            status = client.ask("status")
+            state, why = status.get("state"), status.get("why")
+            text = f"no steps come: the agent is {state}{f' ({why})' if why else ''}"
+            if state in _RESTS:
+                text += f"; look at the robot, then: bam-agent resume {client.url}"
+            if text != self._still:
+                self._tell(text)
+            self._still = text
 
     # ---- candidates and files
 

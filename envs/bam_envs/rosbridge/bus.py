@@ -28,6 +28,7 @@ class Caller:
     session: str = ""  # the session whose signature the message bears; empty without one
     operator: bool = False  # whether it showed a token that administers, and may take command from others
     role: Role = "drive"  # what it may do
+    full: str = ""  # why it has no place among the clients, and may do no more than stop a robot; empty if it has one
     silence: Callable[[], float] = field(default=lambda: math.inf, compare=False)
     """Time since the last sign of life of its connection [s]; infinite if the bus does not know."""
 
@@ -86,7 +87,10 @@ def answer(handler: Handler, request: Message, caller: Caller, name: str) -> Mes
 
 
 class Bus(Protocol):
-    """Publish, subscribe, serve, from any thread. Subclasses inherit `publish`, and an `on_leave` without effect."""
+    """Publish, subscribe, serve, from any thread.
+
+    Subclasses inherit `publish`, and `reserve` and `on_leave` without effect.
+    """
 
     def advertise(self, topic: str, kind: str, *, latch: bool = False) -> None:
         """Declare `topic` of type `kind`; if latched, its last message is repeated to newcomers."""
@@ -108,6 +112,10 @@ class Bus(Protocol):
 
     def serve(self, service: str, kind: str, handler: Handler) -> None:
         """Answer `service` of type `kind`, even when the handler fails."""
+
+    def reserve(self, topic: str, check: Callable[[Caller], None]) -> None:
+        """Refuse what a caller publishes on `topic` if ``check(caller)`` raises a `BamEnvsError`, if the bus can."""
+        return
 
     def on_leave(self, callback: Callable[[Caller], None]) -> None:
         """Call `callback` when a caller's connection ends, if the bus reports that."""

@@ -101,6 +101,11 @@ class Tokens:
         """Whether there is anything to show."""
         return bool(self._secrets)
 
+    @property
+    def roles(self) -> set[Role]:
+        """The roles that secrets give."""
+        return set(self._secrets.values())
+
     def role(self, shown: Iterable[str]) -> Role | None:
         """The highest role that one of these secrets gives; None if all are wrong."""
         given: list[Role] = []
@@ -157,7 +162,7 @@ class Guesses:
     def may_try(self, address: str) -> bool:
         """Whether a token from the IP address `address` may be checked."""
         with self._lock:
-            now, recent = self._clock(), self._wrong.get(_network(address))
+            now, recent = self._clock(), self._wrong.get(network_of(address))
             if recent is None or now - recent[-1] > _LATELY:
                 return True
             # Full queues (4 of one address, 32 of all) whose oldest entry is not a second old.
@@ -166,7 +171,7 @@ class Guesses:
     def wrong(self, address: str) -> None:
         """Record a wrong token from `address`."""
         with self._lock:
-            network = _network(address)
+            network = network_of(address)
             recent = self._wrong.pop(network, None) or deque(maxlen=_OF_ONE)
             self._wrong[network] = recent
             for times in (recent, self._all):
@@ -175,7 +180,7 @@ class Guesses:
                 del self._wrong[next(iter(self._wrong))]
 
 
-def _network(address: str) -> str:
+def network_of(address: str) -> str:
     """The addresses that one attacker surely has: one of IPv4, a network of 64 bits of IPv6."""
     try:
         parsed = ipaddress.ip_address(address.partition("%")[0])

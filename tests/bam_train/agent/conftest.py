@@ -129,7 +129,8 @@ def new_server(hub):
             network = {name: more.pop(name) for name in ("cert", "key") if name in more}
             agent = AgentSocket(hub, **more)
             stack.callback(agent.close)
-            site = Site({"/": Page("text/html; charset=utf-8", b"the console")}, agent.sockets)
+            page = Page("text/html; charset=utf-8", b"the console")
+            site = Site({"/": page}, agent.sockets, always=frozenset(agent.sockets))
             return stack.enter_context(BridgeServer(port=0, tokens=tokens, site=site, options=options, **network))
 
         yield make

@@ -21,8 +21,10 @@ STATUS = {
     "stage": "trial",
     "marks": ["UNSIGNED", "trial"],
     "robot": "ur5e, served in real time",
+    "trial": {"done": 5, "needed": 33, "text": "5 of 5 trials succeeded; 28 more would show more than 90 %"},
     "ticks": 1200,
     "late": 3,
+    "slow": 2,
     "link_ms": 1.25,
     "loop_ms": 0.5,
     "episodes": 22,
@@ -36,7 +38,8 @@ LINES = [
     "  policy    3f2a91c0d7aa (candidate), stage trial, UNSIGNED",
     "  robot     ur5e, served in real time",
     "  episodes  22, 20 succeeded; 2 of the last 3",
-    "  ticks     1200, 3 late; link 1.25 ms, policy 0.5 ms",
+    "  trial     5 of 33: 5 of 5 trials succeeded; 28 more would show more than 90 %",
+    "  ticks     1200, 3 late (2 because of the policy); link 1.25 ms, policy 0.5 ms",
     "  guard     G8 joint speed: altered 2, stopped 1",
     "  warning   the link is slow",
 ]
@@ -57,7 +60,8 @@ def hub(hub):
         if op == "push":
             progress("checking")
             return {**STATUS, "digest": DIGEST, "lines": ["signed by alice"], "outcome": hub.outcome}
-        return STATUS | ({"state": "paused"} if hub.stops else {}) if op == "status" else {}
+        changed = {"state": "paused"} if hub.stops else {"state": "running"} if hub.outcome else {}
+        return STATUS | changed if op == "status" else {}
 
     hub.ask = ask
     return hub
@@ -163,6 +167,7 @@ def test_push_that_waits(hub, server, run, checkpoint, outcome, status):
     hub.outcome = outcome
     code, out, err = run(push.main, checkpoint, server.url, "--wait")
     assert (code, out.splitlines()[0]) == (status, f"3f2a91c0d7aa: {outcome}")
+    assert out.splitlines()[2].startswith("running for ")  # what it led to, not the trial that is over
     assert err.splitlines()[1:] == ([f"bam-push: {outcome}"] if status else [])
     assert hub.asked[0][1]["wait"] is True
 

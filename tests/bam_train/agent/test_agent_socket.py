@@ -8,9 +8,10 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from websockets.exceptions import ConnectionClosed
+from websockets.exceptions import ConnectionClosed, InvalidStatus
 
 from bam_envs import __version__
+from bam_envs.rosbridge.server import ServerOptions
 from bam_envs.rosbridge.tokens import Tokens
 from bam_train.agent.front.agent_socket import Person
 from bam_train.agent.remote.agent_protocol import OPS
@@ -38,6 +39,18 @@ def test_without_a_name_a_person_is_the_address(hub, new_raw):
     assert person.name == person.address
     new_raw().ask("status", name="anna\x1b[31m\n")
     assert hub.asked[1][2].name == "anna?[31m?"
+
+
+def test_texts_of_others_have_no_control_characters(hub, new_raw):
+    raw = new_raw("a")
+    raw.ask("rollback", why="slow\x1b[2J\n")
+    raw.ask("use", version="\x9bab")
+    refused = raw.ask("push", size=10**12, sha256="0" * 64, file="pick\x1b]0;.zip")
+    assert [arguments for _, arguments, _ in hub.asked] == [
+        {"why": "slow?[2J?"},
+        {"version": "?ab", "stage": "auto", "when": "episode", "why": ""},
+    ]
+    assert refused["error"].startswith("The upload has")
 
 
 def test_progress_comes_before_the_answer_and_holds_up_nothing(hub, new_raw):
@@ -172,6 +185,29 @@ def test_stop_and_jog_go_to_the_hub_at_once(hub, new_raw):
     driver.socket.send('{"op": "jog", "seq": 13, "twist": [0, 0, 0, 0]}')
     assert driver.receive() == {"id": None, "ok": False, "error": "bob@lab is in command", "kind": "NotInCommand"}
     assert hub.threads == {"bam-bridge-server"}
+
+
+def test_watchers_keep_no_administrator_out_and_nobody_from_the_stop_button(hub, new_server, new_raw):
+    server = new_server(options=ServerOptions(max_clients=4))
+    watchers = [new_raw("w", server) for _ in range(2)]
+    for raw in watchers:
+        assert raw.ask("status")["ok"]
+    late = new_raw("w", server)
+    assert late.ask("watch", on=True) == {
+        "id": 1,
+        "ok": False,
+        "error": "All 2 of 4 places for the role watch are taken. "
+        "This connection can stop the robot, and look at its status.",
+        "kind": "RequestRefused",
+    }
+    assert late.ask("stop", why="smoke")["ok"]
+    assert late.ask("status")["ok"]
+    assert [(person.role, why) for person, why in hub.stops] == [("watch", "smoke")]
+    for role in "da":
+        assert new_raw(role, server).ask("watch", on=True)["ok"]
+    with pytest.raises(InvalidStatus) as refused:
+        new_raw("w", server, path="/")
+    assert refused.value.response.body == b"All 2 of 4 places for the role watch are taken.\n"
 
 
 def test_stop_waits_for_no_request(hub, new_raw):

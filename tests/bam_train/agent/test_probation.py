@@ -47,6 +47,23 @@ def test_stops_are_counted_among_the_last_episodes():
     assert probation.ended(None, stopped_by="tilt (G9)") == Judgement("roll back", reason)
 
 
+def test_late_ticks_of_the_policy_roll_back():
+    probation = Probation()
+    assert probation.ended(True, slow=50, ticks=99) is None  # too few to tell
+    reason = "its actions took so long that 57 of 300 ticks were late, and at most 5 % may be"
+    assert probation.ended(True, slow=7, ticks=201) == Judgement("roll back", reason)
+
+
+def test_few_late_ticks_do_not_and_old_ones_are_forgotten():
+    probation = Probation()
+    assert {probation.ended(True, slow=5, ticks=100) for _ in range(30)} == {None}
+    assert probation.ended(True, slow=6, ticks=100).decision == "roll back"
+    probation = Probation()
+    assert probation.ended(True, slow=99, ticks=99) is None
+    assert {probation.ended(True) for _ in range(19)} == {None}
+    assert probation.ended(True, slow=5, ticks=100) is None
+
+
 def test_a_fault_of_the_policy_rolls_back():
     reason = "a fault of the policy: action: expected shape (4,), found (3,)"
     assert Probation().failed("action: expected shape (4,),\n found (3,)") == Judgement("roll back", reason)

@@ -43,8 +43,10 @@ class Agent:
         self.notes.append((what, text))
 
     def choose(self, choice):
-        self.succession.activate(choice)
+        replaced = self.succession.activate(choice)
         choice.active.set()
+        if replaced is not None:
+            replaced.close("replaced: another version acts")
 
     def stage_of_champion(self):
         pass
@@ -85,11 +87,20 @@ def test_a_pushed_candidate_acts_and_is_promoted_by_its_trials(agent, better):
     assert not better.exists()
     assert agent.succession.active.digest == new
     assert agent.succession.names == {"champion": old, "given": old, "candidate": new}
+    assert agent.succession.rolls_back_to == old  # in its first trial, before which there was none
     trials = agent.succession.trials()
+    assert (agent.succession.progress["done"], agent.succession.progress["needed"]) == (0, 33)
     for seed in range(33):
         trials.begin(seed)
         trials.end(True, "terminated")
         agent.succession.ended(EpisodeRecord(seed, success=True, end="terminated"))
+        if seed == 4:
+            assert agent.succession.progress == {
+                "done": 5,
+                "needed": 33,
+                "text": "5 of 5 trials succeeded; 28 more without a failure would show more than 90 %",
+            }
+    assert (agent.succession.progress, agent.succession.rolls_back_to) == (None, old)
     assert agent.succession.names == {"champion": new, "given": old, "previous": old}
     text = "33 of 33 trials succeeded, which shows more than 90 % (error probability at most 5 %)"
     assert agent.notes[-1] == ("promoted", f"{new[:12]} is the champion: {text}")
@@ -104,6 +115,34 @@ def test_a_candidate_that_fails_is_rolled_back(agent, better):
     assert agent.succession.active.digest == old
     assert agent.succession.names == {"champion": old, "given": old}
     why = "0 of 3 episodes succeeded, which shows less than 90 % (error probability at most 5 %)"
+    assert choice.result == f"rolled back: {why}"
+
+
+def test_an_episode_that_the_computer_cut_short_does_not_count(agent, better):
+    old, new = agent.succession.active.digest, Checkpoint.open(better).digest
+    agent.ask("push", path=str(better))
+    trials = agent.succession.trials()
+    for seed in range(4):
+        trials.begin(seed)
+        agent.succession.cut_short(EpisodeRecord(seed, length=50), "following (G23)", "the computer is busy")
+    assert agent.succession.active.digest == new
+    assert (trials.evidence.trials, trials.evidence.successes) == (0, 0)
+    text = f"the episode that was cut short does not count against {new[:12]}: the computer is busy"
+    assert agent.notes == [("trial", text)] * 4
+    for seed in (9, 10):
+        trials.begin(seed)
+        agent.succession.cut_short(EpisodeRecord(seed, length=50), "following (G23)")
+    assert agent.succession.active.digest == old
+    assert trials.evidence.trials == 2
+
+
+def test_a_candidate_that_is_too_slow_for_this_computer_is_rolled_back(agent, better):
+    old = agent.succession.active.digest
+    agent.ask("push", path=str(better))
+    choice = agent.succession.choice
+    agent.succession.ended(EpisodeRecord(0, success=True, length=300, end="terminated", slow=57))
+    assert agent.succession.active.digest == old
+    why = "its actions took so long that 57 of 300 ticks were late, and at most 5 % may be"
     assert choice.result == f"rolled back: {why}"
 
 

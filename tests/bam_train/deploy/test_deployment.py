@@ -429,3 +429,37 @@ def test_memory_stays_flat(limit):
     finally:
         tracemalloc.stop()
     assert held[1] - held[0] < 8_000
+
+
+class Clock:
+    """The time [s], and how much of it this thread had the CPU."""
+
+    def __init__(self):
+        self.now = self.cpu = 0.0
+
+    def passes(self, seconds, cpu=0.0):
+        self.now, self.cpu = self.now + seconds, self.cpu + cpu
+
+
+@pytest.mark.parametrize(
+    ("needs", "takes", "sleeps", "late", "slow"),
+    [(0.001, 0.001, 0.0, 0, 0), (0.02, 0.09, 0.0, 4, 4), (0.001, 0.09, 0.0, 4, 0), (0.02, 0.02, 0.2, 4, 0)],
+    ids=["in time", "slow", "preempted", "woken late"],
+)
+def test_late_ticks_of_the_policy_are_counted(monkeypatch, needs, takes, sleeps, late, slow):
+    clock = Clock()
+    times = SimpleNamespace(perf_counter=lambda: clock.now, thread_time=lambda: clock.cpu)
+    monkeypatch.setattr("bam_train.deploy.deployment.time", times)
+
+    class Slow(Right):
+        def act(self, observation):
+            clock.passes(takes, needs)
+            return super().act(observation)
+
+    pacer = Pacer(0.05, now=lambda: clock.now, sleep=lambda seconds: clock.passes(seconds + sleeps))
+    journal = Journal(1)
+    env = gym.wrappers.TimeLimit(gym.make("CartPole-v1"), 5)
+    deployment = Deployment(env, Slow(), pacer, journal)
+    deployment.run(Silent(), seed=0)
+    assert (deployment.times.late, deployment.times.slow, journal.records[0].slow) == (late, slow, slow)
+    assert deployment.times.computed == pytest.approx(needs)

@@ -40,6 +40,11 @@ class CommandLease:
         """Name of the connection on which it was taken."""
         return self._caller.name
 
+    @property
+    def silence(self) -> float:
+        """Time since the last sign of life of that connection [s]; infinite if it is not known."""
+        return self._caller.silence()
+
     def on_change(self, listener: Change) -> None:
         """Call `listener` whenever command changes, in the thread that changes it, without this object's lock."""
         self._listeners.append(listener)

@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from bam_envs.core.errors import LinkLost, ProtocolError, RemoteError, RobotFault
+from bam_envs.core.errors import LinkLost, NotInCommand, ProtocolError, RemoteError, RobotFault
 from bam_envs.core.robot import RobotState
 from bam_envs.core.timing import Ticker
 from bam_envs.remote.serve.command_lease import CommandLease
@@ -26,6 +26,7 @@ from bam_envs.ros.codec import (
     HALT_TOPIC,
     INFO_SERVICE,
     SCENE_TOPIC,
+    STATUS_TOPIC,
     Envelope,
     RobotInfo,
     decode_command,
@@ -147,6 +148,7 @@ class RobotService:
         self._listen(LEASE_TOPIC, "std_msgs/String", self._on_lease)
         self._bus.serve(self._namespace + SESSION_SERVICE, "std_srvs/Trigger", self.sessions.open)
         self._bus.serve(self._namespace + INFO_SERVICE, "std_srvs/Trigger", self._describe)
+        self._bus.reserve(self._namespace + STATUS_TOPIC, self._require_driver)
         self._bus.on_leave(self._on_leave)
         self._lease.on_change(self._on_change)
         self._scene.start()
@@ -185,6 +187,11 @@ class RobotService:
         self._slot.put(Order(values, complete, echo, caller.client))
         if complete and self._at_once:
             self.clock.wake()
+
+    def _require_driver(self, caller: Caller) -> None:
+        """Raise `NotInCommand` for any other client: what the guards did is told by the one whose guards they are."""
+        if self._lease.holder is None or self._lease.connection != caller.name:
+            raise NotInCommand(f"Topic {self._namespace}{STATUS_TOPIC} is for the client in command.")
 
     def _on_lease(self, message: Message, caller: Caller) -> None:
         """The client in command renews its lease, or leaves, over any of its connections."""
@@ -266,7 +273,7 @@ class RobotService:
         state = self._robot.state
         if state is None or self._robot.fault is not None:  # subscribers see that the state becomes stale
             return
-        if getattr(self._bus, "clients", 1) == 0:  # an embedded server without clients
+        if getattr(self._bus, "programs", 1) == 0:  # an embedded server whose topics nobody can hear
             return
         stamp: Callable[[float], Mapping[str, int]] = getattr(self._bus, "stamp", write_stamp)
         try:

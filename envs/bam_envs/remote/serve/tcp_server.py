@@ -27,8 +27,9 @@ from bam_envs.remote.transport import spec_to_json
 from bam_envs.remote.values import Tree
 from bam_envs.ros.freshness import FreshnessCheck, Tag
 from bam_envs.rosbridge.bus import UNKNOWN_CALLER, Caller
+from bam_envs.rosbridge.places import places, who_leaves
 from bam_envs.rosbridge.server.admission import listening_error
-from bam_envs.rosbridge.tokens import Guesses, Tokens
+from bam_envs.rosbridge.tokens import Guesses, Role, Tokens
 
 _LOG = logging.getLogger(__name__)
 _POLL = 0.2  # time between two checks whether the server is closing [s]
@@ -164,9 +165,13 @@ class TcpServer:
         self.server.require_name(hello.env_id)
         with self._lock:
             older = [one for one in self._connections if one is not connection and one.session == hello.session]
-            present = sum(one.caller is not None for one in self._connections) - len(older)
-            if present >= self.max_clients:
-                raise RemoteError(f"All {self.max_clients} places for clients are taken; try again when one has left.")
+            present = [one for one in self._connections if one.caller is not None and one not in older]
+            connection.role, room = role, places(self.max_clients, role or "drive", self._tokens.roles)
+            if len(present) >= room:
+                leaves = who_leaves(connection, present)
+                if leaves is None:
+                    raise RemoteError(f"All {room} places for clients are taken; try again when one has left.")
+                older.append(leaves)
             # An open connection is a sign of life of the system at its other end.
             name, operator = connection.client, role == "administer"
             connection.caller = Caller(name, name, operator=operator, silence=lambda: 0.0)
@@ -187,6 +192,8 @@ class _Connection:
     def __init__(self, owner: TcpServer, sock: socket.socket, host: str, port: int) -> None:
         self.host, self.client, self.session = host, f"{host}:{port}", ""
         self.caller: Caller | None = None  # known after its admission
+        self.role: Role | None = None  # of the token that it showed
+        self.born, self.spoke = time.monotonic(), 0.0  # of its last request; 0 before
         self.dropped = False  # hung up; its thread has yet to end
         self._owner, self._frames = owner, FrameSocket(sock)
         self.thread = threading.Thread(target=self._run, name=f"bam-tcp {self.client}", daemon=True)
@@ -204,6 +211,7 @@ class _Connection:
             self._send(encode([0, "ok", spec_to_json(self._owner.server.spec())]))
             while True:
                 request = self._frames.receive(limit=self._owner.most, patience=self._owner.patience, kind=Request)
+                self.spoke = time.monotonic()
                 self._send(self._answer(request))
         except (ProtocolError, RemoteError) as error:
             with suppress(LinkLost):  # the client learns why the connection ends

@@ -5,7 +5,7 @@ import contextlib
 import errno
 import logging
 import ssl
-from collections.abc import Awaitable, Callable, Iterable
+from collections.abc import Awaitable, Collection, Iterable
 from http import HTTPStatus
 from pathlib import Path
 from urllib.parse import parse_qs, urlsplit
@@ -14,6 +14,7 @@ from websockets.http11 import Request, Response
 
 from bam_envs.core.errors import InvalidValue, ProtocolError
 from bam_envs.rosbridge.encoding import decode_frame
+from bam_envs.rosbridge.places import places, who_leaves
 from bam_envs.rosbridge.server.client_session import ServerOptions
 from bam_envs.rosbridge.server.refusals import Refusals
 from bam_envs.rosbridge.server.server_connection import BridgeConnection
@@ -36,19 +37,19 @@ _logger = logging.getLogger(__name__)
 
 
 class Admission:
-    """Admits or refuses clients; `present` returns the number of clients."""
+    """Admits or refuses clients; `sockets` has the open ones."""
 
     def __init__(
         self,
         tokens: Tokens,
         options: ServerOptions,
-        present: Callable[[], int],
+        sockets: Collection[BridgeConnection],
         refusals: Refusals,
         site: Site | None,
         secure: bool,
     ) -> None:
         self._tokens, self._guesses, self._version = tokens, Guesses(), tokens.version
-        self._options, self._present, self._site, self._secure = options, present, site, secure
+        self._options, self._sockets, self._site, self._secure = options, sockets, site, secure
         self._refusals = refusals
 
     def check(self, connection: BridgeConnection, request: Request) -> Response | None:
@@ -90,11 +91,11 @@ class Admission:
             return None  # browsers set no headers, and an address with a token is logged; `greet` reads a message
         elif self._tokens.needed:
             return HTTPStatus.UNAUTHORIZED, no_token
-        if full := self._full():
-            connection.role = None
-            return HTTPStatus.SERVICE_UNAVAILABLE, full
         connection.role = connection.role or self._tokens.otherwise
-        return None
+        if self._place(connection, request):
+            return None
+        connection.role = None
+        return HTTPStatus.SERVICE_UNAVAILABLE, connection.full
 
     async def greet(self, connection: BridgeConnection) -> None:
         """Close a connection that was opened without a token unless its first message shows one."""
@@ -108,8 +109,9 @@ class Admission:
             message = decode_frame(await asyncio.wait_for(connection.next_frame(), limit))
             if message.get("op") == "auth" and isinstance(message.get("token"), str):
                 reason = self._judge(connection, [message["token"]])
-        if reason is None and (full := self._full()):
-            connection.role, reason = None, full
+        connection.spoke = 0.0
+        if reason is None and not self._place(connection, connection.request):
+            connection.role, reason = None, connection.full
         if reason is not None:
             self._refusals.note(connection.host, reason)
             await connection.close(_POLICY_VIOLATION, reason)
@@ -137,9 +139,19 @@ class Admission:
         connection.secret = shown[0]
         return None
 
-    def _full(self) -> str:
-        most = self._options.max_clients
-        return f"There are {most} clients, and no room for more." if self._present() >= most else ""
+    def _place(self, connection: BridgeConnection, request: Request | None) -> bool:
+        """Give a client a place, perhaps that of another one; whether it is let in."""
+        role, most = connection.role or "watch", self._options.max_clients
+        present, room = [one for one in self._sockets if one.placed], places(most, role, self._tokens.roles)
+        if len(present) >= room:
+            leaves = who_leaves(connection, present)
+            if leaves is None:
+                whose = f"All {room} of {most} places for the role {role} are taken."
+                connection.full = f"There are {most} clients, and no room for more." if room == most else whose
+                return self._site is not None and self._site.lets_in(request)
+            leaves.give_way("It gave its place to another client.")
+        connection.placed = True
+        return True
 
 
 class _LoggedTls(ssl.SSLObject):

@@ -81,6 +81,7 @@ class Bridge:
         self.services = Services(self._events.append)
         self._fragmented: set[Session] = set()
         self._leave: list[Callable[[Caller], None]] = []
+        self._reserved: dict[str, Callable[[Caller], None]] = {}
         self._refusals = refusals or Refusals(_logger)
         rosapi: dict[str, tuple[str, Handler]] = {
             "get_time": ("GetTime", lambda *_: {"time": _time_of_day(clock())}),
@@ -225,6 +226,10 @@ class Bridge:
         """Answer `service` with `handler`, which runs for each event that is a `Call`."""
         self.services.offer(Service(canonical(service), normal_name(kind), service, handler=handler))
 
+    def reserve(self, topic: str, check: Callable[[Caller], None]) -> None:
+        """Let clients publish on `topic` only if `check` raises nothing."""
+        self._reserved[canonical(topic)] = check
+
     def on_leave(self, callback: Callable[[Caller], None]) -> None:
         """Call `callback` when a client's connection ends."""
         self._leave.append(callback)
@@ -259,6 +264,8 @@ class Bridge:
     def _publish(self, session: Session, incoming: Incoming, now: float) -> None:
         topic = self._existing(read_name(incoming.message, "topic"))
         _require_not_ours(topic)
+        if topic.name in self._reserved:
+            self._reserved[topic.name](session.caller)
         self.publish(incoming.content_of(topic.kind), now, session)
 
     def _subscribe(self, session: Session, incoming: Incoming, now: float) -> None:

@@ -89,9 +89,7 @@ class BridgeServer(Bus):
         self._sockets: set[BridgeConnection] = set()
         self._visitors: set[BridgeConnection] = set()  # on paths of the site
         tokens, self._site = tokens or Tokens.of_clients(token, operator_token), site
-        self._admission = Admission(
-            tokens, self.options, lambda: self.clients, self._refusals, site, secure=cert is not None
-        )
+        self._admission = Admission(tokens, self.options, self._sockets, self._refusals, site, secure=cert is not None)
         self._numbers = itertools.count(1)
         self._thread = LoopThread("bam-bridge-server")
         self._workers = Workers(_HANDLER_THREADS, "bam-bridge-handler")
@@ -108,6 +106,11 @@ class BridgeServer(Bus):
     def clients(self) -> int:
         """Number of clients."""
         return len(self._connections) + len(self._visitors)
+
+    @property
+    def programs(self) -> int:
+        """Number of these that speak rosbridge, and not to the site."""
+        return len(self._connections)
 
     @property
     def held(self) -> tuple[int, int]:
@@ -167,6 +170,10 @@ class BridgeServer(Bus):
     def serve(self, service: str, kind: str, handler: Handler) -> None:
         """Answer `service` of type `kind`, even when the handler fails."""
         self._do(lambda: self._bridge.serve(service, kind, handler))
+
+    def reserve(self, topic: str, check: Callable[[Caller], None]) -> None:
+        """Refuse what a client publishes on `topic` if `check` raises a `BamEnvsError`, in the network thread."""
+        self._do(lambda: self._bridge.reserve(topic, check))
 
     def on_leave(self, callback: Callable[[Caller], None]) -> None:
         """Call `callback` in the network thread when a client's connection ends."""
@@ -240,6 +247,7 @@ class BridgeServer(Bus):
             f"{host}:{port}",
             operator=connection.role == "administer" and bool(connection.secret),
             role=connection.role,
+            full=connection.full,
             silence=lambda: time.monotonic() - connection.heard,
         )
         if self._site is not None and (handler := self._site.socket(connection.request)) is not None:

@@ -30,7 +30,7 @@ _LONGEST_QUEUE = 100
 class ServerOptions:
     """Limits on the clients of a `BridgeServer`: a client that exceeds one gets an error, and others are unaffected."""
 
-    max_clients: int = 256  # the next one gets HTTP status 503
+    max_clients: int = 256  # for the next one another leaves (`places`), or it gets HTTP status 503
     service_timeout: float = 30.0  # for the answer of a client's service [s], if the caller gives no timeout
     handler_timeout: float = 300.0  # the same for services of this process [s]: a robot's motion may take long
     max_message: int = 64 * 2**20  # largest answer to a client [bytes]

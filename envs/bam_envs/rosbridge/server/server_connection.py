@@ -14,7 +14,7 @@ from bam_envs.rosbridge.server.refusals import Refusals
 from bam_envs.rosbridge.tokens import Role
 
 TRY_AGAIN_LATER = 1013  # close code of a client that does not read what it must get
-# Most sockets without an admitted client, in all and of one address; the oldest is closed for a new one.
+# Most sockets without a place, in all and of one address; the oldest is closed for a new one.
 _STRANGERS, _STRANGERS_OF_ONE = 128, 32
 _OF_A_STRANGER = 65536  # most unread data of a client before its admission [bytes]
 _BROKEN = (1002, 1003, 1007, 1009)  # close codes for what breaks the protocol, or is too large
@@ -94,6 +94,9 @@ class BridgeConnection(ServerConnection):
         self.host = ""  # the IP address of the client
         self.heard = time.monotonic()  # when data last arrived [s, monotonic]
         self.born = self.heard  # when the socket opened [s, monotonic]
+        self.spoke = 0.0  # when its last message arrived [s, monotonic]; 0 for none since its admission
+        self.placed = False  # whether it has one of the places for clients
+        self.full = ""  # why an admitted client has none
         self._waiting = 0  # size of complete frames that are not taken yet [bytes]
         self._message, self._is_text = 0, False  # of the unfinished message: its size, and whether it is text
         self._whole = deque[tuple[int, bool]]()  # the same of complete messages
@@ -162,6 +165,13 @@ class BridgeConnection(ServerConnection):
         """Close the connection (1009) if a later message is larger than `most` bytes."""
         self.protocol.max_message_size = most
 
+    def give_way(self, why: str) -> None:
+        """Close the connection for another client, and log why."""
+        self._refusals.note(self.host, why)
+        self.placed = False
+        if self._closing is None:
+            self._closing = self.loop.create_task(self.close(TRY_AGAIN_LATER, why))
+
     def cut(self, why: str) -> None:
         """Drop the connection at once, and log why."""
         self._refusals.note(self.host, why)
@@ -178,7 +188,7 @@ class BridgeConnection(ServerConnection):
         self.host = str((self.remote_address or [""])[0])
         self._sockets.add(self)
         here = (one for one in self._sockets if one is self or not one.transport.is_closing())
-        strangers = [one for one in here if one.role is None]
+        strangers = [one for one in here if not one.placed]
         host, most = Counter(one.host for one in strangers).most_common(1)[0]
         if most > _STRANGERS_OF_ONE or len(strangers) > _STRANGERS:
             min((one for one in strangers if one.host == host), key=lambda one: one.born).cut(
@@ -200,8 +210,8 @@ class BridgeConnection(ServerConnection):
         """asyncio: data arrived."""
         self.heard = time.monotonic()
         super().data_received(data)
-        if self.role is None and self.unfinished > _OF_A_STRANGER:
-            self.cut(f"It sent more than {_OF_A_STRANGER} bytes before its token.")
+        if not self.placed and self.unfinished > _OF_A_STRANGER:
+            self.cut(f"It sent more than {_OF_A_STRANGER} bytes before it had a place.")
         elif self.unfinished > _OF_A_STRANGER and sum(one.unfinished for one in self._sockets) > self._most_unfinished:
             max(self._sockets, key=lambda one: one.unfinished).cut("Its unfinished messages fill the memory.")
         # Answers to pings that are never read would pile up.
@@ -216,6 +226,7 @@ class BridgeConnection(ServerConnection):
             self._message += cost
             self._is_text = event.opcode is Opcode.TEXT if event.opcode is not Opcode.CONT else self._is_text
             if event.fin:
+                self.spoke = self.heard
                 self._whole.append((self._message, self._is_text))
                 self._message = 0
         super().process_event(event)

@@ -70,6 +70,12 @@ class Site:
 
     pages: Mapping[str, Page] = field(default_factory=dict)
     sockets: Mapping[str, Handler] = field(default_factory=dict)
+    always: frozenset[str] = frozenset()
+    """Paths of WebSockets that get in although there is no place: their handlers refuse most by `Caller.full`."""
+
+    def lets_in(self, request: Request | None) -> bool:
+        """Whether a client without a place gets in."""
+        return request is not None and _path(request) in self.always
 
     def refusal(self, request: Request, *, secure: bool, tokens: bool) -> tuple[HTTPStatus, str] | None:
         """Why a request is refused, before its token is looked at; None if it is not."""

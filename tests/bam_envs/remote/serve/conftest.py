@@ -18,7 +18,7 @@ class MemoryBus:
 
     def __init__(self):
         self.advertised, self.listeners, self.services, self.leavers = {}, {}, {}, []
-        self.published, self.refusals = [], []
+        self.published, self.refusals, self.reserved = [], [], {}
         self.news = threading.Condition()
         self.fails = None
 
@@ -42,6 +42,9 @@ class MemoryBus:
 
     def serve(self, service, kind, handler):
         self.services[service] = (kind, handler)
+
+    def reserve(self, topic, check):
+        self.reserved[topic] = check
 
     def on_leave(self, callback):
         self.leavers.append(callback)

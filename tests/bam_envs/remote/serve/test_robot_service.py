@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 
-from bam_envs.core.errors import LinkLost, PhysicsDiverged
+from bam_envs.core.errors import LinkLost, NotInCommand, PhysicsDiverged
 from bam_envs.core.robot import Initial
 from bam_envs.remote.serve.command_lease import CommandLease
 from bam_envs.remote.serve.env_server import EnvServer
@@ -424,6 +424,20 @@ def scene(bus, payload, caller="a", identity="1"):
     return json.loads(bus.wait_for("/bam/scene/reply", lambda message: fits in message["data"])["data"])
 
 
+def test_only_the_client_in_command_tells_what_the_guards_did(serve, bus):
+    service, refusal = serve(namespace="/cell"), "Topic /cell/bam/status is for the client in command."
+    check = bus.reserved["/cell/bam/status"]
+    with pytest.raises(NotInCommand, match=refusal):
+        check(Caller("a", "a:1"))
+    service.lease.take("a:1", Caller("a", "a:1"))
+    check(Caller("a", "a:1"))
+    with pytest.raises(NotInCommand, match=refusal):
+        check(Caller("b", "b:1"))
+    service.lease.release("a:1")
+    with pytest.raises(NotInCommand, match=refusal):
+        check(Caller("a", "a:1"))
+
+
 def test_the_scene_can_be_set(serve, bus):
     service = serve()
     assert scene(bus, {"object_pose": [[0.4, -0.1, 0.0]], "seeds": [7]}) == {"id": "1", "payload": {}}
@@ -516,7 +530,7 @@ def test_the_tag_of_the_last_command_stays_until_command_changes(serve, bus):
 
 
 def test_nothing_is_published_where_nobody_listens(serve, bus):
-    bus.clients = 0
+    bus.programs = 0
     service = serve()
     service.service.clock.stop()
     bus.published.clear()

@@ -230,8 +230,12 @@ def test_a_client_that_cannot_be_served_keeps_no_other_out(server, client, monke
 
 def test_too_many_clients_are_refused_and_told(env):
     with TcpServer(EnvServer(env), max_clients=1) as server:
-        one = TcpTransport(server.url)
-        one.connect()
+        silent, one = TcpTransport(server.url), TcpTransport(server.url)
+        silent.connect()
+        one.connect()  # in place of the silent one
+        one.reset(seed=0, options={})
+        with pytest.raises(LinkLost):
+            silent.reset(seed=0, options={})
         with pytest.raises(NoServer) as caught:
             TcpTransport(server.url).connect()
         assert str(caught.value) == (f"{server.url}: All 1 places for clients are taken; try again when one has left.")

@@ -561,6 +561,22 @@ def test_who_holds_most_in_fragments_gives_way(peers):
     assert peers.say(new, op="fragment", id="f", num=1, total=2, data="")[0]["msg"].startswith("Message: expected JSON")
 
 
+def test_a_reserved_topic_is_for_those_whom_the_check_lets(peers):
+    """Else anybody could say what the guards of the robot did."""
+
+    def check(caller):
+        if caller.name != "driver":
+            raise NotInCommand("Topic /status is for the client in command.")
+
+    peers.bridge.reserve("/status", check)
+    listener, liar, driver = peers.client("a"), peers.client("b"), peers.client("driver")
+    peers.say(listener, op="subscribe", topic="/status", type=TEXT)
+    for client, expected in ((liar, status("publish: Topic /status is for the client in command.")), (driver, [])):
+        peers.say(client, op="advertise", topic="/status", type=TEXT)
+        assert peers.say(client, op="publish", topic="/status", msg={"data": client.caller.name}) == expected
+    assert [one["msg"] for one in peers.take(listener)] == [{"data": "driver"}]
+
+
 def test_what_this_process_publishes_nobody_else_does(peers):
     """Else a client could say where the robot is."""
     peers.bridge.advertise("/joint_states", JOINTS)

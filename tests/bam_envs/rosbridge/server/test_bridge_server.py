@@ -354,6 +354,35 @@ def test_there_is_room_for_so_many(new_server, new_client):
     assert refused(url) == (503, "There are 2 clients, and no room for more.\n")
 
 
+def test_websockets_that_say_nothing_keep_nobody_out(new_server, new_client, caplog):
+    server = new_server(options=ServerOptions(max_clients=4))
+    first, *others = [new_client(server.url) for _ in range(4)]
+    for client in others:
+        client.sync()
+    client = new_client(server.url)
+    client.sync()
+    with pytest.raises(ConnectionClosed) as end:
+        first.receive()
+    assert (end.value.rcvd.code, end.value.rcvd.reason) == (1013, "It gave its place to another client.")
+    assert "127.0.0.1 was refused: It gave its place to another client." in [one.getMessage() for one in caplog.records]
+    for one in (*others, client):
+        one.sync()
+    assert refused(server.url) == (503, "There are 4 clients, and no room for more.\n")
+
+
+def test_no_address_takes_all_places(new_server, new_client):
+    """Whoever was silent for longest leaves, of the address with the most clients; a driver never is."""
+    server = new_server(options=ServerOptions(max_clients=4))
+    driver, *others = [new_client(server.url) for _ in range(4)]
+    for client in (*others, driver):
+        client.sync()
+    new_client(server.url, source_address=("127.0.0.2", 0)).sync()
+    with pytest.raises(ConnectionClosed):
+        others[0].receive()
+    for client in (*others[1:], driver):
+        client.sync()
+
+
 # Bad company.
 
 

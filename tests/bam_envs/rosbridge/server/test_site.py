@@ -254,6 +254,8 @@ def test_clients_of_the_site_count(new_server):
     server = new_server(options=ServerOptions(max_clients=1))
     with opened(server) as client:
         client.recv(DEADLINE)
+        client.send("hello")
+        assert client.recv(DEADLINE) == "hello"
         assert (server.clients, refused(server)) == (1, (503, "There are 1 clients, and no room for more.\n"))
 
 

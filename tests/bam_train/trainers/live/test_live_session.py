@@ -1,6 +1,7 @@
 """The learner at an agent whose sockets are real, and whose robot is the test."""
 
 import contextlib
+import os
 import threading
 import time
 
@@ -25,7 +26,7 @@ class Hub:
     """Sends transitions to whoever learns, and keeps what is pushed."""
 
     def __init__(self, folder):
-        self.incoming, self.pushed, self.listeners = folder / "incoming", [], []
+        self.incoming, self.pushed, self.listeners, self.state = folder / "incoming", [], [], "running"
 
     def ask(self, op, arguments, person, progress):
         if op == "push":
@@ -34,7 +35,7 @@ class Hub:
             digest = Checkpoint.open(kept).digest
             self.pushed.append((digest, arguments["stage"], arguments["when"]))
             return {"digest": digest, "active": digest, "lines": []}
-        return {"state": "running", "robot": "a line", "simulated": True}
+        return {"state": self.state, "why": "a guard", "robot": "a line", "simulated": True}
 
     def listen(self, kind, listener):
         self.listeners.append(listener)
@@ -106,7 +107,15 @@ def tell(hub, transitions):
         listener(encode(transitions))
 
 
-def test_transitions_become_candidates_and_a_result(hub, tmp_path):
+@pytest.fixture(autouse=True)
+def niceness(monkeypatch):
+    """By how much the learners gave way."""
+    given = []
+    monkeypatch.setattr("bam_train.trainers.live.live_run.os.nice", given.append)
+    return given
+
+
+def test_transitions_become_candidates_and_a_result(hub, tmp_path, niceness):
     with agent(hub) as server:
         learner = Learning(server.url, tmp_path, steps=80)
         tell(hub, play(5, person=True))
@@ -120,7 +129,9 @@ def test_transitions_become_candidates_and_a_result(hub, tmp_path):
     assert (result.manifest.steps, result.manifest.algorithm) == (80, "rlpd")
     text = f"the policy after 80 steps is in {tmp_path / 'out.zip'} ({result.digest[:12]}); it acts on the robot now"
     assert learner.lines[-1] == text
-    assert learner.lines[1] == f"learns from {server.url}: running, a line"
+    cores = f"the agent runs on this computer too, and its ticks go first on the {os.cpu_count()} cores"
+    assert (learner.lines[0], niceness) == (cores, [10])
+    assert learner.lines[2] == f"learns from {server.url}: running, a line"
 
 
 def test_a_learner_that_was_killed_goes_on_from_its_last_state(hub, tmp_path):
@@ -153,6 +164,24 @@ def test_the_agent_may_go_and_come_back(hub, tmp_path):
         time.sleep(0.5)
         assert learner.end() is False
     assert Checkpoint.open(tmp_path / "runs" / "LiveLine-v0-rlpd" / "last.zip").manifest.steps == 20
+
+
+def test_it_says_why_no_steps_come(hub, tmp_path, monkeypatch):
+    monkeypatch.setattr("bam_train.trainers.live.live_session.TELL_EVERY", 0.05)
+    with agent(hub) as server:
+        learner = Learning(server.url, tmp_path)
+        tell(hub, play(3))
+        until(lambda: any(line.startswith("12 steps") for line in learner.lines))
+        for state in ("stopped by a guard", "waiting for the robot"):
+            hub.state = state
+            remedy = f"; look at the robot, then: bam-agent resume {server.url}" if "stopped" in state else ""
+            text = f"no steps come: the agent is {state} (a guard){remedy}"
+            until(lambda text=text: text in learner.lines)
+        tell(hub, play(1, first=3))
+        until(lambda: any(line.startswith("16 steps") for line in learner.lines))
+        learner.end()
+    still = [line for line in learner.lines if "stopped by a guard" in line]
+    assert len(still) == 1  # said once
 
 
 def test_the_second_learner_is_refused(hub, tmp_path):

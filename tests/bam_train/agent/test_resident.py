@@ -1,0 +1,358 @@
+"""The resident with a stand-in for the robot: what requests and faults lead to, in the order in which they come."""
+
+import queue
+import threading
+from collections import deque
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+
+from bam_envs.core.errors import LinkLost, NotReady, ProtocolError, SafetyStop, StaleState, StartNotReached
+from bam_envs.core.timing import TickTimes
+from bam_train.agent.agent_messages import Answer, Ask, Halt, Report
+from bam_train.agent.agent_options import AgentOptions
+from bam_train.agent.agent_states import State
+from bam_train.agent.resident import Resident
+from bam_train.agent.succession import Choice
+from bam_train.agent.versions import CANDIDATE, Versions
+from bam_train.checkpoint import Checkpoint
+from bam_train.deploy.journal import Journal
+from bam_train.errors import ContractRefused
+
+PICK = Path(__file__).parents[3] / "checkpoints" / "pick-ppo.zip"
+DEADLINE = 20.0
+STOPPED = "following (G23): elbow does not follow its commands"
+
+
+class Session:
+    """A connected robot, whose episodes last until a request ends them, or until a test gives them a fault."""
+
+    stage, is_real, is_up, marks, recorder, recording_fault, identity = "full", False, True, (), None, "", ""
+
+    def __init__(self, agent, faults):
+        self._agent, self._faults = agent, faults
+        self.robot = SimpleNamespace(
+            stopped=None,
+            code=23,
+            info=SimpleNamespace(text="a robot"),
+            spec=SimpleNamespace(period=0.05),
+            halt=lambda: None,
+            report=dict,
+            observe=lambda observer: None,
+            measure=lambda: SimpleNamespace(signals={}),
+            reset=self._reset,
+        )
+        self.deployment = SimpleNamespace(
+            journal=Journal(0),
+            times=TickTimes(0.05),
+            episode=self._episode,
+            swap=lambda policy: None,
+            trials=None,
+            latency=0.0,
+        )
+
+    def _episode(self, watcher, seed):
+        record = self.deployment.journal.begin(seed)
+        while not self._agent.between_ticks():
+            if self._faults:
+                self._fail(*self._faults.popleft())
+        return record
+
+    def _reset(self, env_ids, initial):
+        """The scene that a program sets: a guard stops the robot meanwhile."""
+        self._fail(
+            SafetyStop("following", f"The robot was stopped by {STOPPED}. When it is safe, call resume()."), STOPPED
+        )
+
+    def _fail(self, error, stopped, ticks=()):
+        for tick in ticks:
+            self.deployment.times.add(*tick)
+        self.robot.stopped = stopped
+        raise error
+
+    def record_again(self):
+        return ""
+
+    def event(self, text):
+        pass
+
+    def close(self):
+        pass
+
+
+class Bench:
+    """A resident in a thread, asked as the front process asks it."""
+
+    def __init__(self, folder, *, is_running=True, connect=None, **options):
+        versions = Versions(folder / "versions")
+        versions.first(PICK)
+        self.faults, self.events, self._answers = deque(), [], queue.Queue()
+        self._number, self._changed, self.reports, self._seen = 0, threading.Condition(), [{}], 0
+        self.agent = Resident(
+            AgentOptions("ws://127.0.0.1:1", folder, **options),
+            versions,
+            SimpleNamespace(write=self._write, fault=""),
+            send=self._take,
+            tell=lambda line: None,
+            admit=lambda env, lines: None,
+            is_running=is_running,
+            connect=connect or (lambda *arguments, **more: Session(self.agent, self.faults)),
+        )
+        self._thread = threading.Thread(target=self.agent.run)
+
+    def __enter__(self):
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_):
+        self.agent.quit()
+        self._thread.join(DEADLINE)
+        assert not self._thread.is_alive()
+
+    def _write(self, what, text, **fields):
+        self.events.append((what, text, fields["who"], fields["before"], fields["after"]))
+
+    def _take(self, message):
+        if isinstance(message, Answer):
+            self._answers.put(message)
+        elif isinstance(message, Report):
+            with self._changed:
+                self.reports.append(message.status)
+                self._changed.notify_all()
+
+    def ask(self, op, who="anna", **arguments):
+        """The answer to a request."""
+        self._number, self._seen = self._number + 1, len(self.reports) - 1
+        self.agent.take(Ask(self._number, op, arguments, who, "10.0.0.7"))
+        return self._answers.get(timeout=DEADLINE)
+
+    def fail(self, *fault):
+        """Let the episode that runs end with a fault."""
+        self._seen = len(self.reports) - 1
+        self.faults.append(fault)
+
+    @property
+    def status(self):
+        return self.reports[-1]
+
+    def state(self, state):
+        """The reason for a state, once the agent was in it after the last request or fault."""
+
+        def reached():
+            return next((one for one in self.reports[self._seen :] if one.get("state") == state.value), None)
+
+        with self._changed:
+            assert self._changed.wait_for(reached, DEADLINE), self.status
+            return reached()["why"]
+
+    def changes(self):
+        """What was written down: the changes of state, with their reason and who caused them."""
+        return [(after.value, text.split(": ", 1)[1], who) for _, text, who, _, after in self.events if after]
+
+
+@pytest.fixture
+def bench(tmp_path):
+    return lambda **options: Bench(tmp_path, **options)
+
+
+# Faults while the policy drives: whether the agent goes on by itself, or a person must look first
+
+
+@pytest.mark.parametrize(
+    ("error", "stopped", "state", "goes_on"),
+    [
+        (LinkLost("the link dropped"), None, State.WAITING, True),
+        (NotReady("not ready"), None, State.WAITING, True),
+        (StaleState("the state is old", 1.0, 0.1), None, State.WAITING, True),
+        (StaleState("stopped by state age (G3)", 1.0, 0.1), "state age (G3)", State.STOPPED, False),
+        (SafetyStop("tool speed", "stopped by tool speed (G10)"), "tool speed (G10)", State.STOPPED, False),
+        (StartNotReached("something holds the arm", {}), None, State.PAUSED, False),
+        (ProtocolError("a joint is missing"), None, State.PAUSED, False),
+    ],
+)
+def test_a_fault_while_the_policy_drives(bench, error, stopped, state, goes_on):
+    with bench() as running:
+        running.state(State.RUNNING)
+        running.fail(error, stopped)
+        running.state(state)
+        if goes_on:
+            running.state(State.RUNNING)
+        else:
+            for _ in range(3):  # turns, at least
+                assert running.ask("transitions", on=False).error == ""
+    after = [one for one, *_ in running.changes()]
+    assert after[:2] == [State.RUNNING.value, state.value]
+    assert (State.RUNNING.value in after[2:]) is goes_on
+
+
+def test_a_busy_robot_is_waited_for_also_at_the_start_and_a_wrong_one_is_refused(bench):
+    busy = ContractRefused("age", "age: expected at most 0.1 s, found 0.197 s", passes=True)
+    refusals = [busy, busy]
+
+    def connect(*arguments, **more):
+        if refusals:
+            raise refusals.pop()
+        return Session(running.agent, running.faults)
+
+    running = bench(connect=connect)
+    with running:
+        running.state(State.RUNNING)
+    assert {status.get("why") for status in running.reports} >= {"it starts", str(busy)}
+
+    refusals.append(ContractRefused("topic", "topic /joint_states: expected sensor_msgs/JointState"))
+    with pytest.raises(ContractRefused, match="topic"):
+        bench(connect=connect).agent.run()
+
+
+def test_a_stop_while_a_request_is_executed_is_a_state_and_is_written_down_once(bench):
+    with bench() as running:
+        running.state(State.RUNNING)
+        running.ask("take", who="a program", lease="it")
+        answer = running.ask("scene", who="a program", pose=None, seed=1)
+        assert answer.error == f"The robot was stopped by {STOPPED}. When it is safe, call resume()."
+        why = f"The robot was stopped by {STOPPED}. When it is safe, resume the agent."
+        assert running.state(State.STOPPED) == why
+        assert running.status["owner"] is None
+        assert running.ask("take", who="a program", lease="it").kind == "NotInCommand"
+    assert running.changes()[1:] == [
+        (State.TAKEN_OVER.value, "taken over by a program", "a program"),
+        (State.STOPPED.value, why, "the agent"),
+    ]
+
+
+# Whose fault it is
+
+
+@pytest.fixture
+def candidate(forge, tmp_path):
+    """Lets another version act as a candidate."""
+
+    def act(running):
+        path = tmp_path / "candidate.zip"
+        path.write_bytes(PICK.read_bytes())
+        version = running.agent.succession.versions.add(Checkpoint.open(forge(path, seed=7)))
+        choice = Choice(version, None, {CANDIDATE: version.digest}, "push by anna", "anna")
+        running.agent.choose(choice)
+        assert choice.active.wait(DEADLINE)
+        return choice
+
+    return act
+
+
+IN_TIME, LATE, SLOW = (0.0, 0, 0.0003, 0.00002), (0.06, 1, 0.0003, 0.00002), (0.03, 1, 0.075, 0.02)
+STOP = SafetyStop("following", f"The robot was stopped by {STOPPED}.")
+
+
+@pytest.mark.parametrize(
+    ("stop", "is_back"),
+    [
+        ((STOP, STOPPED, [IN_TIME] * 20), True),
+        ((STOP, STOPPED, [LATE] * 20), False),
+        ((STOP, STOPPED, [*[SLOW] * 15, *[LATE] * 5]), True),
+        ((LinkLost("gone"), None, [IN_TIME] * 20), False),
+    ],
+    ids=["calm", "busy", "slow", "link"],
+)
+def test_a_candidate_is_rolled_back_for_its_own_stops_only(bench, candidate, stop, is_back):
+    with bench() as running:
+        running.state(State.RUNNING)
+        choice = candidate(running)
+        for _ in range(2):
+            running.state(State.TRIAL)
+            running.fail(*stop)
+            if stop[1]:
+                running.state(State.STOPPED)
+                running.ask("resume")
+            else:
+                running.state(State.WAITING)
+        running.state(State.RUNNING if is_back else State.TRIAL)
+        if is_back:  # told once the champion acts
+            assert choice.outcome.wait(DEADLINE)
+            assert running.agent.state is State.RUNNING
+        assert choice.outcome.is_set() is is_back
+    excused = [text for what, text, *_ in running.events if what == "trial"]
+    assert len(excused) == (0 if is_back else 2)
+
+
+def test_what_a_person_drives_into_is_not_the_candidates_fault(bench, candidate):
+    with bench() as running:
+        running.state(State.RUNNING)
+        choice = candidate(running)
+        for lease in ("1", "2"):
+            running.ask("take", lease=lease)
+            running.ask("scene", pose=None, seed=1)
+            running.state(State.STOPPED)
+            running.ask("resume")
+            running.state(State.TRIAL)
+        assert not choice.outcome.is_set()
+
+
+# A pause is lifted by a person only
+
+
+@pytest.mark.parametrize("resume", [False, True])
+def test_what_a_take_over_goes_back_to(bench, resume):
+    with bench(resume=resume) as running:
+        running.state(State.RUNNING)
+        running.ask("take", who="first", lease="1")
+        running.ask("take", who="second", lease="2", force=True)
+        running.ask("hand_back", who="second", lease="2")
+        assert running.state(State.RUNNING if resume else State.PAUSED) == "handed back by second"
+
+
+def test_a_program_does_not_lift_the_pause_of_a_person(bench):
+    with bench(resume=True) as running:
+        running.state(State.RUNNING)
+        running.ask("pause", who="anna", why="hand in the cell")
+        for lease in ("1", "2"):
+            running.ask("take", who="a program", lease=lease)
+            running.ask("hand_back", who="a program", lease=lease)
+            assert running.state(State.PAUSED) == "handed back by a program; paused by anna: hand in the cell"
+        running.ask("take", who="bob", lease="3")
+        running.ask("hand_back", who="bob", lease="3", resume=True)  # by the button of the console
+        assert running.state(State.RUNNING) == "handed back by bob"
+
+
+@pytest.mark.parametrize("why", ["it starts", "the lease ended", "the stop button", "a fault"])
+def test_a_program_lifts_no_other_pause_either(bench, why):
+    with bench(resume=True, is_running=why != "it starts") as running:
+        running.state(State.PAUSED if why == "it starts" else State.RUNNING)
+        if why == "the lease ended":
+            running.ask("take", who="first", lease="1")
+            running.ask("hand_back", who="the agent", lease="1", why="the lease of first ended")
+        elif why == "the stop button":
+            running.agent.take(Halt("anna", stop=True))
+        elif why == "a fault":
+            running.fail(ProtocolError("a joint is missing"), None)
+        running.state(State.PAUSED)
+        running.ask("take", who="a program", lease="2")
+        running.ask("hand_back", who="a program", lease="2")
+        assert running.state(State.PAUSED).startswith("handed back by a program")
+
+
+def test_a_pause_while_the_robot_is_away_holds_and_is_written_down(bench):
+    away = threading.Event()
+
+    def connect(*arguments, **more):
+        if away.is_set():
+            raise LinkLost("gone")
+        return Session(running.agent, running.faults)
+
+    running = bench(connect=connect)
+    with running:
+        running.state(State.RUNNING)
+        away.set()
+        running.fail(LinkLost("gone"), None)
+        running.state(State.WAITING)
+        running.ask("pause", why="hand in the cell")
+        away.clear()
+        assert running.state(State.PAUSED) == "paused by anna: hand in the cell"
+        away.set()
+        running.ask("resume")
+        running.state(State.RUNNING)
+    noted = [(what, text) for what, text, who, _, _ in running.events if who == "anna"]
+    assert noted == [
+        ("pause", "paused by anna: hand in the cell"),
+        ("state", "paused -> running: resumed by anna"),
+    ]

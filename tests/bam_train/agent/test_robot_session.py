@@ -1,0 +1,111 @@
+"""The agent's connection to a robot, with a served simulation at the other end: its recordings."""
+
+import resource
+import threading
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+
+from bam_envs.remote.serve.serve_options import ServeOptions
+from bam_envs.remote.serve.served_environment import ServedEnvironment
+from bam_train.agent import robot_session
+from bam_train.agent.agent_options import AgentOptions
+from bam_train.agent.resident import STOP
+from bam_train.agent.robot_session import RobotSession
+from bam_train.checkpoint import Checkpoint
+from bam_train.deploy.deployment import StopSwitch
+from bam_train.environments import make_env
+from bam_train.loop import Agent
+from bam_train.recording.recording import Recording
+
+REACH = Path(__file__).parents[3] / "checkpoints" / "reach-ppo.zip"
+
+
+class Boundary(Agent):
+    """Ends an episode after some ticks."""
+
+    reads, writes = ("env/done",), (STOP,)
+    ticks = 5
+
+    def forward(self, t, **kwargs):
+        self.set((STOP, t), self.get(("env/done", t)) | (t >= self.ticks))
+
+
+@pytest.fixture
+def session(tmp_path, monkeypatch):
+    """Makes the session of a robot whose time passes with commands only."""
+    monkeypatch.setattr(robot_session, "RECORD_AGAIN", 0.0)
+    made = []
+    with ServedEnvironment(make_env("bam/reach-v0"), ServeOptions(port=0, fast=True)) as served:
+
+        def make(**options):
+            made.append(
+                RobotSession(
+                    AgentOptions(served.bus.url, tmp_path, **options),
+                    Checkpoint.open(REACH),
+                    None,
+                    boundary=Boundary(),
+                    agents=(),
+                    switch=StopSwitch(lambda: None),
+                    admit=lambda env, lines: None,
+                    sleep=lambda seconds: True,
+                )
+            )
+            return made[-1]
+
+        yield make
+        for one in made:
+            one.close()
+
+
+def play(session):
+    watcher = SimpleNamespace(ticked=lambda *tick: None, ended=lambda record: None)
+    session.deployment.episode(watcher, seed=1)
+
+
+def again(session, until):
+    """The name of the recording that goes on, once there is one."""
+    names = []
+    until(lambda: names.append(session.record_again()) or names[-1])
+    return names[-1]
+
+
+def test_after_a_full_disk_the_next_episode_is_recorded_once_there_is_room(session, until, monkeypatch):
+    session = session()
+    assert session.record_again() == ""
+    first = session.recorder
+    resource.prlimit(first.pid, resource.RLIMIT_FSIZE, (1, 1))
+    until(lambda: play(session) or session.recording_fault)
+    assert (
+        session.recording_fault == f"{first.path}: cannot be written: File too large; nothing is recorded from now on"
+    )
+    with monkeypatch.context() as full:
+        full.setattr(robot_session.shutil, "disk_usage", lambda folder: SimpleNamespace(free=robot_session.ROOM - 1))
+        assert session.record_again() == ""
+        assert "bam-recorder-start" not in {thread.name for thread in threading.enumerate()}
+    assert again(session, until) == str(session.recorder.path) != str(first.path)
+    assert session.recording_fault == ""
+    play(session)
+    session.recorder.close()
+    assert len(Recording.open(session.recorder.path).arrays("action")[""]) == Boundary.ticks + 1
+
+
+def test_where_no_recording_can_begin_one_does_once_there_is_room(session, tmp_path, until, caplog):
+    (tmp_path / "recordings").write_text("no folder")
+    session = session()
+    until(lambda: session.record_again() or session.recording_fault)
+    play(session)
+    assert "cannot be written" in session.recording_fault
+    (tmp_path / "recordings").unlink()
+    again(session, until)
+    assert session.recording_fault == ""
+    assert [one.getMessage() for one in caplog.records if "Nothing is recorded" in one.getMessage()] == [
+        caplog.records[0].getMessage()
+    ]
+
+
+def test_without_recordings_none_begins(session):
+    session = session(record=False)
+    play(session)
+    assert (session.recorder, session.recording_fault, session.record_again()) == (None, "", "")
