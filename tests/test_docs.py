@@ -1,6 +1,8 @@
 """The pages say what is true: generated parts are current, examples run, commands and links exist."""
 
+import dataclasses
 import importlib.util
+import inspect
 import json
 import os
 import re
@@ -27,6 +29,8 @@ from bam_envs.tasks import (
 from bam_train.checkpoint import Checkpoint
 from bam_train.cli import train
 from bam_train.cli.data.bam_data import COMMANDS as DATA_COMMANDS
+from bam_train.cli.help_text import help_text
+from bam_train.cli.program import parse
 from bam_train.settings import tomllib
 from tests.test_checkpoints import LEAST
 
@@ -213,6 +217,28 @@ def test_flags_in_the_tables_are_those_of_the_programs(program, monkeypatch, cap
     page = (ROOT / "docs" / FLAGS_OF.get(words[0], "deploying.md")).read_text()
     table = re.search(rf"generated: flags \S+:{config} .*?<!-- /generated -->", page, re.DOTALL)[0]
     assert set(re.findall(r"^\| `(--[a-z-]+)`", table, re.MULTILINE)) == there
+
+
+CONFIGS = [resolve("bam_train.cli.flags:TrainConfig")]
+CONFIGS += map(resolve, re.findall(r"generated: flags (\S+)", "".join(page.read_text() for page in DOCS)))
+
+
+@pytest.mark.parametrize("config", CONFIGS)
+def test_help_has_examples_that_are_accepted_and_every_flag_in_one_group(config):
+    description = inspect.cleandoc(config.__doc__)
+    examples = re.findall(r"^  (bam-.*)$", description, re.MULTILINE)
+    for line in examples:
+        program, *words = shlex.split(line)
+        asks = program == "bam-agent" and not words[0].startswith("-")
+        wanted = resolve("bam_train.cli.live.agent_flags:AskConfig") if asks else config
+        parse(wanted, program, words[program == "bam-data" :])
+    text = help_text(config, "prog", description)
+    assert examples
+    assert "default: None" not in text
+    grouped = [name for names in getattr(config, "GROUPS", {}).values() for name in names]
+    assert len(grouped) == len({*grouped})
+    assert {*grouped} <= {field.name for field in dataclasses.fields(config)}
+    assert grouped or len(re.findall(r"^  --", text, re.MULTILINE)) < 13
 
 
 @pytest.mark.parametrize("page", PAGES, ids=name_of)

@@ -13,9 +13,9 @@ import re
 import signal
 import sys
 from collections.abc import Callable, Sequence
-from typing import Any, TypeVar, get_args
+from typing import Any, TypeVar
 
-from bam_train.cli.console import drop, say, show_logs_and_tracebacks
+from bam_train.cli.console import drop, say, show_logs_and_tracebacks, tell
 from bam_train.signals import SignalMemory, Terminated
 from bam_train.stand_ins import standing_in
 
@@ -131,26 +131,25 @@ def parse(
         arguments: Instead of those of the process.
         description: The docstring of a script; of a program it is that of `config`.
     """
-    from inspect import cleandoc
-
     import tyro
 
+    given = sys.argv[1:] if arguments is None else arguments
+    if {"-h", "--help"} & {*given}:
+        from inspect import cleandoc
+
+        from bam_train.cli.help_text import help_text
+
+        tell(*help_text(config, prog, cleandoc(description or config.__doc__ or "")).rstrip().split("\n"))
+        raise SystemExit(0)
     remedy = f"Run {prog if description is None else f'python {sys.argv[0]}'} --help"
     no_pairs = (tyro.conf.FlagCreatePairsOff,)  # --force, no --no-force
     box = io.StringIO()
     try:
         with contextlib.redirect_stderr(box):
-            parsed = tyro.cli(
-                config,
-                prog=prog,
-                description=description or cleandoc(config.__doc__ or ""),
-                args=arguments,
-                config=no_pairs,
-            )
+            parsed = tyro.cli(config, prog=prog, args=given, config=no_pairs)
     except SystemExit as stop:
-        if stop.code:
-            _complain(prog, f"{usage_error(box.getvalue(), config)} {remedy}")
-        raise
+        _complain(prog, f"{usage_error(box.getvalue(), config)} {remedy}")
+        raise SystemExit(2) from stop
     from bam_envs.core.errors import InvalidValue
     from bam_envs.core.validation import check_fields
     from bam_envs.core.wording import as_flag
@@ -168,21 +167,23 @@ def usage_error(box: str, config: type[Any]) -> str:
 
     Examples: ``unknown option --enb, did you mean --env?``, ``--steps: expected a whole number, found 'x'.``
     """
-    import tyro
-
     from bam_envs.core.validation import expected, type_hints
     from bam_envs.core.wording import as_flag, closest
+    from bam_train.cli.help_text import is_hidden, is_positional
 
     text = " ".join(re.sub(r"[─│╭╮╰╯]+|-{4,}|(?<!\S)[|+](?!\S)", " ", box).split())  # drawn in ASCII where it must be
     text = re.split(r" For full helptext| Argument helptext", text)[0]
-    hints, (_, positional) = type_hints(config), get_args(tyro.conf.Positional[str])
+    hints = type_hints(config)
     if match := re.search(r"Unrecognized options: ([^\s,]+)", text):
         if not match[1].startswith("-"):
             return f"unexpected argument {match[1]}."
-        named = [name for name, hint in hints.items() if positional not in get_args(hint)]
-        flags = [*map(as_flag, named), "--help"]
-        close = closest(match[1].partition("=")[0], flags)
-        choice = f"; there are {' and '.join(flags)}." if len(flags) < 3 else "."
+        flags = [as_flag(name) for name, hint in hints.items() if not (is_positional(hint) or is_hidden(hint))]
+        flags, instead = [*flags, "--help"], getattr(config, "INSTEAD", {})
+        name = match[1].partition("=")[0].replace("_", "-")
+        if name in instead:
+            return f"{match[1]} is no option: {instead[name]}."
+        close = closest(name, flags)
+        choice = f"; there are {' and '.join(flags)}." if len(flags) < 3 else f"{instead.get('', '')}."
         return f"unknown option {match[1]}{f', did you mean {close}?' if close else choice}"
     if match := re.search(r"Error parsing (\S+?):? .*(?:from \[|: )'(.*?)'", text):
         flag, found = match.groups()
@@ -200,6 +201,7 @@ def usage_error(box: str, config: type[Any]) -> str:
         return f"{flag}: expected {', '.join(names[:-1])} or {names[-1]}, found {found!r}."
     if match := re.search(r"Missing value for argument '(\S+)'", text):
         return f"{match[1]} needs a value." if match[1].startswith("--") else f"{match[1].upper()} is missing."
-    if match := re.search(r"Missing from \S+: (\S+)", text):
-        return f"{match[1]} is missing."
+    if match := re.search(r"Missing from [^:]*: (.*)", text):
+        *rest, last = [part.split()[0] for part in match[1].split("(required)") if part.strip()]
+        return f"{', '.join(rest)} and {last} are missing." if rest else f"{last} is missing."
     return f"{text}."
