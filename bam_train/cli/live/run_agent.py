@@ -37,6 +37,8 @@ def run_agent(config: AgentConfig, signals: SignalMemory) -> int:
     from bam_train.settings import parse_assignment
     from bam_train.signals import handled
 
+    if config.record is not None:
+        import pyarrow  # noqa: F401 - it is needed when a recording ends
     options = _options(config)
     handler = logging.StreamHandler()
     handler.setFormatter(ShownFormatter("bam-agent: %(message)s"))
