@@ -22,7 +22,7 @@ from bam_envs.robo_gym.table import ROBO_GYM
 from bam_envs.robots.linked import link_profile
 from bam_envs.tasks.wrappers.late_actions import read_delay
 from bam_train.checkpoint import Checkpoint
-from bam_train.checkpoint.manifest import WHERE
+from bam_train.checkpoint.manifest import WHERE, Manifest
 from bam_train.env_location import HERE, Place
 from bam_train.errors import CheckpointMismatch, SettingsError
 
@@ -231,6 +231,12 @@ def interface_of(env: AnyEnv) -> dict[str, Any]:
     signals = {} if describe is None else _names_and_units(describe())
     plain: dict[str, Any] = json.loads(json.dumps({**spaces, "signals": signals}))  # tuples as lists
     return {**plain, "period": None if period is None else float(period)}
+
+
+def interface_in(manifest: Manifest) -> dict[str, Any]:
+    """As `interface_of`, of the environment of a manifest."""
+    spaces = {name: getattr(manifest, name) for name in ("observation_space", "action_space")}
+    return {**spaces, "signals": _names_and_units(manifest.signals), "period": manifest.period}
 
 
 def interface_pairs(checkpoint: Checkpoint, interface: Mapping[str, Any]) -> list[tuple[str, Any, Any]]:
