@@ -1,6 +1,7 @@
 """Make the environment that a checkpoint belongs to, and check that both fit before a robot moves."""
 
 import contextlib
+import functools
 import json
 import math
 from collections.abc import Callable, Mapping
@@ -13,7 +14,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 import bam_envs  # noqa: F401 - registers our environments with Gymnasium
 from bam_envs.core import registry
 from bam_envs.core.env_options import in_our_words, require_kinds
-from bam_envs.core.errors import InvalidValue, UnknownName
+from bam_envs.core.errors import BamEnvsError, InvalidValue, UnknownName
 from bam_envs.core.registry import entry_of, resolve_id
 from bam_envs.core.spaces import space_to_json
 from bam_envs.core.wording import did_you_mean
@@ -24,7 +25,8 @@ from bam_envs.tasks.wrappers.late_actions import read_delay
 from bam_train.checkpoint import Checkpoint
 from bam_train.checkpoint.manifest import WHERE, Manifest
 from bam_train.env_location import HERE, Place
-from bam_train.errors import CheckpointMismatch, SettingsError
+from bam_train.errors import BamTrainError, CheckpointMismatch, SettingsError
+from bam_train.foreign_env import ForeignEnv, described
 
 ENTRY_POINTS = "bam_train.environments"
 """Group of entry points whose modules a checkpoint may name, because installed packages are trusted."""
@@ -126,7 +128,7 @@ def make_env(
     An environment at a transport ignores `env_kwargs`: its server was given them.
 
     Raises:
-        SettingsError: It cannot be made: a package is missing, or it does not take these arguments.
+        SettingsError: It cannot be made: a package is missing, it does not take these arguments, or its code fails.
     """
     if place.transport:
         from bam_envs.remote.remote_env import make_remote_env
@@ -139,7 +141,8 @@ def make_env(
     kwargs = dict(env_kwargs or {}) if place.robot is None else place.robot_kwargs(env_id, env_kwargs or {})
     if render_mode is not None:
         kwargs["render_mode"] = render_mode
-    return _made(env_id, lambda: gym.make(env_id, disable_env_checker=True, **kwargs))
+    env: gym.Env[Any, Any] = _made(env_id, lambda: gym.make(env_id, disable_env_checker=True, **kwargs))
+    return env if is_batched(env_id) else ForeignEnv(env, env_id)
 
 
 def parity_if_needed(
@@ -180,6 +183,7 @@ def make_vector_env(
         return _made(env_id, lambda: gym.make_vec(env_id, num_envs=num_envs, **(env_kwargs or {})))
     arguments = {"disable_env_checker": True, **(env_kwargs or {})}
     arguments["vector_kwargs"] = {"autoreset_mode": AutoresetMode.SAME_STEP}
+    arguments["wrappers"] = [functools.partial(ForeignEnv, env_id=env_id)]
     return _made(env_id, lambda: gym.make_vec(env_id, num_envs, vectorization_mode="sync", **arguments))
 
 
@@ -279,7 +283,13 @@ def _made(env_id: str, make: Callable[[], T]) -> T:
     """The result of `make`; an exception that the caller can avoid becomes a SettingsError of one line."""
     try:
         return make()
-    except (gym.error.Error, ModuleNotFoundError, TypeError) as error:
+    except (BamEnvsError, BamTrainError):
+        raise
+    except Exception as error:
+        if not isinstance(error, (gym.error.Error, ModuleNotFoundError, TypeError)):
+            if is_batched(env_id):
+                raise
+            raise SettingsError(f"{env_id} cannot be made: {described(error)}") from error
         why = str(error).strip().partition("\n")[0].rstrip(".") or type(error).__name__
         if isinstance(error, TypeError):
             raise SettingsError(f"{env_id} cannot be made with these arguments: {why}") from error

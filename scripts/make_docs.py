@@ -23,7 +23,7 @@ from bam_envs.core.registry import ENVIRONMENTS, NO_ROBOT, EnvEntry, resolve
 from bam_envs.core.robot import SignalSpec
 from bam_envs.core.robot_env import describe
 from bam_envs.core.spaces import space_text
-from bam_train.cli import help_text
+from bam_train.cli import program
 
 DOCS = Path(__file__).resolve().parents[1] / "docs"
 _PART = re.compile(r"(<!-- generated: (?P<name>\S+)(?: (?P<argument>\S+))? -->\n)(.*?)(<!-- /generated -->)", re.DOTALL)
@@ -48,7 +48,7 @@ def _cell(value: object) -> str:
 
 def field_docs(kind: type) -> dict[str, str]:
     """The meaning of each field of a dataclass or member of an enum, as Markdown."""
-    return {name: code(text) for name, text in help_text.field_docs(kind).items()}
+    return {name: code(text) for name, text in program.field_docs(kind).items()}
 
 
 def code(text: str) -> str:

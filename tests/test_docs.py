@@ -29,8 +29,7 @@ from bam_envs.tasks import (
 from bam_train.checkpoint import Checkpoint
 from bam_train.cli import train
 from bam_train.cli.data.bam_data import COMMANDS as DATA_COMMANDS
-from bam_train.cli.help_text import help_text
-from bam_train.cli.program import parse
+from bam_train.cli.program import help_text, parse
 from bam_train.settings import tomllib
 from tests.test_checkpoints import LEAST
 

@@ -24,7 +24,17 @@ ORDER = {
         "testing",
     ],
     "bam_train": [
-        *("errors", "signals", "atomic_file", "place", "stand_ins", "env_location", "settings", "finite_envs"),
+        *(
+            "errors",
+            "signals",
+            "atomic_file",
+            "place",
+            "stand_ins",
+            "env_location",
+            "settings",
+            "finite_envs",
+            "foreign_env",
+        ),
         *(
             "checkpoint",
             "detector",

@@ -154,9 +154,9 @@ def test_a_fault_still_gives_the_report(corridor_checkpoint, corridor, run, monk
 
     monkeypatch.setattr(corridor_class(corridor), "step", step)
     status, out, err = run(main, corridor_checkpoint(), "--fast", "--json")
-    assert status == 1
-    assert err == "bam-deploy: fault: OSError: cable pulled\n"
-    assert json.loads(out)["stop_reason"] == "fault: OSError: cable pulled"
+    place = f"(test_deploy.py, line {step.__code__.co_firstlineno + 1}, in step)"
+    text = f"fault: test/Corridor-v0 failed at step 1 of an episode: OSError: cable pulled {place}"
+    assert (status, err, json.loads(out)["stop_reason"]) == (1, f"bam-deploy: {text}\n", text)
 
 
 def test_no_screen(run, monkeypatch):
