@@ -8,6 +8,8 @@ import pkgutil
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
+from gymnasium import spaces
+
 from bam_envs.core.errors import MissingExtra
 from bam_envs.core.wording import did_you_mean
 from bam_train.errors import SettingsError
@@ -66,6 +68,27 @@ class Algorithm:
         raise SettingsError(
             f"{self.name} does not fit {env}: it takes {' or '.join(self.actions)} actions, found {kind}. {remedy}"
         )
+
+    def require_observations(self, env: str, space: Any, several: tuple[type, ...] = (spaces.Dict,)) -> None:
+        """Refuse `env` if an observation, also in one of `several`, is neither a Box nor a choice."""
+        for name, leaf in _observations(space, several):
+            if type(leaf).__name__ not in ANY:
+                kinds = (
+                    f"{', '.join(ANY[:-1])} or {ANY[-1]}, or a {' or '.join(one.__name__ for one in several)} of them"
+                )
+                raise SettingsError(
+                    f"{self.name} does not fit {env}: {name} is a {type(leaf).__name__}, expected {kinds}. "
+                    "Leave it out, or turn it into numbers, in the environment"
+                )
+
+
+def _observations(space: Any, several: tuple[type, ...], name: str = "the observation") -> list[tuple[str, Any]]:
+    """What is observed, by name, without the spaces of `several`."""
+    if not isinstance(space, several):
+        return [(name, space)]
+    whole: Any = space
+    parts = whole.items() if isinstance(whole, spaces.Dict) else enumerate(whole)
+    return [one for key, part in parts for one in _observations(part, several, f"observation {key!r}")]
 
 
 _BOX = ("Box",)
