@@ -8,13 +8,12 @@ from __future__ import annotations
 
 import json as json_module
 import math
-import sys
 from contextlib import closing, nullcontext
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from bam_train.cli.console import make_console, say, tell
+from bam_train.cli.console import can_draw, make_console, say, tell
 from bam_train.cli.program import run_program
 from bam_train.signals import SignalMemory
 
@@ -138,7 +137,7 @@ def _run(
     with deployment.handles_signals():  # a second Ctrl-C must not lose the report
         deployment.switch.came += signals.came  # after a lost exception, the deployment ends before it begins
         plain = nullcontext(PlainDisplay(journal, say))
-        with live_display(make_console(), env, title, journal) if sys.stderr.isatty() else plain as watcher:
+        with live_display(make_console(), env, title, journal) if can_draw() else plain as watcher:
             ending = deployment.run(watcher, seed=config.seed)
         if ending.status:
             say(f"bam-deploy: {ending.reason}")

@@ -12,7 +12,7 @@ from collections.abc import Callable
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
-from bam_train.cli.console import count, tell
+from bam_train.cli.console import can_draw, count, tell
 from bam_train.cli.program import run_program
 from bam_train.signals import before_quitting, handled
 
@@ -79,7 +79,7 @@ def _train(config: TrainConfig, settings: TrainSettings, checkpoint: Checkpoint 
             folder = RunFolder(runs, file_stem(settings.env, settings.algo, settings.trainer))
             folder.write_config(settings.to_mapping())
             trainer.log_to(folder.tensorboard)
-            display = (LiveDisplay if sys.stderr.isatty() else PlainDisplay)(title)
+            display = (LiveDisplay if can_draw() else PlainDisplay)(title)
             run = TrainingRun(trainer, folder, output.path, display, output.best, copies=copies)
             handlers.enter_context(handled(_stop_on_signals(run, came)))
             with display:
@@ -122,7 +122,7 @@ def _stop_on_signals(run: TrainingRun, came: list[int]) -> Callable[[int], None]
 
     def write(line: str) -> None:
         """Write to standard error without print, which the signal may have interrupted."""
-        show_cursor = b"\x1b[?25h" if sys.stderr.isatty() else b""  # a live panel has hidden it
+        show_cursor = b"\x1b[?25h" if can_draw() else b""  # a live panel has hidden it
         with contextlib.suppress(OSError):  # the reader has closed it
             os.write(2, show_cursor + line.encode())
 
