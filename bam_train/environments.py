@@ -196,10 +196,11 @@ def control_period(env: gym.Env[Any, Any]) -> float | None:
     return 1.0 / float(rate) if rate else None
 
 
-def require_fit(checkpoint: Checkpoint, env: AnyEnv, place: Place = HERE) -> None:
+def require_fit(checkpoint: Checkpoint, env: AnyEnv, place: Place = HERE, env_id: str | None = None) -> None:
     """Check that `env` fits the checkpoint's policy.
 
     Both spaces, the name and unit of every signal, and the control period are compared, where both sides give them.
+    The error names `env_id`, if that may be another environment than the checkpoint's.
 
     Raises:
         CheckpointMismatch: Names the first thing that differs, and both values.
@@ -210,6 +211,12 @@ def require_fit(checkpoint: Checkpoint, env: AnyEnv, place: Place = HERE) -> Non
     if difference is None:
         return
     name, theirs, ours = difference
+    if env_id is not None and not registry.are_same(env_id, checkpoint.manifest.env):
+        raise CheckpointMismatch(
+            checkpoint.path,
+            f"was trained on {checkpoint.manifest.env}, where {name} is {short_json(theirs)}, and it is "
+            f"{short_json(ours)} in {env_id}; give a checkpoint of {env_id}",
+        )
     place_text = f"at {place.text}" if place.transport else f"in {checkpoint.manifest.env} as installed"
     remedy = "serve the version" if place.transport else "install the version"
     raise CheckpointMismatch(

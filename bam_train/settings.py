@@ -52,7 +52,7 @@ class TrainSettings:
     """Seed of weights, exploration and environments: environment i gets seed + i (default 0)."""
     num_envs: Annotated[int, Meta(ge=1, le=100_000)] = 1
     """Environments stepped together, in all: the runners of rllib share them (default: the preset's, or 1)."""
-    device: str = "auto"
+    device: Annotated[str, Meta(pattern=r"^(auto|cpu|cuda(:\d+)?)$", description="auto, cpu, cuda or cuda:1")] = "auto"
     """Where to compute: auto (the GPU for images if there is one, else the CPU), cpu, cuda, cuda:1."""
     threads: Annotated[int, Meta(ge=1, le=1024)] = 1
     """Threads that torch computes with (default 1: more is slower on small networks)."""

@@ -62,7 +62,8 @@ class Algorithm:
         if kind in self.actions:
             return
         table = next(table for table in ALGORITHMS.values() if self in table.values())
-        others = [other for other in table.values() if other.offline == self.offline and kind in other.actions]
+        near = [*table.values(), *(() if self.offline or len(table) > 1 else SB3_ALGORITHMS.values())]
+        others = [other for other in near if other.offline == self.offline and kind in other.actions]
         fitting = ", ".join(sorted(other.name for other in others))
         remedy = f"Use one of: {fitting}." if fitting else "No algorithm here does."
         raise SettingsError(

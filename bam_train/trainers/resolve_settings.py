@@ -1,5 +1,6 @@
 """Complete settings from those that a user gives: with presets for new runs, and a checkpoint's for resumed ones."""
 
+import contextlib
 from collections.abc import Mapping
 from dataclasses import fields, replace
 from pathlib import Path
@@ -10,7 +11,7 @@ from bam_envs.core.registry import entry_of, resolve_id
 from bam_envs.robots.linked import portable
 from bam_train.checkpoint import Checkpoint
 from bam_train.checkpoint.manifest import require_no_place
-from bam_train.environments import environment_of, require_env_kwargs
+from bam_train.environments import environment_of, make_env, require_env_kwargs, require_fit
 from bam_train.errors import CheckpointMismatch, SettingsError
 from bam_train.settings import TrainSettings, check_names, differences, file_stem, merge, parse_config
 from bam_train.trainers.algorithms import ALGORITHMS, EXTRAS, RLLIB_ALGORITHMS, load_trainer, require_algorithm
@@ -66,11 +67,33 @@ def resolve(given: Mapping[str, Any]) -> TrainSettings:
             f"env_kwargs: {', '.join(settings.env_kwargs)}: the environment runs at {settings.place.text}; "
             "give its arguments to bam-serve there"
         )
+    _require_checkpoints(settings)
     completed = _complete(settings)
     if given.get("num_envs", completed.num_envs) != completed.num_envs:
         there = f"there are {completed.num_envs} at {settings.place.text}"
         raise SettingsError(f"num_envs: {settings.num_envs} were asked for, and {there}; leave it out")
     return completed
+
+
+def _require_checkpoints(settings: TrainSettings) -> None:
+    """Refuse a checkpoint that a new run cannot begin with, and a teacher's that cannot be opened."""
+    if settings.teacher not in (None, "scripted"):
+        Checkpoint.open(Path(str(settings.teacher)).expanduser())
+    if settings.start is not None:
+        checkpoint = require_start(settings, settings.start)
+        if not settings.transport:
+            with contextlib.closing(make_env(settings.env, settings.env_kwargs)) as env:
+                require_fit(checkpoint, env, env_id=settings.env)
+
+
+def require_start(settings: TrainSettings, path: str) -> Checkpoint:
+    """The checkpoint at `path`; raises CheckpointMismatch if another algorithm trained it."""
+    checkpoint = Checkpoint.open(path)
+    made = checkpoint.manifest
+    if (made.trainer, made.algorithm) != (settings.trainer, settings.algo):
+        text = f"was trained by {made.algorithm} of {made.trainer}: {settings.algo} of sb3 cannot begin with it"
+        raise CheckpointMismatch(checkpoint.path, f"{text}; leave start out, or give --algo {made.algorithm}")
+    return checkpoint
 
 
 def _of_data(given: Mapping[str, Any]) -> dict[str, Any]:

@@ -24,12 +24,12 @@ from bam_envs.core.spaces import space_to_json
 from bam_train.checkpoint import Checkpoint, write_checkpoint
 from bam_train.data.record_dataset import RecordVectorDataset, info_of
 from bam_train.environments import control_period, require_fit
-from bam_train.errors import CheckpointMismatch, SettingsError, TrainingFailed
+from bam_train.errors import SettingsError, TrainingFailed
 from bam_train.policy import FrozenPolicy
 from bam_train.settings import TrainSettings
 from bam_train.trainers.algorithms import SB3_ALGORITHMS
 from bam_train.trainers.base import OnProgress, Progress, Statistics, manifest
-from bam_train.trainers.resolve_settings import own_settings
+from bam_train.trainers.resolve_settings import own_settings, require_start
 from bam_train.trainers.sb3 import sb3_hyperparameters as hyperparameters
 from bam_train.trainers.sb3 import sb3_resume as resume
 from bam_train.trainers.sb3.sb3_freezing import freeze, golden
@@ -73,12 +73,8 @@ class SB3Trainer:
         """Set up a new run of complete settings."""
         trainer = cls._made(settings)
         if settings.start is not None:
-            checkpoint = Checkpoint.open(settings.start)
-            require_fit(checkpoint, one_env(trainer.venv), settings.place)
-            made = checkpoint.manifest
-            if (made.trainer, made.algorithm) != (settings.trainer, settings.algo):
-                text = f"was trained by {made.algorithm} of {made.trainer}: {settings.algo} of sb3 cannot begin with it"
-                raise CheckpointMismatch(checkpoint.path, f"{text}; leave start out, or give --algo {made.algorithm}")
+            checkpoint = require_start(settings, settings.start)
+            require_fit(checkpoint, one_env(trainer.venv), settings.place, settings.env)
             resume.begin_with(checkpoint, trainer.model, trainer._normaliser)
         return trainer
 

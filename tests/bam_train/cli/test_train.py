@@ -86,6 +86,18 @@ for words in (["--set", "gamma=2"], ["--set", "gama=1"], ["--trainer", "rllib", 
     ]
 
 
+@pytest.mark.parametrize(
+    ("flags", "text"),
+    [
+        ({}, "--record: CartPole-v1 is not of bam_envs; use bam-data collect, or RecordDataset"),
+        ({"trainer": "rllib", "set": ()}, "--record is for --trainer sb3, found rllib; use bam-data collect"),
+    ],
+)
+def test_a_run_that_cannot_be_recorded(bam_train, here, flags, text):
+    assert bam_train(record="data", **flags) == (1, "", f"bam-train: {text}\n")
+    assert list(here.iterdir()) == []
+
+
 def test_print_config_is_read_back(bam_train, here):
     status, printed, err = bam_train(print_config=True)
     assert (status, err) == (0, "")
