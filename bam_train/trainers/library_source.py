@@ -8,6 +8,7 @@ import ast
 import functools
 import importlib.util
 import inspect
+import pkgutil
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple, Optional, Union
@@ -38,21 +39,22 @@ class Source(NamedTuple):
     node: ast.ClassDef
 
 
-def parameters(reference: str, method: str = "__init__") -> dict[str, inspect.Parameter]:
-    """The parameters of the `method` of a class, ``"module:Class"``, by name, with ``self``.
+def parameters(reference: str) -> dict[str, inspect.Parameter]:
+    """The parameters of the constructor of a class, ``"module:Class"``, by name, with ``self``.
+
+    A class without a source that says so, such as one that a function makes, is imported.
 
     Raises:
         ModuleNotFoundError: The library is not installed.
-        LookupError: The class or the method is not in the source.
     """
-    found = next(inherited(reference, method), None)
-    if found is None:
-        raise LookupError(f"{reference} has no {method}")
-    return found
+    try:
+        return next(inherited(reference, "__init__"))
+    except (LookupError, StopIteration):
+        return dict(inspect.signature(pkgutil.resolve_name(reference).__init__).parameters)
 
 
 def inherited(reference: str, method: str) -> Iterator[dict[str, inspect.Parameter]]:
-    """As `parameters`, for each class that has the method, from the class ``"module:Class"`` up."""
+    """The parameters of a `method` of each class that has it, from the class ``"module:Class"`` up."""
     for one in bases(source_of(reference)):
         for node in one.node.body:
             if isinstance(node, ast.FunctionDef) and node.name == method:
@@ -60,14 +62,24 @@ def inherited(reference: str, method: str) -> Iterator[dict[str, inspect.Paramet
 
 
 def table(reference: str, name: str) -> dict[str, str]:
-    """A table of classes in the body of a class, as references: ``{"MlpPolicy": "module:Class"}``."""
+    """A table of classes in a class, as references: ``{"MlpPolicy": "module:Class"}``."""
+    try:
+        return next(_tables(reference, name))
+    except (LookupError, StopIteration):
+        found = getattr(pkgutil.resolve_name(reference), name)
+        return {key: f"{kind.__module__}:{kind.__qualname__}" for key, kind in found.items()}
+
+
+def _tables(reference: str, name: str) -> Iterator[dict[str, str]]:
     for one in bases(source_of(reference)):
         for node in one.node.body:
-            if isinstance(node, ast.AnnAssign) and ast.unparse(node.target) == name:
-                named = node.value if isinstance(node.value, ast.Dict) else ast.Dict([], [])
-                pairs = zip(named.keys, named.values, strict=True)
-                return {str(ast.literal_eval(key)): f"{one.module}:{ast.unparse(kind)}" for key, kind in pairs if key}
-    raise LookupError(f"{reference} has no table {name}")
+            if (
+                isinstance(node, ast.AnnAssign)
+                and ast.unparse(node.target) == name
+                and isinstance(node.value, ast.Dict)
+            ):
+                pairs = zip(node.value.keys, node.value.values, strict=True)
+                yield {str(ast.literal_eval(key)): f"{one.module}:{ast.unparse(kind)}" for key, kind in pairs if key}
 
 
 def source_of(reference: str) -> Source:
@@ -103,8 +115,10 @@ def _tree(module: str) -> ast.Module:
     found = importlib.util.find_spec(library)
     if found is None or found.origin is None:
         raise ModuleNotFoundError(f"No module named {library!r}", name=library)
-    place = Path(found.origin).parent.joinpath(*inner)
-    path = place / "__init__.py" if place.is_dir() else place.with_suffix(".py")
+    path = Path(found.origin)
+    if inner:
+        place = path.parent.joinpath(*inner)
+        path = place / "__init__.py" if place.is_dir() else place.with_suffix(".py")
     try:
         return ast.parse(path.read_text(encoding="utf-8"))
     except OSError as error:

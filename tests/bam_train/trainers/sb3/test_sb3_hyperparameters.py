@@ -5,11 +5,15 @@ from __future__ import annotations
 import copy
 import inspect
 import json
+import sys
+from importlib.machinery import ModuleSpec
+from types import ModuleType
 
 import gymnasium as gym
 import numpy as np
 import pytest
 import torch
+from stable_baselines3 import PPO
 from stable_baselines3.common.noise import NormalActionNoise, OrnsteinUhlenbeckActionNoise
 from stable_baselines3.common.vec_env import VecNormalize
 
@@ -48,12 +52,16 @@ def test_arguments_in_the_source_are_those_of_the_classes(name):
             assert found[argument].default in (known[argument].default, Other)
 
 
-def test_what_is_not_in_the_source():
+def test_a_class_without_a_source_is_imported(monkeypatch):
     with pytest.raises(ModuleNotFoundError, match="No module named 'no_library'"):
         parameters("no_library:Kind")
-    for reference in ("stable_baselines3:NoKind", "stable_baselines3.no_module:PPO"):
-        with pytest.raises(LookupError):
-            parameters(reference)
+    module, ours = ModuleType("made_here"), type("Ours", (PPO,), {"__init__": lambda self, policy, decay=0.5: None})
+    module.Ours = ours
+    module.__spec__ = ModuleSpec("made_here", None, origin="/nowhere/made_here.py")
+    monkeypatch.setitem(sys.modules, "made_here", module)
+    assert parameters("made_here:Ours")["decay"].default == 0.5
+    policies = table("made_here:Ours", "policy_aliases")
+    assert policies["MlpPolicy"] == "stable_baselines3.common.policies:ActorCriticPolicy"
 
 
 @pytest.mark.parametrize("name", SB3_ALGORITHMS)
