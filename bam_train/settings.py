@@ -91,7 +91,8 @@ class TrainSettings:
     """Data set to learn from, without its environment, which it names; also at an address, such as s3://bucket/pick.
     With --trainer rllib also plain Parquet files, for bc, marwil, cql and iql."""
     normalize: bool | dict[str, Any] = False
-    """Normalise observations and rewards by running statistics; a table gives VecNormalize's arguments."""
+    """Normalise observations and rewards by running statistics; a table gives VecNormalize's arguments. Images and
+    choices among the observations stay as they are."""
     hyperparameters: dict[str, Any] = field(default_factory=dict)
     """Arguments of the algorithm."""
 
