@@ -47,8 +47,8 @@ clean:
 	rm -rf $(VENV) build dist runs .pytest_cache .mypy_cache .ruff_cache .hypothesis
 
 $(VENV)/.run: pyproject.toml hatch_build.py constraints.txt | $(BIN)/python
-	@echo "Installing bam-train with simulation and training in $(VENV); the first time takes a few minutes."
-	$(PIP_INSTALL) -e ".[sim,train]"
+	@echo "Installing bam-train with simulation, training and data sets in $(VENV); the first time takes a few minutes."
+	$(PIP_INSTALL) -e ".[sim,train,data]"
 	@touch $@
 
 $(VENV)/.dev: pyproject.toml hatch_build.py constraints.txt | $(BIN)/python

@@ -1,6 +1,7 @@
 """Make the environment that a checkpoint belongs to, and check that both fit before a robot moves."""
 
 import contextlib
+import functools
 import json
 import math
 from collections.abc import Callable, Mapping
@@ -13,7 +14,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 import bam_envs  # noqa: F401 - registers our environments with Gymnasium
 from bam_envs.core import registry
 from bam_envs.core.env_options import in_our_words, require_kinds
-from bam_envs.core.errors import InvalidValue, UnknownName
+from bam_envs.core.errors import BamEnvsError, InvalidValue, UnknownName
 from bam_envs.core.registry import entry_of, resolve_id
 from bam_envs.core.spaces import space_to_json
 from bam_envs.core.wording import did_you_mean
@@ -22,9 +23,10 @@ from bam_envs.robo_gym.table import ROBO_GYM
 from bam_envs.robots.linked import link_profile
 from bam_envs.tasks.wrappers.late_actions import read_delay
 from bam_train.checkpoint import Checkpoint
-from bam_train.checkpoint.manifest import WHERE
+from bam_train.checkpoint.manifest import WHERE, Manifest
 from bam_train.env_location import HERE, Place
-from bam_train.errors import CheckpointMismatch, SettingsError
+from bam_train.errors import BamTrainError, CheckpointMismatch, SettingsError
+from bam_train.foreign_env import ForeignEnv, described
 
 ENTRY_POINTS = "bam_train.environments"
 """Group of entry points whose modules a checkpoint may name, because installed packages are trusted."""
@@ -126,7 +128,7 @@ def make_env(
     An environment at a transport ignores `env_kwargs`: its server was given them.
 
     Raises:
-        SettingsError: It cannot be made: a package is missing, or it does not take these arguments.
+        SettingsError: It cannot be made: a package is missing, it does not take these arguments, or its code fails.
     """
     if place.transport:
         from bam_envs.remote.remote_env import make_remote_env
@@ -139,7 +141,8 @@ def make_env(
     kwargs = dict(env_kwargs or {}) if place.robot is None else place.robot_kwargs(env_id, env_kwargs or {})
     if render_mode is not None:
         kwargs["render_mode"] = render_mode
-    return _made(env_id, lambda: gym.make(env_id, disable_env_checker=True, **kwargs))
+    env: gym.Env[Any, Any] = _made(env_id, lambda: gym.make(env_id, disable_env_checker=True, **kwargs))
+    return env if is_batched(env_id) else ForeignEnv(env, env_id)
 
 
 def parity_if_needed(
@@ -180,6 +183,7 @@ def make_vector_env(
         return _made(env_id, lambda: gym.make_vec(env_id, num_envs=num_envs, **(env_kwargs or {})))
     arguments = {"disable_env_checker": True, **(env_kwargs or {})}
     arguments["vector_kwargs"] = {"autoreset_mode": AutoresetMode.SAME_STEP}
+    arguments["wrappers"] = [functools.partial(ForeignEnv, env_id=env_id)]
     return _made(env_id, lambda: gym.make_vec(env_id, num_envs, vectorization_mode="sync", **arguments))
 
 
@@ -192,10 +196,11 @@ def control_period(env: gym.Env[Any, Any]) -> float | None:
     return 1.0 / float(rate) if rate else None
 
 
-def require_fit(checkpoint: Checkpoint, env: AnyEnv, place: Place = HERE) -> None:
+def require_fit(checkpoint: Checkpoint, env: AnyEnv, place: Place = HERE, env_id: str | None = None) -> None:
     """Check that `env` fits the checkpoint's policy.
 
     Both spaces, the name and unit of every signal, and the control period are compared, where both sides give them.
+    The error names `env_id`, if that may be another environment than the checkpoint's.
 
     Raises:
         CheckpointMismatch: Names the first thing that differs, and both values.
@@ -206,6 +211,12 @@ def require_fit(checkpoint: Checkpoint, env: AnyEnv, place: Place = HERE) -> Non
     if difference is None:
         return
     name, theirs, ours = difference
+    if env_id is not None and not registry.are_same(env_id, checkpoint.manifest.env):
+        raise CheckpointMismatch(
+            checkpoint.path,
+            f"was trained on {checkpoint.manifest.env}, where {name} is {short_json(theirs)}, and it is "
+            f"{short_json(ours)} in {env_id}; give a checkpoint of {env_id}",
+        )
     place_text = f"at {place.text}" if place.transport else f"in {checkpoint.manifest.env} as installed"
     remedy = "serve the version" if place.transport else "install the version"
     raise CheckpointMismatch(
@@ -231,6 +242,12 @@ def interface_of(env: AnyEnv) -> dict[str, Any]:
     signals = {} if describe is None else _names_and_units(describe())
     plain: dict[str, Any] = json.loads(json.dumps({**spaces, "signals": signals}))  # tuples as lists
     return {**plain, "period": None if period is None else float(period)}
+
+
+def interface_in(manifest: Manifest) -> dict[str, Any]:
+    """As `interface_of`, of the environment of a manifest."""
+    spaces = {name: getattr(manifest, name) for name in ("observation_space", "action_space")}
+    return {**spaces, "signals": _names_and_units(manifest.signals), "period": manifest.period}
 
 
 def interface_pairs(checkpoint: Checkpoint, interface: Mapping[str, Any]) -> list[tuple[str, Any, Any]]:
@@ -273,7 +290,13 @@ def _made(env_id: str, make: Callable[[], T]) -> T:
     """The result of `make`; an exception that the caller can avoid becomes a SettingsError of one line."""
     try:
         return make()
-    except (gym.error.Error, ModuleNotFoundError, TypeError) as error:
+    except (BamEnvsError, BamTrainError):
+        raise
+    except Exception as error:
+        if not isinstance(error, (gym.error.Error, ModuleNotFoundError, TypeError)):
+            if is_batched(env_id):
+                raise
+            raise SettingsError(f"{env_id} cannot be made: {described(error)}") from error
         why = str(error).strip().partition("\n")[0].rstrip(".") or type(error).__name__
         if isinstance(error, TypeError):
             raise SettingsError(f"{env_id} cannot be made with these arguments: {why}") from error

@@ -47,12 +47,12 @@ class TrainSettings:
     With --trainer rllib: ppo, appo, impala, sac, tqc, dqn, bc, marwil, cql or iql. With --data: bc, iql, cql, td3bc,
     awac, cal-ql, plas or rebrac. With --teacher: dagger. For grasps from a picture: grasp-q."""
     steps: _Steps = 100_000
-    """Environment steps of the whole run, also after --resume; with --data, updates."""
+    """Steps of the whole run, also after --resume; with --data, updates (default: the preset's, or 100000)."""
     seed: Annotated[int, Meta(ge=0, le=10**15)] = 0
-    """Seed of weights, exploration and environments (environment i gets seed + i)."""
+    """Seed of weights, exploration and environments: environment i gets seed + i (default 0)."""
     num_envs: Annotated[int, Meta(ge=1, le=100_000)] = 1
-    """Environments stepped together, in all: the runners of rllib share them."""
-    device: str = "auto"
+    """Environments stepped together, in all: the runners of rllib share them (default: the preset's, or 1)."""
+    device: Annotated[str, Meta(pattern=r"^(auto|cpu|cuda(:\d+)?)$", description="auto, cpu, cuda or cuda:1")] = "auto"
     """Where to compute: auto (the GPU for images if there is one, else the CPU), cpu, cuda, cuda:1."""
     threads: Annotated[int, Meta(ge=1, le=1024)] = 1
     """Threads that torch computes with (default 1: more is slower on small networks)."""
@@ -66,11 +66,11 @@ class TrainSettings:
     until_success: _Share | None = None
     """Stop once this share of evaluation episodes succeeds, such as 0.99."""
     trial_threshold: Annotated[float, Meta(gt=0, lt=1, description="a share above 0 and below 1, such as 0.9")] = 0.9
-    """Success rate that trials on a real robot must exceed before bam-deploy runs at full speed."""
+    """Success rate that trials on a real robot must exceed before bam-deploy runs at full speed (default 0.9)."""
     eval_every: _Steps | None = None
     """Steps between two evaluations (default a twentieth of the run, and at least 1000)."""
     eval_episodes: Annotated[int, Meta(ge=1, le=1_000_000)] = 20
-    """Episodes of one evaluation."""
+    """Episodes of one evaluation (default: the preset's, or 20)."""
     env_kwargs: dict[str, Any] = field(default_factory=dict)
     """Keyword arguments of the environment."""
     transport: list[str] = field(default_factory=list)
@@ -91,7 +91,8 @@ class TrainSettings:
     """Data set to learn from, without its environment, which it names; also at an address, such as s3://bucket/pick.
     With --trainer rllib also plain Parquet files, for bc, marwil, cql and iql."""
     normalize: bool | dict[str, Any] = False
-    """Normalise observations and rewards by running statistics; a table gives VecNormalize's arguments."""
+    """Normalise observations and rewards by running statistics; a table gives VecNormalize's arguments. Images and
+    choices among the observations stay as they are."""
     hyperparameters: dict[str, Any] = field(default_factory=dict)
     """Arguments of the algorithm."""
 

@@ -8,8 +8,6 @@ part has its function in it.
 from __future__ import annotations
 
 import argparse
-import ast
-import contextlib
 import dataclasses
 import importlib
 import inspect
@@ -25,6 +23,7 @@ from bam_envs.core.registry import ENVIRONMENTS, NO_ROBOT, EnvEntry, resolve
 from bam_envs.core.robot import SignalSpec
 from bam_envs.core.robot_env import describe
 from bam_envs.core.spaces import space_text
+from bam_train.cli import program
 
 DOCS = Path(__file__).resolve().parents[1] / "docs"
 _PART = re.compile(r"(<!-- generated: (?P<name>\S+)(?: (?P<argument>\S+))? -->\n)(.*?)(<!-- /generated -->)", re.DOTALL)
@@ -48,16 +47,8 @@ def _cell(value: object) -> str:
 
 
 def field_docs(kind: type) -> dict[str, str]:
-    """The string below each field of a dataclass or member of an enum, inherited ones too."""
-    docs = {}
-    for owner in reversed(kind.__mro__[:-1]):
-        with contextlib.suppress(OSError):  # made without a source
-            body = ast.parse(textwrap.dedent(inspect.getsource(owner))).body[0].body  # type: ignore[attr-defined]
-            for field, text in itertools.pairwise(body):
-                if isinstance(field, (ast.AnnAssign, ast.Assign)) and isinstance(text, ast.Expr):
-                    target = field.target if isinstance(field, ast.AnnAssign) else field.targets[0]
-                    docs[ast.unparse(target)] = code(str(ast.literal_eval(text.value)))
-    return docs
+    """The meaning of each field of a dataclass or member of an enum, as Markdown."""
+    return {name: code(text) for name, text in program.field_docs(kind).items()}
 
 
 def code(text: str) -> str:

@@ -1,6 +1,8 @@
 """The pages say what is true: generated parts are current, examples run, commands and links exist."""
 
+import dataclasses
 import importlib.util
+import inspect
 import json
 import os
 import re
@@ -27,6 +29,7 @@ from bam_envs.tasks import (
 from bam_train.checkpoint import Checkpoint
 from bam_train.cli import train
 from bam_train.cli.data.bam_data import COMMANDS as DATA_COMMANDS
+from bam_train.cli.program import help_text, parse
 from bam_train.settings import tomllib
 from tests.test_checkpoints import LEAST
 
@@ -215,6 +218,28 @@ def test_flags_in_the_tables_are_those_of_the_programs(program, monkeypatch, cap
     assert set(re.findall(r"^\| `(--[a-z-]+)`", table, re.MULTILINE)) == there
 
 
+CONFIGS = [resolve("bam_train.cli.flags:TrainConfig")]
+CONFIGS += map(resolve, re.findall(r"generated: flags (\S+)", "".join(page.read_text() for page in DOCS)))
+
+
+@pytest.mark.parametrize("config", CONFIGS)
+def test_help_has_examples_that_are_accepted_and_every_flag_in_one_group(config):
+    description = inspect.cleandoc(config.__doc__)
+    examples = re.findall(r"^  (bam-.*)$", description, re.MULTILINE)
+    for line in examples:
+        program, *words = shlex.split(line)
+        asks = program == "bam-agent" and not words[0].startswith("-")
+        wanted = resolve("bam_train.cli.live.agent_flags:AskConfig") if asks else config
+        parse(wanted, program, words[program == "bam-data" :])
+    text = help_text(config, "prog", description)
+    assert examples
+    assert "default: None" not in text
+    grouped = [name for names in getattr(config, "GROUPS", {}).values() for name in names]
+    assert len(grouped) == len({*grouped})
+    assert {*grouped} <= {field.name for field in dataclasses.fields(config)}
+    assert grouped or len(re.findall(r"^  --", text, re.MULTILINE)) < 13
+
+
 @pytest.mark.parametrize("page", PAGES, ids=name_of)
 def test_commands_exist(page):
     targets = re.findall(r"^([\w-]+):", (ROOT / "Makefile").read_text(), re.MULTILINE)
@@ -241,7 +266,11 @@ def test_the_workflow_for_ci_has_commands_that_exist():
 TRAINING = [words for page in PAGES for words in commands(page) if words[0] == "bam-train" and "--resume" not in words]
 
 
-@pytest.mark.parametrize("words", [one for one in TRAINING if ":" not in " ".join(one)], ids=" ".join)
+HERE = [words for words in TRAINING if ":" not in " ".join(words) and "--start" not in words]
+"""Those that need no file of the reader."""
+
+
+@pytest.mark.parametrize("words", HERE, ids=" ".join)
 def test_settings_in_commands_are_accepted(words, monkeypatch, capsys):
     monkeypatch.setattr(sys, "argv", [*words, *([] if "--print-config" in words else ["--print-config"])])
     monkeypatch.setattr(sys, "path", list(sys.path))

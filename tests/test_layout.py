@@ -34,6 +34,7 @@ ORDER = {
             "env_location",
             "settings",
             "finite_envs",
+            "foreign_env",
         ),
         *(
             "checkpoint",

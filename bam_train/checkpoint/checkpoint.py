@@ -134,14 +134,17 @@ class Checkpoint:
             text = f"{member} does not fit these settings: {' '.join(str(error).split()):.200}"
             raise AlteredCheckpoint(self.path, member, text) from error
 
-    def requires_env(self, env_id: str) -> None:
-        """Raise CheckpointMismatch unless `env_id` is the environment of the checkpoint, also by robo-gym's name."""
+    def requires_env(self, env_id: str, remedy: str = "") -> None:
+        """Raise CheckpointMismatch unless `env_id` is the environment of the checkpoint, also by robo-gym's name.
+
+        The `remedy` is what to do where `env_id` does not come from ``--env``.
+        """
         from bam_envs.core.registry import are_same
 
         if not are_same(env_id, self.manifest.env):
             trained = self.manifest.env
-            text = f"was trained on {trained}, not on {env_id}. Use --env {trained}, or train one for {env_id}"
-            raise CheckpointMismatch(self.path, text)
+            remedy = remedy or f"Use --env {trained}, or train one for {env_id}"
+            raise CheckpointMismatch(self.path, f"was trained on {trained}, not on {env_id}. {remedy}")
 
 
 def write_checkpoint(path: str | Path, manifest_fields: Mapping[str, Any], members: Mapping[str, bytes]) -> Checkpoint:

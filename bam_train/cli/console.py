@@ -37,6 +37,11 @@ def drop(stream: TextIO) -> None:
         os.close(null)
 
 
+def can_draw() -> bool:
+    """Whether standard error is a terminal that moves its cursor."""
+    return sys.stderr.isatty() and os.environ.get("TERM") not in ("dumb", "unknown")
+
+
 def make_console() -> Console:
     """A rich console on standard error; standard output is kept for results that programs read."""
     from rich.console import Console

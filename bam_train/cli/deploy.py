@@ -8,13 +8,12 @@ from __future__ import annotations
 
 import json as json_module
 import math
-import sys
 from contextlib import closing, nullcontext
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from bam_train.cli.console import make_console, say, tell
+from bam_train.cli.console import can_draw, make_console, say, tell
 from bam_train.cli.program import run_program
 from bam_train.signals import SignalMemory
 
@@ -165,7 +164,7 @@ def _run(
     with deployment.handles_signals():  # a second Ctrl-C must not lose the report
         deployment.switch.came += signals.came  # after a lost exception, the deployment ends before it begins
         plain = nullcontext(PlainDisplay(journal, say))
-        with live_display(make_console(), env, title, journal) if sys.stderr.isatty() else plain as watcher:
+        with live_display(make_console(), env, title, journal) if can_draw() else plain as watcher:
             ending = deployment.run(watcher, seed=seed)
         if ending.status:
             say(f"bam-deploy: {ending.reason}")
@@ -233,20 +232,23 @@ def _checked_place(config: DeployConfig) -> Place:
     )
     if config.record is not None and config.no_record:
         raise SettingsError("--record and --no-record exclude each other; give one of the two")
+    if config.record is not None:
+        _require_recordable(config.record)
     if config.rate is not None and config.fast:
         raise SettingsError("--fast does not wait for deadlines, so --rate has no meaning with it; give one of the two")
     if config.transport is not None and not place.transport:
         raise SettingsError("--transport: expected an address, found none; leave it out for the simulation here")
     place.require_sane()
     if config.robot is not None and (config.rate is not None or config.fast):
-        raise SettingsError(
-            "a live robot is driven at the rate that its policy was made for; leave out --rate and --fast"
-        )
+        flag = "--fast" if config.fast else "--rate"
+        raise SettingsError(f"a live robot is driven at the rate that its policy was made for; leave out {flag}")
     for name in ("stage", "trials", "keys", "allow_unsigned", "unusual"):
         if robot is None and getattr(config, name):
             raise SettingsError(f"{as_flag(name)} is for a live robot; give its address with --robot too")
-    if config.shadow and (robot is None or config.stage or config.wiggle or config.trials):
-        raise SettingsError("--shadow needs --robot, and moves nothing; leave out --stage, --wiggle and --trials")
+    if config.shadow and robot is None:
+        raise SettingsError("--shadow is for a live robot; give its address with --robot too")
+    if config.shadow and (moving := [name for name in ("stage", "wiggle", "trials") if getattr(config, name)]):
+        raise SettingsError(f"--shadow moves nothing; leave out {' and '.join(map(as_flag, moving))}")
     if config.shadow and config.unusual:
         raise SettingsError("--shadow sends nothing, and --unusual is about what is sent; leave --unusual out")
     if config.i_know and config.stage != "full":
@@ -259,6 +261,19 @@ def _checked_place(config: DeployConfig) -> Place:
 
         require_screen(remote=place.is_remote)
     return place
+
+
+def _require_recordable(place: str) -> None:
+    """Refuse a place that is neither an .mcap file nor a data set, and a data set that cannot be written here."""
+    from bam_train.data.recordings import is_data_set
+    from bam_train.errors import SettingsError
+
+    if is_data_set(place):
+        import pyarrow  # noqa: F401 - it is needed when the deployment has ended
+    elif Path(place).suffix != ".mcap":
+        raise SettingsError(
+            f"--record: expected an .mcap file or a data set, a folder or a name without a suffix, found {place}"
+        )
 
 
 def _recorder(

@@ -7,7 +7,7 @@ Programs import this after they have begun to handle signals, because importing 
 import sys
 from dataclasses import dataclass, make_dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal, get_type_hints
+from typing import Annotated, Any, ClassVar, Literal, get_type_hints
 
 import tyro
 from msgspec import Meta
@@ -26,7 +26,8 @@ Name = Annotated[str | None, tyro.conf.arg(metavar="NAME")]
 EnvId = Annotated[str | None, tyro.conf.arg(metavar="ID")]
 Unusual = Annotated[Literal["warn", "hold", "stop"] | None, tyro.conf.arg(metavar="warn|hold|stop")]
 Url = Annotated[str | None, tyro.conf.arg(metavar="URL")]
-
+Groups = dict[str, tuple[str, ...]]
+"""Title of a group of flags in the help to its fields; fields without a group come last."""
 
 DataSetOrFile = Annotated[str | None, tyro.conf.arg(metavar="FILE|PLACE")]
 DataSetName = Annotated[str | None, tyro.conf.arg(metavar="PLACE")]
@@ -70,7 +71,34 @@ SettingsFlags: Any = _settings_flags()
 
 @dataclass(frozen=True)
 class TrainConfig(SettingsFlags):  # type: ignore[misc]
-    """Train a policy and keep the best as one checkpoint.zip."""
+    """Train a policy and keep the best as one checkpoint.zip.
+
+    Settings come from the preset of environment and algorithm, --config, --set and the options, the later ones first.
+
+    Examples:
+      bam-train --env bam/pick --algo ppo
+      bam-train --env CartPole-v1 --algo ppo --steps 50_000 --set learning_rate=lin_1e-3
+      bam-train --resume runs/pick-ppo/last.zip --steps 2_000_000
+      bam-train --data data/pick --algo iql
+    """
+
+    GROUPS: ClassVar[Groups] = {
+        "What is learnt": ("env", "algo", "steps", "seed", "until_success", "set", "config", "print_config"),
+        "Files": ("out", "force", "runs", "resume", "start", "copy_to", "record"),
+        "Evaluations": ("eval_every", "eval_episodes", "trial_threshold"),
+        "From a data set, a teacher or a robot": ("data", "teacher", "learner", "push_every"),
+        "Where it is computed": (
+            *("trainer", "num_envs", "device", "threads", "num_env_runners", "num_learners", "num_gpus", "address"),
+        ),
+        "An environment that runs elsewhere": ("transport", "ca_file", "token_file"),
+    }
+    INSTEAD: ClassVar[dict[str, str]] = {
+        "--normalize": "give --set normalize=true",
+        "--env-kwargs": "give --set env_kwargs.NAME=VALUE",
+        "--hyperparameters": "give --set NAME=VALUE",
+        "": "; an argument of the algorithm is --set NAME=VALUE",
+    }
+    """What to write for an option that there is not, and what to add to the error of any other one."""
 
     config: _File = None
     """File of settings, .toml or .json, such as --print-config writes."""
@@ -87,7 +115,7 @@ class TrainConfig(SettingsFlags):  # type: ignore[misc]
     """Checkpoint to go on from, with its settings and up to --steps in all."""
     force: bool = False
     """Overwrite the checkpoint at --out instead of adding a number to its name."""
-    runs: Path = Path("runs")
+    runs: Annotated[Path, tyro.conf.arg(metavar="FOLDER")] = Path("runs")
     """Folder in which the run's own folder is made; it may be s3://bucket/runs."""
     record: Annotated[str | None, _unset("PLACE")] = None
     """Add the episodes of training to this data set; of --trainer sb3 with an environment of bam_envs."""
@@ -100,7 +128,19 @@ class TrainConfig(SettingsFlags):  # type: ignore[misc]
 
 @dataclass(frozen=True)
 class EvalConfig:
-    """Evaluate the frozen policy of a checkpoint over seeded episodes, or on recorded ones."""
+    """Evaluate the frozen policy of a checkpoint over seeded episodes, or on recorded ones.
+
+    Examples:
+      bam-eval checkpoints/pick-ppo.zip
+      bam-eval checkpoints/pick-ppo.zip --episodes 20 --set randomize=true --video pick.gif
+      bam-eval checkpoints/pick-ppo.zip --data data/pick
+    """
+
+    GROUPS: ClassVar[Groups] = {
+        "Episodes": ("episodes", "seed", "set", "num_envs"),
+        "What comes out": ("json", "video", "video_episodes", "record"),
+        "On recorded episodes": ("data", "seen", "by"),
+    }
 
     checkpoint: CheckpointFile
     """The checkpoint.zip that bam-train wrote, also at s3://bucket/pick.zip."""
@@ -142,7 +182,23 @@ class EvalConfig:
 
 @dataclass(frozen=True)
 class DeployConfig:
-    """Run the frozen policy of a checkpoint on a robot, simulated here or live, at the rate it was made for."""
+    """Run the frozen policy of a checkpoint on a robot, simulated here or live, at the rate it was made for.
+
+    Examples:
+      bam-deploy checkpoints/pick-ppo.zip
+      bam-deploy checkpoints/pick-ppo.zip --rehearse wifi --episodes 100
+      bam-deploy checkpoints/pick-ppo.zip --robot ws://10.0.0.5:9090 --episodes 1
+    """
+
+    GROUPS: ClassVar[Groups] = {
+        "Episodes": ("episodes", "seed", "rate", "fast", "render"),
+        "Where": ("robot", "transport", "profile", "ca_file", "token_file", "timeout", "rehearse"),
+        "How a live robot may move": (
+            *("stage", "i_know", "guard", "print_guards", "unusual", "wiggle", "motion", "shadow", "trials", "yes"),
+            *("keys", "allow_unsigned"),
+        ),
+        "What comes out": ("record", "no_record", "json"),
+    }
 
     checkpoint: CheckpointFile
     """The checkpoint.zip that bam-train wrote, also at s3://bucket/pick.zip."""
@@ -215,7 +271,12 @@ class DeployConfig:
 
 @dataclass(frozen=True)
 class DoctorConfig:
-    """Check a live robot step by step without moving it, name the first failing step, and measure its link."""
+    """Check a live robot step by step without moving it, name the first failing step, and measure its link.
+
+    Examples:
+      bam-doctor ws://10.0.0.5:9090
+      bam-doctor ws://10.0.0.5:9090 --checkpoint checkpoints/pick-ppo.zip --measure link.json
+    """
 
     url: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="URL")]
     """Address of the robot behind rosbridge, such as ws://10.0.0.5:9090."""
@@ -239,7 +300,11 @@ class DoctorConfig:
 
 @dataclass(frozen=True)
 class ReplayConfig:
-    """Summarise a recording of bam-deploy, play it through its environment with a policy, and draw it."""
+    """Summarise a recording of bam-deploy, play it through its environment with a policy, and draw it.
+
+    Examples:
+      bam-replay recordings/2026-11-23T150901Z-pick.mcap --plot flight.png
+    """
 
     recording: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RECORDING")]
     """The .mcap file that bam-deploy wrote, also at s3://bucket/pick.mcap."""
@@ -257,7 +322,11 @@ class ReplayConfig:
 
 @dataclass(frozen=True)
 class ExportConfig:
-    """Turn a checkpoint directory of RLlib into a checkpoint.zip that can be evaluated and deployed."""
+    """Turn a checkpoint directory of RLlib into a checkpoint.zip that can be evaluated and deployed.
+
+    Examples:
+      bam-export ray_results/run/checkpoint_000010 --trust-pickle
+    """
 
     directory: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="DIR")]
     """What algo.save_to_path or algo.save wrote, or the folder of a policy in it; of the current API or the old one."""
@@ -279,7 +348,12 @@ class ExportConfig:
 
 @dataclass(frozen=True)
 class EnvsConfig:
-    """List our environments, or describe one (any Gymnasium id): spaces, rate, name and unit of every number."""
+    """List our environments, or describe one (any Gymnasium id): spaces, rate, name and unit of every number.
+
+    Examples:
+      bam-envs
+      bam-envs bam/pick
+    """
 
     env: Annotated[tyro.conf.Positional[str | None], tyro.conf.arg(metavar="[ID]")] = None
     """The environment to describe, e.g. bam/pick; without it, all of ours are listed."""
@@ -289,7 +363,18 @@ class EnvsConfig:
 
 @dataclass(frozen=True)
 class ServeConfig:
-    """Serve a Gymnasium environment, and the topics of its simulated robot, to clients of rosbridge, TCP or ROS 2."""
+    """Serve a Gymnasium environment, and the topics of its simulated robot, to clients of rosbridge, TCP or ROS 2.
+
+    Examples:
+      bam-serve --env bam/pick --port 9090
+      bam-serve --env bam/pick --bind 0.0.0.0 --token-file token
+    """
+
+    GROUPS: ClassVar[Groups] = {
+        "What is served": ("env", "num_envs", "set", "realtime", "fast", "image_format", "gymapi_version", "yes"),
+        "Where": ("port", "bind", "tcp", "via", "rclpy", "namespace"),
+        "Who may connect": ("token_file", "operator_token_file", "no_token", "lease", "cert", "key", "ca_file"),
+    }
 
     env: Annotated[str, tyro.conf.arg(metavar="ID")] = "bam/pick"
     """Environment: any Gymnasium id."""
@@ -303,11 +388,11 @@ class ServeConfig:
     # The fields of bam_envs.remote.ServeOptions:
     port: Port = 9090
     """Port of the rosbridge server; 0 takes a free one."""
-    bind: str = "127.0.0.1"
+    bind: Annotated[str, tyro.conf.arg(metavar="ADDRESS")] = "127.0.0.1"
     """Address to listen on; 127.0.0.1 is this computer alone, 0.0.0.0 every network it is in."""
-    name: str = ""
+    name: Annotated[str, tyro.conf.arg(metavar="NAME")] = ""
     """Name that the robot tells its clients, to tell it from others: trials count for the robot of that name."""
-    namespace: str = ""
+    namespace: Annotated[str, tyro.conf.arg(metavar="NAME")] = ""
     """Name before every topic and service, such as bam_001."""
     tcp: Annotated[Port | None, tyro.conf.arg(metavar="PORT")] = None
     """Serve the environment on this TCP port too, which is faster; 0 takes a free one."""
@@ -319,7 +404,7 @@ class ServeConfig:
     """Time passes as on the clock: the default of an environment with a robot."""
     fast: bool = False
     """Time passes only with steps and commands, as fast as they come: the default of other environments."""
-    lease: Positive = 2.0
+    lease: Annotated[Positive, tyro.conf.arg(metavar="S")] = 2.0
     """A client that gives no sign of life for so long may lose command to another one [s]."""
     cert: Annotated[str | None, tyro.conf.arg(metavar="FILE")] = None
     """Certificate in PEM, for wss:// instead of ws://."""
@@ -333,7 +418,7 @@ class ServeConfig:
     """Listen on a network without a token: anybody who reaches this computer may command what is served."""
     ca_file: Annotated[str | None, tyro.conf.arg(metavar="FILE")] = None
     """With --via wss://: certificates to trust instead of the system's."""
-    image_format: str = "png"
+    image_format: Annotated[str, tyro.conf.arg(metavar="png|jpeg")] = "png"
     """Images as png, which keeps every bit, or jpeg."""
     gymapi_version: Annotated[str | None, tyro.conf.arg(metavar="VERSION")] = None
     """Version of bam_msgs/GymAPI, where clients do not show theirs: 2025-05-24, 2025-06-17 or 2025-06-22 (default)."""
@@ -341,9 +426,19 @@ class ServeConfig:
 
 @dataclass(frozen=True)
 class SignConfig:
-    """Make a key, sign a checkpoint with it, verify one, or trust somebody's public key."""
+    """Make a key, sign a checkpoint with it, verify one, or trust somebody's public key.
 
-    action: tyro.conf.Positional[Literal["keygen", "sign", "verify", "trust"]]
+    Examples:
+      bam-sign keygen alice.key
+      bam-sign sign checkpoints/pick-ppo.zip --key alice.key
+      bam-sign trust alice.pub
+      bam-sign verify checkpoints/pick-ppo.zip
+    """
+
+    action: Annotated[
+        tyro.conf.Positional[Literal["keygen", "sign", "verify", "trust"]],
+        tyro.conf.arg(metavar="keygen|sign|verify|trust"),
+    ]
     """Action of the program."""
     file: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="FILE")]
     """keygen: the private key to write; sign, verify: a checkpoint; trust: a public key, NAME.pub."""
@@ -362,7 +457,20 @@ class AgentConfig:
     Without --robot it brings a simulated robot. The console is at http://127.0.0.1:9095, in any browser.
 
     Ask an agent that runs: bam-agent status|pause|resume|versions|stop URL. Give it another policy: bam-push.
+
+    Examples:
+      bam-agent --policy checkpoints/pick-ppo.zip
+      bam-agent --robot ws://127.0.0.1:9090 --policy pick.zip --token-file tokens
+      bam-agent status ws://127.0.0.1:9095
     """
+
+    GROUPS: ClassVar[Groups] = {
+        "The policy and its robot": ("policy", "env", "set", "robot", "profile", "ca_file", "robot_token_file"),
+        "How a live robot may move": ("stage", "i_know", "guard", "unusual", "yes", "keys", "allow_unsigned"),
+        "Who may connect": ("port", "bind", "token_file", "cert", "key", "lease"),
+        "How it runs": ("paused", "resume", "guard_stops", "seed"),
+        "What it keeps": ("folder", "record", "no_record"),
+    }
 
     policy: File = None
     """The checkpoint.zip to begin with; started again with the same one or none, an agent goes on with its champion."""
@@ -373,7 +481,7 @@ class AgentConfig:
     name. A robot that tells another name is refused."""
     port: Port = 9095
     """Port for people and programs; 0 takes a free one."""
-    bind: str = "127.0.0.1"
+    bind: Annotated[str, tyro.conf.arg(metavar="ADDRESS")] = "127.0.0.1"
     """Address to listen on; 127.0.0.1 is this computer only, 0.0.0.0 all its networks, which needs --token-file."""
     token_file: File = None
     """File with the tokens that let people in: lines of watch, drive or administer and a token; or one token alone."""
@@ -381,7 +489,7 @@ class AgentConfig:
     """Certificate in PEM, for https:// and wss://."""
     key: File = None
     """Private key of the certificate, if it is in another file."""
-    folder: Path = Path("agent")
+    folder: Annotated[Path, tyro.conf.arg(metavar="FOLDER")] = Path("agent")
     """Folder of the versions, the audit file, the trials and the recordings."""
     env: EnvId = None
     """Refuse the checkpoint unless it was trained on this environment; needed for some_module:Env-v0."""

@@ -4,18 +4,26 @@ Only the standard library is imported before signals are handled, and only tyro 
 Ctrl-C is one line at any moment and ``--help`` is quick.
 """
 
+import argparse
+import ast
 import contextlib
 import errno
+import inspect
 import io
+import itertools
 import os
 import pkgutil
 import re
 import signal
 import sys
+import textwrap
+import types
 from collections.abc import Callable, Sequence
-from typing import Any, TypeVar, get_args
+from dataclasses import MISSING, Field, fields
+from pathlib import Path
+from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
-from bam_train.cli.console import drop, say, show_logs_and_tracebacks
+from bam_train.cli.console import drop, say, show_logs_and_tracebacks, tell
 from bam_train.signals import SignalMemory, Terminated
 from bam_train.stand_ins import standing_in
 
@@ -131,26 +139,22 @@ def parse(
         arguments: Instead of those of the process.
         description: The docstring of a script; of a program it is that of `config`.
     """
-    from inspect import cleandoc
-
     import tyro
 
+    given = sys.argv[1:] if arguments is None else arguments
+    if {"-h", "--help"} & {*given}:
+        description = inspect.cleandoc(description or config.__doc__ or "")
+        tell(*help_text(config, prog, description).rstrip().split("\n"))
+        raise SystemExit(0)
     remedy = f"Run {prog if description is None else f'python {sys.argv[0]}'} --help"
     no_pairs = (tyro.conf.FlagCreatePairsOff,)  # --force, no --no-force
     box = io.StringIO()
     try:
         with contextlib.redirect_stderr(box):
-            parsed = tyro.cli(
-                config,
-                prog=prog,
-                description=description or cleandoc(config.__doc__ or ""),
-                args=arguments,
-                config=no_pairs,
-            )
+            parsed = tyro.cli(config, prog=prog, args=given, config=no_pairs)
     except SystemExit as stop:
-        if stop.code:
-            _complain(prog, f"{usage_error(box.getvalue(), config)} {remedy}")
-        raise
+        _complain(prog, f"{usage_error(box.getvalue(), config)} {remedy}")
+        raise SystemExit(2) from stop
     from bam_envs.core.errors import InvalidValue
     from bam_envs.core.validation import check_fields
     from bam_envs.core.wording import as_flag
@@ -168,21 +172,22 @@ def usage_error(box: str, config: type[Any]) -> str:
 
     Examples: ``unknown option --enb, did you mean --env?``, ``--steps: expected a whole number, found 'x'.``
     """
-    import tyro
-
     from bam_envs.core.validation import expected, type_hints
     from bam_envs.core.wording import as_flag, closest
 
     text = " ".join(re.sub(r"[─│╭╮╰╯]+|-{4,}|(?<!\S)[|+](?!\S)", " ", box).split())  # drawn in ASCII where it must be
     text = re.split(r" For full helptext| Argument helptext", text)[0]
-    hints, (_, positional) = type_hints(config), get_args(tyro.conf.Positional[str])
+    hints = type_hints(config)
     if match := re.search(r"Unrecognized options: ([^\s,]+)", text):
         if not match[1].startswith("-"):
             return f"unexpected argument {match[1]}."
-        named = [name for name, hint in hints.items() if positional not in get_args(hint)]
-        flags = [*map(as_flag, named), "--help"]
-        close = closest(match[1].partition("=")[0], flags)
-        choice = f"; there are {' and '.join(flags)}." if len(flags) < 3 else "."
+        flags = [as_flag(name) for name, hint in hints.items() if not (is_positional(hint) or is_hidden(hint))]
+        flags, instead = [*flags, "--help"], getattr(config, "INSTEAD", {})
+        name = match[1].partition("=")[0].replace("_", "-")
+        if name in instead:
+            return f"{match[1]} is no option: {instead[name]}."
+        close = closest(name, flags)
+        choice = f"; there are {' and '.join(flags)}." if len(flags) < 3 else f"{instead.get('', '')}."
         return f"unknown option {match[1]}{f', did you mean {close}?' if close else choice}"
     if match := re.search(r"Error parsing (\S+?):? .*(?:from \[|: )'(.*?)'", text):
         flag, found = match.groups()
@@ -200,6 +205,103 @@ def usage_error(box: str, config: type[Any]) -> str:
         return f"{flag}: expected {', '.join(names[:-1])} or {names[-1]}, found {found!r}."
     if match := re.search(r"Missing value for argument '(\S+)'", text):
         return f"{match[1]} needs a value." if match[1].startswith("--") else f"{match[1].upper()} is missing."
-    if match := re.search(r"Missing from \S+: (\S+)", text):
-        return f"{match[1]} is missing."
+    if match := re.search(r"Missing from [^:]*: (.*)", text):
+        *rest, last = [part.split()[0] for part in match[1].split("(required)") if part.strip()]
+        return f"{', '.join(rest)} and {last} are missing." if rest else f"{last} is missing."
     return f"{text}."
+
+
+# The help
+
+_METAVARS: dict[Any, str] = {int: "N", float: "X", Path: "FILE", str: "TEXT"}
+
+
+class _Paragraphs(argparse.HelpFormatter):
+    """Fills paragraphs, without breaking flags, and keeps the lines of those with indented lines, such as examples."""
+
+    def _fill_text(self, text: str, width: int, indent: str) -> str:
+        parts = text.split("\n\n")
+        return "\n\n".join(one if "\n " in one else "\n".join(self._split_lines(one, width)) for one in parts)
+
+    def _split_lines(self, text: str, width: int) -> list[str]:
+        return textwrap.wrap(" ".join(text.split()), width, break_on_hyphens=False)
+
+
+def help_text(config: type[Any], prog: str, description: str) -> str:
+    """The help of a program.
+
+    Args:
+        config: A frozen dataclass; one field is one flag. ``GROUPS``, if it has one, gives the titles of its groups of
+            flags, and their fields.
+        prog: The program's name.
+        description: What it does, with examples.
+    """
+    hints, docs = get_type_hints(config, include_extras=True), field_docs(config)
+    known = {field.name: field for field in fields(config) if not is_hidden(hints[field.name])}
+    first = [name for name in known if is_positional(hints[name])]
+    groups = getattr(config, "GROUPS", {})
+    rest = [name for name in known if name not in {*first, *itertools.chain(*groups.values())}]
+    usage = " ".join([prog, *(_metavar(hints[name]) for name in first), "[OPTIONS]"])
+    parser = argparse.ArgumentParser(
+        prog, usage, description, formatter_class=lambda prog: _Paragraphs(prog, max_help_position=26), add_help=False
+    )
+    for title, names in {"Arguments": first, **groups, "Other options" if groups else "Options": rest}.items():
+        group = parser.add_argument_group(title)
+        for name in names:
+            text = f"{docs[name]}{_default(known[name], docs[name])}".replace("%", "%%")
+            if name in first:
+                group.add_argument(name, metavar=_metavar(hints[name]), help=text)
+                continue
+            value: dict[str, Any] = {"action": "store_true"}
+            if hints[name] is not bool:
+                value = {"metavar": _metavar(hints[name])}
+            group.add_argument("--" + name.replace("_", "-"), help=text, **value)
+    group.add_argument("-h", "--help", action="store_true", help="Show this text.")
+    return parser.format_help()
+
+
+def field_docs(kind: type) -> dict[str, str]:
+    """The string below each field of a dataclass or member of an enum, inherited ones too."""
+    docs = {}
+    for owner in reversed(kind.__mro__[:-1]):
+        with contextlib.suppress(OSError):  # made without a source
+            body = ast.parse(textwrap.dedent(inspect.getsource(owner))).body[0].body  # type: ignore[attr-defined]
+            for field, text in itertools.pairwise(body):
+                if isinstance(field, (ast.AnnAssign, ast.Assign)) and isinstance(text, ast.Expr):
+                    target = field.target if isinstance(field, ast.AnnAssign) else field.targets[0]
+                    docs[ast.unparse(target)] = str(ast.literal_eval(text.value))
+    return docs
+
+
+def is_positional(hint: Any) -> bool:
+    """Whether a field is given without a flag."""
+    import tyro
+
+    return get_args(tyro.conf.Positional[str])[1] in get_args(hint)
+
+
+def is_hidden(hint: Any) -> bool:
+    """Whether a field has no flag."""
+    import tyro
+
+    return tyro.conf.Suppress in get_args(hint)
+
+
+def _metavar(hint: Any) -> str:
+    """The word for the value of a field."""
+    origin, arguments = get_origin(hint), get_args(hint)
+    if origin is Annotated:
+        named = [one.metavar for one in arguments[1:] if getattr(one, "metavar", None)]
+        return str(named[-1]) if named else _metavar(arguments[0])
+    if origin is Literal:
+        return "|".join(map(str, arguments))
+    if origin in (Union, types.UnionType, tuple):
+        return _metavar(arguments[0])
+    return _METAVARS[hint]
+
+
+def _default(field: Field[Any], text: str) -> str:
+    """The default of a field, unless it says nothing or is in the field's own `text`."""
+    value = field.default
+    is_empty = value is MISSING or value is None or value is False or value in ((), "")
+    return "" if is_empty or "default" in text else f" (default: {value})"

@@ -12,7 +12,7 @@ from collections.abc import Callable
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
-from bam_train.cli.console import count, tell
+from bam_train.cli.console import can_draw, count, tell
 from bam_train.cli.program import run_program
 from bam_train.signals import before_quitting, handled
 
@@ -51,6 +51,7 @@ def train(config: TrainConfig) -> int:
 def _train(config: TrainConfig, settings: TrainSettings, checkpoint: Checkpoint | None) -> int:
     """Train with complete settings, and print the outcome; returns the exit status."""
     from bam_train.cli.train_display import LiveDisplay, MayClose, PlainDisplay, summarise
+    from bam_train.environments import is_batched
     from bam_train.errors import SettingsError
     from bam_train.settings import file_stem
     from bam_train.trainers import load_trainer
@@ -62,6 +63,11 @@ def _train(config: TrainConfig, settings: TrainSettings, checkpoint: Checkpoint 
     if checkpoint is not None:
         title += f", going on from {checkpoint.path} at {count(checkpoint.manifest.steps)} steps"
     require_room(runs)
+    if config.record is not None:
+        if settings.trainer != "sb3":
+            raise SettingsError(f"--record is for --trainer sb3, found {settings.trainer}; use bam-data collect")
+        if not (is_batched(settings.env) or settings.transport):
+            raise SettingsError(f"--record: {settings.env} is not of bam_envs; use bam-data collect, or RecordDataset")
     output = choose_output(settings, config.out, config.force, checkpoint)
     kind = load_trainer(settings.trainer)
     copies = None if config.copy_to is None else Copies(config.copy_to)
@@ -71,15 +77,11 @@ def _train(config: TrainConfig, settings: TrainSettings, checkpoint: Checkpoint 
         try:
             settings = trainer.settings  # as the trainer completed them
             if config.record is not None:
-                if not hasattr(trainer, "record"):
-                    raise SettingsError(
-                        f"--record is for --trainer sb3, found {settings.trainer}; use bam-data collect"
-                    )
-                trainer.record(config.record)
+                trainer.record(config.record)  # type: ignore[attr-defined]
             folder = RunFolder(runs, file_stem(settings.env, settings.algo, settings.trainer))
             folder.write_config(settings.to_mapping())
             trainer.log_to(folder.tensorboard)
-            display = (LiveDisplay if sys.stderr.isatty() else PlainDisplay)(title)
+            display = (LiveDisplay if can_draw() else PlainDisplay)(title)
             run = TrainingRun(trainer, folder, output.path, display, output.best, copies=copies)
             handlers.enter_context(handled(_stop_on_signals(run, came)))
             with display:
@@ -122,7 +124,7 @@ def _stop_on_signals(run: TrainingRun, came: list[int]) -> Callable[[int], None]
 
     def write(line: str) -> None:
         """Write to standard error without print, which the signal may have interrupted."""
-        show_cursor = b"\x1b[?25h" if sys.stderr.isatty() else b""  # a live panel has hidden it
+        show_cursor = b"\x1b[?25h" if can_draw() else b""  # a live panel has hidden it
         with contextlib.suppress(OSError):  # the reader has closed it
             os.write(2, show_cursor + line.encode())
 

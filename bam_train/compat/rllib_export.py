@@ -21,7 +21,7 @@ from gymnasium import spaces
 
 from bam_envs.core.errors import UnknownName
 from bam_envs.core.registry import are_same, entry_of, resolve_id
-from bam_envs.core.spaces import space_to_json
+from bam_envs.core.spaces import leaves, space_to_json
 from bam_envs.robo_gym.making import PLACES
 from bam_train.checkpoint import GOLDEN, POLICY, Checkpoint, safetensors_file, write_checkpoint
 from bam_train.compat.rllib_directory import Directory, find_policy
@@ -40,7 +40,7 @@ from bam_train.policy.frozen_policy import TOLERANCE
 from bam_train.settings import TrainSettings
 from bam_train.trainers.algorithms import RLLIB_ALGORITHMS
 from bam_train.trainers.base import origin
-from bam_train.trainers.frozen_network import leaves, pack
+from bam_train.trainers.frozen_network import pack
 from bam_train.trainers.rllib.rllib_freezing import AnySpace, FrozenModule, PolicyParts, RLlibPolicy, golden
 from bam_train.trainers.zero_based_spaces import space_from_zero
 

@@ -43,7 +43,11 @@ class DataSetWriter:
     def __init__(
         self, place: str | Path | Place, info: DataSetInfo, *, flush_episodes: int = 50, flush_bytes: int = 2**26
     ) -> None:
+        import pyarrow  # noqa: F401 - it writes the episodes, and without it nothing must be made
+
         self._files, self.info = Files(place), info
+        if self._files.root.suffix == ".mcap":
+            raise BadDataSet(f"{place}: is named as a recording, and a data set is a folder; leave .mcap out")
         self._flush_episodes, self._flush_bytes = flush_episodes, flush_bytes
         self._observation = leaves_of(info.observation_space, "observation")
         self._action = leaves_of(info.action_space, "action")

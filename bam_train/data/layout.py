@@ -178,6 +178,8 @@ class WriterLock:
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
             file = path.open("a+")
+        except (NotADirectoryError, FileExistsError) as error:
+            raise BadDataSet(f"{self._text}: is a file, and a data set is a folder; choose another place") from error
         except OSError as error:
             raise BadDataSet(f"{self._text}: cannot be written: {error.strerror}; choose another place") from error
         try:

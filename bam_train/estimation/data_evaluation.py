@@ -143,7 +143,7 @@ def evaluate_on_data(
 
 def require_same_interface(checkpoint: Checkpoint, data: DataSet) -> None:
     """Refuse a data set of another environment, or of other spaces, units or rate, than those of the checkpoint."""
-    checkpoint.requires_env(data.info.env)
+    checkpoint.requires_env(data.info.env, f"That is the environment of {data.place}; give data of its own one")
     info = data.info
     spaces = {name: space_to_json(getattr(info, name)) for name in ("observation_space", "action_space")}
     names = {

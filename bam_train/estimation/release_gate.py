@@ -12,8 +12,17 @@ from typing import Any
 
 from bam_train.checkpoint import Checkpoint
 from bam_train.data import DataSet
-from bam_train.environments import environment_of, make_vector_env, require_env_kwargs, require_fit
-from bam_train.errors import SettingsError
+from bam_train.environments import (
+    environment_of,
+    first_difference,
+    interface_in,
+    interface_pairs,
+    make_vector_env,
+    require_env_kwargs,
+    require_fit,
+    short_json,
+)
+from bam_train.errors import CheckpointMismatch, SettingsError
 from bam_train.estimation.data_evaluation import (
     Seen,
     require_contrast,
@@ -87,8 +96,8 @@ def compare(
         SettingsError: The environment does not take these arguments.
         CheckpointMismatch: A checkpoint does not fit the environment.
     """
+    require_comparable(candidate, champion)
     env_id, kwargs = environment_of(champion, env)
-    candidate.requires_env(env_id)
     require_env_kwargs(env_id, env_kwargs or {})
     policies = [FrozenPolicy.from_checkpoint(one) for one in (candidate, champion)]
     played: list[list[Episode]] = [[], []]
@@ -106,6 +115,17 @@ def compare(
             pairs += count_pairs(*wave)
             on_progress(len(pairs), pairs)
     return _comparison(env_id, played, pairs, margin, seed)
+
+
+def require_comparable(candidate: Checkpoint, champion: Checkpoint) -> None:
+    """Refuse a candidate of another environment, other spaces, units or rate than those of the champion."""
+    theirs, remedy = champion.manifest, f"Compare it with a champion of {candidate.manifest.env}"
+    candidate.requires_env(theirs.env, f"{champion.path} is the champion of that one. {remedy}")
+    for name, ours, other in interface_pairs(candidate, interface_in(theirs)):
+        if found := first_difference(ours, other, name):
+            what, one, another = found
+            text = f"{what} is {short_json(one)}, and {short_json(another)} in the champion {champion.path}"
+            raise CheckpointMismatch(candidate.path, f"{text}; a gate compares policies that see and do the same")
 
 
 def count_pairs(candidate: list[Episode], champion: list[Episode]) -> Pairs:

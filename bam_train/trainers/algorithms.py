@@ -8,6 +8,8 @@ import pkgutil
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
+from gymnasium import spaces
+
 from bam_envs.core.errors import MissingExtra
 from bam_envs.core.wording import did_you_mean
 from bam_train.errors import SettingsError
@@ -60,12 +62,34 @@ class Algorithm:
         if kind in self.actions:
             return
         table = next(table for table in ALGORITHMS.values() if self in table.values())
-        others = [other for other in table.values() if other.offline == self.offline and kind in other.actions]
+        near = [*table.values(), *(() if self.offline or len(table) > 1 else SB3_ALGORITHMS.values())]
+        others = [other for other in near if other.offline == self.offline and kind in other.actions]
         fitting = ", ".join(sorted(other.name for other in others))
         remedy = f"Use one of: {fitting}." if fitting else "No algorithm here does."
         raise SettingsError(
             f"{self.name} does not fit {env}: it takes {' or '.join(self.actions)} actions, found {kind}. {remedy}"
         )
+
+    def require_observations(self, env: str, space: Any, several: tuple[type, ...] = (spaces.Dict,)) -> None:
+        """Refuse `env` if an observation, also in one of `several`, is neither a Box nor a choice."""
+        for name, leaf in _observations(space, several):
+            if type(leaf).__name__ not in ANY:
+                kinds = (
+                    f"{', '.join(ANY[:-1])} or {ANY[-1]}, or a {' or '.join(one.__name__ for one in several)} of them"
+                )
+                raise SettingsError(
+                    f"{self.name} does not fit {env}: {name} is a {type(leaf).__name__}, expected {kinds}. "
+                    "Leave it out, or turn it into numbers, in the environment"
+                )
+
+
+def _observations(space: Any, several: tuple[type, ...], name: str = "the observation") -> list[tuple[str, Any]]:
+    """What is observed, by name, without the spaces of `several`."""
+    if not isinstance(space, several):
+        return [(name, space)]
+    whole: Any = space
+    parts = whole.items() if isinstance(whole, spaces.Dict) else enumerate(whole)
+    return [one for key, part in parts for one in _observations(part, several, f"observation {key!r}")]
 
 
 _BOX = ("Box",)

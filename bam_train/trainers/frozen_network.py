@@ -17,6 +17,7 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 from torch import nn
 
+from bam_envs.core.spaces import leaves
 from bam_train.checkpoint import safetensors_file
 from bam_train.errors import PolicyError
 
@@ -32,11 +33,6 @@ _HARMLESS_WARNINGS = {
     "Constant folding - Only steps=1 can be constant folded": UserWarning,  # about the padding of images
     "": torch.jit.TracerWarning,  # about branches on shapes, which are the same for every observation
 }
-
-
-def leaves(space: spaces.Space[Any]) -> dict[str, Any]:
-    """The spaces of a Dict by key, in alphabetical order; any other space by ``""``."""
-    return {key: space[key] for key in sorted(space.spaces)} if isinstance(space, spaces.Dict) else {"": space}
 
 
 def to(x: torch.Tensor, dtype: torch.dtype) -> torch.Tensor:

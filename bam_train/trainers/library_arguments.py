@@ -72,5 +72,7 @@ def require_known(
         if name in known:
             continue
         if name not in elsewhere:
-            raise SettingsError(f"Unknown {what} {name!r}. {did_you_mean(name, [*known, *others])}")
+            raise SettingsError(
+                f"Unknown {what} {name!r}. {did_you_mean(name, [*known, *others], examples=sorted(known))}"
+            )
         raise SettingsError(f"{name} is not a hyperparameter here: {elsewhere[name]}")

@@ -1,20 +1,22 @@
 """Complete settings from those that a user gives: with presets for new runs, and a checkpoint's for resumed ones."""
 
+import contextlib
 from collections.abc import Mapping
 from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
-from bam_envs.core.errors import UnknownName
+from bam_envs.core.errors import MissingExtra, UnknownName
 from bam_envs.core.registry import entry_of, resolve_id
 from bam_envs.robots.linked import portable
 from bam_train.checkpoint import Checkpoint
 from bam_train.checkpoint.manifest import require_no_place
-from bam_train.environments import environment_of, require_env_kwargs
+from bam_train.environments import environment_of, make_env, require_env_kwargs, require_fit
 from bam_train.errors import CheckpointMismatch, SettingsError
 from bam_train.settings import TrainSettings, check_names, differences, file_stem, merge, parse_config
-from bam_train.trainers import load_trainer, require_algorithm
-from bam_train.trainers.algorithms import ALGORITHMS
+from bam_train.trainers.algorithms import ALGORITHMS, EXTRAS, RLLIB_ALGORITHMS, load_trainer, require_algorithm
+from bam_train.trainers.rllib_arguments import require_plausible
+from bam_train.trainers.sb3.sb3_hyperparameters import complete_settings
 
 PRESETS = Path(__file__).parent / "presets"
 """Tuned settings, laid out like a ``--config`` file: ``<environment>-<algorithm>.toml`` is for sb3,
@@ -65,11 +67,33 @@ def resolve(given: Mapping[str, Any]) -> TrainSettings:
             f"env_kwargs: {', '.join(settings.env_kwargs)}: the environment runs at {settings.place.text}; "
             "give its arguments to bam-serve there"
         )
-    completed = load_trainer(settings.trainer).complete(settings)
+    _require_checkpoints(settings)
+    completed = _complete(settings)
     if given.get("num_envs", completed.num_envs) != completed.num_envs:
         there = f"there are {completed.num_envs} at {settings.place.text}"
         raise SettingsError(f"num_envs: {settings.num_envs} were asked for, and {there}; leave it out")
     return completed
+
+
+def _require_checkpoints(settings: TrainSettings) -> None:
+    """Refuse a checkpoint that a new run cannot begin with, and a teacher's that cannot be opened."""
+    if settings.teacher not in (None, "scripted"):
+        Checkpoint.open(Path(str(settings.teacher)).expanduser())
+    if settings.start is not None:
+        checkpoint = require_start(settings, settings.start)
+        if not settings.transport:
+            with contextlib.closing(make_env(settings.env, settings.env_kwargs)) as env:
+                require_fit(checkpoint, env, env_id=settings.env)
+
+
+def require_start(settings: TrainSettings, path: str) -> Checkpoint:
+    """The checkpoint at `path`; raises CheckpointMismatch if another algorithm trained it."""
+    checkpoint = Checkpoint.open(path)
+    made = checkpoint.manifest
+    if (made.trainer, made.algorithm) != (settings.trainer, settings.algo):
+        text = f"was trained by {made.algorithm} of {made.trainer}: {settings.algo} of sb3 cannot begin with it"
+        raise CheckpointMismatch(checkpoint.path, f"{text}; leave start out, or give --algo {made.algorithm}")
+    return checkpoint
 
 
 def _of_data(given: Mapping[str, Any]) -> dict[str, Any]:
@@ -104,6 +128,18 @@ def _require_of_trainer(settings: TrainSettings) -> None:
         raise SettingsError(f"start: the {settings.trainer} trainer has no use for it; leave it out")
     if settings.trainer != "imitation" and settings.teacher is not None:
         raise SettingsError(f"teacher: {settings.algo} has none; leave it out, or give --algo dagger")
+
+
+def _complete(settings: TrainSettings) -> TrainSettings:
+    """Check settings and add the trainer's defaults, as far as possible without its library, which takes seconds."""
+    try:
+        if settings.trainer == "sb3":
+            return complete_settings(settings)
+        if settings.trainer == "rllib":
+            require_plausible(RLLIB_ALGORITHMS[settings.algo], settings.hyperparameters)
+    except ModuleNotFoundError as error:
+        raise MissingExtra(str(error.name), EXTRAS[settings.trainer], f"The {settings.trainer} trainer") from error
+    return load_trainer(settings.trainer).complete(settings)
 
 
 def own_settings(checkpoint: Checkpoint, env: str | None = None, *, elsewhere: bool = False) -> dict[str, Any]:
@@ -158,7 +194,7 @@ def resolve_resumed(given: Mapping[str, Any], checkpoint: Checkpoint) -> TrainSe
     fixed = [row for row in differences(asked, own) if row[0] not in CHANGEABLE]
     _require_same([row for row in fixed if row[2] is not None], checkpoint)
     _require_of_trainer(settings)
-    completed = load_trainer(settings.trainer).complete(settings)  # refuses names that the algorithm does not have
+    completed = _complete(settings)  # refuses names that the algorithm does not have
     _require_same(fixed, checkpoint)
     done = checkpoint.manifest.steps
     if done >= completed.steps:

@@ -7,6 +7,7 @@
     tensorboard/        event files
     last.zip            the newest checkpoint; `--resume` continues from it
     learning-curve.png  return and success over steps
+    traceback.txt       where the code of the environment failed, if it did
 
 `Copies` stores the best checkpoint at an fsspec address too, such as a bucket, in case the computer is lost.
 """
@@ -18,6 +19,7 @@ import json
 import posixpath
 import shutil
 import tempfile
+import traceback
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -70,6 +72,15 @@ class RunFolder:
             with contextlib.suppress(ValueError):
                 records.append(json.loads(line))
         return records
+
+    def write_traceback(self, error: BaseException) -> str:
+        """Write where an exception came from, for whoever corrects it; says so, or nothing if it cannot be written."""
+        path = self.path / "traceback.txt"
+        try:
+            path.write_text("".join(traceback.format_exception(error)), encoding="utf-8")
+        except OSError:
+            return ""
+        return f"; the traceback is in {path}"
 
     def remove_unfinished(self) -> None:
         """Remove temporary files of an interrupted save."""

@@ -139,7 +139,9 @@ class TrainingRun:
         except (TrainingFailed, EnvironmentFailed) as error:  # during an update, which is not saved
             where = "" if isinstance(error, TrainingFailed) else f"at step {self.trainer.steps}: "
             good = f"the last good checkpoint is {self.last}" if self.last else "no checkpoint had been saved yet"
-            raise TrainingFailed(f"{where}{error}; {good}") from error
+            is_foreign = isinstance(error, EnvironmentFailed) and error.__cause__ is not None
+            trace = self.folder.write_traceback(error) if is_foreign else ""
+            raise TrainingFailed(f"{where}{error}; {good}{trace}") from error
         self._save_last()
         if self._stop and self._kept is None and not self.out.exists():
             self._kept = self.out if self._write(self.out, None, "--out") else None  # none was evaluated

@@ -26,6 +26,7 @@ def test_settings_survive_json_and_share_nothing_with_what_they_are_made_from():
     [
         ({"stps": 3}, "settings: unknown setting 'stps'. Did you mean 'steps'?"),
         ({"steps": "many"}, "steps: expected a whole number from 1 to 1000000000000000, found 'many'"),
+        ({"device": "gpu"}, "device: expected auto, cpu, cuda or cuda:1, found 'gpu'"),
         ({"steps": 0}, "steps: expected a whole number from 1 to 1000000000000000, found 0"),
         ({"until_success": 1.5}, "until_success: expected a share above 0 and at most 1, such as 0.99, found 1.5"),
         ({"normalize": 3}, "normalize: expected true or false or a table of named values, found 3"),

@@ -15,7 +15,12 @@ Share = Annotated[float, Meta(ge=0, le=1), tyro.conf.arg(metavar="SHARE")]
 
 @dataclass(frozen=True)
 class CollectConfig:
-    """Run a policy in simulation and add its episodes to a data set, which is made if there is none."""
+    """Run a policy in simulation and add its episodes to a data set, which is made if there is none.
+
+    Examples:
+      bam-data collect data/pick --env bam/pick --policy scripted --episodes 50
+      bam-data collect data/pick --policy checkpoints/pick-ppo.zip --random 0.6 --seed 100
+    """
 
     place: DataPlace
     """The data set: a folder, or an address such as s3://bucket/pick."""
@@ -47,6 +52,10 @@ class CheckConfig:
 
     Files that are not whole are copied to its folder damaged/ first, and every whole episode in them is kept. Exit
     status: 0 the data set is whole now, 1 it cannot be mended, or is not whole with --no-mend.
+
+    Examples:
+      bam-data check data/pick
+      bam-data check data/pick --no-mend
     """
 
     place: DataPlace
@@ -62,6 +71,9 @@ class ImportConfig:
     """Add the episodes of recordings of bam-deploy and bam-agent (.mcap) to a data set; those that it has are left out.
 
     An episode that was cut off is added as truncated, with the fact "end": "cut off".
+
+    Examples:
+      bam-data import data/robot recordings/2026-11-23T150901Z-pick.mcap --group blue-cube
     """
 
     place: DataPlace

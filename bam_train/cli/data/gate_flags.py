@@ -14,6 +14,10 @@ class GateConfig:
     """Compare a candidate with the champion, over pairs of simulated episodes, on recorded ones, or both.
 
     Exit status: 0 better, 1 not worse, 2 worse, 3 undecided, 4 no comparison: wrong usage, or an error.
+
+    Examples:
+      bam-gate pick-2.zip checkpoints/pick-ppo.zip
+      bam-gate pick-2.zip checkpoints/pick-ppo.zip --data data/lab --no-simulation
     """
 
     candidate: Annotated[CheckpointFile, tyro.conf.arg(metavar="CANDIDATE")]

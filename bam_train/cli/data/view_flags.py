@@ -19,7 +19,12 @@ Kind = Literal["episodes", "numbers", "success", "table"]
 
 @dataclass(frozen=True)
 class ExportDataConfig:
-    """Write the episodes of a data set in the format of another library."""
+    """Write the episodes of a data set in the format of another library.
+
+    Examples:
+      bam-data export data/pick --to lerobot --out pick-lerobot
+      bam-data export data/pick --to hdf5 --out pick.hdf5 --where success=true
+    """
 
     place: DataPlace
     """The data set."""
@@ -34,7 +39,11 @@ class ExportDataConfig:
 
 @dataclass(frozen=True)
 class InfoConfig:
-    """Say what a data set is of and how much is in it."""
+    """Say what a data set is of and how much is in it.
+
+    Examples:
+      bam-data info data/pick
+    """
 
     place: DataPlace
     """The data set."""
@@ -44,7 +53,11 @@ class InfoConfig:
 
 @dataclass(frozen=True)
 class MergeConfig:
-    """Add the episodes of several data sets to one; those that are in it already are left out."""
+    """Add the episodes of several data sets to one; those that are in it already are left out.
+
+    Examples:
+      bam-data merge data/monday data/tuesday --out data/week
+    """
 
     places: Places
     """The data sets, in the order of their episodes."""
@@ -54,7 +67,11 @@ class MergeConfig:
 
 @dataclass(frozen=True)
 class SplitConfig:
-    """Split a data set in two, by the digests of its episodes: whatever is added later, an episode keeps its part."""
+    """Split a data set in two, by the digests of its episodes: whatever is added later, an episode keeps its part.
+
+    Examples:
+      bam-data split data/pick --out data/train --rest data/test --share 0.9
+    """
 
     place: DataPlace
     """The data set."""
@@ -70,7 +87,11 @@ class SplitConfig:
 
 @dataclass(frozen=True)
 class FilterConfig:
-    """Add some episodes of a data set to another one."""
+    """Add some episodes of a data set to another one.
+
+    Examples:
+      bam-data filter data/pick --out data/good --where success=true --where "return>=10"
+    """
 
     place: DataPlace
     """The data set."""
@@ -83,7 +104,11 @@ class FilterConfig:
 
 @dataclass(frozen=True)
 class StatsConfig:
-    """Print how often episodes succeed and how large every number is."""
+    """Print how often episodes succeed and how large every number is.
+
+    Examples:
+      bam-data stats data/pick --by policy
+    """
 
     place: DataPlace
     """The data set."""
@@ -95,7 +120,11 @@ class StatsConfig:
 
 @dataclass(frozen=True)
 class PlotConfig:
-    """Draw a data set into a picture."""
+    """Draw a data set into a picture.
+
+    Examples:
+      bam-data plot data/pick --out pick.png --kind success
+    """
 
     place: DataPlace
     """The data set."""
@@ -112,7 +141,11 @@ class PlotConfig:
 
 @dataclass(frozen=True)
 class ShowConfig:
-    """Play an episode as a film: its recorded pictures, or its actions once more in the simulated environment."""
+    """Play an episode as a film: its recorded pictures, or its actions once more in the simulated environment.
+
+    Examples:
+      bam-data show data/pick --episode 3 --out episode.gif
+    """
 
     place: DataPlace
     """The data set."""

@@ -14,11 +14,17 @@ Seconds = Annotated[Positive, tyro.conf.arg(metavar="S")]
 class AskConfig:
     """Ask the live agent on a robot's computer for its state or its versions, or let it pause, resume or stop.
 
-    bam-agent status|pause|resume|versions|stop URL.
     Exit status: 0 done, 1 the agent cannot be reached, or failed, 2 wrong usage, 3 the agent refuses.
+
+    Examples:
+      bam-agent status ws://127.0.0.1:9095
+      bam-agent pause ws://127.0.0.1:9095 --why "the table is full"
     """
 
-    action: tyro.conf.Positional[Literal["status", "pause", "resume", "versions", "stop"]]
+    action: Annotated[
+        tyro.conf.Positional[Literal["status", "pause", "resume", "versions", "stop"]],
+        tyro.conf.arg(metavar="status|pause|resume|versions|stop"),
+    ]
     """status and versions change nothing; stop halts the robot at once, and pauses the agent."""
     url: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="URL")]
     """Address of the agent, such as ws://robot:9095 (wss:// with TLS)."""
@@ -38,14 +44,18 @@ class AskConfig:
 class PushConfig:
     """Push a checkpoint to a live agent, which checks it and tries it as the candidate; or roll back.
 
-    bam-push CHECKPOINT URL, or bam-push --rollback URL. Exit status: 0 done, 1 the agent cannot be reached, or failed,
-    2 wrong usage, 3 the agent refuses the candidate or the request, or --gate does not let it through, 5 with --wait:
-    the candidate was rolled back, or replaced before its trials were done.
+    Exit status: 0 done, 1 the agent cannot be reached, or failed, 2 wrong usage, 3 the agent refuses the candidate or
+    the request, or --gate does not let it through, 5 with --wait: the candidate was rolled back, or replaced before its
+    trials were done.
+
+    Examples:
+      bam-push pick-2.zip ws://127.0.0.1:9095 --wait
+      bam-push --rollback ws://127.0.0.1:9095 --why "it drops the cube"
     """
 
-    checkpoint: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="CHECKPOINT")]
+    checkpoint: Annotated[tyro.conf.Positional[str | None], tyro.conf.arg(metavar="CHECKPOINT")] = None
     """The checkpoint.zip that bam-train wrote, signed for a real robot; left out with --rollback."""
-    url: Annotated[tyro.conf.Positional[str | None], tyro.conf.arg(metavar="URL", help_behavior_hint="")] = None
+    url: Annotated[tyro.conf.Positional[str | None], tyro.conf.arg(metavar="URL")] = None
     """Address of the agent, such as ws://robot:9095 (wss:// with TLS)."""
     token_file: File = None
     """File with one token of the agent, of the role administer."""

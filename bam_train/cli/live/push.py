@@ -51,6 +51,8 @@ def _arguments(config: PushConfig) -> tuple[Path | None, str]:
     """The checkpoint, None for a roll-back, and the address."""
     first, url = config.checkpoint, config.url
     if config.rollback:
+        if first is None:
+            raise _misused("URL is missing: bam-push --rollback URL")
         if url is not None:
             raise _misused("--rollback takes no CHECKPOINT: bam-push --rollback URL")
         if config.wait:
@@ -58,8 +60,9 @@ def _arguments(config: PushConfig) -> tuple[Path | None, str]:
         if config.gate is not None:
             raise _misused("--rollback pushes nothing through a gate; leave --gate out")
         return None, first
-    if url is None:
-        raise _misused(f"{'CHECKPOINT' if '://' in first else 'URL'} is missing: bam-push CHECKPOINT URL")
+    if first is None or url is None:
+        missing = "CHECKPOINT and URL are" if first is None else "CHECKPOINT is" if "://" in first else "URL is"
+        raise _misused(f"{missing} missing: bam-push CHECKPOINT URL")
     return Path(first).expanduser(), url
 
 

@@ -32,6 +32,8 @@ def run_agent(config: AgentConfig, signals: SignalMemory) -> int:
     from bam_train.settings import parse_assignment
     from bam_train.signals import handled
 
+    if config.record is not None:
+        import pyarrow  # noqa: F401 - it is needed when a recording ends
     options = _options(config)
     tell = begin_log("bam-agent")
     with ExitStack() as stack:

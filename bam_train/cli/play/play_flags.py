@@ -1,16 +1,28 @@
 """The flags of `bam-play`; see `bam_train.cli.flags`."""
 
 from dataclasses import dataclass
-from typing import Annotated, Literal
+from typing import Annotated, ClassVar, Literal
 
 import tyro
 
-from bam_train.cli.flags import Assignments, Count, DataSetName, File, Folder, Name, Positive, Seed, Url
+from bam_train.cli.flags import Assignments, Count, DataSetName, File, Folder, Groups, Name, Positive, Seed, Url
 
 
 @dataclass(frozen=True)
 class PlayConfig:
-    """Drive any environment, or a live robot, by keyboard or gamepad; the key ? shows the keys."""
+    """Drive any environment, or a live robot, by keyboard or gamepad; the key ? shows the keys.
+
+    Examples:
+      bam-play bam/reach
+      bam-play bam/pick --render --policy checkpoints/pick-ppo.zip
+      bam-play bam/reach --record demos/reach
+    """
+
+    GROUPS: ClassVar[Groups] = {
+        "What is played": ("policy", "set", "seed", "episodes", "speed", "render", "record"),
+        "Where": ("robot", "transport", "profile", "ca_file", "token_file", "timeout"),
+        "How a live robot may move": ("stage", "guard", "yes", "keys", "allow_unsigned"),
+    }
 
     env: Annotated[tyro.conf.Positional[str | None], tyro.conf.arg(metavar="[ID]")] = None
     """The environment, e.g. bam/pick; by default that of --policy."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from contextlib import closing
 from functools import partial
@@ -9,7 +10,7 @@ from math import inf
 from time import monotonic
 from typing import TYPE_CHECKING, Any
 
-from bam_train.cli.console import say, tell
+from bam_train.cli.console import can_draw, say, tell
 from bam_train.cli.program import run_program
 from bam_train.errors import NoTerminal, SettingsError
 from bam_train.signals import SignalMemory
@@ -29,6 +30,9 @@ def play(config: PlayConfig, signals: SignalMemory) -> int:
     """Run the program with its parsed flags."""
     if not config.render and not sys.stdin.isatty():
         raise NoTerminal("standard input is no terminal: run it in one, or in a window with --render")
+    if not config.render and sys.stderr.isatty() and not can_draw():
+        what = f"a terminal with TERM={os.environ['TERM']} draws no screen"
+        raise NoTerminal(f"{what}: run it in another, or in a window with --render")
     place = _checked_place(config)
     from gymnasium.error import DependencyNotInstalled
 

@@ -16,8 +16,8 @@ from gymnasium import spaces
 from msgspec import Meta
 from torch.nn import functional
 
+from bam_envs.core.spaces import leaves
 from bam_train.trainers.base import Statistics
-from bam_train.trainers.frozen_network import leaves
 from bam_train.trainers.imitation.imitation_network import ImitationNetwork
 from bam_train.trainers.imitation.teacher import Teacher
 from bam_train.trainers.offline.training_data import ActionCode

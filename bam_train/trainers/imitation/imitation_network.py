@@ -10,8 +10,9 @@ import torch
 from gymnasium import spaces
 from torch import nn
 
+from bam_envs.core.spaces import leaves
 from bam_train.errors import SettingsError
-from bam_train.trainers.frozen_network import KINDS, FrozenNetwork, Layer, OneHot, action_head, leaves, pack, to
+from bam_train.trainers.frozen_network import KINDS, FrozenNetwork, Layer, OneHot, action_head, pack, to
 
 LIMIT = 10.0
 """Normalised numbers end here."""

@@ -41,7 +41,7 @@ class Teacher:
             wanted = None
         else:
             checkpoint = Checkpoint.open(Path(str(settings.teacher)).expanduser())
-            checkpoint.requires_env(settings.env)
+            checkpoint.requires_env(settings.env, "A teacher knows the environment of the learner; give another one")
             wanted = checkpoint.manifest.observation_space
             _require_same(checkpoint, "action_space", checkpoint.manifest.action_space, envs.single_action_space)
             self._policy = FrozenPolicy.from_checkpoint(checkpoint)

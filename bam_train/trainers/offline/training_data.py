@@ -11,9 +11,9 @@ import torch
 from gymnasium import spaces
 from numpy.typing import NDArray
 
+from bam_envs.core.spaces import leaves
 from bam_train.data import DataSet
 from bam_train.errors import SettingsError
-from bam_train.trainers.frozen_network import leaves
 
 Array = NDArray[Any]
 LIMIT = 10.0

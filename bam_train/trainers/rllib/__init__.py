@@ -20,7 +20,9 @@ import gymnasium as gym
 
 import bam_envs  # noqa: F401 - registers our environments with Gymnasium
 from bam_envs.core.registry import ENVIRONMENTS
+from bam_train.environments import is_batched
 from bam_train.finite_envs import FiniteEnv
+from bam_train.foreign_env import ForeignEnv
 from bam_train.trainers.zero_based_spaces import from_zero
 
 if TYPE_CHECKING:
@@ -62,7 +64,8 @@ def _register(name: str, env: str | gym.envs.registration.EnvSpec) -> None:
 def create(env: str | gym.envs.registration.EnvSpec, context: Mapping[str, Any]) -> gym.Env[Any, Any]:
     """Make one environment for RLlib's own runner; `context` holds the keyword arguments of ``env_config``."""
     name = env if isinstance(env, str) else env.id
-    return from_zero(FiniteEnv(gym.make(env, disable_env_checker=True, **dict(context)), name))
+    made: gym.Env[Any, Any] = gym.make(env, disable_env_checker=True, **dict(context))
+    return from_zero(FiniteEnv(made if is_batched(name) else ForeignEnv(made, name), name))
 
 
 if importlib.util.find_spec("ray") is not None:  # checkpoints of the old API stack are read without Ray

@@ -23,7 +23,7 @@ from ray.rllib.core.rl_module.default_model_config import DefaultModelConfig
 from ray.rllib.utils.error import UnsupportedSpaceException
 from ray.rllib.utils.replay_buffers import EpisodeReplayBuffer, PrioritizedEpisodeReplayBuffer
 
-from bam_envs.core.validation import Finite, Fraction, NonNegative, Positive, PositiveInt, check
+from bam_envs.core.validation import Finite, PositiveInt, check
 from bam_envs.core.wording import brief
 from bam_train.environments import is_batched
 from bam_train.errors import BamTrainError, SettingsError
@@ -41,53 +41,9 @@ from bam_train.trainers.rllib.runner_deaths import (
     ReportingEnvRunner,
     first_cause_of_death,
 )
-
-_GPUS, _CPUS = "env runners use no GPU, and --num-gpus is for the learners", "each env runner has one CPU"
-_ENVS = "use --num-envs, which is of all runners together"
-ELSEWHERE = {
-    "train_batch_size": "use train_batch_size_per_learner",
-    "num_sgd_iter": "use num_epochs",
-    "lr_schedule": "use lr, which takes a schedule too",
-    "entropy_coeff_schedule": "use entropy_coeff, which takes a schedule too",
-    "model": "use model_config",
-    "vf_share_layers": "use model_config.vf_share_layers",
-    "policy_model_config": "use model_config",
-    "q_model_config": "use model_config",
-    "hiddens": "use model_config.head_fcnet_hiddens",
-    "optimization_config": "use actor_lr, critic_lr and alpha_lr",
-    "learning_rate": "use lr",
-    "observation_filter": "use normalize=true",
-    **dict.fromkeys(("num_workers", "num_rollout_workers"), "use --num-env-runners"),
-    **dict.fromkeys(("num_envs_per_worker", "num_envs_per_env_runner"), _ENVS),
-    "seed": "use --seed",
-    **dict.fromkeys(("num_gpus_per_worker", "num_gpus_per_env_runner"), _GPUS),
-    **dict.fromkeys(("num_cpus_per_worker", "num_cpus_per_env_runner"), _CPUS),
-    "log_level": "RLlib's log is off",
-    **dict.fromkeys(("horizon", "soft_horizon"), "the environment ends its episodes"),
-    "framework": "RLlib has nothing but torch any more",
-    **dict.fromkeys(
-        (
-            *("optimizer", "learner_class", "learner_connector", "add_default_connectors_to_learner_pipeline"),
-            *("learner_config_dict", "num_aggregator_actors_per_learner", "store_buffer_in_checkpoints", "decay"),
-            *("max_requests_in_flight_per_aggregator_actor", "max_requests_in_flight_per_aggregator_worker"),
-            *("max_requests_in_flight_per_sampler_worker", "num_aggregation_workers", "before_learn_on_batch"),
-            *("categorical_distribution_temperature", "num_gpu_loader_threads", "num_multi_gpu_tower_stacks"),
-            *("minibatch_buffer_size", "replay_proportion", "replay_buffer_num_slots", "learner_queue_size"),
-            *("learner_queue_timeout", "timeout_s_sampler_manager", "timeout_s_aggregator_manager", "opt_type"),
-            *("momentum", "target_update_frequency", "training_intensity", "bc_iters"),
-        ),
-        "it belongs to RLlib's old API stack, or bam-train takes care of it",
-    ),
-}
-"""Arguments of RLlib that are not hyperparameters here, many of its old API stack, and the replacement or reason."""
-
-_OLD_HERE = {"impala": {"epsilon"}, "appo": {"epsilon", "use_critic"}}
-"""Arguments by algorithm that belong to its old API stack, and are current in other algorithms."""
+from bam_train.trainers.rllib_arguments import ELSEWHERE, LAST, OURS, RANGES, left_out
 
 _OF_CONNECTORS = frozenset({"self", "kwargs", "multi_agent", "update_stats"})
-
-_OURS = ("model_config", "rollout_fragment_length", "log_std_init", "action_init_scale")
-"""Hyperparameters that ``training()`` does not take."""
 
 
 def complete(algorithm: Algorithm, given: Mapping[str, Any]) -> dict[str, Any]:
@@ -126,12 +82,11 @@ def complete_normalize(given: bool | Mapping[str, Any]) -> bool | dict[str, Any]
 
 def _defaults(algorithm: Algorithm, config: Any) -> dict[str, tuple[Any, Any]]:
     """Annotation and default of every hyperparameter, by name."""
-    left_out = ELSEWHERE.keys() | _OLD_HERE.get(algorithm.name, set())
     found: dict[str, tuple[Any, Any]] = {}
     for owner in type(config).__mro__:
         method = vars(owner).get("training")
         for name, row in inspect.signature(method).parameters.items() if method else ():
-            if name not in left_out | {"self", "kwargs"} and not name.startswith("_") and name not in found:
+            if name not in left_out(algorithm) and not name.startswith("_") and name not in found:
                 found[name] = row.annotation, getattr(config, name, None)
     if "entropy_coeff" in found:  # PPO takes a schedule too, unlike its annotation
         found["entropy_coeff"] = found["lr"][0], found["entropy_coeff"][1]
@@ -211,36 +166,13 @@ def _complete_model(config: Any, given: Any) -> dict[str, Any]:
     }
 
 
-# Ranges of numbers, schedules and layers with which an algorithm can learn; with some others RLlib hangs
-
-_RATES = (
-    *("lr", "actor_lr", "critic_lr", "alpha_lr", "value_lr", "adam_epsilon"),
-    *("grad_clip", "clip_param", "vf_clip_param", "kl_target", "initial_alpha", "temperature"),
-)
-_COUNTS = (
-    *("train_batch_size_per_learner", "minibatch_size", "num_epochs", "rollout_fragment_length", "n_step"),
-    *("num_atoms", "n_quantiles", "n_critics", "num_actions", "broadcast_interval", "simple_queue_size"),
-    *("circular_buffer_num_batches", "circular_buffer_iterations_per_batch"),
-)
-_WEIGHTS = (
-    *("action_init_scale", "entropy_coeff", "vf_loss_coeff", "vf_coeff", "kl_coeff", "beta", "sigma0"),
-    *("num_steps_sampled_before_learning_starts", "target_network_update_freq", "top_quantiles_to_drop_per_net"),
-)
-_LAST: dict[str, Any] = {
-    **dict.fromkeys(("gamma", "lambda_", "tau", "expectile", "epsilon"), Fraction),
-    **dict.fromkeys((*_RATES, *_WEIGHTS), NonNegative),
-}
-"""Ranges of later values of a schedule, where a rate may be 0."""
-_RANGES = _LAST | dict.fromkeys(_RATES, Positive) | dict.fromkeys(_COUNTS, PositiveInt)
-
-
 def _require_ranges(values: Mapping[str, Any]) -> None:
     """Refuse complete hyperparameters with which no algorithm can learn."""
     for name, value in values.items():
         if isinstance(value, bool):
             continue
         if isinstance(value, (int, float)):
-            check(value, _RANGES.get(name, Finite), name, SettingsError)
+            check(value, RANGES.get(name, Finite), name, SettingsError)
         elif name == "rollout_fragment_length" and value != "auto":
             raise SettingsError(f"{name}: expected a whole number or 'auto', found {value!r}")
         elif name == "target_entropy" and value not in (None, "auto"):
@@ -253,9 +185,9 @@ def _require_ranges(values: Mapping[str, Any]) -> None:
             if len(steps) < max(2, len(value)) or steps[0] != 0 or sorted(set(steps)) != steps:
                 text = "expected a number or a schedule [[0, value], [step, value], ...] with rising steps"
                 raise SettingsError(f"{name}: {text}, found {value!r}")
-            check(value[0][1], _RANGES.get(name, Finite), name, SettingsError)
+            check(value[0][1], RANGES.get(name, Finite), name, SettingsError)
             for _, number in value[1:]:
-                check(number, _LAST.get(name, Finite), name, SettingsError)
+                check(number, LAST.get(name, Finite), name, SettingsError)
     for name, sizes in values["model_config"].items():
         if not name.endswith("_hiddens") or sizes is None:
             continue
@@ -276,7 +208,7 @@ def make_config(settings: TrainSettings, observation_space: Space[Any], action_s
     number, gpus_each = learners(settings)
     config = algorithm.load()()
     config.framework("torch").rl_module(model_config=dict(values["model_config"]))
-    arguments = {name: _plain(value) for name, value in values.items() if name not in _OURS}
+    arguments = {name: _plain(value) for name, value in values.items() if name not in OURS}
     if isinstance(n_step := arguments.get("n_step"), list):
         arguments["n_step"] = tuple(n_step)  # a range to draw from
     config.training(**arguments)

@@ -98,6 +98,7 @@ class RLlibTrainer:
         with contextlib.closing(make_env(settings.env, settings.env_kwargs)) as env:
             space, action_space = env.observation_space, env.action_space
         algorithm.require_actions(settings.env, type(action_space).__name__)
+        algorithm.require_observations(settings.env, space, (spaces.Dict, spaces.Tuple))
         if isinstance(space, spaces.Box) and len(space.shape) == 3 and not np.issubdtype(space.dtype, np.floating):
             raise SettingsError(  # RLlib's networks fail in the first update
                 f"{settings.env}: the rllib trainer takes images of floats, found {space.dtype} of shape {space.shape}."

@@ -18,6 +18,7 @@ from stable_baselines3.common.preprocessing import is_image_space
 from stable_baselines3.common.vec_env import VecNormalize, VecTransposeImage, unwrap_vec_wrapper
 from torch import nn
 
+from bam_envs.core.spaces import leaves
 from bam_train.errors import PolicyError
 from bam_train.trainers.frozen_network import (
     FrozenNetwork,
@@ -25,7 +26,6 @@ from bam_train.trainers.frozen_network import (
     Normalised,
     OneHot,
     action_head,
-    leaves,
     pack,
     to,
 )

@@ -1,31 +1,28 @@
-"""Hyperparameters, checked against the constructors of stable-baselines3 and completed; the model of a run.
+"""Hyperparameters, checked against the constructors of stable-baselines3 and completed, without importing it.
 
 In settings they are JSON: a schedule is ``"lin_3e-4"`` (linear to 0), action noise ``"normal_0.1"`` or
 ``"ornstein-uhlenbeck_0.1"``, a class its name (``activation_fn="tanh"``), ``train_freq`` ``1`` or ``[1, "episode"]``.
 """
 
-import copy
-import inspect
-import typing
-import warnings
-from collections.abc import Container, Mapping
+import contextlib
+import dataclasses
+import json
+from collections.abc import Mapping
 from typing import Annotated, Any
 
 import numpy as np
-import torch
 from gymnasium import spaces
 from msgspec import Meta
-from stable_baselines3.common import noise, torch_layers, utils
-from stable_baselines3.common.preprocessing import is_image_space, is_image_space_channels_first
-from stable_baselines3.common.vec_env import VecEnv, VecNormalize, VecTransposeImage
 
+from bam_envs.core.spaces import leaves, space_text
 from bam_envs.core.validation import Finite, Fraction, NonNegative, Positive, PositiveInt, check
-from bam_envs.core.wording import did_you_mean
+from bam_envs.core.wording import did_you_mean, listed
+from bam_train.environments import make_env, make_vector_env
 from bam_train.errors import SettingsError
 from bam_train.settings import NAMES, TrainSettings
 from bam_train.trainers.algorithms import SB3_ALGORITHMS, Algorithm
-from bam_train.trainers.frozen_network import leaves
 from bam_train.trainers.library_arguments import fit, linear_start, require_known
+from bam_train.trainers.library_source import parameters, table
 
 ELSEWHERE = {
     "seed": "use --seed",
@@ -40,23 +37,24 @@ ELSEWHERE = {
 }
 """Constructor arguments that are not hyperparameters, and the replacement or reason."""
 
+NORMALISER = "stable_baselines3.common.vec_env.vec_normalize:VecNormalize"
 _POLICY_ELSEWHERE = frozenset({"self", "observation_space", "action_space", "lr_schedule", "use_sde"})
 
-_ACTIVATIONS = ("CELU", "ELU", "GELU", "Hardswish", "Identity", "LeakyReLU", "Mish", "ReLU", "SELU", "SiLU", "Tanh")
-_OPTIMIZERS = ("Adam", "AdamW", "NAdam", "RAdam", "RMSprop", "SGD")
-_EXTRACTORS = ("CombinedExtractor", "FlattenExtractor", "NatureCNN")
-CLASSES: dict[str, dict[str, type]] = {
-    "activation_fn": {name.lower(): getattr(torch.nn, name) for name in _ACTIVATIONS},
-    "optimizer_class": {name.lower(): getattr(torch.optim, name) for name in _OPTIMIZERS},
-    "features_extractor_class": {name.lower(): getattr(torch_layers, name) for name in _EXTRACTORS},
+CLASSES = {
+    "activation_fn": (
+        *("CELU", "ELU", "GELU", "Hardswish", "Identity", "LeakyReLU", "Mish", "ReLU", "SELU", "SiLU", "Tanh"),
+    ),
+    "optimizer_class": ("Adam", "AdamW", "NAdam", "RAdam", "RMSprop", "SGD"),
+    "features_extractor_class": ("CombinedExtractor", "FlattenExtractor", "NatureCNN"),
 }
-"""Policy arguments that are classes, by lower-case name."""
+"""Names of the classes that an argument of a policy may be."""
 
-_NOISES = {"normal": noise.NormalActionNoise, "ornstein-uhlenbeck": noise.OrnsteinUhlenbeckActionNoise}
+NOISES = ("normal", "ornstein-uhlenbeck")
+"""Kinds of action noise."""
 _Noise = Annotated[
     str,
     Meta(
-        pattern=rf"^({'|'.join(_NOISES)})_\d+\.?\d*([eE][-+]?\d+)?$",
+        pattern=rf"^({'|'.join(NOISES)})_\d+\.?\d*([eE][-+]?\d+)?$",
         description='"normal_0.1" or "ornstein-uhlenbeck_0.1"',
     ),
 ]
@@ -74,74 +72,133 @@ _RANGES = {
 """Ranges of numbers outside which no algorithm can learn, although the library accepts them."""
 
 
+def complete_settings(settings: TrainSettings) -> TrainSettings:
+    """Add the algorithm's defaults, and the number of environments that servers run.
+
+    Raises:
+        SettingsError: A setting that the algorithm or its policy does not take, or that does not fit the environment.
+    """
+    if settings.transport:
+        with contextlib.closing(make_vector_env(settings.env, {}, 1, settings.place)) as envs:
+            num_envs, seen, acted = envs.num_envs, envs.single_observation_space, envs.single_action_space
+    else:
+        with contextlib.closing(make_env(settings.env, settings.env_kwargs)) as env:
+            num_envs, seen, acted = settings.num_envs, env.observation_space, env.action_space
+    algorithm = SB3_ALGORITHMS[settings.algo]
+    algorithm.require_actions(settings.env, type(acted).__name__)
+    algorithm.require_observations(settings.env, seen)
+    check_pictures(seen)
+    values = complete(algorithm, settings.hyperparameters, seen)
+    normalize = complete_normalize(settings.normalize, values["gamma"], seen)
+    eval_every = settings.eval_every or max(1000, settings.steps // 20)
+    return dataclasses.replace(
+        settings, num_envs=num_envs, hyperparameters=values, normalize=normalize, eval_every=eval_every
+    )
+
+
 def complete(algorithm: Algorithm, given: Mapping[str, Any], observation_space: spaces.Space[Any]) -> dict[str, Any]:
     """Check hyperparameters by name, type and range, and add defaults for missing ones."""
-    parameters = _parameters(algorithm.load(), ELSEWHERE)
-    require_known(given, parameters, f"{algorithm.name} hyperparameter", ELSEWHERE, NAMES)
+    known = {name: one for name, one in parameters(algorithm.reference).items() if name not in ELSEWHERE}
+    require_known(given, known, f"{algorithm.name} hyperparameter", ELSEWHERE, NAMES)
     values: dict[str, Any] = {"policy": default_policy(algorithm, observation_space)}
-    for name, parameter in parameters.items():
+    for name, parameter in known.items():
         if name in given:
-            is_noise = noise.ActionNoise in typing.get_args(parameter.annotation)
-            values[name] = fit(name, given[name], _Noise | None if is_noise else parameter.annotation)
+            hint = _Noise | None if name == "action_noise" else parameter.annotation
+            values[name] = fit(name, given[name], hint)
         elif name != "policy":
             values[name] = list(parameter.default) if isinstance(parameter.default, tuple) else parameter.default
-    policies, policy = algorithm.load().policy_aliases, values["policy"]
+    policies, policy = table(algorithm.reference, "policy_aliases"), values["policy"]
     if policy not in policies:
         raise SettingsError(f"policy: unknown policy {policy!r} of {algorithm.name}. {did_you_mean(policy, policies)}")
     values["policy_kwargs"] = _checked_policy(policies[policy], values["policy_kwargs"] or {})
+    _require_policy(policy, values["policy_kwargs"], observation_space)
     _check_ranges(values)
     return values
+
+
+def is_image(space: spaces.Space[Any]) -> bool:
+    """Whether stable-baselines3 takes a space for an image: uint8 from 0 to 255 with three axes."""
+    is_bytes = isinstance(space, spaces.Box) and len(space.shape) == 3 and space.dtype == np.uint8
+    return is_bytes and bool(np.all(space.low == 0) and np.all(space.high == 255))  # type: ignore[attr-defined]
+
+
+def is_large(image: spaces.Space[Any]) -> bool:
+    """Whether an image fits stable-baselines3's network of convolutions; its channels are its shortest axis."""
+    return sorted(image.shape or ())[1] >= SMALLEST_IMAGE
 
 
 def default_policy(algorithm: Algorithm, observation_space: spaces.Space[Any]) -> str:
     """Name of the policy for an observation space of several inputs, images, or numbers."""
     several = isinstance(observation_space, spaces.Dict)
-    is_image = is_image_space(observation_space) and sorted(observation_space.shape or ())[1] >= SMALLEST_IMAGE
-    kind = "MultiInput" if several else "Cnn" if is_image else "Mlp"
-    return f"{kind}{'Lstm' if algorithm.recurrent else ''}Policy"
+    kind = "Cnn" if is_image(observation_space) and is_large(observation_space) else "Mlp"
+    return f"{'MultiInput' if several else kind}{'Lstm' if algorithm.recurrent else ''}Policy"
 
 
-def complete_normalize(given: bool | Mapping[str, Any], gamma: float) -> bool | dict[str, Any]:
-    """Check the arguments of `VecNormalize`; its gamma is the algorithm's unless given."""
-    if isinstance(given, bool):
-        return {"gamma": gamma} if given else False
-    known = _parameters(VecNormalize, ("self", "venv", "training"))
+def _require_policy(policy: str, given: Mapping[str, Any], space: spaces.Space[Any]) -> None:
+    """Refuse a policy for another kind of observation; `given` are its arguments."""
+    kind, wanted = policy.partition("Policy")[0].removesuffix("Lstm"), ""
+    if (kind == "MultiInput") != isinstance(space, spaces.Dict):
+        wanted = "a Dict of observations" if kind == "MultiInput" else "a single observation"
+    own = str(given.get("features_extractor_class", "NatureCNN")).lower() == "naturecnn"
+    if kind == "Cnn" and own and given.get("normalize_images", True) and not wanted:
+        if not is_image(space):
+            wanted = "images, uint8 from 0 to 255"
+        elif not is_large(space):
+            wanted = f"images of at least {SMALLEST_IMAGE} pixels along the shorter side"
+    if wanted:
+        raise SettingsError(f"policy: {policy} is for {wanted}, found {brief_space(space)}. Leave policy out")
+
+
+def brief_space(space: spaces.Space[Any]) -> str:
+    """An observation space in a few words."""
+    return f"a Dict of {listed(space.spaces)}" if isinstance(space, spaces.Dict) else space_text(space)
+
+
+def complete_normalize(
+    given: bool | Mapping[str, Any], gamma: float, space: spaces.Space[Any]
+) -> bool | dict[str, Any]:
+    """Check the arguments of `VecNormalize`; its gamma is the algorithm's unless given.
+
+    For ``true``, it normalises numbers alone: images are divided by 255, and choices are one-hot codes.
+    """
+    seen = leaves(space)
+    numbers = [key for key, leaf in seen.items() if isinstance(leaf, spaces.Box) and not is_image(leaf)]
+    if given is True:
+        if not numbers:
+            return {"gamma": gamma, "norm_obs": False}
+        return {"gamma": gamma} if len(numbers) == len(seen) else {"gamma": gamma, "norm_obs_keys": numbers}
+    if given is False:
+        return False
+    known = {name: one for name, one in parameters(NORMALISER).items() if name not in ("self", "venv", "training")}
     require_known(given, known, "normalize argument", ELSEWHERE)
     fitted = {name: fit(f"normalize.{name}", value, known[name].annotation) for name, value in given.items()}
     _check_ranges(fitted)
+    if fitted.get("norm_obs", True):
+        _require_normalisable(fitted.get("norm_obs_keys"), seen, numbers)
     return {"gamma": gamma, **fitted}
+
+
+def _require_normalisable(keys: Any, seen: Mapping[str, Any], numbers: list[str]) -> None:
+    """Refuse to normalise observations, all or those of some `keys`, that are no Box."""
+    if "" in seen and keys is not None:
+        raise SettingsError("normalize.norm_obs_keys: is for a Dict of observations, and there is one; leave it out")
+    instead = f"--set normalize.norm_obs_keys='{json.dumps(numbers)}'"
+    if "" in seen or not numbers:
+        instead = "--set normalize.norm_obs=false"
+    for key in seen if keys is None else keys:
+        leaf = seen.get(key)
+        if leaf is None:
+            raise SettingsError(f"normalize.norm_obs_keys: there is no observation {key!r}. {did_you_mean(key, seen)}")
+        if not isinstance(leaf, spaces.Box) or ("" in seen and is_image(leaf)):
+            what = f"observation {key!r}" if key else "the observation"
+            text = f"{what} is {space_text(leaf)}, which cannot be normalised; give {instead}"
+            raise SettingsError(f"normalize: {text}")
 
 
 def over_the_whole_run(values: Mapping[str, Any]) -> list[str]:
     """Names of complete hyperparameters that change over the run, and depend on its total of steps."""
     schedules = [name for name, value in values.items() if isinstance(value, str) and linear_start(value) is not None]
     return sorted([*schedules, *({"exploration_fraction"} & values.keys())])
-
-
-def build(values: Mapping[str, Any], action_space: spaces.Space[Any]) -> dict[str, Any]:
-    """Turn complete hyperparameters into arguments of the constructor; `values` does not change."""
-    arguments = copy.deepcopy(dict(values))
-    for name, value in arguments.items():
-        if isinstance(value, str) and (start := linear_start(value)) is not None:  # to 0 over the run
-            schedule: Any = getattr(utils, "LinearSchedule", None) or utils.get_linear_fn
-            arguments[name] = schedule(start, 0.0, 1.0)
-        elif isinstance(value, list) and len(value) == 2 and value[1] in ("step", "episode"):
-            arguments[name] = tuple(value)
-    if arguments.get("action_noise") is not None:
-        kind, _, sigma = arguments["action_noise"].rpartition("_")
-        shape = action_space.shape or ()
-        arguments["action_noise"] = _NOISES[kind](np.zeros(shape), np.full(shape, float(sigma)))
-    policy = arguments["policy_kwargs"]
-    for name, table in CLASSES.items():
-        if name in policy:
-            policy[name] = table[policy[name].lower()]
-    return arguments
-
-
-def _parameters(kind: Any, but: Container[str]) -> dict[str, inspect.Parameter]:
-    """Parameters of a class's constructor by name, without those in `but`."""
-    parameters = inspect.signature(kind.__init__).parameters
-    return {name: parameter for name, parameter in parameters.items() if name not in but}
 
 
 def _check_ranges(values: Mapping[str, Any]) -> None:
@@ -153,94 +210,42 @@ def _check_ranges(values: Mapping[str, Any]) -> None:
             check(number, _RANGES.get(name, Finite), name, SettingsError)
 
 
-def _checked_policy(policy: Any, given: Mapping[str, Any]) -> dict[str, Any]:
-    parameters, values = _parameters(policy, _POLICY_ELSEWHERE), {}
-    require_known(given, parameters, "policy_kwargs argument", ELSEWHERE)
+def _checked_policy(policy: str, given: Mapping[str, Any]) -> dict[str, Any]:
+    known = {name: one for name, one in parameters(policy).items() if name not in _POLICY_ELSEWHERE}
+    require_known(given, known, "policy_kwargs argument", ELSEWHERE)
+    values = {}
     for name, value in given.items():
-        values[name] = fit(f"policy_kwargs.{name}", value, parameters[name].annotation)
-        if name in CLASSES and values[name].lower() not in CLASSES[name]:
-            close = did_you_mean(value.lower(), CLASSES[name])
+        values[name] = fit(f"policy_kwargs.{name}", value, known[name].annotation)
+        if name in CLASSES and values[name].lower() not in map(str.lower, CLASSES[name]):
+            close = did_you_mean(value.lower(), map(str.lower, CLASSES[name]))
             raise SettingsError(f"policy_kwargs.{name}: unknown {value!r}. {close}")
     return values
-
-
-_REFUSALS = (AssertionError, ValueError, TypeError, RuntimeError, ZeroDivisionError, NotImplementedError)
-"""Exceptions of stable-baselines3 and torch for settings that cannot work."""
-
-
-def make_model(settings: TrainSettings, venv: VecEnv) -> tuple[Any, list[str]]:
-    """Make the algorithm's model, whose constructor sets all seeds; returns it with its warnings, one line each.
-
-    Raises SettingsError if the library refuses the settings, or the device does not exist.
-    """
-    about_pictures = check_pictures(venv.observation_space)
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always", UserWarning)
-        try:
-            env = _normalised(venv, settings.normalize) if settings.normalize else venv
-            arguments = build(settings.hyperparameters, venv.action_space)
-            kind, policy = SB3_ALGORITHMS[settings.algo].load(), arguments.pop("policy")
-            device = _device(settings.device, policy)
-            model = kind(policy, env, seed=settings.seed, device=device, verbose=0, **arguments)
-        except SettingsError:
-            raise
-        except _REFUSALS as error:
-            why = " ".join(str(error).split())
-            raise SettingsError(f"{settings.algo} on {settings.env} cannot be set up: {why}") from error
-    notices = [" ".join(str(warning.message).split()) for warning in caught]
-    if any(text.startswith("You have specified a mini-batch size") for text in notices):  # in terms of the settings
-        steps, batch = model.n_steps * model.n_envs, model.batch_size
-        notices = [
-            f"batch_size {batch} does not divide a rollout of n_steps {model.n_steps} x num_envs {model.n_envs} = "
-            f"{steps} steps: its last batch has {steps % batch}"
-        ]
-    return model, [*about_pictures, *notices]
 
 
 def check_pictures(observed: spaces.Space[Any]) -> list[str]:
     """Messages about observations that look like pictures and are learnt as plain numbers.
 
     Raises:
-        SettingsError: A picture has its channels between height and width.
+        SettingsError: A picture has its channels between height and width, or is too small for its network.
     """
     told = []
     for key, leaf in leaves(observed).items():
         if not isinstance(leaf, spaces.Box) or len(leaf.shape) != 3:
             continue
         name = f"observation {key!r}" if key else "the observation"
-        if is_image_space(leaf) and leaf.shape[1] < min(leaf.shape[0], leaf.shape[2]):
+        if is_image(leaf) and leaf.shape[1] < min(leaf.shape[0], leaf.shape[2]):
             raise SettingsError(
                 f"{name} is a picture of shape {leaf.shape}: expected (height, width, channels) or (channels, height, "
                 "width); turn it in the environment, with np.moveaxis"
             )
-        if not is_image_space(leaf):
+        if key and is_image(leaf) and not is_large(leaf):
+            raise SettingsError(
+                f"{name} is a picture of shape {leaf.shape}: expected at least {SMALLEST_IMAGE} pixels along the "
+                "shorter side, for the network of convolutions; make it larger in the environment"
+            )
+        if not is_image(leaf):
             told.append(
                 f"{name}, {leaf.dtype} of shape {leaf.shape}, is learnt as plain numbers: a picture for a "
                 "convolutional network is uint8 from 0 to 255"
             )
     return told
-
-
-def _normalised(venv: VecEnv, given: bool | dict[str, Any]) -> VecNormalize:
-    """Normalise `venv`, below which a wrapper moves the channels of images, if any, to the front.
-
-    With this wrapper on top, as in stable-baselines3, the replay buffer would get images with channels last.
-    """
-    arguments = given if isinstance(given, dict) else {}
-    venv.observation_space = copy.deepcopy(venv.observation_space)  # VecNormalize writes into a Dict
-    env = VecNormalize(venv, **arguments)
-    seen = leaves(env.observation_space).values()
-    if any(is_image_space(leaf) and not is_image_space_channels_first(leaf) for leaf in seen):
-        return VecNormalize(VecTransposeImage(venv), **arguments)
-    return env
-
-
-def _device(name: str, policy: str) -> str:
-    """The device to compute on: `name` if it exists, or the choice of ``auto``."""
-    if name == "auto":
-        # Copies to a GPU take longer than the computations of a small network.
-        return "cuda" if torch.cuda.is_available() and not policy.startswith("Mlp") else "cpu"
-    there = ["cpu", *(f"cuda:{i}" for i in range(torch.cuda.device_count()))]
-    if name in there or (name == "cuda" and len(there) > 1):
-        return name
-    raise SettingsError(f"device: {name!r} is not there; expected auto or one of {', '.join(there)}")

@@ -17,10 +17,10 @@ from stable_baselines3.common.noise import VectorizedActionNoise
 from stable_baselines3.common.save_util import recursive_getattr
 from stable_baselines3.common.vec_env import VecNormalize
 
+from bam_envs.core.spaces import leaves
 from bam_envs.core.validation import check
 from bam_train.checkpoint import Checkpoint
 from bam_train.checkpoint.safetensors_file import pack
-from bam_train.trainers.frozen_network import leaves
 
 MODEL, STATE, REPLAY, NOTES = "bam/resume/model", "bam/resume/state", "bam/resume/replay", "bam/resume/notes.json"
 

@@ -6,7 +6,6 @@ Progress is reported where the algorithm starts a rollout: the last update is do
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 import functools
 import io
 import math
@@ -24,16 +23,17 @@ from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 from bam_envs.core.spaces import space_to_json
 from bam_train.checkpoint import Checkpoint, write_checkpoint
 from bam_train.data.record_dataset import RecordVectorDataset, info_of
-from bam_train.environments import control_period, make_env, make_vector_env, require_fit
-from bam_train.errors import CheckpointMismatch, SettingsError, TrainingFailed
+from bam_train.environments import control_period, require_fit
+from bam_train.errors import SettingsError, TrainingFailed
 from bam_train.policy import FrozenPolicy
 from bam_train.settings import TrainSettings
 from bam_train.trainers.algorithms import SB3_ALGORITHMS
 from bam_train.trainers.base import OnProgress, Progress, Statistics, manifest
-from bam_train.trainers.resolve_settings import own_settings
+from bam_train.trainers.resolve_settings import own_settings, require_start
 from bam_train.trainers.sb3 import sb3_hyperparameters as hyperparameters
 from bam_train.trainers.sb3 import sb3_resume as resume
 from bam_train.trainers.sb3.sb3_freezing import freeze, golden
+from bam_train.trainers.sb3.sb3_model import make_model
 from bam_train.trainers.sb3.sb3_vec_env import BatchVecEnv, make_training_env, one_env
 from bam_train.trainers.tensorboard_files import TensorBoardFiles
 
@@ -66,35 +66,15 @@ class SB3Trainer:
         self._total = self._reported = 0
         model.collect_rollouts = functools.partial(self._roll_out, model.collect_rollouts)
 
-    @classmethod
-    def complete(cls, settings: TrainSettings) -> TrainSettings:
-        """Add the algorithm's defaults, and the number of environments that servers run."""
-        if settings.transport:
-            with contextlib.closing(make_vector_env(settings.env, {}, 1, settings.place)) as envs:
-                num_envs, seen, acted = envs.num_envs, envs.single_observation_space, envs.single_action_space
-        else:
-            with contextlib.closing(make_env(settings.env, settings.env_kwargs)) as env:
-                num_envs, seen, acted = settings.num_envs, env.observation_space, env.action_space
-        algorithm = SB3_ALGORITHMS[settings.algo]
-        algorithm.require_actions(settings.env, type(acted).__name__)
-        values = hyperparameters.complete(algorithm, settings.hyperparameters, seen)
-        normalize = hyperparameters.complete_normalize(settings.normalize, values["gamma"])
-        eval_every = settings.eval_every or max(1000, settings.steps // 20)
-        return dataclasses.replace(
-            settings, num_envs=num_envs, hyperparameters=values, normalize=normalize, eval_every=eval_every
-        )
+    complete = staticmethod(hyperparameters.complete_settings)
 
     @classmethod
     def create(cls, settings: TrainSettings) -> SB3Trainer:
         """Set up a new run of complete settings."""
         trainer = cls._made(settings)
         if settings.start is not None:
-            checkpoint = Checkpoint.open(settings.start)
-            require_fit(checkpoint, one_env(trainer.venv), settings.place)
-            made = checkpoint.manifest
-            if (made.trainer, made.algorithm) != (settings.trainer, settings.algo):
-                text = f"was trained by {made.algorithm} of {made.trainer}: {settings.algo} of sb3 cannot begin with it"
-                raise CheckpointMismatch(checkpoint.path, f"{text}; leave start out, or give --algo {made.algorithm}")
+            checkpoint = require_start(settings, settings.start)
+            require_fit(checkpoint, one_env(trainer.venv), settings.place, settings.env)
             resume.begin_with(checkpoint, trainer.model, trainer._normaliser)
         return trainer
 
@@ -102,7 +82,7 @@ class SB3Trainer:
     def _made(cls, settings: TrainSettings) -> SB3Trainer:
         torch.set_num_threads(settings.threads)
         venv = make_training_env(settings.env, settings.env_kwargs, settings.num_envs, settings.place)
-        model, notices = hyperparameters.make_model(settings, venv)
+        model, notices = make_model(settings, venv)
         model.set_logger(Logger(None, []))
         trainer = cls(settings, model, venv)
         trainer.notices += notices

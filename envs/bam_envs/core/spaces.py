@@ -75,6 +75,11 @@ def space_text(space: Space[Any]) -> str:
     return f"{space.dtype} {space.shape}" if isinstance(space, spaces.Box) else str(space)
 
 
+def leaves(space: Space[Any]) -> dict[str, Any]:
+    """The spaces of a Dict by key, in alphabetical order; any other space by ``""``."""
+    return {key: space[key] for key in sorted(space.spaces)} if isinstance(space, spaces.Dict) else {"": space}
+
+
 def space_from_json(value: Mapping[str, Any]) -> Space[Any]:
     """Decode a space that `space_to_json` encoded.
 

@@ -1,10 +1,12 @@
 """robo-gym's own classes behind a robot server that answers with the states it is given.
 
 Where release 2.0.1 cannot run at all with Gymnasium 1 (old `reset` and `step` of three classes), only that is mended
-here: observation, reward and end are theirs.
+here: observation, reward and end are theirs. In 2.1.0 these classes have Gymnasium's `reset` and `step` and are used as
+they are.
 """
 
 import contextlib
+import inspect
 import io
 import warnings
 from types import SimpleNamespace
@@ -80,14 +82,19 @@ class _Obstacles(ObstacleAvoidanceMir100):
         return super().reset(**(options or {})), {}
 
 
+def _is_old(kind):
+    return "options" not in inspect.signature(kind.reset).parameters
+
+
+IS_OLD = _is_old(BasicAvoidanceUR)
 CLASSES = {
     "NoObstacleNavigationMir100": NoObstacleNavigationMir100,
-    "ObstacleAvoidanceMir100": _Obstacles,
+    "ObstacleAvoidanceMir100": _Obstacles if _is_old(ObstacleAvoidanceMir100) else ObstacleAvoidanceMir100,
     "EmptyEnvironmentUR": URBaseEnv,
     "EndEffectorPositioningUR": EndEffectorPositioningUR,
-    "BasicAvoidanceUR": _Basic,
-    "AvoidanceRaad2022UR": _Raad,
-    "AvoidanceRaad2022TestUR": _RaadTest,
+    "BasicAvoidanceUR": _Basic if IS_OLD else BasicAvoidanceUR,
+    "AvoidanceRaad2022UR": _Raad if IS_OLD else AvoidanceRaad2022UR,
+    "AvoidanceRaad2022TestUR": _RaadTest if IS_OLD else AvoidanceRaad2022UR,
 }
 
 

@@ -23,14 +23,14 @@ def require_browser():
     return chromium, driver
 
 
-def new_browser():
-    """A browser without a page."""
+def new_browser(*flags):
+    """A browser without a page, with further `flags`."""
     chromium, driver = require_browser()
     from selenium import webdriver
 
     options = webdriver.ChromeOptions()
     options.binary_location = chromium
-    for flag in FLAGS:
+    for flag in (*FLAGS, *flags):
         options.add_argument(flag)
     options.set_capability("goog:loggingPrefs", {"browser": "ALL", "performance": "ALL"})
     return webdriver.Chrome(options=options, service=webdriver.ChromeService(driver))

@@ -185,6 +185,8 @@ def test_roll_back(hub, server, run):
     [
         (["ws://robot:9095"], "CHECKPOINT is missing: bam-push CHECKPOINT URL"),
         (["pick.zip"], "URL is missing: bam-push CHECKPOINT URL"),
+        (["--rollback"], "URL is missing: bam-push --rollback URL"),
+        ([], "CHECKPOINT and URL are missing: bam-push CHECKPOINT URL"),
         (["--rollback", "pick.zip", "ws://robot"], "--rollback takes no CHECKPOINT: bam-push --rollback URL"),
         (["--rollback", "ws://robot", "--wait"], "--rollback has nothing to wait for; leave --wait out"),
         (["--rollback", "ws://robot", "--gate", "a.zip"], "--rollback pushes nothing through a gate; leave --gate out"),

@@ -79,16 +79,18 @@ def test_the_rate_and_its_deadlines_are_reported(corridor_checkpoint, run, flags
 def test_a_recording_that_cannot_be_made_is_one_line_and_nothing_moves(corridor_checkpoint, corridor, run, monkeypatch):
     moved, path = [], corridor_checkpoint()
     monkeypatch.setattr(corridor_class(corridor), "reset", lambda *_, **__: moved.append(True))
-    assert run(main, path, "--record", path) == (
-        1,
-        "",
-        f"bam-deploy: {path}: a recording is there already. Choose another file\n",
-    )
-    assert run(main, path, "--record", path, "--no-record") == (
-        1,
-        "",
-        "bam-deploy: --record and --no-record exclude each other; give one of the two\n",
-    )
+    there = path.with_suffix(".mcap")
+    there.touch()
+
+    def refusal(*flags):
+        status, out, err = run(main, path, "--record", *flags)
+        assert (status, out) == (1, "")
+        return err.removeprefix("bam-deploy: ")
+
+    assert refusal(there) == f"{there}: a recording is there already. Choose another file\n"
+    assert refusal(there, "--no-record") == "--record and --no-record exclude each other; give one of the two\n"
+    monkeypatch.setitem(sys.modules, "pyarrow", None)
+    assert refusal("data") == 'needs pyarrow, which is not installed. Run: pip install "bam-train[data]"\n'
     assert moved == []
 
 
@@ -153,9 +155,9 @@ def test_a_fault_still_gives_the_report(corridor_checkpoint, corridor, run, monk
 
     monkeypatch.setattr(corridor_class(corridor), "step", step)
     status, out, err = run(main, corridor_checkpoint(), "--fast", "--json")
-    assert status == 1
-    assert err == "bam-deploy: fault: OSError: cable pulled\n"
-    assert json.loads(out)["stop_reason"] == "fault: OSError: cable pulled"
+    place = f"(test_deploy.py, line {step.__code__.co_firstlineno + 1}, in step)"
+    text = f"fault: test/Corridor-v0 failed at step 1 of an episode: OSError: cable pulled {place}"
+    assert (status, err, json.loads(out)["stop_reason"]) == (1, f"bam-deploy: {text}\n", text)
 
 
 def test_no_screen(run, monkeypatch):
@@ -264,7 +266,11 @@ def test_live_display_on_a_terminal(corridor_checkpoint, run, monkeypatch):
         ),
         (
             ["--robot", "ws://a:1", "--fast"],
-            "a live robot is driven at the rate that its policy was made for; leave out --rate and --fast",
+            "a live robot is driven at the rate that its policy was made for; leave out --fast",
+        ),
+        (
+            ["--record", "y.txt"],
+            "--record: expected an .mcap file or a data set, a folder or a name without a suffix, found y.txt",
         ),
         (
             ["--transport", "tcp://a:1", "--render"],

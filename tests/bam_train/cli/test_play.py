@@ -78,6 +78,15 @@ def test_a_terminal_gives_the_commands_of_twenty_keys_and_its_settings_come_back
     assert shown.startswith(b"\x1b[?1049h\x1b[?25l\x1b[Hone\x1b[K\r\n" + rb"\x1b[2Jtwo" + b"\x1b[K\x1b[J")
 
 
+def test_a_terminal_that_draws_nothing_is_one_line(tty, monkeypatch, capsys, run):
+    standard = SimpleNamespace(fileno=lambda: tty[1], isatty=lambda: True)
+    monkeypatch.setattr(sys, "stdin", standard)
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: True, raising=False)
+    monkeypatch.setenv("TERM", "dumb")
+    text = "a terminal with TERM=dumb draws no screen: run it in another, or in a window with --render"
+    assert run(run_play.main, "bam/reach") == (2, "", f"bam-play: {text}\n")
+
+
 def test_what_a_terminal_sends_in_pieces_or_nobody_knows():
     assert keys_in(b"W\x1b[5") == (["KeyW"], b"\x1b[5")
     assert keys_in(b"\x1b[5~ 7?+\x7f\r") == (["PageUp", "Space", "Digit7", "Slash", "Equal", "Backspace", "Enter"], b"")

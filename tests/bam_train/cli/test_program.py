@@ -15,13 +15,19 @@ import pytest
 from bam_envs.core.errors import MissingExtra, UnknownName
 from bam_train.cli import console, deploy, envs, serve, train
 from bam_train.cli.console import count, duration, number, percent, rich_text, shown
+from bam_train.cli.data import bam_data
 from bam_train.cli.program import guarded, run_program, usage_error
 from bam_train.errors import OutputError, SettingsError
 
 
 @dataclass(frozen=True)
 class Flags:
-    """Does things."""
+    """Does things.
+    These are many, so that the text is longer than a line.
+
+    Examples:
+      prog --steps 5 --force
+    """
 
     steps: int = 3
     """How many."""
@@ -48,11 +54,26 @@ def test_flags_reach_the_program_and_its_status_the_shell():
     assert ended([], lambda flags: None) == 0
 
 
-def test_help(capsys):
-    assert ended(["--help"]) == 0
-    shown = capsys.readouterr().out
-    assert "Does things." in shown
-    assert "--no-force" not in shown
+def test_help(capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "60")
+    assert ended(["--steps", "5", "--help"]) == 0
+    assert (
+        capsys.readouterr().out
+        == """\
+usage: prog [OPTIONS]
+
+Does things. These are many, so that the text is longer
+than a line.
+
+Examples:
+  prog --steps 5 --force
+
+Options:
+  --steps N   How many. (default: 3)
+  --force     Whether.
+  -h, --help  Show this text.
+"""
+    )
 
 
 @pytest.mark.parametrize(
@@ -262,7 +283,22 @@ OUT_OF_RANGE = [
     (envs, ["--lst"], "unknown option --lst; there are --json and --help"),
     (deploy, ["x.zip", "--stage", "trail"], "--stage: expected full or trial, found 'trail'"),
     (envs, ["a", "b"], "unexpected argument b"),
+    (train, ["--normalize"], "--normalize is no option: give --set normalize=true"),
+    (train, ["--env_kwargs", "x"], "--env_kwargs is no option: give --set env_kwargs.NAME=VALUE"),
+    (train, ["--lr", "1"], "unknown option --lr; an argument of the algorithm is --set NAME=VALUE"),
 ]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "text"),
+    [
+        (["export"], "export: PLACE, --to and --out are missing. Run bam-data export"),
+        (["split", "d", "--out=a"], "split: --rest is missing. Run bam-data split"),
+        (["collect", "d"], "collect: --policy is missing. Run bam-data collect"),
+    ],
+)
+def test_missing_options_are_named(run, arguments, text):
+    assert run(bam_data.main, *arguments) == (2, "", f"bam-data {text} --help\n")
 
 
 @pytest.mark.parametrize(("program", "arguments", "text"), OUT_OF_RANGE)

@@ -171,13 +171,17 @@ def test_nothing_is_sent(run, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    "flags", [(), *(("--robot", "ws://a:1", *one) for one in (("--stage", "trial"), ("--wiggle",), ("--trials", "a")))]
+    ("flags", "text"),
+    [
+        ([], "--shadow is for a live robot; give its address with --robot too"),
+        (["--robot", "ws://a:1", "--stage", "trial"], "--shadow moves nothing; leave out --stage"),
+        (
+            ["--robot", "ws://a:1", "--wiggle", "--trials", "a"],
+            "--shadow moves nothing; leave out --wiggle and --trials",
+        ),
+    ],
 )
-def test_a_shadow_needs_a_robot_and_moves_nothing(run, flags):
+def test_a_shadow_needs_a_robot_and_moves_nothing(run, flags, text):
     from bam_train.cli.deploy import main
 
-    assert run(main, "a.zip", "--shadow", *flags) == (
-        1,
-        "",
-        "bam-deploy: --shadow needs --robot, and moves nothing; leave out --stage, --wiggle and --trials\n",
-    )
+    assert run(main, "a.zip", "--shadow", *flags) == (1, "", f"bam-deploy: {text}\n")

@@ -66,6 +66,38 @@ def test_a_whole_run(bam_train, here):
     assert lines[-2:] == ["next:", "  bam-eval checkpoints/CartPole-v1-ppo.zip"]
 
 
+def test_settings_are_checked_before_torch_and_ray_are_imported():
+    code = """
+import sys
+from bam_train.cli import train
+for words in (["--set", "gamma=2"], ["--set", "gama=1"], ["--trainer", "rllib", "--set", "lr=-1"], ["--print-config"]):
+    try: train.main(["--env", "bam/reach", "--algo", "ppo", *words])
+    except SystemExit as end: print(end.code, *{'torch', 'ray', 'stable_baselines3'} & {*sys.modules}, file=sys.stderr)
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stderr.splitlines() == [
+        "bam-train: gamma: expected a number from 0 to 1, found 2",
+        "1",
+        "bam-train: Unknown ppo hyperparameter 'gama'. Did you mean 'gamma'?",
+        "1",
+        "bam-train: lr: expected a number above 0, found -1",
+        "1",
+        "0",
+    ]
+
+
+@pytest.mark.parametrize(
+    ("flags", "text"),
+    [
+        ({}, "--record: CartPole-v1 is not of bam_envs; use bam-data collect, or RecordDataset"),
+        ({"trainer": "rllib", "set": ()}, "--record is for --trainer sb3, found rllib; use bam-data collect"),
+    ],
+)
+def test_a_run_that_cannot_be_recorded(bam_train, here, flags, text):
+    assert bam_train(record="data", **flags) == (1, "", f"bam-train: {text}\n")
+    assert list(here.iterdir()) == []
+
+
 def test_print_config_is_read_back(bam_train, here):
     status, printed, err = bam_train(print_config=True)
     assert (status, err) == (0, "")

@@ -1,5 +1,7 @@
 """What happens in an environment is what is in the data set, in one and in several side by side."""
 
+import sys
+
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -41,6 +43,28 @@ def counting():
     gym.register("Counting-v0", Counting)
     yield "Counting-v0"
     del gym.registry["Counting-v0"]
+
+
+def test_nothing_is_made_without_pyarrow(tmp_path, counting, monkeypatch):
+    monkeypatch.setitem(sys.modules, "pyarrow", None)
+    with pytest.raises(ModuleNotFoundError, match="pyarrow"):
+        collect(tmp_path / "d", "random", counting, episodes=1)
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("name", "why"),
+    [
+        ("a.zip", "is a file, and a data set is a folder; choose another place"),
+        ("b.mcap", "is named as a recording, and a data set is a folder; leave .mcap out"),
+    ],
+)
+def test_a_file_is_no_place_for_a_data_set(tmp_path, counting, name, why):
+    (tmp_path / "a.zip").write_text("hello")
+    with pytest.raises(BadDataSet) as caught:
+        collect(tmp_path / name, "random", counting, episodes=1)
+    assert str(caught.value) == f"{tmp_path / name}: {why}"
+    assert [one.name for one in tmp_path.iterdir()] == ["a.zip"]
 
 
 def test_one_environment(tmp_path, counting):

@@ -77,11 +77,10 @@ def test_data_that_does_not_do(corridor_checkpoint, make_data, run, made, flags,
 
 
 def test_data_of_another_environment(corridor_checkpoint, make_data, run):
-    path = corridor_checkpoint()
-    text = (
-        "was trained on test/Corridor-v0, not on CartPole-v1. Use --env test/Corridor-v0, or train one for CartPole-v1"
-    )
-    assert run(main, path, "--data", make_data("other", 20, env="CartPole-v1")) == (
+    path, other = corridor_checkpoint(), make_data("other", 20, env="CartPole-v1")
+    remedy = f"That is the environment of {other}; give data of its own one"
+    text = f"was trained on test/Corridor-v0, not on CartPole-v1. {remedy}"
+    assert run(main, path, "--data", other) == (
         1,
         "",
         f"bam-eval: {path}: {text}\n",

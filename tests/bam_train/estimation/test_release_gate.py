@@ -97,6 +97,30 @@ def test_an_error_is_no_verdict(right, run, arguments, text):
     assert text in err
 
 
+WIDE = {"type": "Box", "shape": [1], "dtype": "float32", "low": 0.0, "high": 9.0}
+
+
+@pytest.mark.parametrize(
+    ("fields", "text"),
+    [
+        (
+            {"env": "CartPole-v1"},
+            "was trained on test/Corridor-v0, not on CartPole-v1. {} is the champion of that one. "
+            "Compare it with a champion of test/Corridor-v0",
+        ),
+        (
+            {"observation_space": WIDE},
+            "observation_space.high is 4.0, and 9.0 in the champion {}; "
+            "a gate compares policies that see and do the same",
+        ),
+    ],
+)
+@pytest.mark.parametrize("named", [[], ["--env", "test/Corridor-v0"]])
+def test_policies_of_two_environments(corridor_checkpoint, right, run, named, fields, text):
+    champion = corridor_checkpoint("champion.zip", **fields)
+    assert run(gate.main, right, champion, *named) == (4, "", f"bam-gate: {right}: {text.format(champion)}\n")
+
+
 def test_a_bug_is_no_verdict(right, run, monkeypatch):
     monkeypatch.setattr(gate, "decide", lambda config: 1 / 0)
     status, _, err = run(gate.main, right, right)

@@ -16,7 +16,7 @@ from bam_envs.remote.serve.env_server import EnvServer
 from bam_envs.remote.serve.tcp_server import TcpServer
 from bam_envs.robots.linked import link_profile
 from bam_train.checkpoint import write_checkpoint
-from bam_train.errors import AlteredCheckpoint, CheckpointMismatch, OutputError, SettingsError
+from bam_train.errors import AlteredCheckpoint, CheckpointMismatch, NotACheckpoint, OutputError, SettingsError
 from bam_train.settings import file_stem
 from bam_train.trainers import load_trainer, require_algorithm
 from bam_train.trainers.algorithms import ALGORITHMS
@@ -191,7 +191,7 @@ def test_where_a_run_computes_is_not_read_from_a_file(saved, fields, tmp_path):
         ("hyperparameters", [1], "hyperparameters: expected a table of named values, found [1]"),
         ("hyperparameters", {"n_steps": "x"}, "n_steps: expected a whole number, found 'x'"),
         ("normalize", 3, "normalize: expected true or false or a table of named values, found 3"),
-        ("device", 7, "device: expected text, found 7"),
+        ("device", 7, "device: expected auto, cpu, cuda or cuda:1, found 7"),
     ],
 )
 def test_settings_that_no_run_has_are_refused(saved, fields, tmp_path, name, value, message):
@@ -383,3 +383,17 @@ def test_a_name_of_robo_gym_is_tuned_as_the_environment():
     theirs = resolve({**ROBO_GYM, "env_kwargs": {"ip": "127.0.0.1"}})
     assert (theirs.env, theirs.env_kwargs) == ("NoObstacleNavigationMir100Sim-v0", {"ip": "127.0.0.1"})
     assert replace(theirs, env=ours.env, env_kwargs=ours.env_kwargs) == ours
+
+
+def test_a_checkpoint_that_a_run_cannot_begin_with_is_refused_at_once(corridor_checkpoint):
+    path = corridor_checkpoint()
+    given = {"env": "CartPole-v1", "algo": "ppo", "start": str(path)}
+    where = "observation_space.shape[0] is 1, and it is 4 in CartPole-v1"
+    text = f"{path}: was trained on test/Corridor-v0, where {where}; give a checkpoint of CartPole-v1"
+    with pytest.raises(CheckpointMismatch) as caught:
+        resolve(given)
+    assert str(caught.value) == text
+    with pytest.raises(CheckpointMismatch, match="was trained by ppo of sb3: dqn of sb3 cannot begin with it; "):
+        resolve({**given, "algo": "dqn"})
+    with pytest.raises(NotACheckpoint, match=r"^nowhere\.zip: no such file\."):
+        resolve({**given, "start": "nowhere.zip"})

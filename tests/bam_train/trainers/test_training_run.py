@@ -237,6 +237,18 @@ def test_a_failure_names_the_last_good_checkpoint(start, failure, text, kept):
     assert run.folder.last.read_text() == kept
 
 
+def test_the_traceback_of_an_environment_is_kept(start):
+    run, trainer, _ = start(at(0.5))
+    trainer.fails_at, trainer.failure = 60, EnvironmentFailed("My-v0 failed in reset: KeyError: 'x'")
+    trainer.failure.__cause__ = KeyError("x")
+    with pytest.raises(TrainingFailed) as caught:
+        run.run()
+    path = run.folder.path / "traceback.txt"
+    kept = f"the last good checkpoint is {run.folder.last}; the traceback is in {path}"
+    assert str(caught.value) == f"at step 60: {trainer.failure}; {kept}"
+    assert path.read_text().startswith("KeyError: 'x'\n")
+
+
 def test_a_failure_before_anything_was_saved(start):
     run, trainer, _ = start({})
     trainer.fails_at, trainer.failure = 10, TrainingFailed("loss is nan")

@@ -13,6 +13,7 @@ from bam_train.trainers.algorithms import RLLIB_ALGORITHMS
 from bam_train.trainers.resolve_settings import resolve
 from bam_train.trainers.rllib import rllib_hyperparameters as hyperparameters
 from bam_train.trainers.rllib.recorded_episodes import load
+from bam_train.trainers.rllib_arguments import require_plausible
 
 pytestmark = pytest.mark.filterwarnings("ignore:.*:DeprecationWarning:ray")  # Ray's own, of its data library
 
@@ -57,6 +58,21 @@ WRONG = [
     ("sac", "replay_buffer_config", {"capacity": 0}, "capacity: expected a whole number of at least 1, found 0"),
     ("sac", "replay_buffer_config", {"type": "Foo"}, "expected EpisodeReplayBuffer or PrioritizedEpisodeReplayBuffer,"),
 ]
+
+
+EARLY = [row for row in WRONG if isinstance(row[2], (int, float)) and row[1] != "model_config"]
+
+
+@pytest.mark.parametrize(("algo", "name", "value", "text"), EARLY)
+def test_hyperparameters_are_refused_before_rllib_is_imported(algo, name, value, text):
+    with pytest.raises(SettingsError) as caught:
+        require_plausible(RLLIB_ALGORITHMS[algo], {name: value})
+    assert text in str(caught.value)
+
+
+@pytest.mark.parametrize("name", sorted(RLLIB_ALGORITHMS))
+def test_every_hyperparameter_is_plausible(name):
+    require_plausible(RLLIB_ALGORITHMS[name], hyperparameters.complete(RLLIB_ALGORITHMS[name], {}))
 
 
 @pytest.mark.parametrize(("algo", "name", "value", "text"), WRONG)
