@@ -171,13 +171,16 @@ def joined(space: gym.Space[Any], arrays: Mapping[str, Array], leaves: list[Leaf
     return build(space, ())
 
 
-def digest_of(arrays: Mapping[str, Array], terminated: bool, truncated: bool, success: bool | None) -> str:
-    """SHA-256 of an episode's arrays by column and of its end; hexadecimal."""
+def digest_of(arrays: Mapping[str, Array], *end: bool | None) -> str:
+    """SHA-256 of an episode's arrays by column, and of how it ended: terminated, truncated, success; hexadecimal."""
     digest = hashlib.sha256()
     for name in sorted(arrays):
         array = np.ascontiguousarray(arrays[name])
+        if array.dtype.kind in "UO":
+            digest.update(json.dumps([name, [str(one) for one in array]]).encode())
+            continue
         array = array.astype(array.dtype.newbyteorder("<"), copy=False)
         digest.update(f"{name}:{array.dtype.str}:{array.shape};".encode())
         digest.update(array.reshape(-1).view(np.uint8).data)
-    digest.update(json.dumps([bool(terminated), bool(truncated), success]).encode())
+    digest.update(json.dumps(end).encode())
     return digest.hexdigest()
