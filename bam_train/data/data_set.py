@@ -69,13 +69,12 @@ class DataSet:
         """Open the data set at `place`.
 
         Raises:
-            BadDataSet: It is none, a file of it is missing or damaged, or a newer bam-train wrote it.
-            NoSuchPlace: Nothing is there.
+            BadDataSet: There is none, a file of it is missing or damaged, or a newer bam-train wrote it.
         """
         files = Files(place)
         files.require()
         head = files.read_json(INFO)
-        if not files.exists(BAM):
+        if not files.exists(BAM) and not files.numbers(COPIES):
             raise BadDataSet(f"{place}: has no {BAM}, so its environment is unknown; bam-train did not write it")
         own = files.read_json(BAM)
         if not isinstance(own.get("format"), int) or own["format"] > FORMAT:

@@ -161,8 +161,15 @@ class DataSetWriter:
                 self._lock.release()
 
 
-def require_same(place: str, there: DataSetInfo, given: DataSetInfo) -> None:
+def require_same(place: str, there: DataSetInfo, given: DataSetInfo, whose: str = "", remedy: str = "") -> None:
     """Refuse episodes that do not belong to those that are there.
+
+    Args:
+        place: The place of those.
+        there: What is equal for them.
+        given: What is equal for the others.
+        whose: The others, by default the new episodes.
+        remedy: What to do, by default to write them into another place.
 
     Raises:
         BadDataSet: Names the first thing that differs, and both values.
@@ -175,7 +182,5 @@ def require_same(place: str, there: DataSetInfo, given: DataSetInfo) -> None:
         difference = first_difference(old[name], new[name], name)
         if difference is not None:
             what, theirs, ours = difference
-            raise BadDataSet(
-                f"{place}: {what} is {short_json(theirs)} there, and {short_json(ours)} of the new episodes; "
-                f"write {brief(given.env)} into another place"
-            )
+            text = f"{what} is {short_json(theirs)} there, and {short_json(ours)} of {whose or 'the new episodes'}"
+            raise BadDataSet(f"{place}: {text}; {remedy or f'write {brief(given.env)} into another place'}")

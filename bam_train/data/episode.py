@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bam_envs.core.spaces import space_from_json, space_to_json
+from bam_envs.core.wording import brief
 from bam_train.errors import BadDataSet
 
 Array = NDArray[Any]
@@ -152,7 +153,7 @@ def _leaves(space: gym.Space[Any], kind: str, path: tuple[str | int, ...]) -> An
     else:
         where = "".join(f"[{part!r}]" for part in path)
         raise BadDataSet(
-            f"the {kind} space{where} is {space}; a data set holds Box, Discrete, MultiDiscrete, MultiBinary, "
+            f"the {kind} space{where} is {brief(space)}; a data set holds Box, Discrete, MultiDiscrete, MultiBinary, "
             "and Dict and Tuple of them"
         )
 

@@ -78,14 +78,12 @@ class Files:
         return (self.root / name).exists()
 
     def require(self) -> None:
-        """Raise BadDataSet unless a data set, or a part of one, is there.
-
-        Raises:
-            NoSuchPlace: Nothing is there, or there is no such bucket.
-        """
+        """Raise BadDataSet unless a data set, or a part of one, is there; it names a bucket that is not there."""
         if not self.root.is_dir():
-            if self.root.local is None or not self.root.exists():
-                self.root.list()
+            try:
+                self.root.size()
+            except NoSuchPlace as error:
+                raise BadDataSet(str(error)) from error
             raise BadDataSet(f"{self.text}: is no data set but a file; give a folder that bam-data wrote")
         if not any(self.exists(name) for name in (INFO, BAM, "meta/episodes", "data", "copies")):
             raise BadDataSet(f"{self.text}: is no data set: it has no {INFO}; give a folder that bam-data wrote")
