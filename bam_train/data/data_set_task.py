@@ -100,9 +100,14 @@ class DataSetTask(LocalTask):
         except BadDataSet as error:
             raise InvalidValue(f"bam/dataset-v0: {error}") from error
 
+    @property
+    def num_starts(self) -> int:
+        """How many steps there are; `drawn` says which is shown."""
+        return len(self.steps.rewards)
+
     def begin(self, env_ids: EnvIds, rngs: Sequence[np.random.Generator]) -> None:
         """Draw a step."""
-        count = len(self.steps.rewards)
+        count = self.num_starts
         self.own_memory()
         self.drawn[env_ids] = [int(rng.integers(count)) for rng in rngs]
 
