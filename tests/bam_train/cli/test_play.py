@@ -125,6 +125,16 @@ def test_a_window_gives_the_commands_of_twenty_keys_and_sees_them_go_up(display)
         window.show(["text"], np.zeros((48, 64, 3), np.uint8))
         window.wait(0.01)
         assert (window._image.width(), window._image.height()) == (64, 48)
+        window.show(["text"], np.zeros((480, 640, 3), np.uint8))
+        window.wait(0.01)
+        columns, lines = window.size
+        assert (columns, lines) < (160, 80)
+        window.show(["m" * columns] * lines)
+        window.wait(0.05)
+        root, text = window._root, window._text
+        assert text.winfo_width() >= window._font.measure("m" * columns)  # the last column is there
+        assert text.winfo_rootx() + text.winfo_width() <= root.winfo_screenwidth()
+        assert text.winfo_rooty() + text.winfo_height() <= root.winfo_screenheight()
 
 
 def test_a_gamepad_that_is_pulled_out_in_mid_motion_lets_go(tmp_path):
