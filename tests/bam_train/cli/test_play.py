@@ -221,8 +221,9 @@ def test_it_runs_in_a_terminal_and_records(tty, tmp_path):
     script = [("seed 2", right), ("step 1 ", left), ("step 2 ", right), ("step 3 ", left), ("step 4 ", right)]
     script += [("no success, time limit after 5 steps", b"?"), ("X       quit", b"x")]
     arguments = ("bam/grid-world", "--seed", "2", "--set", "max_episode_steps=5", "--record", "demos")
-    status, out, _ = played(tty, tmp_path, script, *arguments)
+    status, out, shown = played(tty, tmp_path, script, *arguments)
     assert (status, script, out) == (0, [], "1 episode, 0 succeeded, recorded in demos\n")
+    assert "bam-play: demos has 1 of the 20 episodes or so that cloning takes; record more" in shown
     (episode,) = DataSet.open(tmp_path / "demos")
     assert np.ravel(episode.actions).tolist() == [0, 2, 0, 2, 0]
     assert termios.tcgetattr(tty[1]) == before
