@@ -102,7 +102,7 @@ def row(path: Path, episodes: int, runs: Path, known: dict[tuple[str, ...], str]
         kwargs = held_out(manifest.env, manifest.env_kwargs, {} if entry_of(manifest.env) is None else asked)
         if not rates or any(manifest.env_kwargs.get(name) for name in SIMULATED):
             rates.append(success(evaluate(policy, manifest.env, kwargs, episodes=episodes, seed=FIRST_SEED)))
-    rates += [rates[0]] if len(rates) == 1 else []
+    rates += [""] if len(rates) == 1 else []
     made = [f"`{command(manifest, path.name)}`", str(manifest.seed), f"{manifest.steps:,}"]
     first = [f"[{path.name}]({path.name})", *made]
     seconds = wall_time(manifest, runs) or known.get(tuple(first), "not recorded")
