@@ -13,9 +13,8 @@ import numpy as np
 
 from bam_envs.core.errors import BamEnvsError
 from bam_train.data.arrow_columns import from_arrow
-from bam_train.data.copies import Copy, sha256
 from bam_train.data.episode import Array, DataSetInfo, Episode, Transitions, Values, digest_of, joined, leaves_of
-from bam_train.data.file_pair import Head
+from bam_train.data.file_pair import Copy, Head, sha256
 from bam_train.data.layout import (
     BAM,
     CHUNK,

@@ -17,10 +17,9 @@ import numpy as np
 
 from bam_envs.core.errors import BamEnvsError
 from bam_train.data.arrow_columns import to_arrow
-from bam_train.data.copies import Copy, sha256
 from bam_train.data.data_set import DataSet
 from bam_train.data.episode import DataSetInfo, Episode
-from bam_train.data.file_pair import Columns, Head
+from bam_train.data.file_pair import Columns, Copy, Head, sha256
 from bam_train.data.layout import (
     BAM,
     COPIES,
@@ -75,6 +74,8 @@ class _Reader:
     def __init__(self, files: Files) -> None:
         self.files = files
         self.numbers = sorted({number for kind in (DATA, EPISODES, COPIES) for number in files.numbers(kind)})
+        self.is_cut_off = files.exists(MENDING)
+        """Whether a mending was cut off, which has left some episodes twice."""
         own, self.problems = self._bam_json()
         try:
             self.info, self.extra = DataSetInfo.from_json(own), dict(own["columns"])
@@ -105,11 +106,11 @@ class _Reader:
         return Copy.from_bytes(self.files.content(file_name(COPIES, number)))
 
     def pairs(self) -> Iterator[Pair]:
-        """What the files say, number by number; a mending that was cut off has left some episodes twice."""
-        is_mending, seen = self.files.exists(MENDING), set[Any]()
+        """What the files say, number by number."""
+        seen = set[Any]()
         for number in self.numbers:
             pair = read_pair(self.files, self.data, number)
-            if is_mending and pair.episodes and pair.same in seen:
+            if self.is_cut_off and pair.episodes and pair.same in seen:
                 pair = Pair(number, damaged=[f"{file_name(DATA, number)} is twice there"])
             seen.add(pair.same)
             yield pair
@@ -132,8 +133,8 @@ def _look(reader: _Reader) -> tuple[Found, set[int]]:
     """What there is, and the numbers of files that a writer had not completed when it was killed."""
     files, found, left_over = reader.files, Found(), set[int]()
     found.problems += reader.problems
-    head, is_mending = Head(reader.info, reader.extra), files.exists(MENDING)
-    found.problems += ["a mending was cut off"] if is_mending else []
+    head = Head(reader.info, reader.extra)
+    found.problems += ["a mending was cut off"] if reader.is_cut_off else []
     said = _said(files, reader)
     counted = said.get("total_episodes") if _counts(said) else None
     last = reader.copy(reader.numbers[-1]) if reader.numbers else None
@@ -141,14 +142,14 @@ def _look(reader: _Reader) -> tuple[Found, set[int]]:
     lost: list[tuple[str, dict[str, Any], str]] = []
     for pair in reader.pairs():
         name, before = file_name(DATA, pair.number), len(found.problems)
-        if pair.number > head.file and not is_mending:
+        if pair.number > head.file and not reader.is_cut_off:
             found.problems.append(f"{file_name(DATA, head.file)} is missing")
             first = next(
                 (row for row in [*pair.rows, *(row for row, _ in pair.lost)] if "dataset_from_index" in row), {}
             )
             gone = range(head.episodes, first.get("episode_index", head.episodes))
             lost += [(file_name(DATA, head.file), {"episode_index": index}, "") for index in gone]
-            head.episodes, head.frames = gone.stop, first.get("dataset_from_index", head.frames)
+            head.episodes, head.frames = max(gone.start, gone.stop), first.get("dataset_from_index", head.frames)
         head.file = pair.number
         if pair.lost and not pair.is_complete and counted is not None and head.episodes >= counted:
             found.problems.append(f"{name}: was not complete when its writer was killed")
@@ -172,7 +173,7 @@ def _look(reader: _Reader) -> tuple[Found, set[int]]:
             found.problems.append(
                 f"{file_name(EPISODES, pair.number)}: its {len(columns)} episodes are not counted yet"
             )
-    if counted is not None and counted > head.episodes and not is_mending:
+    if counted is not None and counted > head.episodes and not reader.is_cut_off:
         lost += [("no file", {"episode_index": index}, "") for index in range(head.episodes, counted)]
     lost = [one for one in lost if (one[1].get("bam/digest"), one[1].get("bam/facts")) not in whole or one[2]]
     found.lost = [*_lines(lost)]
@@ -326,8 +327,8 @@ def mend(files: Files, *, accept_loss: bool = False) -> Found:
     for pair in reader.pairs():
         for name, content in pair.exact.items():
             files.write(name, content)
-        if pair.is_as_written:
-            pair.damaged = []
+        copy_line = file_name(COPIES, pair.number)
+        pair.damaged = [] if pair.is_as_written else [one for one in pair.damaged if not one.startswith(copy_line)]
         columns, ahead = [Columns.read(one, reader.info) for one in pair.episodes], replace(head, tasks=[*head.tasks])
         if pair.number == head.file and columns and not pair.lost and not [*_problems(pair, columns, ahead)]:
             head = ahead

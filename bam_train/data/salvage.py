@@ -11,9 +11,9 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from bam_train.data.arrow_columns import Arrow
-from bam_train.data.copies import MAGIC, Copy, sha256
 from bam_train.data.data_set import DataSet
 from bam_train.data.episode import Episode, leaves_of
+from bam_train.data.file_pair import MAGIC, Copy, sha256
 from bam_train.data.layout import (
     COPIES,
     DATA,

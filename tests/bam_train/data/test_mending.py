@@ -192,6 +192,24 @@ def test_without_copies_the_steps_say_what_the_episodes_file_does_not(place, cap
     assert_equal(data[3].observations[-1], numbered(3).observations[4])
 
 
+def test_a_damaged_copy_costs_nothing(place, capsys):
+    right = contents(place)
+    (place / COPY.format("001")).write_bytes(b"PK")
+    status, lines, _ = check(place, capsys)
+    assert (status, lines[1:]) == (0, [f"mended: {COPY.format('001')} is not as it was written"])
+    assert contents(place).keys() - {Path("meta/.writer")} == right.keys()
+    assert seeds(place) == [0, 1, 2, 3, 4, 5]
+
+
+def test_episodes_that_are_there_twice_stay_twice(tmp_path):
+    for _ in range(2):
+        write(tmp_path / "d", info_of(), [numbered(0), numbered(1)])
+    (tmp_path / "d/meta/stats.json").unlink()
+    (tmp_path / "d" / EPISODES.format("000")).unlink()
+    mend(Files(tmp_path / "d"))
+    assert seeds(tmp_path / "d") == [0, 1, 0, 1]
+
+
 def test_copies_are_made_of_a_data_set_that_has_none(place, capsys):
     shutil.rmtree(place / "copies")
     own = json.loads((place / "meta/bam.json").read_text())
