@@ -91,7 +91,7 @@ class DataSet:
         """Refuse an info.json that says something else than bam.json and the episodes."""
         frames = sum(row["length"] for row in self._rows)
         truth = Head(self.info, self.extra, len(self._rows), frames).content()
-        said = {name: head.get(name) for name in ("fps", "total_episodes", "total_frames", "splits")}
+        said = {name: head.get(name) for name in ("fps", "total_episodes", "total_frames")}
         new = self.extra.keys() - head["features"].keys()  # columns of a writer that has not counted them yet
         said["features"] = {name: head["features"].get(name) for name in truth["features"].keys() - new}
         for name, one in said.items():

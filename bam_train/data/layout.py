@@ -79,13 +79,15 @@ class Files:
 
     def require(self) -> None:
         """Raise BadDataSet unless a data set, or a part of one, is there; it names a bucket that is not there."""
+        if self.exists(INFO):  # who may read objects of a bucket may not list them
+            return
         if not self.root.is_dir():
             try:
                 self.root.size()
             except NoSuchPlace as error:
                 raise BadDataSet(str(error)) from error
             raise BadDataSet(f"{self.text}: is no data set but a file; give a folder that bam-data wrote")
-        if not any(self.exists(name) for name in (INFO, BAM, "meta/episodes", "data", "copies")):
+        if not any(self.exists(name) for name in (BAM, "meta/episodes", "data", "copies")):
             raise BadDataSet(f"{self.text}: is no data set: it has no {INFO}; give a folder that bam-data wrote")
 
     def content(self, name: str) -> bytes | None:

@@ -205,9 +205,11 @@ def _said(files: Files, reader: _Reader) -> dict[str, Any]:
 
 
 def _counts(said: dict[str, Any]) -> bool:
-    """Whether an info.json agrees with itself about the number of episodes."""
-    count = said.get("total_episodes")
-    return isinstance(count, int) and said.get("splits") == {"train": f"0:{count}"}
+    """Whether an info.json agrees with itself about the number of episodes; somebody may have split them."""
+    with contextlib.suppress(ValueError, TypeError, AttributeError):
+        ends = [int(part.partition(":")[2]) for part in said["splits"].values()] if said.get("splits") else []
+        return max(ends, default=-1) == said.get("total_episodes")
+    return False
 
 
 def _problems(pair: Pair, columns: list[Columns], head: Head) -> Iterator[str]:
@@ -241,7 +243,7 @@ def _differences(files: Files, head: Head, said: dict[str, Any], last: Copy | No
         yield f"{INFO} is missing or damaged"
     right = head.content()
     for key, value in right.items() if said else ():
-        there = said.get(key)
+        there = value if key == "splits" and _counts(said) else said.get(key)
         if key == "features" and isinstance(there, dict):
             there = {name: there.get(name) for name in value}
         if found := first_difference(there, value, key):

@@ -244,6 +244,15 @@ def test_a_rate_that_nobody_wrote_is_refused(place):
         mend(Files(place))
 
 
+def test_splits_of_somebody_stay(place):
+    info = json.loads((place / "meta/info.json").read_text())
+    (place / "meta/info.json").write_text(json.dumps({**info, "splits": {"train": "0:4", "test": "4:6"}}))
+    assert look(Files(place)).is_whole
+    assert seeds(place) == [0, 1, 2, 3, 4, 5]
+    (place / "meta/info.json").write_text(json.dumps({**info, "splits": {"train": "0:4", "test": "4:9"}}))
+    assert mend(Files(place)).problems == ['meta/info.json: splits.test is "4:9", expected null']
+
+
 @pytest.mark.parametrize("name", ["meta/stats.json", "meta/tasks.parquet"])
 def test_statistics_and_tasks_are_those_of_the_episodes(place, name, capsys):
     path = place / name
