@@ -144,7 +144,7 @@ def test_offline_to_online(bam_train):
 @pytest.mark.parametrize(
     ("flags", "text"),
     [
-        ({"data": "nowhere"}, "nowhere: is no data set: it has no meta/info.json; give a folder that bam-data wrote"),
+        ({"data": "nowhere"}, "nowhere: no such file or folder. Check the name"),
         ({"env": "bam/reach"}, "data: points is of elsewhere/Point-v0, not of bam/reach-v0; leave --env out"),
         ({"until_success": 0.9}, "until_success: nothing is chosen by simulation while learning from data"),
         ({"algo": "ppo"}, "Unknown algorithm 'ppo'. It is one of rllib's; those of offline are: awac, bc, cal-ql"),
