@@ -74,6 +74,7 @@ def test_a_run_without_a_preset_has_so_many_updates():
     assert resolve({"data": "points", "algo": "td3bc"}).steps == 20_000
     assert resolve({"data": "points", "algo": "bc", "steps": 700}).steps == 700
     assert resolve({"data": "picks", "algo": "iql"}).steps == 13_000  # of its preset
+    assert resolve({"data": "picks", "algo": "td3bc"}).steps == 10_000
 
 
 def test_cloning_needs_no_environment(bam_train):
