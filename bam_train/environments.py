@@ -263,6 +263,13 @@ def interface_pairs(checkpoint: Checkpoint, interface: Mapping[str, Any]) -> lis
     return pairs
 
 
+def held_out(env_id: str, env_kwargs: Mapping[str, Any], asked: Mapping[str, Any]) -> dict[str, Any]:
+    """Arguments of an environment for an evaluation: those that were asked for, else the test split if it has one."""
+    entry = entry_of(env_id)
+    split = {"split": "test"} if entry is not None and "split" in entry.options() else {}
+    return {**env_kwargs, **split, **asked}
+
+
 def first_difference(theirs: Any, ours: Any, name: str) -> tuple[str, Any, Any] | None:
     """The first difference of two JSON values: its name and both values; None if they are equal."""
     if isinstance(theirs, dict) and isinstance(ours, dict):

@@ -50,6 +50,8 @@ class Episode:
     """Number of steps."""
     success: bool | None
     """`is_success` in the info of its last step; None if the environment does not report it."""
+    start: int | None = None
+    """Number of its start where there are so many and no more, such as pictures of a test split."""
 
 
 @dataclass(frozen=True)
@@ -72,10 +74,13 @@ class EvaluationReport:
     return_max: float | None
     length_mean: float
     length_std: float
+    starts: int | None = None
+    """Number of different starts that there are, none of which counts twice; None if there are any number."""
 
     def to_json(self) -> dict[str, Any]:
         """The report as plain JSON values."""
-        return {**asdict(self), "success_interval": self.success_interval and list(self.success_interval)}
+        found = {**asdict(self), "success_interval": self.success_interval and list(self.success_interval)}
+        return {name: value for name, value in found.items() if name != "starts" or value is not None}
 
 
 def wilson_interval(successes: int, episodes: int) -> tuple[float, float]:
@@ -91,7 +96,7 @@ def wilson_interval(successes: int, episodes: int) -> tuple[float, float]:
     return low, high
 
 
-def summarise(env: str, episodes: Sequence[Episode]) -> EvaluationReport:
+def summarise(env: str, episodes: Sequence[Episode], starts: int | None = None) -> EvaluationReport:
     """The report over `episodes` (at least one), which are in the order of their seeds."""
 
     def finite(value: float) -> float | None:
@@ -113,6 +118,7 @@ def summarise(env: str, episodes: Sequence[Episode]) -> EvaluationReport:
         return_max=finite(totals.max()),
         length_mean=float(lengths.mean()),
         length_std=float(lengths.std()),
+        starts=starts,
     )
 
 
@@ -133,7 +139,7 @@ def evaluate(
         policy: The policy to evaluate; its recurrent state is reset at the start of every episode.
         env_id: Gymnasium id.
         env_kwargs: Keyword arguments of the environment.
-        episodes: At least 1.
+        episodes: At least 1. Of an environment with fewer different starts, each is played once.
         seed: Seed of the first episode; episode k gets ``seed + k``.
         num_envs: Number of environments stepped together; by default that of `default_num_envs`.
         env: A vector environment of `make_vector_env`, used instead of a new one; it is left open.
@@ -152,25 +158,44 @@ def evaluate(
         env = make_vector_env(env_id, env_kwargs, num_envs or default_num_envs(env_id, episodes))
     elif env.metadata.get("autoreset_mode") is not AutoresetMode.SAME_STEP:
         raise SettingsError(f"env: expected autoreset mode SAME_STEP, found {env.metadata.get('autoreset_mode')}")
-    finite, done = FiniteVectorEnv(env, env_id), list[Episode]()
+    finite, done, seen = FiniteVectorEnv(env, env_id), list[Episode](), set[int]()
+    starts = number_of_starts(env)
+    wanted, played = min(episodes, starts or episodes), 0
     try:
-        while len(done) < episodes:
-            done += play_wave(finite, policy, seed + len(done), min(env.num_envs, episodes - len(done)))
+        while len(done) < wanted:
+            count = min(env.num_envs, wanted - len(done)) if starts is None else env.num_envs
+            done += first_of_each(play_wave(finite, policy, seed + played, count), seen)
+            played += count
             if on_progress is not None:
-                on_progress(len(done), episodes)
+                on_progress(min(len(done), wanted), wanted)
     finally:
         if is_new:
             env.close()
-    return summarise(env_id, done)
+    return summarise(env_id, done[:wanted], starts)
+
+
+def number_of_starts(env: VectorEnv[Any, Any, Any]) -> int | None:
+    """How many different episodes can begin; None if there is no such number."""
+    count: int | None = getattr(getattr(env.unwrapped, "task", None), "num_starts", None)
+    return count
+
+
+def first_of_each(episodes: Sequence[Episode], seen: set[int]) -> list[Episode]:
+    """The episodes whose start is not one of `seen`, to which theirs are added: a second one would say the same."""
+    found = []
+    for one in episodes:
+        found += [] if one.start in seen else [one]
+        seen |= set() if one.start is None else {one.start}
+    return found
 
 
 def play_wave(env: VectorEnv[Any, Any, Any], policy: BatchPolicy, seed: int, count: int) -> list[Episode]:
     """Play one episode in each of the first `count` environments; every environment i gets the seed ``seed + i``."""
     batch = _Batch(lambda: env, auto_reset=False, arrays="numpy", info_keys=("is_success",))
     acting = PolicyAgent(policy, [f"env/{name}" for name in names(env.single_observation_space)])
-    workspace = Workspace(window=2)
+    workspace, wave = Workspace(window=2), _Wave(count, env)
     seeds = [seed + i for i in range(env.num_envs)]
-    loop = TemporalAgent(Agents(batch, _Wave(count), acting))
+    loop = TemporalAgent(Agents(batch, wave, acting))
     loop(workspace, t=0, stop_variable="wave/done", seed=seeds)
     last = {name: workspace.get(name, -1) for name in workspace}  # repeats until all have ended
 
@@ -179,7 +204,12 @@ def play_wave(env: VectorEnv[Any, Any, Any], policy: BatchPolicy, seed: int, cou
         return bool(last["env/info/is_success"][i]) if is_reported else None
 
     totals, lengths = last["env/cumulated_reward"], last["env/timestep"]
-    return [Episode(seed + i, float(totals[i]), int(lengths[i]), success(i)) for i in range(count)]
+    return [
+        Episode(
+            seed + i, float(totals[i]), int(lengths[i]), success(i), None if wave.starts is None else wave.starts[i]
+        )
+        for i in range(count)
+    ]
 
 
 def record_video(env: gym.Env[Any, Any], policy: Any, add: Callable[[Frame], Any], *, episodes: int, seed: int) -> int:
@@ -215,11 +245,16 @@ class _Wave(Agent):
     reads = ("env/done",)
     writes = ("wave/done",)
 
-    def __init__(self, count: int) -> None:
+    def __init__(self, count: int, env: VectorEnv[Any, Any, Any]) -> None:
         super().__init__()
-        self._count = count
+        self._count, self._env = count, env
+        self.starts: list[int] | None = None
+        """Number of the start of each environment, where there are so many and no more."""
 
     def forward(self, t: int, **kwargs: Any) -> None:
+        if t == 0 and number_of_starts(self._env) is not None:
+            inner: Any = self._env.unwrapped
+            self.starts = inner.task.drawn.tolist()
         done = self.get(("env/done", t)).copy()
         done[self._count :] = True
         self.set(("wave/done", t), done)

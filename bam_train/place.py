@@ -176,7 +176,9 @@ class Place:
         """Size of the file [bytes]."""
         with self._errors("read"):
             size = self.local.stat().st_size if self.local is not None else self._info().size
-        return size if size is not None else self._missing()
+        if size is None:
+            raise NoSuchPlace(self, self._why_missing())
+        return size
 
     def list(self) -> list[Place]:
         """What is in the folder, by name; raises NoSuchPlace if there is no folder."""
@@ -194,9 +196,6 @@ class Place:
 
     def _info(self) -> Any:
         return self.filesystem.get_file_info(self.path)
-
-    def _missing(self) -> Any:
-        raise NoSuchPlace(self, "no such file. Check the name")
 
     # Reading
 

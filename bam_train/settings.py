@@ -47,7 +47,8 @@ class TrainSettings:
     With --trainer rllib: ppo, appo, impala, sac, tqc, dqn, bc, marwil, cql or iql. With --data: bc, iql, cql, td3bc,
     awac, cal-ql, plas or rebrac. With --teacher: dagger. For grasps from a picture: grasp-q."""
     steps: _Steps = 100_000
-    """Steps of the whole run, also after --resume; with --data, updates (default: the preset's, or 100000)."""
+    """Environment steps of the whole run, also after --resume; with --data, updates (default: the preset's, or 100000;
+    20000 updates)."""
     seed: Annotated[int, Meta(ge=0, le=10**15)] = 0
     """Seed of weights, exploration and environments: environment i gets seed + i (default 0)."""
     num_envs: Annotated[int, Meta(ge=1, le=100_000)] = 1

@@ -1,10 +1,11 @@
 """Evaluate the committed checkpoints and write the table in ``checkpoints/README.md``.
 
 Command, seed and steps come from each checkpoint's manifest, wall time from the run that made it (`--runs`) or, without
-that, from the table as it is; the success rate is measured here, over episodes that neither training nor its
-evaluations have seen: those of ``bam-eval --episodes 1000``. A policy that was trained with randomised physics, late
-actions or a link is evaluated without them here; ``scripts/evaluate_links.py`` evaluates all with them. Where there is
-a training and a test split, it is the test split that counts.
+that, from the table as it is; the success rates are measured here, over episodes that neither training nor its
+evaluations have seen. The first one is that of ``bam-eval CHECKPOINT --episodes 1000``: a policy that was trained with
+randomised physics, late actions or a link is evaluated with them. The second one is without them;
+``scripts/evaluate_links.py`` evaluates all with them. Where there is a training and a test split, it is the test split
+that counts, and each picture of it counts once.
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ from bam_envs.core.registry import entry_of
 from bam_train.checkpoint import Checkpoint, Manifest
 from bam_train.cli.console import duration
 from bam_train.env_location import SIMULATED
+from bam_train.environments import held_out
 from bam_train.errors import BamTrainError
 from bam_train.evaluation import FIRST_SEED, EvaluationReport, evaluate
 from bam_train.policy import FrozenPolicy
@@ -29,7 +31,7 @@ from bam_train.settings import differences, file_stem
 from bam_train.trainers.resolve_settings import resolve
 
 FOLDER = Path(__file__).resolve().parents[1] / "checkpoints"
-HEADER = ("checkpoint", "command", "seed", "steps", "wall time", "success", "size")
+HEADER = ("checkpoint", "command", "seed", "steps", "wall time", "success", "plain", "size")
 FLAGS = (
     *("steps", "seed", "num_envs", "device", "threads", "start", "until_success", "eval_every", "eval_episodes"),
     *("num_env_runners", "num_learners", "num_gpus", "address", "data"),
@@ -87,7 +89,7 @@ def old_wall_times(text: str) -> dict[tuple[str, ...], str]:
     """(checkpoint, command, seed, steps) of each row of the table as it is, to its wall time."""
     rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in text.splitlines() if line[:1] == "|"]
     place = HEADER.index("wall time")
-    return {tuple(row[:place]): row[place] for row in rows if len(row) == len(HEADER)}
+    return {tuple(row[:place]): row[place] for row in rows if len(row) > place}
 
 
 def row(path: Path, episodes: int, runs: Path, known: dict[tuple[str, ...], str]) -> list[str]:
@@ -95,21 +97,25 @@ def row(path: Path, episodes: int, runs: Path, known: dict[tuple[str, ...], str]
     checkpoint = Checkpoint.open(path)
     manifest = checkpoint.manifest
     policy = FrozenPolicy.from_checkpoint(checkpoint)
-    entry = entry_of(manifest.env)
-    plain = {} if entry is None else {**SIMULATED, **({"split": "test"} if "split" in entry.options() else {})}
-    report = evaluate(policy, manifest.env, {**manifest.env_kwargs, **plain}, episodes=episodes, seed=FIRST_SEED)
+    rates: list[str] = []
+    for asked in ({}, SIMULATED):
+        kwargs = held_out(manifest.env, manifest.env_kwargs, {} if entry_of(manifest.env) is None else asked)
+        if not rates or any(manifest.env_kwargs.get(name) for name in SIMULATED):
+            rates.append(success(evaluate(policy, manifest.env, kwargs, episodes=episodes, seed=FIRST_SEED)))
+    rates += [""] if len(rates) == 1 else []
     made = [f"`{command(manifest, path.name)}`", str(manifest.seed), f"{manifest.steps:,}"]
     first = [f"[{path.name}]({path.name})", *made]
     seconds = wall_time(manifest, runs) or known.get(tuple(first), "not recorded")
-    return [*first, seconds, success(report), f"{path.stat().st_size / 1000:.0f} kB"]
+    return [*first, seconds, *rates, f"{path.stat().st_size / 1000:.0f} kB"]
 
 
 def success(report: EvaluationReport) -> str:
-    """The success rate and its 95 % interval."""
+    """The success rate and its 95 % interval, and how many episodes there are if fewer than asked for."""
     if report.success_rate is None or report.success_interval is None:
         return "not reported"
     low, high = report.success_interval
-    return f"{report.success_rate:.1%} ({low:.1%} to {high:.1%})"
+    of_all = "" if report.starts is None else f" of all {report.episodes}"
+    return f"{report.success_rate:.1%}{of_all} ({low:.1%} to {high:.1%})"
 
 
 def main() -> int:

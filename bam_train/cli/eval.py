@@ -53,8 +53,12 @@ def evaluate_checkpoint(config: EvalConfig) -> None:
             env.reset(seed=0)
             picture(env)
 
+    told = 0
+
     def on_progress(done: int, episodes: int) -> None:
-        if done < episodes:
+        nonlocal told
+        if told + 0.05 * episodes <= done < episodes:
+            told = done
             say(f"bam-eval: {done} of {episodes} episodes")
 
     num_envs = config.num_envs or default_num_envs(subject.env, config.episodes)
@@ -151,7 +155,7 @@ def _add_detector(subject: _Subject, path: Path) -> None:
 def _own(config: EvalConfig, path: Path) -> _Subject:
     """Open a checkpoint of bam-train, without unpickling and without torch."""
     from bam_train.checkpoint import Checkpoint
-    from bam_train.environments import environment_of, require_env_kwargs
+    from bam_train.environments import environment_of, held_out, require_env_kwargs
     from bam_train.errors import CheckpointMismatch
     from bam_train.policy import FrozenPolicy
     from bam_train.settings import read_env_kwargs
@@ -163,7 +167,8 @@ def _own(config: EvalConfig, path: Path) -> _Subject:
         raise CheckpointMismatch(path, f"was trained by {manifest.algorithm}, not by {config.algo}; leave --algo out")
     require_env_kwargs(env_id, asked)
     policy = FrozenPolicy.from_checkpoint(checkpoint)
-    return _Subject(policy, env_id, {**env_kwargs, **asked}, manifest.algorithm, manifest.steps, asked, checkpoint)
+    used = held_out(env_id, env_kwargs, asked)
+    return _Subject(policy, env_id, used, manifest.algorithm, manifest.steps, asked, checkpoint)
 
 
 def _foreign(config: EvalConfig, path: Path) -> _Subject:
@@ -209,12 +214,16 @@ def _table(report: EvaluationReport, subject: _Subject, path: Path) -> list[str]
     if report.return_min is not None and report.return_max is not None:
         extremes = f"from {report.return_min:.2f} to {report.return_max:.2f}"
     what = f"{path} ({subject.algorithm}, {subject.steps:,} steps) on {report.env}"
+    seeds = f"seeds {report.seed} to {report.seed + report.episodes - 1}"
+    if report.starts is not None:
+        all_of_them = "all" if report.episodes == report.starts else f"of {report.starts}"
+        seeds = f"{all_of_them} different starts, none of them twice"
     return [
         what + (f" with {given}" if given else ""),
         f"  success   {success}",
         f"  return    {returns}, {extremes}",
         f"  length    {report.length_mean:.2f} ± {report.length_std:.2f} steps",
-        f"  episodes  {report.episodes}, seeds {report.seed} to {report.seed + report.episodes - 1}",
+        f"  episodes  {report.episodes}, {seeds}",
     ]
 
 

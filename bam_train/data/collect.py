@@ -12,6 +12,7 @@ import gymnasium as gym
 import numpy as np
 
 from bam_envs.core.registry import resolve_id
+from bam_envs.core.wording import brief
 from bam_envs.tasks.scripted import scripted_policy
 from bam_train.checkpoint import Checkpoint
 from bam_train.data.episode import Array
@@ -167,7 +168,7 @@ class Disturbance:
 
     def __init__(self, space: gym.Space[Any], noise: float, random: float, num_envs: int, seed: int) -> None:
         if noise and not isinstance(space, gym.spaces.Box):
-            raise SettingsError(f"--noise is for continuous actions, found {space}; use --random")
+            raise SettingsError(f"--noise is for continuous actions, found {brief(space)}; use --random")
         self._space, self._noise, self._random = space, noise, random
         self._rng = np.random.default_rng([seed, 1])
         self._draws = gym.vector.utils.batch_space(space, num_envs)

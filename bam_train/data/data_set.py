@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import json
 from collections.abc import Iterator, Mapping, Sequence
@@ -13,20 +14,29 @@ import numpy as np
 from bam_envs.core.errors import BamEnvsError
 from bam_train.data.arrow_columns import from_arrow
 from bam_train.data.episode import Array, DataSetInfo, Episode, Transitions, Values, digest_of, joined, leaves_of
+from bam_train.data.file_pair import Copy, Head, sha256
 from bam_train.data.layout import (
     BAM,
     CHUNK,
+    COPIES,
     DATA,
     DEFAULTS,
     EPISODES,
+    EXTRA,
     FINAL,
     FORMAT,
     INFO,
     LIGHT,
     NEXT,
+    ROW,
+    STATS,
+    UNREADABLE,
     Files,
     file_name,
+    row_digest,
+    sealed,
 )
+from bam_train.environments import first_difference, short_json
 from bam_train.errors import BadDataSet, PlaceError
 from bam_train.place import Place
 
@@ -61,26 +71,48 @@ class DataSet:
             BadDataSet: There is none, a file of it is missing or damaged, or a newer bam-train wrote it.
         """
         files = Files(place)
-        if not files.exists(INFO):
-            raise BadDataSet(f"{place}: is no data set: it has no {INFO}; give a folder that bam-data wrote")
+        files.require()
         head = files.read_json(INFO)
-        if not files.exists(BAM):
+        if not files.exists(BAM) and not files.numbers(COPIES):
             raise BadDataSet(f"{place}: has no {BAM}, so its environment is unknown; bam-train did not write it")
         own = files.read_json(BAM)
         if not isinstance(own.get("format"), int) or own["format"] > FORMAT:
             raise BadDataSet(f"{place}: has format {own.get('format')}; this bam-train reads up to {FORMAT}. Update it")
+        if sealed(own)["digest"] != own.get("digest", sealed(own)["digest"]):  # older ones have none
+            raise BadDataSet(f"{place}: {BAM} is not as it was written; run bam-data check {place}")
         try:
-            return cls(files, DataSetInfo.from_json(own), head, own["columns"])
+            data = cls(files, DataSetInfo.from_json(own), head, own["columns"])
+            data._require_true(head)
         except (KeyError, TypeError, ValueError, BamEnvsError) as error:
             raise BadDataSet(f"{place}: {BAM} or {INFO} is damaged: {error!r}; run bam-data check {place}") from error
+        return data
+
+    def _require_true(self, head: Mapping[str, Any]) -> None:
+        """Refuse an info.json that says something else than bam.json and the episodes."""
+        frames = sum(row["length"] for row in self._rows)
+        truth = Head(self.info, self.extra, len(self._rows), frames).content()
+        said = {name: head.get(name) for name in ("fps", "total_episodes", "total_frames")}
+        new = self.extra.keys() - head["features"].keys()  # columns of a writer that has not counted them yet
+        said["features"] = {name: head["features"].get(name) for name in truth["features"].keys() - new}
+        for name, one in said.items():
+            true = {key: truth[name][key] for key in one} if isinstance(one, dict) else truth[name]
+            if found := first_difference(one, true, name):
+                what, wrong, right = found
+                text = f"{INFO}: {what} is {short_json(wrong)}, expected {short_json(right)}"
+                raise BadDataSet(f"{self.place}: {text}; run bam-data check {self.place}")
 
     def _read_rows(self, count: int) -> list[dict[str, Any]]:
         rows: list[dict[str, Any]] = []
         number = 0
         while len(rows) < count:
             name = file_name(EPISODES, number)
-            table = self._files.open_parquet(name, LIGHT)
-            rows += table.to_pylist()
+            table = self._files.open_parquet(name, (*LIGHT, EXTRA, ROW))
+            found = table.to_pylist()
+            if {*LIGHT} - {*table.column_names} or any(
+                row_digest(row) != row.get(ROW, row_digest(row)) for row in found
+            ):
+                raise BadDataSet(f"{self.place}: {name} is not as it was written; run bam-data check {self.place}")
+            rows += found
             number += 1
         if [row["episode_index"] for row in rows] != list(range(len(rows))):
             raise BadDataSet(f"{self.place}: its episodes are not numbered from 0 on; run bam-data check {self.place}")
@@ -115,6 +147,24 @@ class DataSet:
         """Names of the further columns of an episode, without reading it."""
         return list(json.loads(self._rows[self._index(index)]["bam/columns"]))
 
+    def stats(self) -> dict[str, Any]:
+        """Least, greatest, mean, deviation and quantiles of each column, as LeRobot has them.
+
+        Raises:
+            BadDataSet: They are not those of its steps.
+        """
+        if not self.next_file:
+            return {}
+        copy = Copy.from_bytes(self._files.content(file_name(COPIES, self.next_file - 1)))
+        with contextlib.suppress(*UNREADABLE):
+            content = self._files.content(STATS) or b""
+            stats: dict[str, Any] = json.loads(content)
+            if stats["next.reward"]["count"] == [self.total_frames] and (
+                not copy or copy.others[STATS] == sha256(content)
+            ):
+                return stats
+        raise BadDataSet(f"{self.place}: {STATS} is not that of its steps; run bam-data check {self.place}")
+
     def _index(self, index: int) -> int:
         if not -len(self) <= index < len(self):
             raise IndexError(f"{self.place}: has {len(self)} episodes, and there is no episode {index}")
@@ -148,8 +198,6 @@ class DataSet:
         return int(row["data/chunk_index"]) * CHUNK + int(row["data/file_index"])
 
     def _of_file(self, number: int, indices: Sequence[int]) -> Iterator[Episode]:
-        import pyarrow as pa
-
         name = file_name(DATA, number)
         try:
             data = self._files.open_parquet(name)
@@ -168,7 +216,7 @@ class DataSet:
                     batch, size = [], 0
         except PlaceError:
             raise
-        except (OSError, pa.ArrowException, KeyError, IndexError) as error:
+        except UNREADABLE as error:
             why = str(error).partition("\n")[0]
             raise BadDataSet(f"{self.place}: {name} is damaged: {why}; run bam-data check {self.place}") from error
 
@@ -182,14 +230,18 @@ class DataSet:
                 numbers = np.unique(steps["episode_index"].to_numpy()).tolist()
                 if len(steps) != length or numbers != [index]:
                     raise ValueError(f"its place has {len(steps)} steps of episodes {numbers}")
+                if missing := {*DEFAULTS, *NEXT} - {*steps.column_names}:
+                    raise ValueError(f"it has no column {min(missing)}")
                 yield self.read(self._rows[index], steps, last.slice(index - first, 1))
-            except (ValueError, KeyError) as error:
+            except UNREADABLE as error:
                 raise BadDataSet(
                     f"{self.place}: {name}: episode {index} is damaged: {error}; run bam-data check {self.place}"
                 ) from error
 
     def read(self, row: Mapping[str, Any], steps: Any, final: Any) -> Episode:
         """An episode of its rows in the files: that of the episodes, those of its steps, and its last observation.
+
+        Digests that the row lacks are not compared.
 
         Raises:
             ValueError: They are not the numbers that were written.
@@ -203,14 +255,17 @@ class DataSet:
         rewards = from_arrow(steps["next.reward"], (), np.dtype(np.float64))
         end = (row["bam/terminated"], row["bam/truncated"], row["bam/success"])
         digest = digest_of({**arrays, "reward": rewards}, *end)
-        if digest != row["bam/digest"]:
+        columns = self._columns(row, steps, [*arrays, *NEXT, *DEFAULTS])
+        own = {name: columns[name] for name in json.loads(row["bam/columns"])}
+        pairs = ((digest, row["bam/digest"]), (row.get(EXTRA) and digest_of(own), row.get(EXTRA)))
+        if any(found != written for found, written in pairs if written is not None):
             raise ValueError("its numbers are not those that were written")
         return Episode(
             joined(self.info.observation_space, arrays, self._observation),
             joined(self.info.action_space, arrays, self._action),
             rewards,
             *end,
-            columns=self._columns(row, steps, [*arrays, *NEXT, *DEFAULTS]),
+            columns=columns,
             facts=json.loads(row["bam/facts"]),
             digest=digest,
         )

@@ -14,6 +14,7 @@ from bam_envs.core.errors import InvalidValue
 from bam_envs.core.robot import EnvIds, RobotState
 from bam_envs.core.task import Array, Label, Score
 from bam_envs.core.validation import NonNegative, check
+from bam_envs.core.wording import brief
 from bam_envs.local.local_task import LocalTask, one_step
 from bam_train.data.data_set import DataSet
 from bam_train.data.episode import Transitions
@@ -79,7 +80,9 @@ class DataSetTask(LocalTask):
         observed = self.observation_space.spaces if isinstance(self.observation_space, spaces.Dict) else {}
         for space in (*(observed.values() or [self.observation_space]), self.action_space):
             if not isinstance(space, _ARRAYS):
-                raise InvalidValue(f"bam/dataset-v0: {data} has the space {space}; expected arrays, or a Dict of them")
+                raise InvalidValue(
+                    f"bam/dataset-v0: {data} has the space {brief(space)}; expected arrays, or a Dict of them"
+                )
         self.observation_labels = tuple(Label(name, "as recorded", "") for name in observed or ["observation"])
         self.action_labels = (Label("action", "as recorded", ""),)
         self.drawn = np.zeros(num_envs, np.int64)
@@ -97,9 +100,14 @@ class DataSetTask(LocalTask):
         except BadDataSet as error:
             raise InvalidValue(f"bam/dataset-v0: {error}") from error
 
+    @property
+    def num_starts(self) -> int:
+        """How many steps there are; `drawn` says which is shown."""
+        return len(self.steps.rewards)
+
     def begin(self, env_ids: EnvIds, rngs: Sequence[np.random.Generator]) -> None:
         """Draw a step."""
-        count = len(self.steps.rewards)
+        count = self.num_starts
         self.own_memory()
         self.drawn[env_ids] = [int(rng.integers(count)) for rng in rngs]
 

@@ -13,9 +13,8 @@ from bam_envs.core.wording import brief
 from bam_train.data.data_set import DataSet
 from bam_train.data.episode import Array, DataSetInfo, Episode, Leaf, digest_of, leaves_of
 from bam_train.data.file_pair import Columns, Head, kind_of
-from bam_train.data.layout import DATA, DEFAULTS, EPISODES, INFO, STATS, Files, WriterLock, file_name
+from bam_train.data.layout import BAM, COPIES, DATA, DEFAULTS, EPISODES, INFO, Files, WriterLock, file_name
 from bam_train.data.mending import mend
-from bam_train.data.statistics import add_stats, stats_of
 from bam_train.environments import first_difference, short_json
 from bam_train.errors import BadDataSet
 from bam_train.place import Place
@@ -53,7 +52,6 @@ class DataSetWriter:
         self._action = leaves_of(info.action_space, "action")
         self._waiting: list[Columns] = []
         self._bytes = 0
-        self._images = {leaf.column for leaf in self._observation if leaf.is_image}
         self._lock = WriterLock(self._files)
         try:
             self._open()
@@ -62,19 +60,27 @@ class DataSetWriter:
             raise
 
     def _open(self) -> None:
-        self._stats: dict[str, Any] = {}
-        if not self._files.exists(INFO):
+        files, kinds = self._files, (DATA, EPISODES, COPIES)
+        if not files.exists(INFO):
+            if any(files.numbers(kind) for kind in kinds):
+                raise BadDataSet(f"{files.text}: {INFO} is missing; run bam-data check {files.text}")
             self._head = Head(self.info, {})
-            self._head.write_columns(self._files)
-            self._head.write(self._files)
+            files.write_json(BAM, self._head.own())
+            self._head.write(files)
             return
-        old = DataSet.open(self._files.text)
-        require_same(self._files.text, old.info, self.info)
-        if any(self._files.exists(file_name(kind, old.next_file)) for kind in (DATA, EPISODES)):
-            mend(self._files)  # a writer was killed
-            old = DataSet.open(self._files.text)
-        self._head = Head(self.info, dict(old.extra), len(old), old.total_frames, old.next_file, list(old.tasks))
-        self._stats = stats_of(self._files, old)
+        old = DataSet.open(files.text)
+        require_same(files.text, old.info, self.info)
+        try:
+            stats = old.stats()
+        except BadDataSet:
+            stats = None
+        if stats is None or any(files.exists(file_name(kind, old.next_file)) for kind in kinds):
+            if lost := mend(files).lost:  # else a writer was killed
+                raise BadDataSet(f"{files.text}: is damaged: {lost[0]}; run bam-data check {files.text}")
+            old = DataSet.open(files.text)
+            stats = old.stats()
+        counts = (len(old), old.total_frames, old.next_file)
+        self._head = Head(self.info, dict(old.extra), *counts, list(old.tasks), stats)
 
     def __enter__(self) -> Self:
         return self
@@ -142,13 +148,11 @@ class DataSetWriter:
         return array
 
     def flush(self) -> None:
-        """Write the episodes in memory: a data file, an episodes file, then info.json."""
+        """Write the episodes in memory: a copy, a data file, an episodes file, then info.json."""
         if not self._waiting:
             return
-        self._head.write_columns(self._files)
+        self._files.write_json(BAM, self._head.own())
         self._head.write_pair(self._files, self._waiting)
-        self._stats = add_stats(self._stats, [one.steps for one in self._waiting], self._images)
-        self._files.write_json(STATS, self._stats)
         self._head.write(self._files)
         self._waiting, self._bytes = [], 0
 
@@ -161,8 +165,15 @@ class DataSetWriter:
                 self._lock.release()
 
 
-def require_same(place: str, there: DataSetInfo, given: DataSetInfo) -> None:
+def require_same(place: str, there: DataSetInfo, given: DataSetInfo, whose: str = "", remedy: str = "") -> None:
     """Refuse episodes that do not belong to those that are there.
+
+    Args:
+        place: The place of those.
+        there: What is equal for them.
+        given: What is equal for the others.
+        whose: The others, by default the new episodes.
+        remedy: What to do, by default to write them into another place.
 
     Raises:
         BadDataSet: Names the first thing that differs, and both values.
@@ -175,7 +186,5 @@ def require_same(place: str, there: DataSetInfo, given: DataSetInfo) -> None:
         difference = first_difference(old[name], new[name], name)
         if difference is not None:
             what, theirs, ours = difference
-            raise BadDataSet(
-                f"{place}: {what} is {short_json(theirs)} there, and {short_json(ours)} of the new episodes; "
-                f"write {brief(given.env)} into another place"
-            )
+            text = f"{what} is {short_json(theirs)} there, and {short_json(ours)} of {whose or 'the new episodes'}"
+            raise BadDataSet(f"{place}: {text}; {remedy or f'write {brief(given.env)} into another place'}")

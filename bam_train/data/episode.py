@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bam_envs.core.spaces import space_from_json, space_to_json
+from bam_envs.core.wording import brief
 from bam_train.errors import BadDataSet
 
 Array = NDArray[Any]
@@ -152,7 +153,7 @@ def _leaves(space: gym.Space[Any], kind: str, path: tuple[str | int, ...]) -> An
     else:
         where = "".join(f"[{part!r}]" for part in path)
         raise BadDataSet(
-            f"the {kind} space{where} is {space}; a data set holds Box, Discrete, MultiDiscrete, MultiBinary, "
+            f"the {kind} space{where} is {brief(space)}; a data set holds Box, Discrete, MultiDiscrete, MultiBinary, "
             "and Dict and Tuple of them"
         )
 
@@ -171,13 +172,16 @@ def joined(space: gym.Space[Any], arrays: Mapping[str, Array], leaves: list[Leaf
     return build(space, ())
 
 
-def digest_of(arrays: Mapping[str, Array], terminated: bool, truncated: bool, success: bool | None) -> str:
-    """SHA-256 of an episode's arrays by column and of its end; hexadecimal."""
+def digest_of(arrays: Mapping[str, Array], *end: bool | None) -> str:
+    """SHA-256 of an episode's arrays by column, and of how it ended: terminated, truncated, success; hexadecimal."""
     digest = hashlib.sha256()
     for name in sorted(arrays):
         array = np.ascontiguousarray(arrays[name])
+        if array.dtype.kind in "UO":
+            digest.update(json.dumps([name, [str(one) for one in array]]).encode())
+            continue
         array = array.astype(array.dtype.newbyteorder("<"), copy=False)
         digest.update(f"{name}:{array.dtype.str}:{array.shape};".encode())
         digest.update(array.reshape(-1).view(np.uint8).data)
-    digest.update(json.dumps([bool(terminated), bool(truncated), success]).encode())
+    digest.update(json.dumps(end).encode())
     return digest.hexdigest()

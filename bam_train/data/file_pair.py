@@ -1,8 +1,13 @@
-"""One data file and the episodes file of the same number, which a flush writes together."""
+"""One data file and the episodes file of the same number, which a flush writes together, and the copy of both."""
 
 from __future__ import annotations
 
+import hashlib
+import io
 import json
+import struct
+import zipfile
+import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -10,23 +15,35 @@ from typing import Any
 import numpy as np
 
 from bam_train.data.arrow_columns import Arrow, to_arrow
-from bam_train.data.episode import Array, DataSetInfo, Episode, leaves_of
+from bam_train.data.episode import Array, DataSetInfo, Episode, digest_of, leaves_of
 from bam_train.data.layout import (
-    BAM,
     CHUNK,
+    COPIES,
     DATA,
     DEFAULTS,
     EPISODES,
+    EXTRA,
     FINAL,
     FORMAT,
     INFO,
     NEXT,
+    ROW,
+    STATS,
     TASKS,
     VERSION,
     Files,
     file_name,
+    json_bytes,
+    parquet_bytes,
+    row_digest,
+    sealed,
     tasks_table,
 )
+from bam_train.data.statistics import add_stats
+
+_TAIL = struct.Struct("<I4s")  # how a Parquet file ends: length of its footer, magic
+MAGIC = b"PAR1"
+"""How a Parquet file begins and ends."""
 
 
 @dataclass
@@ -58,7 +75,7 @@ class Columns:
 
 @dataclass
 class Head:
-    """How far a data set is written: the content of its info.json."""
+    """How far a data set is written: the content of its info.json, stats.json and tasks.parquet."""
 
     info: DataSetInfo
     extra: dict[str, dict[str, Any]]
@@ -68,6 +85,11 @@ class Head:
     file: int = 0
     """Number of the next file."""
     tasks: list[str] = field(default_factory=list)
+    stats: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def _images(self) -> set[str]:
+        return {leaf.column for leaf in leaves_of(self.info.observation_space, "observation") if leaf.is_image}
 
     def task(self, episode: Episode) -> int:
         """Index of the episode's task, which is added if it is new."""
@@ -76,34 +98,37 @@ class Head:
             self.tasks.append(task)
         return self.tasks.index(task)
 
-    def pass_by(self, episodes: Sequence[Episode]) -> None:
-        """Count the episodes of the next file, which is there."""
-        for episode in episodes:
-            self.task(episode)
-            self.episodes, self.frames = self.episodes + 1, self.frames + len(episode)
-        self.file += 1
+    def count(self, episode: Episode) -> None:
+        """Count the next episode."""
+        self.task(episode)
+        self.episodes, self.frames = self.episodes + 1, self.frames + len(episode)
+
+    def add_stats(self, episodes: Sequence[Columns]) -> None:
+        """Add the steps of the episodes of a file to the statistics."""
+        self.stats = add_stats(self.stats, [one.steps for one in episodes], self._images)
 
     def write_pair(self, files: Files, episodes: Sequence[Columns]) -> None:
-        """Write the next data file, the tasks and the next episodes file; `write` makes them visible."""
+        """Write the next copy, data file and episodes file; `write` makes them visible."""
         import pyarrow as pa
 
-        images = {leaf.column for leaf in leaves_of(self.info.observation_space, "observation") if leaf.is_image}
-        tables, rows = [], []
+        tables, rows, images = [], [], self._images
         for one in episodes:
             for name, values in one.episode.columns.items():
                 self.extra.setdefault(name, kind_of(values))
             steps = {name: to_arrow(values, is_image=name in images) for name, values in one.steps.items()}
-            tables.append(pa.table(steps | self._places(one.episode)))
+            tables.append(pa.table(steps | self.places(one.episode)))
             rows.append(self._row(one))
-            self.episodes, self.frames = self.episodes + 1, self.frames + len(one.episode)
-        data = pa.concat_tables(tables, promote_options="default")
-        files.write_table(file_name(DATA, self.file), data, [len(table) for table in tables])
-        files.write_table(TASKS, tasks_table(self.tasks))
-        files.write_table(file_name(EPISODES, self.file), _table(rows, images))
+            self.count(one.episode)
+        self.add_stats(episodes)
+        data = parquet_bytes(pa.concat_tables(tables, promote_options="default"), [len(table) for table in tables])
+        heads = parquet_bytes(_table(rows, images))
+        files.write(file_name(COPIES, self.file), self.copy(data, heads).to_bytes())
+        files.write(file_name(DATA, self.file), data)
+        files.write(file_name(EPISODES, self.file), heads)
         self.file += 1
 
-    def _places(self, episode: Episode) -> dict[str, Arrow]:
-        """The columns that LeRobot needs."""
+    def places(self, episode: Episode) -> dict[str, Arrow]:
+        """The columns that LeRobot needs, of the next episode."""
         import pyarrow as pa
 
         index = np.arange(len(episode))
@@ -116,8 +141,9 @@ class Head:
         }
         return {name: pa.array(values) for name, values in columns.items()}
 
-    def _row(self, one: Columns) -> dict[str, Any]:
-        episode, places = one.episode, {"chunk_index": self.file // CHUNK, "file_index": self.file % CHUNK}
+    def numbers(self, episode: Episode) -> dict[str, Any]:
+        """What of the row of the next episode follows from the episodes before."""
+        places = {"chunk_index": self.file // CHUNK, "file_index": self.file % CHUNK}
         return {
             "episode_index": self.episodes,
             "tasks": [self.tasks[self.task(episode)]],
@@ -126,6 +152,12 @@ class Head:
             "dataset_from_index": self.frames,
             "dataset_to_index": self.frames + len(episode),
             **{f"meta/episodes/{name}": value for name, value in places.items()},
+        }
+
+    def _row(self, one: Columns) -> dict[str, Any]:
+        episode = one.episode
+        row = {
+            **self.numbers(episode),
             "bam/digest": episode.digest,
             "bam/terminated": bool(episode.terminated),
             "bam/truncated": bool(episode.truncated),
@@ -133,16 +165,30 @@ class Head:
             "bam/return": float(np.sum(episode.rewards)),
             "bam/facts": json.dumps(episode.facts),
             "bam/columns": json.dumps(list(episode.columns)),
-            **{FINAL + name: values for name, values in one.final.items()},
         }
+        row[EXTRA] = digest_of(episode.columns)
+        return row | {ROW: row_digest(row)} | {FINAL + name: values for name, values in one.final.items()}
 
-    def write_columns(self, files: Files) -> None:
-        """Replace bam.json."""
-        files.write_json(BAM, {"format": FORMAT, **self.info.to_json(), "columns": self.extra})
+    def own(self) -> dict[str, Any]:
+        """The content of bam.json."""
+        return sealed({"format": FORMAT, **self.info.to_json(), "columns": self.extra})
 
     def write(self, files: Files) -> None:
-        """Replace info.json: from now on, readers see the episodes so far."""
-        content = {
+        """Replace tasks.parquet, stats.json and then info.json: from now on, readers see the episodes so far."""
+        for name, content in self._others().items() if self.episodes else ():
+            files.write(name, content)
+        files.write_json(INFO, self.content())
+
+    def _others(self) -> dict[str, bytes]:
+        return {STATS: json_bytes(self.stats), TASKS: parquet_bytes(tasks_table(self.tasks))}
+
+    def copy(self, data: bytes, episodes: bytes) -> Copy:
+        """The copy of a data file and its episodes file, the last that are counted."""
+        return Copy.of(json_bytes(self.own()), data, episodes, self._others())
+
+    def content(self) -> dict[str, Any]:
+        """The content of info.json."""
+        return {
             "codebase_version": VERSION,
             "robot_type": self.info.robot or None,
             "total_episodes": self.episodes,
@@ -157,7 +203,6 @@ class Head:
             "video_path": None,
             "features": self.features(),
         }
-        files.write_json(INFO, content)
 
     def features(self) -> dict[str, dict[str, Any]]:
         """The columns as LeRobot describes them."""
@@ -183,6 +228,71 @@ class Head:
         size = int(np.prod(shape))
         names = [str(one.get("name")) for one in labels] if len(labels) == size else None
         return {"dtype": dtype, "shape": [size], "names": names}
+
+
+@dataclass(frozen=True)
+class Copy:
+    """What was written together."""
+
+    bam: bytes
+    """bam.json."""
+    episodes: bytes
+    """The episodes file."""
+    footer: bytes
+    """The end of the data file, which says where each column of it begins."""
+    size: int
+    """Of the data file, without its footer [bytes]."""
+    data: str
+    """SHA-256 of the data file."""
+    others: dict[str, str]
+    """SHA-256 of stats.json and tasks.parquet as they were then, by name."""
+
+    @classmethod
+    def of(cls, bam: bytes, data: bytes, episodes: bytes, others: Mapping[str, bytes]) -> Copy:
+        """A copy of what these files hold."""
+        size = len(data) - _TAIL.size - _TAIL.unpack(data[-_TAIL.size :])[0]
+        return cls(bam, episodes, data[size:], size, sha256(data), {name: sha256(one) for name, one in others.items()})
+
+    def to_bytes(self) -> bytes:
+        """The zip, each member of which has a checksum."""
+        buffer = io.BytesIO()
+        facts = json.dumps({"size": self.size, "data": self.data, "others": self.others}).encode()
+        members = {"bam.json": self.bam, "episodes.parquet": self.episodes, "footer": self.footer, "data.json": facts}
+        with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
+            for name, content in members.items():
+                archive.writestr(zipfile.ZipInfo(name), content, zipfile.ZIP_DEFLATED)
+        return buffer.getvalue()
+
+    @classmethod
+    def from_bytes(cls, content: bytes | None) -> Copy | None:
+        """The copy in a zip; None without one, or if it is damaged."""
+        if content is None:
+            return None
+        try:
+            with zipfile.ZipFile(io.BytesIO(content)) as archive:
+                facts = json.loads(archive.read("data.json"))
+                bam, episodes, footer = (archive.read(name) for name in ("bam.json", "episodes.parquet", "footer"))
+            return cls(bam, episodes, footer, facts["size"], facts["data"], facts["others"])
+        except (
+            zipfile.BadZipFile,
+            zlib.error,
+            KeyError,
+            ValueError,
+            TypeError,
+            EOFError,
+            NotImplementedError,
+            OSError,
+        ):
+            return None
+
+    def restored(self, data: bytes) -> bytes:
+        """A damaged data file with its beginning and its end put back; what is cut off of its numbers is zero."""
+        return (MAGIC + data[len(MAGIC) : self.size]).ljust(self.size, b"\0") + self.footer
+
+
+def sha256(content: bytes) -> str:
+    """Hexadecimal."""
+    return hashlib.sha256(content).hexdigest()
 
 
 def kind_of(values: Array) -> dict[str, Any]:

@@ -7,26 +7,29 @@ meta/stats.json                          least, greatest, mean, deviation and qu
 meta/tasks.parquet                       sentence of each task
 meta/episodes/chunk-000/file-000.parquet one row an episode; columns ``bam/...``: digest, end, facts, last observation
 data/chunk-000/file-000.parquet          one row a step, one row group an episode
+copies/chunk-000/file-000.zip            `Copy`: what makes bam.json and the two files of that number whole again
 =======================================  =============================================================================
 
-A flush adds one data file, then one episodes file of the same number, then replaces info.json. What info.json does not
-count yet does not exist for readers.
+A flush adds one copy, one data file, then one episodes file of the same number, then replaces info.json. What info.json
+does not count yet does not exist for readers.
 """
 
 from __future__ import annotations
 
+import hashlib
+import io
 import itertools
 import json
 import os
 import re
 import socket
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import IO, Any
 
 from bam_train.data.arrow_columns import Arrow
-from bam_train.errors import BadDataSet, PlaceError
+from bam_train.errors import BadDataSet, NoSuchPlace, PlaceError
 from bam_train.place import Place
 
 try:
@@ -34,7 +37,9 @@ try:
 except ImportError:  # Windows
     fcntl = None  # type: ignore[assignment]
 
-LOCK = "meta/.writer"
+LOCK, MENDING = "meta/.writer", "meta/.mending"
+UNREADABLE = (OSError, ValueError, LookupError, TypeError, MemoryError, NotImplementedError, OverflowError)
+"""What pyarrow and Pillow raise for damaged bytes."""
 VERSION = "v3.0"
 FORMAT = 1
 """Of bam.json."""
@@ -43,6 +48,7 @@ CHUNK = 1000
 INFO, BAM, STATS, TASKS = "meta/info.json", "meta/bam.json", "meta/stats.json", "meta/tasks.parquet"
 DATA = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
 EPISODES = "meta/episodes/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
+COPIES = "copies/chunk-{chunk_index:03d}/file-{file_index:03d}.zip"
 DEFAULTS = {"timestamp": "float32", "frame_index": "int64", "episode_index": "int64", "index": "int64"} | {
     "task_index": "int64"
 }
@@ -55,6 +61,9 @@ LIGHT = (
     *("bam/digest", "bam/terminated", "bam/truncated", "bam/success", "bam/return", "bam/facts", "bam/columns"),
 )
 """Columns of an episodes file that are read when a data set is opened."""
+EXTRA, ROW = "bam/extra", "bam/row"
+"""Columns with the digests of the further columns of an episode, and of its row (`row_digest`); older data sets lack
+both."""
 
 
 class Files:
@@ -68,12 +77,32 @@ class Files:
         """Whether there is a file of this name."""
         return (self.root / name).exists()
 
+    def require(self) -> None:
+        """Raise BadDataSet unless a data set, or a part of one, is there; it names a bucket that is not there."""
+        if self.exists(INFO):  # who may read objects of a bucket may not list them
+            return
+        if not self.root.is_dir():
+            try:
+                self.root.size()
+            except NoSuchPlace as error:
+                raise BadDataSet(str(error)) from error
+            raise BadDataSet(f"{self.text}: is no data set but a file; give a folder that bam-data wrote")
+        if not any(self.exists(name) for name in (BAM, "meta/episodes", "data", "copies")):
+            raise BadDataSet(f"{self.text}: is no data set: it has no {INFO}; give a folder that bam-data wrote")
+
+    def content(self, name: str) -> bytes | None:
+        """The bytes of a file; None if there is none."""
+        try:
+            return (self.root / name).read_bytes()
+        except NoSuchPlace:
+            return None
+
     def read_json(self, name: str) -> dict[str, Any]:
         """The content of a JSON file."""
         try:
             value = json.loads((self.root / name).read_bytes())
-        except FileNotFoundError as error:
-            raise BadDataSet(f"{self.text}: {name} is missing; copy the folder again, whole") from error
+        except NoSuchPlace as error:
+            raise BadDataSet(f"{self.text}: {name} is missing; run bam-data check {self.text}") from error
         except PlaceError:
             raise
         except (OSError, ValueError) as error:
@@ -82,42 +111,33 @@ class Files:
             raise BadDataSet(f"{self.text}: {name} is no JSON object; run bam-data check {self.text}")
         return value
 
+    def write(self, name: str, content: bytes) -> None:
+        """Replace a file."""
+        (self.root / name).write_bytes(content)
+
     def write_json(self, name: str, value: dict[str, Any]) -> None:
         """Replace a JSON file."""
-        with (self.root / name).replacing() as path:
-            path.write_text(json.dumps(value, indent=2))
-
-    def write_table(self, name: str, table: Arrow, groups: list[int] | None = None) -> None:
-        """Replace a Parquet file; `groups` are the rows of each row group."""
-        import pyarrow.parquet as pq
-
-        texts = [field.name for field in table.schema if str(field.type) == "string"]
-        options = {
-            "compression": "snappy",
-            "use_dictionary": texts,
-            "write_page_checksum": True,
-        }  # a dictionary of floats would merge kinds of NaN
-        with (self.root / name).replacing() as path, pq.ParquetWriter(path, table.schema, **options) as writer:
-            first = 0
-            for rows in groups or [len(table)]:
-                writer.write_table(table.slice(first, rows), row_group_size=max(rows, 1))
-                first += rows
+        self.write(name, json_bytes(value))
 
     def numbers(self, template: str) -> list[int]:
-        """The numbers of the data or episodes files that are there."""
+        """The numbers of the data files, episodes files or copies that are there."""
         folder = self.root / template.partition("/chunk")[0]
         chunks = [one for one in (folder.list() if folder.is_dir() else ()) if re.fullmatch(r"chunk-\d{3,}", one.name)]
         paths = [(chunk.name, file.name) for chunk in chunks for file in chunk.list()]
-        found = [(chunk, re.fullmatch(r"file-(\d{3})\.parquet", file)) for chunk, file in paths]
+        kind = re.escape(template.rpartition(".")[2])
+        found = [(chunk, re.fullmatch(rf"file-(\d{{3}})\.{kind}", file)) for chunk, file in paths]
         return sorted(int(chunk[6:]) * CHUNK + int(match[1]) for chunk, match in found if match)
 
-    def copy_aside(self, name: str, folder: str) -> None:
-        """Copy a file, if it is there, into a folder of the data set, under the first free name."""
-        if self.exists(name):
-            target = f"{folder}/{name.replace('/', '-')}"
-            copies = itertools.chain([target], (f"{target}.{k}" for k in itertools.count(2)))
-            with (self.root / name).local_copy() as path:
-                (self.root / next(one for one in copies if not self.exists(one))).put(path)
+    def copy_aside(self, name: str, folder: str) -> list[str]:
+        """Copy a file, if it is there, into a folder of the data set, under the first free name; returns that name."""
+        if not self.exists(name):
+            return []
+        target = f"{folder}/{name.replace('/', '-')}"
+        copies = itertools.chain([target], (f"{target}.{k}" for k in itertools.count(2)))
+        free = next(one for one in copies if not self.exists(one))
+        with (self.root / name).local_copy() as path:
+            (self.root / free).put(path)
+        return [free]
 
     def delete(self, name: str) -> None:
         """Delete a file, if it is there."""
@@ -130,7 +150,6 @@ class Files:
         Raises:
             BadDataSet: The file is missing or damaged.
         """
-        import pyarrow as pa
         import pyarrow.parquet as pq
 
         try:
@@ -142,7 +161,7 @@ class Files:
             raise BadDataSet(f"{self.text}: {name} is missing; run bam-data check {self.text}") from error
         except PlaceError:
             raise
-        except (OSError, pa.ArrowInvalid) as error:
+        except UNREADABLE as error:
             why = str(error).partition("\n")[0]
             raise BadDataSet(
                 f"{self.text}: {name} is damaged or no Parquet file: {why}; run bam-data check {self.text}"
@@ -219,6 +238,37 @@ def _may_live(who: str) -> bool:
     except (PermissionError, ValueError):
         pass
     return True
+
+
+def parquet_bytes(table: Arrow, groups: Sequence[int] = ()) -> bytes:
+    """A Parquet file; `groups` are the rows of each row group."""
+    import pyarrow.parquet as pq
+
+    texts = [field.name for field in table.schema if str(field.type) == "string"]
+    buffer = io.BytesIO()
+    options = {"compression": "snappy", "use_dictionary": texts}  # a dictionary of floats would merge kinds of NaN
+    with pq.ParquetWriter(buffer, table.schema, write_page_checksum=True, **options) as writer:
+        first = 0
+        for rows in groups or [len(table)]:
+            writer.write_table(table.slice(first, rows), row_group_size=max(rows, 1))
+            first += rows
+    return buffer.getvalue()
+
+
+def json_bytes(value: Mapping[str, Any]) -> bytes:
+    """The content of a JSON file."""
+    return json.dumps(value, indent=2).encode()
+
+
+def sealed(value: Mapping[str, Any]) -> dict[str, Any]:
+    """A JSON object with its own SHA-256 as its last value, ``digest``."""
+    plain = {name: one for name, one in value.items() if name != "digest"}
+    return {**plain, "digest": hashlib.sha256(json.dumps(plain, sort_keys=True).encode()).hexdigest()}
+
+
+def row_digest(row: Mapping[str, Any]) -> str:
+    """SHA-256 of the values of a row of an episodes file that are read when a data set is opened."""
+    return hashlib.sha256(json.dumps([row.get(name) for name in (*LIGHT, EXTRA)]).encode()).hexdigest()
 
 
 def file_name(template: str, number: int) -> str:

@@ -46,7 +46,7 @@ def info_of(
     spec, single = env.spec, "single_" if isinstance(env, VectorEnv) else ""
     name = env_id or (None if spec is None else spec.id)
     if name is None:
-        raise SettingsError("the environment has no id to record; give env_id=")
+        raise SettingsError('the environment has no id to record; give env_id=, such as env_id="Own-v0"')
     kwargs = dict((spec.kwargs if spec is not None else {}) if env_kwargs is None else env_kwargs)
     registered = gym.registry.get(name)
     usual = {} if registered is None else {**registered.kwargs, "max_episode_steps": registered.max_episode_steps}
@@ -260,6 +260,9 @@ class RecordDataset(gym.Wrapper[Any, Any, Any, Any]):
         info: What is equal for all episodes; by default that of `env`.
         facts: Facts of every episode, such as ``{"policy": "...", "task": "lift the cube"}``.
         keep: Which episodes are recorded, by number in the order of beginning and seed; by default all.
+        env_id: Without `info`: its Gymnasium id, and
+        env_kwargs: its arguments, by default those of ``env.spec``, and
+        period: its time of a step [s], by default its own, or 1 s.
         options: Of `DataSetWriter`.
 
     Raises:
@@ -277,10 +280,14 @@ class RecordDataset(gym.Wrapper[Any, Any, Any, Any]):
         info: DataSetInfo | None = None,
         facts: Mapping[str, Any] | None = None,
         keep: Keep | None = None,
+        *,
+        env_id: str | None = None,
+        env_kwargs: Mapping[str, Any] | None = None,
+        period: float | None = None,
         **options: Any,
     ) -> None:
         super().__init__(env)
-        info = info or info_of(env)
+        info = info or info_of(env, env_id, env_kwargs, period)
         self.writer = DataSetWriter(place, info, **options)
         self._tracks = Tracks(env, info, 1, facts or {}, keep)
         self.extra: dict[str, Array] = {}
@@ -336,6 +343,10 @@ class RecordVectorDataset(VectorWrapper):
         info: DataSetInfo | None = None,
         facts: Mapping[str, Any] | None = None,
         keep: Keep | None = None,
+        *,
+        env_id: str | None = None,
+        env_kwargs: Mapping[str, Any] | None = None,
+        period: float | None = None,
         **options: Any,
     ) -> None:
         super().__init__(env)
@@ -344,7 +355,7 @@ class RecordVectorDataset(VectorWrapper):
                 f"{place}: environments side by side are recorded in autoreset mode SAME_STEP, which keeps the last "
                 f"observation; found {env.metadata.get('autoreset_mode')}"
             )
-        info = info or info_of(env)
+        info = info or info_of(env, env_id, env_kwargs, period)
         self.writer = DataSetWriter(place, info, **options)
         self._tracks = Tracks(env, info, env.num_envs, facts or {}, keep)
         self.extra: dict[str, Array] = {}

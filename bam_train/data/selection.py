@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import json
 import operator
@@ -35,12 +36,8 @@ def merge(sets: Sequence[DataSet], out: str | Path) -> tuple[int, int]:
     Raises:
         BadDataSet: Two are of different environments, spaces, units or periods; nothing is written then.
     """
-    one = sets[0]
-    try:
-        for one in sets[1:]:
-            require_same(sets[0].place, sets[0].info, one.info)
-    except BadDataSet as error:
-        raise BadDataSet(f"{one.place}: does not fit the others: {error}") from error
+    for one in sets[1:]:
+        require_same(sets[0].place, sets[0].info, one.info, one.place, f"merge {one.place} into another place")
     return _copy([(one, range(len(one))) for one in sets], out)
 
 
@@ -51,7 +48,8 @@ def choose(data: DataSet, conditions: Sequence[str]) -> list[int]:
     or ``truncated``; then comes = != > >= < <= or ~ (contains), and a value. A fact that is missing fits only !=.
 
     Raises:
-        SettingsError: A condition cannot be read, or no episode has the fact.
+        SettingsError: A condition cannot be read, no episode has the fact, its value is of another kind, or nothing
+            fits.
     """
     rows = [{**data.facts(i), "index": i, "digest": digest} for i, digest in enumerate(data.digests)]
     known = {name for row in rows for name in row}
@@ -63,17 +61,29 @@ def choose(data: DataSet, conditions: Sequence[str]) -> list[int]:
         name, sign, text = found.groups()
         if name not in known and rows:
             raise SettingsError(f"--where: no episode of {data.place} has {name!r}. {did_you_mean(name, known)}")
-        kept = [i for i in kept if _holds(rows[i].get(name), sign, text)]
+        kept = [i for i in kept if _holds(name, rows[i].get(name), sign, text)]
+    if conditions and not kept:
+        raise SettingsError(
+            f"--where: none of the {len(rows)} episodes of {data.place} fits {' and '.join(conditions)}"
+        )
     return kept
 
 
-def _holds(found: Any, sign: str, text: str) -> bool:
+def _holds(name: str, found: Any, sign: str, text: str) -> bool:
     if found is None and text not in ("null", "None"):
         return sign == "!="
-    try:
-        wanted = text if isinstance(found, str) else json.loads(text.replace("None", "null"))
-    except ValueError:
-        wanted = text
+    wanted: Any = text
+    if isinstance(found, (bool, int, float)) and sign != "~":
+        kind, values = ("true or false", (True, False)) if isinstance(found, bool) else ("a number", None)
+        try:
+            wanted = json.loads(text.replace("None", "null"))
+        except ValueError:
+            wanted = text
+        if wanted is not None and (wanted not in values if values else not isinstance(wanted, (int, float))):
+            raise SettingsError(f"--where: {name} is {kind}, found {text!r}")
+    elif not isinstance(found, str):
+        with contextlib.suppress(ValueError):
+            wanted = json.loads(text.replace("None", "null"))
     try:
         return _SIGNS[sign](found, wanted)
     except TypeError as error:

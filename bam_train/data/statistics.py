@@ -2,16 +2,11 @@
 
 from __future__ import annotations
 
-import contextlib
 from typing import Any
 
 import numpy as np
 
-from bam_train.data.data_set import DataSet
-from bam_train.data.episode import Array, leaves_of
-from bam_train.data.file_pair import Columns
-from bam_train.data.layout import STATS, Files
-from bam_train.errors import BadDataSet
+from bam_train.data.episode import Array
 
 QUANTILES = {"q01": 0.01, "q10": 0.1, "q50": 0.5, "q90": 0.9, "q99": 0.99}
 MOST_IMAGES = 20
@@ -25,20 +20,6 @@ def add_stats(old: dict[str, Any], episodes: list[dict[str, Array]], images: set
         parts = [columns[name] for columns in episodes if name in columns]
         if parts[0].dtype.kind not in "UO":
             stats[name] = _together(old.get(name), _stats(parts, name in images))
-    return stats
-
-
-def stats_of(files: Files, data: DataSet) -> dict[str, Any]:
-    """The statistics of a data set: those of its file where they are of all its steps, else computed and written."""
-    with contextlib.suppress(BadDataSet):
-        stats = files.read_json(STATS)
-        if stats.get("next.reward", {}).get("count") == [data.total_frames]:
-            return stats
-    stats = {}
-    images = {leaf.column for leaf in leaves_of(data.info.observation_space, "observation") if leaf.is_image}
-    for episode in data.episodes():
-        stats = add_stats(stats, [Columns.read(episode, data.info).steps], images)
-    files.write_json(STATS, stats)
     return stats
 
 

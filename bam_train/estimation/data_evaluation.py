@@ -32,13 +32,15 @@ _SAME = 0.1
 
 @dataclass(frozen=True)
 class Agreement:
-    """How far the policy would have acted as whoever was recorded."""
+    """How far the policy would have acted as whoever was recorded meant to, without the noise that was added."""
 
     share: float
     """Share of the steps in which all numbers of the action agree: choices exactly, others within a tenth of half
     their range."""
     difference: float | None
     """Root mean square difference, in halves of the range; None for choices."""
+    noise: float | None = None
+    """The same of what was done and what was meant; None for choices."""
 
 
 @dataclass(frozen=True)
@@ -81,8 +83,11 @@ class DataReport:
     """The weakest of each fact first."""
 
     def to_json(self) -> dict[str, Any]:
-        """Plain JSON values."""
-        importance = {name: one.to_json() for name, one in self.importance.items()}
+        """Plain JSON values; null for importance weights that too few episodes have."""
+        importance = {
+            name: one.to_json() if one.is_sound else {"value": None, "interval": None, "effective": one.effective}
+            for name, one in self.importance.items()
+        }
         groups = [{**vars(one), "estimate": one.estimate.to_json()} for one in self.groups]
         interval = self.recorded_interval and list(self.recorded_interval)
         own = {"agreement": vars(self.agreement), "fitted_q": self.fitted_q.to_json(), "recorded_interval": interval}
@@ -121,7 +126,7 @@ def evaluate_on_data(
     require_contrast(data, steps)
     fitted = fit_q(steps, seed=seed, on_progress=on_progress)
     ratios = action_ratios(steps, data.info.action_space, seed)
-    agrees, difference = _agreement(steps, data.info.action_space)
+    agrees, *differences = _agreement(steps, data.info.action_space)
     used = {data.digests[index] for index in indices} & set(checkpoint.manifest.data.get("episodes", ()))
     returns = steps.returns
     return DataReport(
@@ -133,9 +138,9 @@ def evaluate_on_data(
         seen=len(used),
         recorded=float(returns.mean()),
         recorded_interval=wilson_interval(int(returns.sum()), len(returns)) if by_success else None,
-        agreement=Agreement(float(agrees.mean()), difference),
+        agreement=Agreement(float(agrees.mean()), *differences),
         fitted_q=within_bounds(fitted.estimate(), by_success),
-        importance={} if ratios is None else _importance(steps, ratios, fitted),
+        importance={} if ratios is None else _importance(steps, ratios, fitted, by_success),
         probabilities="none" if ratios is None else "estimated" if steps.propensity is None else "recorded",
         groups=tuple(_groups(divisions, steps, fitted, agrees, by_success)),
     )
@@ -200,23 +205,24 @@ def _divisions(data: DataSet, facts: list[dict[str, Any]], by: Sequence[str]) ->
     return found
 
 
-def _agreement(steps: Steps, space: gym.Space[Any]) -> tuple[Array, float | None]:
-    """Whether each step agrees (n,), and the root mean square difference."""
+def _agreement(steps: Steps, space: gym.Space[Any]) -> tuple[Array, float | None, float | None]:
+    """Whether each step agrees (n,), and the root mean square difference to what was meant, and of that to the deed."""
     if not isinstance(space, gym.spaces.Box):
-        return np.all(steps.actions == steps.wanted, axis=1), None
+        return np.all(steps.meant == steps.wanted, axis=1), None, None
     half = np.ravel(space.high.astype(np.float64) - space.low) / 2
     unit = np.where(np.isfinite(half) & (half > 0), half, 1.0)
-    error = (steps.actions - steps.wanted) / unit
-    return np.all(np.abs(error) <= _SAME, axis=1), float(np.sqrt(np.mean(error**2)))
+    error, noise = (steps.meant - steps.wanted) / unit, (steps.actions - steps.meant) / unit
+    return np.all(np.abs(error) <= _SAME, axis=1), *(float(np.sqrt(np.mean(one**2))) for one in (error, noise))
 
 
-def _importance(steps: Steps, ratios: Array, fitted: FittedQ) -> dict[str, Estimate]:
+def _importance(steps: Steps, ratios: Array, fitted: FittedQ, by_success: bool) -> dict[str, Estimate]:
     taken = steps.rewards, ratios, steps.episode
-    return {
+    found = {
         "ips": importance_sampling(*taken),
         "snips": self_normalised(*taken),
         "dr": doubly_robust(*taken, fitted.of_actions, fitted.of_states, fitted.of_next),
     }
+    return {name: one.as_rate() if by_success else one for name, one in found.items()}
 
 
 def _groups(

@@ -37,6 +37,11 @@ class Estimate:
         """Whether enough episodes have weight."""
         return self.effective >= FEWEST
 
+    def as_rate(self) -> Estimate:
+        """The same between 0 and 1, where the value of an episode is its success."""
+        value, low, high = (min(1.0, max(0.0, one)) for one in (self.value, *self.interval))
+        return Estimate(value, (low, high), self.effective)
+
     def to_json(self) -> dict[str, Any]:
         """Plain JSON values."""
         return {"value": self.value, "interval": list(self.interval), "effective": self.effective}

@@ -15,6 +15,7 @@ from bam_train.data import DataSet
 from bam_train.environments import (
     environment_of,
     first_difference,
+    held_out,
     interface_in,
     interface_pairs,
     make_vector_env,
@@ -35,7 +36,14 @@ from bam_train.estimation.estimates import Estimate
 from bam_train.estimation.fitted_q import fit_q
 from bam_train.estimation.paired_test import Pairs, Verdict, verdict_of
 from bam_train.estimation.steps import read_steps
-from bam_train.evaluation import Episode, default_num_envs, play_wave, wilson_interval
+from bam_train.evaluation import (
+    Episode,
+    default_num_envs,
+    first_of_each,
+    number_of_starts,
+    play_wave,
+    wilson_interval,
+)
 from bam_train.finite_envs import FiniteVectorEnv
 from bam_train.policy import FrozenPolicy
 
@@ -103,13 +111,17 @@ def compare(
     played: list[list[Episode]] = [[], []]
     pairs = Pairs()
     width = num_envs or default_num_envs(env_id, episodes)
-    with closing(make_vector_env(env_id, {**kwargs, **(env_kwargs or {})}, width)) as envs:
+    with closing(make_vector_env(env_id, held_out(env_id, kwargs, env_kwargs or {}), width)) as envs:
         for one in (candidate, champion):
             require_fit(one, envs)
-        finite = FiniteVectorEnv(envs, env_id)
+        finite, begun, starts = FiniteVectorEnv(envs, env_id), 0, number_of_starts(envs)
+        seen: list[set[int]] = [set(), set()]
+        episodes = min(episodes, starts or episodes)
         while len(pairs) < episodes and not pairs.is_decided(margin):
-            count = min(envs.num_envs, episodes - len(pairs))
-            wave = [play_wave(finite, policy, seed + len(pairs), count) for policy in policies]
+            count = envs.num_envs if starts else min(envs.num_envs, episodes - len(pairs))
+            waves = [play_wave(finite, policy, seed + begun, count) for policy in policies]
+            wave = [first_of_each(one, known) for one, known in zip(waves, seen, strict=True)]
+            begun += count
             for all_of_it, new in zip(played, wave, strict=True):
                 all_of_it += new
             pairs += count_pairs(*wave)

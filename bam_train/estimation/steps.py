@@ -42,6 +42,9 @@ class Steps:
     """Shape: (n, d)."""
     actions: Floats
     """Recorded. Shape: (n, k)."""
+    meant: Floats
+    """What whoever acted would have done without noise, where that is recorded (``raw_action``); else `actions`.
+    Shape: (n, k)."""
     wanted: Floats
     """The policy's, at the same observations. Shape: (n, k)."""
     next_observations: Floats
@@ -91,7 +94,7 @@ def read_steps(data: DataSet, policy: Acting, indices: Sequence[int], by_success
         raise BadDataSet(f"{data.place}: {text}. Leave pictures out of it, or evaluate in simulation")
     parts = [_parts(one, policy, info, by_success) for one in data.episodes(indices)]
     columns = list(zip(*parts, strict=True))
-    observations, actions, wanted, rewards, ends, propensities = columns
+    observations, actions, meant, wanted, rewards, ends, propensities = columns
     lengths = np.array([len(one) for one in rewards])
     longest = int(lengths.max())
     for end, length in zip(ends, lengths, strict=True):
@@ -100,6 +103,7 @@ def read_steps(data: DataSet, policy: Acting, indices: Sequence[int], by_success
     return Steps(
         join([one[:-1] for one in observations]),
         join(actions),
+        join(meant),
         join([one[:-1] for one in wanted]),
         join([one[1:] for one in observations]),
         join([one[1:] for one in wanted]),
@@ -113,7 +117,7 @@ def read_steps(data: DataSet, policy: Acting, indices: Sequence[int], by_success
 
 
 def _parts(episode: Episode, policy: Acting, info: Any, by_success: bool) -> tuple[Any, ...]:
-    """Observations (T + 1, d), actions (T, k), wanted (T + 1, k), rewards (T,), ends (T,), propensity (T,) or None."""
+    """The columns of `Steps` of an episode: observations and wanted have the shape (T + 1, ...)."""
     steps = len(episode)
     policy.reset()
     if policy.recurrent:
@@ -126,15 +130,28 @@ def _parts(episode: Episode, policy: Acting, info: Any, by_success: bool) -> tup
     if by_success:
         rewards = np.zeros(steps)
         rewards[-1] = float(episode.success or 0)
-    recorded = [_at(episode.actions, t) for t in range(steps)]
+    recorded = vectors(info.action_space, [_at(episode.actions, t) for t in range(steps)])
     return (
         vectors(info.observation_space, [_at(episode.observations, t) for t in range(steps + 1)]),
-        vectors(info.action_space, recorded),
+        recorded,
+        _meant(episode, recorded, info.action_space),
         vectors(info.action_space, actions),
         rewards,
         ends,
         episode.columns.get("propensity"),
     )
+
+
+def _meant(episode: Episode, recorded: Floats, space: gym.Space[Any]) -> Floats:
+    """What whoever acted would have done without noise; what a person did is what the person meant. Shape: (T, k)."""
+    raw = episode.columns.get("raw_action")
+    if raw is None:
+        return recorded
+    is_person = np.asarray(episode.columns.get("intervention", np.zeros(len(recorded))) == 1)
+    is_known = np.isfinite(raw.astype(np.float64).reshape(len(raw), -1)).all(axis=1) & ~is_person
+    meant: Floats = recorded.copy()
+    meant[is_known] = vectors(space, list(raw[is_known])) if is_known.any() else meant[is_known]
+    return meant
 
 
 def vectors(space: gym.Space[Any], values: Sequence[Any]) -> Floats:

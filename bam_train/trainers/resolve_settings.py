@@ -32,6 +32,9 @@ runs and where the teacher lies; not what to learn."""
 OF_RLLIB = ("num_env_runners", "num_learners", "num_gpus", "address")
 """Settings of the rllib trainer only."""
 
+OFFLINE_STEPS = 20_000
+"""Updates of a run on a data set without a preset; of an algorithm of d3rlpy, some minutes of CPU time."""
+
 NOWHERE: dict[str, Any] = {"transport": [], "ca_file": None, "token_file": None, "address": None}
 """Settings of the place of a run, with their values for this computer."""
 
@@ -53,7 +56,8 @@ def resolve(given: Mapping[str, Any]) -> TrainSettings:
     require_algorithm(asked.trainer, asked.algo)
     entry = entry_of(env)  # also by an id of robo-gym
     preset = read_preset(env if entry is None else entry.id, asked.algo, asked.trainer)
-    settings = TrainSettings.from_mapping(merge(preset, given, {"env": env}))
+    usual = {"steps": OFFLINE_STEPS} if asked.trainer == "offline" else {}
+    settings = TrainSettings.from_mapping(merge({**usual, **preset}, given, {"env": env}))
     _require_of_trainer(settings)
     require_env_kwargs(env, settings.env_kwargs)
     if "link" in settings.env_kwargs and entry is not None:

@@ -1,3 +1,4 @@
+import contextlib
 import json
 
 import gymnasium as gym
@@ -164,3 +165,25 @@ def test_an_episode_depends_on_its_seed_and_on_no_other_episode(env_id):
     assert together.length_mean > 1
     assert together == evaluate(policy, env_id, options, episodes=4, seed=3, num_envs=1)
     assert together == evaluate(policy, env_id, options, episodes=4, seed=3, num_envs=3)
+
+
+@pytest.mark.parametrize("episodes", [50, 1000])
+def test_a_picture_counts_once(episodes):
+    """Of 359 pictures of the test split; more draws say no more."""
+
+    class Always:
+        recurrent = False
+
+        def reset(self, env_ids=None):
+            pass
+
+        def act_batch(self, observations):
+            return np.full(len(observations), 3)
+
+    with contextlib.closing(make_vector_env("bam/digits-v0", {"split": "test"}, 50)) as envs:
+        report = evaluate(Always(), "bam/digits-v0", env=envs, episodes=episodes)
+        labels = envs.unwrapped.task.pictures()[1]
+    assert (report.episodes, report.starts) == (min(episodes, 359), 359)
+    if episodes > 359:
+        assert report.successes == (labels == 3).sum()
+        assert report.success_interval == wilson_interval(report.successes, 359)

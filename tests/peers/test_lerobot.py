@@ -9,6 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from bam_train.data import DataSet
+from bam_train.data.layout import Files
+from bam_train.data.mending import mend
 from tests.bam_train.data.export.test_export import record
 from tests.peers.conftest import PEERS
 
@@ -41,7 +44,14 @@ def read(root, tmp_path):
 
 @pytest.mark.slow
 def test_every_episode_is_read(tmp_path):
+    """Also after damage of every file that LeRobot reads, which was mended."""
     data = record(tmp_path / "data", "nested")
+    for path in [path for path in (tmp_path / "data").rglob("*.*") if path.suffix in (".json", ".parquet")]:
+        content = bytearray(path.read_bytes())
+        content[-40] ^= 1
+        path.write_bytes(content)
+    assert len(mend(Files(tmp_path / "data")).problems) >= 4
+    data = DataSet.open(tmp_path / "data")
     found = read(tmp_path / "data", tmp_path)
     assert found["fps"] == 20
     assert len(found["episodes"]) == len(data)

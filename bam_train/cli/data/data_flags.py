@@ -48,10 +48,11 @@ class CollectConfig:
 
 @dataclass(frozen=True)
 class CheckConfig:
-    """Read a whole data set, compare every episode with its digest, and mend what is not whole.
+    """Read a whole data set, compare it with what was written, and mend what is not whole.
 
-    Files that are not whole are copied to its folder damaged/ first, and every whole episode in them is kept. Exit
-    status: 0 the data set is whole now, 1 it cannot be mended, or is not whole with --no-mend.
+    What a file does not say any more is taken from its copy, or from the other files. If something is lost all the
+    same, nothing is changed without --accept-loss. Exit status: 0 the data set is whole now, and nothing is lost; 1 it
+    is not whole; 3 it is whole again, without what is lost.
 
     Examples:
       bam-data check data/pick
@@ -62,6 +63,8 @@ class CheckConfig:
     """The data set."""
     no_mend: bool = False
     """Say what is not whole, and change nothing."""
+    accept_loss: bool = False
+    """Give up what is lost, and mend the rest. What was not whole is copied to its folder damaged/ first."""
     json: bool = False
     """Print one JSON object on standard output instead of lines."""
 

@@ -21,8 +21,10 @@ def data_lines(report: DataReport, what: str, place: str) -> Iterator[str]:
     interval = report.recorded_interval
     recorded = shown(report.recorded, is_rate) + ("" if interval is None else f" ({between(interval, is_rate)})")
     yield f"  recorded  {recorded} {report.metric} of whoever acted"
-    near = "" if report.agreement.difference is None else f"; they differ by {report.agreement.difference:.2f} (rms)"
-    yield f"  agreement {report.agreement.share:.1%} of the actions{near}"
+    agreement = report.agreement
+    near = "" if agreement.difference is None else f"; they differ by {agreement.difference:.2f} (rms)"
+    noise = f", without its noise of {agreement.noise:.2f}" if agreement.noise else ""
+    yield f"  agreement {agreement.share:.1%} of the actions{noise}{near}"
     yield f"  FQE       {estimate_text(report.fitted_q, is_rate)} {report.metric} of this policy, estimated"
     for name, estimate in report.importance.items():
         weighed = f"{estimate.effective:.1f} effective episodes"
@@ -41,8 +43,11 @@ def data_lines(report: DataReport, what: str, place: str) -> Iterator[str]:
         yield f"    {group.value:<20.20} {group.episodes:>5} episodes  {text}, agreement {group.agreement:.0%}"
 
 
-def estimate_text(estimate: Estimate, is_rate: bool) -> str:
-    """An estimate with its interval."""
+def estimate_text(estimate: Estimate, is_rate: bool, least: float = 0.0) -> str:
+    """An estimate with its interval; of a rate from `least` to 1 of which nothing is known, just that."""
+    low, high = estimate.interval
+    if is_rate and low <= least and high >= 1:
+        return f"unknown ({between(estimate.interval, is_rate)}, which says nothing)"
     return f"{shown(estimate.value, is_rate)} ({between(estimate.interval, is_rate)})"
 
 

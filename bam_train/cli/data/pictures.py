@@ -14,9 +14,9 @@ def plot_data(config: PlotConfig) -> None:
     """Draw a data set."""
     from bam_train.atomic_file import require_writable
     from bam_train.data import DataSet
-    from bam_train.data.views.figures import plot
+    from bam_train.data.views.figures import plot, require_picture_path
 
-    path = require_writable(config.out)
+    path = require_writable(require_picture_path(config.out))
     against = None if config.against is None else DataSet.open(config.against)
     drawn = plot(DataSet.open(config.place), path, config.kind, against, config.episodes)
     tell(f"{path}: {', '.join(drawn)}")

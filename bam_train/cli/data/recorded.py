@@ -69,21 +69,34 @@ def check(config: CheckConfig) -> int:
     from bam_train.data.mending import look, mend
 
     files = Files(config.place)
-    found = look(files) if config.no_mend else None
-    if found is None:
+    files.require()
+    if config.no_mend:
+        found = look(files)
+    else:
         lock = WriterLock(files)
         try:
-            found = mend(files)
+            found = mend(files, accept_loss=config.accept_loss)
         finally:
             lock.release()
-    status = int(config.no_mend and not found.is_whole)
+    is_mended = not config.no_mend and (config.accept_loss or not found.lost)
+    status = 0 if found.is_whole or (is_mended and not found.lost) else 3 if is_mended else 1
     if config.json:
-        tell(json.dumps({"place": config.place, **vars(found), "whole": not status}))
+        tell(json.dumps({"place": config.place, **vars(found), "whole": status == 0}))
         return status
-    for line in found.notes:
-        say(f"bam-data: note: {line}")
-    for line in found.problems:
-        say(f"bam-data: {'not whole' if config.no_mend else 'mended'}: {line}")
-    whole = "whole" if found.is_whole else "not whole" if config.no_mend else "whole again"
-    tell(f"{config.place}: {whole}: {found.episodes} episodes, {found.frames} steps")
+    copies = (
+        "had none of some files; it has them now" if is_mended else "has none of some files; bam-data check makes them"
+    )
+    said = {
+        "note": [*([] if found.has_copies else [f"copies/ {copies}"]), *found.notes],
+        "mended" if is_mended else "not whole": found.problems,
+        "lost": found.lost,
+        "set aside": [f"{config.place}/{name}" for name in found.set_aside],
+    }
+    for what, lines in said.items():
+        for line in lines:
+            say(f"bam-data: {what}: {line}")
+    if found.lost and not (is_mended or config.no_mend):
+        say(f"bam-data: nothing was changed. To give up what is lost: bam-data check {config.place} --accept-loss")
+    whole = {0: "whole" if found.is_whole else "whole again", 1: "not whole", 3: "whole again, without what is lost"}
+    tell(f"{config.place}: {whole[status]}: {found.episodes} episodes, {found.frames} steps")
     return status

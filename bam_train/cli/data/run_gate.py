@@ -94,7 +94,7 @@ def _lines(simulated: Comparison | None, recorded: DataComparison | None, margin
         yield f"  recorded    {recorded.place}: {recorded.episodes} episodes"
         yield f"    candidate {estimate_text(recorded.candidate, is_rate)} {recorded.metric}, estimated"
         yield f"    champion  {estimate_text(recorded.champion, is_rate)} {recorded.metric}, estimated"
-        yield f"    verdict   {recorded.verdict}: difference {estimate_text(recorded.difference, is_rate)}"
+        yield f"    verdict   {recorded.verdict}: difference {estimate_text(recorded.difference, is_rate, -1.0)}"
     yield f"  margin      {margin:.1%}: a candidate that is worse by less is not worse"
 
 

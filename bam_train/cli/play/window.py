@@ -2,6 +2,7 @@
 
 import time
 import tkinter
+import tkinter.font
 from collections.abc import Sequence
 from typing import Any
 
@@ -11,6 +12,8 @@ _NAMES = {"Prior": "PageUp", "Next": "PageDown", "space": "Space", "Return": "En
 _NAMES |= {"period": "Period", "question": "Slash", "slash": "Slash", "plus": "Equal", "equal": "Equal"}
 _NAMES |= {"minus": "Minus", "underscore": "Minus", "KP_Add": "Equal", "KP_Subtract": "Minus"}
 _NAMES |= {way: f"Arrow{way}" for way in ("Up", "Down", "Left", "Right")}
+_MOST = (160, 80)  # columns and lines
+_FRAME = 80  # what a screen has around a window, such as its title and a bar [pixels]
 _AGAIN = 30  # a release that a press follows within this time [ms] is X's own repetition of a key
 
 
@@ -35,7 +38,8 @@ class Window:
         self._image: Any = None
         self._picture = tkinter.Label(self._root)
         self._picture.pack(side="left", anchor="n")
-        self._text = tkinter.Label(self._root, font=("monospace", 9), justify="left", anchor="nw")
+        self._font = tkinter.font.Font(self._root, family="monospace", size=9)
+        self._text = tkinter.Label(self._root, font=self._font, justify="left", anchor="nw")
         self._text.pack(side="left", fill="both", expand=True)
         self._keys: list[tuple[str, float, bool]] = []
         self._ups: dict[str, str] = {}
@@ -77,7 +81,16 @@ class Window:
         taken, self._keys = self._keys, []
         return taken
 
-    size = (120, 60)
+    @property
+    def size(self) -> tuple[int, int]:
+        """Columns and lines that fit beside the picture: on the screen, or in a window that was made smaller."""
+        screen = self._root.winfo_screenwidth() - _FRAME, self._root.winfo_screenheight() - _FRAME
+        window = self._root.winfo_width(), self._root.winfo_height()
+        wanted = self._root.winfo_reqwidth(), self._root.winfo_reqheight()
+        width, height = (min(a, b) if 1 < b < c else a for a, b, c in zip(screen, window, wanted, strict=True))
+        columns = (width - self._picture.winfo_reqwidth() - _FRAME // 8) // self._font.measure("0")
+        lines = (height - _FRAME // 8) // self._font.metrics("linespace")
+        return max(20, min(_MOST[0], columns)), max(5, min(_MOST[1], lines))
 
     def show(self, lines: Sequence[str], picture: Any = None) -> None:
         """Draw the text, and a picture (h, w, 3) uint8 beside it."""

@@ -28,7 +28,10 @@ def write(data: DataSet, indices: Sequence[int], path: Path) -> str:
 def require_fit(info: DataSetInfo) -> None:
     """Refuse actions that d3rlpy does not know."""
     if not isinstance(info.action_space, (gym.spaces.Box, gym.spaces.Discrete)):
-        raise SettingsError(f"--to d3rlpy: its actions are Box or Discrete, and these are {info.action_space}")
+        found = type(info.action_space).__name__
+        raise SettingsError(
+            f"--to d3rlpy: its actions are Box or Discrete, found {found}; use --to minari or --to hdf5"
+        )
 
 
 class Episodes(Sequence[Any]):

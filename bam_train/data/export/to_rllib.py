@@ -23,7 +23,8 @@ def write(data: DataSet, indices: Sequence[int], path: Path) -> str:
 
     for kind, space in (("observations", data.info.observation_space), ("actions", data.info.action_space)):
         if isinstance(space, (gym.spaces.Dict, gym.spaces.Tuple)):
-            raise SettingsError(f"--to rllib: its offline reader takes one array a step, and the {kind} are {space}")
+            what = f"the {kind} are a {type(space).__name__} of several"
+            raise SettingsError(f"--to rllib: RLlib reads one array a step, and {what}; use --to minari or --to hdf5")
     tables: list[Any] = []
     count = 0
 

@@ -21,8 +21,21 @@ if TYPE_CHECKING:
 
 KINDS = ("episodes", "numbers", "success", "table")
 MOST_NUMBERS, MOST_SAMPLES, MOST_EPISODES = 48, 300, 6
+SUFFIXES = (".png", ".svg", ".pdf")
 _WINDOW = 20
 """Episodes of the running success."""
+
+
+def require_picture_path(path: Path) -> Path:
+    """Refuse a file that `plot` does not write; returns it.
+
+    Raises:
+        SettingsError: It ends in none of `SUFFIXES`.
+    """
+    if path.suffix.lower() not in SUFFIXES:
+        kinds = ", ".join(SUFFIXES)
+        raise SettingsError(f"{path}: expected a picture that ends in {kinds}, found {path.suffix or 'no suffix'!r}")
+    return path
 
 
 def plot(
@@ -35,10 +48,11 @@ def plot(
     """Draw `data` into an image file; returns the kinds that were drawn.
 
     Raises:
-        SettingsError: The data set lacks what a kind shows.
+        SettingsError: The data set lacks what a kind shows, or this is no kind of picture.
         BadDataSet: `against` is of another environment, or has other names or units.
         MissingExtra: matplotlib is not installed.
     """
+    require_picture_path(path)
     try:
         from matplotlib.figure import Figure
     except ImportError as error:
@@ -46,7 +60,8 @@ def plot(
     if not len(data):
         raise SettingsError(f"{data.place}: has no episodes to draw; record some first")
     if against is not None:
-        require_same(against.place, against.info, data.info)
+        remedy = "compare data sets of one environment"
+        require_same(against.place, against.info, data.info, data.place, remedy)
     is_known = any(data.facts(i)["success"] is not None for i in range(len(data)))
     lacking = {} if is_known else {"success": "it is not known whether its episodes succeeded"}
     if _table_places(data, [data[0]]) is None:
@@ -70,7 +85,7 @@ def plot(
             _table(part, data)
     try:
         with replacing(path) as temporary:
-            figure.savefig(temporary, dpi=100, format=path.suffix[1:] or "png")
+            figure.savefig(temporary, dpi=100, format=path.suffix[1:].lower())
     except (OSError, ValueError) as error:
         raise OutputError(f"{path}: cannot be written: {getattr(error, 'strerror', None) or error}") from error
     return drawn

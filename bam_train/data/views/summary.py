@@ -10,7 +10,6 @@ import numpy as np
 
 from bam_envs.core.wording import did_you_mean
 from bam_train.data.data_set import DataSet
-from bam_train.data.layout import STATS, Files
 from bam_train.errors import SettingsError
 from bam_train.evaluation import wilson_interval
 
@@ -49,8 +48,7 @@ def _group(name: str, rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
 
 def numbers(data: DataSet) -> list[dict[str, Any]]:
     """A row for each number of a step: column, name, unit, min, q01, q50, q99, max, mean and std."""
-    files = Files(data.place)
-    stats = files.read_json(STATS) if files.exists(STATS) else {}
+    stats = data.stats()
     units = {
         column: [str(one.get("unit") or "") for one in data.info.contract.get(kind) or ()]
         for column, kind in (("observation.state", "observation"), ("action", "action"), ("command", "command"))

@@ -12,6 +12,7 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from bam_envs.core.spaces import leaves
+from bam_envs.core.wording import brief
 from bam_train.data import DataSet
 from bam_train.errors import SettingsError
 
@@ -70,7 +71,9 @@ class ActionCode:
             self.size = int(np.prod(space.shape))
             self._low, self._range = space.low.reshape(-1), (space.high - space.low).reshape(-1)
         else:
-            raise SettingsError(f"data: expected a Discrete action space or a bounded Box of floats, found {space}")
+            raise SettingsError(
+                f"data: expected a Discrete action space or a bounded Box of floats, found {brief(space)}"
+            )
 
     def encode(self, actions: Array) -> torch.Tensor:
         """Shape: (n, ...) -> (n, size) float32."""
@@ -95,7 +98,9 @@ class Normaliser:
         for key, leaf in self.leaves.items():
             if not isinstance(leaf, spaces.Box) or len(leaf.shape) > 2:
                 what = f"observation {key!r}" if key else "observations"
-                raise SettingsError(f"data: {what}: expected a Box of numbers, found {leaf}; use --trainer rllib")
+                raise SettingsError(
+                    f"data: {what}: expected a Box of numbers, found {brief(leaf)}; use --trainer rllib"
+                )
         self.inputs = sum(int(np.prod(leaf.shape)) for leaf in self.leaves.values())
         self.mean, self.deviation = np.zeros(self.inputs), np.ones(self.inputs)
 

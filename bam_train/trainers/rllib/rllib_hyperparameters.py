@@ -46,13 +46,22 @@ from bam_train.trainers.rllib_arguments import ELSEWHERE, LAST, OURS, RANGES, le
 _OF_CONNECTORS = frozenset({"self", "kwargs", "multi_agent", "update_stats"})
 
 
-def complete(algorithm: Algorithm, given: Mapping[str, Any]) -> dict[str, Any]:
+_CLONING = {"lr": 1e-3, "train_batch_size_per_learner": 256}
+"""Defaults of bc and marwil. With RLlib's, 1e-4 and 2,000, 100,000 recorded steps are 50 small updates."""
+
+
+def complete(algorithm: Algorithm, given: Mapping[str, Any], *, is_continuous: bool = False) -> dict[str, Any]:
     """Check hyperparameters by name, type and range, and add defaults for missing ones.
+
+    Those of bc and marwil are `_CLONING`, and for numbers as actions (`is_continuous`) a free standard deviation: one
+    that depends on the observation excuses every error of the mean, which is the action that is deployed.
 
     Raises:
         SettingsError: An unknown name (with the closest match), a wrong type or a number out of range.
     """
-    config = algorithm.load()()
+    config, clones = algorithm.load()(), algorithm.name in ("bc", "marwil")
+    if clones:
+        config.training(**_CLONING)
     defaults = _defaults(algorithm, config)
     require_known(given, [*defaults, "model_config"], f"{algorithm.name} hyperparameter", ELSEWHERE, NAMES)
     values = {
@@ -61,7 +70,10 @@ def complete(algorithm: Algorithm, given: Mapping[str, Any]) -> dict[str, Any]:
     }
     if isinstance(given.get("replay_buffer_config"), Mapping):
         values["replay_buffer_config"] = _complete_buffer(config, given["replay_buffer_config"])
-    values["model_config"] = _complete_model(config, given.get("model_config", {}))
+    free = {"free_log_std": True} if clones and is_continuous else {}
+    values["model_config"] = _complete_model(
+        config, {**free, **fit("model_config", given.get("model_config", {}), dict)}
+    )
     if values["log_std_init"] is not None and not values["model_config"]["free_log_std"]:
         raise SettingsError("log_std_init: only a free standard deviation has one; add model_config.free_log_std=true")
     _require_ranges(values)
@@ -151,9 +163,8 @@ def _complete_buffer(config: Any, given: Mapping[str, Any]) -> dict[str, Any]:
     return {**values, "capacity": check(fit(name, values["capacity"], int), PositiveInt, name, SettingsError)}
 
 
-def _complete_model(config: Any, given: Any) -> dict[str, Any]:
+def _complete_model(config: Any, given: Mapping[str, Any]) -> dict[str, Any]:
     """Check ``model_config`` and add RLlib's defaults."""
-    given = fit("model_config", given, dict)
     hints = typing.get_type_hints(DefaultModelConfig)
     hints |= {name: typing.Optional[str] for name in hints if name.endswith("_initializer")}  # noqa: UP045 - no function
     defaults = dataclasses.asdict(DefaultModelConfig()) | config._model_config_auto_includes

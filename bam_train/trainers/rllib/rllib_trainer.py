@@ -104,7 +104,7 @@ class RLlibTrainer:
                 f"{settings.env}: the rllib trainer takes images of floats, found {space.dtype} of shape {space.shape}."
                 " Scale them in the environment (gymnasium.wrappers.TransformObservation), or use --trainer sb3"
             )
-        values = complete(algorithm, settings.hyperparameters)
+        values = complete(algorithm, settings.hyperparameters, is_continuous=isinstance(action_space, spaces.Box))
         if isinstance(action_space, spaces.Discrete) and values.get("twin_q") is False:
             # The SAC of RLlib 2.60 fails in the first update with one critic and discrete actions
             raise SettingsError("twin_q: expected true, as actions are choices, found false. Leave it out")

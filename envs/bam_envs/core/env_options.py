@@ -25,7 +25,9 @@ CAMERA_OPTIONS: dict[str, Any] = {
     "looks": "fixed",
 }
 """Options of an environment with cameras, and their defaults."""
-_Size = Annotated[int, Meta(ge=8, le=512, description="a whole number of pixels from 8 to 512")]
+_PIXELS = "whole numbers of pixels from 8 to 1280: one, or width and height, such as 640x480"
+_Size = Annotated[int, Meta(ge=8, le=1280, description=_PIXELS)]
+_Sizes = Annotated[list[_Size], Meta(min_length=2, max_length=2, description=_PIXELS)]
 
 
 def constructor_options(task: type) -> dict[str, Any]:
@@ -105,6 +107,21 @@ def read_cameras(env_id: str, known: Sequence[str], given: Mapping[str, Any]) ->
             raise UnknownName(f"camera of {env_id}", name, known)
     if not names or len(set(names)) != len(names):
         raise InvalidValue(f"camera= of {env_id} must be one or more different names, not {names!r}.")
-    size = check(options["image_size"], _Size, f"image_size= of {env_id}")
+    width, height = _size(options["image_size"], f"image_size= of {env_id}")
     check(options["looks"], Literal["fixed", "random"], f"looks= of {env_id}")
-    return tuple(CameraSpec(name, size, options["depth"], options["segmentation"]) for name in names)
+    return tuple(CameraSpec(name, width, height, options["depth"], options["segmentation"]) for name in names)
+
+
+def _size(value: Any, name: str) -> tuple[int, int]:
+    """Width and height of ``64``, ``[640, 480]`` or ``640x480``."""
+    parts = value.split("x") if isinstance(value, str) else value
+    numbers = (
+        [int(one) if isinstance(one, str) and one.isdecimal() else one for one in parts]
+        if isinstance(parts, (list, tuple))
+        else [parts, parts]
+    )
+    try:
+        width, height = check(numbers, _Sizes, name)
+    except InvalidValue as error:
+        raise InvalidValue(f"{name}: expected {_PIXELS}, found {value!r}") from error
+    return width, height

@@ -73,25 +73,27 @@ class BaseBody:
 
 @dataclass(frozen=True)
 class CameraSpec:
-    """One camera, whose images are square."""
+    """One camera."""
 
     name: str
-    """Name of the camera, and of its colour images, uint8 (size, size, 3) RGB, among the signals of a state."""
-    size: int = 64
-    """Width and height of its images [pixels]."""
+    """Name of the camera, and of its colour images, uint8 (height, width, 3) RGB, among the signals of a state."""
+    width: int = 64
+    """Width of its images [pixels]."""
+    height: int = 64
+    """Height of its images [pixels]."""
     depth: bool = False
-    """Whether ``<name>_depth`` is a signal too: float32 (size, size, 1), distance from the camera's plane [m]."""
+    """Whether ``<name>_depth`` is a signal too: float32 (height, width, 1), distance from the camera's plane [m]."""
     segmentation: bool = False
-    """Whether ``<name>_segmentation`` is a signal too: uint8 (size, size, 1), indices of `SEGMENTS`."""
+    """Whether ``<name>_segmentation`` is a signal too: uint8 (height, width, 1), indices of `SEGMENTS`."""
 
     def spaces(self) -> dict[str, spaces.Box]:
         """Spaces of its images, by signal."""
-        square = (self.size, self.size)
-        images = {self.name: spaces.Box(0, 255, (*square, 3), np.uint8)}
+        size = (self.height, self.width)
+        images = {self.name: spaces.Box(0, 255, (*size, 3), np.uint8)}
         if self.depth:
-            images[f"{self.name}_depth"] = spaces.Box(0.0, FARTHEST, (*square, 1), np.float32)
+            images[f"{self.name}_depth"] = spaces.Box(0.0, FARTHEST, (*size, 1), np.float32)
         if self.segmentation:
-            images[f"{self.name}_segmentation"] = spaces.Box(0, len(SEGMENTS) - 1, (*square, 1), np.uint8)
+            images[f"{self.name}_segmentation"] = spaces.Box(0, len(SEGMENTS) - 1, (*size, 1), np.uint8)
         return images
 
 

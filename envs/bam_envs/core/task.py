@@ -49,6 +49,9 @@ class Task(Protocol):
 
     A task may have one more attribute, ``reset_options``: the names of the options that `reset` of its environment
     takes. Its `sample_initial` then has a third argument, ``options``, a mapping of the options in use.
+
+    A task with a fixed number of different starts has it as ``num_starts``, and as ``drawn`` the number of the start of
+    each environment, from 0 on. Shape: (n,).
     """
 
     num_envs: int

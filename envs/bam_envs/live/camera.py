@@ -137,7 +137,7 @@ class LiveCamera:
 
 
 def fitted(pixels: Pixels, box: spaces.Box) -> Pixels:
-    """An image as a task sees it: the middle square, in the size and kind of `box` (size, size, channels); a copy.
+    """An image as a task sees it: the middle, as wide to high as `box` (height, width, channels), in its size; a copy.
 
     Colours are averaged; distances and ids are not. A distance of 0, which stands for no measurement, counts as the
     farthest, as where a simulation sees nothing.
@@ -146,16 +146,18 @@ def fitted(pixels: Pixels, box: spaces.Box) -> Pixels:
         ProtocolError: Colours are expected and it is grey, or the other way round.
         MissingExtra: It has another size, and Pillow is not installed.
     """
-    size, channels = box.shape[0], box.shape[2]
+    wanted_height, wanted_width, channels = box.shape
     image = pixels[:, :, None] if pixels.ndim == 2 else pixels[:, :, :channels]
     if image.shape[2] != channels or image.dtype != box.dtype:
         found = f"{image.dtype} with {image.shape[2]} channels"
         raise ProtocolError(f"An image must be {box.dtype} with {channels} channels, not {found}.")
     height, width = image.shape[:2]
-    if (height, width) != (size, size):
-        edge = min(height, width)
-        top, left = (height - edge) // 2, (width - edge) // 2
-        image = resized(image[top : top + edge, left : left + edge], size, smooth=channels == 3)
+    if (height, width) != (wanted_height, wanted_width):
+        scale = min(height / wanted_height, width / wanted_width)
+        high, wide = round(scale * wanted_height), round(scale * wanted_width)
+        top, left = (height - high) // 2, (width - wide) // 2
+        middle = image[top : top + high, left : left + wide]
+        image = resized(middle, wanted_height, wanted_width, smooth=channels == 3)
     if image.dtype == np.float32:
         image = np.where(image == 0.0, box.high.flat[0], image)
     fit: Pixels = np.clip(image, box.low, box.high)

@@ -76,9 +76,14 @@ class Digits(LocalTask):
         """All pictures of the split, and their labels."""
         return _shipped(self.split)
 
+    @property
+    def num_starts(self) -> int:
+        """How many pictures there are; `drawn` says which is shown."""
+        return len(self.pictures()[1])
+
     def begin(self, env_ids: EnvIds, rngs: Sequence[np.random.Generator]) -> None:
         """Draw a picture."""
-        count = len(self.pictures()[1])
+        count = self.num_starts
         self.own_memory()
         self.drawn[env_ids] = [int(rng.integers(count)) for rng in rngs]
 

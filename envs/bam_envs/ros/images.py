@@ -106,13 +106,13 @@ def depth_message(
     return {"header": header, **raw, "data": depth.astype("<f4").tobytes()}
 
 
-def resized(image: NDArray[Any], size: int, *, smooth: bool) -> NDArray[Any]:
-    """A square image (height, width, channels) in another size; `smooth` averages pixels, else the nearest counts."""
+def resized(image: NDArray[Any], height: int, width: int, *, smooth: bool) -> NDArray[Any]:
+    """An image (h, w, channels) in another size; `smooth` averages pixels, else the nearest counts."""
     if not smooth:
-        places = (np.arange(size) * len(image)) // size
-        return np.asarray(image[places][:, places])
+        rows, columns = ((np.arange(to) * of) // to for to, of in zip((height, width), image.shape, strict=False))
+        return np.asarray(image[rows][:, columns])
     pillow = _pillow()
-    return np.asarray(pillow.fromarray(np.ascontiguousarray(image)).resize((size, size), pillow.Resampling.BOX))
+    return np.asarray(pillow.fromarray(np.ascontiguousarray(image)).resize((width, height), pillow.Resampling.BOX))
 
 
 def message_bytes(message: Mapping[str, Any]) -> bytes:

@@ -62,6 +62,10 @@ def test_images_are_cut_to_a_square_and_made_smaller():
     pixels[:, 4:8] = 100
     small = fitted(pixels, spaces.Box(0, 255, (4, 4, 3), np.uint8))
     assert small[:, :, 0].tolist() == [[100, 100, 0, 0]] * 4
+    wide = fitted(pixels, spaces.Box(0, 255, (2, 4, 3), np.uint8))
+    assert wide[:, :, 0].tolist() == [[0, 100, 0, 0]] * 2
+    high = fitted(pixels, spaces.Box(0, 255, (4, 2, 3), np.uint8))
+    assert high[:, :, 0].tolist() == [[100, 0]] * 4  # columns 6 to 9
     metres = np.arange(16, dtype=np.float32).reshape(4, 4) / 4
     depth = fitted(metres, spaces.Box(0.0, 3.0, (2, 2, 1), np.float32))
     assert depth[:, :, 0].tolist() == [[3.0, 0.5], [2.0, 2.5]]  # the first pixel has no measurement

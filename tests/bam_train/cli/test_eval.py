@@ -6,6 +6,8 @@ from PIL import Image
 
 from bam_train.cli.eval import main
 
+ROOT = Path(__file__).parents[3]
+
 
 def test_one_json_object(corridor_checkpoint, starting_cell, run):
     path = corridor_checkpoint()
@@ -50,6 +52,16 @@ def test_table(corridor_checkpoint, run):
     assert lines[1] == "  success   100.0% (20 of 20; 95 % interval 83.9% to 100.0%)"
     assert lines[2].endswith(", from 0.25 to 0.75")
     assert lines[4] == "  episodes  20, seeds 1000000 to 1000019"
+
+
+def test_pictures_of_the_test_split_unless_others_are_asked_for(run):
+    path = ROOT / "checkpoints/digits-dqn.zip"
+    lines = run(main, path, "--episodes", 1000)[1].splitlines()
+    assert lines[0].endswith(" on bam/digits-v0 with split='test'")
+    assert lines[4] == "  episodes  359, all different starts, none of them twice"
+    lines = run(main, path, "--episodes", 5, "--set", "split=train")[1].splitlines()
+    assert lines[0].endswith(" on bam/digits-v0 with split='train'")
+    assert lines[4] == "  episodes  5, of 1438 different starts, none of them twice"
 
 
 def test_table_without_success(corridor_checkpoint, run):

@@ -134,6 +134,16 @@ def test_a_window_gives_the_commands_of_twenty_keys_and_sees_them_go_up(display)
         window.show(["text"], np.zeros((48, 64, 3), np.uint8))
         window.wait(0.01)
         assert (window._image.width(), window._image.height()) == (64, 48)
+        window.show(["text"], np.zeros((480, 640, 3), np.uint8))
+        window.wait(0.01)
+        columns, lines = window.size
+        assert (columns, lines) < (160, 80)
+        window.show(["m" * columns] * lines)
+        window.wait(0.05)
+        root, text = window._root, window._text
+        assert text.winfo_width() >= window._font.measure("m" * columns)  # the last column is there
+        assert text.winfo_rootx() + text.winfo_width() <= root.winfo_screenwidth()
+        assert text.winfo_rooty() + text.winfo_height() <= root.winfo_screenheight()
 
 
 def test_a_gamepad_that_is_pulled_out_in_mid_motion_lets_go(tmp_path):
@@ -220,8 +230,9 @@ def test_it_runs_in_a_terminal_and_records(tty, tmp_path):
     script = [("seed 2", right), ("step 1 ", left), ("step 2 ", right), ("step 3 ", left), ("step 4 ", right)]
     script += [("no success, time limit after 5 steps", b"?"), ("X       quit", b"x")]
     arguments = ("bam/grid-world", "--seed", "2", "--set", "max_episode_steps=5", "--record", "demos")
-    status, out, _ = played(tty, tmp_path, script, *arguments)
+    status, out, shown = played(tty, tmp_path, script, *arguments)
     assert (status, script, out) == (0, [], "1 episode, 0 succeeded, recorded in demos\n")
+    assert "bam-play: demos has 1 of the 20 episodes or so that cloning takes; record more" in shown
     (episode,) = DataSet.open(tmp_path / "demos")
     assert np.ravel(episode.actions).tolist() == [0, 2, 0, 2, 0]
     assert termios.tcgetattr(tty[1]) == before

@@ -1,6 +1,7 @@
 """Episodes come back bit for bit, appended ones too; what does not fit is refused with one line."""
 
 import re
+import shutil
 
 import numpy as np
 import pytest
@@ -132,10 +133,15 @@ def test_episodes_that_do_not_fit_are_refused(tmp_path, changes, text):
 
 
 def test_what_is_no_data_set(tmp_path):
-    with pytest.raises(BadDataSet, match=r"d: is no data set: it has no meta/info\.json"):
+    with pytest.raises(BadDataSet, match=r"d: no such file or folder\. Check the name"):
         DataSet.open(tmp_path / "d")
+    with pytest.raises(BadDataSet, match=r": is no data set: it has no meta/info\.json"):
+        DataSet.open(tmp_path)
     write(tmp_path / "d", info_of(), [episode(info_of(), 2)])
     (tmp_path / "d/meta/bam.json").rename(tmp_path / "bam.json")
+    with pytest.raises(BadDataSet, match=r"meta/bam\.json is missing; run bam-data check"):
+        DataSet.open(tmp_path / "d")
+    shutil.rmtree(tmp_path / "d/copies")
     with pytest.raises(BadDataSet, match=r"has no meta/bam\.json, so its environment is unknown"):
         DataSet.open(tmp_path / "d")
 

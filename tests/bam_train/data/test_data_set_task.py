@@ -103,7 +103,7 @@ def refused(**options):
 def test_what_is_refused(write, tmp_path):
     assert refused() == "bam/dataset-v0 needs a data set: give its place with data="
     nowhere = str(tmp_path / "nowhere")
-    assert refused(data=nowhere).startswith(f"bam/dataset-v0: {nowhere}: is no data set: it has no meta/info.json")
+    assert refused(data=nowhere).startswith(f"bam/dataset-v0: {nowhere}: no such file or folder. Check the name")
     assert refused(dat="x") == "Unknown argument of bam/dataset-v0 'dat'. Did you mean 'data'?"
     place = write(DISCRETE)
     assert refused(data=place, split="half").startswith("split: expected ")

@@ -42,6 +42,13 @@ def test_plot_draws_what_there_is(kind, tmp_path, capsys):
     assert run(capsys, *given, "--against", tmp_path / "b") == (0, drawn, "")
     with image.open(tmp_path / "a.png") as picture:
         assert picture.size[0] == 1200
+    reach(tmp_path / "c")
+    status, _, err = run(capsys, *given, "--against", tmp_path / "c")
+    other = f'{tmp_path}/c: env is "bam/reach-v0" there, and "bam/pick-v0" of {tmp_path}/a'
+    assert (status, err) == (1, f"bam-data plot: {other}; compare data sets of one environment\n")
+    status, _, err = run(capsys, *given[:-1], tmp_path / "a.bmp")
+    expected = f"{tmp_path}/a.bmp: expected a picture that ends in .png, .svg, .pdf, found '.bmp'"
+    assert (status, err) == (1, f"bam-data plot: {expected}\n")
     status, _, err = run(capsys, *given, "--kind", "table")
     assert (status, err.partition(": --kind")[2]) == (
         1,

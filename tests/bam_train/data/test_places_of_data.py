@@ -11,10 +11,11 @@ import pytest
 
 from bam_train.cli.data.bam_data import main
 from bam_train.data import DataSet, DataSetInfo, DataSetWriter, Episode
-from bam_train.data.layout import LOCK
+from bam_train.data.layout import LOCK, Files
+from bam_train.data.mending import look, mend
 from bam_train.errors import BadDataSet, PlaceError
 from bam_train.place import Place
-from tests.object_store import Proxy, bucket_fixture  # noqa: F401
+from tests.object_store import Proxy, answering, bucket_fixture, environment  # noqa: F401
 
 BOX = gym.spaces.Box(-1.0, 1.0, (3,), np.float32)
 INFO = DataSetInfo("bam/reach-v0", {}, BOX, BOX, 0.05, "", {})
@@ -41,6 +42,39 @@ def test_a_bucket_has_what_a_disk_has(bucket, tmp_path):
     for one, other in zip(here.episodes(), there.episodes(), strict=True):
         assert np.array_equal(one.observations, other.observations)
     assert not (Place(bucket) / "data" / LOCK).exists()
+
+
+@pytest.mark.parametrize("command", ["info", "stats", "check"])
+def test_reading_what_is_not_there_names_the_bucket(bucket, capsys, command):
+    why = "there is no bucket none-such. Check the name and the endpoint, or make the bucket"
+    nothing = "no such file or folder. Check the name"
+    for place, text in (("s3://none-such/d", why), (f"{bucket}/none", nothing)):
+        with pytest.raises(SystemExit) as stop:
+            main([command, place])
+        assert (stop.value.code, capsys.readouterr().err) == (1, f"bam-data {command}: {place}: {text}\n")
+
+
+def test_reading_without_the_right_names_the_credentials(monkeypatch):
+    with answering(403, "AccessDenied") as endpoint, environment(endpoint):
+        place = f"s3://b/d?endpoint_override={endpoint}"
+        with pytest.raises(
+            PlaceError, match=r"not allowed with these credentials\. Ask the owner of b for the right, or"
+        ):
+            DataSet.open(place)
+
+
+def test_damage_in_a_bucket_is_mended(bucket):
+    place = Place(f"{bucket}/damaged-set")
+    for number in range(3):
+        write(place, [number])
+    whole = {one: (place / one).read_bytes() for one in ("meta/info.json", "meta/bam.json")}
+    name = "meta/episodes/chunk-000/file-001.parquet"
+    (place / name).write_bytes(b"PAR1")
+    (place / "meta/bam.json").delete()
+    assert mend(Files(place)).problems == ["meta/bam.json is missing", f"{name} is not as it was written"]
+    assert [one.facts["seed"] for one in DataSet.open(place)] == [0, 1, 2]
+    assert {one: (place / one).read_bytes() for one in whole} == whole
+    assert look(Files(place)).is_whole
 
 
 def test_one_writer_in_a_bucket(bucket):
@@ -78,11 +112,6 @@ def test_a_connection_that_is_cut_while_episodes_are_read(bucket):
         proxy.after, proxy.cuts = 0, 10**6
         with pytest.raises(PlaceError, match="cannot be read: no connection"):
             list(data.episodes())
-
-
-def test_nothing_at_a_place(bucket):
-    with pytest.raises(BadDataSet, match=r"is no data set: it has no meta/info\.json"):
-        DataSet.open(f"{bucket}/nothing")
 
 
 def test_an_export_goes_to_a_bucket_whole_and_alone(bucket, tmp_path):

@@ -67,6 +67,24 @@ def test_a_file_is_no_place_for_a_data_set(tmp_path, counting, name, why):
     assert [one.name for one in tmp_path.iterdir()] == ["a.zip"]
 
 
+@pytest.mark.parametrize("how_many", [1, 2])
+def test_an_environment_that_is_not_registered(tmp_path, how_many):
+    def make():
+        return Counting()
+
+    options = {"autoreset_mode": AutoresetMode.SAME_STEP}
+    env = make() if how_many == 1 else gym.vector.SyncVectorEnv([make, make], **options)
+    with pytest.raises(SettingsError, match='has no id to record; give env_id=, such as env_id="Own-v0"'):
+        RecordDataset(env, tmp_path / "d")
+    assert not (tmp_path / "d").exists()
+    env = RecordDataset(env, tmp_path / "d", env_id="Own-v0", env_kwargs={"size": 3}, period=0.5, flush_episodes=9)
+    env.reset(seed=1)
+    env.step(env.action_space.sample())
+    env.close()
+    info = DataSet.open(tmp_path / "d").info
+    assert (info.env, info.env_kwargs, info.period) == ("Own-v0", {"size": 3}, 0.5)
+
+
 def test_one_environment(tmp_path, counting):
     env = RecordDataset(gym.make(counting, disable_env_checker=True), tmp_path / "d", facts={"group": "a"})
     lengths = []

@@ -27,8 +27,8 @@ def test_merge_keeps_order_digests_and_facts(tmp_path):
 @pytest.mark.parametrize(
     ("change", "what"),
     [
-        ({"env": "bam/reach-v0"}, 'env is "bam/pick-v0" there, and "bam/reach-v0" of the new episodes'),
-        ({"period": 0.1}, "period is 0.05 there, and 0.1 of the new episodes"),
+        ({"env": "bam/reach-v0"}, 'env is "bam/pick-v0" there, and "bam/reach-v0" of '),
+        ({"period": 0.1}, "period is 0.05 there, and 0.1 of "),
         ({"contract": {"action": [{"name": "dx", "unit": "mm"}]}}, r"contract.action is "),
     ],
 )
@@ -40,7 +40,7 @@ def test_others_are_not_merged(change, what, tmp_path):
     )
     with DataSetWriter(tmp_path / "b", info) as writer:
         writer.add(a[0])
-    with pytest.raises(BadDataSet, match=f"b: does not fit the others: .*a: {what}"):
+    with pytest.raises(BadDataSet, match=f"a: {what}.*b; merge .*b into another place$"):
         merge([a, DataSet.open(tmp_path / "b")], tmp_path / "out")
     assert not (tmp_path / "out").exists()
 
@@ -51,13 +51,20 @@ def test_conditions(tmp_path):
     assert choose(data, ["length>=5", "truncated=false"]) == [2, 4]
     assert choose(data, ["seed!=3", "policy~b", "index<4"]) == [0, 1, 2]
     assert choose(data, ["digest=" + data.digests[1]]) == [1]
-    assert choose(data, ["policy=other"]) == []
+    assert choose(data, ["success!=true", "index=1"]) == [1]
     with pytest.raises(SettingsError, match=r"has 'lenght'. Did you mean 'length'"):
         choose(data, ["lenght=3"])
     with pytest.raises(SettingsError, match="expected NAME=VALUE, NAME>VALUE or the like, found 'success'"):
         choose(data, ["success"])
-    with pytest.raises(SettingsError, match="3 cannot be compared with 'long' by >"):
-        choose(data, ["length>long"])
+    for condition, why in (
+        ("length>long", "length is a number, found 'long'"),
+        ("success=maybe", "success is true or false, found 'maybe'"),
+        ("success!=yes", "success is true or false, found 'yes'"),
+        ("policy=other", f"none of the 6 episodes of {data.place} fits policy=other"),
+    ):
+        with pytest.raises(SettingsError) as caught:
+            choose(data, [condition])
+        assert str(caught.value) == f"--where: {why}"
 
 
 def test_a_split_stays_when_episodes_are_added(tmp_path):
@@ -85,6 +92,9 @@ def test_programs(tmp_path, monkeypatch, capsys):
         return caught.value.code, out, err
 
     assert run("filter", "a", "--out", "c", "--where", "success=true") == (0, "c: 3 episodes added\n", "")
+    none = "bam-data filter: --where: none of the 6 episodes of a fits index>8\n"
+    assert run("filter", "a", "--out", "none", "--where", "index>8") == (1, "", none)
+    assert not (tmp_path / "none").exists()
     assert run("merge", "b", "c", "a", "--out", "d") == (
         0,
         "d: 6 episodes added; 5 left out, which are in it already\n",

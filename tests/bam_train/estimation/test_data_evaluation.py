@@ -2,11 +2,17 @@
 
 import json
 
+import numpy as np
 import pytest
+from gymnasium.spaces import Box
 
 from bam_train.cli.data import run_gate as gate
+from bam_train.cli.data.data_table import data_lines
 from bam_train.cli.eval import main
-from bam_train.data import DataSet
+from bam_train.data import DataSet, DataSetInfo, DataSetWriter, Episode
+from bam_train.estimation.data_evaluation import Agreement, DataReport
+from bam_train.estimation.estimates import Estimate
+from bam_train.estimation.steps import read_steps
 from bam_train.evaluation import wilson_interval
 
 pytest.importorskip("pyarrow")
@@ -23,7 +29,7 @@ def test_a_policy_that_always_goes_right_always_arrives(corridor_checkpoint, mak
     right = sum(int(one.actions.sum()) for one in steps) / sum(map(len, steps))
     assert (report["metric"], report["episodes"], report["skipped"], report["seen"]) == ("success", 120, 0, 0)
     assert report["recorded"] == successes / 120
-    assert report["agreement"] == {"share": pytest.approx(right), "difference": None}
+    assert report["agreement"] == {"share": pytest.approx(right), "difference": None, "noise": None}
     assert report["fitted_q"]["value"] == pytest.approx(1.0, abs=0.1)
     assert report["fitted_q"]["interval"][1] <= 1
     assert report["importance"]["snips"]["value"] == pytest.approx(1.0)
@@ -46,6 +52,56 @@ def test_the_table_says_what_is_estimated(corridor_checkpoint, make_data, run):
     assert lines[7] == note
     assert lines[8] == "  by site, the weakest first"
     assert {line.split()[0] for line in lines[9:]} == {"a", "b"}
+
+
+def test_agreement_is_with_what_was_meant_before_noise_was_added(tmp_path):
+    """But with what a person did who took over, whatever the policy said."""
+
+    class Policy:
+        recurrent = False
+
+        def reset(self):
+            pass
+
+        def act_batch(self, observations):
+            return np.full((len(observations), 2), 0.5, np.float32)
+
+    box, rng = Box(-1, 1, (2,), np.float32), np.random.default_rng(0)
+    noise = rng.normal(0, 0.3, (40, 2)).astype(np.float32)
+    raw, person = np.full((40, 2), 0.5, np.float32), np.zeros(40)
+    person[:10] = 1
+    with DataSetWriter(tmp_path / "d", DataSetInfo("a/B-v0", {}, box, box, 0.1)) as writer:
+        columns = {"raw_action": raw, "intervention": person}
+        parts = np.zeros((41, 2), np.float32), raw + noise, np.zeros(40), True, False, True
+        writer.add(Episode(*parts, columns=columns))
+    steps = read_steps(DataSet.open(tmp_path / "d"), Policy(), [0], True)
+    assert np.array_equal(steps.meant[10:], raw[10:])
+    assert np.array_equal(steps.meant[:10], steps.actions[:10])
+    assert np.array_equal(steps.actions, raw + noise)
+
+
+def made_report(**changes):
+    """What three hundred episodes say of a policy."""
+    wide, few = Estimate(0.4, (0.0, 1.0), 300.0), Estimate(82.9, (-60.0, 226.0), 1.3).as_rate()
+    values = {"env": "a/B-v0", "metric": "success", "episodes": 300, "steps": 900, "skipped": 0, "seen": 0}
+    values |= {"recorded": 0.5, "recorded_interval": (0.4, 0.6), "agreement": Agreement(0.998, 0.01, 0.3)}
+    values |= {"fitted_q": wide, "importance": {"ips": few}, "probabilities": "recorded", "groups": ()}
+    return DataReport(**{**values, **changes})
+
+
+def test_an_estimate_that_says_nothing_says_so():
+    lines = list(data_lines(made_report(), "p.zip", "d"))
+    assert lines[2] == "  agreement 99.8% of the actions, without its noise of 0.30; they differ by 0.01 (rms)"
+    nothing = "unknown (95 % interval 0.0% to 100.0%, which says nothing)"
+    assert lines[3] == f"  FQE       {nothing} success of this policy, estimated"
+    assert lines[4] == "  IPS       too few to say: 1.3 effective episodes"
+
+
+def test_no_weight_of_a_few_episodes_is_shown_as_a_success_rate():
+    assert made_report().to_json()["importance"] == {"ips": {"value": None, "interval": None, "effective": 1.3}}
+    sound = Estimate(1.2, (0.9, 1.5), 30.0).as_rate()
+    found = made_report(importance={"ips": sound}).to_json()["importance"]["ips"]
+    assert found == {"value": 1.0, "interval": [0.9, 1.0], "effective": 30.0}
 
 
 def test_episodes_that_it_learnt_from_are_refused(corridor_checkpoint, make_data, run):

@@ -211,9 +211,23 @@ def test_the_screen_shows_every_number_with_name_unit_and_limits():
     assert [line.split()[0] for line in lines if line.startswith("  ")][-18:] == [
         row["name"] for row in driven.env.unwrapped.describe()["observation"]
     ]
-    assert screen_lines(session, "", 120, 5)[-1] == f"… {len(lines) - 4} more lines on a higher screen"
+    assert screen_lines(session, "", 40, 5)[-1].endswith(" more lines on a higher screen")
     driven.tap("Slash")
     assert "W ↑     forward" in screen_lines(session, "", 120, 60)
+    driven.env.close()
+
+
+@pytest.mark.parametrize("env_id", ["bam/reach-v0", "bam/pick-v0", "bam/pick-place-v0", "bam/mir100-navigation-v0"])
+def test_a_small_terminal_shows_every_number_and_the_key_that_starts(env_id):
+    driven = Driven(env_id)
+    ready = screen_lines(driven.session, env_id, 80, 24)
+    assert any(line.endswith("W or another key starts time; ? shows the keys") for line in ready)
+    lines = screen_lines(driven.tick(3, "KeyW"), env_id, 80, 24)
+    described = driven.env.unwrapped.describe()
+    shown = " ".join(lines).split()
+    for row in (*described["action"], *described["observation"]):
+        assert row["name"][:24] in shown
+    assert max(map(len, [*ready, *lines])) <= 80
     driven.env.close()
 
 

@@ -99,12 +99,12 @@ class Cameras:
         return {**self.__dict__, "_painter": None, "_thread": None}
 
 
-def _visual_model(scene: str, size: int) -> Any:
+def _visual_model(scene: str, width: int, height: int) -> Any:
     """The model of a scene with cheap graphics, surroundings, and textures for its table."""
     spec = mujoco.MjSpec.from_file(str(MODELS / scene))
     quality = spec.visual.quality
     quality.offsamples, quality.numslices, quality.numstacks = 0, 12, 6
-    spec.visual.global_.offwidth = spec.visual.global_.offheight = size
+    spec.visual.global_.offwidth, spec.visual.global_.offheight = width, height
     for name, builtin, mark in (("checked", "CHECKER", "NONE"), ("speckled", "FLAT", "RANDOM")):
         spec.add_texture(
             name=name, type=mujoco.mjtTexture.mjTEXTURE_2D, width=64, height=64, random=0.3,
@@ -123,11 +123,11 @@ class _Painter:
     """An OpenGL context of the thread that makes it, and a model of its own, for one environment after the other."""
 
     def __init__(self, scene: str, specs: Sequence[CameraSpec]) -> None:
-        self._specs, size = specs, specs[0].size
-        self._model: Any = _visual_model(scene, size)
+        self._specs, width, height = specs, specs[0].width, specs[0].height
+        self._model: Any = _visual_model(scene, width, height)
         self._nominal = copy.copy(self._model)
         self._data = mujoco.MjData(self._model)
-        self._camera = FastCamera(self._model, size)
+        self._camera = FastCamera(self._model, width, height)
         self._object = mujoco.mj_name2id(self._model, mujoco.mjtObj.mjOBJ_GEOM, "object")  # -1: there is none
 
     def pose(self, model: Any, qpos: Array, draws: Array | None) -> None:

@@ -182,7 +182,7 @@ class GraspCell:
             from bam_envs.robots.physics.rendering import FastCamera
 
             self._thread = ThreadPoolExecutor(1, "bam-camera")  # an OpenGL context belongs to a thread
-            self._camera = self._thread.submit(FastCamera, physics.model, self._size, (_GRIPPER,)).result()
+            self._camera = self._thread.submit(FastCamera, physics.model, self._size, self._size, (_GRIPPER,)).result()
         self._color, self._depth = self._color.copy(), self._depth.copy()
         self._thread.submit(self._look, self._camera, fresh.tolist()).result()
         width = physics.qpos[:, 2:3] + physics.qpos[:, 3:4]

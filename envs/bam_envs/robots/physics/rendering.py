@@ -81,11 +81,11 @@ class FastCamera:
 
     _OFF = ("mjRND_SHADOW", "mjRND_REFLECTION", "mjRND_SKYBOX", "mjRND_HAZE", "mjRND_FOG")
 
-    def __init__(self, model: Any, size: int, hidden: Sequence[int] = ()) -> None:
-        self._gl: Any = gl_context(find_backend(), size, size)
+    def __init__(self, model: Any, width: int, height: int, hidden: Sequence[int] = ()) -> None:
+        self._gl: Any = gl_context(find_backend(), width, height)
         quality, screen = model.vis.quality, model.vis.global_
         before = quality.offsamples, screen.offwidth, screen.offheight
-        quality.offsamples, screen.offwidth, screen.offheight = 0, size, size
+        quality.offsamples, screen.offwidth, screen.offheight = 0, width, height
         self._context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_50.value)
         quality.offsamples, screen.offwidth, screen.offheight = before
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, self._context)
@@ -95,11 +95,11 @@ class FastCamera:
         self._option, self._camera = mujoco.MjvOption(), mujoco.MjvCamera()
         self._option.geomgroup[list(hidden)] = 0
         self._camera.type = mujoco.mjtCamera.mjCAMERA_FIXED
-        self._view = mujoco.MjrRect(0, 0, size, size)
-        self._pixels, self._buffer = np.empty((size, size, 3), np.uint8), np.empty((size, size), np.float32)
+        self._view = mujoco.MjrRect(0, 0, width, height)
+        self._pixels, self._buffer = np.empty((height, width, 3), np.uint8), np.empty((height, width), np.float32)
 
     def look(self, model: Any, data: Any, camera: str) -> NDArray[np.uint8]:
-        """The colours that a camera sees. Shape: (size, size, 3)."""
+        """The colours that a camera sees. Shape: (height, width, 3)."""
         self._gl.make_current()
         self._camera.fixedcamid = model.camera(camera).id
         everything = mujoco.mjtCatBit.mjCAT_ALL.value
@@ -115,7 +115,7 @@ class FastCamera:
         return self._pixels[::-1]  # OpenGL's first line is the lowest
 
     def depth(self, model: Any) -> NDArray[np.float32]:
-        """Distances of the last picture from the camera's plane [m]. Shape: (size, size)."""
+        """Distances of the last picture from the camera's plane [m]. Shape: (height, width)."""
         mujoco.mjr_readPixels(None, self._buffer, self._view, self._context)
         # 1 in the buffer is the near clipping plane, 0 the far one.
         near, far = model.vis.map.znear * model.stat.extent, model.vis.map.zfar * model.stat.extent

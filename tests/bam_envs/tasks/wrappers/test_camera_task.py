@@ -14,6 +14,10 @@ from bam_envs.robots.physics.mujoco_arm import SimulatedArm
 from bam_envs.testing import RobotContract, TaskContract
 from bam_envs.testing.assertions import assert_same_value
 
+PIXELS = (
+    "image_size= of bam/pick-v0: expected whole numbers of pixels from 8 to 1280: one, or width and height, such as "
+    "640x480"
+)
 EVERYTHING = {"camera": ["wrist", "front"], "image_size": 16, "depth": True, "segmentation": True, "looks": "random"}
 
 
@@ -41,7 +45,7 @@ class TestCameraTask(TaskContract):
 @draws
 class TestArmWithCameras(RobotContract):
     def make(self, num_robots):
-        return SimulatedArm(num_robots, cameras=(CameraSpec("wrist", 16, depth=True),), looks="random")
+        return SimulatedArm(num_robots, cameras=(CameraSpec("wrist", 16, 16, depth=True),), looks="random")
 
 
 @draws
@@ -124,16 +128,31 @@ def test_images_that_were_returned_keep_their_pixels(make_rows):
     assert_same_value(first, kept)
 
 
+@draws
+@pytest.mark.parametrize("size", [[40, 24], "40x24"])
+def test_images_are_as_wide_and_as_high_as_a_camera(make, size):
+    """The middle of a wide image is the square one: the height is the same view."""
+    wide = make("bam/pick-v0", camera="front", image_size=size, depth=True, segmentation=True)
+    square = make("bam/pick-v0", camera="front", image_size=24)
+    shapes = {name: box.shape for name, box in wide.observation_space.items() if name != "robot"}
+    sizes = {"front": (24, 40, 3), "front_depth": (24, 40, 1), "front_segmentation": (24, 40, 1)}
+    assert shapes == sizes
+    seen, middle = wide.reset(seed=1)[0], square.reset(seed=1)[0]["front"]
+    assert {name: seen[name].shape for name in sizes} == sizes
+    assert np.abs(seen["front"][:, 8:32].astype(int) - middle).mean() < 2
+    wide.close()
+    square.close()
+
+
 @pytest.mark.parametrize(
     ("options", "error", "text"),
     [
         ({"camera": "wrst"}, UnknownName, "Unknown camera of bam/pick-v0 'wrst'. Did you mean 'wrist'?"),
         ({"camera": []}, InvalidValue, "camera= of bam/pick-v0 must be one or more different names, not []."),
         ({"depth": True}, InvalidValue, "depth= of bam/pick-v0 is for images; give camera= too, such as 'front'."),
-        (
-            {"camera": "front", "image_size": 4},
-            InvalidValue,
-            "image_size= of bam/pick-v0: expected a whole number of pixels from 8 to 512, found 4",
+        *(
+            ({"camera": "front", "image_size": size}, InvalidValue, f"{PIXELS}, found {size!r}")
+            for size in (4, "640x", "large", [64, 48, 3], [64.5, 48], "4000x3000", None)
         ),
     ],
 )

@@ -179,7 +179,9 @@ def test_lerobot_is_a_data_set_of_few_files(tmp_path):
 
 def test_what_cannot_be_exported_is_one_line(tmp_path):
     data = record(tmp_path / "data", "nested")
-    with pytest.raises(SettingsError, match="--to rllib: its offline reader takes one array a step, and the observati"):
+    with pytest.raises(
+        SettingsError, match="--to rllib: RLlib reads one array a step, and the observations are a Dict"
+    ):
         export(data, "rllib", tmp_path / "out")
     assert [path.name for path in tmp_path.iterdir()] == ["data"]
     with pytest.raises(SettingsError, match=r"there is no format 'minary'. Did you mean 'minari'"):

@@ -19,6 +19,7 @@ from bam_train.cli.program import guarded
 from bam_train.cli.train import train
 from bam_train.data import DataSet, DataSetInfo, DataSetWriter, Episode
 from bam_train.policy import FrozenPolicy
+from bam_train.trainers.resolve_settings import resolve
 
 SEEN = spaces.Box(-1, 1, (2,), np.float32)
 ACTED = spaces.Box(np.float32([-1, 0]), np.float32([1, 10]))
@@ -65,6 +66,15 @@ def record(place, *, action_space=ACTED, env="elsewhere/Point-v0", episodes=8, s
 
 def expected(seen):
     return np.stack([-seen[:, 0], 5 + 4 * seen[:, 1]], 1)
+
+
+def test_a_run_without_a_preset_has_so_many_updates():
+    record("points")
+    record("picks", env="bam/pick-v0")
+    assert resolve({"data": "points", "algo": "td3bc"}).steps == 20_000
+    assert resolve({"data": "points", "algo": "bc", "steps": 700}).steps == 700
+    assert resolve({"data": "picks", "algo": "iql"}).steps == 13_000  # of its preset
+    assert resolve({"data": "picks", "algo": "td3bc"}).steps == 10_000
 
 
 def test_cloning_needs_no_environment(bam_train):
@@ -144,7 +154,7 @@ def test_offline_to_online(bam_train):
 @pytest.mark.parametrize(
     ("flags", "text"),
     [
-        ({"data": "nowhere"}, "nowhere: is no data set: it has no meta/info.json; give a folder that bam-data wrote"),
+        ({"data": "nowhere"}, "nowhere: no such file or folder. Check the name"),
         ({"env": "bam/reach"}, "data: points is of elsewhere/Point-v0, not of bam/reach-v0; leave --env out"),
         ({"until_success": 0.9}, "until_success: nothing is chosen by simulation while learning from data"),
         ({"algo": "ppo"}, "Unknown algorithm 'ppo'. It is one of rllib's; those of offline are: awac, bc, cal-ql"),

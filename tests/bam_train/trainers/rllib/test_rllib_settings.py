@@ -125,6 +125,17 @@ def test_complete_settings_stay_as_they_are(name):
     assert hyperparameters.complete(RLLIB_ALGORITHMS[name], values) == values
 
 
+@pytest.mark.parametrize("algo", ["bc", "marwil"])
+def test_cloning_has_defaults_with_which_it_learns(algo):
+    values = hyperparameters.complete(RLLIB_ALGORITHMS[algo], {}, is_continuous=True)
+    assert (values["lr"], values["train_batch_size_per_learner"]) == (1e-3, 256)
+    assert values["model_config"]["free_log_std"]
+    given = {"lr": 1e-4, "model_config": {"free_log_std": False, "fcnet_hiddens": [9]}}
+    values = hyperparameters.complete(RLLIB_ALGORITHMS[algo], given, is_continuous=True)
+    assert (values["lr"], values["model_config"]["free_log_std"]) == (1e-4, False)
+    assert not hyperparameters.complete(RLLIB_ALGORITHMS[algo], {})["model_config"]["free_log_std"]
+
+
 def test_the_preset_belongs_to_its_trainer():
     assert resolve({"env": "bam/pick", "algo": "ppo", "trainer": "rllib"}).hyperparameters["action_init_scale"] == 0.01
     assert "n_steps" in resolve({"env": "bam/pick", "algo": "ppo"}).hyperparameters

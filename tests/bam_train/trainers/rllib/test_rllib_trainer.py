@@ -18,6 +18,7 @@ import ray
 from bam_train.checkpoint import Checkpoint
 from bam_train.compat.rllib_export import export
 from bam_train.errors import BamTrainError, EnvironmentFailed, SettingsError
+from bam_train.evaluation import evaluate
 from bam_train.policy import FrozenPolicy
 from bam_train.settings import TrainSettings
 from bam_train.trainers.resolve_settings import resolve, resolve_resumed
@@ -288,6 +289,19 @@ def test_recorded_episodes_teach(trained, tmp_path, monkeypatch, capsys):
             np.testing.assert_allclose(again.freeze().act(zeros), FrozenPolicy.load(saved.path).act(zeros), atol=1e-6)
             train(again, 641)
             again.save(tmp_path / f"{algo}-2.zip", {}, {"best": None})
+
+
+@pytest.mark.training
+def test_fifty_scripted_episodes_are_cloned(shared_ray, tmp_path):
+    from bam_train.data.collect import collect
+
+    shared_ray.start()
+    place = str(tmp_path / "scripted")
+    collect(place, "scripted", "bam/pick-v0", episodes=50)
+    with made("bc", "bam/pick", {}, data=place, steps=300_000) as trainer:
+        train(trainer, 300_000)
+        result = evaluate(trainer.freeze(), "bam/pick-v0", episodes=100)
+    assert result.successes >= 90  # 100 were measured
 
 
 def test_data_that_is_not_there(tmp_path):
