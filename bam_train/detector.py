@@ -117,7 +117,8 @@ class Model:
             return cls(**arrays)
         hidden, matrix = arrays["hidden"], arrays["matrix"]
         lever = np.roll(matrix[:, : len(matrix)], hidden.shape[1], axis=0)
-        return cls(hidden, lever, arrays["whiten"], *np.zeros((2, 2), np.float32), arrays["bounds"])
+        none = np.zeros(2, np.float32)
+        return cls(hidden, lever, arrays["whiten"], none, none, arrays["bounds"])
 
     def require_shapes(self) -> None:
         """Raise ValueError unless the arrays fit each other, are finite and not too large."""
