@@ -95,12 +95,12 @@ def commanded():
 
 def test_the_answer_is_judged_to_the_command_that_was_sent(commanded):
     assert alarms(commanded, rollouts(200, 1, share=0.3)) == 0
-    weak = rollouts(50, 2, share=1.0, gain=0.3)  # all of each action is sent, and a part is executed
-    assert alarms(commanded, weak) == 50
-    commanded.levels(weak[0])
+    stuck = rollouts(50, 2, share=1.0, gain=0.0)  # every action is sent, and none is executed
+    assert alarms(commanded, stuck) == 50
+    commanded.levels(stuck[0])
     assert commanded.reason == REASONS[3]
-    as_told = [one._replace(commands=0.3 * one.commands) for one in weak]
-    assert alarms(commanded, as_told) == 0
+    weak = rollouts(50, 3, share=1.0, gain=0.3)
+    assert alarms(commanded, [one._replace(commands=0.3 * one.commands) for one in weak]) == 0
 
 
 def test_without_the_command_or_in_time_no_answer_is_judged(commanded, detector):
