@@ -10,7 +10,7 @@ Five charts, each divided by its bound; the largest is the level of a tick, and 
   1992),
 - two CUSUM charts (Page 1954) of l = log(1 + h), and the same of e's squared length, for what lasts:
   S = max(0, S + p (min(l, cut) - drift)),
-- ``duration``: ticks since the episode began, times p.
+- ``duration``: ticks since the episode began, times p; those in which a guard held the robot do not count.
 
 p, the pace, is the share of its speed at which the robot is allowed to move. The bounds are conformal: quantiles of the
 largest value in each of the episodes that were kept apart, continued beyond the largest of them by the exponential tail
@@ -199,7 +199,7 @@ class Detector:
         """The newest level; above 1 it is an alarm."""
         self.charts = [0.0] * 5
         """The newest value of each chart, before it is divided by its bound."""
-        self._ticks, self._usual, self._pace = 0, 0.0, pace
+        self._ticks, self._usual, self._pace = 0, 0.0, pace  # ticks without those that were held
         self._mean.fill(0.0)
         self._is_sent = False  # whether the command before the last observation is known
 
@@ -209,7 +209,15 @@ class Detector:
         levels = [value / bound for value, bound in zip(self.charts, self._bounds, strict=True)]
         return REASONS[levels.index(max(levels))]
 
-    def step(self, observation: Array, action: Array, command: Array | None = None, periods: float = 1.0) -> float:
+    def step(
+        self,
+        observation: Array,
+        action: Array,
+        command: Array | None = None,
+        periods: float = 1.0,
+        *,
+        held: bool = False,
+    ) -> float:
         """The level of a tick, after the policy has chosen `action` for `observation`.
 
         The answer to a command is judged if the detector knows commands, and the observation came on time; without a
@@ -220,6 +228,7 @@ class Detector:
             action: a numbers.
             command: The command that was sent before the observation, m numbers [SI]; None without a robot.
             periods: Time since the observation before [periods].
+            held: Whether a guard held the robot meanwhile.
         """
         model, white, seen = self.model, None, observation.reshape(-1)
         is_sent = (0 if command is None else command.size) == self._m
@@ -237,7 +246,7 @@ class Detector:
             self._sent[:] = self._command[:] = command
         np.tanh(np.dot(self._known, model.lever_hidden, out=self._lever_h), out=self._lever_h)
         np.dot(self._lever_features, model.lever, out=self._lever)
-        return self._advance(float(np.dot(self._lever, self._lever)) * self._share, white)
+        return self._advance(float(np.dot(self._lever, self._lever)) * self._share, white, held=held)
 
     def levels(self, rollout: Rollout) -> Array:
         """The level of each tick of an episode; `step` in one call. Shape: (T,) float64."""
@@ -254,9 +263,9 @@ class Detector:
             found.append(self.charts)
         return np.array(found)
 
-    def _advance(self, leverage: float, white: Array | None) -> float:
+    def _advance(self, leverage: float, white: Array | None, *, held: bool = False) -> float:
         """Add a tick to the charts; returns the level."""
-        self._ticks += 1
+        self._ticks += not held
         self._usual += _MEMORY * (leverage - self._usual)
         (drift, drift_of_error), (cut, cut_of_error), before, pace = self._drift, self._cut, self.charts, self._pace
         lasting = max(0.0, before[2] + pace * (min(math.log1p(leverage), cut) - drift))

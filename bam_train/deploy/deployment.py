@@ -300,9 +300,9 @@ class _DetectorAgent(Agent):
         self._policy, self._journal = policy, deployment.journal
         self._of: Any = None  # the detector of the running episode
         self._env: Any = deployment.env.unwrapped
-        robot = getattr(self._env, "robot", None)
-        self._tell = getattr(robot, "tell_unusual", None)
-        self._pace = getattr(getattr(robot, "limits", None), "pace", 1.0)
+        self._robot: Any = getattr(self._env, "robot", None)
+        self._tell = getattr(self._robot, "tell_unusual", None)
+        self._pace = getattr(getattr(self._robot, "limits", None), "pace", 1.0)
         self._stamp = math.nan
         self.reads = (*policy.names, "action", "env/done")
 
@@ -315,7 +315,8 @@ class _DetectorAgent(Agent):
         if t == 0 or detector is not self._of:
             detector.begin(self._pace)
             self._of = detector
-        level = detector.step(self.get((self._policy.names[0], t))[0], self.get(("action", t))[0], *self._answered())
+        seen, action = self.get((self._policy.names[0], t))[0], self.get(("action", t))[0]
+        level = detector.step(seen, action, *self._answered(), held=getattr(self._robot, "is_held", False))
         text = f"{detector.reason} (score {level:.2f}, usual is at most 1)" if level > 1.0 else ""
         journal.compare(level, text, begins=t == 0)
         if text and self._tell is not None:
@@ -328,7 +329,7 @@ class _DetectorAgent(Agent):
             return None, 1.0
         stamp = float(state.stamp[0])
         before, self._stamp = self._stamp, stamp
-        return state.command[0], (stamp - before) / self._env.robot.spec.period
+        return state.command[0], (stamp - before) / self._robot.spec.period
 
 
 class _DeployedRobot(RobotAgent):

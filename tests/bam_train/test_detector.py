@@ -122,6 +122,10 @@ def test_at_a_lower_pace_an_episode_may_last_longer(detector):
     slow = rollouts(1, 4, steps=80)[0]._replace(pace=0.25)
     np.testing.assert_array_equal(detector.values(slow)[:, 4], 0.25 * np.arange(1, 81))
     assert alarms(detector, [slow]) == 0
+    detector.begin(0.5)
+    for held in (False, True, False):
+        detector.step(slow.observations[0], slow.actions[0], held=held)
+    assert detector.charts[4] == 1.0
 
 
 def test_the_bound_of_the_duration_is_below_the_time_limit():
