@@ -20,7 +20,7 @@ Array = NDArray[np.float64]
 SLOWEST = 0.15
 """Smallest share of the speed; a robot on trial has `guard.TRIAL_SPEED`."""
 _ACCELERATION = 0.5, 2.0  # least and greatest factor on the default limit
-_LATE = 0.5  # greatest time from a measurement to the end of its period [periods]
+_LATE = 1.0  # greatest time by which all states of an episode are old [periods]
 _JITTER = 0.5  # greatest deviation of this time from tick to tick [periods]
 _HOLD, _LONGEST_HOLD = 0.01, 5  # probability that commands begin to be late; for how many periods at most
 _DRAWS = 3  # random numbers of a step
