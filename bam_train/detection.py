@@ -1,5 +1,6 @@
 """Make the detector of a checkpoint: of fresh episodes of its frozen policy, or of a data set."""
 
+import math
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -7,8 +8,11 @@ from typing import Any
 import numpy as np
 from gymnasium.vector import VectorEnv
 
+from bam_envs.core.robot_env import RobotVectorEnv
+from bam_envs.robots.live_like import LiveLike
 from bam_train.checkpoint import Checkpoint
 from bam_train.checkpoint.added_members import add_members
+from bam_train.data.episode import Episode
 from bam_train.detector import DETECTOR, LEAST_TICKS, MOST_NUMBERS, Detector, Rollout, make_detector
 from bam_train.environments import make_vector_env
 from bam_train.errors import NoDetector
@@ -17,19 +21,19 @@ from bam_train.finite_envs import FiniteVectorEnv
 
 SEED = 4_000_000
 """First seed of the episodes, far from those of training and evaluations."""
-WANTED = 24_000
-"""Steps that a detector is made of: 600 episodes of bam/pick, half a minute of CPU time."""
+WANTED = 48_000
+"""Steps that a detector is made of: 1,000 episodes of bam/pick, half a minute of CPU time."""
 SIDE_BY_SIDE = 64
 
 
-def add_detector(path: str | Path, rollouts: Iterable[Rollout]) -> Detector:
-    """Make a detector of episodes, and add it to the checkpoint at `path`, whose digest changes.
+def add_detector(path: str | Path, *kinds: Iterable[Rollout], limit: float | None = None) -> Detector:
+    """Make a detector of episodes, see `make_detector`, and add it to the checkpoint at `path`; its digest changes.
 
     Raises:
         NoDetector: None can be made of these episodes; the checkpoint is unchanged.
         CheckpointError: It cannot be read or written.
     """
-    detector = make_detector(rollouts)
+    detector = make_detector(*kinds, limit=limit)
     add_members(path, {DETECTOR: detector.to_bytes()})
     return detector
 
@@ -45,6 +49,8 @@ def add_own_detector(
 ) -> Detector:
     """As `add_detector`, of about `steps` steps of the checkpoint's own policy in new episodes of its environment.
 
+    If that has simulated robots, these are as live ones in half of the steps; see `LiveLike`.
+
     Raises:
         NoDetector: Too few steps, or the observations are not up to `MOST_NUMBERS` numbers.
     """
@@ -57,9 +63,24 @@ def add_own_detector(
         return add_detector(path, fresh_episodes(envs, env, policy, steps))
     with_own = make_vector_env(env, env_kwargs, SIDE_BY_SIDE)
     try:
-        return add_detector(path, fresh_episodes(with_own, env, policy, steps))
+        inner: Any = with_own.unwrapped
+        if not (isinstance(inner, RobotVectorEnv) and inner.robot.spec.command.labels):
+            return add_detector(path, fresh_episodes(with_own, env, policy, steps))
+        limit = inner.max_episode_steps
+        plain = fresh_episodes(with_own, env, policy, steps // 2)
+        inner.robot = LiveLike(inner.robot)
+        return add_detector(path, plain, fresh_episodes(with_own, env, policy, steps // 2, SEED + steps), limit=limit)
     finally:
         with_own.close()
+
+
+def recorded(episode: Episode, period: float) -> Rollout:
+    """An episode of a data set whose steps take `period` [s], for the detector of unusual observations."""
+    sent, stamps, periods = episode.columns.get("command"), episode.columns.get("stamp"), None
+    commands = None if sent is None else np.concatenate([np.full_like(sent[:1], np.nan, np.float64), sent[:-1]])
+    if stamps is not None:
+        periods = np.diff(stamps, prepend=math.nan) / period
+    return Rollout(episode.observations, episode.actions, episode.success, commands, periods)
 
 
 def unusual_episodes(detector: Detector, rollouts: Iterable[Rollout]) -> dict[str, float]:
@@ -71,29 +92,40 @@ def unusual_episodes(detector: Detector, rollouts: Iterable[Rollout]) -> dict[st
 def fresh_episodes(
     envs: VectorEnv[Any, Any, Any], env: str, policy: BatchPolicy, steps: int, seed: int = SEED
 ) -> list[Rollout]:
-    """Whole episodes of `policy` of about `steps` steps in all: every one that begins before as many are done."""
+    """Whole episodes of `policy` of about `steps` steps in all: every one that begins before as many are done.
+
+    A robot that is slower, see `LiveLike`, has more time in proportion.
+    """
     finite, n = FiniteVectorEnv(envs, env), envs.num_envs
+    inner: Any = envs.unwrapped
+    robot = inner.robot if isinstance(inner, RobotVectorEnv) else None
+    limit, paces = getattr(inner, "max_episode_steps", None), np.ones(n)
     observation, _ = finite.reset(seed=[seed + i for i in range(n)])
     policy.reset()
-    running: list[list[tuple[Any, Any]] | None] = [[] for _ in range(n)]  # None: what runs there is not counted
+    running: list[list[tuple[Any, ...]] | None] = [[] for _ in range(n)]  # None: what runs there is not counted
     done, count = list[Rollout](), 0
     for _ in range(steps):  # an episode of that many steps has no end
+        if isinstance(robot, LiveLike):
+            paces = robot.pace
+            inner.max_episode_steps = None if limit is None else np.ceil(limit / paces)
+        sent = np.zeros((n, 0)) if robot is None else inner.state.command
         action = np.asarray(policy.act_batch(observation))
         after, _, terminated, truncated, info = finite.step(action)
-        for i, pairs in enumerate(running):
-            if pairs is not None:
-                pairs.append((observation[i], action[i]))
+        for i, steps_of in enumerate(running):
+            if steps_of is not None:
+                steps_of.append((observation[i], action[i], sent[i]))
         ended = np.flatnonzero(terminated | truncated)
         for i in ended.tolist():
-            pairs = running[i]
-            if pairs is None:
+            steps_of = running[i]
+            if steps_of is None:
                 continue
-            count += len(pairs)
+            count += len(steps_of)
             success = info.get("final_info", {}).get("is_success")
-            seen, acted = (np.array(part) for part in zip(*pairs, strict=True))
-            done.append(Rollout(seen, acted, None if success is None else bool(success[i])))
+            seen, acted, commands = (np.array(part) for part in zip(*steps_of, strict=True))
+            is_success = None if success is None else bool(success[i])
+            done.append(Rollout(seen, acted, is_success, None if robot is None else commands, pace=float(paces[i])))
             running[i] = [] if count < steps else None
-        if not any(pairs is not None for pairs in running):
+        if not any(one is not None for one in running):
             break
         policy.reset(ended)
         observation = after

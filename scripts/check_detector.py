@@ -1,4 +1,4 @@
-"""Measure a checkpoint's detector on bam/pick: false alarms on episodes of its training's kind, and twelve shifts.
+"""Measure a checkpoint's detector: false alarms in usual episodes, and on bam/pick twelve shifts.
 
 An episode is flagged if there is an alarm at one of its ticks, so before it ends. One that succeeds in spite of a shift
 counts as harmless, flagged or not. A false alarm is an episode without any shift that is flagged and succeeds.
@@ -6,10 +6,13 @@ counts as harmless, flagged or not. A false alarm is an episode without any shif
 Examples:
   python scripts/check_detector.py
   python scripts/check_detector.py checkpoints/pick-ppo.zip --ticks 150000 --steps 6400
+  python scripts/check_detector.py checkpoints/reach-ppo.zip --ticks 0 --guarded 720000 --steps 0
 """
 
+import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from contextlib import closing
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
@@ -17,20 +20,29 @@ from typing import Annotated, Any
 import numpy as np
 import tyro
 
+from bam_envs.core.errors import SafetyStop
+from bam_envs.core.registry import ENVIRONMENTS
 from bam_envs.core.robot import EnvIds, RobotState
 from bam_envs.core.robot_env import RobotVectorEnv
 from bam_envs.core.task import Array, Floats, Score
+from bam_envs.live.rehearsed_robot import rehearsed_robot
+from bam_envs.robots.linked import LinkProfile
 from bam_envs.robots.physics.mujoco_arm import SimulatedArm
+from bam_envs.safety.guard import TRIAL_SPEED
 from bam_envs.tasks.pick import PickTask
 from bam_envs.tasks.wrappers.late_actions import LateActions
+from bam_train.checkpoint import Checkpoint
 from bam_train.cli.program import guarded, parse
 from bam_train.detection import fresh_episodes
 from bam_train.detector import TICKS, Detector, Rollout
+from bam_train.env_location import SIMULATED
+from bam_train.environments import environment_of, make_env, make_vector_env
 from bam_train.errors import NoDetector
 from bam_train.policy import FrozenPolicy
 
 NAME = Path(__file__).stem
 SIDE_BY_SIDE = 64
+AT_ONCE = LinkProfile([0.0, 0.0], [0.0, 0.0])
 Signals = dict[str, Array]
 
 
@@ -39,11 +51,15 @@ class Flags:
     """What is measured."""
 
     checkpoint: tyro.conf.Positional[Path] = Path("checkpoints/pick-ppo.zip")
-    """A checkpoint of bam/pick with a detector."""
-    ticks: Annotated[int, tyro.conf.arg(metavar="N")] = 2 * TICKS
-    """Ticks without any shift."""
+    """A checkpoint of a robot, with a detector."""
+    ticks: Annotated[int, tyro.conf.arg(metavar="N")] = 144_000
+    """Ticks without any shift; 0 for none."""
+    guarded: Annotated[int, tyro.conf.arg(metavar="N")] = 0
+    """Ticks without any shift behind the guards of a live robot, at full speed, and as many on trial."""
+    seed: int = 20_000_000
+    """Seed of the first episode without a shift."""
     steps: Annotated[int, tyro.conf.arg(metavar="N")] = 6_400
-    """Ticks of each shift."""
+    """Ticks of each shift of bam/pick; 0 for none."""
     only: str = ""
     """Only shifts whose name has this text."""
 
@@ -149,7 +165,7 @@ PHYSICS: dict[str, Callable[[Any], None]] = {
 DELAYS = {"actions 4 steps late": 4}
 
 
-def make(shift: str = "") -> RobotVectorEnv:
+def make(shift: str) -> RobotVectorEnv:
     """bam/pick with a shift."""
     n = SIDE_BY_SIDE
     task: Any = MisledTask(n, SENSORS[shift]()) if shift in SENSORS else PickTask(n)
@@ -163,24 +179,73 @@ def make(shift: str = "") -> RobotVectorEnv:
     return RobotVectorEnv(arm, task, max_episode_steps=100)
 
 
-def play(policy: FrozenPolicy, steps: int, seed: int, shift: str = "") -> list[Rollout]:
-    """Whole episodes."""
+def play(policy: FrozenPolicy, steps: int, seed: int, shift: str) -> list[Rollout]:
+    """Whole episodes of bam/pick with a shift."""
     envs = make(shift)
     try:
-        return fresh_episodes(envs, shift or "bam/pick", policy, steps, seed)
+        return fresh_episodes(envs, shift, policy, steps, seed)
     finally:
         envs.close()
 
 
-def false_alarms(detector: Detector, episodes: list[Rollout]) -> str:
+def plain(checkpoint: Checkpoint, policy: FrozenPolicy, ticks: int, seed: int) -> list[Rollout]:
+    """Whole episodes in the checkpoint's simulation."""
+    env_id, kwargs = environment_of(checkpoint)
+    with closing(make_vector_env(env_id, kwargs, SIDE_BY_SIDE)) as envs:
+        return fresh_episodes(envs, env_id, policy, ticks, seed)
+
+
+def behind_guards(checkpoint: Checkpoint, policy: FrozenPolicy, ticks: int, seed: int, *, trial: bool) -> list[Rollout]:
+    """Whole episodes behind a live robot's guards; one that a guard stops has failed."""
+    env_id, saved = environment_of(checkpoint)
+    limit = saved.get("max_episode_steps") or ENVIRONMENTS[env_id].max_episode_steps
+    pace = TRIAL_SPEED if trial else 1.0
+    kwargs = {**saved, **SIMULATED, "link": asdict(AT_ONCE), "max_episode_steps": round(limit / pace)}
+    done, count = list[Rollout](), 0
+    with closing(make_env(env_id, kwargs)) as env:
+        inner: Any = env.unwrapped
+        straight = getattr(inner.task, "moves_straight", False)
+        inner.robot = gate = rehearsed_robot(inner.robot, trial=trial, straight=straight)
+        while count < ticks:
+            observation, info = env.reset(seed=seed + len(done))
+            policy.reset()
+            steps, ended = list[tuple[Any, ...]](), False
+            try:
+                while not ended:
+                    action = policy.act(observation)
+                    steps.append((observation, action, inner.state.command[0]))
+                    observation, _, terminated, truncated, info = env.step(action)
+                    ended = terminated or truncated
+            except SafetyStop:
+                gate.resume()
+            seen, acted, sent = (np.array(part) for part in zip(*steps, strict=True))
+            done.append(Rollout(seen, acted, ended and bool(info["is_success"]), sent, pace=gate.limits.pace))
+            count += len(steps)
+    return done
+
+
+def at_most(count: int) -> float:
+    """The greatest mean of a Poisson number of which one sample is `count`, with a confidence of 95 %."""
+    low, high = 0.0, 10.0 + 3 * count
+    while high - low > 1e-6:
+        mean = (low + high) / 2
+        share = math.exp(-mean) * sum(mean**k / math.factorial(k) for k in range(count + 1))
+        low, high = (mean, high) if share > 0.05 else (low, mean)
+    return high
+
+
+def false_alarms(detector: Detector, episodes: list[Rollout], where: str) -> str:
     """A line about episodes without a shift."""
-    flagged = np.array([(detector.levels(one) > 1).any() for one in episodes])
-    good = np.array([bool(one.success) for one in episodes])
-    ticks = sum(len(one.actions) for one in episodes)
-    hour = (flagged & good).sum() * TICKS / ticks
+    levels = [detector.values(one) / detector.model.bounds for one in episodes]
+    charts = np.array([one.max(axis=0) > 1 for one in levels])
+    flagged, good = charts.any(axis=1), np.array([bool(one.success) for one in episodes])
+    ticks, count = sum(len(one.actions) for one in episodes), int((flagged & good).sum())
+    highest = max(float(one.max()) for one, success in zip(levels, good, strict=True) if success)
+    most = at_most(count) * TICKS / ticks
     return (
-        f"no shift: {len(episodes)} episodes, {ticks} ticks: {(flagged & good).sum()} false alarms, {hour:.2f} in "
-        f"{TICKS} ticks; {(flagged & ~good).sum()} of {(~good).sum()} failed episodes flagged"
+        f"{where}: {len(episodes)} episodes, {ticks} ticks: {count} false alarms, at most {most:.2f} in {TICKS} ticks "
+        f"(95 %), by chart {charts[good].sum(axis=0).tolist()}, highest level {highest:.2f}; "
+        f"{(flagged & ~good).sum()} of {(~good).sum()} failed episodes flagged"
     )
 
 
@@ -203,11 +268,21 @@ def row(detector: Detector, shift: str, episodes: list[Rollout]) -> tuple[str, b
 def main() -> None:
     """Measure, and print a table in Markdown."""
     options = parse(Flags, NAME, description=__doc__)
-    policy = FrozenPolicy.load(options.checkpoint.expanduser())
+    checkpoint = Checkpoint.open(options.checkpoint.expanduser())
+    policy = FrozenPolicy.from_checkpoint(checkpoint)
     if policy.detector is None:
         raise NoDetector(f"{options.checkpoint} has no detector. Run: bam-eval {options.checkpoint} --add-detector")
     detector = policy.detector
-    print(false_alarms(detector, play(policy, options.ticks, seed=20_000_000)), end="\n\n", flush=True)
+    if options.ticks:
+        episodes = plain(checkpoint, policy, options.ticks, options.seed)
+        print(false_alarms(detector, episodes, "no shift"), flush=True)
+    for trial in (False, True) if options.guarded else ():
+        episodes = behind_guards(checkpoint, policy, options.guarded, options.seed, trial=trial)
+        where = f"behind guards, {'on trial' if trial else 'at full speed'}"
+        print(false_alarms(detector, episodes, where), flush=True)
+    if not options.steps:
+        return
+    print()
     print("| shift | episodes | failed | flagged before | without duration | at tick (median) | harmless | flagged |")
     print("| --- | --- | --- | --- | --- | --- | --- | --- |")
     verdicts = []

@@ -105,8 +105,8 @@ def _on_data(config: EvalConfig, place: str) -> None:
     from bam_train.checkpoint import Checkpoint
     from bam_train.cli.data.data_table import data_lines
     from bam_train.data import DataSet
-    from bam_train.detection import unusual_episodes
-    from bam_train.detector import Detector, Rollout
+    from bam_train.detection import recorded, unusual_episodes
+    from bam_train.detector import Detector
     from bam_train.estimation.data_evaluation import evaluate_on_data
 
     checkpoint = Checkpoint.open(config.checkpoint)
@@ -124,7 +124,7 @@ def _on_data(config: EvalConfig, place: str) -> None:
     manifest, path = checkpoint.manifest, checkpoint.path
     unusual: dict[str, Any] = {}
     if detector is not None:
-        rollouts = (Rollout(one.observations, one.actions) for one in data.episodes())
+        rollouts = (recorded(one, data.info.period) for one in data.episodes())
         unusual["unusual"] = found = unusual_episodes(detector, rollouts)
     if config.json:
         facts = {"checkpoint": str(path), "algorithm": manifest.algorithm, "steps_trained": manifest.steps, **unusual}

@@ -5,6 +5,7 @@ own agents join the same chain. At the end, for any reason (all episodes done, C
 halted and closed before anything is reported.
 """
 
+import math
 import signal
 import time
 from collections.abc import Callable, Sequence
@@ -319,7 +320,11 @@ class _DetectorAgent(Agent):
         super().__init__()
         self._policy, self._journal = policy, deployment.journal
         self._of: Any = None  # the detector of the running episode
-        self._tell = getattr(getattr(deployment.env.unwrapped, "robot", None), "tell_unusual", None)
+        self._env: Any = deployment.env.unwrapped
+        self._robot: Any = getattr(self._env, "robot", None)
+        self._tell = getattr(self._robot, "tell_unusual", None)
+        self._pace = getattr(getattr(self._robot, "limits", None), "pace", 1.0)
+        self._stamp = math.nan
         self.reads = (*policy.names, "action", "env/done")
 
     def forward(self, t: int, **kwargs: Any) -> None:
@@ -329,13 +334,23 @@ class _DetectorAgent(Agent):
             journal.unusual = None if detector is None else journal.unusual
             return
         if t == 0 or detector is not self._of:
-            detector.begin()
+            detector.begin(self._pace)
             self._of = detector
-        level = detector.step(self.get((self._policy.names[0], t))[0], self.get(("action", t))[0])
+        seen, action = self.get((self._policy.names[0], t))[0], self.get(("action", t))[0]
+        level = detector.step(seen, action, *self._answered(), held=getattr(self._robot, "is_held", False))
         text = f"{detector.reason} (score {level:.2f}, usual is at most 1)" if level > 1.0 else ""
         journal.compare(level, text, begins=t == 0)
         if text and self._tell is not None:
             self._tell(text)
+
+    def _answered(self) -> tuple[Any, float]:
+        """The command that was sent before the newest state, and the time since the state before [periods]."""
+        state = getattr(self._env, "last_state", None)
+        if state is None:
+            return None, 1.0
+        stamp = float(state.stamp[0])
+        before, self._stamp = self._stamp, stamp
+        return state.command[0], (stamp - before) / self._robot.spec.period
 
 
 class _DeployedRobot(RobotAgent):

@@ -21,7 +21,7 @@ from bam_envs.core.registry import are_same
 from bam_envs.core.validation import read_table
 from bam_train.checkpoint import Checkpoint
 from bam_train.data import DataSet
-from bam_train.detection import WANTED
+from bam_train.detection import WANTED, recorded
 from bam_train.detector import Rollout
 from bam_train.environments import control_period, make_env, require_fit
 from bam_train.errors import CheckpointMismatch, SettingsError
@@ -178,7 +178,7 @@ class OfflineTrainer(TorchTrainer):
         random.Random(self.settings.seed).shuffle(order)
         for index in order:
             episode = self._data[index]
-            yield Rollout(episode.observations, episode.actions, episode.success)
+            yield recorded(episode, self._data.info.period)
             ticks += len(episode)
             if ticks >= WANTED:
                 return

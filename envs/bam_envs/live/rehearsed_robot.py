@@ -82,6 +82,7 @@ def rehearsed_robot(
     *,
     profile: str | None = None,
     guards: Mapping[str, float] | None = None,
+    trial: bool = False,
     straight: bool = False,
 ) -> SafeRobot:
     """A `SafeRobot` around `robot`, with the limits and the lag of a live robot.
@@ -90,6 +91,7 @@ def rehearsed_robot(
         robot: One simulated robot behind a link.
         profile: The robot profile with the limits of the guards; by default the shipped one for the robot.
         guards: Limits that replace the profile's, such as ``{"lag": 0.15}``.
+        trial: Whether it is on trial: slow, and in a box around its start; see `Limits.on_trial`.
         straight: Whether the task moves the tool in straight lines, see `SafeRobot`.
 
     Raises:
@@ -100,6 +102,8 @@ def rehearsed_robot(
     chosen = profile_for(robot.spec) if profile is None else load_profile(profile).narrowed(labels)
     tool = getattr(robot.robot, "tool_position", None)  # forward kinematics of an arm that is no UR5e
     limits = profile_limits(chosen).changed({} if guards is None else guards)
+    if trial:
+        limits = limits.on_trial(base=chosen.kind == "base")
     lag = replace(chosen, period=robot.spec.period).spec().lag
     safe = SafeRobot(RehearsedRobot(robot, lag), limits=limits, tool_position=tool, straight=straight)
     require_effect(safe, guards or {})

@@ -243,6 +243,11 @@ class SafeRobot(metaclass=Sealed):
         return self._code
 
     @property
+    def is_held(self) -> bool:
+        """Whether the last command was not executed, and the robot is held in place."""
+        return self._bad > 0
+
+    @property
     def stopped(self) -> str | None:
         """The guard that stopped the robot and its reason, until a person calls `resume`; None if it may move."""
         return None if self._stopped is None else self._stopped[1]

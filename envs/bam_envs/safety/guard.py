@@ -34,6 +34,8 @@ LONGEST_PERIOD = 1.0
 """Longest time between two commands to a live robot [s]: a robot may move for that long before the next check."""
 
 
+SPEEDS = ("joint_speed", "tool_speed", "base_speed", "turn_speed")
+"""The limits on speeds."""
 TRIAL_SPEED = 0.25
 """Share of the speed limits of a robot on trial."""
 TRIAL_BOX = {"arm": 0.35, "base": 3.0}
@@ -189,8 +191,12 @@ class Limits:
 
     def scaled(self, share: float) -> Limits:
         """These limits with `share` of the speeds, as far as `BOUNDS` allow."""
-        speeds = ("joint_speed", "tool_speed", "base_speed", "turn_speed")
-        return replace(self, **{name: max(BOUNDS[name][0], share * getattr(self, name)) for name in speeds})
+        return replace(self, **{name: max(BOUNDS[name][0], share * getattr(self, name)) for name in SPEEDS})
+
+    @property
+    def pace(self) -> float:
+        """The smallest share of a default speed limit that these limits allow, at most 1."""
+        return float(min(1.0, *(getattr(self, name) / getattr(Limits(), name) for name in SPEEDS)))
 
     def on_trial(self, *, base: bool) -> Limits:
         """These limits for a policy on trial on an arm or a base: `TRIAL_SPEED` of the speeds, and a `trial_box`.

@@ -16,6 +16,7 @@ from bam_envs.core.timing import Pacer
 from bam_envs.robots.fake import FakeRobot
 from bam_envs.robots.physics.mujoco_arm import SimulatedArm
 from bam_envs.safety.gate import SafeRobot
+from bam_envs.safety.guard import Guard, Limits
 from bam_envs.tasks.pick import PickTask
 from bam_envs.tasks.reach import ReachTask
 from bam_envs.testing.drivers import DrivenRobot
@@ -275,6 +276,46 @@ def test_the_same_loop_drives_any_robot():
     assert [(record.length, record.end) for record in journal.records] == [(7, "truncated")] * 2
     assert len(robot.sent) == pacer.ticks == 14
     assert robot.halts >= 1
+
+
+class Spy:
+    """A detector that remembers what it was given; in an alarm at its third tick."""
+
+    reason = "another place"
+
+    def __init__(self):
+        self.paces, self.ticks = [], []
+
+    def begin(self, pace):
+        self.paces.append(pace)
+
+    def step(self, observation, action, command, periods, *, held):
+        self.ticks.append((command.copy(), periods, held))
+        return 2.0 if len(self.ticks) == 3 else 0.5
+
+
+def test_the_detector_gets_the_command_that_guards_have_changed_and_the_time_between_states():
+    class Hold(Guard):
+        number, name, unit, limit_value = "G99", "hold", "ticks", 1.0
+        count, patience = 0, 9
+
+        def fault(self, tick):
+            self.count += 1
+            return "held" if self.count == 2 else None
+
+    robot = SafeRobot(SimulatedArm(with_object=False), [Hold()], limits=Limits().on_trial(base=False))
+    env = gym.wrappers.TimeLimit(RobotEnv(robot, ReachTask(1)), 5)
+    policy, sent = Right(np.array([1, 0, 0, 0, 0, 0], np.float32)), []
+    policy.detector = spy = Spy()
+    robot.observe(lambda tick, state: sent.append(list(tick.command)))
+    ending, journal, _ = run(env, policy, episodes=1)
+    assert ending == DONE
+    assert spy.paces == [0.25]
+    np.testing.assert_array_equal([command for command, _, _ in spy.ticks[1:]], sent[:4])
+    np.testing.assert_allclose([periods for _, periods, _ in spy.ticks[1:]], 1.0)
+    assert [held for _, _, held in spy.ticks] == [False, False, True, False, False]
+    assert (journal.highest, journal.alarms) == (2.0, 1)
+    assert robot.warnings == ("unusual observations (G19): another place (score 2.00, usual is at most 1)",)
 
 
 @pytest.mark.parametrize(
