@@ -4,8 +4,10 @@ Only the standard library is imported before signals are handled, and only tyro 
 Ctrl-C is one line at any moment and ``--help`` is quick.
 """
 
+import atexit
 import contextlib
 import errno
+import gc
 import io
 import os
 import pkgutil
@@ -56,6 +58,7 @@ def run_program(
     """
     sys.path.append(os.getcwd())  # --env my_module:Env-v0, as with python -m; last, so that it hides nothing
     show_logs_and_tracebacks()
+    atexit.register(gc.freeze)  # Python's last collection of garbage takes seconds after torch was imported
     signals = SignalMemory()
 
     def run() -> int | None:
