@@ -124,7 +124,12 @@ def _steps(progress: Progress) -> str:
     return f"{count(progress.steps)} of {count(progress.total)} steps"
 
 
-_REASONS = {"steps": "all steps done", "success": "success reached", "stopped": "stopped"}
+_REASONS = {
+    "steps": "all steps done",
+    "success": "success reached",
+    "reward": "reward reached",
+    "stopped": "stopped",
+}
 
 
 def summarise(settings: TrainSettings, outcome: Outcome, folder: RunFolder, seconds: float) -> None:
@@ -170,7 +175,7 @@ def _next_commands(settings: TrainSettings, outcome: Outcome) -> list[str]:
     named = f" --env {shlex.quote(settings.env)}" if must_be_named(settings.env) else ""
     if usable is not None:
         commands.append(f"bam-eval {_short(usable)}{named}")
-        if is_batched(settings.env):
+        if is_batched(settings.env) and outcome.shortfall is None:
             commands.append(f"bam-deploy {_short(usable)}{named}")
     if outcome.reason == "stopped" and outcome.last is not None:
         commands.append(f"bam-train --resume {_short(outcome.last)}{named}")
