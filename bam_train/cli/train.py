@@ -54,7 +54,7 @@ def train(config: TrainConfig) -> int:
 
 def _train(config: TrainConfig, settings: TrainSettings, checkpoint: Checkpoint | None, notices: list[str]) -> int:
     """Train with complete settings, and print `notices` and the outcome; returns the exit status."""
-    from bam_train.cli.train_display import LiveDisplay, MayClose, PlainDisplay, summarise
+    from bam_train.cli.train_display import LiveDisplay, MayClose, PlainDisplay, say_next, summarise
     from bam_train.errors import LearntNothing, SettingsError
     from bam_train.settings import file_stem
     from bam_train.trainers import load_trainer
@@ -90,9 +90,12 @@ def _train(config: TrainConfig, settings: TrainSettings, checkpoint: Checkpoint 
                 for notice in [*notices, *output.notices, *trainer.notices]:
                     display.note(notice)
                 outcome = run.run()
+            summarise(settings, outcome, folder, time.monotonic() - _STARTED)
+            if outcome.shortfall is None:
+                run.add_detector()  # a tenth of a short run's time, so that nobody waits for the outcome
         finally:
             trainer.close()
-        summarise(settings, outcome, folder, time.monotonic() - _STARTED)
+        say_next(settings, outcome)
         if came:
             _KEPT.append(handlers.pop_all())  # otherwise its collection would restore the earlier handlers
     if outcome.failure is not None:

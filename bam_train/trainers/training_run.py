@@ -148,7 +148,6 @@ class TrainingRun:
         if self._stop and self._kept is None and not self.out.exists():
             self._kept = self.out if self._write(self.out, None, "--out") else None  # none was evaluated
             self._copy()
-        self._detect()
         if "copy" in self._failures:
             self._copy()  # the cause of the failure may be gone
         self.done = True
@@ -182,8 +181,8 @@ class TrainingRun:
             return None
         return f"return {mean:.4g}, and the goal is {goal:.4g}"
 
-    def _detect(self) -> None:
-        """Add a detector to the best checkpoint; a run that was stopped, or is a short trial, gets none.
+    def add_detector(self) -> None:
+        """Add a detector to the best checkpoint, after `run`; a run that was stopped, or is a short trial, gets none.
 
         It is made of new episodes, or of the data set that the policy has learnt from.
         """
