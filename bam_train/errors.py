@@ -37,6 +37,7 @@
     ├── EnvironmentFailed          an environment gave NaN or infinity
     ├── TrainingFailed             training cannot continue (a NaN loss); the last good checkpoint is kept
     │   └── ProcessesLost          processes that training needs have ended; earlier checkpoints are good
+    ├── LearntNothing              a run whose steps are all done, and whose policy is nowhere near the run's goal
     └── OutputError                no space, no permission, or a file that is in the way
         └── PlaceError             a place, such as one in a bucket, that cannot be reached, read or written
             └── NoSuchPlace        nothing is there
@@ -234,6 +235,12 @@ class TrainingFailed(BamTrainError):  # noqa: N818
 
 class ProcessesLost(TrainingFailed):
     """Processes that training needs have ended and are not restarted; earlier checkpoints are good."""
+
+
+class LearntNothing(BamTrainError):  # noqa: N818
+    """All steps of a run are done, and its best policy is nowhere near the run's goal."""
+
+    exit_status = 3
 
 
 class OutputError(BamTrainError, OSError):

@@ -30,6 +30,7 @@ TABLES = frozenset({"env_kwargs", "normalize", "hyperparameters"})
 
 _Steps = Annotated[int, Meta(ge=1, le=10**15)]
 _Processes = Annotated[int, Meta(ge=0, le=1000)]
+_MOST = sys.float_info.max
 _Share = Annotated[float, Meta(gt=0, le=1, description="a share above 0 and at most 1, such as 0.99")]
 
 
@@ -66,6 +67,8 @@ class TrainSettings:
     """Whom dagger imitates: a checkpoint of the same environment, with or without its cameras, or scripted."""
     until_success: _Share | None = None
     """Stop once this share of evaluation episodes succeeds, such as 0.99."""
+    stop_reward: Annotated[float, Meta(ge=-_MOST, le=_MOST, description="a finite number, such as 475")] | None = None
+    """Stop once the mean return of the evaluation episodes is this or more, such as 475 of CartPole-v1."""
     trial_threshold: Annotated[float, Meta(gt=0, lt=1, description="a share above 0 and below 1, such as 0.9")] = 0.9
     """Success rate that trials on a real robot must exceed before bam-deploy runs at full speed (default 0.9)."""
     eval_every: _Steps | None = None

@@ -41,6 +41,7 @@ def _unset(metavar: str) -> object:
 _File = Annotated[Path | None, _unset("FILE")]
 _METAVARS = {
     "until_success": "SHARE",
+    "stop_reward": "R",
     "trial_threshold": "SHARE",
     "address": "auto|HOST:PORT",
     "data": "PLACE",

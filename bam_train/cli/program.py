@@ -6,8 +6,10 @@ Ctrl-C is one line at any moment and ``--help`` is quick.
 
 import argparse
 import ast
+import atexit
 import contextlib
 import errno
+import gc
 import inspect
 import io
 import itertools
@@ -64,6 +66,7 @@ def run_program(
     """
     sys.path.append(os.getcwd())  # --env my_module:Env-v0, as with python -m; last, so that it hides nothing
     show_logs_and_tracebacks()
+    atexit.register(gc.freeze)  # Python's last collection of garbage takes seconds after torch was imported
     signals = SignalMemory()
 
     def run() -> int | None:

@@ -31,7 +31,7 @@ def train(config: TrainConfig) -> int:
     from bam_train.checkpoint import Checkpoint
     from bam_train.env_location import addresses
     from bam_train.settings import NAMES, merge, read_assignments, read_config
-    from bam_train.trainers.resolve_settings import resolve, resolve_resumed
+    from bam_train.trainers.resolve_settings import read_preset, resolve, resolve_resumed
 
     checkpoint = None if config.resume is None else Checkpoint.open(config.resume)
     file = {} if config.config is None else read_config(config.config)
@@ -45,14 +45,18 @@ def train(config: TrainConfig) -> int:
     if config.print_config:
         tell(*json.dumps(settings.to_mapping(), indent=2).split("\n"))
         return 0
-    return _train(config, settings, checkpoint)
+    notices = []
+    if checkpoint is None and not read_preset(settings.env, settings.algo, settings.trainer):
+        besides = ", ".join(given.get("hyperparameters", {}))
+        notices.append(f"no preset: the library's defaults{f', but for {besides}' if besides else ''}")
+    return _train(config, settings, checkpoint, notices)
 
 
-def _train(config: TrainConfig, settings: TrainSettings, checkpoint: Checkpoint | None) -> int:
-    """Train with complete settings, and print the outcome; returns the exit status."""
-    from bam_train.cli.train_display import LiveDisplay, MayClose, PlainDisplay, summarise
+def _train(config: TrainConfig, settings: TrainSettings, checkpoint: Checkpoint | None, notices: list[str]) -> int:
+    """Train with complete settings, and print `notices` and the outcome; returns the exit status."""
+    from bam_train.cli.train_display import LiveDisplay, MayClose, PlainDisplay, say_next, summarise
     from bam_train.environments import is_batched
-    from bam_train.errors import SettingsError
+    from bam_train.errors import LearntNothing, SettingsError
     from bam_train.settings import file_stem
     from bam_train.trainers import load_trainer
     from bam_train.trainers.best_checkpoint import choose_output
@@ -85,16 +89,22 @@ def _train(config: TrainConfig, settings: TrainSettings, checkpoint: Checkpoint 
             run = TrainingRun(trainer, folder, output.path, display, output.best, copies=copies)
             handlers.enter_context(handled(_stop_on_signals(run, came)))
             with display:
-                for notice in [*output.notices, *trainer.notices]:
+                for notice in [*notices, *output.notices, *trainer.notices]:
                     display.note(notice)
                 outcome = run.run()
+            summarise(settings, outcome, folder, time.monotonic() - _STARTED)
+            if outcome.shortfall is None:
+                run.add_detector()  # a tenth of a short run's time, so that nobody waits for the outcome
         finally:
             trainer.close()
-        summarise(settings, outcome, folder, time.monotonic() - _STARTED)
+        say_next(settings, outcome)
         if came:
             _KEPT.append(handlers.pop_all())  # otherwise its collection would restore the earlier handlers
     if outcome.failure is not None:
         raise outcome.failure
+    if outcome.shortfall is not None:
+        remedy = f"Try --seed {settings.seed + 1}, more --steps or other settings (docs/training.md); do not deploy it"
+        raise LearntNothing(f"nothing was learnt in {outcome.steps:,} steps: {outcome.shortfall}. {remedy}")
     return 128 + came[0] if came else 0
 
 

@@ -124,7 +124,12 @@ def _steps(progress: Progress) -> str:
     return f"{count(progress.steps)} of {count(progress.total)} steps"
 
 
-_REASONS = {"steps": "all steps done", "success": "success reached", "stopped": "stopped"}
+_REASONS = {
+    "steps": "all steps done",
+    "success": "success reached",
+    "reward": "reward reached",
+    "stopped": "stopped",
+}
 
 
 def summarise(settings: TrainSettings, outcome: Outcome, folder: RunFolder, seconds: float) -> None:
@@ -148,9 +153,6 @@ def summarise(settings: TrainSettings, outcome: Outcome, folder: RunFolder, seco
         older = "" if outcome.last_steps == outcome.steps else f" (after {count(outcome.last_steps)} steps)"
         say(f"  last state  {_short(outcome.last)}{older}")
     say(f"  run         {_short(folder.path)}/: learning-curve.png, progress.jsonl, config.json, tensorboard/")
-    commands = _next_commands(settings, outcome)
-    for line in ["next:", *(f"  {command}" for command in commands)] if commands else []:
-        say(line)
 
 
 def _score_text(best: Scores) -> str:
@@ -162,7 +164,8 @@ def _score_text(best: Scores) -> str:
     return f"{success}return {number(best.get('return_mean'))}{episodes}, after {count(best['steps'])} steps"
 
 
-def _next_commands(settings: TrainSettings, outcome: Outcome) -> list[str]:
+def say_next(settings: TrainSettings, outcome: Outcome) -> None:
+    """Print the commands that use what the run has left."""
     from bam_train.environments import is_batched, must_be_named
 
     commands = []
@@ -170,11 +173,12 @@ def _next_commands(settings: TrainSettings, outcome: Outcome) -> list[str]:
     named = f" --env {shlex.quote(settings.env)}" if must_be_named(settings.env) else ""
     if usable is not None:
         commands.append(f"bam-eval {_short(usable)}{named}")
-        if is_batched(settings.env):
+        if is_batched(settings.env) and outcome.shortfall is None:
             commands.append(f"bam-deploy {_short(usable)}{named}")
     if outcome.reason == "stopped" and outcome.last is not None:
         commands.append(f"bam-train --resume {_short(outcome.last)}{named}")
-    return commands
+    for line in ["next:", *(f"  {command}" for command in commands)] if commands else []:
+        say(line)
 
 
 def _short(path: Path) -> str:

@@ -23,7 +23,7 @@ PRESETS = Path(__file__).parent / "presets"
 ``<environment>-<trainer>-<algorithm>.toml`` for any other trainer."""
 
 CHANGEABLE = frozenset(
-    {"steps", "teacher", "until_success", "eval_every", "eval_episodes", "device", "threads"}
+    {"steps", "teacher", "until_success", "stop_reward", "eval_every", "eval_episodes", "device", "threads"}
     | {"transport", "ca_file", "token_file", "num_env_runners", "num_learners", "num_gpus", "address"}
 )
 """Settings that may change in a resumed run: when to stop, how to evaluate, where to compute, where the environment
@@ -40,8 +40,9 @@ NOWHERE: dict[str, Any] = {"transport": [], "ca_file": None, "token_file": None,
 
 
 def read_preset(env: str, algo: str, trainer: str = "sb3") -> dict[str, Any]:
-    """Read the preset of an environment and an algorithm; {} if there is none."""
-    path = PRESETS / f"{file_stem(env, algo, trainer)}.toml"
+    """Read the preset of an environment, by its full id or one of robo-gym, and an algorithm; {} if there is none."""
+    entry = entry_of(env)
+    path = PRESETS / f"{file_stem(env if entry is None else entry.id, algo, trainer)}.toml"
     return parse_config(path.name, path.read_text(encoding="utf-8")) if path.is_file() else {}
 
 
@@ -54,13 +55,12 @@ def resolve(given: Mapping[str, Any]) -> TrainSettings:
     asked = TrainSettings.from_mapping(given)
     env = _resolve_env(asked.env, elsewhere=bool(asked.transport or asked.data))
     require_algorithm(asked.trainer, asked.algo)
-    entry = entry_of(env)  # also by an id of robo-gym
-    preset = read_preset(env if entry is None else entry.id, asked.algo, asked.trainer)
+    preset = read_preset(env, asked.algo, asked.trainer)
     usual = {"steps": OFFLINE_STEPS} if asked.trainer == "offline" else {}
     settings = TrainSettings.from_mapping(merge({**usual, **preset}, given, {"env": env}))
     _require_of_trainer(settings)
     require_env_kwargs(env, settings.env_kwargs)
-    if "link" in settings.env_kwargs and entry is not None:
+    if "link" in settings.env_kwargs and entry_of(env) is not None:
         settings = replace(settings, env_kwargs={**settings.env_kwargs, "link": portable(settings.env_kwargs["link"])})
     try:
         require_no_place(settings.env_kwargs)

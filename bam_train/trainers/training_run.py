@@ -24,6 +24,7 @@ from bam_train.evaluation import BatchPolicy, EvaluationReport, evaluate
 from bam_train.policy import FrozenPolicy
 from bam_train.settings import TrainSettings
 from bam_train.trainers.base import Progress, Statistics, Trainer
+from bam_train.trainers.resolve_settings import read_preset
 from bam_train.trainers.run_folder import Copies, RunFolder, unwritable
 
 FIRST_SAVE = 2.0
@@ -69,7 +70,7 @@ class Outcome:
     """The outcome of a run."""
 
     reason: str
-    """``steps`` (all done), ``success`` (``until_success`` reached) or ``stopped`` (by the user)."""
+    """``steps`` (all done), ``success`` or ``reward`` (`until_success` or `stop_reward` reached), or ``stopped``."""
     steps: int
     """Steps trained since the start of the run."""
     best: Scores | None
@@ -82,6 +83,8 @@ class Outcome:
     """Steps of that state."""
     failure: OutputError | None
     """The first failure to write a file; None if all were written."""
+    shortfall: str | None = None
+    """What the best evaluation lacks, if the run has learnt nothing."""
 
 
 class TrainingRun:
@@ -108,13 +111,14 @@ class TrainingRun:
         self._start = self._recorded = self._saved = clock()
         self._first_step = trainer.steps
         self._save_pause = FIRST_SAVE
-        self._stop = self._reached = False
+        self._stop, self._reached = False, ""
         self._evaluated_at = trainer.steps if best else 0
         self._scores: Scores = {}  # the newest evaluation
         self._kept: Path | None = out if best else None
         self._last_steps = 0
         self._failures: dict[str, OutputError] = {}
         self._noted = len(trainer.notices)
+        self._first_return: float | None = None  # of training; None in a resumed run
 
     def stop(self) -> None:
         """Stop after the update in progress; may be called from a signal handler."""
@@ -146,22 +150,41 @@ class TrainingRun:
         if self._stop and self._kept is None and not self.out.exists():
             self._kept = self.out if self._write(self.out, None, "--out") else None  # none was evaluated
             self._copy()
-        self._detect()
         if "copy" in self._failures:
             self._copy()  # the cause of the failure may be gone
         self.done = True
         return Outcome(
-            reason="stopped" if self._stop else "success" if self._reached else "steps",
+            reason="stopped" if self._stop else self._reached or "steps",
             steps=self.trainer.steps,
             best=self.best,
             checkpoint=self._kept,
             last=self.folder.last if self._last_steps else None,
             last_steps=self._last_steps,
             failure=next(iter(self._failures.values()), None),
+            shortfall=None if self._stop or self._reached else self._shortfall(),
         )
 
-    def _detect(self) -> None:
-        """Add a detector to the best checkpoint; a run that was stopped, or is a short trial, gets none.
+    def _shortfall(self) -> str | None:
+        """What the best evaluation lacks, if it is not half of the way to the run's goal.
+
+        The goal is `until_success`, with a preset at least `trial_threshold`, or else `stop_reward`, to which the way
+        begins at the return of the first training episodes. A run of fewer steps than its preset may learn nothing.
+        """
+        settings, best = self.settings, self.best or {}
+        preset = read_preset(settings.env, settings.algo, settings.trainer)
+        if settings.steps < preset.get("steps", 0):
+            return None
+        wanted = settings.until_success or (settings.trial_threshold if preset else None)
+        if wanted is not None and best.get("success_interval"):
+            found = f"success {best['success_rate']:.1%}, and the goal is {wanted:.1%}"
+            return found if best["success_interval"][1] < wanted / 2 else None
+        begin, goal, mean = self._first_return, settings.stop_reward, best.get("return_mean")
+        if begin is None or goal is None or mean is None or mean >= (begin + goal) / 2:
+            return None
+        return f"return {mean:.4g}, and the goal is {goal:.4g}"
+
+    def add_detector(self) -> None:
+        """Add a detector to the best checkpoint, after `run`; a run that was stopped, or is a short trial, gets none.
 
         It is made of new episodes, or of the data set that the policy has learnt from.
         """
@@ -199,13 +222,14 @@ class TrainingRun:
         return not (self._stop or self._reached)
 
     def _due(self, progress: Progress) -> bool:
-        """Whether to evaluate: every `eval_every` steps, and earlier once training episodes reach `until_success`."""
-        every, wanted = self.settings.eval_every or self.settings.steps, self.settings.until_success
+        """Whether to evaluate: every `eval_every` steps, and earlier once training episodes reach the run's goal."""
+        settings, since = self.settings, progress.steps - self._evaluated_at
+        every = settings.eval_every or settings.steps
         if progress.steps // every > self._evaluated_at // every:
             return True
-        if wanted is None or progress.steps - self._evaluated_at < every / 4:
+        if (settings.until_success is None and settings.stop_reward is None) or since < every / 4:
             return False
-        return (progress.statistics().success_rate or 0.0) >= wanted
+        return bool(_reached(progress.statistics(), settings))
 
     def _record(self, progress: Progress) -> None:
         now = self._clock()
@@ -213,6 +237,8 @@ class TrainingRun:
             return
         self._recorded = now
         statistics = progress.statistics()
+        if self._first_return is None and self._first_step == 0:
+            self._first_return = statistics.return_mean
         rate = (progress.steps - self._first_step) / max(now - self._start, 1e-9)
         left = (progress.total - progress.steps) / rate if rate > 0 else None
         figures = asdict(statistics)
@@ -229,7 +255,7 @@ class TrainingRun:
             return
         with self.trainer.undisturbed(), self.trainer.evaluation_envs() as envs:
             last = steps >= self.settings.steps
-            report, self._reached = evaluate_for_success(self.trainer.freeze(), self.settings, last=last, envs=envs)
+            report, self._reached = evaluate_for_goal(self.trainer.freeze(), self.settings, last=last, envs=envs)
         if report.success_rate is None and self.settings.until_success is not None and not self._scores:
             self.watcher.note(f"{self.settings.env} reports no is_success, so --until-success has no effect")
         self._scores = {**report.to_json(), "steps": steps}
@@ -317,14 +343,14 @@ EVALUATION_SEED = 2_000_000
 """First seed of evaluations, far from the small seeds of training and from bam-eval's."""
 
 
-def evaluate_for_success(
+def evaluate_for_goal(
     policy: BatchPolicy, settings: TrainSettings, *, last: bool, envs: VectorEnv[Any, Any, Any] | None
-) -> tuple[EvaluationReport, bool]:
-    """Evaluate a policy; returns the report (the worse of two), and whether ``until_success`` was reached.
+) -> tuple[EvaluationReport, str]:
+    """Evaluate a policy; returns the report (the worse of two), and which goal of the run was reached, "" for none.
 
-    First a quarter of the episodes is played; then all, if the quarter leaves ``until_success`` possible; then, if it
-    was reached, as many other episodes, which must reach it too. The last evaluation of a run always plays all. Episode
-    k has the seed EVALUATION_SEED + seed + k; `envs` are left open.
+    First a quarter of the episodes is played; then all, if the quarter leaves the goal possible; then, if it was
+    reached, as many other episodes, which must reach it too. The last evaluation of a run always plays all. Episode k
+    has the seed EVALUATION_SEED + seed + k; `envs` are left open.
     """
 
     def play(first: int, count: int) -> EvaluationReport:
@@ -332,15 +358,21 @@ def evaluate_for_success(
         return evaluate(policy, settings.env, settings.env_kwargs, episodes=count, seed=seed, env=envs)
 
     episodes, wanted = settings.eval_episodes, settings.until_success
-    if wanted is None:
-        return play(0, episodes), False
-    if not last:
+    if wanted is not None and settings.stop_reward is None and not last:
         look = play(0, math.ceil(episodes / 4))
         if look.successes is not None and look.episodes - look.successes > (1 - wanted) * episodes + 1e-9:
-            return look, False
+            return look, ""
     report = play(0, episodes)
-    if report.success_rate is None or report.success_rate < wanted:
-        return report, False
+    if not _reached(report, settings):
+        return report, ""
     again = play(episodes, episodes)
-    worse = min(report, again, key=lambda report: report.success_rate or 0.0)
-    return worse, again.success_rate is not None and again.success_rate >= wanted
+    worse = min(report, again, key=lambda report: (report.success_rate or 0.0, report.return_mean or 0.0))
+    return worse, _reached(again, settings)
+
+
+def _reached(found: EvaluationReport | Statistics, settings: TrainSettings) -> str:
+    """The goal of the run that these episodes reach: ``success``, ``reward``, or "" for none."""
+    rate, mean = found.success_rate, found.return_mean
+    if settings.until_success is not None and rate is not None and rate >= settings.until_success:
+        return "success"
+    return "reward" if settings.stop_reward is not None and mean is not None and mean >= settings.stop_reward else ""

@@ -78,8 +78,9 @@ class OfflineTrainer(TorchTrainer):
     def complete(cls, settings: TrainSettings) -> TrainSettings:
         """Check the settings against the data set, and add the defaults of the algorithm."""
         data = _open(settings)
-        if settings.until_success is not None and settings.hyperparameters.get("online_from") is None:
-            raise SettingsError("until_success: nothing is chosen by simulation while learning from data; leave it out")
+        for name in ("until_success", "stop_reward"):
+            if getattr(settings, name) is not None and settings.hyperparameters.get("online_from") is None:
+                raise SettingsError(f"{name}: nothing is chosen by simulation while learning from data; leave it out")
         OFFLINE_ALGORITHMS[settings.algo].require_actions(settings.env, type(data.info.action_space).__name__)
         Normaliser(data.info.observation_space), ActionCode(data.info.action_space)
         own = _OWN.get(settings.algo)

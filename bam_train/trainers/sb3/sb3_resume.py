@@ -86,10 +86,17 @@ def members(
     return written
 
 
-def load_weights(checkpoint: Checkpoint, model: Any) -> None:
-    """Restore the weights of a checkpoint, and the state of its optimisers, into a new model of the same networks."""
+def load_weights(checkpoint: Checkpoint, model: Any, *, own_noise: bool = False) -> None:
+    """Restore the weights of a checkpoint, and the state of its optimisers, into a new model of the same networks.
+
+    With `own_noise`, a model whose actions have another kind of noise keeps it, and its new optimiser.
+    """
     with checkpoint.fitting(MODEL):
         weights = checkpoint.state(MODEL, torch.from_numpy)
+        saved, own = weights["states"], model.get_parameters()
+        theirs, ours = (states["policy"].get("log_std") for states in (saved, own))
+        if own_noise and theirs is not None and ours is not None and theirs.shape != ours.shape:
+            saved["policy"]["log_std"], saved["policy.optimizer"] = ours, own["policy.optimizer"]
         model.set_parameters(weights["states"], exact_match=True, device=model.device)
         for name, value in weights["loose"].items():
             if value is not None:
@@ -98,7 +105,7 @@ def load_weights(checkpoint: Checkpoint, model: Any) -> None:
 
 def begin_with(checkpoint: Checkpoint, model: Any, normaliser: VecNormalize | None) -> None:
     """Give a new run the weights of a checkpoint, and what its observations and rewards are normalised by."""
-    load_weights(checkpoint, model)
+    load_weights(checkpoint, model, own_noise=True)
     if normaliser is not None:
         with checkpoint.fitting(STATE):
             _load_statistics(normaliser, checkpoint.state(STATE, torch.from_numpy)["normaliser"])

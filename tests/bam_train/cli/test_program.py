@@ -152,6 +152,24 @@ sys.exit(guarded(main, 'prog'))
     assert process.returncode == 1
 
 
+def test_the_end_waits_for_no_last_collection_of_garbage():
+    """Of torch's objects it takes seconds; this one says so if it is collected."""
+    code = """
+import os
+from bam_train.cli import envs
+class Cycle:
+    def __init__(self):
+        self.itself, self.say = self, os.write
+    def __del__(self):
+        self.say(2, b'collected')
+cycle = Cycle()
+envs.main(['bam/reach', '--json'])
+"""
+    with python(code, stdout=subprocess.DEVNULL) as run:
+        assert run.stderr.read() == ""
+    assert run.returncode == 0
+
+
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="no /dev/full here")
 def test_a_full_device_behind_standard_output_is_one_line():
     with (

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -60,7 +61,10 @@ def test_a_whole_run(bam_train, here):
     ]
     assert Checkpoint.open(folder / "last.zip").manifest.steps == 128
     lines = err.splitlines()
-    assert lines[0] == "ppo on CartPole-v1, seed 0"
+    assert lines[:2] == [
+        "ppo on CartPole-v1, seed 0",
+        "no preset: the library's defaults, but for n_steps, batch_size, n_epochs, policy_kwargs",
+    ]
     assert any(line.startswith("evaluation at 64 steps: return ") for line in lines)
     assert any(line.startswith("ppo on CartPole-v1: all steps done at 128 steps, ") for line in lines)
     assert lines[-2:] == ["next:", "  bam-eval checkpoints/CartPole-v1-ppo.zip"]
@@ -96,6 +100,15 @@ for words in (["--set", "gamma=2"], ["--set", "gama=1"], ["--trainer", "rllib", 
 def test_a_run_that_cannot_be_recorded(bam_train, here, flags, text):
     assert bam_train(record="data", **flags) == (1, "", f"bam-train: {text}\n")
     assert list(here.iterdir()) == []
+
+
+def test_a_run_that_has_learnt_nothing_is_no_success(bam_train):
+    status, _, err = bam_train(stop_reward=475.0)
+    assert status == 3
+    lines = err.splitlines()
+    last = r"bam-train: nothing was learnt in 128 steps: return \d+(\.\d+)?, and the goal is 475\. Try --seed 1, "
+    assert re.match(last, lines[-1])
+    assert "  bam-eval checkpoints/CartPole-v1-ppo.zip" in lines
 
 
 def test_print_config_is_read_back(bam_train, here):
@@ -137,6 +150,7 @@ def test_resume_counts_from_the_first_step_and_needs_nothing_else(bam_train):
     status, _, err = bam_train(**nothing, resume=checkpoint, steps=192, set=())
     assert status == 0
     assert err.splitlines()[0] == f"ppo on CartPole-v1, seed 0, going on from {checkpoint} at 128 steps"
+    assert "no preset" not in err
     assert "CartPole-v1 cannot save running episodes: new ones begin" in err
     assert Checkpoint.open("runs/CartPole-v1-ppo-2/last.zip").manifest.steps == 192
     text = f"{last}: has trained 128 of 128 steps already; give a larger total with --steps"

@@ -201,6 +201,45 @@ def test_success_that_nobody_reports_never_ends_a_run(start):
     assert watcher.notes == ["test/Count-v0 reports no is_success, so --until-success has no effect"]
 
 
+def test_a_return_that_fresh_episodes_confirm_ends_a_run(start):
+    """All episodes are played at once: a few may be below the mean that is asked for."""
+    results = {30: report(None, 4.0), 60: [report(None, 5.0), report(None, 4.9)], 70: report(None, 4.0)}
+    run, trainer, watcher = start(results | {80: [report(None, 6.0), report(None, 5.0)]}, stop_reward=5.0)
+    run.watcher.training = lambda progress, *_: setattr(
+        trainer, "statistics", replace(STATISTICS, return_mean=5.0 if progress.steps >= 60 else 1.5)
+    )
+    outcome = run.run()
+    assert [asked[2] for asked in start.seeds] == [10] * 6
+    assert [(row[0], row[2]) for row in watcher.evaluations] == [(30, 4.0), (60, 4.9), (70, 4.0), (80, 5.0)]
+    assert (outcome.reason, outcome.steps, outcome.shortfall) == ("reward", 80, None)
+
+
+@pytest.mark.parametrize(
+    ("extra", "results", "shortfall"),
+    [
+        ({"until_success": 0.9}, [(0.0, 1.0)], "success 0.0%, and the goal is 90.0%"),
+        ({"until_success": 0.9}, [(0.1, 1.0)], "success 10.0%, and the goal is 90.0%"),  # at most 40 %
+        ({"until_success": 0.9}, [(0.0, 1.0), (0.2, 1.0)], None),  # of ten episodes it may be 51 %
+        ({"until_success": 0.9, "stop_reward": 9.0}, [(0.8, 1.0)], None),
+        ({"stop_reward": 9.0}, [(None, 5.2)], "return 5.2, and the goal is 9"),  # 1.5 at the beginning
+        ({"stop_reward": 9.0}, [(None, 5.3)], None),
+        ({}, [(0.0, 1.0)], None),
+        ({"env": "bam/pick-v0", "steps": 100}, [(0.0, 1.0)], None),  # its preset has more
+    ],
+)
+def test_a_run_that_has_learnt_nothing_says_what_it_lacks(start, extra, results, shortfall):
+    found = [report(*one) for one in results]
+    found += found[-1:] * (4 - len(found))
+    run, _, _ = start(dict(zip((30, 60, 90, 100), found, strict=True)), **extra)
+    assert run.run().shortfall == shortfall
+
+
+def test_with_a_preset_the_success_that_trials_ask_for_is_a_goal(start):
+    pick = {"env": "bam/pick-v0", "algo": "dagger", "trainer": "imitation", "steps": 16_000, "eval_every": 16_000}
+    run, _, _ = start({16_000: report(0.0)}, begin=15_990, **pick)
+    assert run.run().shortfall == "success 0.0%, and the goal is 90.0%"
+
+
 def test_asked_to_stop_it_saves_and_ends_without_an_evaluation(start):
     run, _, watcher = start(at(0.5))
     watcher.training = lambda progress, *rest: run.stop() if progress.steps == 50 else None

@@ -65,6 +65,20 @@ def test_a_new_run_begins_with_the_weights_of_another(walk, tmp_path, normalize)
     assert (again.steps, again.settings.start) == (hardened.steps, str(path))
 
 
+def test_a_run_with_another_kind_of_noise_begins_with_the_weights_and_its_own_noise(walk, tmp_path):
+    """Checkpoints of before the presets had noise that lasts (gSDE) are still good beginnings."""
+    path = tmp_path / "plain.zip"
+    plain = SB3Trainer.create(completed(walk, hyperparameters=FIRST))
+    plain.train(96, lambda progress: True)
+    plain.save(path, {}, {"best": None})
+    lasting = {**FIRST, "use_sde": True, "policy_kwargs": {"log_std_init": -1.8}}
+    trainer = SB3Trainer.create(completed(walk, hyperparameters=lasting, start=str(path)))
+    observations = np.random.default_rng(0).uniform(-1, 1, (50, 2)).astype(np.float32)
+    np.testing.assert_array_equal(trainer.freeze().act_batch(observations), plain.freeze().act_batch(observations))
+    assert torch.equal(trainer.model.policy.log_std, torch.full_like(trainer.model.policy.log_std, -1.8))
+    trainer.train(96, lambda progress: True)
+
+
 def test_weights_that_a_run_cannot_begin_with(walk, tmp_path):
     path = tmp_path / "a.zip"
     trainer = SB3Trainer.create(completed(walk, hyperparameters=FIRST))
