@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bam_envs.core.errors import InvalidValue, MissingExtra
-from bam_train.atomic_file import replacing, require_writable
 from bam_train.errors import OutputError, SettingsError
+from bam_train.files.atomic_file import replacing, require_writable
 
 Frame = NDArray[np.uint8]
 """One picture. Shape: (height, width, 3)."""

@@ -79,6 +79,7 @@ class StandIn:
             dump_json({"op": "publish", "topic": topic, "msg": message})
         self.sent_at = clock()
         self.now += self.spec.period
+        self._signals["joint_velocity"] = (values[None, :6] - self._command[:, :6]) / self.spec.period
         self._command = values[None].copy()
         state = self._state()
         self.inside = clock() - self.command_at

@@ -28,12 +28,12 @@ from typing import Annotated, NamedTuple
 import gymnasium as gym
 from tyro.conf import arg
 
-from bam_train.atomic_file import replacing
 from bam_train.checkpoint import Checkpoint
 from bam_train.cli.flags import Count, Seed
 from bam_train.cli.program import guarded, parse
 from bam_train.errors import LearntNothing
 from bam_train.evaluation import evaluate
+from bam_train.files.atomic_file import replacing
 from bam_train.policy import FrozenPolicy
 from bam_train.trainers.base import origin
 

@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from bam_envs.core.splines import splines_through
+from bam_envs.robots.splines import splines_through
 
 WAYPOINTS = (162, 137, 213)
 """Of each segment."""

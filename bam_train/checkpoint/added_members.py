@@ -8,11 +8,11 @@ import zipfile
 from collections.abc import Mapping
 from pathlib import Path
 
-from bam_train.atomic_file import replacing
 from bam_train.checkpoint.checkpoint import Checkpoint
 from bam_train.checkpoint.manifest import MANIFEST
 from bam_train.checkpoint.zip_members import SIGNATURE, chunks, list_members, open_zip
 from bam_train.errors import OutputError
+from bam_train.files.atomic_file import replacing
 
 
 def add_members(path: str | Path, members: Mapping[str, bytes]) -> Checkpoint:

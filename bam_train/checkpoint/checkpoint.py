@@ -30,7 +30,6 @@ from typing import Any
 
 import numpy as np
 
-from bam_train.atomic_file import replacing
 from bam_train.checkpoint import safetensors_file
 from bam_train.checkpoint.manifest import AGAIN, MANIFEST, Manifest, manifest_bytes, parse_manifest
 from bam_train.checkpoint.zip_members import (
@@ -44,6 +43,7 @@ from bam_train.checkpoint.zip_members import (
     require_same_members,
 )
 from bam_train.errors import AlteredCheckpoint, CheckpointError, CheckpointMismatch, FormatError, OutputError
+from bam_train.files.atomic_file import replacing
 
 POLICY = "bam/policy.onnx"
 GOLDEN = "bam/golden.safetensors"

@@ -23,12 +23,12 @@ import msgspec
 from msgspec import Meta
 
 from bam_envs.core.config_folder import config_folder
-from bam_train.atomic_file import replacing
 from bam_train.checkpoint.checkpoint import Checkpoint
 from bam_train.checkpoint.manifest import AGAIN, MANIFEST
 from bam_train.checkpoint.ownership import who_else
 from bam_train.checkpoint.zip_members import RESUME, SIGNATURE, chunks, list_members, open_zip
 from bam_train.errors import AlteredCheckpoint, BadKey, OutputError, UntrustedCheckpoint
+from bam_train.files.atomic_file import replacing
 
 _NAME = r"[A-Za-z0-9][A-Za-z0-9_.@-]{0,63}"
 Name = Annotated[str, Meta(pattern=f"^{_NAME}$")]

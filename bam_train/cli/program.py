@@ -26,8 +26,8 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
 from bam_train.cli.console import drop, say, show_logs_and_tracebacks, tell
+from bam_train.files.stand_ins import standing_in
 from bam_train.signals import SignalMemory, Terminated
-from bam_train.stand_ins import standing_in
 
 Config = TypeVar("Config")
 

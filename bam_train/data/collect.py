@@ -20,7 +20,7 @@ from bam_train.data.record_dataset import RecordVectorDataset, info_of
 from bam_train.environments import environment_of, make_vector_env, require_env_kwargs, require_fit
 from bam_train.errors import SettingsError
 from bam_train.evaluation import BatchPolicy, default_num_envs
-from bam_train.place import Place
+from bam_train.files.place import Place
 from bam_train.policy import FrozenPolicy
 
 SCRIPTED, RANDOM = "scripted", "random"

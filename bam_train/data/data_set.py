@@ -38,7 +38,7 @@ from bam_train.data.layout import (
 )
 from bam_train.environments import first_difference, short_json
 from bam_train.errors import BadDataSet, PlaceError
-from bam_train.place import Place
+from bam_train.files.place import Place
 
 MOST_BYTES = 2**26
 """Bytes of a file that are in memory together, unless one episode has more."""

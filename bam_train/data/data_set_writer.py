@@ -17,7 +17,7 @@ from bam_train.data.layout import BAM, COPIES, DATA, DEFAULTS, EPISODES, INFO, F
 from bam_train.data.mending import mend
 from bam_train.environments import first_difference, short_json
 from bam_train.errors import BadDataSet
-from bam_train.place import Place
+from bam_train.files.place import Place
 
 if TYPE_CHECKING:
     from typing_extensions import Self

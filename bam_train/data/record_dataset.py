@@ -20,7 +20,7 @@ from bam_train.data.data_set_writer import DataSetWriter
 from bam_train.data.episode import Array, DataSetInfo, Episode, Leaf, joined, leaves_of
 from bam_train.environments import AnyEnv, control_period
 from bam_train.errors import BadDataSet, SettingsError
-from bam_train.place import Place
+from bam_train.files.place import Place
 
 Keep = Callable[[int, "int | None"], bool]
 """Whether an episode is recorded, by its number in the order of beginning and its seed."""

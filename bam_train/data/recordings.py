@@ -20,7 +20,7 @@ from bam_train.data.episode import Array, DataSetInfo, Episode, joined, leaves_o
 from bam_train.data.record_dataset import info_of
 from bam_train.environments import make_env, must_be_named
 from bam_train.errors import BadRecording
-from bam_train.place import Place
+from bam_train.files.place import Place
 from bam_train.recording.recording import Recording
 
 

@@ -25,10 +25,10 @@ from bam_train.checkpoint import Checkpoint
 from bam_train.deploy.journal import Journal
 from bam_train.env_location import Place
 from bam_train.environments import control_period
+from bam_train.files.stand_ins import with_addresses
 from bam_train.loop import Agent
 from bam_train.loop.gym.gym_spaces import NAME
 from bam_train.recording.recorder import WARNING, Recorder
-from bam_train.stand_ins import with_addresses
 
 STAGES = ("step", "wait", "late", "policy", "age", "record")
 """Names of the latencies in /latency; see `RecorderAgent`."""

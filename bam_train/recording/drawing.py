@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from bam_envs.core.errors import MissingExtra, ProtocolError
 from bam_envs.ros.images import decode_image
-from bam_train.atomic_file import replacing
 from bam_train.errors import BadRecording, OutputError
+from bam_train.files.atomic_file import replacing
 from bam_train.recording.recording import Recording
 
 if TYPE_CHECKING:

@@ -9,10 +9,10 @@ from typing import Any
 import msgspec
 from msgspec import Struct
 
-from bam_train.atomic_file import remove_orphans
 from bam_train.checkpoint import Checkpoint
 from bam_train.checkpoint.manifest import AGAIN
 from bam_train.errors import AlteredCheckpoint, CheckpointError, OutputError
+from bam_train.files.atomic_file import remove_orphans
 from bam_train.settings import TrainSettings, file_stem, read_config
 from bam_train.trainers.resolve_settings import CHANGEABLE
 from bam_train.trainers.run_folder import require_room

@@ -24,9 +24,9 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from bam_train.atomic_file import remove_orphans
 from bam_train.errors import OutputError
-from bam_train.place import Place
+from bam_train.files.atomic_file import remove_orphans
+from bam_train.files.place import Place
 
 LEAST_FREE = 20_000_000
 """Minimum free bytes of the disk before training."""

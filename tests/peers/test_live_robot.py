@@ -27,7 +27,7 @@ POSITIONS, GRIPPER, TRAJECTORY = "positions", "gripper", "trajectory"
 
 @contextlib.contextmanager
 def live(server, spec=SPEC, **options):
-    robot = live_robot(server.url, spec, **options)
+    robot = live_robot(server.url, spec, robot_name="node", **options)  # what is proved belongs to that name
     try:
         robot.connect()
         yield robot
@@ -149,7 +149,10 @@ PROGRAM = "/io_and_status_controller/robot_program_running"
 def test_a_paused_program_is_named(rosbridge, robot_node, wait_until):
     """Said once, before we came; the server knows none of the other topics, and two of their types."""
     robot_node.ask("pause")
-    paused = f"the external control program is not running ({PROGRAM})"
+    paused = (
+        f"the external control program is not running ({PROGRAM}): start it on the pendant; in headless mode call the "
+        "service /io_and_status_controller/resend_robot_program"
+    )
     try:
         with live(rosbridge) as robot:
             assert robot.not_ready() == paused

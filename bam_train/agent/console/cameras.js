@@ -35,7 +35,10 @@ export function showCameras(parent) {
     try {
       const picture = await createImageBitmap(new Blob([new Uint8Array(data, 1)]));
       if (place.canvas.width !== picture.width) Object.assign(place.canvas, { width: picture.width, height: picture.height });
-      if (place.size) place.sees.textContent = `: ${picture.width === picture.height ? "as the policy sees it" : "the policy sees its middle square"}, ${place.size} by ${place.size} pixels`;
+      if (place.size) {
+        const [width, height] = place.size, whole = picture.width * height === picture.height * width;
+        place.sees.textContent = `: ${whole ? "as the policy sees it" : "the policy sees its middle"}, ${width} by ${height} pixels`;
+      }
       place.canvas.getContext("2d").drawImage(picture, 0, 0);
       picture.close();
       place.at = performance.now();

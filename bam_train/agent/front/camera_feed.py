@@ -59,7 +59,7 @@ class CameraFeed:
         seen: Width and height of the images that the policy sees [pixels], by the camera's name.
     """
 
-    def __init__(self, cameras: Mapping[str, Camera], seen: Mapping[str, int] | None = None) -> None:
+    def __init__(self, cameras: Mapping[str, Camera], seen: Mapping[str, tuple[int, int]] | None = None) -> None:
         self._names, self._readers = list(cameras), [_Reader(one) for one in cameras.values()]
         self._seen = dict(seen or {})
         self._viewers = 0

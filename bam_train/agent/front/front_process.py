@@ -375,9 +375,9 @@ class FrontProcess:
         shown = [one for one in self.shadow.profile.cameras if one.name in seen or not one.optional]
         return {one.name: LiveCamera(endpoint, one) for one in shown}
 
-    def seen(self) -> dict[str, int]:
+    def seen(self) -> dict[str, tuple[int, int]]:
         """The cameras that the task sees: width and height of its images [pixels], by name."""
-        return {name: camera.size for camera in self.shadow.spec.cameras for name in camera.spaces()}
+        return {name: (camera.width, camera.height) for camera in self.shadow.spec.cameras for name in camera.spaces()}
 
     def _on_halt(self, message: Fields, caller: Caller) -> None:
         """Stop the policy; the halt of whoever drives, or has just handed back, over another connection does not."""

@@ -12,9 +12,9 @@ if TYPE_CHECKING:
 
 def plot_data(config: PlotConfig) -> None:
     """Draw a data set."""
-    from bam_train.atomic_file import require_writable
     from bam_train.data import DataSet
     from bam_train.data.views.figures import plot, require_picture_path
+    from bam_train.files.atomic_file import require_writable
 
     path = require_writable(require_picture_path(config.out))
     against = None if config.against is None else DataSet.open(config.against)

@@ -130,8 +130,8 @@ def _shown(steps: Iterator[Step], config: DoctorConfig) -> Iterator[Step]:
 
 
 def _require_valid(config: DoctorConfig) -> None:
-    from bam_train.atomic_file import require_writable
     from bam_train.errors import SettingsError
+    from bam_train.files.atomic_file import require_writable
 
     if config.env is not None and config.checkpoint is None:
         raise SettingsError("--env says what a checkpoint was trained on; give --checkpoint too, or leave it out")
@@ -147,8 +147,8 @@ def _write_measured(config: DoctorConfig, diagnosis: Diagnosis) -> dict[str, Any
     if config.measure is None:
         return None
     from bam_envs.core.errors import InvalidValue
-    from bam_train.atomic_file import replacing
     from bam_train.errors import OutputError
+    from bam_train.files.atomic_file import replacing
 
     measurement, path = diagnosis.measurement, config.measure.expanduser()
     if measurement is None:

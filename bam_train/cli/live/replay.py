@@ -25,7 +25,7 @@ MOST_EVENTS = 20
 
 def replay(config: ReplayConfig) -> None:
     """Run the program with its parsed flags."""
-    from bam_train.atomic_file import require_writable
+    from bam_train.files.atomic_file import require_writable
     from bam_train.recording.recording import Recording
     from bam_train.video import require_video_path
 

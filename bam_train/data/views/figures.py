@@ -10,11 +10,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from bam_envs.core.errors import MissingExtra
-from bam_train.atomic_file import replacing
 from bam_train.data.data_set import DataSet
 from bam_train.data.data_set_writer import require_same
 from bam_train.data.episode import Array, Episode, leaves_of
 from bam_train.errors import OutputError, SettingsError
+from bam_train.files.atomic_file import replacing
 
 if TYPE_CHECKING:
     from matplotlib.figure import SubFigure

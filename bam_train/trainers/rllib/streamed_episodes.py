@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from bam_envs.core.spaces import space_to_json
 from bam_train.data import DataSet
 from bam_train.errors import PlaceError, SettingsError
-from bam_train.place import Place
+from bam_train.files.place import Place
 
 Array = NDArray[Any]
 _BLOCK_STEPS = 20_000

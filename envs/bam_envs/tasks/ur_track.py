@@ -16,10 +16,10 @@ from msgspec import Meta
 
 from bam_envs.core.errors import InvalidValue
 from bam_envs.core.robot import EnvIds, Initial, RobotState
-from bam_envs.core.splines import splines_through
 from bam_envs.core.task import Array, Flags, Floats, Label, Score
 from bam_envs.core.validation import Finite, check
 from bam_envs.robots.physics.obstacles import PATH_POINTS
+from bam_envs.robots.splines import splines_through
 from bam_envs.tasks.ur_arm import joint_labels, normalised
 from bam_envs.tasks.ur_avoidance import COLLISION, UrObstacleTask
 

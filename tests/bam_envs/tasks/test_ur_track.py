@@ -6,7 +6,7 @@ import math
 import numpy as np
 import pytest
 
-from bam_envs.core.splines import splines_through
+from bam_envs.robots.splines import splines_through
 from bam_envs.robots.ur import ur_model
 from tests.bam_envs.making import arm_state as state
 from tests.bam_envs.making import make_task

@@ -50,7 +50,7 @@ def look():
     servers = []
 
     def open_socket(**cameras):
-        feed = CameraFeed(cameras, {"wrist": 64})
+        feed = CameraFeed(cameras, {"wrist": (64, 64)})
         servers.append(
             BridgeServer(port=0, tokens=Tokens(otherwise="administer"), site=Site({}, {"/camera": feed.serve}))
         )
@@ -79,7 +79,7 @@ def until(condition):
 def test_a_picture_comes_when_the_one_before_was_drawn_and_it_is_the_newest(look):
     wrist, cell = Camera(), Camera()
     with look(wrist=wrist, cell=cell) as client:
-        assert json.loads(client.recv(DEADLINE)) == {"cameras": ["wrist", "cell"], "seen": {"wrist": 64}}
+        assert json.loads(client.recv(DEADLINE)) == {"cameras": ["wrist", "cell"], "seen": {"wrist": [64, 64]}}
         first = pictures(client)
         seen = wrist.number
         until(lambda: min(wrist.number, cell.number) > seen + 5)
@@ -163,8 +163,8 @@ def test_greys_distances_and_what_is_transparent():
     ("env_kwargs", "seen"),
     [
         ({}, {}),
-        ({"camera": ["wrist"]}, {"wrist": 64}),
-        ({"camera": "front", "image_size": 32, "depth": True}, {"front": 32, "front_depth": 32}),
+        ({"camera": ["wrist"]}, {"wrist": (64, 64)}),
+        ({"camera": "front", "image_size": 32, "depth": True}, {"front": (32, 32), "front_depth": (32, 32)}),
     ],
 )
 def test_the_console_shows_the_cameras_that_the_policy_sees(tmp_path, env_kwargs, seen):

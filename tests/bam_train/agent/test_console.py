@@ -415,7 +415,7 @@ class FakeCamera:
 
 
 def test_pictures_of_cameras(page):
-    with FakeAgent(cameras={"wrist": FakeCamera("red"), "cell": FakeCamera("blue")}, seen={"wrist": 64}) as agent:
+    with FakeAgent(cameras={"wrist": FakeCamera("red"), "cell": FakeCamera("blue")}, seen={"wrist": (64, 64)}) as agent:
         page.open(agent.url)
         drawn = "return [...document.querySelectorAll('#cameras canvas')].map((one) => one.drawn)"
         until(lambda: page.run(drawn) and min(page.run(drawn)) > 5, "pictures")
@@ -423,7 +423,7 @@ def test_pictures_of_cameras(page):
         middle += "return [...c.getContext('2d').getImageData(320, 240, 1, 1).data]"
         assert page.run(middle, 0)[0] > 240
         assert page.run(middle, 1)[2] > 240
-        assert page.text("cameras") == "wrist: the policy sees its middle square, 64 by 64 pixels\ncell"
+        assert page.text("cameras") == "wrist: the policy sees its middle, 64 by 64 pixels\ncell"
         page.click("stop")
         page.shows("state", "paused")
         assert page.complaints() == []

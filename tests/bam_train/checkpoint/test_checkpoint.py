@@ -16,7 +16,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from bam_train.atomic_file import remove_orphans, replacing
 from bam_train.checkpoint import MANIFEST, Checkpoint, safetensors_file, write_checkpoint
 from bam_train.checkpoint.manifest import WHERE
 from bam_train.errors import (
@@ -27,6 +26,7 @@ from bam_train.errors import (
     NotACheckpoint,
     OutputError,
 )
+from bam_train.files.atomic_file import remove_orphans, replacing
 
 BOX = {"type": "Box", "shape": [3], "dtype": "float32", "low": "-inf", "high": "inf"}
 FIELDS: dict[str, Any] = {

@@ -14,7 +14,7 @@ from bam_train.data import DataSet, DataSetInfo, DataSetWriter, Episode
 from bam_train.data.layout import LOCK, Files
 from bam_train.data.mending import look, mend
 from bam_train.errors import BadDataSet, PlaceError
-from bam_train.place import Place
+from bam_train.files.place import Place
 from tests.object_store import Proxy, answering, bucket_fixture, environment  # noqa: F401
 
 BOX = gym.spaces.Box(-1.0, 1.0, (3,), np.float32)

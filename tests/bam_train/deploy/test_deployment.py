@@ -303,11 +303,13 @@ def test_the_detector_gets_the_command_that_guards_have_changed_and_the_time_bet
             self.count += 1
             return "held" if self.count == 2 else None
 
-    robot = SafeRobot(SimulatedArm(with_object=False), [Hold()], limits=Limits().on_trial(base=False))
+    arm = SimulatedArm(with_object=False)
+    robot = SafeRobot(arm, [Hold()], limits=Limits().on_trial(base=False))
     env = gym.wrappers.TimeLimit(RobotEnv(robot, ReachTask(1)), 5)
     policy, sent = Right(np.array([1, 0, 0, 0, 0, 0], np.float32)), []
     policy.detector = spy = Spy()
-    robot.observe(lambda tick, state: sent.append(list(tick.command)))
+    step = arm.step
+    arm.step = lambda command: (sent.append(command[0].tolist()), step(command))[1]
     ending, journal, _ = run(env, policy, episodes=1)
     assert ending == DONE
     assert spy.paces == [0.25]

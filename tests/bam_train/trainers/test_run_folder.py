@@ -10,9 +10,9 @@ from types import SimpleNamespace
 
 import pytest
 
-from bam_train.atomic_file import replacing
 from bam_train.errors import OutputError
-from bam_train.place import Place
+from bam_train.files.atomic_file import replacing
+from bam_train.files.place import Place
 from bam_train.trainers.run_folder import Copies, RunFolder, draw_curve, require_room
 from tests.object_store import bucket_fixture  # noqa: F401
 

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bam_envs.core.robot import EnvIds
-from bam_envs.core.splines import Splines, splines_through
 from bam_envs.core.task import Memory
+from bam_envs.robots.splines import Splines, splines_through
 
 Array = NDArray[np.float64]
 UPDATE_RATE = 100.0  # of an obstacle's position [Hz]

@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from bam_envs.core.splines import splines_through
 from bam_envs.robots.physics.obstacles import Obstacles, wave_signals
+from bam_envs.robots.splines import splines_through
 
 ROW, SEED = np.zeros(1, np.int64), np.zeros(1, np.int64)
 PATH = np.random.default_rng(1).uniform(-1, 1, (1, 10, 3))

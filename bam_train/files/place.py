@@ -23,8 +23,8 @@ from typing import IO, Any, cast
 from urllib.parse import parse_qsl, urlsplit
 from urllib.request import url2pathname
 
-from bam_train.atomic_file import replacing
 from bam_train.errors import NoSuchPlace, PlaceError
+from bam_train.files.atomic_file import replacing
 
 ATTEMPTS = 4
 """Tries of a request, the first one included."""

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from bam_envs.core.splines import splines_through
+from bam_envs.robots.splines import splines_through
 
 POINTS = np.random.default_rng(0).uniform(-1, 1, (4, 10, 3))
 ALONG = np.linspace(0, 1, 301)

@@ -10,15 +10,15 @@ from urllib.parse import urlsplit
 
 import pytest
 
-from bam_train import stand_ins
 from bam_train.checkpoint import Checkpoint
 from bam_train.cli import eval, sign, train
 from bam_train.cli.live import replay
 from bam_train.errors import PlaceError
-from bam_train.place import Place
+from bam_train.files import stand_ins
+from bam_train.files.place import Place
 from tests.object_store import Proxy, answering, bucket_fixture, environment  # noqa: F401
 
-SHIPPED = Path(__file__).parents[2] / "checkpoints" / "reach-ppo.zip"
+SHIPPED = Path(__file__).parents[3] / "checkpoints" / "reach-ppo.zip"
 
 
 @pytest.fixture(autouse=True)

@@ -13,9 +13,9 @@ from urllib.parse import urlsplit
 
 import pytest
 
-from bam_train import place as module
 from bam_train.errors import NoSuchPlace, PlaceError
-from bam_train.place import Place
+from bam_train.files import place as module
+from bam_train.files.place import Place
 from tests.object_store import Proxy, answering, bucket_fixture, environment  # noqa: F401
 
 
@@ -109,7 +109,7 @@ def test_without_pyarrow_a_path_works_and_an_address_names_the_extra(tmp_path):
     code = f"""
 import sys
 sys.modules["pyarrow"] = None
-from bam_train.place import Place
+from bam_train.files.place import Place
 Place({str(tmp_path)!r} + "/x").write_bytes(b"1")
 try:
     Place("s3://b/x").read_bytes()

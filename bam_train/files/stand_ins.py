@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 if TYPE_CHECKING:
     from bam_train.errors import PlaceError
-    from bam_train.place import Place
+    from bam_train.files.place import Place
 
 Config = TypeVar("Config")
 WRITTEN = ("out", "record", "video", "plot", "measure", "runs")
@@ -49,9 +49,9 @@ def standing_in(config: Config) -> Iterator[Config]:
     if not texts:
         yield config
         return
-    from bam_train.atomic_file import REPLACED
     from bam_train.errors import PlaceError
-    from bam_train.place import Place
+    from bam_train.files.atomic_file import REPLACED
+    from bam_train.files.place import Place
 
     places = {name: Place(value) for name, value in texts.items()}
     for name, place in places.items():
