@@ -113,7 +113,7 @@ def _tree(module: str) -> ast.Module:
     """The source of a module; only its outermost package may have to be found."""
     library, *inner = module.split(".")
     found = importlib.util.find_spec(library)
-    if found is None or found.origin is None:
+    if found is None or found.origin is None or (inner and found.submodule_search_locations is None):
         raise ModuleNotFoundError(f"No module named {library!r}", name=library)
     path = Path(found.origin)
     if inner:

@@ -21,6 +21,7 @@ from bam_envs.ros.messages import write_stamp
 from bam_envs.rosbridge.bus import Caller
 from bam_envs.rosbridge.server import BridgeServer
 
+PERIOD = 0.05  # of the shipped profiles [s]
 DEADLINE = 10.0
 HOME = np.array([-0.27, -1.54, 1.89, -1.93, -1.57, -1.84])
 
@@ -142,7 +143,7 @@ class ScriptedRobot:
         self.stamp = lambda: write_stamp(time.time())
         self._bus, self._namespace, self._info = bus, namespace, info
         self._lock, self._changed = threading.RLock(), threading.Condition()
-        self._told, self._moved_at = {}, 0.0
+        self._told = {}
         self.tag = ""
         """Echo of the last complete command."""
         self._stopped, self._thread = threading.Event(), None
@@ -206,16 +207,14 @@ class ScriptedRobot:
     def _move(self):
         if self.frozen:
             return
-        before, now_is = self.signals.get("joint_position"), time.monotonic()
+        before = self.signals.get("joint_position")
         names = [one for one in ("base_velocity", "joint_position", "gripper_width") if one in self.signals]
         now = np.concatenate([self.signals[name] for name in names])
         now[list(self._told)] = list(self._told.values())
         ends = np.cumsum([len(self.signals[name]) for name in names])
         self.signals |= dict(zip(names, np.split(now, ends[:-1]), strict=True))
         if "joint_velocity" in self.signals:
-            speed = (self.signals["joint_position"] - before) / max(now_is - self._moved_at, 0.02)
-            self.signals["joint_velocity"] = np.clip(speed, -3.0, 3.0)
-        self._moved_at = now_is
+            self.signals["joint_velocity"] = np.clip((self.signals["joint_position"] - before) / PERIOD, -3.0, 3.0)
 
     def publish(self):
         with self._lock:
