@@ -414,23 +414,33 @@ class Resident:
             return
         self._holds = False
         try:
+            if session.robot.is_unproved:  # this motion is the first: the next command comes after it
+                session.robot.prove()
+                self._report(_REPORT)
+                return
             session.robot.step(np.array([drive.command]))
             session.deployment.record_command()
             self._ticks += 1
+        except _Interrupted:
+            session.robot.halt()
+            self._holds = True
         except Exception as error:
             self._failed(error)
         self._report(_REPORT)
 
     def _sent(self, tick: Any, state: Any) -> None:
-        """After each command: requests may interrupt the way to a start pose."""
+        """After each command: requests may interrupt the way to a start pose, and the proof of the commands."""
         session = self.session
         if session is None:
             return
         session.deployment.sent(tick, state)
         self.send(Sent(list(tick.command)))
         self._link_ms += 0.05 * (1e3 * tick.age - self._link_ms)
-        if tick.approach and self.driver is None and self._requests and self._settled():
-            raise _Interrupted
+        if tick.approach and self._requests:
+            driver = self.driver
+            ends = self._settled()
+            if ends if driver is None else self.driver is not driver or self._holds:
+                raise _Interrupted
 
     # ---- the link
 
@@ -553,7 +563,7 @@ class Resident:
         """The link of the owner was cut: hold; the front process ends the lease later."""
         if self.driver is not None and self.driver.lease == lease:
             self.halt()
-            self._command = None
+            self._command, self._holds = None, True
             self._change(State.TAKEN_OVER, f"the link of {self.driver.who} {how}; the robot holds", who, address)
 
     def _hand_back(

@@ -10,7 +10,7 @@ import pytest
 
 from bam_envs.core.errors import LinkLost, NotReady, ProtocolError, SafetyStop, StaleState, StartNotReached
 from bam_envs.core.timing import TickTimes
-from bam_train.agent.agent_messages import Answer, Ask, Halt, Report
+from bam_train.agent.agent_messages import Answer, Ask, Drive, Halt, Report
 from bam_train.agent.agent_options import AgentOptions
 from bam_train.agent.agent_states import State
 from bam_train.agent.resident import Resident
@@ -39,7 +39,8 @@ class Session:
             spec=SimpleNamespace(period=0.05),
             halt=lambda: None,
             report=dict,
-            observe=lambda observer: None,
+            observe=lambda observer: setattr(self, "observer", observer),
+            is_unproved=False,
             measure=lambda: SimpleNamespace(signals={}),
             reset=self._reset,
         )
@@ -50,6 +51,8 @@ class Session:
             swap=lambda policy: None,
             trials=None,
             latency=0.0,
+            sent=lambda tick, state: None,
+            record_command=lambda: None,
         )
 
     def _episode(self, watcher, seed):
@@ -286,6 +289,53 @@ def test_what_a_person_drives_into_is_not_the_candidates_fault(bench, candidate)
             running.ask("resume")
             running.state(State.TRIAL)
         assert not choice.outcome.is_set()
+
+
+# The first command of somebody who has taken over
+
+
+@pytest.mark.parametrize("interrupted", [False, True])
+def test_the_first_motion_of_a_driver_proves_the_commands(bench, interrupted):
+    """And a request ends it at once."""
+    did, moves = [], threading.Event()
+
+    def connect(*arguments, **more):
+        session = Session(running.agent, running.faults)
+
+        def prove():
+            tick = SimpleNamespace(command=[0.0], age=0.0, approach=True)
+            session.observer(tick, None)
+            moves.set()
+            while interrupted:
+                session.observer(tick, None)
+            did.append("proved")
+            session.robot.is_unproved = False
+
+        def step(command):
+            did.append(command.tolist())
+            moves.set()
+
+        session.robot.is_unproved, session.robot.prove, session.robot.step = True, prove, step
+        session.robot.halt = lambda: did.append("halted")
+        return session
+
+    running = bench(connect=connect)
+    with running:
+        running.state(State.RUNNING)
+        running.ask("take", who="first", lease="1")
+        did.clear()
+        running.agent.take(Drive([0.1], "1"))
+        assert moves.wait(DEADLINE)
+        if interrupted:
+            running.ask("pause", who="anna", why="look")
+            assert running.state(State.PAUSED) == "paused by anna: look"
+            assert set(did) == {"halted"}
+            return
+        moves.clear()
+        running.agent.take(Drive([0.2], "1"))
+        assert moves.wait(DEADLINE)
+        assert did[0] == "proved"
+        assert [one for one in did if isinstance(one, list)] == [[[0.2]]]
 
 
 # A pause is lifted by a person only
