@@ -32,6 +32,7 @@ from bam_envs.rosbridge.threads import LoopThread, Workers
 
 _LOG = logging.getLogger(__name__)
 _FIRST_DELAY, _LONGEST_DELAY = 0.05, 2.0
+_LEAST_TRY = 0.1  # least time for one attempt: a server that refuses is told apart, also on a busy computer [s]
 _STEADY = 2.0  # a connection that lasted this long [s] is reopened without a longer delay
 _SEND_WITHIN = 0.5
 _LEAVE_WITHIN = 3.0
@@ -263,7 +264,7 @@ class RosbridgeLink(Declarations):
         while True:
             self._require_open()
             try:
-                return await self._open(deadline - time.monotonic())
+                return await self._open(max(deadline - time.monotonic(), _LEAST_TRY))
             except NoServer as error:
                 # A server that refuses connections may still be starting; other errors persist.
                 if not isinstance(error.__cause__, ConnectionRefusedError) or time.monotonic() + delay >= deadline:

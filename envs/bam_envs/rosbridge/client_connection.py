@@ -291,10 +291,17 @@ class Connection:
 
 async def open_port(address: Address, timeout: float) -> socket.socket:
     """A TCP connection to a server; `NoServer` gives the reason why there is none within `timeout` [s]."""
+    opening = asyncio.get_running_loop().create_task(_open_tcp(address))
     try:
-        return await asyncio.wait_for(_open_tcp(address), timeout)
+        await asyncio.wait((opening,), timeout=timeout)
+        await asyncio.sleep(0)  # on a busy computer, the answer may have come together with the end of the time
+        if not opening.done():
+            raise asyncio.TimeoutError
+        return opening.result()
     except (OSError, asyncio.TimeoutError) as error:
         raise NoServer(address.url, _no_connection(address, error, timeout)) from error
+    finally:
+        opening.cancel()
 
 
 async def open_socket(endpoint: Endpoint, timeout: float, max_message: int, path: str = "/") -> ClientConnection:

@@ -175,11 +175,13 @@ def test_a_server_that_knows_no_session_is_asked_once(server, open_to):
     assert len(asked) == 1
 
 
-def test_no_server_at_all():
+@pytest.mark.parametrize("timeout", [0.2, 1e-6])
+def test_no_server_at_all(timeout):
+    """A refusal is one, also where the time is over before it comes."""
     with closing(socket.create_server(("127.0.0.1", 0))) as listener:
         url = f"ws://127.0.0.1:{listener.getsockname()[1]}"
     with pytest.raises(NoServer, match=r"(?i)refused"):
-        RosbridgeTransport(url, connect_timeout=0.2).connect()
+        RosbridgeTransport(url, connect_timeout=timeout).connect()
 
 
 def test_closed_is_closed(served, open_to):
