@@ -12,12 +12,17 @@ def script(load_script):
     return load_script("check_detector")
 
 
-def test_episodes_of_training_are_usual_and_a_frozen_encoder_is_not(script, run):
-    status, out, err = run(CHECKPOINT, "--ticks", 640, "--steps", 640, "--only", "elbow")
+def test_episodes_of_training_and_behind_guards_are_usual_and_a_frozen_encoder_is_not(script, run):
+    status, out, err = run(CHECKPOINT, "--ticks", 640, "--guarded", 300, "--steps", 640, "--only", "elbow")
     lines = out.splitlines()
     assert (status, err) == (0, "")
-    assert lines[0].startswith("no shift: ")
-    assert int(lines[0].split(" ticks: ")[1].split()[0]) <= 2  # false alarms: one in 72,000 ticks is expected
-    shift, episodes, failed, flagged, *_ = (cell.strip() for cell in lines[4].strip("|").split("|"))
+    for line, where in zip(lines, ("no shift", "behind guards, at full speed", "behind guards, on trial"), strict=False):
+        assert line.startswith(f"{where}: ")
+        assert ": 0 false alarms, at most " in line
+    shift, episodes, failed, flagged, *_ = (cell.strip() for cell in lines[6].strip("|").split("|"))
     assert (shift, failed, flagged) == ("elbow's encoder frozen", episodes, episodes)
     assert lines[-1] == "1 of 1 shifts: at least 90 % of the failed episodes flagged before they end"
+
+
+def test_the_greatest_mean_of_a_poisson_number(script):
+    assert [round(script.at_most(count), 3) for count in (0, 1, 5)] == [2.996, 4.744, 10.513]

@@ -212,7 +212,7 @@ def test_states_that_are_old_when_they_arrive(server, robot_on):
 
 def test_states_that_come_too_rarely(server, robot_on):
     robot, numbers = robot_on(server), iter(range(10**6))
-    robot.mangle = lambda topic, message: message if next(numbers) % 30 < 3 else None
+    robot.mangle = lambda topic, message: message if next(numbers) % 60 < 3 else None
     why = failure(diagnose(server.url)[1])[1]
     assert why.endswith("Hz. They come too rarely: raise the rate of their driver.")
 
