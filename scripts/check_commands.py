@@ -177,7 +177,7 @@ class Flags:
     episodes: Count = 200
     """Fresh episodes of an evaluation."""
     folder: Annotated[Path | None, arg(metavar="DIR")] = None
-    """Where outputs and checkpoints go; by default a new one."""
+    """Where a new folder with outputs and checkpoints is made; by default that of temporary files."""
     log: Annotated[Path, arg(metavar="FILE")] = LOG
     """Where the table goes."""
 
@@ -190,7 +190,9 @@ def main(args: Flags) -> int:
         for words in chosen:
             print(f"{sum(command == shlex.join(words) for command, _ in logged)} seeds  {shlex.join(words)}")
         return 0
-    folder = args.folder or Path(tempfile.mkdtemp(prefix="check-commands-"))
+    if args.folder is not None:
+        args.folder.mkdir(parents=True, exist_ok=True)
+    folder = Path(tempfile.mkdtemp(prefix="check-commands-", dir=args.folder))
     print(f"outputs and checkpoints are in {folder}", file=sys.stderr, flush=True)
     learnt = []
     for number, words in enumerate(chosen):
