@@ -207,9 +207,10 @@ class RobotSession:
         try:
             recorder.start()
         except BamTrainError as error:
-            if str(error) != self._not_recorded:
-                _log.warning("Nothing is recorded: %s", error)
-            self._not_recorded = str(error)
+            why = str(error)  # of a file whose name has the time in it
+            if why.rpartition(".mcap: ")[2] != self._not_recorded.rpartition(".mcap: ")[2]:
+                _log.warning("Nothing is recorded: %s", why)
+            self._not_recorded = why
             return None
         with contextlib.suppress(BamTrainError):
             for warning in watch_cameras(recorder, options.place(trial=None)):

@@ -16,7 +16,9 @@ def test_episodes_of_training_and_behind_guards_are_usual_and_a_frozen_encoder_i
     status, out, err = run(CHECKPOINT, "--ticks", 640, "--guarded", 300, "--steps", 640, "--only", "elbow")
     lines = out.splitlines()
     assert (status, err) == (0, "")
-    for line, where in zip(lines, ("no shift", "behind guards, at full speed", "behind guards, on trial"), strict=False):
+    for line, where in zip(
+        lines, ("no shift", "behind guards, at full speed", "behind guards, on trial"), strict=False
+    ):
         assert line.startswith(f"{where}: ")
         assert ": 0 false alarms, at most " in line
     shift, episodes, failed, flagged, *_ = (cell.strip() for cell in lines[6].strip("|").split("|"))

@@ -91,10 +91,15 @@ def test_after_a_full_disk_the_next_episode_is_recorded_once_there_is_room(sessi
     assert len(Recording.open(session.recorder.path).arrays("action")[""]) == Boundary.ticks + 1
 
 
-def test_where_no_recording_can_begin_one_does_once_there_is_room(session, tmp_path, until, caplog):
+def test_where_no_recording_can_begin_one_does_once_there_is_room(session, tmp_path, until, caplog, monkeypatch):
+    """It is said once, although each attempt is for a file of another name."""
+    names = (Path(f"recordings/{number}-reach.mcap") for number in range(10**6))
+    monkeypatch.setattr(robot_session, "recording_names", lambda env_id: [next(names)])
     (tmp_path / "recordings").write_text("no folder")
     session = session()
     until(lambda: session.record_again() or session.recording_fault)
+    before = session.recording_fault
+    until(lambda: session.record_again() or session.recording_fault != before)
     play(session)
     assert "cannot be written" in session.recording_fault
     (tmp_path / "recordings").unlink()
