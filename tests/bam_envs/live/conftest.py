@@ -21,7 +21,6 @@ from bam_envs.ros.messages import write_stamp
 from bam_envs.rosbridge.bus import Caller
 from bam_envs.rosbridge.server import BridgeServer
 
-PERIOD = 0.05  # of the shipped profiles [s]
 DEADLINE = 10.0
 HOME = np.array([-0.27, -1.54, 1.89, -1.93, -1.57, -1.84])
 
@@ -143,7 +142,7 @@ class ScriptedRobot:
         self.stamp = lambda: write_stamp(time.time())
         self._bus, self._namespace, self._info = bus, namespace, info
         self._lock, self._changed = threading.RLock(), threading.Condition()
-        self._told = {}
+        self._told, self.period = {}, 0.05  # between two commands [s]
         self.tag = ""
         """Echo of the last complete command."""
         self._stopped, self._thread = threading.Event(), None
@@ -214,7 +213,7 @@ class ScriptedRobot:
         ends = np.cumsum([len(self.signals[name]) for name in names])
         self.signals |= dict(zip(names, np.split(now, ends[:-1]), strict=True))
         if "joint_velocity" in self.signals:
-            self.signals["joint_velocity"] = np.clip((self.signals["joint_position"] - before) / PERIOD, -3.0, 3.0)
+            self.signals["joint_velocity"] = np.clip((self.signals["joint_position"] - before) / self.period, -3.0, 3.0)
 
     def publish(self):
         with self._lock:

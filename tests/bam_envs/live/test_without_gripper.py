@@ -74,6 +74,7 @@ def test_an_arm_without_gripper_runs_a_task_that_has_none(server, robot_on, make
     scripted = robot_on(server, spec=SIX)
     scripted.signals["joint_position"][:] = START
     env = make("bam/ur-reach-v0", server.url)
+    scripted.period = env.unwrapped.robot.spec.period
     assert env.unwrapped.robot.spec.command.labels == SIX.command.labels
     assert run(env) > 0.05
     assert {topic for topic, _, _ in scripted.commands} == {ARM, "/bam/halt"}
