@@ -731,7 +731,10 @@ def connect_again(arm, robot, state, pushed):
     robot.close()
     arm.place(pushed)
     robot.connect()
-    robot.reset(np.arange(1), start_at(pushed))
+    try:
+        robot.reset(np.arange(1), start_at(pushed))
+    except InvalidValue:  # a pose outside the box is no start
+        assume(False)
 
 
 INTERRUPTIONS = {"halt": halt, "lost link": lose_link, "stop": stop, "pause": pause, "connect": connect_again}
