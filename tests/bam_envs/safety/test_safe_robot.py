@@ -734,7 +734,7 @@ def connect_again(arm, robot, state, pushed):
     try:
         robot.reset(np.arange(1), start_at(pushed))
     except InvalidValue:  # a pose outside the box is no start
-        assume(False)
+        reject()
 
 
 INTERRUPTIONS = {"halt": halt, "lost link": lose_link, "stop": stop, "pause": pause, "connect": connect_again}
