@@ -188,8 +188,8 @@ def test_the_cut_link_of_the_owner_holds_the_robot_and_pauses_the_policy(running
     running.run()
     program = (
         "import sys, time, gymnasium as gym, bam_envs\n"
-        f"env = gym.make('bam/pick-v0', robot={running.url!r}, disable_env_checker=True)\n"
         "while True:\n"
+        f"    env = gym.make('bam/pick-v0', robot={running.url!r}, disable_env_checker=True)\n"
         "    try:\n"
         "        env.unwrapped.robot.connect()\n"
         "        env.unwrapped.robot._robot._take_over.take()\n"
