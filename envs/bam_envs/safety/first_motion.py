@@ -34,8 +34,6 @@ OTHERS = 0.3
 """Share of the motion of a joint by which another joint may move with it, and that counts as no motion."""
 COMPARED = 0.15
 """Motion over which a measured speed is compared with the measured position [m, rad]."""
-MOST_APART, LATE_TICK = 2.5, 1.4
-"""Longest times between two measurements that are compared, and between the two commands before them, in periods."""
 OPEN, OPENS_WITHIN = 0.95, 3.0
 """Share of its range to which a gripper is commanded when it is to open, and the longest time for that [s]."""
 Step = tuple[Numbers, float | None]
@@ -201,7 +199,6 @@ class FirstMotion(Guard):
         self._grippers = [(at, spec.command.labels[at], spec.command.high[at]) for at in columns_in(spec.command, "m")]
         self._opening, self._longest = 0, ticks_of(OPENS_WITHIN, spec)
         self._pose: Numbers | None = None
-        self._age: float | None = None
 
     @property
     def opens(self) -> bool:
@@ -210,7 +207,7 @@ class FirstMotion(Guard):
 
     def restart(self) -> None:
         """Forget the motion so far: time may have passed without commands."""
-        self._opening, self._pose, self._age = 0, None, None
+        self._opening, self._pose = 0, None
         for way in self._ways:
             way.restart()
 
@@ -220,9 +217,7 @@ class FirstMotion(Guard):
             return reason
         if not self._ways:
             return None
-        age, self._age = tick.age if self._age is None else self._age, tick.age
-        begins, signals = self._pose is None, tick.signals
-        seconds = 0.0 if begins else (tick.pause or self._period) + age - tick.age  # between the two measurements
+        signals, seconds = tick.signals, tick.pause or self._period
         if self._is_base:
             speeds, changes = signals["base_velocity"][0].tolist(), self._driven(signals["base_pose"][0].tolist())
         else:
@@ -230,10 +225,6 @@ class FirstMotion(Guard):
             positions = signals["joint_position"][0].tolist()
             before, self._pose = self._pose or positions, positions
             changes = [now - old for now, old in zip(positions, before, strict=True)]
-        if seconds > MOST_APART * self._period or tick.pause > LATE_TICK * self._period:  # it has rested meanwhile
-            for way in self._ways:
-                way.restart()
-            return None
         for way in self._ways:
             if (reason := way.add(changes[way.column], speeds[way.column] * seconds)) is not None:
                 return reason

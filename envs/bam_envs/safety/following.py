@@ -112,7 +112,6 @@ class JointFollowing(Following):
         self._known_lag = math.inf  # as measured
         self._stuck, self._stuck_ticks, self._place = 0, ticks_of(STUCK_TIME, spec), list[float]()
         self._moved: Numbers = []  # in the period before [rad]
-        self._settles = 0  # ticks for which a joint that was held may still move
         self._change = limits.joint_acceleration * spec.period**2
 
     def measured(self, lag: float) -> None:
@@ -122,7 +121,7 @@ class JointFollowing(Following):
     def restart(self) -> None:
         """Forget the motion."""
         super().restart()
-        self._stuck, self._moved, self._settles = 0, list[float](), 0
+        self._stuck, self._moved = 0, list[float]()
 
     def fault(self, tick: Tick) -> str | None:
         """Report the joint, the gap, and likely causes."""
@@ -132,7 +131,7 @@ class JointFollowing(Following):
         if self._stuck > self._stuck_ticks:
             self._stuck, self.patience = 0, 1
             return f"no joint has moved for {STUCK_TIME:g} s, and the arm was commanded to move: {LIKELY}"
-        off, self._settles = self.off(sent, measured), self._settles - 1
+        off = self.off(sent, measured)
         # The farthest that a command may be from a joint at rest.
         allowed, farthest, over = self._slow_allowed if tick.approach else self._allowed, 0.0, False
         if any(off):
@@ -148,9 +147,6 @@ class JointFollowing(Following):
         at = max(range(len(off)), key=lambda column: abs(off[column]) / allowed[column])
         moved = measured[at] - self._pick(tick.before)[at]  # NaN in a first tick
         away = moved * off[at] < 0.0 and abs(moved) > allowed[at] / 2
-        # A joint that is held moves on for its lag, and an old state shows where older commands led it.
-        away = away and self._settles <= 0 and tick.age <= self._period
-        self._settles = self._sent.maxlen or 0
         self.is_struck(over, at_once=away)
         if away:
             return (
