@@ -46,7 +46,8 @@ class Following(Guard):
 
     def __init__(self, spec: RobotSpec, limits: Limits) -> None:
         self._lag = spec.lag if limits.lag is None else limits.lag
-        # A command lasts for a period after it is sent, and the robot is behind it by its lag.
+        # A command lasts for a period after it is sent, and the robot is behind it by its lag: also after a halt, when
+        # the next motion begins before the robot is at rest.
         self._sent: deque[Numbers] = deque(maxlen=2 + ticks_of(self._lag, spec))
         self._strikes, self._good, self._forgiven = 0, 0, ticks_of(FORGIVEN, spec)
         self._spec, self._own_lag = spec, self._lag
@@ -56,8 +57,8 @@ class Following(Guard):
         self._lag = self._own_lag + delay
         self._sent = deque(maxlen=2 + ticks_of(self._lag, self._spec))
 
-    def restart(self) -> None:
-        """Forget the commands: the next one begins at the robot's position."""
+    def resumed(self) -> None:
+        """Forget the commands: the robot is at rest where a person found it."""
         self._sent.clear()
 
     def forgive(self) -> None:
@@ -84,7 +85,6 @@ class Following(Guard):
             return False
         self._strikes, self._good = self._strikes + 1, 0
         self.patience = 1 if at_once or self._strikes >= STRIKES else math.inf
-        self._sent.clear()
         return True
 
 
@@ -111,6 +111,7 @@ class JointFollowing(Following):
         self.limit_value = max(fastest) * (self._lag + self._period)
         self._known_lag = math.inf  # as measured
         self._stuck, self._stuck_ticks, self._place = 0, ticks_of(STUCK_TIME, spec), list[float]()
+        self._ended: Numbers = []  # see Tick
         self._moved: Numbers = []  # in the period before [rad]
         self._change = limits.joint_acceleration * spec.period**2
 
@@ -120,7 +121,6 @@ class JointFollowing(Following):
 
     def restart(self) -> None:
         """Forget the motion."""
-        super().restart()
         self._stuck, self._moved = 0, list[float]()
 
     def fault(self, tick: Tick) -> str | None:
@@ -131,6 +131,10 @@ class JointFollowing(Following):
         if self._stuck > self._stuck_ticks:
             self._stuck, self.patience = 0, 1
             return f"no joint has moved for {STUCK_TIME:g} s, and the arm was commanded to move: {LIKELY}"
+        if tick.ended is not self._ended:
+            self._ended = tick.ended
+            if tick.ended and self._sent:
+                self._sent.append(self._pick(tick.ended))
         off = self.off(sent, measured)
         # The farthest that a command may be from a joint at rest.
         allowed, farthest, over = self._slow_allowed if tick.approach else self._allowed, 0.0, False
@@ -245,8 +249,7 @@ class BaseFollowing(Following):
         self._speeds: deque[Numbers] = deque(maxlen=1 + ticks_of(GAIN_TIME, spec))  # as measured
 
     def restart(self) -> None:
-        """Forget the reached speed as well: the base may still be moving."""
-        super().restart()
+        """Forget the motion and the reached speed: the base may still be moving."""
         self._reached = None
         self._speeds.clear()
 

@@ -120,6 +120,7 @@ class SafeRobot(metaclass=Sealed):
         "_checks",
         "_clock",
         "_code",
+        "_ended",
         "_every",
         "_further",
         "_guards",
@@ -214,6 +215,7 @@ class SafeRobot(metaclass=Sealed):
         self._state: RobotState | None = None
         self._before: Numbers | None = None  # measured values of the tick before
         self._sent: Numbers | None = None  # the last command that the robot was sent
+        self._ended: Numbers = []  # the same, when the motion began
         self._last: Numbers | None = None  # the same; None if the next command begins at the measured position
         self._speed = [0.0] * len(self.spec.command.labels)  # of the last command [unit/s]
 
@@ -391,6 +393,7 @@ class SafeRobot(metaclass=Sealed):
             approach=approach,
             action_age=self._clock() - self._returned_at if pause else 0.0,
             kept_out=self._kept_out,
+            ended=self._ended,
             signals=self._state.signals if self._state is not None else {},
         )
 
@@ -428,6 +431,7 @@ class SafeRobot(metaclass=Sealed):
             for joint in columns_in(command, "rad"):
                 last[joint] = measured[joint]
         self._last, self._speed, self._before = last, [0.0] * len(last), None
+        self._ended = (self._sent or []).copy()
         self._restart()
         return last
 

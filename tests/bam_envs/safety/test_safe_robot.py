@@ -98,6 +98,22 @@ def live(joints=ARM_HOME, **options):
     return arm, robot, robot.reset(np.arange(1), start_at(joints))
 
 
+class LaggingArm(LiveArm):
+    """An arm that is one command behind, also after a halt."""
+
+    def __init__(self):
+        super().__init__()
+        self.behind = None
+
+    def step(self, command):
+        before = self.state_dict()["position"]
+        position = before if self.behind is None else self.behind
+        self.behind = command.for_robot(self)
+        super().step(command)
+        velocity = (position - before)[:, :6] / self.spec.period
+        return self.load_state_dict(self.state_dict() | {"position": position.copy(), "velocity": velocity})
+
+
 def fake(joints=ARM_HOME, **options):
     inner = FakeRobot()
     robot = SafeRobot(inner, **options)
@@ -306,6 +322,26 @@ class Opener(Guard):
         tick.last[:], tick.period, tick.approach = tick.goal, 100.0, True
         tick.command = tick.goal + 1.0
         return True
+
+
+@pytest.mark.parametrize("pause", [0.0, 0.2])
+def test_an_arm_that_still_moves_when_the_next_motion_begins_follows_its_commands(pause):
+    """A live agent goes to the start pose as soon as a person hands back, and a busy computer sends commands late."""
+    arm = LaggingArm()
+    robot = SafeRobot(arm, clock=arm.clock, limits=Limits(lag=0.05))
+    robot.connect()
+    arm.place(ARM_HOME)
+    state = robot.reset(FIRST, start_at())
+    for _ in range(6):
+        state = robot.step(turned(state, 0.05))
+    if pause:
+        arm.now += pause
+        for _ in range(6):
+            state = robot.step(turned(state, -0.05))
+    else:
+        robot.reset(FIRST, start_at())
+    following = robot.report()["following"]
+    assert (following["held"], following["stopped"]) == (0, 0)
 
 
 @pytest.mark.parametrize("kind", [FakeRobot, lambda: LiveArm()])
