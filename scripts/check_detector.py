@@ -32,13 +32,13 @@ from bam_envs.safety.guard import TRIAL_SPEED
 from bam_envs.tasks.pick import PickTask
 from bam_envs.tasks.wrappers.late_actions import LateActions
 from bam_train.checkpoint import Checkpoint
+from bam_train.checkpoint.detector import TICKS, Detector, Rollout
 from bam_train.cli.program import guarded, parse
-from bam_train.detection import fresh_episodes
-from bam_train.detector import TICKS, Detector, Rollout
 from bam_train.env_location import SIMULATED
 from bam_train.environments import environment_of, make_env, make_vector_env
 from bam_train.errors import NoDetector
 from bam_train.policy import FrozenPolicy
+from bam_train.trainers.detection import fresh_episodes
 
 NAME = Path(__file__).stem
 SIDE_BY_SIDE = 64

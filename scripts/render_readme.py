@@ -12,8 +12,8 @@ from bam_train.checkpoint import Checkpoint
 from bam_train.environments import make_env
 from bam_train.errors import BamTrainError
 from bam_train.evaluation import record_video
+from bam_train.files.video import Frame
 from bam_train.policy import FrozenPolicy
-from bam_train.video import Frame
 
 LIMIT = 2_000_000
 """Largest picture that the README may have [bytes]."""

@@ -11,6 +11,7 @@ ROOT = Path(__file__).parents[1]
 ORDER = {
     "bam_envs": [
         "core",
+        "aliases",
         "ros",
         "rosbridge",
         "safety",
@@ -27,24 +28,20 @@ ORDER = {
         *(
             "errors",
             "signals",
-            "files",
-            "log_lines",
             "env_location",
             "settings",
             "finite_envs",
             "foreign_env",
         ),
         *(
+            "files",
             "checkpoint",
-            "detector",
             "policy",
             "environments",
-            "video",
             "recording",
             "loop",
             "evaluation",
             "data",
-            "detection",
             "deploy",
             "agent",
             "trainers",
@@ -63,12 +60,12 @@ SOURCES = {
 }
 
 
-def imports(module):
-    """The modules of ours that a module imports, at its top or in a function, other than for types only."""
+def imports(module, *, types=True):
+    """The modules of ours that a module imports, at its top or in a function, and with `types` for types only."""
     path = SOURCES[module]
     package = module.split(".") if path.name == "__init__.py" else module.split(".")[:-1]
     found = set()
-    for node in without_type_checking(ast.parse(path.read_text())):
+    for node in walk(ast.parse(path.read_text()), types):
         if isinstance(node, ast.Import):
             names = [alias.name for alias in node.names]
         elif isinstance(node, ast.ImportFrom):
@@ -84,11 +81,16 @@ def imports(module):
     return found
 
 
-def without_type_checking(tree):
+def walk(tree, types):
     for node in ast.iter_child_nodes(tree):
-        if not (isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test)):
+        if types or not (isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test)):
             yield node
-            yield from without_type_checking(node)
+            yield from walk(node, types)
+
+
+def package_of(module, depth):
+    parts = module.split(".")
+    return ".".join((parts if SOURCES[module].name == "__init__.py" else parts[:-1])[:depth])
 
 
 def place(module):
@@ -103,12 +105,21 @@ def test_every_package_has_its_place():
 
 
 def test_imports_point_up_the_order():
-    wrong = [f"{a} imports {b}" for a in SOURCES for b in imports(a) if place(b) > place(a)]
+    wrong = [f"{a} imports {b}" for a in SOURCES for b in imports(a, types=False) if place(b) > place(a)]
     assert wrong == []
 
 
 def test_no_file_imports_itself_round_a_circle():
     TopologicalSorter({module: imports(module) for module in SOURCES}).prepare()
+
+
+@pytest.mark.parametrize("depth", [2, 3])
+def test_no_package_imports_itself_round_a_circle(depth):
+    """The files of a package without those of the packages in it, for packages of the first and second level."""
+    graph = {package_of(module, depth): set() for module in SOURCES}
+    for module in SOURCES:
+        graph[package_of(module, depth)] |= {package_of(one, depth) for one in imports(module)}
+    TopologicalSorter({package: others - {package} for package, others in graph.items()}).prepare()
 
 
 def test_folders_are_small():

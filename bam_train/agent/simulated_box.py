@@ -15,7 +15,7 @@ from bam_envs.remote.serve.served_environment import ServedEnvironment
 from bam_train.agent.agent_messages import child_environment
 from bam_train.environments import make_env
 from bam_train.errors import SettingsError
-from bam_train.log_lines import begin_log
+from bam_train.files.log_lines import begin_log
 
 _PROGRAM = (  # without the folder it is started in, whose files could hide ours
     "import sys; sys.path[:] = filter(None, sys.path); import bam_train.agent.simulated_box as it; it.main()"

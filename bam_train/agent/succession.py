@@ -10,25 +10,25 @@ from __future__ import annotations
 import contextlib
 import logging
 import threading
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol
 
 from bam_envs.core.errors import BamEnvsError
 from bam_envs.core.registry import are_same
-from bam_train.agent.agent_messages import Answer, Ask, Progress
+from bam_train.agent.agent_messages import Answer, Ask, Message, Progress
+from bam_train.agent.agent_options import AgentOptions
+from bam_train.agent.agent_states import State
 from bam_train.agent.candidate import CandidateRequest, Verdict, check_candidate
 from bam_train.agent.probation import Judgement, Probation
+from bam_train.agent.robot_session import RobotSession
 from bam_train.agent.versions import CANDIDATE, CHAMPION, PREVIOUS, Version, Versions, load_policy
 from bam_train.checkpoint import Checkpoint
 from bam_train.deploy.checkpoint_admission import trials_of
 from bam_train.deploy.journal import EpisodeRecord
 from bam_train.deploy.trials import Evidence, Trials
 from bam_train.errors import BadTrials, BamTrainError, CandidateRefused, RequestRefused, TrialsNeeded
-
-if TYPE_CHECKING:
-    from bam_train.agent.resident import Resident
 
 _log = logging.getLogger(__name__)
 _EPISODE = 3600.0  # longest wait for the end of an episode [s]
@@ -65,15 +65,41 @@ class Choice:
         self.outcome.set()
 
 
+class ActingAgent(Protocol):
+    """What a `Succession` needs of a live agent: its `Resident`."""
+
+    options: AgentOptions
+    session: RobotSession | None
+    state: State
+
+    def send(self, message: Message) -> None:
+        """Send a message to the front process."""
+
+    def post(self, do: Callable[[], dict[str, Any] | None]) -> None:
+        """Let the main thread call `do` between two ticks."""
+
+    def note(self, what: str, text: str, who: str = ..., where: str = ...) -> None:
+        """Write an event into the audit file."""
+
+    def choose(self, choice: Choice) -> None:
+        """Let another version act as soon as it may."""
+
+    def stage_of_champion(self) -> None:
+        """Move at the stage of the agent's setting from the next episode on."""
+
+    def status(self) -> dict[str, Any]:
+        """The status of the agent."""
+
+
 class Succession:
     """The versions of an agent that act, one after the other.
 
     Args:
-        resident: The agent.
+        resident: The live agent; a `Resident`.
         versions: Its folder; one version is called `CHAMPION`.
     """
 
-    def __init__(self, resident: Resident, versions: Versions) -> None:
+    def __init__(self, resident: ActingAgent, versions: Versions) -> None:
         self._resident, self.versions = resident, versions
         self.active = versions.find(CHAMPION)
         """The version that acts, or will when the robot is there."""

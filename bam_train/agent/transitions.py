@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from bam_envs.core.wording import brief
 from bam_train.errors import FormatError
 from bam_train.loop import Agent
-from bam_train.loop.robot_agent import SAYS_SUCCESS, SUCCESS
+from bam_train.loop.gym.robot_agent import SAYS_SUCCESS, SUCCESS
 
 EVENT = "transitions"
 """Value of ``event`` in a message with transitions."""

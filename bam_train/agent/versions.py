@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import IO, Any
 
 from bam_train.checkpoint import MANIFEST, POLICY, Checkpoint
-from bam_train.detector import Detector
+from bam_train.checkpoint.detector import Detector
 from bam_train.errors import AlteredCheckpoint, CheckpointError, FolderInUse, OutputError, SettingsError, UnknownVersion
 from bam_train.files.atomic_file import remove_orphans, replacing
 from bam_train.policy import FrozenPolicy

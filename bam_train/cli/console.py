@@ -12,7 +12,7 @@ import sys
 import traceback
 from typing import TYPE_CHECKING, Any, TextIO
 
-from bam_train.log_lines import ShownFormatter, shown
+from bam_train.files.log_lines import ShownFormatter, shown
 
 if TYPE_CHECKING:
     from rich.console import Console

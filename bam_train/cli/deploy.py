@@ -49,11 +49,11 @@ def deploy_checkpoint(config: DeployConfig, signals: SignalMemory) -> int:
     place = _checked_place(config)
     from bam_envs.core.timing import Pacer
     from bam_train.checkpoint import Checkpoint
+    from bam_train.checkpoint.detector import DETECTOR
     from bam_train.cli.consent import connected_env
     from bam_train.deploy.checkpoint_admission import Admission
     from bam_train.deploy.deployment import Deployment
     from bam_train.deploy.journal import Journal
-    from bam_train.detector import DETECTOR
     from bam_train.errors import NoDetector
 
     checkpoint = Checkpoint.open(config.checkpoint)

@@ -39,8 +39,8 @@ def evaluate_checkpoint(config: EvalConfig) -> None:
         return
     from bam_train.environments import make_env, make_vector_env, require_fit
     from bam_train.evaluation import default_num_envs, evaluate
+    from bam_train.files.video import picture, require_video_path
     from bam_train.trainers.sb3.plain_sb3_zip import is_plain_sb3
-    from bam_train.video import picture, require_video_path
 
     video = None if config.video is None else require_video_path(config.video)
     path = config.checkpoint.expanduser()
@@ -103,11 +103,11 @@ def _recorded(config: EvalConfig, subject: _Subject, envs: Any) -> AbstractConte
 def _on_data(config: EvalConfig, place: str) -> None:
     """Estimate from recorded episodes how good the policy of a checkpoint is."""
     from bam_train.checkpoint import Checkpoint
-    from bam_train.cli.data.data_table import data_lines
+    from bam_train.checkpoint.detector import Detector
     from bam_train.data import DataSet
-    from bam_train.detection import recorded, unusual_episodes
-    from bam_train.detector import Detector
     from bam_train.estimation.data_evaluation import evaluate_on_data
+    from bam_train.estimation.data_table import data_lines
+    from bam_train.trainers.detection import recorded, unusual_episodes
 
     checkpoint = Checkpoint.open(config.checkpoint)
     if config.env is not None:
@@ -140,8 +140,8 @@ def _add_detector(subject: _Subject, path: Path) -> None:
     """Add a detector of unusual observations to a checkpoint, of new episodes of its policy."""
     from bam_train.checkpoint import Checkpoint
     from bam_train.checkpoint.zip_members import SIGNATURE, list_members, open_zip
-    from bam_train.detection import add_own_detector
     from bam_train.errors import NotACheckpoint
+    from bam_train.trainers.detection import add_own_detector
 
     if subject.checkpoint is None:
         raise NotACheckpoint(path, "a plain stable-baselines3 file has no place for a detector. Train with bam-train")
@@ -230,7 +230,7 @@ def _table(report: EvaluationReport, subject: _Subject, path: Path) -> list[str]
 def _record(config: EvalConfig, subject: _Subject, path: Path) -> None:
     from bam_train.environments import control_period, make_env
     from bam_train.evaluation import record_video
-    from bam_train.video import open_video
+    from bam_train.files.video import open_video
 
     episodes = min(config.video_episodes, config.episodes)
     env = make_env(subject.env, subject.env_kwargs, render_mode="rgb_array")

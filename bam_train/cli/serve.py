@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from bam_train.cli.console import say
 from bam_train.cli.program import run_program
-from bam_train.log_lines import ShownFormatter
+from bam_train.files.log_lines import ShownFormatter
 from bam_train.signals import SignalMemory
 
 if TYPE_CHECKING:

@@ -14,7 +14,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv, VectorWrapper
 from numpy.typing import NDArray
 
 from bam_envs.core.robot_env import RobotEnv, RobotVectorEnv
-from bam_envs.remote.values import plain_info, tree_to_json
+from bam_envs.remote.wire.values import plain_info, tree_to_json
 from bam_train.checkpoint.manifest import WHERE
 from bam_train.data.data_set_writer import DataSetWriter
 from bam_train.data.episode import Array, DataSetInfo, Episode, Leaf, joined, leaves_of

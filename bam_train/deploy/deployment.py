@@ -24,7 +24,7 @@ from bam_train.deploy.journal import Ending, EpisodeRecord, Journal
 from bam_train.deploy.trials import Trials
 from bam_train.errors import BamTrainError
 from bam_train.loop import Agent, Agents, PolicyAgent, RobotAgent, TemporalAgent, Workspace
-from bam_train.loop.robot_agent import SAYS_SUCCESS, SUCCESS
+from bam_train.loop.gym.robot_agent import SAYS_SUCCESS, SUCCESS
 from bam_train.loop.workspace import Sink
 from bam_train.recording.recorder import ERROR, INFO, Recorder
 from bam_train.signals import handled, interrupt

@@ -10,36 +10,36 @@ The core needs NumPy only. Names that need torch, and names for programs written
 import importlib
 from typing import TYPE_CHECKING, Any
 
-from bam_train.loop.agent import Agent as Agent
-from bam_train.loop.agent import import_torch
 from bam_train.loop.agents import Agents as Agents
 from bam_train.loop.agents import CopyTAgent as CopyTAgent
 from bam_train.loop.agents import EpisodesDone as EpisodesDone
 from bam_train.loop.agents import KWAgentWrapper as KWAgentWrapper
 from bam_train.loop.agents import PrintAgent as PrintAgent
 from bam_train.loop.agents import SeedableAgent as SeedableAgent
-from bam_train.loop.temporal_agent import TemporalAgent as TemporalAgent
+from bam_train.loop.agents.agent import Agent as Agent
+from bam_train.loop.agents.agent import import_torch
+from bam_train.loop.agents.temporal_agent import TemporalAgent as TemporalAgent
 from bam_train.loop.workspace import Workspace as Workspace
 
 if TYPE_CHECKING:
     from bam_train.loop.gym.gym_agent import GymAgent as GymAgent
     from bam_train.loop.gym.parallel_gym_agent import ParallelGymAgent as ParallelGymAgent
     from bam_train.loop.gym.parallel_gym_agent import make_env as make_env
+    from bam_train.loop.gym.robot_agent import PolicyAgent as PolicyAgent
+    from bam_train.loop.gym.robot_agent import RobotAgent as RobotAgent
     from bam_train.loop.gym.vec_gym_agent import VecGymAgent as VecGymAgent
-    from bam_train.loop.robot_agent import PolicyAgent as PolicyAgent
-    from bam_train.loop.robot_agent import RobotAgent as RobotAgent
-    from bam_train.loop.tensors.replay_buffer import ReplayBuffer as ReplayBuffer
-    from bam_train.loop.tensors.returns import gae as gae
-    from bam_train.loop.video_agent import record_video as record_video
+    from bam_train.loop.gym.video_agent import record_video as record_video
+    from bam_train.loop.workspace.replay_buffer import ReplayBuffer as ReplayBuffer
+    from bam_train.loop.workspace.returns import gae as gae
 
 _ON_USE = {
     "loop.gym.gym_agent": ("GymAgent",),
     "loop.gym.parallel_gym_agent": ("ParallelGymAgent", "make_env"),
     "loop.gym.vec_gym_agent": ("VecGymAgent",),
-    "loop.robot_agent": ("PolicyAgent", "RobotAgent"),
-    "loop.tensors.replay_buffer": ("ReplayBuffer",),
-    "loop.tensors.returns": ("cumulated_reward", "doubleqlearning_temporal_difference", "gae", "temporal_difference"),
-    "loop.video_agent": ("record_video",),
+    "loop.gym.robot_agent": ("PolicyAgent", "RobotAgent"),
+    "loop.workspace.replay_buffer": ("ReplayBuffer",),
+    "loop.workspace.returns": ("cumulated_reward", "doubleqlearning_temporal_difference", "gae", "temporal_difference"),
+    "loop.gym.video_agent": ("record_video",),
     "compat.bbrl.conventions": (
         *("SeedableAgentLast", "SeedableAgentMean", "SeedableAgentSum", "SerializableAgent", "TimeAgent", "load"),
         *("get_arguments", "get_class", "instantiate_class"),

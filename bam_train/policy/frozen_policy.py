@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from bam_train.checkpoint import GOLDEN, POLICY, Checkpoint
-from bam_train.detector import Detector
+from bam_train.checkpoint.detector import Detector
 from bam_train.errors import FormatError, PolicyError
 from bam_train.policy.array_specs import ArraySpec, array_spec, observation_arrays
 

@@ -16,7 +16,7 @@ from bam_train.errors import CheckpointMismatch, SettingsError
 from bam_train.settings import TrainSettings, check_names, differences, file_stem, merge, parse_config
 from bam_train.trainers.algorithms import ALGORITHMS, EXTRAS, RLLIB_ALGORITHMS, load_trainer, require_algorithm
 from bam_train.trainers.rllib_arguments import require_plausible
-from bam_train.trainers.sb3.sb3_hyperparameters import complete_settings
+from bam_train.trainers.sb3_hyperparameters import complete_settings
 
 PRESETS = Path(__file__).parent / "presets"
 """Tuned settings, laid out like a ``--config`` file: ``<environment>-<algorithm>.toml`` is for sb3,

@@ -19,6 +19,7 @@ import json
 import posixpath
 import shutil
 import tempfile
+import threading
 import traceback
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -202,3 +203,37 @@ class Copies:
         except Exception as error:  # each kind of storage has its own exceptions
             why = f"{type(error).__name__}: {' '.join(str(error).split())}"
             raise OutputError(f"{self.url}: {checkpoint} could not be copied there: {why}") from error
+
+
+class TensorBoardFiles:
+    """Writes numbers into a folder as TensorBoard's event files; a full disk ends that, and not the run."""
+
+    def __init__(self, folder: Path) -> None:
+        from torch.utils.tensorboard import SummaryWriter
+
+        self._writer: Any = SummaryWriter(str(folder))
+        self._hook = threading.excepthook
+        threading.excepthook = self._thread_failed
+
+    def write(self, numbers: Mapping[str, Any], step: int) -> None:
+        """Write numbers at a step."""
+        try:
+            if self._writer is not None:
+                for name, value in numbers.items():
+                    self._writer.add_scalar(name, value, step)
+                self._writer.flush()
+        except OSError:
+            self.close()
+
+    def close(self) -> None:
+        """Close the files."""
+        writer, self._writer = self._writer, None
+        if writer is not None:
+            with contextlib.suppress(OSError):
+                writer.close()
+            threading.excepthook = self._hook
+
+    def _thread_failed(self, failed: threading.ExceptHookArgs) -> None:
+        """Hide the errors of TensorBoard's thread, which `write` gets too, from standard error."""
+        if not (isinstance(failed.exc_value, OSError) and type(failed.thread).__module__.startswith("tensorboard.")):
+            self._hook(failed)

@@ -19,7 +19,7 @@ from bam_train.environments import control_period, make_env
 from bam_train.policy import FrozenPolicy
 from bam_train.settings import TrainSettings
 from bam_train.trainers.base import manifest
-from bam_train.trainers.tensorboard_files import TensorBoardFiles
+from bam_train.trainers.run_folder import TensorBoardFiles
 
 STATE, NOTES = "bam/resume/state", "bam/resume/notes.json"
 _LOGGED = 200  # entries of TensorBoard in a run

@@ -17,13 +17,13 @@ from gymnasium.vector import VectorEnv
 
 from bam_envs.core.errors import BamEnvsError, RobotFault
 from bam_train.checkpoint import Checkpoint
-from bam_train.detection import WANTED, add_detector, add_own_detector
-from bam_train.detector import DETECTOR, LEAST_TICKS
+from bam_train.checkpoint.detector import DETECTOR, LEAST_TICKS
 from bam_train.errors import BamTrainError, EnvironmentFailed, NoDetector, OutputError, ProcessesLost, TrainingFailed
 from bam_train.evaluation import BatchPolicy, EvaluationReport, evaluate
 from bam_train.policy import FrozenPolicy
 from bam_train.settings import TrainSettings
 from bam_train.trainers.base import Progress, Statistics, Trainer
+from bam_train.trainers.detection import WANTED, add_detector, add_own_detector
 from bam_train.trainers.resolve_settings import read_preset
 from bam_train.trainers.run_folder import Copies, RunFolder, unwritable
 

@@ -8,11 +8,11 @@ import pytest
 
 from bam_train.checkpoint import Checkpoint, safetensors_file
 from bam_train.checkpoint.added_members import add_members
+from bam_train.checkpoint.detector import DETECTOR, REASONS, Detector, Rollout, make_detector
 from bam_train.cli.eval import main as bam_eval
-from bam_train.detection import add_detector
-from bam_train.detector import DETECTOR, REASONS, Detector, Rollout, make_detector
 from bam_train.errors import AlteredCheckpoint, NoDetector
 from bam_train.policy import FrozenPolicy
+from bam_train.trainers.detection import add_detector
 
 POINT = Path(__file__).parents[2] / "checkpoints" / "mir100-navigation-ppo.zip"
 """A small checkpoint: 4 numbers an observation, 2 an action."""

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from gymnasium.vector import AutoresetMode
 
+from bam_envs.aliases.robo_gym_names import ROBO_GYM
 from bam_envs.core.registry import ENVIRONMENTS
 from bam_envs.core.spaces import space_to_json
-from bam_envs.robo_gym.table import ROBO_GYM
 from bam_train.checkpoint import Checkpoint
 from bam_train.environments import (
     ENTRY_POINTS,

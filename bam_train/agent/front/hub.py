@@ -6,7 +6,7 @@ import threading
 import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -20,13 +20,11 @@ from bam_train.agent.agent_messages import Ask, Drive, Halt
 from bam_train.agent.audit import tail
 from bam_train.agent.front.agent_socket import Person
 from bam_train.agent.front.jog import Jogger
+from bam_train.agent.front.robot_front import FrontProcess
 from bam_train.agent.front.telemetry import Telemetry
 from bam_train.agent.transitions import EVENT, TransitionLog, encode
 from bam_train.agent.versions import Versions
 from bam_train.errors import BamTrainError
-
-if TYPE_CHECKING:
-    from bam_train.agent.front.front_process import FrontProcess
 
 Listener = Callable[[dict[str, Any]], None]
 _SHOW = 0.1  # time between two messages of telemetry [s]

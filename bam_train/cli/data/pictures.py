@@ -27,7 +27,7 @@ def show_episode(config: ShowConfig) -> None:
     from bam_train.data import DataSet
     from bam_train.data.views.film import frames
     from bam_train.errors import SettingsError
-    from bam_train.video import open_video, require_video_path
+    from bam_train.files.video import open_video, require_video_path
 
     path = require_video_path(config.out)
     data = DataSet.open(config.place)

@@ -77,7 +77,7 @@ def decide(config: GateConfig) -> dict[str, Any]:
 
 
 def _lines(simulated: Comparison | None, recorded: DataComparison | None, margin: float) -> Iterator[str]:
-    from bam_train.cli.data.data_table import between, estimate_text, shown
+    from bam_train.estimation.data_table import between, estimate_text, shown
 
     if simulated is not None:
         is_rate = simulated.metric == "success"

@@ -26,8 +26,8 @@ MOST_EVENTS = 20
 def replay(config: ReplayConfig) -> None:
     """Run the program with its parsed flags."""
     from bam_train.files.atomic_file import require_writable
+    from bam_train.files.video import require_video_path
     from bam_train.recording.recording import Recording
-    from bam_train.video import require_video_path
 
     picture = None if config.plot is None else require_writable(config.plot)
     video = None if config.video is None else require_video_path(config.video)
@@ -180,8 +180,8 @@ def _event_lines(recording: Recording) -> list[str]:
 def _write_video(recording: Recording, checkpoint: Checkpoint | str, named: str | None, path: Path) -> None:
     """Write a video of the recorded pictures, else of the simulated robot in the recorded states."""
     from bam_train.errors import SettingsError
+    from bam_train.files.video import open_video, picture
     from bam_train.recording.drawing import frames
-    from bam_train.video import open_video, picture
 
     period = float(recording.metadata.get("period_s", "0.05"))
     recorded = list(islice(frames(recording), 1))

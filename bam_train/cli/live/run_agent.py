@@ -11,7 +11,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from bam_train.log_lines import begin_log
+from bam_train.files.log_lines import begin_log
 from bam_train.signals import SignalMemory
 
 if TYPE_CHECKING:

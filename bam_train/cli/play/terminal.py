@@ -10,7 +10,7 @@ import tty
 from collections.abc import Sequence
 from contextlib import ExitStack
 
-from bam_train.log_lines import shown
+from bam_train.files.log_lines import shown
 from bam_train.signals import at_quit
 
 _TOKEN = re.compile(rb"\x1b[\[O][0-9;]*[A-Za-z~]|\x1b|[^\x1b]")

@@ -11,7 +11,7 @@ from bam_train.data.data_set import DataSet
 from bam_train.data.episode import Episode, Leaf, leaves_of
 from bam_train.environments import make_env, must_be_named
 from bam_train.errors import SettingsError
-from bam_train.video import Frame, picture
+from bam_train.files.video import Frame, picture
 
 _SAME = 1e-4
 """Largest difference of an observation that is played again from the recorded one."""

@@ -14,7 +14,7 @@ from gymnasium import Space, spaces
 from numpy.typing import NDArray
 
 from bam_train.errors import ValueMismatch
-from bam_train.loop.variables import kind_name, mismatch, to_array
+from bam_train.loop.workspace.variables import kind_name, mismatch, to_array
 
 Array = NDArray[Any]
 Arrays = dict[str, Array]

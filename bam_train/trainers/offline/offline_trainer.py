@@ -20,14 +20,14 @@ from bam_envs.core.errors import BamEnvsError
 from bam_envs.core.registry import are_same
 from bam_envs.core.validation import read_table
 from bam_train.checkpoint import Checkpoint
+from bam_train.checkpoint.detector import Rollout
 from bam_train.data import DataSet
-from bam_train.detection import WANTED, recorded
-from bam_train.detector import Rollout
 from bam_train.environments import control_period, make_env, require_fit
 from bam_train.errors import CheckpointMismatch, SettingsError
 from bam_train.settings import TrainSettings, differences
 from bam_train.trainers.algorithms import OFFLINE_ALGORITHMS
 from bam_train.trainers.base import OnProgress, Progress, Statistics
+from bam_train.trainers.detection import WANTED, recorded
 from bam_train.trainers.offline.implicit_q import Cloning, ImplicitQ, ImplicitQLearner
 from bam_train.trainers.offline.offline_policy import OfflinePolicy
 from bam_train.trainers.offline.online_phase import OnlinePhase

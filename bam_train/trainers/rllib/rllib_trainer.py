@@ -44,7 +44,7 @@ from bam_train.trainers.rllib.rllib_hyperparameters import (
 from bam_train.trainers.rllib.robot_env_runner import ENDS
 from bam_train.trainers.rllib.runner_deaths import RunnerWatch
 from bam_train.trainers.rllib.streamed_episodes import is_data_set
-from bam_train.trainers.tensorboard_files import TensorBoardFiles
+from bam_train.trainers.run_folder import TensorBoardFiles
 
 _EPISODES = 100
 """Training episodes behind the means of `Statistics`."""

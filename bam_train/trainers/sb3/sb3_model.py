@@ -17,7 +17,7 @@ from bam_train.errors import SettingsError
 from bam_train.settings import TrainSettings
 from bam_train.trainers.algorithms import SB3_ALGORITHMS
 from bam_train.trainers.library_arguments import linear_start
-from bam_train.trainers.sb3.sb3_hyperparameters import CLASSES, check_pictures
+from bam_train.trainers.sb3_hyperparameters import CLASSES, check_pictures
 
 _MODULES = {"activation_fn": torch.nn, "optimizer_class": torch.optim, "features_extractor_class": torch_layers}
 _NOISES = {"normal": noise.NormalActionNoise, "ornstein-uhlenbeck": noise.OrnsteinUhlenbeckActionNoise}

@@ -27,15 +27,15 @@ from bam_train.environments import control_period, require_fit
 from bam_train.errors import SettingsError, TrainingFailed
 from bam_train.policy import FrozenPolicy
 from bam_train.settings import TrainSettings
+from bam_train.trainers import sb3_hyperparameters as hyperparameters
 from bam_train.trainers.algorithms import SB3_ALGORITHMS
 from bam_train.trainers.base import OnProgress, Progress, Statistics, manifest
 from bam_train.trainers.resolve_settings import own_settings, require_start
-from bam_train.trainers.sb3 import sb3_hyperparameters as hyperparameters
+from bam_train.trainers.run_folder import TensorBoardFiles
 from bam_train.trainers.sb3 import sb3_resume as resume
 from bam_train.trainers.sb3.sb3_freezing import freeze, golden
 from bam_train.trainers.sb3.sb3_model import make_model
 from bam_train.trainers.sb3.sb3_vec_env import BatchVecEnv, make_training_env, one_env
-from bam_train.trainers.tensorboard_files import TensorBoardFiles
 
 _FINITE = "expected finite numbers: try a smaller learning_rate"
 _REFUSED = ("Expected parameter", "expects all elements of std", "probability tensor")

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from bam_envs.remote.serve.served_environment import ServedEnvironment
     from bam_envs.remote.serve.tcp_server import TcpServer
     from bam_envs.remote.tcp_transport import TcpTransport
-    from bam_envs.remote.transport import EnvSpecMessage, Transport
+    from bam_envs.remote.wire.transport import EnvSpecMessage, Transport
 
 __all__ = ["EnvServer", "EnvSpecMessage", "LocalTransport", "RclpyTransport", "RemoteEnv"]
 __all__ += ["RemoteVectorEnv", "RosbridgeTransport", "ServeOptions", "ServedEnvironment", "TcpServer", "TcpTransport"]

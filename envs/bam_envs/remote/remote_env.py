@@ -11,7 +11,7 @@ from gymnasium import Space
 from bam_envs.core.close_at_exit import close_at_exit
 from bam_envs.core.errors import InvalidValue, ResetNeeded, UnknownName
 from bam_envs.remote.remote_vector_env import Described, RemoteVectorEnv
-from bam_envs.remote.transport import EnvSpecMessage, Info, Transport
+from bam_envs.remote.wire.transport import EnvSpecMessage, Info, Transport
 from bam_envs.rosbridge.endpoint import Endpoint
 
 __all__ = ["RemoteEnv", "RemoteVectorEnv", "make_remote_env", "make_remote_vector_env", "open_transport"]

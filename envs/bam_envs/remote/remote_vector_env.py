@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from bam_envs.core.close_at_exit import close_at_exit
 from bam_envs.core.errors import InvalidValue, ResetNeeded
 from bam_envs.core.spaces import space_to_json
-from bam_envs.remote.transport import EnvSpecMessage, Info, Seed, Transport
-from bam_envs.remote.values import stack
+from bam_envs.remote.wire.transport import EnvSpecMessage, Info, Seed, Transport
+from bam_envs.remote.wire.values import stack
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")

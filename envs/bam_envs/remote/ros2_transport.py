@@ -7,9 +7,9 @@ from typing import Any, Literal
 
 from bam_envs.core.errors import InvalidValue, LinkLost, NoServer
 from bam_envs.core.timing import Deadline
-from bam_envs.remote.gymapi_messages import base_name, service_name
-from bam_envs.remote.ros2_node import RclpyBus
 from bam_envs.remote.rosbridge_transport import RosbridgeTransport
+from bam_envs.remote.wire.gymapi_messages import base_name, service_name
+from bam_envs.remote.wire.ros2_node import RclpyBus
 from bam_envs.ros.messages import write_stamp
 
 _LOOK = 0.02

@@ -13,8 +13,8 @@ from gymnasium import Space
 from bam_envs.core.errors import LinkLost, NoServer, ProtocolError, RemoteError, UnknownName
 from bam_envs.core.registry import resolve_id
 from bam_envs.core.validation import PositiveInt, check
-from bam_envs.remote.gymapi_codec import DEFAULT, EnvCodec
-from bam_envs.remote.gymapi_messages import (
+from bam_envs.remote.wire.gymapi_codec import DEFAULT, EnvCodec
+from bam_envs.remote.wire.gymapi_messages import (
     KIND,
     GymRequest,
     GymResponse,
@@ -26,8 +26,8 @@ from bam_envs.remote.gymapi_messages import (
     whole_request,
     write_request,
 )
-from bam_envs.remote.gymapi_versions import version_named
-from bam_envs.remote.transport import EnvSpecMessage, Info, Seed, plain_seed, spec_from_json, spec_to_json
+from bam_envs.remote.wire.gymapi_versions import version_named
+from bam_envs.remote.wire.transport import EnvSpecMessage, Info, Seed, plain_seed, spec_from_json, spec_to_json
 from bam_envs.ros.freshness import Tagger
 from bam_envs.rosbridge.bus import namespaces_with
 from bam_envs.rosbridge.client import RosbridgeLink

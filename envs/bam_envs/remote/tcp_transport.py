@@ -9,7 +9,7 @@ from typing import Any
 from urllib.parse import urlsplit
 
 from bam_envs.core.errors import InvalidValue, LinkLost, NoServer, ProtocolError, RemoteError
-from bam_envs.remote.tcp_wire import (
+from bam_envs.remote.wire.tcp_wire import (
     ForeignPeer,
     FrameSocket,
     Hello,
@@ -23,8 +23,8 @@ from bam_envs.remote.tcp_wire import (
     pack_action,
     read_result,
 )
-from bam_envs.remote.transport import EnvSpecMessage, Info, Seed, plain_seed, spec_from_json, spec_to_json
-from bam_envs.remote.values import Tree, plain_info
+from bam_envs.remote.wire.transport import EnvSpecMessage, Info, Seed, plain_seed, spec_from_json, spec_to_json
+from bam_envs.remote.wire.values import Tree, plain_info
 from bam_envs.ros.freshness import Tagger
 from bam_envs.rosbridge.endpoint import Endpoint
 

@@ -11,11 +11,11 @@ from typing import Any
 import gymnasium as gym
 
 from bam_envs import make_env as ours
+from bam_envs.aliases.robo_gym_names import ROBO_GYM, RoboGymId
 from bam_envs.core.env_options import in_our_words, require_kinds
 from bam_envs.core.errors import InvalidValue, UnknownName
 from bam_envs.core.registry import ENVIRONMENTS, MAKE_OPTIONS
 from bam_envs.core.robot_env import RobotEnv, render_modes
-from bam_envs.robo_gym.table import ROBO_GYM, RoboGymId
 
 _LOG = logging.getLogger(__name__)
 _MANAGER = ("ip", "lower_bound_port", "upper_bound_port", "server_manager_port")

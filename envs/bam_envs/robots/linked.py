@@ -20,7 +20,7 @@ from bam_envs.core.errors import InvalidValue
 from bam_envs.core.robot import EnvIds, Initial, Robot, RobotState, checked_command
 from bam_envs.core.validation import Fraction, check_fields, read_table
 from bam_envs.core.wording import brief, did_you_mean
-from bam_envs.robots.physics.room import mixed
+from bam_envs.robots.room import mixed
 from bam_envs.safety.guard import is_base, measured_places
 
 Array = NDArray[np.float64]

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bam_envs.core.robot import EnvIds, Initial, Robot, RobotState, checked_command
-from bam_envs.robots.physics.room import mixed
+from bam_envs.robots.room import mixed
 from bam_envs.safety.guard import Limits, is_base, max_rate
 
 Array = NDArray[np.float64]

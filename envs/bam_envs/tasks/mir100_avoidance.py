@@ -9,7 +9,7 @@ import numpy as np
 from bam_envs.core.robot import EnvIds, RobotState
 from bam_envs.core.task import Array, Flags, Floats, Label
 from bam_envs.robots.mir100 import BACK_RAYS, FRONT_RAYS
-from bam_envs.robots.physics.room import touches
+from bam_envs.robots.room import touches
 from bam_envs.tasks.mir100_navigation import DriveTask, spread
 
 SIDE = (2.1, 3.1)

@@ -14,7 +14,7 @@ from bam_envs.core.errors import InvalidValue, LinkLost, RemoteError
 from bam_envs.core.spaces import space_to_json
 from bam_envs.remote.remote_env import RemoteEnv, RemoteVectorEnv
 from bam_envs.remote.serve.env_server import Env
-from bam_envs.remote.transport import EnvSpecMessage, Info, Transport
+from bam_envs.remote.wire.transport import EnvSpecMessage, Info, Transport
 from bam_envs.testing.assertions import assert_same_value, raised
 
 _INF = np.inf

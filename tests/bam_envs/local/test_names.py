@@ -4,10 +4,10 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
+from bam_envs.aliases.bam_names import BAM_NAMES
 from bam_envs.core.errors import UnknownName
 from bam_envs.core.registry import are_same, entry_of, resolve_id
 from bam_envs.local.bandits import ContextBandit
-from bam_envs.local.names import BAM_NAMES
 from bam_envs.remote.serve.env_server import EnvServer
 from bam_envs.remote.serve.gymapi_service import GymApiService
 from bam_envs.rosbridge.server import BridgeServer

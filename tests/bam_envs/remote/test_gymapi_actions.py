@@ -7,7 +7,7 @@ import pytest
 from gymnasium import spaces
 
 from bam_envs.core.errors import InvalidValue, ProtocolError
-from bam_envs.remote.gymapi_codec import WAYPOINT, ActionCodec
+from bam_envs.remote.wire.gymapi_codec import WAYPOINT, ActionCodec
 from bam_envs.ros.interfaces import complete
 
 POSE = spaces.Dict(

@@ -8,8 +8,8 @@ import pytest
 from gymnasium import spaces
 
 from bam_envs.core.errors import InvalidValue, ProtocolError
-from bam_envs.remote.gymapi_codec import EnvCodec
-from bam_envs.remote.gymapi_messages import (
+from bam_envs.remote.wire.gymapi_codec import EnvCodec
+from bam_envs.remote.wire.gymapi_messages import (
     GymRequest,
     RequestType,
     read_request,
@@ -17,7 +17,7 @@ from bam_envs.remote.gymapi_messages import (
     write_request,
     write_response,
 )
-from bam_envs.remote.transport import EnvSpecMessage
+from bam_envs.remote.wire.transport import EnvSpecMessage
 from bam_envs.ros.interfaces import complete
 from bam_envs.testing.transports import assert_same_value
 

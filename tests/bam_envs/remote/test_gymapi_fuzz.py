@@ -8,12 +8,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from bam_envs.core.errors import BamEnvsError
-from bam_envs.remote.gymapi_codec import EnvCodec
-from bam_envs.remote.gymapi_messages import read_response
 from bam_envs.remote.serve.env_server import EnvServer
 from bam_envs.remote.serve.gymapi_service import GymApiService
-from bam_envs.remote.transport import EnvSpecMessage
-from bam_envs.remote.values import exact
+from bam_envs.remote.wire.gymapi_codec import EnvCodec
+from bam_envs.remote.wire.gymapi_messages import read_response
+from bam_envs.remote.wire.transport import EnvSpecMessage
+from bam_envs.remote.wire.values import exact
 from bam_envs.rosbridge.bus import UNKNOWN_CALLER
 from bam_envs.testing.transports import MirrorEnv
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 
-from bam_envs.remote.gymapi_leaves import is_depth, leaves_of
+from bam_envs.remote.wire.gymapi_leaves import is_depth, leaves_of
 
 POSE = {"position": spaces.Box(-1, 1, (3,)), "orientation": spaces.Box(-1, 1, (4,))}
 WIDTH = spaces.Box(0, 1, ())

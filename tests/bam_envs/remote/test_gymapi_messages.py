@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from bam_envs.core.errors import InvalidValue, NotInCommand, ProtocolError, RemoteError
-from bam_envs.remote.gymapi_messages import (
+from bam_envs.remote.wire.gymapi_messages import (
     GymRequest,
     RequestType,
     base_name,
@@ -22,7 +22,7 @@ from bam_envs.remote.gymapi_messages import (
     write_request,
     write_response,
 )
-from bam_envs.remote.gymapi_versions import JUNE_17, JUNE_22, MAY_24
+from bam_envs.remote.wire.gymapi_versions import JUNE_17, JUNE_22, MAY_24
 from bam_envs.ros.freshness import Tag
 
 STAMP = {"sec": 7, "nanosec": 8}

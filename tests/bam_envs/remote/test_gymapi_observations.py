@@ -8,8 +8,8 @@ import pytest
 from gymnasium import spaces
 
 from bam_envs.core.errors import InvalidValue, ProtocolError
-from bam_envs.remote.gymapi_codec import ObservationCodec
-from bam_envs.remote.gymapi_versions import JUNE_17, JUNE_22
+from bam_envs.remote.wire.gymapi_codec import ObservationCodec
+from bam_envs.remote.wire.gymapi_versions import JUNE_17, JUNE_22
 from bam_envs.ros import images
 from bam_envs.ros.interfaces import complete
 

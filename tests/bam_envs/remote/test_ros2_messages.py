@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from bam_envs.core.errors import InvalidValue
-from bam_envs.remote import ros2_node
-from bam_envs.remote.ros2_node import RclpyBus, interface, to_dict, to_message
+from bam_envs.remote.wire import ros2_node
+from bam_envs.remote.wire.ros2_node import RclpyBus, interface, to_dict, to_message
 
 
 def message_class(types, **defaults):

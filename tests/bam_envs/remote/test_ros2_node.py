@@ -6,7 +6,7 @@ import threading
 import pytest
 
 from bam_envs.core.errors import InvalidValue, LinkLost, RemoteError
-from bam_envs.remote.ros2_node import RclpyBus
+from bam_envs.remote.wire.ros2_node import RclpyBus
 from bam_envs.rosbridge.bus import UNKNOWN_CALLER
 
 pytestmark = pytest.mark.filterwarnings("ignore:module 'sre_:DeprecationWarning")  # of what ROS imports

@@ -7,10 +7,10 @@ import pytest
 import bam_envs  # noqa: F401 - registers the environments
 from bam_envs.core.errors import InvalidValue, LinkLost, NoServer
 from bam_envs.remote.remote_env import open_transport
-from bam_envs.remote.ros2_node import RclpyBus
 from bam_envs.remote.ros2_transport import RclpyTransport
 from bam_envs.remote.serve.env_server import EnvServer
 from bam_envs.remote.serve.gymapi_service import GymApiService
+from bam_envs.remote.wire.ros2_node import RclpyBus
 
 RISE = np.array([0.0, 0.0, 0.5, 0.0, 0.0], dtype=np.float32)
 

@@ -12,7 +12,7 @@ from bam_envs.core.errors import InvalidValue, LinkLost, NoServer, NotInCommand,
 from bam_envs.remote.rosbridge_transport import RosbridgeTransport
 from bam_envs.remote.serve.env_server import EnvServer
 from bam_envs.remote.serve.gymapi_service import GymApiService
-from bam_envs.remote.transport import Transport
+from bam_envs.remote.wire.transport import Transport
 from bam_envs.rosbridge.client import RosbridgeLink
 from bam_envs.rosbridge.server import BridgeServer
 from bam_envs.testing import TransportContract

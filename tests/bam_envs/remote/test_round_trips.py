@@ -11,12 +11,12 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import array_shapes, arrays
 
-from bam_envs.remote.gymapi_codec import EnvCodec
 from bam_envs.remote.serve.env_server import EnvServer
 from bam_envs.remote.serve.tcp_server import TcpServer
 from bam_envs.remote.tcp_transport import TcpTransport
-from bam_envs.remote.transport import EnvSpecMessage
-from bam_envs.remote.values import exact, pack, tree_from_json, tree_to_json
+from bam_envs.remote.wire.gymapi_codec import EnvCodec
+from bam_envs.remote.wire.transport import EnvSpecMessage
+from bam_envs.remote.wire.values import exact, pack, tree_from_json, tree_to_json
 from bam_envs.testing.transports import MirrorEnv, assert_same_value
 from tests.bam_envs.remote.test_gymapi_codec import action_there, result_back
 

@@ -15,8 +15,8 @@ from bam_envs.core.errors import LinkLost, NoServer, ProtocolError
 from bam_envs.remote.serve.env_server import EnvServer
 from bam_envs.remote.serve.tcp_server import TcpServer
 from bam_envs.remote.tcp_transport import TcpTransport
-from bam_envs.remote.tcp_wire import FrameSocket, encode
-from bam_envs.remote.transport import spec_to_json
+from bam_envs.remote.wire.tcp_wire import FrameSocket, encode
+from bam_envs.remote.wire.transport import spec_to_json
 from bam_envs.testing.transports import MirrorEnv
 from tests.bam_envs.remote.fakes import FakeEnv
 

@@ -12,7 +12,7 @@ from gymnasium import spaces
 from msgspec.msgpack import Ext
 
 from bam_envs.core.errors import LinkLost, NotInCommand, ProtocolError, RemoteError, ResetNeeded
-from bam_envs.remote.tcp_wire import (
+from bam_envs.remote.wire.tcp_wire import (
     MAX_FRAME,
     ForeignPeer,
     FrameSocket,
@@ -32,7 +32,7 @@ from bam_envs.remote.tcp_wire import (
     read_result,
     refusal,
 )
-from bam_envs.remote.transport import EnvSpecMessage
+from bam_envs.remote.wire.transport import EnvSpecMessage
 from bam_envs.testing.transports import assert_same_value
 
 PATIENCE = 10.0

@@ -7,7 +7,7 @@ import pytest
 from gymnasium import spaces
 
 from bam_envs.core.errors import InvalidValue, ProtocolError
-from bam_envs.remote.transport import EnvSpecMessage, plain_seed, spec_from_json, spec_to_json
+from bam_envs.remote.wire.transport import EnvSpecMessage, plain_seed, spec_from_json, spec_to_json
 
 SPEC = EnvSpecMessage(
     "bam/pick-v0",

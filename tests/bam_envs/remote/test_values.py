@@ -7,7 +7,7 @@ import pytest
 from gymnasium import spaces
 
 from bam_envs.core.errors import InvalidValue, ProtocolError, UnknownName
-from bam_envs.remote.values import exact, pack, plain_info, tree_from_json, tree_to_json
+from bam_envs.remote.wire.values import exact, pack, plain_info, tree_from_json, tree_to_json
 
 BOX = spaces.Box(-1, 1, (2,))
 FREE = spaces.Box(-np.inf, np.inf, (2,))

@@ -6,9 +6,9 @@ import sys
 import numpy as np
 import pytest
 
+from bam_envs.aliases.robo_gym_names import ROBO_GYM
 from bam_envs.core.errors import InvalidValue, UnknownName
 from bam_envs.robo_gym.making import constructor_options, say_once, translate
-from bam_envs.robo_gym.table import ROBO_GYM
 
 SIM, ROB = ROBO_GYM["EndEffectorPositioningURSim-v0"], ROBO_GYM["EndEffectorPositioningURRob-v0"]
 DEFAULTS = {"ur_model": "ur5", "rs_state_to_info": True}

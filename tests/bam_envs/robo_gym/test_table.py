@@ -5,8 +5,8 @@ import gymnasium as gym
 import pytest
 
 from bam_envs import ENVIRONMENTS
+from bam_envs.aliases.robo_gym_names import ROBO_GYM
 from bam_envs.core.registry import are_same, entry_of, resolve_id
-from bam_envs.robo_gym.table import ROBO_GYM
 
 STEMS = {
     "NoObstacleNavigationMir100": "bam/mir100-navigation-v0",

@@ -6,7 +6,7 @@ import pytest
 
 from bam_envs.core.errors import NotInCommand
 from bam_envs.rosbridge.bus import Caller
-from bam_train.agent.front.front_process import CUT, SILENT, AgentLease
+from bam_train.agent.front.agent_lease import CUT, SILENT, AgentLease
 
 
 class Clock:

@@ -15,7 +15,8 @@ from bam_envs.rosbridge.server import BridgeServer, Site
 from bam_envs.rosbridge.tokens import Tokens
 from bam_train.agent.agent_messages import Front
 from bam_train.agent.front.camera_feed import CameraFeed, PagePace, jpeg
-from bam_train.agent.front.front_process import FrontProcess
+from bam_train.agent.front.hub import AgentHub
+from bam_train.agent.front.robot_front import FrontProcess
 
 DEADLINE = 10.0
 
@@ -174,5 +175,5 @@ def test_the_console_shows_the_cameras_that_the_policy_sees(tmp_path, env_kwargs
     front = FrontProcess(options, lambda message: None)
     assert front.seen() == seen
     assert {name: camera.source.name for name, camera in front.cameras().items()} == dict(zip(seen, seen, strict=True))
-    assert front.hub.status()["name"] == "ur5e"
-    assert front.hub.status()["address"] == "ws://127.0.0.1:9090"
+    status = AgentHub(front, by_force=False).status()
+    assert (status["name"], status["address"]) == ("ur5e", "ws://127.0.0.1:9090")

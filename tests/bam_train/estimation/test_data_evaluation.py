@@ -7,10 +7,10 @@ import pytest
 from gymnasium.spaces import Box
 
 from bam_train.cli.data import run_gate as gate
-from bam_train.cli.data.data_table import data_lines
 from bam_train.cli.eval import main
 from bam_train.data import DataSet, DataSetInfo, DataSetWriter, Episode
 from bam_train.estimation.data_evaluation import Agreement, DataReport
+from bam_train.estimation.data_table import data_lines
 from bam_train.estimation.estimates import Estimate
 from bam_train.estimation.steps import read_steps
 from bam_train.evaluation import wilson_interval

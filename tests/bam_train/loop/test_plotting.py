@@ -9,7 +9,7 @@ import torch
 from bam_envs.core.errors import MissingExtra
 from bam_train.errors import UnknownVariable, WorkspaceError
 from bam_train.loop import Workspace
-from bam_train.loop.plotting import MAX_LINES, plot, to_dataframe
+from bam_train.loop.workspace.plotting import MAX_LINES, plot, to_dataframe
 
 pytest.importorskip("matplotlib")
 pandas = pytest.importorskip("pandas")

@@ -1,7 +1,7 @@
 import resource
 import threading
 
-from bam_train.trainers.tensorboard_files import TensorBoardFiles
+from bam_train.trainers.run_folder import TensorBoardFiles
 
 
 def test_a_full_disk_ends_the_files_and_says_nothing(tmp_path, capfd):

@@ -22,8 +22,8 @@ from bam_envs.core.registry import ALIASES
 from bam_envs.core.spaces import space_to_json
 from bam_envs.core.timing import Pacer
 from bam_envs.remote.serve.command_lease import LEASE_SECONDS, CommandLease
-from bam_envs.remote.transport import EnvSpecMessage, Info, Seed
-from bam_envs.remote.values import exact, plain_info, stack
+from bam_envs.remote.wire.transport import EnvSpecMessage, Info, Seed
+from bam_envs.remote.wire.values import exact, plain_info, stack
 from bam_envs.rosbridge.bus import UNKNOWN_CALLER, Caller
 
 Env = gym.Env[Any, Any] | VectorEnv[Any, Any, Any]

@@ -12,8 +12,9 @@ from functools import partial
 from typing import Any
 
 from bam_envs.core.errors import BamEnvsError, RemoteError
-from bam_envs.remote.gymapi_codec import EnvCodec
-from bam_envs.remote.gymapi_messages import (
+from bam_envs.remote.serve.env_server import EnvServer
+from bam_envs.remote.wire.gymapi_codec import EnvCodec
+from bam_envs.remote.wire.gymapi_messages import (
     KIND,
     GymRequest,
     RequestType,
@@ -24,9 +25,15 @@ from bam_envs.remote.gymapi_messages import (
     write_info,
     write_response,
 )
-from bam_envs.remote.gymapi_versions import JUNE_17, JUNE_22, Version, version_named, version_of_bus, version_of_request
-from bam_envs.remote.serve.env_server import EnvServer
-from bam_envs.remote.transport import spec_to_json
+from bam_envs.remote.wire.gymapi_versions import (
+    JUNE_17,
+    JUNE_22,
+    Version,
+    version_named,
+    version_of_bus,
+    version_of_request,
+)
+from bam_envs.remote.wire.transport import spec_to_json
 from bam_envs.ros.freshness import FreshnessCheck
 from bam_envs.ros.messages import write_stamp
 from bam_envs.rosbridge.bus import Bus, Caller, Message

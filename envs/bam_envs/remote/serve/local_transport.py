@@ -6,7 +6,7 @@ from typing import Any
 
 from bam_envs.core.errors import BamEnvsError, InvalidValue, LinkLost, RemoteError
 from bam_envs.remote.serve.env_server import Env, EnvServer
-from bam_envs.remote.transport import EnvSpecMessage, Info, Seed
+from bam_envs.remote.wire.transport import EnvSpecMessage, Info, Seed
 
 
 class LocalTransport:

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from bam_envs.core.errors import InvalidValue
 from bam_envs.core.validation import Port, Positive, RobotName, check_fields
 from bam_envs.core.wording import as_flag
-from bam_envs.remote.gymapi_versions import version_named
 from bam_envs.remote.serve.command_lease import LEASE_SECONDS
+from bam_envs.remote.wire.gymapi_versions import version_named
 from bam_envs.rosbridge.endpoint import is_loopback
 
 _NAMESPACE = re.compile(r"(/[A-Za-z]\w*)*")

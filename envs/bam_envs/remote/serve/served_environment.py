@@ -8,8 +8,6 @@ from contextlib import ExitStack
 from typing import Any
 
 from bam_envs.core.errors import InvalidValue, RemoteError
-from bam_envs.remote.gymapi_messages import base_name, service_name
-from bam_envs.remote.ros2_node import RclpyBus
 from bam_envs.remote.serve.command_lease import CommandLease
 from bam_envs.remote.serve.env_server import Env, EnvServer
 from bam_envs.remote.serve.gymapi_service import GymApiService
@@ -17,6 +15,8 @@ from bam_envs.remote.serve.robot_service import RobotService
 from bam_envs.remote.serve.serve_options import ServeOptions
 from bam_envs.remote.serve.served_robot import ServedRobot
 from bam_envs.remote.serve.tcp_server import TcpServer
+from bam_envs.remote.wire.gymapi_messages import base_name, service_name
+from bam_envs.remote.wire.ros2_node import RclpyBus
 from bam_envs.robots.profile import profile_for
 from bam_envs.ros.codec import INFO_SERVICE
 from bam_envs.ros.profile_tables import RobotProfile

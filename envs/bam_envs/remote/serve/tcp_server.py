@@ -11,7 +11,7 @@ from contextlib import suppress
 
 from bam_envs.core.errors import BamEnvsError, LinkLost, ProtocolError, RemoteError
 from bam_envs.remote.serve.env_server import EnvServer
-from bam_envs.remote.tcp_wire import (
+from bam_envs.remote.wire.tcp_wire import (
     FrameSocket,
     Greeting,
     Hello,
@@ -23,8 +23,8 @@ from bam_envs.remote.tcp_wire import (
     pack_result,
     refusal,
 )
-from bam_envs.remote.transport import spec_to_json
-from bam_envs.remote.values import Tree
+from bam_envs.remote.wire.transport import spec_to_json
+from bam_envs.remote.wire.values import Tree
 from bam_envs.ros.freshness import FreshnessCheck, Tag
 from bam_envs.rosbridge.bus import UNKNOWN_CALLER, Caller
 from bam_envs.rosbridge.places import places, who_leaves

@@ -14,8 +14,9 @@ from numpy.typing import NDArray
 
 from bam_envs.core.robot import EnvIds, Initial, RobotState, checked_command
 from bam_envs.core.task import Memory
+from bam_envs.robots.physics.drawn import Drawn
 from bam_envs.robots.physics.obstacles import RADIUS, Obstacles
-from bam_envs.robots.physics.shapes import BLUE, GREY, RED, WOOD, Drawn, Shape, View
+from bam_envs.robots.physics.shapes import BLUE, GREY, RED, WOOD, Shape, View
 from bam_envs.robots.ur import DEFAULT_MODEL, START, UrModel, ur_spec
 from bam_envs.robots.ur import ur_model as model_called
 from bam_envs.robots.ur5e import TOOL_LENGTH

@@ -24,8 +24,9 @@ from bam_envs.robots.mir100 import (
     SCAN_SPAN,
     base_spec,
 )
-from bam_envs.robots.physics.room import BOX_EDGE, LAB, NOWHERE, LaserScanner, Room, measured, mixed, noise, touches
-from bam_envs.robots.physics.shapes import BLUE, DARK, GREY, RED, WOOD, Colour, Drawn, Shape, View, turned
+from bam_envs.robots.physics.drawn import Drawn
+from bam_envs.robots.physics.shapes import BLUE, DARK, GREY, RED, WOOD, Colour, Shape, View, turned
+from bam_envs.robots.room import BOX_EDGE, LAB, NOWHERE, LaserScanner, Room, measured, mixed, noise, touches
 
 Array = NDArray[np.float64]
 _HEIGHT = 0.352  # of a MiR100 [m]

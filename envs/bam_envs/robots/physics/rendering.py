@@ -16,16 +16,14 @@ import threading
 import warnings
 from collections.abc import Sequence
 from functools import cache
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from bam_envs.core.errors import BamEnvsError
 from bam_envs.robots.physics.mujoco_batch import MODELS, mujoco
-
-if TYPE_CHECKING:
-    from bam_envs.robots.physics.shapes import Shape, View
+from bam_envs.robots.physics.shapes import Shape, View
 
 WIDTH, HEIGHT = 640, 480
 MOST_GEOMS = 1000

@@ -26,6 +26,7 @@ from bam_envs.rosbridge.server.client_session import (
     ServerOptions,
     Service,
     Session,
+    Stream,
     canonical,
     pack,
     read_name,
@@ -35,7 +36,7 @@ from bam_envs.rosbridge.server.client_session import (
 )
 from bam_envs.rosbridge.server.refusals import Refusals
 from bam_envs.rosbridge.server.services import Services, checked, packed_response
-from bam_envs.rosbridge.server.topics import Stream, Topic, Topics
+from bam_envs.rosbridge.server.topics import Topic, Topics
 from bam_envs.rosbridge.sessions import FORBIDDEN
 
 _FOR_WATCHERS = frozenset({"subscribe", "unsubscribe", "set_level", "fragment", "call_service"})

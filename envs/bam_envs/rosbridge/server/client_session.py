@@ -7,15 +7,12 @@ from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import lru_cache
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from bam_envs.core.errors import InvalidValue, ProtocolError
 from bam_envs.core.wording import brief
 from bam_envs.rosbridge.bus import Caller, Handler, Message
 from bam_envs.rosbridge.encoding import COMPRESSIONS, Fragments, Id, dump_json, encode_cbor, encode_png, split
-
-if TYPE_CHECKING:
-    from bam_envs.rosbridge.server.topics import Stream
 
 LEVELS = ("none", "error", "warning", "info")  # of status messages: each one includes those before it
 _NEVER_SPLIT = 2**31  # a fragment size above that of every message
@@ -116,6 +113,55 @@ class Send:
     keep: int = 0  # most packets of the same stream that may wait for a slow client; 0: the server's limit
 
 
+class Stream:
+    """All subscriptions of one client to one topic, which it calls `name`; the client gets each message once."""
+
+    def __init__(self, session: "Session", topic: str, name: str) -> None:
+        self.session, self.topic, self.name = session, topic, name
+        self.wishes: dict[Id, Wish] = {}
+        self.wish = Wish()  # all of them combined
+        self._waiting: deque[Publication] = deque(maxlen=1)
+        self._next = -math.inf
+
+    def set_wish(self, name: Id, wish: Wish | None) -> None:
+        """Add a subscription, or remove it with None."""
+        if wish is None:
+            self.wishes.pop(name, None)
+        else:
+            self.wishes[name] = wish
+        wishes = self.wishes.values()
+        if wishes:
+            self.wish = Wish(
+                max((one.compression for one in wishes), key=COMPRESSIONS.index),
+                *(min(getattr(one, name) for one in wishes) for name in ("fragment_size", "throttle", "queue_length")),
+            )
+            self._waiting = deque(self._waiting, maxlen=max(1, self.wish.queue_length))
+
+    @property
+    def deadline(self) -> float:
+        """When a waiting message may be sent [s]; infinite if none waits."""
+        return self._next if self._waiting else math.inf
+
+    def offer(self, publication: Publication, now: float) -> Send | None:
+        """Take a new message; returns what to send now, or None. Early messages wait; the oldest is dropped."""
+        if self.wish.throttle == 0.0:
+            return self._send(publication)
+        self._waiting.append(publication)
+        return self.due(now)
+
+    def due(self, now: float) -> Send | None:
+        """The message that has waited long enough, or None."""
+        if not self._waiting or now < self._next:
+            return None
+        # On a grid, so that a topic of exactly this rate does not lose every second message to jitter.
+        on_grid = self._next + self.wish.throttle
+        self._next = on_grid if on_grid > now else now + self.wish.throttle
+        return self._send(self._waiting.popleft())
+
+    def _send(self, publication: Publication) -> Send:
+        return Send(self.session, publication.packet(self.name, self.wish), self.wish.queue_length)
+
+
 @dataclass(frozen=True)
 class Service:
     """A service and its provider."""
@@ -158,7 +204,7 @@ class Session:
     level: str = "error"  # the status messages it wants: this one of LEVELS and those before it
     advertised: dict[str, set[Id]] = field(default_factory=dict)
     """Its topics, each with the ids of its advertisements."""
-    streams: "dict[str, Stream]" = field(default_factory=dict)  # what it has subscribed, by topic
+    streams: dict[str, Stream] = field(default_factory=dict)  # what it has subscribed, by topic
     services: set[str] = field(default_factory=set)
     calls: set[int] = field(default_factory=set)  # numbers of its unanswered calls
     running: int = 0  # number of its calls that handlers run

@@ -1,7 +1,6 @@
 """The topics of a rosbridge server: publishers, subscribers, throttling and queues."""
 
 import math
-from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
@@ -9,57 +8,7 @@ from bam_envs.core.errors import InvalidValue
 from bam_envs.core.wording import brief
 from bam_envs.ros.interfaces import normal_name
 from bam_envs.rosbridge.bus import Listener
-from bam_envs.rosbridge.encoding import COMPRESSIONS, Id
-from bam_envs.rosbridge.server.client_session import Publication, Send, Session, Wish
-
-
-class Stream:
-    """All subscriptions of one client to one topic, which it calls `name`; the client gets each message once."""
-
-    def __init__(self, session: Session, topic: str, name: str) -> None:
-        self.session, self.topic, self.name = session, topic, name
-        self.wishes: dict[Id, Wish] = {}
-        self.wish = Wish()  # all of them combined
-        self._waiting: deque[Publication] = deque(maxlen=1)
-        self._next = -math.inf
-
-    def set_wish(self, name: Id, wish: Wish | None) -> None:
-        """Add a subscription, or remove it with None."""
-        if wish is None:
-            self.wishes.pop(name, None)
-        else:
-            self.wishes[name] = wish
-        wishes = self.wishes.values()
-        if wishes:
-            self.wish = Wish(
-                max((one.compression for one in wishes), key=COMPRESSIONS.index),
-                *(min(getattr(one, name) for one in wishes) for name in ("fragment_size", "throttle", "queue_length")),
-            )
-            self._waiting = deque(self._waiting, maxlen=max(1, self.wish.queue_length))
-
-    @property
-    def deadline(self) -> float:
-        """When a waiting message may be sent [s]; infinite if none waits."""
-        return self._next if self._waiting else math.inf
-
-    def offer(self, publication: Publication, now: float) -> Send | None:
-        """Take a new message; returns what to send now, or None. Early messages wait; the oldest is dropped."""
-        if self.wish.throttle == 0.0:
-            return self._send(publication)
-        self._waiting.append(publication)
-        return self.due(now)
-
-    def due(self, now: float) -> Send | None:
-        """The message that has waited long enough, or None."""
-        if not self._waiting or now < self._next:
-            return None
-        # On a grid, so that a topic of exactly this rate does not lose every second message to jitter.
-        on_grid = self._next + self.wish.throttle
-        self._next = on_grid if on_grid > now else now + self.wish.throttle
-        return self._send(self._waiting.popleft())
-
-    def _send(self, publication: Publication) -> Send:
-        return Send(self.session, publication.packet(self.name, self.wish), self.wish.queue_length)
+from bam_envs.rosbridge.server.client_session import Publication, Send, Session, Stream
 
 
 @dataclass(eq=False)

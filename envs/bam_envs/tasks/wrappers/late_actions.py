@@ -11,7 +11,7 @@ from bam_envs.core.errors import InvalidValue
 from bam_envs.core.robot import EnvIds, Initial, RobotState
 from bam_envs.core.task import Array, Floats, Score, Task
 from bam_envs.core.validation import check
-from bam_envs.robots.physics.room import mixed
+from bam_envs.robots.room import mixed
 
 _Steps = Annotated[int, Meta(ge=0, le=32, description="a whole number from 0 to 32, or two of them")]
 

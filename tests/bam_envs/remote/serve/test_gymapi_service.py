@@ -11,7 +11,7 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 from bam_envs.remote.serve.env_server import EnvServer
 from bam_envs.remote.serve.gymapi_service import GymApiService
-from bam_envs.remote.transport import spec_from_json
+from bam_envs.remote.wire.transport import spec_from_json
 from bam_envs.ros.freshness import Tag
 from bam_envs.ros.images import decode_image
 from bam_envs.rosbridge.bus import Caller

@@ -17,7 +17,7 @@ from bam_envs.remote.serve.command_lease import CommandLease
 from bam_envs.remote.serve.env_server import EnvServer
 from bam_envs.remote.serve.tcp_server import TcpServer
 from bam_envs.remote.tcp_transport import TcpTransport
-from bam_envs.remote.tcp_wire import FrameSocket, Hello, encode
+from bam_envs.remote.wire.tcp_wire import FrameSocket, Hello, encode
 from bam_envs.testing.transports import MirrorEnv
 from tests.bam_envs.remote.fakes import FakeEnv
 

@@ -8,8 +8,8 @@ from bam_envs.robots.mir100 import BACK_RAYS, FRONT_RAYS
 from bam_envs.robots.physics.kinematic_arm import obstacle_arm
 from bam_envs.robots.physics.kinematic_base import SimulatedBase, lab, open_floor
 from bam_envs.robots.physics.rendering import RenderingUnavailable
-from bam_envs.robots.physics.room import LAB
 from bam_envs.robots.physics.shapes import BLUE, RED
+from bam_envs.robots.room import LAB
 
 pytestmark = pytest.mark.slow
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from bam_envs.robots.mir100 import BACK_MASKED, BACK_MOUNT, BACK_RAYS, FRONT_MASKED, FRONT_MOUNT, FRONT_RAYS
-from bam_envs.robots.physics.room import LAB, NOISE, NOWHERE, LaserScanner, Room, measured, mixed, noise, touches
+from bam_envs.robots.room import LAB, NOISE, NOWHERE, LaserScanner, Room, measured, mixed, noise, touches
 
 
 def touching(pose, room=None, boxes=()):

@@ -3,7 +3,7 @@ import torch
 
 from bam_train.errors import UnknownVariable, ValueMismatch, WorkspaceError
 from bam_train.loop import Workspace
-from bam_train.loop.tensors.replay_buffer import ReplayBuffer
+from bam_train.loop.workspace.replay_buffer import ReplayBuffer
 
 
 def rows(first, count):

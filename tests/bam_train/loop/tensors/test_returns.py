@@ -2,7 +2,7 @@ import pytest
 import torch
 
 from bam_train.errors import ValueMismatch, WorkspaceError
-from bam_train.loop.tensors.returns import (
+from bam_train.loop.workspace.returns import (
     cumulated_reward,
     doubleqlearning_temporal_difference,
     gae,

@@ -6,7 +6,7 @@ from torch.utils.data import DataLoader, TensorDataset
 
 import bam_train.loop as ours
 from bam_train.compat.bbrl.shared_workspace import shared_workspace
-from bam_train.loop.tensors import returns
+from bam_train.loop.workspace import returns
 
 theirs = pytest.importorskip("bbrl.workspace")
 pytest.importorskip("bbrl.agents")

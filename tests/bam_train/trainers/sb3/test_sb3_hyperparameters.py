@@ -21,14 +21,14 @@ from bam_train.errors import SettingsError
 from bam_train.trainers.algorithms import SB3_ALGORITHMS
 from bam_train.trainers.library_arguments import as_written
 from bam_train.trainers.library_source import Other, parameters, table
-from bam_train.trainers.sb3.sb3_hyperparameters import (
+from bam_train.trainers.sb3.sb3_model import build
+from bam_train.trainers.sb3_hyperparameters import (
     NORMALISER,
     check_pictures,
     complete,
     complete_normalize,
     default_policy,
 )
-from bam_train.trainers.sb3.sb3_model import build
 
 NUMBERS = gym.spaces.Box(-1, 1, (3,))
 IMAGE = gym.spaces.Box(0, 255, (36, 36, 3), np.uint8)

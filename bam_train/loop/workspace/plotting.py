@@ -3,22 +3,33 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from functools import partial
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
 from bam_envs.core.errors import MissingExtra
 from bam_train.errors import WorkspaceError
-from bam_train.loop.variables import to_array
+from bam_train.loop.workspace.variables import to_array
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
     from pandas import DataFrame
 
-    from bam_train.loop.workspace import Workspace
+
+class Recorded(Protocol):
+    """What is drawn of a `Workspace`."""
+
+    first_time: int
+
+    def keys(self) -> Iterable[str]:
+        """The names of the variables."""
+
+    def get_full(self, name: str) -> Any:
+        """A variable. Shape: (T, B, ...)."""
+
 
 MAX_LINES = 10
 """Maximum lines in one plot, the number of matplotlib's colours."""
@@ -26,7 +37,7 @@ MAX_VALUE_AXES = 2
 """A value with more axes than this is an image."""
 
 
-def plot(workspace: Workspace, *names: str, batch: int | Sequence[int] | None = None) -> Figure:
+def plot(workspace: Recorded, *names: str, batch: int | Sequence[int] | None = None) -> Figure:
     """Draw variables over time: one plot below the other, with one line for each batch column and component.
 
     Floats are drawn as lines, bool and integers as steps. A plot has at most 10 lines; its title then gives the total.
@@ -61,7 +72,7 @@ def plot(workspace: Workspace, *names: str, batch: int | Sequence[int] | None = 
     return figure
 
 
-def to_dataframe(workspace: Workspace, *names: str) -> DataFrame:
+def to_dataframe(workspace: Recorded, *names: str) -> DataFrame:
     """Return the variables as a table with one row for each time and batch column, indexed by ``("time", "batch")``.
 
     A scalar variable is one column with its name, a vector ``name[0]``, ``name[1]``, …, a matrix ``name[0,0]``, ….
@@ -87,7 +98,7 @@ def to_dataframe(workspace: Workspace, *names: str) -> DataFrame:
     return pandas.DataFrame(columns, index=rows)
 
 
-def _arrays(workspace: Workspace, names: tuple[str, ...], purpose: str) -> dict[str, np.ndarray]:
+def _arrays(workspace: Recorded, names: tuple[str, ...], purpose: str) -> dict[str, np.ndarray]:
     """The named variables, or all, (T, B, ...) each, without images."""
     arrays = {name: to_array(workspace.get_full(name)) for name in names or workspace.keys()}
     arrays = {name: array if array.ndim > 1 else array[:, None] for name, array in arrays.items()}  # without a batch

@@ -8,7 +8,7 @@ It is BBRL's `Workspace`, with these differences:
 
 - BBRL's assertions are exceptions that name the variable, the expected and the found value; a first write that fails
   does not make the variable.
-- A full read is cached until the next write, see `bam_train.loop.variables`.
+- A full read is cached until the next write, see `bam_train.loop.workspace.variables`.
 - `to`, `cat_batch` and `sample_subworkspace` with more than one window work; `copy_n_last_steps` copies only the
   variables that it was given, and once.
 - A workspace with a window passes old times to a sink and forgets them: its memory is bounded in a loop of any length.
@@ -26,7 +26,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from bam_train.errors import TimeNotWritten, UnknownVariable, WorkspaceError
-from bam_train.loop.variables import Variable, kind_mismatch, no_batch
+from bam_train.loop.workspace.variables import Variable, kind_mismatch, no_batch
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -331,14 +331,14 @@ class Workspace:
     # -- pictures --------------------------------------------------------------------------------------------------
 
     def plot(self, *names: str, batch: int | Sequence[int] | None = None) -> Figure:
-        """A matplotlib figure of these variables over time, see `bam_train.loop.plotting.plot`."""
-        from bam_train.loop.plotting import plot
+        """A matplotlib figure of these variables over time, see `bam_train.loop.workspace.plotting.plot`."""
+        from bam_train.loop.workspace.plotting import plot
 
         return plot(self, *names, batch=batch)
 
     def to_dataframe(self, *names: str) -> pd.DataFrame:
-        """A pandas table of these variables, see `bam_train.loop.plotting.to_dataframe`."""
-        from bam_train.loop.plotting import to_dataframe
+        """A pandas table of these variables, see `bam_train.loop.workspace.plotting.to_dataframe`."""
+        from bam_train.loop.workspace.plotting import to_dataframe
 
         return to_dataframe(self, *names)
 
@@ -355,7 +355,7 @@ class Workspace:
         if isinstance(value, np.ndarray):
             kind: type[Variable] = Variable
         elif sys.modules.get("torch") is not None and isinstance(value, sys.modules["torch"].Tensor):
-            from bam_train.loop.tensors.tensor_variable import TensorVariable
+            from bam_train.loop.workspace.tensor_variable import TensorVariable
 
             kind = TensorVariable
         elif isinstance(value, np.generic):

@@ -14,7 +14,7 @@ from gymnasium import Space, spaces
 
 from bam_envs.core.errors import InvalidValue, ProtocolError
 from bam_envs.core.wording import brief
-from bam_envs.remote.gymapi_leaves import (
+from bam_envs.remote.wire.gymapi_leaves import (
     EXACT,
     GRIPPER_WIDTH,
     IMAGE,
@@ -27,10 +27,10 @@ from bam_envs.remote.gymapi_leaves import (
     joined,
     leaves_of,
 )
-from bam_envs.remote.gymapi_messages import PREFIX, GymResponse, write_feedback
-from bam_envs.remote.gymapi_versions import JUNE_22, Version
-from bam_envs.remote.transport import EnvSpecMessage, Info
-from bam_envs.remote.values import exact, pack, tree_from_json, tree_to_json
+from bam_envs.remote.wire.gymapi_messages import PREFIX, GymResponse, write_feedback
+from bam_envs.remote.wire.gymapi_versions import JUNE_22, Version
+from bam_envs.remote.wire.transport import EnvSpecMessage, Info
+from bam_envs.remote.wire.values import exact, pack, tree_from_json, tree_to_json
 from bam_envs.ros.images import FORMATS, color_message, read_color_message, read_depth_message
 from bam_envs.rosbridge.encoding import dump_json, load_json
 

@@ -5,7 +5,7 @@ from typing import Any
 
 import torch
 
-from bam_train.loop.variables import Variable
+from bam_train.loop.workspace.variables import Variable
 
 
 class TensorVariable(Variable):

@@ -7,7 +7,7 @@ import gymnasium as gym
 import numpy as np
 
 from bam_train.errors import LoopError, PolicyError
-from bam_train.loop.agent import Agent
+from bam_train.loop.agents.agent import Agent
 from bam_train.loop.gym.gym_agent import NUMBERS
 from bam_train.loop.gym.gym_spaces import Kind, flat, kinds, names, pack
 

@@ -43,8 +43,8 @@ from numpy.typing import NDArray
 
 from bam_envs.core.errors import BamEnvsError, InvalidValue, LinkLost, NotInCommand, ProtocolError, RemoteError
 from bam_envs.core.wording import brief
-from bam_envs.remote.transport import EnvSpecMessage
-from bam_envs.remote.values import Tree, exact, number_dtype, pack
+from bam_envs.remote.wire.transport import EnvSpecMessage
+from bam_envs.remote.wire.values import Tree, exact, number_dtype, pack
 
 MARK, VERSION = b"bam", 1
 MAX_FRAME = 256 * 1024 * 1024

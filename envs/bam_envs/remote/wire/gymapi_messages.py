@@ -16,9 +16,9 @@ from typing import Any
 import numpy as np
 
 from bam_envs.core.errors import BamEnvsError, InvalidValue, NotInCommand, ProtocolError, RemoteError
-from bam_envs.remote.gymapi_versions import JUNE_22, Version, version_of_response
-from bam_envs.remote.transport import Info, Seed
-from bam_envs.remote.values import plain_info, tree_from_json, tree_to_json
+from bam_envs.remote.wire.gymapi_versions import JUNE_22, Version, version_of_response
+from bam_envs.remote.wire.transport import Info, Seed
+from bam_envs.remote.wire.values import plain_info, tree_from_json, tree_to_json
 from bam_envs.ros.freshness import Tag, read_tag
 from bam_envs.ros.interfaces import complete, request_type, response_type
 from bam_envs.rosbridge.encoding import dump_json, load_json

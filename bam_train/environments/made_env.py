@@ -2,8 +2,6 @@
 
 import contextlib
 import functools
-import json
-import math
 from collections.abc import Callable, Mapping
 from importlib import metadata
 from typing import Any, TypeVar
@@ -12,18 +10,17 @@ import gymnasium as gym
 from gymnasium.vector import AutoresetMode, VectorEnv
 
 import bam_envs  # noqa: F401 - registers our environments with Gymnasium
+from bam_envs.aliases.robo_gym_names import ROBO_GYM
 from bam_envs.core import registry
 from bam_envs.core.env_options import in_our_words, require_kinds
 from bam_envs.core.errors import BamEnvsError, InvalidValue, UnknownName
 from bam_envs.core.registry import entry_of, resolve_id
-from bam_envs.core.spaces import space_to_json
 from bam_envs.core.wording import did_you_mean
 from bam_envs.robo_gym.making import constructor_options, require_values
-from bam_envs.robo_gym.table import ROBO_GYM
 from bam_envs.robots.linked import link_profile
 from bam_envs.tasks.wrappers.late_actions import read_delay
 from bam_train.checkpoint import Checkpoint
-from bam_train.checkpoint.manifest import WHERE, Manifest
+from bam_train.checkpoint.manifest import WHERE
 from bam_train.env_location import HERE, Place
 from bam_train.errors import BamTrainError, CheckpointMismatch, SettingsError
 from bam_train.foreign_env import ForeignEnv, described
@@ -32,7 +29,6 @@ ENTRY_POINTS = "bam_train.environments"
 """Group of entry points whose modules a checkpoint may name, because installed packages are trusted."""
 
 T = TypeVar("T")
-AnyEnv = gym.Env[Any, Any] | VectorEnv[Any, Any, Any]
 
 
 def environment_of(
@@ -187,110 +183,11 @@ def make_vector_env(
     return _made(env_id, lambda: gym.make_vec(env_id, num_envs, vectorization_mode="sync", **arguments))
 
 
-def control_period(env: gym.Env[Any, Any]) -> float | None:
-    """Time between two actions [s]: the environment's `period`, else one frame of its `render_fps`, else None."""
-    period = getattr(env.unwrapped, "period", None)
-    if period is not None:
-        return float(period)
-    rate = env.metadata.get("render_fps")
-    return 1.0 / float(rate) if rate else None
-
-
-def require_fit(checkpoint: Checkpoint, env: AnyEnv, place: Place = HERE, env_id: str | None = None) -> None:
-    """Check that `env` fits the checkpoint's policy.
-
-    Both spaces, the name and unit of every signal, and the control period are compared, where both sides give them.
-    The error names `env_id`, if that may be another environment than the checkpoint's.
-
-    Raises:
-        CheckpointMismatch: Names the first thing that differs, and both values.
-    """
-    pairs = fit_pairs(checkpoint, env)
-    differences = (first_difference(theirs, ours, name) for name, theirs, ours in pairs)
-    difference = next(filter(None, differences), None)
-    if difference is None:
-        return
-    name, theirs, ours = difference
-    if env_id is not None and not registry.are_same(env_id, checkpoint.manifest.env):
-        raise CheckpointMismatch(
-            checkpoint.path,
-            f"was trained on {checkpoint.manifest.env}, where {name} is {short_json(theirs)}, and it is "
-            f"{short_json(ours)} in {env_id}; give a checkpoint of {env_id}",
-        )
-    place_text = f"at {place.text}" if place.transport else f"in {checkpoint.manifest.env} as installed"
-    remedy = "serve the version" if place.transport else "install the version"
-    raise CheckpointMismatch(
-        checkpoint.path,
-        f"{name} is {short_json(theirs)} in the checkpoint and {short_json(ours)} {place_text}; "
-        f"train it anew, or {remedy} it was trained with",
-    )
-
-
-def fit_pairs(checkpoint: Checkpoint, env: AnyEnv) -> list[tuple[str, Any, Any]]:
-    """What must be equal for the policy of a checkpoint to fit `env`: name, the checkpoint's value, the environment's.
-
-    The values are plain JSON; those that one of the two does not give are left out.
-    """
-    return interface_pairs(checkpoint, interface_of(env))
-
-
-def interface_of(env: AnyEnv) -> dict[str, Any]:
-    """What a policy sees of `env`, as plain JSON: its spaces, signals and period [s]; {} and None where unknown."""
-    single = "single_" if isinstance(env, VectorEnv) else ""
-    spaces = {name: space_to_json(getattr(env, single + name)) for name in ("observation_space", "action_space")}
-    describe, period = getattr(env.unwrapped, "describe", None), getattr(env.unwrapped, "period", None)
-    signals = {} if describe is None else _names_and_units(describe())
-    plain: dict[str, Any] = json.loads(json.dumps({**spaces, "signals": signals}))  # tuples as lists
-    return {**plain, "period": None if period is None else float(period)}
-
-
-def interface_in(manifest: Manifest) -> dict[str, Any]:
-    """As `interface_of`, of the environment of a manifest."""
-    spaces = {name: getattr(manifest, name) for name in ("observation_space", "action_space")}
-    return {**spaces, "signals": _names_and_units(manifest.signals), "period": manifest.period}
-
-
-def interface_pairs(checkpoint: Checkpoint, interface: Mapping[str, Any]) -> list[tuple[str, Any, Any]]:
-    """As `fit_pairs`, for an environment of which `interface_of` is given."""
-    manifest = checkpoint.manifest
-    pairs = [(name, getattr(manifest, name), interface[name]) for name in ("observation_space", "action_space")]
-    if interface["signals"] and manifest.signals:
-        pairs.append(("signals", _names_and_units(manifest.signals), interface["signals"]))
-    period = interface["period"]
-    if period is not None and manifest.period is not None:
-        same = math.isclose(period, manifest.period, rel_tol=1e-9)
-        pairs.append(("period [s]", manifest.period, manifest.period if same else period))
-    return pairs
-
-
 def held_out(env_id: str, env_kwargs: Mapping[str, Any], asked: Mapping[str, Any]) -> dict[str, Any]:
     """Arguments of an environment for an evaluation: those that were asked for, else the test split if it has one."""
     entry = entry_of(env_id)
     split = {"split": "test"} if entry is not None and "split" in entry.options() else {}
     return {**env_kwargs, **split, **asked}
-
-
-def first_difference(theirs: Any, ours: Any, name: str) -> tuple[str, Any, Any] | None:
-    """The first difference of two JSON values: its name and both values; None if they are equal."""
-    if isinstance(theirs, dict) and isinstance(ours, dict):
-        keys: list[Any] = sorted(theirs.keys() | ours.keys(), key=lambda key: (key != "type", key != "shape", key))
-        pairs = [(f"{name}.{key}", theirs.get(key), ours.get(key)) for key in keys]
-    elif isinstance(theirs, list) and isinstance(ours, list) and len(theirs) == len(ours):
-        pairs = [(f"{name}[{i}]", a, b) for i, (a, b) in enumerate(zip(theirs, ours, strict=True))]
-    else:
-        return None if theirs == ours else (name, theirs, ours)
-    return next((found for pair in pairs if (found := first_difference(pair[1], pair[2], pair[0]))), None)
-
-
-def _names_and_units(signals: Mapping[str, Any]) -> dict[str, Any]:
-    """The names and units of the signals that `RobotEnv.describe` returns, by kind."""
-    return {kind: [{key: entry.get(key) for key in ("name", "unit")} for entry in signals[kind]] for kind in signals}
-
-
-def short_json(value: Any, most: int = 60) -> str:
-    """`value` as JSON, at most `most` characters of it."""
-    text = json.dumps(value)
-    return text if len(text) <= most else text[: most - 3] + "..."
 
 
 def _made(env_id: str, make: Callable[[], T]) -> T:

@@ -10,7 +10,7 @@ from gymnasium import Space
 from bam_envs.core.errors import InvalidValue, ProtocolError
 from bam_envs.core.spaces import space_from_json, space_to_json
 from bam_envs.core.wording import brief
-from bam_envs.remote.values import plain_info, tree_from_json, tree_to_json
+from bam_envs.remote.wire.values import plain_info, tree_from_json, tree_to_json
 
 Info = dict[str, Any]
 Seed = int | list[int | None] | None

@@ -16,11 +16,11 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from bam_envs.core.validation import NonNegativeInt, PositiveInt, check
 from bam_train.environments import is_batched, make_vector_env
 from bam_train.errors import SettingsError
+from bam_train.files.video import Frame
 from bam_train.finite_envs import FiniteVectorEnv
 from bam_train.loop import Agent, Agents, PolicyAgent, RobotAgent, TemporalAgent, VecGymAgent, Workspace
 from bam_train.loop.gym.gym_spaces import names
-from bam_train.loop.video_agent import VideoAgent
-from bam_train.video import Frame
+from bam_train.loop.gym.video_agent import VideoAgent
 
 FIRST_SEED = 1_000_000
 """The default seed of the first episode: far from the small seeds that training uses."""
@@ -218,7 +218,7 @@ def record_video(env: gym.Env[Any, Any], policy: Any, add: Callable[[Frame], Any
     Args:
         env: Made with ``render_mode="rgb_array"``.
         policy: Has ``reset()`` and ``act(observation)``: a `FrozenPolicy`.
-        add: Called with each picture, such as the function that `bam_train.video.open_video` yields.
+        add: Called with each picture, such as the function that `bam_train.files.video.open_video` yields.
         episodes: Number of episodes.
         seed: Seed of the first episode.
 

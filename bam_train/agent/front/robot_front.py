@@ -1,0 +1,296 @@
+"""The robot of a live agent for programs that take over: who has the lease, and what the resident is asked."""
+
+from __future__ import annotations
+
+import itertools
+import logging
+import threading
+import time
+from collections.abc import Callable, Mapping
+from concurrent.futures import Future
+from concurrent.futures import TimeoutError as NoAnswer
+from typing import Any, Protocol
+
+from bam_envs.core.errors import BamEnvsError, LinkLost, NotInCommand, RemoteError
+from bam_envs.live.camera import LiveCamera
+from bam_envs.remote.serve.robot_service import RobotService
+from bam_envs.ros.codec import AGENT_STEP_TOPIC, AGENT_TOPIC, HALT_TOPIC, RobotInfo
+from bam_envs.rosbridge.bus import Caller
+from bam_envs.rosbridge.bus import Message as Fields
+from bam_envs.rosbridge.encoding import load_json
+from bam_envs.rosbridge.endpoint import Endpoint
+from bam_envs.rosbridge.server import BridgeServer
+from bam_envs.rosbridge.string_rpc import StringRpcService
+from bam_train.agent.agent_messages import (
+    Answer,
+    Ask,
+    Front,
+    Halt,
+    Listening,
+    Message,
+    Progress,
+    Report,
+    Rows,
+    Sent,
+)
+from bam_train.agent.front.agent_lease import SILENT, AgentLease
+from bam_train.agent.front.remote_robot import RemoteRobot
+from bam_train.agent.remote.agent_protocol import printable
+from bam_train.agent.transitions import EVENT
+from bam_train.env_location import Place
+from bam_train.environments import make_env
+from bam_train.errors import BamTrainError, CandidateRefused, RequestRefused, TrialsNeeded, UnknownVersion
+
+_log = logging.getLogger(__name__)
+_LOOK = 0.1  # time between two looks at the lease [s]
+_HALT_LATE = 1.0  # longest time for which a halt comes after the end of its sender's lease [s]
+_REFUSALS = {one.__name__: one for one in (NotInCommand, CandidateRefused, TrialsNeeded, UnknownVersion)}
+_ANSWER = 10.0  # longest wait for an answer of the resident, unless it needs longer [s]
+
+
+class Watchers(Protocol):
+    """Who listens to what happens."""
+
+    @property
+    def has_learner(self) -> bool:
+        """Whether a learner listens."""
+
+    def tell(self, kind: str, event: dict[str, Any]) -> None:
+        """Give an event to those who listen to events of this kind."""
+
+    def tell_step(self, row: Mapping[str, Any], episode: int) -> None:
+        """Pass on a step of a person's program; raises ProtocolError."""
+
+
+class FrontProcess:
+    """The port of a live agent, and the hub of its agent socket.
+
+    Args:
+        options: Where it listens, and where the robot is.
+        send: Sends a message to the resident.
+    """
+
+    watchers: Watchers
+    """Who listens to what happens; to be set before `serve`."""
+
+    def __init__(self, options: Front, send: Callable[[Message], None]) -> None:
+        self.options, self.send = options, send
+        self.status: dict[str, Any] = {"state": "waiting for the robot", "why": "it starts", "active": None}
+        self.status |= {"owner": None, "names": {}}
+        """The last report of the resident."""
+        place = Place(
+            options.robot,
+            profile=options.profile,
+            ca_file=options.ca_file,
+            token_file=options.robot_token_file,
+            shadow=True,
+        )
+        env: Any = make_env(options.env, options.env_kwargs, place=place)
+        self.shadow, self.task = env.unwrapped.robot, env.unwrapped.task
+        self.lease = AgentLease(options.lease)
+        self.robot = RemoteRobot(
+            self.shadow, send, lambda: self.lease.holder, self._ask_now, options.command_timeout, self._describe
+        )
+        self._service: RobotService | None = None
+        self._pending: dict[int, tuple[Future[Any], Callable[[str], None]]] = {}
+        self._numbers = itertools.count(1)
+        self._driver: str | None = None  # the last owner of the lease
+        self._episode = 0  # of people
+        self._ended_at = -_HALT_LATE  # of the last lease [s]
+        self._handing: dict[str, bool | None] = {}  # clients that hand back -> whether the policy goes on
+        self.sent: list[float] | None = None
+        """The command that was sent last."""
+        self.changed: Callable[[], None] = lambda: None
+        """Called when the status has changed."""
+        self._stopped = threading.Event()
+
+    # ---- the resident
+
+    def take(self, message: Any) -> None:
+        """Take a message of the resident, in the reading thread."""
+        if isinstance(message, Report):
+            self._report(message.status)
+        elif isinstance(message, Sent):
+            self.sent = message.command
+        elif isinstance(message, Answer):
+            waiting = self._pending.pop(message.number, None)
+            if waiting is not None:
+                waiting[0].set_result(message)
+        elif isinstance(message, Rows):
+            self.watchers.tell(EVENT, message.event)
+        elif isinstance(message, Progress) and message.number in self._pending:
+            self._pending[message.number][1](message.text)
+
+    def stop(self) -> None:
+        """End the process: the resident is gone."""
+        self._stopped.set()
+
+    def _report(self, status: dict[str, Any]) -> None:
+        ended, state = status.pop("ended", None), status["state"]
+        if ended is not None and self.lease.holder == ended:
+            self._handing[ended] = None
+            self.lease.release(ended)
+        self.status = status
+        self._describe()
+        drivable = state not in ("waiting for the robot", "stopped by a guard")
+        self.robot.why_not = "" if drivable else f"the agent is {state}: {status.get('why')}"
+        self.changed()
+
+    def ask(
+        self,
+        op: str,
+        arguments: dict[str, Any],
+        who: str,
+        address: str,
+        progress: Callable[[str], None] = lambda text: None,
+        timeout: float = _ANSWER,
+    ) -> dict[str, Any]:
+        """Ask the resident, and wait for its answer; raises what it refuses."""
+        number, future = next(self._numbers), Future[Any]()
+        self._pending[number] = future, progress
+        self.send(Ask(number, op, arguments, who, address))
+        try:
+            answer: Answer = future.result(timeout)
+        except NoAnswer as error:
+            raise LinkLost(f"{op}: the agent did not answer in {timeout:g} s; look at its status.") from error
+        finally:
+            self._pending.pop(number, None)
+        if answer.result is None:
+            raise _REFUSALS.get(answer.kind, RequestRefused)(answer.error)
+        return answer.result
+
+    def _ask_now(self, op: str, arguments: dict[str, Any]) -> dict[str, Any]:
+        try:
+            return self.ask(op, arguments, self.lease.owner or "a client", "")
+        except BamTrainError as error:
+            raise RemoteError(str(error)) from error
+
+    # ---- the lease
+
+    def _on_lease(self, before: str | None, after: str | None) -> None:
+        """Tell the resident who drives; called in the thread that changes the lease."""
+        holder, self._ended_at = self.lease.holder, time.monotonic()
+        if after is not None and holder is not None:
+            self._driver = holder
+            self.send(Ask(0, "take", {"lease": holder}, after, ""))
+        elif self._driver is not None and self._driver not in self._handing and not self.lease.is_cut:
+            self.send(Ask(0, "hand_back", {"lease": self._driver}, before or "", ""))
+
+    def _on_leave(self, caller: Caller) -> None:
+        """A connection ended: if it was the owner's, the robot holds at once, and the lease ends a little later."""
+        holder = self.lease.holder
+        if holder is None:
+            return
+        if caller.name == self.lease.connection or caller.client == holder:
+            self.cut(holder, caller.address)
+
+    def cut(self, client: str, address: str, how: str = "was cut") -> None:
+        """The link of `client` ended: if it has the lease, the robot holds, and the lease ends a little later."""
+        if self.lease.holder == client and client not in self._handing:
+            shown = self.lease.owner or client
+            self.send(Ask(0, "cut", {"lease": client, "how": how}, shown, address))
+            self.lease.cut(client, shown, how)
+            self.lease.release(client)
+
+    def _watch_lease(self) -> None:
+        """End leases that are over, or whose owner is silent."""
+        holder = self.lease.holder
+        if holder is not None and self.lease.is_silent:
+            self.cut(holder, "", f"was silent for {SILENT:g} s")
+        over = self.lease.over()
+        if over is not None:
+            client, why = over
+            self.send(Ask(0, "hand_back", {"lease": client, "why": why}, "the agent", ""))
+            self._handing[client] = None
+            self.lease.release(client)
+            self._handing.pop(client, None)
+
+    def answer_client(self, request: Fields, caller: Caller) -> Fields:
+        """A program's request on `AGENT_TOPIC`."""
+        do, who = request.get("do"), f"{printable(str(request.get('who'))[:80])} ({caller.address or caller.shown})"
+        if do == "look":
+            owner = (
+                None if self.lease.holder in (None, caller.client) and self.lease.owner is None else self.lease.owner
+            )
+            refusal = None if owner is None else self.lease.refusal()
+            return {"owner": owner, "refusal": refusal, "state": self.status["state"]}
+        if do == "take":
+            self.lease.grant(caller.client, caller, shown=who)
+            try:
+                self.ask("take", {"lease": caller.client}, who, caller.address)
+            except (BamTrainError, BamEnvsError):
+                self.lease.release(caller.client)
+                raise
+            self._episode += 1
+            return {"state": self.status["state"], "learner": self.watchers.has_learner}
+        if do == "hand_back":
+            self.hand_back(caller.client, who, caller.address)
+            return {"state": self.status["state"]}
+        raise RemoteError(f"{AGENT_TOPIC}: expected look, take or hand_back, found {do!r:.40}.")
+
+    def hand_back(self, client: str, who: str, address: str, resume: bool | None = None) -> None:
+        """End a lease; the policy goes on if `resume`, or the agent's setting, says so."""
+        if self.lease.holder != client:
+            return
+        self._handing[client] = resume
+        try:
+            self.lease.release(client)
+            self.ask("hand_back", {"lease": client, "resume": resume}, who, address)
+        finally:
+            self._handing.pop(client, None)
+
+    # ---- serving
+
+    def serve(self, server: BridgeServer) -> None:
+        """Serve until the resident is gone."""
+        server.on_leave(self._on_leave)
+        self.lease.on_change(self._on_lease)
+        robot: Any = self.robot
+        self._service = service = RobotService(robot, self.shadow.profile, server, self.lease, info=self._info())
+        requests = StringRpcService(server, AGENT_TOPIC, self.answer_client, service.sessions)
+        server.subscribe(HALT_TOPIC, "std_msgs/Empty", self._on_halt)
+        server.subscribe(AGENT_STEP_TOPIC, "std_msgs/String", self._on_step)
+        service.start()
+        requests.start()
+        self.robot.start()
+        self.send(Listening(server.port))
+        try:
+            while not self._stopped.wait(_LOOK):
+                self._watch_lease()
+        finally:
+            requests.close()
+            service.close()
+            self.robot.close()
+
+    def _info(self) -> RobotInfo:
+        """The description of the robot for programs that take over; until it is known, that of a real one."""
+        robot, period = self.shadow.info, self.shadow.spec.period
+        watchdog, text = max(self.options.command_timeout, 1.5 * period), f"{robot.text or self.options.robot}"
+        text = f"{text}, driven by a live agent, from which you take over"
+        identity = str(self.status.get("identity", ""))
+        return RobotInfo(self.shadow.profile.name, robot.simulated, False, period, text, watchdog, True, identity)
+
+    def _describe(self) -> None:
+        if self._service is not None:
+            self._service.info = self._info()
+
+    def _on_step(self, message: Fields, caller: Caller) -> None:
+        """A step of the program that has taken over, over the connection on which it took the lease."""
+        if caller.name == self.lease.connection and self.lease.holder is not None:
+            self.watchers.tell_step(load_json(message.get("data"), AGENT_STEP_TOPIC), self._episode)
+
+    def cameras(self) -> dict[str, LiveCamera]:
+        """The cameras of the robot's profile that are not optional, or that the task sees; not connected yet."""
+        options, seen = self.options, self.seen()
+        endpoint = Endpoint.with_token_file(options.robot, ca_file=options.ca_file, token_file=options.robot_token_file)
+        shown = [one for one in self.shadow.profile.cameras if one.name in seen or not one.optional]
+        return {one.name: LiveCamera(endpoint, one) for one in shown}
+
+    def seen(self) -> dict[str, tuple[int, int]]:
+        """The cameras that the task sees: width and height of its images [pixels], by name."""
+        return {name: (camera.width, camera.height) for camera in self.shadow.spec.cameras for name in camera.spaces()}
+
+    def _on_halt(self, message: Fields, caller: Caller) -> None:
+        """Stop the policy; the halt of whoever drives, or has just handed back, over another connection does not."""
+        if self.lease.owner is None and time.monotonic() - self._ended_at > _HALT_LATE:
+            self.send(Halt(caller.shown, caller.address, stop=True))

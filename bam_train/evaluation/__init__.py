@@ -1,0 +1,31 @@
+"""Episodes of a policy over a fixed list of starts: success, return and length; and the detector made from them."""
+
+from bam_train.evaluation.evaluation import (
+    FIRST_SEED,
+    BatchPolicy,
+    Episode,
+    EvaluationReport,
+    default_num_envs,
+    evaluate,
+    first_of_each,
+    number_of_starts,
+    play_wave,
+    record_video,
+    summarise,
+    wilson_interval,
+)
+
+__all__ = [
+    "FIRST_SEED",
+    "BatchPolicy",
+    "Episode",
+    "EvaluationReport",
+    "default_num_envs",
+    "evaluate",
+    "first_of_each",
+    "number_of_starts",
+    "play_wave",
+    "record_video",
+    "summarise",
+    "wilson_interval",
+]

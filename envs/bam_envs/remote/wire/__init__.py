@@ -1,0 +1,1 @@
+"""What an environment says over a network, for both sides: its messages as JSON, ROS messages and frames of TCP."""
