@@ -46,8 +46,8 @@ print(sorted(name for name in sys.modules if name.startswith("bam_envs.")))
 """
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     core = ("env_options", "errors", "registry", "robot", "validation", "wording")
-    others = ("local", "local.names", "robo_gym", "robo_gym.table")
-    modules = ["core", *(f"core.{name}" for name in core), *others]
+    others = ("aliases", "aliases.bam_names", "aliases.robo_gym_names")
+    modules = [*others, "core", *(f"core.{name}" for name in core)]
     assert done.stdout.strip() == str([f"bam_envs.{name}" for name in modules])
 
 
