@@ -196,9 +196,10 @@ def test_wrong_usage_has_status_2(run, arguments, text):
     assert run(push.main, *arguments) == (2, "", f"bam-push: {text}. Run bam-push --help\n")
 
 
-def test_an_unknown_action_has_status_2(run):
-    text = "action: expected pause, resume, status, stop or versions, found 'halt'"
-    assert run(agent.main, "halt", "ws://robot") == (2, "", f"bam-agent: {text}. Run bam-agent --help\n")
+@pytest.mark.parametrize(("action", "end"), [("halt", "."), ("staus", ", did you mean status?")])
+def test_an_unknown_action_has_status_2(run, action, end):
+    text = f"action: expected pause, resume, status, stop or versions, found '{action}'{end}"
+    assert run(agent.main, action, "ws://robot") == (2, "", f"bam-agent: {text} Run bam-agent --help\n")
 
 
 def test_help_names_the_exit_statuses(capsys):
