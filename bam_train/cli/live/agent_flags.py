@@ -25,7 +25,8 @@ class AskConfig:
         tyro.conf.Positional[Literal["status", "pause", "resume", "versions", "stop"]],
         tyro.conf.arg(metavar="status|pause|resume|versions|stop"),
     ]
-    """status and versions change nothing; stop halts the robot at once, and pauses the agent."""
+    """status and versions change nothing; stop halts the robot at once, and pauses the agent, whose program goes on
+    running: Ctrl-C in its terminal ends it."""
     url: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="URL")]
     """Address of the agent, such as ws://robot:9095 (wss:// with TLS)."""
     token_file: File = None

@@ -35,7 +35,10 @@ def ask_agent(config: AskConfig, signals: SignalMemory) -> None:
 
     found = with_agent(config, config.url, ask)
     if not config.json:
-        tell(*(_versions(found) if config.action == "versions" else status_lines(found)))
+        lines = [*(_versions(found) if config.action == "versions" else status_lines(found))]
+        if config.action == "stop":
+            lines.insert(1, "  program   goes on running; Ctrl-C in its terminal ends it")
+        tell(*lines)
 
 
 def _rest(agent: AgentClient) -> dict[str, Any]:

@@ -107,6 +107,8 @@ def test_pause_and_stop(hub, server, run):
     status, out, _ = run(agent.main, "stop", server.url, "--why", "smoke", "--json", token="w")
     assert (status, json.loads(out)["state"]) == (0, "paused")
     assert [why for _, why in hub.stops] == ["smoke"]
+    lines = run(agent.main, "stop", server.url, token="w")[1].splitlines()
+    assert (lines[0].split()[0], lines[1]) == ("paused", "  program   goes on running; Ctrl-C in its terminal ends it")
 
 
 def test_versions(hub, server, run):
