@@ -46,7 +46,9 @@ class SimulatedBox:
             start_new_session=True,  # Ctrl-C at the terminal is for the resident alone
             text=True,
         )
-        self.url = self._process.stdout.readline().strip() if self._process.stdout else ""
+        if self._process.stdout is not None:
+            with self._process.stdout as output:
+                self.url = output.readline().strip()
         if not self.url:
             self._process.wait()
             raise SettingsError("The simulated robot did not start; its log is above.")

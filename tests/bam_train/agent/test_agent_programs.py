@@ -10,6 +10,7 @@ from bam_train.cli.live import push
 from bam_train.errors import RequestRefused
 
 DIGEST = "3f2a91c0d7aa" + 52 * "0"
+PICK = Path(__file__).parents[3] / "checkpoints" / "pick-ppo.zip"
 STATUS = {
     "state": "trial",
     "why": "push by anna@laptop",
@@ -196,6 +197,24 @@ def test_roll_back(hub, server, run):
 )
 def test_wrong_usage_has_status_2(run, arguments, text):
     assert run(push.main, *arguments) == (2, "", f"bam-push: {text}. Run bam-push --help\n")
+
+
+@pytest.mark.parametrize(
+    ("flags", "text"),
+    [
+        (["--policy", "nope.zip"], "nope.zip: no such file."),
+        ([], "has no version yet; give a checkpoint with --policy"),
+        (["--policy", PICK, "--env", "bam/reach"], "was trained on bam/pick-v0"),
+        (["--policy", PICK, "--bind", "192.0.2.1"], "192.0.2.1"),
+    ],
+)
+def test_a_refused_start_leaves_nothing(run, tmp_path, monkeypatch, flags, text):
+    (tmp_path / "here").mkdir()
+    monkeypatch.chdir(tmp_path / "here")
+    status, out, err = run(agent.main, *flags, "--folder", "lab/agent")
+    assert (status, out) == (1, "")
+    assert text in err
+    assert [*Path().iterdir()] == []
 
 
 @pytest.mark.parametrize(("action", "end"), [("halt", "."), ("staus", ", did you mean status?")])
