@@ -17,7 +17,6 @@ from bam_train.signals import SignalMemory
 
 if TYPE_CHECKING:
     from bam_train.checkpoint import Checkpoint
-    from bam_train.cli.consent import say_agent_rests
     from bam_train.cli.play.gamepad import Gamepad
     from bam_train.cli.play.play_flags import PlayConfig
     from bam_train.env_location import Place
@@ -41,6 +40,7 @@ def play(config: PlayConfig, signals: SignalMemory) -> int:
 
     from bam_envs.core.errors import BamEnvsError
     from bam_train.checkpoint import Checkpoint
+    from bam_train.cli.consent import say_agent_rests
     from bam_train.cli.play.gamepad import Gamepad
     from bam_train.deploy.deployment import ending_of
     from bam_train.play.hands import hand_for
