@@ -9,8 +9,12 @@ Example:
 
 # %% script only
 import argparse
+import signal
+from sys import exit as end
+from sys import stderr
 
 argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter).parse_args()
+signal.signal(signal.SIGINT, lambda *_: end(print("stopped by Ctrl-C", file=stderr) or 130))
 print("play, collect, train, evaluate, freeze, deploy, take over: about two minutes in all", flush=True)
 
 # %% [markdown]

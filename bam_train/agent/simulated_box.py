@@ -46,9 +46,7 @@ class SimulatedBox:
             start_new_session=True,  # Ctrl-C at the terminal is for the resident alone
             text=True,
         )
-        if self._process.stdout is not None:
-            with self._process.stdout as output:
-                self.url = output.readline().strip()
+        self.url = self._process.stdout.readline().strip() if self._process.stdout else ""
         if not self.url:
             self._process.wait()
             raise SettingsError("The simulated robot did not start; its log is above.")
@@ -67,6 +65,8 @@ class SimulatedBox:
             except subprocess.TimeoutExpired:
                 self._process.kill()
                 self._process.wait()
+            if self._process.stdout is not None:
+                self._process.stdout.close()
 
 
 def main() -> None:
