@@ -9,8 +9,13 @@ Example:
 
 # %% script only
 import argparse
+import signal
+from sys import exit as end
+from sys import stderr
 
 argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter).parse_args()
+signal.signal(signal.SIGINT, lambda *_: end(print("stopped by Ctrl-C", file=stderr) or 130))
+print("play, collect, train, evaluate, freeze, deploy, take over: about two minutes in all", flush=True)
 
 # %% [markdown]
 # # A tour of bam-train
@@ -18,6 +23,8 @@ argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescrip
 # The commands are those that you would type in a terminal; here they run in a new folder.
 
 # %%
+import atexit
+import json
 import os
 import shlex
 import socket
@@ -47,7 +54,7 @@ def command(line):
 
 def run(line, most=12):
     """Run a command, and print the last lines of what it prints."""
-    print(f"$ {line}")
+    print(f"$ {line}", flush=True)
     done = subprocess.run(command(line), cwd=folder, capture_output=True, text=True, check=False)
     print("\n".join((done.stdout or done.stderr).splitlines()[-most:]))
     if done.returncode:
@@ -119,9 +126,10 @@ with socket.socket() as free:
 line = f"bam-agent --policy online.zip --port {url.rpartition(':')[2]} --folder agent"
 with (folder / "agent.log").open("w") as log:
     agent = subprocess.Popen(command(line), cwd=folder, stdout=log, stderr=log)
+atexit.register(agent.kill)  # whatever happens
 for _ in range(120):
-    asked = subprocess.run(command(f"bam-agent status {url}"), cwd=folder, capture_output=True, check=False)
-    if asked.returncode == 0 or agent.poll() is not None:
+    asked = subprocess.run(command(f"bam-agent status {url} --json"), cwd=folder, capture_output=True, check=False)
+    if json.loads(asked.stdout)["state"] == "running" or agent.poll() is not None:
         break
     time.sleep(0.5)
 run(f"bam-push offline.zip {url}")

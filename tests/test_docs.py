@@ -29,6 +29,7 @@ from bam_envs.tasks import (
 from bam_train.checkpoint import Checkpoint
 from bam_train.cli import train
 from bam_train.cli.data.bam_data import COMMANDS as DATA_COMMANDS
+from bam_train.cli.data.run_gate import FAILED, STATUSES
 from bam_train.cli.program import help_text, parse
 from bam_train.settings import tomllib
 from tests.test_checkpoints import LEAST
@@ -250,6 +251,13 @@ def test_commands_exist(page):
             assert (ROOT / words[1]).exists() or f"`{words[1]}`" in page.read_text()
         else:
             assert words[0] in {*PROGRAMS, "pip", "pytest", "python3", "ray", "ros2", "source", "ssh"}
+
+
+@pytest.mark.parametrize("page", ["README.md", "docs/cheat-sheet.md"])
+def test_the_exit_statuses_of_the_gate_are_told_where_it_is_shown(page):
+    statuses = {**STATUSES, "no comparison": FAILED}
+    found = re.findall(r"\b(\d):? (better|not worse|worse|undecided|no comparison)\b", (ROOT / page).read_text())
+    assert {name: int(status) for status, name in found} == statuses
 
 
 def test_the_workflow_for_ci_has_commands_that_exist():

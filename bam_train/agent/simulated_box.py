@@ -65,6 +65,8 @@ class SimulatedBox:
             except subprocess.TimeoutExpired:
                 self._process.kill()
                 self._process.wait()
+            if self._process.stdout is not None:
+                self._process.stdout.close()
 
 
 def main() -> None:

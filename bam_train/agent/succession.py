@@ -10,6 +10,7 @@ from __future__ import annotations
 import contextlib
 import logging
 import threading
+import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -33,6 +34,14 @@ from bam_train.errors import BadTrials, BamTrainError, CandidateRefused, Request
 _log = logging.getLogger(__name__)
 _EPISODE = 3600.0  # longest wait for the end of an episode [s]
 _TRIAL = 24 * 3600.0  # longest wait for the end of a trial [s]
+_STATE_POLL_PERIOD = 0.2  # [s]
+_ONCE = {
+    State.WAITING: "the robot is there again",
+    State.PAUSED: "somebody resumes the agent: bam-agent resume",
+    State.TAKEN_OVER: "the robot is handed back and the agent runs",
+    State.STOPPED: "somebody resumes the agent: bam-agent resume",
+}
+"""What ends each state in which there are no trials."""
 
 
 @dataclass
@@ -71,6 +80,7 @@ class ActingAgent(Protocol):
     options: AgentOptions
     session: RobotSession | None
     state: State
+    why: str
 
     def send(self, message: Message) -> None:
         """Send a message to the front process."""
@@ -216,8 +226,7 @@ class Succession:
             if not resident.state.drives:
                 news = f"is the candidate; its trials begin when the agent runs, and it is {resident.state.value} now"
             resident.send(Progress(ask.number, news))
-            if not choice.outcome.wait(_TRIAL):
-                raise RequestRefused("the trial did not end in a day")
+            self._wait_for_outcome(choice, ask.number)
         status = resident.status()
         return {
             "digest": version.digest,
@@ -228,6 +237,21 @@ class Succession:
             "owner": status["owner"],
             "outcome": choice.result,
         }
+
+    def _wait_for_outcome(self, choice: Choice, number: int) -> None:
+        """Wait for the end of the trials; meanwhile, say why they rest, and that they go on."""
+        resident, end = self._resident, time.monotonic() + _TRIAL
+        told = resident.state
+        while not choice.outcome.wait(_STATE_POLL_PERIOD):
+            state, why = resident.state, resident.why
+            if state.drives and not told.drives:
+                resident.send(Progress(number, "the trials go on"))
+            elif state is not told and state in _ONCE and not choice.result:
+                text = f"{state.value}: {why.rstrip('.')}. The trials go on once {_ONCE[state]}"
+                resident.send(Progress(number, text))
+            told = state
+            if time.monotonic() > end:
+                raise RequestRefused("the trial did not end in a day")
 
     def _made(self, version: Version, ask: Ask) -> Choice:
         resident, digest = self._resident, version.digest

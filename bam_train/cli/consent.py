@@ -15,6 +15,7 @@ from bam_envs.core.robot import RobotSpec
 from bam_envs.core.wording import listed
 from bam_envs.live.inspection import Inspection
 from bam_envs.safety.guard import is_base
+from bam_train.agent.agent_states import State
 from bam_train.checkpoint import Checkpoint
 from bam_train.cli.console import say
 from bam_train.deploy.checkpoint_admission import has_real_robot
@@ -152,6 +153,19 @@ def guards_of(env: Any) -> dict[str, dict[str, Any]]:
     """The counts of the guards of an environment's live robot, by name; empty for a simulated one."""
     report = getattr(getattr(env.unwrapped, "robot", None), "report", None)
     return {} if report is None else dict(report())
+
+
+def say_agent_rests(env: Any, who: str, url: str | None) -> None:
+    """Say so if the live agent at `url`, which got its robot back from the closed `env`, rests until it is resumed.
+
+    Args:
+        env: The environment.
+        who: The program that drove.
+        url: Address of the agent, if the robot has one.
+    """
+    state = getattr(getattr(env.unwrapped, "robot", None), "agent_state", "")
+    if state in (State.PAUSED.value, State.STOPPED.value):
+        say(f"{who}: the live agent is {state} now; its policy drives again after: bam-agent resume {url}")
 
 
 def plan_lines(env: Any, env_id: str, address: str, episodes: int, *, wiggle: bool = False) -> list[str]:

@@ -155,7 +155,7 @@ def _run(
     seed: int,
 ) -> int:
     """Run the deployment and report it, also after a signal; returns the exit status."""
-    from bam_train.cli.consent import guards_of
+    from bam_train.cli.consent import guards_of, say_agent_rests
     from bam_train.cli.deploy_display import PlainDisplay, live_display
     from bam_train.deploy.journal import DeployReport
 
@@ -175,6 +175,7 @@ def _run(
         for warning in report.warnings():
             say(f"bam-deploy: warning: {warning}")
         tell(*([json_module.dumps(report.to_json(), allow_nan=False)] if config.json else report.lines()))
+        say_agent_rests(env, "bam-deploy", place.robot)
         _add_to_data_set(config, checkpoint, env, deployment.recorder)
     return ending.status
 

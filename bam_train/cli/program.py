@@ -205,7 +205,9 @@ def usage_error(box: str, config: type[Any]) -> str:
     if match := re.search(r"invalid choice '(.*?)' for argument '(\S+)'\. Expected one of \((.*?)\)", text):
         found, flag, choices = match.groups()
         names = sorted({*re.findall(r"'(.*?)'", choices)} - {"None"})  # tyro does not keep their order
-        return f"{flag}: expected {', '.join(names[:-1])} or {names[-1]}, found {found!r}."
+        close = closest(found, names)
+        end = f", did you mean {close}?" if close else "."
+        return f"{flag}: expected {', '.join(names[:-1])} or {names[-1]}, found {found!r}{end}"
     if match := re.search(r"Missing value for argument '(\S+)'", text):
         return f"{match[1]} needs a value." if match[1].startswith("--") else f"{match[1].upper()} is missing."
     if match := re.search(r"Missing from [^:]*: (.*)", text):

@@ -12,7 +12,7 @@ from collections.abc import Callable
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
-from bam_train.cli.console import can_draw, count, tell
+from bam_train.cli.console import can_draw, count, say, tell
 from bam_train.cli.program import run_program
 from bam_train.signals import before_quitting, handled
 
@@ -41,7 +41,7 @@ def train(config: TrainConfig) -> int:
     given = merge(file, read_assignments(config.set), flags)
     if config.learner is not None:
         return _learn(config, config.learner, given, checkpoint)
-    settings = resolve(given) if checkpoint is None else resolve_resumed(given, checkpoint)
+    settings = resolve(given, say) if checkpoint is None else resolve_resumed(given, checkpoint, say)
     if config.print_config:
         tell(*json.dumps(settings.to_mapping(), indent=2).split("\n"))
         return 0
@@ -110,7 +110,6 @@ def _train(config: TrainConfig, settings: TrainSettings, checkpoint: Checkpoint 
 
 def _learn(config: TrainConfig, url: str, given: dict[str, Any], checkpoint: Checkpoint | None) -> int:
     """Learn from a live agent; returns the exit status."""
-    from bam_train.cli.console import say
     from bam_train.cli.experiment import signals_ask
     from bam_train.trainers.live.live_run import learn
 

@@ -1,7 +1,7 @@
 """Complete settings from those that a user gives: with presets for new runs, and a checkpoint's for resumed ones."""
 
 import contextlib
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
@@ -35,6 +35,8 @@ OF_RLLIB = ("num_env_runners", "num_learners", "num_gpus", "address")
 OFFLINE_STEPS = 20_000
 """Updates of a run on a data set without a preset; of an algorithm of d3rlpy, some minutes of CPU time."""
 
+Tell = Callable[[str], None]
+
 NOWHERE: dict[str, Any] = {"transport": [], "ca_file": None, "token_file": None, "address": None}
 """Settings of the place of a run, with their values for this computer."""
 
@@ -46,8 +48,10 @@ def read_preset(env: str, algo: str, trainer: str = "sb3") -> dict[str, Any]:
     return parse_config(path.name, path.read_text(encoding="utf-8")) if path.is_file() else {}
 
 
-def resolve(given: Mapping[str, Any]) -> TrainSettings:
+def resolve(given: Mapping[str, Any], tell: Tell = lambda text: None) -> TrainSettings:
     """Complete settings of a new run: the trainer's defaults, overridden by the preset, overridden by `given`.
+
+    `tell` gets a line before a library is imported for that, which takes seconds.
 
     Raises UnknownName for an unknown environment, SettingsError for any other setting that is unknown or does not fit.
     """
@@ -72,7 +76,7 @@ def resolve(given: Mapping[str, Any]) -> TrainSettings:
             "give its arguments to bam-serve there"
         )
     _require_checkpoints(settings)
-    completed = _complete(settings)
+    completed = _complete(settings, tell)
     if given.get("num_envs", completed.num_envs) != completed.num_envs:
         there = f"there are {completed.num_envs} at {settings.place.text}"
         raise SettingsError(f"num_envs: {settings.num_envs} were asked for, and {there}; leave it out")
@@ -134,7 +138,7 @@ def _require_of_trainer(settings: TrainSettings) -> None:
         raise SettingsError(f"teacher: {settings.algo} has none; leave it out, or give --algo dagger")
 
 
-def _complete(settings: TrainSettings) -> TrainSettings:
+def _complete(settings: TrainSettings, tell: Tell) -> TrainSettings:
     """Check settings and add the trainer's defaults, as far as possible without its library, which takes seconds."""
     try:
         if settings.trainer == "sb3":
@@ -143,6 +147,7 @@ def _complete(settings: TrainSettings) -> TrainSettings:
             require_plausible(RLLIB_ALGORITHMS[settings.algo], settings.hyperparameters)
     except ModuleNotFoundError as error:
         raise MissingExtra(str(error.name), EXTRAS[settings.trainer], f"The {settings.trainer} trainer") from error
+    tell(f"{settings.algo} on {settings.env}: the {settings.trainer} trainer is loaded, which takes a few seconds")
     return load_trainer(settings.trainer).complete(settings)
 
 
@@ -160,7 +165,7 @@ def own_settings(checkpoint: Checkpoint, env: str | None = None, *, elsewhere: b
     return settings
 
 
-def resolve_resumed(given: Mapping[str, Any], checkpoint: Checkpoint) -> TrainSettings:
+def resolve_resumed(given: Mapping[str, Any], checkpoint: Checkpoint, tell: Tell = lambda text: None) -> TrainSettings:
     """Complete settings of a run that continues from a checkpoint, of which `given` changes some.
 
     Raises CheckpointMismatch for a setting that may not change, SettingsError if the run has all its steps already.
@@ -198,7 +203,7 @@ def resolve_resumed(given: Mapping[str, Any], checkpoint: Checkpoint) -> TrainSe
     fixed = [row for row in differences(asked, own) if row[0] not in CHANGEABLE]
     _require_same([row for row in fixed if row[2] is not None], checkpoint)
     _require_of_trainer(settings)
-    completed = _complete(settings)  # refuses names that the algorithm does not have
+    completed = _complete(settings, tell)  # refuses names that the algorithm does not have
     _require_same(fixed, checkpoint)
     done = checkpoint.manifest.steps
     if done >= completed.steps:

@@ -35,6 +35,8 @@ SAVE_SHARE = 0.02
 """Maximum share of the time for saving: a large replay buffer is saved less often."""
 RECORD_EVERY = 0.1
 """Minimum seconds between two training records."""
+LEARNT_FOR, LEARNT_SHARE = 3.0, 0.01
+"""Seconds, and share of the steps, of learning on which an estimate of the time left rests at least."""
 
 
 class Watcher(Protocol):
@@ -111,6 +113,7 @@ class TrainingRun:
         self._start = self._recorded = self._saved = clock()
         self._first_step = trainer.steps
         self._save_pause = FIRST_SAVE
+        self._learning_from: tuple[int, float] | None = None  # steps and time when the trainer had first learnt
         self._stop, self._reached = False, ""
         self._evaluated_at = trainer.steps if best else 0
         self._scores: Scores = {}  # the newest evaluation
@@ -240,11 +243,25 @@ class TrainingRun:
         if self._first_return is None and self._first_step == 0:
             self._first_return = statistics.return_mean
         rate = (progress.steps - self._first_step) / max(now - self._start, 1e-9)
-        left = (progress.total - progress.steps) / rate if rate > 0 else None
+        if statistics.metrics and self._learning_from is None:
+            self._learning_from = progress.steps, now
+        left = self._time_left(progress, now)
         figures = asdict(statistics)
         metrics = figures.pop("metrics")
         self._add("training", progress.steps, {"steps_per_second": round(rate, 1), **figures, **metrics})
         self.watcher.training(progress, statistics, rate, left)
+
+    def _time_left(self, progress: Progress, now: float) -> float | None:
+        """The longest time that the run may still take [s], at its speed since it has learnt; None if that is new.
+
+        Steps are quick before the first update, while a replay buffer fills.
+        """
+        if self._learning_from is None:
+            return None
+        steps, seconds = progress.steps - self._learning_from[0], now - self._learning_from[1]
+        if seconds < LEARNT_FOR - 1e-9 or steps < LEARNT_SHARE * progress.total:
+            return None
+        return (progress.total - progress.steps) * seconds / steps
 
     def _evaluate(self) -> None:
         """Evaluate the frozen policy, and keep it if it is the best, or if evaluations choose nothing."""

@@ -25,7 +25,8 @@ class AskConfig:
         tyro.conf.Positional[Literal["status", "pause", "resume", "versions", "stop"]],
         tyro.conf.arg(metavar="status|pause|resume|versions|stop"),
     ]
-    """status and versions change nothing; stop halts the robot at once, and pauses the agent."""
+    """status and versions change nothing; stop halts the robot at once, and pauses the agent, whose program goes on
+    running: Ctrl-C in its terminal ends it."""
     url: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="URL")]
     """Address of the agent, such as ws://robot:9095 (wss:// with TLS)."""
     token_file: File = None
@@ -44,9 +45,9 @@ class AskConfig:
 class PushConfig:
     """Push a checkpoint to a live agent, which checks it and tries it as the candidate; or roll back.
 
-    Exit status: 0 done, 1 the agent cannot be reached, or failed, 2 wrong usage, 3 the agent refuses the candidate or
-    the request, or --gate does not let it through, 5 with --wait: the candidate was rolled back, or replaced before its
-    trials were done.
+    Exit status: 0 done, 1 the file is no whole checkpoint, the agent cannot be reached, or failed, 2 wrong usage, 3 the
+    agent refuses the candidate or the request, or --gate does not let it through, 5 with --wait: the candidate was
+    rolled back, or replaced before its trials were done.
 
     Examples:
       bam-push pick-2.zip ws://127.0.0.1:9095 --wait

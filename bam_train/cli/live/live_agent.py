@@ -13,6 +13,8 @@ from bam_train.cli.program import run_program
 from bam_train.signals import SignalMemory
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from bam_train.agent.remote.agent_client import AgentClient
     from bam_train.cli.flags import AgentConfig
     from bam_train.cli.live.agent_flags import AskConfig, PushConfig
@@ -35,7 +37,10 @@ def ask_agent(config: AskConfig, signals: SignalMemory) -> None:
 
     found = with_agent(config, config.url, ask)
     if not config.json:
-        tell(*(_versions(found) if config.action == "versions" else status_lines(found)))
+        lines = [*(_versions(found) if config.action == "versions" else status_lines(found))]
+        if config.action == "stop":
+            lines.insert(1, "  program   goes on running; Ctrl-C in its terminal ends it")
+        tell(*lines)
 
 
 def _rest(agent: AgentClient) -> dict[str, Any]:
@@ -48,14 +53,25 @@ def _rest(agent: AgentClient) -> dict[str, Any]:
         time.sleep(0.05)
 
 
-def with_agent(config: AskConfig | PushConfig, url: str, do: Callable[[AgentClient], dict[str, Any]]) -> dict[str, Any]:
-    """Call `do` with a connected client; with --json, print its result, or the error, as one JSON object."""
+def with_agent(
+    config: AskConfig | PushConfig,
+    url: str,
+    do: Callable[[AgentClient], dict[str, Any]],
+    checkpoints: Sequence[Path] = (),
+) -> dict[str, Any]:
+    """Call `do` with a connected client; with --json, print its result, or the error, as one JSON object.
+
+    The `checkpoints` are opened first: one that is missing or damaged is refused before anybody is asked.
+    """
     from bam_envs.core.errors import BamEnvsError
     from bam_train.agent.remote.agent_client import AgentClient
+    from bam_train.checkpoint import Checkpoint
     from bam_train.errors import AgentRefused, BamTrainError
 
     nothing = {"state": None, "active": None, "owner": None}
     try:
+        for path in checkpoints:
+            Checkpoint.open(path)
         files: dict[str, Any] = {"token_file": config.token_file, "ca_file": config.ca_file}
         with AgentClient(url, timeout=config.timeout, **files) as agent:
             result = {**nothing, **do(agent)}

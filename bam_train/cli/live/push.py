@@ -32,7 +32,7 @@ def push(config: PushConfig, signals: SignalMemory) -> int:
         result = agent.push(path, **choice, progress=_progress)
         return {**result, **agent.ask("status")}
 
-    result = with_agent(config, url, do)
+    result = with_agent(config, url, do, [one for one in (path, config.gate) if one is not None])
     outcome = str(result.get("outcome") or "")
     if not config.json:
         digest = result.get("digest")

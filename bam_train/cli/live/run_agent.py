@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import replace
@@ -37,8 +38,15 @@ def run_agent(config: AgentConfig, signals: SignalMemory) -> int:
     options = _options(config)
     tell = begin_log("bam-agent")
     with ExitStack() as stack:
+        made = options.folder / "versions"
+        is_new = not made.exists()
+        while not made.parent.exists():
+            made = made.parent
         versions = Versions(options.folder / "versions")
         stack.enter_context(versions.held())
+        refused = stack.enter_context(ExitStack())  # a start that is refused leaves nothing behind
+        if is_new:
+            refused.callback(shutil.rmtree, made)
         ran_before = (options.folder / "audit.jsonl").exists()
         if config.policy is not None:
             environment_of(Checkpoint.open(config.policy.expanduser()), config.env)  # before it becomes the champion
@@ -71,6 +79,7 @@ def run_agent(config: AgentConfig, signals: SignalMemory) -> int:
         )
         stack.callback(front.close)
         front.start()
+        refused.pop_all()
         begun = f"bam-agent {version('bam-train')} (process {os.getpid()}) at {options.robot}"
         audit.write("started", begun, who="the agent", digest=active.digest)
         stack.callback(audit.write, "ended", f"process {os.getpid()}", who="the agent")

@@ -40,6 +40,7 @@ def play(config: PlayConfig, signals: SignalMemory) -> int:
 
     from bam_envs.core.errors import BamEnvsError
     from bam_train.checkpoint import Checkpoint
+    from bam_train.cli.consent import say_agent_rests
     from bam_train.cli.play.gamepad import Gamepad
     from bam_train.deploy.deployment import ending_of
     from bam_train.play.hands import hand_for
@@ -71,6 +72,7 @@ def play(config: PlayConfig, signals: SignalMemory) -> int:
         if config.record is not None and hasattr(env, "discard"):
             env.discard()  # what is not whole
         env.close()
+        say_agent_rests(env, "bam-play", place.robot)
     recorded = f", recorded in {config.record}" if config.record is not None else ""
     tell(f"{session.episodes} episode{'' if session.episodes == 1 else 's'}, {session.successes} succeeded{recorded}")
     if config.record is not None:

@@ -123,6 +123,8 @@ class RosbridgeRobot:
         self._halt_failed = False  # and the failure was reported
         self._commanded = False  # since `connect`
         self._take_over: TakeOver | None = None  # of a robot that a live agent drives
+        self.agent_state = ""
+        """The state of that agent once the robot was handed back, such as ``"paused"``; "" if it is unknown."""
         self._session_over = False  # as the robot's side reported
         self._refusals: list[BamEnvsError] = []
         self._status = ""  # of this tick, as JSON
@@ -517,7 +519,7 @@ class RosbridgeRobot:
         if self._commanded:  # a client that only reads must not stop the robot of another one
             self.halt()
         if self._take_over is not None:
-            self._take_over.hand_back()
+            self.agent_state = self._take_over.hand_back()
             self._take_over = None
         self._session.leave()
         control, halting = self._control, self._halting

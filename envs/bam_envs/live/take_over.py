@@ -73,13 +73,18 @@ class TakeOver:
             self._link.publish_soon(self._link.namespace + AGENT_STEP_TOPIC, {"data": json.dumps(row)})
         self._step += 1
 
-    def hand_back(self) -> None:
-        """End the lease, if this client has it. Never raises; the agent ends it by itself when the link is cut."""
+    def hand_back(self) -> str:
+        """End the lease, if this client has it, and return the agent's state then; "" if it is unknown.
+
+        Never raises; the agent ends the lease by itself when the link is cut.
+        """
+        state = ""
         if self.taken and self._link.is_up:
             with suppress(BamEnvsError):
-                self._call("hand_back")
+                state = str(self._call("hand_back").get("state", ""))
         self.taken = False
         self._rpc.close()
+        return state
 
     def _call(self, do: str) -> dict[str, Any]:
         return self._rpc.call({"do": do, "who": person()}, _ANSWER)

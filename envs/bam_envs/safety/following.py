@@ -34,6 +34,8 @@ STUCK, STUCK_TIME = 0.002, 2.0
 """An arm none of whose joints moves by so much [rad] for so long [s], although its commands go on, is stopped."""
 SLOWEST_GAIN, GAIN_TIME = 0.25, 0.2
 """Least acceleration of a base that follows [m/s^2, rad/s^2], and the time over which it is measured [s]."""
+LATE = 1.5
+"""Periods after the last command from which a command is called late in a message."""
 LIKELY = (
     "look for a protective stop, a paused program, an inactive controller, a low speed slider, or something in its way"
 )
@@ -76,6 +78,15 @@ class Following(Guard):
             low, high = min(commands), max(commands)
             off[at] = low - value if value < low else high - value if value > high else 0.0  # NaN: it is not measured
         return off
+
+    def busy(self, tick: Tick) -> str:
+        """What else a gap can be, as the end of a message: an old state, or a late command; empty if neither was so."""
+        period, what = self._spec.period, ""
+        if tick.age > period:
+            what = f"the newest state was {tick.age:.2f} s old"
+        elif tick.pause > LATE * period:
+            what = f"the last command was sent {tick.pause:.2f} s ago"
+        return what and f"; {what}: this computer or the link is busy"
 
     def is_struck(self, over: bool, *, at_once: bool = False) -> bool:
         """Count a tick whose gap is `over` the limit; after `STRIKES` of them, or `at_once`, the robot is stopped."""
@@ -155,12 +166,12 @@ class JointFollowing(Following):
         if away:
             return (
                 f"{self._labels[at]} moved {moved:+.3f} rad within a period, away from its commands: what moves is not "
-                f"what was commanded, or something pushes the arm"
+                f"what was commanded, or something pushes the arm{self.busy(tick)}"
             )
         return (
             f"{self._labels[at]} does not follow its commands: it is {measured[at] - sent[at]:+.3f} rad from the last "
             f"one, and beyond a lag of {self._lag:g} s it may be {allowed[at]:.3f} rad, and the tool "
-            f"{SHARE * self._tool_reach:.3f} m: {LIKELY}"
+            f"{SHARE * self._tool_reach:.3f} m: {LIKELY}{self.busy(tick)}"
         )
 
     def hold(self, tick: Tick) -> Numbers:
@@ -269,7 +280,7 @@ class BaseFollowing(Following):
         return (
             f"the base does not follow its commands: it goes at {measured[at]:.3f} {self.unit}, and was sent "
             f"{sent[at]:.3f} {self.unit}; beyond a lag of {self._lag:g} s it may be off by {self._allowed[at]:.3f} "
-            f"{self.unit}: {LIKELY}"
+            f"{self.unit}: {LIKELY}{self.busy(tick)}"
         )
 
     def _is_gaining(self, at: int, sent: float, measured: Numbers) -> bool:

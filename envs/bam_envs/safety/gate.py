@@ -264,6 +264,11 @@ class SafeRobot(metaclass=Sealed):
         """The robot's description of itself, or None."""
         return getattr(self._robot, "info", None)
 
+    @property
+    def agent_state(self) -> str:
+        """The state of a live agent once its robot was handed back, such as ``"paused"``; "" if it is unknown."""
+        return getattr(self._live, "agent_state", "")
+
     def not_ready(self) -> str | None:
         """Why a live robot reports that it cannot move now, or None. May call its services: only at rest."""
         why: str | None = getattr(self._live, "not_ready", lambda: None)()

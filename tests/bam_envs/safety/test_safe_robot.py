@@ -640,16 +640,26 @@ def test_a_live_arm_that_is_there_is_sent_nothing():
     assert len(arm.sent) == count
 
 
-def test_a_joint_that_is_blocked_on_the_way_to_the_start_stops_the_arm():
+@pytest.mark.parametrize(
+    ("old", "late", "else_"),
+    [
+        (0.05, 0.0, ""),
+        (0.06, 0.0, "; the newest state was 0.06 s old: this computer or the link is busy"),
+        (0.05, 0.03, "; the last command was sent 0.08 s ago: this computer or the link is busy"),
+    ],
+)
+def test_a_joint_that_is_blocked_on_the_way_to_the_start_stops_the_arm(old, late, else_):
     arm, robot, _ = live()
-    arm.stuck = 1
+    arm.stuck, arm.old, arm.during = 1, old, lambda: setattr(arm, "now", arm.now + late)
     halts, count = arm.halts, len(arm.sent)
     with pytest.raises(SafetyStop) as caught:
         robot.reset(np.arange(1), start_at(ARM_HOME + 0.2))
     assert caught.value.guard == "following"
-    assert str(caught.value).startswith(
+    assert str(caught.value) == (
         "The robot was stopped by following (G23): shoulder_lift_joint does not follow its commands: it is -0.012 rad "
         "from the last one, and beyond a lag of 0 s it may be 0.009 rad, and the tool 0.009 m: look for a protective "
+        "stop, a paused program, an inactive controller, a low speed slider, or something in its way"
+        f"{else_}. When it is safe, call resume()."
     )
     assert arm.halts > halts + 1
     assert np.abs(np.array(arm.sent[count:])[:, 0, 1] - ARM_HOME[1]).max() <= 0.0125 + 1e-9

@@ -10,6 +10,7 @@ from bam_train.cli.live import push
 from bam_train.errors import RequestRefused
 
 DIGEST = "3f2a91c0d7aa" + 52 * "0"
+PICK = Path(__file__).parents[3] / "checkpoints" / "pick-ppo.zip"
 STATUS = {
     "state": "trial",
     "why": "push by anna@laptop",
@@ -82,13 +83,6 @@ def run(capsys, tmp_path, server):
     return run
 
 
-@pytest.fixture
-def checkpoint(tmp_path):
-    path = tmp_path / "pick.zip"
-    path.write_bytes(b"a checkpoint")
-    return path
-
-
 def test_status(hub, server, run):
     status, out, _ = run(agent.main, "status", server.url, token="w")
     lines = out.splitlines()
@@ -107,6 +101,8 @@ def test_pause_and_stop(hub, server, run):
     status, out, _ = run(agent.main, "stop", server.url, "--why", "smoke", "--json", token="w")
     assert (status, json.loads(out)["state"]) == (0, "paused")
     assert [why for _, why in hub.stops] == ["smoke"]
+    lines = run(agent.main, "stop", server.url, token="w")[1].splitlines()
+    assert (lines[0].split()[0], lines[1]) == ("paused", "  program   goes on running; Ctrl-C in its terminal ends it")
 
 
 def test_versions(hub, server, run):
@@ -137,9 +133,9 @@ def test_no_agent_has_status_1(server, run):
     assert run(agent.main, "status", url) == (1, "", f"bam-agent: {url}: {text}\n")
 
 
-def test_push(hub, server, run, checkpoint):
+def test_push(hub, server, run):
     given = ("--stage", "trial", "--when", "tick", "--why", "better")
-    status, out, err = run(push.main, checkpoint, server.url, *given)
+    status, out, err = run(push.main, PICK, server.url, *given)
     assert (status, err) == (0, "bam-push: checking\n")
     lines = out.splitlines()
     assert lines[:2] == ["3f2a91c0d7aa: accepted", "  signed by alice"]
@@ -148,14 +144,14 @@ def test_push(hub, server, run, checkpoint):
     assert not Path(arguments.pop("path")).exists()
     del arguments["sha256"]
     assert arguments == {
-        "size": 12,
+        "size": PICK.stat().st_size,
         "stage": "trial",
         "when": "tick",
         "wait": False,
-        "file": "pick.zip",
+        "file": "pick-ppo.zip",
         "why": "better",
     }
-    status, out, _ = run(push.main, checkpoint, server.url, "--json")
+    status, out, _ = run(push.main, PICK, server.url, "--json")
     assert (status, json.loads(out)["active"]) == (0, DIGEST)
 
 
@@ -163,13 +159,33 @@ def test_push(hub, server, run, checkpoint):
     ("outcome", "status"),
     [("promoted: 30 of 30", 0), ("rolled back: a guard stopped it twice", 5), ("replaced: another version acts", 5)],
 )
-def test_push_that_waits(hub, server, run, checkpoint, outcome, status):
+def test_push_that_waits(hub, server, run, outcome, status):
     hub.outcome = outcome
-    code, out, err = run(push.main, checkpoint, server.url, "--wait")
+    code, out, err = run(push.main, PICK, server.url, "--wait")
     assert (code, out.splitlines()[0]) == (status, f"3f2a91c0d7aa: {outcome}")
     assert out.splitlines()[2].startswith("running for ")  # what it led to, not the trial that is over
     assert err.splitlines()[1:] == ([f"bam-push: {outcome}"] if status else [])
     assert hub.asked[0][1]["wait"] is True
+
+
+@pytest.mark.parametrize(
+    ("content", "kind", "text"),
+    [
+        (None, "NotACheckpoint", "no such file. Train one with bam-train, or check the name"),
+        (PICK.read_bytes()[:-100], "NotACheckpoint", "not a whole zip file: truncated, altered or something else"),
+    ],
+    ids=["missing", "truncated"],
+)
+def test_what_is_no_checkpoint_is_refused_before_anybody_is_asked(run, tmp_path, content, kind, text):
+    path = tmp_path / "next.zip"
+    if content is not None:
+        path.write_bytes(content)
+    for given in ([path], [PICK, "--gate", path]):
+        status, out, err = run(push.main, given[0], "ws://127.0.0.1:1", *given[1:])
+        assert (status, out) == (1, "")
+        assert err.startswith(f"bam-push: {path}: {text}")
+    status, out, _ = run(push.main, path, "ws://127.0.0.1:1", "--json")
+    assert (status, json.loads(out)["kind"]) == (1, kind)
 
 
 def test_roll_back(hub, server, run):
@@ -196,9 +212,28 @@ def test_wrong_usage_has_status_2(run, arguments, text):
     assert run(push.main, *arguments) == (2, "", f"bam-push: {text}. Run bam-push --help\n")
 
 
-def test_an_unknown_action_has_status_2(run):
-    text = "action: expected pause, resume, status, stop or versions, found 'halt'"
-    assert run(agent.main, "halt", "ws://robot") == (2, "", f"bam-agent: {text}. Run bam-agent --help\n")
+@pytest.mark.parametrize(
+    ("flags", "text"),
+    [
+        (["--policy", "nope.zip"], "nope.zip: no such file."),
+        ([], "has no version yet; give a checkpoint with --policy"),
+        (["--policy", PICK, "--env", "bam/reach"], "was trained on bam/pick-v0"),
+        (["--policy", PICK, "--bind", "192.0.2.1"], "192.0.2.1"),
+    ],
+)
+def test_a_refused_start_leaves_nothing(run, tmp_path, monkeypatch, flags, text):
+    (tmp_path / "here").mkdir()
+    monkeypatch.chdir(tmp_path / "here")
+    status, out, err = run(agent.main, *flags, "--folder", "lab/agent")
+    assert (status, out) == (1, "")
+    assert text in err
+    assert [*Path().iterdir()] == []
+
+
+@pytest.mark.parametrize(("action", "end"), [("halt", "."), ("staus", ", did you mean status?")])
+def test_an_unknown_action_has_status_2(run, action, end):
+    text = f"action: expected pause, resume, status, stop or versions, found '{action}'{end}"
+    assert run(agent.main, action, "ws://robot") == (2, "", f"bam-agent: {text} Run bam-agent --help\n")
 
 
 def test_help_names_the_exit_statuses(capsys):

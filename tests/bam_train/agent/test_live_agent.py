@@ -19,6 +19,7 @@ import bam_envs  # noqa: F401 - registers the environments
 from bam_envs.core.errors import NotInCommand, RobotFault
 from bam_train.agent.remote.agent_client import AgentClient
 from bam_train.checkpoint import GOLDEN, POLICY, Checkpoint, safetensors_file
+from bam_train.cli.deploy import main as deploy
 from bam_train.errors import AgentRefused
 from bam_train.policy import FrozenPolicy
 from bam_train.recording.recording import Recording
@@ -168,6 +169,15 @@ def test_a_program_takes_over_and_hands_back(running):
     assert (status["owner"], status["why"].split(" by ")[0]) == (None, "handed back")
     running.run()
     assert running.state()["stage"] == "full"
+
+
+def test_bam_deploy_says_that_the_agent_rests_after_it(running, capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(SystemExit):
+        deploy([str(PICK), "--robot", running.url, "--episodes", "1", "--no-record"])
+    state = running.state()["state"]  # "paused", unless a guard stopped it on a busy computer
+    text = f"the live agent is {state} now; its policy drives again after: bam-agent resume {running.url}"
+    assert capsys.readouterr().err.splitlines()[-1] == f"bam-deploy: {text}"
 
 
 def test_a_stop_ends_the_driving_of_a_program(running):

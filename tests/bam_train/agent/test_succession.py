@@ -6,8 +6,9 @@ from types import SimpleNamespace
 
 import pytest
 
-from bam_train.agent.agent_messages import Ask
+from bam_train.agent.agent_messages import Ask, Progress
 from bam_train.agent.agent_options import AgentOptions
+from bam_train.agent.agent_states import State
 from bam_train.agent.succession import Succession
 from bam_train.agent.versions import Versions
 from bam_train.checkpoint import Checkpoint
@@ -29,7 +30,7 @@ class Agent:
         interface = interface_of(make_env(env))
         self.session = SimpleNamespace(env_id=env, env_kwargs={}, interface=interface, is_real=False, identity="")
         self.succession, self.sent, self.notes = Succession(self, versions), [], []
-        self.answered = threading.Event()
+        self.answered, self.state, self.why = threading.Event(), State.TRIAL, ""
 
     def send(self, message):
         self.sent.append(message)
@@ -116,6 +117,28 @@ def test_a_candidate_that_fails_is_rolled_back(agent, better):
     assert agent.succession.names == {"champion": old, "given": old}
     why = "0 of 3 episodes succeeded, which shows less than 90 % (error probability at most 5 %)"
     assert choice.result == f"rolled back: {why}"
+
+
+def test_who_waits_for_the_trials_is_told_why_they_rest(agent, better, until):
+    def tell(state, why, text):
+        agent.state, agent.why = state, why
+        until(lambda: agent.sent[-1] == Progress(1, text))
+
+    agent.succession.begin(Ask(1, "push", {"path": str(better), "wait": True}, "anna", "10.0.0.7"))
+    tell(State.TRIAL, "push by anna", "acts as the candidate; its trials decide")
+    why = "The robot was stopped by following (G23): the elbow is away. When it is safe, resume the agent."
+    resume = "The trials go on once somebody resumes the agent: bam-agent resume"
+    tell(State.STOPPED, why, f"stopped by a guard: {why} {resume}")
+    tell(State.TRIAL, "resumed by bob", "the trials go on")
+    tell(State.PAUSED, "paused by bob", f"paused: paused by bob. {resume}")
+    text = "waiting for the robot: no state came. The trials go on once the robot is there again"
+    tell(State.WAITING, "no state came.", text)
+    text = "taken over: taken over by bob. The trials go on once the robot is handed back and the agent runs"
+    tell(State.TAKEN_OVER, "taken over by bob", text)
+    agent.state = State.TRIAL
+    agent.succession.choice.close("promoted: 33 of 33")
+    assert agent.answered.wait(60)
+    assert agent.sent[-1].result["outcome"] == "promoted: 33 of 33"
 
 
 def test_an_episode_that_the_computer_cut_short_does_not_count(agent, better):
