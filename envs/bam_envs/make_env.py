@@ -28,7 +28,7 @@ def make_env(
     randomize: bool = False,
     link: Any = None,
     action_delay: Any = None,
-    robot: str | None = None,
+    robot: str | Any | None = None,
     transport: str | None = None,
     profile: str | None = None,
     guards: Mapping[str, float] | None = None,
@@ -51,7 +51,8 @@ def make_env(
         action_delay: Steps by which the actions of a simulation are late, or the least and the greatest number of
             them, drawn for each episode.
         robot: Address of a live robot behind rosbridge, such as ``"ws://10.0.0.5:9090"``, instead of the simulated one.
-            The task runs in this process. A path in the address is the namespace of the robot's topics.
+            The task runs in this process. A path in the address is the namespace of the robot's topics. Or a connected
+            `roslibpy.Ros` of the asyncio transport; see `live_robot`.
         transport: Address of a whole environment that runs elsewhere, such as ``"ws://10.0.0.5:9090/bam_001"`` or
             ``"tcp://10.0.0.5:9091"``; then this process has no robot and no task.
         profile: Profile of the live robot: a shipped name or a file; by default that of the simulated robot.
@@ -151,7 +152,7 @@ def _late(action_delay: Any, task: Task) -> Task:
 
 
 def _check_place(
-    robot: str | None,
+    robot: str | Any | None,
     transport: object,
     timeout: float | None,
     render_mode: str | None,

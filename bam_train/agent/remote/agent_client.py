@@ -10,6 +10,7 @@ import getpass
 import hashlib
 import itertools
 import json
+import logging
 import math
 import re
 import socket
@@ -22,14 +23,14 @@ from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
-from websockets.asyncio.client import ClientConnection
-from websockets.exceptions import ConnectionClosed, InvalidStatus
+from websockets.asyncio.client import ClientConnection, connect
+from websockets.exceptions import ConnectionClosed, InvalidStatus, WebSocketException
 
 from bam_envs import __version__
 from bam_envs.core.errors import BamEnvsError, LinkLost, NoServer
 from bam_envs.core.wording import brief
 from bam_envs.rosbridge.bus import tell
-from bam_envs.rosbridge.client_connection import open_socket
+from bam_envs.rosbridge.dialing import http_refusal, no_connection, open_port, silent
 from bam_envs.rosbridge.endpoint import Endpoint
 from bam_envs.rosbridge.threads import LoopThread
 from bam_train.agent.remote.agent_protocol import CHUNK, PATH, PROTOCOL, Stage, When
@@ -50,9 +51,12 @@ REFUSED = 3
 _LARGEST = 64 * 2**20
 _PATIENCE = 1.0  # time after which a silent server is asked whether it is one of rosbridge [s]
 _PING, _PONG = 5.0, 20.0  # time between two pings, and longest time for their answer [s]
+_CLOSE = 1.0  # longest time for a closing handshake [s]
 _LOOK = 0.5  # time between two looks whether the connection has ended [s]
 _IS_IT_ROSBRIDGE = '{"op": "call_service", "service": "/rosapi/get_time", "id": "agent?"}'
 
+_QUIET = logging.getLogger(f"{__name__}.websockets")
+_QUIET.setLevel(logging.CRITICAL)  # a client itself reports in one line why it ended or did not connect
 T = TypeVar("T")
 Event = Mapping[str, Any]
 Progress = Callable[[str], None]
@@ -241,7 +245,7 @@ class AgentClient:
 
     async def _open(self) -> ClientConnection:
         try:
-            socket = await open_socket(self._endpoint, self.timeout, _LARGEST, PATH)
+            socket = await self._open_socket()
         except NoServer as error:
             raise self._better(error) from error.__cause__
         try:
@@ -253,6 +257,37 @@ class AgentClient:
             await socket.close()
             raise NoServer(self.url, problem)
         return socket
+
+    async def _open_socket(self) -> ClientConnection:
+        endpoint, address, timeout = self._endpoint, self._endpoint.address, self.timeout
+        context, deadline = endpoint.tls_context(), time.monotonic() + timeout
+        plain = await open_port(address, timeout)  # and so that websockets uses no proxy
+        try:
+            return await connect(
+                f"{address.url}{PATH}",
+                sock=plain,
+                ssl=context,
+                server_hostname=address.host if context is not None else None,
+                additional_headers={"Authorization": f"Bearer {endpoint.token}"} if endpoint.token else None,
+                compression=None,  # deflate costs more time than a fast network saves
+                open_timeout=deadline - time.monotonic(),
+                close_timeout=_CLOSE,
+                ping_interval=None,
+                max_size=_LARGEST,
+                logger=_QUIET,
+            )
+        except InvalidStatus as error:
+            refusal = http_refusal(error.response.status_code, bytes(error.response.body or b""))
+            raise NoServer(address.url, refusal) from error
+        except TimeoutError as error:
+            raise NoServer(address.url, silent(address, timeout)) from error
+        except OSError as error:
+            raise NoServer(address.url, no_connection(address, error, timeout)) from error
+        except ValueError as error:  # a redirect, which leads to another server than the one that was meant
+            raise NoServer(address.url, f"a web server answers there: {error}. Is it the right port?") from error
+        except WebSocketException as error:
+            text = f"something listens there that is no WebSocket server ({error.__cause__ or error})."
+            raise NoServer(address.url, f"{text} If it has TLS, use wss://.") from error
 
     async def _hello(self, socket: ClientConnection) -> Any:
         first = asyncio.ensure_future(socket.recv())

@@ -14,6 +14,7 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
+from gymnasium.envs.registration import EnvSpec
 from gymnasium.utils import seeding
 from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
@@ -135,6 +136,20 @@ class RobotEnv(_RobotAndTask, gym.Env[Any, Any]):
         self._first = np.zeros(1, dtype=np.int64)
         self._observed: Any = None
         self._tell_step = getattr(robot, "tell_step", None)
+        self._made_by: EnvSpec | None = None
+
+    @property
+    def spec(self) -> EnvSpec | None:
+        """How `gymnasium.make` made it, with the address of a `roslibpy.Ros`, which cannot be copied as wrappers do."""
+        return self._made_by
+
+    @spec.setter
+    def spec(self, spec: EnvSpec | None) -> None:
+        ros: Any = None if spec is None else spec.kwargs.get("robot")
+        if spec is not None and hasattr(ros, "factory"):
+            spec = copy.copy(spec)
+            spec.kwargs = {**spec.kwargs, "robot": ros.factory.url}
+        self._made_by = spec
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Begin an episode; a live robot goes to its start pose slowly."""

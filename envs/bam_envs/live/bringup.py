@@ -20,7 +20,7 @@ from bam_envs.ros.freshness import Tagger, read_tag
 from bam_envs.ros.messages import bare_type, same_type, tag_text
 from bam_envs.ros.profile_tables import Readiness, RobotProfile, Sink
 from bam_envs.rosbridge.bus import Caller, Listener, Message, namespaces_with
-from bam_envs.rosbridge.client import RosbridgeLink
+from bam_envs.rosbridge.ros_bus import RosBus
 from bam_envs.rosbridge.sessions import LEASE_TOPIC, LEAVE, RENEW, SESSION_SERVICE, is_forbidden, read_session
 
 TIMEOUT = 3.0
@@ -42,7 +42,7 @@ _ACTIVE = ("active", "running")
 
 
 def ask(
-    link: RosbridgeLink, service: str, tries: int = _TRIES, *, request: Mapping[str, Any] | None = None
+    link: RosBus, service: str, tries: int = _TRIES, *, request: Mapping[str, Any] | None = None
 ) -> dict[str, Any] | None:
     """Call `service`; None if it does not exist, `LinkLost` if it does not answer.
 
@@ -94,7 +94,7 @@ def tagged_sinks(profile: RobotProfile, mode: str | None) -> tuple[Sink, ...] | 
 class TopicTypes:
     """Asks a server for the types of its topics, if it offers rosapi; waits at most `timeout` [s] for each."""
 
-    def __init__(self, link: RosbridgeLink, profile: RobotProfile, timeout: float) -> None:
+    def __init__(self, link: RosBus, profile: RobotProfile, timeout: float) -> None:
         self._link, self._profile, self._timeout = link, profile, timeout
         self.answers = True
         """Whether the server offers rosapi, as far as is known."""
@@ -146,7 +146,7 @@ class TopicTypes:
         return kind if isinstance(kind, str) else ""
 
 
-def await_first(link: RosbridgeLink, state: LiveState, profile: RobotProfile, timeout: float) -> None:
+def await_first(link: RosBus, state: LiveState, profile: RobotProfile, timeout: float) -> None:
     """Wait until every source has sent a message; `StaleState` names those that are silent after `timeout` [s]."""
     wanted = {source.signal: f"{link.namespace}{source.topic} ({source.type})" for source in state.sources}
     arrived = state.mailbox.wait_for(lambda slots: wanted.keys() <= slots.keys() or not link.is_up, timeout)
@@ -182,7 +182,7 @@ class LiveReadiness:
         self._states: Mapping[str, str] | None = None  # of the controllers, by name
         self._answers = bool(self._controllers)  # whether the server has the service that lists them
 
-    def begin(self, link: RosbridgeLink) -> None:
+    def begin(self, link: RosBus) -> None:
         """Subscribe to the topics, wait briefly for their latched messages, and query the controllers."""
         if not self._begun:  # on a later connection the link subscribes again by itself
             self._begun = True
@@ -231,7 +231,7 @@ class LiveReadiness:
                     return trouble
         return None
 
-    def not_ready(self, link: RosbridgeLink) -> str | None:
+    def not_ready(self, link: RosBus) -> str | None:
         """As `fault`, including the controllers, whose states are queried now."""
         reason = self.fault(moving=False)
         if reason is not None:
@@ -243,7 +243,7 @@ class LiveReadiness:
                 return f"the controller {name} is {state}: ros2 control switch_controllers --activate {name}"
         return None
 
-    def _query(self, link: RosbridgeLink) -> None:
+    def _query(self, link: RosBus) -> None:
         """Query the states of the controllers; a server without that service is not queried again."""
         if not self._answers:
             return
@@ -280,11 +280,11 @@ class DrivingSession:
     def __init__(self) -> None:
         self.tagger = Tagger()
         """Signs messages for the open session; without one, as for robots without sessions, it signs nothing."""
-        self._link: RosbridgeLink | None = None  # of the open session
+        self._link: RosBus | None = None  # of the open session
         self._thread: threading.Thread | None = None
         self._left = threading.Event()
 
-    def open(self, link: RosbridgeLink) -> None:
+    def open(self, link: RosBus) -> None:
         """Leave the session that is open, and open a new one on `link` if the robot's side has sessions."""
         link.advertise(link.namespace + LEASE_TOPIC, "std_msgs/String")
         self.leave()

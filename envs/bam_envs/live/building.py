@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Mapping
 from pathlib import Path
+from typing import Any
 
 from bam_envs.core.errors import InvalidValue
 from bam_envs.core.robot import RobotSpec
@@ -15,7 +16,7 @@ from bam_envs.safety.guard import Limits, ToolPosition, limits_of
 
 
 def live_robot(
-    url: str,
+    url: str | Any,
     spec: RobotSpec | None = None,
     *,
     profile: RobotProfile | str | Path | None = None,
@@ -32,7 +33,9 @@ def live_robot(
     """A live robot behind its guards. Nothing is connected yet.
 
     Args:
-        url: ``ws://host:port`` or ``wss://host:port``, followed by the namespace of its topics, if any.
+        url: ``ws://host:port`` or ``wss://host:port``, followed by the namespace of its topics, if any. Or a connected
+            `roslibpy.Ros` of the asyncio transport: states and commands go over it, halts and images over connections
+            of their own to its server.
         spec: Signals and commands that the task needs; None: all of the profile that are not optional.
         profile: The profile of its topics: a shipped name or a file. None: the shipped one with the commands of `spec`.
         limits: The limits of the guards; None: those of the profile.
@@ -51,10 +54,9 @@ def live_robot(
             command of `spec`; or a limit is outside its bounds, contradicts another one, or changes no guard.
         UnknownName: There is no such profile, command mode or limit.
     """
-    require_robot_address(url)
-    endpoint = Endpoint.with_token_file(url, ca_file=ca_file, token_file=token_file, robot_name=robot_name)
+    endpoint, ros = _server(url, ca_file, token_file, robot_name)
     chosen = _chosen(profile, spec)
-    robot = RosbridgeRobot(endpoint, chosen, spec=spec, command=command)
+    robot = RosbridgeRobot(endpoint, chosen, spec=spec, command=command, ros=ros)
     chosen_limits = limits or profile_limits(chosen)
     if guards is not None:
         chosen_limits = chosen_limits.changed(guards)
@@ -66,7 +68,7 @@ def live_robot(
 
 
 def shadow_robot(
-    url: str,
+    url: str | Any,
     spec: RobotSpec | None = None,
     *,
     profile: RobotProfile | str | Path | None = None,
@@ -76,11 +78,24 @@ def shadow_robot(
     robot_name: str = "",
 ) -> ShadowRobot:
     """A live robot that somebody else drives: its states are read, and nothing is sent. Arguments: see `live_robot`."""
-    require_robot_address(url)
-    endpoint = Endpoint.with_token_file(url, ca_file=ca_file, token_file=token_file, robot_name=robot_name)
+    endpoint, ros = _server(url, ca_file, token_file, robot_name)
     chosen = _chosen(profile, spec)
     limits = profile_limits(chosen).changed({} if guards is None else guards)
-    return ShadowRobot(endpoint, chosen, spec=spec, limits=limits)
+    return ShadowRobot(endpoint, chosen, spec=spec, limits=limits, ros=ros)
+
+
+def _server(
+    robot: str | Any, ca_file: str | None, token_file: str | None, robot_name: str
+) -> tuple[Endpoint, Any | None]:
+    """The server of a robot, by its address or by a `roslibpy.Ros`, and the latter."""
+    if isinstance(robot, str):
+        require_robot_address(robot)
+        return Endpoint.with_token_file(robot, ca_file=ca_file, token_file=token_file, robot_name=robot_name), None
+    if ca_file is not None or token_file is not None:
+        raise InvalidValue("ca_file= and token_file= are for an address; a roslibpy.Ros has made its connection.")
+    from bam_envs.rosbridge.user_ros import endpoint_of
+
+    return endpoint_of(robot, robot_name), robot
 
 
 def _chosen(profile: RobotProfile | str | Path | None, spec: RobotSpec | None) -> RobotProfile:

@@ -23,8 +23,8 @@ from bam_envs.core.errors import BamEnvsError, LinkLost, NotReady
 from bam_envs.live.robot_identity import is_one_robot, robot_identity
 from bam_envs.ros.codec import RobotInfo
 from bam_envs.ros.profile_tables import RobotProfile, Sink
-from bam_envs.rosbridge.client import RosbridgeLink
 from bam_envs.rosbridge.endpoint import Endpoint
+from bam_envs.rosbridge.ros_bus import RosBus
 
 _LOG = logging.getLogger(__name__)
 BOOL = 1
@@ -63,7 +63,7 @@ class Controllers:
         return ""
 
 
-def ask_controllers(link: RosbridgeLink, profile: RobotProfile, sinks: Sequence[Sink]) -> Controllers:
+def ask_controllers(link: RosBus, profile: RobotProfile, sinks: Sequence[Sink]) -> Controllers:
     """Ask the robot's side for the joints of the controllers that take the commands of `sinks`. Moves nothing."""
     answer = _ask(link, link.namespace + profile.controllers, "", {}) if profile.controllers else {}
     rows: Any = answer.get("controller")
@@ -78,7 +78,7 @@ def _controller(sink: Sink) -> str:
     return sink.controller or sink.topic.strip("/").rpartition("/")[0]
 
 
-def _parameters(link: RosbridgeLink, controller: str, *names: str) -> list[Any]:
+def _parameters(link: RosBus, controller: str, *names: str) -> list[Any]:
     """The parameters of a controller of ROS 2 (rcl_interfaces/ParameterValue), in their order; empty if unknown."""
     service = f"{link.namespace}/{controller}/get_parameters"
     values: Any = _ask(link, service, "rcl_interfaces/srv/GetParameters", {"names": list(names)}).get("values")
@@ -86,14 +86,14 @@ def _parameters(link: RosbridgeLink, controller: str, *names: str) -> list[Any]:
     return values if readable else []
 
 
-def _begins_where_measured(link: RosbridgeLink, controller: str) -> bool:
+def _begins_where_measured(link: RosBus, controller: str) -> bool:
     """Whether it is known that a trajectory controller does not begin at its last set point."""
     found = _parameters(link, controller, "interpolate_from_desired_state", "open_loop_control")
     known = [one.get("bool_value") for one in found if one.get("type") == BOOL]
     return bool(known) and not any(known)
 
 
-def _joints(link: RosbridgeLink, listed: Sequence[Mapping[str, Any]], controller: str) -> tuple[str, ...] | None:
+def _joints(link: RosBus, listed: Sequence[Mapping[str, Any]], controller: str) -> tuple[str, ...] | None:
     """The joints of `controller` in its own order: by its interfaces, by its parameter, or by rosapi; None: unknown."""
     if not controller:
         return None
@@ -115,7 +115,7 @@ def _joints(link: RosbridgeLink, listed: Sequence[Mapping[str, Any]], controller
     return tuple(map(str, joints)) if isinstance(joints, list) and joints else None
 
 
-def _ask(link: RosbridgeLink, service: str, kind: str, request: Mapping[str, Any]) -> Mapping[str, Any]:
+def _ask(link: RosBus, service: str, kind: str, request: Mapping[str, Any]) -> Mapping[str, Any]:
     """The answer of a service of the robot's side; empty if it does not exist or cannot be read."""
     try:
         return link.call(service, kind, request, ANSWER_WITHIN)
@@ -133,7 +133,7 @@ def _remedy(profile: RobotProfile) -> str:
 
 
 def needed_proof(
-    link: RosbridgeLink,
+    link: RosBus,
     info: RobotInfo | None,
     profile: RobotProfile,
     sinks: Sequence[Sink],

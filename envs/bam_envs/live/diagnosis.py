@@ -24,7 +24,8 @@ from bam_envs.ros.codec import INFO_SERVICE, RobotInfo, read_info
 from bam_envs.ros.profile_tables import RobotProfile
 from bam_envs.rosbridge.bus import namespaces_with
 from bam_envs.rosbridge.client import RosbridgeLink
-from bam_envs.rosbridge.client_connection import open_port, open_socket
+from bam_envs.rosbridge.client_connection import open_connection
+from bam_envs.rosbridge.dialing import open_port
 from bam_envs.rosbridge.endpoint import Endpoint
 from bam_envs.safety.gate import SafeRobot
 from bam_envs.safety.guard import measured_places, position_range
@@ -133,10 +134,9 @@ class Diagnosis:
         start = time.monotonic()
 
         async def shake_hands() -> float:
-            socket = await open_socket(self.endpoint, self._timeout, _HANDSHAKE)
+            connection = await open_connection(self.endpoint, self._timeout, _HANDSHAKE)
             duration = time.monotonic() - start
-            with suppress(asyncio.TimeoutError):
-                await asyncio.wait_for(socket.close(), self._timeout)
+            await connection.close()
             return duration
 
         kind = "with TLS, " if self.endpoint.address.secure else ""

@@ -24,7 +24,7 @@ from bam_envs.robots.linked import LinkProfile
 from bam_envs.ros.codec import decode_source
 from bam_envs.ros.profile_tables import RobotProfile, Source
 from bam_envs.rosbridge.bus import Caller, Message
-from bam_envs.rosbridge.client import RosbridgeLink
+from bam_envs.rosbridge.ros_bus import RosBus
 
 Array = NDArray[np.float64]
 PING_TOPIC = "/bam/ping"
@@ -133,7 +133,7 @@ class _Log(Mailbox):
 class _Pings:
     """Pings on `topic` and their echoes; times on the monotonic clock [s]."""
 
-    def __init__(self, link: RosbridgeLink, topic: str) -> None:
+    def __init__(self, link: RosBus, topic: str) -> None:
         self._link, self._topic, self._name = link, topic, secrets.token_hex(4)
         self.sent: list[float] = []
         self.echoes: dict[int, float] = {}
@@ -179,7 +179,7 @@ class _Pings:
 
 
 def measure_link(
-    link: RosbridgeLink,
+    link: RosBus,
     profile: RobotProfile,
     state: LiveState,
     *,

@@ -46,8 +46,8 @@ from bam_envs.ros.codec import (
 from bam_envs.ros.freshness import Tag
 from bam_envs.ros.profile_tables import RobotProfile, Sink
 from bam_envs.rosbridge.client import RosbridgeLink
-from bam_envs.rosbridge.client_connection import bare_reason
 from bam_envs.rosbridge.endpoint import Endpoint
+from bam_envs.rosbridge.ros_bus import RosBus, bare_reason
 from bam_envs.rosbridge.sessions import is_over
 from bam_envs.rosbridge.string_rpc import StringRpc
 from bam_envs.safety.first_motion import REST_REACH
@@ -77,7 +77,8 @@ _LATE = ("expired", "old message", "old connection")
 class RosbridgeRobot:
     """One robot behind a rosbridge server; commands reach it only through a `SafeRobot`. See `live_robot`.
 
-    Only the signals of `spec` are subscribed, and only its commands sent; None: everything that is not optional.
+    Only the signals of `spec` are subscribed, and only its commands sent; None: everything that is not optional. With
+    `ros`, a connected `roslibpy.Ros` to the same server, states and commands go over it; halts and images never do.
     """
 
     needs_clearance = True
@@ -90,8 +91,10 @@ class RosbridgeRobot:
         *,
         spec: RobotSpec | None = None,
         command: str | None = None,
+        ros: Any = None,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
+        self._ros = ros
         self._endpoint = Endpoint(endpoint) if isinstance(endpoint, str) else endpoint
         self.url, self.namespace = self._endpoint.url, self._endpoint.address.namespace
         self._timeout = self._endpoint.timeout or bringup.TIMEOUT
@@ -114,7 +117,7 @@ class RosbridgeRobot:
         self._pacer, self._session = Pacer(self.spec.period, now=clock), bringup.DrivingSession()
         self._ended_at, self._lead = clock(), 0.0  # of the last step; how long before its deadline the next one ends
         self._command_life = profile.command_life(self.spec.period)
-        self._control: RosbridgeLink | None = None
+        self._control: RosBus | None = None
         self._halting: RosbridgeLink | None = None
         self._epoch = 0  # of the connection that was verified; another one needs a reset
         self._cut = threading.Event()
@@ -155,7 +158,7 @@ class RosbridgeRobot:
         """
         if self._control is not None:
             return
-        control = RosbridgeLink(self._endpoint, name="control")
+        control = self._control_link()
         halting = RosbridgeLink(self._endpoint, name="halt", lost_after=_LOST_AFTER)
         self._state.mailbox.clear()
         try:
@@ -172,7 +175,14 @@ class RosbridgeRobot:
             raise
         close_at_exit(self)
 
-    def _open(self, control: RosbridgeLink, halting: RosbridgeLink) -> None:
+    def _control_link(self) -> RosBus:
+        if self._ros is None:
+            return RosbridgeLink(self._endpoint, name="control")
+        from bam_envs.rosbridge.user_ros import UserRosLink
+
+        return UserRosLink(self._ros)
+
+    def _open(self, control: RosBus, halting: RosbridgeLink) -> None:
         control.on_down(self._on_down)
         control.on_status(self._on_status)
         control.connect()
@@ -204,7 +214,7 @@ class RosbridgeRobot:
             session = self._session.tagger.session
             self._readiness = bringup.LiveReadiness(self.profile, self._sinks, types, session)
 
-    def _subscribe(self, control: RosbridgeLink, types: bringup.TopicTypes) -> None:
+    def _subscribe(self, control: RosBus, types: bringup.TopicTypes) -> None:
         """Subscribe states, with their types on the server."""
         itself = self._describes_itself
         for topic, kind in {source.topic: source.type for source in self._state.sources}.items():
@@ -213,7 +223,7 @@ class RosbridgeRobot:
             listener, kind = self._state.listener(topic), types.check(name, kind)
             control.subscribe(name, kind, listener, throttle_ms=least, queue_length=1 if least else 0)
 
-    def _advertise(self, control: RosbridgeLink, halting: RosbridgeLink, types: bringup.TopicTypes) -> None:
+    def _advertise(self, control: RosBus, halting: RosbridgeLink, types: bringup.TopicTypes) -> None:
         """Advertise commands, with their types on the server."""
         for sink in self._sinks:
             name = self.namespace + sink.topic
@@ -223,7 +233,7 @@ class RosbridgeRobot:
         halting.advertise(self.namespace + HALT_TOPIC, "std_msgs/Empty")
         control.advertise(self.namespace + STATUS_TOPIC, "std_msgs/String")
 
-    def _begin(self, control: RosbridgeLink) -> None:
+    def _begin(self, control: RosBus) -> None:
         """Use this connection from now on, and ignore messages of an older one."""
         self._cut.clear()
         self._epoch = control.epoch
@@ -240,7 +250,7 @@ class RosbridgeRobot:
         self._state.read()
         self._sent = None
 
-    def _needed_proof(self, control: RosbridgeLink) -> CommandProof | None:
+    def _needed_proof(self, control: RosBus) -> CommandProof | None:
         return needed_proof(control, self.info, self.profile, self._sinks, self._endpoint)
 
     def tell_proved(self, lag: float) -> None:
@@ -248,7 +258,7 @@ class RosbridgeRobot:
         if self.proof is not None:
             self.proof.done(lag)
 
-    def _open_session(self, control: RosbridgeLink) -> None:
+    def _open_session(self, control: RosBus) -> None:
         """Sign commands for a new session from now on, if the robot's side has sessions."""
         self._session_over = True  # until one is open: a reset after a failure tries again
         if self._describes_itself:
@@ -305,7 +315,7 @@ class RosbridgeRobot:
         self._pacer = Pacer(self.spec.period, now=self._clock)  # the first period begins with the first command
         return self.measure()
 
-    def _set_scene(self, control: RosbridgeLink, initial: Initial) -> None:
+    def _set_scene(self, control: RosBus, initial: Initial) -> None:
         pose = initial.signals.get("object_pose")
         scene = {"object_pose": None if pose is None else pose.tolist(), "seeds": np.asarray(initial.seeds).tolist()}
         self._session.drive()
@@ -386,7 +396,7 @@ class RosbridgeRobot:
         if not self._cut.is_set() and self._halts == halts:
             self._woken.wait(max(0.0, seconds))
 
-    def _send(self, control: RosbridgeLink, command: Array, tag: Tag, halts: int, until: float) -> None:
+    def _send(self, control: RosBus, command: Array, tag: Tag, halts: int, until: float) -> None:
         """Send every part of `command` (m,), unless there were more than `halts` halts: one came after `step` began.
 
         Nor is it sent after `until` [s], when this process was stopped meanwhile: a robot of ours would refuse it by
@@ -413,7 +423,7 @@ class RosbridgeRobot:
         if stopped and self._control is not None:
             self._publish_status(self._control)
 
-    def _publish_status(self, control: RosbridgeLink) -> None:
+    def _publish_status(self, control: RosBus) -> None:
         if self._status:
             control.publish_soon(self.namespace + STATUS_TOPIC, {"data": self._status})
 
@@ -425,7 +435,11 @@ class RosbridgeRobot:
     def measure(self) -> RobotState:
         """The newest state, with the command that was sent last. Raises the errors of `step`."""
         self._connected()
-        signals, stamp = self._state.read()
+        try:
+            signals, stamp = self._state.read()
+        except StaleState:
+            self._require_link()  # one that is down is why
+            raise
         for name, (camera, box) in self._cameras.items():
             if self.info.lockstep:  # no time passes: its image comes over another connection
                 camera.await_stamp(stamp)
@@ -533,12 +547,12 @@ class RosbridgeRobot:
             if link is not None:
                 link.close()
 
-    def _connected(self) -> RosbridgeLink:
+    def _connected(self) -> RosBus:
         if self._control is None:
             raise ResetNeeded(f"{self.profile.name} at {self.url} is not connected. Call connect() first.")
         return self._control
 
-    def _wait_up(self) -> RosbridgeLink:
+    def _wait_up(self) -> RosBus:
         """The connection of the commands, when both are up; `LinkLost` if they are not after `_RESET_TIMEOUT` [s]."""
         control, halting = self._connected(), self._halting
         control.wait_up(_RESET_TIMEOUT)

@@ -11,7 +11,7 @@ from bam_envs.core.robot import EnvIds, Initial, RobotState
 from bam_envs.core.timing import Pacer
 from bam_envs.live import bringup
 from bam_envs.live.rosbridge_robot import RosbridgeRobot
-from bam_envs.rosbridge.client import RosbridgeLink
+from bam_envs.rosbridge.ros_bus import RosBus
 from bam_envs.safety.guard import Limits
 
 Watch = Callable[[NDArray[np.float64], RobotState, RobotState], None]
@@ -34,13 +34,13 @@ class ShadowRobot(RosbridgeRobot):
         """The limits that its guards would have; the commands are compared with them."""
         self.watch: Watch = lambda command, before, after: None
 
-    def _advertise(self, control: RosbridgeLink, halting: RosbridgeLink, types: bringup.TopicTypes) -> None:
+    def _advertise(self, control: RosBus, halting: RosBus, types: bringup.TopicTypes) -> None:
         """Do nothing: no command is sent."""
 
-    def _needed_proof(self, control: RosbridgeLink) -> None:
+    def _needed_proof(self, control: RosBus) -> None:
         """Return None: nothing is sent."""
 
-    def _open_session(self, control: RosbridgeLink) -> None:
+    def _open_session(self, control: RosBus) -> None:
         """Do nothing: a session is for the program that drives."""
 
     def not_ready(self) -> str | None:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from bam_envs.core.errors import BamEnvsError, NotInCommand
 from bam_envs.ros.codec import AGENT_STEP_TOPIC, AGENT_TOPIC
 from bam_envs.ros.freshness import Tagger
-from bam_envs.rosbridge.client import RosbridgeLink
+from bam_envs.rosbridge.ros_bus import RosBus
 from bam_envs.rosbridge.string_rpc import StringRpc
 
 _ANSWER = 3.0  # longest wait for an answer [s]
@@ -34,7 +34,7 @@ def person() -> str:
 class TakeOver:
     """The lease of one client on a robot that a live agent drives."""
 
-    def __init__(self, link: RosbridgeLink, tagger: Tagger) -> None:
+    def __init__(self, link: RosBus, tagger: Tagger) -> None:
         self._link, self._rpc = link, StringRpc(link, link.namespace + AGENT_TOPIC, tagger)
         self.taken = False
         """Whether this client drives."""

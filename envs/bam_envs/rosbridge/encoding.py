@@ -176,7 +176,9 @@ def _typed_field(one: Field, value: Any) -> Any:
     return _typed(one.type, value) if isinstance(value, dict) else value
 
 
-def _base64(value: object) -> str:
+def _plain(value: object) -> str | dict[Any, Any]:
+    if isinstance(value, Mapping):  # such as the messages of roslibpy, which are no dicts
+        return dict(value)
     if not isinstance(value, bytes):
         raise TypeError(f"{type(value).__name__} is not plain")
     return base64.b64encode(value).decode("ascii")
@@ -296,7 +298,7 @@ def _count(message: Mapping[str, Any], name: str) -> int:
     return int(value)
 
 
-_ENCODER = json.JSONEncoder(separators=(",", ":"), allow_nan=False, check_circular=False, default=_base64)
+_ENCODER = json.JSONEncoder(separators=(",", ":"), allow_nan=False, check_circular=False, default=_plain)
 # json.loads and json.dumps with options would create one for each message.
 _STRICT, _PATIENT = json.JSONDecoder(), json.JSONDecoder(parse_constant=lambda _: None)
 _FINITE = json.JSONDecoder(parse_constant=_finite, parse_float=_finite)

@@ -19,8 +19,8 @@ from typing import Any
 from bam_envs.core.errors import BamEnvsError, LinkLost, NotInCommand, ProtocolError, RemoteError
 from bam_envs.ros.freshness import FreshnessCheck, Tagger, read_tag
 from bam_envs.rosbridge.bus import Bus, Caller, Handler, Message, answer
-from bam_envs.rosbridge.client import RosbridgeLink
 from bam_envs.rosbridge.encoding import MOST_ITEMS, dump_json, load_json
+from bam_envs.rosbridge.ros_bus import RosBus
 from bam_envs.rosbridge.sessions import Sessions
 
 _log = logging.getLogger(__name__)
@@ -38,7 +38,7 @@ class StringRpc:
     Thread-safe; the first call opens the topics. When the link drops, calls under way fail at once.
     """
 
-    def __init__(self, link: RosbridgeLink, name: str, tagger: Tagger | None = None) -> None:
+    def __init__(self, link: RosBus, name: str, tagger: Tagger | None = None) -> None:
         self.name = name
         self._link, self._tagger, self._lock = link, tagger or Tagger(), threading.Lock()
         self._pending: dict[str, Future[dict[str, Any]]] = {}

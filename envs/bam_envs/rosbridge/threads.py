@@ -20,13 +20,17 @@ class LoopThread:
 
     def __init__(self, name: str, owner: str = "this server") -> None:
         self._name, self._owner, self.was_started = name, owner, False
-        self._loop: asyncio.AbstractEventLoop | None = None
+        self.loop: asyncio.AbstractEventLoop | None = None
+        """The loop while it runs; one that runs in a thread of other code can be put here."""
         self._thread: threading.Thread | None = None
 
     @property
     def is_current(self) -> bool:
         """Whether the caller runs in this thread."""
-        return threading.current_thread() is self._thread
+        try:
+            return asyncio.get_running_loop() is self.loop
+        except RuntimeError:
+            return False
 
     def start(self, main: Callable[[Future[None]], Coroutine[Any, Any, None]]) -> None:
         """Run ``main(ready)`` in the thread; returns when `ready` has its result, or raises its exception."""
@@ -45,7 +49,7 @@ class LoopThread:
 
     def post(self, work: Callable[[], object]) -> bool:
         """Schedule `work` in the thread; False if the loop does not run."""
-        loop = self._loop
+        loop = self.loop
         if loop is None:
             return False
         try:
@@ -84,7 +88,7 @@ class LoopThread:
             done.cancel()  # also after Ctrl-C: work that has not begun is not wanted any more
 
     async def _run(self, main: Callable[[Future[None]], Coroutine[Any, Any, None]], ready: Future[None]) -> None:
-        self._loop = asyncio.get_running_loop()
+        self.loop = asyncio.get_running_loop()
         try:
             await main(ready)
         except Exception as error:  # any error goes to the thread that waits for `ready`
@@ -92,7 +96,7 @@ class LoopThread:
                 raise
             ready.set_exception(error)
         finally:
-            self._loop = None
+            self.loop = None
 
 
 class Workers:

@@ -234,7 +234,7 @@ from bam_train.cli.{program} import main
 try:
     main()
 except SystemExit as done:
-    heavy = {{"torch", "stable_baselines3", "mujoco", "rich", "roslibpy", "onnx", "PIL"}}
+    heavy = {{"torch", "stable_baselines3", "mujoco", "rich", "twisted", "onnx", "PIL"}}
     print(done.code, sorted(heavy & set(sys.modules)))
 """
     command = [sys.executable, "-c", code, str(cartpole_checkpoint), *flags]

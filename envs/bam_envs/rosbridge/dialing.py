@@ -1,0 +1,83 @@
+"""A TCP connection to a server, and the reasons why there is none, or no WebSocket."""
+
+import asyncio
+import socket
+import ssl
+
+from bam_envs.core.errors import NoServer
+from bam_envs.rosbridge.endpoint import Address
+
+_HOST_MISMATCH = (62, 64)  # X509_V_ERR_HOSTNAME_MISMATCH, X509_V_ERR_IP_ADDRESS_MISMATCH
+
+
+async def open_port(address: Address, timeout: float) -> socket.socket:
+    """A TCP connection to a server; `NoServer` gives the reason why there is none within `timeout` [s]."""
+    opening = asyncio.get_running_loop().create_task(_open_tcp(address))
+    try:
+        await asyncio.wait((opening,), timeout=timeout)
+        await asyncio.sleep(0)  # on a busy computer, the answer may have come together with the end of the time
+        if not opening.done():
+            raise asyncio.TimeoutError
+        return opening.result()
+    except (OSError, asyncio.TimeoutError) as error:
+        raise NoServer(address.url, no_connection(address, error, timeout)) from error
+    finally:
+        opening.cancel()
+
+
+async def _open_tcp(address: Address) -> socket.socket:
+    loop = asyncio.get_running_loop()
+    infos = await loop.getaddrinfo(address.host, address.port, type=socket.SOCK_STREAM)
+    for place, (family, kind, protocol, _, target) in enumerate(infos):
+        plain = socket.socket(family, kind, protocol)
+        plain.setblocking(False)
+        try:
+            await loop.sock_connect(plain, target)
+            return plain
+        except BaseException as error:
+            plain.close()
+            if not isinstance(error, OSError) or place == len(infos) - 1:
+                raise
+    raise OSError("the name has no address")
+
+
+def no_connection(address: Address, error: OSError | asyncio.TimeoutError, timeout: float) -> str:
+    """The reason why no TCP or TLS connection was made within `timeout` [s]."""
+    if isinstance(error, ssl.SSLCertVerificationError):
+        reason = error.verify_message.rstrip(".")
+        if error.verify_code in _HOST_MISMATCH:
+            return f"the certificate is not for {address.host!r}: {reason}. Use a name that is in it."
+        remedy = "Give the file of the authority that signed it as ca_file (--ca-file)."
+        return f"the certificate is not trusted: {reason}. {remedy}"
+    if isinstance(error, ssl.SSLError):
+        return f"TLS failed: {error.reason}. If the server has no TLS, use ws://."
+    if isinstance(error, TimeoutError | asyncio.TimeoutError):
+        return f"no connection within {timeout:.1f} s. Is the address right, is the machine on, is a firewall between?"
+    if isinstance(error, socket.gaierror):
+        return f"the name {address.host!r} is not known: {error.strerror}. Try the IP address."
+    if isinstance(error, ConnectionRefusedError):
+        return (
+            f"refused: nothing listens there. Is the port open? Start one with `bam-serve --env bam/pick --port "
+            f"{address.port}` or `ros2 launch rosbridge_server rosbridge_websocket_launch.xml`."
+        )
+    if isinstance(error, ConnectionError):
+        hint = "If the server has no TLS, use ws://." if address.secure else "Is it the right port?"
+        return f"the connection was cut while it was made. {hint}"
+    return f"cannot be reached: {error.strerror or error}."
+
+
+def silent(address: Address, timeout: float) -> str:
+    """The reason why there is no WebSocket where a port is open that did not answer within `timeout` [s]."""
+    hint = " Does it speak TLS? If not, use ws://." if address.secure else ""
+    text = f"the port is open, and what listens there is silent for {timeout:.1f} s. Is it a rosbridge server?"
+    return f"{text}{hint}"
+
+
+def http_refusal(status: int, body: bytes) -> str:
+    """The reason why a web server did not open a WebSocket, by its response."""
+    said = body[:300].decode(errors="replace").strip()
+    if status in (400, 403, 429, 503) and said.endswith("."):  # a server of ours gives its reason
+        return f"the server refuses this client (HTTP {status}): {said}"
+    if status in (401, 403):
+        return f"the token was refused (HTTP {status}). Give the server's token (--token-file)."
+    return f"a web server answers there, with HTTP {status}: no WebSocket. Is it the right port?"
