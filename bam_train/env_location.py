@@ -12,7 +12,7 @@ from bam_train.errors import SettingsError
 
 
 @dataclass(frozen=True)
-class Place:
+class EnvLocation:
     """The place of an environment: an address, or none for the simulation here."""
 
     robot: str | None = None
@@ -110,7 +110,7 @@ class Place:
 
 SIMULATED: Mapping[str, Any] = {"randomize": False, "link": None, "action_delay": None}
 """Arguments of an environment that only a simulated robot has, with their values for an ideal one."""
-HERE = Place()
+HERE = EnvLocation()
 """The simulation here."""
 
 

@@ -21,7 +21,7 @@ from msgspec import Meta
 from bam_train.errors import SettingsError
 
 if TYPE_CHECKING:
-    from bam_train.env_location import Place
+    from bam_train.env_location import EnvLocation
 
 tomllib: Any = importlib.import_module("tomllib" if sys.version_info >= (3, 11) else "tomli")
 
@@ -115,11 +115,11 @@ class TrainSettings:
         return settings
 
     @property
-    def place(self) -> Place:
+    def place(self) -> EnvLocation:
         """Where the environment runs."""
-        from bam_train.env_location import Place
+        from bam_train.env_location import EnvLocation
 
-        return Place(transport=tuple(self.transport), ca_file=self.ca_file, token_file=self.token_file)
+        return EnvLocation(transport=tuple(self.transport), ca_file=self.ca_file, token_file=self.token_file)
 
     def to_mapping(self) -> dict[str, Any]:
         """The settings as plain JSON values, in the order of the fields."""

@@ -379,9 +379,12 @@ def agent_requests() -> str:
 
 def audit_fields() -> str:
     """The fields of a line in the audit file of a live agent."""
-    from bam_train.agent.audit import Event
+    from bam_train.agent.audit import AuditEvent
 
-    names, docs = zip(Event.__struct_encode_fields__, Event.__struct_fields__, strict=True), field_docs(Event)
+    names, docs = (
+        zip(AuditEvent.__struct_encode_fields__, AuditEvent.__struct_fields__, strict=True),
+        field_docs(AuditEvent),
+    )
     return table(["field", "meaning"], [[f"`{name}`", docs[field]] for name, field in names])
 
 

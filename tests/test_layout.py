@@ -136,3 +136,13 @@ def test_names_of_files_are_unique():
 @pytest.mark.parametrize("name", ["utils", "common", "helpers", "misc"])
 def test_no_file_of_leftovers(name):
     assert [module for module in SOURCES if module.rpartition(".")[2] == name] == []
+
+
+def test_a_class_has_a_name_of_its_own():
+    classes = Counter(
+        node.name
+        for path in SOURCES.values()
+        for node in ast.parse(path.read_text()).body
+        if isinstance(node, ast.ClassDef) and not node.name.startswith("_")
+    )
+    assert [name for name, number in classes.items() if number > 1] == []

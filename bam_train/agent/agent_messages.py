@@ -61,7 +61,7 @@ class Answer(msgspec.Struct, tag=True, frozen=True):
     kind: str = ""
 
 
-class Progress(msgspec.Struct, tag=True, frozen=True):
+class RequestProgress(msgspec.Struct, tag=True, frozen=True):
     """News of an `Ask` that is not answered yet."""
 
     number: int
@@ -102,7 +102,7 @@ class Rows(msgspec.Struct, tag=True, frozen=True):
     event: dict[str, Any]
 
 
-Message = Front | Listening | Ask | Answer | Progress | Halt | Drive | Report | Sent | Rows
+Message = Front | Listening | Ask | Answer | RequestProgress | Halt | Drive | Report | Sent | Rows
 _encoder, _decoder = msgspec.msgpack.Encoder(), msgspec.msgpack.Decoder(Message)
 
 

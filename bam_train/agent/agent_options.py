@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from bam_envs.rosbridge.endpoint import is_loopback
-from bam_train.env_location import Place
+from bam_train.env_location import EnvLocation
 
 
 @dataclass(frozen=True)
@@ -51,9 +51,9 @@ class AgentOptions:
             return None
         return f"tokens and commands go over {self.bind} unencrypted: give --cert and --key, or trust that network"
 
-    def place(self, *, trial: bool | None) -> Place:
+    def place(self, *, trial: bool | None) -> EnvLocation:
         """The place of the robot."""
-        return Place(
+        return EnvLocation(
             self.robot,
             profile=self.profile,
             ca_file=self.ca_file,

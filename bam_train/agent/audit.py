@@ -1,6 +1,6 @@
 """The audit file of a live agent: who did what, when, from where and why; one line of JSON for each event.
 
-The fields of a line are those of `Event`. ``time`` is the wall clock, and ``monotonic`` another one that nobody sets:
+The fields of a line are those of `AuditEvent`. ``time`` is the wall clock, and ``monotonic`` a clock that nobody sets:
 where the wall clock was set since the line before, ``clock_moved`` has by how much [s]. Another thread writes, so that
 the loop waits for no disk.
 """
@@ -32,7 +32,7 @@ _RETRY = 5.0  # time between two attempts to write to a full disk [s]
 _LOG = logging.getLogger(__name__)
 
 
-class Event(msgspec.Struct, frozen=True, omit_defaults=True, rename={"before": "from", "after": "to"}):
+class AuditEvent(msgspec.Struct, frozen=True, omit_defaults=True, rename={"before": "from", "after": "to"}):
     """One line of the file."""
 
     time: str
@@ -75,7 +75,7 @@ class Audit:
         self.path, self.fault = path, ""
         self._wall, self._monotonic, self._offset = wall, monotonic, wall() - monotonic()
         self._lock = threading.Lock()
-        self._events: queue.SimpleQueue[Event | None] = queue.SimpleQueue()
+        self._events: queue.SimpleQueue[AuditEvent | None] = queue.SimpleQueue()
         self._thread = threading.Thread(target=self._run, name="bam-audit", daemon=True)
         self._thread.start()
 
@@ -90,7 +90,7 @@ class Audit:
         before: State | None = None,
         after: State | None = None,
     ) -> None:
-        """Append an event, as of `Event`; long texts are cut."""
+        """Append an event, as of `AuditEvent`; long texts are cut."""
         what, text, who, where = (one[:_TEXT] for one in (what, text, who, where))
         states = {name: state.value for name, state in (("before", before), ("after", after)) if state is not None}
         with self._lock:  # events are in the order of their times
@@ -98,7 +98,7 @@ class Audit:
             moved, self._offset = wall - monotonic - self._offset, wall - monotonic
             at = datetime.fromtimestamp(wall, timezone.utc).isoformat(timespec="milliseconds")
             moved = round(moved, 3) if abs(moved) >= 1 else 0.0
-            event = Event(at, round(monotonic, 3), what, text, who, where, digest, **states, clock_moved=moved)
+            event = AuditEvent(at, round(monotonic, 3), what, text, who, where, digest, **states, clock_moved=moved)
             self._events.put(event)
 
     def close(self, timeout: float = 5.0) -> None:
@@ -165,7 +165,7 @@ def tail(path: Path, n: int = 50) -> list[dict[str, Any]]:
         found = []
         for line in lines:
             with contextlib.suppress(msgspec.MsgspecError, UnicodeDecodeError):  # cut, by a kill or by the seek
-                found.append(msgspec.to_builtins(msgspec.json.decode(line, type=Event)))
+                found.append(msgspec.to_builtins(msgspec.json.decode(line, type=AuditEvent)))
         events = found + events
         if len(events) >= n:
             break

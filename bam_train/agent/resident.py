@@ -40,17 +40,17 @@ if TYPE_CHECKING:
 
 _log = logging.getLogger(__name__)
 _FLAGS = np.array([False]), np.array([True])
-_LOOK = 0.2  # time between two looks at the link while the robot rests [s]
-_AGAIN = 1.0  # time between two attempts to reach the robot [s]
-_REPORT = 0.5  # time between two reports while nothing changes [s]
-FRESH = 0.2
+_LINK_POLL_PERIOD = 0.2  # time between two looks at the link while the robot rests [s]
+_RECONNECT_PERIOD = 1.0  # time between two attempts to reach the robot [s]
+_REPORT_PERIOD = 0.5  # time between two reports while nothing changes [s]
+COMMAND_LIFETIME = 0.2
 """Age of a person's newest command from which the robot rests, at least one and a half periods [s]."""
-THERE = "the robot is there, and fits"
+ROBOT_FITS = "the robot is there, and fits"
 """Why the agent no longer waits."""
-_RECENT = 20  # episodes in the status
-_BY_TIME = (3, 4, 15, 16)
+_RECENT_EPISODES = 20  # episodes in the status
+_TIMING_GUARDS = (3, 4, 15, 16)
 """Codes of the guards that look at when states, answers and commands come, and not at what the robot does."""
-_AT_ONCE = ("pause", "take")
+_HALTING_REQUESTS = ("pause", "take")
 """Requests for which the robot is halted before they are executed."""
 
 
@@ -134,7 +134,7 @@ class Resident:
         self._stopped = self._paused = ""  # why, once a guard stopped the robot, and once a person or a fault paused it
         self._was_connected = self._holds = self._was_cut_short = False
         self._seed, self._reported = options.seed, 0.0
-        self._episodes: deque[int | None] = deque(maxlen=_RECENT)
+        self._episodes: deque[int | None] = deque(maxlen=_RECENT_EPISODES)
         self._ticks = self._completed = self._successes = 0
         self._late = self._slow = 0  # late ticks of earlier connections, and those that a policy made late
         self._link_ms = self._loop_ms = 0.0
@@ -203,7 +203,7 @@ class Resident:
             self.send(Answer(ask.number, error=f"{ask.op}: this agent does not know that", kind="RequestRefused"))
         else:
             self.post(lambda: do(ask.who, ask.address, **ask.arguments), ask.number)
-            if ask.op in _AT_ONCE:
+            if ask.op in _HALTING_REQUESTS:
                 self._hurry.set()
                 self.halt()
 
@@ -301,7 +301,7 @@ class Resident:
             return
         session.deployment.trials = self.succession.trials()
         self._record_again()
-        self._change(self._driving, THERE if self.state is State.WAITING else self.why)
+        self._change(self._driving, ROBOT_FITS if self.state is State.WAITING else self.why)
         journal = session.deployment.journal
         begun = journal.begun
         try:
@@ -327,7 +327,7 @@ class Resident:
     def _judge(self, session: RobotSession, record: EpisodeRecord, error: Exception) -> None:
         """Judge the policy whose episode ended with `error`: by a stop of a guard, or by the loss of the link."""
         if self._stopped:
-            excuse = session.deployment.times.excuse(by_time=session.robot.code in _BY_TIME)
+            excuse = session.deployment.times.excuse(by_time=session.robot.code in _TIMING_GUARDS)
             self.succession.cut_short(record, self._stopped, excuse)
         elif isinstance(error, LinkLost):
             self.succession.cut_short(record, excuse="the link to the robot was lost")
@@ -384,9 +384,9 @@ class Resident:
         self._activate()
         self._record_again()
         with self._news:
-            self._news.wait_for(lambda: bool(self._requests) or bool(self.switch.came), _LOOK)
+            self._news.wait_for(lambda: bool(self._requests) or bool(self.switch.came), _LINK_POLL_PERIOD)
         self._require_link()
-        self._report(_REPORT)
+        self._report(_REPORT_PERIOD)
 
     def _record_again(self) -> None:
         if self.session is not None and (name := self.session.record_again()):
@@ -399,7 +399,7 @@ class Resident:
     def _drive(self) -> None:
         """Send the newest command of the person who has taken over, or rest while there is none."""
         session = self._connected
-        life = max(FRESH, 1.5 * session.robot.spec.period)
+        life = max(COMMAND_LIFETIME, 1.5 * session.robot.spec.period)
         with self._news:
             self._news.wait_for(lambda: bool(self._requests) or self._command is not None, life)
             drive, self._command = self._command, None
@@ -410,13 +410,13 @@ class Resident:
                 session.robot.halt()
             self._holds = True
             self._require_link()
-            self._report(_REPORT)
+            self._report(_REPORT_PERIOD)
             return
         self._holds = False
         try:
             if session.robot.is_unproved:  # this motion is the first: the next command comes after it
                 session.robot.prove()
-                self._report(_REPORT)
+                self._report(_REPORT_PERIOD)
                 return
             session.robot.step(np.array([drive.command]))
             session.deployment.record_command()
@@ -426,7 +426,7 @@ class Resident:
             self._holds = True
         except Exception as error:
             self._failed(error)
-        self._report(_REPORT)
+        self._report(_REPORT_PERIOD)
 
     def _sent(self, tick: Any, state: Any) -> None:
         """After each command: requests may interrupt the way to a start pose, and the proof of the commands."""
@@ -472,8 +472,8 @@ class Resident:
             if not self._stopped:
                 self._change(State.WAITING, fault_text(error))
             with self._news:
-                self._news.wait_for(lambda: bool(self._requests), _AGAIN)
-            self._report(_REPORT)
+                self._news.wait_for(lambda: bool(self._requests), _RECONNECT_PERIOD)
+            self._report(_REPORT_PERIOD)
             return
         self._was_connected = True
         self._admit = lambda env, lines: None  # the operator is asked once
@@ -484,7 +484,7 @@ class Resident:
         if self._stopped:
             self._change(State.STOPPED, self._stopped)
         elif not self._is_running:
-            self._change(State.PAUSED, self._paused or THERE)
+            self._change(State.PAUSED, self._paused or ROBOT_FITS)
 
     def _drop(self, why: str) -> None:
         """Halt the robot and drop the link."""
@@ -618,7 +618,7 @@ class Resident:
     def ticked(self, record: EpisodeRecord, action: Any, pacer: Any) -> None:
         """Called by the deployment after every step."""
         self._ticks += 1
-        self._report(_REPORT)
+        self._report(_REPORT_PERIOD)
 
     def ended(self, record: EpisodeRecord) -> None:
         """Called by the deployment after every episode."""

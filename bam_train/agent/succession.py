@@ -18,7 +18,7 @@ from typing import Any, Protocol
 
 from bam_envs.core.errors import BamEnvsError
 from bam_envs.core.registry import are_same
-from bam_train.agent.agent_messages import Answer, Ask, Message, Progress
+from bam_train.agent.agent_messages import Answer, Ask, Message, RequestProgress
 from bam_train.agent.agent_options import AgentOptions
 from bam_train.agent.agent_states import State
 from bam_train.agent.candidate import CandidateRequest, Verdict, check_candidate
@@ -32,8 +32,8 @@ from bam_train.deploy.trials import Evidence, Trials
 from bam_train.errors import BadTrials, BamTrainError, CandidateRefused, RequestRefused, TrialsNeeded
 
 _log = logging.getLogger(__name__)
-_EPISODE = 3600.0  # longest wait for the end of an episode [s]
-_TRIAL = 24 * 3600.0  # longest wait for the end of a trial [s]
+_EPISODE_TIMEOUT = 3600.0  # longest wait for the end of an episode [s]
+_TRIAL_TIMEOUT = 24 * 3600.0  # longest wait for the end of a trial [s]
 _STATE_POLL_PERIOD = 0.2  # [s]
 _ONCE = {
     State.WAITING: "the robot is there again",
@@ -194,7 +194,7 @@ class Succession:
         resident, session = self._resident, self._resident.session
         if session is None:
             raise RequestRefused("the agent waits for the robot, and checks no candidate without it; push it later")
-        resident.send(Progress(ask.number, "checking"))
+        resident.send(RequestProgress(ask.number, "checking"))
         verdict = check_candidate(
             CandidateRequest(
                 path,
@@ -217,15 +217,15 @@ class Succession:
         resident, arguments = self._resident, ask.arguments
         choice = self._made(version, ask)
         when = "tick" if choice.at_once else "episode"
-        resident.send(Progress(ask.number, f"accepted; it acts from the next {when} on"))
+        resident.send(RequestProgress(ask.number, f"accepted; it acts from the next {when} on"))
         resident.choose(choice)
-        if not choice.active.wait(_EPISODE):
+        if not choice.active.wait(_EPISODE_TIMEOUT):
             raise RequestRefused(f"{version.digest[:12]} was accepted, and did not become active in an hour")
         if arguments.get("wait") and choice.trials is not None:
             news = "acts as the candidate; its trials decide"
             if not resident.state.drives:
                 news = f"is the candidate; its trials begin when the agent runs, and it is {resident.state.value} now"
-            resident.send(Progress(ask.number, news))
+            resident.send(RequestProgress(ask.number, news))
             self._wait_for_outcome(choice, ask.number)
         status = resident.status()
         return {
@@ -240,15 +240,15 @@ class Succession:
 
     def _wait_for_outcome(self, choice: Choice, number: int) -> None:
         """Wait for the end of the trials; meanwhile, say why they rest, and that they go on."""
-        resident, end = self._resident, time.monotonic() + _TRIAL
+        resident, end = self._resident, time.monotonic() + _TRIAL_TIMEOUT
         told = resident.state
         while not choice.outcome.wait(_STATE_POLL_PERIOD):
             state, why = resident.state, resident.why
             if state.drives and not told.drives:
-                resident.send(Progress(number, "the trials go on"))
+                resident.send(RequestProgress(number, "the trials go on"))
             elif state is not told and state in _ONCE and not choice.result:
                 text = f"{state.value}: {why.rstrip('.')}. The trials go on once {_ONCE[state]}"
-                resident.send(Progress(number, text))
+                resident.send(RequestProgress(number, text))
             told = state
             if time.monotonic() > end:
                 raise RequestRefused("the trial did not end in a day")

@@ -1,7 +1,7 @@
 """Transitions of a live agent, for a learner on another computer: collected in the loop, carried as JSON.
 
-An event has a column for each field of `Transitions`. Arrays are ``{"shape": [...], "data": base64 of float32, little
-endian}``, flags and counts lists, so that no number is rounded and a thousand transitions need a few milliseconds.
+An event has a column for each field of `LiveTransitions`. Arrays are ``{"shape": [...], "data": base64 of float32,
+little endian}``, flags and counts lists, so that no number is rounded and a thousand transitions need a few milliseconds.
 """
 
 import base64
@@ -34,7 +34,7 @@ Counts = NDArray[np.int64]
 
 
 @dataclass(frozen=True)
-class Transitions:
+class LiveTransitions:
     """n transitions in the order in which they happened; step k of an episode leads from time k to time k + 1."""
 
     observation: Floats
@@ -69,10 +69,10 @@ class Transitions:
         return self.terminated | self.truncated
 
 
-def encode(transitions: Transitions) -> dict[str, Any]:
+def encode(transitions: LiveTransitions) -> dict[str, Any]:
     """The event with `transitions`, as plain JSON values."""
     event: dict[str, Any] = {"event": EVENT, "count": len(transitions), "policy": list(transitions.policy)}
-    for field in fields(Transitions):
+    for field in fields(LiveTransitions):
         column = getattr(transitions, field.name)
         if field.name in (*_FLAGS, *_COUNTS):
             event[field.name] = column.tolist()
@@ -82,7 +82,7 @@ def encode(transitions: Transitions) -> dict[str, Any]:
     return event
 
 
-def decode(event: Mapping[str, Any]) -> Transitions:
+def decode(event: Mapping[str, Any]) -> LiveTransitions:
     """The transitions of an event.
 
     Raises:
@@ -99,7 +99,7 @@ def decode(event: Mapping[str, Any]) -> Transitions:
         raise FormatError(f"transitions: next_observation: expected shape {shapes[0]}, found {shapes[1]}")
     if columns["reward"].ndim != 1:
         raise FormatError(f"transitions: reward: expected shape ({count},), found {columns['reward'].shape}")
-    return Transitions(**columns, policy=_listed(event, "policy", count, str))
+    return LiveTransitions(**columns, policy=_listed(event, "policy", count, str))
 
 
 def _is_count(value: Any) -> bool:
@@ -147,20 +147,20 @@ class TransitionLog:
         """Number of transitions that were dropped because nobody took them in time."""
 
     def add(self, *row: Any) -> None:
-        """Add one transition: the fields of `Transitions` in their order, without the axis n."""
+        """Add one transition: the fields of `LiveTransitions` in their order, without the axis n."""
         self.lost += len(self._rows) == self._rows.maxlen
         self._rows.append(row)
 
-    def take(self) -> Transitions | None:
+    def take(self) -> LiveTransitions | None:
         """Remove and return all; None if there are none."""
         if not self._rows:
             return None
         columns: dict[str, Any] = {}
-        for field, column in zip(fields(Transitions), zip(*self._rows, strict=True), strict=True):
+        for field, column in zip(fields(LiveTransitions), zip(*self._rows, strict=True), strict=True):
             kind = np.bool_ if field.name in _FLAGS else np.int64 if field.name in _COUNTS else np.float32
             columns[field.name] = list(column) if field.name == "policy" else np.array(column, kind)
         self._rows.clear()
-        return Transitions(**columns)
+        return LiveTransitions(**columns)
 
 
 class TransitionsAgent(Agent):

@@ -20,7 +20,7 @@ from bam_train.checkpoint import Checkpoint
 from bam_train.cli.console import say
 from bam_train.deploy.checkpoint_admission import has_real_robot
 from bam_train.deploy.contract_table import Contract
-from bam_train.env_location import Place
+from bam_train.env_location import EnvLocation
 from bam_train.environments import environment_of, make_env, require_fit
 from bam_train.errors import SettingsError
 from bam_train.signals import SignalMemory
@@ -28,7 +28,7 @@ from bam_train.signals import SignalMemory
 
 def connected_env(
     checkpoint: Checkpoint | None,
-    place: Place,
+    place: EnvLocation,
     signals: SignalMemory,
     *,
     who: str,
@@ -37,7 +37,7 @@ def connected_env(
     render: bool | str = False,
     named: str | None = None,
     env_kwargs: Mapping[str, Any] | None = None,
-    admit: Callable[[gym.Env[Any, Any], Place, str], Sequence[str]] = lambda env, place, identity: (),
+    admit: Callable[[gym.Env[Any, Any], EnvLocation, str], Sequence[str]] = lambda env, place, identity: (),
     motion: Path | None = None,
     wiggle: bool = False,
 ) -> gym.Env[Any, Any]:
@@ -101,7 +101,7 @@ def _connect(env: Any, signals: SignalMemory) -> None:
         signals.raise_again()
 
 
-def required_contract(checkpoint: Checkpoint, env: Any, place: Place, motion: Path | None = None) -> Contract:
+def required_contract(checkpoint: Checkpoint, env: Any, place: EnvLocation, motion: Path | None = None) -> Contract:
     """The contract of a checkpoint with a live robot, shown in short if it is real or refused; moves nothing.
 
     For any other environment, only spaces and signals are compared, and the contract is empty.

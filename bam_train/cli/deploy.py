@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from bam_train.cli.flags import DeployConfig
     from bam_train.deploy.checkpoint_admission import Admission
     from bam_train.deploy.deployment import Deployment
-    from bam_train.env_location import Place
+    from bam_train.env_location import EnvLocation
     from bam_train.recording.recorder import Recorder
 
 
@@ -87,7 +87,7 @@ def deploy_checkpoint(config: DeployConfig, signals: SignalMemory) -> int:
     return _run(config, checkpoint, place, deployment, signals, admission, seed)
 
 
-def print_guards(config: DeployConfig, checkpoint: Checkpoint, place: Place) -> int:
+def print_guards(config: DeployConfig, checkpoint: Checkpoint, place: EnvLocation) -> int:
     """Print the guards between a live robot and the policy of `checkpoint`; nothing is connected."""
     from bam_envs.core.registry import entry_of
     from bam_train.deploy.guard_table import guard_lines, in_force
@@ -107,7 +107,7 @@ def print_guards(config: DeployConfig, checkpoint: Checkpoint, place: Place) -> 
     return 0
 
 
-def _print_contract(config: DeployConfig, checkpoint: Checkpoint, place: Place) -> int:
+def _print_contract(config: DeployConfig, checkpoint: Checkpoint, place: EnvLocation) -> int:
     """Print the whole contract of `checkpoint` with the live robot at `place`; nothing moves."""
     from bam_train.deploy.contract import check_contract
     from bam_train.environments import environment_of, make_env
@@ -148,7 +148,7 @@ def _rehearse(config: DeployConfig, link: str) -> int:
 def _run(
     config: DeployConfig,
     checkpoint: Checkpoint,
-    place: Place,
+    place: EnvLocation,
     deployment: Deployment,
     signals: SignalMemory,
     admission: Admission,
@@ -156,14 +156,14 @@ def _run(
 ) -> int:
     """Run the deployment and report it, also after a signal; returns the exit status."""
     from bam_train.cli.consent import guards_of, say_agent_rests
-    from bam_train.cli.deploy_display import PlainDisplay, live_display
+    from bam_train.cli.deploy_display import PlainDeployment, live_display
     from bam_train.deploy.journal import DeployReport
 
     env, journal, pacer = deployment.env, deployment.journal, deployment.pacer
     title = f"{checkpoint.path} on {checkpoint.manifest.env}{place.text and f' at {place.text}'}{journal.marked}"
     with deployment.handles_signals():  # a second Ctrl-C must not lose the report
         deployment.switch.came += signals.came  # after a lost exception, the deployment ends before it begins
-        plain = nullcontext(PlainDisplay(journal, say))
+        plain = nullcontext(PlainDeployment(journal, say))
         with live_display(make_console(), env, title, journal) if can_draw() else plain as watcher:
             ending = deployment.run(watcher, seed=seed)
         if ending.status:
@@ -203,10 +203,10 @@ def _add_to_data_set(
     say(f"bam-deploy: {recorder.path} is in {config.record} now")
 
 
-def _checked_place(config: DeployConfig) -> Place:
+def _checked_place(config: DeployConfig) -> EnvLocation:
     """The place of the environment by the flags; invalid flags are refused before anything is loaded."""
     from bam_envs.core.wording import as_flag
-    from bam_train.env_location import Place, addresses, read_guards
+    from bam_train.env_location import EnvLocation, addresses, read_guards
     from bam_train.errors import SettingsError
 
     ca_file, token_file = (None if path is None else str(path) for path in (config.ca_file, config.token_file))
@@ -219,7 +219,7 @@ def _checked_place(config: DeployConfig) -> Place:
     if config.print_guards and config.shadow:
         raise SettingsError("--print-guards shows what limits commands, and --shadow sends none; give one of the two")
     robot = ANY_ROBOT if config.print_guards and config.robot is None else config.robot
-    place = Place(
+    place = EnvLocation(
         robot,
         addresses(config.transport),
         config.profile,
@@ -278,7 +278,7 @@ def _require_recordable(place: str) -> None:
 
 
 def _recorder(
-    config: DeployConfig, checkpoint: Checkpoint, place: Place, env: gym.Env[Any, Any], facts: Mapping[str, Any]
+    config: DeployConfig, checkpoint: Checkpoint, place: EnvLocation, env: gym.Env[Any, Any], facts: Mapping[str, Any]
 ) -> Recorder | None:
     """The recorder that the flags ask for, started; None for none."""
     if config.record is None and (config.no_record or place.robot is None):

@@ -24,7 +24,7 @@ _MOST_NUMBERS = 16
 """Numbers of an action or a state signal that are shown; the rest (of an image, say) is left out."""
 
 
-class PlainDisplay:
+class PlainDeployment:
     """Writes one line for each episode."""
 
     def __init__(self, journal: Journal, write: Callable[[str], None]) -> None:
@@ -44,7 +44,7 @@ class PlainDisplay:
         self._write(f"{which}: {how} after {steps}, return {record.total:.2f}{self._journal.marked}")
 
 
-class LiveDisplay(PlainDisplay):
+class LiveDeployment(PlainDeployment):
     """A panel below those lines, redrawn ten times a second at most, and only when there is time until a deadline.
 
     Rich's live area has no thread of its own; `now` is the clock of the redraws [s].
@@ -113,9 +113,9 @@ def _text(values: Any, labels: Sequence[str] = ()) -> str:
 
 
 @contextmanager
-def live_display(console: Console, env: gym.Env[Any, Any], title: str, journal: Journal) -> Iterator[LiveDisplay]:
+def live_display(console: Console, env: gym.Env[Any, Any], title: str, journal: Journal) -> Iterator[LiveDeployment]:
     """The live panel on `console`; it stays on the screen at the end."""
     from rich.live import Live
 
     with Live(console=console, auto_refresh=False, redirect_stdout=False, redirect_stderr=False) as live:
-        yield LiveDisplay(live, env, title, journal)
+        yield LiveDeployment(live, env, title, journal)

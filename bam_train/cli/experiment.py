@@ -13,7 +13,7 @@ from bam_train.checkpoint import Checkpoint
 from bam_train.cli.consent import connected_env, require_screen
 from bam_train.cli.console import say
 from bam_train.cli.flags import EnvId, File, Url
-from bam_train.env_location import Place
+from bam_train.env_location import EnvLocation
 from bam_train.signals import SignalMemory, handled, interrupt
 
 
@@ -51,7 +51,7 @@ def require_place(env_id: str, robot: str | None, render: bool) -> None:
     """Refuse an invalid ``--robot`` and a ``--render`` without a screen; makes and connects nothing."""
     if robot is not None:
         require_robot_address(robot)
-        Place(robot).robot_kwargs(env_id, {})
+        EnvLocation(robot).robot_kwargs(env_id, {})
     if render:
         require_screen(remote=robot is not None)
 
@@ -89,6 +89,6 @@ def open_env(
     """
     require_place(checkpoint.manifest.env, robot, render)
     with SignalMemory() as signals:
-        env = connected_env(checkpoint, Place(robot), signals, render=render, **asked)
+        env = connected_env(checkpoint, EnvLocation(robot), signals, render=render, **asked)
         with contextlib.closing(env):
             yield env

@@ -15,7 +15,7 @@ from bam_train.signals import SignalMemory
 if TYPE_CHECKING:
     from bam_train.cli.flags import ServeConfig
 
-_LOOK = 1.0
+_CHECK_PERIOD = 1.0
 """Time between two checks that everything still runs [s]."""
 
 
@@ -39,7 +39,7 @@ def serve(config: ServeConfig, signals: SignalMemory) -> None:
         for line in served.endpoints:
             _tell(line)
         forever = threading.Event()
-        while not forever.wait(_LOOK):
+        while not forever.wait(_CHECK_PERIOD):
             signals.raise_again()
             served.require_running()
 

@@ -13,7 +13,7 @@ from bam_envs.safety.guard import TRIAL_SPEED
 from bam_train.checkpoint import Checkpoint
 from bam_train.deploy.agreement import Shadow
 from bam_train.deploy.trials import Subject, TrialRecord, Trials
-from bam_train.env_location import Place
+from bam_train.env_location import EnvLocation
 from bam_train.errors import SettingsError, TrialsNeeded, UntrustedCheckpoint
 from bam_train.policy import FrozenPolicy
 
@@ -52,7 +52,7 @@ class Admission:
     policy: FrozenPolicy = field(init=False)
     """The frozen policy, once it is admitted."""
 
-    def __call__(self, env: gym.Env[Any, Any], place: Place, identity: str = "") -> list[str]:
+    def __call__(self, env: gym.Env[Any, Any], place: EnvLocation, identity: str = "") -> list[str]:
         """Check signature and trials if the robot is real, and load the policy; returns lines for the operator.
 
         A simulated robot needs no signature, and trials only if `place.trial` is set. For `identity` see `Inspection`.

@@ -17,12 +17,12 @@ from bam_train.checkpoint import Checkpoint
 from bam_train.deploy.arm_checks import arm_checks, geometry_of
 from bam_train.deploy.contract_table import Check, Contract, check
 from bam_train.deploy.robot_checks import robot_checks
-from bam_train.env_location import Place
+from bam_train.env_location import EnvLocation
 from bam_train.environments import first_difference, fit_pairs, short_json
 
 
 def check_contract(
-    checkpoint: Checkpoint, env: Any, place: Place, *, listen: float | None = None, timeout: float = TIMEOUT
+    checkpoint: Checkpoint, env: Any, place: EnvLocation, *, listen: float | None = None, timeout: float = TIMEOUT
 ) -> Contract:
     """Compare a checkpoint with the live robot at `place`; sends nothing, moves nothing.
 

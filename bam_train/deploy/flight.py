@@ -23,7 +23,7 @@ from bam_envs.rosbridge.endpoint import Endpoint
 from bam_envs.safety.guard import Tick
 from bam_train.checkpoint import Checkpoint
 from bam_train.deploy.journal import Journal
-from bam_train.env_location import Place
+from bam_train.env_location import EnvLocation
 from bam_train.environments import control_period
 from bam_train.files.stand_ins import with_addresses
 from bam_train.loop import Agent
@@ -94,7 +94,7 @@ def deployment_facts(checkpoint: Checkpoint, env: gym.Env[Any, Any]) -> dict[str
     }
 
 
-def watch_cameras(recorder: Recorder, place: Place) -> list[str]:
+def watch_cameras(recorder: Recorder, place: EnvLocation) -> list[str]:
     """Connect and record the cameras of the live robot's profile; returns a warning for each camera left out."""
     left_out = []
     cameras = load_profile(place.profile).cameras if place.robot and place.profile else ()

@@ -11,7 +11,7 @@ from gymnasium.vector import VectorEnv
 from bam_envs.core import registry
 from bam_envs.core.spaces import space_to_json
 from bam_train.checkpoint import Checkpoint, Manifest
-from bam_train.env_location import HERE, Place
+from bam_train.env_location import HERE, EnvLocation
 from bam_train.errors import CheckpointMismatch
 
 AnyEnv = gym.Env[Any, Any] | VectorEnv[Any, Any, Any]
@@ -26,7 +26,7 @@ def control_period(env: gym.Env[Any, Any]) -> float | None:
     return 1.0 / float(rate) if rate else None
 
 
-def require_fit(checkpoint: Checkpoint, env: AnyEnv, place: Place = HERE, env_id: str | None = None) -> None:
+def require_fit(checkpoint: Checkpoint, env: AnyEnv, place: EnvLocation = HERE, env_id: str | None = None) -> None:
     """Check that `env` fits the checkpoint's policy.
 
     Both spaces, the name and unit of every signal, and the control period are compared, where both sides give them.

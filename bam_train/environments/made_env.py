@@ -21,7 +21,7 @@ from bam_envs.robots.linked import link_profile
 from bam_envs.tasks.wrappers.late_actions import read_delay
 from bam_train.checkpoint import Checkpoint
 from bam_train.checkpoint.manifest import WHERE
-from bam_train.env_location import HERE, Place
+from bam_train.env_location import HERE, EnvLocation
 from bam_train.errors import BamTrainError, CheckpointMismatch, SettingsError
 from bam_train.foreign_env import ForeignEnv, described
 
@@ -117,7 +117,7 @@ def make_env(
     env_kwargs: Mapping[str, Any] | None = None,
     *,
     render_mode: str | None = None,
-    place: Place = HERE,
+    place: EnvLocation = HERE,
 ) -> gym.Env[Any, Any]:
     """One environment, with its time limit and without Gymnasium's (slow) checker; nothing is connected yet.
 
@@ -164,7 +164,7 @@ def parity_if_needed(
 
 
 def make_vector_env(
-    env_id: str, env_kwargs: Mapping[str, Any] | None, num_envs: int, place: Place = HERE
+    env_id: str, env_kwargs: Mapping[str, Any] | None, num_envs: int, place: EnvLocation = HERE
 ) -> VectorEnv[Any, Any, Any]:
     """`num_envs` environments stepped together, with automatic resets in the same step.
 

@@ -31,7 +31,7 @@ _SAME = 0.1
 
 
 @dataclass(frozen=True)
-class Agreement:
+class ActionAgreement:
     """How far the policy would have acted as whoever was recorded meant to, without the noise that was added."""
 
     share: float
@@ -73,7 +73,7 @@ class DataReport:
     recorded: float
     recorded_interval: tuple[float, float] | None
     """Wilson's 95 % interval of the success rate; None for returns."""
-    agreement: Agreement
+    agreement: ActionAgreement
     fitted_q: Estimate
     importance: dict[str, Estimate]
     """``ips``, ``snips`` and ``dr``; empty where actions have no probabilities."""
@@ -138,7 +138,7 @@ def evaluate_on_data(
         seen=len(used),
         recorded=float(returns.mean()),
         recorded_interval=wilson_interval(int(returns.sum()), len(returns)) if by_success else None,
-        agreement=Agreement(float(agrees.mean()), *differences),
+        agreement=ActionAgreement(float(agrees.mean()), *differences),
         fitted_q=within_bounds(fitted.estimate(), by_success),
         importance={} if ratios is None else _importance(steps, ratios, fitted, by_success),
         probabilities="none" if ratios is None else "estimated" if steps.propensity is None else "recorded",

@@ -3,7 +3,7 @@
 from bam_train.evaluation.evaluation import (
     FIRST_SEED,
     BatchPolicy,
-    Episode,
+    EpisodeScore,
     EvaluationReport,
     default_num_envs,
     evaluate,
@@ -18,7 +18,7 @@ from bam_train.evaluation.evaluation import (
 __all__ = [
     "FIRST_SEED",
     "BatchPolicy",
-    "Episode",
+    "EpisodeScore",
     "EvaluationReport",
     "default_num_envs",
     "evaluate",

@@ -39,7 +39,7 @@ class BatchPolicy(Protocol):
 
 
 @dataclass(frozen=True)
-class Episode:
+class EpisodeScore:
     """One counted episode."""
 
     seed: int
@@ -96,7 +96,7 @@ def wilson_interval(successes: int, episodes: int) -> tuple[float, float]:
     return low, high
 
 
-def summarise(env: str, episodes: Sequence[Episode], starts: int | None = None) -> EvaluationReport:
+def summarise(env: str, episodes: Sequence[EpisodeScore], starts: int | None = None) -> EvaluationReport:
     """The report over `episodes` (at least one), which are in the order of their seeds."""
 
     def finite(value: float) -> float | None:
@@ -158,7 +158,7 @@ def evaluate(
         env = make_vector_env(env_id, env_kwargs, num_envs or default_num_envs(env_id, episodes))
     elif env.metadata.get("autoreset_mode") is not AutoresetMode.SAME_STEP:
         raise SettingsError(f"env: expected autoreset mode SAME_STEP, found {env.metadata.get('autoreset_mode')}")
-    finite, done, seen = FiniteVectorEnv(env, env_id), list[Episode](), set[int]()
+    finite, done, seen = FiniteVectorEnv(env, env_id), list[EpisodeScore](), set[int]()
     starts = number_of_starts(env)
     wanted, played = min(episodes, starts or episodes), 0
     try:
@@ -180,7 +180,7 @@ def number_of_starts(env: VectorEnv[Any, Any, Any]) -> int | None:
     return count
 
 
-def first_of_each(episodes: Sequence[Episode], seen: set[int]) -> list[Episode]:
+def first_of_each(episodes: Sequence[EpisodeScore], seen: set[int]) -> list[EpisodeScore]:
     """The episodes whose start is not one of `seen`, to which theirs are added: a second one would say the same."""
     found = []
     for one in episodes:
@@ -189,7 +189,7 @@ def first_of_each(episodes: Sequence[Episode], seen: set[int]) -> list[Episode]:
     return found
 
 
-def play_wave(env: VectorEnv[Any, Any, Any], policy: BatchPolicy, seed: int, count: int) -> list[Episode]:
+def play_wave(env: VectorEnv[Any, Any, Any], policy: BatchPolicy, seed: int, count: int) -> list[EpisodeScore]:
     """Play one episode in each of the first `count` environments; every environment i gets the seed ``seed + i``."""
     batch = _Batch(lambda: env, auto_reset=False, arrays="numpy", info_keys=("is_success",))
     acting = PolicyAgent(policy, [f"env/{name}" for name in names(env.single_observation_space)])
@@ -205,7 +205,7 @@ def play_wave(env: VectorEnv[Any, Any, Any], policy: BatchPolicy, seed: int, cou
 
     totals, lengths = last["env/cumulated_reward"], last["env/timestep"]
     return [
-        Episode(
+        EpisodeScore(
             seed + i, float(totals[i]), int(lengths[i]), success(i), None if wave.starts is None else wave.starts[i]
         )
         for i in range(count)

@@ -8,7 +8,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from bam_train.agent.front.jog import FRESH
+from bam_train.agent.front.jog import JOG_LIFETIME
 from bam_train.environments import control_period
 from bam_train.play.hands import Hand
 from bam_train.play.key_map import moved, next_speed, stick_moved, table
@@ -17,14 +17,16 @@ USUAL_PERIOD = 0.05
 """Period of an environment that does not say one [s]."""
 UNDO = 1.0
 """Time that an undo goes back [s]."""
-_AGAIN = 0.7  # time after which the key of a control counts as pressed anew; a terminal sends repetitions only [s]
+_NEW_PRESS_PAUSE = (
+    0.7  # time after which the key of a control counts as pressed anew; a terminal sends repetitions only [s]
+)
 _KEPT = 1200  # steps that can be undone
 PLOTTED = 20
 """Steps that are plotted."""
 
 
 class HeldKeys:
-    """Which keys are held: until they are let go, or in a terminal for `FRESH` after the last repetition."""
+    """Which keys are held: until they are let go, or in a terminal for `JOG_LIFETIME` after the last repetition."""
 
     def __init__(self) -> None:
         self._until: dict[str, float] = {}
@@ -32,8 +34,8 @@ class HeldKeys:
 
     def press(self, key: str, now: float, *, until_let: bool = False) -> bool:
         """Take a key at the time `now` [s]; whether it is a new press, not a repetition."""
-        is_new = now - self._last.get(key, -_AGAIN) >= _AGAIN
-        self._until[key], self._last[key] = float("inf") if until_let else now + FRESH, now
+        is_new = now - self._last.get(key, -_NEW_PRESS_PAUSE) >= _NEW_PRESS_PAUSE
+        self._until[key], self._last[key] = float("inf") if until_let else now + JOG_LIFETIME, now
         return is_new
 
     def let(self, key: str) -> None:

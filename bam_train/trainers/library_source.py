@@ -32,7 +32,7 @@ _NAMES: dict[str, Any] = {
 }
 
 
-class Source(NamedTuple):
+class LibrarySource(NamedTuple):
     """A class in the source of the module that defines it."""
 
     module: str
@@ -82,12 +82,12 @@ def _tables(reference: str, name: str) -> Iterator[dict[str, str]]:
                 yield {str(ast.literal_eval(key)): f"{one.module}:{ast.unparse(kind)}" for key, kind in pairs if key}
 
 
-def source_of(reference: str) -> Source:
+def source_of(reference: str) -> LibrarySource:
     """The class ``"module:Class"``, wherever the module has it from."""
     module, name = reference.split(":")
     for node in _tree(module).body:
         if isinstance(node, ast.ClassDef) and node.name == name:
-            return Source(module, node)
+            return LibrarySource(module, node)
         if isinstance(node, ast.Assign) and isinstance(node.value, ast.Name) and ast.unparse(node.targets[0]) == name:
             return source_of(f"{module}:{node.value.id}")
         if isinstance(node, ast.ImportFrom) and node.module:
@@ -97,7 +97,7 @@ def source_of(reference: str) -> Source:
     raise LookupError(f"{reference} is not in the source")
 
 
-def bases(source: Source) -> Iterator[Source]:
+def bases(source: LibrarySource) -> Iterator[LibrarySource]:
     """The class and what it inherits from, of its own library, the nearest first."""
     yield source
     library = source.module.partition(".")[0]

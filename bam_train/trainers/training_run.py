@@ -39,7 +39,7 @@ LEARNT_FOR, LEARNT_SHARE = 3.0, 0.01
 """Seconds, and share of the steps, of learning on which an estimate of the time left rests at least."""
 
 
-class Watcher(Protocol):
+class RunWatcher(Protocol):
     """Receives the progress of a run, such as a display; times are in seconds."""
 
     def training(
@@ -101,7 +101,7 @@ class TrainingRun:
         trainer: Trainer,
         folder: RunFolder,
         out: Path,
-        watcher: Watcher,
+        watcher: RunWatcher,
         best: Scores | None = None,
         clock: Callable[[], float] = time.monotonic,
         copies: Copies | None = None,

@@ -2,7 +2,7 @@
 
 import pytest
 
-from bam_train.env_location import HERE, Place, addresses, read_guards
+from bam_train.env_location import HERE, EnvLocation, addresses, read_guards
 from bam_train.errors import SettingsError
 
 
@@ -22,32 +22,32 @@ def test_addresses(text, found):
     ("place", "message"),
     [
         (
-            Place(robot="ws://a:1", transport=("tcp://b:2",)),
+            EnvLocation(robot="ws://a:1", transport=("tcp://b:2",)),
             "--robot and --transport exclude each other: the task runs here, or over there; give one",
         ),
-        (Place(profile="ur5e"), "--profile describes a live robot; give its address with --robot too"),
+        (EnvLocation(profile="ur5e"), "--profile describes a live robot; give its address with --robot too"),
         (
-            Place(ca_file="ca.pem"),
+            EnvLocation(ca_file="ca.pem"),
             "--ca-file is for a link, and the robot is simulated here; give --robot or --transport",
         ),
         (
-            Place(robot="ws://a:1", ca_file="ca.pem"),
+            EnvLocation(robot="ws://a:1", ca_file="ca.pem"),
             "--ca-file is for wss:// only, and ws://a:1 is without TLS; leave it out",
         ),
         (
-            Place(transport=("wss://a:1", "tcp://b:2"), ca_file="ca.pem"),
+            EnvLocation(transport=("wss://a:1", "tcp://b:2"), ca_file="ca.pem"),
             "--ca-file is for wss:// only, and tcp://b:2 is without TLS; leave it out",
         ),
         (
-            Place(transport=("tcp://a:1", "tcp://b:2", "tcp://a:1/")),
+            EnvLocation(transport=("tcp://a:1", "tcp://b:2", "tcp://a:1/")),
             "--transport: tcp://a:1 comes twice, and an address is one environment; give it once",
         ),
         (
-            Place(guards=(("joint_speed", 0.3),)),
+            EnvLocation(guards=(("joint_speed", 0.3),)),
             "--guard changes a limit of a live robot; give its address with --robot too",
         ),
-        (Place(timeout=5.0), "--timeout limits the wait for an answer of --transport; leave it out"),
-        (Place(transport=("tcp://a:1",), timeout=0.0), "--timeout: expected a number above 0, found 0.0"),
+        (EnvLocation(timeout=5.0), "--timeout limits the wait for an answer of --transport; leave it out"),
+        (EnvLocation(transport=("tcp://a:1",), timeout=0.0), "--timeout: expected a number above 0, found 0.0"),
     ],
 )
 def test_what_excludes_each_other_is_refused(place, message):
@@ -59,13 +59,13 @@ def test_what_excludes_each_other_is_refused(place, message):
 def test_what_a_transport_is_opened_with():
     HERE.require_sane()
     assert (HERE.is_remote, HERE.text) == (False, "")
-    place = Place(transport=("wss://a:1", "wss://b:2"), ca_file="ca.pem", timeout=2.5)
+    place = EnvLocation(transport=("wss://a:1", "wss://b:2"), ca_file="ca.pem", timeout=2.5)
     place.require_sane()
     assert place.link_options == {"ca_file": "ca.pem", "token_file": None, "timeout": 2.5}
 
 
 def test_a_live_robot_is_as_it_is():
-    place = Place(robot="ws://a:1", profile="mine.toml", ca_file="ca.pem")
+    place = EnvLocation(robot="ws://a:1", profile="mine.toml", ca_file="ca.pem")
     assert place.robot_kwargs("bam/pick-v0", {"randomize": True, "link": "wifi", "action_delay": 2}) == {
         "robot": "ws://a:1",
         "profile": "mine.toml",
@@ -75,7 +75,7 @@ def test_a_live_robot_is_as_it_is():
 
 
 def test_the_limits_of_its_guards():
-    place = Place(robot="ws://a:1", guards=read_guards([" joint_speed = 0.3", "tool_speed=1e-1"]))
+    place = EnvLocation(robot="ws://a:1", guards=read_guards([" joint_speed = 0.3", "tool_speed=1e-1"]))
     assert place.robot_kwargs("bam/pick-v0", {})["guards"] == {"joint_speed": 0.3, "tool_speed": 0.1}
 
 
@@ -107,7 +107,7 @@ def test_a_guard_that_is_refused(texts, message):
 
 def test_an_environment_without_a_robot_says_so():
     with pytest.raises(SettingsError) as caught:
-        Place(robot="ws://a:1").robot_kwargs("CartPole-v1", {})
+        EnvLocation(robot="ws://a:1").robot_kwargs("CartPole-v1", {})
     assert str(caught.value) == (
         "CartPole-v1 has no robot that --robot could exchange; serve it next to the robot with "
         "bam-serve --env CartPole-v1, and give --transport"

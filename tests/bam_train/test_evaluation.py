@@ -8,7 +8,7 @@ import pytest
 from bam_train.environments import make_vector_env
 from bam_train.errors import PolicyError, SettingsError
 from bam_train.evaluation import (
-    Episode,
+    EpisodeScore,
     default_num_envs,
     evaluate,
     play_wave,
@@ -128,7 +128,7 @@ def test_an_action_that_is_not_finite_is_refused_and_a_given_environment_left_op
 
 
 def test_returns_that_are_not_finite_are_none():
-    report = summarise("e", [Episode(0, float("nan"), 1, None), Episode(1, 1.0, 3, None)])
+    report = summarise("e", [EpisodeScore(0, float("nan"), 1, None), EpisodeScore(1, 1.0, 3, None)])
     assert (report.return_mean, report.return_std, report.return_min, report.return_max) == (None, None, None, None)
     assert (report.length_mean, report.length_std) == (2.0, 1.0)
     json.dumps(report.to_json(), allow_nan=False)

@@ -8,9 +8,9 @@ from bam_envs.core.errors import NotInCommand
 from bam_envs.remote.serve.command_lease import CommandLease
 from bam_envs.rosbridge.bus import UNKNOWN_CALLER, Caller
 
-CUT = 2.0
+CUT_LINK_TIMEOUT = 2.0
 """Time for which the lease of an owner stays whose link was cut [s]."""
-SILENT = 3.0
+SILENT_LINK_TIMEOUT = 3.0
 """Time without a sign of life, of which there is one a second, after which the link of an owner counts as cut [s]."""
 
 
@@ -69,13 +69,13 @@ class AgentLease(CommandLease):
         self._used = self._now()
 
     def cut(self, client: str, shown: str, how: str = "was cut") -> None:
-        """Keep the lease of a client for `CUT` [s], as `how` it lost its link."""
-        self._cut, self._how = (client, shown, self._now() + CUT), how
+        """Keep the lease of a client for `CUT_LINK_TIMEOUT` [s], as `how` it lost its link."""
+        self._cut, self._how = (client, shown, self._now() + CUT_LINK_TIMEOUT), how
 
     @property
     def is_silent(self) -> bool:
         """Whether there is an owner without a sign of life: frozen, or behind a network that is gone."""
-        return self.holder is not None and SILENT < self.silence < math.inf
+        return self.holder is not None and SILENT_LINK_TIMEOUT < self.silence < math.inf
 
     @property
     def is_cut(self) -> bool:
@@ -88,7 +88,7 @@ class AgentLease(CommandLease):
             client, shown, end = self._cut
             if self._now() >= end:
                 self._cut = None
-                return client, f"the lease of {shown} ended, {CUT:g} s after its link {self._how}"
+                return client, f"the lease of {shown} ended, {CUT_LINK_TIMEOUT:g} s after its link {self._how}"
         elif self.holder is not None and self._now() - self._used > self.seconds:
             client, shown = self.holder, self._shown or self.holder
             return client, f"the lease of {shown} ended: it was not used for {self.seconds:g} s"

@@ -257,7 +257,7 @@ class _Client:
             case protocol.Watch():
                 self._switch("watch", request.on)
                 self._answer(request.id, {"on": request.on})
-            case protocol.Transitions():
+            case protocol.StreamTransitions():
                 self._learn(request.on)
                 self._answer(request.id, {"on": request.on})
             case protocol.Push():

@@ -23,7 +23,7 @@ from bam_envs.live.camera import CameraImage, Pixels
 from bam_envs.rosbridge.bus import Caller
 from bam_envs.rosbridge.server.server_connection import BridgeConnection
 
-_LOOK, _AGAIN, _ALIVE = 0.02, 2.0, 1.0
+_IMAGE_POLL_PERIOD, _RECONNECT_PERIOD, _KEEPALIVE_PERIOD = 0.02, 2.0, 1.0
 """Times between two looks at a camera, two attempts to connect it, and two signs of life to a page [s]."""
 _QUICK, _LONGEST = 0.02, 0.5
 """Time to draw a picture above which pictures give way, and longest pause between two of them [s]."""
@@ -31,7 +31,7 @@ _QUALITY = 80
 """Quality of pictures that arrive uncompressed, and are sent as JPEG."""
 
 
-class Camera(Protocol):
+class FeedCamera(Protocol):
     """What `LiveCamera` has."""
 
     def connect(self) -> None:
@@ -59,7 +59,7 @@ class CameraFeed:
         seen: Width and height of the images that the policy sees [pixels], by the camera's name.
     """
 
-    def __init__(self, cameras: Mapping[str, Camera], seen: Mapping[str, tuple[int, int]] | None = None) -> None:
+    def __init__(self, cameras: Mapping[str, FeedCamera], seen: Mapping[str, tuple[int, int]] | None = None) -> None:
         self._names, self._readers = list(cameras), [_Reader(one) for one in cameras.values()]
         self._seen = dict(seen or {})
         self._viewers = 0
@@ -99,8 +99,8 @@ class CameraFeed:
                         shown[number], silent, turn = at, time.monotonic(), number + 1
                         page.sent(number)
                         await connection.send(bytes([number]) + data)
-                await page.wait(_LOOK)
-                if time.monotonic() - silent > _ALIVE:
+                await page.wait(_IMAGE_POLL_PERIOD)
+                if time.monotonic() - silent > _KEEPALIVE_PERIOD:
                     await connection.send('{"event": "alive"}')
                     silent = time.monotonic()
         finally:
@@ -167,7 +167,7 @@ async def _listen(connection: BridgeConnection, page: PagePace, cameras: int) ->
 class _Reader:
     """Reads one camera in a thread of its own."""
 
-    def __init__(self, camera: Camera) -> None:
+    def __init__(self, camera: FeedCamera) -> None:
         self._camera = camera
         self._stopped, self._thread = threading.Event(), threading.Thread()
         self.newest: tuple[int, bytes] = (0, b"")
@@ -198,13 +198,13 @@ class _Reader:
             self._read(stopped)
         except BamEnvsError as error:
             self.error = str(error)
-            stopped.wait(_AGAIN)
+            stopped.wait(_RECONNECT_PERIOD)
         finally:
             self._camera.close()
 
     def _read(self, stopped: threading.Event) -> None:
         seen = 0
-        while not stopped.wait(_LOOK):
+        while not stopped.wait(_IMAGE_POLL_PERIOD):
             file = self._camera.file()
             if file is not None:
                 number, _, data = file

@@ -27,9 +27,9 @@ from bam_train.agent.versions import Versions
 from bam_train.errors import BamTrainError
 
 Listener = Callable[[dict[str, Any]], None]
-_SHOW = 0.1  # time between two messages of telemetry [s]
-_LONG = 3700.0  # longest wait until a candidate acts [s]; the agent itself gives up after an hour
-_TRIAL = 25 * 3600.0  # the same until its trial has ended, for which the agent waits a day [s]
+_TELEMETRY_PERIOD = 0.1  # time between two messages of telemetry [s]
+_ACTIVATION_TIMEOUT = 3700.0  # longest wait until a candidate acts [s]; the agent itself gives up after an hour
+_TRIAL_TIMEOUT = 25 * 3600.0  # the same until its trial has ended, for which the agent waits a day [s]
 
 
 class AgentHub:
@@ -57,7 +57,7 @@ class AgentHub:
             self._jogger = None
         self._jogs = False  # whether the last period had a command
         self._clock = Ticker(self._jog, shadow.spec.period)
-        self._shown = Ticker(self._show, _SHOW)
+        self._shown = Ticker(self._show, _TELEMETRY_PERIOD)
         self._lock = threading.Lock()
 
     def start(self) -> None:
@@ -92,7 +92,7 @@ class AgentHub:
             return self.status()
         if op == "push":
             arguments = {**arguments, "path": str(arguments["path"])}
-        long = _TRIAL if arguments.get("wait") else _LONG if op in ("push", "use") else 10.0
+        long = _TRIAL_TIMEOUT if arguments.get("wait") else _ACTIVATION_TIMEOUT if op in ("push", "use") else 10.0
         return self._front.ask(op, arguments, person.name, person.address, progress, long)
 
     def stop(self, person: Person, why: str) -> dict[str, Any]:

@@ -1,7 +1,7 @@
 """Jogging: from a person's twist of the tool or the base to a command of the robot, one period at a time.
 
-A twist is good for `FRESH` on the clock of this computer. It then ends by itself, whatever became of the page, the
-browser or the network that sent it.
+A twist is good for `JOG_LIFETIME` on the clock of this computer. Then it ends by itself, whatever became of the page,
+the browser or the network that sent it.
 """
 
 import math
@@ -20,7 +20,7 @@ from bam_envs.core.wording import brief
 from bam_envs.safety.guard import columns_in, is_base, measured_places
 
 Array = NDArray[np.float64]
-FRESH = 0.2
+JOG_LIFETIME = 0.2
 """Time for which a twist is valid [s]."""
 SPEED, TURN_SPEED = 0.25, 0.5
 """Fastest motion [m/s] and turn [rad/s] of the tool or the base."""
@@ -84,7 +84,7 @@ class Jogger:
         Args:
             message: ``seq``, which grows; ``twist``: vx, vy, vz [m/s] and wz [rad/s] in ``base_link``, or v, 0, 0, wz
                 of a base; ``gripper``: 1 closes it, -1 opens it, 0 (or none) leaves it. With ``sent``, the sender's
-                time [s], a twist that was on its way for `FRESH` longer than the quickest one counts as late.
+                time [s], a twist that was on its way for `JOG_LIFETIME` longer than the quickest one counts as late.
 
         Raises:
             ProtocolError: A number is missing, or is none.
@@ -106,10 +106,10 @@ class Jogger:
         return True
 
     def _is_late(self, delay: float, now: float) -> bool:
-        """Whether a twist took `FRESH` longer than the quickest one; `delay` [s] is between two different clocks."""
+        """Whether a twist took `JOG_LIFETIME` longer than the quickest one; `delay` [s] is between two clocks."""
         drift = _DRIFT * (now - self._newest.at)  # infinite for the first one
         self._delay = min(delay, self._delay + drift)
-        return delay - self._delay > FRESH
+        return delay - self._delay > JOG_LIFETIME
 
     def command(self, state: RobotState) -> Array | None:
         """The command of the next period (1, m), or None: nothing is to be sent, as there is no fresh twist.
@@ -117,7 +117,7 @@ class Jogger:
         `state` has n = 1; its ``command`` is the last one that the robot was sent, from where the gripper goes on.
         """
         newest = self._newest
-        if self._clock() - newest.at > FRESH:
+        if self._clock() - newest.at > JOG_LIFETIME:
             self.sent = None
             return None
         if self.sent is None and not (any(newest.twist) or newest.grip):  # nothing moves, nothing is to move

@@ -17,7 +17,7 @@ from bam_train.agent.agent_messages import Drive, Halt, Message
 
 Array = NDArray[np.float64]
 _PARTS = 5  # looks at the state in a period
-_AGAIN = 1.0  # time between two attempts to reach the robot [s]
+_RECONNECT_PERIOD = 1.0  # time between two attempts to reach the robot [s]
 
 
 class RemoteRobot:
@@ -79,11 +79,11 @@ class RemoteRobot:
                     self._shadow.connect()
                     connected = True
                     self._connected()
-                elif self._shadow.age() > _AGAIN:
+                elif self._shadow.age() > _RECONNECT_PERIOD:
                     self._shadow.reset(np.array([0]), None)  # type: ignore[arg-type]
             except BamEnvsError:  # the status says what the agent waits for
                 pass
-            if self._closed.wait(_AGAIN):
+            if self._closed.wait(_RECONNECT_PERIOD):
                 return
 
     def tick(self) -> None:

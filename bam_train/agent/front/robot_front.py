@@ -28,24 +28,24 @@ from bam_train.agent.agent_messages import (
     Halt,
     Listening,
     Message,
-    Progress,
     Report,
+    RequestProgress,
     Rows,
     Sent,
 )
-from bam_train.agent.front.agent_lease import SILENT, AgentLease
+from bam_train.agent.front.agent_lease import SILENT_LINK_TIMEOUT, AgentLease
 from bam_train.agent.front.remote_robot import RemoteRobot
 from bam_train.agent.remote.agent_protocol import printable
 from bam_train.agent.transitions import EVENT
-from bam_train.env_location import Place
+from bam_train.env_location import EnvLocation
 from bam_train.environments import make_env
 from bam_train.errors import BamTrainError, CandidateRefused, RequestRefused, TrialsNeeded, UnknownVersion
 
 _log = logging.getLogger(__name__)
-_LOOK = 0.1  # time between two looks at the lease [s]
+_LEASE_POLL_PERIOD = 0.1  # time between two looks at the lease [s]
 _HALT_LATE = 1.0  # longest time for which a halt comes after the end of its sender's lease [s]
 _REFUSALS = {one.__name__: one for one in (NotInCommand, CandidateRefused, TrialsNeeded, UnknownVersion)}
-_ANSWER = 10.0  # longest wait for an answer of the resident, unless it needs longer [s]
+_ANSWER_TIMEOUT = 10.0  # longest wait for an answer of the resident, unless it needs longer [s]
 
 
 class Watchers(Protocol):
@@ -78,7 +78,7 @@ class FrontProcess:
         self.status: dict[str, Any] = {"state": "waiting for the robot", "why": "it starts", "active": None}
         self.status |= {"owner": None, "names": {}}
         """The last report of the resident."""
-        place = Place(
+        place = EnvLocation(
             options.robot,
             profile=options.profile,
             ca_file=options.ca_file,
@@ -118,7 +118,7 @@ class FrontProcess:
                 waiting[0].set_result(message)
         elif isinstance(message, Rows):
             self.watchers.tell(EVENT, message.event)
-        elif isinstance(message, Progress) and message.number in self._pending:
+        elif isinstance(message, RequestProgress) and message.number in self._pending:
             self._pending[message.number][1](message.text)
 
     def stop(self) -> None:
@@ -143,7 +143,7 @@ class FrontProcess:
         who: str,
         address: str,
         progress: Callable[[str], None] = lambda text: None,
-        timeout: float = _ANSWER,
+        timeout: float = _ANSWER_TIMEOUT,
     ) -> dict[str, Any]:
         """Ask the resident, and wait for its answer; raises what it refuses."""
         number, future = next(self._numbers), Future[Any]()
@@ -196,7 +196,7 @@ class FrontProcess:
         """End leases that are over, or whose owner is silent."""
         holder = self.lease.holder
         if holder is not None and self.lease.is_silent:
-            self.cut(holder, "", f"was silent for {SILENT:g} s")
+            self.cut(holder, "", f"was silent for {SILENT_LINK_TIMEOUT:g} s")
         over = self.lease.over()
         if over is not None:
             client, why = over
@@ -255,7 +255,7 @@ class FrontProcess:
         self.robot.start()
         self.send(Listening(server.port))
         try:
-            while not self._stopped.wait(_LOOK):
+            while not self._stopped.wait(_LEASE_POLL_PERIOD):
                 self._watch_lease()
         finally:
             requests.close()

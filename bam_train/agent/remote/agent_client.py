@@ -49,10 +49,10 @@ _REFUSALS = frozenset(
 REFUSED = 3
 """Exit status of a program whose request an agent refuses."""
 _LARGEST = 64 * 2**20
-_PATIENCE = 1.0  # time after which a silent server is asked whether it is one of rosbridge [s]
+_SILENT_SERVER_TIMEOUT = 1.0  # time after which a silent server is asked whether it is one of rosbridge [s]
 _PING, _PONG = 5.0, 20.0  # time between two pings, and longest time for their answer [s]
 _CLOSE = 1.0  # longest time for a closing handshake [s]
-_LOOK = 0.5  # time between two looks whether the connection has ended [s]
+_CLOSED_POLL_PERIOD = 0.5  # time between two looks whether the connection has ended [s]
 _IS_IT_ROSBRIDGE = '{"op": "call_service", "service": "/rosapi/get_time", "id": "agent?"}'
 
 _QUIET = logging.getLogger(f"{__name__}.websockets")
@@ -202,7 +202,7 @@ class AgentClient:
 
     def _wait(self, answer: Future[T], op: str, within: float) -> T:
         end = time.monotonic() + within
-        while not wait([answer], max(0.0, min(_LOOK, end - time.monotonic()))).done:
+        while not wait([answer], max(0.0, min(_CLOSED_POLL_PERIOD, end - time.monotonic()))).done:
             if self.error is not None:  # it ended before this was sent
                 raise self.error
             if time.monotonic() > end:
@@ -291,7 +291,7 @@ class AgentClient:
 
     async def _hello(self, socket: ClientConnection) -> Any:
         first = asyncio.ensure_future(socket.recv())
-        done, _ = await asyncio.wait([first], timeout=_PATIENCE)
+        done, _ = await asyncio.wait([first], timeout=_SILENT_SERVER_TIMEOUT)
         if not done:
             await socket.send(_IS_IT_ROSBRIDGE)
         return json.loads(await first)

@@ -46,11 +46,11 @@ class Status(Request, tag="status"):
     """The state of the agent."""
 
 
-class Versions(Request, tag="versions"):
+class ListVersions(Request, tag="versions"):
     """The versions that the agent has."""
 
 
-class Audit(Request, tag="audit"):
+class ReadAudit(Request, tag="audit"):
     """The last lines of the audit file."""
 
 
@@ -136,7 +136,7 @@ class Rollback(Request, tag="rollback"):
     why: Text = ""
 
 
-class Transitions(Request, tag="transitions"):
+class StreamTransitions(Request, tag="transitions"):
     """From now on the events with the transitions, for one learner, or no longer."""
 
     role: ClassVar[Role] = "administer"
@@ -150,7 +150,22 @@ class _Head(msgspec.Struct):
 
 AnyRequest = TypeVar("AnyRequest", bound=Request)
 _KINDS: tuple[type[Request], ...] = (
-    *(Status, Versions, Audit, Watch, Stop, Pause, Resume, Take, HandBack, Jog, Push, Use, Rollback, Transitions),
+    *(
+        Status,
+        ListVersions,
+        ReadAudit,
+        Watch,
+        Stop,
+        Pause,
+        Resume,
+        Take,
+        HandBack,
+        Jog,
+        Push,
+        Use,
+        Rollback,
+        StreamTransitions,
+    ),
 )
 OPS: dict[str, type[Request]] = {str(kind.__struct_config__.tag): kind for kind in _KINDS}
 """Each op with its request."""

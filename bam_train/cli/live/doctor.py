@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from bam_train.checkpoint import Checkpoint
     from bam_train.cli.flags import DoctorConfig
     from bam_train.deploy.contract_table import Contract
-    from bam_train.env_location import Place
+    from bam_train.env_location import EnvLocation
 
 CONTRACT = "contract"
 """Name of the last step, with a checkpoint."""
@@ -75,7 +75,7 @@ class _Subject:
 
     checkpoint: Checkpoint
     env: Any
-    place: Place
+    place: EnvLocation
     contract: Contract | None = None
     """The contract, once it was checked."""
 
@@ -85,12 +85,12 @@ class _Subject:
         if config.checkpoint is None:
             return None
         from bam_train.checkpoint import Checkpoint
-        from bam_train.env_location import Place
+        from bam_train.env_location import EnvLocation
         from bam_train.environments import environment_of, make_env
 
         checkpoint = Checkpoint.open(config.checkpoint)
         env_id, env_kwargs = environment_of(checkpoint, config.env)
-        place = Place(config.url, profile=config.profile, **files)
+        place = EnvLocation(config.url, profile=config.profile, **files)
         return cls(checkpoint, make_env(env_id, env_kwargs, place=place), place)
 
 

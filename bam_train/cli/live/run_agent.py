@@ -164,7 +164,7 @@ def _text(path: Path | None) -> str | None:
 
 def _front(options: AgentOptions, env_id: str, env_kwargs: dict[str, Any]) -> Any:
     from bam_train.agent.agent_messages import Front
-    from bam_train.agent.resident import FRESH
+    from bam_train.agent.resident import COMMAND_LIFETIME
 
     return Front(
         env=env_id,
@@ -180,5 +180,5 @@ def _front(options: AgentOptions, env_id: str, env_kwargs: dict[str, Any]) -> An
         token_file=options.token_file,
         folder=str(options.folder),
         lease=options.lease,
-        command_timeout=FRESH,
+        command_timeout=COMMAND_LIFETIME,
     )

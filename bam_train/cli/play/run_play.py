@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from bam_train.checkpoint import Checkpoint
     from bam_train.cli.play.gamepad import Gamepad
     from bam_train.cli.play.play_flags import PlayConfig
-    from bam_train.env_location import Place
+    from bam_train.env_location import EnvLocation
     from bam_train.play.session import Session
 
 DEMONSTRATIONS = 20
@@ -90,14 +90,14 @@ def _next_of(place: str) -> str:
     return f"bam-play: clone them with  bam-train --data {place} --algo bc"
 
 
-def _checked_place(config: PlayConfig) -> Place:
+def _checked_place(config: PlayConfig) -> EnvLocation:
     """The place of the environment by the flags."""
-    from bam_train.env_location import Place, addresses, read_guards
+    from bam_train.env_location import EnvLocation, addresses, read_guards
 
     ca_file, token_file = (None if path is None else str(path) for path in (config.ca_file, config.token_file))
     trial = None if config.stage is None else config.stage == "trial"
     link = (config.robot, addresses(config.transport), config.profile, ca_file, token_file, config.timeout)
-    place = Place(*link, read_guards(config.guard), trial=trial, robot_name=config.robot_name)
+    place = EnvLocation(*link, read_guards(config.guard), trial=trial, robot_name=config.robot_name)
     place.require_sane()
     if config.env is None and config.policy is None and not place.transport:
         raise SettingsError(
@@ -112,7 +112,7 @@ def _checked_place(config: PlayConfig) -> Place:
     return place
 
 
-def _connected(config: PlayConfig, place: Place, checkpoint: Checkpoint | None, signals: SignalMemory) -> Any:
+def _connected(config: PlayConfig, place: EnvLocation, checkpoint: Checkpoint | None, signals: SignalMemory) -> Any:
     """The environment, connected and with consent, and the policy, if there is one."""
     from bam_envs.core.registry import resolve_id
     from bam_train.cli.consent import connected_env
@@ -149,11 +149,11 @@ def _screen(config: PlayConfig, title: str) -> Any:
     try:
         from tkinter import TclError
 
-        from bam_train.cli.play.window import Window
+        from bam_train.cli.play.window import PlayWindow
     except ImportError as error:
         raise SettingsError("--render needs tkinter, which this Python lacks: apt-get install python3-tk") from error
     try:
-        return Window(f"bam-play: {title}")
+        return PlayWindow(f"bam-play: {title}")
     except TclError as error:
         raise SettingsError(f"--render: the window cannot be opened: {error}; check DISPLAY") from error
 
@@ -161,12 +161,12 @@ def _screen(config: PlayConfig, title: str) -> Any:
 def _drive(session: Session, screen: Any, pad: Gamepad, title: str, episodes: int | None) -> None:
     """Tick at the session's pace until it is done; keys are read between two ticks."""
     from bam_envs.core.timing import Pacer
-    from bam_train.agent.front.jog import FRESH
+    from bam_train.agent.front.jog import JOG_LIFETIME
     from bam_train.play.readout import screen_lines
 
     pacer, drawn = Pacer(session.pace, sleep=screen.wait), -DRAWN
     pacer.start()
-    looked, limit = -inf, max(FRESH, 1.5 * session.period) if session.is_live else inf
+    looked, limit = -inf, max(JOG_LIFETIME, 1.5 * session.period) if session.is_live else inf
     while not session.done and session.episodes != episodes:
         pacer.period = session.pace
         waited = monotonic() - looked  # keys that came meanwhile, as while a robot went to its start, are old

@@ -14,7 +14,7 @@ _NAMES |= {"minus": "Minus", "underscore": "Minus", "KP_Add": "Equal", "KP_Subtr
 _NAMES |= {way: f"Arrow{way}" for way in ("Up", "Down", "Left", "Right")}
 _MOST = (160, 80)  # columns and lines
 _FRAME = 80  # what a screen has around a window, such as its title and a bar [pixels]
-_AGAIN = 30  # a release that a press follows within this time [ms] is X's own repetition of a key
+_KEY_REPEAT_PAUSE = 30  # a release that a press follows within this time [ms] is X's own repetition of a key
 
 
 def key_of(keysym: str) -> str:
@@ -24,7 +24,7 @@ def key_of(keysym: str) -> str:
     return _NAMES.get(keysym, "")
 
 
-class Window:
+class PlayWindow:
     """The window, as long as the ``with`` block runs.
 
     Args:
@@ -49,7 +49,7 @@ class Window:
         self._root.bind("<KeyRelease>", self._up)
         self._root.bind("<FocusOut>", lambda event: self.let.append(""))
 
-    def __enter__(self) -> "Window":
+    def __enter__(self) -> "PlayWindow":
         return self
 
     def __exit__(self, *error: object) -> None:
@@ -64,7 +64,7 @@ class Window:
 
     def _up(self, event: Any) -> None:
         key = key_of(event.keysym)
-        self._ups[key] = self._root.after(_AGAIN, self._let, key)
+        self._ups[key] = self._root.after(_KEY_REPEAT_PAUSE, self._let, key)
 
     def _let(self, key: str) -> None:
         self._ups.pop(key, None)

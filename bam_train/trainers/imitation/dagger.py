@@ -52,7 +52,7 @@ class Dagger:
     """Units of each of the two hidden layers."""
 
 
-class Experience:
+class TaughtSteps:
     """The newest steps: observations, codes of the teacher's actions, and the states that it saw."""
 
     def __init__(self, space: spaces.Space[Any], size: int, codes: int, states: int) -> None:
@@ -90,7 +90,7 @@ class DaggerLearner:
         sizes = self._code.size, teacher.state_size
         self.network = ImitationNetwork(seen, *sizes, values.channels, values.width)
         self._optimiser = torch.optim.Adam(self.network.parameters(), lr=values.learning_rate)
-        self._experience = Experience(seen, values.memory, *sizes)
+        self._experience = TaughtSteps(seen, values.memory, *sizes)
         self._rng = np.random.default_rng(seed)
         self._observation: Any = None
         self._taught = self._draw_taught(envs.num_envs, 0.0)  # where the teacher acts in this episode

@@ -7,7 +7,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from bam_train.agent.transitions import Transitions
+from bam_train.agent.transitions import LiveTransitions
 from bam_train.trainers.live.rlpd import Batch
 
 Floats = NDArray[np.float32]
@@ -45,9 +45,9 @@ class Experience:
         """How many of them were a person's."""
         self.outcomes: list[tuple[bool, bool, str]] = []
         """Of each episode: whether it succeeded, whether a person drove, and the policy's digest at its end."""
-        self._open: dict[bool, list[Transitions]] = {}
+        self._open: dict[bool, list[LiveTransitions]] = {}
 
-    def add(self, transitions: Transitions) -> int:
+    def add(self, transitions: LiveTransitions) -> int:
         """Add what came; returns the number of transitions that can be learnt from now on."""
         before = self.added
         same = (np.diff(transitions.episode) == 0) & (np.diff(transitions.intervention) == 0)
@@ -57,7 +57,7 @@ class Experience:
                 self._extend(_some(transitions, rows))
         return self.added - before
 
-    def _extend(self, piece: Transitions) -> None:
+    def _extend(self, piece: LiveTransitions) -> None:
         """Add a piece of one episode."""
         person = bool(piece.intervention[0])
         running = self._open.get(person)
@@ -138,18 +138,18 @@ class Experience:
         self.outcomes = [(bool(success), bool(person), str(policy)) for success, person, policy in state["outcomes"]]
 
 
-def _some(transitions: Transitions, rows: NDArray[np.int64]) -> Transitions:
-    columns: dict[str, Any] = {field.name: getattr(transitions, field.name) for field in fields(Transitions)}
+def _some(transitions: LiveTransitions, rows: NDArray[np.int64]) -> LiveTransitions:
+    columns: dict[str, Any] = {field.name: getattr(transitions, field.name) for field in fields(LiveTransitions)}
     policy: list[str] = columns.pop("policy")
-    return Transitions(
+    return LiveTransitions(
         **{name: column[rows] for name, column in columns.items()}, policy=[policy[row] for row in rows.tolist()]
     )
 
 
-def _joined(pieces: list[Transitions]) -> Transitions:
+def _joined(pieces: list[LiveTransitions]) -> LiveTransitions:
     columns: dict[str, Any] = {
         field.name: np.concatenate([getattr(piece, field.name) for piece in pieces])
-        for field in fields(Transitions)
+        for field in fields(LiveTransitions)
         if field.name != "policy"
     }
-    return Transitions(**columns, policy=[one for piece in pieces for one in piece.policy])
+    return LiveTransitions(**columns, policy=[one for piece in pieces for one in piece.policy])

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 
 from bam_envs.core.validation import read_table
-from bam_train.agent.transitions import Transitions
+from bam_train.agent.transitions import LiveTransitions
 from bam_train.checkpoint import GOLDEN, POLICY, Checkpoint, write_checkpoint
 from bam_train.checkpoint.safetensors_file import pack
 from bam_train.environments import control_period, make_env, make_vector_env, require_fit
@@ -100,7 +100,7 @@ class LiveLearner:
         """Steps of the robot that were learnt from, of a person and of policies."""
         return self.experience.added
 
-    def add(self, transitions: Transitions) -> None:
+    def add(self, transitions: LiveTransitions) -> None:
         """Take transitions of the robot.
 
         Raises:

@@ -22,8 +22,8 @@ from bam_train.trainers.live.live_learner import LiveLearner
 from bam_train.trainers.run_folder import RunFolder
 
 _UPDATES = 20  # updates between two looks at what came
-_LOOK = 0.2  # longest wait for transitions [s]
-_AGAIN = 2.0  # time between two attempts to reach the agent [s]
+_TRANSITIONS_TIMEOUT = 0.2  # longest wait for transitions [s]
+_RECONNECT_PERIOD = 2.0  # time between two attempts to reach the agent [s]
 _GHOST = 60.0  # time for which an agent may take this learner, whose link was cut, for another one [s]
 _SAVE_EVERY = 60.0  # [s]
 TELL_EVERY = 15.0
@@ -107,11 +107,11 @@ class LiveSession:
             client.close()
             if self._learned_at is None or time.monotonic() - self._learned_at > _GHOST:
                 raise
-            time.sleep(_AGAIN)
+            time.sleep(_RECONNECT_PERIOD)
         except BamEnvsError as error:
             client.close()
             self._tell(f"{error} It is tried again.")
-            self._wait(_AGAIN)
+            self._wait(_RECONNECT_PERIOD)
         else:
             self._client = client
             self._tell(f"learns from {client.url}: {status.get('state')}, {status.get('robot')}")
@@ -119,14 +119,14 @@ class LiveSession:
     def _wait(self, seconds: float) -> None:
         end = time.monotonic() + seconds
         while time.monotonic() < end and not self._stopped():
-            time.sleep(min(_LOOK, seconds))
+            time.sleep(min(_TRANSITIONS_TIMEOUT, seconds))
 
     def _take(self) -> None:
         """Take the transitions that came; wait a little if there is nothing else to do."""
         client, can_wait = self._client, self.learner.due <= 0
         try:
             while True:
-                event = self._events.get(timeout=_LOOK) if can_wait else self._events.get_nowait()
+                event = self._events.get(timeout=_TRANSITIONS_TIMEOUT) if can_wait else self._events.get_nowait()
                 can_wait = False
                 self.learner.add(decode(event))
                 self._learned_at = time.monotonic()

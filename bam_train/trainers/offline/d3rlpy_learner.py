@@ -18,7 +18,7 @@ from bam_train.errors import SettingsError, TrainingFailed
 from bam_train.trainers.algorithms import OFFLINE_ALGORITHMS, without_notice
 from bam_train.trainers.frozen_network import Layer
 from bam_train.trainers.library_arguments import fit, require_known
-from bam_train.trainers.offline.training_data import ActionCode, Batch
+from bam_train.trainers.offline.training_data import ActionCode, TrainingBatch
 
 
 def _config_class(algorithm: str) -> Any:
@@ -57,7 +57,7 @@ class D3rlpyLearner:
     tanh = False
 
     def __init__(
-        self, algorithm: str, values: Mapping[str, Any], inputs: int, code: ActionCode, data: Batch, seed: int
+        self, algorithm: str, values: Mapping[str, Any], inputs: int, code: ActionCode, data: TrainingBatch, seed: int
     ) -> None:
         self.data, self.iql = data, None
         kind = _config_class(algorithm)

@@ -24,7 +24,7 @@ from torch.nn import functional
 
 from bam_train.errors import TrainingFailed
 from bam_train.trainers.frozen_network import Layer
-from bam_train.trainers.offline.training_data import ActionCode, Batch
+from bam_train.trainers.offline.training_data import ActionCode, TrainingBatch
 
 _Count = Annotated[int, Meta(ge=1, le=100_000)]
 _Positive = Annotated[float, Meta(gt=0, le=1e6)]
@@ -98,7 +98,7 @@ class ImplicitQLearner:
     tanh = True
     """Whether scores of a Box are squashed."""
 
-    def __init__(self, settings: Cloning, inputs: int, code: ActionCode, data: Batch) -> None:
+    def __init__(self, settings: Cloning, inputs: int, code: ActionCode, data: TrainingBatch) -> None:
         self.settings, self._code, self.data = settings, code, data
         self.iql = settings if isinstance(settings, ImplicitQ) else None
         width = settings.width
@@ -138,7 +138,7 @@ class ImplicitQLearner:
         rows = torch.searchsorted(self._chances, drawn).clamp(max=len(self.data) - 1)
         self.update_actor(self.data.rows(rows), None, (step - turn) / (total - turn))
 
-    def update_critics(self, batch: Batch, done: float) -> None:
+    def update_critics(self, batch: TrainingBatch, done: float) -> None:
         """Update Q and V on a batch; `done` is the share of the updates before this one."""
         iql = self._of_iql()
         with torch.no_grad():
@@ -152,7 +152,7 @@ class ImplicitQLearner:
             torch._foreach_lerp_([*self._target.parameters()], [*self._q.parameters()], iql.tau)
         self.metrics["value"] = float(goal.mean())
 
-    def update_actor(self, batch: Batch, weights: torch.Tensor | None, done: float) -> None:
+    def update_actor(self, batch: TrainingBatch, weights: torch.Tensor | None, done: float) -> None:
         """Update the actor on a batch; `weights` (n,) of its transitions have the mean 1."""
         scores = self.actor(batch.seen)
         if self._code.is_discrete:
@@ -163,7 +163,7 @@ class ImplicitQLearner:
         self._descend("actor", (errors if weights is None else weights * errors).mean(), done)
 
     @torch.no_grad()  # type: ignore[untyped-decorator] # torch is not typed here
-    def _weights(self, batch: Batch) -> torch.Tensor:
+    def _weights(self, batch: TrainingBatch) -> torch.Tensor:
         """Weight of every action by its advantage; their mean is 1. Shape: (n,)."""
         iql = self._of_iql()
         pieces = zip(*(column.split(4096) for column in (batch.seen, batch.action)), strict=True)
@@ -171,7 +171,7 @@ class ImplicitQLearner:
         weights = (iql.advantage_scale * advantage / advantage.std().clamp(min=1e-6)).exp().clamp(max=_MOST)
         return weights / weights.mean()
 
-    def update_online(self, batch: Batch, done: float) -> None:
+    def update_online(self, batch: TrainingBatch, done: float) -> None:
         """Update critics and actor on a batch."""
         self.update_critics(batch, done)
         self.update_actor(batch, self._weights(batch), done)

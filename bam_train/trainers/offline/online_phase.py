@@ -13,7 +13,7 @@ from bam_train.errors import SettingsError
 from bam_train.settings import TrainSettings
 from bam_train.trainers.base import Statistics
 from bam_train.trainers.offline.implicit_q import ImplicitQLearner
-from bam_train.trainers.offline.training_data import ActionCode, Batch, Normaliser
+from bam_train.trainers.offline.training_data import ActionCode, Normaliser, TrainingBatch
 
 _LARGEST = 200_000  # own transitions that are kept
 _RECENT = 100  # episodes of the statistics
@@ -28,7 +28,7 @@ class OnlinePhase:
         self._normaliser, self._code, self._reward_scale = normaliser, code, reward_scale
         self._rng = np.random.default_rng(settings.seed)
         self._observation: Any = None
-        self._own: Batch | None = None  # a ring buffer
+        self._own: TrainingBatch | None = None  # a ring buffer
         self._added, self._due = 0, 0.0
         self._running = np.zeros((2, self.envs.num_envs))  # return and length of the running episodes
         self._ended: deque[tuple[float, float, bool | None]] = deque(maxlen=_RECENT)
@@ -46,7 +46,7 @@ class OnlinePhase:
         ended = terminated | truncated
         following = _with_last(after, infos["final_obs"], ended) if ended.any() else after
         reward = torch.as_tensor(rewards / self._reward_scale, dtype=torch.float32)
-        self._keep(Batch(seen, codes, reward, self._normaliser(following), torch.as_tensor(terminated).float()))
+        self._keep(TrainingBatch(seen, codes, reward, self._normaliser(following), torch.as_tensor(terminated).float()))
         self._count(rewards, ended, infos)
         self._observation = after
         self._due += len(rewards) * learner.iql.update_ratio
@@ -68,16 +68,16 @@ class OnlinePhase:
             return torch.nn.functional.one_hot(choice, self._code.size).float()
         return (torch.tanh(scores) + exploration * torch.randn_like(scores)).clamp(-1, 1)
 
-    def _keep(self, batch: Batch) -> None:
+    def _keep(self, batch: TrainingBatch) -> None:
         """Write transitions into the ring buffer."""
         if self._own is None:
-            self._own = Batch(*(torch.zeros(_LARGEST, *column.shape[1:]) for column in batch.columns()))
+            self._own = TrainingBatch(*(torch.zeros(_LARGEST, *column.shape[1:]) for column in batch.columns()))
         rows = (torch.arange(len(batch)) + self._added) % _LARGEST
         for column, new in zip(self._own.columns(), batch.columns(), strict=True):
             column[rows] = new
         self._added += len(batch)
 
-    def _drawn(self, count: int) -> Batch:
+    def _drawn(self, count: int) -> TrainingBatch:
         """Random transitions of the own ones, of which there are some."""
         own: Any = self._own
         return own.rows(torch.randint(min(self._added, _LARGEST), (count,)))  # type: ignore[no-any-return]
@@ -112,7 +112,7 @@ class OnlinePhase:
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restore the result of `state_dict`."""
         if state["own"] is not None:
-            self._keep(Batch(*state["own"]))
+            self._keep(TrainingBatch(*state["own"]))
         self._added, self._due = int(state["added"]), float(state["due"])
         self._rng.bit_generator.state = state["rng"]
 

@@ -23,7 +23,7 @@ _LEAST = 1e-3  # standard deviation of a value that was (almost) constant in the
 
 
 @dataclass
-class Batch:
+class TrainingBatch:
     """n transitions."""
 
     seen: torch.Tensor
@@ -40,17 +40,17 @@ class Batch:
     def __len__(self) -> int:
         return len(self.reward)
 
-    def rows(self, index: torch.Tensor) -> Batch:
+    def rows(self, index: torch.Tensor) -> TrainingBatch:
         """The transitions of an index."""
-        return Batch(*(column[index] for column in self.columns()))
+        return TrainingBatch(*(column[index] for column in self.columns()))
 
     def columns(self) -> tuple[torch.Tensor, ...]:
         """The tensors in the order of the fields."""
         return self.seen, self.action, self.reward, self.after, self.terminal
 
-    def joined(self, other: Batch) -> Batch:
+    def joined(self, other: TrainingBatch) -> TrainingBatch:
         """Both, one after the other."""
-        return Batch(*(torch.cat(pair) for pair in zip(self.columns(), other.columns(), strict=True)))
+        return TrainingBatch(*(torch.cat(pair) for pair in zip(self.columns(), other.columns(), strict=True)))
 
 
 class ActionCode:
@@ -123,7 +123,7 @@ class Normaliser:
 
 def read_batch(
     data: DataSet, indices: Sequence[int], normaliser: Normaliser, code: ActionCode, *, fit: bool
-) -> tuple[Batch, float]:
+) -> tuple[TrainingBatch, float]:
     """All transitions of some episodes, and the deviation of their rewards; `fit` the normaliser to them first.
 
     Raises:
@@ -138,4 +138,6 @@ def read_batch(
     scale = float(steps.rewards.std()) or 1.0
     reward = torch.as_tensor(steps.rewards / scale, dtype=torch.float32)
     seen, after = normaliser(steps.observations), normaliser(steps.next_observations)
-    return Batch(seen, code.encode(steps.actions), reward, after, torch.as_tensor(steps.terminals).float()), scale
+    return TrainingBatch(
+        seen, code.encode(steps.actions), reward, after, torch.as_tensor(steps.terminals).float()
+    ), scale

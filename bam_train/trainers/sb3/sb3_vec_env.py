@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
-from bam_train.env_location import HERE, Place
+from bam_train.env_location import HERE, EnvLocation
 from bam_train.environments import is_batched, make_env, make_vector_env
 from bam_train.errors import SettingsError
 from bam_train.finite_envs import FiniteEnv, FiniteVectorEnv
@@ -21,7 +21,7 @@ Observations = Any
 """An array (n, …), or a mapping of them."""
 
 
-def make_training_env(env_id: str, env_kwargs: Mapping[str, Any], num_envs: int, place: Place = HERE) -> VecEnv:
+def make_training_env(env_id: str, env_kwargs: Mapping[str, Any], num_envs: int, place: EnvLocation = HERE) -> VecEnv:
     """Make `num_envs` environments to train on; those of `bam_envs` can save and restore their state."""
     if is_batched(env_id) or place.transport:
         return BatchVecEnv(make_vector_env(env_id, env_kwargs, num_envs, place), env_id)

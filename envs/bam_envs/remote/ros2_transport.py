@@ -12,7 +12,7 @@ from bam_envs.remote.wire.gymapi_messages import base_name, service_name
 from bam_envs.remote.wire.ros2_node import RclpyBus
 from bam_envs.ros.messages import write_stamp
 
-_LOOK = 0.02
+_GRAPH_POLL_PERIOD = 0.02
 """Time between two checks for the environment in the graph [s]."""
 
 
@@ -82,7 +82,7 @@ class RclpyLink(RclpyBus):
                     f"no node offers {wanted} after {self._timeout:g} s. Have both ends the same "
                     f"ROS_DOMAIN_ID? Start one: bam-serve --rclpy{flag}",
                 )
-            time.sleep(_LOOK)
+            time.sleep(_GRAPH_POLL_PERIOD)
         self.epoch = 1
 
     def wait_up(self, timeout: float) -> None:

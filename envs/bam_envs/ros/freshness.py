@@ -120,7 +120,7 @@ class ClockOffset:
         return difference - self.offset
 
 
-class Freshness:
+class StampFreshness:
     """Checks the freshness of the messages of one session, which a bridge may delay. Thread-safe; steady clock [s]."""
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
@@ -143,16 +143,16 @@ class Freshness:
 
 
 class FreshnessCheck:
-    """`Freshness` of each of the latest sessions. Thread-safe."""
+    """`StampFreshness` of each of the latest sessions. Thread-safe."""
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self._clock, self._lock = clock, threading.Lock()
-        self._sessions: OrderedDict[str, Freshness] = OrderedDict()
+        self._sessions: OrderedDict[str, StampFreshness] = OrderedDict()
 
     def require(self, tag: Tag, channel: str = "") -> None:
-        """As `Freshness.require`, for the session of `tag`."""
+        """As `StampFreshness.require`, for the session of `tag`."""
         with self._lock:
-            fresh = self._sessions.setdefault(tag.session, Freshness(self._clock))
+            fresh = self._sessions.setdefault(tag.session, StampFreshness(self._clock))
             self._sessions.move_to_end(tag.session)
             if len(self._sessions) > _MOST_SESSIONS:
                 self._sessions.popitem(last=False)

@@ -14,7 +14,7 @@ from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 from bam_envs.core.errors import ProtocolError, RemoteError
-from bam_envs.ros.freshness import Freshness, Tag, Tagger, new_session, signature
+from bam_envs.ros.freshness import StampFreshness, Tag, Tagger, new_session, signature
 from bam_envs.rosbridge.bus import Caller, Message
 
 SESSION_SERVICE = "/bam/session"  # where a session is opened (std_srvs/Trigger)
@@ -30,7 +30,7 @@ _MOST = 64  # sessions of one caller; the oldest is closed for a new one
 class _Session(NamedTuple):
     caller: str
     key: bytes
-    fresh: Freshness
+    fresh: StampFreshness
 
 
 class Sessions:
@@ -47,11 +47,13 @@ class Sessions:
             names = [one for one, session in self._sessions.items() if session.caller == caller.name]
             if len(names) >= _MOST:
                 del self._sessions[next(one for one in names if not self._is_driving(one))]
-            self._sessions[name] = session = _Session(caller.name, secrets.token_bytes(32), Freshness())
+            self._sessions[name] = session = _Session(caller.name, secrets.token_bytes(32), StampFreshness())
         return {"success": True, "message": json.dumps({"session": name, "key": session.key.hex()})}
 
-    def prove(self, tag: Tag, channel: str, content: bytes, caller: Caller, *, anywhere: bool = False) -> Freshness:
-        """Check that `content` was signed for `channel` by the session of `tag`; returns the session's `Freshness`.
+    def prove(
+        self, tag: Tag, channel: str, content: bytes, caller: Caller, *, anywhere: bool = False
+    ) -> StampFreshness:
+        """Check that `content` was signed for `channel` by the session of `tag`; returns its `StampFreshness`.
 
         It must come over the connection that opened the session or, with `anywhere`, over any. `RemoteError` if the
         session is not open, or did not sign it.

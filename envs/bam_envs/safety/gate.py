@@ -34,7 +34,7 @@ from bam_envs.safety.guard import (
     position_range,
     require_bounded,
 )
-from bam_envs.safety.guards import LATE, Freshness, MeasuredLimits, Shape, default_guards
+from bam_envs.safety.guards import LATE, CommandShape, Freshness, MeasuredLimits, default_guards
 from bam_envs.safety.link_guards import Share, Watchdog
 from bam_envs.safety.unusual import UnusualObservations
 
@@ -50,7 +50,7 @@ GRIPPER_TIME = 1.0
 """Longest wait for the gripper to open before an arm goes to its start pose [s]."""
 GRIPPER_NEAR = 0.002
 """Tolerance within which a gripper counts as open [m]."""
-FRESH_LOOKS, FRESH_PAUSE = 50, 0.005
+FRESH_STATE_TRIES, FRESH_PAUSE = 50, 0.005
 """Number of checks for a fresh state before a motion begins, and the time between two checks [s]."""
 
 
@@ -170,7 +170,7 @@ class SafeRobot(metaclass=Sealed):
         self._observer: Observer | None = None
         self._tell: Any = getattr(self._live, "tell_status", None)
         self._tell_step: Any = getattr(self._live, "tell_step", None)
-        self._shape = Shape(robot.spec)
+        self._shape = CommandShape(robot.spec)
         self._further = tuple(guards)
         self._guards = tuple(default_guards(robot.spec, self._limits, tool_position=tool_position, straight=straight))
         self._checks = tuple(one for one in self._guards if type(one).fault is not Guard.fault)
@@ -455,7 +455,7 @@ class SafeRobot(metaclass=Sealed):
         Waits briefly for a newer one: after a pause of this process, messages may be unread.
         """
         limit = next(guard.limit_value for guard in self._guards if isinstance(guard, Freshness))
-        for _ in range(FRESH_LOOKS):
+        for _ in range(FRESH_STATE_TRIES):
             age = self.age()  # read first: a later measurement can only be newer
             state: RobotState = self._live.measure()
             if age <= limit:

@@ -58,7 +58,7 @@ MEASURED_PATIENCE = 3
 """Faults in a row before a stop: a robot may execute bunched commands within one tick, and slows down when held."""
 
 
-class Shape(Guard):
+class CommandShape(Guard):
     """A command has one number for each label. Any other shape is a bug in the program, and raises at once."""
 
     number, name, unit = "G2", "shape", "numbers"
@@ -280,7 +280,7 @@ def default_guards(
     first = [Finite(spec, limits), Freshness(spec, limits), Pace(spec, limits), ActionAge(limits)]
     watched = [Answers(spec, limits), Watchdog(spec, limits)]
     last = [UnusualObservations(), FirstMotion(spec), MeasuredLimits(spec)]
-    return [Shape(spec), *counting, *first, *watched, *moving, *last]
+    return [CommandShape(spec), *counting, *first, *watched, *moving, *last]
 
 
 def _arm_guards(spec: RobotSpec, limits: Limits, tool_position: ToolPosition | None, straight: bool) -> list[Guard]:

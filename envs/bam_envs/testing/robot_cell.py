@@ -242,7 +242,7 @@ def _send(wire: socket.socket, message: object) -> None:
 # ---- the driver
 
 
-class DrivenRobot:
+class CellRobot:
     """The robot as its driver sees it: the part of a `ServedRobot` that a `RobotService` uses."""
 
     realtime = True
@@ -334,7 +334,7 @@ def run_driver(
     link = RosbridgeLink(f"ws://127.0.0.1:{port.value}", name="driver")
     link.connect()
     wire.setblocking(False)
-    robot: Any = DrivenRobot(spec, profile.command_life(spec.period), wire)
+    robot: Any = CellRobot(spec, profile.command_life(spec.period), wire)
     RobotService(robot, profile, _DriversBus(link, fault, describes_itself), CommandLease()).start()
     ready.set()
     threading.Event().wait()

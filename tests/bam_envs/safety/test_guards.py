@@ -48,7 +48,7 @@ def acceleration(limit=10.0):
 
 
 def test_what_is_not_executed():
-    shape, finite, age = guards.Shape(ARM), guards.Finite(ARM, Limits()), guards.Freshness(ARM, Limits())
+    shape, finite, age = guards.CommandShape(ARM), guards.Finite(ARM, Limits()), guards.Freshness(ARM, Limits())
     for bad in ((7,), (1, 6), (2, 7), (1, 7, 1)):
         with pytest.raises(InvalidValue) as caught:
             shape.numbers(np.zeros(bad))

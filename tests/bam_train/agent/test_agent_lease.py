@@ -6,7 +6,7 @@ import pytest
 
 from bam_envs.core.errors import NotInCommand
 from bam_envs.rosbridge.bus import Caller
-from bam_train.agent.front.agent_lease import CUT, SILENT, AgentLease
+from bam_train.agent.front.agent_lease import CUT_LINK_TIMEOUT, SILENT_LINK_TIMEOUT, AgentLease
 
 
 class Clock:
@@ -35,7 +35,8 @@ def test_without_use_it_ends(lease):
 
 
 @pytest.mark.parametrize(
-    ("silence", "is_silent"), [(0.0, False), (SILENT, False), (SILENT + 0.1, True), (math.inf, False)]
+    ("silence", "is_silent"),
+    [(0.0, False), (SILENT_LINK_TIMEOUT, False), (SILENT_LINK_TIMEOUT + 0.1, True), (math.inf, False)],
 )
 def test_an_owner_without_a_sign_of_life_is_silent(lease, silence, is_silent):
     lease.heard = silence
@@ -50,7 +51,7 @@ def test_once_its_link_was_cut_it_ends_a_little_later(lease):
     with pytest.raises(NotInCommand, match=r"^anna drives this robot; the lease ends 2\.0 s after its last use\."):
         lease.grant("b", Caller("client2"))
     assert lease.over() is None
-    lease.clock.now += CUT
+    lease.clock.now += CUT_LINK_TIMEOUT
     assert lease.over() == ("a", "the lease of anna ended, 2 s after its link was cut")
     assert lease.grant("b", Caller("client2"), shown="bob")
     with pytest.raises(NotInCommand, match=r"bob drives this robot"):

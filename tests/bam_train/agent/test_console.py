@@ -10,7 +10,7 @@ from PIL import Image
 from bam_envs.live.camera import CameraImage
 from bam_envs.rosbridge.tokens import Tokens
 from bam_train.agent.agent_states import State
-from bam_train.agent.front.jog import FRESH
+from bam_train.agent.front.jog import JOG_LIFETIME
 from tests.bam_train.agent.browsers import LEAVINGS, browser, page, until
 from tests.bam_train.agent.fake_agent import FakeAgent
 from tests.bam_train.cli.test_play import CODES, COMMANDS
@@ -223,7 +223,7 @@ def test_a_page_that_is_left_in_mid_jog_leaves_the_robot_at_rest(driven, agent, 
     leave(driven)
     until(lambda: not agent.moves, "the end of the motion")
     last, joints = agent.twists[-1][0], agent.joints
-    assert agent.commands[-1][0] - last <= FRESH
+    assert agent.commands[-1][0] - last <= JOG_LIFETIME
     time.sleep(0.5)
     assert (agent.twists[-1][0], agent.joints is joints) == (last, True)
 
@@ -233,7 +233,7 @@ def test_a_page_that_is_frozen_in_mid_jog_leaves_the_robot_at_rest_also_when_it_
     with driven.frozen():
         until(lambda: not agent.moves, "the end of the motion")
         last, joints = agent.twists[-1][0], agent.joints
-        assert agent.commands[-1][0] - last <= FRESH
+        assert agent.commands[-1][0] - last <= JOG_LIFETIME
         time.sleep(0.5)
         assert agent.twists[-1][0] == last
     until(lambda: driven.text("jog-state").startswith("Hold a key"), "the release of the key")

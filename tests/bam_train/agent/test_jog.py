@@ -11,7 +11,7 @@ from bam_envs.core.robot import RobotSpec, RobotState, SignalSpec
 from bam_envs.robots.mir100 import base_spec
 from bam_envs.robots.ur5e import GEOMETRY, GRIPPER_OPEN, arm_spec
 from bam_envs.testing import ARM_HOME
-from bam_train.agent.front.jog import FRESH, LEASH, Jogger
+from bam_train.agent.front.jog import JOG_LIFETIME, LEASH, Jogger
 
 ARM, BASE, PERIOD = arm_spec("ur5e", with_object=False), base_spec(with_scans=False), 0.05
 HOME = np.array([*ARM_HOME, 0.04])
@@ -99,9 +99,9 @@ def test_near_a_singularity_no_joint_is_fast(arm, clock):
 def test_a_twist_is_fresh_for_a_fifth_of_a_second(arm, clock):
     assert arm.command(arm_state()) is None
     arm.put(twist(1, 0.1))
-    clock.now += 0.99 * FRESH
+    clock.now += 0.99 * JOG_LIFETIME
     assert arm.command(arm_state()) is not None
-    clock.now += 0.02 * FRESH
+    clock.now += 0.02 * JOG_LIFETIME
     assert arm.command(arm_state()) is None
 
 
@@ -109,7 +109,7 @@ def test_twists_out_of_order_are_dropped(arm, clock):
     assert arm.put(twist(5, 0.1))
     assert not arm.put(twist(5, 0.2))
     assert not arm.put(twist(4, 0.2))
-    clock.now += FRESH + 0.01
+    clock.now += JOG_LIFETIME + 0.01
     assert not arm.put(twist(3, 0.2))
     assert arm.command(arm_state()) is None
     arm.release()  # another page begins at 0 again

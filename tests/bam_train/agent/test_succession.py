@@ -6,7 +6,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from bam_train.agent.agent_messages import Ask, Progress
+from bam_train.agent.agent_messages import Ask, RequestProgress
 from bam_train.agent.agent_options import AgentOptions
 from bam_train.agent.agent_states import State
 from bam_train.agent.succession import Succession
@@ -122,7 +122,7 @@ def test_a_candidate_that_fails_is_rolled_back(agent, better):
 def test_who_waits_for_the_trials_is_told_why_they_rest(agent, better, until):
     def tell(state, why, text):
         agent.state, agent.why = state, why
-        until(lambda: agent.sent[-1] == Progress(1, text))
+        until(lambda: agent.sent[-1] == RequestProgress(1, text))
 
     agent.succession.begin(Ask(1, "push", {"path": str(better), "wait": True}, "anna", "10.0.0.7"))
     tell(State.TRIAL, "push by anna", "acts as the candidate; its trials decide")

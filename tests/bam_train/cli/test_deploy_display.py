@@ -6,7 +6,7 @@ import pytest
 from rich.console import Console
 
 from bam_envs.core.timing import Pacer
-from bam_train.cli.deploy_display import LiveDisplay, PlainDisplay, live_display, numbers_of
+from bam_train.cli.deploy_display import LiveDeployment, PlainDeployment, live_display, numbers_of
 from bam_train.deploy.journal import Journal
 
 
@@ -39,7 +39,7 @@ class Slack:
 )
 def test_plain_display_writes_a_line_an_episode(success, end, length, line):
     journal, lines, pacer = Journal(5), [], Pacer(None)
-    display, record = PlainDisplay(journal, lines.append), journal.begin(8)
+    display, record = PlainDeployment(journal, lines.append), journal.begin(8)
     display.ticked(record, 1, pacer)
     assert lines == []
     record.total, record.length, record.success, record.end = 12.3123, length, success, end
@@ -50,7 +50,7 @@ def test_plain_display_writes_a_line_an_episode(success, end, length, line):
 def test_redraws_are_rare_and_only_when_there_is_time(corridor):
     times = iter([0.0, 0.05, 0.1, 0.3, 0.31, 0.4])
     panel, journal = Panel(), Journal(1)
-    display = LiveDisplay(panel, gym.make(corridor), "title", journal, now=lambda: next(times))
+    display = LiveDeployment(panel, gym.make(corridor), "title", journal, now=lambda: next(times))
     record = journal.begin(0)
     drawn = []
     for slack in (0.04, 0.04, 0.04, 0.005, 0.04, 0.04):

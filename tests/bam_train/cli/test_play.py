@@ -25,7 +25,7 @@ from bam_train.cli.play import run_play, terminal
 from bam_train.cli.play.gamepad import Gamepad
 from bam_train.cli.play.terminal import Terminal, keys_in
 from bam_train.data import DataSet
-from bam_train.env_location import Place
+from bam_train.env_location import EnvLocation
 from bam_train.environments import make_env
 from bam_train.play.hands import hand_for
 from bam_train.play.key_map import moved
@@ -110,11 +110,11 @@ def display(monkeypatch):
 
 
 def test_a_window_gives_the_commands_of_twenty_keys_and_sees_them_go_up(display):
-    from bam_train.cli.play.window import Window
+    from bam_train.cli.play.window import PlayWindow
 
     names = {"ArrowUp": "Up", "ArrowDown": "Down", "ArrowLeft": "Left", "ArrowRight": "Right"}
     names |= {"PageUp": "Prior", "PageDown": "Next"}
-    with Window("test") as window:
+    with PlayWindow("test") as window:
         window.wait(0.05)
         window._root.focus_force()
         window.wait(0.05)
@@ -255,7 +255,7 @@ def test_ctrl_c_gives_the_terminal_back(tty, tmp_path):
 def test_a_live_robot_moves_through_its_guards_while_a_key_is_fresh_and_else_holds():
     options = ServeOptions(port=0, fast=True)
     with ServedEnvironment(make_env("bam/pick-v0", {}), options) as served, SignalMemory() as signals:
-        place = Place(served.bus.url, trial=None)
+        place = EnvLocation(served.bus.url, trial=None)
         env = connected_env(None, place, signals, who="bam-play", episodes=0, named="bam/pick-v0")
         with closing(env):
             session = Session(env, hand_for(env, is_live=True), is_live=True)

@@ -19,7 +19,7 @@ from bam_train.checkpoint import Checkpoint
 from bam_train.cli.deploy import main as deploy
 from bam_train.deploy.checkpoint_admission import Admission
 from bam_train.deploy.trials import Subject, TrialRecord, Trials
-from bam_train.env_location import HERE, Place
+from bam_train.env_location import HERE, EnvLocation
 from bam_train.errors import BadTrials, SettingsError, TrialsNeeded
 from bam_train.recording.recording import Recording
 from tests.bam_train.deploy.test_deployment import Driven, raises
@@ -29,7 +29,7 @@ REACH = Path(__file__).parents[3] / "checkpoints" / "reach-ppo.zip"
 URL = "ws://10.0.0.5:9090"
 SIMULATED = SimpleNamespace(unwrapped=SimpleNamespace(robot=SimpleNamespace(info=SimpleNamespace(simulated=True))))
 REAL = SimpleNamespace(unwrapped=SimpleNamespace(robot=SimpleNamespace(info=SimpleNamespace(simulated=False))))
-ON_TRIAL, FULL = Place(robot=URL, trial=True), Place(robot=f"{URL}/", trial=False)
+ON_TRIAL, FULL = EnvLocation(robot=URL, trial=True), EnvLocation(robot=f"{URL}/", trial=False)
 
 
 @pytest.fixture(autouse=True)
@@ -127,7 +127,7 @@ def test_an_edited_record_is_refused_at_every_stage(admission, tmp_path):
 
 
 def test_a_simulated_robot_has_no_stage_unless_one_is_asked_for(admission):
-    for place in (HERE, Place(robot=URL, trial=None)):
+    for place in (HERE, EnvLocation(robot=URL, trial=None)):
         one = admission()
         with pytest.raises(SettingsError, match="a simulated robot is on trial only with --stage trial; give that too"):
             one(SIMULATED, place)

@@ -9,7 +9,7 @@ from gymnasium.spaces import Box
 from bam_train.cli.data import run_gate as gate
 from bam_train.cli.eval import main
 from bam_train.data import DataSet, DataSetInfo, DataSetWriter, Episode
-from bam_train.estimation.data_evaluation import Agreement, DataReport
+from bam_train.estimation.data_evaluation import ActionAgreement, DataReport
 from bam_train.estimation.data_table import data_lines
 from bam_train.estimation.estimates import Estimate
 from bam_train.estimation.steps import read_steps
@@ -84,7 +84,7 @@ def made_report(**changes):
     """What three hundred episodes say of a policy."""
     wide, few = Estimate(0.4, (0.0, 1.0), 300.0), Estimate(82.9, (-60.0, 226.0), 1.3).as_rate()
     values = {"env": "a/B-v0", "metric": "success", "episodes": 300, "steps": 900, "skipped": 0, "seen": 0}
-    values |= {"recorded": 0.5, "recorded_interval": (0.4, 0.6), "agreement": Agreement(0.998, 0.01, 0.3)}
+    values |= {"recorded": 0.5, "recorded_interval": (0.4, 0.6), "agreement": ActionAgreement(0.998, 0.01, 0.3)}
     values |= {"fitted_q": wide, "importance": {"ips": few}, "probabilities": "recorded", "groups": ()}
     return DataReport(**{**values, **changes})
 

@@ -14,7 +14,7 @@ from mcap.writer import Writer
 from bam_envs.core.timing import Pacer
 from bam_train.checkpoint import Checkpoint
 from bam_train.cli.deploy import main as deploy
-from bam_train.cli.deploy_display import PlainDisplay
+from bam_train.cli.deploy_display import PlainDeployment
 from bam_train.cli.live.replay import facts_of
 from bam_train.cli.live.replay import main as replay
 from bam_train.deploy.deployment import Deployment
@@ -320,7 +320,7 @@ def test_an_episode_longer_than_the_environments_is_played_to_its_end(tmp_path):
     recorder = flight_recorder(path, env, {**deployment_facts(checkpoint, env), "seed": 0})
     recorder.start()
     deployment = Deployment(env, Still(), Pacer(None), Journal(1), recorder=recorder)
-    assert deployment.run(PlainDisplay(deployment.journal, print), seed=0).status == 0
+    assert deployment.run(PlainDeployment(deployment.journal, print), seed=0).status == 0
     recording = Recording.open(path)
     played = play(recording, replay_env(recording, checkpoint), Still())
     assert (played.ticks, played.same) == (121, True)

@@ -28,7 +28,7 @@ from bam_envs.remote.wire.gymapi_messages import (
 from bam_envs.remote.wire.gymapi_versions import (
     JUNE_17,
     JUNE_22,
-    Version,
+    GymApiVersion,
     version_named,
     version_of_bus,
     version_of_request,
@@ -120,7 +120,7 @@ class GymApiService:
         return write_failure(failure, time.monotonic() - begun, self._stamp(), version)
 
     def _perform(
-        self, request: GymRequest, version: Version, caller: Caller, deadline: float | None, published: bool
+        self, request: GymRequest, version: GymApiVersion, caller: Caller, deadline: float | None, published: bool
     ) -> list[dict[str, Any]]:
         self.env.require_name(request.env_name)
         name = request.client_id[:_LONGEST_NAME] or "somebody"

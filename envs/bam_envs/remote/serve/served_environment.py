@@ -27,7 +27,7 @@ from bam_envs.rosbridge.server import BridgeServer
 from bam_envs.rosbridge.tokens import read_token
 from bam_envs.safety.gate import SafeRobot
 
-_LOOK = 3.0
+_ROBOT_INFO_TIMEOUT = 3.0
 """Longest wait for the answer of another robot with the same names [s]."""
 _WITHIN, _AGAIN, _ANSWER = 3.0, 0.2, 3.0
 """Longest time until a ROS graph lists a declaration, time between two checks, longest wait for an answer [s]."""
@@ -162,7 +162,7 @@ class ServedEnvironment:
         """Refuse names that another robot has: both would execute the commands for one of them."""
         service = self.prefix + INFO_SERVICE
         try:
-            link.call(service, "", {}, _LOOK)
+            link.call(service, "", {}, _ROBOT_INFO_TIMEOUT)
         except RemoteError:  # there is none
             return
         raise InvalidValue(

@@ -20,7 +20,7 @@ from bam_envs.remote.wire.gymapi_leaves import (
     IMAGE,
     NUMBERS,
     POSE,
-    Leaf,
+    GymApiLeaf,
     Lists,
     Path,
     is_depth,
@@ -28,7 +28,7 @@ from bam_envs.remote.wire.gymapi_leaves import (
     leaves_of,
 )
 from bam_envs.remote.wire.gymapi_messages import PREFIX, GymResponse, write_feedback
-from bam_envs.remote.wire.gymapi_versions import JUNE_22, Version
+from bam_envs.remote.wire.gymapi_versions import JUNE_22, GymApiVersion
 from bam_envs.remote.wire.transport import EnvSpecMessage, Info
 from bam_envs.remote.wire.values import exact, pack, tree_from_json, tree_to_json
 from bam_envs.ros.images import FORMATS, color_message, read_color_message, read_depth_message
@@ -102,7 +102,7 @@ class ObservationCodec:
             raise InvalidValue(f"The image format must be png or jpeg, not {image_format!r}.")
 
     def encode(
-        self, observation: Any, stamp: Mapping[str, int] | None = None, version: Version = JUNE_22
+        self, observation: Any, stamp: Mapping[str, int] | None = None, version: GymApiVersion = JUNE_22
     ) -> tuple[dict[str, Any], Trees]:
         """Fields of a message, without those at their defaults, and exact trees of the parts that are not in them.
 
@@ -142,7 +142,7 @@ class ObservationCodec:
         except InvalidValue as error:
             raise ProtocolError(f"The observation does not fit its space: {error}") from error
 
-    def _missing(self, kind: str, values: Values) -> tuple[Leaf, ...]:
+    def _missing(self, kind: str, values: Values) -> tuple[GymApiLeaf, ...]:
         return tuple(leaf for leaf in self._leaves if leaf.kind == kind and leaf.path not in values)
 
     def _read_images(self, feedback: Mapping[str, Any], values: Values) -> None:
@@ -166,7 +166,7 @@ class ObservationCodec:
             values[leaf.path] = _shaped(leaf, image, "color_img")
 
 
-def _lists(kind: str, leaves: tuple[Leaf, ...] = ()) -> Lists:
+def _lists(kind: str, leaves: tuple[GymApiLeaf, ...] = ()) -> Lists:
     """The lists of a feedback, in which a rack may send more than the space contains."""
     if kind == NUMBERS:
         return Lists("observation_names", "observation", leaves, extra=True)
@@ -178,7 +178,7 @@ def _listed(images: Any) -> list[Mapping[str, Any]]:
     return list(images) if isinstance(images, (list, tuple)) else [images]
 
 
-def _shaped(leaf: Leaf, image: np.ndarray[Any, Any], field: str) -> np.ndarray[Any, Any]:
+def _shaped(leaf: GymApiLeaf, image: np.ndarray[Any, Any], field: str) -> np.ndarray[Any, Any]:
     shape = leaf.space.shape or ()
     # A grey image in a file has no channel axis.
     if image.shape != shape and (*image.shape, 1) != shape:
@@ -209,7 +209,12 @@ class EnvCodec:
         return actions if self.spec.vector else actions[0]
 
     def write_result(
-        self, result: tuple[Any, ...], stamp: Mapping[str, int], version: Version = JUNE_22, *, executed: bool = True
+        self,
+        result: tuple[Any, ...],
+        stamp: Mapping[str, int],
+        version: GymApiVersion = JUNE_22,
+        *,
+        executed: bool = True,
     ) -> list[dict[str, Any]]:
         """The feedback of a reset or step, sent at `stamp`; `executed`: whether the action was executed."""
         feedback = []

@@ -40,7 +40,7 @@ Path = tuple[str | int, ...]
 
 
 @dataclass(frozen=True)
-class Leaf:
+class GymApiLeaf:
     """One part of a value."""
 
     kind: str
@@ -61,12 +61,12 @@ class Leaf:
         return value
 
 
-def leaves_of(space: Space[Any], name: str, *, gripper: bool = False) -> tuple[Leaf, ...]:
+def leaves_of(space: Space[Any], name: str, *, gripper: bool = False) -> tuple[GymApiLeaf, ...]:
     """The leaves of `space`, which is called `name`; with `gripper`, a pose may have a gripper width."""
     leaves = tuple(_walk(space, (), name, gripper))
     names, labels = [leaf.name for leaf in leaves], [label for leaf in leaves for label in leaf.labels]
     unique = len({*names}) == len(names) and len({*labels}) == len(labels)
-    return leaves if unique else (Leaf(EXACT, name, (), space, (name,)),)
+    return leaves if unique else (GymApiLeaf(EXACT, name, (), space, (name,)),)
 
 
 def joined(space: Space[Any], values: Mapping[Path, Any], path: Path = ()) -> Any:
@@ -77,7 +77,7 @@ def joined(space: Space[Any], values: Mapping[Path, Any], path: Path = ()) -> An
     return tuple(parts.values()) if isinstance(space, spaces.Tuple) else parts
 
 
-def _walk(space: Space[Any], path: Path, name: str, gripper: bool) -> list[Leaf]:
+def _walk(space: Space[Any], path: Path, name: str, gripper: bool) -> list[GymApiLeaf]:
     parts, is_pose = _parts(space), _is_pose(space, gripper)
     if parts and not is_pose:
         return [leaf for key, part in parts.items() for leaf in _walk(part, (*path, key), name, gripper)]
@@ -91,7 +91,7 @@ def _walk(space: Space[Any], path: Path, name: str, gripper: bool) -> list[Leaf]
     elif fits or isinstance(space, spaces.Discrete):
         indices, kind = np.ndindex(*shape), NUMBERS
         labels = tuple(f"{name}[{', '.join(map(str, index))}]" if index else name for index in indices)
-    return [Leaf(kind, name, path, space, labels or (name,))]
+    return [GymApiLeaf(kind, name, path, space, labels or (name,))]
 
 
 def _is_image(space: Space[Any], shape: tuple[int, ...]) -> bool:
@@ -132,12 +132,12 @@ class Lists:
     """Field with the names."""
     values: str
     """Field with the numbers or poses."""
-    leaves: tuple[Leaf, ...]
+    leaves: tuple[GymApiLeaf, ...]
     """In the order of the values if none of the names is known."""
     extra: bool = False
     """Whether the lists may hold more than the leaves."""
 
-    def write(self, leaf: Leaf, part: Any, fields: dict[str, Any]) -> bool:
+    def write(self, leaf: GymApiLeaf, part: Any, fields: dict[str, Any]) -> bool:
         """Append a part to the lists in `fields`; False if those cannot hold it exactly."""
         written = _numbers(part) if leaf.kind == NUMBERS else _pose(part)
         if written is None:
@@ -186,7 +186,7 @@ def _numbers(value: Any) -> list[Any] | None:
     return plain if all(-_WHOLE <= one <= _WHOLE for one in plain) else None
 
 
-def _read_numbers(leaf: Leaf, numbers: Sequence[Any]) -> Any:
+def _read_numbers(leaf: GymApiLeaf, numbers: Sequence[Any]) -> Any:
     dtype = np.dtype(leaf.space.dtype)
     wide = np.asarray(numbers, np.float64)
     with np.errstate(over="ignore", invalid="ignore"):
@@ -207,7 +207,7 @@ def _pose(value: Mapping[str, Any]) -> list[dict[str, Any]] | None:
     return [{"pose": {"position": position, "orientation": orientation}}]
 
 
-def _read_pose(leaf: Leaf, messages: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+def _read_pose(leaf: GymApiLeaf, messages: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """The pose in one PoseStamped; a gripper width, which the message lacks, is 0."""
     pose = messages[0]["pose"]
     numbers = {

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from bam_envs.core.errors import BamEnvsError, InvalidValue, NotInCommand, ProtocolError, RemoteError
-from bam_envs.remote.wire.gymapi_versions import JUNE_22, Version, version_of_response
+from bam_envs.remote.wire.gymapi_versions import JUNE_22, GymApiVersion, version_of_response
 from bam_envs.remote.wire.transport import Info, Seed
 from bam_envs.remote.wire.values import plain_info, tree_from_json, tree_to_json
 from bam_envs.ros.freshness import Tag, read_tag
@@ -94,7 +94,7 @@ class GymResponse:
     """The info of each feedback."""
     exact: tuple[Info, ...]
     """The part of each info under ``bam``; empty dicts from racks without `bam-serve`."""
-    version: Version | None = None
+    version: GymApiVersion | None = None
     """The version of the server's messages; None if it cannot be told."""
 
 
@@ -130,7 +130,7 @@ def write_request(request: GymRequest, stamp: Message) -> dict[str, Any]:
     return {"header": header, "seed": in_field, "env_name": request.env_name, "action": actions}
 
 
-def whole_request(message: Message, version: Version | None) -> dict[str, Any]:
+def whole_request(message: Message, version: GymApiVersion | None) -> dict[str, Any]:
     """`message` with all fields of `version`, or those of all versions, for a rack that may read any of them."""
     busy = (version or JUNE_22).busy
     whole = complete(request_type(KIND), {**message, "header": {**message["header"], busy: False}})
@@ -186,7 +186,7 @@ def write_feedback(
     trees: Mapping[str, Any],
     ends: tuple[float, bool, bool],
     info: Mapping[str, Any],
-    version: Version = JUNE_22,
+    version: GymApiVersion = JUNE_22,
     *,
     executed: bool = True,
 ) -> dict[str, Any]:
@@ -209,7 +209,7 @@ def write_feedback(
 
 
 def write_response(
-    feedback: Sequence[Message], duration: float, stamp: Message, version: Version = JUNE_22
+    feedback: Sequence[Message], duration: float, stamp: Message, version: GymApiVersion = JUNE_22
 ) -> dict[str, Any]:
     """The message of a success that took `duration` [s] and is sent at `stamp`, with the fields of `version`."""
     code = {"value": int(ErrorCode.SUCCESS)}
@@ -219,7 +219,9 @@ def write_response(
     return {"header": header, "feedback": list(feedback)}
 
 
-def write_failure(error: BamEnvsError, duration: float, stamp: Message, version: Version = JUNE_22) -> dict[str, Any]:
+def write_failure(
+    error: BamEnvsError, duration: float, stamp: Message, version: GymApiVersion = JUNE_22
+) -> dict[str, Any]:
     """The message of a request that was refused or failed; see `write_response`."""
     feedback = {**version.no_images, "info": dump_json({"bam": {"error": type(error).__name__}}, "info")}
     message = write_response([feedback], duration, stamp, version)

@@ -15,7 +15,7 @@ from bam_envs.rosbridge.client import RosbridgeLink
 
 _FEEDBACK = "bam_msgs/GymFeedback"
 _DETAILS = "/rosapi/message_details"
-_LOOK = 1.0
+_ROSAPI_TIMEOUT = 1.0
 """Longest wait for an answer of rosapi [s]."""
 _ECHO = "/bam/gymapi_fields"
 """Topic on which an empty message comes back with the fields that a server without rosapi was compiled with."""
@@ -24,7 +24,7 @@ _TRIES, _AGAIN = 10, 0.2
 
 
 @dataclass(frozen=True)
-class Version:
+class GymApiVersion:
     """One version of the messages."""
 
     name: str
@@ -45,25 +45,25 @@ class Version:
         return {"color_img": [], "depth_img": [], "camera_info": []} if self.lists else {}
 
 
-MAY_24 = Version("2025-05-24", "force_if_busy", lists=False)
-JUNE_17 = Version("2025-06-17", "force_busy", lists=False)
-JUNE_22 = Version("2025-06-22", "force_busy", lists=True)
+MAY_24 = GymApiVersion("2025-05-24", "force_if_busy", lists=False)
+JUNE_17 = GymApiVersion("2025-06-17", "force_busy", lists=False)
+JUNE_22 = GymApiVersion("2025-06-22", "force_busy", lists=True)
 VERSIONS = {one.name: one for one in (MAY_24, JUNE_17, JUNE_22)}
 
 
-def version_named(name: str) -> Version:
+def version_named(name: str) -> GymApiVersion:
     """The version of that day. Raises InvalidValue if there is none."""
     if name not in VERSIONS:
         raise InvalidValue(f"A version of GymAPI must be one of {', '.join(VERSIONS)}, not {name!r}.")
     return VERSIONS[name]
 
 
-def version_of_request(message: object) -> Version | None:
+def version_of_request(message: object) -> GymApiVersion | None:
     """The version of a request; None if it could be of several."""
     return MAY_24 if MAY_24.busy in _header(message) else None
 
 
-def version_of_response(message: object) -> Version | None:
+def version_of_response(message: object) -> GymApiVersion | None:
     """The version of a response, which suffices for requests to its server; None if it cannot be told."""
     header = _header(message)
     if "process_duration" in header:
@@ -76,14 +76,14 @@ def _header(message: object) -> Mapping[str, Any]:
     return header if isinstance(header, Mapping) else {}
 
 
-def version_of_bus(bus: Bus) -> Version | None:
+def version_of_bus(bus: Bus) -> GymApiVersion | None:
     """The version of the types that `bus` was compiled with; None if it has none or does not report it."""
     fields: Mapping[str, bool] = {}  # name of each field of GymFeedback -> whether it is a list
     if hasattr(bus, "fields"):  # a ROS 2 node
         fields = bus.fields(_FEEDBACK)
     elif hasattr(bus, "call"):  # a link to a rosbridge server
         with suppress(RemoteError, LinkLost, ProtocolError):  # no rosapi there
-            fields = _read_fields(bus.call(_DETAILS, "", {"type": _FEEDBACK}, _LOOK))
+            fields = _read_fields(bus.call(_DETAILS, "", {"type": _FEEDBACK}, _ROSAPI_TIMEOUT))
     if isinstance(bus, RosbridgeLink) and not fields:
         with suppress(BamEnvsError):
             fields = _echoed_fields(bus)

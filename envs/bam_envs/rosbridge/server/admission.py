@@ -36,7 +36,7 @@ _STATUS = {_TOO_OFTEN: HTTPStatus.TOO_MANY_REQUESTS}
 _logger = logging.getLogger(__name__)
 
 
-class Admission:
+class ClientAdmission:
     """Admits or refuses clients; `sockets` has the open ones."""
 
     def __init__(

@@ -20,12 +20,12 @@ from bam_envs.rosbridge.encoding import Id, decode_frame, read_id
 from bam_envs.rosbridge.server.client_session import (
     LEVELS,
     Call,
+    ClientSession,
     Event,
     Publication,
     Send,
     ServerOptions,
     Service,
-    Session,
     Stream,
     canonical,
     pack,
@@ -80,7 +80,7 @@ class Bridge:
         self._events: list[Event] = []
         self.topics = Topics(self._events.append)
         self.services = Services(self._events.append)
-        self._fragmented: set[Session] = set()
+        self._fragmented: set[ClientSession] = set()
         self._leave: list[Callable[[Caller], None]] = []
         self._reserved: dict[str, Callable[[Caller], None]] = {}
         self._refusals = refusals or Refusals(_logger)
@@ -97,11 +97,11 @@ class Bridge:
 
     # ---- clients
 
-    def open(self, caller: Caller) -> Session:
+    def open(self, caller: Caller) -> ClientSession:
         """Add a client that connected."""
-        return Session(caller, self.options)
+        return ClientSession(caller, self.options)
 
-    def lost(self, session: Session) -> None:
+    def lost(self, session: ClientSession) -> None:
         """Remove a client whose connection ended, with everything that it declared."""
         self._fragmented.discard(session)
         self.services.leave(session)
@@ -142,7 +142,7 @@ class Bridge:
                 return response_type(kind), lambda: checked(kind, response_type, message.get("values"))
         return "", lambda: None
 
-    def take(self, session: Session, incoming: Incoming | ProtocolError, now: float) -> str | None:
+    def take(self, session: ClientSession, incoming: Incoming | ProtocolError, now: float) -> str | None:
         """Execute a frame at `now` [s, steady]; returns the joined text if it was the last fragment of a message."""
         if isinstance(incoming, ProtocolError):
             self._status(session, str(incoming))
@@ -199,7 +199,7 @@ class Bridge:
         """Check a message of this process, for `publish`. Thread-safe."""
         return _publication(self._existing(canonical(topic)), message)
 
-    def publish(self, publication: Publication, now: float, publisher: Session | None = None) -> None:
+    def publish(self, publication: Publication, now: float, publisher: ClientSession | None = None) -> None:
         """Send a message, of this process unless a client is its `publisher`, to all subscribers."""
         topic = self.topics.get(publication.topic)
         if topic is None or topic.kind != publication.kind:
@@ -237,7 +237,7 @@ class Bridge:
 
     # ---- messages of clients: one function for each op
 
-    def _advertise(self, session: Session, incoming: Incoming, now: float) -> None:
+    def _advertise(self, session: ClientSession, incoming: Incoming, now: float) -> None:
         message = incoming.message
         name, kind, number = read_name(message, "topic"), read_text(message, "type"), read_id(message)
         latch = message.get("latch")
@@ -251,7 +251,7 @@ class Bridge:
             topic.latching.add(session)
         session.advertised.setdefault(name, set()).add(number)
 
-    def _unadvertise(self, session: Session, incoming: Incoming, now: float) -> None:
+    def _unadvertise(self, session: ClientSession, incoming: Incoming, now: float) -> None:
         name, number = read_name(incoming.message, "topic"), read_id(incoming.message)
         ids = session.advertised.get(name)
         topic = self.topics.get(name)
@@ -262,14 +262,14 @@ class Bridge:
             del session.advertised[name]
             self.topics.retire(topic, session)
 
-    def _publish(self, session: Session, incoming: Incoming, now: float) -> None:
+    def _publish(self, session: ClientSession, incoming: Incoming, now: float) -> None:
         topic = self._existing(read_name(incoming.message, "topic"))
         _require_not_ours(topic)
         if topic.name in self._reserved:
             self._reserved[topic.name](session.caller)
         self.publish(incoming.content_of(topic.kind), now, session)
 
-    def _subscribe(self, session: Session, incoming: Incoming, now: float) -> None:
+    def _subscribe(self, session: ClientSession, incoming: Incoming, now: float) -> None:
         message = incoming.message
         name, number = read_name(message, "topic"), read_id(message)
         kind, wish = message.get("type"), read_wish(message)
@@ -283,7 +283,7 @@ class Bridge:
         stream.set_wish(number, wish)
         self.topics.subscribe(stream, topic, now)
 
-    def _unsubscribe(self, session: Session, incoming: Incoming, now: float) -> None:
+    def _unsubscribe(self, session: ClientSession, incoming: Incoming, now: float) -> None:
         name, number = read_name(incoming.message, "topic"), read_id(incoming.message)
         stream = session.streams.get(name)
         if stream is None or (number is not None and number not in stream.wishes):
@@ -292,7 +292,7 @@ class Bridge:
         if number is None or not stream.wishes:
             self.topics.unsubscribe(session.streams.pop(name))
 
-    def _call_service(self, session: Session, incoming: Incoming, now: float) -> None:
+    def _call_service(self, session: ClientSession, incoming: Incoming, now: float) -> None:
         message = incoming.message
         spelling = message.get("service")
         call = Call(session, read_id(message), spelling if isinstance(spelling, str) else "")
@@ -310,7 +310,7 @@ class Bridge:
         except BamEnvsError as error:
             self._events.append(Send(session, packed_response(call, str(error), False)))
 
-    def _advertise_service(self, session: Session, incoming: Incoming, now: float) -> None:
+    def _advertise_service(self, session: ClientSession, incoming: Incoming, now: float) -> None:
         message = incoming.message
         name, kind = read_name(message, "service"), read_text(message, "type")
         _require_room(len(session.services), session.options.services, "services")
@@ -318,36 +318,36 @@ class Bridge:
         if before is not None and before.provider is not None:
             self._status(before.provider, f"Service {name} is offered by another client now.")
 
-    def _unadvertise_service(self, session: Session, incoming: Incoming, now: float) -> None:
+    def _unadvertise_service(self, session: ClientSession, incoming: Incoming, now: float) -> None:
         name = read_name(incoming.message, "service")
         service = self.services.get(name)
         if service is None or service.provider is not session:
             raise ProtocolError(f"Service {name} is not offered by this client.")
         self.services.withdraw(service)
 
-    def _service_response(self, session: Session, incoming: Incoming, now: float) -> None:
+    def _service_response(self, session: ClientSession, incoming: Incoming, now: float) -> None:
         self.services.respond(session, incoming.message, incoming.content_of)
 
-    def _set_level(self, session: Session, incoming: Incoming, now: float) -> None:
+    def _set_level(self, session: ClientSession, incoming: Incoming, now: float) -> None:
         level = incoming.message.get("level")
         if level not in LEVELS:
             raise ProtocolError(f"level: expected one of {', '.join(LEVELS)}, found {level!r:.40}.")
         session.level = level
 
-    def _send_action_goal(self, session: Session, incoming: Incoming, now: float) -> None:
+    def _send_action_goal(self, session: ClientSession, incoming: Incoming, now: float) -> None:
         action, aborted = read_text(incoming.message, "action"), 6
         result = {"op": "action_result", "action": action, "values": _NO_ACTIONS, "status": aborted, "result": False}
         self._events.append(Send(session, pack({**result, "id": read_id(incoming.message)})))
 
     # ---- inside
 
-    def _require_watching(self, session: Session, name: str, message: Mapping[str, Any]) -> None:
+    def _require_watching(self, session: ClientSession, name: str, message: Mapping[str, Any]) -> None:
         """Refuse what a client that may only watch asks for; everybody may halt the robot."""
         halts = name in _ON_HALT and read_name(message, "topic").endswith(HALT_TOPIC)
         if name not in _FOR_WATCHERS and not halts:
             raise self._refused(session, name)
 
-    def _refused(self, session: Session, what: str) -> RemoteError:
+    def _refused(self, session: ClientSession, what: str) -> RemoteError:
         self._refusals.note(session.caller.shown, f"{what} is not for the role watch")
         return RemoteError(FORBIDDEN)
 
@@ -357,7 +357,7 @@ class Bridge:
             raise InvalidValue(f"Topic {name} does not exist; advertise it with its type first.")
         return topic
 
-    def _add_fragment(self, session: Session, message: Mapping[str, Any], now: float) -> str | None:
+    def _add_fragment(self, session: ClientSession, message: Mapping[str, Any], now: float) -> str | None:
         try:
             return session.fragments.add(message, now)
         finally:
@@ -368,10 +368,10 @@ class Bridge:
                 self._note_fragments(greatest)
                 self._status(greatest, f"All unfinished fragments hold more than {self.options.unfinished} bytes.")
 
-    def _note_fragments(self, session: Session) -> None:
+    def _note_fragments(self, session: ClientSession) -> None:
         (self._fragmented.add if session.fragments.size else self._fragmented.discard)(session)
 
-    def _deliver(self, listener: Listener, publication: Publication, publisher: Session | None) -> None:
+    def _deliver(self, listener: Listener, publication: Publication, publisher: ClientSession | None) -> None:
         # An error of one listener must not end the publisher's connection, nor skip the other listeners.
         text = deliver(
             listener, publication.message, publisher.caller if publisher is not None else _PROCESS, publication.topic
@@ -383,7 +383,7 @@ class Bridge:
         else:
             self._status(publisher, text)
 
-    def _status(self, session: Session, text: str, name: Id = None) -> None:
+    def _status(self, session: ClientSession, text: str, name: Id = None) -> None:
         """Send an error to a client, unless its level excludes errors."""
         if session.level != "none":
             message = {"op": "status", "level": "error", "msg": text}

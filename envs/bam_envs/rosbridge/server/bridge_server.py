@@ -22,9 +22,9 @@ from websockets.protocol import State
 from bam_envs.core.errors import InvalidValue, LinkLost, ProtocolError
 from bam_envs.rosbridge.bus import Bus, Caller, Handler, Listener, Message
 from bam_envs.rosbridge.endpoint import Address
-from bam_envs.rosbridge.server.admission import Admission, listening_error, tls_context
+from bam_envs.rosbridge.server.admission import ClientAdmission, listening_error, tls_context
 from bam_envs.rosbridge.server.bridge import Bridge, Incoming
-from bam_envs.rosbridge.server.client_session import Call, Send, ServerOptions, Session
+from bam_envs.rosbridge.server.client_session import Call, ClientSession, Send, ServerOptions
 from bam_envs.rosbridge.server.refusals import Refusals
 from bam_envs.rosbridge.server.server_connection import BridgeConnection
 from bam_envs.rosbridge.server.site import Handler as SiteHandler
@@ -85,11 +85,13 @@ class BridgeServer(Bus):
         self._cert, self._key = cert, key
         self._refusals = Refusals(_logger)
         self._bridge = Bridge(self.options, refusals=self._refusals)
-        self._connections: dict[Session, BridgeConnection] = {}
+        self._connections: dict[ClientSession, BridgeConnection] = {}
         self._sockets: set[BridgeConnection] = set()
         self._visitors: set[BridgeConnection] = set()  # on paths of the site
         tokens, self._site = tokens or Tokens.of_clients(token, operator_token), site
-        self._admission = Admission(tokens, self.options, self._sockets, self._refusals, site, secure=cert is not None)
+        self._admission = ClientAdmission(
+            tokens, self.options, self._sockets, self._refusals, site, secure=cert is not None
+        )
         self._numbers = itertools.count(1)
         self._thread = LoopThread("bam-bridge-server")
         self._workers = Workers(_HANDLER_THREADS, "bam-bridge-handler")
@@ -277,7 +279,7 @@ class BridgeServer(Bus):
         finally:
             self._visitors.discard(connection)
 
-    async def _read(self, connection: BridgeConnection, session: Session) -> None:
+    async def _read(self, connection: BridgeConnection, session: ClientSession) -> None:
         for number in itertools.count(1):
             text: bytes | str | None = await connection.next_frame()
             joined = False

@@ -108,7 +108,7 @@ class Publication:
 class Send:
     """Event: send a packet to a client."""
 
-    session: "Session"
+    session: "ClientSession"
     packet: Packet
     keep: int = 0  # most packets of the same stream that may wait for a slow client; 0: the server's limit
 
@@ -116,7 +116,7 @@ class Send:
 class Stream:
     """All subscriptions of one client to one topic, which it calls `name`; the client gets each message once."""
 
-    def __init__(self, session: "Session", topic: str, name: str) -> None:
+    def __init__(self, session: "ClientSession", topic: str, name: str) -> None:
         self.session, self.topic, self.name = session, topic, name
         self.wishes: dict[Id, Wish] = {}
         self.wish = Wish()  # all of them combined
@@ -169,7 +169,7 @@ class Service:
     name: str  # with a leading slash
     kind: str  # normal name of its type
     spelling: str  # its name as its provider spells it
-    provider: "Session | None" = None  # the client that offers it; None for this process
+    provider: "ClientSession | None" = None  # the client that offers it; None for this process
     handler: Handler | None = None  # answers it in this process
     inline: bool = False  # whether the handler is quick and may run in the network thread
 
@@ -181,7 +181,7 @@ class Call:
     As an event: run `Services.packed_answer` outside the network thread, and give its result to `Services.finish`.
     """
 
-    session: "Session"
+    session: "ClientSession"
     id: Id
     name: str  # of the service, as the client spells it
     wish: Wish = field(default_factory=Wish)
@@ -196,7 +196,7 @@ Event = Send | Call
 
 
 @dataclass(eq=False)
-class Session:
+class ClientSession:
     """The state of one connection."""
 
     caller: Caller

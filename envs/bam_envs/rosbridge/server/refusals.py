@@ -4,7 +4,7 @@ import logging
 import time
 from collections.abc import Callable
 
-_AGAIN = 1.0  # least time between two equal lines [s]
+_REPEAT_PERIOD = 1.0  # least time between two equal lines [s]
 _MOST = 1024  # different lines that are remembered
 
 
@@ -21,8 +21,8 @@ class Refusals:
     def note(self, who: str, why: str) -> None:
         """Log one refusal. `why` is one line that shows no secret, and of what a stranger sent only a short part."""
         now, key = self._clock(), (who, why)
-        at, more = self._seen.get(key, (now - _AGAIN, 0))
-        if now - at < _AGAIN:
+        at, more = self._seen.get(key, (now - _REPEAT_PERIOD, 0))
+        if now - at < _REPEAT_PERIOD:
             self._seen[key] = at, more + 1
             return
         self._logger.warning("%s was refused: %s%s", who, why, f" (and {more} times before)" if more else "")

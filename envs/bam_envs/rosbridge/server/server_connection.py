@@ -18,7 +18,7 @@ TRY_AGAIN_LATER = 1013  # close code of a client that does not read what it must
 _STRANGERS, _STRANGERS_OF_ONE = 128, 32
 _OF_A_STRANGER = 65536  # most unread data of a client before its admission [bytes]
 _BROKEN = (1002, 1003, 1007, 1009)  # close codes for what breaks the protocol, or is too large
-_LOOK = 1.0  # longest time that a socket is open which only looks for the port [s]
+_PORT_PROBE_LIFETIME = 1.0  # longest time that a socket is open which only looks for the port [s]
 _FRAME = 200  # approximate overhead of a frame [bytes]
 
 
@@ -199,7 +199,7 @@ class BridgeConnection(ServerConnection):
         """asyncio: the socket closed."""
         self._sockets.discard(self)
         # A socket that was closed at once, and empty, is a look whether the port is open.
-        if self.request is None and (self.heard > self.born or time.monotonic() - self.born > _LOOK):
+        if self.request is None and (self.heard > self.born or time.monotonic() - self.born > _PORT_PROBE_LIFETIME):
             self._refusals.note(self.host, "It sent no complete request.")
         closed = self.protocol.close_sent
         if closed is not None and closed.code in _BROKEN and not self.protocol.close_rcvd_then_sent:

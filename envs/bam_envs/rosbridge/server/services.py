@@ -12,7 +12,7 @@ from bam_envs.core.errors import BamEnvsError, InvalidValue, ProtocolError
 from bam_envs.core.wording import brief
 from bam_envs.ros.interfaces import complete, request_type, response_type, variants
 from bam_envs.rosbridge.bus import Message, answer
-from bam_envs.rosbridge.server.client_session import Call, Event, Packet, Send, Service, Session, pack
+from bam_envs.rosbridge.server.client_session import Call, ClientSession, Event, Packet, Send, Service, pack
 
 _GROWING = "bam_msgs/GymAPI"  # unknown fields of this type, of a newer version, are ignored, as in every transport
 _LONGEST_NUMBER = 20  # digits of the number of a call
@@ -49,7 +49,7 @@ class Services(dict[str, Service]):
         for call in [one for one in self._calls.values() if one.service is service]:
             self._fail(call, f"Service {service.name} is gone: the client that offered it left or withdrew it.")
 
-    def leave(self, session: Session) -> None:
+    def leave(self, session: ClientSession) -> None:
         """Forget the calls of a client that left, and withdraw its services."""
         for number in session.calls:
             self._calls.pop(number, None)
@@ -79,7 +79,7 @@ class Services(dict[str, Service]):
             session.waiting.append(call)
             self._start_waiting(session)
 
-    def _start_waiting(self, session: Session) -> None:
+    def _start_waiting(self, session: ClientSession) -> None:
         while session.waiting and session.running < session.options.at_once:
             call = session.waiting.popleft()
             if call.number in self._calls:
@@ -111,7 +111,7 @@ class Services(dict[str, Service]):
         known = isinstance(name, str) and len(name) < _LONGEST_NUMBER and name.isascii() and name.isdigit()
         return self._calls.get(int(str(name))) if known else None
 
-    def respond(self, provider: Session, message: Mapping[str, Any], values: Callable[[str], Any]) -> None:
+    def respond(self, provider: ClientSession, message: Mapping[str, Any], values: Callable[[str], Any]) -> None:
         """Pass on a client's answer to a call of its service; `values` completes its content for a type."""
         call = self.call_named(message.get("id"))
         if call is None or call.service.provider is not provider:

@@ -8,7 +8,7 @@ from bam_envs.core.errors import InvalidValue
 from bam_envs.core.wording import brief
 from bam_envs.ros.interfaces import normal_name
 from bam_envs.rosbridge.bus import Listener
-from bam_envs.rosbridge.server.client_session import Publication, Send, Session, Stream
+from bam_envs.rosbridge.server.client_session import ClientSession, Publication, Send, Stream
 
 
 @dataclass(eq=False)
@@ -17,12 +17,12 @@ class Topic:
 
     name: str
     kind: str  # normal name of its type
-    publishers: set[Session | None] = field(default_factory=set)  # None is this process
-    streams: dict[Session, Stream] = field(default_factory=dict)
+    publishers: set[ClientSession | None] = field(default_factory=set)  # None is this process
+    streams: dict[ClientSession, Stream] = field(default_factory=dict)
     listeners: list[Listener] = field(default_factory=list)  # those of this process
-    latching: set[Session | None] = field(default_factory=set)
+    latching: set[ClientSession | None] = field(default_factory=set)
     """The publishers whose last message is repeated to newcomers."""
-    latched: tuple[Session | None, Publication] | None = None  # that message, with its publisher
+    latched: tuple[ClientSession | None, Publication] | None = None  # that message, with its publisher
 
 
 class Topics(dict[str, Topic]):
@@ -62,7 +62,7 @@ class Topics(dict[str, Topic]):
         if topic is not None and topic.streams.pop(stream.session, None) is not None:
             self.forget(topic)
 
-    def publish(self, publication: Publication, topic: Topic, publisher: Session | None, now: float) -> None:
+    def publish(self, publication: Publication, topic: Topic, publisher: ClientSession | None, now: float) -> None:
         """Send to every subscriber that is a client."""
         if publisher in topic.latching:
             topic.latched = (publisher, publication)
@@ -79,7 +79,7 @@ class Topics(dict[str, Topic]):
         for stream in list(self._delayed):
             self._note(stream, stream.due(now))
 
-    def retire(self, topic: Topic, publisher: Session | None) -> None:
+    def retire(self, topic: Topic, publisher: ClientSession | None) -> None:
         """Remove a publisher of `topic`, and its latched message."""
         topic.publishers.discard(publisher)
         topic.latching.discard(publisher)
@@ -93,7 +93,7 @@ class Topics(dict[str, Topic]):
         if not used and self.get(topic.name) is topic:
             del self[topic.name]
 
-    def leave(self, session: Session) -> None:
+    def leave(self, session: ClientSession) -> None:
         """Remove a client that left."""
         for name in session.advertised:
             self.retire(self[name], session)

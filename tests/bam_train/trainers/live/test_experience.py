@@ -4,7 +4,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from bam_train.agent.transitions import Transitions
+from bam_train.agent.transitions import LiveTransitions
 from bam_train.trainers.live.experience import Experience
 
 
@@ -13,7 +13,7 @@ def episode(number, rewards, *, first=0, person=False, success=False, terminated
     n = len(rewards)
     time = np.arange(first, first + n, dtype=np.float32)[:, None]
     last, no = np.arange(n) == n - 1, np.zeros(n, bool)
-    return Transitions(
+    return LiveTransitions(
         observation=time,
         action=(time + 1) / 10,
         reward=np.array(rewards, np.float32),
