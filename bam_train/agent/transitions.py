@@ -1,7 +1,7 @@
 """Transitions of a live agent, for a learner on another computer: collected in the loop, carried as JSON.
 
-An event has a column for each field of `LiveTransitions`. Arrays are ``{"shape": [...], "data": base64 of float32,
-little endian}``, flags and counts lists, so that no number is rounded and a thousand transitions need a few milliseconds.
+An event has a column for each field of `LiveTransitions`. Arrays are ``{"shape": [...], "data": base64}`` of little
+endian float32, flags and counts lists, so that no number is rounded and a thousand transitions need a few milliseconds.
 """
 
 import base64
