@@ -45,10 +45,11 @@ def test_no_environment_imports_a_learner_or_the_trainer(python):
     assert imported(python, modules(bam_envs), (*LEARNERS, "bam_train")) == ""
 
 
-MAY_LEARN = ("bam_train.trainers.", "bam_train.compat.", "bam_train.loop.tensors.")
+_TORCH = (f"bam_train.loop.workspace.{name}" for name in ("replay_buffer", "returns", "tensor_variable"))
+MAY_LEARN = ("bam_train.trainers.", "bam_train.compat.", *_TORCH)
 
 
-def test_learners_are_imported_below_trainers_and_in_the_loops_torch_layer_only(python):
+def test_learners_are_imported_below_trainers_and_by_what_keeps_tensors_only(python):
     names = [name for name in modules(bam_train) if not name.startswith(MAY_LEARN)]
     assert imported(python, names, LEARNERS) == ""
 

@@ -32,7 +32,7 @@ _MODULES = {
     "serve.served_environment": ("ServedEnvironment",),
     "serve.tcp_server": ("TcpServer",),
     "tcp_transport": ("TcpTransport",),
-    "transport": ("EnvSpecMessage", "Transport"),
+    "wire.transport": ("EnvSpecMessage", "Transport"),
 }
 __getattr__, __dir__ = lazy_imports(
     __name__, {name: f"{__name__}.{module}" for module, names in _MODULES.items() for name in names}
