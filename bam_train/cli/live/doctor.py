@@ -15,7 +15,7 @@ from bam_train.signals import SignalMemory
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from bam_envs.live.diagnosis import Diagnosis, Step
+    from bam_envs.live.diagnosis import Diagnosis, DiagnosisStep
     from bam_train.checkpoint import Checkpoint
     from bam_train.cli.flags import DoctorConfig
     from bam_train.deploy.contract_table import Contract
@@ -33,7 +33,7 @@ def examine(config: DoctorConfig, signals: SignalMemory) -> int:
     paths = {"ca_file": config.ca_file, "token_file": config.token_file}
     files: dict[str, Any] = {name: None if path is None else str(path) for name, path in paths.items()}
     subject = _Subject.of(config, files)
-    steps: list[Step] = []
+    steps: list[DiagnosisStep] = []
     try:
         robot = None if subject is None else subject.env.unwrapped.robot
         diagnosis = Diagnosis(config.url, robot, profile=config.profile, seconds=config.seconds, **files)
@@ -94,11 +94,11 @@ class _Subject:
         return cls(checkpoint, make_env(env_id, env_kwargs, place=place), place)
 
 
-def _all_steps(diagnosis: Diagnosis, subject: _Subject | None) -> Iterator[Step]:
+def _all_steps(diagnosis: Diagnosis, subject: _Subject | None) -> Iterator[DiagnosisStep]:
     """The steps of the diagnosis; then, if none failed, the contract of the checkpoint."""
     from bam_envs.core.errors import BamEnvsError
     from bam_envs.core.wording import listed
-    from bam_envs.live.diagnosis import Step
+    from bam_envs.live.diagnosis import DiagnosisStep
 
     passed = True
     for step in diagnosis.steps():
@@ -112,14 +112,14 @@ def _all_steps(diagnosis: Diagnosis, subject: _Subject | None) -> Iterator[Step]
         subject.contract = contract = check_contract(subject.checkpoint, subject.env, subject.place)
         contract.require(f"{subject.checkpoint.path} and the robot")
     except (BamEnvsError, ContractRefused) as error:
-        yield Step(CONTRACT, "failed", str(error))
+        yield DiagnosisStep(CONTRACT, "failed", str(error))
         return
     unknown = [line.what for line in contract.checks if line.verdict == "unknown"]
     warnings = [f"unknown: {listed(unknown)}"] if unknown else []
-    yield Step(CONTRACT, "warning" if warnings else "ok", f"{len(contract.checks)} lines", tuple(warnings))
+    yield DiagnosisStep(CONTRACT, "warning" if warnings else "ok", f"{len(contract.checks)} lines", tuple(warnings))
 
 
-def _shown(steps: Iterator[Step], config: DoctorConfig) -> Iterator[Step]:
+def _shown(steps: Iterator[DiagnosisStep], config: DoctorConfig) -> Iterator[DiagnosisStep]:
     """The steps, each printed at once unless JSON is requested."""
     for step in steps:
         if not config.json:

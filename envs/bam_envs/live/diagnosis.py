@@ -44,7 +44,7 @@ Verdict = Literal["ok", "warning", "failed"]
 
 
 @dataclass(frozen=True)
-class Step:
+class DiagnosisStep:
     """The outcome of one step."""
 
     name: str
@@ -104,7 +104,7 @@ class Diagnosis:
         self._link = RosbridgeLink(endpoint, name="doctor")
         self._timeout = endpoint.timeout or bringup.TIMEOUT
 
-    def steps(self) -> Iterator[Step]:
+    def steps(self) -> Iterator[DiagnosisStep]:
         """Run the steps in order, up to the first failure."""
         for name in STEPS:
             check: Callable[[_Findings], None] = getattr(self, f"_{name.replace(' ', '_')}")
@@ -112,10 +112,10 @@ class Diagnosis:
             try:
                 check(findings)
             except BamEnvsError as error:
-                yield Step(name, "failed", str(error))
+                yield DiagnosisStep(name, "failed", str(error))
                 return
             verdict: Verdict = "warning" if findings.warnings else "ok"
-            yield Step(name, verdict, "; ".join(findings.text), tuple(findings.warnings))
+            yield DiagnosisStep(name, verdict, "; ".join(findings.text), tuple(findings.warnings))
 
     def close(self) -> None:
         """Close all links; the robot is not halted, because it was not moved."""

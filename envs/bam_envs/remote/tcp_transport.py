@@ -16,7 +16,7 @@ from bam_envs.remote.wire.tcp_wire import (
     Leave,
     Request,
     Reset,
-    StepFrame,
+    Step,
     TagMessage,
     content_of,
     encode,
@@ -100,7 +100,7 @@ class TcpTransport:
                 why = "this transport is closed" if self._closed else "the link is down"
                 raise LinkLost(f"{self.url}: {why}, and nothing was sent. Call reset() to connect again.")
             packed = pack_action(self._spec, action)
-            return self._result(self._spec, self._ask(StepFrame(self._tag(self.timeout), packed)), 5)
+            return self._result(self._spec, self._ask(Step(self._tag(self.timeout), packed)), 5)
 
     def close(self) -> None:
         """Release the environment and drop the link; a request that is under way ends with `LinkLost`."""

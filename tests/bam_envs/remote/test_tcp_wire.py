@@ -21,7 +21,7 @@ from bam_envs.remote.wire.tcp_wire import (
     Leave,
     Request,
     Reset,
-    StepFrame,
+    Step,
     TagMessage,
     content_of,
     decode,
@@ -144,10 +144,10 @@ def test_messages_as_trees():
     ]
     tag = ["s1", 2, 7, 10.0, 40.0]
     assert through_bytes(Reset(TAG, 3, None, False)) == ["reset", tag, 3, None, False]
-    assert through_bytes(StepFrame(TAG, 1)) == ["step", tag, 1]
+    assert through_bytes(Step(TAG, 1)) == ["step", tag, 1]
     assert through_bytes(Leave(TAG)) == ["leave", tag]
     assert through_bytes(["hello", HELLO], Greeting) == ("hello", HELLO)
-    for request in (Reset(TAG, [1, None], {"a": 1.5}, True), StepFrame(TAG, "abc"), Leave(TAG)):
+    for request in (Reset(TAG, [1, None], {"a": 1.5}, True), Step(TAG, "abc"), Leave(TAG)):
         assert through_bytes(request, Request) == request
 
 

@@ -123,7 +123,7 @@ def test_a_signal_still_gives_the_report(corridor_checkpoint, corridor, run, mon
         "bam_train.cli.consent.require_fit",
         "bam_train.cli.consent.require_consent",
         "bam_train.deploy.deployment.Deployment",
-        "bam_train.cli.deploy_display.PlainDisplay",
+        "bam_train.cli.deploy_display.PlainDeployment",
     ],
 )
 @pytest.mark.parametrize(("number", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])

@@ -17,7 +17,7 @@ from bam_envs.remote.wire.tcp_wire import (
     Hello,
     Leave,
     Request,
-    StepFrame,
+    Step,
     action_size,
     encode,
     pack_result,
@@ -238,7 +238,7 @@ class _Connection:
         server, deadline = self._owner.server, time.monotonic() + request.tag.lifetime
         if isinstance(request, Leave):
             return server.leave(self.client)
-        if isinstance(request, StepFrame):
+        if isinstance(request, Step):
             return pack_result(server.spec(), server.step(self.client, request.action, deadline=deadline))
         options, take, caller = request.options, request.take is True, self.caller or UNKNOWN_CALLER
         begun = server.reset(self.client, request.seed, options, take=take, deadline=deadline, caller=caller)

@@ -102,7 +102,7 @@ class Reset(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=
     take: Any
 
 
-class StepFrame(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=True, tag="step"):
+class Step(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=True, tag="step"):
     """Request: perform an action."""
 
     tag: TagMessage
@@ -115,7 +115,7 @@ class Leave(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=
     tag: TagMessage
 
 
-Request = Reset | StepFrame | Leave
+Request = Reset | Step | Leave
 """A message after the hello."""
 Greeting = tuple[Literal["hello"], Hello]
 """The first message."""
