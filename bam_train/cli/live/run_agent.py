@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import shutil
 from collections.abc import Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from dataclasses import replace
 from functools import partial
 from importlib.metadata import version
@@ -38,15 +38,13 @@ def run_agent(config: AgentConfig, signals: SignalMemory) -> int:
     options = _options(config)
     tell = begin_log("bam-agent")
     with ExitStack() as stack:
-        made = options.folder / "versions"
-        is_new = not made.exists()
-        while not made.parent.exists():
-            made = made.parent
+        new = [
+            one for one in (options.folder / "versions", options.folder, *options.folder.parents) if not one.exists()
+        ]
         versions = Versions(options.folder / "versions")
         stack.enter_context(versions.held())
         refused = stack.enter_context(ExitStack())  # a start that is refused leaves nothing behind
-        if is_new:
-            refused.callback(shutil.rmtree, made)
+        refused.callback(_remove, new, options.folder)
         ran_before = (options.folder / "audit.jsonl").exists()
         if config.policy is not None:
             environment_of(Checkpoint.open(config.policy.expanduser()), config.env)  # before it becomes the champion
@@ -84,8 +82,8 @@ def run_agent(config: AgentConfig, signals: SignalMemory) -> int:
         audit.write("started", begun, who="the agent", digest=active.digest)
         stack.callback(audit.write, "ended", f"process {os.getpid()}", who="the agent")
         scheme = "wss" if options.cert else "ws"
-        where = f"{options.bind}:{front.options.port}"
-        tell(f"listens on {scheme}://{where}; the console is at {scheme.replace('ws', 'http')}://{where}")
+        at = f"{options.bind}:{front.options.port}"
+        tell(f"listens on {scheme}://{at}; the console is at {scheme.replace('ws', 'http')}://{at}")
         if options.warning is not None:
             tell(options.warning)
         if ran_before and not config.paused:
@@ -98,6 +96,16 @@ def run_agent(config: AgentConfig, signals: SignalMemory) -> int:
                 tell("interrupted: the robot is halted, and nobody drives it")
                 return 128 + resident.switch.came[0]
     return 0
+
+
+def _remove(new: Sequence[Path], folder: Path) -> None:
+    """Remove the `new` folders: those of the agent at `folder` with what is in them, and others if they are empty."""
+    for one in new:  # the innermost first
+        if one == folder or folder in one.parents:
+            shutil.rmtree(one, ignore_errors=True)
+        else:
+            with suppress(OSError):
+                one.rmdir()
 
 
 def _admit(config: AgentConfig, signals: SignalMemory, env: Any, lines: Sequence[str]) -> None:

@@ -34,7 +34,7 @@ STUCK, STUCK_TIME = 0.002, 2.0
 """An arm none of whose joints moves by so much [rad] for so long [s], although its commands go on, is stopped."""
 SLOWEST_GAIN, GAIN_TIME = 0.25, 0.2
 """Least acceleration of a base that follows [m/s^2, rad/s^2], and the time over which it is measured [s]."""
-LATE = 1.5
+LATE_COMMAND = 1.5
 """Periods after the last command from which a command is called late in a message."""
 LIKELY = (
     "look for a protective stop, a paused program, an inactive controller, a low speed slider, or something in its way"
@@ -53,6 +53,7 @@ class Following(Guard):
         self._sent: deque[Numbers] = deque(maxlen=2 + ticks_of(self._lag, spec))
         self._strikes, self._good, self._forgiven = 0, 0, ticks_of(FORGIVEN, spec)
         self._spec, self._own_lag = spec, self._lag
+        self._ended: Numbers = []  # see Tick
 
     def relayed(self, delay: float) -> None:
         """Explain that the robot gets commands later by `delay` [s], from a live agent that has guards of its own."""
@@ -62,6 +63,19 @@ class Following(Guard):
     def resumed(self) -> None:
         """Forget the commands: the robot is at rest where a person found it."""
         self._sent.clear()
+
+    def begin(self, tick: Tick) -> None:
+        """In the first tick of a motion, forget the commands before it if the robot is at rest since."""
+        if tick.ended is not self._ended:
+            self._ended = tick.ended
+            if not tick.ended:
+                self._sent.clear()
+            elif self._sent:
+                self._sent.append(self.pick_from(tick.ended))
+
+    def pick_from(self, command: Numbers) -> Numbers:
+        """The numbers of a command that this guard compares. Shape: (m,) to (k,)."""
+        raise NotImplementedError
 
     def forgive(self) -> None:
         """Reset the count, when an episode begins or a person resumes the robot."""
@@ -84,7 +98,7 @@ class Following(Guard):
         period, what = self._spec.period, ""
         if tick.age > period:
             what = f"the newest state was {tick.age:.2f} s old"
-        elif tick.pause > LATE * period:
+        elif tick.pause > LATE_COMMAND * period:
             what = f"the last command was sent {tick.pause:.2f} s ago"
         return what and f"; {what}: this computer or the link is busy"
 
@@ -122,7 +136,6 @@ class JointFollowing(Following):
         self.limit_value = max(fastest) * (self._lag + self._period)
         self._known_lag = math.inf  # as measured
         self._stuck, self._stuck_ticks, self._place = 0, ticks_of(STUCK_TIME, spec), list[float]()
-        self._ended: Numbers = []  # see Tick
         self._moved: Numbers = []  # in the period before [rad]
         self._change = limits.joint_acceleration * spec.period**2
 
@@ -142,10 +155,7 @@ class JointFollowing(Following):
         if self._stuck > self._stuck_ticks:
             self._stuck, self.patience = 0, 1
             return f"no joint has moved for {STUCK_TIME:g} s, and the arm was commanded to move: {LIKELY}"
-        if tick.ended is not self._ended:
-            self._ended = tick.ended
-            if tick.ended and self._sent:
-                self._sent.append(self._pick(tick.ended))
+        self.begin(tick)
         off = self.off(sent, measured)
         # The farthest that a command may be from a joint at rest.
         allowed, farthest, over = self._slow_allowed if tick.approach else self._allowed, 0.0, False
@@ -173,6 +183,10 @@ class JointFollowing(Following):
             f"one, and beyond a lag of {self._lag:g} s it may be {allowed[at]:.3f} rad, and the tool "
             f"{SHARE * self._tool_reach:.3f} m: {LIKELY}{self.busy(tick)}"
         )
+
+    def pick_from(self, command: Numbers) -> Numbers:
+        """The joints of a command [rad]. Shape: (m,) to (k,)."""
+        return self._pick(command)
 
     def hold(self, tick: Tick) -> Numbers:
         """The measured joints, approached no faster than the joints' limits. Shape: (m,)."""
@@ -266,6 +280,7 @@ class BaseFollowing(Following):
 
     def fault(self, tick: Tick) -> str | None:
         """Report the measured speed and the commanded one."""
+        self.begin(tick)
         sent, measured = [tick.last[at] for at in self._columns], [tick.measured[at] for at in self._columns]
         rows = zip(sent, self._reached or measured, self._change, strict=True)
         self._reached = [min(max(value, before - change), before + change) for value, before, change in rows]
@@ -282,6 +297,10 @@ class BaseFollowing(Following):
             f"{sent[at]:.3f} {self.unit}; beyond a lag of {self._lag:g} s it may be off by {self._allowed[at]:.3f} "
             f"{self.unit}: {LIKELY}{self.busy(tick)}"
         )
+
+    def pick_from(self, command: Numbers) -> Numbers:
+        """The speed of a command, in `unit`. Shape: (m,) to (k,)."""
+        return [command[at] for at in self._columns]
 
     def _is_gaining(self, at: int, sent: float, measured: Numbers) -> bool:
         """Whether a base that is behind goes towards what it was sent, with less acceleration than expected.

@@ -50,6 +50,8 @@ GRIPPER_TIME = 1.0
 """Longest wait for the gripper to open before an arm goes to its start pose [s]."""
 GRIPPER_NEAR = 0.002
 """Tolerance within which a gripper counts as open [m]."""
+AT_REST_AFTER = 1.0
+"""Time after the last command from which the robot counts as at rest: twice the longest lag [s]."""
 FRESH_STATE_TRIES, FRESH_PAUSE = 50, 0.005
 """Number of checks for a fresh state before a motion begins, and the time between two checks [s]."""
 
@@ -436,7 +438,8 @@ class SafeRobot(metaclass=Sealed):
             for joint in columns_in(command, "rad"):
                 last[joint] = measured[joint]
         self._last, self._speed, self._before = last, [0.0] * len(last), None
-        self._ended = (self._sent or []).copy()
+        is_recent = self._sent is not None and self._clock() - self._returned_at <= AT_REST_AFTER
+        self._ended = (self._sent or []).copy() if is_recent else []
         self._restart()
         return last
 

@@ -314,7 +314,7 @@ class Tick:
     kept_out: bool = False
     """Whether the previous command was changed to keep the robot out of a forbidden region."""
     ended: Numbers = field(default_factory=list)
-    """Command that was sent last before this motion began, and that the robot may still be moving to; or empty."""
+    """Command that was sent shortly before this motion began, and that the robot may still be moving to; or empty."""
     signals: Mapping[str, Array] = field(default_factory=dict)
     """The newest measured signals, with shape (1, k) each; to be read only."""
 

@@ -344,6 +344,28 @@ def test_an_arm_that_still_moves_when_the_next_motion_begins_follows_its_command
     assert (following["held"], following["stopped"]) == (0, 0)
 
 
+def test_a_command_before_a_rest_explains_no_motion():
+    """Somebody moves the arm by hand; a joint that then jumps towards its old command stops it at once."""
+    arm = LaggingArm()
+    robot = SafeRobot(arm, clock=arm.clock, limits=Limits(lag=0.05))
+    robot.connect()
+    arm.place(ARM_HOME)
+    state = robot.reset(FIRST, start_at())
+    for _ in range(6):
+        state = robot.step(turned(state, 0.05))
+    robot.halt()
+    arm.now += 2.0
+    moved = [*ARM_HOME[:5], ARM_HOME[5] - 0.3]
+    arm.place(moved)
+    state = robot.reset(FIRST, start_at(moved))
+    arm.behind = np.array([[*moved[:5], moved[5] + 0.045, 0.085]])
+    state = robot.step(turned(state, -0.005))
+    with pytest.raises(
+        SafetyStop, match=r"G23\): wrist_3_joint moved \+0\.045 rad within a period, away from its commands"
+    ):
+        robot.step(turned(state, -0.005))
+
+
 @pytest.mark.parametrize("kind", [FakeRobot, lambda: LiveArm()])
 def test_guards_of_ones_own_are_asked_first_and_never_have_the_last_word(kind):
     inner = kind()

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 
+from bam_train.checkpoint import Checkpoint
 from bam_train.cli.live import live_agent as agent
 from bam_train.cli.live import push
 from bam_train.errors import RequestRefused
@@ -228,6 +229,19 @@ def test_a_refused_start_leaves_nothing(run, tmp_path, monkeypatch, flags, text)
     assert (status, out) == (1, "")
     assert text in err
     assert [*Path().iterdir()] == []
+
+
+def test_a_refused_start_keeps_what_others_made_meanwhile(run, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    opened = Checkpoint.open
+
+    def open_later(path):
+        Path("lab/other/versions").mkdir(parents=True)
+        return opened(path)
+
+    monkeypatch.setattr(Checkpoint, "open", open_later)
+    assert run(agent.main, "--policy", "nope.zip", "--folder", "lab/agent")[0] == 1
+    assert sorted(map(str, Path("lab").rglob("*"))) == ["lab/other", "lab/other/versions"]
 
 
 @pytest.mark.parametrize(("action", "end"), [("halt", "."), ("staus", ", did you mean status?")])
