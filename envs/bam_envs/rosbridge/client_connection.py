@@ -2,6 +2,7 @@
 
 Everything here runs on the network thread. A connection is never reopened: messages that it had not sent cannot reach
 the server over the next one.
+Longer than most files: how a connection begins, and every way in which it ends, are read together.
 """
 
 import asyncio

@@ -2,6 +2,7 @@
 
 The server gets one subscription per topic for any number of listeners: it sends one stream per topic, and ends it at
 the first unsubscribe.
+Longer than most files: what is declared, sent and answered shares one lock and one network thread.
 """
 
 import itertools
