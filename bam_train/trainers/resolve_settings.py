@@ -112,7 +112,7 @@ def _of_data(given: Mapping[str, Any]) -> dict[str, Any]:
 
     trainer = given.get("trainer", "offline")
     if trainer != "offline" and given.get("env") is not None:
-        return {}  # for rllib it may be plain Parquet files
+        return {}  # the trainer compares them
     info = DataSet.open(given["data"]).info
     return {"trainer": trainer, "env": info.env, **({"env_kwargs": info.env_kwargs} if info.env_kwargs else {})}
 
