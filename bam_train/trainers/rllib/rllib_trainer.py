@@ -131,6 +131,8 @@ class RLlibTrainer:
         settings = settings or TrainSettings.from_mapping(own_settings(checkpoint), str(checkpoint.path))
         with contextlib.closing(make_env(settings.env, settings.env_kwargs)) as env:
             require_fit(checkpoint, env)
+        if settings.data is not None:
+            learnt_episodes(checkpoint, DataSet.open(settings.data))
         steps = checkpoint.manifest.steps
         trainer = cls(settings, settings.seed + steps)  # does not repeat the first episodes
         with trainer._or_close():
