@@ -108,7 +108,8 @@ def episodes_of(source: Path, info: DataSetInfo) -> Iterator[Episode]:
         pieces = [part[2] for part in parts]
         rows = {name: np.concatenate([piece[name] for piece in pieces]) for name in pieces[0]}
         where = f"{source}: episode {eps_id!r} of the rows"
-        gaps = np.flatnonzero((rows["obs"][1:] != rows["new_obs"][:-1]).reshape(len(rows["obs"]) - 1, -1).any(axis=1))
+        differ = rows["obs"][1:] != rows["new_obs"][:-1]
+        gaps = np.flatnonzero(differ.any(axis=tuple(range(1, differ.ndim))))
         if len(gaps) or eps_id in cut_off:
             what = f"new_obs of its step {gaps[0]} is not obs of the next" if len(gaps) else "others are in between"
             raise BadDataSet(f"{where}: {what}; put its rows in order, and give each unbroken part its own eps_id")

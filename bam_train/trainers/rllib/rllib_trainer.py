@@ -30,7 +30,7 @@ from bam_train.policy import FrozenPolicy
 from bam_train.settings import TrainSettings
 from bam_train.trainers.algorithms import RLLIB_ALGORITHMS
 from bam_train.trainers.base import OnProgress, Progress, Statistics, manifest
-from bam_train.trainers.resolve_settings import own_settings
+from bam_train.trainers.resolve_settings import learnt_episodes, own_settings
 from bam_train.trainers.rllib import rllib_state
 from bam_train.trainers.rllib.ray_cluster import cluster
 from bam_train.trainers.rllib.rllib_freezing import FrozenModule, RLlibPolicy, golden, parts_of
