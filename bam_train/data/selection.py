@@ -118,7 +118,7 @@ def split(data: DataSet, share: float, by: str | None = None) -> tuple[list[int]
 
 def _copy(sources: Iterable[tuple[DataSet, Sequence[int]]], out: str | Path) -> tuple[int, int]:
     sources = list(sources)
-    if any(same_place(one.place, out) for one, _ in sources):
+    if any(_same_place(one.place, out) for one, _ in sources):
         raise BadDataSet(f"{out}: is read and cannot be written too; choose another --out")
     added = left_out = 0
     with DataSetWriter(out, sources[0][0].info) as writer:
@@ -136,7 +136,6 @@ def _copy(sources: Iterable[tuple[DataSet, Sequence[int]]], out: str | Path) -> 
     return added, left_out
 
 
-def same_place(one: str | Path, other: str | Path) -> bool:
-    """Whether both are the same address, or the same file or folder on this computer."""
+def _same_place(one: str, other: str | Path) -> bool:
     a, b = Path(one).expanduser(), Path(other).expanduser()
-    return str(one) == str(other) or (a.exists() and b.exists() and a.samefile(b))
+    return one == str(other) or (a.exists() and b.exists() and a.samefile(b))

@@ -47,9 +47,7 @@ def collect(config: CollectConfig) -> None:
 
 def import_(config: ImportConfig) -> None:
     """Add recordings or Parquet rows to a data set."""
-    from bam_train.data import DataSet
-    from bam_train.data.parquet_rows import add_rows, info_of_env, is_rows
-    from bam_train.data.recordings import add_recording, info_of_recording
+    from bam_train.data import DataSet, recordings
     from bam_train.errors import SettingsError
     from bam_train.recording.recording import Recording
     from bam_train.settings import read_env_kwargs
@@ -60,13 +58,16 @@ def import_(config: ImportConfig) -> None:
         raise SystemExit(2)
     env_kwargs = read_env_kwargs(config.set)
     for path in config.recordings:
-        if is_rows(path):
-            notes = add_rows(path, config.place, info_of_env(path, config.env, env_kwargs), **facts)
+        if recordings.is_rows(path):
+            info = recordings.info_of_rows(path, config.env, env_kwargs)
+            episodes = recordings.episodes_of_rows(path, info)
+            notes = recordings.add_episodes(path, episodes, config.place, info, **facts)
         elif env_kwargs:
             raise SettingsError(f"--set: {path} says the arguments of its environment; leave --set out")
         else:
             recording = Recording.open(path)
-            notes = add_recording(recording, config.place, info_of_recording(recording, config.env), **facts)
+            info = recordings.info_of_recording(recording, config.env)
+            notes = recordings.add_recording(recording, config.place, info, **facts)
         for note in notes:
             say(f"bam-data: note: {note}")
     data = DataSet.open(config.place)

@@ -11,7 +11,7 @@ from bam_train.data import DataSet, DataSetInfo
 from bam_train.data.export import export
 from tests.bam_train.data.episode_samples import SPACES, assert_equal, episode, write
 
-pa = pytest.importorskip("pyarrow")
+pa, pq = pytest.importorskip("pyarrow"), pytest.importorskip("pyarrow.parquet")
 ENV = "test/Rows-v0"
 
 
@@ -55,99 +55,69 @@ def test_exported_rows_come_back_bit_for_bit(observation, action, import_):
         assert_equal(one.actions, other.actions)
         facts = {"recording": "rows", "number": number, "eps_id": f"{number:06d}", "group": "cell-7"}
         assert one.facts == facts
-    note = "bam-data: note: rows: episodes that are in back already, and are left out: 3\n"
+    note = "bam-data: note: rows: episode 0 and 2 more: is in back already\n"
     assert import_("back", *given) == (0, "back: 3 episodes, 4503 steps now\n", note)
 
 
-def rows(file="rows/a.parquet", **changes):
+def rows(**changes):
     """Six steps of two episodes of `ENV`, but for some columns; None leaves one out."""
     observed = np.arange(24, dtype=np.float32).reshape(8, 3)
     obs, after = (np.concatenate([observed[k : k + 3], observed[k + 4 : k + 7]]).tolist() for k in (0, 1))
     columns = {"eps_id": ["a"] * 3 + ["b"] * 3, "t": [0, 1, 2] * 2, "obs": obs, "new_obs": after}
     columns |= {"actions": [2, 5] * 3, "rewards": [1.0] * 6, "terminateds": [False, False, True] * 2}
     columns |= {"truncateds": [False] * 6, **changes}
+    Path("rows").mkdir()
     table = pa.table({name: values for name, values in columns.items() if values is not None})
-    pa.parquet.write_table(table, file)
-
-
-def test_episodes_go_from_file_to_file_and_may_have_no_end(import_, tmp_path):
-    import pyarrow.parquet as pq
-
-    (tmp_path / "rows" / "more").mkdir(parents=True)
-    rows(terminateds=[False] * 6)
-    table = pq.read_table("rows/a.parquet")
     pq.write_table(table.slice(0, 1), "rows/a.parquet")
-    pq.write_table(table.slice(1), "rows/more/b.parquet")
-    (tmp_path / "rows" / "_lock.parquet").touch()
-    note = "bam-data: note: rows: episodes that have no end, and are taken as truncated: 2\n"
+    pq.write_table(table.slice(1), "rows/b.parquet")
+
+
+def test_episodes_go_from_file_to_file_and_may_have_no_end(import_):
+    rows(terminateds=[False] * 6)
+    note = "bam-data: note: rows: episode 0 and 1 more: it has no end, and is taken as truncated\n"
     assert import_("data", "rows", "--env", ENV) == (0, "data: 2 episodes, 6 steps now\n", note)
     one, other = DataSet.open("data")
     assert one.observations[:, 0].tolist() == [0, 3, 6, 9]
     assert (one.actions.tolist(), other.actions.tolist()) == ([2, 5, 2], [5, 2, 5])
     assert (other.terminated, other.truncated, other.facts["end"]) == (False, True, "cut off")
+    again = "bam-data import: data: is a data set already; add it to another one with bam-data merge\n"
+    assert import_("more", "data", "--env", ENV) == (1, "", again)
 
 
-NONE = {name: [] for name in ("eps_id", "t", "obs", "new_obs", "actions", "rewards", "terminateds", "truncateds")}
 OTHER = "expected finite numbers, found others or rows without one; record it again"
-ORDER = "put its rows in order, and give each unbroken part its own eps_id"
+ORDER = "do not follow each other, or some are missing; sort them, and give each unbroken part an eps_id of its own"
 WRONG = {
-    "no column": (
-        {"new_obs": None, "rewards": None},
-        "rows/a.parquet: lacks the column rewards, new_obs; it has eps_id, t, obs, actions, terminateds, truncateds",
-    ),
-    "text": ({"actions": ["x"] * 6}, f"rows: actions: {OTHER}"),
-    "null": ({"rewards": [1.0, None, 1.0, 1.0, 1.0, 1.0]}, f"rows: rewards: {OTHER}"),
-    "nan": ({"obs": [[np.nan] * 3] * 6}, f"rows: obs: {OTHER}"),
-    "half": (
-        {"actions": [2.5] * 6},
-        "rows: actions: expected int64 numbers, found float64 that are none; record it again",
-    ),
-    "ragged": (
-        {"obs": [[0.0], [1.0, 2.0]] * 3},
-        "rows: obs: expected rows of shape (3,), found rows of different lengths",
-    ),
-    "shape": ({"obs": [[0.0]] * 6}, "rows: obs: expected rows of shape (3,), found shape (1,)"),
-    "gap": (
-        {"new_obs": [[9.0] * 3] * 6},
-        f"rows: episode 'a' of the rows: new_obs of its step 0 is not obs of the next; {ORDER}",
-    ),
-    "mixed": (
-        {"eps_id": ["a", "b"] * 3, "terminateds": [False] * 6},
-        f"rows: episode 'a' of the rows: others are in between; {ORDER}",
-    ),
-    "empty": (NONE, "rows: has no rows"),
+    "column": ({"new_obs": None}, ": lacks the column new_obs; it has eps_id, t, obs, actions, rewards, "),
+    "text": ({"actions": ["x"] * 6}, f": actions: {OTHER}"),
+    "null": ({"rewards": [1.0, None, 1.0, 1.0, 1.0, 1.0]}, f": rewards: {OTHER}"),
+    "nan": ({"obs": [[np.nan] * 3] * 6}, f": obs: {OTHER}"),
+    "half": ({"actions": [2.5] * 6}, ": actions: expected int64 numbers, found float64 that are none; record it again"),
+    "ragged": ({"obs": [[0.0], [1.0, 2.0]] * 3}, ": obs: expected rows of shape (3,), found ('different lengths',)"),
+    "shape": ({"obs": [[0.0]] * 6}, ": obs: expected rows of shape (3,), found (1,)"),
+    "gap": ({"new_obs": [[9.0] * 3] * 6}, f": the rows of episode 'a' {ORDER}"),
+    "mixed": ({"eps_id": ["a", "b"] * 3, "terminateds": [False] * 6}, f": the rows of episode 'a' {ORDER}"),
 }
 
 
 @pytest.mark.parametrize(("changes", "text"), WRONG.values(), ids=WRONG)
-def test_rows_that_are_not_whole_change_nothing(changes, text, import_, tmp_path):
-    (tmp_path / "rows").mkdir()
-    rows("rows/a.parquet", **changes)
-    assert import_("data", "rows", "--env", ENV) == (1, "", f"bam-data import: {text}\n")
-    assert not (tmp_path / "data").exists()
+def test_rows_that_are_not_whole_change_nothing(changes, text, import_):
+    rows(**changes)
+    status, out, err = import_("data", "rows", "--env", ENV)
+    assert (status, out, err.count("\n"), Path("data").exists()) == (1, "", 1, False)
+    assert err.startswith(f"bam-data import: rows{text}")
 
 
-def test_what_cannot_be_imported_is_one_line(import_, tmp_path):
-    (tmp_path / "rows").mkdir()
-    none = (1, "", "bam-data import: rows: has no .parquet file in it\n")
-    assert import_("data", "rows", "--env", ENV) == none
-    rows()
-    nameless = "rows: Parquet rows do not name their environment; add --env ENV"
-    same = "rows: is read and cannot be written too; choose another PLACE"
-    nested = "record it with RecordDataset"
-    (tmp_path / "b.parquet").write_text("text")
-    cases = [
-        (("data", "rows"), nameless),
-        (("rows", "rows", "--env", ENV), same),
-        (("data", "rows", "--env", ENV, "--set", "observation=nested"), nested),
-        (("data", "b.parquet", "--env", ENV), "b.parquet: cannot be read as Parquet: "),
-        (("data", "b.mcap", "--set", "a=1"), "--set: b.mcap says the arguments of its environment; leave --set out"),
-    ]
-    for arguments, text in cases:
-        status, out, err = import_(*arguments)
-        assert (status, out, err.count("\n")) == (1, "", 1)
-        assert text in err
-    assert not (tmp_path / "data").exists()
-    assert import_("data", "rows/a.parquet", "--env", ENV)[0] == 0
-    again = "data: is a data set already; add it with bam-data merge data --out more"
-    assert import_("more", "data", "--env", ENV) == (1, "", f"bam-data import: {again}\n")
+def test_what_cannot_be_imported_is_one_line(import_):
+    Path("a.parquet").write_text("text")
+    Path("none").mkdir()
+    nested = ("a.parquet", "--env", ENV, "--set", "observation=nested")
+    for arguments, text in (
+        (["a.parquet"], "a.parquet: Parquet rows do not name their environment; add --env ENV"),
+        (["a.parquet", "--env", ENV], "a.parquet: cannot be read as Parquet: "),
+        (["none", "--env", ENV], "none: lacks the column eps_id, obs, new_obs, actions, "),
+        (nested, "a.parquet: Parquet rows have one array a step, and the spaces of test/Rows-v0 are Dict("),
+        (["b.mcap", "--set", "a=1"], "--set: b.mcap says the arguments of its environment; leave --set out"),
+    ):
+        status, out, err = import_("data", *arguments)
+        assert (status, out, err.count("\n"), Path("data").exists()) == (1, "", 1, False)
+        assert err.startswith(f"bam-data import: {text}")

@@ -85,7 +85,7 @@ def test_hyperparameters_are_refused(algo, name, value, text):
     [
         ({"algo": "pp"}, "Unknown algorithm 'pp'. Did you mean 'ppo'?"),
         ({"algo": "dqn"}, "dqn does not fit bam/reach-v0: it takes Discrete actions, found Box"),
-        ({"algo": "bc"}, "data: bc learns from recorded episodes, found none"),
+        ({"algo": "bc"}, "data: bc learns from a data set, found none"),
         ({"data": "x"}, "data: ppo learns in the environment"),
         ({"device": "cuda"}, "device: rllib learns on the CPU, or on as many GPUs as --num-gpus says; found 'cuda'."),
         ({"transport": ["tcp://127.0.0.1:1"]}, "transport: the rllib trainer makes its environments"),
