@@ -93,7 +93,7 @@ class TrainSettings:
     """Ray cluster that rllib trains on; by default it starts one on this computer, for this run."""
     data: str | None = None
     """Data set to learn from, without its environment, which it names; also at an address, such as s3://bucket/pick.
-    With --trainer rllib also plain Parquet files, for bc, marwil, cql and iql."""
+    With --trainer rllib for bc, marwil, cql and iql."""
     normalize: bool | dict[str, Any] = False
     """Normalise observations and rewards by running statistics; a table gives VecNormalize's arguments. Images and
     choices among the observations stay as they are."""

@@ -81,14 +81,16 @@ class Files:
         """Raise BadDataSet unless a data set, or a part of one, is there; it names a bucket that is not there."""
         if self.exists(INFO):  # who may read objects of a bucket may not list them
             return
+        remedy = "give a folder that bam-data wrote, or make one of recordings or Parquet rows: bam-data import PLACE "
+        remedy += self.text
         if not self.root.is_dir():
             try:
                 self.root.size()
             except NoSuchPlace as error:
                 raise BadDataSet(str(error)) from error
-            raise BadDataSet(f"{self.text}: is no data set but a file; give a folder that bam-data wrote")
+            raise BadDataSet(f"{self.text}: is no data set but a file; {remedy}")
         if not any(self.exists(name) for name in (BAM, "meta/episodes", "data", "copies")):
-            raise BadDataSet(f"{self.text}: is no data set: it has no {INFO}; give a folder that bam-data wrote")
+            raise BadDataSet(f"{self.text}: is no data set: it has no {INFO}; {remedy}")
 
     def content(self, name: str) -> bytes | None:
         """The bytes of a file; None if there is none."""

@@ -1,27 +1,40 @@
-"""Recordings of deployments (MCAP) as episodes of a data set."""
+"""Recordings of deployments (MCAP), and plain Parquet files with one row a step, as episodes of a data set."""
 
 from __future__ import annotations
 
 import base64
 import json
 import time
-from collections.abc import Iterator
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import closing
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from bam_envs.core.registry import resolve_id
+from bam_envs.core.wording import brief
 from bam_train.checkpoint.manifest import require_no_place
+from bam_train.data.arrow_columns import Arrow
 from bam_train.data.data_set import DataSet
 from bam_train.data.data_set_writer import DataSetWriter
-from bam_train.data.episode import Array, DataSetInfo, Episode, joined, leaves_of
+from bam_train.data.episode import Array, DataSetInfo, Episode, digest_of, joined, leaves_of
+from bam_train.data.layout import INFO, Files
 from bam_train.data.record_dataset import info_of
-from bam_train.environments import make_env, must_be_named
-from bam_train.errors import BadRecording
+from bam_train.environments import make_env, must_be_named, require_env_kwargs
+from bam_train.errors import BadDataSet, BadRecording
 from bam_train.files.place import Place
 from bam_train.recording.recording import Recording
+
+_CUT, _NO_END = "cut off", "it has no end, and is taken as truncated"
+
+
+def is_rows(source: Path) -> bool:
+    """Whether it is a Parquet file or a folder, and no recording."""
+    return source.suffix == ".parquet" or Place(source).is_dir()
 
 
 def is_data_set(text: str) -> bool:
@@ -55,30 +68,58 @@ def info_of_recording(recording: Recording, env: str | None = None) -> DataSetIn
         return info_of(made, env or named, kwargs, period)
 
 
+def info_of_rows(source: Path, env: str | None, env_kwargs: Mapping[str, Any]) -> DataSetInfo:
+    """What all episodes of Parquet rows have in common, by their environment, which is made.
+
+    Raises:
+        BadDataSet: No environment is given, or one whose observations or actions are several arrays.
+    """
+    if env is None:
+        raise BadDataSet(f"{source}: Parquet rows do not name their environment; add --env ENV")
+    env = resolve_id(env)
+    require_env_kwargs(env, env_kwargs)
+    with closing(make_env(env, dict(env_kwargs))) as made:
+        info = info_of(made, env, env_kwargs)
+    if info.observation_space.shape is None or info.action_space.shape is None:
+        what = f"the spaces of {env} are {brief(info.observation_space)} and {brief(info.action_space)}"
+        raise BadDataSet(f"{source}: Parquet rows have one array a step, and {what}; record it with RecordDataset")
+    return info
+
+
 def add_recording(recording: Recording, place: str | Path | Place, info: DataSetInfo, **facts: Any) -> list[str]:
-    """Add the episodes of a recording to a data set, but for those that it has already.
+    """Add the episodes of a recording to a data set, as `add_episodes`."""
+    return add_episodes(recording.path, episodes_of(recording, info), place, info, **facts)
+
+
+def add_episodes(
+    source: Path, episodes: Iterable[tuple[Episode, str]], place: str | Path | Place, info: DataSetInfo, **facts: Any
+) -> list[str]:
+    """Add the episodes of a recording or of rows to a data set, but for those that it has already.
 
     Args:
-        recording: The recording.
+        source: The recording or the rows.
+        episodes: What `episodes_of` or `episodes_of_rows` gives.
         place: The data set.
         info: What all its episodes have in common.
         facts: Further facts of every episode.
 
     Returns:
-        A line for each episode that was added with a fault, or left out.
+        A line for each reason for which episodes were added with a fault, or left out.
     """
-    notes = []
+    notes: dict[str, list[int]] = {}
     with DataSetWriter(place, info) as writer:
         data = DataSet.open(place)
-        there = {(row.get("recording"), row.get("number")) for row in map(data.facts, range(len(data)))}
-        for episode, note in episodes_of(recording, info):
-            key = (episode.facts["recording"], episode.facts["number"])
-            notes += [f"{recording.path}: episode {key[1]}: {note}"] if note else []
-            if len(episode) and key not in there and "left out" not in note:
+        recorded = [(row.get("recording"), row.get("number")) for row in map(data.facts, range(len(data)))]
+        there: Counter[Any] = Counter([*recorded, *data.digests])
+        for episode, note in episodes:
+            key = episode.digest or (episode.facts["recording"], episode.facts["number"])
+            is_there, there[key] = there[key] > 0, there[key] - 1
+            for text in (note, f"is in {place} already" if is_there else ""):
+                notes.setdefault(text, []).append(episode.facts["number"])
+            if len(episode) and not is_there and "left out" not in note:
                 writer.add(replace(episode, facts={**episode.facts, **facts}))
-            elif key in there:
-                notes.append(f"{recording.path}: episode {key[1]} is in {place} already")
-    return notes
+    more = {text: f" and {len(numbers) - 1} more" if len(numbers) > 1 else "" for text, numbers in notes.items()}
+    return [f"{source}: episode {numbers[0]}{more[text]}: {text}" for text, numbers in notes.items() if text]
 
 
 def episodes_of(recording: Recording, info: DataSetInfo) -> Iterator[tuple[Episode, str]]:
@@ -106,7 +147,7 @@ def episodes_of(recording: Recording, info: DataSetInfo) -> Iterator[tuple[Episo
             "date": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime(table.times[first] / 1e9)),
         }
         if not any(end.values()):
-            end["truncated"], facts["end"], note = True, "cut off", "it has no end, and is taken as truncated"
+            end["truncated"], facts["end"], note = True, _CUT, _NO_END
         parts: dict[str, Array] = {}
         for leaf in leaves:
             name = "/".join(map(str, leaf.path))
@@ -127,6 +168,87 @@ def episodes_of(recording: Recording, info: DataSetInfo) -> Iterator[tuple[Episo
             ),
             note,
         )
+
+
+def episodes_of_rows(source: Path, info: DataSetInfo) -> list[tuple[Episode, str]]:
+    """Each episode of a Parquet file or a folder of them, with its digest, and what is odd about it.
+
+    The rows of an episode follow each other, also from one file to the next; it ends where it terminates, is truncated,
+    or another ``eps_id`` begins.
+
+    Raises:
+        BadDataSet: There are no rows, a column or a value is missing, not finite or of another shape or kind than the
+            environment's, or the rows of an episode do not follow each other.
+    """
+    [observed], [acted] = leaves_of(info.observation_space, "observation"), leaves_of(info.action_space, "action")
+    kinds: dict[str, tuple[tuple[int, ...], Any]] = dict.fromkeys(("obs", "new_obs"), (observed.shape, observed.dtype))
+    kinds |= {"actions": (acted.shape, acted.dtype), "rewards": ((), np.float64)}
+    kinds |= dict.fromkeys(("terminateds", "truncateds"), ((), np.bool_))
+    table = _rows(source, ["eps_id", *kinds])
+    rows = {name: _numbers(f"{source}: {name}", table[name].combine_chunks(), *kind) for name, kind in kinds.items()}
+    ids, ends = table["eps_id"].to_pylist(), rows["terminateds"] | rows["truncateds"]
+    starts = [0, *(k for k in range(1, len(ids)) if ends[k - 1] or ids[k] != ids[k - 1]), len(ids)]
+    found: list[tuple[Episode, str]] = []
+    cut_off: set[Any] = set()
+    for number, (start, stop) in enumerate(pairwise(starts)):
+        observations = np.concatenate([rows["obs"][start:stop], rows["new_obs"][stop - 1 : stop]])
+        if ids[start] in cut_off or (observations[1:] != rows["new_obs"][start:stop]).any():
+            what = f"the rows of episode {ids[start]!r} do not follow each other, or some are missing"
+            raise BadDataSet(f"{source}: {what}; sort them, and give each unbroken part an eps_id of its own")
+        end = bool(rows["terminateds"][stop - 1]), bool(rows["truncateds"][stop - 1] or not ends[stop - 1])
+        facts = {"recording": Place(source).name, "number": number, "eps_id": str(ids[start])}
+        if not ends[stop - 1]:
+            facts["end"] = _CUT
+            cut_off.add(ids[start])
+        actions, rewards = rows["actions"][start:stop], rows["rewards"][start:stop]
+        digest = digest_of({observed.column: observations, acted.column: actions, "reward": rewards}, *end, None)
+        episode = Episode(observations, actions, rewards, *end, facts=facts, digest=digest)
+        found.append((episode, "" if ends[stop - 1] else _NO_END))
+    return found
+
+
+def _rows(source: Path, columns: list[str]) -> Arrow:
+    """The table of these columns."""
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    if Files(source).exists(INFO):
+        raise BadDataSet(f"{source}: is a data set already; add it to another one with bam-data merge")
+    place = Place(source)
+    try:
+        files = pq.ParquetDataset(place.path, filesystem=place.filesystem)
+        if missing := [name for name in columns if name not in files.schema.names]:
+            text = f"lacks the column {', '.join(missing)}; it has {', '.join(files.schema.names) or 'none'}"
+            raise BadDataSet(f"{source}: {text}")
+        table = files.read(columns)
+    except (OSError, pa.ArrowInvalid) as error:
+        raise BadDataSet(f"{source}: cannot be read as Parquet: {' '.join(str(error).split())}") from error
+    if not len(table):
+        raise BadDataSet(f"{source}: has no rows")
+    return table
+
+
+def _numbers(name: str, column: Arrow, shape: tuple[int, ...], dtype: Any) -> Array:
+    """A column of numbers, tensors, or (nested) lists of numbers as one array (rows, *shape)."""
+    import pyarrow as pa
+    import pyarrow.compute as pc
+
+    found: list[Any] = []
+    if isinstance(column, pa.FixedShapeTensorArray):
+        found, column = list(column.type.shape), column.storage.flatten()
+    while pa.types.is_list(column.type) or pa.types.is_fixed_size_list(column.type):
+        lengths = pc.unique(pc.list_value_length(column)).to_pylist()
+        found.append(lengths[0] if len(lengths) == 1 else "different lengths")
+        column = column.flatten()
+    if tuple(found) != shape:
+        raise BadDataSet(f"{name}: expected rows of shape {shape}, found {tuple(found)}")
+    array: Array = column.to_numpy(zero_copy_only=False).reshape(-1, *shape)
+    if array.dtype.kind not in "biuf" or not np.isfinite(array).all():
+        raise BadDataSet(f"{name}: expected finite numbers, found others or rows without one; record it again")
+    exact = array.astype(dtype)
+    if exact.dtype.kind != "f" and not np.array_equal(exact, array):
+        raise BadDataSet(f"{name}: expected {exact.dtype} numbers, found {array.dtype} that are none; record it again")
+    return exact
 
 
 def _columns(recording: Recording, first: int, last: int) -> dict[str, Array]:

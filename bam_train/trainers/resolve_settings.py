@@ -1,10 +1,12 @@
 """Complete settings from those that a user gives: with presets for new runs, and a checkpoint's for resumed ones."""
 
+from __future__ import annotations
+
 import contextlib
 from collections.abc import Callable, Mapping
 from dataclasses import fields, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from bam_envs.core.errors import MissingExtra, UnknownName
 from bam_envs.core.registry import entry_of, resolve_id
@@ -17,6 +19,9 @@ from bam_train.settings import TrainSettings, check_names, differences, file_ste
 from bam_train.trainers.algorithms import ALGORITHMS, EXTRAS, RLLIB_ALGORITHMS, load_trainer, require_algorithm
 from bam_train.trainers.rllib_arguments import require_plausible
 from bam_train.trainers.sb3_hyperparameters import complete_settings
+
+if TYPE_CHECKING:
+    from bam_train.data import DataSet
 
 PRESETS = Path(__file__).parent / "presets"
 """Tuned settings, laid out like a ``--config`` file: ``<environment>-<algorithm>.toml`` is for sb3,
@@ -112,7 +117,7 @@ def _of_data(given: Mapping[str, Any]) -> dict[str, Any]:
 
     trainer = given.get("trainer", "offline")
     if trainer != "offline" and given.get("env") is not None:
-        return {}  # for rllib it may be plain Parquet files
+        return {}  # the trainer checks whether they fit
     info = DataSet.open(given["data"]).info
     return {"trainer": trainer, "env": info.env, **({"env_kwargs": info.env_kwargs} if info.env_kwargs else {})}
 
@@ -190,7 +195,7 @@ def resolve_resumed(given: Mapping[str, Any], checkpoint: Checkpoint, tell: Tell
     goes_online = checkpoint.manifest.trainer == "offline" and given.get("env") is not None
     elsewhere = bool(given.get("transport")) or (checkpoint.manifest.trainer == "offline" and not goes_online)
     own, asked = own_settings(checkpoint, given.get("env"), elsewhere=elsewhere), dict(given)
-    if checkpoint.manifest.trainer == "offline" and given.get("data") is not None:
+    if checkpoint.manifest.trainer in ("offline", "rllib") and given.get("data") is not None:
         own["data"] = given["data"]  # moved; the trainer compares the episodes
     if goes_online:
         own |= _online(own, given, checkpoint)
@@ -210,6 +215,16 @@ def resolve_resumed(given: Mapping[str, Any], checkpoint: Checkpoint, tell: Tell
         text = f"has trained {done} of {completed.steps} steps already; give a larger total with --steps"
         raise SettingsError(f"{checkpoint.path}: {text}")
     return completed
+
+
+def learnt_episodes(checkpoint: Checkpoint, data: DataSet) -> list[int]:
+    """Indices of the episodes that a checkpoint was trained on; CheckpointMismatch if the data set lacks one."""
+    places = {digest: index for index, digest in enumerate(data.digests)}
+    learnt = checkpoint.manifest.data.get("episodes", [])
+    if missing := [digest for digest in learnt if digest not in places]:
+        text = f"was trained on an episode ({missing[0][:12]}) that {data.place} does not have"
+        raise CheckpointMismatch(checkpoint.path, f"{text}; give the data set it was trained on with --data")
+    return [places[digest] for digest in learnt]
 
 
 def _online(own: Mapping[str, Any], given: Mapping[str, Any], checkpoint: Checkpoint) -> dict[str, Any]:

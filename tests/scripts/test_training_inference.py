@@ -50,7 +50,7 @@ WRONG = [
     (
         ["--run", "BC"],
         1,
-        "data: bc learns from recorded episodes, found none. Give a folder of Parquet files with bam-",
+        "data: bc learns from a data set, found none. Give its place with --data; bam-data collect records one",
     ),
     (["--run", "DQN"], 1, "dqn does not fit bam/mir100-navigation-v0: it takes Discrete actions, found Box. "),
     (["--num-cpus", "1000"], 1, "--num-cpus: expected at most "),

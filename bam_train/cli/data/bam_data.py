@@ -26,7 +26,7 @@ _FLAGS, _VIEW = "bam_train.cli.data.data_flags", "bam_train.cli.data.view_flags"
 _SEEN = "bam_train.cli.data.pictures"
 COMMANDS = {
     "collect": Command("run a policy in simulation and record it", f"{_FLAGS}:CollectConfig", f"{_RECORDED}:collect"),
-    "import": Command("add the episodes of recordings (.mcap)", f"{_FLAGS}:ImportConfig", f"{_RECORDED}:import_"),
+    "import": Command("add episodes of recordings or Parquet rows", f"{_FLAGS}:ImportConfig", f"{_RECORDED}:import_"),
     "check": Command("say what is whole, and mend the rest", f"{_FLAGS}:CheckConfig", f"{_RECORDED}:check"),
     "info": Command("what it is of, and how much is in it", f"{_VIEW}:InfoConfig", f"{_OPENED}:show_info"),
     "stats": Command(

@@ -73,18 +73,24 @@ class CheckConfig:
 class ImportConfig:
     """Add the episodes of recordings of bam-deploy and bam-agent (.mcap) to a data set; those that it has are left out.
 
+    Folders of Parquet files with one row a step are taken too. They have the columns eps_id, obs, actions, rewards,
+    new_obs, terminateds and truncateds, and do not name their environment.
+
     An episode that was cut off is added as truncated, with the fact "end": "cut off".
 
     Examples:
       bam-data import data/robot recordings/2026-11-23T150901Z-pick.mcap --group blue-cube
+      bam-data import data/pick rows --env bam/pick --set randomize=true
     """
 
     place: DataPlace
     """The data set, which is made if there is none."""
     recordings: Annotated[tyro.conf.Positional[tuple[Path, ...]], tyro.conf.arg(metavar="RECORDING...")]
-    """The .mcap files."""
+    """The .mcap files, or folders of Parquet rows."""
     env: EnvId = None
-    """Environment of the recordings; needed for some_module:Env-v0."""
+    """Environment of the recordings; needed for some_module:Env-v0 and for Parquet rows."""
+    set: Assignments = ()
+    """An argument of the environment of Parquet rows, any number of times: randomize=true."""
     task: Annotated[str | None, tyro.conf.arg(metavar="TEXT")] = None
     """What the episodes are about, as a sentence; by default the environment's id."""
     group: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None

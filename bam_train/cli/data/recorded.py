@@ -46,18 +46,29 @@ def collect(config: CollectConfig) -> None:
 
 
 def import_(config: ImportConfig) -> None:
-    """Add recordings to a data set."""
-    from bam_train.data import DataSet
-    from bam_train.data.recordings import add_recording, info_of_recording
+    """Add recordings or Parquet rows to a data set."""
+    from bam_train.data import DataSet, recordings
+    from bam_train.errors import SettingsError
     from bam_train.recording.recording import Recording
+    from bam_train.settings import read_env_kwargs
 
     facts = {name: value for name in ("task", "group") if (value := getattr(config, name)) is not None}
     if not config.recordings:
         say("bam-data import: RECORDING is missing. Run bam-data import --help")
         raise SystemExit(2)
+    env_kwargs = read_env_kwargs(config.set)
     for path in config.recordings:
-        recording = Recording.open(path)
-        for note in add_recording(recording, config.place, info_of_recording(recording, config.env), **facts):
+        if recordings.is_rows(path):
+            info = recordings.info_of_rows(path, config.env, env_kwargs)
+            episodes = recordings.episodes_of_rows(path, info)
+            notes = recordings.add_episodes(path, episodes, config.place, info, **facts)
+        elif env_kwargs:
+            raise SettingsError(f"--set: {path} says the arguments of its environment; leave --set out")
+        else:
+            recording = Recording.open(path)
+            info = recordings.info_of_recording(recording, config.env)
+            notes = recordings.add_recording(recording, config.place, info, **facts)
+        for note in notes:
             say(f"bam-data: note: {note}")
     data = DataSet.open(config.place)
     tell(f"{config.place}: {len(data)} episodes, {data.total_frames} steps now")

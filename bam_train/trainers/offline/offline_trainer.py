@@ -23,7 +23,7 @@ from bam_train.checkpoint import Checkpoint
 from bam_train.checkpoint.detector import Rollout
 from bam_train.data import DataSet
 from bam_train.environments import control_period, make_env, require_fit
-from bam_train.errors import CheckpointMismatch, SettingsError
+from bam_train.errors import SettingsError
 from bam_train.settings import TrainSettings, differences
 from bam_train.trainers.algorithms import OFFLINE_ALGORITHMS
 from bam_train.trainers.base import OnProgress, Progress, Statistics
@@ -32,7 +32,7 @@ from bam_train.trainers.offline.implicit_q import Cloning, ImplicitQ, ImplicitQL
 from bam_train.trainers.offline.offline_policy import OfflinePolicy
 from bam_train.trainers.offline.online_phase import OnlinePhase
 from bam_train.trainers.offline.training_data import ActionCode, Normaliser, read_batch
-from bam_train.trainers.resolve_settings import own_settings
+from bam_train.trainers.resolve_settings import learnt_episodes, own_settings
 from bam_train.trainers.torch_trainer import STATE, TorchTrainer
 
 _OWN: dict[str, type[Cloning]] = {"bc": Cloning, "iql": ImplicitQ}
@@ -112,12 +112,7 @@ class OfflineTrainer(TorchTrainer):
         own = own_settings(checkpoint, elsewhere=True) if settings is None else {}
         settings = settings or TrainSettings.from_mapping(own, str(checkpoint.path))
         data = _open(settings)
-        places = {digest: index for index, digest in enumerate(data.digests)}
-        missing = [digest for digest in checkpoint.manifest.data.get("episodes", []) if digest not in places]
-        if missing:
-            text = f"was trained on an episode ({missing[0][:12]}) that {data.place} does not have"
-            raise CheckpointMismatch(checkpoint.path, f"{text}; give the data set it was trained on with --data")
-        trainer = cls(settings, data, [places[digest] for digest in checkpoint.manifest.data["episodes"]])
+        trainer = cls(settings, data, learnt_episodes(checkpoint, data))
         with checkpoint.fitting(STATE):
             state = checkpoint.state(STATE, torch.as_tensor)
             trainer.learner.load_state_dict(state["learner"])

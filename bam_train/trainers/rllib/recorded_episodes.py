@@ -1,25 +1,18 @@
-"""Recorded episodes for bc, marwil, cql and iql: a data set, or plain Parquet files with one row per step.
-
-A data set is read while learning (`streamed_episodes`). Plain files have the columns ``eps_id`` (text), ``obs``,
-``actions`` (in the environment's action space), ``rewards``, ``new_obs``, ``terminateds``, ``truncateds``; others are
-ignored. The rows of an episode are consecutive.
+"""Data sets for bc, marwil, cql and iql: read while learning, in blocks of episodes, within bounded memory.
 
 RLlib sends every row of every update through Ray Data as a separate episode, at a few thousand rows a second. Here a
-learner reads the files into its memory once and draws rows from it, a hundred times as fast. One update learns from
-``train_batch_size_per_learner`` rows, each of which counts as a step of the run.
+learner reads blocks of episodes into its memory and draws rows from them, a hundred times as fast. One update learns
+from ``train_batch_size_per_learner`` rows, each of which counts as a step of the run. Each learner reads its own
+episodes, so several learners share a data set, at a place that all of them reach.
 """
 
 from __future__ import annotations
 
-import os
+from collections import deque
 from collections.abc import Iterator
 from typing import Any
 
-import fsspec
 import numpy as np
-import pyarrow.compute
-import pyarrow.fs
-import pyarrow.parquet
 import torch
 from gymnasium import Space, spaces
 from numpy.typing import NDArray
@@ -27,19 +20,19 @@ from ray.rllib.core import DEFAULT_MODULE_ID
 from ray.rllib.offline.offline_data import OfflineData
 from ray.rllib.utils.spaces.space_utils import normalize_action
 
+from bam_envs.core.spaces import space_to_json
 from bam_train.data import DataSet
 from bam_train.errors import SettingsError
 from bam_train.settings import TrainSettings
 from bam_train.trainers.rllib import register_foreign
-from bam_train.trainers.rllib.streamed_episodes import blocks, columns_of, draws, is_data_set, require_fit
 from bam_train.trainers.zero_based_spaces import less_start
 
 Array = NDArray[Any]
 
-COLUMNS = ("eps_id", "obs", "actions", "rewards", "new_obs", "terminateds", "truncateds")
-"""Columns that every file must have."""
-
 _MOST_UPDATES = 100  # of an iteration
+_BLOCK_STEPS = 20_000
+"""About so many steps are read together; batches are drawn from `_BLOCKS` blocks."""
+_BLOCKS = 8
 
 
 def add_data(config: Any, settings: TrainSettings, observation_space: Space[Any], action_space: Space[Any]) -> Any:
@@ -48,7 +41,7 @@ def add_data(config: Any, settings: TrainSettings, observation_space: Space[Any]
     Raises:
         SettingsError: There are no episodes, or they do not fit the environment.
     """
-    _require_columns(settings.data or "", observation_space, action_space)
+    require_fit(settings.data or "", observation_space, action_space)
     batch = int(settings.hyperparameters["train_batch_size_per_learner"])
     updates = max(2, min(_MOST_UPDATES, min(settings.steps, settings.eval_every or settings.steps) // batch))
     config.environment(
@@ -66,9 +59,9 @@ def add_data(config: Any, settings: TrainSettings, observation_space: Space[Any]
 
 
 class RecordedData(OfflineData):  # type: ignore[misc]
-    """RLlib's `OfflineData` for files that fit into memory, for `AlgorithmConfig.offline_data`."""
+    """RLlib's `OfflineData` for a data set, for `AlgorithmConfig.offline_data`."""
 
-    def __init__(self, config: Any) -> None:  # not RLlib's, which opens the files with Ray Data
+    def __init__(self, config: Any) -> None:  # not RLlib's, which opens files with Ray Data
         self._config = config
         self.iter_batches_kwargs: dict[str, Any] = {}
         self.spaces = self.module_spec = self.learner_handles = self.locality_hints = None  # RLlib sets them
@@ -85,97 +78,60 @@ class Draws:
 
     def __init__(self, data: str, config: Any, seed: int, shard: int = 0, shards: int = 1) -> None:
         self._data, self._seed, self._shard, self._shards = data, seed + shard, shard, shards
-        self._spaces = config.observation_space, config.action_space
         self._gamma = float(config.gamma)
 
     def iter_torch_batches(self, *, batch_size: int, device: Any = None, **_: Any) -> Iterator[dict[str, Any]]:
         """Yield batches of tensors (batch_size, ...) by module and column, as ``default_policy/obs``."""
-        if is_data_set(self._data):
-            for batch in self._streamed(batch_size):
-                yield {f"{DEFAULT_MODULE_ID}/{name}": torch.from_numpy(one).to(device) for name, one in batch.items()}
-        table = load(self._data, *self._spaces, self._gamma)
-        columns = {name: torch.from_numpy(values).to(device or "cpu") for name, values in table.items()}
-        rng = np.random.default_rng(self._seed)
-        while True:
-            rows = torch.from_numpy(rng.integers(len(table["rewards"]), size=batch_size)).to(device or "cpu")
-            yield {f"{DEFAULT_MODULE_ID}/{name}": values[rows] for name, values in columns.items()}
-
-    def _streamed(self, batch_size: int) -> Iterator[dict[str, Array]]:
-        """Batches of a data set, of which a few blocks of episodes are in memory."""
         data, rng = DataSet.open(self._data), np.random.default_rng(self._seed)
         parts = blocks(data, self._shard, self._shards, rng)
-        tables = (for_learners(self._data, *columns_of(data, part), *self._spaces, self._gamma) for part in parts)
-        return draws(tables, batch_size, rng, every=len(next(blocks(data, 0, 1, rng))) == len(data))
+        tables = (table_of(data, part, self._gamma) for part in parts)
+        for batch in draws(tables, batch_size, rng, every=len(next(blocks(data, 0, 1, rng))) == len(data)):
+            yield {f"{DEFAULT_MODULE_ID}/{name}": torch.from_numpy(one).to(device) for name, one in batch.items()}
 
 
-def load(data: str, observation_space: Space[Any], action_space: Space[Any], gamma: float) -> dict[str, Array]:
-    """Read all rows in the form that RLlib's learners take.
+def require_fit(data: str, observation_space: Space[Any], action_space: Space[Any]) -> None:
+    """Raise SettingsError unless a data set has episodes of these spaces."""
+    found = DataSet.open(data)
+    if not len(found):
+        raise SettingsError(f"data: {data} has no episodes yet. Record some first")
+    pairs = ((found.info.observation_space, observation_space), (found.info.action_space, action_space))
+    for (theirs, ours), name in zip(pairs, ("observation", "action"), strict=True):
+        if space_to_json(theirs) != space_to_json(ours):
+            raise SettingsError(f"data: {data} has the {name} space {theirs}, and the environment {ours}")
+
+
+def table_of(data: DataSet, indices: list[int], gamma: float) -> dict[str, Array]:
+    """Read episodes in the form that RLlib's learners take.
 
     Returns:
         Columns (rows, ...): obs, new_obs, actions, rewards, terminateds, truncateds, value_targets (the sum of the
-        rewards from a row to the last recorded one of its episode, discounted by `gamma`), weights, n_step.
+        rewards from a row to the last one of its episode, discounted by `gamma`), weights, n_step.
 
     Raises:
-        SettingsError: There are no rows, or a value is missing, not finite or not in its space.
+        SettingsError: A number is not finite, or an action not in its space.
     """
-    path, filesystem = _open(data)
-    table = pyarrow.parquet.ParquetDataset(path, filesystem=filesystem).read(list(COLUMNS))
-    shapes = {"obs": observation_space.shape, "new_obs": observation_space.shape, "actions": action_space.shape}
-    columns = {
-        name: _column(f"data: {data}: {name}", table[name], shapes.get(name) or ())
-        for name in COLUMNS
-        if name != "eps_id"
-    }
-    episode = np.asarray(table["eps_id"].to_pylist())
-    last = np.append(episode[1:] != episode[:-1], True) | columns["terminateds"] | columns["truncateds"]
-    return for_learners(data, columns, last, observation_space, action_space, gamma)
-
-
-def for_learners(
-    data: str,
-    columns: dict[str, Array],
-    last: Array,
-    observation_space: Space[Any],
-    action_space: Space[Any],
-    gamma: float,
-) -> dict[str, Array]:
-    """The result of `load` from the columns of files; `last` (rows,) says which rows end an episode."""
-    rewards = columns["rewards"].astype(np.float32)
+    steps = data.transitions(indices)
+    last = np.append(steps.episode[1:] != steps.episode[:-1], True)
+    rewards = steps.rewards.astype(np.float32)
+    found = {"obs": steps.observations, "new_obs": steps.next_observations, "actions": steps.actions}
+    for name, values in {**found, "rewards": rewards}.items():
+        if not np.isfinite(np.asarray(values, np.float64)).all():
+            raise SettingsError(f"data: {data.place}: {name} has a number that is not finite; see bam-data check")
     total, targets = 0.0, np.empty_like(rewards)
     for t in range(len(rewards) - 1, -1, -1):  # R_t = r_t + gamma R_{t+1}, 0 after an episode's last row
         total = float(rewards[t]) + (0.0 if last[t] else gamma * total)
         targets[t] = total
     return {
-        "obs": columns["obs"].astype(observation_space.dtype),
-        "new_obs": columns["new_obs"].astype(observation_space.dtype),
-        "actions": _for_module(f"data: {data}: actions", columns["actions"], action_space),
+        "obs": steps.observations,
+        "new_obs": steps.next_observations,
+        "actions": _for_module(f"data: {data.place}: actions", steps.actions, data.info.action_space),
         "rewards": rewards,
-        "terminateds": columns["terminateds"].astype(bool),
-        "truncateds": columns["truncateds"].astype(bool),
+        "terminateds": steps.terminals,
+        "truncateds": last & ~steps.terminals,
         "value_targets": targets,
         "weights": np.ones_like(rewards),
         "n_step": np.ones_like(rewards),
     }
-
-
-def _column(name: str, column: Any, shape: tuple[int, ...]) -> Array:
-    """A column of numbers, or of (nested) lists of them, as one array (rows, *shape); SettingsError for others."""
-    found: list[int] | None = []
-    values = column.combine_chunks()
-    while found is not None and (pyarrow.types.is_list(values.type) or pyarrow.types.is_fixed_size_list(values.type)):
-        lengths = pyarrow.compute.unique(pyarrow.compute.list_value_length(values)).to_pylist()
-        whole = len(lengths) <= 1 and None not in lengths
-        found = [*found, max(lengths, default=0)] if whole else None
-        values = values.flatten()
-    if not len(column):
-        raise SettingsError(f"{name}: expected a row or more, found none")
-    if found is None or tuple(found) != shape:
-        text = "rows of different lengths" if found is None else f"shape {tuple(found)}"
-        raise SettingsError(f"{name}: expected rows of shape {shape}, found {text}")
-    array: Array = values.to_numpy(zero_copy_only=False).reshape(-1, *shape)
-    if array.dtype.kind not in "biuf" or not np.isfinite(array).all():
-        raise SettingsError(f"{name}: expected finite numbers, found others or rows without one. Record it again")
-    return array
 
 
 def _for_module(name: str, actions: Array, space: Space[Any]) -> Array:
@@ -190,37 +146,28 @@ def _for_module(name: str, actions: Array, space: Space[Any]) -> Array:
     return np.asarray(less_start(space, actions), np.int64)
 
 
-def _open(data: str) -> tuple[str, Any]:
-    """Path and filesystem of a folder of Parquet files, local or at any fsspec address."""
-    try:
-        known, path = fsspec.core.url_to_fs(os.path.expanduser(data))
-        files = [path] if known.isfile(path) else sorted(known.glob(f"{path.rstrip('/')}/**/*.parquet"))
-    except (ImportError, ValueError, OSError) as error:
-        raise SettingsError(f"data: {data} cannot be opened: {' '.join(str(error).split())}") from error
-    if not files:
-        what = "has no .parquet file in it" if known.exists(path) else "does not exist"
-        raise SettingsError(f"data: {data} {what}. Write some with scripts/record_parquet.py")
-    if known.protocol in ("file", ("file", "local")):
-        return str(path), None
-    return str(path), pyarrow.fs.PyFileSystem(pyarrow.fs.FSSpecHandler(known))
+def blocks(data: DataSet, shard: int, shards: int, rng: np.random.Generator) -> Iterator[list[int]]:
+    """Endless lists of neighbouring episodes, every `shards`-th one from `shard` on, in random order."""
+    length = max(1, int(np.mean([data.facts(index)["length"] for index in range(min(len(data), 1000))])))
+    size = max(1, min(_BLOCK_STEPS // length, len(data) // shards))
+    starts = list(range(0, len(data), size))
+    own = starts[shard % len(starts) :: shards]
+    while True:
+        for start in rng.permutation(own).tolist():
+            yield list(range(start, min(start + size, len(data))))
 
 
-def _require_columns(data: str, observation_space: Space[Any], action_space: Space[Any]) -> None:
-    """Refuse files that lack a column, or have observations or actions of another shape."""
-    if is_data_set(data):
-        require_fit(data, observation_space, action_space)
-        return
-    path, filesystem = _open(data)
-    try:
-        dataset = pyarrow.parquet.ParquetDataset(path, filesystem=filesystem)
-        names = dataset.schema.names
-        missing = [name for name in COLUMNS if name not in names]
-        if missing:
-            raise SettingsError(f"data: {data} lacks the column {', '.join(missing)}; it has {', '.join(names)}")
-        first = dataset.fragments[0].head(1, columns=["obs", "actions"]).to_pylist()
-    except (OSError, pyarrow.ArrowInvalid) as error:
-        raise SettingsError(f"data: {data} cannot be read as Parquet: {' '.join(str(error).split())}") from error
-    for name, space in (("obs", observation_space), ("actions", action_space)):
-        found = np.shape(first[0][name]) if first else space.shape
-        if found != space.shape:
-            raise SettingsError(f"data: {data}: expected {name} of shape {space.shape}, found {found}")
+def draws(
+    tables: Iterator[dict[str, Array]], batch_size: int, rng: np.random.Generator, every: bool
+) -> Iterator[dict[str, Array]]:
+    """Endless batches from the newest blocks; `every`: of one block, which is then not read again."""
+    pool: deque[dict[str, Array]] = deque(maxlen=_BLOCKS)
+    for table in tables:
+        pool.append(table)
+        sizes = np.array([len(one["rewards"]) for one in pool])
+        count = len(table["rewards"]) // batch_size + 1
+        while every or count > 0:
+            count -= 1
+            drawn = rng.multinomial(batch_size, sizes / sizes.sum())
+            parts = [(one, rng.integers(len(one["rewards"]), size=n)) for one, n in zip(pool, drawn, strict=True) if n]
+            yield {name: np.concatenate([one[name][rows] for one, rows in parts]) for name in table}

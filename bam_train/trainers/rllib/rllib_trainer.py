@@ -30,7 +30,7 @@ from bam_train.policy import FrozenPolicy
 from bam_train.settings import TrainSettings
 from bam_train.trainers.algorithms import RLLIB_ALGORITHMS
 from bam_train.trainers.base import OnProgress, Progress, Statistics, manifest
-from bam_train.trainers.resolve_settings import own_settings
+from bam_train.trainers.resolve_settings import learnt_episodes, own_settings
 from bam_train.trainers.rllib import rllib_state
 from bam_train.trainers.rllib.ray_cluster import cluster
 from bam_train.trainers.rllib.rllib_freezing import FrozenModule, RLlibPolicy, golden, parts_of
@@ -43,7 +43,6 @@ from bam_train.trainers.rllib.rllib_hyperparameters import (
 )
 from bam_train.trainers.rllib.robot_env_runner import ENDS
 from bam_train.trainers.rllib.runner_deaths import RunnerWatch
-from bam_train.trainers.rllib.streamed_episodes import is_data_set
 from bam_train.trainers.run_folder import TensorBoardFiles
 
 _EPISODES = 100
@@ -132,6 +131,8 @@ class RLlibTrainer:
         settings = settings or TrainSettings.from_mapping(own_settings(checkpoint), str(checkpoint.path))
         with contextlib.closing(make_env(settings.env, settings.env_kwargs)) as env:
             require_fit(checkpoint, env)
+        if settings.data is not None:
+            learnt_episodes(checkpoint, DataSet.open(settings.data))
         steps = checkpoint.manifest.steps
         trainer = cls(settings, settings.seed + steps)  # does not repeat the first episodes
         with trainer._or_close():
@@ -248,7 +249,7 @@ class RLlibTrainer:
     @functools.cached_property
     def _learnt_from(self) -> dict[str, Any]:
         """What the manifest says of the data set, which has episodes of this run only when it began."""
-        if self.settings.data is None or not is_data_set(self.settings.data):
+        if self.settings.data is None:
             return {}
         data = DataSet.open(self.settings.data)
         steps = sum(data.facts(index)["length"] for index in range(len(data)))
@@ -311,8 +312,8 @@ def _require_fitting(settings: TrainSettings) -> None:
         raise SettingsError(f"data: {settings.algo} learns in the environment; leave it out, or use one of: {names}")
     if offline and settings.data is None:
         raise SettingsError(
-            f"data: {settings.algo} learns from recorded episodes, found none. Give a folder of Parquet files with "
-            "bam-train --data, such as scripts/record_parquet.py writes"
+            f"data: {settings.algo} learns from a data set, found none. Give its place with --data; bam-data collect "
+            "records one"
         )
     if offline and settings.num_env_runners:
         raise SettingsError(f"num_env_runners: {settings.algo} learns from recorded episodes alone; leave it out")

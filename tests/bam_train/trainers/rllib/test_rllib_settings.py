@@ -1,9 +1,8 @@
-"""Settings of RLlib's runs and files of recorded episodes, checked without Ray."""
+"""Settings of RLlib's runs checked without Ray."""
 
 from __future__ import annotations
 
 import pytest
-from gymnasium.spaces import Box, Discrete
 
 pytest.importorskip("ray")
 
@@ -12,7 +11,6 @@ from bam_train.settings import TrainSettings
 from bam_train.trainers.algorithms import RLLIB_ALGORITHMS
 from bam_train.trainers.resolve_settings import resolve
 from bam_train.trainers.rllib import rllib_hyperparameters as hyperparameters
-from bam_train.trainers.rllib.recorded_episodes import load
 from bam_train.trainers.rllib_arguments import require_plausible
 
 pytestmark = pytest.mark.filterwarnings("ignore:.*:DeprecationWarning:ray")  # Ray's own, of its data library
@@ -87,7 +85,7 @@ def test_hyperparameters_are_refused(algo, name, value, text):
     [
         ({"algo": "pp"}, "Unknown algorithm 'pp'. Did you mean 'ppo'?"),
         ({"algo": "dqn"}, "dqn does not fit bam/reach-v0: it takes Discrete actions, found Box"),
-        ({"algo": "bc"}, "data: bc learns from recorded episodes, found none"),
+        ({"algo": "bc"}, "data: bc learns from a data set, found none"),
         ({"data": "x"}, "data: ppo learns in the environment"),
         ({"device": "cuda"}, "device: rllib learns on the CPU, or on as many GPUs as --num-gpus says; found 'cuda'."),
         ({"transport": ["tcp://127.0.0.1:1"]}, "transport: the rllib trainer makes its environments"),
@@ -139,53 +137,3 @@ def test_cloning_has_defaults_with_which_it_learns(algo):
 def test_the_preset_belongs_to_its_trainer():
     assert resolve({"env": "bam/pick", "algo": "ppo", "trainer": "rllib"}).hyperparameters["action_init_scale"] == 0.01
     assert "n_steps" in resolve({"env": "bam/pick", "algo": "ppo"}).hyperparameters
-
-
-def recorded(folder, **columns):
-    """Six steps of two episodes of `test/Sampled-v0`, but for some columns."""
-    import pyarrow
-    import pyarrow.parquet
-
-    observed = [[0.1 * k, 0.5] for k in range(6)]
-    rows = {
-        "eps_id": ["a"] * 3 + ["b"] * 3,
-        "obs": observed,
-        "actions": [-1, 0] * 3,
-        "rewards": [1.0] * 6,
-        "new_obs": observed,
-        "terminateds": [False, False, True] * 2,
-        "truncateds": [False] * 6,
-    }
-    pyarrow.parquet.write_table(pyarrow.table(rows | columns), folder / "a.parquet")
-    return str(folder)
-
-
-@pytest.mark.parametrize(
-    ("columns", "text"),
-    [
-        ({"actions": [-1, 0, 7, 0, 0, 0]}, "actions: expected -1 to 0, found 7"),
-        ({"actions": ["x"] * 6}, "actions: expected finite numbers, found others"),
-        ({"rewards": [1.0, None, 1.0, 1.0, 1.0, 1.0]}, "rewards: expected finite numbers, found others"),
-        ({"obs": [[float("nan"), 0.0]] * 6}, "obs: expected finite numbers, found others"),
-        (
-            {"obs": [[0.0, 0.0], [1.0], [0.0, 1.0, 2.0]] * 2},
-            "obs: expected rows of shape (2,), found rows of different",
-        ),
-        (
-            {name: [] for name in ("eps_id", "obs", "actions", "rewards", "new_obs", "terminateds", "truncateds")},
-            "found none",
-        ),
-    ],
-    ids=["choice", "text", "null", "nan", "ragged", "empty"],
-)
-def test_recorded_rows_that_are_not_whole(columns, text, tmp_path):
-    with pytest.raises(SettingsError) as caught:
-        load(recorded(tmp_path, **columns), Box(-1, 1, (2,)), Discrete(2, start=-1), 0.9)
-    assert text in str(caught.value)
-    assert "\n" not in str(caught.value)
-
-
-def test_value_targets_are_what_is_earned_to_the_end_of_an_episode(tmp_path):
-    table = load(recorded(tmp_path), Box(-1, 1, (2,)), Discrete(2, start=-1), 0.5)
-    assert table["value_targets"].tolist() == [1.75, 1.5, 1.0] * 2
-    assert table["actions"].tolist() == [0, 1] * 3  # counted from 0

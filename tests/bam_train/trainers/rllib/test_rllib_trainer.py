@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-import sys
+import shutil
 from pathlib import Path
 
 import gymnasium as gym
@@ -17,7 +17,8 @@ import ray
 
 from bam_train.checkpoint import Checkpoint
 from bam_train.compat.rllib_export import export
-from bam_train.errors import BamTrainError, EnvironmentFailed, SettingsError
+from bam_train.data import DataSetInfo, DataSetWriter, Episode
+from bam_train.errors import BadDataSet, BamTrainError, CheckpointMismatch, EnvironmentFailed, SettingsError
 from bam_train.evaluation import evaluate
 from bam_train.policy import FrozenPolicy
 from bam_train.settings import TrainSettings
@@ -268,27 +269,29 @@ def test_every_environment_of_ours_is_registered():
         assert _global_registry.contains(ENV_CREATOR, env_id.rpartition("-v")[0])
 
 
-def test_recorded_episodes_teach(trained, tmp_path, monkeypatch, capsys):
-    _, checkpoint = trained
-    sys.path.insert(0, str(Path(__file__).parents[4] / "scripts"))
-    import record_parquet
+def test_recorded_episodes_teach(trained, tmp_path):
+    from bam_train.data.collect import collect
 
-    folder = tmp_path / "recorded"
-    arguments = ["record_parquet.py", str(checkpoint.path), "--out", str(folder), "--episodes", "3", "--num-envs", "2"]
-    monkeypatch.setattr(sys, "argv", arguments)
-    record_parquet.main()
-    assert "3 episodes" in capsys.readouterr().out
+    _, checkpoint = trained
+    place, moved = str(tmp_path / "recorded"), str(tmp_path / "moved")
+    collect(place, str(checkpoint.path), episodes=3, num_envs=2)
+    shutil.copytree(place, moved)
+    collect(other := str(tmp_path / "other"), str(checkpoint.path), episodes=1, seed=7)
     hyper = {"train_batch_size_per_learner": 64, "model_config": SMALL}
     zeros = np.zeros(FrozenPolicy.load(checkpoint.path).observation_space["shape"], np.float32)
     for algo in ("bc", "marwil"):
-        with made(algo, hyper=hyper, data=str(folder), steps=640) as trainer:
+        with made(algo, hyper=hyper, data=place, steps=640) as trainer:
             train(trainer, 640)
             assert trainer.steps == 640
             saved = Checkpoint.open(trainer.save(tmp_path / f"{algo}.zip", {}, {"best": None}).path)
-        with contextlib.closing(RLlibTrainer.load(saved, resolve_resumed({"steps": 641}, saved))) as again:
+        with contextlib.closing(
+            RLlibTrainer.load(saved, resolve_resumed({"steps": 641, "data": moved}, saved))
+        ) as again:
             np.testing.assert_allclose(again.freeze().act(zeros), FrozenPolicy.load(saved.path).act(zeros), atol=1e-6)
             train(again, 641)
             again.save(tmp_path / f"{algo}-2.zip", {}, {"best": None})
+    with pytest.raises(CheckpointMismatch, match=r"was trained on an episode \(\w{12}\) that .*other does not have"):
+        RLlibTrainer.load(saved, resolve_resumed({"steps": 641, "data": other}, saved))
 
 
 @pytest.mark.training
@@ -304,22 +307,25 @@ def test_fifty_scripted_episodes_are_cloned(shared_ray, tmp_path):
     assert result.successes >= 90  # 100 were measured
 
 
-def test_data_that_is_not_there(tmp_path):
-    for data, text in ((tmp_path / "no", "does not exist"), (tmp_path, "has no .parquet file in it")):
-        with pytest.raises(SettingsError, match=text):
-            made("bc", hyper={}, data=str(data))
+def test_plain_rows_are_refused_with_the_remedy(tmp_path):
+    (tmp_path / "a.parquet").touch()
+    with pytest.raises(BadDataSet) as caught:
+        made("bc", hyper={}, data=str(tmp_path))
+    assert str(caught.value) == (
+        f"{tmp_path}: is no data set: it has no meta/info.json; give a folder that bam-data wrote, "
+        f"or make one of recordings or Parquet rows: bam-data import PLACE {tmp_path}"
+    )
 
 
-def test_what_a_learner_elsewhere_says_of_recorded_rows(sampled, tmp_path):
-    import pyarrow
-    import pyarrow.parquet
-
-    rows = {"eps_id": ["a"] * 6, "obs": [[0.5, 0.5]] * 6, "new_obs": [[0.5, 0.5]] * 6, "actions": [-1, 0, 7, 0, 0, 0]}
-    rows |= {"rewards": [1.0] * 6, "terminateds": [False] * 6, "truncateds": [False] * 6}
-    pyarrow.parquet.write_table(pyarrow.table(rows), tmp_path / "a.parquet")
-    hyper, env = {"train_batch_size_per_learner": 8, "model_config": SMALL}, sampled(Box(-1, 1, (2,)))
+def test_what_a_learner_elsewhere_says_of_recorded_actions(sampled, tmp_path):
+    seen = Box(-1, 1, (2,))
+    with DataSetWriter(
+        tmp_path / "data", DataSetInfo("test/Sampled-v0", {}, seen, Discrete(2, start=-1), 1.0)
+    ) as writer:
+        writer.add(Episode(np.zeros((3, 2), np.float32), np.array([-1, 7]), np.ones(2), True, False))
+    hyper, env = {"train_batch_size_per_learner": 8, "model_config": SMALL}, sampled(seen)
     with (
-        made("bc", env, hyper, data=str(tmp_path), steps=64, num_learners=1) as trainer,
+        made("bc", env, hyper, data=str(tmp_path / "data"), steps=64, num_learners=1) as trainer,
         pytest.raises(SettingsError, match="actions: expected -1 to 0, found 7"),
     ):
         train(trainer, 64)

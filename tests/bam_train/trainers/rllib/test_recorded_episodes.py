@@ -10,13 +10,12 @@ pytest.importorskip("ray.rllib")
 
 from gymnasium.spaces import Box, Discrete
 
-from bam_train.data import DataSet, DataSetInfo, DataSetWriter, Episode
+from bam_train.data import DataSetInfo, DataSetWriter, Episode
 from bam_train.errors import SettingsError
-from bam_train.trainers.rllib import streamed_episodes
-from bam_train.trainers.rllib.recorded_episodes import Draws, RecordedData
+from bam_train.trainers.rllib import recorded_episodes
 
 SEEN, ACTED = Box(-1e3, 1e3, (2,)), Discrete(2, start=5)
-CONFIG = SimpleNamespace(observation_space=SEEN, action_space=ACTED, gamma=0.5, seed=0)
+CONFIG = SimpleNamespace(gamma=0.5, seed=0)
 
 
 @pytest.fixture
@@ -29,7 +28,7 @@ def place(tmp_path):
 
 
 def test_every_episode_has_its_last_observation(place):
-    batch = next(Draws(place, CONFIG, 0).iter_torch_batches(batch_size=500))
+    batch = next(recorded_episodes.Draws(place, CONFIG, 0).iter_torch_batches(batch_size=500))
     numbers = {name.removeprefix("default_policy/"): one.numpy() for name, one in batch.items()}
     assert np.array_equal(numbers["new_obs"], numbers["obs"] + [0, 1])
     assert {(tuple(row)) for row in numbers["new_obs"][numbers["terminateds"]].tolist()} == {(0, 3), (20, 3), (40, 3)}
@@ -39,10 +38,12 @@ def test_every_episode_has_its_last_observation(place):
 
 
 def test_learners_share_the_episodes_and_keep_few_of_them(place, monkeypatch):
-    monkeypatch.setattr(streamed_episodes, "_BLOCK_STEPS", 3)
-    monkeypatch.setattr(streamed_episodes, "_BLOCKS", 2)
+    monkeypatch.setattr(recorded_episodes, "_BLOCK_STEPS", 3)
+    monkeypatch.setattr(recorded_episodes, "_BLOCKS", 2)
     config = SimpleNamespace(**vars(CONFIG), input_=[place])
-    learners = [one.iter_torch_batches(batch_size=4) for one in RecordedData(config).sample(4, num_shards=2)]
+    learners = [
+        one.iter_torch_batches(batch_size=4) for one in recorded_episodes.RecordedData(config).sample(4, num_shards=2)
+    ]
     for learner, expected in zip(learners, ({0, 20, 40}, {10, 30, 50}), strict=True):
         batches = [batch["default_policy/obs"].numpy()[:, 0] for batch in itertools.islice(learner, 60)]
         assert set(np.concatenate(batches)) == expected
@@ -50,7 +51,6 @@ def test_learners_share_the_episodes_and_keep_few_of_them(place, monkeypatch):
 
 
 def test_other_spaces_are_refused(place):
-    streamed_episodes.require_fit(place, SEEN, ACTED)
+    recorded_episodes.require_fit(place, SEEN, ACTED)
     with pytest.raises(SettingsError, match=r"has the action space Discrete\(2, start=5\), and the env"):
-        streamed_episodes.require_fit(place, SEEN, Discrete(2))
-    assert not streamed_episodes.is_data_set(str(DataSet.open(place).place) + "/data")
+        recorded_episodes.require_fit(place, SEEN, Discrete(2))
