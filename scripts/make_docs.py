@@ -1,7 +1,8 @@
 """Write the generated parts of ``docs/*.md`` from the code; with ``--check``, only say whether they are current.
 
 A generated part stands between ``<!-- generated: NAME -->`` and ``<!-- /generated -->``; NAME may carry an argument,
-as in ``environment bam/pick-v0``. The rest of a page is written by hand. Longer than most files here: every kind of
+as in ``topics ur5e``. Where a page has ``<!-- site: NAME -->``, the part is written while the site is built: it is what a
+program prints (``--help``, ``bam-envs ID``, ``--print-guards``). The rest of a page is written by hand. Longer than most files here: every kind of
 part has its function in it.
 """
 
@@ -27,6 +28,7 @@ from bam_train.cli import program
 
 DOCS = Path(__file__).resolve().parents[1] / "docs"
 _PART = re.compile(r"(<!-- generated: (?P<name>\S+)(?: (?P<argument>\S+))? -->\n)(.*?)(<!-- /generated -->)", re.DOTALL)
+_SITE = re.compile(r"<!-- site: (?P<name>\S+)(?: (?P<argument>\S+))? -->")
 SECTIONS = ("Start", "Reward", "Success", "End", "Info")
 """Parts of a task's docstring that its page shows; every task has them."""
 OPTIONAL = ("Action",)
@@ -83,15 +85,10 @@ def environments() -> str:
     """The table of environments."""
     rows = []
     for entry in ENVIRONMENTS.values():
-        task = resolve(entry.task)(1)
-        shapes = [space_text(task.observation_space), space_text(task.action_space)]
-        if entry.has_robot:
-            shapes = [f"{len(task.observation_labels)} numbers", f"{len(task.action_labels)} numbers"]
         steps = entry.max_episode_steps
-        seconds = f"{steps * entry.period:g} s" if entry.has_robot else ""
-        rows.append([f"[`{entry.id}`]({page_of(entry.id)})", entry.summary, *shapes, steps, seconds])
-    header = ["id", "what to do", "observation", "action", "steps an episode", "which is"]
-    return table(header, rows)
+        time = f" ({steps * entry.period:g} s)" if entry.has_robot and steps > 1 else ""
+        rows.append([f"[`{entry.id}`]({page_of(entry.id)})", entry.summary, f"{steps}{time}"])
+    return table(["id", "what to do", "steps an episode"], rows)
 
 
 def page_of(env_id: str) -> str:
@@ -139,7 +136,10 @@ def environment(env_id: str, told: dict[str, str] | None = None) -> str:
     for kind in ("observation", "action"):
         space = getattr(resolve(entry.task)(1), f"{kind}_space")
         shape = f"float32, shape ({len(signals[kind])},)" if robot else space_text(space)
-        parts.append(_numbers(f"**{kind.capitalize()}**: {shape}", signals[kind]))
+        title = f"**{kind.capitalize()}**: {shape}"
+        parts.append(f"{title}. {_line(signals[kind])}" if len(signals[kind]) <= 2 else f"{title}, named by `bam-envs {env_id}`.")
+        if len(signals[kind]) > 2:
+            parts.append(f"<!-- site: {kind} {env_id} -->")
     return "\n\n".join(parts)
 
 
@@ -149,19 +149,30 @@ def _new(told: dict[str, str], text: str, env_id: str) -> str:
     return text if first == env_id or len(text) < 50 else f"As in `{first}`."
 
 
-def _numbers(title: str, rows: Sequence[Mapping[str, Any]]) -> str:
-    """A line for one or two numbers, else a table, in which columns that are the same in every row are left out."""
-    lines = [[where, *line] for where, line in _joined(rows)]
-    if len(rows) <= 2:
-        return f"{title}. " + "; ".join(
-            f"{line[1]}: {line[2]} ({f'{line[3]}, ' if line[3] not in ('', '1') else ''}{_cell(line[5])} to {_cell(line[6])})"
-            for line in lines
-        )
+def _line(rows: Sequence[Mapping[str, Any]]) -> str:
+    """One or two numbers, in a line."""
+    return "; ".join(
+        f"{names}: {meaning} ({f'{unit}, ' if unit not in ('', '1') else ''}{_cell(low)} to {_cell(high)})"
+        for _, (names, meaning, unit, _, low, high) in _joined(rows)
+    )
+
+
+def observation(env_id: str) -> str:
+    """Every number of an observation."""
+    return numbers(env_id, "observation")
+
+
+def action(env_id: str) -> str:
+    """Every number of an action."""
+    return numbers(env_id, "action")
+
+
+def numbers(env_id: str, kind: str) -> str:
+    """Every number of an observation or an action: names, unit, scale and limits."""
+    entry = ENVIRONMENTS[env_id]
+    rows = describe(resolve(entry.robot)(1), resolve(entry.task)(1))[kind]
     header = ["numbers", "names", "meaning", "unit", "scale", "min", "max"]
-    if len({(line[5], line[6]) for line in lines}) == 1:
-        title += f", each from {_cell(lines[0][5])} to {_cell(lines[0][6])}"
-        header, lines = header[:5], [line[:5] for line in lines]
-    return f"{title}\n\n{table(header, lines)}"
+    return table(header, [[where, *line] for where, line in _joined(rows)])
 
 
 def _joined(rows: Sequence[Mapping[str, Any]]) -> list[tuple[str, list[object]]]:
@@ -474,7 +485,8 @@ def audit_fields() -> str:
 
 PARTS: dict[str, Callable[..., str]] = {
     "environments": environments,
-    "environment": environment,
+    "observation": observation,
+    "action": action,
     "environment-page": environment_page,
     "robot-signals": robot_signals,
     "guards": guards,
@@ -503,6 +515,11 @@ def generate(text: str) -> str:
         return f"{match[1]}\n{PARTS[match['name']](*arguments)}\n\n{match[5]}"
 
     return _PART.sub(part, text)
+
+
+def build(text: str) -> str:
+    """A page of the site: with the parts that are not kept in its file."""
+    return _SITE.sub(lambda match: PARTS[match["name"]](*([match["argument"]] if match["argument"] else [])), text)
 
 
 def main() -> int:
