@@ -120,9 +120,8 @@ def environment(env_id: str, told: dict[str, str] | None = None) -> str:
     if limit is not None:
         docs["End"] += f" Truncated after {limit} steps{f' ({limit * entry.period:g} s)' * robot}."
     texts = {name: docs[name] for name in (*OPTIONAL, *SECTIONS) if name in docs}
-    parity = [text for variant in entry.variants.values() for text in _paragraphs(resolve(variant), "With ``parity=True``")]
-    texts |= {"Parity": " ".join(parity)} if parity else {}
     parts += [f"**{name}.** {_new(told, text, env_id)}" for name, text in texts.items()]
+    parts += [f"<!-- site: parity {env_id} -->"] if entry.variants else []
     if options := arguments(entry):
         rows = {item(*option): option[0] for option in options}
         names = [f"`{name}`" for row, name in rows.items() if told.setdefault(row, env_id) != env_id]
@@ -155,6 +154,13 @@ def _line(rows: Sequence[Mapping[str, Any]]) -> str:
         f"{names}: {meaning} ({f'{unit}, ' if unit not in ('', '1') else ''}{_cell(low)} to {_cell(high)})"
         for _, (names, meaning, unit, _, low, high) in _joined(rows)
     )
+
+
+def parity(env_id: str) -> str:
+    """What ``parity=True`` changes."""
+    variants = map(resolve, ENVIRONMENTS[env_id].variants.values())
+    texts = [text for variant in variants for text in _paragraphs(variant, "With ``parity=True``")]
+    return f"**Parity.** {' '.join(texts)}" if texts else ""
 
 
 def observation(env_id: str) -> str:
@@ -321,8 +327,16 @@ def fields_of(reference: str) -> str:
     """Name, type and meaning of every field of the dataclass ``"module:Class"``."""
     kind = resolve(reference)
     docs = field_docs(kind)
-    rows = [[f"`{field.name}`", f"`{field.type}`", docs[field.name]] for field in dataclasses.fields(kind)]
-    return table(["field", "type", "meaning"], rows)
+    fields = dataclasses.fields(kind)
+    return "\n".join(f"- `{field.name}: {_plain(str(field.type))}`: {docs[field.name]}" for field in fields)
+
+
+def _plain(kind: str) -> str:
+    """A type without the bounds that its annotation has: ``float | None``."""
+    named = {"_Count": "int", "_Digest": "str"}
+    return re.sub(r"\b_\w+", lambda match: named[match[0]], re.sub(r"Annotated\[(\w+), .*?\)\]", r"\1", kind))
+
+
 
 
 def defaults_of(reference: str) -> str:
@@ -385,16 +399,15 @@ def flag(kind: type, field: dataclasses.Field[Any]) -> str:
 
 
 def algorithms(trainer: str = "sb3") -> str:
-    """The table of a trainer's algorithms."""
+    """A trainer's algorithms by what they learn from and the actions that they take."""
     from bam_train.trainers.algorithms import ALGORITHMS
 
-    rows = []
+    kinds: dict[str, list[str]] = {}
     for row in ALGORITHMS[trainer].values():
         memory = "recorded episodes" if row.offline else "fresh rollouts" if row.on_policy else "replay buffer"
-        policy = f"{memory}, recurrent policy" if row.recurrent else memory
-        rows.append([f"`{row.name}`", f"`{row.reference.replace(':', '.')}`", ", ".join(row.actions), policy])
-    kind = "configuration" if trainer == "rllib" else "class"
-    return table(["--algo", kind, "action spaces", "learns from"], rows)
+        kind = f"{memory}, {'recurrent policy, ' * row.recurrent}{', '.join(row.actions)}"
+        kinds.setdefault(kind, []).append(f"`{row.name}`")
+    return "\n".join(f"- {kind}: {', '.join(names)}" for kind, names in kinds.items())
 
 
 def robo_gym() -> str:
@@ -485,6 +498,7 @@ def audit_fields() -> str:
 
 PARTS: dict[str, Callable[..., str]] = {
     "environments": environments,
+    "parity": parity,
     "observation": observation,
     "action": action,
     "environment-page": environment_page,

@@ -101,8 +101,8 @@ def test_a_stale_page_is_found(make_docs, tmp_path, monkeypatch, capsys):
         monkeypatch.setattr(sys, "argv", ["make_docs.py", *arguments])
         assert make_docs.main() == status
         assert capsys.readouterr().out == said
-    assert page.read_text().startswith("Before\n<!-- generated: algorithms -->\n\n| --algo |")
-    assert page.read_text().endswith("|\n\n<!-- /generated -->\nafter\n")
+    assert page.read_text().startswith("Before\n<!-- generated: algorithms -->\n\n- fresh rollouts, Box, ")
+    assert page.read_text().endswith(": `recurrent-ppo`\n\n<!-- /generated -->\nafter\n")
 
 
 def test_every_environment_is_on_one_page(make_docs):
