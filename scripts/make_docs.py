@@ -440,7 +440,7 @@ def presets() -> str:
 def _about(text: str) -> str:
     """The comment at the head of a preset, as the end of its line."""
     comments = itertools.takewhile(lambda line: line.startswith("#"), text.splitlines())
-    about = " ".join(line.lstrip("# ") for line in comments)
+    about = re.sub(r"^\S+ with [\w-]+[.:,] ", "", " ".join(line.lstrip("# ") for line in comments))
     return f": {about}" if about else ""
 
 
