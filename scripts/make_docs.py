@@ -417,15 +417,9 @@ def robo_gym() -> str:
     rows = []
     for entry in (entry for entry in ROBO_GYM.values() if not entry.is_live):
         ours = ENVIRONMENTS[entry.env_id]
-        task = ours.make_task(1, {**entry.defaults, "parity": True})
-        numbers = [len(task.observation_labels), len(task.action_labels)]
         told = ", ".join(f"`{name}={value!r}`" for name, value in entry.defaults.items() if value is not False)
-        link = f"[`{ours.id}`](environments/{page_of(ours.id)})"
-        rate = f"{1 / ours.period:g} Hz"
-        rows.append([f"`{entry.stem}`", link, told, *numbers, ours.max_episode_steps, rate])
-    names = ["id, before `Sim-v0` or `Rob-v0`", "is", "with"]
-    header = [*names, "observation", "action", "steps", "rate"]
-    return table(header, rows)
+        rows.append([f"`{entry.stem}`", f"[`{ours.id}`](environments/{page_of(ours.id)})", told])
+    return table(["id, before `Sim-v0` or `Rob-v0`", "is", "with"], rows)
 
 
 def presets() -> str:
@@ -493,7 +487,7 @@ def audit_fields() -> str:
         zip(AuditEvent.__struct_encode_fields__, AuditEvent.__struct_fields__, strict=True),
         field_docs(AuditEvent),
     )
-    return table(["field", "meaning"], [[f"`{name}`", docs[field]] for name, field in names])
+    return "\n".join(f"- `{name}`: {docs[field]}" for name, field in names)
 
 
 PARTS: dict[str, Callable[..., str]] = {
