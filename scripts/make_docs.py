@@ -1,9 +1,9 @@
 """Write the generated parts of ``docs/*.md`` from the code; with ``--check``, only say whether they are current.
 
 A generated part stands between ``<!-- generated: NAME -->`` and ``<!-- /generated -->``; NAME may carry an argument,
-as in ``topics ur5e``. Where a page has ``<!-- site: NAME -->``, the part is written while the site is built: it is what a
-program prints (``--help``, ``bam-envs ID``, ``--print-guards``). The rest of a page is written by hand. Longer than most files here: every kind of
-part has its function in it.
+as in ``fields module:Class``. A part at ``<!-- site: NAME -->`` is written while the site is built (``make site``): it is
+what a program prints (``--help``, ``bam-envs ID``, ``--print-guards``) or a docstring says. The rest of a page is written
+by hand. Longer than most files here: every kind of part has its function in it.
 """
 
 from __future__ import annotations
@@ -126,7 +126,9 @@ def environment(env_id: str, told: dict[str, str] | None = None) -> str:
         rows = {item(*option): option[0] for option in options}
         names = [f"`{name}`" for row, name in rows.items() if told.setdefault(row, env_id) != env_id]
         shared = f", besides {', '.join(names)} as above" if names else ""
-        parts.append("\n".join([f"**Options** of `gym.make`{shared}:\n", *(row for row in rows if told[row] == env_id)]))
+        parts.append(
+            "\n".join([f"**Options** of `gym.make`{shared}:\n", *(row for row in rows if told[row] == env_id)])
+        )
     if entry.cameras:
         both = " and ".join(f"`{name}`" for name in entry.cameras)
         shown = f"of {both}, or of those in" if entry.shows else f"with `camera=` of {both};"
@@ -136,14 +138,16 @@ def environment(env_id: str, told: dict[str, str] | None = None) -> str:
         space = getattr(resolve(entry.task)(1), f"{kind}_space")
         shape = f"float32, shape ({len(signals[kind])},)" if robot else space_text(space)
         title = f"**{kind.capitalize()}**: {shape}"
-        parts.append(f"{title}. {_line(signals[kind])}" if len(signals[kind]) <= 2 else f"{title}, named by `bam-envs {env_id}`.")
+        parts.append(
+            f"{title}. {_line(signals[kind])}" if len(signals[kind]) <= 2 else f"{title}, named by `bam-envs {env_id}`."
+        )
         if len(signals[kind]) > 2:
             parts.append(f"<!-- site: {kind} {env_id} -->")
     return "\n\n".join(parts)
 
 
 def _new(told: dict[str, str], text: str, env_id: str) -> str:
-    """The text, or which environment has it already; a short text is given again."""
+    """The text, or the environment above that has it; a short text is given again."""
     first = told.setdefault(text, env_id)
     return text if first == env_id or len(text) < 50 else f"As in `{first}`."
 
@@ -337,8 +341,6 @@ def _plain(kind: str) -> str:
     return re.sub(r"\b_\w+", lambda match: named[match[0]], re.sub(r"Annotated\[(\w+), .*?\)\]", r"\1", kind))
 
 
-
-
 def defaults_of(reference: str) -> str:
     """Name, default and meaning of every field of the dataclass ``"module:Class"``."""
     kind = resolve(reference)
@@ -347,7 +349,7 @@ def defaults_of(reference: str) -> str:
 
 
 def item(name: str, default: str, meaning: str) -> str:
-    """A line of a list: ``- `--episodes=5`: How many episodes.``"""
+    """A line of a list, such as ``- `--episodes=5`: How many episodes.``."""
     return f"- `{name}{default and '='}{default}`: {meaning}"
 
 
@@ -457,15 +459,11 @@ def listing(module: str) -> str:
 
 
 def agent_states() -> str:
-    """The states of a live agent, and those that may follow each."""
-    from bam_train.agent.agent_states import TRANSITIONS, State
+    """The states of a live agent."""
+    from bam_train.agent.agent_states import State
 
     docs = field_docs(State)
-    rows = [
-        [f"**{state.value}**", docs[state.name], ", ".join(one.value for one in State if one in TRANSITIONS[state])]
-        for state in State
-    ]
-    return table(["state", "what the agent does", "may be followed by"], rows)
+    return "\n".join(f"- **{state.value}**: {docs[state.name]}" for state in State)
 
 
 def agent_requests() -> str:

@@ -210,8 +210,12 @@ def test_flags_on_the_site_are_the_flags_of_the_programs(make_docs, program, mon
         main()
     assert caught.value.code == 0
     there = set(re.findall(r"--[a-z][a-z-]*", capsys.readouterr().out)) - {"--help"}
-    page = (ROOT / "docs" / ("reference-training.md" if program == "bam-train" else "reference-programs.md")).read_text()
-    part = re.search(r"<!-- site: (?:train-)?flags .*? -->", page[0 if program == "bam-train" else page.index(f"## {program}\n") :])
+    page = (
+        ROOT / "docs" / ("reference-training.md" if program == "bam-train" else "reference-programs.md")
+    ).read_text()
+    part = re.search(
+        r"<!-- site: (?:train-)?flags .*? -->", page[0 if program == "bam-train" else page.index(f"## {program}\n") :]
+    )
     assert set(re.findall(r"^- `(--[a-z-]+)", make_docs.build(part[0]), re.MULTILINE)) == there
 
 
