@@ -1,9 +1,9 @@
 """Write the generated parts of ``docs/*.md`` from the code; with ``--check``, only say whether they are current.
 
 A generated part stands between ``<!-- generated: NAME -->`` and ``<!-- /generated -->``; NAME may carry an argument,
-as in ``fields module:Class``. A part at ``<!-- site: NAME -->`` is written while the site is built (``make site``): it is
-what a program prints (``--help``, ``bam-envs ID``, ``--print-guards``) or a docstring says. The rest of a page is written
-by hand. Longer than most files here: every kind of part has its function in it.
+as in ``fields module:Class``. A part at ``<!-- site: NAME -->`` is written while the site is built (``make site``): it
+is what a program prints (``--help``, ``bam-envs ID``, ``--print-guards``) or a docstring says. The rest of a page is
+written by hand. Longer than most files here: every kind of part has its function in it.
 """
 
 from __future__ import annotations
