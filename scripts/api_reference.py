@@ -1,7 +1,8 @@
 """A hook of mkdocs: a page of reference for every package, and an index of all public names.
 
-The pages are made while the site is built (``make site``) and are no files here. What a page shows comes from the
+The pages are made while the site is built (``make site``) and are not files here. What a page shows comes from the
 docstrings, without importing anything: modules of the package, and in them what does not begin with an underscore.
+The lists of flags and numbers that ``make_docs.build`` writes into other pages do import the packages.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ import re
 from pathlib import Path
 from typing import Any
 
+import make_docs
 from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.structure.files import File, Files
 
@@ -18,7 +20,7 @@ ROOT = Path(__file__).resolve().parents[1]
 SOURCES = (ROOT / "envs", ROOT)
 PACKAGES = ("bam_envs", "bam_train")
 LEFT_OUT = ("bam_train.cli",)
-"""Programs, which the cheat sheet has."""
+"""Programs, which have pages of their own."""
 _ELSEWHERE = re.compile(r"\[[^\]]+\]\((?:\.\./)+(?P<path>(?:bam_train|checkpoints|envs|scripts)/[^)#]+)[^)]*\)")
 
 
@@ -40,8 +42,8 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
 
 
 def on_page_markdown(markdown: str, **_: Any) -> str:
-    """A link to a file of the repository is the file's path: the site has the pages only."""
-    return _ELSEWHERE.sub(lambda match: f"`{match['path']}`", markdown)
+    """A link to a file of the repository is the file's path: the site has the pages only. Lists are written here."""
+    return _ELSEWHERE.sub(lambda match: f"`{match['path']}`", make_docs.build(markdown))
 
 
 def packages() -> dict[str, list[str]]:

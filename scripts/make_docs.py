@@ -1,8 +1,9 @@
 """Write the generated parts of ``docs/*.md`` from the code; with ``--check``, only say whether they are current.
 
 A generated part stands between ``<!-- generated: NAME -->`` and ``<!-- /generated -->``; NAME may carry an argument,
-as in ``environment bam/pick-v0``. The rest of a page is written by hand. Longer than most files here: every kind of
-part has its function in it.
+as in ``fields module:Class``. A part at ``<!-- site: NAME -->`` is written while the site is built (``make site``): it
+is what a program prints (``--help``, ``bam-envs ID``, ``--print-guards``) or a docstring says. The rest of a page is
+written by hand. Longer than most files here: every kind of part has its function in it.
 """
 
 from __future__ import annotations
@@ -27,12 +28,30 @@ from bam_train.cli import program
 
 DOCS = Path(__file__).resolve().parents[1] / "docs"
 _PART = re.compile(r"(<!-- generated: (?P<name>\S+)(?: (?P<argument>\S+))? -->\n)(.*?)(<!-- /generated -->)", re.DOTALL)
+_SITE = re.compile(r"<!-- site: (?P<name>\S+)(?: (?P<argument>\S+))? -->")
 SECTIONS = ("Start", "Reward", "Success", "End", "Info")
 """Parts of a task's docstring that its page shows; every task has them."""
 OPTIONAL = ("Action",)
 """Parts that a task may have."""
 DIRECTIONS = ("x", "y", "z", "forward", "to the left", "up", "above the table", "near", "close up")
 """What may follow the last comma of a signal's meaning."""
+
+
+ENVIRONMENT_PAGES = {
+    "arm": ("bam/reach-v0", "bam/pick-v0", "bam/pick-place-v0", "bam/obs-v0"),
+    "mir100": ("bam/mir100-navigation-v0", "bam/mir100-avoidance-v0"),
+    "ur": ("bam/ur-reach-v0", "bam/ur-empty-v0", "bam/ur-avoidance-v0", "bam/ur-track-v0", "bam/isaac-reach-v0"),
+    "grasps": ("bam/grasp-xyr-v0", "bam/grasp-xyrw-v0", "bam/grasp-6d-v0", "bam/grasp-xy-v0"),
+    "local": (
+        "bam/grid-world-v0",
+        "bam/classic-bandit-v0",
+        "bam/context-bandit-v0",
+        "bam/image-bandit-v0",
+        "bam/digits-v0",
+        "bam/mnist-v0",
+    ),
+}
+"""The page of each environment, in ``docs/environments``."""
 
 
 def table(header: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
@@ -66,20 +85,22 @@ def environments() -> str:
     """The table of environments."""
     rows = []
     for entry in ENVIRONMENTS.values():
-        task = resolve(entry.task)(1)
-        shapes = [space_text(task.observation_space), space_text(task.action_space)]
-        if entry.has_robot:
-            shapes = [f"{len(task.observation_labels)} numbers", f"{len(task.action_labels)} numbers"]
         steps = entry.max_episode_steps
-        seconds = f"{steps * entry.period:g} s" if entry.has_robot else ""
-        rows.append([f"[`{entry.id}`]({page_of(entry.id)})", entry.summary, *shapes, steps, seconds])
-    header = ["id", "what to do", "observation", "action", "steps an episode", "which is"]
-    return table(header, rows)
+        time = f" ({steps * entry.period:g} s)" if entry.has_robot and steps > 1 else ""
+        rows.append([f"[`{entry.id}`]({page_of(entry.id)})", entry.summary, f"{steps}{time}"])
+    return table(["id", "what to do", "steps an episode"], rows)
 
 
 def page_of(env_id: str) -> str:
-    """The file of an environment's page: ``pick-place.md`` for ``bam/pick-place-v0``."""
-    return env_id.partition("/")[2].rpartition("-v")[0] + ".md"
+    """Where an environment is described: ``arm.md#bampick-v0`` for ``bam/pick-v0``."""
+    page = next(name for name, ids in ENVIRONMENT_PAGES.items() if env_id in ids)
+    return f"{page}.md#{anchor(env_id)}"
+
+
+def environment_page(name: str) -> str:
+    """The environments of one page; what is as in one before it is said by its name alone."""
+    told: dict[str, str] = {}
+    return "\n\n".join(f"## {env_id}\n\n{environment(env_id, told)}" for env_id in ENVIRONMENT_PAGES[name])
 
 
 def anchor(heading: str) -> str:
@@ -87,36 +108,81 @@ def anchor(heading: str) -> str:
     return re.sub(r"[^\w -]", "", heading.lower()).replace(" ", "-")
 
 
-def environment(env_id: str) -> str:
-    """Everything about one environment."""
+def environment(env_id: str, told: dict[str, str] | None = None) -> str:
+    """Everything about one environment; ``told`` has the texts of those above it on its page, and their ids."""
+    told = {} if told is None else told
     entry = ENVIRONMENTS[env_id]
     task = resolve(entry.task)
     docs = {name: text for kind in reversed(task.__mro__[:-1]) for name, text in sections(kind.__doc__ or "").items()}
-    signals = describe(resolve(entry.robot)(1), resolve(entry.task)(1))
     limit, robot = entry.time_limit, entry.has_robot
     time = "There is no robot." if entry.robot == NO_ROBOT else f"One step is {entry.period:g} s of robot time."
     parts = [f"{entry.summary[0].upper()}{entry.summary[1:]}. {time}"]
     if limit is not None:
         docs["End"] += f" Truncated after {limit} steps{f' ({limit * entry.period:g} s)' * robot}."
-    docs["Info"] += " `is_success`, as everywhere."
-    names = [name for name in (*OPTIONAL, *SECTIONS) if name in docs]
-    parts += [f"**{name}.** {docs[name]}" for name in names]
-    for variant in entry.variants.values():
-        parts += [f"**Parity.** {text}" for text in _paragraphs(resolve(variant), "With ``parity=True``")]
+    texts = {name: docs[name] for name in (*OPTIONAL, *SECTIONS) if name in docs}
+    parts += [f"**{name}.** {_new(told, text, env_id)}" for name, text in texts.items()]
+    parts += [f"<!-- site: parity {env_id} -->"] if entry.variants else []
     if options := arguments(entry):
-        named = [[f"`{name}`", default, meaning] for name, default, meaning in options]
-        parts.append(f"**Options**: arguments of `gym.make`\n\n{table(['name', 'default', 'meaning'], named)}")
+        rows = {item(*option): option[0] for option in options}
+        names = [f"`{name}`" for row, name in rows.items() if told.setdefault(row, env_id) != env_id]
+        shared = f", besides {', '.join(names)} as above" if names else ""
+        parts.append(
+            "\n".join([f"**Options** of `gym.make`{shared}:\n", *(row for row in rows if told[row] == env_id)])
+        )
     if entry.cameras:
         both = " and ".join(f"`{name}`" for name in entry.cameras)
         shown = f"of {both}, or of those in" if entry.shows else f"with `camera=` of {both};"
         parts.append(f"**Images**: {shown}{' `camera=`;' * bool(entry.shows)} see [images](index.md#images).")
+    signals = describe(resolve(entry.robot)(1), resolve(entry.task)(1))
     for kind in ("observation", "action"):
-        rows = signals[kind]
-        lines = [[where, *line] for where, line in _joined(rows)]
         space = getattr(resolve(entry.task)(1), f"{kind}_space")
-        parts.append(f"**{kind.capitalize()}**: {f'float32, shape ({len(rows)},)' if robot else space_text(space)}")
-        parts.append(table(["numbers", "names", "meaning", "unit", "scale", "min", "max"], lines))
+        shape = f"float32, shape ({len(signals[kind])},)" if robot else space_text(space)
+        title = f"**{kind.capitalize()}**: {shape}"
+        parts.append(
+            f"{title}. {_line(signals[kind])}" if len(signals[kind]) <= 2 else f"{title}, named by `bam-envs {env_id}`."
+        )
+        if len(signals[kind]) > 2:
+            parts.append(f"<!-- site: {kind} {env_id} -->")
     return "\n\n".join(parts)
+
+
+def _new(told: dict[str, str], text: str, env_id: str) -> str:
+    """The text, or the environment above that has it; a short text is given again."""
+    first = told.setdefault(text, env_id)
+    return text if first == env_id or len(text) < 50 else f"As in `{first}`."
+
+
+def _line(rows: Sequence[Mapping[str, Any]]) -> str:
+    """One or two numbers, in a line."""
+    return "; ".join(
+        f"{names}: {meaning} ({f'{unit}, ' if unit not in ('', '1') else ''}{_cell(low)} to {_cell(high)})"
+        for _, (names, meaning, unit, _, low, high) in _joined(rows)
+    )
+
+
+def parity(env_id: str) -> str:
+    """What ``parity=True`` changes."""
+    variants = map(resolve, ENVIRONMENTS[env_id].variants.values())
+    texts = [text for variant in variants for text in _paragraphs(variant, "With ``parity=True``")]
+    return f"**Parity.** {' '.join(texts)}" if texts else ""
+
+
+def observation(env_id: str) -> str:
+    """Every number of an observation."""
+    return numbers(env_id, "observation")
+
+
+def action(env_id: str) -> str:
+    """Every number of an action."""
+    return numbers(env_id, "action")
+
+
+def numbers(env_id: str, kind: str) -> str:
+    """Every number of an observation or an action: names, unit, scale and limits."""
+    entry = ENVIRONMENTS[env_id]
+    rows = describe(resolve(entry.robot)(1), resolve(entry.task)(1))[kind]
+    header = ["numbers", "names", "meaning", "unit", "scale", "min", "max"]
+    return table(header, [[where, *line] for where, line in _joined(rows)])
 
 
 def _joined(rows: Sequence[Mapping[str, Any]]) -> list[tuple[str, list[object]]]:
@@ -147,6 +213,9 @@ def _listed(names: Sequence[str]) -> str:
 def _alike(row: Mapping[str, Any]) -> tuple[Any, ...]:
     """What rows have in common that stand in one line."""
     joint = row["name"].removeprefix("d_")
+    number = joint.rpartition("_")[2]
+    if number.isdigit():
+        row = {**row, "meaning": row["meaning"].replace(f" {number} ", " 0, 1, … ")}
     head, comma, direction = row["meaning"].rpartition(", ")
     meaning = head if comma and direction in DIRECTIONS else row["meaning"].replace(joint, "the joint")
     return (meaning, *(row[name] for name in ("unit", "scale", "low", "high")))
@@ -170,24 +239,34 @@ def arguments(entry: EnvEntry) -> list[tuple[str, str, str]]:
 
 
 def _default(value: object) -> str:
-    return "" if value is None else f"`{value}`"
+    return "" if value is None else str(value)
 
 
 def guards() -> str:
-    """The guards of an arm and of a base, with their limits."""
+    """The guards of an arm and of a base, with their limits; what does the same is one row."""
     from bam_envs.live.building import profile_limits
     from bam_envs.robots.profile import load_profile
     from bam_envs.safety.guards import default_guards
 
-    robots: dict[tuple[str, ...], list[str]] = {}
+    robots: dict[str, dict[str, list[str]]] = {}
     for name in ("ur5e", "mir100"):
         profile = load_profile(name)
         for guard in default_guards(profile.spec(), profile_limits(profile), straight=True):
             does = code(inspect.cleandoc(type(guard).__doc__ or "").partition("\n\n")[0])
-            key = (guard.number, guard.name, f"{guard.limit_value:g} {guard.unit}", does)
-            robots.setdefault(key, []).append(profile.kind)
-    rows = [[*key, " and ".join(dict.fromkeys(kinds))] for key, kinds in robots.items()]
-    return table(["number", "guard", "limit", "what it does", "of"], rows)
+            limits = robots.setdefault(does, {}).setdefault(f"{guard.name} ({guard.number})", [])
+            limits.append(f"{guard.limit_value:g} {guard.unit} ({profile.kind})")
+    rows = [[_guards_of(limits), does] for does, limits in robots.items()]
+    return table(["guard, with its limit", "what it does"], rows)
+
+
+def _guards_of(limits: Mapping[str, Sequence[str]]) -> str:
+    """Names with their limits, and the kind of robot unless an arm and a base have the same."""
+    lines = []
+    for name, (first, *others) in limits.items():
+        limit = first.rpartition(" (")[0]
+        same = others and others[0].rpartition(" (")[0] == limit
+        lines.append(f"{name}: {limit if same else ', '.join([first, *others])}")
+    return "; ".join(lines)
 
 
 def topics_of(name: str) -> str:
@@ -252,16 +331,26 @@ def fields_of(reference: str) -> str:
     """Name, type and meaning of every field of the dataclass ``"module:Class"``."""
     kind = resolve(reference)
     docs = field_docs(kind)
-    rows = [[f"`{field.name}`", f"`{field.type}`", docs[field.name]] for field in dataclasses.fields(kind)]
-    return table(["field", "type", "meaning"], rows)
+    fields = dataclasses.fields(kind)
+    return "\n".join(f"- `{field.name}: {_plain(str(field.type))}`: {docs[field.name]}" for field in fields)
+
+
+def _plain(kind: str) -> str:
+    """A type without the bounds that its annotation has: ``float | None``."""
+    named = {"_Count": "int", "_Digest": "str"}
+    return re.sub(r"\b_\w+", lambda match: named[match[0]], re.sub(r"Annotated\[(\w+), .*?\)\]", r"\1", kind))
 
 
 def defaults_of(reference: str) -> str:
     """Name, default and meaning of every field of the dataclass ``"module:Class"``."""
     kind = resolve(reference)
     docs = field_docs(kind)
-    rows = [[f"`{field.name}`", default_of(field), docs[field.name]] for field in dataclasses.fields(kind)]
-    return table(["name", "default", "meaning"], rows)
+    return "\n".join(item(field.name, default_of(field), docs[field.name]) for field in dataclasses.fields(kind))
+
+
+def item(name: str, default: str, meaning: str) -> str:
+    """A line of a list, such as ``- `--episodes=5`: How many episodes.``."""
+    return f"- `{name}{default and '='}{default}`: {meaning}"
 
 
 def default_of(field: dataclasses.Field[Any]) -> str:
@@ -269,20 +358,34 @@ def default_of(field: dataclasses.Field[Any]) -> str:
     value = field.default
     if field.default_factory is not dataclasses.MISSING:
         value = field.default_factory()
-    if value is dataclasses.MISSING:
-        return "required"
-    if value is None or value == ():
+    if value is dataclasses.MISSING or value is None or value == ():
         return ""
-    return f"`{str(value).lower() if isinstance(value, bool) else value}`"
+    return str(value).lower() if isinstance(value, bool) else str(value)
 
 
 def flags_of(reference: str) -> str:
     """The flags of a program whose configuration is the dataclass ``"module:Class"``."""
     kind = resolve(reference)
-    docs, hints = field_docs(kind), get_type_hints(kind, include_extras=True)
-    shown = [field for field in dataclasses.fields(kind) if "Suppress" not in str(hints[field.name])]
-    rows: list[list[object]] = [[flag(kind, field), flag_default(field), docs[field.name]] for field in shown]
-    return table(["flag", "default", "meaning"], rows)
+    docs = field_docs(kind)
+    return "\n".join(item(flag(kind, field), flag_default(field), docs[field.name]) for field in _flags(kind))
+
+
+def _flags(kind: type) -> list[dataclasses.Field[Any]]:
+    hints = get_type_hints(kind, include_extras=True)
+    return [field for field in dataclasses.fields(kind) if "Suppress" not in str(hints[field.name])]
+
+
+def train_flags(reference: str) -> str:
+    """The flags of ``bam-train`` with the defaults of the settings, then the settings that have no flag."""
+    from bam_train.settings import TrainSettings
+
+    kind = resolve(reference)
+    docs, shown = field_docs(kind), _flags(kind)
+    defaults = {field.name: flag_default(field) for field in dataclasses.fields(TrainSettings)}
+    flags = [item(flag(kind, one), defaults.get(one.name) or flag_default(one), docs[one.name]) for one in shown]
+    names = [name for name in defaults if name not in {one.name for one in shown}]
+    others = [item(name, defaults[name], field_docs(TrainSettings)[name]) for name in names]
+    return "\n".join([*flags, "\nSettings without a flag, for `--set`:\n", *others])
 
 
 def flag_default(field: dataclasses.Field[Any]) -> str:
@@ -293,21 +396,20 @@ def flag_default(field: dataclasses.Field[Any]) -> str:
 def flag(kind: type, field: dataclasses.Field[Any]) -> str:
     """How a field is given on the command line."""
     if "Positional" in str(get_type_hints(kind, include_extras=True)[field.name]):
-        return f"`{field.name.upper() if field.name != 'env' else 'ID'}`"
-    return f"`--{field.name.replace('_', '-')}`"
+        return field.name.upper() if field.name != "env" else "ID"
+    return f"--{field.name.replace('_', '-')}"
 
 
 def algorithms(trainer: str = "sb3") -> str:
-    """The table of a trainer's algorithms."""
+    """A trainer's algorithms by what they learn from and the actions that they take."""
     from bam_train.trainers.algorithms import ALGORITHMS
 
-    rows = []
+    kinds: dict[str, list[str]] = {}
     for row in ALGORITHMS[trainer].values():
         memory = "recorded episodes" if row.offline else "fresh rollouts" if row.on_policy else "replay buffer"
-        policy = f"{memory}, recurrent policy" if row.recurrent else memory
-        rows.append([f"`{row.name}`", f"`{row.reference.replace(':', '.')}`", ", ".join(row.actions), policy])
-    kind = "configuration" if trainer == "rllib" else "class"
-    return table(["--algo", kind, "action spaces", "learns from"], rows)
+        kind = f"{memory}, {'recurrent policy, ' * row.recurrent}{', '.join(row.actions)}"
+        kinds.setdefault(kind, []).append(f"`{row.name}`")
+    return "\n".join(f"- {kind}: {', '.join(names)}" for kind, names in kinds.items())
 
 
 def robo_gym() -> str:
@@ -317,23 +419,25 @@ def robo_gym() -> str:
     rows = []
     for entry in (entry for entry in ROBO_GYM.values() if not entry.is_live):
         ours = ENVIRONMENTS[entry.env_id]
-        task = ours.make_task(1, {**entry.defaults, "parity": True})
-        numbers = [len(task.observation_labels), len(task.action_labels)]
         told = ", ".join(f"`{name}={value!r}`" for name, value in entry.defaults.items() if value is not False)
-        link = f"[`{ours.id}`](environments/{page_of(ours.id)})"
-        rate = f"{1 / ours.period:g} Hz"
-        rows.append([f"`{entry.stem}`", link, told, *numbers, ours.max_episode_steps, rate])
-    names = ["id, before `Sim-v0` or `Rob-v0`", "is", "with"]
-    header = [*names, "observation", "action", "steps", "rate"]
-    return table(header, rows)
+        rows.append([f"`{entry.stem}`", f"[`{ours.id}`](environments/{page_of(ours.id)})", told])
+    return table(["id, before `Sim-v0` or `Rob-v0`", "is", "with"], rows)
 
 
 def presets() -> str:
-    """The settings of every preset."""
+    """Every preset: a link to its file, and what it says of itself."""
     from bam_train.trainers.resolve_settings import PRESETS
 
+    link = "../bam_train/trainers/presets"
     files = sorted(PRESETS.glob("*.toml"))
-    return "\n\n".join(f"`{file.name}`\n\n```toml\n{file.read_text().strip()}\n```" for file in files)
+    return "\n".join(f"- [{file.stem}]({link}/{file.name}){_about(file.read_text())}" for file in files)
+
+
+def _about(text: str) -> str:
+    """The comment at the head of a preset, as the end of its line."""
+    comments = itertools.takewhile(lambda line: line.startswith("#"), text.splitlines())
+    about = re.sub(r"^\S+ with [\w-]+[.:,] ", "", " ".join(line.lstrip("# ") for line in comments))
+    return f": {about}" if about else ""
 
 
 def run_folder() -> str:
@@ -355,15 +459,11 @@ def listing(module: str) -> str:
 
 
 def agent_states() -> str:
-    """The states of a live agent, and those that may follow each."""
-    from bam_train.agent.agent_states import TRANSITIONS, State
+    """The states of a live agent."""
+    from bam_train.agent.agent_states import State
 
     docs = field_docs(State)
-    rows = [
-        [f"**{state.value}**", docs[state.name], ", ".join(one.value for one in State if one in TRANSITIONS[state])]
-        for state in State
-    ]
-    return table(["state", "what the agent does", "may be followed by"], rows)
+    return "\n".join(f"- **{state.value}**: {docs[state.name]}" for state in State)
 
 
 def agent_requests() -> str:
@@ -385,18 +485,22 @@ def audit_fields() -> str:
         zip(AuditEvent.__struct_encode_fields__, AuditEvent.__struct_fields__, strict=True),
         field_docs(AuditEvent),
     )
-    return table(["field", "meaning"], [[f"`{name}`", docs[field]] for name, field in names])
+    return "\n".join(f"- `{name}`: {docs[field]}" for name, field in names)
 
 
 PARTS: dict[str, Callable[..., str]] = {
     "environments": environments,
-    "environment": environment,
+    "parity": parity,
+    "observation": observation,
+    "action": action,
+    "environment-page": environment_page,
     "robot-signals": robot_signals,
     "guards": guards,
     "topics": topics_of,
     "fields": fields_of,
     "defaults": defaults_of,
     "flags": flags_of,
+    "train-flags": train_flags,
     "algorithms": algorithms,
     "presets": presets,
     "robo-gym": robo_gym,
@@ -417,6 +521,11 @@ def generate(text: str) -> str:
         return f"{match[1]}\n{PARTS[match['name']](*arguments)}\n\n{match[5]}"
 
     return _PART.sub(part, text)
+
+
+def build(text: str) -> str:
+    """A page of the site: with the parts that are not kept in its file."""
+    return _SITE.sub(lambda match: PARTS[match["name"]](*([match["argument"]] if match["argument"] else [])), text)
 
 
 def main() -> int:

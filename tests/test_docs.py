@@ -3,6 +3,7 @@
 import dataclasses
 import importlib.util
 import inspect
+import itertools
 import json
 import os
 import re
@@ -38,18 +39,6 @@ ROOT = Path(__file__).parents[1]
 DOCS = sorted((ROOT / "docs").rglob("*.md"))
 PAGES = [ROOT / "README.md", ROOT / "CHANGELOG.md", ROOT / "checkpoints" / "README.md", *DOCS]
 PROGRAMS = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["scripts"]
-FLAGS_OF = {
-    "bam-train": "training.md",
-    "bam-data": "data.md",
-    "bam-doctor": "doctor.md",
-    "bam-replay": "recording.md",
-    "bam-serve": "remote.md",
-    "bam-sign": "signing.md",
-    "bam-agent": "live-agent.md",
-    "bam-push": "live-agent.md",
-    "bam-gate": "data.md",
-    "bam-play": "play.md",
-}
 EXAMPLES = {"PYTHONPATH": os.pathsep.join([str(ROOT), str(ROOT / "envs")]), "OMP_NUM_THREADS": "1"}
 
 
@@ -112,31 +101,41 @@ def test_a_stale_page_is_found(make_docs, tmp_path, monkeypatch, capsys):
         monkeypatch.setattr(sys, "argv", ["make_docs.py", *arguments])
         assert make_docs.main() == status
         assert capsys.readouterr().out == said
-    assert page.read_text().startswith("Before\n<!-- generated: algorithms -->\n\n| --algo |")
-    assert page.read_text().endswith("|\n\n<!-- /generated -->\nafter\n")
+    assert page.read_text().startswith("Before\n<!-- generated: algorithms -->\n\n- fresh rollouts, Box, ")
+    assert page.read_text().endswith(": `recurrent-ppo`\n\n<!-- /generated -->\nafter\n")
 
 
-def test_every_environment_has_a_page_and_a_version(make_docs):
+def test_every_environment_is_on_one_page(make_docs):
     folder = ROOT / "docs" / "environments"
-    versions = (folder / "index.md").read_text().partition("## Version history")[2]
-    for env_id in ENVIRONMENTS:
-        page = (folder / make_docs.page_of(env_id)).read_text()
-        assert page.startswith(f"# {env_id}\n\n<!-- generated: environment {env_id} -->")
-        assert f"| `{env_id}` | " in versions
-    assert len(list(folder.iterdir())) == len(ENVIRONMENTS) + 1
+    pages = {path.stem: path.read_text() for path in folder.iterdir() if path.name != "index.md"}
+    assert sorted(pages) == sorted(make_docs.ENVIRONMENT_PAGES)
+    assert sorted(itertools.chain(*make_docs.ENVIRONMENT_PAGES.values())) == sorted(ENVIRONMENTS)
+    for page, ids in make_docs.ENVIRONMENT_PAGES.items():
+        assert re.findall("^## (bam/.*)$", pages[page], re.MULTILINE) == list(ids)
+        assert f"<!-- generated: environment-page {page} -->" in pages[page]
+
+
+def test_what_an_environment_has_in_common_with_one_above_it_is_not_said_again(make_docs):
+    told = {}
+    first = make_docs.environment("bam/grasp-xyr-v0", told)
+    second = make_docs.environment("bam/grasp-xyrw-v0", told)
+    for name in make_docs.SECTIONS:
+        assert f"**{name}.** " in first
+    assert "**Start.** As in `bam/grasp-xyr-v0`." in second
+    assert "**Options** of `gym.make`, besides `objects`, `grasps`, `size` as above:" in second
 
 
 def test_every_number_of_an_environment_is_in_its_table(make_docs):
-    text = make_docs.environment("bam/pick-v0")
-    assert "| `[2]` | `tool_z` | tool, above the table | m | (z - 0.183) / 0.167 | -2 | 2 |" in text
+    page = make_docs.build(make_docs.environment("bam/pick-v0"))
+    assert "| `[2]` | `tool_z` | tool, above the table | m | (z - 0.183) / 0.167 | -2 | 2 |" in page
     line = "tool target from the tool: forward, to the left, up | m | / 0.03 | -2 | 2 |"
-    assert f"| `[3:6]` | `target_dx`, `target_dy`, `target_dz` | {line}" in text
-    assert "| `[4]` | `grip` | close the gripper when positive, open it otherwise | 1 | 1 | -1 | 1 |" in text
-    assert "| `[0:6]` | `d_shoulder_pan_joint` … `d_wrist_3_joint` | turn the joint | rad |" in make_docs.environment(
+    assert f"| `[3:6]` | `target_dx`, `target_dy`, `target_dz` | {line}" in page
+    assert "| `[4]` | `grip` | close the gripper when positive, open it otherwise | 1 | 1 | -1 | 1 |" in page
+    assert "| `[0:6]` | `d_shoulder_pan_joint` … `d_wrist_3_joint` | turn the joint | rad |" in make_docs.action(
         "bam/reach-v0"
     )
-    for name in make_docs.SECTIONS:
-        assert f"**{name}.** " in text
+    sectors = "| `[4:12]` | `front_0` … `front_7` | shortest ray of sector 0, 1, … of the front scanner"
+    assert sectors in make_docs.observation("bam/mir100-avoidance-v0")
 
 
 DRIVING = (
@@ -193,7 +192,7 @@ def test_prose_has_the_numbers_of_the_code(make_docs, task, section, facts):
 
 
 def test_every_field_of_a_table_has_its_meaning(make_docs):
-    assert "| `max_delay` | `2` | Commands arrive 0 to this many periods late" in make_docs.defaults_of(
+    assert "- `max_delay=2`: Commands arrive 0 to this many periods late" in make_docs.defaults_of(
         f"{Ranges.__module__}:Ranges"
     )
 
@@ -201,7 +200,7 @@ def test_every_field_of_a_table_has_its_meaning(make_docs):
 @pytest.mark.parametrize(
     "program", [*sorted(PROGRAMS.keys() - {"bam-data"}), *(f"bam-data {command}" for command in DATA_COMMANDS)]
 )
-def test_flags_in_the_tables_are_those_of_the_programs(program, monkeypatch, capsys):
+def test_flags_on_the_site_are_the_flags_of_the_programs(make_docs, program, monkeypatch, capsys):
     words = program.split()
     module, _, name = PROGRAMS[words[0]].partition(":")
     main = getattr(importlib.import_module(module), name)
@@ -211,16 +210,17 @@ def test_flags_in_the_tables_are_those_of_the_programs(program, monkeypatch, cap
         main()
     assert caught.value.code == 0
     there = set(re.findall(r"--[a-z][a-z-]*", capsys.readouterr().out)) - {"--help"}
-    config = f"{program.removeprefix('bam-').capitalize()}Config"
-    if words[0] == "bam-data":
-        config = DATA_COMMANDS[words[1]].flags.partition(":")[2]
-    page = (ROOT / "docs" / FLAGS_OF.get(words[0], "deploying.md")).read_text()
-    table = re.search(rf"generated: flags \S+:{config} .*?<!-- /generated -->", page, re.DOTALL)[0]
-    assert set(re.findall(r"^\| `(--[a-z-]+)`", table, re.MULTILINE)) == there
+    page = (
+        ROOT / "docs" / ("reference-training.md" if program == "bam-train" else "reference-programs.md")
+    ).read_text()
+    part = re.search(
+        r"<!-- site: (?:train-)?flags .*? -->", page[0 if program == "bam-train" else page.index(f"## {program}\n") :]
+    )
+    assert set(re.findall(r"^- `(--[a-z-]+)", make_docs.build(part[0]), re.MULTILINE)) == there
 
 
 CONFIGS = [resolve("bam_train.cli.flags:TrainConfig")]
-CONFIGS += map(resolve, re.findall(r"generated: flags (\S+)", "".join(page.read_text() for page in DOCS)))
+CONFIGS += map(resolve, re.findall(r"site: flags (\S+)", "".join(page.read_text() for page in DOCS)))
 
 
 @pytest.mark.parametrize("config", CONFIGS)
@@ -253,7 +253,7 @@ def test_commands_exist(page):
             assert words[0] in {*PROGRAMS, "pip", "pytest", "python3", "ray", "ros2", "source", "ssh"}
 
 
-@pytest.mark.parametrize("page", ["README.md", "docs/cheat-sheet.md"])
+@pytest.mark.parametrize("page", ["README.md", "docs/reference-programs.md"])
 def test_the_exit_statuses_of_the_gate_are_told_where_it_is_shown(page):
     statuses = {**STATUSES, "no comparison": FAILED}
     found = re.findall(r"\b(\d):? (better|not worse|worse|undecided|no comparison)\b", (ROOT / page).read_text())
