@@ -114,6 +114,8 @@ class RobotSpec:
     """Shape and laser scanners of a base, if they are known."""
     cameras: tuple[CameraSpec, ...] = ()
     """Its cameras, whose images are signals without labels."""
+    is_timed: bool = field(default=True, compare=False)
+    """Whether a joint takes a period to reach a command; otherwise it goes there at once, as fast as it can."""
 
     def describe(self) -> dict[str, list[dict[str, Any]]]:
         """Labels, units and limits of state and command, as plain values."""

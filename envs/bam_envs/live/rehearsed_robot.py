@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 
 from bam_envs.core.errors import InvalidValue
-from bam_envs.core.robot import EnvIds, Initial, RobotState
+from bam_envs.core.robot import EnvIds, Initial, RobotSpec, RobotState
 from bam_envs.live.building import profile_limits, require_effect
 from bam_envs.robots.linked import Array, LinkedRobot
 from bam_envs.robots.profile import load_profile, profile_for
@@ -27,13 +27,14 @@ class RehearsedRobot:
 
     Args:
         robot: The robot behind the link.
-        lag: Time by which its live counterpart is behind its commands [s], which the guards expect.
+        live: The spec of its live counterpart, whose way to follow commands the guards expect.
     """
 
     needs_clearance = True
 
-    def __init__(self, robot: LinkedRobot, lag: float) -> None:
-        self.robot, self.spec, self.num_robots = robot, replace(robot.spec, lag=lag), robot.num_robots
+    def __init__(self, robot: LinkedRobot, live: RobotSpec) -> None:
+        self.robot, self.num_robots = robot, robot.num_robots
+        self.spec = replace(robot.spec, lag=live.lag, is_timed=live.is_timed)
         text = f"{robot.spec.name}, simulated behind a link; its time advances with commands"
         self.info = RobotInfo(robot.spec.name, simulated=True, lockstep=True, period=robot.spec.period, text=text)
 
@@ -104,8 +105,8 @@ def rehearsed_robot(
     limits = profile_limits(chosen).changed({} if guards is None else guards)
     if trial:
         limits = limits.on_trial(base=chosen.kind == "base")
-    lag = replace(chosen, period=robot.spec.period).spec().lag
-    safe = SafeRobot(RehearsedRobot(robot, lag), limits=limits, tool_position=tool, straight=straight)
+    live = replace(chosen, period=robot.spec.period).spec()
+    safe = SafeRobot(RehearsedRobot(robot, live), limits=limits, tool_position=tool, straight=straight)
     require_effect(safe, guards or {})
     return safe
 

@@ -291,9 +291,11 @@ class RobotProfile:
         # A trajectory that takes longer than a period adds to the lag.
         reached = (sink.reach_at(period) for sink in self.sinks(mode) if sink.type == _TRAJECTORY)
         lag = _LAGS[self.kind] + max(0.0, max(reached, default=0.0) - period)
+        joints = {at for at, unit in zip(self.command.labels, self.command.units, strict=True) if unit == "rad"}
+        is_timed = all(sink.is_timed for sink in self.sinks(mode) if joints & set(sink.labels))
         if wanted is None:
             signals = tuple(signal for signal in self.signals if not self.source(signal.name).optional)
-            return RobotSpec(self.name, signals, self.command, period, lag, self.body)
+            return RobotSpec(self.name, signals, self.command, period, lag, self.body, is_timed=is_timed)
         for name in (name for camera in wanted.cameras for name in camera.spaces()):
             self.camera(name)
         known = {signal.name: signal for signal in self.signals}
@@ -308,7 +310,7 @@ class RobotProfile:
                 raise InvalidValue(f"{signal.name} must be {', '.join(signal.labels)}; that of {self.name} is {found}.")
         signals = tuple(known[signal.name] for signal in wanted.signals)
         command = self.narrowed(wanted.command.labels, mode).command
-        return RobotSpec(self.name, signals, command, period, lag, self.body, wanted.cameras)
+        return RobotSpec(self.name, signals, command, period, lag, self.body, wanted.cameras, is_timed)
 
 
 def _missing(sink: Sink, labels: tuple[str, ...]) -> list[str]:

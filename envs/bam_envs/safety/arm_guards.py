@@ -27,6 +27,9 @@ ROUNDING = 1 + 1e-9
 """A step that is exactly as long as its limit must not exceed it by floating point rounding."""
 _ROUNDS = 8
 """Maximum number of times that a step is shortened until the tool is slow enough."""
+SHARE_AT_ONCE = 0.5
+"""Share of its limit that a joint gets which goes to a command at once: slowed down by its side and released, it makes
+the rest of one step and the whole of the next one within a period."""
 JUMP = 0.05
 """Tolerance of the measured change of a joint beyond its fastest turn [rad]."""
 
@@ -36,6 +39,12 @@ def fastest_joints(spec: RobotSpec, limits: Limits, unlimited: float = math.inf)
     rates = max_rate(spec.command)
     fastest = [min(limits.joint_speed, rates[column]) for column in columns_in(spec.command, "rad")]
     return [speed if math.isfinite(speed) else unlimited for speed in fastest]
+
+
+def fastest_commands(spec: RobotSpec, limits: Limits, unlimited: float = math.inf) -> Numbers:
+    """Maximum speed at which each joint is commanded (k,) [rad/s]: so that it turns within its limit."""
+    share = 1.0 if spec.is_timed else SHARE_AT_ONCE
+    return [share * speed for speed in fastest_joints(spec, limits, unlimited)]
 
 
 class PositionLimits(Guard):
@@ -72,7 +81,7 @@ class JointSpeed(Guard):
     number, name, unit, setting = "G8", "joint speed", "rad/s", "joint_speed"
 
     def __init__(self, spec: RobotSpec, limits: Limits) -> None:
-        self._joints, self._fastest = columns_in(spec.command, "rad"), fastest_joints(spec, limits)
+        self._joints, self._fastest = columns_in(spec.command, "rad"), fastest_commands(spec, limits)
         self.limit_value = max(self._fastest)
 
     def limit(self, tick: Tick) -> bool:

@@ -9,7 +9,7 @@ import math
 from collections import deque
 
 from bam_envs.core.robot import RobotSpec
-from bam_envs.safety.arm_guards import fastest_joints, within_reach
+from bam_envs.safety.arm_guards import fastest_commands, within_reach
 from bam_envs.safety.guard import (
     Guard,
     Limits,
@@ -125,7 +125,7 @@ class JointFollowing(Following):
         self._tool = None if tool_position is None else tool_point_of(tool_position)
         self._tool_reach = limits.tool_speed * spec.period
         self._labels = [spec.command.labels[at] for at in self._joints]
-        fastest, self._tolerance = fastest_joints(spec, limits, limits.reset_speed), limits.follow_tolerance
+        fastest, self._tolerance = fastest_commands(spec, limits, limits.reset_speed), limits.follow_tolerance
         self._fastest = fastest
         self._step = [speed * spec.period for speed in fastest]
         self._slow_step = [min(speed, limits.reset_speed) * spec.period for speed in fastest]

@@ -42,7 +42,7 @@ class TestContract(RobotContract):
 
 
 def test_it_takes_cleared_commands_only():
-    robot = RehearsedRobot(LinkedRobot(FakeRobot(), PROFILES["wifi"]), lag=0.1)
+    robot = RehearsedRobot(LinkedRobot(FakeRobot(), PROFILES["wifi"]), FakeRobot().spec)
     robot.connect()
     state = robot.reset(np.arange(1), START)
     with pytest.raises(InvalidValue, match=r"^Commands to fake must be cleared by a SafeRobot: use rehearsed_robot"):

@@ -280,10 +280,11 @@ def turned(robot, arm, seconds, step=0.0499):
 
 @pytest.mark.parametrize("seconds", [0.1, 0.5, 2.0, 30.0])
 @pytest.mark.parametrize("share", [0.1, 0.3, 0.6])
-@pytest.mark.parametrize("lag", [0.0, 0.03])
-def test_a_slider_that_nobody_reports_lets_no_joint_catch_up_faster_than_its_limit(lag, share, seconds):
+@pytest.mark.parametrize("lag", [0.0, 0.03, 0.06])
+@pytest.mark.parametrize("mode", ["trajectory", "position"])
+def test_a_slider_that_nobody_reports_lets_no_joint_catch_up_faster_than_its_limit(mode, lag, share, seconds):
     """Over any 50 ms, before, during and after the slow-down; a stopped arm is resumed once the slider is back."""
-    arm = WiredArm(lag=lag, known=True, start=(0, -1.57, 1.57, 0, 1.57, 0))
+    arm = WiredArm(lag=lag, known=True, mode=mode, start=(0, -1.57, 1.57, 0, 1.57, 0))
     robot, why = driven(arm)
     assert why is None
     arm.trace.clear()
@@ -298,7 +299,7 @@ def test_a_slider_that_nobody_reports_lets_no_joint_catch_up_faster_than_its_lim
     trace = np.array(arm.trace)
     speeds = np.abs(trace[PARTS:] - trace[:-PARTS]) / arm.spec.period
     assert speeds.max() <= 1.0 + 1e-3
-    assert speeds.max() > 0.6  # it did move fast
+    assert speeds.max() > 0.45  # it did move fast
 
 
 @pytest.mark.parametrize("scale", [0.0, 0.5, -1.0])
