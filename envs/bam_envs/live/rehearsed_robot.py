@@ -7,7 +7,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import replace
 
-from bam_envs.core.errors import InvalidValue
+from bam_envs.core.errors import InvalidValue, ResetNeeded
 from bam_envs.core.robot import EnvIds, Initial, RobotSpec, RobotState
 from bam_envs.live.building import profile_limits, require_effect
 from bam_envs.robots.linked import Array, LinkedRobot
@@ -62,7 +62,9 @@ class RehearsedRobot:
         return self.robot.step(command.for_robot(self))
 
     def measure(self) -> RobotState:
-        """The newest state that has arrived."""
+        """The newest state that has arrived; `ResetNeeded` before `connect`."""
+        if not self.robot.newest.signals:
+            raise ResetNeeded("The rehearsed robot is not connected. Call connect() first.")
         return self.robot.newest
 
     def age(self) -> float:

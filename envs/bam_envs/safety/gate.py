@@ -423,7 +423,7 @@ class SafeRobot(metaclass=Sealed):
             and (sent_at is not None or self._live is None or self._in_lockstep())
         ):
             return last
-        if self._live is not None and self._state is not None:
+        if self._live is not None:
             self._state = self._fresh_state()
             self._require_in_range(self._state)  # a motion does not begin at a wrong measurement
         measured, command = self._measured(self._places), self.spec.command

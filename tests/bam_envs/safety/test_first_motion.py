@@ -264,6 +264,24 @@ def test_late_arms_are_proved(lag):
     assert driven(WiredArm(lag=lag))[1] is None
 
 
+@pytest.mark.parametrize("again", [False, True])
+def test_an_arm_that_needs_no_proof_begins_where_it_is_also_without_a_reset(again):
+    """As for a person who drives an agent's robot before its first episode, or after its link was lost."""
+    arm = WiredArm()
+    arm.tell_proved(arm.lag)
+    robot = SafeRobot(arm, clock=arm.clock)
+    robot.connect()
+    if again:
+        robot.reset(ROW, Initial({"joint_position": arm.joints[None]}, ROW))
+        robot.close()
+        robot.connect()
+    there = np.append(arm.joints, 0.085)[None]
+    there[0, 5] += 0.01
+    for _ in range(10):
+        robot.step(there)
+    np.testing.assert_allclose(arm.joints - arm.start, [0, 0, 0, 0, 0, 0.01], atol=1e-3)
+
+
 def turned(robot, arm, seconds, step=0.0499):
     """Turn wrist_3 to and fro for so long, faster than it may; why the arm was stopped, or None."""
     command, end, way = robot.measure().command.copy(), arm.now + seconds, step
