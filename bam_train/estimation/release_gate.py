@@ -37,7 +37,6 @@ from bam_train.estimation.fitted_q import fit_q
 from bam_train.estimation.paired_test import Pairs, Verdict, verdict_of
 from bam_train.estimation.steps import read_steps
 from bam_train.evaluation import (
-    EpisodeScore,
     default_num_envs,
     first_of_each,
     number_of_starts,
@@ -46,6 +45,7 @@ from bam_train.evaluation import (
 )
 from bam_train.finite_envs import FiniteVectorEnv
 from bam_train.policy import FrozenPolicy
+from bam_train.rollout import PlayedEpisode
 
 
 @dataclass(frozen=True)
@@ -108,7 +108,7 @@ def compare(
     env_id, kwargs = environment_of(champion, env)
     require_env_kwargs(env_id, env_kwargs or {})
     policies = [FrozenPolicy.from_checkpoint(one) for one in (candidate, champion)]
-    played: list[list[EpisodeScore]] = [[], []]
+    played: list[list[PlayedEpisode]] = [[], []]
     pairs = Pairs()
     width = num_envs or default_num_envs(env_id, episodes)
     with closing(make_vector_env(env_id, held_out(env_id, kwargs, env_kwargs or {}), width)) as envs:
@@ -140,7 +140,7 @@ def require_comparable(candidate: Checkpoint, champion: Checkpoint) -> None:
             raise CheckpointMismatch(candidate.path, f"{text}; a gate compares policies that see and do the same")
 
 
-def count_pairs(candidate: list[EpisodeScore], champion: list[EpisodeScore]) -> Pairs:
+def count_pairs(candidate: list[PlayedEpisode], champion: list[PlayedEpisode]) -> Pairs:
     """Who wins each pair of episodes: by success, or by return where success is not reported."""
     by_success = all(one.success is not None for one in (*candidate, *champion))
     scores = [[float(one.success or 0) if by_success else one.total for one in side] for side in (candidate, champion)]
@@ -149,7 +149,7 @@ def count_pairs(candidate: list[EpisodeScore], champion: list[EpisodeScore]) -> 
     return Pairs(wins, len(candidate) - wins - losses, losses)
 
 
-def _comparison(env: str, played: list[list[EpisodeScore]], pairs: Pairs, margin: float, seed: int) -> Comparison:
+def _comparison(env: str, played: list[list[PlayedEpisode]], pairs: Pairs, margin: float, seed: int) -> Comparison:
     known = [[one.success is not None for one in side] for side in played]
     by_success = all(map(all, known))
     if not by_success and any(map(any, known)):

@@ -2,8 +2,6 @@
 
 from bam_train.evaluation.evaluation import (
     FIRST_SEED,
-    BatchPolicy,
-    EpisodeScore,
     EvaluationReport,
     default_num_envs,
     evaluate,
@@ -17,8 +15,6 @@ from bam_train.evaluation.evaluation import (
 
 __all__ = [
     "FIRST_SEED",
-    "BatchPolicy",
-    "EpisodeScore",
     "EvaluationReport",
     "default_num_envs",
     "evaluate",
