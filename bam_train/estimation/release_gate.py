@@ -38,9 +38,7 @@ from bam_train.estimation.paired_test import Pairs, Verdict, verdict_of
 from bam_train.estimation.steps import read_steps
 from bam_train.evaluation import (
     default_num_envs,
-    first_of_each,
-    number_of_starts,
-    play_wave,
+    waves,
     wilson_interval,
 )
 from bam_train.finite_envs import FiniteVectorEnv
@@ -114,18 +112,15 @@ def compare(
     with closing(make_vector_env(env_id, held_out(env_id, kwargs, env_kwargs or {}), width)) as envs:
         for one in (candidate, champion):
             require_fit(one, envs)
-        finite, begun, starts = FiniteVectorEnv(envs, env_id), 0, number_of_starts(envs)
-        seen: list[set[int]] = [set(), set()]
-        episodes = min(episodes, starts or episodes)
-        while len(pairs) < episodes and not pairs.is_decided(margin):
-            count = envs.num_envs if starts else min(envs.num_envs, episodes - len(pairs))
-            waves = [play_wave(finite, policy, seed + begun, count) for policy in policies]
-            wave = [first_of_each(one, known) for one, known in zip(waves, seen, strict=True)]
-            begun += count
+        finite = FiniteVectorEnv(envs, env_id)
+        sides = [waves(finite, policy, episodes=episodes, seed=seed) for policy in policies]
+        for wave in zip(*sides, strict=True):
             for all_of_it, new in zip(played, wave, strict=True):
                 all_of_it += new
             pairs += count_pairs(*wave)
             on_progress(len(pairs), pairs)
+            if pairs.is_decided(margin):
+                break
     return _comparison(env_id, played, pairs, margin, seed)
 
 

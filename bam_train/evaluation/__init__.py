@@ -5,11 +5,10 @@ from bam_train.evaluation.evaluation import (
     EvaluationReport,
     default_num_envs,
     evaluate,
-    first_of_each,
     number_of_starts,
-    play_wave,
     record_video,
     summarise,
+    waves,
     wilson_interval,
 )
 
@@ -18,10 +17,9 @@ __all__ = [
     "EvaluationReport",
     "default_num_envs",
     "evaluate",
-    "first_of_each",
     "number_of_starts",
-    "play_wave",
     "record_video",
     "summarise",
+    "waves",
     "wilson_interval",
 ]

@@ -5,8 +5,11 @@ of one episode each; the steps after the end of an episode, while others are sti
 """
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import closing, nullcontext
 from dataclasses import asdict, dataclass
+from functools import partial
+from operator import gt
 from typing import Any
 
 import gymnasium as gym
@@ -125,25 +128,17 @@ def evaluate(
     check(seed, NonNegativeInt, "seed", SettingsError)
     check(episodes, PositiveInt, "episodes", SettingsError)
     check(num_envs, PositiveInt | None, "num_envs", SettingsError)
-    is_new = env is None
-    if env is None:
-        env = make_vector_env(env_id, env_kwargs, num_envs or default_num_envs(env_id, episodes))
-    elif env.metadata.get("autoreset_mode") is not AutoresetMode.SAME_STEP:
+    if env is not None and env.metadata.get("autoreset_mode") is not AutoresetMode.SAME_STEP:
         raise SettingsError(f"env: expected autoreset mode SAME_STEP, found {env.metadata.get('autoreset_mode')}")
-    finite, done, seen = FiniteVectorEnv(env, env_id), list[PlayedEpisode](), set[int]()
-    starts = number_of_starts(env)
-    wanted, played = min(episodes, starts or episodes), 0
-    try:
-        while len(done) < wanted:
-            count = min(env.num_envs, wanted - len(done)) if starts is None else env.num_envs
-            done += first_of_each(play_wave(finite, policy, seed + played, count), seen)
-            played += count
+    num_envs = num_envs or default_num_envs(env_id, episodes)
+    made = nullcontext(env) if env is not None else closing(make_vector_env(env_id, env_kwargs, num_envs))
+    with made as envs:
+        starts, done = number_of_starts(envs), list[PlayedEpisode]()
+        for wave in waves(FiniteVectorEnv(envs, env_id), policy, episodes=episodes, seed=seed):
+            done += wave
             if on_progress is not None:
-                on_progress(min(len(done), wanted), wanted)
-    finally:
-        if is_new:
-            env.close()
-    return summarise(env_id, done[:wanted], seed, starts)
+                on_progress(len(done), min(episodes, starts or episodes))
+    return summarise(env_id, done, seed, starts)
 
 
 def number_of_starts(env: VectorEnv[Any, Any, Any]) -> int | None:
@@ -152,25 +147,30 @@ def number_of_starts(env: VectorEnv[Any, Any, Any]) -> int | None:
     return count
 
 
-def first_of_each(episodes: Sequence[PlayedEpisode], seen: set[int]) -> list[PlayedEpisode]:
-    """The episodes whose start is not one of `seen`, to which theirs are added: a second one would say the same."""
-    found = []
-    for one in episodes:
-        start = int(one.parts[0][0]) if one.parts else None
-        found += [] if start in seen else [one]
-        seen |= set() if start is None else {start}
-    return found
+def waves(
+    env: VectorEnv[Any, Any, Any], policy: BatchPolicy, *, episodes: int, seed: int
+) -> Iterator[list[PlayedEpisode]]:
+    """Play `episodes` episodes, one in each environment at a time; yields those of each wave that count.
 
-
-def play_wave(env: VectorEnv[Any, Any, Any], policy: BatchPolicy, seed: int, count: int) -> list[PlayedEpisode]:
-    """Play one episode in each of the first `count` environments; every environment i gets the seed ``seed + i``.
-
-    Where there are so many starts and no more, such as pictures of a test split, the numbers of the starts are kept.
+    Episode k starts from ``reset(seed=seed + k)``. Where there are so many starts and no more, such as pictures of a
+    test split, an episode counts if its start is new: a second one would say the same.
     """
     inner: Any = env.unwrapped
-    drawn = None if number_of_starts(env) is None else lambda *_: (inner.task.drawn,)
-    played = rollout(env, policy, seed=seed, keep=lambda number: number < count, parts=drawn)
-    return sorted(played, key=lambda one: one.env_id)
+    starts, played, seen = number_of_starts(env), 0, set[int]()
+    left, drawn = min(episodes, starts or episodes), None if starts is None else lambda *_: (inner.task.drawn,)
+    while left:
+        count = env.num_envs if starts else min(env.num_envs, left)
+        ended = rollout(env, policy, seed=seed + played, keep=partial(gt, count), parts=drawn)
+        wave = sorted(ended, key=lambda one: one.env_id)
+        if starts is not None:
+            first: dict[int, PlayedEpisode] = {}
+            for one in wave:
+                first.setdefault(int(one.parts[0][0]), one)
+            wave = [one for start, one in first.items() if start not in seen]
+            seen.update(first)
+        wave = wave[:left]
+        left, played = left - len(wave), played + count
+        yield wave
 
 
 def record_video(env: gym.Env[Any, Any], policy: Any, add: Callable[[Frame], Any], *, episodes: int, seed: int) -> int:

@@ -10,8 +10,8 @@ from bam_train.errors import PolicyError, SettingsError
 from bam_train.evaluation import (
     default_num_envs,
     evaluate,
-    play_wave,
     summarise,
+    waves,
     wilson_interval,
 )
 from bam_train.rollout import PlayedEpisode
@@ -80,9 +80,9 @@ def test_recurrent_state_is_forgotten_at_the_start_of_every_episode(corridor, st
     policy = Always(1)
     rows = make_vector_env(corridor, None, 2)
     seed = next(seed for seed in range(100) if starting_cell(seed) == 3 and starting_cell(seed + 1) == 2)
-    waves = [play_wave(rows, policy, seed, 2) for _ in range(2)]
+    played = [wave for _ in range(2) for wave in waves(rows, policy, episodes=2, seed=seed)]
     rows.close()
-    assert [[episode.length for episode in wave] for wave in waves] == [[1, 2], [1, 2]]
+    assert [[episode.length for episode in wave] for wave in played] == [[1, 2], [1, 2]]
     assert policy.forgotten == [None, [0], None, [0]]
     assert len(policy.batches) == 4
 

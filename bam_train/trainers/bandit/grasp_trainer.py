@@ -11,7 +11,6 @@ import contextlib
 import dataclasses
 import math
 from collections import deque
-from collections.abc import Iterator
 from typing import Annotated, Any
 
 import numpy as np
@@ -23,7 +22,7 @@ from bam_envs.core.validation import read_table
 from bam_train.checkpoint import Checkpoint
 from bam_train.environments import make_env, make_vector_env, require_fit
 from bam_train.errors import SettingsError, TrainingFailed
-from bam_train.rollout import PlayedEpisode, PlayedStep, play
+from bam_train.rollout import PlayedEpisode, play
 from bam_train.settings import TrainSettings
 from bam_train.trainers.algorithms import BANDIT_ALGORITHMS
 from bam_train.trainers.bandit.grasp_network import EDGE, HEIGHT_UNIT, Bytes, GraspNetwork, GraspPolicy, Grid
@@ -76,7 +75,7 @@ class GraspTrainer(TorchTrainer):
         self._recent: deque[PlayedEpisode] = deque(maxlen=_RECENT)
         self._metrics: dict[str, float] = {}
         self._observation: Any = None
-        self._playing: Iterator[PlayedStep] | None = None
+        self._playing = play(self.envs, self, seed=settings.seed)
         self._tried: tuple[Any, ...] = ()  # patches and widths of the last grasps
         self._table = 0.0  # depth of the table [m]
 
@@ -114,6 +113,7 @@ class GraspTrainer(TorchTrainer):
             trainer._recent += [PlayedEpisode(None, reward, 1, bool(success)) for reward, success in state["recent"]]
             if state["envs"] is not None:
                 trainer._observation = trainer.envs.unwrapped.load_state_dict(state["envs"])
+                trainer._playing = play(trainer.envs, trainer, observations=trainer._observation)
         return trainer
 
     def train(self, steps: int, on_progress: OnProgress) -> None:
@@ -131,7 +131,6 @@ class GraspTrainer(TorchTrainer):
 
     def _try_grasps(self) -> None:
         """Grasp once in every environment, and keep what came of it."""
-        self._playing = self._playing or play(self.envs, self, seed=self.settings.seed, observations=self._observation)
         step = next(self._playing)
         self._observation, rewards = step.observations, step.rewards
         if not ((rewards >= 0) & (rewards <= 1)).all():

@@ -7,7 +7,6 @@ S. Ross, G. Gordon, D. Bagnell: A reduction of imitation learning and structured
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Annotated, Any
 
@@ -18,7 +17,7 @@ from msgspec import Meta
 from torch.nn import functional
 
 from bam_envs.core.spaces import leaves
-from bam_train.rollout import PlayedEpisode, PlayedStep, play
+from bam_train.rollout import PlayedEpisode, play
 from bam_train.trainers.base import Statistics
 from bam_train.trainers.imitation.imitation_network import ImitationNetwork
 from bam_train.trainers.imitation.teacher import Teacher
@@ -94,10 +93,10 @@ class DaggerLearner:
         self._optimiser = torch.optim.Adam(self.network.parameters(), lr=values.learning_rate)
         self._experience = TaughtSteps(seen, values.memory, *sizes)
         self._rng = np.random.default_rng(seed)
-        self._playing: Iterator[PlayedStep] | None = None
+        self._playing = play(envs, self, seed=seed)
         self._taught = self._draw_taught(envs.num_envs, 0.0)  # where the teacher acts in this episode
         self._ended: deque[PlayedEpisode] = deque(maxlen=_RECENT)
-        self._due, self._seed, self._refill = 0.0, seed, 0
+        self._due, self._refill = 0.0, 0
         self.metrics: dict[str, float] = {}
 
     def _tensors(self, observation: Any) -> list[torch.Tensor]:
@@ -109,7 +108,6 @@ class DaggerLearner:
 
         The learner's own episodes count; who acts in an episode is drawn when it begins.
         """
-        self._playing = self._playing or play(self.envs, self, seed=self._seed)
         step = next(self._playing)
         self._ended += [one for one in step.ended if not self._taught[one.env_id]]
         if step.ended:
@@ -190,6 +188,6 @@ class DaggerLearner:
         self.network.load_state_dict(state["network"])
         self._optimiser.load_state_dict(state["optimiser"])
         self._rng.bit_generator.state = state["rng"]
-        self._seed = int(self._rng.integers(2**31))
+        self._playing = play(self.envs, self, seed=int(self._rng.integers(2**31)))
         self._refill = min(int(state["steps"]), 100 * self.envs.num_envs)
         self._taught = self._draw_taught(self.envs.num_envs, done)

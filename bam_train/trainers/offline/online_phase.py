@@ -13,7 +13,6 @@ from bam_train.environments import make_vector_env
 from bam_train.errors import SettingsError
 from bam_train.rollout import PlayedEpisode, PlayedStep, play
 from bam_train.settings import TrainSettings
-from bam_train.trainers.base import Statistics
 from bam_train.trainers.offline.implicit_q import ImplicitQLearner
 from bam_train.trainers.offline.training_data import ActionCode, Normaliser, TrainingBatch
 
@@ -34,7 +33,8 @@ class OnlinePhase:
         self._acted: Any = None  # observations and codes of the last step
         self._own: TrainingBatch | None = None  # a ring buffer
         self._added, self._due = 0, 0.0
-        self._ended: deque[PlayedEpisode] = deque(maxlen=_RECENT)
+        self.ended: deque[PlayedEpisode] = deque(maxlen=_RECENT)
+        """The last episodes."""
 
     def step(self, learner: ImplicitQLearner) -> int:
         """Step all environments once, then do the updates that are due; returns the number of steps."""
@@ -47,7 +47,7 @@ class OnlinePhase:
         reward = torch.as_tensor(step.rewards / self._reward_scale, dtype=torch.float32)
         terminated = torch.as_tensor(step.terminated).float()
         self._keep(TrainingBatch(seen, codes, reward, self._normaliser(step.following), terminated))
-        self._ended += step.ended
+        self.ended += step.ended
         self._due += len(reward) * learner.iql.update_ratio
         size = learner.settings.batch_size
         while self._due >= 1:
@@ -89,10 +89,6 @@ class OnlinePhase:
         """Random transitions of the own ones, of which there are some."""
         own: Any = self._own
         return own.rows(torch.randint(min(self._added, _LARGEST), (count,)))  # type: ignore[no-any-return]
-
-    def statistics(self, metrics: dict[str, float]) -> Statistics:
-        """Means over the last episodes."""
-        return Statistics.of(self._ended, metrics)
 
     def state_dict(self) -> dict[str, Any]:
         """The own transitions and the random numbers; running episodes begin anew."""
