@@ -4,37 +4,25 @@ from __future__ import annotations
 
 import argparse
 import time
+from contextlib import closing
 
-import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
 from bam_envs.core.errors import BamEnvsError
 from bam_envs.core.registry import ENVIRONMENTS, resolve_id
 from bam_envs.tasks.scripted import GRASP, SCRIPTED, scripted_policy
+from bam_train.environments import make_vector_env
+from bam_train.evaluation import waves
 
 ROWS = 64
 
 
 def run_episodes(env_id: str, episodes: int, seed: int, *, randomize: bool) -> tuple[int, NDArray[np.int64]]:
     """Episode k is seeded ``seed + k``; how many succeeded, and how many steps each took."""
-    policy, successes, lengths = scripted_policy(env_id), 0, []
-    for first in range(0, episodes, ROWS):
-        rows = min(ROWS, episodes - first)
-        env = gym.make_vec(env_id, num_envs=rows, randomize=randomize)
-        observation, _ = env.reset(seed=seed + first)
-        running = np.ones(rows, dtype=bool)
-        length = np.zeros(rows, dtype=np.int64)
-        while running.any():
-            observation, _, terminated, truncated, infos = env.step(policy.act_batch(observation))
-            length[running] += 1
-            ended = running & (terminated | truncated)
-            if ended.any():
-                successes += int(infos["final_info"]["is_success"][ended].sum())
-            running &= ~ended
-        env.close()
-        lengths.append(length)
-    return successes, np.concatenate(lengths)
+    with closing(make_vector_env(env_id, {"randomize": randomize}, min(ROWS, episodes))) as envs:
+        played = [one for wave in waves(envs, scripted_policy(env_id), episodes=episodes, seed=seed) for one in wave]
+    return sum(bool(one.success) for one in played), np.array([one.length for one in played])
 
 
 def main() -> int:

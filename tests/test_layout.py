@@ -32,6 +32,7 @@ ORDER = {
             "settings",
             "finite_envs",
             "foreign_env",
+            "rollout",
         ),
         *(
             "files",

@@ -19,9 +19,10 @@ from bam_train.data.episode import Array
 from bam_train.data.record_dataset import RecordVectorDataset, info_of
 from bam_train.environments import environment_of, make_vector_env, require_env_kwargs, require_fit
 from bam_train.errors import SettingsError
-from bam_train.evaluation import BatchPolicy, default_num_envs
+from bam_train.evaluation import default_num_envs
 from bam_train.files.place import Place
 from bam_train.policy import FrozenPolicy
+from bam_train.rollout import BatchPolicy, rollout
 
 SCRIPTED, RANDOM = "scripted", "random"
 
@@ -114,11 +115,18 @@ def collect(
         name = policy if checkpoint is None else checkpoint.digest
         told = {"policy": name, "noise": noise, "random": random, "num_envs": envs.num_envs, **(facts or {})}
         actor = _policy(policy, checkpoint, env_id, envs, seed)
-        disturb = Disturbance(envs.single_action_space, noise, 1.0 if policy == RANDOM else random, envs.num_envs, seed)
+        acting, done = Disturbance(actor, envs, noise, 1.0 if policy == RANDOM else random, seed), Collected()
         recorded = RecordVectorDataset(
             envs, place, info_of(envs, env_id, kwargs), told, keep=lambda number, _: number < episodes
         )
-        return _run(recorded, actor, disturb, episodes, seed, on_progress)
+        recorded.extra = acting.columns
+        with closing(recorded):
+            for episode in rollout(recorded, acting, seed=seed, keep=lambda number: number < episodes):
+                done.episodes += 1
+                done.steps += episode.length
+                done.successes += bool(episode.success)
+                on_progress(done.episodes, episodes)
+        return done
 
 
 def _policy(policy: str, checkpoint: Checkpoint | None, env_id: str, envs: Any, seed: int) -> BatchPolicy:
@@ -131,51 +139,33 @@ def _policy(policy: str, checkpoint: Checkpoint | None, env_id: str, envs: Any, 
     return StatePolicy(scripted, envs.unwrapped) if has_images else scripted
 
 
-def _run(
-    envs: Any,
-    policy: BatchPolicy,
-    disturb: Disturbance,
-    episodes: int,
-    seed: int,
-    on_progress: Callable[[int, int], None],
-) -> Collected:
-    done, running = Collected(), np.zeros(envs.num_envs, np.int64)
-    number, begun = np.arange(envs.num_envs), envs.num_envs
-    with closing(envs):
-        observations, _ = envs.reset(seed=seed)
-        policy.reset()
-        while done.episodes < episodes:
-            wanted = np.array(policy.act_batch(observations))
-            actions = disturb(wanted)
-            envs.extra = disturb.columns(wanted, actions)
-            observations, _, terminated, truncated, infos = envs.step(actions)
-            running += 1
-            ended = np.flatnonzero(terminated | truncated)
-            for i in ended.tolist():
-                if number[i] < episodes:
-                    done.episodes += 1
-                    done.steps += int(running[i])
-                    done.successes += bool(infos.get("final_info", {}).get("is_success", np.zeros(i + 1))[i])
-                number[i], begun, running[i] = begun, begun + 1, 0
-            if ended.size:
-                policy.reset(ended.tolist())
-                on_progress(done.episodes, episodes)
-    return done
-
-
 class Disturbance:
-    """Noise on actions of n environments, and random ones instead."""
+    """A policy with noise on its actions in n environments, and random ones instead."""
 
-    def __init__(self, space: gym.Space[Any], noise: float, random: float, num_envs: int, seed: int) -> None:
+    def __init__(self, policy: BatchPolicy, envs: Any, noise: float, random: float, seed: int) -> None:
+        space = envs.single_action_space
         if noise and not isinstance(space, gym.spaces.Box):
             raise SettingsError(f"--noise is for continuous actions, found {brief(space)}; use --random")
-        self._space, self._noise, self._random = space, noise, random
+        self._policy, self._space, self._noise, self._random = policy, space, noise, random
+        self.columns: dict[str, Array] = {}
+        """What a data set has of the next step beside its actions: ``raw_action`` and, where known, ``propensity``."""
         self._rng = np.random.default_rng([seed, 1])
-        self._draws = gym.vector.utils.batch_space(space, num_envs)
+        self._draws = gym.vector.utils.batch_space(space, envs.num_envs)
         self._draws.seed(seed + 1)
 
-    def __call__(self, actions: Array) -> Array:
+    def reset(self, env_ids: Any = None) -> None:
+        """Forget what the policy remembers of these environments."""
+        self._policy.reset(env_ids)
+
+    def act_batch(self, observations: Any) -> Array:
         """The actions that the environments get. Shape: (n, ...)."""
+        wanted = np.array(self._policy.act_batch(observations))
+        actions = self._disturbed(wanted)
+        self.columns.clear()
+        self.columns.update(self._columns(wanted, actions))
+        return actions
+
+    def _disturbed(self, actions: Array) -> Array:
         if not self._noise and not self._random:
             return actions
         disturbed = actions.copy()
@@ -189,8 +179,8 @@ class Disturbance:
         changed: Array = disturbed.astype(actions.dtype)
         return changed
 
-    def columns(self, wanted: Array, actions: Array) -> dict[str, Array]:
-        """What a data set has of a step beside `actions`: ``raw_action`` and, where it is known, ``propensity``.
+    def _columns(self, wanted: Array, actions: Array) -> dict[str, Array]:
+        """Of these actions instead of the wanted ones.
 
         Whole numbers have a probability, and so has a drawn action of a Box its density; noise that is cut at the
         bounds has neither.

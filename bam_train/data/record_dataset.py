@@ -21,6 +21,7 @@ from bam_train.data.episode import Array, DataSetInfo, Episode, Leaf, joined, le
 from bam_train.environments import AnyEnv, control_period
 from bam_train.errors import BadDataSet, SettingsError
 from bam_train.files.place import Place
+from bam_train.rollout import last_observations
 
 Keep = Callable[[int, "int | None"], bool]
 """Whether an episode is recorded, by its number in the order of beginning and its seed."""
@@ -387,7 +388,7 @@ class RecordVectorDataset(VectorWrapper):
         """Step every environment."""
         observations, rewards, terminated, truncated, infos = self.env.step(actions)
         ended: NDArray[np.bool_] = np.asarray(terminated) | np.asarray(truncated)
-        final = _where(ended, _turned(infos["final_obs"], observations), observations) if ended.any() else observations
+        final = last_observations(observations, infos, ended)
         columns = info_columns(infos, self.num_envs) | self.extra
         self._add(self._tracks.step(actions, final, rewards, terminated, truncated, columns))
         if ended.any():
@@ -407,28 +408,6 @@ def _batched(value: Any) -> Any:
     if isinstance(value, Mapping):
         return {key: _batched(one) for key, one in value.items()}
     return tuple(_batched(one) for one in value) if isinstance(value, tuple) else np.asarray(value)[None]
-
-
-def _where(ended: NDArray[np.bool_], final: Any, observations: Any) -> Any:
-    """The last observations of `ended` environments, the present ones of the others."""
-    if isinstance(observations, Mapping):
-        return {key: _where(ended, final[key], one) for key, one in observations.items()}
-    if isinstance(observations, tuple):
-        return tuple(_where(ended, *parts) for parts in zip(final, observations, strict=True))
-    merged = np.array(observations)
-    for i in np.flatnonzero(ended).tolist():
-        merged[i] = final[i]
-    return merged
-
-
-def _turned(final: Any, observations: Any) -> Any:
-    """Gymnasium's last observations, an array of one for each environment, nested as `observations` are."""
-    if isinstance(final, np.ndarray) and isinstance(observations, (Mapping, tuple)):
-        keys = observations.keys() if isinstance(observations, Mapping) else range(len(observations))
-        parts = {key: [None if one is None else one[key] for one in final] for key in keys}
-        nested = {key: _turned(_objects(parts[key]), observations[key]) for key in keys}
-        return nested if isinstance(observations, Mapping) else tuple(nested.values())
-    return final
 
 
 def _objects(values: list[Any]) -> Array:

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 from bam_envs.core.errors import SafetyStop, StaleState
 from bam_envs.core.registry import entry_of
@@ -18,6 +19,7 @@ from bam_train.env_location import SIMULATED
 from bam_train.environments import environment_of, make_env, require_fit
 from bam_train.errors import SettingsError
 from bam_train.evaluation import wilson_interval
+from bam_train.rollout import BatchPolicy, play, success_of
 
 HALTS_WITHIN = 1.0
 """Time from the start of an episode within which its halt is tried, while the robot moves [s]."""
@@ -125,12 +127,13 @@ class Rehearsal:
         straight = getattr(inner.task, "moves_straight", False)
         self._gate = rehearsed_robot(self._linked, profile=profile, guards=guards, straight=straight)
         inner.robot = self._gate
+        self._envs = SyncVectorEnv([lambda: self.env], autoreset_mode=AutoresetMode.DISABLED)
 
-    def run(self, policy: Any, *, episodes: int, seed: int, tell: Callable[[str], None]) -> RehearsalReport:
+    def run(self, policy: BatchPolicy, *, episodes: int, seed: int, tell: Callable[[str], None]) -> RehearsalReport:
         """Play `episodes`, at least 1; a stop by a guard ends its episode only.
 
         Args:
-            policy: Has ``reset()`` and ``act(observation)``: a `FrozenPolicy`.
+            policy: A `FrozenPolicy`.
             episodes: Number of episodes.
             seed: Seed of the first one.
             tell: Called with a line about each stop by a guard; the first line of each guard has the reason.
@@ -149,20 +152,19 @@ class Rehearsal:
         report.guards = self._gate.report()
         return report
 
-    def _play(self, policy: Any, report: RehearsalReport) -> None:
+    def _play(self, policy: BatchPolicy, report: RehearsalReport) -> None:
         """Play one episode; at a moment drawn from its seed a halt is tried, and the robot's state is then restored."""
         record = report.records[-1]
         halt_at = 1 + np.random.default_rng(record.seed).integers(round(HALTS_WITHIN / self._linked.spec.period))
-        observation, _ = self.env.reset(seed=record.seed)
-        policy.reset()
-        while record.end == "stopped":
-            observation, reward, terminated, truncated, info = self.env.step(policy.act(observation))
-            record.total, record.length = record.total + float(reward), record.length + 1
-            record.success = bool(info["is_success"])
-            record.end = "terminated" if terminated else "truncated" if truncated else "stopped"
+        for step in play(self._envs, policy, seed=record.seed):
+            record.total, record.length = record.total + float(step.rewards[0]), record.length + 1
+            record.success = success_of(step.infos, 0)
+            record.end = "terminated" if step.terminated[0] else "truncated" if step.truncated[0] else "stopped"
             if record.length == halt_at:
                 report.halts.append(time_to_stop(self._linked))
+            if step.ended:
+                return
 
     def close(self) -> None:
         """Close the environment."""
-        self.env.close()  # type: ignore[no-untyped-call]
+        self._envs.close()

@@ -37,15 +37,13 @@ from bam_train.estimation.fitted_q import fit_q
 from bam_train.estimation.paired_test import Pairs, Verdict, verdict_of
 from bam_train.estimation.steps import read_steps
 from bam_train.evaluation import (
-    EpisodeScore,
     default_num_envs,
-    first_of_each,
-    number_of_starts,
-    play_wave,
+    waves,
     wilson_interval,
 )
 from bam_train.finite_envs import FiniteVectorEnv
 from bam_train.policy import FrozenPolicy
+from bam_train.rollout import PlayedEpisode
 
 
 @dataclass(frozen=True)
@@ -108,24 +106,21 @@ def compare(
     env_id, kwargs = environment_of(champion, env)
     require_env_kwargs(env_id, env_kwargs or {})
     policies = [FrozenPolicy.from_checkpoint(one) for one in (candidate, champion)]
-    played: list[list[EpisodeScore]] = [[], []]
+    played: list[list[PlayedEpisode]] = [[], []]
     pairs = Pairs()
     width = num_envs or default_num_envs(env_id, episodes)
     with closing(make_vector_env(env_id, held_out(env_id, kwargs, env_kwargs or {}), width)) as envs:
         for one in (candidate, champion):
             require_fit(one, envs)
-        finite, begun, starts = FiniteVectorEnv(envs, env_id), 0, number_of_starts(envs)
-        seen: list[set[int]] = [set(), set()]
-        episodes = min(episodes, starts or episodes)
-        while len(pairs) < episodes and not pairs.is_decided(margin):
-            count = envs.num_envs if starts else min(envs.num_envs, episodes - len(pairs))
-            waves = [play_wave(finite, policy, seed + begun, count) for policy in policies]
-            wave = [first_of_each(one, known) for one, known in zip(waves, seen, strict=True)]
-            begun += count
+        finite = FiniteVectorEnv(envs, env_id)
+        sides = [waves(finite, policy, episodes=episodes, seed=seed) for policy in policies]
+        for wave in zip(*sides, strict=True):
             for all_of_it, new in zip(played, wave, strict=True):
                 all_of_it += new
             pairs += count_pairs(*wave)
             on_progress(len(pairs), pairs)
+            if pairs.is_decided(margin):
+                break
     return _comparison(env_id, played, pairs, margin, seed)
 
 
@@ -140,7 +135,7 @@ def require_comparable(candidate: Checkpoint, champion: Checkpoint) -> None:
             raise CheckpointMismatch(candidate.path, f"{text}; a gate compares policies that see and do the same")
 
 
-def count_pairs(candidate: list[EpisodeScore], champion: list[EpisodeScore]) -> Pairs:
+def count_pairs(candidate: list[PlayedEpisode], champion: list[PlayedEpisode]) -> Pairs:
     """Who wins each pair of episodes: by success, or by return where success is not reported."""
     by_success = all(one.success is not None for one in (*candidate, *champion))
     scores = [[float(one.success or 0) if by_success else one.total for one in side] for side in (candidate, champion)]
@@ -149,7 +144,7 @@ def count_pairs(candidate: list[EpisodeScore], champion: list[EpisodeScore]) -> 
     return Pairs(wins, len(candidate) - wins - losses, losses)
 
 
-def _comparison(env: str, played: list[list[EpisodeScore]], pairs: Pairs, margin: float, seed: int) -> Comparison:
+def _comparison(env: str, played: list[list[PlayedEpisode]], pairs: Pairs, margin: float, seed: int) -> Comparison:
     known = [[one.success is not None for one in side] for side in played]
     by_success = all(map(all, known))
     if not by_success and any(map(any, known)):

@@ -2,30 +2,24 @@
 
 from bam_train.evaluation.evaluation import (
     FIRST_SEED,
-    BatchPolicy,
-    EpisodeScore,
     EvaluationReport,
     default_num_envs,
     evaluate,
-    first_of_each,
     number_of_starts,
-    play_wave,
     record_video,
     summarise,
+    waves,
     wilson_interval,
 )
 
 __all__ = [
     "FIRST_SEED",
-    "BatchPolicy",
-    "EpisodeScore",
     "EvaluationReport",
     "default_num_envs",
     "evaluate",
-    "first_of_each",
     "number_of_starts",
-    "play_wave",
     "record_video",
     "summarise",
+    "waves",
     "wilson_interval",
 ]

@@ -5,9 +5,12 @@ of one episode each; the steps after the end of an episode, while others are sti
 """
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import closing, nullcontext
 from dataclasses import asdict, dataclass
-from typing import Any, Protocol
+from functools import partial
+from operator import gt
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -16,42 +19,14 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from bam_envs.core.validation import NonNegativeInt, PositiveInt, check
 from bam_train.environments import is_batched, make_vector_env
 from bam_train.errors import SettingsError
-from bam_train.files.video import Frame
+from bam_train.files.video import Frame, picture
 from bam_train.finite_envs import FiniteVectorEnv
-from bam_train.loop import Agent, Agents, PolicyAgent, RobotAgent, TemporalAgent, VecGymAgent, Workspace
-from bam_train.loop.gym.gym_spaces import names
-from bam_train.loop.gym.video_agent import VideoAgent
+from bam_train.rollout import BatchPolicy, PlayedEpisode, rollout
 
 FIRST_SEED = 1_000_000
 """The default seed of the first episode: far from the small seeds that training uses."""
 
 _Z95 = 1.959963984540054  # 97.5 % quantile of the normal distribution, for a two-sided 95 % interval
-
-
-class BatchPolicy(Protocol):
-    """A policy that can be evaluated: a `FrozenPolicy`, or an adapter of a trainer's model."""
-
-    def reset(self, env_ids: Any = None) -> None:
-        """Forget the recurrent state of `env_ids` (indices), or of all environments."""
-
-    def act_batch(self, observations: Any) -> Any:
-        """Actions for a batch of observations. Shapes: (n, ...) -> (n, ...)."""
-
-
-@dataclass(frozen=True)
-class EpisodeScore:
-    """One counted episode."""
-
-    seed: int
-    """Seed of its reset."""
-    total: float
-    """Undiscounted sum of its rewards."""
-    length: int
-    """Number of steps."""
-    success: bool | None
-    """`is_success` in the info of its last step; None if the environment does not report it."""
-    start: int | None = None
-    """Number of its start where there are so many and no more, such as pictures of a test split."""
 
 
 @dataclass(frozen=True)
@@ -96,8 +71,8 @@ def wilson_interval(successes: int, episodes: int) -> tuple[float, float]:
     return low, high
 
 
-def summarise(env: str, episodes: Sequence[EpisodeScore], starts: int | None = None) -> EvaluationReport:
-    """The report over `episodes` (at least one), which are in the order of their seeds."""
+def summarise(env: str, episodes: Sequence[PlayedEpisode], seed: int, starts: int | None = None) -> EvaluationReport:
+    """The report over `episodes` (at least one), of which the first has this seed."""
 
     def finite(value: float) -> float | None:
         return float(value) if math.isfinite(value) else None
@@ -108,7 +83,7 @@ def summarise(env: str, episodes: Sequence[EpisodeScore], starts: int | None = N
     return EvaluationReport(
         env=env,
         episodes=n,
-        seed=episodes[0].seed,
+        seed=seed,
         successes=successes if known else None,
         success_rate=successes / n if known else None,
         success_interval=wilson_interval(successes, n) if known else None,
@@ -153,25 +128,17 @@ def evaluate(
     check(seed, NonNegativeInt, "seed", SettingsError)
     check(episodes, PositiveInt, "episodes", SettingsError)
     check(num_envs, PositiveInt | None, "num_envs", SettingsError)
-    is_new = env is None
-    if env is None:
-        env = make_vector_env(env_id, env_kwargs, num_envs or default_num_envs(env_id, episodes))
-    elif env.metadata.get("autoreset_mode") is not AutoresetMode.SAME_STEP:
+    if env is not None and env.metadata.get("autoreset_mode") is not AutoresetMode.SAME_STEP:
         raise SettingsError(f"env: expected autoreset mode SAME_STEP, found {env.metadata.get('autoreset_mode')}")
-    finite, done, seen = FiniteVectorEnv(env, env_id), list[EpisodeScore](), set[int]()
-    starts = number_of_starts(env)
-    wanted, played = min(episodes, starts or episodes), 0
-    try:
-        while len(done) < wanted:
-            count = min(env.num_envs, wanted - len(done)) if starts is None else env.num_envs
-            done += first_of_each(play_wave(finite, policy, seed + played, count), seen)
-            played += count
+    num_envs = num_envs or default_num_envs(env_id, episodes)
+    made = nullcontext(env) if env is not None else closing(make_vector_env(env_id, env_kwargs, num_envs))
+    with made as envs:
+        starts, done = number_of_starts(envs), list[PlayedEpisode]()
+        for wave in waves(FiniteVectorEnv(envs, env_id), policy, episodes=episodes, seed=seed):
+            done += wave
             if on_progress is not None:
-                on_progress(min(len(done), wanted), wanted)
-    finally:
-        if is_new:
-            env.close()
-    return summarise(env_id, done[:wanted], starts)
+                on_progress(len(done), min(episodes, starts or episodes))
+    return summarise(env_id, done, seed, starts)
 
 
 def number_of_starts(env: VectorEnv[Any, Any, Any]) -> int | None:
@@ -180,36 +147,30 @@ def number_of_starts(env: VectorEnv[Any, Any, Any]) -> int | None:
     return count
 
 
-def first_of_each(episodes: Sequence[EpisodeScore], seen: set[int]) -> list[EpisodeScore]:
-    """The episodes whose start is not one of `seen`, to which theirs are added: a second one would say the same."""
-    found = []
-    for one in episodes:
-        found += [] if one.start in seen else [one]
-        seen |= set() if one.start is None else {one.start}
-    return found
+def waves(
+    env: VectorEnv[Any, Any, Any], policy: BatchPolicy, *, episodes: int, seed: int
+) -> Iterator[list[PlayedEpisode]]:
+    """Play `episodes` episodes, one in each environment at a time; yields those of each wave that count.
 
-
-def play_wave(env: VectorEnv[Any, Any, Any], policy: BatchPolicy, seed: int, count: int) -> list[EpisodeScore]:
-    """Play one episode in each of the first `count` environments; every environment i gets the seed ``seed + i``."""
-    batch = _Batch(lambda: env, auto_reset=False, arrays="numpy", info_keys=("is_success",))
-    acting = PolicyAgent(policy, [f"env/{name}" for name in names(env.single_observation_space)])
-    workspace, wave = Workspace(window=2), _Wave(count, env)
-    seeds = [seed + i for i in range(env.num_envs)]
-    loop = TemporalAgent(Agents(batch, wave, acting))
-    loop(workspace, t=0, stop_variable="wave/done", seed=seeds)
-    last = {name: workspace.get(name, -1) for name in workspace}  # repeats until all have ended
-
-    def success(i: int) -> bool | None:
-        is_reported = "env/info/is_success" in last and last["env/info/_is_success"][i]
-        return bool(last["env/info/is_success"][i]) if is_reported else None
-
-    totals, lengths = last["env/cumulated_reward"], last["env/timestep"]
-    return [
-        EpisodeScore(
-            seed + i, float(totals[i]), int(lengths[i]), success(i), None if wave.starts is None else wave.starts[i]
-        )
-        for i in range(count)
-    ]
+    Episode k starts from ``reset(seed=seed + k)``. Where there are so many starts and no more, such as pictures of a
+    test split, an episode counts if its start is new: a second one would say the same.
+    """
+    inner: Any = env.unwrapped
+    starts, played, seen = number_of_starts(env), 0, set[int]()
+    left, drawn = min(episodes, starts or episodes), None if starts is None else lambda *_: (inner.task.drawn,)
+    while left:
+        count = env.num_envs if starts else min(env.num_envs, left)
+        ended = rollout(env, policy, seed=seed + played, keep=partial(gt, count), parts=drawn)
+        wave = sorted(ended, key=lambda one: one.env_id)
+        if starts is not None:
+            first: dict[int, PlayedEpisode] = {}
+            for one in wave:
+                first.setdefault(int(one.parts[0][0]), one)
+            wave = [one for start, one in first.items() if start not in seen]
+            seen.update(first)
+        wave = wave[:left]
+        left, played = left - len(wave), played + count
+        yield wave
 
 
 def record_video(env: gym.Env[Any, Any], policy: Any, add: Callable[[Frame], Any], *, episodes: int, seed: int) -> int:
@@ -225,39 +186,18 @@ def record_video(env: gym.Env[Any, Any], policy: Any, add: Callable[[Frame], Any
     Returns:
         The number of pictures.
     """
-    robot, video = RobotAgent(env), VideoAgent(env, add)
-    loop = TemporalAgent(Agents(robot, video, PolicyAgent(policy, robot.observation_names, single=True)))
+    count = 0
     for k in range(episodes):
-        loop(Workspace(window=2), t=0, stop_variable="env/done", seed=seed + k)
-    return video.count
-
-
-class _Batch(VecGymAgent):
-    """An environment of the caller, which an exception does not close."""
-
-    def close(self) -> None:
-        """Nothing."""
-
-
-class _Wave(Agent):
-    """Writes ``wave/done`` (B,) bool: True for environments that have ended and for those that are not counted."""
-
-    reads = ("env/done",)
-    writes = ("wave/done",)
-
-    def __init__(self, count: int, env: VectorEnv[Any, Any, Any]) -> None:
-        super().__init__()
-        self._count, self._env = count, env
-        self.starts: list[int] | None = None
-        """Number of the start of each environment, where there are so many and no more."""
-
-    def forward(self, t: int, **kwargs: Any) -> None:
-        if t == 0 and number_of_starts(self._env) is not None:
-            inner: Any = self._env.unwrapped
-            self.starts = inner.task.drawn.tolist()
-        done = self.get(("env/done", t)).copy()
-        done[self._count :] = True
-        self.set(("wave/done", t), done)
+        observation, _ = env.reset(seed=seed + k)
+        policy.reset()
+        is_over = False
+        while not is_over:
+            add(picture(env))
+            observation, _, terminated, truncated, _ = env.step(policy.act(observation))
+            is_over, count = terminated or truncated, count + 1
+        add(picture(env))
+        count += 1
+    return count
 
 
 def default_num_envs(env_id: str, episodes: int) -> int:

@@ -5,19 +5,21 @@ import datetime
 import functools
 import platform
 import subprocess
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
 from typing import Any, Protocol
 
+import numpy as np
 from gymnasium import Space
 from gymnasium.vector import VectorEnv
 
 from bam_envs.core.spaces import space_to_json
 from bam_train.checkpoint import Checkpoint
 from bam_train.policy import FrozenPolicy
+from bam_train.rollout import PlayedEpisode
 from bam_train.settings import TrainSettings
 
 
@@ -35,6 +37,18 @@ class Statistics:
     """Share of successful episodes; None too if the environment does not report success."""
     metrics: dict[str, float]
     """Finite numbers of the trainer, such as train/loss."""
+
+    @classmethod
+    def of(cls, episodes: Collection[PlayedEpisode], metrics: Mapping[str, float]) -> "Statistics":
+        """The means over `episodes`."""
+        known = [one.success for one in episodes if one.success is not None]
+        return cls(
+            episodes=len(episodes),
+            return_mean=float(np.mean([one.total for one in episodes])) if episodes else None,
+            length_mean=float(np.mean([one.length for one in episodes])) if episodes else None,
+            success_rate=float(np.mean(known)) if known else None,
+            metrics=dict(metrics),
+        )
 
 
 @dataclass(frozen=True)

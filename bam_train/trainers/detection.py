@@ -16,8 +16,8 @@ from bam_train.checkpoint.detector import DETECTOR, LEAST_TICKS, MOST_NUMBERS, D
 from bam_train.data.episode import Episode
 from bam_train.environments import make_vector_env
 from bam_train.errors import NoDetector
-from bam_train.evaluation import BatchPolicy
 from bam_train.finite_envs import FiniteVectorEnv
+from bam_train.rollout import BatchPolicy, rollout
 
 SEED = 4_000_000
 """First seed of the episodes, far from those of training and evaluations."""
@@ -96,37 +96,28 @@ def fresh_episodes(
 
     A robot that is slower, see `LiveLike`, has more time in proportion.
     """
-    finite, n = FiniteVectorEnv(envs, env), envs.num_envs
     inner: Any = envs.unwrapped
     robot = inner.robot if isinstance(inner, RobotVectorEnv) else None
-    limit, paces = getattr(inner, "max_episode_steps", None), np.ones(n)
-    observation, _ = finite.reset(seed=[seed + i for i in range(n)])
-    policy.reset()
-    running: list[list[tuple[Any, ...]] | None] = [[] for _ in range(n)]  # None: what runs there is not counted
-    done, count = list[Rollout](), 0
-    for _ in range(steps):  # an episode of that many steps has no end
+    limit = getattr(inner, "max_episode_steps", None)
+
+    def seen(observations: Any, actions: Any) -> tuple[Any, ...]:
+        paces = robot.pace if isinstance(robot, LiveLike) else np.ones(envs.num_envs)
         if isinstance(robot, LiveLike):
-            paces = robot.pace
             inner.max_episode_steps = None if limit is None else np.ceil(limit / paces)
-        sent = np.zeros((n, 0)) if robot is None else inner.state.command
-        action = np.asarray(policy.act_batch(observation))
-        after, _, terminated, truncated, info = finite.step(action)
-        for i, steps_of in enumerate(running):
-            if steps_of is not None:
-                steps_of.append((observation[i], action[i], sent[i]))
-        ended = np.flatnonzero(terminated | truncated)
-        for i in ended.tolist():
-            steps_of = running[i]
-            if steps_of is None:
-                continue
-            count += len(steps_of)
-            success = info.get("final_info", {}).get("is_success")
-            seen, acted, commands = (np.array(part) for part in zip(*steps_of, strict=True))
-            is_success = None if success is None else bool(success[i])
-            done.append(Rollout(seen, acted, is_success, None if robot is None else commands, pace=float(paces[i])))
-            running[i] = [] if count < steps else None
-        if not any(one is not None for one in running):
-            break
-        policy.reset(ended)
-        observation = after
+        return observations, actions, np.zeros((len(paces), 0)) if robot is None else inner.state.command, paces
+
+    done, count = list[Rollout](), 0
+    played = rollout(
+        FiniteVectorEnv(envs, env),
+        policy,
+        seed=seed,
+        keep=lambda _: count < steps,
+        parts=seen,
+        limit=steps,  # an episode of that many steps has no end
+    )
+    for episode in played:
+        count += episode.length
+        observed, acted, sent, paces = episode.parts
+        commands = None if robot is None else sent
+        done.append(Rollout(observed, acted, episode.success, commands, pace=float(paces[-1])))
     return done

@@ -19,8 +19,9 @@ from bam_envs.core.errors import BamEnvsError, RobotFault
 from bam_train.checkpoint import Checkpoint
 from bam_train.checkpoint.detector import DETECTOR, LEAST_TICKS
 from bam_train.errors import BamTrainError, EnvironmentFailed, NoDetector, OutputError, ProcessesLost, TrainingFailed
-from bam_train.evaluation import BatchPolicy, EvaluationReport, evaluate
+from bam_train.evaluation import EvaluationReport, evaluate
 from bam_train.policy import FrozenPolicy
+from bam_train.rollout import BatchPolicy
 from bam_train.settings import TrainSettings
 from bam_train.trainers.base import Progress, Statistics, Trainer
 from bam_train.trainers.detection import WANTED, add_detector, add_own_detector

@@ -8,13 +8,13 @@ import pytest
 from bam_train.environments import make_vector_env
 from bam_train.errors import PolicyError, SettingsError
 from bam_train.evaluation import (
-    EpisodeScore,
     default_num_envs,
     evaluate,
-    play_wave,
     summarise,
+    waves,
     wilson_interval,
 )
+from bam_train.rollout import PlayedEpisode
 from tests.bam_envs.making import EACH
 
 
@@ -76,15 +76,15 @@ def test_time_limit_and_no_success_where_the_environment_has_none(corridor):
     assert json.loads(json.dumps(report.to_json(), allow_nan=False))["success_rate"] is None
 
 
-def test_recurrent_state_is_forgotten_at_the_start_of_every_wave(corridor, starting_cell):
+def test_recurrent_state_is_forgotten_at_the_start_of_every_episode(corridor, starting_cell):
     policy = Always(1)
     rows = make_vector_env(corridor, None, 2)
     seed = next(seed for seed in range(100) if starting_cell(seed) == 3 and starting_cell(seed + 1) == 2)
-    waves = [play_wave(rows, policy, seed, 2) for _ in range(2)]
+    played = [wave for _ in range(2) for wave in waves(rows, policy, episodes=2, seed=seed)]
     rows.close()
-    assert [[episode.length for episode in wave] for wave in waves] == [[1, 2], [1, 2]]
-    assert policy.forgotten == [None, None]
-    assert len(policy.batches) == 6  # at the end of an episode too, for nobody
+    assert [[episode.length for episode in wave] for wave in played] == [[1, 2], [1, 2]]
+    assert policy.forgotten == [None, [0], None, [0]]
+    assert len(policy.batches) == 4
 
 
 def test_a_given_environment_is_used_again_and_left_open(corridor):
@@ -128,7 +128,7 @@ def test_an_action_that_is_not_finite_is_refused_and_a_given_environment_left_op
 
 
 def test_returns_that_are_not_finite_are_none():
-    report = summarise("e", [EpisodeScore(0, float("nan"), 1, None), EpisodeScore(1, 1.0, 3, None)])
+    report = summarise("e", [PlayedEpisode(0, float("nan"), 1, None), PlayedEpisode(1, 1.0, 3, None)], 0)
     assert (report.return_mean, report.return_std, report.return_min, report.return_max) == (None, None, None, None)
     assert (report.length_mean, report.length_std) == (2.0, 1.0)
     json.dumps(report.to_json(), allow_nan=False)

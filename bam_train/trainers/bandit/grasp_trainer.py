@@ -22,6 +22,7 @@ from bam_envs.core.validation import read_table
 from bam_train.checkpoint import Checkpoint
 from bam_train.environments import make_env, make_vector_env, require_fit
 from bam_train.errors import SettingsError, TrainingFailed
+from bam_train.rollout import PlayedEpisode, play
 from bam_train.settings import TrainSettings
 from bam_train.trainers.algorithms import BANDIT_ALGORITHMS
 from bam_train.trainers.bandit.grasp_network import EDGE, HEIGHT_UNIT, Bytes, GraspNetwork, GraspPolicy, Grid
@@ -57,7 +58,7 @@ class GraspQ:
 
 
 class GraspTrainer(TorchTrainer):
-    """Made by `create` or `load`."""
+    """Made by `create` or `load`; the policy that is played chooses what to try."""
 
     def __init__(self, settings: TrainSettings) -> None:
         super().__init__(settings)
@@ -71,9 +72,11 @@ class GraspTrainer(TorchTrainer):
         self._patches: Bytes = np.zeros((0, EDGE, EDGE), np.uint8)
         self._widths, self._rewards = np.zeros(0, np.int64), np.zeros(0, np.float32)
         self._due = 0.0
-        self._recent: deque[tuple[float, bool]] = deque(maxlen=_RECENT)
+        self._recent: deque[PlayedEpisode] = deque(maxlen=_RECENT)
         self._metrics: dict[str, float] = {}
         self._observation: Any = None
+        self._playing = play(self.envs, self, seed=settings.seed)
+        self._tried: tuple[Any, ...] = ()  # patches and widths of the last grasps
         self._table = 0.0  # depth of the table [m]
 
     @classmethod
@@ -107,9 +110,10 @@ class GraspTrainer(TorchTrainer):
             trainer._rng.bit_generator.state = state["rng"]
             torch.set_rng_state(state["torch"])
             trainer._table, trainer._due, trainer._steps = state["table"], state["due"], len(trainer._rewards)
-            trainer._recent.extend((reward, bool(success)) for reward, success in state["recent"])
+            trainer._recent += [PlayedEpisode(None, reward, 1, bool(success)) for reward, success in state["recent"]]
             if state["envs"] is not None:
                 trainer._observation = trainer.envs.unwrapped.load_state_dict(state["envs"])
+                trainer._playing = play(trainer.envs, trainer, observations=trainer._observation)
         return trainer
 
     def train(self, steps: int, on_progress: OnProgress) -> None:
@@ -127,27 +131,33 @@ class GraspTrainer(TorchTrainer):
 
     def _try_grasps(self) -> None:
         """Grasp once in every environment, and keep what came of it."""
-        if self._observation is None:
-            self._observation, _ = self.envs.reset(seed=self.settings.seed)
-        depth = self._observation["depth"].reshape(self.envs.num_envs, self._grid.rows, self._grid.columns)
-        if not self._table:
-            self._table = float(np.median(depth))
-        heights = ((self._table - depth) / HEIGHT_UNIT).round().clip(0, 255).astype(np.uint8)
-        tried = self._choose(heights)
-        patches = self._grid.patches(heights, *tried[:3])
-        actions = self._grid.actions(*tried).astype(self.spaces[1].dtype)
-        self._observation, rewards, _, _, infos = self.envs.step(actions)
+        step = next(self._playing)
+        self._observation, rewards = step.observations, step.rewards
         if not ((rewards >= 0) & (rewards <= 1)).all():
             raise TrainingFailed(
                 f"a grasp was rewarded with {rewards.min():g} to {rewards.max():g}: grasp-q learns the probability of "
                 "success, from rewards between 0 and 1"
             )
-        success = infos.get("final_info", {}).get("is_success", rewards > 0)
-        self._recent.extend(zip(rewards.tolist(), success.tolist(), strict=True))
+        for one in step.ended:
+            self._recent.append(one if one.success is not None else dataclasses.replace(one, success=one.total > 0))
+        patches, widths = self._tried
         self._patches = np.concatenate([self._patches, patches])
-        self._widths = np.concatenate([self._widths, tried[3]])
+        self._widths = np.concatenate([self._widths, widths])
         self._rewards = np.concatenate([self._rewards, rewards.astype(np.float32)])
         self._steps += len(rewards)
+
+    def reset(self, env_ids: Any = None) -> None:
+        """Nothing: it has no memory."""
+
+    def act_batch(self, observations: Any) -> Any:
+        """The grasps to try."""
+        depth = observations["depth"].reshape(self.envs.num_envs, self._grid.rows, self._grid.columns)
+        if not self._table:
+            self._table = float(np.median(depth))
+        heights = ((self._table - depth) / HEIGHT_UNIT).round().clip(0, 255).astype(np.uint8)
+        tried = self._choose(heights)
+        self._tried = self._grid.patches(heights, *tried[:3]), tried[3]
+        return self._grid.actions(*tried).astype(self.spaces[1].dtype)
 
     def _choose(self, heights: Bytes) -> tuple[Any, Any, Any, Any]:
         """Column, row, rotation and width of the grasp to try in each picture (n, h, w). Shape: (n,) each."""
@@ -193,10 +203,7 @@ class GraspTrainer(TorchTrainer):
         self._metrics = {"loss": loss.item()}
 
     def _statistics(self) -> Statistics:
-        known = np.array(self._recent, np.float64).reshape(-1, 2)
-        mean, success = known.mean(axis=0).tolist() if len(known) else (None, None)
-        length = 1.0 if len(known) else None
-        return Statistics(len(known), mean, length, success, dict(self._metrics))
+        return Statistics.of(self._recent, self._metrics)
 
     def policy(self) -> GraspPolicy:
         """A copy of the network, which looks at whole pictures."""
@@ -215,7 +222,7 @@ class GraspTrainer(TorchTrainer):
             "rng": dict(self._rng.bit_generator.state),
             "table": self._table,
             "due": self._due,
-            "recent": [list(one) for one in self._recent],
+            "recent": [[one.total, one.success] for one in self._recent],
             "envs": getattr(self.envs.unwrapped, "state_dict", lambda: None)(),
         }
 

@@ -17,6 +17,7 @@ from msgspec import Meta
 from torch.nn import functional
 
 from bam_envs.core.spaces import leaves
+from bam_train.rollout import PlayedEpisode, play
 from bam_train.trainers.base import Statistics
 from bam_train.trainers.imitation.imitation_network import ImitationNetwork
 from bam_train.trainers.imitation.teacher import Teacher
@@ -81,7 +82,7 @@ class TaughtSteps:
 
 
 class DaggerLearner:
-    """The learner, its teacher, and the environments that both act in."""
+    """The learner, its teacher, and the environments that both act in: the policy that is played there."""
 
     def __init__(self, values: Dagger, seed: int, envs: Any, teacher: Teacher) -> None:
         self.values, self.envs, self.teacher = values, envs, teacher
@@ -92,11 +93,10 @@ class DaggerLearner:
         self._optimiser = torch.optim.Adam(self.network.parameters(), lr=values.learning_rate)
         self._experience = TaughtSteps(seen, values.memory, *sizes)
         self._rng = np.random.default_rng(seed)
-        self._observation: Any = None
+        self._playing = play(envs, self, seed=seed)
         self._taught = self._draw_taught(envs.num_envs, 0.0)  # where the teacher acts in this episode
-        self._running = np.zeros((2, envs.num_envs))  # return and length of the running episodes
-        self._ended: deque[tuple[float, float, bool | None]] = deque(maxlen=_RECENT)
-        self._due, self._seed, self._refill = 0.0, seed, 0
+        self._ended: deque[PlayedEpisode] = deque(maxlen=_RECENT)
+        self._due, self._refill = 0.0, 0
         self.metrics: dict[str, float] = {}
 
     def _tensors(self, observation: Any) -> list[torch.Tensor]:
@@ -104,22 +104,31 @@ class DaggerLearner:
         return [torch.as_tensor(np.ascontiguousarray(one)) for one in each]
 
     def step(self, done: float) -> int:
-        """Step every environment once, when a share `done` of the run is over; returns the number of steps."""
-        if self._observation is None:
-            self._observation, _ = self.envs.reset(seed=self._seed)
-            self.teacher.reset()
-        observed = self._tensors(self._observation)
-        wanted, states = self.teacher(self._observation)
+        """Step every environment once, when a share `done` of the run is over; returns the number of steps.
+
+        The learner's own episodes count; who acts in an episode is drawn when it begins.
+        """
+        step = next(self._playing)
+        self._ended += [one for one in step.ended if not self._taught[one.env_id]]
+        if step.ended:
+            self._taught[[one.env_id for one in step.ended]] = self._draw_taught(len(step.ended), done)
+        self._due += len(step.rewards) * self.values.passes / self.values.batch_size
+        return len(step.rewards)
+
+    def reset(self, env_ids: Any = None) -> None:
+        """Let the teacher forget these environments, or all."""
+        self.teacher.reset(env_ids)
+
+    def act_batch(self, observations: Any) -> Any:
+        """Actions for all environments, once the teacher's are remembered."""
+        observed = self._tensors(observations)
+        wanted, states = self.teacher(observations)
         codes = self._code.encode(wanted)
         self.network.learn_moments(dict(zip(self._keys, observed, strict=True)))
         if states is not None:
             self.network.seen.learn(torch.as_tensor(states))
         self._experience.add(observed, codes, states)
-        actions = wanted if self._taught.all() else self._mixed(wanted, observed)
-        self._observation, rewards, terminated, truncated, infos = self.envs.step(actions)
-        self._count(rewards, terminated | truncated, infos, done)
-        self._due += len(rewards) * self.values.passes / self.values.batch_size
-        return len(rewards)
+        return wanted if self._taught.all() else self._mixed(wanted, observed)
 
     def _mixed(self, wanted: Any, observed: list[torch.Tensor]) -> Any:
         """The learner's actions, and the teacher's in the episodes that it acts in."""
@@ -128,20 +137,6 @@ class DaggerLearner:
         scores = scores if self._code.is_discrete else scores.clamp(-1, 1)
         own = self._code.decode(scores, self.envs.single_action_space)
         return np.where(self._taught.reshape(-1, *[1] * (own.ndim - 1)), wanted, own).astype(own.dtype)
-
-    def _count(self, rewards: Any, ended: Any, infos: Any, done: float) -> None:
-        """Note the episodes that ended, and draw who acts in the next ones; the learner's own count."""
-        self._running += [rewards, np.ones(len(rewards))]
-        rows = np.flatnonzero(ended)
-        success = infos.get("final_info", {}).get("is_success")
-        for row in rows.tolist():
-            if not self._taught[row]:
-                total, length = self._running[:, row].tolist()
-                self._ended.append((total, length, None if success is None else bool(success[row])))
-        self._running[:, rows] = 0.0
-        if rows.size:
-            self._taught[rows] = self._draw_taught(rows.size, done)
-            self.teacher.reset(rows)
 
     def _draw_taught(self, episodes: int, done: float) -> Any:
         """In which of these new episodes the teacher acts: in all at first, in none after its share of the run."""
@@ -177,15 +172,7 @@ class DaggerLearner:
 
     def statistics(self) -> Statistics:
         """Means over the learner's last episodes."""
-        totals, lengths = [one[0] for one in self._ended], [one[1] for one in self._ended]
-        known = [success for _, _, success in self._ended if success is not None]
-        return Statistics(
-            episodes=len(totals),
-            return_mean=float(np.mean(totals)) if totals else None,
-            length_mean=float(np.mean(lengths)) if lengths else None,
-            success_rate=float(np.mean(known)) if known else None,
-            metrics=dict(self.metrics),
-        )
+        return Statistics.of(self._ended, self.metrics)
 
     def state_dict(self) -> dict[str, Any]:
         """Weights, optimiser and random numbers; the experience is collected anew."""
@@ -201,6 +188,6 @@ class DaggerLearner:
         self.network.load_state_dict(state["network"])
         self._optimiser.load_state_dict(state["optimiser"])
         self._rng.bit_generator.state = state["rng"]
-        self._seed = int(self._rng.integers(2**31))
+        self._playing = play(self.envs, self, seed=int(self._rng.integers(2**31)))
         self._refill = min(int(state["steps"]), 100 * self.envs.num_envs)
         self._taught = self._draw_taught(self.envs.num_envs, done)

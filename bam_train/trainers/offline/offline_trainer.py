@@ -139,10 +139,7 @@ class OfflineTrainer(TorchTrainer):
                 return
 
     def _statistics(self) -> Statistics:
-        metrics = dict(self.learner.metrics)
-        if self._online is not None:
-            return self._online.statistics(metrics)
-        return Statistics(episodes=0, return_mean=None, length_mean=None, success_rate=None, metrics=metrics)
+        return Statistics.of(() if self._online is None else self._online.ended, self.learner.metrics)
 
     @functools.cached_property
     def described(self) -> tuple[dict[str, Any], float | None]:

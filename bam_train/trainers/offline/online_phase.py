@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -10,8 +11,8 @@ import torch
 
 from bam_train.environments import make_vector_env
 from bam_train.errors import SettingsError
+from bam_train.rollout import PlayedEpisode, PlayedStep, play
 from bam_train.settings import TrainSettings
-from bam_train.trainers.base import Statistics
 from bam_train.trainers.offline.implicit_q import ImplicitQLearner
 from bam_train.trainers.offline.training_data import ActionCode, Normaliser, TrainingBatch
 
@@ -21,41 +22,48 @@ _DONE = 0.5  # the learning rate stays at half of the first one
 
 
 class OnlinePhase:
-    """The environments of a run that went online, and what was seen in them."""
+    """The environments of a run that went online, what was seen in them, and the policy that explores there."""
 
     def __init__(self, settings: TrainSettings, normaliser: Normaliser, code: ActionCode, reward_scale: float) -> None:
         self.envs: Any = make_vector_env(settings.env, settings.env_kwargs, settings.num_envs, settings.place)
         self._normaliser, self._code, self._reward_scale = normaliser, code, reward_scale
         self._rng = np.random.default_rng(settings.seed)
-        self._observation: Any = None
+        self._playing: Iterator[PlayedStep] | None = None
+        self._learner: Any = None
+        self._acted: Any = None  # observations and codes of the last step
         self._own: TrainingBatch | None = None  # a ring buffer
         self._added, self._due = 0, 0.0
-        self._running = np.zeros((2, self.envs.num_envs))  # return and length of the running episodes
-        self._ended: deque[tuple[float, float, bool | None]] = deque(maxlen=_RECENT)
+        self.ended: deque[PlayedEpisode] = deque(maxlen=_RECENT)
+        """The last episodes."""
 
     def step(self, learner: ImplicitQLearner) -> int:
         """Step all environments once, then do the updates that are due; returns the number of steps."""
         if learner.iql is None:
             raise SettingsError("online: behaviour cloning has no critics to go on with; train with --algo iql first")
-        if self._observation is None:
-            self._observation, _ = self.envs.reset(seed=int(self._rng.integers(2**31)))
-        seen = self._normaliser(self._observation)
-        codes = self._explore(learner, seen, learner.iql.exploration)
-        actions = self._code.decode(codes, self.envs.single_action_space)
-        after, rewards, terminated, truncated, infos = self.envs.step(actions)
-        ended = terminated | truncated
-        following = _with_last(after, infos["final_obs"], ended) if ended.any() else after
-        reward = torch.as_tensor(rewards / self._reward_scale, dtype=torch.float32)
-        self._keep(TrainingBatch(seen, codes, reward, self._normaliser(following), torch.as_tensor(terminated).float()))
-        self._count(rewards, ended, infos)
-        self._observation = after
-        self._due += len(rewards) * learner.iql.update_ratio
+        self._learner = learner
+        self._playing = self._playing or play(self.envs, self, seed=int(self._rng.integers(2**31)))
+        step = next(self._playing)
+        seen, codes = self._acted
+        reward = torch.as_tensor(step.rewards / self._reward_scale, dtype=torch.float32)
+        terminated = torch.as_tensor(step.terminated).float()
+        self._keep(TrainingBatch(seen, codes, reward, self._normaliser(step.following), terminated))
+        self.ended += step.ended
+        self._due += len(reward) * learner.iql.update_ratio
         size = learner.settings.batch_size
         while self._due >= 1:
             self._due -= 1
             recorded = learner.data.rows(torch.randint(len(learner.data), (size - size // 2,)))
             learner.update_online(self._drawn(size // 2).joined(recorded), _DONE)
-        return len(rewards)
+        return len(reward)
+
+    def reset(self, env_ids: Any = None) -> None:
+        """Nothing: it has no memory."""
+
+    def act_batch(self, observations: Any) -> Any:
+        """Actions of the learner, with noise."""
+        seen = self._normaliser(observations)
+        self._acted = seen, self._explore(self._learner, seen, self._learner.iql.exploration)
+        return self._code.decode(self._acted[1], self.envs.single_action_space)
 
     def _explore(self, learner: ImplicitQLearner, seen: torch.Tensor, exploration: float) -> torch.Tensor:
         """Codes of the policy's actions with noise. Shape: (n, k)."""
@@ -82,27 +90,6 @@ class OnlinePhase:
         own: Any = self._own
         return own.rows(torch.randint(min(self._added, _LARGEST), (count,)))  # type: ignore[no-any-return]
 
-    def _count(self, rewards: Any, ended: Any, infos: Any) -> None:
-        """Add to the returns and lengths of the running episodes, and note those that ended."""
-        self._running += [rewards, np.ones(len(rewards))]
-        success = infos.get("final_info", {}).get("is_success")
-        for row in np.flatnonzero(ended).tolist():
-            total, length = self._running[:, row].tolist()
-            self._ended.append((total, length, None if success is None else bool(success[row])))
-        self._running[:, ended] = 0.0
-
-    def statistics(self, metrics: dict[str, float]) -> Statistics:
-        """Means over the last episodes."""
-        known = [success for _, _, success in self._ended if success is not None]
-        totals, lengths = [one[0] for one in self._ended], [one[1] for one in self._ended]
-        return Statistics(
-            episodes=len(totals),
-            return_mean=float(np.mean(totals)) if totals else None,
-            length_mean=float(np.mean(lengths)) if lengths else None,
-            success_rate=float(np.mean(known)) if known else None,
-            metrics=metrics,
-        )
-
     def state_dict(self) -> dict[str, Any]:
         """The own transitions and the random numbers; running episodes begin anew."""
         kept = min(self._added, _LARGEST)
@@ -115,13 +102,3 @@ class OnlinePhase:
             self._keep(TrainingBatch(*state["own"]))
         self._added, self._due = int(state["added"]), float(state["due"])
         self._rng.bit_generator.state = state["rng"]
-
-
-def _with_last(after: Any, last: Any, ended: Any) -> Any:
-    """Observations after a step, with the `last` ones of the episodes that `ended` instead of the first of new ones."""
-    if isinstance(after, dict):
-        return {key: _with_last(value, last[key], ended) for key, value in after.items()}
-    observations = np.array(after)
-    for row in np.flatnonzero(ended).tolist():
-        observations[row] = last[row]
-    return observations

@@ -30,6 +30,7 @@ from bam_envs.core.registry import resolve_id
 from bam_train.environments import is_batched, make_vector_env
 from bam_train.errors import SettingsError
 from bam_train.finite_envs import FiniteVectorEnv
+from bam_train.rollout import success_of
 from bam_train.trainers.rllib.mean_std_filter import MeanStdFilter
 from bam_train.trainers.rllib.rllib_freezing import LAYOUT_CONNECTORS
 from bam_train.trainers.rllib.runner_deaths import FaultReporting
@@ -181,10 +182,9 @@ class RobotEnvRunner(FaultReporting, SingleAgentEnvRunner):  # type: ignore[misc
             observations, rewards, terminated, truncated, infos = results
             ended = np.flatnonzero(terminated | truncated)
             if len(ended):
-                success = infos.get("final_info", {}).get("is_success")
                 last = self._filtered(np.asarray(infos["final_obs"])[ended])
                 for env_id, observation in zip(ended.tolist(), last, strict=True):
-                    finals[env_id, t] = observation, None if success is None else bool(success[env_id])
+                    finals[env_id, t] = observation, success_of(infos, env_id)
             self._observation = self._filtered(observations)
             seen.append(self._observation)
             ends = {Columns.TERMINATEDS: np.array(terminated), Columns.TRUNCATEDS: np.array(truncated)}

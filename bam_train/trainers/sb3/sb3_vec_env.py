@@ -15,6 +15,7 @@ from bam_train.env_location import HERE, EnvLocation
 from bam_train.environments import is_batched, make_env, make_vector_env
 from bam_train.errors import SettingsError
 from bam_train.finite_envs import FiniteEnv, FiniteVectorEnv
+from bam_train.rollout import success_of
 from bam_train.trainers.zero_based_spaces import from_zero
 
 Observations = Any
@@ -98,8 +99,8 @@ class BatchVecEnv(VecEnv):  # type: ignore[misc]
                 "TimeLimit.truncated": not terminated[index],
                 "episode": {"r": float(self._returns[index]), "l": int(lengths[index])},
             }
-            if (success := extra["final_info"].get("is_success")) is not None:
-                infos[index]["is_success"] = bool(success[index])
+            if (success := success_of(extra, index)) is not None:
+                infos[index]["is_success"] = success
         self._returns[done] = 0
         return self._copy(observations), np.asarray(rewards, dtype=np.float32), done, infos
 
