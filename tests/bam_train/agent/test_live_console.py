@@ -45,6 +45,18 @@ class Robot:
         recent = [joints for at, joints in list(self.commands) if time.monotonic() - at < REST]
         return len(recent) > 1 and bool(np.ptp(recent, axis=0).max() > 1e-6)
 
+    def rests(self):
+        """Where the tool is once it is sent nowhere else and has arrived, which takes longer on a busy computer."""
+        places = [self.tool]
+
+        def is_still():
+            time.sleep(REST)
+            places.append(self.tool)
+            return not self.moves and np.abs(places[-1] - places[-2]).max() < 1e-4
+
+        until(is_still, "rest")
+        return places[-1]
+
     @property
     def tool(self):
         return GEOMETRY.tool_position(self.served.robot_service._robot.state.signals["joint_position"])[0]
@@ -116,10 +128,8 @@ def test_jogging_moves_the_tool_along_the_key_and_no_farther(driven, robot):
     start = robot.tool
     driven.move("r", lambda: robot.tool[2] > start[2] + 0.03)
     driven.let("r")
-    until(lambda: not robot.moves, "rest")
-    moved = robot.tool - start
-    assert np.abs(moved[:2]).max() < 0.02
-    end = robot.tool
+    end = robot.rests()
+    assert np.abs((end - start)[:2]).max() < 0.02
     time.sleep(REST)
     np.testing.assert_allclose(robot.tool, end, atol=2e-3)
     assert driven.complaints() == []
@@ -130,8 +140,7 @@ def test_a_page_that_is_left_in_mid_jog_leaves_the_robot_at_rest(driven, agent, 
     driven.move("r", lambda: robot.moves)
     robot.halts.clear()
     leave(driven)
-    until(lambda: not robot.moves, "rest")
-    here = robot.tool
+    here = robot.rests()
     time.sleep(REST)
     assert not robot.moves
     np.testing.assert_allclose(robot.tool, here, atol=2e-3)
@@ -144,7 +153,7 @@ def test_a_frozen_page_leaves_the_robot_at_rest_and_the_policy_does_not_go_on(dr
         until(lambda: not robot.moves, "rest")
         until(lambda: robot.halts, "the halt")
         assert agent.agent.ask("status")["state"] in ("taken over", "paused")
-    here = robot.tool
+    here = robot.rests()
     time.sleep(REST)
     assert not robot.moves
     np.testing.assert_allclose(robot.tool, here, atol=2e-3)
