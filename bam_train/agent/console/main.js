@@ -10,11 +10,16 @@ import { Plots } from "./plots.js";
 const LOOK = 2000; // time between two looks at versions and log [ms]
 const OLD = 1000; // age of the newest state from which on the page says that it is old [ms]
 const WRITE = 250; // least time between two sets of plots and numbers [ms]
+const BUSY = 50; // a drawing that takes longer, with its wait for the screen, shows that this computer is busy [ms]
+const GIVE_WAY = 4; // then the next one waits for so many times as long, so that buttons and keys are heard at once
+const LONGEST_WAIT = 1000; // at most [ms]
 
 let status = { state: "not connected" };
 let telemetry = null;
 let heard = -Infinity; // when it came
 let written = -Infinity; // when plots and numbers were drawn
+let asked = null; // when the drawing that comes was asked for
+let rested = -Infinity; // until when drawings give way
 let role = "watch"; // what this page's token may do
 let owner = null; // how the status calls this page while it drives; "" until it says so; null: it does not drive
 let cameras = null;
@@ -81,7 +86,10 @@ function event(message) {
     telemetry = message;
     heard = performance.now();
     plots.add(message);
-    requestAnimationFrame(draw);
+    if (asked === null && heard >= rested) {
+      asked = heard;
+      requestAnimationFrame(draw);
+    }
   } else if (message.ok === false) {
     fault(message.error); // of a twist
   }
@@ -98,15 +106,19 @@ function show(newest) {
 }
 
 function draw() {
-  if (telemetry === null) return;
-  const newest = telemetry, now = performance.now();
-  telemetry = null;
-  picture.draw(newest);
-  if (now - written < WRITE) return;
-  written = now;
-  plots.draw();
-  showTelemetry(newest);
-  showNear(newest.near ?? {}, status.guards ?? {});
+  const now = performance.now();
+  try {
+    picture.draw(telemetry);
+    if (now - written < WRITE) return;
+    written = now;
+    plots.draw();
+    showTelemetry(telemetry);
+    showNear(telemetry.near ?? {}, status.guards ?? {});
+  } finally {
+    const took = performance.now() - asked;
+    rested = performance.now() + (took > BUSY ? Math.min(GIVE_WAY * took, LONGEST_WAIT) : 0);
+    asked = null;
+  }
 }
 
 setInterval(() => {

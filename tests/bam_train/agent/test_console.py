@@ -4,6 +4,7 @@ import io
 import time
 from pathlib import Path
 
+import numpy as np
 import pytest
 from PIL import Image
 
@@ -219,6 +220,17 @@ def test_a_button_moves_the_robot_while_it_is_held_and_a_key_with_a_modifier_doe
     driven.tap("o")
     until(lambda: len(agent.twists) > sent, "the gripper's command")
     assert agent.twists[sent][1]["gripper"] == -1
+
+
+def test_drawings_give_way_on_a_busy_computer(driven):
+    """A drawing that comes 0.2 s late is followed by a pause of four times as long, in which buttons are heard."""
+    driven.run(
+        "window.drawn = [];"
+        "window.requestAnimationFrame = (draw) =>"
+        "  setTimeout(() => (window.drawn.push(performance.now()), draw()), 200);"
+    )
+    until(lambda: len(driven.run("return window.drawn")) > 3, "drawings")
+    assert np.diff(driven.run("return window.drawn")[1:]).min() > 990
 
 
 @pytest.mark.parametrize("leave", LEAVINGS)
