@@ -58,7 +58,7 @@ def fast_session(url):
         def __init__(self, options, checkpoint, stage, *, boundary, agents, switch, sleep, **rest):
             self.checkpoint, self.env_id, self.env_kwargs = checkpoint, checkpoint.manifest.env, {}
             self._options = options
-            self.stage, self.is_real, self.marks, self.recorder = "full", False, (), None
+            self.stage, self.is_real, self.identity, self.marks, self.recorder = "full", False, "", (), None
             fast = replace(arm_spec("ur5e", with_object=True), period=PERIOD)
             robot = live_robot(url, fast) if url else guarded_robot()[0]
             inner = Slower(RobotEnv(robot, ENVIRONMENTS[self.env_id].make_task(1, {})))

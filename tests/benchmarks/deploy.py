@@ -176,7 +176,7 @@ def measure_tick(flags):
 
 def measure_rate(flags):
     """100 Hz against the embedded server, and a loop that only sleeps, in turns: how late commands are sent."""
-    late, asleep, count, rounds = [], [], 1000, flags.times(6)
+    late, asleep, count, rounds = [], [], flags.times(1000), 6
     with Peer(serve_robot, True) as server:
         robot, state = live_arm(f"ws://127.0.0.1:{server.ports[0]}", period=0.01)
         pacer = robot._robot._pacer

@@ -118,9 +118,8 @@ def cpu_rates(flags, env_id, goal, factor, what, **options):
     """A batch by CPU time and by the clock."""
     n, steps = flags.num_envs or 64, flags.times(10)
     envs = gym.make_vec(env_id, num_envs=n, **options)
-    run, rates = stepper(envs, steps), []
-    for clock in (time.process_time, time.perf_counter):
-        rates.append(factor * n * steps / median(in_turns({"batch": run}, flags.times(9), clock)["batch"]))
+    works, clocks = {"batch": stepper(envs, steps)}, (time.process_time, time.perf_counter)
+    rates = [factor * n * steps / median(in_turns(works, flags.times(9), clock)["batch"]) for clock in clocks]
     found = f"{rates[0]:,.0f}, {rates[1]:,.0f} a second"
     yield at_least(f"{env_id}, {what} a CPU second", rates[0], goal, "", found)
     envs.close()

@@ -5,11 +5,11 @@ maybe with a dataclass ``Flags``. Every figure has something beside it that is m
 that a busy machine slows both alike: compare ratios, the times are this machine's, now.
 """
 
+import ast
 import gc
 import importlib
 import inspect
 import os
-import pkgutil
 import subprocess
 import sys
 import time
@@ -64,7 +64,7 @@ class Row(NamedTuple):
 
     def __str__(self):
         verdict = {None: "", True: "met", False: "MISSED"}[self.met]
-        return f"{self.what:<50} {self.found:<52} {self.goal:<30} {verdict}".rstrip()
+        return f"{self.what:<50}   {self.found:<50}   {self.goal:<28}   {verdict}".rstrip()
 
 
 def number(value):
@@ -168,29 +168,38 @@ def measure(module, flags):
     for name in flags.only:
         if name not in names:
             raise InvalidValue(f"--only: there is no {name!r}. {did_you_mean(name, names)}")
-    missed = 0
+    missed, head = 0, str(Row("figure", "measured", "goal"))
     for name in flags.only or names:
-        try:
-            for row in getattr(module, names[name])(flags):
-                missed += isinstance(row, Row) and row.met is False
-                print(row, flush=True)
-        except ModuleNotFoundError as error:
-            print(Row(name, f"needs {error.name}", f"pip install {error.name}"), flush=True)
+        for row in rows_of(name, getattr(module, names[name]), flags):
+            if head and isinstance(row, Row):
+                print(head)
+                head = ""
+            missed += isinstance(row, Row) and row.met is False
+            print(row, flush=True)
     return int(missed > 0)
+
+
+def rows_of(name, measure, flags):
+    """The rows of a function, or the one that says what is not installed."""
+    try:
+        yield from measure(flags)
+    except ModuleNotFoundError as error:
+        yield Row(name, f"needs {error.name}", f"pip install {error.name}")
 
 
 def main(package):
     """Run the module that the command line names, or list all of them; returns the exit status."""
     folder = Path(importlib.import_module(package).__path__[0])
-    names = [one.name for one in pkgutil.iter_modules([str(folder)]) if one.name not in ("__main__", "harness")]
+    files = [path for path in sorted(folder.glob("[!_]*.py")) if path.stem != "harness" and path.stem[:5] != "test_"]
+    names = [path.stem for path in files]
     name, *arguments = sys.argv[1:] or [""]
     if name == "all":
         command = [sys.executable, "-m", package]
         return max(subprocess.run([*command, one, *arguments], check=False).returncode for one in names)
     if name not in names:
         print(f"python -m {package} NAME [OPTIONS], or all; --help after a name has its options.\n")
-        for one in names:
-            print(f"  {one:<12}{importlib.import_module(f'{package}.{one}').__doc__.partition(chr(10))[0]}")
+        for path in files:
+            print(f"  {path.stem:<13}{ast.get_docstring(ast.parse(path.read_text())).splitlines()[0]}")
         return 0 if name in ("", "-h", "--help") else 2
     prog = f"python -m {package} {name}"
 
@@ -201,7 +210,6 @@ def main(package):
             return module.main(flags)
         cores, load = len(os.sched_getaffinity(0)), os.getloadavg()[0]
         print(f"{name}: {cores} cores, load {load:.1f}, Python {sys.version.split()[0]}, NumPy {np.__version__}")
-        print(Row("figure", "measured", "goal"))
         return measure(module, flags)
 
     return guarded(run, prog)

@@ -74,10 +74,11 @@ def measure_trainers(flags):
     """Each trainer; the last one is held against the goal."""
     if any(flags.batch % flags.num_envs or flags.num_envs % max(1, runners) for runners in flags.runners):
         raise InvalidValue("--batch must be a multiple of --num-envs, and --num-envs of every number of --runners")
+    reference = 0.0
     for runners in (None, *flags.runners):
         rates, shares = train(flags, runners)
         name = "sb3" if runners is None else f"rllib, {runners} runners"
-        reference = median(rates) if runners is None else reference
+        reference = reference or median(rates)
         yield Row(name, f"{median(rates):,.0f} steps/s ({min(rates):,.0f} to {max(rates):,.0f})")
         if shares:
             yield "  " + ", ".join(f"{name} {share:.0%}" for name, share in shares.items())

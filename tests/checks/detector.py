@@ -4,9 +4,9 @@ An episode is flagged if there is an alarm at one of its ticks, so before it end
 counts as harmless, flagged or not. A false alarm is an episode without any shift that is flagged and succeeds.
 
 Examples:
-  python scripts/check_detector.py
-  python scripts/check_detector.py checkpoints/pick-ppo.zip --ticks 150000 --steps 6400
-  python scripts/check_detector.py checkpoints/reach-ppo.zip --ticks 0 --guarded 720000 --steps 0
+  python -m tests.checks detector
+  python -m tests.checks detector checkpoints/pick-ppo.zip --ticks 150000 --steps 6400
+  python -m tests.checks detector checkpoints/reach-ppo.zip --ticks 0 --guarded 720000 --steps 0
 """
 
 import math
@@ -33,24 +33,21 @@ from bam_envs.tasks.pick import PickTask
 from bam_envs.tasks.wrappers.late_actions import LateActions
 from bam_train.checkpoint import Checkpoint
 from bam_train.checkpoint.detector import TICKS, Detector, Rollout
-from bam_train.cli.program import guarded, parse
 from bam_train.env_location import SIMULATED
 from bam_train.environments import environment_of, make_env, make_vector_env
 from bam_train.errors import NoDetector
 from bam_train.policy import FrozenPolicy
 from bam_train.trainers.detection import fresh_episodes
+from tests.benchmarks import harness
 
-NAME = Path(__file__).stem
 SIDE_BY_SIDE = 64
 AT_ONCE = LinkProfile([0.0, 0.0], [0.0, 0.0])
 Signals = dict[str, Array]
 
 
 @dataclass(frozen=True, kw_only=True)
-class Flags:
-    """What is measured."""
-
-    checkpoint: tyro.conf.Positional[Path] = Path("checkpoints/pick-ppo.zip")
+class Flags(harness.Flags):
+    checkpoint: tyro.conf.Positional[Path] = harness.PICK
     """A checkpoint of a robot, with a detector."""
     ticks: Annotated[int, tyro.conf.arg(metavar="N")] = 144_000
     """Ticks without any shift; 0 for none."""
@@ -60,7 +57,7 @@ class Flags:
     """Seed of the first episode without a shift."""
     steps: Annotated[int, tyro.conf.arg(metavar="N")] = 6_400
     """Ticks of each shift of bam/pick; 0 for none."""
-    only: str = ""
+    shift: str = ""
     """Only shifts whose name has this text."""
 
 
@@ -265,34 +262,25 @@ def row(detector: Detector, shift: str, episodes: list[Rollout]) -> tuple[str, b
     return "| " + " | ".join(cells) + " |", bool(found.sum() >= 0.9 * failed.sum())
 
 
-def main() -> None:
-    """Measure, and print a table in Markdown."""
-    options = parse(Flags, NAME, description=__doc__)
-    checkpoint = Checkpoint.open(options.checkpoint.expanduser())
+def measure_detector(flags):
+    """Episodes without a shift, then each shift, as a table in Markdown."""
+    checkpoint = Checkpoint.open(flags.checkpoint.expanduser())
     policy = FrozenPolicy.from_checkpoint(checkpoint)
     if policy.detector is None:
-        raise NoDetector(f"{options.checkpoint} has no detector. Run: bam-eval {options.checkpoint} --add-detector")
-    detector = policy.detector
-    if options.ticks:
-        episodes = plain(checkpoint, policy, options.ticks, options.seed)
-        print(false_alarms(detector, episodes, "no shift"), flush=True)
-    for trial in (False, True) if options.guarded else ():
-        episodes = behind_guards(checkpoint, policy, options.guarded, options.seed, trial=trial)
-        where = f"behind guards, {'on trial' if trial else 'at full speed'}"
-        print(false_alarms(detector, episodes, where), flush=True)
-    if not options.steps:
+        raise NoDetector(f"{flags.checkpoint} has no detector. Run: bam-eval {flags.checkpoint} --add-detector")
+    if flags.ticks:
+        yield false_alarms(policy.detector, plain(checkpoint, policy, flags.ticks, flags.seed), "no shift")
+    for trial in (False, True) if flags.guarded else ():
+        episodes = behind_guards(checkpoint, policy, flags.guarded, flags.seed, trial=trial)
+        yield false_alarms(policy.detector, episodes, f"behind guards, {'on trial' if trial else 'at full speed'}")
+    if not flags.steps:
         return
-    print()
-    print("| shift | episodes | failed | flagged before | without duration | at tick (median) | harmless | flagged |")
-    print("| --- | --- | --- | --- | --- | --- | --- | --- |")
+    yield "\n| shift | episodes | failed | flagged before | without duration | at tick (median) | harmless | flagged |"
+    yield "| --- | --- | --- | --- | --- | --- | --- | --- |"
     verdicts = []
     for shift in (*SENSORS, *PHYSICS, *DELAYS):
-        if options.only in shift:
-            line, good = row(detector, shift, play(policy, options.steps, 30_000_000, shift))
+        if flags.shift in shift:
+            line, good = row(policy.detector, shift, play(policy, flags.steps, 30_000_000, shift))
             verdicts.append(good)
-            print(line, flush=True)
-    print(f"\n{sum(verdicts)} of {len(verdicts)} shifts: at least 90 % of the failed episodes flagged before they end")
-
-
-if __name__ == "__main__":
-    guarded(main, NAME)
+            yield line
+    yield f"\n{sum(verdicts)} of {len(verdicts)} shifts: at least 90 % of the failed episodes flagged before they end"

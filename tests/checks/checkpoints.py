@@ -3,34 +3,31 @@
 Command, seed and steps come from each checkpoint's manifest, wall time from the run that made it (`--runs`) or, without
 that, from the table as it is; the success rates are measured here, over episodes that neither training nor its
 evaluations have seen. The first one is that of ``bam-eval CHECKPOINT --episodes 1000``: a policy that was trained with
-randomised physics, late actions or a link is evaluated with them. The second one is without them;
-``scripts/evaluate_links.py`` evaluates all with them. Where there is a training and a test split, it is the test split
-that counts, and each picture of it counts once.
+randomised physics, late actions or a link is evaluated with them. The second one is without them; ``python -m
+tests.checks links`` evaluates all with them. Where there is a training and a test split, it is the test split that
+counts, and each image of it counts once.
 """
 
-from __future__ import annotations
-
-import argparse
 import json
 import re
 import shlex
-from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
-from bam_envs.core.errors import BamEnvsError
+import tyro
+
 from bam_envs.core.registry import entry_of
-from bam_train.checkpoint import Checkpoint, Manifest
+from bam_train.checkpoint import Checkpoint
 from bam_train.cli.console import duration
+from bam_train.cli.flags import Count
 from bam_train.env_location import SIMULATED
 from bam_train.environments import held_out
-from bam_train.errors import BamTrainError
-from bam_train.evaluation import FIRST_SEED, EvaluationReport, evaluate
+from bam_train.evaluation import FIRST_SEED, evaluate
 from bam_train.policy import FrozenPolicy
 from bam_train.settings import differences, file_stem
 from bam_train.trainers.resolve_settings import resolve
+from tests.benchmarks.harness import CHECKPOINTS
 
-FOLDER = Path(__file__).resolve().parents[1] / "checkpoints"
 HEADER = ("checkpoint", "command", "seed", "steps", "wall time", "success", "plain", "size")
 FLAGS = (
     *("steps", "seed", "num_envs", "device", "threads", "start", "until_success", "eval_every", "eval_episodes"),
@@ -40,7 +37,19 @@ FLAGS = (
 _TABLE = re.compile(r"(<!-- generated -->\n).*?(<!-- /generated -->)", re.DOTALL)
 
 
-def command(manifest: Manifest, name: str) -> str:
+@dataclass(frozen=True, kw_only=True)
+class Flags:
+    checkpoints: tyro.conf.Positional[tuple[Path, ...]] = ()
+    """By default every .zip in checkpoints/."""
+    episodes: Count = 1000
+    """Episodes each."""
+    runs: Path = Path("runs")
+    """Where the runs' folders are."""
+    page: Path = CHECKPOINTS / "README.md"
+    """The page with the table."""
+
+
+def command(manifest, name):
     """What trains this checkpoint again: the preset, and what the run had otherwise."""
     if manifest.trainer == "script":
         script = f"scripts/{manifest.algorithm.replace('-', '_')}.py"
@@ -61,14 +70,14 @@ def command(manifest: Manifest, name: str) -> str:
     return shlex.join(words)
 
 
-def _words(setting: str, value: Any) -> list[str]:
+def _words(setting, value):
     text = value if isinstance(value, str) else json.dumps(value, separators=(",", ":"))
     if setting in FLAGS:
         return [f"--{setting.replace('_', '-')}", text]
     return ["--set", f"{setting.removeprefix('hyperparameters.')}={text}"]
 
 
-def wall_time(manifest: Manifest, runs: Path) -> str | None:
+def wall_time(manifest, runs):
     """Wall time of the run up to the evaluation that kept this checkpoint, if the run's folder is still there."""
     wanted = {"steps": manifest.steps, "return_mean": manifest.scores.get("return_mean")}
     for path in sorted(runs.glob("*/progress.jsonl")):
@@ -78,26 +87,26 @@ def wall_time(manifest: Manifest, runs: Path) -> str | None:
     return None
 
 
-def _evaluations(path: Path) -> Iterator[dict[str, Any]]:
+def _evaluations(path):
     for line in path.read_text(encoding="utf-8").splitlines():
         record = json.loads(line)
         if record["kind"] == "evaluation":
             yield record
 
 
-def old_wall_times(text: str) -> dict[tuple[str, ...], str]:
+def old_wall_times(text):
     """(checkpoint, command, seed, steps) of each row of the table as it is, to its wall time."""
     rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in text.splitlines() if line[:1] == "|"]
     place = HEADER.index("wall time")
     return {tuple(row[:place]): row[place] for row in rows if len(row) > place}
 
 
-def row(path: Path, episodes: int, runs: Path, known: dict[tuple[str, ...], str]) -> list[str]:
+def row(path, episodes, runs, known):
     """One line of the table."""
     checkpoint = Checkpoint.open(path)
     manifest = checkpoint.manifest
     policy = FrozenPolicy.from_checkpoint(checkpoint)
-    rates: list[str] = []
+    rates = []
     for asked in ({}, SIMULATED):
         kwargs = held_out(manifest.env, manifest.env_kwargs, {} if entry_of(manifest.env) is None else asked)
         if not rates or any(manifest.env_kwargs.get(name) for name in SIMULATED):
@@ -109,7 +118,7 @@ def row(path: Path, episodes: int, runs: Path, known: dict[tuple[str, ...], str]
     return [*first, seconds, *rates, f"{path.stat().st_size / 1000:.0f} kB"]
 
 
-def success(report: EvaluationReport) -> str:
+def success(report):
     """The success rate and its 95 % interval, and how many episodes there are if fewer than asked for."""
     if report.success_rate is None or report.success_interval is None:
         return "not reported"
@@ -118,26 +127,13 @@ def success(report: EvaluationReport) -> str:
     return f"{report.success_rate:.1%}{of_all} ({low:.1%} to {high:.1%})"
 
 
-def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("checkpoints", nargs="*", type=Path, help="default: every .zip in checkpoints/")
-    parser.add_argument("--episodes", type=int, default=1000, help="episodes each (default 1000)")
-    parser.add_argument("--runs", type=Path, default=Path("runs"), help="where the runs' folders are (default runs)")
-    parser.add_argument("--page", type=Path, default=FOLDER / "README.md", help="default checkpoints/README.md")
-    arguments = parser.parse_args()
-    text = arguments.page.read_text(encoding="utf-8")
-    known = old_wall_times(text)
-    lines = [list(HEADER), ["---"] * len(HEADER)]
-    try:
-        for path in arguments.checkpoints or sorted(FOLDER.glob("*.zip")):
-            lines.append(row(path, arguments.episodes, arguments.runs, known))
-            print("  ".join(lines[-1]), flush=True)
-    except (BamTrainError, BamEnvsError) as error:
-        parser.error(str(error))
+def main(flags):
+    """Print the rows and write the table."""
+    text = flags.page.read_text(encoding="utf-8")
+    known, lines = old_wall_times(text), [list(HEADER), ["---"] * len(HEADER)]
+    for path in flags.checkpoints or sorted(CHECKPOINTS.glob("*.zip")):
+        lines.append(row(path, flags.episodes, flags.runs, known))
+        print("  ".join(lines[-1]), flush=True)
     table = "\n".join(f"| {' | '.join(cells)} |" for cells in lines)
-    arguments.page.write_text(_TABLE.sub(lambda match: f"{match[1]}\n{table}\n\n{match[2]}", text), encoding="utf-8")
+    flags.page.write_text(_TABLE.sub(lambda match: f"{match[1]}\n{table}\n\n{match[2]}", text), encoding="utf-8")
     return 0
-
-
-if __name__ == "__main__":
-    raise SystemExit(main())

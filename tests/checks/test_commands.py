@@ -4,13 +4,10 @@ import shlex
 
 import pytest
 
-
-@pytest.fixture(scope="module")
-def script(load_script):
-    return load_script("check_commands")
+from tests.checks import commands as script
 
 
-def test_the_commands_are_those_that_train_here_each_once(script, capsys):
+def test_the_commands_are_those_that_train_here_each_once(capsys):
     assert script.main(script.Flags(list=True)) == 0
     found = [line.partition(" seeds  ")[2] for line in capsys.readouterr().out.splitlines()]
     assert "bam-train --trainer rllib --env bam/pick --algo ppo --num-env-runners 2" in found
@@ -20,12 +17,12 @@ def test_the_commands_are_those_that_train_here_each_once(script, capsys):
     assert not {*script.ELSEWHERE, *script.SAME} & {word for line in found for word in shlex.split(line)}
 
 
-def test_a_flag_goes_with_its_value_but_force_has_none(script):
+def test_a_flag_goes_with_its_value_but_force_has_none():
     words = ["bam-train", "--force", "--env", "bam/pick", "--out", "a.zip", "--algo", "ppo"]
     assert script.without(words, *script.SAME) == ("bam-train", "--env", "bam/pick", "--algo", "ppo")
 
 
-def test_a_run_is_logged_in_the_place_of_its_earlier_row(script, tmp_path, monkeypatch, capsys):
+def test_a_run_is_logged_in_the_place_of_its_earlier_row(tmp_path, monkeypatch, capsys):
     """And a row of a command that no page has any more is removed."""
     results = [(0, 0.5), (0, 0.95), (3, None)]
     monkeypatch.setattr(
@@ -48,7 +45,7 @@ def test_a_run_is_logged_in_the_place_of_its_earlier_row(script, tmp_path, monke
     assert capsys.readouterr().out == f"2 seeds  {command}\n"
 
 
-def test_every_row_of_the_committed_log_has_learnt(script):
+def test_every_row_of_the_committed_log_has_learnt():
     rows = script.read_log(script.LOG).values()
     assert rows
     assert {line.split(" | ")[-2] for line in rows} == {"yes"}
@@ -66,7 +63,7 @@ def test_every_row_of_the_committed_log_has_learnt(script):
         (3, None, None, None, "NO"),  # bam-train says so itself
     ],
 )
-def test_what_learning_is(script, status, success, reward, threshold, learnt):
+def test_what_learning_is(status, success, reward, threshold, learnt):
     result = script.Result(status, 61.4, 70.0, 204800, success, reward, threshold)
     assert result.learnt == learnt
     line = script.row(("bam-train", "--env", "bam/pick"), 2, result)

@@ -4,15 +4,11 @@ Wrist 1 of a UR5 whose flange points down goes around three places in three segm
 next. The joints run along a cubic spline through the poses on the way, from rest to rest (minimum jerk in the spline's
 parameter).
 
-Examples:
-    python scripts/make_ur_track.py               say how long and how fast it is
-    python scripts/make_ur_track.py track.json    write it, for gymnasium.make("bam/ur-track-v0", trajectory=...)
+    python -m tests.bam_envs.tasks.make_ur_track >envs/bam_envs/tasks/data/ur_track.json
 """
 
-import argparse
 import json
 import math
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -57,19 +53,6 @@ def trajectory() -> list[NDArray[np.float64]]:
     return [segment(first, last, waypoints) for first, last, waypoints in ends]
 
 
-def main() -> None:
-    """Say how long and how fast it is; write it where one wants it."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("file", nargs="?", type=Path, help="JSON file to write")
-    file = parser.parse_args().file
-    segments = trajectory()
-    for number, one in enumerate(segments):
-        fastest = (np.abs(np.diff(one, axis=0)) * RATE).max()
-        print(f"segment {number}: {len(one)} waypoints, {len(one) / RATE:.2f} s, at most {fastest:.2f} rad/s")
-    if file is not None:
-        rows = ",\n".join(json.dumps(one.tolist(), separators=(",", ":")) for one in segments)
-        file.write_text('{"trajectory":[\n' + rows + "\n]}\n", encoding="utf-8")
-
-
 if __name__ == "__main__":
-    main()
+    rows = ",\n".join(json.dumps(one.tolist(), separators=(",", ":")) for one in trajectory())
+    print('{"trajectory":[\n' + rows + "\n]}")

@@ -1,15 +1,13 @@
 """A few rows of the fault matrix, in one robot cell; the script has all of them."""
 
 import contextlib
+import sys
 
 import pytest
 
 from bam_envs.testing.robot_cell import RobotCell, StateFault
-
-
-@pytest.fixture(scope="module")
-def matrix(load_script):
-    return load_script("fault_matrix")
+from tests.benchmarks import harness
+from tests.checks import faults
 
 
 @pytest.fixture(scope="module")
@@ -27,16 +25,14 @@ def cell(whole_cell):
 @pytest.mark.parametrize(
     ("flags", "text"),
     [
-        (("--only", "bridge", "--only", "frozn"), "--only: no fault's name has 'frozn'. Did you mean 'network frozen"),
+        (("--only", "bridge", "frozn"), "--only: no fault's name has 'frozn'. Did you mean 'network frozen"),
         (("--checkpoint", "none.zip"), "none.zip: no such file. Train one with bam-train, or check the name"),
     ],
 )
-def test_a_typo_is_refused(matrix, monkeypatch, capsys, flags, text):
-    monkeypatch.setattr("sys.argv", ["fault_matrix.py", *flags])
-    with pytest.raises(SystemExit) as caught:
-        matrix.main()
-    assert caught.value.code == 2
-    assert f"fault_matrix.py: error: {text}" in capsys.readouterr().err
+def test_a_typo_is_refused(monkeypatch, capsys, flags, text):
+    monkeypatch.setattr(sys, "argv", ["checks", "faults", *flags])
+    assert harness.main("tests.checks") == 1
+    assert capsys.readouterr().err.startswith(f"python -m tests.checks faults: {text}")
 
 
 @pytest.mark.parametrize(
@@ -48,13 +44,13 @@ def test_a_typo_is_refused(matrix, monkeypatch, capsys, flags, text):
         ("bridge killed", 4, ("bam-deploy: link lost: ws://127.0.0.1:",)),
     ],
 )
-def test_the_robot_rests_and_the_operator_knows_why(matrix, cell, monkeypatch, name, status, said):
-    monkeypatch.setattr(matrix, "BRAKING", 5.0)  # on a busy computer
-    fault = next(fault for fault in matrix.FAULTS if fault.name == name)
+def test_the_robot_rests_and_the_operator_knows_why(cell, monkeypatch, name, status, said):
+    monkeypatch.setattr(faults, "BRAKING", 5.0)  # on a busy computer
+    fault = next(fault for fault in faults.FAULTS if fault.name == name)
     outcome = None
     for _ in range(3):
         with contextlib.suppress(RuntimeError):  # guards stop a deployment before its fault: the computer is too busy
-            outcome = outcome or matrix.strike(fault, cell, matrix.CHECKPOINT)
+            outcome = outcome or faults.strike(fault, cell, faults.CHECKPOINT)
     assert outcome is not None
     assert (outcome.problems, outcome.status) == ((), status)
     seen = [line for line in outcome.saw if "warning" not in line]  # of missed ticks, on a busy computer

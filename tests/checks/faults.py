@@ -5,9 +5,6 @@ row shows the times of the last motion command, of rest and of the end, the exit
 content of the recording.
 """
 
-from __future__ import annotations
-
-import argparse
 import contextlib
 import json
 import os
@@ -22,20 +19,21 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Annotated
 
 from mcap.exceptions import McapError
 from mcap.records import Channel, Message
 from mcap.stream_reader import StreamReader
+from tyro.conf import arg
 from zstandard import ZstdError
 
+from bam_envs.core.errors import InvalidValue
 from bam_envs.core.wording import did_you_mean
 from bam_envs.testing.robot_cell import CellLog, Network, RobotCell, StateFault
 from bam_train.checkpoint import Checkpoint
-from bam_train.errors import BamTrainError
+from tests.benchmarks.harness import CHECKPOINTS, ROOT
 
-ROOT = Path(__file__).parents[1]
-CHECKPOINT = ROOT / "checkpoints" / "reach-ppo.zip"
+CHECKPOINT = CHECKPOINTS / "reach-ppo.zip"
 FAST, AT_REST = 0.1, 0.02
 """Speed above which a fault is injected, and speed below which the robot is at rest [rad/s or m/s]."""
 BRAKING = 0.3
@@ -52,6 +50,18 @@ WATCHED = 1.0
 """Time for which the robot is observed after the end of the deployment [s]."""
 
 
+@dataclass(frozen=True, kw_only=True)
+class Flags:
+    only: Annotated[tuple[str, ...], arg(metavar="TEXT ...")] = ()
+    """Only faults whose names contain one of these texts."""
+    checkpoint: Path = CHECKPOINT
+    """The policy; its environment has a robot."""
+    plain: bool = False
+    """A robot without sessions, halt topic and description."""
+    json: bool = False
+    """Print one JSON object a fault instead of a table."""
+
+
 class Deployment:
     """A bam-deploy in a separate process.
 
@@ -61,9 +71,8 @@ class Deployment:
     """
 
     def __init__(self, command: list[str], recording: Path) -> None:
-        environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), str(ROOT / "envs")])}
-        pipes: Any = {"stdout": subprocess.DEVNULL, "stderr": subprocess.PIPE, "text": True}
-        self.process: subprocess.Popen[str] = subprocess.Popen(command, env=environment, **pipes)
+        pipes = {"stdout": subprocess.DEVNULL, "stderr": subprocess.PIPE, "text": True}
+        self.process = subprocess.Popen(command, cwd=ROOT, **pipes)
         self.recording, self.lines, self.ended = recording, list[tuple[float, str]](), 0.0
         self._reading = threading.Thread(target=self._read)
         self._reading.start()
@@ -117,7 +126,7 @@ class Scene:
         flags = ["--robot", self.network.url, "--yes", "--episodes", "4", *self.flags]
         flags += ["--trials", str(self.folder / "trials.jsonl")] if self.flags else []
         flags += ["--record", str(self.folder / disk / recording)]
-        command = [*before, sys.executable, *program, str(self.checkpoint), *flags]
+        command = [*before, sys.executable, *program, str(self.checkpoint.resolve()), *flags]
         return Deployment(command, self.folder / recording)
 
     @property
@@ -196,7 +205,7 @@ class Fault:
 
 def with_clock(scene: Scene) -> Deployment:
     """A deployment whose wall clock can jump."""
-    return scene.deploy("first", program=(__file__, "--jumping-clock", str(scene.clock)))
+    return scene.deploy("first", program=("-c", JUMPING, str(scene.clock)))
 
 
 def with_full_disk(scene: Scene) -> Deployment:
@@ -344,8 +353,12 @@ def read_recording(path: Path) -> Recorded:
     return Recorded(len(ticks), max(ticks, default=0.0), tuple(events))
 
 
-def run_with_jumping_clock(file: Path, arguments: list[str]) -> None:
-    """Run bam-deploy in this process with a wall clock that is an hour ahead while `file` exists."""
+JUMPING = "from tests.checks.faults import run_with_jumping_clock; run_with_jumping_clock()"
+
+
+def run_with_jumping_clock():
+    """Run bam-deploy in this process with a wall clock that is an hour ahead while the first argument exists."""
+    file, arguments = Path(sys.argv[1]), sys.argv[2:]
     wall, wall_ns = time.time, time.time_ns
     time.time = lambda: wall() + 3600 * file.exists()
     time.time_ns = lambda: wall_ns() + 3600 * 10**9 * file.exists()
@@ -353,43 +366,26 @@ def run_with_jumping_clock(file: Path, arguments: list[str]) -> None:
     runpy.run_module("bam_train.cli.deploy", run_name="__main__")
 
 
-def main() -> None:
+def main(flags):
     """Print the matrix; exit status 1 if a row has a problem."""
-    if sys.argv[1:2] == ["--jumping-clock"]:
-        run_with_jumping_clock(Path(sys.argv[2]), sys.argv[3:])
-        return
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--only", action="append", help="run faults whose names contain this text; may be repeated")
-    parser.add_argument("--checkpoint", type=Path, default=CHECKPOINT, help="the policy; its environment has a robot")
-    parser.add_argument("--plain", action="store_true", help="a robot without sessions, halt topic and description")
-    parser.add_argument("--json", action="store_true", help="print one JSON object a fault instead of a table")
-    options = parser.parse_args()
-    try:
-        env_id, wrong = Checkpoint.open(options.checkpoint).manifest.env, 0
-    except BamTrainError as error:
-        parser.error(str(error))
+    env_id, wrong = Checkpoint.open(flags.checkpoint).manifest.env, 0
     is_base = "m/s" in RobotCell(env_id).spec.command.units
     rows = [fault for fault in FAULTS if not (is_base and fault.name == JOINT)]
-    chosen = [fault for fault in rows if not options.only or any(text in fault.name for text in options.only)]
-    for text in options.only or ():
+    for text in flags.only:
         if not any(text in fault.name for fault in rows):
-            names = [fault.name for fault in rows]
-            parser.error(f"--only: no fault's name has {text!r}. {did_you_mean(text, names, cutoff=0.3)}")
-    if not options.json:
+            remedy = did_you_mean(text, [fault.name for fault in rows], cutoff=0.3)
+            raise InvalidValue(f"--only: no fault's name has {text!r}. {remedy}")
+    if not flags.json:
         print(f"{'fault':40}{'motion':>9}{'rest':>9}{'end':>9}{'exit':>6}")
-    for fault in chosen:
+    for fault in (fault for fault in rows if not flags.only or any(text in fault.name for text in flags.only)):
         try:
-            with RobotCell(env_id, describes_itself=not options.plain) as cell:
-                result = strike(fault, cell, options.checkpoint, PLAIN if options.plain else ())
+            with RobotCell(env_id, describes_itself=not flags.plain) as cell:
+                result = strike(fault, cell, flags.checkpoint, PLAIN if flags.plain else ())
         except RuntimeError as error:
             print(f"{fault.name}: not tried: {error}", flush=True)
             wrong += 1
             continue
         wrong += bool(result.problems)
-        for line in [json.dumps(vars(result))] if options.json else result.lines():
+        for line in [json.dumps(vars(result))] if flags.json else result.lines():
             print(line, flush=True)
-    sys.exit(min(1, wrong))
-
-
-if __name__ == "__main__":
-    main()
+    return min(1, wrong)

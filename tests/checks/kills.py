@@ -2,22 +2,15 @@
 
 After every kill the data set opens, every episode has its own numbers, and nothing that was flushed is missing; then it
 is mended by `bam-data check` or by the next writer.
-
-Example:
-  python scripts/kill_data_writer.py --kills 200
 """
 
-import argparse
 import multiprocessing
 import os
 import signal
-import sys
 import tempfile
 import time
 from dataclasses import dataclass
-from multiprocessing.sharedctypes import Synchronized
 from pathlib import Path
-from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -41,7 +34,7 @@ class Outcome:
     """Times that something was not whole."""
 
 
-def numbered(number: int) -> Episode:
+def numbered(number):
     """The episode with this number in the data set: every number of it says so."""
     steps = 1 + number % 7
     observations = np.full((steps + 1, 4), number, np.float32) + np.arange(steps + 1, dtype=np.float32)[:, None] / 100
@@ -50,7 +43,7 @@ def numbered(number: int) -> Episode:
     )
 
 
-def write_for_ever(place: str, begun: "Synchronized[int]", flushed: "Synchronized[int]") -> None:
+def write_for_ever(place, begun, flushed):
     """Append numbered episodes until somebody kills the process; `flushed` is how many are on the disk for sure."""
     begun.value = 1
     with DataSetWriter(place, INFO, flush_episodes=3) as writer:
@@ -65,7 +58,7 @@ def write_for_ever(place: str, begun: "Synchronized[int]", flushed: "Synchronize
                 flushed.value = number
 
 
-def require_right(place: Path) -> int:
+def require_right(place):
     """Raise AssertionError unless every episode has its own numbers; the number of episodes."""
     data = DataSet.open(place)
     for index, episode in enumerate(data.episodes()):
@@ -77,17 +70,15 @@ def require_right(place: Path) -> int:
     return len(data)
 
 
-def kill(place: Path, kills: int, seed: int) -> Outcome:
+def kill(place, kills, seed):
     """Kill a writer `kills` times after up to 0.3 s."""
     context = multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload(
-        ["bam_train.data", "pyarrow.parquet", "pandas"]
-    )  # pyarrow imports pandas where it is
+    context.set_forkserver_preload(["bam_train.data", "pyarrow.parquet", "pandas"])  # pyarrow imports pandas
     rng, outcome = np.random.default_rng(seed), Outcome()
     begun, flushed = context.Value("q", 0), context.Value("q", 0)
     while outcome.kills < kills:
         begun.value = 0
-        process: Any = context.Process(target=write_for_ever, args=(str(place), begun, flushed))
+        process = context.Process(target=write_for_ever, args=(str(place), begun, flushed))
         process.start()
         while process.is_alive() and not begun.value:
             time.sleep(0.001)
@@ -111,16 +102,8 @@ def kill(place: Path, kills: int, seed: int) -> Outcome:
     return outcome
 
 
-def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--kills", type=int, default=200, help="how many (default 200)")
-    parser.add_argument("--seed", type=int, default=0, help="of the moments (default 0)")
-    arguments = parser.parse_args()
+def measure_kills(flags):
+    """Kill it 200 times."""
     with tempfile.TemporaryDirectory() as folder:
-        outcome = kill(Path(folder) / "data", arguments.kills, arguments.seed)
-    print(f"{outcome.kills} kills, {outcome.mended} left something to mend; {outcome.episodes} episodes, all whole")
-    return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())
+        outcome = kill(Path(folder) / "data", flags.times(200), 0)
+    yield f"{outcome.kills} kills, {outcome.mended} left something to mend; {outcome.episodes} episodes, all whole"

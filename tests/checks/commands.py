@@ -6,11 +6,11 @@ a threshold. Status 1 if a command failed or did not learn. The log, checkpoints
 a row takes the place of an earlier one of the same command and seed, and rows of commands that no page has are removed.
 
 Examples:
-  python scripts/check_commands.py --list              the commands, with how many seeds are in the log; run nothing
-  python scripts/check_commands.py                     all of them, seeds 0, 1 and 2
-  python scripts/check_commands.py --missing           those that the log does not have yet
-  python scripts/check_commands.py --only rllib        those with this in them
-  python scripts/check_commands.py --only td3 --seeds 5 --folder /tmp/td3 --log /tmp/td3.md
+  python -m tests.checks commands --list              the commands, with how many seeds are in the log; run nothing
+  python -m tests.checks commands                     all of them, seeds 0, 1 and 2
+  python -m tests.checks commands --missing           those that the log does not have yet
+  python -m tests.checks commands --only rllib        those with this in them
+  python -m tests.checks commands --only td3 --seeds 5 --folder /tmp/td3 --log /tmp/td3.md
 """
 
 import os
@@ -30,16 +30,15 @@ from tyro.conf import arg
 
 from bam_train.checkpoint import Checkpoint
 from bam_train.cli.flags import Count, Seed
-from bam_train.cli.program import guarded, parse
 from bam_train.errors import LearntNothing
 from bam_train.evaluation import evaluate
 from bam_train.files.atomic_file import replacing
 from bam_train.policy import FrozenPolicy
 from bam_train.trainers.base import origin
+from tests.benchmarks.harness import CHECKPOINTS, ROOT
 
-ROOT, NAME = Path(__file__).resolve().parents[1], Path(__file__).stem
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
-LOG = ROOT / "checkpoints" / "commands.md"
+LOG = CHECKPOINTS / "commands.md"
 SCRIPTS = ("ppo_pick", "td3_mir", "training_inference_mir", "training_inference_ur")
 ELSEWHERE = ("--resume", "--start", "--learner", "--print-config", "--transport", "--address", "--data")
 """Flags of commands that go on from something, train nothing, or need other files or computers."""
@@ -51,9 +50,9 @@ THRESHOLDS = {"Pendulum-v1": -200.0}
 HEADER = ("command", "seed", "steps of the checkpoint", "wall time", "CPU time", "success", "return", "learnt", "made")
 HEAD = """# Commands that learn
 
-Every training command of README.md and docs, run to its end by `scripts/check_commands.py`, which writes this page. It
-learnt if 90 % of 200 fresh episodes succeed; where an environment knows no success, if their mean return reaches its
-threshold. The times are those of a computer that did other things too.
+Every training command of README.md and docs, run to its end by `python -m tests.checks commands`, which writes this
+page. It learnt if 90 % of 200 fresh episodes succeed; where an environment knows no success, if their mean return
+reaches its threshold. The times are those of a computer that did other things too.
 
 """
 
@@ -164,8 +163,6 @@ def write_log(log: Path, rows: dict[tuple[str, str], str]) -> None:
 
 @dataclass(frozen=True)
 class Flags:
-    """Which commands are run, and how."""
-
     list: bool = False
     """Print the commands and run nothing."""
     only: Annotated[str, arg(metavar="TEXT")] = ""
@@ -205,7 +202,3 @@ def main(args: Flags) -> int:
             print(line, flush=True)
             write_log(args.log, read_log(args.log) | {(shlex.join(words), str(seed)): line})
     return int(bool({"FAILED", "NO"} & {*learnt}))
-
-
-if __name__ == "__main__":
-    raise SystemExit(guarded(lambda: main(parse(Flags, NAME, description=__doc__)), NAME))

@@ -1,18 +1,16 @@
-"""Check the error rates of ``bam-gate`` over simulated releases: pairs of Bernoulli outcomes through its procedure.
+"""Error rates of ``bam-gate`` over simulated releases: pairs of Bernoulli outcomes through its procedure.
 
 Printed for every case: success rates of candidate and champion, how often both have the same luck, the share of each
 verdict, and the mean number of pairs. A candidate that is worse by the margin or more should pass (better, or not
 worse) in at most 5 % of the releases.
 """
 
-from __future__ import annotations
-
-import argparse
 from collections import Counter
 
 import numpy as np
 
-from bam_train.estimation.paired_test import Pairs, Verdict
+from bam_train.estimation.paired_test import Pairs
+from tests.benchmarks.harness import at_most
 
 CASES = (
     *((0.998, 0.998, 0.5), (0.978, 0.998, 0.0), (0.978, 0.998, 0.9), (0.95, 0.97, 0.5), (0.68, 0.70, 0.0)),
@@ -28,9 +26,7 @@ CASES = (
 """Success rates of candidate and champion, and the share of pairs that have the same luck."""
 
 
-def release(
-    rng: np.random.Generator, candidate: float, champion: float, same: float, margin: float = 0.02, episodes: int = 2000
-) -> tuple[Verdict, int]:
+def release(rng, candidate, champion, same, margin=0.02, episodes=2000):
     """One comparison in waves of 64 pairs; the verdict and the number of pairs."""
     pairs = Pairs()
     while len(pairs) < episodes and not pairs.is_decided(margin):
@@ -43,27 +39,16 @@ def release(
     return pairs.verdict(margin), len(pairs)
 
 
-def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--releases", type=int, default=1000, help="of each case (default 1000)")
-    arguments = parser.parse_args()
-    rng = np.random.default_rng(0)
-    worst = 0.0
-    print("candidate champion same   better  not worse  undecided  worse   pairs")
+def measure_gate(flags):
+    """Each case."""
+    rng, worst, count = np.random.default_rng(0), 0.0, flags.times(1000)
+    yield "candidate champion same   better  not worse  undecided  worse   pairs"
     for case in CASES:
-        found = [release(rng, *case) for _ in range(arguments.releases)]
+        found = [release(rng, *case) for _ in range(count)]
         counts = Counter(verdict for verdict, _ in found)
-        shares = [counts[name] / len(found) for name in ("better", "not worse", "undecided", "worse")]
-        pairs = np.mean([number for _, number in found])
-        print(
-            "{:9.3f} {:8.3f} {:4.1f}  {:7.1%}  {:9.1%}  {:9.1%} {:6.1%}  {:6.0f}".format(*case, *shares, float(pairs)),
-            flush=True,
-        )
+        shares = [counts[name] / count for name in ("better", "not worse", "undecided", "worse")]
+        pairs = float(np.mean([number for _, number in found]))
+        yield "{:9.3f} {:8.3f} {:4.1f}  {:7.1%}  {:9.1%}  {:9.1%} {:6.1%}  {:6.0f}".format(*case, *shares, pairs)
         if case[0] <= case[1] - 0.02 + 1e-9:
             worst = max(worst, shares[0] + shares[1])
-    print(f"of candidates that are worse by the margin or more, at most {worst:.1%} pass")
-    return 0
-
-
-if __name__ == "__main__":
-    raise SystemExit(main())
+    yield at_most("of candidates worse by the margin or more, pass", 100 * worst, 5, "%")

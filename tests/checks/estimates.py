@@ -6,19 +6,14 @@ for every pair: truth, estimate and 95 % interval; at the end, the share of inte
 correlation (Spearman) of the estimates of each data set with the truth.
 """
 
-from __future__ import annotations
-
-import argparse
-import json
 import tempfile
-import time
 from contextlib import closing
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bam_train.cli.flags import Count, Seed
 from bam_train.data import DataSet
 from bam_train.data.record_dataset import RecordVectorDataset
 from bam_train.environments import make_vector_env
@@ -26,18 +21,30 @@ from bam_train.estimation.data_evaluation import within_bounds
 from bam_train.estimation.fitted_q import fit_q
 from bam_train.estimation.steps import read_steps
 from bam_train.evaluation import evaluate
-from bam_train.policy import FrozenPolicy
 from bam_train.trainers.resolve_settings import resolve
 from bam_train.trainers.sb3.sb3_trainer import SB3Trainer
+from tests.benchmarks import harness
 
 ENV = "bam/pick-v0"
 STAGES = (15_000, 40_000, 65_000, 80_000, 95_000, 110_000, 130_000, 160_000, 200_000, 240_000)
 """Steps after which a policy of the run is kept."""
 
 
-def train(seed: int) -> list[FrozenPolicy]:
+@dataclass(frozen=True, kw_only=True)
+class Flags(harness.Flags):
+    sets: Count = 5
+    """Data sets."""
+    episodes: Count = 400
+    """Episodes of each."""
+    truth: Count = 1000
+    """Simulated episodes of each policy."""
+    seed: Seed = 0
+    """Of training and the first data set."""
+
+
+def train(seed):
     """The policies of a run at `STAGES`."""
-    policies: list[FrozenPolicy] = []
+    policies = []
     trainer = SB3Trainer.create(resolve({"env": ENV, "algo": "ppo", "seed": seed, "steps": STAGES[-1]}))
     with closing(trainer):
         for steps in STAGES:
@@ -46,7 +53,7 @@ def train(seed: int) -> list[FrozenPolicy]:
     return policies
 
 
-def record(place: Path, policies: list[FrozenPolicy], episodes: int, seed: int) -> DataSet:
+def record(place, policies, episodes, seed):
     """A data set of four of the policies, with noise and random actions."""
     rng = np.random.default_rng(seed)
     chosen = [policies[i] for i in rng.choice(len(policies), 4, replace=False)]
@@ -69,28 +76,21 @@ def record(place: Path, policies: list[FrozenPolicy], episodes: int, seed: int) 
     return DataSet.open(place)
 
 
-def ranks(values: Any) -> NDArray[np.float64]:
+def ranks(values):
     return np.argsort(np.argsort(values)).astype(float)
 
 
-def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--sets", type=int, default=5, help="data sets (default 5)")
-    parser.add_argument("--episodes", type=int, default=400, help="episodes of each (default 400)")
-    parser.add_argument("--truth", type=int, default=1000, help="simulated episodes of each policy (default 1000)")
-    parser.add_argument("--seed", type=int, default=0, help="of training and the first data set (default 0)")
-    parser.add_argument("--json", type=Path, help="write the pairs to this file")
-    arguments = parser.parse_args()
-    began = time.process_time()
-    policies = train(arguments.seed)
-    truth = [evaluate(one, ENV, episodes=arguments.truth, seed=5_000_000).success_rate or 0.0 for one in policies]
-    print("truth", np.round(truth, 3).tolist(), f"{time.process_time() - began:.0f} CPU-s", flush=True)
-    covered, correlations, pairs = [], [], []
-    for seed in range(arguments.seed, arguments.seed + arguments.sets):
+def measure_estimates(flags):
+    """Each data set and policy."""
+    policies = train(flags.seed)
+    truth = [evaluate(one, ENV, episodes=flags.truth, seed=5_000_000).success_rate or 0.0 for one in policies]
+    yield f"truth {np.round(truth, 3).tolist()}"
+    covered, correlations, widths = [], [], []
+    for seed in range(flags.seed, flags.seed + flags.sets):
         with tempfile.TemporaryDirectory() as folder:
-            data = record(Path(folder) / "data", policies, arguments.episodes, seed)
+            data = record(Path(folder) / "data", policies, flags.episodes, seed)
             own = np.mean([bool(data.facts(i)["success"]) for i in range(len(data))])
-            print(f"data set {seed}: {len(data)} episodes, {own:.1%} succeeded", flush=True)
+            yield f"data set {seed}: {len(data)} episodes, {own:.1%} succeeded"
             values = []
             for number, policy in enumerate(policies):
                 fitted = fit_q(read_steps(data, policy, range(len(data)), by_success=True))
@@ -98,22 +98,12 @@ def main() -> int:
                 low, high = found.interval
                 covered.append(low <= truth[number] <= high)
                 values.append(found.value)
-                pairs.append({"set": seed, "policy": number, "truth": truth[number], **found.to_json()})
-                line = (
-                    f"  policy {number}: truth {truth[number]:.3f}, estimate {found.value:.3f}, {low:.3f} to {high:.3f}"
-                )
-                print(line + ("" if covered[-1] else "  missed"), flush=True)
+                widths.append((high - low) / 2)
+                text = f"truth {truth[number]:.3f}, estimate {found.value:.3f}, {low:.3f} to {high:.3f}"
+                yield f"  policy {number}: {text}{'' if covered[-1] else '  missed'}"
         correlations.append(float(np.corrcoef(ranks(values), ranks(truth))[0, 1]))
-        errors = np.array(values) - truth
-        print(f"  error {np.sqrt(np.mean(errors**2)):.3f}, rank correlation {correlations[-1]:.2f}", flush=True)
-    print(f"{sum(covered)} of {len(covered)} intervals cover the truth: {np.mean(covered):.1%}")
-    print("mean half width", round(float(np.mean([(one["interval"][1] - one["interval"][0]) / 2 for one in pairs])), 3))
-    print(f"rank correlation {min(correlations):.2f} to {max(correlations):.2f}, mean {np.mean(correlations):.2f}")
-    print(f"{time.process_time() - began:.0f} CPU-s")
-    if arguments.json is not None:
-        arguments.json.write_text(json.dumps(pairs))
-    return 0
-
-
-if __name__ == "__main__":
-    raise SystemExit(main())
+        error = np.sqrt(np.mean((np.array(values) - truth) ** 2))
+        yield f"  error {error:.3f}, rank correlation {correlations[-1]:.2f}"
+    yield f"{sum(covered)} of {len(covered)} intervals cover the truth: {np.mean(covered):.1%}"
+    yield f"mean half width {np.mean(widths):.3f}"
+    yield f"rank correlation {min(correlations):.2f} to {max(correlations):.2f}, mean {np.mean(correlations):.2f}"

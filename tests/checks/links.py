@@ -6,34 +6,43 @@ the plain success rate is in brackets. With --guarded, the columns are the links
 ``bam-deploy --rehearse`` has them, and a link without delay first.
 """
 
-from __future__ import annotations
-
-import argparse
 from contextlib import closing
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
-from bam_envs.core.errors import BamEnvsError
+import tyro
+
 from bam_envs.core.registry import entry_of
 from bam_envs.robots.linked import PROFILES
 from bam_train.checkpoint import Checkpoint
+from bam_train.cli.flags import Count
 from bam_train.deploy.rehearsal import Rehearsal
 from bam_train.env_location import SIMULATED
 from bam_train.errors import BamTrainError
 from bam_train.evaluation import evaluate
 from bam_train.policy import FrozenPolicy
+from tests.benchmarks.harness import CHECKPOINTS
 
-FOLDER = Path(__file__).resolve().parents[1] / "checkpoints"
 SEED = 3_000_000
 """Seed of the first episode; neither training nor `bam-eval` uses it."""
 NO_DELAY = {"command_delay": [0.0, 0.0], "state_delay": [0.0, 0.0]}
-GUARDED: dict[str, Any] = {"no delay": NO_DELAY, **{name: name for name in PROFILES}}
+GUARDED = {"no delay": NO_DELAY, **{name: name for name in PROFILES}}
 """Links behind which the guards of a live robot are shown."""
 STEPS = 2
 """Delay of late actions and commands [steps]."""
 
 
-def columns(period: float) -> dict[str, dict[str, Any]]:
+@dataclass(frozen=True, kw_only=True)
+class Flags:
+    checkpoints: tyro.conf.Positional[tuple[Path, ...]] = ()
+    """By default those in checkpoints/ of robots."""
+    episodes: Count = 300
+    """Episodes in each column."""
+    guarded: bool = False
+    """Behind the guards of a live robot."""
+
+
+def columns(period):
     """Arguments of the environment for each column of the table; `period` is the robot's [s]."""
     plain = dict(SIMULATED)
     late = {"command_delay": [STEPS * period] * 2, "state_delay": [0.0, 0.0]}
@@ -47,7 +56,7 @@ def columns(period: float) -> dict[str, dict[str, Any]]:
     }
 
 
-def row(path: Path, episodes: int) -> list[str]:
+def row(path, episodes):
     """The success of one checkpoint in each column."""
     checkpoint = Checkpoint.open(path)
     manifest = checkpoint.manifest
@@ -63,7 +72,7 @@ def row(path: Path, episodes: int) -> list[str]:
     return cells
 
 
-def guarded_row(path: Path, episodes: int) -> list[str]:
+def guarded_row(path, episodes):
     """The success of one checkpoint behind each link and the guards of a live robot."""
     checkpoint = Checkpoint.open(path)
     policy, cells = FrozenPolicy.from_checkpoint(checkpoint), [path.name]
@@ -76,28 +85,19 @@ def guarded_row(path: Path, episodes: int) -> list[str]:
     return cells
 
 
-def of_robots() -> list[Path]:
+def of_robots():
     """The committed checkpoints whose environment has a robot."""
-    entries = ((path, entry_of(Checkpoint.open(path, members=False).manifest.env)) for path in FOLDER.glob("*.zip"))
+    entries = (
+        (path, entry_of(Checkpoint.open(path, members=False).manifest.env)) for path in CHECKPOINTS.glob("*.zip")
+    )
     return sorted(path for path, entry in entries if entry is None or entry.has_robot)
 
 
-def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("checkpoints", nargs="*", type=Path, help="default: those in checkpoints/ of robots")
-    parser.add_argument("--episodes", type=int, default=300, help="episodes in each column (default 300)")
-    parser.add_argument("--guarded", action="store_true", help="behind the guards of a live robot")
-    arguments = parser.parse_args()
-    header = ["checkpoint", *(GUARDED if arguments.guarded else columns(1.0))]
+def main(flags):
+    """Print the table."""
+    header = ["checkpoint", *(GUARDED if flags.guarded else columns(1.0))]
     print(f"| {' | '.join(header)} |\n| {' | '.join(['---'] * len(header))} |", flush=True)
-    try:
-        for path in arguments.checkpoints or of_robots():
-            cells = (guarded_row if arguments.guarded else row)(path, arguments.episodes)
-            print(f"| {' | '.join(cells)} |", flush=True)
-    except (BamTrainError, BamEnvsError) as error:
-        parser.error(str(error))
+    for path in flags.checkpoints or of_robots():
+        cells = (guarded_row if flags.guarded else row)(path, flags.episodes)
+        print(f"| {' | '.join(cells)} |", flush=True)
     return 0
-
-
-if __name__ == "__main__":
-    raise SystemExit(main())
