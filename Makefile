@@ -24,7 +24,7 @@ quick: $(VENV)/.dev
 
 # ROS 2, a rosbridge server and roslibjs for tests/peers; where they cannot be installed, those tests are skipped.
 peers:
-	PYTHON=$(PYTHON) scripts/install_peers
+	PYTHON=$(PYTHON) tests/peers/install_peers
 
 lint: $(VENV)/.dev
 	$(BIN)/ruff check .
@@ -37,7 +37,7 @@ format: $(VENV)/.dev
 
 # The generated parts of docs/*.md, from the code.
 docs: $(VENV)/.dev
-	$(BIN)/python scripts/make_docs.py
+	$(BIN)/python docs/hooks/make_docs.py
 
 # All pages and the reference of the code, with search, in build/site: open build/site/index.html.
 site: $(VENV)/.dev

@@ -16,7 +16,7 @@ import make_docs
 from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.structure.files import File, Files
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 SOURCES = (ROOT / "envs", ROOT)
 PACKAGES = ("bam_envs", "bam_train")
 LEFT_OUT = ("bam_train.cli",)

@@ -9,32 +9,38 @@ written by hand. Longer than most files here: every kind of part has its functio
 from __future__ import annotations
 
 import argparse
+import contextlib
 import dataclasses
 import importlib
 import inspect
+import io
 import itertools
 import re
 import textwrap
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
-from typing import Any, get_type_hints
+from typing import Any
+
+import numpy as np
 
 from bam_envs.core.env_options import CAMERA_OPTIONS as IMAGES
 from bam_envs.core.registry import ENVIRONMENTS, NO_ROBOT, EnvEntry, resolve
 from bam_envs.core.robot import SignalSpec
-from bam_envs.core.robot_env import describe
 from bam_envs.core.spaces import space_text
 from bam_train.cli import program
+from bam_train.cli.deploy import deploy_checkpoint
+from bam_train.cli.envs import detail_lines, details
+from bam_train.cli.flags import DeployConfig
+from bam_train.signals import SignalMemory
 
-DOCS = Path(__file__).resolve().parents[1] / "docs"
+ROOT = Path(__file__).resolve().parents[2]
+DOCS, CHECKPOINTS = ROOT / "docs", ROOT / "checkpoints"
 _PART = re.compile(r"(<!-- generated: (?P<name>\S+)(?: (?P<argument>\S+))? -->\n)(.*?)(<!-- /generated -->)", re.DOTALL)
 _SITE = re.compile(r"<!-- site: (?P<name>\S+)(?: (?P<argument>\S+))? -->")
 SECTIONS = ("Start", "Reward", "Success", "End", "Info")
 """Parts of a task's docstring that its page shows; every task has them."""
 OPTIONAL = ("Action",)
 """Parts that a task may have."""
-DIRECTIONS = ("x", "y", "z", "forward", "to the left", "up", "above the table", "near", "close up")
-"""What may follow the last comma of a signal's meaning."""
 
 
 ENVIRONMENT_PAGES = {
@@ -133,31 +139,20 @@ def environment(env_id: str, told: dict[str, str] | None = None) -> str:
         both = " and ".join(f"`{name}`" for name in entry.cameras)
         shown = f"of {both}, or of those in" if entry.shows else f"with `camera=` of {both};"
         parts.append(f"**Images**: {shown}{' `camera=`;' * bool(entry.shows)} see [images](index.md#images).")
-    signals = describe(resolve(entry.robot)(1), resolve(entry.task)(1))
-    for kind in ("observation", "action"):
-        space = getattr(resolve(entry.task)(1), f"{kind}_space")
-        shape = f"float32, shape ({len(signals[kind])},)" if robot else space_text(space)
-        title = f"**{kind.capitalize()}**: {shape}"
-        parts.append(
-            f"{title}. {_line(signals[kind])}" if len(signals[kind]) <= 2 else f"{title}, named by `bam-envs {env_id}`."
-        )
-        if len(signals[kind]) > 2:
-            parts.append(f"<!-- site: {kind} {env_id} -->")
+    kinds = [(kind, getattr(task(1), f"{kind}_space")) for kind in ("observation", "action")]
+    shapes = [f"**{kind.capitalize()}**: {_shape(space) if robot else space_text(space)}" for kind, space in kinds]
+    parts += [f"{'. '.join(shapes)}; `bam-envs {env_id}` names the numbers.", f"<!-- site: numbers {env_id} -->"]
     return "\n\n".join(parts)
+
+
+def _shape(space: Any) -> str:
+    return f"float32, shape ({int(np.prod(space.shape))},)"
 
 
 def _new(told: dict[str, str], text: str, env_id: str) -> str:
     """The text, or the environment above that has it; a short text is given again."""
     first = told.setdefault(text, env_id)
     return text if first == env_id or len(text) < 50 else f"As in `{first}`."
-
-
-def _line(rows: Sequence[Mapping[str, Any]]) -> str:
-    """One or two numbers, in a line."""
-    return "; ".join(
-        f"{names}: {meaning} ({f'{unit}, ' if unit not in ('', '1') else ''}{_cell(low)} to {_cell(high)})"
-        for _, (names, meaning, unit, _, low, high) in _joined(rows)
-    )
 
 
 def parity(env_id: str) -> str:
@@ -167,58 +162,21 @@ def parity(env_id: str) -> str:
     return f"**Parity.** {' '.join(texts)}" if texts else ""
 
 
-def observation(env_id: str) -> str:
-    """Every number of an observation."""
-    return numbers(env_id, "observation")
+def numbers(env_id: str) -> str:
+    """Every number of observation and action, as ``bam-envs ID`` prints them."""
+    text = "\n".join(detail_lines(details(env_id)))
+    return printed(text[text.index("observation\n") :].partition("\n\nstate\n")[0])
 
 
-def action(env_id: str) -> str:
-    """Every number of an action."""
-    return numbers(env_id, "action")
-
-
-def numbers(env_id: str, kind: str) -> str:
-    """Every number of an observation or an action: names, unit, scale and limits."""
-    entry = ENVIRONMENTS[env_id]
-    rows = describe(resolve(entry.robot)(1), resolve(entry.task)(1))[kind]
-    header = ["numbers", "names", "meaning", "unit", "scale", "min", "max"]
-    return table(header, [[where, *line] for where, line in _joined(rows)])
-
-
-def _joined(rows: Sequence[Mapping[str, Any]]) -> list[tuple[str, list[object]]]:
-    """Neighbours that differ in their joint or direction only, as one line: ``[0:6]`` and what they are.
-
-    A meaning ends with its direction ("tool, x"), or names its joint ("turn elbow_joint"), or is the same for all.
-    """
-    lines: list[tuple[str, list[object]]] = []
-    groups = itertools.groupby(enumerate(rows), lambda pair: _alike(pair[1]))
-    for (head, *columns), members in groups:
-        numbered = list(members)
-        first, last = numbered[0][0], numbered[-1][0]
-        where = f"[{first}]" if first == last else f"[{first}:{last + 1}]"
-        tails = [row["meaning"].rpartition(", ")[2] for _, row in numbered]
-        meaning = numbered[0][1]["meaning"] if first == last else head
-        if len(set(tails)) > 1 and head != tails[0] and "the joint" not in head:
-            meaning = f"{head}: {', '.join(tails)}"
-        lines.append((f"`{where}`", [_listed([row["name"] for _, row in numbered]), meaning, *columns]))
-    return lines
+def printed(text: str) -> str:
+    """What a program prints."""
+    return f"```text\n{text.rstrip()}\n```"
 
 
 def _listed(names: Sequence[str]) -> str:
     """Names as code; of more than three the first and the last, with the dots between them."""
     quoted = [f"`{name}`" for name in names]
     return ", ".join(quoted) if len(quoted) <= 3 else f"{quoted[0]} … {quoted[-1]}"
-
-
-def _alike(row: Mapping[str, Any]) -> tuple[Any, ...]:
-    """What rows have in common that stand in one line."""
-    joint = row["name"].removeprefix("d_")
-    number = joint.rpartition("_")[2]
-    if number.isdigit():
-        row = {**row, "meaning": row["meaning"].replace(f" {number} ", " 0, 1, … ")}
-    head, comma, direction = row["meaning"].rpartition(", ")
-    meaning = head if comma and direction in DIRECTIONS else row["meaning"].replace(joint, "the joint")
-    return (meaning, *(row[name] for name in ("unit", "scale", "low", "high")))
 
 
 def _paragraphs(kind: type, beginning: str) -> list[str]:
@@ -242,31 +200,11 @@ def _default(value: object) -> str:
     return "" if value is None else str(value)
 
 
-def guards() -> str:
-    """The guards of an arm and of a base, with their limits; what does the same is one row."""
-    from bam_envs.live.building import profile_limits
-    from bam_envs.robots.profile import load_profile
-    from bam_envs.safety.guards import default_guards
-
-    robots: dict[str, dict[str, list[str]]] = {}
-    for name in ("ur5e", "mir100"):
-        profile = load_profile(name)
-        for guard in default_guards(profile.spec(), profile_limits(profile), straight=True):
-            does = code(inspect.cleandoc(type(guard).__doc__ or "").partition("\n\n")[0])
-            limits = robots.setdefault(does, {}).setdefault(f"{guard.name} ({guard.number})", [])
-            limits.append(f"{guard.limit_value:g} {guard.unit} ({profile.kind})")
-    rows = [[_guards_of(limits), does] for does, limits in robots.items()]
-    return table(["guard, with its limit", "what it does"], rows)
-
-
-def _guards_of(limits: Mapping[str, Sequence[str]]) -> str:
-    """Names with their limits, and the kind of robot unless an arm and a base have the same."""
-    lines = []
-    for name, (first, *others) in limits.items():
-        limit = first.rpartition(" (")[0]
-        same = others and others[0].rpartition(" (")[0] == limit
-        lines.append(f"{name}: {limit if same else ', '.join([first, *others])}")
-    return "; ".join(lines)
+def guards(checkpoint: str) -> str:
+    """What ``bam-deploy CHECKPOINT --print-guards`` prints."""
+    with contextlib.redirect_stdout(io.StringIO()) as output:
+        deploy_checkpoint(DeployConfig(CHECKPOINTS / checkpoint, print_guards=True), SignalMemory())
+    return printed(output.getvalue())
 
 
 def topics_of(name: str) -> str:
@@ -364,40 +302,10 @@ def default_of(field: dataclasses.Field[Any]) -> str:
 
 
 def flags_of(reference: str) -> str:
-    """The flags of a program whose configuration is the dataclass ``"module:Class"``."""
+    """The ``--help`` of a program whose configuration is the dataclass ``"module:Class"``."""
     kind = resolve(reference)
-    docs = field_docs(kind)
-    return "\n".join(item(flag(kind, field), flag_default(field), docs[field.name]) for field in _flags(kind))
-
-
-def _flags(kind: type) -> list[dataclasses.Field[Any]]:
-    hints = get_type_hints(kind, include_extras=True)
-    return [field for field in dataclasses.fields(kind) if "Suppress" not in str(hints[field.name])]
-
-
-def train_flags(reference: str) -> str:
-    """The flags of ``bam-train`` with the defaults of the settings, then the settings that have no flag."""
-    from bam_train.settings import TrainSettings
-
-    kind = resolve(reference)
-    docs, shown = field_docs(kind), _flags(kind)
-    defaults = {field.name: flag_default(field) for field in dataclasses.fields(TrainSettings)}
-    flags = [item(flag(kind, one), defaults.get(one.name) or flag_default(one), docs[one.name]) for one in shown]
-    names = [name for name in defaults if name not in {one.name for one in shown}]
-    others = [item(name, defaults[name], field_docs(TrainSettings)[name]) for name in names]
-    return "\n".join([*flags, "\nSettings without a flag, for `--set`:\n", *others])
-
-
-def flag_default(field: dataclasses.Field[Any]) -> str:
-    """What a flag is when it is not given; a switch is then off, which need not be said."""
-    return "" if field.default is False else default_of(field)
-
-
-def flag(kind: type, field: dataclasses.Field[Any]) -> str:
-    """How a field is given on the command line."""
-    if "Positional" in str(get_type_hints(kind, include_extras=True)[field.name]):
-        return field.name.upper() if field.name != "env" else "ID"
-    return f"--{field.name.replace('_', '-')}"
+    text = program.help_text(kind, "", inspect.cleandoc(kind.__doc__ or ""))
+    return printed(text.partition("\n\n")[2])  # without the line of its usage
 
 
 def algorithms(trainer: str = "sb3") -> str:
@@ -491,8 +399,7 @@ def audit_fields() -> str:
 PARTS: dict[str, Callable[..., str]] = {
     "environments": environments,
     "parity": parity,
-    "observation": observation,
-    "action": action,
+    "numbers": numbers,
     "environment-page": environment_page,
     "robot-signals": robot_signals,
     "guards": guards,
@@ -500,7 +407,6 @@ PARTS: dict[str, Callable[..., str]] = {
     "fields": fields_of,
     "defaults": defaults_of,
     "flags": flags_of,
-    "train-flags": train_flags,
     "algorithms": algorithms,
     "presets": presets,
     "robo-gym": robo_gym,
@@ -542,7 +448,7 @@ def main() -> int:
         if not check:
             page.write_text(current, encoding="utf-8")
     if stale:
-        print(f"{', '.join(stale)}: {'not current; run scripts/make_docs.py' if check else 'written'}")
+        print(f"{', '.join(stale)}: {'not current; run docs/hooks/make_docs.py' if check else 'written'}")
     return int(check and bool(stale))
 
 
