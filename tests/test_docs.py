@@ -208,12 +208,10 @@ def test_flags_on_the_site_are_the_flags_of_the_programs(make_docs, program, mon
         main()
     assert caught.value.code == 0
     there = set(re.findall(r"--[a-z][a-z-]*", capsys.readouterr().out)) - {"--help"}
-    page = (
-        ROOT / "docs" / ("reference-training.md" if program == "bam-train" else "reference-programs.md")
-    ).read_text()
-    part = re.search(
-        r"<!-- site: flags .*? -->", page[0 if program == "bam-train" else page.index(f"## {program}\n") :]
-    )
+    name = "reference-training.md" if program == "bam-train" else "reference-programs.md"
+    page = (ROOT / "docs" / name).read_text()
+    section = page if program == "bam-train" else page.partition(f"## {program}\n")[2]
+    part = re.search(r"<!-- site: flags .*? -->", section)
     assert set(re.findall(r"--[a-z][a-z-]*", make_docs.build(part[0]))) - {"--help"} == there
 
 

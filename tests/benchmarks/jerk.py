@@ -47,14 +47,11 @@ class Flags(harness.Flags):
 
 
 class Controller(NamedTuple):
-    """What a controller makes of commands."""
+    """When a command is reached [periods]; whether it begins where the joint is measured, and ends at rest."""
 
     reach: float = 0.0
-    """When a command is reached [periods]; 0: at once."""
     measured: bool = False
-    """Whether a trajectory begins where the joint is measured, or at the last set point."""
     at_rest: bool = False
-    """Whether the point says that the arm rests there."""
 
 
 CONTROLLERS = {

@@ -10,24 +10,17 @@ import json
 import os
 import threading
 import time
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import gymnasium as gym
 import numpy as np
 
 from bam_train.errors import SettingsError
-from tests.benchmarks import harness
-from tests.benchmarks.harness import HOME, Peer, Row, at_least, at_most, percentiles, timed, until_the_end
+from tests.benchmarks.harness import HOME, Peer, at_least, at_most, percentiles, timed, until_the_end
 
 CAMERA = "/camera/image/compressed"
 IMAGE = (84, 84, 3)
-
-
-@dataclass(frozen=True, kw_only=True)
-class Flags(harness.Flags):
-    rosbridge: str | None = None
-    """Address of a UR5e behind a rosbridge server that is not ours, such as ws://10.0.0.5:9090."""
 
 
 # The servers, each in a process of its own.
@@ -312,29 +305,3 @@ def measure_subscribers(flags):
     (begun, before), (ended, after) = marks
     share = 100 * (after - before) / (ended - begun)
     yield at_most("20 subscribers to 100 Hz joint states, of a core", share, 25, "%")
-
-
-def measure_rosbridge(flags):
-    """One robot at 100 Hz through somebody else's rosbridge server: ticks lost, ticks late."""
-    if flags.rosbridge is None:
-        yield Row("100 Hz through a rosbridge server", "not measured", "--rosbridge URL")
-        return
-    robot, state = live_arm(flags.rosbridge, period=0.01)
-    ticks, ages, ends = 100 * flags.times(10), [], []
-    for _ in range(ticks):
-        robot.step(state.command)
-        ends.append(time.monotonic())
-        ages.append(robot._robot.age())
-    robot.close()
-    late, lost = lateness(np.array(ends), 0.01), max(0, round((ends[-1] - ends[0]) / 0.01) - (ticks - 1))
-    yield at_most(f"100 Hz through {flags.rosbridge}, lost of {ticks}", lost, 0, "")
-    yield at_most("  ticks late by more than 2 ms", 100 * float((late > 0.002).mean()), 1, "%")
-    yield percentiles("  age of states", ages, "ms")
-
-
-def lateness(times, period):
-    """How long after the points of their grid, whose place is theirs to say, `times` are [s]."""
-    offset = (times - times[0]) % period
-    middle = np.median((offset + period / 2) % period) - period / 2  # of offsets around 0, which may have wrapped
-    around = (offset - middle + period / 2) % period - period / 2
-    return around - np.percentile(around, 1)
