@@ -93,11 +93,11 @@ def percentiles(what, times, unit, p50=None, p99=None):
 
 
 def timed(act, count, clock=time.perf_counter):
-    """How long each of `count` calls of ``act(k)`` took [s]."""
+    """How long each of `count` calls took [s]."""
     times = np.empty(count)
     for k in range(count):
         begun = clock()
-        act(k)
+        act()
         times[k] = clock() - begun
     return times
 

@@ -11,6 +11,7 @@ import os
 import threading
 import time
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import gymnasium as gym
@@ -20,7 +21,6 @@ from bam_train.errors import SettingsError
 from tests.benchmarks.harness import HOME, Peer, at_least, at_most, percentiles, timed, until_the_end
 
 CAMERA = "/camera/image/compressed"
-IMAGE = (84, 84, 3)
 
 
 # The servers, each in a process of its own.
@@ -221,8 +221,8 @@ def measure_link(flags):
         back.subscribe(lambda message: came.release())
         there.advertise()
 
-        def once(k):
-            there.publish({"data": str(k)})
+        def once():
+            there.publish({"data": "ping"})
             if not came.acquire(timeout=5):
                 raise SettingsError("the echo did not answer")
 
@@ -239,29 +239,26 @@ def measure_link(flags):
         yield at_most(f"  ratio of p{percent}, median of rounds", found, 2, "x")
 
 
-def steps(flags, shape, scheme, what, goal):
+STEPS = {
+    "GymAPI step, state": ((18,), "ws", 1_000),
+    "TCP step, state": ((18,), "tcp", 5_000),
+    "TCP step, 84 x 84 x 3 image": ((84, 84, 3), "tcp", 2_000),
+}
+"""Shape of the observation, scheme of the address, and the goal [steps/s]."""
+
+
+def measure_steps(flags):
     """Steps/s of a trivial environment; the median round."""
     from bam_envs.remote.remote_env import make_remote_env
 
-    with Peer(serve_environment, shape) as server:
-        env = make_remote_env("Trivial-v0", f"{scheme}://127.0.0.1:{server.ports[scheme == 'tcp']}")
-        env.reset(seed=1)
-        action = np.zeros(5, np.float32)
-        rates = [1 / timed(lambda k: env.step(action), flags.times(1000)).mean() for _ in range(flags.times(7) + 1)]
-        env.close()
-    yield at_least(f"{what}, steps/s", np.median(rates[1:]), goal)
-
-
-def measure_gymapi(flags):
-    yield from steps(flags, (18,), "ws", "GymAPI step, state", 1_000)
-
-
-def measure_tcp(flags):
-    yield from steps(flags, (18,), "tcp", "TCP step, state", 5_000)
-
-
-def measure_tcp_image(flags):
-    yield from steps(flags, IMAGE, "tcp", "TCP step, 84 x 84 x 3 image", 2_000)
+    for what, (shape, scheme, goal) in STEPS.items():
+        with Peer(serve_environment, shape) as server:
+            env = make_remote_env("Trivial-v0", f"{scheme}://127.0.0.1:{server.ports[scheme == 'tcp']}")
+            env.reset(seed=1)
+            step = partial(env.step, np.zeros(5, np.float32))
+            rates = [1 / timed(step, flags.times(1000)).mean() for _ in range(flags.times(7) + 1)]
+            env.close()
+        yield at_least(f"{what}, steps/s", np.median(rates[1:]), goal)
 
 
 def measure_camera(flags):

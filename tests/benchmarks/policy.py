@@ -60,11 +60,11 @@ def contenders(flags):
     session = onnxruntime.InferenceSession(graph, options, providers=["CPUExecutionProvider"])
     x = observation.sample()
     ways = {
-        "FrozenPolicy.act": lambda k: frozen.act(x),
-        "onnxruntime": lambda k: session.run(["action"], {"observation": x[None]})[0][0],
-        "SB3 predict": lambda k: model.predict(normaliser.normalize_obs(x) if normaliser else x, deterministic=True)[0],
+        "FrozenPolicy.act": lambda: frozen.act(x),
+        "onnxruntime": lambda: session.run(["action"], {"observation": x[None]})[0][0],
+        "SB3 predict": lambda: model.predict(normaliser.normalize_obs(x) if normaliser else x, deterministic=True)[0],
     }
-    worst = max(float(np.abs(way(0) - ways["SB3 predict"](0)).max()) for way in ways.values())
+    worst = max(float(np.abs(way() - ways["SB3 predict"]()).max()) for way in ways.values())
     if not worst <= 1e-5:
         raise SettingsError(f"the contenders differ by {worst:.2g}: nothing to compare")
     return ways
