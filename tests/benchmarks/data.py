@@ -58,7 +58,7 @@ def measure_collect(flags):
 
     def recorded():
         with tempfile.TemporaryDirectory() as folder:
-            steps["recorded"] = collect_into(Path(folder) / "d", flags.times(300)).steps
+            steps["recorded"] = collect_into(Path(folder) / "d", max(64, flags.times(300))).steps
 
     times = in_turns({"alone": alone, "recorded": recorded}, flags.times(3))
     rates = {name: steps[name] / median(one) for name, one in times.items()}

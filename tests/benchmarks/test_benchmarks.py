@@ -50,7 +50,7 @@ def test_they_are_listed(run):
 @pytest.mark.parametrize(
     ("arguments", "status", "said"),
     [
-        (("link", "--only", "gimapi"), 1, "link: --only: there is no 'gimapi'. Did you mean 'gymapi'?\n"),
+        (("link", "--only", "camra"), 1, "link: --only: there is no 'camra'. Did you mean 'camera'?\n"),
         (
             ("link", "--quik"),
             2,
