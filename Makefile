@@ -8,7 +8,7 @@ WORKERS := -n 3 --no-loadscope-reorder
 # Python keeps what it has compiled, also where the environment says otherwise: half the time of collecting the tests.
 export PYTHONDONTWRITEBYTECODE :=
 
-.PHONY: demo test quick peers lint format docs site clean
+.PHONY: demo test quick benchmarks peers lint format docs site clean
 
 demo: $(VENV)/.run
 	$(BIN)/bam-train --env bam/pick --algo ppo --out $(DEMO)/pick-ppo.zip --runs $(DEMO)/runs --force
@@ -22,9 +22,13 @@ test: $(VENV)/.dev peers
 quick: $(VENV)/.dev
 	$(BIN)/python -m pytest $(WORKERS) -m "not (slow or ray or peers or training)"
 
+# Every figure against its goal, on an idle machine in some hours; python -m tests.benchmarks lists them.
+benchmarks: $(VENV)/.dev
+	$(BIN)/python -m tests.benchmarks all
+
 # ROS 2, a rosbridge server and roslibjs for tests/peers; where they cannot be installed, those tests are skipped.
 peers:
-	PYTHON=$(PYTHON) scripts/install_peers
+	PYTHON=$(PYTHON) tests/peers/install_peers
 
 lint: $(VENV)/.dev
 	$(BIN)/ruff check .
@@ -37,7 +41,7 @@ format: $(VENV)/.dev
 
 # The generated parts of docs/*.md, from the code.
 docs: $(VENV)/.dev
-	$(BIN)/python scripts/make_docs.py
+	$(BIN)/python docs/hooks/make_docs.py
 
 # All pages and the reference of the code, with search, in build/site: open build/site/index.html.
 site: $(VENV)/.dev

@@ -33,6 +33,7 @@ from bam_train.cli.data.bam_data import COMMANDS as DATA_COMMANDS
 from bam_train.cli.data.run_gate import FAILED, STATUSES
 from bam_train.cli.program import help_text, parse
 from bam_train.settings import tomllib
+from tests.checks import checkpoints
 from tests.test_checkpoints import LEAST
 
 ROOT = Path(__file__).parents[1]
@@ -44,13 +45,6 @@ EXAMPLES = {"PYTHONPATH": os.pathsep.join([str(ROOT), str(ROOT / "envs")]), "OMP
 
 def name_of(page):
     return str(page.relative_to(ROOT))
-
-
-def load_script(name):
-    spec = importlib.util.spec_from_file_location(name, ROOT / "scripts" / f"{name}.py")
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
 
 
 def blocks(page, language):
@@ -80,13 +74,16 @@ def python(*arguments, folder, **variables):
 
 @pytest.fixture(scope="module")
 def make_docs():
-    return load_script("make_docs")
+    spec = importlib.util.spec_from_file_location("make_docs", ROOT / "docs" / "hooks" / "make_docs.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
 
 
 @pytest.mark.parametrize("page", DOCS, ids=name_of)
 def test_generated_parts_are_current(make_docs, page):
     text = page.read_text()
-    assert make_docs.generate(text) == text, f"run: python scripts/make_docs.py ({page.name})"
+    assert make_docs.generate(text) == text, f"run: python docs/hooks/make_docs.py ({page.name})"
 
 
 def test_a_stale_page_is_found(make_docs, tmp_path, monkeypatch, capsys):
@@ -94,7 +91,7 @@ def test_a_stale_page_is_found(make_docs, tmp_path, monkeypatch, capsys):
     page.write_text("Before\n<!-- generated: algorithms -->\nold\n<!-- /generated -->\nafter\n")
     monkeypatch.setattr(make_docs, "DOCS", tmp_path)
     for arguments, status, said in (
-        (["--check"], 1, "page.md: not current; run scripts/make_docs.py\n"),
+        (["--check"], 1, "page.md: not current; run docs/hooks/make_docs.py\n"),
         ([], 0, "page.md: written\n"),
         (["--check"], 0, ""),
     ):
@@ -125,17 +122,18 @@ def test_what_an_environment_has_in_common_with_one_above_it_is_not_said_again(m
     assert "**Options** of `gym.make`, besides `objects`, `grasps`, `size` as above:" in second
 
 
-def test_every_number_of_an_environment_is_in_its_table(make_docs):
+def test_every_number_of_an_environment_is_named_on_the_site(make_docs):
     page = make_docs.build(make_docs.environment("bam/pick-v0"))
-    assert "| `[2]` | `tool_z` | tool, above the table | m | (z - 0.183) / 0.167 | -2 | 2 |" in page
-    line = "tool target from the tool: forward, to the left, up | m | / 0.03 | -2 | 2 |"
-    assert f"| `[3:6]` | `target_dx`, `target_dy`, `target_dz` | {line}" in page
-    assert "| `[4]` | `grip` | close the gripper when positive, open it otherwise | 1 | 1 | -1 | 1 |" in page
-    assert "| `[0:6]` | `d_shoulder_pan_joint` … `d_wrist_3_joint` | turn the joint | rad |" in make_docs.action(
-        "bam/reach-v0"
-    )
-    sectors = "| `[4:12]` | `front_0` … `front_7` | shortest ray of sector 0, 1, … of the front scanner"
-    assert sectors in make_docs.observation("bam/mir100-avoidance-v0")
+    assert "**Observation**: float32, shape (18,). **Action**: float32, shape (5,); `bam-envs bam/pick-v0`" in page
+    names, action = page.partition("```text\n")[2].split("\n\naction\n")
+    assert "  tool_z          -2   2     (z - 0.183) / 0.167  m     tool, above the table\n" in names
+    assert re.search(r"^  grip +-1 +1 +1 +1 +close the gripper when positive, open it otherwise\n```", action, re.M)
+
+
+def test_guards_on_the_site(make_docs):
+    lines = make_docs.guards("mir100-navigation-ppo.zip").splitlines()
+    assert lines[0] == "```text"
+    assert any(re.match(r"G2 +finite +3 bad ticks in a row +bad_ticks ", line) for line in lines)
 
 
 DRIVING = (
@@ -210,13 +208,11 @@ def test_flags_on_the_site_are_the_flags_of_the_programs(make_docs, program, mon
         main()
     assert caught.value.code == 0
     there = set(re.findall(r"--[a-z][a-z-]*", capsys.readouterr().out)) - {"--help"}
-    page = (
-        ROOT / "docs" / ("reference-training.md" if program == "bam-train" else "reference-programs.md")
-    ).read_text()
-    part = re.search(
-        r"<!-- site: (?:train-)?flags .*? -->", page[0 if program == "bam-train" else page.index(f"## {program}\n") :]
-    )
-    assert set(re.findall(r"^- `(--[a-z-]+)", make_docs.build(part[0]), re.MULTILINE)) == there
+    name = "reference-training.md" if program == "bam-train" else "reference-programs.md"
+    page = (ROOT / "docs" / name).read_text()
+    section = page if program == "bam-train" else page.partition(f"## {program}\n")[2]
+    part = re.search(r"<!-- site: flags .*? -->", section)
+    assert set(re.findall(r"--[a-z][a-z-]*", make_docs.build(part[0]))) - {"--help"} == there
 
 
 CONFIGS = [resolve("bam_train.cli.flags:TrainConfig")]
@@ -248,7 +244,8 @@ def test_commands_exist(page):
         if words[0] == "make":
             assert words[1] in targets
         elif words[0] == "python":
-            assert (ROOT / words[1]).exists() or f"`{words[1]}`" in page.read_text()
+            path = words[2].replace(".", "/") if words[1] == "-m" else words[1]
+            assert (ROOT / path).exists() or f"`{words[1]}`" in page.read_text()
         else:
             assert words[0] in {*PROGRAMS, "pip", "pytest", "python3", "ray", "ros2", "source", "ssh"}
 
@@ -324,15 +321,14 @@ def test_python_examples_run(page, tmp_path):
 
 
 def test_the_table_of_checkpoints_is_of_the_files():
-    script = load_script("evaluate_checkpoints")
-    known = script.old_wall_times((ROOT / "checkpoints" / "README.md").read_text())
+    known = checkpoints.old_wall_times((ROOT / "checkpoints" / "README.md").read_text())
     del known["checkpoint", "command", "seed", "steps"], known[("---",) * 4]
     names = [row[0].partition("]")[0].removeprefix("[") for row in known]
     assert names == sorted(f"{name}.zip" for name in LEAST)
     for name, (_, command, seed, steps) in zip(names, known, strict=True):
         path = ROOT / "checkpoints" / name
         manifest = Checkpoint.open(path).manifest
-        assert command == f"`{script.command(manifest, name)}`"
+        assert command == f"`{checkpoints.command(manifest, name)}`"
         assert (seed, steps) == (str(manifest.seed), f"{manifest.steps:,}")
 
 

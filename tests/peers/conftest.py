@@ -1,6 +1,6 @@
 """Real peers on loopback: a rosbridge server, a robot that is a ROS 2 node, and roslibjs under Node.
 
-`scripts/install_peers` puts them in build/peers. Where it could not, these tests are skipped with its reason; with
+`tests/peers/install_peers` puts them in build/peers. Where it could not, these tests are skipped with its reason; with
 CI=true they fail.
 
 Longer than other files: the test files here share nothing but what is in this one.
@@ -36,7 +36,7 @@ def missing() -> str:
     if (PEERS / "digest").exists():
         return ""
     told = PEERS / "missing"
-    return told.read_text().strip() if told.exists() else "run scripts/install_peers first"
+    return told.read_text().strip() if told.exists() else "run tests/peers/install_peers first"
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -23,7 +23,7 @@ READER = Path(__file__).parent / "lerobot_reader.py"
 def lerobot(peers):
     pytest.importorskip("torch")
     if not (FOLDER / "lerobot").exists():
-        (pytest.fail if os.environ.get("CI") == "true" else pytest.skip)("no peers: run scripts/install_peers")
+        (pytest.fail if os.environ.get("CI") == "true" else pytest.skip)("no peers: run tests/peers/install_peers")
 
 
 def read(root, tmp_path):

@@ -19,7 +19,7 @@ ENV = {name: value for name, value in os.environ.items() if not name.startswith(
 @pytest.fixture(scope="session", autouse=True)
 def robo_gym(peers):
     if not (PEERS / "robo_gym").exists():
-        pytest.fail("no robo-gym among the peers: run scripts/install_peers")
+        pytest.fail("no robo-gym among the peers: run tests/peers/install_peers")
 
 
 def run(*command, root, limit=900.0):

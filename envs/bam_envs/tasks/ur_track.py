@@ -24,7 +24,7 @@ from bam_envs.tasks.ur_arm import joint_labels, normalised
 from bam_envs.tasks.ur_avoidance import COLLISION, UrObstacleTask
 
 RECORDED = "ur_track.json"
-"""The shipped trajectory; ``scripts/make_ur_track.py`` makes it."""
+"""The shipped trajectory; ``tests/bam_envs/tasks/make_ur_track.py`` makes it."""
 _MOST_BYTES = 2**24  # of a trajectory, whose file may be named by an untrusted checkpoint
 _Waypoint = Annotated[tuple[Finite, Finite, Finite, Finite, Finite, Finite], Meta(description="six joint positions")]
 _Segment = Annotated[list[_Waypoint], Meta(min_length=1, description="a list of waypoints")]

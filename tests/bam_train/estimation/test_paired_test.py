@@ -1,12 +1,10 @@
 """The interval of paired differences, and how often the gate lets a worse candidate pass."""
 
-import importlib.util
-from pathlib import Path
-
 import numpy as np
 import pytest
 
 from bam_train.estimation.paired_test import Pairs, verdict_of
+from tests.checks import gate
 
 
 def test_the_interval_narrows_round_the_difference():
@@ -44,12 +42,8 @@ def test_it_is_decided_as_soon_as_more_pairs_would_hardly_matter():
 
 
 def test_worse_candidates_do_not_pass():
-    """60 releases of candidates that are worse by exactly the margin; scripts/check_gate.py has 1,000 of each case."""
-    path = Path(__file__).parents[3] / "scripts" / "check_gate.py"
-    spec = importlib.util.spec_from_file_location("check_gate", path)
-    check_gate = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(check_gate)
+    """60 releases of candidates that are worse by exactly the margin; `tests.checks.gate` has 1,000 of each case."""
     rng = np.random.default_rng(0)
-    found = [check_gate.release(rng, 0.93, 0.98, 0.5, margin=0.05)[0] for _ in range(60)]
+    found = [gate.release(rng, 0.93, 0.98, 0.5, margin=0.05)[0] for _ in range(60)]
     assert sum(verdict in ("better", "not worse") for verdict in found) <= 3
     assert found.count("worse") >= 50

@@ -1,0 +1,217 @@
+"""A deployment: guards, one tick without the network, the recorder, 100 Hz over loopback, and memory.
+
+Except at 100 Hz, the robot is a simulated one in this process, which follows its commands exactly, behind the guards of
+a live robot; its time advances with commands.
+"""
+
+import contextlib
+import tempfile
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from types import SimpleNamespace
+
+import gymnasium as gym
+import numpy as np
+
+from bam_envs.core.registry import ENVIRONMENTS
+from bam_envs.core.robot import Initial
+from bam_envs.core.robot_env import RobotEnv
+from bam_envs.core.timing import Pacer
+from bam_envs.live.rehearsed_robot import rehearsed_robot
+from bam_envs.robots.fake import FakeRobot
+from bam_envs.robots.linked import LinkedRobot, LinkProfile
+from bam_train.checkpoint import Checkpoint
+from bam_train.deploy.deployment import Deployment
+from bam_train.deploy.flight import RecorderAgent, flight_recorder
+from bam_train.deploy.journal import Journal
+from bam_train.errors import SettingsError
+from bam_train.policy import FrozenPolicy
+from tests.benchmarks import harness
+from tests.benchmarks.harness import HOME, Peer, at_most, percentiles, resident
+from tests.benchmarks.link import live_arm, serve_robot
+
+GROWTH = 5.0
+"""By how much memory may grow after 10,000 ticks [MB]."""
+clock = time.perf_counter
+
+
+@dataclass(frozen=True, kw_only=True)
+class Flags(harness.Flags):
+    cpu: bool = False
+    """Count this thread's processor time in microseconds; for a busy machine."""
+    robot: str | None = None
+    """A UR5e for the row at 100 Hz instead of the embedded server's, such as ws://10.0.0.5:9090."""
+
+
+class TimedLink(LinkedRobot):
+    """A robot behind a link without delays; when its last step began, and how long it took [s]."""
+
+    begun = took = 0.0
+
+    def step(self, command):
+        self.begun = clock()
+        state = super().step(command)
+        self.took = clock() - self.begun
+        return state
+
+
+def guarded_robot():
+    """The robot behind all guards, as a task has them that moves the tool in straight lines; and its link."""
+    link = TimedLink(FakeRobot(1), LinkProfile([0.0, 0.0], [0.0, 0.0]))
+    # Changed commands (G18) are not limited, because the motion is random.
+    return rehearsed_robot(link, guards={"clamp_stop": 1.0}, straight=True), link
+
+
+def choose_clock(flags):
+    """Measure by what --cpu says."""
+    global clock
+    clock = time.thread_time if flags.cpu else time.perf_counter
+
+
+def measure_guards(flags):
+    """All guards together, around a smooth random motion of six joints and a gripper at 20 Hz."""
+    choose_clock(flags)
+    (robot, link), rng = guarded_robot(), np.random.default_rng(0)
+    robot.connect()
+    robot.reset(np.arange(1), Initial({"joint_position": np.array([HOME])}, np.zeros(1, np.int64)))
+    times, bare, speed, home = [], [], np.zeros(7), np.array([[*HOME, 0.085]])
+    command = robot.step(home).command.copy()
+    for k in range(flags.times(20_000)):
+        if k % 20 == 0:  # a new direction each second, back towards the middle
+            speed[:6] = rng.uniform(-0.4, 0.4, 6) - 0.8 * (command[0, :6] - home[0, :6])
+        command = command + speed * link.spec.period
+        begun = clock()
+        command = robot.step(command).command
+        times.append(clock() - begun - link.took)
+        bare.append(link.took)
+    yield percentiles(f"{len(robot.report())} guards together, 6-joint arm, a tick", times, "us", p50=60, p99=250)
+    yield percentiles("  the robot's own step, without physics", bare, "us")
+
+
+class TimedEnv(gym.Wrapper):
+    """Measures the time from an observation to its command [s]; the way to a start pose is not counted."""
+
+    def __init__(self, env, link):
+        super().__init__(env)
+        self.link, self.times, self.made = link, [], 0.0
+
+    def reset(self, **arguments):
+        result = self.env.reset(**arguments)
+        self.made = clock()
+        return result
+
+    def step(self, action):
+        result = self.env.step(action)
+        self.times.append(self.link.begun - self.made)
+        self.made = clock()
+        return result
+
+
+class Watcher:
+    """Measures the memory of a deployment after `warm_up` ticks."""
+
+    ticks, warm = 0, 0.0
+
+    def __init__(self, warm_up):
+        self.warm_up = warm_up
+
+    def ticked(self, record, action, pacer):
+        self.ticks += 1
+        if self.ticks == self.warm_up:
+            self.warm = resident()
+
+    def ended(self, record):
+        """Nothing is shown."""
+
+
+def deploy(ticks, steps, recording=None):
+    """Run a deployment of bam/pick without waiting, in episodes of `steps`; times to a command, and the watcher."""
+    robot, link = guarded_robot()
+    inner = gym.wrappers.TimeLimit(RobotEnv(robot, ENVIRONMENTS["bam/pick-v0"].make_task(1, {})), steps)
+    env = inner if recording is None else TimedEnv(inner, link)
+    policy = FrozenPolicy.from_checkpoint(Checkpoint.open(harness.PICK))
+    timed = SimpleNamespace(reset=policy.reset, act=policy.act, times=[])
+
+    def act(observation):
+        begun = clock()
+        action = policy.act(observation)
+        timed.times.append(clock() - begun)
+        return action
+
+    timed.act = policy.act if recording is None else act
+    recorder, watcher = (
+        None if recording is None else flight_recorder(recording, env, {}),
+        Watcher(min(10_000, ticks // 2)),
+    )
+    if recorder is not None:
+        recorder.start()
+    deployment = Deployment(env, timed, Pacer(None), Journal(-(-ticks // steps)), recorder=recorder)
+    deployment.connect()
+    ending = deployment.run(watcher, seed=1)
+    if ending.status or (recorder is not None and recorder.fault):
+        raise SettingsError(f"the deployment ended: {ending.reason} {recorder and recorder.fault}")
+    return getattr(env, "times", None), timed.times, watcher
+
+
+def measure_tick(flags):
+    """From an observation to its command: policy, task, guards and loop; and what the recorder adds."""
+    choose_clock(flags)
+    shares, forward = [], RecorderAgent.forward
+
+    def clocked(agent, **arguments):
+        begun = clock()
+        forward(agent, **arguments)
+        shares.append(clock() - begun)
+
+    with tempfile.TemporaryDirectory() as folder:
+        RecorderAgent.forward = clocked
+        try:
+            whole, acting, _ = deploy(flags.times(20_000), 100, Path(folder) / "bench.mcap")
+        finally:
+            RecorderAgent.forward = forward
+    whole, shares = np.array(whole), np.array(shares)
+    yield percentiles("observation in to command out", whole - shares[: len(whole)], "us", p50=200)
+    yield percentiles("  the frozen policy's own", acting, "us")
+    yield percentiles("  with the recorder", whole, "us")
+    yield percentiles("recorder's share of a tick", shares, "us", p50=30)
+
+
+def measure_rate(flags):
+    """100 Hz against a server, and a loop that only sleeps, in turns: how late commands are sent.
+
+    A tick that is late by more than a period is lost.
+    """
+    late, ages, asleep, count = [], [], [], flags.times(1000)
+    with contextlib.ExitStack() as stack:
+        url = flags.robot or f"ws://127.0.0.1:{stack.enter_context(Peer(serve_robot, True)).ports[0]}"
+        robot, state = live_arm(url, period=0.01)
+        stack.callback(robot.close)
+        pacer = robot._robot._pacer
+        tick = pacer.tick
+        pacer.tick = lambda: late.append(tick())
+        for _ in range(6):
+            pacer.start()
+            for _ in range(count):
+                robot.step(state.command)
+                ages.append(robot._robot.age())
+            robot.halt()  # the next round begins a new motion
+            alone = Pacer(0.01)
+            alone.start()
+            asleep += [alone.wait() for _ in range(count)]
+    share, bare = (100 * float((np.array(times) > 0.001).mean()) for times in (late, asleep))
+    found = f"{share:.2f} %; of a loop that only sleeps {bare:.2f} %"
+    yield at_most(f"100 Hz, {flags.robot or 'embedded server'}, ticks late by > 1 ms", share, 1, "%", found)
+    yield percentiles("  late by", late, "ms")
+    yield percentiles("  age of states", ages, "ms")
+    yield at_most("  ticks lost", int((np.array(late) > 0.01).sum()), 0)
+
+
+def measure_memory(flags):
+    """Growth of a deployment in accelerated time, in episodes and in a single one."""
+    ticks = flags.times(1_000_000)
+    for what, steps in (("episodes of 100", 100), ("one episode", ticks)):
+        watcher = deploy(ticks, steps)[-1]
+        growth = (resident() - watcher.warm) / 1e6
+        found = f"{growth:+.2f} MB after {watcher.ticks:,}"
+        yield at_most(f"memory of a deployment, {what}", growth, GROWTH, "MB", found)

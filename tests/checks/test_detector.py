@@ -1,0 +1,20 @@
+"""A small part of what the script measures."""
+
+from tests.checks import detector
+
+
+def test_episodes_of_training_and_behind_guards_are_usual_and_a_frozen_encoder_is_not():
+    flags = detector.Flags(ticks=640, guarded=300, steps=640, shift="elbow")
+    lines = list(detector.measure_detector(flags))
+    for line, where in zip(
+        lines, ("no shift", "behind guards, at full speed", "behind guards, on trial"), strict=False
+    ):
+        assert line.startswith(f"{where}: ")
+        assert ": 0 false alarms, at most " in line
+    shift, episodes, failed, flagged, *_ = (cell.strip() for cell in lines[5].strip("|").split("|"))
+    assert (shift, failed, flagged) == ("elbow's encoder frozen", episodes, episodes)
+    assert lines[-1] == "\n1 of 1 shifts: at least 90 % of the failed episodes flagged before they end"
+
+
+def test_the_greatest_mean_of_a_poisson_number():
+    assert [round(detector.at_most(count), 3) for count in (0, 1, 5)] == [2.996, 4.744, 10.513]

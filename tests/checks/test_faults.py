@@ -1,0 +1,57 @@
+"""A few rows of the fault matrix, in one robot cell; the script has all of them."""
+
+import contextlib
+import sys
+
+import pytest
+
+from bam_envs.testing.robot_cell import RobotCell, StateFault
+from tests.benchmarks import harness
+from tests.checks import faults
+
+
+@pytest.fixture(scope="module")
+def whole_cell():
+    with RobotCell("bam/reach-v0") as cell:
+        yield cell
+
+
+@pytest.fixture
+def cell(whole_cell):
+    yield whole_cell
+    whole_cell.publish_wrongly(StateFault.NONE)
+
+
+@pytest.mark.parametrize(
+    ("flags", "text"),
+    [
+        (("--only", "bridge", "frozn"), "--only: no fault's name has 'frozn'. Did you mean 'network frozen"),
+        (("--checkpoint", "none.zip"), "none.zip: no such file. Train one with bam-train, or check the name"),
+    ],
+)
+def test_a_typo_is_refused(monkeypatch, capsys, flags, text):
+    monkeypatch.setattr(sys, "argv", ["checks", "faults", *flags])
+    assert harness.main("tests.checks") == 1
+    assert capsys.readouterr().err.startswith(f"python -m tests.checks faults: {text}")
+
+
+@pytest.mark.parametrize(
+    ("name", "status", "said"),
+    [
+        ("policy process killed", -9, ()),
+        ("Ctrl-C twice", 130, ("bam-deploy: interrupted",)),
+        ("joint vanishes from the message", 1, ("bam-deploy: fault: /joint_states: wrist_3_joint missing; found: ",)),
+        ("bridge killed", 4, ("bam-deploy: link lost: ws://127.0.0.1:",)),
+    ],
+)
+def test_the_robot_rests_and_the_operator_knows_why(cell, monkeypatch, name, status, said):
+    monkeypatch.setattr(faults, "BRAKING", 5.0)  # on a busy computer
+    fault = next(fault for fault in faults.FAULTS if fault.name == name)
+    outcome = None
+    for _ in range(3):
+        with contextlib.suppress(RuntimeError):  # guards stop a deployment before its fault: the computer is too busy
+            outcome = outcome or faults.strike(fault, cell, faults.CHECKPOINT)
+    assert outcome is not None
+    assert (outcome.problems, outcome.status) == ((), status)
+    seen = [line for line in outcome.saw if "warning" not in line]  # of missed ticks, on a busy computer
+    assert all(line.startswith(text) for line, text in zip(seen[-1:], said, strict=True)), seen
