@@ -13,6 +13,8 @@ from typing import Any
 import pytest
 from hypothesis import settings
 
+from tests.one_ray import SHARED
+
 settings.register_profile("quick", max_examples=30, deadline=None, derandomize=True)
 settings.register_profile("thorough", max_examples=1000, deadline=None)
 settings.load_profile("quick")  # pytest --hypothesis-profile=thorough for the other
@@ -82,6 +84,14 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
             return kind if kind in ("ray", "peers") else file
 
     return ByFile(config, log)
+
+
+def pytest_runtest_setup(item: pytest.Item) -> None:
+    """Stop the Ray that tests of other files shared, unless this one needs it."""
+    if "shared_ray" in getattr(item, "fixturenames", ()):
+        SHARED.file = item.path
+    elif SHARED.file not in (None, item.path):
+        SHARED.stop()
 
 
 def pytest_runtest_logreport(report: pytest.TestReport) -> None:

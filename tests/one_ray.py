@@ -1,4 +1,7 @@
-"""One Ray for every test that trains with it: the first one starts it, and the tests of Ray itself stop it."""
+"""One Ray for every test that trains with it: the first one starts it, and a test of a file without Ray stops it.
+
+On a busy computer Ray may take a node for dead, which ends the process that is connected to it.
+"""
 
 import contextlib
 import inspect
@@ -21,6 +24,8 @@ def make_connectors_quickly():
 class SharedRay:
     def __init__(self):
         self._stack = contextlib.ExitStack()
+        self.file = None
+        """The file of the last test that needed it."""
 
     def start(self):
         ray = pytest.importorskip("ray")
@@ -33,14 +38,17 @@ class SharedRay:
 
     def stop(self):
         self._stack.close()
+        self.file = None
+
+
+SHARED = SharedRay()
 
 
 @pytest.fixture(scope="session", name="shared_ray")
 def shared_ray_fixture():
     """For fixtures of other scopes: ``shared_ray.start()``."""
-    shared = SharedRay()
-    yield shared
-    shared.stop()
+    yield SHARED
+    SHARED.stop()
 
 
 @pytest.fixture(name="one_ray")
