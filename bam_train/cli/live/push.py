@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from bam_train.cli.console import say, tell
-from bam_train.cli.live.live_agent import SHORT, status_lines, with_agent
+from bam_train.cli.live.ask_agent import SHORT, status_lines, with_agent
 from bam_train.cli.program import run_program
 from bam_train.signals import SignalMemory
 
