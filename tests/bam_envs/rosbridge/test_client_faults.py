@@ -261,9 +261,9 @@ def test_a_server_that_is_alive_is_not_lost(scripted, new_link):
 
 
 def test_a_link_is_not_lost_because_this_process_stood_still(scripted, new_link, heard):
-    link = new_link(scripted, lost_after=0.1)
+    link = new_link(scripted, lost_after=0.5)
     lost = _loss(link)
-    link.subscribe("/pong", STRING, lambda message, caller: (threading.Event().wait(0.3), heard(message)))
+    link.subscribe("/pong", STRING, lambda message, caller: (threading.Event().wait(1.0), heard(message)))
     scripted.wait_for("subscribe")
     scripted.send({"op": "publish", "topic": "/pong", "msg": {}})
     heard.wait()
