@@ -388,4 +388,6 @@ def test_added_things_train_and_deploy(added):
 
 
 def test_added_environments_are_described(added):
-    assert "goal_dx" in python("-m", "bam_train.cli.envs", "hover:my/hover", folder=added)
+    shown = python("-m", "bam_train.cli.envs", "hover:my/hover", folder=added)
+    assert "goal_dx" in shown
+    assert "name of" not in shown  # it is nobody else's

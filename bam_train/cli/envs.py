@@ -81,7 +81,7 @@ def details(name: str) -> dict[str, Any]:
         return {
             "id": env_id,
             "summary": None if entry is None else entry.summary,
-            "same_as": None if entry is None or entry.id == env_id else entry.id,
+            "same_as": None if entry is None or entry.id == env_id.rpartition(":")[2] else entry.id,
             "is_live": theirs is not None and theirs.is_live,
             "episode_steps": getattr(env.spec, "max_episode_steps", None) if entry is None else steps,
             "rate_hz": None if period is None else 1 / period,
