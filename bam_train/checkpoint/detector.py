@@ -48,11 +48,11 @@ _HIDDEN = 96
 _MEMORY = 0.2  # weight of the newest tick in a mean
 _RIDGE = 1e-3
 _RATES = np.array([0.05, 0.05, 0.05, 0.05, 0.4])  # false alarms of each chart in `TICKS` ticks
-_TAIL = 0.1  # share of the episodes' maxima that the tail is fitted to
+_TAILS = 0.1, 0.05, 0.02  # shares of the episodes' maxima that tails are fitted to; the highest bound counts
 _NOT_FINITE = 1e6  # level of an observation with NaN
 _LONGEST = 10.0  # of a whitened error, per square root of a number
 _LOG_SIZE = 0.635  # a normal distribution's deviation over the geometric mean of its size, as a logarithm
-_USUAL = [0.95, 0.99]  # quantiles of the charts for what lasts: drift and cut
+_USUAL = (0.95, 0.999), (0.95, 0.99)  # quantiles of the charts for what lasts: drift and cut, of state and answer
 REASONS = (
     "the policy sees and does what it did not in training",
     "the robot answers its commands otherwise than in training",
@@ -355,7 +355,8 @@ def make_detector(*kinds: Iterable[Rollout], limit: float | None = None, seed: i
     found = [surprises(model, one) for kind in kept for one in kind]
     leverage = np.concatenate([one for one, _, _ in found])
     square = np.concatenate([np.square(white[judged]).mean(axis=1) for _, white, judged in found])
-    usual = [np.quantile(np.log1p(one), _USUAL) if len(one) else np.zeros(2) for one in (leverage, square)]
+    parts = zip((leverage, square), _USUAL, strict=True)
+    usual = [np.quantile(np.log1p(one), shares) if len(one) else np.zeros(2) for one, shares in parts]
     drift, cut = np.array(usual, np.float32).T
     detector = Detector(replace(model, drift=drift, cut=cut))
     failed = [one.pace * len(one.actions) for kind in every for one in kind if one.success is False]
@@ -431,15 +432,17 @@ def _standardised(rows: Array, constant: int, rng: np.random.Generator) -> tuple
 def _bounds(maxima: Array, episodes: float, limit: float) -> Array:
     """The bound of each chart, of its maxima in n episodes (n, 5), if `TICKS` ticks are so many episodes.
 
-    Exceedances of the upper tenth are exponential with their mean (1.5 standard errors more, as it is estimated); no
-    duration is above `limit`.
+    Exceedances of the upper tenth are exponential with their mean (1.5 standard errors more, as it is estimated). Where
+    a few episodes in a hundred are of a rare kind, those of the upper twentieth or fiftieth have a larger mean, and the
+    highest bound counts. No duration is above `limit`.
     """
-    k = max(5, int(_TAIL * len(maxima)))
-    top = np.sort(maxima, axis=0)[::-1]
-    beyond = (top[:k] - top[k]).mean(axis=0) * (1 + 1.5 / math.sqrt(k))
-    share = _RATES * len(maxima) / (k * episodes)  # of the exceedances that may be above the bound
-    limits = np.array([math.inf] * 4 + [limit])
-    with np.errstate(divide="ignore", invalid="ignore"):
-        share = share + np.where(beyond > 0, np.exp(-(limits - top[k]) / beyond), 0.0)
-    bounds: Array = np.maximum(top[k] - beyond * np.log(np.minimum(share, 1.0)), top[0])
-    return np.maximum(bounds, 1e-6)
+    top, limits = np.sort(maxima, axis=0)[::-1], np.array([math.inf] * 4 + [limit])
+    bounds: Array = np.maximum(top[0], 1e-6)
+    for tail in _TAILS:
+        k = max(5, int(tail * len(maxima)))
+        beyond = (top[:k] - top[k]).mean(axis=0) * (1 + (1.5 / math.sqrt(k) if tail == _TAILS[0] else 0.0))
+        share = _RATES * len(maxima) / (k * episodes)  # of the exceedances that may be above the bound
+        with np.errstate(divide="ignore", invalid="ignore"):
+            share = share + np.where(beyond > 0, np.exp(-(limits - top[k]) / beyond), 0.0)
+        bounds = np.maximum(bounds, top[k] - beyond * np.log(np.minimum(share, 1.0)))
+    return bounds

@@ -141,13 +141,13 @@ def _add_detector(subject: _Subject, path: Path) -> None:
     from bam_train.checkpoint import Checkpoint
     from bam_train.checkpoint.zip_members import SIGNATURE, list_members, open_zip
     from bam_train.errors import NotACheckpoint
-    from bam_train.trainers.detection import add_own_detector
+    from bam_train.trainers.detection import THOROUGH, add_own_detector
 
     if subject.checkpoint is None:
         raise NotACheckpoint(path, "a plain stable-baselines3 file has no place for a detector. Train with bam-train")
     with open_zip(path) as archive:
         was_signed = SIGNATURE in list_members(path, archive)
-    add_own_detector(path, subject.policy, subject.env, subject.env_kwargs)
+    add_own_detector(path, subject.policy, subject.env, subject.env_kwargs, steps=THOROUGH)
     signed = ["  signature removed, as it was of the checkpoint without it: bam-sign sign again"] if was_signed else []
     tell(f"{path}: has a detector of unusual observations; digest {Checkpoint.open(path).digest[:12]}", *signed)
 

@@ -22,7 +22,9 @@ from bam_train.rollout import BatchPolicy, rollout
 SEED = 4_000_000
 """First seed of the episodes, far from those of training and evaluations."""
 WANTED = 48_000
-"""Steps that a detector is made of: 1,000 episodes of bam/pick, half a minute of CPU time."""
+"""Steps that a detector is made of at the end of training: 1,000 episodes of bam/pick."""
+THOROUGH = 240_000
+"""The same, of a detector that is asked for afterwards: rare kinds of usual episodes are among so many."""
 SIDE_BY_SIDE = 64
 
 

@@ -136,6 +136,15 @@ def test_the_bound_of_the_duration_is_below_the_time_limit():
     assert make_detector([*episodes, late]).model.bounds[4] == make_detector(episodes, limit=60).model.bounds[4]
 
 
+def test_a_rare_kind_of_usual_episodes_sets_the_bound():
+    lengths = np.full(500, 50)
+    lengths[2::65] = 10 * np.arange(6, 14)  # eight of the 300 that are kept apart last for 60, 70, ... 130 ticks
+    whole = rollouts(500, 0, steps=130)
+    episodes = [Rollout(one.observations[:n], one.actions[:n], True) for one, n in zip(whole, lengths, strict=True)]
+    share = 0.4 * 300 / 6 / (300 * 720_000 / sum(k for i, k in enumerate(lengths) if i % 5 > 1))  # of the highest six
+    np.testing.assert_allclose(make_detector(episodes).model.bounds[4], 70 - 35 * np.log(share), rtol=1e-6)
+
+
 def test_a_bound_is_the_largest_of_the_kinds():
     kinds = [rollouts(200, 0), rollouts(200, 8, steps=70), rollouts(10, 9, steps=90)]
     plain, both = make_detector(kinds[0]), make_detector(*kinds)  # the third has too few
