@@ -48,7 +48,7 @@ _HIDDEN = 96
 _MEMORY = 0.2  # weight of the newest tick in a mean
 _RIDGE = 1e-3
 _RATES = np.array([0.05, 0.05, 0.05, 0.05, 0.4])  # false alarms of each chart in `TICKS` ticks
-_TAILS = 0.1, 0.05, 0.02  # shares of the episodes' maxima that tails are fitted to; the highest bound counts
+_TAILS = 0.1, 0.05, 0.02, 0.01  # shares of the episodes' maxima that tails are fitted to; the highest bound counts
 _NOT_FINITE = 1e6  # level of an observation with NaN
 _LONGEST = 10.0  # of a whitened error, per square root of a number
 _LOG_SIZE = 0.635  # a normal distribution's deviation over the geometric mean of its size, as a logarithm
@@ -433,8 +433,8 @@ def _bounds(maxima: Array, episodes: float, limit: float) -> Array:
     """The bound of each chart, of its maxima in n episodes (n, 5), if `TICKS` ticks are so many episodes.
 
     Exceedances of the upper tenth are exponential with their mean (1.5 standard errors more, as it is estimated). Where
-    a few episodes in a hundred are of a rare kind, those of the upper twentieth or fiftieth have a larger mean, and the
-    highest bound counts. No duration is above `limit`.
+    a few episodes in a hundred are of a rare kind, those of the upper twentieth, fiftieth or hundredth have a larger
+    mean, and the highest bound counts. No duration is above `limit`.
     """
     top, limits = np.sort(maxima, axis=0)[::-1], np.array([math.inf] * 4 + [limit])
     bounds: Array = np.maximum(top[0], 1e-6)

@@ -228,6 +228,7 @@ def test_bam_eval_adds_one(tmp_path, capsys, monkeypatch):
     path = tmp_path / "policy.zip"
     shutil.copy(POINT, path)
     monkeypatch.setattr("sys.argv", ["bam-eval", str(path), "--add-detector"])
+    monkeypatch.setattr("bam_train.trainers.detection.THOROUGH", 4_000)
     with pytest.raises(SystemExit) as ended:
         bam_eval()
     assert ended.value.code == 0

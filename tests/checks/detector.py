@@ -1,12 +1,13 @@
-"""Measure a checkpoint's detector: false alarms in usual episodes, and on bam/pick twelve shifts.
+"""Measure the detectors of checkpoints: false alarms in usual episodes, and on bam/pick twelve shifts.
 
 An episode is flagged if there is an alarm at one of its ticks, so before it ends. One that succeeds in spite of a shift
-counts as harmless, flagged or not. A false alarm is an episode without any shift that is flagged and succeeds.
+counts as harmless, flagged or not. A false alarm is an episode without any shift that is flagged and succeeds. Hours
+are the robot's; "at most" is the upper end of a one-sided interval of 95 %.
 
 Examples:
   python -m tests.checks detector
   python -m tests.checks detector checkpoints/pick-ppo.zip --ticks 150000 --steps 6400
-  python -m tests.checks detector checkpoints/reach-ppo.zip --ticks 0 --guarded 720000 --steps 0
+  python -m tests.checks detector checkpoints/*reach-ppo.zip --like-live 360000 --guarded 30000 --steps 0
 """
 
 import math
@@ -27,12 +28,13 @@ from bam_envs.core.robot_env import RobotVectorEnv
 from bam_envs.core.task import Array, Floats, Score
 from bam_envs.live.rehearsed_robot import rehearsed_robot
 from bam_envs.robots.linked import LinkProfile
+from bam_envs.robots.live_like import LiveLike
 from bam_envs.robots.physics.mujoco_arm import SimulatedArm
 from bam_envs.safety.guard import TRIAL_SPEED
 from bam_envs.tasks.pick import PickTask
 from bam_envs.tasks.wrappers.late_actions import LateActions
 from bam_train.checkpoint import Checkpoint
-from bam_train.checkpoint.detector import TICKS, Detector, Rollout
+from bam_train.checkpoint.detector import Detector, Rollout
 from bam_train.env_location import SIMULATED
 from bam_train.environments import environment_of, make_env, make_vector_env
 from bam_train.errors import NoDetector
@@ -47,10 +49,13 @@ Signals = dict[str, Array]
 
 @dataclass(frozen=True, kw_only=True)
 class Flags(harness.Flags):
-    checkpoint: tyro.conf.Positional[Path] = harness.PICK
-    """A checkpoint of a robot, with a detector."""
+    checkpoints: tyro.conf.Positional[tuple[Path, ...]] = (harness.PICK,)
+    """Checkpoints of robots, with detectors."""
     ticks: Annotated[int, tyro.conf.arg(metavar="N")] = 144_000
     """Ticks without any shift; 0 for none."""
+    like_live: Annotated[int, tyro.conf.arg(metavar="N")] = 0
+    """Ticks without any shift of simulated robots that move and are measured as live ones are: slower, held now and
+    then, their states late; see `bam_envs.robots.live_like`."""
     guarded: Annotated[int, tyro.conf.arg(metavar="N")] = 0
     """Ticks without any shift behind the guards of a live robot, at full speed, and as many on trial."""
     seed: int = 20_000_000
@@ -185,10 +190,14 @@ def play(policy: FrozenPolicy, steps: int, seed: int, shift: str) -> list[Rollou
         envs.close()
 
 
-def plain(checkpoint: Checkpoint, policy: FrozenPolicy, ticks: int, seed: int) -> list[Rollout]:
-    """Whole episodes in the checkpoint's simulation."""
+def simulated(
+    checkpoint: Checkpoint, policy: FrozenPolicy, ticks: int, seed: int, *, like_live: bool = False
+) -> list[Rollout]:
+    """Whole episodes in the checkpoint's simulation; as of live robots if `like_live`."""
     env_id, kwargs = environment_of(checkpoint)
     with closing(make_vector_env(env_id, kwargs, SIDE_BY_SIDE)) as envs:
+        inner: Any = envs.unwrapped
+        inner.robot = LiveLike(inner.robot) if like_live else inner.robot
         return fresh_episodes(envs, env_id, policy, ticks, seed)
 
 
@@ -231,18 +240,18 @@ def at_most(count: int) -> float:
     return high
 
 
-def false_alarms(detector: Detector, episodes: list[Rollout], where: str) -> str:
-    """A line about episodes without a shift."""
+def false_alarms(detector: Detector, episodes: list[Rollout], where: str, period: float) -> str:
+    """A line about episodes without a shift, whose ticks take `period` [s]."""
     levels = [detector.values(one) / detector.model.bounds for one in episodes]
     charts = np.array([one.max(axis=0) > 1 for one in levels])
     flagged, good = charts.any(axis=1), np.array([bool(one.success) for one in episodes])
     ticks, count = sum(len(one.actions) for one in episodes), int((flagged & good).sum())
-    highest = max(float(one.max()) for one, success in zip(levels, good, strict=True) if success)
-    most = at_most(count) * TICKS / ticks
+    highest = max((float(one.max()) for one, success in zip(levels, good, strict=True) if success), default=0.0)
+    hours = ticks * period / 3600
     return (
-        f"{where}: {len(episodes)} episodes, {ticks} ticks: {count} false alarms, at most {most:.2f} in {TICKS} ticks "
-        f"(95 %), by chart {charts[good].sum(axis=0).tolist()}, highest level {highest:.2f}; "
-        f"{(flagged & ~good).sum()} of {(~good).sum()} failed episodes flagged"
+        f"{where}: {len(episodes)} episodes, {ticks} ticks, {hours:.1f} h: {count} false alarms, "
+        f"at most {at_most(count) * 10 / hours:.2f} in 10 h (95 %), by chart {charts[good].sum(axis=0).tolist()}, "
+        f"highest level {highest:.2f}; {(flagged & ~good).sum()} of {(~good).sum()} failed episodes flagged"
     )
 
 
@@ -263,17 +272,27 @@ def row(detector: Detector, shift: str, episodes: list[Rollout]) -> tuple[str, b
 
 
 def measure_detector(flags):
-    """Episodes without a shift, then each shift, as a table in Markdown."""
-    checkpoint = Checkpoint.open(flags.checkpoint.expanduser())
+    """For each checkpoint, episodes without a shift, then each shift of bam/pick, as a table in Markdown."""
+    for path in flags.checkpoints:
+        yield str(path)
+        yield from _measured(Checkpoint.open(path.expanduser()), flags)
+
+
+def _measured(checkpoint, flags):
     policy = FrozenPolicy.from_checkpoint(checkpoint)
     if policy.detector is None:
-        raise NoDetector(f"{flags.checkpoint} has no detector. Run: bam-eval {flags.checkpoint} --add-detector")
-    if flags.ticks:
-        yield false_alarms(policy.detector, plain(checkpoint, policy, flags.ticks, flags.seed), "no shift")
-    for trial in (False, True) if flags.guarded else ():
-        episodes = behind_guards(checkpoint, policy, flags.guarded, flags.seed, trial=trial)
-        yield false_alarms(policy.detector, episodes, f"behind guards, {'on trial' if trial else 'at full speed'}")
-    if not flags.steps:
+        raise NoDetector(f"{checkpoint.path} has no detector. Run: bam-eval {checkpoint.path} --add-detector")
+    kinds = {
+        "no shift": (flags.ticks, simulated),
+        "as of live robots": (flags.like_live, partial(simulated, like_live=True)),
+        "behind guards, at full speed": (flags.guarded, partial(behind_guards, trial=False)),
+        "behind guards, on trial": (flags.guarded, partial(behind_guards, trial=True)),
+    }
+    for where, (ticks, played) in kinds.items():
+        if ticks:
+            episodes = played(checkpoint, policy, ticks, flags.seed)
+            yield false_alarms(policy.detector, episodes, where, checkpoint.manifest.period)
+    if not flags.steps or checkpoint.manifest.env != "bam/pick-v0":
         return
     yield "\n| shift | episodes | failed | flagged before | without duration | at tick (median) | harmless | flagged |"
     yield "| --- | --- | --- | --- | --- | --- | --- | --- |"

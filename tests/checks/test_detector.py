@@ -4,14 +4,13 @@ from tests.checks import detector
 
 
 def test_episodes_of_training_and_behind_guards_are_usual_and_a_frozen_encoder_is_not():
-    flags = detector.Flags(ticks=640, guarded=300, steps=640, shift="elbow")
+    flags = detector.Flags(ticks=640, like_live=640, guarded=300, steps=640, shift="elbow")
     lines = list(detector.measure_detector(flags))
-    for line, where in zip(
-        lines, ("no shift", "behind guards, at full speed", "behind guards, on trial"), strict=False
-    ):
+    kinds = ("no shift", "as of live robots", "behind guards, at full speed", "behind guards, on trial")
+    for line, where in zip(lines[1:5], kinds, strict=True):
         assert line.startswith(f"{where}: ")
-        assert ": 0 false alarms, at most " in line
-    shift, episodes, failed, flagged, *_ = (cell.strip() for cell in lines[5].strip("|").split("|"))
+        assert " h: 0 false alarms, at most " in line
+    shift, episodes, failed, flagged, *_ = (cell.strip() for cell in lines[7].strip("|").split("|"))
     assert (shift, failed, flagged) == ("elbow's encoder frozen", episodes, episodes)
     assert lines[-1] == "\n1 of 1 shifts: at least 90 % of the failed episodes flagged before they end"
 
