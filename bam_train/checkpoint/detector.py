@@ -365,7 +365,10 @@ def make_detector(*kinds: Iterable[Rollout], limit: float | None = None, seed: i
     for kind in kept:
         maxima = np.array([detector.values(one).max(axis=0) for one in kind])
         bounds.append(_bounds(maxima, len(kind) * TICKS / sum(len(one.actions) for one in kind), longest))
-    return Detector(replace(detector.model, bounds=np.max(bounds, axis=0).astype(np.float32)))
+    bound = np.max(bounds, axis=0)
+    if longest - 0.5 < max(failed, default=0.0):  # others, as slow, may succeed in their last tick
+        bound[4] = longest - 0.5
+    return Detector(replace(detector.model, bounds=bound.astype(np.float32)))
 
 
 def _learnt(rollouts: Sequence[Rollout], d: int, rng: np.random.Generator) -> Model:
