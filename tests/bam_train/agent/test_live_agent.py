@@ -204,7 +204,7 @@ def test_the_cut_link_of_the_owner_holds_the_robot_and_pauses_the_policy(running
         "        env.unwrapped.robot.connect()\n"
         "        env.unwrapped.robot._robot._take_over.take()\n"
         "        break\n"
-        "    except bam_envs.core.errors.LinkLost:\n"  # on a busy computer
+        "    except (bam_envs.core.errors.LinkLost, bam_envs.core.errors.StaleState):\n"  # on a busy computer
         "        env.close()\n"
         "print('driving', flush=True)\n"
         "time.sleep(60)\n"
