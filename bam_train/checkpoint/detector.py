@@ -49,6 +49,7 @@ _MEMORY = 0.2  # weight of the newest tick in a mean
 _RIDGE = 1e-3
 _RATES = np.array([0.05, 0.05, 0.05, 0.05, 0.4])  # false alarms of each chart in `TICKS` ticks
 _TAILS = 0.1, 0.05, 0.02, 0.01  # shares of the episodes' maxima that tails are fitted to; the highest bound counts
+_NEAR = 0.75  # share of the time limit above which the bound of the duration is in the last tick
 _NOT_FINITE = 1e6  # level of an observation with NaN
 _LONGEST = 10.0  # of a whitened error, per square root of a number
 _LOG_SIZE = 0.635  # a normal distribution's deviation over the geometric mean of its size, as a logarithm
@@ -366,8 +367,8 @@ def make_detector(*kinds: Iterable[Rollout], limit: float | None = None, seed: i
         maxima = np.array([detector.values(one).max(axis=0) for one in kind])
         bounds.append(_bounds(maxima, len(kind) * TICKS / sum(len(one.actions) for one in kind), longest))
     bound = np.max(bounds, axis=0)
-    if longest - 0.5 < max(failed, default=0.0):  # others, as slow, may succeed in their last tick
-        bound[4] = longest - 0.5
+    if longest - 0.5 < max(failed, default=0.0) or _NEAR * longest < bound[4] < longest:
+        bound[4] = longest - 0.5  # others, as slow, may succeed in their last tick
     return Detector(replace(detector.model, bounds=bound.astype(np.float32)))
 
 

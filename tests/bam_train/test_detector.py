@@ -131,7 +131,7 @@ def test_at_a_lower_pace_an_episode_may_last_longer(detector):
 def test_the_bound_of_the_duration_is_below_the_time_limit():
     episodes = [one for k in range(10, 50) for one in rollouts(5, k, steps=k)]
     assert make_detector(episodes).model.bounds[4] > 60
-    assert 49 <= make_detector(episodes, limit=60).model.bounds[4] < 60
+    assert make_detector(episodes, limit=60).model.bounds[4] == 59.5  # it would be in the last quarter
 
 
 def test_if_the_time_limit_ended_an_episode_the_last_tick_alone_is_too_late():
@@ -139,9 +139,8 @@ def test_if_the_time_limit_ended_an_episode_the_last_tick_alone_is_too_late():
     late = rollouts(1, 7, steps=60)[0]._replace(success=False)
     assert make_detector([*episodes, late]).model.bounds[4] == 59.5
     assert make_detector([*episodes, late], limit=60).model.bounds[4] == 59.5
-    assert (
-        make_detector([*episodes, late], limit=61).model.bounds[4] == make_detector(episodes, limit=61).model.bounds[4]
-    )
+    early = make_detector([*episodes, late], limit=1000).model.bounds[4]  # it ended by itself
+    assert 60 < early == make_detector(episodes, limit=1000).model.bounds[4] < 750
 
 
 def test_a_rare_kind_of_usual_episodes_sets_the_bound():
