@@ -18,7 +18,15 @@ from gymnasium.vector import VectorEnv
 from bam_envs.core.errors import BamEnvsError, RobotFault
 from bam_train.checkpoint import Checkpoint
 from bam_train.checkpoint.detector import DETECTOR, LEAST_TICKS
-from bam_train.errors import BamTrainError, EnvironmentFailed, NoDetector, OutputError, ProcessesLost, TrainingFailed
+from bam_train.errors import (
+    BamTrainError,
+    EnvironmentFailed,
+    NoDetector,
+    OutputError,
+    PolicyError,
+    ProcessesLost,
+    TrainingFailed,
+)
 from bam_train.evaluation import EvaluationReport, evaluate
 from bam_train.policy import FrozenPolicy
 from bam_train.rollout import BatchPolicy
@@ -144,7 +152,7 @@ class TrainingRun:
             kept = f"go on with --resume {self.folder.last}" if self._last_steps else "nothing had been learnt yet"
             text = f"at step {self.trainer.steps}: {str(error).rstrip('.')}. What was learnt is kept: {kept}"
             raise TrainingFailed(text) from error
-        except (TrainingFailed, EnvironmentFailed) as error:  # during an update, which is not saved
+        except (TrainingFailed, EnvironmentFailed, PolicyError) as error:  # during an update, which is not saved
             where = "" if isinstance(error, TrainingFailed) else f"at step {self.trainer.steps}: "
             good = f"the last good checkpoint is {self.last}" if self.last else "no checkpoint had been saved yet"
             is_foreign = isinstance(error, EnvironmentFailed) and error.__cause__ is not None

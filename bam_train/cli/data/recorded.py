@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import time
 from typing import TYPE_CHECKING
 
@@ -49,6 +50,7 @@ def import_(config: ImportConfig) -> None:
     """Add recordings or Parquet rows to a data set."""
     from bam_train.data import DataSet, recordings
     from bam_train.errors import SettingsError
+    from bam_train.files.place import Place
     from bam_train.recording.recording import Recording
     from bam_train.settings import read_env_kwargs
 
@@ -59,6 +61,8 @@ def import_(config: ImportConfig) -> None:
     env_kwargs = read_env_kwargs(config.set)
     for path in config.recordings:
         if recordings.is_rows(path):
+            if os.path.abspath(Place(path).path) == os.path.abspath(Place(config.place).path):
+                raise SettingsError(f"{config.place}: has the Parquet rows; give another PLACE for the data set")
             info = recordings.info_of_rows(path, config.env, env_kwargs)
             episodes = recordings.episodes_of_rows(path, info)
             notes = recordings.add_episodes(path, episodes, config.place, info, **facts)

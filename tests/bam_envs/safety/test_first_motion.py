@@ -317,7 +317,7 @@ def test_a_slider_that_nobody_reports_lets_no_joint_catch_up_faster_than_its_lim
     trace = np.array(arm.trace)
     speeds = np.abs(trace[PARTS:] - trace[:-PARTS]) / arm.spec.period
     assert speeds.max() <= 1.0 + 1e-3
-    assert speeds.max() > 0.45  # it did move fast
+    assert speeds.max() > {"trajectory": 0.6, "position": 0.45}[mode]  # it did move fast
 
 
 @pytest.mark.parametrize("scale", [0.0, 0.5, -1.0])

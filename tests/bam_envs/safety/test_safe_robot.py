@@ -324,9 +324,8 @@ class Opener(Guard):
         return True
 
 
-@pytest.mark.parametrize("pause", [0.0, 0.2])
-def test_an_arm_that_still_moves_when_the_next_motion_begins_follows_its_commands(pause):
-    """A live agent goes to the start pose as soon as a person hands back, and a busy computer sends commands late."""
+def turning_arm():
+    """A lagging arm behind its guards that has turned a joint for six periods, and its state."""
     arm = LaggingArm()
     robot = SafeRobot(arm, clock=arm.clock, limits=Limits(lag=0.05))
     robot.connect()
@@ -334,6 +333,13 @@ def test_an_arm_that_still_moves_when_the_next_motion_begins_follows_its_command
     state = robot.reset(FIRST, start_at())
     for _ in range(6):
         state = robot.step(turned(state, 0.05))
+    return arm, robot, state
+
+
+@pytest.mark.parametrize("pause", [0.0, 0.2])
+def test_an_arm_that_still_moves_when_the_next_motion_begins_follows_its_commands(pause):
+    """A live agent goes to the start pose as soon as a person hands back, and a busy computer sends commands late."""
+    arm, robot, state = turning_arm()
     if pause:
         arm.now += pause
         for _ in range(6):
@@ -346,13 +352,7 @@ def test_an_arm_that_still_moves_when_the_next_motion_begins_follows_its_command
 
 def test_a_command_before_a_rest_explains_no_motion():
     """Somebody moves the arm by hand; a joint that then jumps towards its old command stops it at once."""
-    arm = LaggingArm()
-    robot = SafeRobot(arm, clock=arm.clock, limits=Limits(lag=0.05))
-    robot.connect()
-    arm.place(ARM_HOME)
-    state = robot.reset(FIRST, start_at())
-    for _ in range(6):
-        state = robot.step(turned(state, 0.05))
+    arm, robot, state = turning_arm()
     robot.halt()
     arm.now += 2.0
     moved = [*ARM_HOME[:5], ARM_HOME[5] - 0.3]

@@ -121,3 +121,11 @@ def test_what_cannot_be_imported_is_one_line(import_):
         status, out, err = import_("data", *arguments)
         assert (status, out, err.count("\n"), Path("data").exists()) == (1, "", 1, False)
         assert err.startswith(f"bam-data import: {text}")
+
+
+def test_rows_are_not_imported_into_their_own_folder(import_):
+    rows()
+    before = sorted(Path("rows").iterdir())
+    text = "bam-data import: ./rows: has the Parquet rows; give another PLACE for the data set\n"
+    assert import_("./rows", "rows", "--env", ENV) == (1, "", text)
+    assert sorted(Path("rows").iterdir()) == before

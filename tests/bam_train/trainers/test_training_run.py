@@ -9,7 +9,7 @@ from types import SimpleNamespace
 import pytest
 
 from bam_envs.core.errors import LinkLost
-from bam_train.errors import EnvironmentFailed, OutputError, ProcessesLost, TrainingFailed
+from bam_train.errors import EnvironmentFailed, OutputError, PolicyError, ProcessesLost, TrainingFailed
 from bam_train.evaluation import EvaluationReport, wilson_interval
 from bam_train.settings import TrainSettings
 from bam_train.trainers import training_run as run_module
@@ -274,6 +274,7 @@ KEPT = "What was learnt is kept: go on with --resume {last}"
     [
         (TrainingFailed("loss is nan"), "loss is nan; the last good checkpoint is {last}", "30"),
         (EnvironmentFailed("reward is inf"), "at step 60: reward is inf; the last good checkpoint is {last}", "30"),
+        (PolicyError("action[0] is nan"), "at step 60: action[0] is nan; the last good checkpoint is {last}", "30"),
         (LinkLost("tcp://a:9: the link dropped."), f"at step 60: tcp://a:9: the link dropped. {KEPT}", "60"),
         (ProcessesLost("env runner 2 died"), f"at step 60: env runner 2 died. {KEPT}", "60"),
     ],
