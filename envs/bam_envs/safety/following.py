@@ -34,6 +34,8 @@ STUCK, STUCK_TIME = 0.002, 2.0
 """An arm none of whose joints moves by so much [rad] for so long [s], although its commands go on, is stopped."""
 SLOWEST_GAIN, GAIN_TIME = 0.25, 0.2
 """Least acceleration of a base that follows [m/s^2, rad/s^2], and the time over which it is measured [s]."""
+OLD_STATE = 0.1
+"""Longest age of a state for which it is compared with older commands [s]: it says where the robot was then."""
 LATE_COMMAND = 1.5
 """Periods after the last command from which a command is called late in a message."""
 LIKELY = (
@@ -50,7 +52,8 @@ class Following(Guard):
         self._lag = spec.lag if limits.lag is None else limits.lag
         # A command lasts for a period after it is sent, and the robot is behind it by its lag: also after a halt, when
         # the next motion begins before the robot is at rest.
-        self._sent: deque[Numbers] = deque(maxlen=2 + ticks_of(self._lag, spec))
+        self._recent = 2 + ticks_of(self._lag, spec)
+        self._sent: deque[Numbers] = deque(maxlen=self._recent + ticks_of(OLD_STATE, spec))
         self._strikes, self._good, self._forgiven = 0, 0, ticks_of(FORGIVEN, spec)
         self._spec, self._own_lag = spec, self._lag
         self._ended: Numbers = []  # see Tick
@@ -58,7 +61,8 @@ class Following(Guard):
     def relayed(self, delay: float) -> None:
         """Explain that the robot gets commands later by `delay` [s], from a live agent that has guards of its own."""
         self._lag = self._own_lag + delay
-        self._sent = deque(maxlen=2 + ticks_of(self._lag, self._spec))
+        self._recent = 2 + ticks_of(self._lag, self._spec)
+        self._sent = deque(maxlen=self._recent + ticks_of(OLD_STATE, self._spec))
 
     def resumed(self) -> None:
         """Forget the commands: the robot is at rest where a person found it."""
@@ -81,14 +85,15 @@ class Following(Guard):
         """Reset the count, when an episode begins or a person resumes the robot."""
         self._strikes = self._good = 0
 
-    def off(self, sent: Numbers, measured: Numbers) -> Numbers:
-        """Distance of the measured values from the range of the recent commands, 0 inside it. Shape: (k,)."""
+    def off(self, sent: Numbers, measured: Numbers, age: float) -> Numbers:
+        """Distance of values measured `age` [s] ago from the range of the commands until then, 0 inside it (k,)."""
         self._sent.append(sent)
-        off = [0.0] * len(sent)
-        for at, (value, oldest, newest) in enumerate(zip(measured, self._sent[0], sent, strict=True)):
+        off, first = [0.0] * len(sent), -self._recent - int(min(age, OLD_STATE) / self._spec.period)
+        known = [*self._sent][first:]
+        for at, (value, oldest, newest) in enumerate(zip(measured, known[0], sent, strict=True)):
             if oldest <= value <= newest or newest <= value <= oldest:
                 continue
-            commands = [command[at] for command in self._sent]
+            commands = [command[at] for command in known]
             low, high = min(commands), max(commands)
             off[at] = low - value if value < low else high - value if value > high else 0.0  # NaN: it is not measured
         return off
@@ -156,7 +161,7 @@ class JointFollowing(Following):
             self._stuck, self.patience = 0, 1
             return f"no joint has moved for {STUCK_TIME:g} s, and the arm was commanded to move: {LIKELY}"
         self.begin(tick)
-        off = self.off(sent, measured)
+        off = self.off(sent, measured, tick.age)
         # The farthest that a command may be from a joint at rest.
         allowed, farthest, over = self._slow_allowed if tick.approach else self._allowed, 0.0, False
         if any(off):
@@ -284,7 +289,7 @@ class BaseFollowing(Following):
         sent, measured = [tick.last[at] for at in self._columns], [tick.measured[at] for at in self._columns]
         rows = zip(sent, self._reached or measured, self._change, strict=True)
         self._reached = [min(max(value, before - change), before + change) for value, before, change in rows]
-        off = [abs(gap) for gap in self.off(self._reached, measured)]
+        off = [abs(gap) for gap in self.off(self._reached, measured, tick.age)]
         self._speeds.append(measured)
         over = any(gap > most for gap, most in zip(off, self._allowed, strict=True))
         at = off.index(max(off))

@@ -264,6 +264,42 @@ def test_late_arms_are_proved(lag):
     assert driven(WiredArm(lag=lag))[1] is None
 
 
+class LateStates(WiredArm):
+    """A late arm, some of whose states are nearly as old as they may be, as on a busy computer."""
+
+    def __init__(self, seed):
+        super().__init__(known=True, lag=0.15)
+        self.rng, self.late, self.late_ticks = np.random.default_rng(seed), 0.0, 0
+
+    def age(self):
+        return self.late
+
+    def measure(self):
+        now, before = self.joints, round(self.late * PARTS / self.spec.period)
+        self.joints = self.trace[-1 - min(len(self.trace) - 1, before)]
+        state = super().measure()
+        self.joints = now
+        return state
+
+    def step(self, cleared):
+        if self.late_ticks == 0 and self.rng.random() < 0.1:
+            self.late_ticks = int(self.rng.integers(2, 6))
+        self.late_ticks = max(0, self.late_ticks - 1)
+        self.late = 0.095 if self.late_ticks and self.proof.is_done else 0.005
+        return super().step(cleared)
+
+
+@pytest.mark.parametrize("seed", range(1, 5))
+def test_an_old_state_does_not_stop_an_arm_that_follows(seed):
+    """It says where the arm was, which was sent farther since."""
+    arm = LateStates(seed)
+    robot, why = driven(arm)
+    assert why is None
+    there = arm.joints + np.array([0.0, 0.2, -0.4, 0.4, 0.0, -0.4])
+    robot.reset(ROW, Initial({"joint_position": there[None]}, ROW))
+    assert robot.report()["following"]["stopped"] == 0
+
+
 @pytest.mark.parametrize("again", [False, True])
 def test_an_arm_that_needs_no_proof_begins_where_it_is_also_without_a_reset(again):
     """As for a person who drives an agent's robot before its first episode, or after its link was lost."""
