@@ -1,4 +1,4 @@
-"""Wrappers that raise an error as soon as an environment returns NaN or infinity.
+"""Numbers that must be finite: wrappers of environments that raise an error at the first NaN, and a check of actions.
 
 Training on such a number fails much later, and then the policy or the learning rate seems to be the cause.
 """
@@ -9,8 +9,9 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 from gymnasium.vector import VectorEnv, VectorWrapper
+from numpy.typing import NDArray
 
-from bam_train.errors import EnvironmentFailed
+from bam_train.errors import EnvironmentFailed, PolicyError
 
 
 class FiniteEnv(gym.Wrapper[Any, Any, Any, Any]):
@@ -122,4 +123,22 @@ def _require_finite(env: Any, env_id: str, signal: str, value: Any, steps: Any, 
     raise EnvironmentFailed(
         f"{env_id}: {name}{where} is {number} at step {steps} of an episode{one}; "
         "expected finite numbers: correct the environment"
+    )
+
+
+def require_finite_action(action: NDArray[Any], step: Any, which: str) -> None:
+    """Raise PolicyError if a number of an action is not finite.
+
+    Args:
+        action: One action, or those of n environments (n, ...).
+        step: Its step in the episode; an array (n,) for n environments.
+        which: The episode, or the episodes, for the error.
+    """
+    if action.dtype.kind != "f" or np.isfinite(action).all():
+        return
+    index = tuple(np.argwhere(~np.isfinite(action))[0].tolist())
+    step = step if np.ndim(step) == 0 else step[index[0]]
+    raise PolicyError(
+        f"action{list(index)} is {action[index]} at step {step} of {which}; "
+        "expected finite numbers: the policy is broken"
     )

@@ -14,7 +14,7 @@ import numpy as np
 from gymnasium.vector import AutoresetMode, VectorEnv
 from numpy.typing import NDArray
 
-from bam_train.errors import PolicyError
+from bam_train.finite_envs import require_finite_action
 
 Array = NDArray[Any]
 Parts = Callable[[Any, Array], tuple[Array, ...]]
@@ -132,8 +132,7 @@ def play(
     policy.reset()
     while True:
         actions = np.asarray(policy.act_batch(observations))
-        if actions.dtype.kind == "f" and not np.isfinite(actions).all():
-            raise _not_finite(actions, lengths, seed)
+        require_finite_action(actions, lengths, "an episode" if seed is None else f"the episodes from seed {seed} on")
         if parts is not None:
             rows.append(tuple(map(np.array, parts(observations, actions))))
         observations, rewards, terminated, truncated, infos = envs.step(actions)
@@ -183,12 +182,3 @@ def _replaced(observations: Any, final: Any, rows: list[int]) -> Any:
     for i in rows:
         merged[i] = final[i]
     return merged
-
-
-def _not_finite(actions: Array, lengths: NDArray[np.int64], seed: int | None) -> PolicyError:
-    index = np.argwhere(~np.isfinite(actions))[0].tolist()
-    which = "an episode" if seed is None else f"the episodes from seed {seed} on"
-    return PolicyError(
-        f"action{index} is {actions[tuple(index)]} at step {lengths[index[0]]} of {which}; "
-        "expected finite numbers: the policy is broken"
-    )

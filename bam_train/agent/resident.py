@@ -1,6 +1,6 @@
 """The resident program on a robot's computer: it owns the robot, and runs the active policy episode after episode.
 
-Only the main thread moves the robot: the chain of a `Deployment` while the policy drives, or the newest command of the
+Only the main thread moves the robot: the loop of a `Deployment` while the policy drives, or the newest command of the
 person who has taken over. Requests wait in a queue and are executed by the main thread between two ticks; a halt is
 executed at once, in the thread in which it comes.
 
@@ -27,19 +27,17 @@ from bam_train.agent.agent_options import AgentOptions
 from bam_train.agent.agent_states import TRANSITIONS, State
 from bam_train.agent.robot_session import RobotSession
 from bam_train.agent.succession import Choice, Succession
-from bam_train.agent.transitions import TransitionLog, TransitionsAgent, encode
+from bam_train.agent.transitions import TransitionCollector, TransitionLog, encode
 from bam_train.agent.versions import Versions
 from bam_train.checkpoint import Checkpoint
-from bam_train.deploy.deployment import STOP, StopSwitch, fault_text
+from bam_train.deploy.deployment import StopSwitch, fault_text
 from bam_train.deploy.journal import EpisodeRecord
 from bam_train.errors import BamTrainError, ContractRefused, PolicyError, RequestRefused
-from bam_train.loop import Agent
 
 if TYPE_CHECKING:
     from bam_train.agent.audit import Audit
 
 _log = logging.getLogger(__name__)
-_FLAGS = np.array([False]), np.array([True])
 _LINK_POLL_PERIOD = 0.2  # time between two looks at the link while the robot rests [s]
 _RECONNECT_PERIOD = 1.0  # time between two attempts to reach the robot [s]
 _REPORT_PERIOD = 0.5  # time between two reports while nothing changes [s]
@@ -68,21 +66,6 @@ class Driver:
     """The same for people."""
     ran: bool
     """Whether the policy drove before."""
-
-
-class _Boundary(Agent):
-    """Between a deadline and the policy: executes the requests that came, which may end the episode."""
-
-    reads = ("env/done",)
-    writes = (STOP,)
-
-    def __init__(self, resident: Resident) -> None:
-        super().__init__()
-        self._resident = resident
-
-    def forward(self, t: int, **kwargs: Any) -> None:
-        ends = self._resident.between_ticks()
-        self.set((STOP, t), _FLAGS[ends or bool(self.get(("env/done", t))[0])])
 
 
 class Resident:
@@ -272,7 +255,7 @@ class Resident:
         return SafetyStop(stopped.partition(" (")[0], text)
 
     def between_ticks(self) -> bool:
-        """Called by the chain between a deadline and the policy: whether the episode ends here."""
+        """Called by the loop between a deadline and the policy: whether the episode ends here."""
         deployment = self._connected.deployment
         self._loop_ms += 0.05 * (1e3 * deployment.latency - self._loop_ms)
         self._was_cut_short = self._hurry.is_set()
@@ -455,9 +438,9 @@ class Resident:
                 self.options,
                 checkpoint,
                 self._stage,
-                boundary=_Boundary(self),
-                agents=[
-                    TransitionsAgent(
+                between_ticks=self.between_ticks,
+                observers=[
+                    TransitionCollector(
                         self.transitions, lambda: self.succession.active.digest, lambda: self._was_cut_short
                     )
                 ],

@@ -7,7 +7,7 @@ import shutil
 import threading
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import gymnasium as gym
@@ -15,14 +15,15 @@ import gymnasium as gym
 from bam_envs.core.timing import Pacer
 from bam_train.agent.agent_options import AgentOptions
 from bam_train.checkpoint import Checkpoint
-from bam_train.deploy.checkpoint_admission import Admission, has_real_robot
+from bam_train.deploy.checkpoint_admission import Admission, bring_up, has_real_robot
 from bam_train.deploy.contract import check_contract
 from bam_train.deploy.deployment import Deployment, StopSwitch
+from bam_train.deploy.episode import EpisodeStep
 from bam_train.deploy.flight import deployment_facts, flight_recorder, recording_names, watch_cameras
 from bam_train.deploy.journal import Journal
+from bam_train.env_location import EnvLocation
 from bam_train.environments import control_period, environment_of, interface_of, make_env
 from bam_train.errors import BamTrainError
-from bam_train.loop import Agent
 from bam_train.recording.recorder import Recorder
 from bam_train.recording.recording import Recording
 
@@ -48,8 +49,8 @@ class RobotSession:
         options: The options of the agent.
         checkpoint: The checkpoint whose policy begins.
         stage: ``"trial"``, ``"full"``, or None: on trial if the robot is real.
-        boundary: See `Deployment`.
-        agents: See `Deployment`.
+        between_ticks: See `Deployment`.
+        observers: See `Deployment`; of an environment whose observation is one array.
         switch: See `Deployment`.
         admit: Called with the connected environment before anything can move; lines for the operator are given too.
         sleep: See `Pacer`.
@@ -71,34 +72,32 @@ class RobotSession:
         checkpoint: Checkpoint,
         stage: str | None,
         *,
-        boundary: Agent,
-        agents: Sequence[Agent],
+        between_ticks: Callable[[], bool],
+        observers: Sequence[Callable[[EpisodeStep], None]],
         switch: StopSwitch,
         admit: Callable[[Any, Sequence[str]], None],
         sleep: Callable[[float], bool],
     ) -> None:
         self.checkpoint, self._options = checkpoint, options
         self.env_id, self.env_kwargs = environment_of(checkpoint)
-        self.stage = stage or "full"
-        """The stage at which the robot moves."""
-        place = options.place(trial=True if stage == "trial" else None)
-        self._env = make_env(self.env_id, self.env_kwargs, place=place)
-        try:
-            contract = check_contract(checkpoint, self._env, place)
+        at = options.place(trial=True if stage == "trial" else None)
+
+        def examine(env: Any, place: EnvLocation) -> str:
+            contract = check_contract(checkpoint, env, place)
             contract.require(f"{checkpoint.path} and the robot at {place.text}")
-            self.robot.connect()
+            return "" if contract.inspection is None else contract.inspection.identity
+
+        make = partial(make_env, self.env_id, self.env_kwargs)
+        self._env, place, known = bring_up(make, at, examine, trial_if_real=stage != "full")
+        try:
             self.is_real = has_real_robot(self._env)
-            if self.is_real and stage != "trial":
-                self.stage = stage or "trial"
-                place = replace(place, trial=self.stage == "trial")
-                self._env.close()  # type: ignore[no-untyped-call]
-                self._env = make_env(self.env_id, self.env_kwargs, place=place)  # a robot's limits are fixed
-                self.robot.connect()
+            self.stage = stage or ("trial" if self.is_real else "full")
+            """The stage at which the robot moves."""
             record = options.folder / "trials.jsonl"
             admission = Admission(checkpoint, options.keys, options.allow_unsigned, record, options.i_know)
             if place.trial is None:
                 admission.record = None
-            lines = admission(self._env, place, "" if contract.inspection is None else contract.inspection.identity)
+            lines = admission(self._env, place, known)
             self.identity = admission.identity
             """Serial number or name of the robot; empty if neither is known."""
             admit(self._env, lines)
@@ -112,23 +111,23 @@ class RobotSession:
                 Pacer(control_period(self._env), sleep=sleep),
                 Journal(0, marks=self.marks),
                 recorder=self.recorder,
-                boundary=boundary,
-                agents=agents if isinstance(self._env.observation_space, gym.spaces.Box) else (),
+                between_ticks=between_ticks,
+                observers=observers if isinstance(self._env.observation_space, gym.spaces.Box) else (),
                 switch=switch,
             )
         except BaseException:
-            self._env.close()  # type: ignore[no-untyped-call]
+            self._env.close()
             raise
 
     @property
     def robot(self) -> Any:
         """The robot behind its guards."""
-        return self._env.unwrapped.robot  # type: ignore[attr-defined]
+        return self._env.unwrapped.robot
 
     @property
     def task(self) -> Any:
         """The task."""
-        return self._env.unwrapped.task  # type: ignore[attr-defined]
+        return self._env.unwrapped.task
 
     @property
     def is_up(self) -> bool:
@@ -174,7 +173,7 @@ class RobotSession:
         """Halt the robot and drop the link; the end of the recording is written in another thread."""
         self._closed = True
         self.deployment.record_command()
-        self._env.close()  # type: ignore[no-untyped-call]
+        self._env.close()
         for recorder in (self.recorder, self._next):
             self._end(recorder)
 

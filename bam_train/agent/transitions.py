@@ -15,9 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bam_envs.core.wording import brief
+from bam_train.deploy.episode import EpisodeStep
 from bam_train.errors import FormatError
-from bam_train.loop import Agent
-from bam_train.loop.gym.robot_agent import SAYS_SUCCESS, SUCCESS
 
 EVENT = "transitions"
 """Value of ``event`` in a message with transitions."""
@@ -163,44 +162,32 @@ class TransitionLog:
         return LiveTransitions(**columns)
 
 
-class TransitionsAgent(Agent):
-    """Adds each complete step of the chain to a `TransitionLog`; the last agent in the chain.
+class TransitionCollector:
+    """Adds each complete step of a deployment to a `TransitionLog`; one of the observers of its loop.
 
     Args:
         log: Where they go.
         policy: Returns the digest of the policy that acts now.
         cut_short: Returns whether a request ended the last step before its time; such a step is left out.
-        observation: Variable of the observation, which is one array.
     """
 
-    writes = ()
-
     def __init__(
-        self,
-        log: TransitionLog,
-        policy: Callable[[], str],
-        cut_short: Callable[[], bool] = lambda: False,
-        observation: str = "env/env_obs",
+        self, log: TransitionLog, policy: Callable[[], str], cut_short: Callable[[], bool] = lambda: False
     ) -> None:
-        super().__init__()
-        self._log, self._policy, self._observation, self._episode = log, policy, observation, -1
-        self._cut_short = cut_short
-        self.reads = (observation, "action", *(f"env/{name}" for name in ("reward", *_ENDS, SUCCESS, SAYS_SUCCESS)))
+        self._log, self._policy, self._cut_short, self._episode = log, policy, cut_short, -1
         self._before: tuple[Any, Any, str] | None = None
 
-    def forward(self, t: int, **kwargs: Any) -> None:
-        """Add the step from time t - 1 to t."""
-        if t == 0:
+    def __call__(self, step: EpisodeStep) -> None:
+        """Add the step that led to `step`."""
+        if step.number == 0:
             self._episode += 1
         if not self._log.wanted:
             self._before = None
             return
-        observation, get = self.get((self._observation, t))[0].copy(), self.get
-        if t > 0 and self._before is not None and not self._cut_short():
+        [array] = step.arrays.values()
+        observation = array[0].copy()
+        if step.number > 0 and self._before is not None and not self._cut_short():
+            flags = (step.terminated, step.truncated, bool(step.success), False)
             seen, action, policy = self._before
-            terminated, truncated = (bool(get((f"env/{end}", t))[0]) for end in _ENDS)
-            success = bool(get((f"env/{SUCCESS}", t))[0]) and bool(get((f"env/{SAYS_SUCCESS}", t))[0])
-            flags = (terminated, truncated, success, False)
-            reward = float(get(("env/reward", t))[0])
-            self._log.add(seen, action, reward, observation, *flags, self._episode, t - 1, policy)
-        self._before = observation, get(("action", t))[0].copy(), self._policy()
+            self._log.add(seen, action, step.reward, observation, *flags, self._episode, step.number - 1, policy)
+        self._before = observation, step.action.copy(), self._policy()

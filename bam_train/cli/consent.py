@@ -18,7 +18,7 @@ from bam_envs.safety.guard import is_base
 from bam_train.agent.agent_states import State
 from bam_train.checkpoint import Checkpoint
 from bam_train.cli.console import say
-from bam_train.deploy.checkpoint_admission import has_real_robot
+from bam_train.deploy.checkpoint_admission import bring_up, has_real_robot
 from bam_train.deploy.contract_table import Contract
 from bam_train.env_location import EnvLocation
 from bam_train.environments import environment_of, make_env, require_fit
@@ -67,16 +67,13 @@ def connected_env(
         env_id, saved = environment_of(checkpoint, named, elsewhere=bool(place.transport))
     mode = "human" if render is True else render or None
     make = partial(make_env, env_id, {**saved, **(env_kwargs or {})}, render_mode=mode)
-    env = make(place=place)
+
+    def examine(env: Any, place: EnvLocation) -> Contract:
+        return Contract(()) if checkpoint is None else required_contract(checkpoint, env, place, motion)
+
+    env: gym.Env[Any, Any]
+    env, place, contract = bring_up(make, place, examine, raise_again=signals.raise_again)
     try:
-        contract = Contract(()) if checkpoint is None else required_contract(checkpoint, env, place, motion)
-        signals.raise_again()
-        _connect(env, signals)
-        if place.robot is not None and place.trial is None and not place.shadow and has_real_robot(env):
-            env.close()  # type: ignore[no-untyped-call]
-            place = replace(place, trial=True)  # a robot's limits are fixed when it is made
-            env = make(place=place)
-            _connect(env, signals)
         known = "" if contract.inspection is None else contract.inspection.identity
         plan = [*plan_lines(env, env_id, place.text, episodes, wiggle=wiggle), *admit(env, place, known)]
         signals.raise_again()
@@ -91,14 +88,6 @@ def connected_env(
         env.close()  # type: ignore[no-untyped-call]
         raise
     return env
-
-
-def _connect(env: Any, signals: SignalMemory) -> None:
-    """Connect the robot of `env`, if it has one."""
-    robot: Any = getattr(env.unwrapped, "robot", None)
-    if robot is not None:
-        robot.connect()
-        signals.raise_again()
 
 
 def required_contract(checkpoint: Checkpoint, env: Any, place: EnvLocation, motion: Path | None = None) -> Contract:

@@ -2,7 +2,7 @@
 
 from bam_train.data.data_set import DataSet
 from bam_train.data.data_set_writer import DataSetWriter
-from bam_train.data.episode import DataSetInfo, Episode, Transitions
 from bam_train.data.record_dataset import RecordDataset
+from bam_train.data.recorded_episode import DataSetInfo, Episode, Transitions
 
 __all__ = ["DataSet", "DataSetInfo", "DataSetWriter", "Episode", "RecordDataset", "Transitions"]

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from bam_train.data.episode import Array
+from bam_train.data.recorded_episode import Array
 
 Arrow = Any
 """An array, table or type of pyarrow."""

@@ -15,8 +15,8 @@ from bam_envs.core.registry import resolve_id
 from bam_envs.core.wording import brief
 from bam_envs.tasks.scripted import scripted_policy
 from bam_train.checkpoint import Checkpoint
-from bam_train.data.episode import Array
 from bam_train.data.record_dataset import RecordVectorDataset, info_of
+from bam_train.data.recorded_episode import Array
 from bam_train.environments import environment_of, make_vector_env, require_env_kwargs, require_fit
 from bam_train.errors import SettingsError
 from bam_train.evaluation import default_num_envs

@@ -13,7 +13,6 @@ import numpy as np
 
 from bam_envs.core.errors import BamEnvsError
 from bam_train.data.arrow_columns import from_arrow
-from bam_train.data.episode import Array, DataSetInfo, Episode, Transitions, Values, digest_of, joined, leaves_of
 from bam_train.data.file_pair import Copy, Head, sha256
 from bam_train.data.layout import (
     BAM,
@@ -35,6 +34,16 @@ from bam_train.data.layout import (
     file_name,
     row_digest,
     sealed,
+)
+from bam_train.data.recorded_episode import (
+    Array,
+    DataSetInfo,
+    Episode,
+    Transitions,
+    Values,
+    digest_of,
+    joined,
+    leaves_of,
 )
 from bam_train.environments import first_difference, short_json
 from bam_train.errors import BadDataSet, PlaceError

@@ -17,7 +17,7 @@ from bam_envs.core.validation import NonNegative, check
 from bam_envs.core.wording import brief
 from bam_envs.local.local_task import LocalTask, one_step
 from bam_train.data.data_set import DataSet
-from bam_train.data.episode import Transitions
+from bam_train.data.recorded_episode import Transitions
 from bam_train.data.selection import split as split_episodes
 from bam_train.errors import BadDataSet, BamTrainError
 

@@ -11,10 +11,10 @@ import numpy as np
 
 from bam_envs.core.wording import brief
 from bam_train.data.data_set import DataSet
-from bam_train.data.episode import Array, DataSetInfo, Episode, Leaf, digest_of, leaves_of
 from bam_train.data.file_pair import Columns, Head, kind_of
 from bam_train.data.layout import BAM, COPIES, DATA, DEFAULTS, EPISODES, INFO, Files, WriterLock, file_name
 from bam_train.data.mending import mend
+from bam_train.data.recorded_episode import Array, DataSetInfo, Episode, Leaf, digest_of, leaves_of
 from bam_train.environments import first_difference, short_json
 from bam_train.errors import BadDataSet
 from bam_train.files.place import Place

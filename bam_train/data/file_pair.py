@@ -15,7 +15,6 @@ from typing import Any
 import numpy as np
 
 from bam_train.data.arrow_columns import Arrow, to_arrow
-from bam_train.data.episode import Array, DataSetInfo, Episode, digest_of, leaves_of
 from bam_train.data.layout import (
     CHUNK,
     COPIES,
@@ -39,6 +38,7 @@ from bam_train.data.layout import (
     sealed,
     tasks_table,
 )
+from bam_train.data.recorded_episode import Array, DataSetInfo, Episode, digest_of, leaves_of
 from bam_train.data.statistics import add_stats
 
 _TAIL = struct.Struct("<I4s")  # how a Parquet file ends: length of its footer, magic

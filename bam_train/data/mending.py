@@ -18,7 +18,6 @@ import numpy as np
 from bam_envs.core.errors import BamEnvsError
 from bam_train.data.arrow_columns import to_arrow
 from bam_train.data.data_set import DataSet
-from bam_train.data.episode import DataSetInfo, Episode
 from bam_train.data.file_pair import Columns, Copy, Head, sha256
 from bam_train.data.layout import (
     BAM,
@@ -36,6 +35,7 @@ from bam_train.data.layout import (
     sealed,
     tasks_table,
 )
+from bam_train.data.recorded_episode import DataSetInfo, Episode
 from bam_train.data.salvage import Pair, read_pair
 from bam_train.environments import first_difference, short_json
 from bam_train.errors import BadDataSet

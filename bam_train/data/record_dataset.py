@@ -17,7 +17,7 @@ from bam_envs.core.robot_env import RobotEnv, RobotVectorEnv
 from bam_envs.remote.wire.values import plain_info, tree_to_json
 from bam_train.checkpoint.manifest import WHERE
 from bam_train.data.data_set_writer import DataSetWriter
-from bam_train.data.episode import Array, DataSetInfo, Episode, Leaf, joined, leaves_of
+from bam_train.data.recorded_episode import Array, DataSetInfo, Episode, Leaf, joined, leaves_of
 from bam_train.environments import AnyEnv, control_period
 from bam_train.errors import BadDataSet, SettingsError
 from bam_train.files.place import Place

@@ -21,9 +21,9 @@ from bam_train.checkpoint.manifest import require_no_place
 from bam_train.data.arrow_columns import Arrow
 from bam_train.data.data_set import DataSet
 from bam_train.data.data_set_writer import DataSetWriter
-from bam_train.data.episode import Array, DataSetInfo, Episode, digest_of, joined, leaves_of
 from bam_train.data.layout import INFO, Files
 from bam_train.data.record_dataset import info_of
+from bam_train.data.recorded_episode import Array, DataSetInfo, Episode, digest_of, joined, leaves_of
 from bam_train.environments import make_env, must_be_named, require_env_kwargs
 from bam_train.errors import BadDataSet, BadRecording
 from bam_train.files.place import Place

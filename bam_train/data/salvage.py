@@ -12,7 +12,6 @@ from typing import Any
 
 from bam_train.data.arrow_columns import Arrow
 from bam_train.data.data_set import DataSet
-from bam_train.data.episode import Episode, leaves_of
 from bam_train.data.file_pair import MAGIC, Copy, sha256
 from bam_train.data.layout import (
     COPIES,
@@ -29,6 +28,7 @@ from bam_train.data.layout import (
     file_name,
     row_digest,
 )
+from bam_train.data.recorded_episode import Episode, leaves_of
 
 _ENDS = ("bam/terminated", "bam/truncated", "bam/success")
 

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from bam_train.data.episode import Array
+from bam_train.data.recorded_episode import Array
 
 QUANTILES = {"q01": 0.01, "q10": 0.1, "q50": 0.5, "q90": 0.9, "q99": 0.99}
 MOST_IMAGES = 20

@@ -1,12 +1,14 @@
-"""Admission of a checkpoint to a real robot: a signature that this computer trusts, and enough trials."""
+"""What comes before a robot moves: it is brought up, and the checkpoint is admitted: its signature, its trials."""
 
-from dataclasses import dataclass, field
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import gymnasium as gym
 
 from bam_envs.core.config_folder import config_folder
+from bam_envs.core.robot_env import robot_of
 from bam_envs.live.robot_identity import is_one_robot
 from bam_envs.rosbridge.endpoint import Endpoint
 from bam_envs.safety.guard import TRIAL_SPEED
@@ -21,12 +23,55 @@ UNSIGNED, UNPROVEN, TRIAL, SHADOW = "UNSIGNED", "UNPROVEN", "trial", "shadow: no
 """Marks of a deployment: no trusted signature; full speed without enough trials; on trial; somebody else drives."""
 TRIALS = Path("recordings") / "trials.jsonl"
 """Default record of trials."""
+Found = TypeVar("Found")
 
 
 def has_real_robot(env: Any) -> bool:
     """Whether the environment has a real robot; known once it is connected."""
-    info = getattr(getattr(env.unwrapped, "robot", None), "info", None)
+    info = getattr(robot_of(env), "info", None)
     return info is not None and not info.simulated
+
+
+def bring_up(
+    make: Callable[..., Any],
+    place: EnvLocation,
+    examine: Callable[[Any, EnvLocation], Found],
+    *,
+    trial_if_real: bool = True,
+    raise_again: Callable[[], None] = lambda: None,
+) -> tuple[Any, EnvLocation, Found]:
+    """The connected environment, its place, and what `examine` found.
+
+    A robot that turns out to be real, at a place that names no stage, is made again: its limits are fixed when it is
+    made, and they depend on the stage.
+
+    Args:
+        make: Makes the environment for ``place=...``.
+        place: The place of the environment.
+        examine: Called with the environment before it is connected; raises an error if the robot does not fit.
+        trial_if_real: The stage of such a robot: on trial, or at full speed.
+        raise_again: Raises a signal whose exception Python discarded again.
+    """
+    env = make(place=place)
+    try:
+        found = examine(env, place)
+        _connect(env, raise_again)
+        if place.robot is not None and place.trial is None and not place.shadow and has_real_robot(env):
+            env.close()
+            place = replace(place, trial=trial_if_real)
+            env = make(place=place)
+            _connect(env, raise_again)
+    except BaseException:
+        env.close()
+        raise
+    return env, place, found
+
+
+def _connect(env: Any, raise_again: Callable[[], None]) -> None:
+    raise_again()
+    if (robot := robot_of(env)) is not None:
+        robot.connect()
+        raise_again()
 
 
 @dataclass

@@ -1,49 +1,34 @@
-"""The deployment: a chain of agents that moves a robot at absolute deadlines.
+"""The deployment: the loop that moves a robot at absolute deadlines, from its first episode to its end.
 
-Robot, journal and policy are agents of one `TemporalAgent`, which waits for each deadline before the policy acts; your
-own agents join the same chain. At the end, for any reason (all episodes done, Ctrl-C, SIGTERM, a fault), the robot is
-halted and closed before anything is reported.
+At the end, for any reason (all episodes done, Ctrl-C, SIGTERM, a fault), the robot is halted and closed before anything
+is reported.
 """
 
+import contextlib
 import math
 import signal
-import time
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 from functools import partial
-from typing import Any, Protocol
+from typing import Any
 
 import gymnasium as gym
 
 from bam_envs.core.errors import BamEnvsError, LinkLost, SafetyStop
 from bam_envs.core.robot import RobotState
+from bam_envs.core.robot_env import halt_and_close, robot_of
 from bam_envs.core.timing import Pacer, TickTimes
 from bam_envs.safety.guard import Tick
-from bam_train.deploy.flight import RecorderAgent, Stopwatch
+from bam_train.deploy.episode import EpisodeLoop, EpisodeStep, Watcher
+from bam_train.deploy.flight import FlightLog
 from bam_train.deploy.journal import Ending, EpisodeRecord, Journal
 from bam_train.deploy.trials import Trials
 from bam_train.errors import BamTrainError
-from bam_train.loop import Agent, Agents, PolicyAgent, RobotAgent, TemporalAgent, Workspace
-from bam_train.loop.gym.robot_agent import SAYS_SUCCESS, SUCCESS
-from bam_train.loop.workspace import Sink
 from bam_train.recording.recorder import ERROR, INFO, Recorder
 from bam_train.signals import handled, interrupt
 
 WINDOW = 1000
 """Minimum number of ticks that the workspace of a deployment keeps: 50 s at 20 Hz."""
-STOP = "deployment/stop"
-"""Variable (1,): whether the episode ends at this time."""
-_ENDS = ("terminated", "truncated")
-
-
-class Watcher(Protocol):
-    """Displays the loop; called between ticks, so it must be fast."""
-
-    def ticked(self, record: EpisodeRecord, action: Any, pacer: Pacer) -> None:
-        """Called after every step."""
-
-    def ended(self, record: EpisodeRecord) -> None:
-        """Called after every episode."""
 
 
 class Stopped(BaseException):
@@ -87,21 +72,23 @@ class StopSwitch:
 
 
 class Deployment:
-    """A frozen policy and a robot in one loop, which runs once, with bounded memory.
+    """A frozen policy and a robot in one loop, which runs once, with bounded memory; see `EpisodeLoop`.
 
     Args:
         env: The environment, already checked to fit the policy.
         policy: Has ``reset()`` and ``act(observation)``.
         pacer: The deadlines.
         journal: Updated at every tick.
-        agents: Further agents, run after the policy; they declare the variables that they read and write.
-        window: Minimum number of ticks that the workspace keeps.
+        observers: Called with each `EpisodeStep` once the policy has decided, so they must be fast.
+        agents: Agents of the interaction loop, run after the policy on the variables that `RobotAgent` and
+            `PolicyAgent` write; they declare what they read and write.
+        window: Minimum number of ticks that the workspace of `agents` and `sink` keeps.
         sink: ``sink(first_time, {variable: array (n, 1, ...)})`` gets every tick once, in order, episode by episode.
             It is called between two ticks, so it must be fast; if it fails, the deployment ends.
         recorder: Records every tick, if given; it has started, and is closed at the end. If it fails, the deployment
             goes on.
         trials: Where each episode is recorded as a trial, if given; may be exchanged between two episodes.
-        boundary: Agent that runs between a deadline and the policy, and writes `STOP`, which ends the episode.
+        between_ticks: Called between a deadline and the policy; whether the episode ends there.
         switch: Handler of SIGINT and SIGTERM; None: one of its own.
 
     Raises:
@@ -115,41 +102,38 @@ class Deployment:
         pacer: Pacer,
         journal: Journal,
         *,
-        agents: Sequence[Agent] = (),
+        observers: Sequence[Callable[[EpisodeStep], None]] = (),
+        agents: Sequence[Any] = (),
         window: int = WINDOW,
-        sink: Sink | None = None,
+        sink: Callable[[int, dict[str, Any]], None] | None = None,
         recorder: Recorder | None = None,
         trials: Trials | None = None,
-        boundary: Agent | None = None,
+        between_ticks: Callable[[], bool] = lambda: False,
         switch: StopSwitch | None = None,
     ) -> None:
         self.env, self.pacer, self.journal, self.recorder, self.trials = env, pacer, journal, recorder, trials
-        self.switch = switch or StopSwitch(lambda: self._robot.halt())
+        self.switch = switch or StopSwitch(self._halt)
         """Handler of SIGINT and SIGTERM."""
-        self._robot = _DeployedRobot(env, self.switch)
-        self._workspace = Workspace(window=window, sink=None if sink is None else _silent_once_broken(sink))
-        self._watch = watch = Stopwatch()
-        names = self._robot.observation_names
-        self._policy = policy_agent = _TimedPolicy(policy, names, watch)
-        self.times = TickTimes(pacer.period)
-        """Of the last ticks."""
-        self._stop_variable = "env/done" if boundary is None else STOP
-        chain: list[Agent] = [
-            _StopAgent(self.switch, watch),
-            self._robot,
-            _JournalAgent(self, watch, getattr(env.unwrapped, "robot", None)),
-            *(() if boundary is None else (boundary,)),
-            policy_agent,
-            *agents,
-            _DetectorAgent(self, policy_agent),
-        ]
-        self._flight = RecorderAgent(recorder, env, names, journal, watch)
-        chain.append(self._flight)
-        self._loop = TemporalAgent(Agents(*chain))
+        self._loop = EpisodeLoop(
+            env, policy, pacer, journal, raise_again=self.switch.raise_again, between_ticks=between_ticks
+        )
+        self._flush: Callable[[], None] = lambda: None
+        self._closing = self._closed = False
+        self._flight = FlightLog(recorder, env, journal)
+        extra: list[Callable[[EpisodeStep], None]] = []
+        if agents or sink is not None:
+            from bam_train.loop.gym.observing_agents import ObservingAgents  # nothing of a robot's path needs them
+
+            extra = [observing := ObservingAgents(env, agents, window=window, sink=sink)]
+            self._flush = observing.flush
+        comparison = _Comparison(env, self._loop, journal)
+        self._loop.observers += [*extra, *observers, comparison, self._flight.record]
 
     def connect(self) -> None:
         """Open the link to the robot, if there is one, without moving it; fails before the loop if it is missing."""
-        self._robot.connect()
+        self._closed = False
+        if (robot := robot_of(self.env)) is not None:
+            robot.connect()
 
     def handles_signals(self) -> AbstractContextManager[None]:
         """Within the ``with`` block, SIGINT and SIGTERM go to the switch, even if ignored; `run` uses this itself."""
@@ -166,24 +150,49 @@ class Deployment:
                 self._end_recording(ending)
 
     def swap(self, policy: Any) -> None:
-        """Let another policy act from the next action on; called between two ticks, as by the `boundary` agent."""
+        """Let another policy act from the next action on; called between two ticks."""
         policy.reset()
-        self._policy.policy = policy
+        self._loop.policy = policy
 
     def episode(self, watcher: Watcher, *, seed: int) -> EpisodeRecord:
         """Run one episode; afterwards the robot is halted, and stays connected. After an exception it is closed."""
-        self._loop(self._workspace, t=0, stop_variable=self._stop_variable, seed=seed, watcher=watcher)
-        self._robot.halt()  # the sink and the next reset may be slow
-        record = self.journal.records[-1]
+        self._closed = False
+        try:
+            record = self._loop.run(watcher, seed=seed, begins=self._begins)
+        except BaseException:
+            with contextlib.suppress(Exception):  # the fault itself is what the operator must see
+                self._close()
+            raise
+        self._halt()  # the sink and the next reset may be slow
         if self.trials is not None:
             self.trials.end(record.success is True, record.end)
-        self._workspace.flush()
+        self._flush()
         return record
+
+    def _begins(self, seed: int) -> None:
+        if self.trials is not None:
+            self.trials.begin(seed)  # before the first command
+
+    def _halt(self) -> None:
+        if (robot := robot_of(self.env)) is not None:
+            robot.halt()
+
+    def _close(self) -> None:
+        """Halt the robot and close the environment, which no signal interrupts; a second call does nothing."""
+        self._closing, self.switch.armed = True, False
+        if not self._closed:
+            halt_and_close(self.env)
+            self._closed = True
+
+    @property
+    def times(self) -> TickTimes:
+        """Of the last ticks."""
+        return self._loop.times
 
     @property
     def latency(self) -> float:
         """Time from a deadline to the step that followed it, in the last tick [s]."""
-        return self._watch.latency
+        return self._loop.latency
 
     def sent(self, tick: Tick, state: RobotState) -> None:
         """Take a command that a `SafeRobot` has sent, for the recording: `SafeRobot.observe` has one observer only."""
@@ -224,14 +233,14 @@ class Deployment:
         except Exception as error:  # after any fault, the robot must be halted and the report made
             ending = ending_of(error)
         except BaseException:
-            if not self._robot.closing:
-                self._robot.halt()
+            if not self._closing:
+                self._halt()
             raise
-        ending = _unless_it_fails(ending, "closing", self._robot.close)
+        ending = _unless_it_fails(ending, "closing", self._close)
         if self.trials is not None:
             ended = partial(self.trials.end, False, ending.reason)  # of an episode that was cut short
             ending = _unless_it_fails(ending, "recording the trial", ended)
-        return _unless_it_fails(ending, "recording", self._workspace.flush)  # of an episode that was cut short
+        return _unless_it_fails(ending, "recording", self._flush)  # of an episode that was cut short
 
 
 def ending_of(error: Exception) -> Ending:
@@ -254,20 +263,6 @@ def _unless_it_fails(ending: Ending, what: str, end: Callable[[], None]) -> Endi
     return ending
 
 
-def _silent_once_broken(sink: Sink) -> Sink:
-    """The sink, which is not called again after it has failed."""
-    broken = False
-
-    def guarded(first_time: int, piece: dict[str, Any]) -> None:
-        nonlocal broken
-        if not broken:
-            broken = True  # until it returns without an exception
-            sink(first_time, piece)
-            broken = False
-
-    return guarded
-
-
 def fault_text(error: Exception) -> str:
     """The exception in one line, with its type unless it belongs to `bam_envs` or `bam_train`."""
     text = " ".join(str(error).split())
@@ -275,71 +270,30 @@ def fault_text(error: Exception) -> str:
     return text if is_clear else f"{type(error).__name__}: {text}".removesuffix(": ")
 
 
-# ---- the agents beside robot and policy
-
-
-class _StopAgent(Agent):
-    """Runs before the robot's agent, so that the robot gets no command after a signal whose exception was lost."""
-
-    reads = ()
-    writes = ()
-
-    def __init__(self, switch: StopSwitch, watch: Stopwatch) -> None:
-        super().__init__()
-        self._switch, self._watch = switch, watch
-
-    def forward(self, t: int, **kwargs: Any) -> None:
-        watch, watch.begun = self._watch, time.perf_counter()
-        if t > 0:  # a reset follows no deadline
-            watch.latency = watch.begun - watch.waited
-        self._switch.raise_again()
-
-
-class _TimedPolicy(PolicyAgent):
-    """The policy's agent, which measures how long an action takes."""
-
-    def __init__(self, policy: Any, names: tuple[str, ...], watch: Stopwatch) -> None:
-        super().__init__(policy, names, single=True)
-        self._declare(_TimedPolicy, reads=(*names, self._timestep, self._done), writes=(self.output,))
-        self._watch = watch
-
-    def forward(self, t: int, seed: Any = None, **kwargs: Any) -> None:
-        watch, begun, computed = self._watch, time.perf_counter(), time.thread_time()
-        try:
-            super().forward(t, seed, **kwargs)
-        finally:
-            watch.acted, watch.computed = time.perf_counter() - begun, time.thread_time() - computed
-
-
-class _DetectorAgent(Agent):
+class _Comparison:
     """Compares what the policy sees and does, and how the robot answers, with its training, if it has a detector."""
 
-    writes = ()
-
-    def __init__(self, deployment: "Deployment", policy: PolicyAgent) -> None:
-        super().__init__()
-        self._policy, self._journal = policy, deployment.journal
+    def __init__(self, env: gym.Env[Any, Any], loop: EpisodeLoop, journal: Journal) -> None:
+        self._loop, self._journal = loop, journal
         self._of: Any = None  # the detector of the running episode
-        self._env: Any = deployment.env.unwrapped
-        self._robot: Any = getattr(self._env, "robot", None)
+        self._env: Any = env.unwrapped
+        self._robot = robot_of(env)
         self._tell = getattr(self._robot, "tell_unusual", None)
         self._pace = getattr(getattr(self._robot, "limits", None), "pace", 1.0)
         self._stamp = math.nan
-        self.reads = (*policy.names, "action", "env/done")
 
-    def forward(self, t: int, **kwargs: Any) -> None:
-        journal = self._journal
-        detector: Any = getattr(self._policy.policy, "detector", None)
-        if detector is None or self.get(("env/done", t))[0]:
+    def __call__(self, step: EpisodeStep) -> None:
+        journal, detector = self._journal, getattr(self._loop.policy, "detector", None)
+        if detector is None or step.is_last:
             journal.unusual = None if detector is None else journal.unusual
             return
-        if t == 0 or detector is not self._of:
+        if step.number == 0 or detector is not self._of:
             detector.begin(self._pace)
             self._of = detector
-        seen, action = self.get((self._policy.names[0], t))[0], self.get(("action", t))[0]
-        level = detector.step(seen, action, *self._answered(), held=getattr(self._robot, "is_held", False))
+        seen, held = next(iter(step.arrays.values()))[0], getattr(self._robot, "is_held", False)
+        level = detector.step(seen, step.action, *self._answered(), held=held)
         text = f"{detector.reason} (score {level:.2f}, usual is at most 1)" if level > 1.0 else ""
-        journal.compare(level, text, begins=t == 0)
+        journal.compare(level, text, begins=step.number == 0)
         if text and self._tell is not None:
             self._tell(text)
 
@@ -351,59 +305,3 @@ class _DetectorAgent(Agent):
         stamp = float(state.stamp[0])
         before, self._stamp = self._stamp, stamp
         return state.command[0], (stamp - before) / self._robot.spec.period
-
-
-class _DeployedRobot(RobotAgent):
-    """The robot's agent, whose closing no signal interrupts."""
-
-    closing = False
-
-    def __init__(self, env: gym.Env[Any, Any], switch: StopSwitch) -> None:
-        super().__init__(env)
-        self._switch = switch
-
-    def close(self) -> None:
-        self.closing, self._switch.armed = True, False
-        super().close()
-
-
-class _JournalAgent(Agent):
-    """Updates the journal, calls the watcher, then waits for the deadline of the next action."""
-
-    reads = tuple(f"env/{name}" for name in ("reward", "done", *_ENDS, SUCCESS, SAYS_SUCCESS))
-    reads_previous = ("action",)
-    writes = ()
-
-    def __init__(self, deployment: Deployment, watch: Stopwatch, robot: Any) -> None:
-        super().__init__()
-        self._deployment, self._journal, self._pacer = deployment, deployment.journal, deployment.pacer
-        self._watch, self._robot = watch, robot
-
-    def forward(self, t: int, seed: int, watcher: Watcher, **kwargs: Any) -> None:
-        self._watch.stepped, done = time.perf_counter(), self.get(("env/done", t))[0]
-        if t == 0:
-            self._journal.begin(seed)
-            if self._deployment.trials is not None:
-                self._deployment.trials.begin(seed)  # before the first command
-            self._pacer.start()
-        else:  # the step that led to time t
-            success = self.get((f"env/{SUCCESS}", t))[0] if self.get((f"env/{SAYS_SUCCESS}", t))[0] else None
-            end = next(end for end in _ENDS if self.get((f"env/{end}", t))[0]) if done else "stopped"
-            self._journal.warn(getattr(self._robot, "warnings", ()))
-            record = self._journal.step(self.get(("env/reward", t))[0], success, end)
-            watcher.ticked(record, self.get(("action", t - 1))[0], self._pacer)
-            if end != "stopped":
-                watcher.ended(record)
-        if done:
-            self._watch.late = 0.0
-        else:
-            self._wait(self._journal.records[-1], begins=t == 0)
-        self._watch.waited = time.perf_counter()
-
-    def _wait(self, record: EpisodeRecord, *, begins: bool) -> None:
-        """Wait for the deadline of the next action."""
-        pacer, watch, missed = self._pacer, self._watch, self._pacer.missed
-        watch.late = pacer.wait()
-        if not begins:
-            missed = pacer.missed - missed
-            record.slow += self._deployment.times.add(watch.late, missed, watch.acted, watch.computed)

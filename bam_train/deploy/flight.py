@@ -1,4 +1,4 @@
-"""The flight recorder's agent: it hands the numbers of every tick of a deployment to a `Recorder`."""
+"""The flight recorder: it hands the numbers of every step of a deployment to a `Recorder`."""
 
 import json
 import math
@@ -16,22 +16,21 @@ from numpy.typing import NDArray
 
 from bam_envs.core.errors import BamEnvsError
 from bam_envs.core.robot import RobotState
-from bam_envs.core.robot_env import RobotEnv
+from bam_envs.core.robot_env import RobotEnv, robot_of
 from bam_envs.live.camera import LiveCamera
 from bam_envs.robots.profile import load_profile
 from bam_envs.rosbridge.endpoint import Endpoint
 from bam_envs.safety.guard import Tick
 from bam_train.checkpoint import Checkpoint
+from bam_train.deploy.episode import OBSERVATION, EpisodeStep
 from bam_train.deploy.journal import Journal
 from bam_train.env_location import EnvLocation
 from bam_train.environments import control_period
 from bam_train.files.stand_ins import with_addresses
-from bam_train.loop import Agent
-from bam_train.loop.gym.gym_spaces import NAME
 from bam_train.recording.recorder import WARNING, Recorder
 
 STAGES = ("step", "wait", "late", "policy", "age", "record")
-"""Names of the latencies in /latency; see `RecorderAgent`."""
+"""Names of the latencies in /latency; see `FlightLog`."""
 _SCALARS = {
     "/status": ("code", "guard"),
     "/latency": STAGES,
@@ -40,18 +39,6 @@ _SCALARS = {
 }
 MAX_SENT_SIGNAL = 32
 """Maximum size of the signals in /sent, which leaves out laser scans."""
-
-
-class Stopwatch:
-    """The times of a tick on the clock of `perf_counter` [s], which the agents of the loop fill in."""
-
-    begun = stepped = waited = 0.0
-    late = 0.0
-    """Delay of the tick after its deadline [s]."""
-    acted = computed = 0.0
-    """Duration and CPU time of the last action [s]."""
-    latency = 0.0
-    """Time from the deadline of the tick before to its step [s]."""
 
 
 def flight_recorder(
@@ -112,8 +99,8 @@ def watch_cameras(recorder: Recorder, place: EnvLocation) -> list[str]:
     return left_out
 
 
-class RecorderAgent(Agent):
-    """Records each tick; the last agent in the chain, so that the action is the one that the environment gets.
+class FlightLog:
+    """Records each step of a deployment, once the policy has decided on it.
 
     The latencies are ``step``, from an action to the observation that it led to; ``wait``, until the next deadline;
     ``late``, the delay of the tick after that; ``policy``, from then to the next action; ``age`` of a guarded
@@ -122,26 +109,13 @@ class RecorderAgent(Agent):
     Args:
         recorder: The recorder, which has started; None: nothing is recorded until `begin`.
         env: The environment.
-        names: The variables of the observation.
         journal: The journal.
-        watch: The times of the tick, filled in by the other agents.
     """
 
-    writes = ()
-
-    def __init__(
-        self,
-        recorder: Recorder | None,
-        env: gym.Env[Any, Any],
-        names: tuple[str, ...],
-        journal: Journal,
-        watch: Stopwatch,
-    ) -> None:
-        super().__init__()
-        self._env, self._journal, self._watch = env.unwrapped, journal, watch
-        self._robot: Any = getattr(self._env, "robot", None)
+    def __init__(self, recorder: Recorder | None, env: gym.Env[Any, Any], journal: Journal) -> None:
+        self._env, self._journal = env.unwrapped, journal
+        self._robot: Any = robot_of(env)
         self._has_states = isinstance(self._env, RobotEnv)
-        self._names, self.reads = names, (*names, "action", "env/reward")
         self._numbers: list[str] = []
         self._pictures: list[str] = []
         self.begin(recorder)
@@ -177,55 +151,55 @@ class RecorderAgent(Agent):
             self._declared = True
         self._recorder.tick([state.signals[signal.name] for signal in signals], [*command, *self._status()], series=1)
 
-    def forward(self, t: int, seed: int, **kwargs: Any) -> None:
-        """Record the tick."""
+    def record(self, step: EpisodeStep) -> None:
+        """Record the step."""
         if self._recorder is None:
             return
-        begun, watch, record, self._sent = perf_counter(), self._watch, self._journal.records[-1], None
+        begun, record, self._sent = perf_counter(), self._journal.records[-1], None
         state: Any = self._env.last_state if self._has_states else None  # type: ignore[attr-defined]
-        get, action = self.get, self.get(("action", t))
-        if t == 0:
-            self._recorder.event(f"episode {self._journal.begun} begins, seed {seed}")
-            self._describe(state, {name: get((name, t)) for name in self._names}, action)
+        action = np.asarray(step.action)[None]
+        if step.number == 0:
+            self._recorder.event(f"episode {self._journal.begun} begins, seed {step.seed}")
+            self._describe(state, step.arrays, action)
         if len(self._journal.warnings) > self._warned:
             for title, text in [*self._journal.warnings.items()][self._warned :]:
                 self._recorder.event(f"{title}: {text}", WARNING)
             self._warned = len(self._journal.warnings)
         scalars = [
             *self._status(),
-            *(watch.stepped - watch.begun, watch.waited - watch.stepped, watch.late, begun - watch.waited),
-            *(self._age, self._took, self._journal.begun - 1, t, get(("env/reward", t))[0]),
+            *(step.stepped - step.begun, step.waited - step.stepped, step.late, begun - step.waited),
+            *(self._age, self._took, self._journal.begun - 1, step.number, step.reward),
             *(record.end == "terminated", record.end == "truncated"),
             math.nan if record.success is None else record.success,
             math.nan if self._journal.unusual is None else self._journal.unusual,
         ]
-        arrays = [*[get((name, t)) for name in self._numbers], action]
+        arrays = [*[step.arrays[name] for name in self._numbers], action]
         if state is not None:
             truth = _numeric(state.truth).values() if state.truth else ()
             measured = [state.signals[one.name] for one in self._robot.spec.signals if one.name in state.signals]
             arrays = [state.stamp, *measured, *truth, state.command, *arrays]
-        self._recorder.tick(arrays, scalars, begun - self._decided if t else 0.0)
+        self._recorder.tick(arrays, scalars, begun - self._decided if step.number else 0.0)
         for name in self._pictures:
-            self._recorder.pixels(name.removeprefix("env/"), get((name, t))[0])
+            self._recorder.pixels(name, step.arrays[name][0])
         self._recorder.look()
         self._decided = perf_counter()
         self._took = self._decided - begun
 
     def _describe(self, state: Any, observed: Mapping[str, NDArray[Any]], action: NDArray[Any]) -> None:
-        """Declare the names of a tick's numbers, in the order of `forward`."""
+        """Declare the names of a tick's numbers, in the order of `record`."""
         labels = {
             kind: [str(row["name"]) for row in rows] for kind, rows in getattr(self._env, "describe", dict)().items()
         }
         self._pictures = [name for name, array in observed.items() if _is_picture(array)]
         self._numbers = [name for name in observed if name not in self._pictures]
-        arrays = {name.removeprefix(f"env/{NAME}").lstrip("/"): observed[name] for name in self._numbers}
+        arrays = {name.removeprefix(OBSERVATION).lstrip("/"): observed[name] for name in self._numbers}
         layout, truth = {}, {} if state is None else _numeric(state.truth)
         if state is not None:
             spec = self._robot.spec
             present = [signal for signal in spec.signals if signal.name in state.signals]
             signals = [f"{signal.name}.{label}" for signal in present for label in signal.labels]
             layout = {"/state": ["stamp", *signals], "/truth": _named(truth), "/command": list(spec.command.labels)}
-        pictures = {name.removeprefix(f"env/{NAME}/") for name in self._pictures}
+        pictures = {name.removeprefix(f"{OBSERVATION}/") for name in self._pictures}
         layout["/observation"] = _named(arrays, [one for one in labels.get("observation", ()) if one not in pictures])
         layout["/action"] = _named({"": action}, labels.get("action"))
         layout |= {topic: list(names) for topic, names in _SCALARS.items()}

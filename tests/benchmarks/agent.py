@@ -48,7 +48,7 @@ def fast_session(url):
     from bam_train.policy import FrozenPolicy
 
     class FastSession(RobotSession):
-        def __init__(self, options, checkpoint, stage, *, boundary, agents, switch, sleep, **rest):
+        def __init__(self, options, checkpoint, stage, *, between_ticks, observers, switch, sleep, **rest):
             self.checkpoint, self.env_id, self.env_kwargs = checkpoint, checkpoint.manifest.env, {}
             self._options = options
             self.stage, self.is_real, self.identity, self.marks, self.recorder = "full", False, "", (), None
@@ -64,8 +64,8 @@ def fast_session(url):
                 self.recorder = flight_recorder(path, self._env, deployment_facts(checkpoint, self._env))
                 self.recorder.start()
             env, pacer = HeldOpen(self._env), Pacer(PERIOD if url else None, sleep=sleep)
-            parts = {"recorder": self.recorder, "boundary": boundary, "agents": agents, "switch": switch}
-            self.deployment = Deployment(env, self.policy, pacer, Journal(0), **parts)
+            parts = {"between_ticks": between_ticks, "observers": observers, "switch": switch}
+            self.deployment = Deployment(env, self.policy, pacer, Journal(0), recorder=self.recorder, **parts)
 
     return FastSession
 

@@ -23,7 +23,7 @@ from bam_envs.robots.fake import FakeRobot
 from bam_envs.robots.linked import LinkedRobot, LinkProfile
 from bam_train.checkpoint import Checkpoint
 from bam_train.deploy.deployment import Deployment
-from bam_train.deploy.flight import RecorderAgent, flight_recorder
+from bam_train.deploy.flight import FlightLog, flight_recorder
 from bam_train.deploy.journal import Journal
 from bam_train.errors import SettingsError
 from bam_train.policy import FrozenPolicy
@@ -157,19 +157,19 @@ def deploy(ticks, steps, recording=None):
 def measure_tick(flags):
     """From an observation to its command: policy, task, guards and loop; and what the recorder adds."""
     choose_clock(flags)
-    shares, forward = [], RecorderAgent.forward
+    shares, record = [], FlightLog.record
 
-    def clocked(agent, **arguments):
+    def clocked(log, step):
         begun = clock()
-        forward(agent, **arguments)
+        record(log, step)
         shares.append(clock() - begun)
 
     with tempfile.TemporaryDirectory() as folder:
-        RecorderAgent.forward = clocked
+        FlightLog.record = clocked
         try:
             whole, acting, _ = deploy(flags.times(20_000), 100, Path(folder) / "bench.mcap")
         finally:
-            RecorderAgent.forward = forward
+            FlightLog.record = record
     whole, shares = np.array(whole), np.array(shares)
     yield percentiles("observation in to command out", whole - shares[: len(whole)], "us", p50=200)
     yield percentiles("  the frozen policy's own", acting, "us")

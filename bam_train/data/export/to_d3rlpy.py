@@ -12,7 +12,7 @@ import numpy as np
 
 from bam_envs.core.errors import MissingExtra
 from bam_train.data.data_set import DataSet
-from bam_train.data.episode import Array, DataSetInfo, Episode, leaves_of
+from bam_train.data.recorded_episode import Array, DataSetInfo, Episode, leaves_of
 from bam_train.errors import SettingsError
 
 

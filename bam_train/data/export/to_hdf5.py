@@ -10,7 +10,7 @@ import numpy as np
 
 from bam_envs.core.errors import MissingExtra
 from bam_train.data.data_set import DataSet
-from bam_train.data.episode import leaves_of
+from bam_train.data.recorded_episode import leaves_of
 
 
 def write(data: DataSet, indices: Sequence[int], path: Path) -> str:

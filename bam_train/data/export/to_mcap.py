@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from bam_train.data.data_set import DataSet
-from bam_train.data.episode import Array, DataSetInfo, Episode, leaves_of
+from bam_train.data.recorded_episode import Array, DataSetInfo, Episode, leaves_of
 from bam_train.recording.recorder_process import RecordingFile
 from bam_train.recording.ring import EVENT, LAYOUT, PIXELS, TICK, TIMES
 

@@ -15,7 +15,7 @@ import numpy as np
 
 from bam_envs.core.errors import MissingExtra
 from bam_train.data.data_set import DataSet
-from bam_train.data.episode import DataSetInfo, Episode
+from bam_train.data.recorded_episode import DataSetInfo, Episode
 
 
 def write(data: DataSet, indices: Sequence[int], path: Path) -> str:

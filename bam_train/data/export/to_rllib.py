@@ -10,7 +10,7 @@ import gymnasium as gym
 import numpy as np
 
 from bam_train.data.data_set import DataSet
-from bam_train.data.episode import Array, Episode
+from bam_train.data.recorded_episode import Array, Episode
 from bam_train.errors import SettingsError
 
 ROWS_A_FILE = 50_000

@@ -8,7 +8,7 @@ import numpy as np
 
 from bam_envs.core.wording import did_you_mean
 from bam_train.data.data_set import DataSet
-from bam_train.data.episode import Episode, Leaf, leaves_of
+from bam_train.data.recorded_episode import Episode, Leaf, leaves_of
 from bam_train.environments import make_env, must_be_named
 from bam_train.errors import SettingsError
 from bam_train.files.video import Frame, picture

@@ -5,8 +5,11 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
+from numpy.typing import NDArray
 
-from bam_train.errors import LoopError, PolicyError
+from bam_envs.core.robot_env import halt_and_close, robot_of
+from bam_train.errors import LoopError
+from bam_train.finite_envs import require_finite_action
 from bam_train.loop.agents.agent import Agent
 from bam_train.loop.gym.gym_agent import NUMBERS
 from bam_train.loop.gym.gym_spaces import Kind, flat, kinds, names, pack
@@ -16,7 +19,25 @@ SUCCESS = "info/is_success"
 SAYS_SUCCESS = "info/_is_success"
 """Variable with Gymnasium's mask for it: whether the info has ``is_success``."""
 
+RESULTS = (*NUMBERS, SUCCESS, SAYS_SUCCESS)
+"""Variables of a step beside its observation."""
 _FLAGS = np.array([False]), np.array([True])
+
+
+def results(
+    reward: float, total: float, steps: int, terminated: bool, truncated: bool, success: bool | None
+) -> dict[str, NDArray[Any]]:
+    """The values of `RESULTS` for a batch of one; `success` is None if the environment does not say it."""
+    return {
+        "reward": np.array([reward]),
+        "cumulated_reward": np.array([total]),
+        "timestep": np.array([steps]),
+        "terminated": _FLAGS[terminated],
+        "truncated": _FLAGS[truncated],
+        "done": _FLAGS[terminated or truncated],
+        SUCCESS: _FLAGS[bool(success)],
+        SAYS_SUCCESS: _FLAGS[success is not None],
+    }
 
 
 class RobotAgent(Agent):
@@ -44,7 +65,7 @@ class RobotAgent(Agent):
         self.env, self.input, self.output = env, input_string, output_string
         self.live = robot_of(env) is not None
         self.observation_names = tuple(output_string + name for name in names(env.observation_space))
-        writes = (*self.observation_names, *(output_string + name for name in (*NUMBERS, SUCCESS, SAYS_SUCCESS)))
+        writes = (*self.observation_names, *(output_string + name for name in RESULTS))
         self._declare(RobotAgent, reads=(), reads_previous=(input_string,), writes=writes)
         self._total, self._steps = 0.0, 0
         self._kinds: dict[str, Kind] = {}
@@ -68,12 +89,7 @@ class RobotAgent(Agent):
         self._running = False
         if self._closed:
             return
-        try:
-            self.halt()
-        except Exception:  # not a second Ctrl-C, which quits at once: closing would halt again
-            self.env.close()  # type: ignore[no-untyped-call]
-            raise
-        self.env.close()  # type: ignore[no-untyped-call]
+        halt_and_close(self.env)
         self._closed = True
 
     def forward(self, t: int, seed: int | None = None, **kwargs: Any) -> None:
@@ -95,25 +111,12 @@ class RobotAgent(Agent):
             self._total += float(reward)
             self._steps += 1
         self._running = not (terminated or truncated)
-        values = {
-            **pack(self._kinds, [observation]),
-            "reward": np.array([float(reward)]),
-            "cumulated_reward": np.array([self._total]),
-            "timestep": np.array([self._steps]),
-            "terminated": _FLAGS[bool(terminated)],
-            "truncated": _FLAGS[bool(truncated)],
-            "done": _FLAGS[not self._running],
-            SUCCESS: _FLAGS[bool(info.get("is_success", False))],
-            SAYS_SUCCESS: _FLAGS["is_success" in info],
-        }
+        success = bool(info["is_success"]) if "is_success" in info else None
+        found = results(float(reward), self._total, self._steps, bool(terminated), bool(truncated), success)
+        values = {**pack(self._kinds, [observation]), **found}
         put = self.workspace.set  # copies the arrays
         for name, value in values.items():
             put(self.output + name, t, value)
-
-
-def robot_of(env: gym.Env[Any, Any]) -> Any:
-    """The robot of a `RobotEnv`, or None."""
-    return getattr(env.unwrapped, "robot", None)
 
 
 class PolicyAgent(Agent):
@@ -161,14 +164,8 @@ class PolicyAgent(Agent):
             values = [value[0].copy() for value in values]  # the policy may keep it
         observation = values[0] if self._keys is None else dict(zip(self._keys, values, strict=True))
         action = np.asarray(self.policy.act(observation) if self.single else self.policy.act_batch(observation))
-        # Once all episodes have ended, the action is not used.
-        if action.dtype.kind == "f" and not (np.isfinite(action).all() or self.get((self._done, t)).all()):
-            index = tuple(int(i) for i in np.argwhere(~np.isfinite(action))[0])
+        if not self.get((self._done, t)).all():  # once all episodes have ended, the action is not used
             which = "the episode" if seed is None else f"the episode with seed {seed}"
-            if isinstance(seed, Sequence):
-                which = f"the episodes from seed {seed[0]} on"
-            raise PolicyError(
-                f"action{list(index)} is {action[index]} at step {t} of {which}; "
-                f"expected finite numbers: the policy is broken"
-            )
+            which = f"the episodes from seed {seed[0]} on" if isinstance(seed, Sequence) else which
+            require_finite_action(action, t, which)
         self.set((self.output, t), action[None] if self.single else action)

@@ -387,3 +387,19 @@ class RobotVectorEnv(_RobotAndTask, gym.vector.VectorEnv[Any, Any, NDArray[Any]]
         for rng, rng_state in zip(self._rngs, state["rngs"], strict=True):
             rng.bit_generator.state = rng_state
         return self.task.observe(restored)
+
+
+def robot_of(env: gym.Env[Any, Any]) -> Any:
+    """The robot of a `RobotEnv`, behind any wrappers; None for another environment."""
+    return getattr(env.unwrapped, "robot", None)
+
+
+def halt_and_close(env: gym.Env[Any, Any]) -> None:
+    """Halt the robot of `env`, if it has one, then close `env`, even if the halt fails."""
+    try:
+        if (robot := robot_of(env)) is not None:
+            robot.halt()
+    except Exception:  # not a second Ctrl-C, which quits at once: closing would halt again
+        env.close()  # type: ignore[no-untyped-call]
+        raise
+    env.close()  # type: ignore[no-untyped-call]

@@ -1,5 +1,6 @@
 """The agent's connection to a robot, with a served simulation at the other end: its recordings."""
 
+import itertools
 import resource
 import threading
 from pathlib import Path
@@ -11,32 +12,20 @@ from bam_envs.remote.serve.serve_options import ServeOptions
 from bam_envs.remote.serve.served_environment import ServedEnvironment
 from bam_train.agent import robot_session
 from bam_train.agent.agent_options import AgentOptions
-from bam_train.agent.resident import STOP
 from bam_train.agent.robot_session import RobotSession
 from bam_train.checkpoint import Checkpoint
 from bam_train.deploy.deployment import StopSwitch
 from bam_train.environments import make_env
-from bam_train.loop import Agent
 from bam_train.recording.recording import Recording
 
 REACH = Path(__file__).parents[3] / "checkpoints" / "reach-ppo.zip"
-
-
-class Boundary(Agent):
-    """Ends an episode after some ticks."""
-
-    reads, writes = ("env/done",), (STOP,)
-    ticks = 5
-
-    def forward(self, t, **kwargs):
-        self.set((STOP, t), self.get(("env/done", t)) | (t >= self.ticks))
 
 
 @pytest.fixture
 def session(tmp_path, monkeypatch):
     """Makes the session of a robot whose time passes with commands only."""
     monkeypatch.setattr(robot_session, "RECORD_AGAIN", 0.0)
-    made = []
+    made, ticks = [], itertools.count()
     with ServedEnvironment(make_env("bam/reach-v0"), ServeOptions(port=0, fast=True)) as served:
 
         def make(**options):
@@ -45,8 +34,8 @@ def session(tmp_path, monkeypatch):
                     AgentOptions(served.bus.url, tmp_path, **options),
                     Checkpoint.open(REACH),
                     None,
-                    boundary=Boundary(),
-                    agents=(),
+                    between_ticks=lambda: next(ticks) % 6 == 5,  # an episode ends after some ticks
+                    observers=(),
                     switch=StopSwitch(lambda: None),
                     admit=lambda env, lines: None,
                     sleep=lambda seconds: True,
@@ -88,7 +77,7 @@ def test_after_a_full_disk_the_next_episode_is_recorded_once_there_is_room(sessi
     assert session.recording_fault == ""
     play(session)
     session.recorder.close()
-    assert len(Recording.open(session.recorder.path).arrays("action")[""]) == Boundary.ticks + 1
+    assert len(Recording.open(session.recorder.path).arrays("action")[""]) == 6
 
 
 def test_where_no_recording_can_begin_one_does_once_there_is_room(session, tmp_path, until, caplog, monkeypatch):

@@ -1,12 +1,15 @@
 import json
+from types import SimpleNamespace
 
 import gymnasium as gym
 import numpy as np
 import pytest
 
-from bam_train.agent.transitions import MOST, TransitionLog, TransitionsAgent, decode, encode
+from bam_envs.core.timing import Pacer
+from bam_train.agent.transitions import MOST, TransitionCollector, TransitionLog, decode, encode
+from bam_train.deploy.deployment import Deployment
+from bam_train.deploy.journal import Journal
 from bam_train.errors import FormatError
-from bam_train.loop import Agent, Agents, PolicyAgent, RobotAgent, TemporalAgent, Workspace
 
 
 def three():
@@ -109,11 +112,9 @@ class HalfOfIt:
 
 
 def two_episodes(*arguments):
-    log, robot = TransitionLog(), RobotAgent(Counting())
-    chain: list[Agent] = [robot, PolicyAgent(HalfOfIt(), robot.observation_names, single=True)]
-    loop = TemporalAgent(Agents(*chain, TransitionsAgent(log, *arguments)))
-    for _ in range(2):
-        loop(Workspace(window=2), t=0, stop_variable="env/done")
+    log, watcher = TransitionLog(), SimpleNamespace(ticked=lambda *tick: None, ended=lambda record: None)
+    collector = TransitionCollector(log, *arguments)
+    Deployment(Counting(), HalfOfIt(), Pacer(None), Journal(2), observers=[collector]).run(watcher, seed=0)
     return log.take()
 
 

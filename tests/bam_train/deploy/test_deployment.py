@@ -339,7 +339,7 @@ def test_what_the_operator_looks_for_first_is_in_the_status(corridor, error, end
     assert "halt" in env.robot.calls
 
 
-# The chain of agents, and the sink that gets what happens
+# Agents beside the loop, and the sink that gets what happens
 
 
 class Endless(gym.Env):
@@ -358,7 +358,7 @@ class Endless(gym.Env):
 
 
 class Sees(Agent):
-    """Another agent of the chain: sees what was acted on."""
+    """Another agent: sees what was acted on."""
 
     reads = ("action", "env/env_obs")
     writes = ("seen",)
@@ -426,7 +426,7 @@ def test_a_signal_inside_the_sink(corridor, number):
     assert pieces == [0]
 
 
-def test_agents_of_ones_own_join_the_chain(corridor, starting_cell):
+def test_agents_of_ones_own_see_each_step(corridor, starting_cell):
     """Those behind the policy may read its action at the end, too."""
     sees = Sees()
     assert run(gym.make(corridor), episodes=1, agents=[sees, CopyTAgent("action", "sent")])[0] == DONE
@@ -491,8 +491,8 @@ class Clock:
 )
 def test_late_ticks_of_the_policy_are_counted(monkeypatch, needs, takes, sleeps, late, slow):
     clock = Clock()
-    times = SimpleNamespace(perf_counter=lambda: clock.now, thread_time=lambda: clock.cpu)
-    monkeypatch.setattr("bam_train.deploy.deployment.time", times)
+    monkeypatch.setattr("bam_train.deploy.episode.perf_counter", lambda: clock.now)
+    monkeypatch.setattr("bam_train.deploy.episode.thread_time", lambda: clock.cpu)
 
     class Slow(Right):
         def act(self, observation):

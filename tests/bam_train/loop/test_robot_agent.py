@@ -183,7 +183,7 @@ def test_a_robot_is_halted_before_anything_else_is_closed(wrap):
             calls.append("camera")
 
     robot = RobotAgent(robot_env())
-    robot.halt = lambda: calls.append("halt")
+    robot.env.unwrapped.robot.halt = lambda: calls.append("halt")
     robot.chain = Agents(robot, Choose(np.zeros(5, np.float32)))
     Agents(Camera(), wrap(robot), Choose(np.zeros(5, np.float32))).close()
     assert calls == ["halt", "camera"]
