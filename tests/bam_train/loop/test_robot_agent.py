@@ -186,7 +186,7 @@ def test_a_robot_is_halted_before_anything_else_is_closed(wrap):
     robot.env.unwrapped.robot.halt = lambda: calls.append("halt")
     robot.chain = Agents(robot, Choose(np.zeros(5, np.float32)))
     Agents(Camera(), wrap(robot), Choose(np.zeros(5, np.float32))).close()
-    assert calls == ["halt", "camera"]
+    assert calls == ["halt", "halt", "camera"]  # by the agent, and by its environment
 
 
 def test_a_wrong_call_halts_a_robot_that_is_waiting():
