@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -15,6 +17,9 @@ if TYPE_CHECKING:
     from bam_train.agent.remote.agent_client import AgentClient
     from bam_train.cli.live.agent_flags import PushConfig
 
+_GATE = "from bam_train.cli.data.run_gate import main; main()"
+_PASSED = (0, 1)
+"""Exit statuses of bam-gate for "better" and "not worse"."""
 ROLLED_BACK = 5
 """Exit status when the candidate was rolled back, or replaced before its trials were done."""
 
@@ -69,8 +74,6 @@ def _arguments(config: PushConfig) -> tuple[Path | None, str]:
 def _pass_gate(agent: AgentClient, candidate: Path, champion: Path) -> None:
     """Refuse a candidate that `bam-gate` finds neither better nor not worse than the agent's champion."""
     from bam_train.checkpoint import Checkpoint
-    from bam_train.cli.data.gate_flags import GateConfig
-    from bam_train.cli.data.run_gate import decide
     from bam_train.errors import CandidateRefused
 
     digest = Checkpoint.open(champion).digest
@@ -80,12 +83,14 @@ def _pass_gate(agent: AgentClient, candidate: Path, champion: Path) -> None:
             f"has the digest {digest[:SHORT]}, and the agent's champion {found[:SHORT]}; give that one's file to --gate"
         )
         raise CandidateRefused(f"{champion}: {text}")
-    report = decide(GateConfig(candidate, champion))
-    for line in report["lines"]:
+    command = [sys.executable, "-c", _GATE, str(candidate), str(champion)]
+    gate = subprocess.run(command, stdout=subprocess.PIPE, text=True)  # which says on standard error what went wrong
+    lines = gate.stdout.splitlines()
+    for line in lines:
         _progress(line)
-    if report["verdict"] not in ("better", "not worse"):
-        text = f"bam-gate finds it {report['verdict']} against {champion}, so it was not pushed"
-        raise CandidateRefused(f"{candidate}: {text}")
+    if gate.returncode not in _PASSED:
+        found = f"finds it {lines[0].partition(':')[0]} against {champion}" if lines else "gave no verdict"
+        raise CandidateRefused(f"{candidate}: bam-gate {found}, so it was not pushed")
 
 
 def _misused(text: str) -> SystemExit:

@@ -189,6 +189,22 @@ def test_what_is_no_checkpoint_is_refused_before_anybody_is_asked(run, tmp_path,
     assert (status, json.loads(out)["kind"]) == (1, kind)
 
 
+@pytest.mark.parametrize(
+    ("champion", "status", "text"),
+    [
+        ("digits-dqn", 0, "bam-push: not worse: {0} against {0}\n"),
+        ("grid-world-ppo", 1, "bam-push: {0}: bam-gate gave no verdict, so it was not pushed\n"),
+    ],
+    ids=["as good", "of another environment"],
+)
+def test_a_candidate_is_pushed_once_the_gate_lets_it_pass(hub, server, run, monkeypatch, champion, status, text):
+    candidate, path = PICK.with_name("digits-dqn.zip"), PICK.with_name(f"{champion}.zip")
+    monkeypatch.setitem(STATUS, "names", {"champion": Checkpoint.open(path).digest})
+    found, _, err = run(push.main, candidate, server.url, "--gate", path)
+    assert (found, [op for op, *_ in hub.asked].count("push")) == (status, 1 - status)
+    assert text.format(candidate) in err
+
+
 def test_roll_back(hub, server, run):
     status, out, _ = run(push.main, "--rollback", server.url, "--why", "it drops the cube")
     assert (status, out.splitlines()[0].split()[0]) == (0, "trial")
