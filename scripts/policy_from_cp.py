@@ -11,7 +11,7 @@ import numpy as np
 from bam_envs.core.registry import resolve_id
 from bam_train.checkpoint import Checkpoint
 from bam_train.cli.console import say, tell
-from bam_train.cli.experiment import RobotFlags, open_env
+from bam_train.cli.experiment import RobotFlags, open_env, play
 from bam_train.cli.flags import Assignments, CheckpointFile, Count, EnvId, Seed
 from bam_train.cli.program import guarded, parse
 from bam_train.evaluation import FIRST_SEED
@@ -54,21 +54,27 @@ def open_checkpoint(args: Flags, given: dict[str, Any], name: str, default: str,
     return exported.write(Path(folder) / "policy.zip")
 
 
-def play(env: gym.Env[Any, Any], policy: FrozenPolicy, seed: int) -> tuple[float, bool, int, int]:
-    """One episode: its return, whether it succeeded, its clipped actions, and how many there were."""
-    space = env.action_space
-    observation, _ = env.reset(seed=seed)
-    policy.reset()
-    total, clipped, steps, ended = 0.0, 0, 0, False
-    while not ended:  # on a live robot, each step waits for the end of its period
-        action = policy.act(observation)
+class Clipped:
+    """A policy whose actions are clipped to their space, and counted."""
+
+    def __init__(self, policy: FrozenPolicy, space: gym.Space[Any]) -> None:
+        self._policy, self._space = policy, space
+        self.clipped = 0
+
+    def reset(self) -> None:
+        """Begin an episode."""
+        self._policy.reset()
+        self.clipped, self._last = 0, False
+
+    def act(self, observation: Any) -> Any:
+        """The action; that on the last observation of an episode is not counted."""
+        action, space = self._policy.act(observation), self._space
+        self.clipped += self._last
         if isinstance(space, gym.spaces.Box):
             action = np.clip(action, space.low, space.high)
             # A frozen policy clips by itself, as RLlib does: a number is then exactly at its bound.
-            clipped += bool(((action <= space.low) | (action >= space.high)).any())
-        observation, reward, terminated, truncated, info = env.step(action)
-        total, steps, ended = total + float(reward), steps + 1, terminated or truncated
-    return total, bool(info.get("is_success")), clipped, steps
+            self._last = bool(((action <= space.low) | (action >= space.high)).any())
+        return action
 
 
 def run(args: Flags, name: str, default: str, kind: str) -> None:
@@ -83,12 +89,12 @@ def run(args: Flags, name: str, default: str, kind: str) -> None:
             robot = f"a {moved.spec.name}" if moved is not None else "no robot of ours"
             if not robot.startswith(f"a {kind}"):
                 say(f"{name}: note: {checkpoint.manifest.env} moves {robot}")
-            successes = 0
-            for k in range(args.num_episodes):
-                total, success, clipped, steps = play(env, policy, args.seed + k)
-                successes += success
-                how = "success" if success else "no success"
-                print(f"episode {k + 1}: return {total:.2f}, {how}, clipped {clipped} of {steps} actions", flush=True)
+            clipped, successes = Clipped(policy, env.action_space), 0
+            for number, record in enumerate(play(env, clipped, episodes=args.num_episodes, seed=args.seed), 1):
+                successes += bool(record.success)
+                how = "success" if record.success else "no success"
+                counted = f"clipped {clipped.clipped} of {record.length} actions"
+                print(f"episode {number}: return {record.total:.2f}, {how}, {counted}", flush=True)
             tell(f"success in {successes} of {args.num_episodes} episodes on {checkpoint.manifest.env}")
 
 

@@ -16,7 +16,7 @@ from pathlib import Path
 from bam_train.checkpoint import Checkpoint
 from bam_train.cli import experiment
 from bam_train.cli.console import number
-from bam_train.cli.experiment import open_env
+from bam_train.cli.experiment import open_env, play
 from bam_train.cli.flags import Count, Seed
 from bam_train.cli.program import guarded, parse
 from bam_train.evaluation import FIRST_SEED
@@ -69,16 +69,9 @@ def main(args: Flags) -> None:
     policy = FrozenPolicy.load(checkpoint.path)
     watched = {"yes": args.yes, "render": args.render}
     with open_env(checkpoint, args.robot, who=NAME, episodes=args.episodes, **watched) as env:
-        for k in range(args.episodes):
-            observation, _ = env.reset(seed=FIRST_SEED + args.seed + k)
-            policy.reset()
-            total, ended = 0.0, False
-            while not ended:
-                observation, reward, terminated, truncated, info = env.step(policy.act(observation))
-                total, ended = total + float(reward), terminated or truncated
-            print(
-                f"episode {k + 1}: total reward {total:.2f}{', success' if info.get('is_success') else ''}", flush=True
-            )
+        played = play(env, policy, episodes=args.episodes, seed=FIRST_SEED + args.seed)
+        for number, record in enumerate(played, 1):
+            print(f"episode {number}: total reward {record.total:.2f}{', success' * bool(record.success)}", flush=True)
 
 
 if __name__ == "__main__":

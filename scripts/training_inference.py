@@ -6,12 +6,11 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any
 
-import gymnasium as gym
 from tyro.conf import arg
 
 from bam_train.checkpoint import Checkpoint
 from bam_train.cli.console import number
-from bam_train.cli.experiment import TrainingFlags, environment_of, open_env, require_place, signals_ask
+from bam_train.cli.experiment import TrainingFlags, environment_of, open_env, play, require_place, signals_ask
 from bam_train.cli.flags import Count, Seed
 from bam_train.cli.program import guarded, parse
 from bam_train.errors import SettingsError
@@ -95,25 +94,14 @@ def train(args: Flags, experiment: Experiment) -> tuple[Checkpoint, Any]:
         return checkpoint, trainer.exploring() if args.explore_during_inference else FrozenPolicy.load(output.path)
 
 
-def infer(env: gym.Env[Any, Any], policy: Any, episodes: int, seed: int) -> None:
-    """Run episodes of the policy and print each one's total reward."""
-    for k in range(episodes):
-        observation, _ = env.reset(seed=seed + k)
-        policy.reset()
-        total, ended = 0.0, False
-        while not ended:  # on a live robot, each step waits for the end of its period
-            observation, reward, terminated, truncated, info = env.step(policy.act(observation))
-            total, ended = total + float(reward), terminated or truncated
-        print(f"episode {k + 1}: total reward {total:.2f}{', success' if info.get('is_success') else ''}", flush=True)
-
-
 def run(args: Flags, experiment: Experiment, name: str) -> None:
     """Train, then infer in an environment of its own: simulated, or a live robot's."""
     checkpoint, policy = train(args, experiment)
     episodes = args.num_episodes_during_inference
     watched = {"yes": args.yes, "render": args.render}
     with open_env(checkpoint, args.robot, who=name, episodes=episodes, **watched) as env:
-        infer(env, policy, episodes, FIRST_SEED + args.seed)
+        for number, record in enumerate(play(env, policy, episodes=episodes, seed=FIRST_SEED + args.seed), 1):
+            print(f"episode {number}: total reward {record.total:.2f}{', success' * bool(record.success)}", flush=True)
 
 
 def read(script: str, description: str, experiment: Experiment) -> tuple[Flags, Experiment]:

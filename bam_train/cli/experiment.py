@@ -1,4 +1,4 @@
-"""For scripts with their own loop: flags, and the environment of a checkpoint, simulated or with a live robot."""
+"""For scripts of experiments: flags, the environment of a checkpoint, simulated or with a live robot, and episodes."""
 
 import contextlib
 import signal
@@ -8,11 +8,14 @@ from typing import Any
 
 import gymnasium as gym
 
+from bam_envs.core.timing import Pacer
 from bam_envs.live.building import require_robot_address
 from bam_train.checkpoint import Checkpoint
 from bam_train.cli.consent import connected_env, require_screen
 from bam_train.cli.console import say
 from bam_train.cli.flags import EnvId, File, Url
+from bam_train.deploy.deployment import Deployment
+from bam_train.deploy.journal import EpisodeRecord, Journal
 from bam_train.env_location import EnvLocation
 from bam_train.signals import SignalMemory, handled, interrupt
 
@@ -92,3 +95,27 @@ def open_env(
         env = connected_env(checkpoint, EnvLocation(robot), signals, render=render, **asked)
         with contextlib.closing(env):
             yield env
+
+
+class _Unwatched:
+    """A `Watcher` that displays nothing."""
+
+    def ticked(self, record: EpisodeRecord, action: Any, pacer: Pacer) -> None:
+        """Called after every step."""
+
+    def ended(self, record: EpisodeRecord) -> None:
+        """Called after every episode."""
+
+
+def play(env: gym.Env[Any, Any], policy: Any, *, episodes: int, seed: int) -> Iterator[EpisodeRecord]:
+    """Play episodes of a policy in the loop of `bam-deploy`, and yield the record of each; episode k gets ``seed + k``.
+
+    Args:
+        env: An environment of `open_env`; a live robot is halted after every episode.
+        policy: Has ``reset()`` and ``act(observation)``.
+        episodes: Number of episodes.
+        seed: Seed of the first one.
+    """
+    deployment = Deployment(env, policy, Pacer(None), Journal(episodes))
+    for k in range(episodes):
+        yield deployment.episode(_Unwatched(), seed=seed + k)
