@@ -14,6 +14,7 @@ import pytest
 import bam_envs  # noqa: F401 - registers the environments
 from bam_envs.remote.serve.serve_options import ServeOptions
 from bam_envs.remote.serve.served_environment import ServedEnvironment
+from bam_train.cli.experiment import play
 
 ROOT = Path(__file__).parents[2]
 SCRIPTS = ROOT / "scripts"
@@ -130,10 +131,10 @@ class Bound:
 def test_clipped_actions_are_counted():
     script = runpy.run_path(str(SCRIPTS / "policy_from_cp.py"))
     env = gym.make("bam/mir100-navigation-v0", max_episode_steps=10)
-    total, success, clipped, steps = script["play"](env, Bound(), 0)
+    policy = script["Clipped"](Bound(), env.action_space)
+    [record] = play(env, policy, episodes=1, seed=0)
     env.close()
-    assert (success, clipped, steps) == (False, 5, 10) or steps < 10
-    assert isinstance(total, float)
+    assert (record.success, policy.clipped, record.length) == (False, 5, 10)
 
 
 def test_it_drives_a_robot_behind_rosbridge(run, checkpoint, monkeypatch):
