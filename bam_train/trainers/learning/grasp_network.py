@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -20,7 +19,7 @@ from numpy.typing import NDArray
 from torch import nn
 
 from bam_train.errors import SettingsError
-from bam_train.trainers.frozen_network import FrozenNetwork, Layer, pack, to
+from bam_train.trainers.frozen_network import FrozenNetwork, Layer, to
 
 EDGE = 33
 """Width of a patch [pixels]."""
@@ -154,17 +153,6 @@ class GraspPolicy(FrozenNetwork):
             logits = self.network(flat.index_select(1, index).reshape(-1, 1, *self.shape))
             each.append(logits.reshape(-1, self.grid.widths * self.places))
         return torch.cat(each, 1)
-
-    def members(self, observation: Mapping[str, NDArray[Any]], count: int) -> tuple[bytes, bytes]:
-        """The ONNX file, and `count` golden observations of those given, with the actions that torch computes.
-
-        Those with the clearest choice are taken, as rounding would decide a tie.
-        """
-        with torch.no_grad():
-            scores = self.scores(*(torch.as_tensor(observation[key]) for key in self.leaves))
-            clearest = np.sort(np.argsort(-self.head.margin(scores).numpy(), kind="stable")[:count])
-            actions = self.head(scores[torch.as_tensor(clearest)]).numpy()
-        return self.onnx_file(), pack({key: observation[key][clearest] for key in self.leaves}, actions)
 
 
 class _Best(Layer):
