@@ -153,7 +153,8 @@ class GraspTrainer(TorchTrainer):
 
     def members(self) -> tuple[bytes, bytes]:
         """The policy's ONNX file, and its golden actions for pictures of the environments."""
-        return self.policy().members(_GOLDEN, self._observation)
+        found: tuple[bytes, bytes] = self.finite_policy().members(_GOLDEN, self._observation)
+        return found
 
     def state(self) -> dict[str, Any]:
         """The network, all grasps, and the environments, if they can be saved."""

@@ -58,27 +58,20 @@ class LivePolicy(FrozenNetwork):
     Args:
         actor: The actor.
         history: Last actions that it sees.
-        observation_space: A Box.
-        action_space: A Box with bounds.
+        seen: The environment's observation space.
+        acts: The environment's action space, with bounds.
         noise: Standard normal numbers for exploration, (TAPE, a); None for the deterministic policy.
     """
 
-    def __init__(
-        self,
-        actor: Actor,
-        history: int,
-        observation_space: spaces.Box,
-        action_space: spaces.Box,
-        noise: np.ndarray | None = None,
-    ) -> None:
-        super().__init__(observation_space)
+    def __init__(self, actor: Actor, history: int, seen: spaces.Box, acts: spaces.Box, noise: Any = None) -> None:
+        super().__init__(seen)
         self.actor = copy.deepcopy(actor).cpu().eval().requires_grad_(False)
-        self.head = action_head(action_space, tanh=True, scale=True, clip=True)
-        self.kept = (history - 1) * action_space.shape[0]
+        self.head = action_head(acts, tanh=True, scale=True, clip=True)
+        self.kept = (history - 1) * acts.shape[0]
         self.noise = None if noise is None else torch.as_tensor(noise, dtype=torch.float32)
-        self.odd = torch.arange(1, 2 * int(np.prod(observation_space.shape)), 2, dtype=torch.float64)
+        self.odd = torch.arange(1, 2 * int(np.prod(seen.shape)), 2, dtype=torch.float64)
         if history:
-            self.state["actions"] = torch.zeros(2, history * action_space.shape[0])
+            self.state["actions"] = torch.zeros(2, history * acts.shape[0])
         if noise is not None:
             self.state["place"] = torch.zeros(2, 1)  # 0: an episode begins; else 1 more than the place in the table
 
@@ -88,8 +81,7 @@ class LivePolicy(FrozenNetwork):
         actions = state[0] if "actions" in self.state else None
         seen = observation.flatten(1) if actions is None else torch.cat([observation.flatten(1), actions], 1)
         mean, log_deviation = self.actor(seen)
-        following = []
-        place = torch.zeros(())
+        following, place = [], torch.zeros(())
         if self.noise is not None:
             place = torch.where(state[-1] < 0.5, self._beginning(observation.flatten(1)), state[-1] - 1.0)
             mean = mean + self.noise.index_select(0, place[:, 0].long()) * log_deviation.exp()
@@ -221,7 +213,8 @@ class LiveLearner(TorchLearner):
 
     def save_candidate(self, path: Path, *, explores: bool = True) -> Checkpoint:
         """Write a checkpoint that can be deployed, without what a run goes on from."""
-        return self.write(path, self.policy(explores=explores).members(), {}, {"explores": explores}, None)
+        members = self.finite_policy(explores=explores).members()
+        return self.write(path, members, {}, {"explores": explores}, None)
 
     # ---- the first policy
 

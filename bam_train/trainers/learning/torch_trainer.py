@@ -21,7 +21,7 @@ from bam_envs.core.validation import read_table
 from bam_train.checkpoint import GOLDEN, POLICY, Checkpoint, write_checkpoint
 from bam_train.checkpoint.safetensors_file import pack
 from bam_train.environments import control_period, make_env, require_fit
-from bam_train.errors import SettingsError
+from bam_train.errors import SettingsError, TrainingFailed
 from bam_train.policy import FrozenPolicy
 from bam_train.rollout import PlayedEpisode, play
 from bam_train.settings import TrainSettings
@@ -85,9 +85,21 @@ class TorchLearner:
         """A copy of the current policy, a `FrozenNetwork`."""
         raise NotImplementedError
 
+    def finite_policy(self, **asked: Any) -> Any:
+        """The current policy; `asked` goes to `policy`.
+
+        Raises:
+            TrainingFailed: A weight is not finite.
+        """
+        policy = self.policy(**asked)
+        if not all(bool(torch.isfinite(one).all()) for one in policy.parameters()):
+            text = f"the network's weights are NaN or infinite at step {self.steps}"
+            raise TrainingFailed(f"{text}; expected finite numbers: try a smaller learning_rate")
+        return policy
+
     def members(self) -> tuple[bytes, bytes]:
         """The current policy as an ONNX file, and its golden actions."""
-        found: tuple[bytes, bytes] = self.policy().members()
+        found: tuple[bytes, bytes] = self.finite_policy().members()
         return found
 
     def state(self) -> dict[str, Any]:
@@ -158,7 +170,7 @@ class TorchLearner:
     def freeze(self, **asked: Any) -> FrozenPolicy:
         """Freeze the current policy; `asked` goes to `policy`."""
         with self.undisturbed():
-            graph = self.policy(**asked).onnx_file()
+            graph = self.finite_policy(**asked).onnx_file()
         return FrozenPolicy.from_graph(graph, *map(space_to_json, self.spaces))
 
     @contextlib.contextmanager

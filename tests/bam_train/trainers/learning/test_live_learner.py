@@ -90,6 +90,17 @@ def test_candidates_explore_and_the_result_does_not(settings, tmp_path):
     assert (manifest.trainer, manifest.algorithm, manifest.env) == ("live", "rlpd", ENV)
 
 
+def test_weights_that_are_not_finite_are_neither_pushed_nor_saved(settings, tmp_path):
+    learner = LiveLearner.create(settings())
+    learner.rlpd.average.mean.bias.fill_(float("nan"))
+    for write in (learner.save_candidate, lambda path: learner.save(path, {}, {})):
+        with pytest.raises(TrainingFailed) as error:
+            write(tmp_path / "broken.zip")
+        text = "the network's weights are NaN or infinite at step 0; expected finite numbers: try a smaller"
+        assert str(error.value) == f"{text} learning_rate"
+    assert not (tmp_path / "broken.zip").exists()
+
+
 def test_the_first_policy_is_a_copy(settings):
     learner = LiveLearner.create(settings())
 
