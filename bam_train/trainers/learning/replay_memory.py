@@ -63,9 +63,15 @@ class ReplayMemory:
         return vars(self.rows(slice(len(self))))
 
     def load(self, columns: Mapping[str, Any], added: int) -> None:
-        """Restore the result of `columns`, after `added` transitions."""
+        """Restore the result of `columns`, after `added` transitions.
+
+        Raises:
+            ValueError: There are not as many as a memory of this size has then.
+        """
         if columns:
             self.add(**columns)
+        if len(self) != min(added, self.size):
+            raise ValueError(f"expected {min(added, self.size)} transitions, found {len(self)}")
         self.added = added
 
 

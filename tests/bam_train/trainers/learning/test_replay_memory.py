@@ -42,6 +42,8 @@ def test_it_goes_on_in_the_same_rows():
     for memory in (first, second):
         memory.add(number=np.array([70, 71, 72]), twice=np.zeros((3, 1)))
     assert [memory.columns()["number"].tolist() for memory in (first, second)] == 2 * [[72, 6, 7, 70, 71]]
+    with pytest.raises(ValueError, match="expected 6 transitions, found 5"):
+        ReplayMemory(6).load(first.columns(), first.added)
 
 
 def test_actions_are_numbers_and_back():
