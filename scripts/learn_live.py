@@ -21,8 +21,7 @@ from bam_train.agent.transitions import TransitionLog
 from bam_train.evaluation import evaluate, wilson_interval
 from bam_train.policy import FrozenPolicy
 from bam_train.settings import TrainSettings
-from bam_train.trainers.live.live_learner import LiveLearner
-from bam_train.trainers.live.live_policy import frozen
+from bam_train.trainers.learning.live_learner import LiveLearner
 
 ENV, SHIPPED = "bam/pick-v0", str(Path(__file__).parents[1] / "checkpoints" / "pick-ppo.zip")
 ROBOTS = {"as in training": (1.0, 0.0, 0), "friction x 0.5": (0.5, 0.0, 0), "payload + 0.5 kg": (1.0, 0.5, 0)}
@@ -123,7 +122,7 @@ def learn(name: str, args: argparse.Namespace) -> None:
                 learner.add(transitions)
             learner.learn(sys.maxsize)
             if (episode + 1) % PUSH_EVERY == 0 and learner.is_ready:
-                driver = frozen(learner.policy(explores=True), learner.observed, learner.acted)
+                driver = learner.freeze(explores=True)
             if learner.steps // args.every > said or learner.steps >= args.steps:
                 said = learner.steps // args.every
                 what = f"  {name}: {learner.steps} steps, {seen.interventions} of a person"

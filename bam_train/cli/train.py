@@ -111,7 +111,7 @@ def _train(config: TrainConfig, settings: TrainSettings, checkpoint: Checkpoint 
 def _learn(config: TrainConfig, url: str, given: dict[str, Any], checkpoint: Checkpoint | None) -> int:
     """Learn from a live agent; returns the exit status."""
     from bam_train.cli.experiment import signals_ask
-    from bam_train.trainers.live.live_run import learn
+    from bam_train.trainers.learning.live_session import learn
 
     with signals_ask() as stopped:
         learn(

@@ -18,9 +18,9 @@ if TYPE_CHECKING:
     from bam_train.trainers.base import Trainer
 
 TRAINERS: dict[str, str] = {
-    "bandit": "bam_train.trainers.bandit.grasp_trainer:GraspTrainer",
-    "imitation": "bam_train.trainers.imitation.dagger_trainer:DaggerTrainer",
-    "offline": "bam_train.trainers.offline.offline_trainer:OfflineTrainer",
+    "bandit": "bam_train.trainers.learning.grasp_q:GraspTrainer",
+    "imitation": "bam_train.trainers.learning.dagger:DaggerTrainer",
+    "offline": "bam_train.trainers.learning.offline_trainer:OfflineTrainer",
     "rllib": "bam_train.trainers.rllib.rllib_trainer:RLlibTrainer",
     "sb3": "bam_train.trainers.sb3.sb3_trainer:SB3Trainer",
 }
@@ -123,8 +123,8 @@ _RLLIB = (
     Algorithm("iql", "ray.rllib.algorithms.iql:IQLConfig", _BOX, offline=True),
 )
 _OFFLINE = (
-    Algorithm("bc", "bam_train.trainers.offline.implicit_q:Cloning", ("Box", "Discrete"), offline=True),
-    Algorithm("iql", "bam_train.trainers.offline.implicit_q:ImplicitQ", ("Box", "Discrete"), offline=True),
+    Algorithm("bc", "bam_train.trainers.learning.implicit_q:Cloning", ("Box", "Discrete"), offline=True),
+    Algorithm("iql", "bam_train.trainers.learning.implicit_q:ImplicitQ", ("Box", "Discrete"), offline=True),
     Algorithm("awac", "d3rlpy.algos:AWACConfig", _BOX, offline=True),
     Algorithm("cal-ql", "d3rlpy.algos:CalQLConfig", _BOX, offline=True),
     Algorithm("cql", "d3rlpy.algos:CQLConfig", _BOX, offline=True),
@@ -132,9 +132,9 @@ _OFFLINE = (
     Algorithm("rebrac", "d3rlpy.algos:ReBRACConfig", _BOX, offline=True),
     Algorithm("td3bc", "d3rlpy.algos:TD3PlusBCConfig", _BOX, offline=True),
 )
-_BANDIT = (Algorithm("grasp-q", "bam_train.trainers.bandit.grasp_trainer:GraspQ", ("MultiDiscrete",)),)
+_BANDIT = (Algorithm("grasp-q", "bam_train.trainers.learning.grasp_q:GraspQ", ("MultiDiscrete",)),)
 BANDIT_ALGORITHMS = {algorithm.name: algorithm for algorithm in _BANDIT}
-_IMITATION = (Algorithm("dagger", "bam_train.trainers.imitation.dagger:Dagger", ("Box", "Discrete")),)
+_IMITATION = (Algorithm("dagger", "bam_train.trainers.learning.dagger:Dagger", ("Box", "Discrete")),)
 IMITATION_ALGORITHMS = {algorithm.name: algorithm for algorithm in _IMITATION}
 SB3_ALGORITHMS = {algorithm.name: algorithm for algorithm in _SB3}
 RLLIB_ALGORITHMS = {algorithm.name: algorithm for algorithm in _RLLIB}

@@ -195,20 +195,36 @@ class FrozenNetwork(Layer):
         """Draw n observations by key, (n, ...) each."""
         return {key: draw_array(leaf, n, rng, self.moments.get(key)) for key, leaf in self.leaves.items()}
 
-    def golden_observations(self, n: int = 256) -> dict[str, Array]:
+    def golden_observations(self, n: int = 256, given: Mapping[str, Array] | None = None) -> dict[str, Array]:
         """Draw n observations by key, (n, ...) each, with a fixed seed; fewer if they are large.
 
-        For discrete actions, those with the clearest choice are taken, as rounding would decide a tie.
+        For discrete actions, those with the clearest choice are taken, as rounding would decide a tie; of the `given`
+        ones if there are any.
         """
         size = sum(math.prod(leaf.shape) * leaf.dtype.itemsize for leaf in self.leaves.values())
         n, rng = min(n, max(4, _BUDGET // (size or 1))), np.random.default_rng(0)
         if self.state or isinstance(self.head, _Continuous):
             return self.draw(n, rng)
-        drawn = self.draw(2 * n, rng)
+        drawn = self.draw(2 * n, rng) if given is None else {key: given[key] for key in self.leaves}
         with torch.no_grad():
             margin = self.head.margin(self.scores(*map(torch.as_tensor, drawn.values()))).numpy()
         keep = np.sort(np.argsort(-margin, kind="stable")[:n])
         return {key: value[keep] for key, value in drawn.items()}
+
+    def members(self, n: int = 256, given: Mapping[str, Array] | None = None) -> tuple[bytes, bytes]:
+        """The ONNX file, and `golden_observations` with the actions that torch computes.
+
+        If the policy is recurrent, they are the steps of one episode.
+        """
+        observations = self.golden_observations(n, given)
+        batch = tuple(map(torch.as_tensor, observations.values()))
+        state, actions = [one[:1] for one in self.state.values()], []
+        with torch.no_grad():
+            for one in zip(*(x.split(1) for x in batch), strict=True) if state else (batch,):
+                outputs = self(*one, *state)
+                action, *state = outputs if isinstance(outputs, tuple) else (outputs,)
+                actions.append(action.numpy())
+        return self.onnx_file(), pack(observations, np.concatenate(actions))
 
 
 _KINDS_TEXT = "Box, Discrete, MultiDiscrete or MultiBinary"

@@ -70,11 +70,12 @@ def measure_collect(flags):
 def measure_batches(flags):
     """Batches of 256 transitions as our learners draw them, against d3rlpy's replay buffer with the same episodes."""
     import d3rlpy
-    import torch
 
     from bam_train.data import DataSet
     from bam_train.data.export import export
-    from bam_train.trainers.offline.training_data import ActionCode, Normaliser, read_batch
+    from bam_train.trainers.learning.networks import Encoders
+    from bam_train.trainers.learning.offline_trainer import transitions
+    from bam_train.trainers.learning.replay_memory import ActionCode
 
     quiet = contextlib.redirect_stdout(io.StringIO())  # d3rlpy tells what it finds
     with tempfile.TemporaryDirectory() as folder, quiet:
@@ -83,12 +84,12 @@ def measure_batches(flags):
         export(data, "d3rlpy", Path(folder) / "d.h5")
         with open(Path(folder) / "d.h5", "rb") as file:
             buffer = d3rlpy.dataset.ReplayBuffer.load(file, d3rlpy.dataset.InfiniteBuffer())
-        normaliser, code = Normaliser(data.info.observation_space), ActionCode(data.info.action_space)
-        rows, _ = read_batch(data, range(len(data)), normaliser, code, fit=True)
+        encoders, code = Encoders(data.info.observation_space, 1e-3), ActionCode(data.info.action_space)
+        memory, _ = transitions(data, range(len(data)), encoders, code)
 
     def ours():
         for _ in range(1000):
-            rows.rows(torch.randint(len(rows), (256,)))
+            memory.draw(256)
 
     def theirs():
         for _ in range(50):

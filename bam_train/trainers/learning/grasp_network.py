@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -20,7 +19,7 @@ from numpy.typing import NDArray
 from torch import nn
 
 from bam_train.errors import SettingsError
-from bam_train.trainers.frozen_network import FrozenNetwork, Layer, pack, to
+from bam_train.trainers.frozen_network import FrozenNetwork, Layer, to
 
 EDGE = 33
 """Width of a patch [pixels]."""
@@ -71,13 +70,17 @@ class Grid:
         parts = [column * self.bins[0] // self.columns, row * self.bins[1] // self.rows, rotation, width]
         return np.stack(parts[: len(self.bins)], axis=1)
 
+    def turned(self, column: Any, row: Any, rotation: Any, across: Any, down: Any) -> tuple[Any, Any, Any]:
+        """Column and row of the pixel `across` and `down` of grasps, in their turned frames; whether it exists."""
+        angle = np.asarray(rotation)[:, None, None] * math.pi / self.rotations
+        x = np.floor(column + np.cos(angle) * across + np.sin(angle) * down + 0.5).astype(np.int64)
+        y = np.floor(row - np.sin(angle) * across + np.cos(angle) * down + 0.5).astype(np.int64)
+        return x, y, (x >= 0) & (x < self.columns) & (y >= 0) & (y < self.rows)
+
     def patches(self, heights: Bytes, column: Any, row: Any, rotation: Any) -> Bytes:
         """The patches around grasps, the table outside the picture. Shapes: (n, h, w), (n,) each -> (n, 33, 33)."""
-        angle = np.asarray(rotation)[:, None, None] * math.pi / self.rotations
-        v, u = np.mgrid[-_HALF : _HALF + 1, -_HALF : _HALF + 1]
-        x = np.floor(column[:, None, None] + np.cos(angle) * u + np.sin(angle) * v + 0.5).astype(np.int64)
-        y = np.floor(row[:, None, None] - np.sin(angle) * u + np.cos(angle) * v + 0.5).astype(np.int64)
-        inside = (x >= 0) & (x < self.columns) & (y >= 0) & (y < self.rows)
+        down, across = np.mgrid[-_HALF : _HALF + 1, -_HALF : _HALF + 1]
+        x, y, inside = self.turned(column[:, None, None], row[:, None, None], rotation, across, down)
         seen = heights[np.arange(len(x))[:, None, None], np.where(inside, y, 0), np.where(inside, x, 0)]
         return np.where(inside, seen, np.uint8(0))
 
@@ -136,11 +139,7 @@ class GraspPolicy(FrozenNetwork):
         """Column, row and place in the flat picture of every pixel of the turned ones, with margins."""
         grid, (v, u) = self.grid, np.mgrid[-_HALF : self.grid.rows + _HALF, -_HALF : self.grid.columns + _HALF]
         middle = (grid.columns - 1) / 2, (grid.rows - 1) / 2
-        angle = np.arange(grid.rotations)[:, None, None] * math.pi / grid.rotations
-        across, down = u - middle[0], v - middle[1]
-        x = np.floor(middle[0] + np.cos(angle) * across + np.sin(angle) * down + 0.5).astype(np.int64)
-        y = np.floor(middle[1] - np.sin(angle) * across + np.cos(angle) * down + 0.5).astype(np.int64)
-        inside = (x >= 0) & (x < grid.columns) & (y >= 0) & (y < grid.rows)
+        x, y, inside = grid.turned(*middle, np.arange(grid.rotations), u - middle[0], v - middle[1])
         index = np.where(inside, y * grid.columns + x, grid.rows * grid.columns)  # the table, behind the last pixel
         return x.clip(0, grid.columns - 1), y.clip(0, grid.rows - 1), index
 
@@ -154,17 +153,6 @@ class GraspPolicy(FrozenNetwork):
             logits = self.network(flat.index_select(1, index).reshape(-1, 1, *self.shape))
             each.append(logits.reshape(-1, self.grid.widths * self.places))
         return torch.cat(each, 1)
-
-    def members(self, observation: Mapping[str, NDArray[Any]], count: int) -> tuple[bytes, bytes]:
-        """The ONNX file, and `count` golden observations of those given, with the actions that torch computes.
-
-        Those with the clearest choice are taken, as rounding would decide a tie.
-        """
-        with torch.no_grad():
-            scores = self.scores(*(torch.as_tensor(observation[key]) for key in self.leaves))
-            clearest = np.sort(np.argsort(-self.head.margin(scores).numpy(), kind="stable")[:count])
-            actions = self.head(scores[torch.as_tensor(clearest)]).numpy()
-        return self.onnx_file(), pack({key: observation[key][clearest] for key in self.leaves}, actions)
 
 
 class _Best(Layer):

@@ -3,9 +3,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from gymnasium.spaces import Box
 
 from bam_train.agent.transitions import LiveTransitions
-from bam_train.trainers.live.experience import Experience
+from bam_train.trainers.learning.experience import Experience
+from bam_train.trainers.learning.replay_memory import ActionCode
 
 
 def episode(number, rewards, *, first=0, person=False, success=False, terminated=True):
@@ -38,8 +40,8 @@ def pieces(whole, *cuts):
 @pytest.fixture
 def new():
     def make(size=100, **changes):
-        bounds = np.array([-1], np.float32), np.array([1], np.float32)
-        return Experience(size, 1, *bounds, **{"history": 2, "gamma": 0.5, "ahead": 2, **changes})
+        code = ActionCode(Box(-1, 1, (1,), np.float32))
+        return Experience(size, code, **{"history": 2, "gamma": 0.5, "ahead": 2, **changes})
 
     return make
 

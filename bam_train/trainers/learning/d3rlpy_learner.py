@@ -17,8 +17,8 @@ from bam_envs.core.errors import MissingExtra
 from bam_train.errors import SettingsError, TrainingFailed
 from bam_train.trainers.algorithms import OFFLINE_ALGORITHMS, without_notice
 from bam_train.trainers.frozen_network import Layer
+from bam_train.trainers.learning.replay_memory import ActionCode, ReplayMemory
 from bam_train.trainers.library_arguments import fit, require_known
-from bam_train.trainers.offline.training_data import ActionCode, TrainingBatch
 
 
 def _config_class(algorithm: str) -> Any:
@@ -57,9 +57,9 @@ class D3rlpyLearner:
     tanh = False
 
     def __init__(
-        self, algorithm: str, values: Mapping[str, Any], inputs: int, code: ActionCode, data: TrainingBatch, seed: int
+        self, algorithm: str, values: Mapping[str, Any], inputs: int, code: ActionCode, data: ReplayMemory, seed: int
     ) -> None:
-        self.data, self.iql = data, None
+        self.data = data
         kind = _config_class(algorithm)
         import d3rlpy
 
@@ -70,13 +70,15 @@ class D3rlpyLearner:
         except (AssertionError, ValueError, TypeError, RuntimeError) as error:
             raise SettingsError(f"{algorithm} cannot be set up: {' '.join(str(error).split())}") from error
         self._impl, self._size = self._algorithm.impl, int(values["batch_size"])
+        modules = vars(self._impl.modules)
+        self.parts = {name: one for name, one in modules.items() if hasattr(one, "load_state_dict")}
         self.metrics: dict[str, float] = {}
 
     def update(self, step: int, total: int) -> None:
         """Update number `step` on the data set; raises TrainingFailed if a loss is not finite."""
         from d3rlpy.torch_utility import TorchMiniBatch
 
-        batch = self.data.rows(torch.randint(len(self.data), (self._size,)))
+        batch = self.data.draw(self._size)
         reward, terminal = batch.reward[:, None], batch.terminal[:, None]
         made = TorchMiniBatch(
             observations=batch.seen,
@@ -94,21 +96,10 @@ class D3rlpyLearner:
         if wrong:
             raise TrainingFailed(f"{wrong[0]} is {self.metrics[wrong[0]]}: try a smaller learning rate")
 
+    @property
     def network(self) -> nn.Module:
         """From normalised observations to actions in [-1, 1]."""
         return _Best(self._impl)
-
-    def _parts(self) -> dict[str, Any]:
-        return {name: one for name, one in vars(self._impl.modules).items() if hasattr(one, "load_state_dict")}
-
-    def state_dict(self) -> dict[str, Any]:
-        """Weights and optimisers."""
-        return {name: one.state_dict() for name, one in self._parts().items()}
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restore the result of `state_dict`."""
-        for name, one in self._parts().items():
-            one.load_state_dict(state[name])
 
 
 class _Best(Layer):

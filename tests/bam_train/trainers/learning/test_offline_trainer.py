@@ -94,7 +94,7 @@ def test_cloning_needs_no_environment(bam_train):
 def test_resumed_is_the_same_as_unbroken(bam_train, algo):
     record("points")
     bam_train(data="points", algo=algo, steps=200, set=TINY, out="whole.zip")
-    from bam_train.trainers.offline.offline_trainer import OfflineTrainer
+    from bam_train.trainers.learning.offline_trainer import OfflineTrainer
 
     settings = OfflineTrainer.complete(OfflineTrainer.load(Checkpoint.open("whole.zip")).settings)
     broken = OfflineTrainer.create(settings)

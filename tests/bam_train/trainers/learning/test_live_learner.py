@@ -4,14 +4,12 @@ import numpy as np
 import pytest
 import torch
 
-from bam_envs.core.errors import InvalidValue
 from bam_train.checkpoint import Checkpoint
 from bam_train.environments import make_vector_env
 from bam_train.errors import CheckpointMismatch, SettingsError, TrainingFailed
 from bam_train.evaluation import evaluate
 from bam_train.policy import FrozenPolicy
-from bam_train.trainers.live.live_learner import LiveLearner
-from bam_train.trainers.live.live_policy import require_spaces
+from bam_train.trainers.learning.live_learner import LiveLearner, require_spaces
 
 from .conftest import ENV, play
 
@@ -58,7 +56,7 @@ def test_a_run_goes_on_as_if_it_had_not_been_interrupted(settings, tmp_path):
         learner.add(play(5, person=True))
         learner.learn(7)
         if learner is first:
-            saved = learner.save(tmp_path / "last.zip", resumable=True)
+            saved = learner.save(tmp_path / "last.zip", {}, {})
             learner = LiveLearner.load(Checkpoint.open(saved.path), settings())
         learner.add(play(5, first=5))
         learner.learn(20)
@@ -75,7 +73,7 @@ def _first(policy, seen):
 def test_candidates_explore_and_the_result_does_not(settings, tmp_path):
     learner, seen = LiveLearner.create(settings()), np.zeros(2, np.float32)
     policies = [
-        FrozenPolicy.load(learner.save(tmp_path / f"{k}.zip", explores=explores).path)
+        FrozenPolicy.load(learner.save_candidate(tmp_path / f"{k}.zip", explores=explores).path)
         for k, explores in enumerate((True, True, False))
     ]
     actions = [[policy.act(seen).item() for _ in range(4)] for policy in policies]
@@ -90,6 +88,17 @@ def test_candidates_explore_and_the_result_does_not(settings, tmp_path):
     assert len({round(noise, 4) for noise in first}) == 3
     manifest = Checkpoint.open(tmp_path / "0.zip").manifest
     assert (manifest.trainer, manifest.algorithm, manifest.env) == ("live", "rlpd", ENV)
+
+
+def test_weights_that_are_not_finite_are_neither_pushed_nor_saved(settings, tmp_path):
+    learner = LiveLearner.create(settings())
+    learner.rlpd.average.mean.bias.fill_(float("nan"))
+    for write in (learner.save_candidate, lambda path: learner.save(path, {}, {})):
+        with pytest.raises(TrainingFailed) as error:
+            write(tmp_path / "broken.zip")
+        text = "the network's weights are NaN or infinite at step 0; expected finite numbers: try a smaller"
+        assert str(error.value) == f"{text} learning_rate"
+    assert not (tmp_path / "broken.zip").exists()
 
 
 def test_the_first_policy_is_a_copy(settings):
@@ -112,10 +121,10 @@ def test_what_does_not_fit_is_refused(settings, tmp_path):
         require_spaces(envs.single_observation_space, envs.single_action_space)
     expected = "expected an action space Box of one axis with bounds, found Discrete(2)"
     assert str(error.value) == f"--learner: {expected}"
-    with pytest.raises(InvalidValue) as error:
+    with pytest.raises(SettingsError) as error:
         LiveLearner.create(settings(hyperparameters={"gama": 0.9}))
     assert str(error.value) == "hyperparameters: unknown key 'gama'. Did you mean 'gamma'?"
-    candidate = learner.save(tmp_path / "candidate.zip")
+    candidate = learner.save_candidate(tmp_path / "candidate.zip")
     with pytest.raises(CheckpointMismatch) as error:
         LiveLearner.load(candidate, settings())
     text = "was made by rlpd of live, and not by a run with --learner: a new run can begin with it by --start"

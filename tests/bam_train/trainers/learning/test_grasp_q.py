@@ -13,8 +13,8 @@ from bam_envs.core.spaces import space_to_json
 from bam_train.checkpoint import Checkpoint
 from bam_train.errors import SettingsError
 from bam_train.policy import FrozenPolicy
-from bam_train.trainers.bandit.grasp_network import HEIGHT_UNIT, GraspNetwork, GraspPolicy, Grid
-from bam_train.trainers.bandit.grasp_trainer import GraspTrainer
+from bam_train.trainers.learning.grasp_network import HEIGHT_UNIT, GraspNetwork, GraspPolicy, Grid
+from bam_train.trainers.learning.grasp_q import GraspTrainer
 from bam_train.trainers.resolve_settings import resolve
 
 SEEN = spaces.Dict(color=spaces.Box(0, 255, (40, 60, 3), np.uint8), depth=spaces.Box(0.0, 2.0, (40, 60, 1), np.float32))
@@ -82,7 +82,7 @@ def test_patches_are_turned_with_the_gripper():
 
 def test_the_frozen_policy_acts_as_torch_does(policy):
     _, seen = pictures(5)
-    onnx, _ = policy.members(seen, 3)
+    onnx, _ = policy.members(3, seen)
     frozen = FrozenPolicy.from_graph(onnx, space_to_json(SEEN), space_to_json(ACTED))
     with torch.no_grad():
         expected = policy(torch.as_tensor(seen["color"]), torch.as_tensor(seen["depth"])).numpy()
@@ -123,14 +123,14 @@ def test_it_learns_which_pictures_succeed():
     left = np.array([np.flatnonzero(one.any(axis=0))[0] for one in heights])
     column[::2] = left[::2] + 2
     row[::2] = [np.flatnonzero(one.any(axis=1)).mean() for one in heights[::2]]
-    trainer._grid = Grid.of(SEEN, ACTED)
-    trainer._patches = trainer._grid.patches(heights, column, row, rotation)
-    trainer._rewards, trainer._widths = np.zeros(200, np.float32), np.zeros(200, np.int64)
-    trainer._rewards[::2] = 1.0
+    rewards = np.zeros(200, np.float32)
+    rewards[::2] = 1.0
+    patches = Grid.of(SEEN, ACTED).patches(heights, column, row, rotation)
+    trainer.memory.add(patches=patches, widths=np.zeros(200, np.int64), rewards=rewards)
     losses = []
     for _ in range(150):
-        trainer._update(0.0)
-        losses.append(trainer._metrics["loss"])
+        trainer.update(0.0)
+        losses.append(trainer.metrics["loss"])
     assert np.mean(losses[-20:]) < 0.5 * np.mean(losses[:5])
     trainer.close()
 

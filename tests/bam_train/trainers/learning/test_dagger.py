@@ -2,14 +2,10 @@
 
 from pathlib import Path
 
-import gymnasium as gym
 import numpy as np
 import pytest
-from gymnasium.vector import AutoresetMode
 
 pytest.importorskip("torch")
-
-import torch
 
 from bam_envs.robots.physics.rendering import RenderingUnavailable, find_backend
 from bam_train.checkpoint import Checkpoint
@@ -18,8 +14,8 @@ from bam_train.cli.program import guarded
 from bam_train.cli.train import train
 from bam_train.evaluation import evaluate
 from bam_train.policy import FrozenPolicy
-from bam_train.trainers.imitation.dagger import Dagger, DaggerLearner
-from bam_train.trainers.imitation.imitation_network import ImitationPolicy
+from bam_train.trainers.learning.dagger import DaggerTrainer
+from bam_train.trainers.resolve_settings import resolve
 
 PICK_PPO = Path(__file__).parents[4] / "checkpoints" / "pick-ppo.zip"
 TINY = ("width=16", "channels=2", "batch_size=16", "env_kwargs.image_size=16", "env_kwargs.action_delay=1")
@@ -83,20 +79,16 @@ class Upright:
         pass
 
 
-def test_whole_numbers_are_learnt_as_choices():
-    torch.manual_seed(0)
-    same_step = {"autoreset_mode": AutoresetMode.SAME_STEP}
-    envs = gym.make_vec("CartPole-v1", 8, vectorization_mode="sync", vector_kwargs=same_step)
-    learner = DaggerLearner(Dagger(width=32, batch_size=32, passes=4), 0, envs, Upright())
-    steps = 0
-    while steps < 2000:
-        steps += learner.step(steps / 2000)
-        learner.learn(steps / 2000)
-    policy = ImitationPolicy(learner.network, envs.single_observation_space, envs.single_action_space)
+def test_whole_numbers_are_learnt_as_choices(monkeypatch):
+    monkeypatch.setattr("bam_train.trainers.learning.dagger.Teacher", lambda settings, envs: Upright())
+    options = {"width": 32, "batch_size": 32, "passes": 4}
+    asked = {"env": "CartPole-v1", "algo": "dagger", "teacher": "scripted", "steps": 2000, "num_envs": 8}
+    trainer = DaggerTrainer.create(resolve({**asked, "hyperparameters": options}))
+    trainer.train(2000, lambda progress: True)
     seen = np.random.default_rng(0).uniform(-0.2, 0.2, (200, 4)).astype(np.float32)
-    agreed = policy(torch.as_tensor(seen)).numpy() == Upright()(seen)[0]
+    agreed = trainer.freeze().act_batch(seen) == Upright()(seen)[0]
     assert agreed.mean() > 0.9
-    envs.close()
+    trainer.close()
 
 
 @pytest.mark.parametrize(

@@ -14,7 +14,7 @@ from bam_train.agent.transitions import encode
 from bam_train.checkpoint import Checkpoint
 from bam_train.errors import AgentRefused, SettingsError
 from bam_train.policy import FrozenPolicy
-from bam_train.trainers.live.live_run import learn, live_settings
+from bam_train.trainers.learning.live_session import learn, live_settings
 
 from .conftest import ENV, play
 
@@ -111,7 +111,7 @@ def tell(hub, transitions):
 def niceness(monkeypatch):
     """By how much the learners gave way."""
     given = []
-    monkeypatch.setattr("bam_train.trainers.live.live_run.os.nice", given.append)
+    monkeypatch.setattr("bam_train.trainers.learning.live_session.os.nice", given.append)
     return given
 
 
@@ -167,7 +167,7 @@ def test_the_agent_may_go_and_come_back(hub, tmp_path):
 
 
 def test_it_says_why_no_steps_come(hub, tmp_path, monkeypatch):
-    monkeypatch.setattr("bam_train.trainers.live.live_session.TELL_EVERY", 0.05)
+    monkeypatch.setattr("bam_train.trainers.learning.live_session.TELL_EVERY", 0.05)
     with agent(hub) as server:
         learner = Learning(server.url, tmp_path)
         tell(hub, play(3))

@@ -23,13 +23,11 @@ from msgspec import Meta
 from torch import nn
 from torch.nn import functional
 
-from bam_train.errors import TrainingFailed
 from bam_train.trainers.frozen_network import Layer
+from bam_train.trainers.learning.networks import Descent, Ensemble, follow, two_layers
+from bam_train.trainers.learning.replay_memory import Batch
+from bam_train.trainers.learning.torch_trainer import Count, Positive, Share, Weight, restore, state_of
 
-_Count = Annotated[int, Meta(ge=1, le=100_000)]
-_Positive = Annotated[float, Meta(gt=0, le=1e6)]
-_Share = Annotated[float, Meta(ge=0, le=1)]
-_Weight = Annotated[float, Meta(ge=0, le=1e6)]
 _DRAWS = 2  # actions that the usual value of an observation is the mean of
 _MOST = 3.0  # greatest exponent of the weight of an action
 
@@ -38,18 +36,18 @@ _MOST = 3.0  # greatest exponent of the weight of an action
 class Hyperparameters:
     """Arguments of the algorithm."""
 
-    gamma: _Share = 0.98
+    gamma: Share = 0.98
     """Discount of a step."""
-    ahead: _Count = 5
+    ahead: Count = 5
     """Steps whose rewards are added before the critics' value of what follows."""
-    tau: _Share = 0.005
+    tau: Share = 0.005
     """Share of the critics that the target critics take over at each update."""
-    learning_rate: _Positive = 1e-4
+    learning_rate: Positive = 1e-4
     """Three times as much unlearns, over ten thousand steps, a part of what a good policy can do already."""
-    batch_size: _Count = 256
+    batch_size: Count = 256
     update_ratio: Annotated[float, Meta(gt=0, le=100)] = 2.0
     """Updates of the critics for each step of the robot."""
-    actor_every: _Count = 2
+    actor_every: Count = 2
     """Updates of the critics for each one of the actor."""
     critics: Annotated[int, Meta(ge=2, le=100)] = 5
     """Size of the ensemble."""
@@ -60,26 +58,26 @@ class Hyperparameters:
     few demonstrations are then learnt for what is around them too."""
     average: Annotated[float, Meta(gt=0, le=1)] = 0.002
     """Share of the actor that its average, which drives the robot, takes over at each update of the actor."""
-    critic_width: _Count = 128
-    actor_width: _Count = 256
+    critic_width: Count = 128
+    actor_width: Count = 256
     history: Annotated[int, Meta(ge=0, le=64)] = 5
     """Last actions that the policy remembers, so that it can act on a robot that is late."""
-    reward_scale: _Positive = 0.1
-    deviation: _Positive = 0.15
+    reward_scale: Positive = 0.1
+    deviation: Positive = 0.15
     """Standard deviation of the first explorations, before the squashing of actions to [-1, 1]."""
     target_entropy: float = -10.0
-    temperature: _Positive = 0.002
+    temperature: Positive = 0.002
     """The first weight of the entropy."""
-    demonstration_share: _Share = 0.5
+    demonstration_share: Share = 0.5
     """Share of a batch that are demonstrations: half of them of a person, half of the robot's own successes."""
-    imitation_weight: _Weight = 1.0
+    imitation_weight: Weight = 1.0
     """Weight of the imitation of demonstrations in the actor's loss."""
-    advantage_weight: _Weight = 0.0
+    advantage_weight: Weight = 0.0
     """Weight of the imitation of experience, each action by the exponential of its advantage; about 1 where there is no
     person and success is rare. Without it, and without `value_weight`, no critics are learnt."""
-    advantage_scale: _Weight = 1.0
+    advantage_scale: Weight = 1.0
     """Exponent of that for an advantage of one standard deviation."""
-    value_weight: _Weight = 0.0
+    value_weight: Weight = 0.0
     """Weight of SAC's own loss, value and entropy of drawn actions, relative to the mean value."""
     warmup: Annotated[int, Meta(ge=0, le=10**9)] = 6000
     """Updates of the critics before they count for the actor."""
@@ -87,60 +85,12 @@ class Hyperparameters:
     """Steps of policies, not of a person, before the actor changes and the first candidate is pushed."""
 
 
-@dataclass(frozen=True)
-class Batch:
-    """n transitions; the last `demonstrations` of them are demonstrations."""
-
-    seen: torch.Tensor
-    """Observation and last actions. Shape: (n, inputs)."""
-    action: torch.Tensor
-    """In [-1, 1]. Shape: (n, a)."""
-    reward: torch.Tensor
-    """Discounted sum of the rewards until `after`. Shape: (n,)."""
-    after: torch.Tensor
-    """`seen` some steps later. Shape: (n, inputs)."""
-    discount: torch.Tensor
-    """Of the value of `after`: 0 where the task ended before. Shape: (n,)."""
-    demonstrations: int
-
-
-class Critics(Layer):
-    """An ensemble of networks with layer normalisation: observation and action to a value each."""
-
-    def __init__(self, count: int, inputs: int, width: int) -> None:
-        super().__init__()
-        sizes = ((inputs, width), (width, width), (width, 1))
-        self.weights = nn.ParameterList(_uniform(count, i, o, fan=i) for i, o in sizes)
-        self.biases = nn.ParameterList(_uniform(count, 1, o, fan=i) for i, o in sizes)
-        self.scales = nn.ParameterList(nn.Parameter(torch.ones(count, 1, width)) for _ in range(2))
-        self.shifts = nn.ParameterList(nn.Parameter(torch.zeros(count, 1, width)) for _ in range(2))
-
-    def forward(self, seen: torch.Tensor, action: torch.Tensor, chosen: torch.Tensor | None = None) -> torch.Tensor:
-        """Values of the `chosen` critics, or of all. Shapes: (n, inputs), (n, a) -> (critics, n)."""
-
-        def of(parameters: nn.ParameterList, layer: int) -> torch.Tensor:
-            return parameters[layer] if chosen is None else parameters[layer][chosen]
-
-        weight = of(self.weights, 0)
-        x = torch.cat([seen, action], 1).expand(len(weight), -1, -1)
-        for layer in range(2):
-            x = torch.baddbmm(of(self.biases, layer), x, of(self.weights, layer))
-            x = functional.layer_norm(x, x.shape[-1:]) * of(self.scales, layer) + of(self.shifts, layer)
-            x = functional.relu(x)
-        return torch.baddbmm(of(self.biases, 2), x, of(self.weights, 2)).squeeze(-1)
-
-
-def _uniform(count: int, rows: int, columns: int, fan: int) -> nn.Parameter:
-    return nn.Parameter((2 * torch.rand(count, rows, columns) - 1) / math.sqrt(fan))
-
-
 class Actor(Layer):
     """Observation and last actions to mean and logarithm of the deviation of the next action, before squashing."""
 
     def __init__(self, inputs: int, actions: int, width: int, deviation: float) -> None:
         super().__init__()
-        layers = (nn.Linear(inputs, width), nn.ReLU(), nn.Linear(width, width), nn.ReLU())
-        self.layers, self.mean = nn.Sequential(*layers), nn.Linear(width, actions)
+        self.layers, self.mean = two_layers(inputs, width), nn.Linear(width, actions)
         self.log_deviation = nn.Linear(width, actions)
         nn.init.zeros_(self.log_deviation.weight)
         nn.init.constant_(self.log_deviation.bias, math.log(deviation))
@@ -176,14 +126,22 @@ class Rlpd:
         self.average = copy.deepcopy(self.actor).requires_grad_(False)
         """The actor's weights, averaged over its last updates: it drives."""
         shape = settings.critics, inputs + actions, settings.critic_width
-        self.critics, self._target = Critics(*shape), Critics(*shape)
+        self.critics, self._target = (Ensemble(*shape, normalises=True) for _ in range(2))
         self._target.load_state_dict(self.critics.state_dict())
         self._log_temperature = torch.tensor(math.log(settings.temperature), requires_grad=True)
-        rate = settings.learning_rate
-        self._optimisers = {
-            "critics": torch.optim.Adam(self.critics.parameters(), lr=rate),
-            "actor": torch.optim.Adam(self.actor.parameters(), lr=rate),
-            "temperature": torch.optim.Adam([self._log_temperature], lr=rate),
+        learnt = {
+            "critics": self.critics.parameters(),
+            "actor": self.actor.parameters(),
+            "temperature": [self._log_temperature],
+        }
+        self._optimisers = {name: Descent(name, some, settings.learning_rate) for name, some in learnt.items()}
+        self._parts = {
+            "actor": self.actor,
+            "average": self.average,
+            "critics": self.critics,
+            "target": self._target,
+            "temperature": self._log_temperature,
+            "optimisers": self._optimisers,
         }
         self.metrics: dict[str, float] = {}
         """Numbers of the last updates."""
@@ -218,11 +176,11 @@ class Rlpd:
         with torch.no_grad():
             action, density, _ = self.actor.draw(batch.after)
             chosen = torch.randperm(settings.critics)[: settings.subset]
-            value = self._target(batch.after, action, chosen).amin(0) - self._log_temperature.exp() * density
+            value = self._target(batch.after, action, chosen=chosen).amin(0) - self._log_temperature.exp() * density
             target = settings.reward_scale * batch.reward + batch.discount * value
         loss = ((self.critics(batch.seen, batch.action) - target) ** 2).sum(0).mean()
-        self._descend("critics", loss)
-        _follow(self._target, self.critics, settings.tau)
+        self._optimisers["critics"].descend(loss)
+        follow(self._target, self.critics, settings.tau)
         self.metrics |= {"loss/critics": loss.item(), "value": target.mean().item()}
 
     def _update_actor(self, batch: Batch) -> None:
@@ -240,10 +198,11 @@ class Rlpd:
             value = self.critics(batch.seen, drawn).mean(0)
             gain = (temperature.detach() * density - value).mean() / value.detach().abs().mean().clamp(min=1e-3)
             losses["value"] = settings.value_weight * gain
-            self._descend("temperature", -temperature * (density.detach().mean() + settings.target_entropy))
+            excess = density.detach().mean() + settings.target_entropy
+            self._optimisers["temperature"].descend(-temperature * excess)
         if losses:
-            self._descend("actor", torch.stack([*losses.values()]).sum())
-            _follow(self.average, self.actor, settings.average)
+            self._optimisers["actor"].descend(torch.stack([*losses.values()]).sum())
+            follow(self.average, self.actor, settings.average)
         self.metrics |= {f"loss/{name}": loss.item() for name, loss in losses.items()}
 
     @torch.no_grad()  # type: ignore[untyped-decorator] # torch is not typed here
@@ -255,41 +214,11 @@ class Rlpd:
         weights = exponent.clamp(max=_MOST).exp()
         return weights / weights.mean()
 
-    def _descend(self, name: str, loss: torch.Tensor) -> None:
-        if not torch.isfinite(loss):
-            raise TrainingFailed(f"the loss of the {name} is {loss.item()}: try a smaller learning_rate")
-        optimiser = self._optimisers[name]
-        optimiser.zero_grad()
-        loss.backward()
-        optimiser.step()
-
     def state_dict(self) -> dict[str, Any]:
         """Everything that the next updates depend on, except torch's random numbers."""
-        return {
-            "actor": self.actor.state_dict(),
-            "average": self.average.state_dict(),
-            "critics": self.critics.state_dict(),
-            "target": self._target.state_dict(),
-            "temperature": self._log_temperature.detach().clone(),
-            "optimisers": {name: one.state_dict() for name, one in self._optimisers.items()},
-            "updates": self.updates,
-        }
+        return {**state_of(self._parts), "updates": self.updates}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restore the result of `state_dict`."""
-        self.actor.load_state_dict(state["actor"])
-        self.average.load_state_dict(state.get("average", state["actor"]))
-        self.critics.load_state_dict(state["critics"])
-        self._target.load_state_dict(state["target"])
-        with torch.no_grad():
-            self._log_temperature.copy_(state["temperature"])
-        for name, optimiser in self._optimisers.items():
-            optimiser.load_state_dict(state["optimisers"][name])
+        """Restore the result of `state_dict`; early ones have no average."""
+        restore(self._parts, {"average": state["actor"], **state})
         self.updates = int(state["updates"])
-
-
-@torch.no_grad()  # type: ignore[untyped-decorator] # torch is not typed here
-def _follow(average: nn.Module, newest: nn.Module, share: float) -> None:
-    """Move the weights of `average` by `share` towards those of `newest`."""
-    for old, new in zip(average.parameters(), newest.parameters(), strict=True):
-        old.lerp_(new, share)

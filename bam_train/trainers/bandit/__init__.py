@@ -1,1 +1,0 @@
-"""Contextual bandits: one decision at a time, such as a grasp from a picture."""

@@ -1,1 +1,0 @@
-"""Imitation of a teacher that acts in the environment: DAgger."""

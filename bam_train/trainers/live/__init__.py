@@ -1,1 +1,0 @@
-"""Learning from a live agent while it runs."""
