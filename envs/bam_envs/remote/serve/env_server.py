@@ -23,7 +23,7 @@ from bam_envs.core.spaces import space_to_json
 from bam_envs.core.timing import Pacer
 from bam_envs.remote.serve.command_lease import LEASE_SECONDS, CommandLease
 from bam_envs.remote.wire.transport import EnvSpecMessage, Info, Seed
-from bam_envs.remote.wire.values import exact, plain_info, stack
+from bam_envs.remote.wire.values import exact, pack, plain_info, stack
 from bam_envs.rosbridge.bus import UNKNOWN_CALLER, Caller
 
 Env = gym.Env[Any, Any] | VectorEnv[Any, Any, Any]
@@ -79,6 +79,8 @@ def _other_names() -> dict[str, str]:
 
 class EnvServer:
     """Serves an environment to clients, one of them in command. Thread-safe; calls run one after another.
+
+    Results are as of a `Transport`, and their values trees (see `bam_envs.remote.wire.values`).
 
     Args:
         env: Any Gymnasium environment, or a vector environment that resets in the same step.
@@ -261,7 +263,7 @@ class EnvServer:
     def _checked_one(self, where: str, last: Any, observation: Any, *rest: Any) -> tuple[Any, ...]:
         """The checked result of one environment; `last` is the final observation of an episode that ended, or None."""
         space, (*ends, info) = self._spec.observation_space, rest
-        checked = [exact(space, observation, f"observation{where}")]
+        checked = [pack(space, observation, f"observation{where}")]
         if ends:
             reward, terminated, truncated = ends
             if (reward := float(reward)) != reward:
@@ -269,7 +271,7 @@ class EnvServer:
             checked += [reward, bool(terminated), bool(truncated)]
         plain = plain_info(info)
         if last is not None:
-            plain["final_obs"] = exact(space, last, f"final_obs{where}")
+            plain["final_obs"] = pack(space, last, f"final_obs{where}")
         return *checked, plain
 
     def _end_episode(self, before: str | None, after: str | None) -> None:

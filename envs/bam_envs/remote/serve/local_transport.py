@@ -32,13 +32,16 @@ class LocalTransport:
         """Begin an episode; (observation, info)."""
         self._require_open()
         with _as_over_a_network():
-            return self.server.reset(self.client, seed, options)
+            begun: tuple[Any, Any] = self.server.spec().exact(self.server.reset(self.client, seed, options))
+        return begun
 
     def step(self, action: Any) -> tuple[Any, Any, Any, Any, Any]:
         """(observation, reward, terminated, truncated, info)."""
         self._require_open()
         with _as_over_a_network():
-            return self.server.step(self.client, action)
+            stepped: tuple[Any, Any, Any, Any, Any]
+            stepped = self.server.spec().exact(self.server.step(self.client, action))
+        return stepped
 
     def close(self) -> None:
         """Release the environment, and close it unless it came with a server."""

@@ -216,11 +216,9 @@ class EnvCodec:
         *,
         executed: bool = True,
     ) -> list[dict[str, Any]]:
-        """The feedback of a reset or step, sent at `stamp`; `executed`: whether the action was executed."""
+        """The feedback of a result of `EnvServer`, sent at `stamp`; `executed`: whether the action was executed."""
         feedback = []
         for observation, *ends, info in self.spec.split(result):
-            if self.spec.vector and "final_obs" in info:
-                info = {**info, "final_obs": pack(self.spec.observation_space, info["final_obs"], "final_obs")}
             fields, trees = self._observations.encode(observation, stamp, version)
             flags: Any = ends or (0.0, False, False)
             feedback.append(write_feedback(fields, trees, flags, info, version, executed=executed))
