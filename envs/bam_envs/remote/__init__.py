@@ -9,8 +9,7 @@ if TYPE_CHECKING:
     from bam_envs.remote.remote_vector_env import RemoteVectorEnv
     from bam_envs.remote.ros2_transport import RclpyTransport
     from bam_envs.remote.rosbridge_transport import RosbridgeTransport
-    from bam_envs.remote.serve.env_server import EnvServer
-    from bam_envs.remote.serve.local_transport import LocalTransport
+    from bam_envs.remote.serve.env_server import EnvServer, LocalTransport
     from bam_envs.remote.serve.serve_options import ServeOptions
     from bam_envs.remote.serve.served_environment import ServedEnvironment
     from bam_envs.remote.serve.tcp_server import TcpServer
@@ -26,8 +25,7 @@ _MODULES = {
     "remote_vector_env": ("RemoteVectorEnv",),
     "ros2_transport": ("RclpyTransport",),
     "rosbridge_transport": ("RosbridgeTransport",),
-    "serve.env_server": ("EnvServer",),
-    "serve.local_transport": ("LocalTransport",),
+    "serve.env_server": ("EnvServer", "LocalTransport"),
     "serve.serve_options": ("ServeOptions",),
     "serve.served_environment": ("ServedEnvironment",),
     "serve.tcp_server": ("TcpServer",),

@@ -1,4 +1,4 @@
-"""One environment, its episode and the lease on it, shared by all services of `bam-serve`.
+"""One environment, its episode and the lease on it, shared by all services of `bam-serve`; and LocalTransport.
 
 The environment runs in the calling thread, one request at a time under `EnvServer.lock`. A separate thread would cost
 two hand-overs a step, more than a step through TCP, and only rendering, which is not served, would need it.
@@ -17,7 +17,7 @@ import numpy as np
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import iterate
 
-from bam_envs.core.errors import InvalidValue, NotInCommand, RemoteError, ResetNeeded
+from bam_envs.core.errors import BamEnvsError, InvalidValue, LinkLost, NotInCommand, RemoteError, ResetNeeded
 from bam_envs.core.registry import ALIASES
 from bam_envs.core.spaces import space_to_json
 from bam_envs.core.timing import Pacer
@@ -302,3 +302,60 @@ def split_infos(infos: Mapping[str, Any], num_envs: int) -> list[Info]:
             if mask is None or mask[i]:
                 info[key] = value[i]
     return each
+
+
+class LocalTransport:
+    """An environment in this process, without a network. Results equal those of the other transports bit for bit.
+
+    Args:
+        env: An environment (see `EnvServer`), or a server, which others may share.
+        client: The name of this client for a shared server.
+    """
+
+    def __init__(self, env: Env | EnvServer, client: str = "local") -> None:
+        self.server = env if isinstance(env, EnvServer) else EnvServer(env)
+        self.client = client
+        self._owned = not isinstance(env, EnvServer)
+        self._closed = False
+
+    def connect(self) -> EnvSpecMessage:
+        """Return the description of the environment."""
+        self._require_open()
+        return self.server.spec()
+
+    def reset(self, seed: Seed = None, options: Info | None = None) -> tuple[Any, Any]:
+        """Begin an episode; (observation, info)."""
+        self._require_open()
+        with _as_over_a_network():
+            begun: tuple[Any, Any] = self.server.spec().exact(self.server.reset(self.client, seed, options))
+        return begun
+
+    def step(self, action: Any) -> tuple[Any, Any, Any, Any, Any]:
+        """(observation, reward, terminated, truncated, info)."""
+        self._require_open()
+        with _as_over_a_network():
+            stepped: tuple[Any, Any, Any, Any, Any]
+            stepped = self.server.spec().exact(self.server.step(self.client, action))
+        return stepped
+
+    def close(self) -> None:
+        """Release the environment, and close it unless it came with a server."""
+        self._closed = True
+        self.server.leave(self.client)
+        if self._owned:
+            self.server.close()
+
+    def _require_open(self) -> None:
+        if self._closed:
+            raise LinkLost("This transport is closed; make a new one.")
+
+
+@contextmanager
+def _as_over_a_network() -> Iterator[None]:
+    """Raise the server's errors as other transports do."""
+    try:
+        yield
+    except (RemoteError, InvalidValue):
+        raise
+    except BamEnvsError as error:
+        raise RemoteError(str(error)) from error

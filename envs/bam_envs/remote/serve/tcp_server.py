@@ -30,9 +30,8 @@ from bam_envs.remote.wire.values import Tree
 from bam_envs.ros.freshness import FreshnessCheck, Tag, read_tag
 from bam_envs.rosbridge.bus import UNKNOWN_CALLER, Caller
 from bam_envs.rosbridge.endpoint import Address
-from bam_envs.rosbridge.places import places, who_leaves
 from bam_envs.rosbridge.server.admission import listening_error
-from bam_envs.rosbridge.tokens import Guesses, Role, Tokens
+from bam_envs.rosbridge.tokens import Guesses, Role, Tokens, places, who_leaves
 
 _LOG = logging.getLogger(__name__)
 _POLL = 0.2  # time between two checks whether the server is closing [s]
