@@ -1,8 +1,7 @@
 """Environments that run in another process: transports to them, Gymnasium environments over these, and servers."""
 
-from typing import TYPE_CHECKING
-
-from bam_envs.core.lazy_imports import lazy_imports
+import importlib
+from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from bam_envs.remote.remote_env import RemoteEnv, make_remote_env, make_remote_vector_env, open_transport
@@ -32,6 +31,15 @@ _MODULES = {
     "tcp_transport": ("TcpTransport",),
     "wire.transport": ("EnvSpecMessage", "Transport"),
 }
-__getattr__, __dir__ = lazy_imports(
-    __name__, {name: f"{__name__}.{module}" for module, names in _MODULES.items() for name in names}
-)
+
+
+def __getattr__(name: str) -> Any:
+    """Import a public name on use (PEP 562)."""
+    module = next((module for module, names in _MODULES.items() if name in names), None)
+    if module is None:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(importlib.import_module(f"{__name__}.{module}"), name)
+
+
+def __dir__() -> list[str]:
+    return sorted(__all__)
