@@ -29,7 +29,6 @@ from bam_envs.remote.wire.transport import spec_to_json
 from bam_envs.remote.wire.values import Tree
 from bam_envs.ros.freshness import FreshnessCheck, Tag, read_tag
 from bam_envs.rosbridge.bus import UNKNOWN_CALLER, Caller
-from bam_envs.rosbridge.endpoint import Address
 from bam_envs.rosbridge.server.admission import listening_error
 from bam_envs.rosbridge.tokens import Guesses, Role, Tokens, places, who_leaves
 
@@ -87,7 +86,7 @@ class TcpServer:
     @property
     def url(self) -> str:
         """Address for clients."""
-        return Address(self.host, self.port, False, "").url.replace("ws", "tcp", 1)
+        return f"tcp://{f'[{self.host}]' if ':' in self.host else self.host}:{self.port}"
 
     def start(self) -> None:
         """Listen. Raises InvalidValue: the port is in use, or the address not of this computer."""
@@ -143,7 +142,7 @@ class TcpServer:
 
     def _begin(self, connection: _Connection) -> None:
         with self.lock:
-            strangers = [one for one in self.connections if one.caller is None]
+            strangers = [one for one in self.connections if one.caller is None and not one.dropped]
             # Silent connections must not keep others out: a new one is always accepted.
             leaves = who_leaves(connection, strangers) if len(strangers) >= _STRANGERS else None
             connection.thread.start()
@@ -161,8 +160,14 @@ class _Connection(FrameSocket):
         self.caller: Caller | None = None  # known after its admission
         self.role: Role | None = None  # of the token that it showed
         self.born, self.spoke = time.monotonic(), 0.0  # of its last request; 0 before
+        self.dropped = False  # hung up; its thread has yet to end
         self._owner = owner
         self.thread = threading.Thread(target=self._run, name=f"bam-tcp {self.client}", daemon=True)
+
+    def hang_up(self) -> None:
+        """See `FrameSocket`."""
+        self.dropped = True
+        super().hang_up()
 
     def _run(self) -> None:
         owner = self._owner
@@ -204,7 +209,7 @@ class _Connection(FrameSocket):
                 raise RemoteError(f"The token is {what}; give the one that the server was started with (--token-file).")
         owner.server.require_name(hello.env_id)
         with owner.lock:
-            known = [one for one in owner.connections if one.caller is not None]
+            known = [one for one in owner.connections if one.caller is not None and not one.dropped]
             leaving = [one for one in known if one.session == tag.session]
             present = [one for one in known if one not in leaving]
             self.role, room = role, places(owner.max_clients, role or "drive", tokens.roles)
