@@ -159,7 +159,7 @@ class TcpTransport:
             raise NoServer(self.url, str(error)) from error
         except (LinkLost, ProtocolError) as error:
             remedy = f"If it is rosbridge, use ws://. {start} PORT, at a free port."
-            raise NoServer(self.url, f"not a bam-serve TCP server: {error}. {remedy}") from error
+            raise NoServer(self.url, f"no usable bam-serve TCP server: {error}. {remedy}") from error
 
     def _exchange(self, frames: FrameSocket, kind: type[TcpRequest], deadline: float, *content: Any) -> Tree:
         """Send a request and return the content of its answer, which must come before `deadline` [s, monotonic]."""

@@ -140,7 +140,7 @@ def test_somebody_listens_and_says_nothing():
         url = f"tcp://127.0.0.1:{silent.getsockname()[1]}"
         begun = time.monotonic()
         assert refused(url, connect_timeout=0.05).startswith(
-            "not a bam-serve TCP server: timed out. If it is rosbridge, use ws://. "
+            "no usable bam-serve TCP server: timed out. If it is rosbridge, use ws://. "
         )
         assert time.monotonic() - begun < 3
 
@@ -148,21 +148,21 @@ def test_somebody_listens_and_says_nothing():
 def test_somebody_who_hangs_up():
     with answering(hang_up) as (url, _):
         assert refused(url) == (
-            "not a bam-serve TCP server: the other end closed the connection. If it is rosbridge, use ws://. "
+            "no usable bam-serve TCP server: the other end closed the connection. If it is rosbridge, use ws://. "
             "Start one: bam-serve --env bam/pick --tcp PORT, at a free port."
         )
 
 
 def test_a_server_of_http():
     with answering(saying(b"HTTP/1.1 400 Bad Request\r\n\r\n")) as (url, _):
-        text = "not a bam-serve TCP server: it says b'HTTP/1.1'. If it is rosbridge, use ws://. "
+        text = "no usable bam-serve TCP server: it says b'HTTP/1.1'. If it is rosbridge, use ws://. "
         assert refused(url).startswith(text)
 
 
 @pytest.mark.parametrize("content", [{}, 3, {"env_id": "x"}])
 def test_a_description_that_is_none(content):
     with answering(telling("ok", content)) as (url, _):
-        assert refused(url).startswith("not a bam-serve TCP server: Expected the description of an environment, found ")
+        assert refused(url).startswith("no usable bam-serve TCP server: Expected the description of an environment, found ")
 
 
 def test_requests_carry_session_epoch_sequence_and_deadline():
