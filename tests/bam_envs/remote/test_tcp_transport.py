@@ -162,7 +162,9 @@ def test_a_server_of_http():
 @pytest.mark.parametrize("content", [{}, 3, {"env_id": "x"}])
 def test_a_description_that_is_none(content):
     with answering(telling("ok", content)) as (url, _):
-        assert refused(url).startswith("no usable bam-serve TCP server: Expected the description of an environment, found ")
+        assert refused(url).startswith(
+            "no usable bam-serve TCP server: Expected the description of an environment, found "
+        )
 
 
 def test_requests_carry_session_epoch_sequence_and_deadline():
