@@ -3,7 +3,6 @@
 Training on such a number fails much later, and then the policy or the learning rate seems to be the cause.
 """
 
-from collections.abc import Mapping
 from typing import Any
 
 import gymnasium as gym
@@ -11,6 +10,7 @@ import numpy as np
 from gymnasium.vector import VectorEnv, VectorWrapper
 from numpy.typing import NDArray
 
+from bam_envs.core.spaces import indexed, leaves_by_path, place_of
 from bam_train.errors import EnvironmentFailed, PolicyError
 
 
@@ -73,7 +73,7 @@ class FiniteVectorEnv(VectorWrapper):
         ended = np.flatnonzero(terminated | truncated).tolist()
         if ended:
             for which in ended if "final_obs" in infos else ():
-                self._require("observation", _of(infos["final_obs"], which), which)
+                self._require("observation", indexed(infos["final_obs"], which), which)
             self.episode_steps[ended] = 0
         self._require("observation", observations)
         return observations, rewards, terminated, truncated, infos
@@ -82,23 +82,14 @@ class FiniteVectorEnv(VectorWrapper):
         _require_finite(self, self._name, signal, values, self.episode_steps, which)
 
 
-def _of(observations: Any, which: int) -> Any:
-    """The observation of one environment from a batch: a mapping of arrays, or an array (of objects too)."""
-    if isinstance(observations, Mapping):
-        return {key: _of(one, which) for key, one in observations.items()}
-    return observations[which]
-
-
 def _not_finite(name: str, value: Any) -> tuple[str, list[int], float] | None:
     """The first number that is not finite: the name of its array, its index there, and its value."""
-    if isinstance(value, (Mapping, tuple)):
-        parts = value.items() if isinstance(value, Mapping) else enumerate(value)
-        return next((found for key, one in parts if (found := _not_finite(f"{name}[{key!r}]", one))), None)
-    array = np.asarray(value)
-    if array.dtype.kind != "f" or np.isfinite(array).all():
-        return None
-    index = np.argwhere(~np.isfinite(array))[0].tolist()
-    return name, index, float(array[tuple(index)])
+    for path, leaf in leaves_by_path(value):
+        array = np.asarray(leaf)
+        if array.dtype.kind == "f" and not np.isfinite(array).all():
+            index = np.argwhere(~np.isfinite(array))[0].tolist()
+            return place_of(name, path), index, float(array[tuple(index)])
+    return None
 
 
 def _require_finite(env: Any, env_id: str, signal: str, value: Any, steps: Any, which: int | None = None) -> None:

@@ -14,6 +14,7 @@ import numpy as np
 from gymnasium.vector import AutoresetMode, VectorEnv
 from numpy.typing import NDArray
 
+from bam_envs.core.spaces import joined, leaves_by_path, part_at
 from bam_train.finite_envs import require_finite_action
 
 Array = NDArray[Any]
@@ -168,17 +169,9 @@ def last_observations(observations: Any, infos: Mapping[str, Any], ended: NDArra
 
 def _replaced(observations: Any, final: Any, rows: list[int]) -> Any:
     """`observations` with the `rows` of `final`: nested as they are, or an array with one observation for each."""
-
-    def part(key: Any) -> Any:
-        return (
-            final[key] if isinstance(final, (Mapping, tuple)) else [one if one is None else one[key] for one in final]
-        )
-
-    if isinstance(observations, Mapping):
-        return {key: _replaced(one, part(key), rows) for key, one in observations.items()}
-    if isinstance(observations, tuple):
-        return tuple(_replaced(one, part(k), rows) for k, one in enumerate(observations))
-    merged = np.array(observations)
-    for i in rows:
-        merged[i] = final[i]
-    return merged
+    is_nested, merged = isinstance(final, (Mapping, tuple)), {}
+    for path, array in leaves_by_path(observations):
+        merged[path] = np.array(array)
+        for i in rows:
+            merged[path][i] = part_at(final, path)[i] if is_nested else part_at(final[i], path)
+    return joined(observations, merged)

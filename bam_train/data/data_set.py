@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from bam_envs.core.errors import BamEnvsError
+from bam_envs.core.spaces import indexed, mapped
 from bam_train.data.arrow_columns import from_arrow
 from bam_train.data.file_pair import Copy, Head, sha256
 from bam_train.data.layout import (
@@ -42,8 +43,8 @@ from bam_train.data.recorded_episode import (
     Transitions,
     Values,
     digest_of,
-    joined,
     leaves_of,
+    nested,
 )
 from bam_train.environments import first_difference, short_json
 from bam_train.errors import BadDataSet, PlaceError
@@ -270,8 +271,8 @@ class DataSet:
         if any(found != written for found, written in pairs if written is not None):
             raise ValueError("its numbers are not those that were written")
         return Episode(
-            joined(self.info.observation_space, arrays, self._observation),
-            joined(self.info.action_space, arrays, self._action),
+            nested(self.info.observation_space, arrays, self._observation),
+            nested(self.info.action_space, arrays, self._action),
             rewards,
             *end,
             columns=columns,
@@ -296,8 +297,8 @@ class DataSet:
         terminals = [
             np.arange(len(one)) == len(one) - 1 if one.terminated else np.zeros(len(one), bool) for one in episodes
         ]
-        before = [_cut(one.observations, slice(None, -1)) for one in episodes]
-        after = [_cut(one.observations, slice(1, None)) for one in episodes]
+        before = [indexed(one.observations, slice(-1)) for one in episodes]
+        after = [indexed(one.observations, slice(1, None)) for one in episodes]
         counts = [len(one) for one in episodes]
         if not episodes:
             raise BadDataSet(f"{self.place}: has no episodes yet; record some first")
@@ -311,15 +312,5 @@ class DataSet:
         )
 
 
-def _cut(values: Values, part: slice) -> Values:
-    if isinstance(values, dict):
-        return {key: _cut(one, part) for key, one in values.items()}
-    return tuple(_cut(one, part) for one in values) if isinstance(values, tuple) else values[part]
-
-
 def _concatenated(each: Sequence[Values]) -> Values:
-    if isinstance(each[0], dict):
-        return {key: _concatenated([one[key] for one in each]) for key in each[0]}
-    if isinstance(each[0], tuple):
-        return tuple(_concatenated(parts) for parts in zip(*each, strict=True))
-    return np.concatenate(each)
+    return mapped(lambda *arrays: np.concatenate(arrays), *each)

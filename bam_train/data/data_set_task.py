@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from bam_envs.core.errors import InvalidValue
 from bam_envs.core.robot import EnvIds, RobotState
+from bam_envs.core.spaces import indexed
 from bam_envs.core.task import Array, Label, Score
 from bam_envs.core.validation import NonNegative, check
 from bam_envs.core.wording import brief
@@ -113,8 +114,7 @@ class DataSetTask(LocalTask):
 
     def observe(self, state: RobotState) -> Any:
         """The recorded observations. Shape: (n, ...)."""
-        seen = self.steps.observations
-        return {key: one[self.drawn] for key, one in seen.items()} if isinstance(seen, dict) else seen[self.drawn]
+        return indexed(self.steps.observations, self.drawn)
 
     def score(self, state: RobotState, action: NDArray[Any]) -> Score:
         """Compare the actions with the recorded ones."""

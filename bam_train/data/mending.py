@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from bam_envs.core.errors import BamEnvsError
+from bam_envs.core.spaces import leaves_by_path
 from bam_train.data.arrow_columns import to_arrow
 from bam_train.data.data_set import DataSet
 from bam_train.data.file_pair import Columns, Copy, Head, sha256
@@ -282,17 +283,11 @@ def _odd(index: int, episode: Episode) -> list[str]:
     notes = []
     values = {"observations": episode.observations, "actions": episode.actions, "rewards": episode.rewards}
     for name, value in values.items():
-        arrays = [value] if isinstance(value, np.ndarray) else _arrays(value)
-        if any(array.dtype.kind == "f" and not np.isfinite(array).all() for array in arrays):
+        if any(array.dtype.kind == "f" and not np.isfinite(array).all() for _, array in leaves_by_path(value)):
             notes.append(f"episode {index}: its {name} have NaN or infinity; learners refuse it")
     if not (episode.terminated or episode.truncated):
         notes.append(f"episode {index} has no end; learners take it as truncated")
     return notes
-
-
-def _arrays(values: Any) -> list[Any]:
-    parts = values.values() if isinstance(values, dict) else values
-    return [array for one in parts for array in ([one] if isinstance(one, np.ndarray) else _arrays(one))]
 
 
 def _lines(episodes: Iterable[tuple[str, dict[str, Any], str]]) -> Iterator[str]:

@@ -14,10 +14,11 @@ from gymnasium.vector import AutoresetMode, VectorEnv, VectorWrapper
 from numpy.typing import NDArray
 
 from bam_envs.core.robot_env import RobotEnv, RobotVectorEnv
+from bam_envs.core.spaces import leaves_by_path, mapped
 from bam_envs.remote.wire.values import plain_info, tree_to_json
 from bam_train.checkpoint.manifest import WHERE
 from bam_train.data.data_set_writer import DataSetWriter
-from bam_train.data.recorded_episode import Array, DataSetInfo, Episode, Leaf, joined, leaves_of
+from bam_train.data.recorded_episode import Array, DataSetInfo, Episode, Leaf, leaves_of, nested
 from bam_train.environments import AnyEnv, control_period
 from bam_train.errors import BadDataSet, SettingsError
 from bam_train.files.place import Place
@@ -197,8 +198,8 @@ class Tracks:
         acted = {one.column: found.pop(one.column) for one in self._action}
         success = found.get("info.is_success", np.array([np.nan]))[-1]
         return Episode(
-            joined(self.info.observation_space, observed, self._observation),
-            joined(self.info.action_space, acted, self._action),
+            nested(self.info.observation_space, observed, self._observation),
+            nested(self.info.action_space, acted, self._action),
             found.pop("reward"),
             terminated,
             truncated,
@@ -309,9 +310,9 @@ class RecordDataset(gym.Wrapper[Any, Any, Any, Any]):
         """Take one step."""
         observation, reward, terminated, truncated, info = self.env.step(action)
         values = {}
-        for key, value in _flat(info).items():
+        for path, value in leaves_by_path(info, lambda part: isinstance(part, tuple)):
             array = np.asarray(value)
-            values[key] = array[None] if array.dtype.kind in "biuf" else _objects([value])
+            values[".".join(map(str, path))] = array[None] if array.dtype.kind in "biuf" else _objects([value])
         ends = (np.array([terminated]), np.array([truncated]))
         columns = info_columns(values, 1) | self.extra
         self._add(self._tracks.step(_batched(action), _batched(observation), [reward], *ends, columns))
@@ -405,20 +406,10 @@ class RecordVectorDataset(VectorWrapper):
 
 
 def _batched(value: Any) -> Any:
-    if isinstance(value, Mapping):
-        return {key: _batched(one) for key, one in value.items()}
-    return tuple(_batched(one) for one in value) if isinstance(value, tuple) else np.asarray(value)[None]
+    return mapped(lambda array: np.asarray(array)[None], value)
 
 
 def _objects(values: list[Any]) -> Array:
     array = np.empty(len(values), object)
     array[:] = values
     return array
-
-
-def _flat(info: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Nested infos by dotted names."""
-    flat: dict[str, Any] = {}
-    for key, value in info.items():
-        flat |= _flat(value, f"{prefix}{key}.") if isinstance(value, Mapping) else {f"{prefix}{key}": value}
-    return flat

@@ -12,7 +12,7 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from bam_envs.core.spaces import space_from_json, space_to_json
+from bam_envs.core.spaces import Path, joined, leaves_by_path, part_at, place_of, space_from_json, space_to_json
 from bam_envs.core.wording import brief
 from bam_train.errors import BadDataSet
 
@@ -106,7 +106,7 @@ class Transitions:
 class Leaf:
     """A part of a space that is one array, and the column of its numbers."""
 
-    path: tuple[str | int, ...]
+    path: Path
     """Keys of Dict spaces and places in Tuple spaces from the root to it; () for the root."""
     shape: tuple[int, ...]
     dtype: np.dtype[Any]
@@ -115,9 +115,7 @@ class Leaf:
 
     def of(self, values: Values) -> Any:
         """Its part of nested `values`."""
-        for key in self.path:
-            values = values[key]
-        return values
+        return part_at(values, self.path)
 
 
 def leaves_of(space: gym.Space[Any], kind: str) -> list[Leaf]:
@@ -126,7 +124,7 @@ def leaves_of(space: gym.Space[Any], kind: str) -> list[Leaf]:
     Raises:
         BadDataSet: A space without a fixed number of values, such as Text.
     """
-    leaves = list(_leaves(space, kind, ()))
+    leaves = [_leaf(path, part, kind) for path, part in leaves_by_path(space)]
     names = [leaf.column for leaf in leaves]
     if len(set(names)) < len(names):
         twice = next(name for name in names if names.count(name) > 1)
@@ -134,42 +132,25 @@ def leaves_of(space: gym.Space[Any], kind: str) -> list[Leaf]:
     return leaves
 
 
-def _leaves(space: gym.Space[Any], kind: str, path: tuple[str | int, ...]) -> Any:
-    if isinstance(space, gym.spaces.Dict):
-        for key, part in space.spaces.items():
-            yield from _leaves(part, kind, (*path, key))
-    elif isinstance(space, gym.spaces.Tuple):
-        for place, part in enumerate(space.spaces):
-            yield from _leaves(part, kind, (*path, place))
-    elif isinstance(space, (gym.spaces.Box, gym.spaces.Discrete, gym.spaces.MultiDiscrete, gym.spaces.MultiBinary)):
-        shape, dtype = tuple(space.shape or ()), np.dtype(space.dtype)
-        is_image = kind == "observation" and dtype == np.uint8 and len(shape) == 3 and shape[2] in (1, 3, 4)
-        name = ".".join(str(part).replace("/", "_") for part in path)
-        if kind == "action":
-            column = f"action.{name}" if name else "action"
-        else:
-            column = f"observation.images.{name or 'camera'}" if is_image else f"observation.{name or 'state'}"
-        yield Leaf(path, shape, dtype, column, is_image)
-    else:
-        where = "".join(f"[{part!r}]" for part in path)
+def _leaf(path: Path, space: gym.Space[Any], kind: str) -> Leaf:
+    if not isinstance(space, gym.spaces.Box | gym.spaces.Discrete | gym.spaces.MultiDiscrete | gym.spaces.MultiBinary):
         raise BadDataSet(
-            f"the {kind} space{where} is {brief(space)}; a data set holds Box, Discrete, MultiDiscrete, MultiBinary, "
-            "and Dict and Tuple of them"
+            f"the {place_of(f'{kind} space', path)} is {brief(space)}; a data set holds Box, Discrete, MultiDiscrete, "
+            "MultiBinary, and Dict and Tuple of them"
         )
+    shape, dtype = tuple(space.shape or ()), np.dtype(space.dtype)
+    is_image = kind == "observation" and dtype == np.uint8 and len(shape) == 3 and shape[2] in (1, 3, 4)
+    name = ".".join(str(part).replace("/", "_") for part in path)
+    if kind == "action":
+        column = f"action.{name}" if name else "action"
+    else:
+        column = f"observation.images.{name or 'camera'}" if is_image else f"observation.{name or 'state'}"
+    return Leaf(path, shape, dtype, column, is_image)
 
 
-def joined(space: gym.Space[Any], arrays: Mapping[str, Array], leaves: list[Leaf]) -> Values:
+def nested(space: gym.Space[Any], arrays: Mapping[str, Array], leaves: list[Leaf]) -> Values:
     """Nested values of `space` from the arrays of its leaves by column."""
-    found = {leaf.path: arrays[leaf.column] for leaf in leaves}
-
-    def build(part: gym.Space[Any], path: tuple[str | int, ...]) -> Values:
-        if isinstance(part, gym.spaces.Dict):
-            return {key: build(one, (*path, key)) for key, one in part.spaces.items()}
-        if isinstance(part, gym.spaces.Tuple):
-            return tuple(build(one, (*path, place)) for place, one in enumerate(part.spaces))
-        return found[path]
-
-    return build(space, ())
+    return joined(space, {leaf.path: arrays[leaf.column] for leaf in leaves})
 
 
 def digest_of(arrays: Mapping[str, Array], *end: bool | None) -> str:

@@ -23,7 +23,7 @@ from bam_train.data.data_set import DataSet
 from bam_train.data.data_set_writer import DataSetWriter
 from bam_train.data.layout import INFO, Files
 from bam_train.data.record_dataset import info_of
-from bam_train.data.recorded_episode import Array, DataSetInfo, Episode, digest_of, joined, leaves_of
+from bam_train.data.recorded_episode import Array, DataSetInfo, Episode, digest_of, leaves_of, nested
 from bam_train.environments import make_env, must_be_named, require_env_kwargs
 from bam_train.errors import BadDataSet, BadRecording
 from bam_train.files.place import Place
@@ -157,7 +157,7 @@ def episodes_of(recording: Recording, info: DataSetInfo) -> Iterator[tuple[Episo
                 note = "left out: a picture is missing, which a slow disk costs"
         yield (
             Episode(
-                joined(info.observation_space, parts, leaves),
+                nested(info.observation_space, parts, leaves),
                 actions[first:last].reshape(last - first, *(info.action_space.shape or ())),
                 table.column("reward")[first + 1 : last + 1],
                 end["terminated"],

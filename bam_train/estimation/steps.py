@@ -10,6 +10,7 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
+from bam_envs.core.spaces import indexed
 from bam_train.data import DataSet, Episode
 from bam_train.errors import BadDataSet
 
@@ -119,9 +120,10 @@ def read_steps(data: DataSet, policy: Acting, indices: Sequence[int], by_success
 def _parts(episode: Episode, policy: Acting, info: Any, by_success: bool) -> tuple[Any, ...]:
     """The columns of `Steps` of an episode: observations and wanted have the shape (T + 1, ...)."""
     steps = len(episode)
+    observations = [indexed(episode.observations, t) for t in range(steps + 1)]
     policy.reset()
     if policy.recurrent:
-        actions = [policy.act(_at(episode.observations, t)) for t in range(steps + 1)]
+        actions = [policy.act(one) for one in observations]
     else:
         actions = list(policy.act_batch(episode.observations))
     ends = np.zeros(steps, np.bool_)
@@ -130,9 +132,9 @@ def _parts(episode: Episode, policy: Acting, info: Any, by_success: bool) -> tup
     if by_success:
         rewards = np.zeros(steps)
         rewards[-1] = float(episode.success or 0)
-    recorded = vectors(info.action_space, [_at(episode.actions, t) for t in range(steps)])
+    recorded = vectors(info.action_space, [indexed(episode.actions, t) for t in range(steps)])
     return (
-        vectors(info.observation_space, [_at(episode.observations, t) for t in range(steps + 1)]),
+        vectors(info.observation_space, observations),
         recorded,
         _meant(episode, recorded, info.action_space),
         vectors(info.action_space, actions),
@@ -160,10 +162,3 @@ def vectors(space: gym.Space[Any], values: Sequence[Any]) -> Floats:
         plain: Floats = np.asarray(values, np.float32).reshape(len(values), -1)
         return plain
     return np.stack([np.asarray(gym.spaces.flatten(space, value), np.float32) for value in values])
-
-
-def _at(values: Any, t: int) -> Any:
-    """Step `t` of arrays, or of dicts and tuples of arrays."""
-    if isinstance(values, dict):
-        return {name: _at(part, t) for name, part in values.items()}
-    return tuple(_at(part, t) for part in values) if isinstance(values, tuple) else values[t]

@@ -8,6 +8,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
+from bam_envs.core.spaces import leaves_by_path
 from bam_train.agent.front.jog import JOG_LIFETIME
 from bam_train.environments import control_period
 from bam_train.play.hands import Hand
@@ -300,8 +301,6 @@ def _layers(env: Any) -> list[Any]:
 
 def flat_numbers(value: Any) -> list[Any]:
     """The numbers of an observation in order; in the place of a picture, its size as a text."""
-    if isinstance(value, (dict, tuple)):
-        parts = value.values() if isinstance(value, dict) else value
-        return [one for part in parts for one in flat_numbers(part)]
-    array = np.asarray(value)
-    return [" x ".join(map(str, array.shape))] if array.ndim > 1 else np.ravel(array).tolist()
+    arrays = [np.asarray(part) for _, part in leaves_by_path(value)]
+    each = ([" x ".join(map(str, one.shape))] if one.ndim > 1 else one.ravel().tolist() for one in arrays)
+    return [number for numbers in each for number in numbers]

@@ -13,7 +13,7 @@ import pytest
 
 import bam_envs  # noqa: F401 - registers the environments
 from bam_envs.remote.remote_env import RemoteEnv, open_transport
-from bam_envs.remote.serve.local_transport import LocalTransport
+from bam_envs.remote.serve.env_server import LocalTransport
 
 HERE = Path(__file__).parent
 play = runpy.run_path(str(HERE / "play.py"))["play"]

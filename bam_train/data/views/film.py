@@ -6,6 +6,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from bam_envs.core.spaces import leaves_by_path, part_at
 from bam_envs.core.wording import did_you_mean
 from bam_train.data.data_set import DataSet
 from bam_train.data.recorded_episode import Episode, Leaf, leaves_of
@@ -62,8 +63,5 @@ def _played(data: DataSet, index: int, episode: Episode) -> Iterator[Frame]:
 
 
 def _is_same(found: object, recorded: object, step: int) -> bool:
-    if isinstance(recorded, dict) and isinstance(found, dict):
-        return all(_is_same(found[key], part, step) for key, part in recorded.items())
-    if isinstance(recorded, tuple) and isinstance(found, tuple):
-        return all(_is_same(one, part, step) for one, part in zip(found, recorded, strict=True))
-    return np.allclose(np.asarray(found), np.asarray(recorded)[step], rtol=_SAME, atol=_SAME, equal_nan=True)
+    pairs = [(part_at(found, path), array[step]) for path, array in leaves_by_path(recorded)]
+    return all(np.allclose(one, other, rtol=_SAME, atol=_SAME, equal_nan=True) for one, other in pairs)

@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 
 from bam_envs.core.errors import InvalidValue, ResetNeeded, UnknownName
 from bam_envs.core.robot import EnvIds, Robot, RobotState
+from bam_envs.core.spaces import indexed
 from bam_envs.core.task import Label, Score, Task
 from bam_envs.core.wording import brief
 
@@ -158,7 +159,7 @@ class RobotEnv(_RobotAndTask, gym.Env[Any, Any]):
         self.state = self.last_state = self._begin(self._first, [self.np_random], task_options)
         if self.render_mode == "human":
             self.render()
-        self._observed = first_of(self.task.observe(self.state))
+        self._observed = indexed(self.task.observe(self.state), 0)
         return self._observed, {"is_success": False}
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
@@ -167,7 +168,7 @@ class RobotEnv(_RobotAndTask, gym.Env[Any, Any]):
         batch = checked_action(self.action_space, action)[None]
         state = self.robot.step(self.task.command(batch, before))
         score = self.task.score(state, batch)
-        observation = first_of(self.task.observe(state))
+        observation = indexed(self.task.observe(state), 0)
         terminated = bool(score.terminated[0])
         self.state, self.last_state = None if terminated else state, state
         if self._tell_step is not None:
@@ -190,7 +191,7 @@ class RobotEnv(_RobotAndTask, gym.Env[Any, Any]):
         self.state = self.last_state = robot.load_state_dict(state["robot"])
         self.task.load_state_dict(state["task"])
         self.np_random.bit_generator.state = state["rng"]
-        self._observed = first_of(self.task.observe(self.state))
+        self._observed = indexed(self.task.observe(self.state), 0)
         return self._observed
 
     def render(self) -> NDArray[np.uint8] | None:  # type: ignore[override]
@@ -201,13 +202,6 @@ class RobotEnv(_RobotAndTask, gym.Env[Any, Any]):
         """Halt the robot and drop the link."""
         self.state = None
         self.robot.close()
-
-
-def first_of(observations: Any) -> Any:
-    """The observation of the first environment from those of n."""
-    if isinstance(observations, Mapping):
-        return {key: value[0] for key, value in observations.items()}
-    return observations[0]
 
 
 def checked_action(space: gym.Space[Any], action: Any) -> NDArray[Any]:

@@ -1,4 +1,7 @@
-"""Gymnasium spaces as plain JSON values and back, for the manifest of a checkpoint.
+"""Gymnasium spaces as plain JSON values and back; and the one walk over nested spaces and their values.
+
+A value of a Dict or Tuple space is nested: dicts and tuples, with leaves that are neither, such as arrays and numbers.
+The path of a leaf has the keys and places that lead to it; () is the path of a leaf alone.
 
 =============  ==========================================================================
 type           fields
@@ -19,7 +22,7 @@ encoded one, except that ``MultiBinary([n])`` becomes ``MultiBinary(n)``, which 
 
 import math
 from collections import OrderedDict
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 import numpy as np
@@ -31,6 +34,8 @@ from bam_envs.core.validation import check
 from bam_envs.core.wording import brief
 
 Json = dict[str, Any]
+Path = tuple[Any, ...]
+"""Keys and places that lead to a part of a nested value; see the top of the module."""
 _KINDS = ("Box", "Discrete", "MultiDiscrete", "MultiBinary", "Text", "Dict", "Tuple", "Sequence")
 _REFUSED = (AssertionError, AttributeError, OverflowError, TypeError, ValueError)
 """Errors of Gymnasium and NumPy for fields that do not fit."""
@@ -78,6 +83,62 @@ def space_text(space: Space[Any]) -> str:
 def leaves(space: Space[Any]) -> dict[str, Any]:
     """The spaces of a Dict by key, in alphabetical order; any other space by ``""``."""
     return {key: space[key] for key in sorted(space.spaces)} if isinstance(space, spaces.Dict) else {"": space}
+
+
+def parts_of(tree: Any) -> Mapping[Any, Any] | None:
+    """The parts of a mapping, tuple, or Dict or Tuple space, by key or place; None for a leaf."""
+    if isinstance(tree, np.ndarray):  # the usual case
+        return None
+    if isinstance(tree, Mapping):  # a Dict space too
+        return tree
+    return dict(enumerate(tree)) if isinstance(tree, (tuple, spaces.Tuple)) else None
+
+
+def leaves_by_path(
+    tree: Any, is_leaf: Callable[[Any], bool] = lambda part: False, path: Path = ()
+) -> Iterator[tuple[Path, Any]]:
+    """Path and leaf, for each leaf in order; a part for which `is_leaf` holds is one too."""
+    parts = None if is_leaf(tree) else parts_of(tree)
+    if parts is None:
+        yield path, tree
+    else:
+        for key, part in parts.items():
+            yield from leaves_by_path(part, is_leaf, (*path, key))
+
+
+def part_at(tree: Any, path: Path) -> Any:
+    """The part at `path`."""
+    for key in path:
+        tree = tree[key]
+    return tree
+
+
+def joined(tree: Any, values: Mapping[Path, Any], path: Path = ()) -> Any:
+    """Nested as in `tree`, from the part at each path of `values`; KeyError for a leaf without one."""
+    parts = parts_of(tree)
+    if parts is None or path in values:
+        return values[path]
+    each = {key: joined(part, values, (*path, key)) for key, part in parts.items()}
+    return each if isinstance(tree, Mapping) else tuple(each.values())
+
+
+def mapped(change: Callable[..., Any], tree: Any, *others: Any) -> Any:
+    """The results of `change` for each leaf of `tree`, and the leaves of `others` at its path, nested as in `tree`."""
+    parts = parts_of(tree)
+    if parts is None:
+        return change(tree, *others)
+    each = {key: mapped(change, part, *(other[key] for other in others)) for key, part in parts.items()}
+    return each if isinstance(tree, Mapping) else tuple(each.values())
+
+
+def indexed(tree: Any, index: Any) -> Any:
+    """Each leaf at `index`: a number, a slice or a mask."""
+    return mapped(lambda leaf: leaf[index], tree)
+
+
+def place_of(name: str, path: Path) -> str:
+    """The part at `path` of what is called `name`, such as ``observation['arm'][0]``."""
+    return name + "".join(f"[{key!r}]" for key in path)
 
 
 def space_from_json(value: Mapping[str, Any]) -> Space[Any]:

@@ -10,14 +10,12 @@ from urllib.parse import urlsplit
 
 from bam_envs.core.errors import InvalidValue, LinkLost, NoServer, ProtocolError, RemoteError
 from bam_envs.remote.wire.tcp_wire import (
-    ForeignPeer,
     FrameSocket,
     Hello,
     Leave,
-    Request,
     Reset,
     Step,
-    TagMessage,
+    TcpRequest,
     content_of,
     encode,
     pack_action,
@@ -26,7 +24,8 @@ from bam_envs.remote.wire.tcp_wire import (
 from bam_envs.remote.wire.transport import EnvSpecMessage, Info, Seed, plain_seed, spec_from_json, spec_to_json
 from bam_envs.remote.wire.values import Tree, plain_info
 from bam_envs.ros.freshness import Tagger
-from bam_envs.rosbridge.endpoint import Endpoint
+from bam_envs.rosbridge.dialing import no_connection
+from bam_envs.rosbridge.endpoint import Address, Endpoint
 
 _LEAVE_TIMEOUT = 1.0  # [s]; a server that is gone must not delay `close`
 
@@ -70,12 +69,10 @@ class TcpTransport:
             raise InvalidValue(f"{url!r} is not a TCP address: {error}.") from error
         if parts.scheme != "tcp" or not host or not port or parts.path.strip("/"):
             raise InvalidValue(f"A TCP address is tcp://host:port, such as tcp://10.0.0.5:5555, not {url!r}.")
-        self._host, self._port = host, port
-        self._name = name
-        self._tagger, self._epoch = Tagger(), 0
+        self._address, self._name = Address(host, port, False, ""), name
+        self._tagger, self._epoch, self._pid = Tagger(), 0, 0
         self._lock = threading.Lock()
         self._frames: FrameSocket | None = None
-        self._pid = 0
         self._spec: EnvSpecMessage | None = None
         self._closed = False
 
@@ -88,10 +85,10 @@ class TcpTransport:
         """Begin an episode; reconnects if the link dropped."""
         plain = plain_seed(seed)
         with self._lock:
-            spec = self._connected()
-            tag = self._tag(self.timeout)
-            tree = self._ask(Reset(tag, plain, None if options is None else plain_info(options), self.take))
-            return self._result(spec, tree, 2)
+            self._connected()
+            given = None if options is None else plain_info(options)
+            begun: tuple[Any, Any] = self._ask(Reset, self.timeout, plain, given, self.take, size=2)
+            return begun
 
     def step(self, action: Any) -> tuple[Any, Any, Any, Any, Any]:
         """(observation, reward, terminated, truncated, info)."""
@@ -100,7 +97,8 @@ class TcpTransport:
                 why = "this transport is closed" if self._closed else "the link is down"
                 raise LinkLost(f"{self.url}: {why}, and nothing was sent. Call reset() to connect again.")
             packed = pack_action(self._spec, action)
-            return self._result(self._spec, self._ask(Step(self._tag(self.timeout), packed)), 5)
+            stepped: tuple[Any, Any, Any, Any, Any] = self._ask(Step, self.timeout, packed, size=5)
+            return stepped
 
     def close(self) -> None:
         """Release the environment and drop the link; a request that is under way ends with `LinkLost`."""
@@ -109,7 +107,7 @@ class TcpTransport:
             try:
                 if self._is_up():
                     with suppress(LinkLost, ProtocolError, RemoteError):  # the server notices that a link is gone
-                        self._ask(Leave(self._tag(min(self.timeout, _LEAVE_TIMEOUT))))
+                        self._ask(Leave, min(self.timeout, _LEAVE_TIMEOUT))
                 self._drop()
             finally:
                 self._lock.release()
@@ -124,7 +122,7 @@ class TcpTransport:
         if self._spec is not None and not self._closed and self._is_up():
             return self._spec
         if self._frames is not None and not self._closed:  # after a fork: the link and the session are the parent's
-            self._frames.abandon()
+            self._frames.close(ends=False)
             self._frames, self._tagger, self._epoch = None, Tagger(), 0
         try:
             self._require_open()
@@ -145,69 +143,53 @@ class TcpTransport:
             raise LinkLost(f"{self.url}: this transport is closed; make a new one.")
 
     def _open(self) -> EnvSpecMessage:
-        deadline = time.monotonic() + self.endpoint.connect_timeout
-        start = f"bam-serve --env {self.env_id or 'bam/pick'} --tcp"
-        try:
-            self._frames = FrameSocket(_dial(self._host, self._port, deadline))
-        except OSError as error:
-            if isinstance(error, ConnectionRefusedError):
-                reason = "nothing listens there (is the port open?)"
-            elif isinstance(error, TimeoutError):
-                limit = f"{self.endpoint.connect_timeout:g} s"
-                reason = f"no answer within {limit} (is the address right, and no firewall between?)"
-            elif isinstance(error, socket.gaierror):
-                reason = f"no computer is known by the name {self._host!r}"
-            else:
-                reason = error.strerror or str(error)
-            raise NoServer(self.url, f"{reason}. Start one: {start} {self._port}") from error
-        self._pid, self._epoch = os.getpid(), self._epoch + 1
-        name = self._name or f"{socket.gethostname()}:{self._pid}"
-        hello = Hello(self._tagger.session, self._epoch, name, self.endpoint.token or "", self.env_id)
-        try:
-            self._frames.send(encode(["hello", hello]), deadline)
-            return spec_from_json(content_of(self._frames.receive(deadline), 0))
-        except (ForeignPeer, RemoteError) as error:
-            raise NoServer(self.url, f"{error}") from error
-        except (LinkLost, ProtocolError) as error:
-            remedy = f"If it is rosbridge, use ws://; else start one at a free port: {start} PORT"
-            raise NoServer(self.url, f"not a bam-serve TCP server: {error}. {remedy}") from error
-
-    def _tag(self, limit: float) -> TagMessage:
-        tag = self._tagger.next(self._epoch, limit)
-        return TagMessage(tag.session, tag.epoch, tag.sequence, tag.sent, tag.deadline)
-
-    def _ask(self, request: Request) -> Tree:
-        """Send a request and return the content of its answer; after any other outcome the link is down."""
-        frames, limit = self._frames, request.tag.lifetime
-        if frames is None:
-            raise LinkLost(f"{self.url}: the link is down.")
-        parts = encode(request)
+        limit, start = self.endpoint.connect_timeout, f"Start one: bam-serve --env {self.env_id or 'bam/pick'} --tcp"
         deadline = time.monotonic() + limit
         try:
-            frames.send(parts, deadline)
-            return content_of(frames.receive(deadline), request.tag.sequence)
+            self._frames = FrameSocket(_dial(self._address, deadline))
+        except OSError as error:
+            reason = no_connection(self._address, error, limit, f"{start} {self._address.port}")
+            raise NoServer(self.url, reason) from error
+        self._pid, self._epoch = os.getpid(), self._epoch + 1
+        name = self._name or f"{socket.gethostname()}:{self._pid}"
+        try:
+            content = name, self.endpoint.token or "", self.env_id
+            return spec_from_json(self._exchange(self._frames, Hello, deadline, *content))
+        except RemoteError as error:
+            raise NoServer(self.url, str(error)) from error
+        except (LinkLost, ProtocolError) as error:
+            remedy = f"If it is rosbridge, use ws://. {start} PORT, at a free port."
+            raise NoServer(self.url, f"no usable bam-serve TCP server: {error}. {remedy}") from error
+
+    def _exchange(self, frames: FrameSocket, kind: type[TcpRequest], deadline: float, *content: Any) -> Tree:
+        """Send a request and return the content of its answer, which must come before `deadline` [s, monotonic]."""
+        tag = self._tagger.next(self._epoch, deadline - time.monotonic())
+        frames.send(encode(kind(tag.to_text(), *content)), deadline)
+        return content_of(frames.receive(deadline), tag.sequence)
+
+    def _ask(self, kind: type[TcpRequest], limit: float, *content: Any, size: int = 0) -> Any:
+        """As `_exchange`, within `limit` [s]; reads a result of `size` values. On any other error the link drops."""
+        if self._frames is None or self._spec is None:
+            raise LinkLost(f"{self.url}: the link is down.")
+        deadline = time.monotonic() + limit
+        try:
+            answer = self._exchange(self._frames, kind, deadline, *content)
+            return read_result(self._spec, answer, size) if size else answer
         except RemoteError:
             raise
-        except LinkLost as error:
+        except BaseException as error:  # even Ctrl-C: a late answer would be taken for that of the next request
             self._drop()
-            reason = str(error)
+            if not isinstance(error, (LinkLost, ProtocolError)):
+                raise
+            reason = str(error).rstrip(".")
             if self._closed:
                 reason = "this transport was closed meanwhile"
-            elif time.monotonic() >= deadline:
-                reason = f"no answer to {type(request).__name__.lower()} within {limit:g} s"
-            raise LinkLost(f"{self.url}: {reason}.") from error
-        except BaseException:  # even Ctrl-C: a late answer would be taken for that of the next request
-            self._drop()
-            raise
+            elif isinstance(error, LinkLost) and time.monotonic() >= deadline:
+                reason = f"no answer to {kind.__name__.lower()} within {limit:g} s"
+            raise type(error)(f"{self.url}: {reason}.") from error
         finally:
             if self._closed:  # by another thread, which only hung up
                 self._drop()
-
-    def _result(self, spec: EnvSpecMessage, tree: Tree, size: int) -> tuple[Any, ...]:
-        try:
-            return read_result(spec, tree, size)
-        except ProtocolError as error:
-            raise ProtocolError(f"{self.url}: {error}") from error
 
     def _drop(self) -> None:
         frames, self._frames = self._frames, None
@@ -215,12 +197,12 @@ class TcpTransport:
             frames.close()
 
 
-def _dial(host: str, port: int, deadline: float) -> socket.socket:
-    """A socket that is connected before `deadline` to one of the addresses of the name."""
-    refusal = OSError("it has no address")
-    for *_, address in socket.getaddrinfo(host, port, type=socket.SOCK_STREAM):
+def _dial(address: Address, deadline: float) -> socket.socket:
+    """A socket that is connected before `deadline` [s, monotonic] to one of the IP addresses of a host."""
+    refusal = OSError("the name has no address")
+    for *_, found in socket.getaddrinfo(address.host, address.port, type=socket.SOCK_STREAM):
         try:
-            return socket.create_connection((str(address[0]), int(address[1])), max(0.01, deadline - time.monotonic()))
+            return socket.create_connection((str(found[0]), int(found[1])), max(0.01, deadline - time.monotonic()))
         except OSError as error:  # noqa: PERF203 - the next address may answer
             refusal = error
     raise refusal

@@ -9,6 +9,8 @@ from bam_envs.rosbridge.endpoint import Address
 
 _HOST_MISMATCH = (62, 64)  # X509_V_ERR_HOSTNAME_MISMATCH, X509_V_ERR_IP_ADDRESS_MISMATCH
 
+_LAUNCH = "ros2 launch rosbridge_server rosbridge_websocket_launch.xml"
+
 
 async def open_port(address: Address, timeout: float) -> socket.socket:
     """A TCP connection to a server; `NoServer` gives the reason why there is none within `timeout` [s]."""
@@ -41,8 +43,8 @@ async def _open_tcp(address: Address) -> socket.socket:
     raise OSError("the name has no address")
 
 
-def no_connection(address: Address, error: OSError | asyncio.TimeoutError, timeout: float) -> str:
-    """The reason why no TCP or TLS connection was made within `timeout` [s]."""
+def no_connection(address: Address, error: OSError | asyncio.TimeoutError, timeout: float, start: str = "") -> str:
+    """The reason why no TCP or TLS connection was made within `timeout` [s]; `start` is how to start a server."""
     if isinstance(error, ssl.SSLCertVerificationError):
         reason = error.verify_message.rstrip(".")
         if error.verify_code in _HOST_MISMATCH:
@@ -56,10 +58,8 @@ def no_connection(address: Address, error: OSError | asyncio.TimeoutError, timeo
     if isinstance(error, socket.gaierror):
         return f"the name {address.host!r} is not known: {error.strerror}. Try the IP address."
     if isinstance(error, ConnectionRefusedError):
-        return (
-            f"refused: nothing listens there. Is the port open? Start one with `bam-serve --env bam/pick --port "
-            f"{address.port}` or `ros2 launch rosbridge_server rosbridge_websocket_launch.xml`."
-        )
+        here = f"Start one with `bam-serve --env bam/pick --port {address.port}` or `{_LAUNCH}`."
+        return f"refused: nothing listens there. Is the port open? {start or here}"
     if isinstance(error, ConnectionError):
         hint = "If the server has no TLS, use ws://." if address.secure else "Is it the right port?"
         return f"the connection was cut while it was made. {hint}"

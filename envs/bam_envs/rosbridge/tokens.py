@@ -1,4 +1,7 @@
-"""Shared secrets that clients show to servers, and the limit on guesses."""
+"""Who comes into a server: the shared secrets that clients show, the limit on guesses, and the places of clients.
+
+Some places are kept for higher roles, and who says nothing gives way.
+"""
 
 from __future__ import annotations
 
@@ -9,10 +12,10 @@ import os
 import stat
 import threading
 import time
-from collections import deque
-from collections.abc import Callable, Iterable, Mapping
+from collections import Counter, deque
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Literal, get_args
+from typing import Literal, Protocol, TypeVar, get_args
 
 from bam_envs.core.errors import InvalidValue
 
@@ -24,6 +27,8 @@ _WINDOW = 1.0
 _OF_ONE, _OF_ALL = 4, 32  # wrong tokens from one address, and from all that were wrong lately, in `_WINDOW` [s]
 _LATELY = 60.0
 _MOST_ADDRESSES = 4096
+_KEPT = 4
+"""A quarter of the places is kept for each higher role."""
 
 
 def read_token(path: str | Path) -> str:
@@ -190,3 +195,46 @@ def network_of(address: str) -> str:
         mapped = parsed.ipv4_mapped
         return str(mapped) if mapped is not None else str(ipaddress.ip_network((parsed, 64), strict=False))
     return str(parsed)
+
+
+class Client(Protocol):
+    """A client, as far as its place is concerned."""
+
+    host: str
+    """Its network address."""
+    role: Role | None
+    """What it may do; None counts as the least role."""
+    born: float
+    """When it connected [s, monotonic]."""
+    spoke: float
+    """When it last sent a message after its admission [s, monotonic]; 0 if it has sent none."""
+
+
+AnyClient = TypeVar("AnyClient", bound=Client)
+
+
+def places(most: int, role: Role, known: Iterable[Role]) -> int:
+    """How many of `most` places are open to a role, if the server has tokens of the roles `known`."""
+    return most - most // _KEPT * sum(ROLES.index(one) > ROLES.index(role) for one in set(known))
+
+
+def who_leaves(newcomer: Client, present: Sequence[AnyClient]) -> AnyClient | None:
+    """The client that gives its place to a newcomer where all are taken; None if everybody may stay.
+
+    Nobody leaves for a lower role. Who never sent a message leaves first, the oldest of the address with the most of
+    them. Then an address with at least two more clients than that of the newcomer gives up the one that has been silent
+    for longest: whoever drives is the last one of these.
+    """
+    rank = _rank(newcomer)
+    rivals = [one for one in present if _rank(one) <= rank]
+    among = [one for one in rivals if not one.spoke] or rivals
+    counts = Counter(network_of(one.host) for one in among)
+    if not counts:
+        return None
+    where, most = counts.most_common(1)[0]
+    leaves = min((one for one in among if network_of(one.host) == where), key=lambda one: one.spoke or one.born)
+    return None if leaves.spoke and most < counts[network_of(newcomer.host)] + 2 else leaves
+
+
+def _rank(client: Client) -> int:
+    return 0 if client.role is None else ROLES.index(client.role)

@@ -11,7 +11,16 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import array_shapes, arrays
 
 from bam_envs.core.errors import InvalidValue, UnknownName
-from bam_envs.core.spaces import space_from_json, space_to_json
+from bam_envs.core.spaces import (
+    indexed,
+    joined,
+    leaves_by_path,
+    mapped,
+    part_at,
+    place_of,
+    space_from_json,
+    space_to_json,
+)
 
 FLOATS, INTS = ("float16", "float32", "float64"), ("uint8", "int8", "int32", "int64", "uint16")
 
@@ -228,3 +237,32 @@ def test_reading_does_not_change_what_it_is_given() -> None:
     before = json.dumps(value)
     space_from_json(value)
     assert json.dumps(value) == before
+
+
+NESTED = spaces.Dict(
+    {"arm": spaces.Dict({"q": spaces.Box(-1, 1, (2,))}), "pair": spaces.Tuple([spaces.Discrete(2)] * 2)}
+)
+PATHS = [("arm", "q"), ("pair", 0), ("pair", 1)]
+
+
+def test_the_walk_over_a_space_and_its_values():
+    value = {"arm": {"q": np.float32([0.5, 1])}, "pair": (np.int64(0), np.int64(1))}
+    for tree in (NESTED, value):
+        assert [path for path, _ in leaves_by_path(tree)] == PATHS
+        assert [part is part_at(tree, path) for path, part in leaves_by_path(tree)] == [True] * 3
+        assert joined(tree, dict(zip(PATHS, "abc", strict=True))) == {"arm": {"q": "a"}, "pair": ("b", "c")}
+        assert joined(tree, {("arm",): 1, ("pair",): 2}) == {"arm": 1, "pair": 2}
+        with pytest.raises(KeyError):
+            joined(tree, {("arm",): 1})
+    assert [path for path, _ in leaves_by_path(value, lambda part: isinstance(part, tuple))] == [
+        ("arm", "q"),
+        ("pair",),
+    ]
+    shapes = mapped(lambda space, one: (space.shape, np.shape(one)), NESTED, value)
+    assert shapes == {"arm": {"q": ((2,), (2,))}, "pair": (((), ()), ((), ()))}
+    twice = mapped(lambda one: np.stack([one, one]), value)
+    assert indexed(twice, 1)["pair"] == (0, 1)
+    assert indexed(twice, slice(1))["arm"]["q"].shape == (1, 2)
+    assert list(leaves_by_path(3)) == [((), 3)]
+    assert list(leaves_by_path({})) == []
+    assert place_of("observation", ("arm", 0)) == "observation['arm'][0]"

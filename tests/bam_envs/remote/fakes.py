@@ -6,7 +6,7 @@ import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 
-from bam_envs.remote.serve.local_transport import LocalTransport
+from bam_envs.remote.serve.env_server import LocalTransport
 
 
 class FakeEnv(gym.Env):

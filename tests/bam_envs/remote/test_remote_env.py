@@ -12,8 +12,7 @@ from gymnasium.utils.env_checker import check_env
 from bam_envs.core.errors import InvalidValue, LinkLost, ResetNeeded
 from bam_envs.core.registry import ENVIRONMENTS
 from bam_envs.remote.remote_env import RemoteEnv, RemoteVectorEnv, make_remote_env, make_remote_vector_env
-from bam_envs.remote.serve.env_server import EnvServer
-from bam_envs.remote.serve.local_transport import LocalTransport
+from bam_envs.remote.serve.env_server import EnvServer, LocalTransport
 from bam_envs.remote.serve.tcp_server import TcpServer
 from bam_envs.remote.tcp_transport import TcpTransport
 from tests.bam_envs.remote.fakes import FakeEnv, FakeTransport

@@ -12,8 +12,7 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from bam_envs.core.errors import InvalidValue, LinkLost, ResetNeeded
 from bam_envs.core.registry import ENVIRONMENTS
 from bam_envs.remote.remote_vector_env import RemoteVectorEnv, join_infos
-from bam_envs.remote.serve.env_server import EnvServer, split_infos
-from bam_envs.remote.serve.local_transport import LocalTransport
+from bam_envs.remote.serve.env_server import EnvServer, LocalTransport, split_infos
 from bam_envs.remote.serve.tcp_server import TcpServer
 from bam_envs.remote.tcp_transport import TcpTransport
 from bam_envs.testing.transports import assert_same_value

@@ -17,6 +17,7 @@ from bam_envs.remote.serve.tcp_server import TcpServer
 from bam_envs.remote.tcp_transport import TcpTransport
 from bam_envs.remote.wire.tcp_wire import FrameSocket, encode
 from bam_envs.remote.wire.transport import spec_to_json
+from bam_envs.ros.freshness import read_tag
 from bam_envs.testing.transports import MirrorEnv
 from tests.bam_envs.remote.fakes import FakeEnv
 
@@ -77,7 +78,7 @@ def answering(*answers):
 
 def welcome(sock, frames, tree):
     spec = EnvServer(FakeEnv()).spec()
-    frames.send(encode([0, "ok", spec_to_json(spec)]), time.monotonic() + PATIENCE)
+    telling("ok", spec_to_json(spec))(sock, frames, tree)
 
 
 def hang_up(sock, frames, tree):
@@ -89,7 +90,10 @@ def saying(data):
 
 
 def telling(kind, content):
-    return lambda sock, frames, tree: frames.send(encode([tree[1][2], kind, content]), time.monotonic() + PATIENCE)
+    def tell(sock, frames, tree):
+        frames.send(encode([read_tag(tree[1]).sequence, kind, content]), time.monotonic() + PATIENCE)
+
+    return tell
 
 
 def refused(url, **options):
@@ -112,7 +116,7 @@ def test_many_addresses_take_no_longer_than_one(monkeypatch):
     found = [(socket.AF_INET, socket.SOCK_STREAM, 6, "", (f"10.0.0.{number}", 5)) for number in range(3)]
     monkeypatch.setattr(socket, "getaddrinfo", lambda *_, **options: found)
     monkeypatch.setattr(socket, "create_connection", silent)
-    assert refused("tcp://many:5", connect_timeout=0.1).startswith("no answer within 0.1 s")
+    assert refused("tcp://many:5", connect_timeout=0.1).startswith("no connection within 0.1 s")
     assert sum(limits) == pytest.approx(0.1, abs=0.03)
 
 
@@ -120,14 +124,15 @@ def test_nobody_listens():
     with socket.create_server(("127.0.0.1", 0)) as free:
         port = free.getsockname()[1]
     assert refused(f"tcp://127.0.0.1:{port}") == (
-        f"nothing listens there (is the port open?). Start one: bam-serve --env bam/pick --tcp {port}"
+        f"refused: nothing listens there. Is the port open? Start one: bam-serve --env bam/pick --tcp {port}"
     )
     assert refused(f"tcp://127.0.0.1:{port}", env_id="bam/reach").endswith(f"bam-serve --env bam/reach --tcp {port}")
 
 
 def test_a_name_that_nobody_has():
     text = refused("tcp://nobody.invalid:5555")
-    assert text == ("no computer is known by the name 'nobody.invalid'. Start one: bam-serve --env bam/pick --tcp 5555")
+    assert text.startswith("the name 'nobody.invalid' is not known: ")
+    assert text.endswith(". Try the IP address.")
 
 
 def test_somebody_listens_and_says_nothing():
@@ -135,7 +140,7 @@ def test_somebody_listens_and_says_nothing():
         url = f"tcp://127.0.0.1:{silent.getsockname()[1]}"
         begun = time.monotonic()
         assert refused(url, connect_timeout=0.05).startswith(
-            "not a bam-serve TCP server: timed out. If it is rosbridge, use ws://; "
+            "no usable bam-serve TCP server: timed out. If it is rosbridge, use ws://. "
         )
         assert time.monotonic() - begun < 3
 
@@ -143,23 +148,23 @@ def test_somebody_listens_and_says_nothing():
 def test_somebody_who_hangs_up():
     with answering(hang_up) as (url, _):
         assert refused(url) == (
-            "not a bam-serve TCP server: the other end closed the connection. If it is rosbridge, use ws://; "
-            "else start one at a free port: bam-serve --env bam/pick --tcp PORT"
+            "no usable bam-serve TCP server: the other end closed the connection. If it is rosbridge, use ws://. "
+            "Start one: bam-serve --env bam/pick --tcp PORT, at a free port."
         )
 
 
 def test_a_server_of_http():
     with answering(saying(b"HTTP/1.1 400 Bad Request\r\n\r\n")) as (url, _):
-        assert refused(url) == (
-            "not a bam-serve TCP server: it says b'HTTP/1.1 400'; rosbridge servers have ws:// URLs"
-        )
+        text = "no usable bam-serve TCP server: it says b'HTTP/1.1'. If it is rosbridge, use ws://. "
+        assert refused(url).startswith(text)
 
 
 @pytest.mark.parametrize("content", [{}, 3, {"env_id": "x"}])
 def test_a_description_that_is_none(content):
-    answer = lambda sock, frames, tree: frames.send(encode([0, "ok", content]), time.monotonic() + PATIENCE)  # noqa: E731
-    with answering(answer) as (url, _):
-        assert refused(url).startswith("not a bam-serve TCP server: Expected the description of an environment, found ")
+    with answering(telling("ok", content)) as (url, _):
+        assert refused(url).startswith(
+            "no usable bam-serve TCP server: Expected the description of an environment, found "
+        )
 
 
 def test_requests_carry_session_epoch_sequence_and_deadline():
@@ -168,10 +173,10 @@ def test_requests_carry_session_epoch_sequence_and_deadline():
         transport.connect()
         transport.reset(5)
         transport.close()
-    kind, (session, epoch, sequence, sent, deadline), seed, options, take = asked[1]
-    assert (kind, seed, options, take) == ("reset", 5, None, False)
-    assert (session, epoch, sequence) == (asked[0][1]["session"], 1, 1)
-    assert round(deadline - sent, 3) == 7.0
+    hello, tag = read_tag(asked[0][1]), read_tag(asked[1][1])
+    assert (asked[1][0], *asked[1][2:]) == ("reset", 5, None, False)
+    assert (tag.session, tag.epoch, tag.sequence) == (hello.session, 1, 2)
+    assert round(tag.deadline - tag.sent, 3) == 7.0
 
 
 def test_a_lost_link_stays_down_until_a_reset_and_nothing_is_sent_again(env):
@@ -229,7 +234,7 @@ def test_an_answer_to_another_request_drops_the_link():
         transport = TcpTransport(url)
         with pytest.raises(ProtocolError) as caught:
             transport.reset()
-        assert str(caught.value) == "Expected the answer to request 1, found [99, 'ok', None]."
+        assert str(caught.value) == f"{url}: Expected the answer to request 2, found [99, 'ok', None]."
         with pytest.raises(LinkLost):
             transport.step(ACTION)
         transport.close()

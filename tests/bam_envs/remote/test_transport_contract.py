@@ -1,7 +1,6 @@
 """Every transport keeps the same promises."""
 
-from bam_envs.remote.serve.env_server import EnvServer
-from bam_envs.remote.serve.local_transport import LocalTransport
+from bam_envs.remote.serve.env_server import EnvServer, LocalTransport
 from bam_envs.remote.serve.tcp_server import TcpServer
 from bam_envs.remote.tcp_transport import TcpTransport
 from bam_envs.remote.wire.transport import Transport

@@ -4,7 +4,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from bam_envs.rosbridge.places import places, who_leaves
+from bam_envs.rosbridge.tokens import places, who_leaves
 
 EVERY = ("watch", "drive", "administer")
 

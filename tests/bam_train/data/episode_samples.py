@@ -3,6 +3,7 @@
 import gymnasium as gym
 import numpy as np
 
+from bam_envs.core.spaces import mapped
 from bam_train.data import DataSetInfo, DataSetWriter, Episode
 
 SPACES = {
@@ -34,11 +35,7 @@ def info_of(observation="box", action="box", **changes):
 
 def samples(space, count):
     """`count` values of a space, as arrays with the steps first."""
-    if isinstance(space, gym.spaces.Dict):
-        return {key: samples(part, count) for key, part in space.spaces.items()}
-    if isinstance(space, gym.spaces.Tuple):
-        return tuple(samples(part, count) for part in space.spaces)
-    return np.stack([np.asarray(space.sample(), space.dtype) for _ in range(count)])
+    return mapped(lambda part: np.stack([np.asarray(part.sample(), part.dtype) for _ in range(count)]), space)
 
 
 def episode(info, steps, seed=0, **changes):
@@ -48,21 +45,6 @@ def episode(info, steps, seed=0, **changes):
     values |= {"truncated": seed % 2 == 1, "success": [True, False, None][seed % 3], "facts": {"seed": seed}}
     values |= {"observations": samples(info.observation_space, steps + 1), "actions": samples(info.action_space, steps)}
     return Episode(**{**values, **changes})
-
-
-def assert_equal(found, expected):
-    """The same structure, dtypes, shapes and bits."""
-    assert type(found) is type(expected)
-    if isinstance(expected, dict):
-        assert list(found) == list(expected)
-        found, expected = tuple(found.values()), tuple(expected.values())
-    if isinstance(expected, tuple):
-        assert len(found) == len(expected)
-        for one, other in zip(found, expected, strict=True):
-            assert_equal(one, other)
-    else:
-        assert (found.dtype, found.shape) == (expected.dtype, expected.shape)
-        assert found.tobytes() == expected.tobytes()
 
 
 def write(place, info, episodes, **options):

@@ -6,9 +6,10 @@ import shutil
 import numpy as np
 import pytest
 
+from bam_envs.testing.assertions import assert_same_value
 from bam_train.data import DataSet, DataSetWriter
 from bam_train.errors import BadDataSet
-from tests.bam_train.data.episode_samples import SPACES, assert_equal, episode, info_of, write
+from tests.bam_train.data.episode_samples import SPACES, episode, info_of, write
 
 pytest.importorskip("pyarrow")
 
@@ -23,9 +24,9 @@ def test_every_number_comes_back(tmp_path, observation, action):
     assert (len(data), data.info) == (4, info)
     assert data.digests == [one.digest for one in written]
     for found, expected in zip(data.episodes(), written, strict=True):
-        assert_equal(found.observations, expected.observations)
-        assert_equal(found.actions, expected.actions)
-        assert_equal(found.rewards, expected.rewards)
+        assert_same_value(found.observations, expected.observations)
+        assert_same_value(found.actions, expected.actions)
+        assert_same_value(found.rewards, expected.rewards)
         for name in ("terminated", "truncated", "success", "facts", "digest"):
             assert getattr(found, name) == getattr(expected, name)
 
@@ -36,7 +37,7 @@ def test_bits_that_are_no_numbers_come_back(tmp_path):
     one = episode(info, 3)
     one.observations[:2] = odd.reshape(2, 3)
     write(tmp_path / "d", info, [one])
-    assert_equal(DataSet.open(tmp_path / "d")[0].observations, one.observations)
+    assert_same_value(DataSet.open(tmp_path / "d")[0].observations, one.observations)
 
 
 def test_further_columns_of_some_episodes(tmp_path):
@@ -53,7 +54,7 @@ def test_further_columns_of_some_episodes(tmp_path):
         if name == "guard":
             assert values.tolist() == columns[name].tolist()
         else:
-            assert_equal(values, columns[name])
+            assert_same_value(values, columns[name])
 
 
 def test_order_indices_and_transitions(tmp_path):
@@ -76,9 +77,9 @@ def test_order_indices_and_transitions(tmp_path):
     steps = data.transitions([3, 2])
     assert steps.episode.tolist() == [3] * 5 + [2] * 4
     assert steps.terminals.tolist() == [False] * 8 + [True]
-    assert_equal(steps.observations, np.concatenate([written[k].observations[:-1] for k in (3, 2)]))
-    assert_equal(steps.next_observations, np.concatenate([written[k].observations[1:] for k in (3, 2)]))
-    assert_equal(steps.actions, np.concatenate([written[k].actions for k in (3, 2)]))
+    assert_same_value(steps.observations, np.concatenate([written[k].observations[:-1] for k in (3, 2)]))
+    assert_same_value(steps.next_observations, np.concatenate([written[k].observations[1:] for k in (3, 2)]))
+    assert_same_value(steps.actions, np.concatenate([written[k].actions for k in (3, 2)]))
 
 
 @pytest.mark.parametrize(

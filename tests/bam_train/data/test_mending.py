@@ -10,12 +10,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from bam_envs.testing.assertions import assert_same_value
 from bam_train.cli.data import bam_data
 from bam_train.data import DataSet, DataSetWriter
 from bam_train.data.layout import Files
 from bam_train.data.mending import look, mend
 from bam_train.errors import BadDataSet
-from tests.bam_train.data.episode_samples import assert_equal, episode, info_of, write
+from tests.bam_train.data.episode_samples import episode, info_of, write
 
 pytest.importorskip("pyarrow")
 ROOT = Path(__file__).parents[3]
@@ -47,7 +48,7 @@ def seeds(place):
     for index, one in enumerate(data.episodes()):
         written = numbered(one.facts["seed"])
         for name in ("observations", "actions", "rewards", "columns"):
-            assert_equal(getattr(one, name), getattr(written, name))
+            assert_same_value(getattr(one, name), getattr(written, name))
         assert (one.terminated, one.truncated, one.success) == (written.terminated, written.truncated, written.success)
         assert one.facts == written.facts
         assert data.facts(index)["return"] == written.rewards.sum()
@@ -184,12 +185,12 @@ def test_without_copies_the_steps_say_what_the_episodes_file_does_not(place, cap
     for index, steps in ((2, 4), (3, 4)):
         found, written = data[index], numbered(index)
         for name in ("observations", "actions", "rewards"):
-            assert_equal(getattr(found, name)[:steps], getattr(written, name)[:steps])
+            assert_same_value(getattr(found, name)[:steps], getattr(written, name)[:steps])
         assert found.columns["guard"].tolist() == [f"g{index}"] * steps
     assert (data[2].terminated, data[2].facts) == (True, {"lost": "last observation"})
     assert data[2].observations[-1].tolist() == data[2].observations[-2].tolist()
     assert (data[3].truncated, data[3].facts) == (True, {"lost": "last step"})
-    assert_equal(data[3].observations[-1], numbered(3).observations[4])
+    assert_same_value(data[3].observations[-1], numbered(3).observations[4])
 
 
 def test_a_damaged_copy_costs_nothing(place, capsys):

@@ -6,10 +6,11 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
+from bam_envs.testing.assertions import assert_same_value
 from bam_train.cli.data import bam_data
 from bam_train.data import DataSet, DataSetInfo
 from bam_train.data.export import export
-from tests.bam_train.data.episode_samples import SPACES, assert_equal, episode, write
+from tests.bam_train.data.episode_samples import SPACES, episode, write
 
 pa, pq = pytest.importorskip("pyarrow"), pytest.importorskip("pyarrow.parquet")
 ENV = "test/Rows-v0"
@@ -51,8 +52,8 @@ def test_exported_rows_come_back_bit_for_bit(observation, action, import_):
     assert found.digests == DataSet.open("data").digests
     assert found.info == info
     for number, (one, other) in enumerate(zip(found, episodes, strict=True)):
-        assert_equal(one.observations, other.observations)
-        assert_equal(one.actions, other.actions)
+        assert_same_value(one.observations, other.observations)
+        assert_same_value(one.actions, other.actions)
         facts = {"recording": "rows", "number": number, "eps_id": f"{number:06d}", "group": "cell-7"}
         assert one.facts == facts
     note = "bam-data: note: rows: episode 0 and 2 more: is in back already\n"

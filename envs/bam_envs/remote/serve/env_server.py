@@ -1,4 +1,4 @@
-"""One environment, its episode and the lease on it, shared by all services of `bam-serve`.
+"""One environment, its episode and the lease on it, shared by all services of `bam-serve`; and LocalTransport.
 
 The environment runs in the calling thread, one request at a time under `EnvServer.lock`. A separate thread would cost
 two hand-overs a step, more than a step through TCP, and only rendering, which is not served, would need it.
@@ -17,13 +17,13 @@ import numpy as np
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import iterate
 
-from bam_envs.core.errors import InvalidValue, NotInCommand, RemoteError, ResetNeeded
+from bam_envs.core.errors import BamEnvsError, InvalidValue, LinkLost, NotInCommand, RemoteError, ResetNeeded
 from bam_envs.core.registry import ALIASES
 from bam_envs.core.spaces import space_to_json
 from bam_envs.core.timing import Pacer
 from bam_envs.remote.serve.command_lease import LEASE_SECONDS, CommandLease
 from bam_envs.remote.wire.transport import EnvSpecMessage, Info, Seed
-from bam_envs.remote.wire.values import exact, plain_info, stack
+from bam_envs.remote.wire.values import exact, pack, plain_info, stack
 from bam_envs.rosbridge.bus import UNKNOWN_CALLER, Caller
 
 Env = gym.Env[Any, Any] | VectorEnv[Any, Any, Any]
@@ -79,6 +79,8 @@ def _other_names() -> dict[str, str]:
 
 class EnvServer:
     """Serves an environment to clients, one of them in command. Thread-safe; calls run one after another.
+
+    Results are as of a `Transport`, and their values trees (see `bam_envs.remote.wire.values`).
 
     Args:
         env: Any Gymnasium environment, or a vector environment that resets in the same step.
@@ -261,7 +263,7 @@ class EnvServer:
     def _checked_one(self, where: str, last: Any, observation: Any, *rest: Any) -> tuple[Any, ...]:
         """The checked result of one environment; `last` is the final observation of an episode that ended, or None."""
         space, (*ends, info) = self._spec.observation_space, rest
-        checked = [exact(space, observation, f"observation{where}")]
+        checked = [pack(space, observation, f"observation{where}")]
         if ends:
             reward, terminated, truncated = ends
             if (reward := float(reward)) != reward:
@@ -269,7 +271,7 @@ class EnvServer:
             checked += [reward, bool(terminated), bool(truncated)]
         plain = plain_info(info)
         if last is not None:
-            plain["final_obs"] = exact(space, last, f"final_obs{where}")
+            plain["final_obs"] = pack(space, last, f"final_obs{where}")
         return *checked, plain
 
     def _end_episode(self, before: str | None, after: str | None) -> None:
@@ -300,3 +302,60 @@ def split_infos(infos: Mapping[str, Any], num_envs: int) -> list[Info]:
             if mask is None or mask[i]:
                 info[key] = value[i]
     return each
+
+
+class LocalTransport:
+    """An environment in this process, without a network. Results equal those of the other transports bit for bit.
+
+    Args:
+        env: An environment (see `EnvServer`), or a server, which others may share.
+        client: The name of this client for a shared server.
+    """
+
+    def __init__(self, env: Env | EnvServer, client: str = "local") -> None:
+        self.server = env if isinstance(env, EnvServer) else EnvServer(env)
+        self.client = client
+        self._owned = not isinstance(env, EnvServer)
+        self._closed = False
+
+    def connect(self) -> EnvSpecMessage:
+        """Return the description of the environment."""
+        self._require_open()
+        return self.server.spec()
+
+    def reset(self, seed: Seed = None, options: Info | None = None) -> tuple[Any, Any]:
+        """Begin an episode; (observation, info)."""
+        self._require_open()
+        with _as_over_a_network():
+            begun: tuple[Any, Any] = self.server.spec().exact(self.server.reset(self.client, seed, options))
+        return begun
+
+    def step(self, action: Any) -> tuple[Any, Any, Any, Any, Any]:
+        """(observation, reward, terminated, truncated, info)."""
+        self._require_open()
+        with _as_over_a_network():
+            stepped: tuple[Any, Any, Any, Any, Any]
+            stepped = self.server.spec().exact(self.server.step(self.client, action))
+        return stepped
+
+    def close(self) -> None:
+        """Release the environment, and close it unless it came with a server."""
+        self._closed = True
+        self.server.leave(self.client)
+        if self._owned:
+            self.server.close()
+
+    def _require_open(self) -> None:
+        if self._closed:
+            raise LinkLost("This transport is closed; make a new one.")
+
+
+@contextmanager
+def _as_over_a_network() -> Iterator[None]:
+    """Raise the server's errors as other transports do."""
+    try:
+        yield
+    except (RemoteError, InvalidValue):
+        raise
+    except BamEnvsError as error:
+        raise RemoteError(str(error)) from error

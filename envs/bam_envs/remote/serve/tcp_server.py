@@ -6,38 +6,40 @@ import logging
 import socket
 import threading
 import time
-from collections import Counter
 from contextlib import suppress
+from typing import Any
+
+from gymnasium import spaces
 
 from bam_envs.core.errors import BamEnvsError, LinkLost, ProtocolError, RemoteError
+from bam_envs.core.wording import brief
 from bam_envs.remote.serve.env_server import EnvServer
 from bam_envs.remote.wire.tcp_wire import (
+    AfterHello,
     FrameSocket,
-    Greeting,
     Hello,
     Leave,
-    Request,
     Step,
-    action_size,
+    TcpRequest,
     encode,
     pack_result,
     refusal,
 )
 from bam_envs.remote.wire.transport import spec_to_json
 from bam_envs.remote.wire.values import Tree
-from bam_envs.ros.freshness import FreshnessCheck, Tag
+from bam_envs.ros.freshness import FreshnessCheck, Tag, read_tag
 from bam_envs.rosbridge.bus import UNKNOWN_CALLER, Caller
-from bam_envs.rosbridge.places import places, who_leaves
 from bam_envs.rosbridge.server.admission import listening_error
-from bam_envs.rosbridge.tokens import Guesses, Role, Tokens
+from bam_envs.rosbridge.tokens import Guesses, Role, Tokens, places, who_leaves
 
 _LOG = logging.getLogger(__name__)
 _POLL = 0.2  # time between two checks whether the server is closing [s]
 _HELLO_TIMEOUT, _HELLO_LIMIT = 5.0, 65536  # limits on the first message of a client [s], [bytes]
-_STRANGERS, _STRANGERS_OF_ONE = 64, 16
-"""Most connections without a hello yet: in all, and of one address. The oldest is dropped for a new one."""
+_STRANGERS = 64  # most connections without a hello yet
 _ROOM = 2**20
 """Most data in a request beside an action [bytes]."""
+_ANY_LENGTH = 2**22
+"""Assumed size of an action of any length [bytes]."""
 
 
 class TcpServer:
@@ -66,14 +68,20 @@ class TcpServer:
     ) -> None:
         self.server, self.host, self.port = server, host, port
         self.max_clients, self.patience = max_clients, patience
-        self.most = _ROOM + 2 * action_size(server.spec())
+        spec = server.spec()
+        try:
+            action_size = 8 * spaces.flatdim(spec.action_space) * spec.num_envs
+        except (NotImplementedError, ValueError):
+            action_size = _ANY_LENGTH
+        self.most = _ROOM + 2 * action_size
         """Largest request [bytes]."""
-        self._tokens, self._guesses = Tokens.of_clients(token, operator_token), Guesses()
+        self.tokens, self.guesses = Tokens.of_clients(token, operator_token), Guesses()
         self.freshness = FreshnessCheck()
+        self.lock = threading.Lock()
+        self.connections: dict[_Connection, None] = {}
+        """The open ones, the oldest first; to be used with `lock`."""
         self._listener: socket.socket | None = None
         self._thread: threading.Thread | None = None
-        self._lock = threading.Lock()
-        self._connections: dict[_Connection, None] = {}  # the oldest first
 
     @property
     def url(self) -> str:
@@ -101,10 +109,10 @@ class TcpServer:
             listener.shutdown(socket.SHUT_RDWR)
         self._thread.join()
         listener.close()
-        with self._lock:
-            connections = list(self._connections)
+        with self.lock:
+            connections = list(self.connections)
         for connection in connections:
-            connection.drop()
+            connection.hang_up()
         for connection in connections:
             connection.thread.join()
 
@@ -133,113 +141,111 @@ class TcpServer:
                 sock.close()
 
     def _begin(self, connection: _Connection) -> None:
-        with self._lock:
-            self._connections[connection] = None
-            strangers = [one for one in self._connections if one.caller is None and not one.dropped]
-            neighbours = [one for one in strangers if one.host == connection.host]
-        # Silent connections must not keep others out: a new one is always accepted.
-        if len(neighbours) > _STRANGERS_OF_ONE:
-            neighbours[0].drop()
-        elif len(strangers) > _STRANGERS:
-            host, _ = Counter(one.host for one in strangers).most_common(1)[0]
-            next(one for one in strangers if one.host == host).drop()
-        try:
+        with self.lock:
+            strangers = [one for one in self.connections if one.caller is None and not one.dropped]
+            # Silent connections must not keep others out: a new one is always accepted.
+            leaves = who_leaves(connection, strangers) if len(strangers) >= _STRANGERS else None
             connection.thread.start()
-        except RuntimeError:
-            with self._lock:
-                del self._connections[connection]
-            raise
-
-    def admit(self, hello: Hello, connection: _Connection) -> None:
-        """Admit a client, and drop its older connections; RemoteError if it is not allowed, or there is no room."""
-        role = None
-        if self._tokens.needed or (hello.token and self._tokens.exist):
-            if not self._guesses.may_try(connection.host):
-                raise RemoteError("Too many wrong tokens came from this address; try again in a second.")
-            role = self._tokens.role([hello.token])
-            if role is None:
-                if hello.token:
-                    self._guesses.wrong(connection.host)
-                what = "wrong" if hello.token else "missing"
-                raise RemoteError(f"The token is {what}; give the one that the server was started with (--token-file).")
-        self.server.require_name(hello.env_id)
-        with self._lock:
-            older = [one for one in self._connections if one is not connection and one.session == hello.session]
-            present = [one for one in self._connections if one.caller is not None and one not in older]
-            connection.role, room = role, places(self.max_clients, role or "drive", self._tokens.roles)
-            if len(present) >= room:
-                leaves = who_leaves(connection, present)
-                if leaves is None:
-                    raise RemoteError(f"All {room} places for clients are taken; try again when one has left.")
-                older.append(leaves)
-            # An open connection is a sign of life of the system at its other end.
-            name, operator = connection.client, role == "administer"
-            connection.caller = Caller(name, name, operator=operator, silence=lambda: 0.0)
-        for one in older:
-            one.drop()
-            self.server.leave(one.client)
-
-    def forget(self, connection: _Connection) -> None:
-        """Remove a connection that has ended."""
-        self.server.leave(connection.client)
-        with self._lock:
-            self._connections.pop(connection, None)
+            self.connections[connection] = None
+        if leaves is not None:
+            leaves.hang_up()
 
 
-class _Connection:
+class _Connection(FrameSocket):
     """One client, with its thread."""
 
     def __init__(self, owner: TcpServer, sock: socket.socket, host: str, port: int) -> None:
+        super().__init__(sock)
         self.host, self.client, self.session = host, f"{host}:{port}", ""
         self.caller: Caller | None = None  # known after its admission
         self.role: Role | None = None  # of the token that it showed
         self.born, self.spoke = time.monotonic(), 0.0  # of its last request; 0 before
         self.dropped = False  # hung up; its thread has yet to end
-        self._owner, self._frames = owner, FrameSocket(sock)
+        self._owner = owner
         self.thread = threading.Thread(target=self._run, name=f"bam-tcp {self.client}", daemon=True)
 
-    def drop(self) -> None:
+    def hang_up(self) -> None:
+        """See `FrameSocket`."""
         self.dropped = True
-        self._frames.hang_up()
+        super().hang_up()
 
     def _run(self) -> None:
+        owner = self._owner
         try:
-            _, hello = self._frames.receive(time.monotonic() + _HELLO_TIMEOUT, _HELLO_LIMIT, kind=Greeting)
-            self.client = f"{hello.name} ({self.client})"
-            self._owner.admit(hello, self)
-            self.session = hello.session
-            self._send(encode([0, "ok", spec_to_json(self._owner.server.spec())]))
+            hello = self.receive(time.monotonic() + _HELLO_TIMEOUT, _HELLO_LIMIT, kind=Hello)
+            tag = _tag_of(hello)
+            self._admit(hello, tag)
+            self._reply(encode([tag.sequence, "ok", spec_to_json(owner.server.spec())]))
             while True:
-                request = self._frames.receive(limit=self._owner.most, patience=self._owner.patience, kind=Request)
+                request = self.receive(limit=owner.most, patience=owner.patience, kind=AfterHello)
                 self.spoke = time.monotonic()
-                self._send(self._answer(request))
+                self._reply(self._answer(request))
         except (ProtocolError, RemoteError) as error:
             with suppress(LinkLost):  # the client learns why the connection ends
-                self._frames.send(encode(refusal(0, RemoteError(str(error)))), time.monotonic() + _POLL)
+                self.send(encode(refusal(0, error)), time.monotonic() + _POLL)
         except LinkLost:
             pass  # it went away
         finally:
-            self._frames.close()
-            self._owner.forget(self)
+            self.close()
+            owner.server.leave(self.client)
+            with owner.lock:
+                owner.connections.pop(self, None)
 
-    def _send(self, frame: bytes) -> None:
-        self._frames.send(frame, time.monotonic() + self._owner.patience)
+    def _reply(self, frame: bytearray) -> None:
+        self.send(frame, time.monotonic() + self._owner.patience)
 
-    def _answer(self, request: Request) -> bytes:
-        """The frame that answers `request`."""
-        tag = request.tag
+    def _admit(self, hello: Hello, tag: Tag) -> None:
+        """Admit this client, and drop its older connections; RemoteError if it is not allowed, or there is no room."""
+        owner = self._owner
+        tokens, role = owner.tokens, None
+        if tokens.needed or (hello.token and tokens.exist):
+            if not owner.guesses.may_try(self.host):
+                raise RemoteError("Too many wrong tokens came from this address; try again in a second.")
+            role = tokens.role([hello.token])
+            if role is None:
+                if hello.token:
+                    owner.guesses.wrong(self.host)
+                what = "wrong" if hello.token else "missing"
+                raise RemoteError(f"The token is {what}; give the one that the server was started with (--token-file).")
+        owner.server.require_name(hello.env_id)
+        with owner.lock:
+            known = [one for one in owner.connections if one.caller is not None and not one.dropped]
+            leaving = [one for one in known if one.session == tag.session]
+            present = [one for one in known if one not in leaving]
+            self.role, room = role, places(owner.max_clients, role or "drive", tokens.roles)
+            if len(present) >= room:
+                leaves = who_leaves(self, present)
+                if leaves is None:
+                    raise RemoteError(f"All {room} places for clients are taken; try again when one has left.")
+                leaving.append(leaves)
+            self.client, self.session = f"{hello.name} ({self.client})", tag.session
+            # An open connection is a sign of life of the system at its other end.
+            self.caller = Caller(self.client, self.client, operator=role == "administer", silence=lambda: 0.0)
+        for one in leaving:
+            one.hang_up()
+            owner.server.leave(one.client)
+
+    def _answer(self, request: TcpRequest) -> bytearray:
+        tag = _tag_of(request)
         try:
-            self._owner.freshness.require(Tag(tag.session, tag.epoch, tag.sequence, tag.sent, tag.deadline))
-            return encode([tag.sequence, "ok", self._do(request)])
+            self._owner.freshness.require(tag)
+            return encode([tag.sequence, "ok", self._do(request, time.monotonic() + tag.deadline - tag.sent)])
         except BamEnvsError as error:
             return encode(refusal(tag.sequence, error))
 
-    def _do(self, request: Request) -> Tree:
-        server, deadline = self._owner.server, time.monotonic() + request.tag.lifetime
+    def _do(self, request: Any, deadline: float) -> Tree:
+        server = self._owner.server
         if isinstance(request, Leave):
             return server.leave(self.client)
         if isinstance(request, Step):
             return pack_result(server.spec(), server.step(self.client, request.action, deadline=deadline))
-        options, take, caller = request.options, request.take is True, self.caller or UNKNOWN_CALLER
-        begun = server.reset(self.client, request.seed, options, take=take, deadline=deadline, caller=caller)
+        take, caller = request.take is True, self.caller or UNKNOWN_CALLER
+        begun = server.reset(self.client, request.seed, request.options, take=take, deadline=deadline, caller=caller)
         return pack_result(server.spec(), begun)
+
+
+def _tag_of(request: TcpRequest) -> Tag:
+    tag = read_tag(request.tag)
+    if tag is None:
+        raise ProtocolError(f"Expected the tag of a request, found {brief(request.tag)}.")
+    return tag

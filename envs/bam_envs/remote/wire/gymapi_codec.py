@@ -13,6 +13,7 @@ import numpy as np
 from gymnasium import Space, spaces
 
 from bam_envs.core.errors import InvalidValue, ProtocolError
+from bam_envs.core.spaces import Path, joined, part_at
 from bam_envs.core.wording import brief
 from bam_envs.remote.wire.gymapi_leaves import (
     EXACT,
@@ -22,9 +23,7 @@ from bam_envs.remote.wire.gymapi_leaves import (
     POSE,
     GymApiLeaf,
     Lists,
-    Path,
     is_depth,
-    joined,
     leaves_of,
 )
 from bam_envs.remote.wire.gymapi_messages import PREFIX, GymResponse, write_feedback
@@ -64,12 +63,12 @@ class ActionCodec:
         value = exact(self.space, action, "action")
         fields: dict[str, Any] = {}
         for lists in (*self._numbers, self._poses):
-            written = self._fits and all(lists.write(leaf, leaf.of(value), fields) for leaf in lists.leaves)
+            written = self._fits and all(lists.write(leaf, part_at(value, leaf.path), fields) for leaf in lists.leaves)
             if not written:
                 tree = tree_to_json(pack(self.space, value, "action"))
                 text = PREFIX + dump_json({"action": tree}, "An action")
                 return {"action_type": self.action_type, "prefix": text}
-        if poses := [leaf.of(value) for leaf in self._poses.leaves]:
+        if poses := [part_at(value, leaf.path) for leaf in self._poses.leaves]:
             widths = [float(one.get(GRIPPER_WIDTH, np.zeros(())).item()) for one in poses]
             fields["pose_param"] = [{**WAYPOINT, GRIPPER_WIDTH: width} for width in widths]
         return {"action_type": self.action_type, **fields}
@@ -115,7 +114,7 @@ class ObservationCodec:
         trees: Trees = {}
         images = self._images if version.lists else self._images[:1]
         for leaf in self._leaves:
-            part = leaf.of(value)
+            part = part_at(value, leaf.path)
             if leaf in images:
                 image = color_message(part, self.image_format, leaf.name, stamp)
                 fields["color_img"] = [*fields.get("color_img", []), image] if version.lists else image
@@ -216,11 +215,9 @@ class EnvCodec:
         *,
         executed: bool = True,
     ) -> list[dict[str, Any]]:
-        """The feedback of a reset or step, sent at `stamp`; `executed`: whether the action was executed."""
+        """The feedback of a result of `EnvServer`, sent at `stamp`; `executed`: whether the action was executed."""
         feedback = []
         for observation, *ends, info in self.spec.split(result):
-            if self.spec.vector and "final_obs" in info:
-                info = {**info, "final_obs": pack(self.spec.observation_space, info["final_obs"], "final_obs")}
             fields, trees = self._observations.encode(observation, stamp, version)
             flags: Any = ends or (0.0, False, False)
             feedback.append(write_feedback(fields, trees, flags, info, version, executed=executed))

@@ -24,6 +24,7 @@ import numpy as np
 from gymnasium import Space, spaces
 
 from bam_envs.core.errors import ProtocolError
+from bam_envs.core.spaces import Path, leaves_by_path, parts_of
 from bam_envs.core.wording import listed
 
 NUMBERS, POSE, IMAGE, EXACT = "numbers", "pose", "image", "exact"
@@ -35,8 +36,6 @@ _WHOLE = 2**53
 """Every integer up to this is exact as a float64."""
 _CHANNELS = ((), (1,), (3,), (4,))
 _POSE_SHAPES: dict[str, list[tuple[int, ...]]] = {"position": [(3,)], "orientation": [(4,)], GRIPPER_WIDTH: [(), (1,)]}
-
-Path = tuple[str | int, ...]
 
 
 @dataclass(frozen=True)
@@ -54,55 +53,33 @@ class GymApiLeaf:
     labels: tuple[str, ...]
     """Names of its numbers; of other kinds only its name."""
 
-    def of(self, value: Any) -> Any:
-        """This part of a checked value."""
-        for key in self.path:
-            value = value[key]
-        return value
-
 
 def leaves_of(space: Space[Any], name: str, *, gripper: bool = False) -> tuple[GymApiLeaf, ...]:
     """The leaves of `space`, which is called `name`; with `gripper`, a pose may have a gripper width."""
-    leaves = tuple(_walk(space, (), name, gripper))
+    found = leaves_by_path(space, lambda part: _is_pose(part, gripper) or not parts_of(part))
+    leaves = tuple(_leaf(path, part, name, gripper) for path, part in found)
     names, labels = [leaf.name for leaf in leaves], [label for leaf in leaves for label in leaf.labels]
     unique = len({*names}) == len(names) and len({*labels}) == len(labels)
     return leaves if unique else (GymApiLeaf(EXACT, name, (), space, (name,)),)
 
 
-def joined(space: Space[Any], values: Mapping[Path, Any], path: Path = ()) -> Any:
-    """The value of `space` from the `values` of its leaves, by path."""
-    if path in values:
-        return values[path]
-    parts = {key: joined(part, values, (*path, key)) for key, part in _parts(space).items()}
-    return tuple(parts.values()) if isinstance(space, spaces.Tuple) else parts
-
-
-def _walk(space: Space[Any], path: Path, name: str, gripper: bool) -> list[GymApiLeaf]:
-    parts, is_pose = _parts(space), _is_pose(space, gripper)
-    if parts and not is_pose:
-        return [leaf for key, part in parts.items() for leaf in _walk(part, (*path, key), name, gripper)]
+def _leaf(path: Path, space: Space[Any], name: str, gripper: bool) -> GymApiLeaf:
     name, shape, kind, labels = "/".join(map(str, path)) or name, space.shape or (), EXACT, None
     arrays = isinstance(space, (spaces.Box, spaces.MultiDiscrete, spaces.MultiBinary))
     fits = arrays and 0 < np.prod(shape) <= _MOST_NUMBERS and np.dtype(space.dtype).itemsize <= 8
-    if is_pose:
+    if _is_pose(space, gripper):
         kind = POSE
     elif _is_image(space, shape):
         kind = IMAGE
     elif fits or isinstance(space, spaces.Discrete):
         indices, kind = np.ndindex(*shape), NUMBERS
         labels = tuple(f"{name}[{', '.join(map(str, index))}]" if index else name for index in indices)
-    return [GymApiLeaf(kind, name, path, space, labels or (name,))]
+    return GymApiLeaf(kind, name, path, space, labels or (name,))
 
 
 def _is_image(space: Space[Any], shape: tuple[int, ...]) -> bool:
     bytes_ = isinstance(space, spaces.Box) and space.dtype == np.uint8
     return bytes_ and len(shape) in (2, 3) and min(shape[:2]) >= _SMALLEST_IMAGE and shape[2:] in _CHANNELS
-
-
-def _parts(space: Space[Any]) -> Mapping[Any, Space[Any]]:
-    if isinstance(space, spaces.Dict) and all(isinstance(key, str) for key in space.spaces):
-        return space.spaces
-    return dict(enumerate(space.spaces)) if isinstance(space, spaces.Tuple) else {}
 
 
 def _is_pose(space: Space[Any], gripper: bool) -> bool:

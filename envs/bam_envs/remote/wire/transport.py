@@ -10,7 +10,7 @@ from gymnasium import Space
 from bam_envs.core.errors import InvalidValue, ProtocolError
 from bam_envs.core.spaces import space_from_json, space_to_json
 from bam_envs.core.wording import brief
-from bam_envs.remote.wire.values import plain_info, tree_from_json, tree_to_json
+from bam_envs.remote.wire.values import exact, plain_info, tree_from_json, tree_to_json
 
 Info = dict[str, Any]
 Seed = int | list[int | None] | None
@@ -59,6 +59,17 @@ class EnvSpecMessage:
     def joined(self, each: Sequence[tuple[Any, ...]]) -> Any:
         """A result of `Transport.reset` or `Transport.step`, from the result of each environment."""
         return tuple(map(list, zip(*each, strict=True))) if self.vector else each[0]
+
+    def exact(self, result: Iterable[Any]) -> Any:
+        """A result of trees, as of `EnvServer`, with the types of the spaces; InvalidValue if it does not fit."""
+        each, space = [], self.observation_space
+        for i, (observation, *ends, info) in enumerate(self.split(result)):
+            where = f" of environment {i}" if self.vector else ""
+            checked = exact(space, observation, f"observation{where}")
+            if self.vector and isinstance(info, dict) and "final_obs" in info:
+                info = {**info, "final_obs": exact(space, info["final_obs"], f"final_obs{where}")}
+            each.append((checked, *ends, info))
+        return self.joined(each)
 
 
 def plain_seed(seed: Any) -> Seed:

@@ -9,9 +9,9 @@ import pytest
 from gymnasium import spaces
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
-from bam_envs.core.errors import InvalidValue, NotInCommand, RemoteError, ResetNeeded, UnknownName
+from bam_envs.core.errors import InvalidValue, LinkLost, NotInCommand, RemoteError, ResetNeeded, UnknownName
 from bam_envs.remote.serve.command_lease import CommandLease
-from bam_envs.remote.serve.env_server import EnvServer, describe_env
+from bam_envs.remote.serve.env_server import EnvServer, LocalTransport, describe_env
 from bam_envs.rosbridge.bus import Caller
 from bam_envs.testing.transports import MirrorEnv
 from tests.bam_envs.remote.fakes import FakeEnv
@@ -324,3 +324,36 @@ def test_spaces_that_cannot_be_sent_are_refused_at_once():
     with pytest.raises(UnknownName) as caught:
         describe_env(FakeEnv(spaces.Graph(spaces.Box(0, 1, (2,)), None)))
     assert caught.value.name == "Graph"
+
+
+class Closing(FakeEnv):
+    closes = 0
+
+    def close(self):
+        self.closes += 1
+
+
+def test_an_environment_of_its_own_is_closed_with_it():
+    env = Closing()
+    transport = LocalTransport(env)
+    transport.close()
+    transport.close()
+    assert env.closes == 1
+
+
+def test_a_shared_server_goes_on():
+    env = Closing()
+    server = EnvServer(env)
+    one, two = LocalTransport(server, "ann"), LocalTransport(server, "bob")
+    one.reset()
+    with pytest.raises(NotInCommand) as caught:
+        two.reset()
+    assert str(caught.value).startswith("ann is in command, not bob")
+    one.close()
+    assert env.closes == 0
+    two.reset()
+    with pytest.raises(LinkLost) as lost:
+        one.reset()
+    assert str(lost.value) == "This transport is closed; make a new one."
+    with pytest.raises(LinkLost):
+        one.connect()

@@ -7,6 +7,8 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
+from bam_envs.core.spaces import mapped
+from bam_envs.testing.assertions import assert_same_value
 from bam_train.data import DataSet, DataSetInfo, DataSetWriter, Episode
 from bam_train.data.export import export
 from bam_train.errors import OutputError, SettingsError
@@ -23,9 +25,7 @@ SPACES = {
 
 
 def drawn(space, count):
-    if isinstance(space, gym.spaces.Dict):
-        return {key: drawn(part, count) for key, part in space.spaces.items()}
-    return np.stack([np.asarray(space.sample(), space.dtype) for _ in range(count)])
+    return mapped(lambda part: np.stack([np.asarray(part.sample(), part.dtype) for _ in range(count)]), space)
 
 
 def record(place, kind="box", count=6, **columns):
@@ -53,16 +53,6 @@ def record(place, kind="box", count=6, **columns):
     return DataSet.open(place)
 
 
-def equal(found, expected):
-    if isinstance(expected, dict):
-        assert found.keys() == expected.keys()
-        for key, part in expected.items():
-            equal(found[key], part)
-    else:
-        assert np.asarray(found).dtype == expected.dtype
-        np.testing.assert_array_equal(found, expected)
-
-
 @pytest.mark.parametrize("kind", SPACES)
 def test_minari(kind, tmp_path, monkeypatch):
     minari = pytest.importorskip("minari")
@@ -77,12 +67,12 @@ def test_minari(kind, tmp_path, monkeypatch):
     for index, theirs in enumerate(found.iterate_episodes()):
         ours = data[index]
         assert theirs.id == index
-        equal(theirs.observations, ours.observations)
-        equal(theirs.actions, ours.actions)
-        equal(theirs.rewards, ours.rewards)
+        assert_same_value(theirs.observations, ours.observations)
+        assert_same_value(theirs.actions, ours.actions)
+        assert_same_value(theirs.rewards, ours.rewards)
         assert theirs.terminations.tolist() == [False] * (len(ours) - 1) + [ours.terminated]
         assert theirs.truncations.tolist() == [False] * (len(ours) - 1) + [ours.truncated]
-        equal(theirs.infos["time"], ours.columns["time"])
+        assert_same_value(theirs.infos["time"], ours.columns["time"])
         assert [one.decode() for one in theirs.infos["guard"]] == ours.columns["guard"].tolist()
     metadata = next(iter(found.storage.get_episode_metadata([2])))
     assert (metadata["seed"], metadata["digest"]) == (2, data.digests[2])
@@ -133,10 +123,10 @@ def test_hdf5(kind, tmp_path):
             names = {"nested": {"images.camera": "camera", "arm": "arm"}, "picture": {"images.camera": None}}
             for name, key in names.get(kind, {"state": None}).items():
                 values = ours.observations if key is None else ours.observations[key]
-                equal(demo["obs"][name][()], values[:-1])
-                equal(demo["next_obs"][name][()], values[1:])
-            equal(demo["actions"][()], ours.actions)
-            equal(demo["rewards"][()], ours.rewards)
+                assert_same_value(demo["obs"][name][()], values[:-1])
+                assert_same_value(demo["next_obs"][name][()], values[1:])
+            assert_same_value(demo["actions"][()], ours.actions)
+            assert_same_value(demo["rewards"][()], ours.rewards)
             assert demo["dones"][()].tolist() == [0] * (len(ours) - 1) + [1]
             assert demo["terminated"][-1] == ours.terminated
 
@@ -155,9 +145,9 @@ def test_mcap(kind, tmp_path):
         part = slice(ticks[0], ticks[-1] + 1)
         if kind != "picture":
             values = ours.observations["arm"] if kind == "nested" else ours.observations
-            equal(observed["arm" if kind == "nested" else ""][part], values)
-        equal(actions[""][part][:-1], ours.actions)
-        equal(reward[part][1:], ours.rewards)
+            assert_same_value(observed["arm" if kind == "nested" else ""][part], values)
+        assert_same_value(actions[""][part][:-1], ours.actions)
+        assert_same_value(reward[part][1:], ours.rewards)
         assert end[part][-1] == ours.terminated
         assert found.guards[part] == ["", *ours.columns["guard"]]
         times = found.tables["/observation"].times[part]
@@ -166,7 +156,7 @@ def test_mcap(kind, tmp_path):
         from bam_train.recording.drawing import frames
 
         pictures = [one.observations if kind == "picture" else one.observations["camera"] for one in data]
-        equal(np.stack(list(frames(found))), np.concatenate(pictures))
+        assert_same_value(np.stack(list(frames(found))), np.concatenate(pictures))
 
 
 def test_lerobot_is_a_data_set_of_few_files(tmp_path):
