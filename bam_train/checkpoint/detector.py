@@ -14,8 +14,8 @@ Five charts, each divided by its bound; the largest is the level of a tick, and 
 
 p, the pace, is the share of its speed at which the robot is allowed to move. The bounds are conformal: quantiles of the
 largest value in each of the episodes that were kept apart, continued beyond the largest of them by the exponential tail
-of such maxima, for at most one false alarm in `TICKS` ticks. Fewer than `FEW` ticks lack episodes of a rare kind, which may
-be unusual until they end: a CUSUM chart is then an alarm only after three quarters of the time limit.
+of such maxima, for at most one false alarm in `TICKS` ticks. Fewer than `FEW` ticks lack episodes of a rare kind, which
+may be unusual until they end: a CUSUM chart is then an alarm only after three quarters of the time limit.
 """
 
 from __future__ import annotations
