@@ -12,7 +12,7 @@ import os
 import re
 import shutil
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Any
@@ -100,6 +100,13 @@ class Versions:
             OutputError: The disk is full, or the folder cannot be written; nothing has changed.
             AlteredCheckpoint: The file was changed after it was verified.
         """
+        self._copy(checkpoint)
+        with self._changing():
+            for one in [one for one in self.all() if not one.names and one.digest != checkpoint.digest][KEPT - 1 :]:
+                one.path.unlink(missing_ok=True)
+            return self.find(checkpoint.digest)
+
+    def _copy(self, checkpoint: Checkpoint) -> None:
         path = self.folder / f"{checkpoint.digest}.zip"
         with self._writing():
             if not (path.exists() and path.samefile(checkpoint.path)):
@@ -108,10 +115,6 @@ class Versions:
                     _require_same(temporary, checkpoint)
                     newest = max((one.added for one in self.all()), default=0.0)
                     os.utime(temporary, (time.time(), max(time.time(), newest + 0.001)))
-        with self._changing():
-            for one in [one for one in self.all() if not one.names and one.digest != checkpoint.digest][KEPT - 1 :]:
-                one.path.unlink(missing_ok=True)
-            return self.find(checkpoint.digest)
 
     def first(self, given: Path | None) -> Version:
         """The version that an agent begins with: a checkpoint that is given for the first time, or the champion.
@@ -123,13 +126,29 @@ class Versions:
         """
         names = self._names()
         if given is not None:
-            version = self.add(Checkpoint.open(given.expanduser()))
+            checkpoint = Checkpoint.open(given.expanduser())
+            self._copy(checkpoint)
+            version = self.find(checkpoint.digest)
             if version.digest != names.get(GIVEN) or CHAMPION not in names:
                 before = {PREVIOUS: names[CHAMPION]} if names.get(CHAMPION, version.digest) != version.digest else {}
                 self.point({GIVEN: version.digest, CHAMPION: version.digest, **before})
         elif CHAMPION not in names:
             raise SettingsError(f"{self.folder} has no version yet; give a checkpoint with --policy")
         return self.find(CHAMPION)
+
+    def undo(self) -> Callable[[], None]:
+        """A function that undoes what `first` changes after this call."""
+        names, before = self._names(), {one.path: one.path.stat().st_mtime_ns for one in self.all()}
+
+        def undo() -> None:
+            self.point({**dict.fromkeys(self._names()), **names})
+            for one in self.all():
+                if one.path in before:
+                    os.utime(one.path, ns=(before[one.path],) * 2)
+                else:
+                    one.path.unlink()
+
+        return undo
 
     def all(self) -> list[Version]:
         """Every version, the newest first."""

@@ -14,7 +14,8 @@ Five charts, each divided by its bound; the largest is the level of a tick, and 
 
 p, the pace, is the share of its speed at which the robot is allowed to move. The bounds are conformal: quantiles of the
 largest value in each of the episodes that were kept apart, continued beyond the largest of them by the exponential tail
-of such maxima, for at most one false alarm in `TICKS` ticks.
+of such maxima, for at most one false alarm in `TICKS` ticks. Fewer than `FEW` ticks lack episodes of a rare kind, which
+may be unusual until they end: a CUSUM chart is then an alarm only after three quarters of the time limit.
 """
 
 from __future__ import annotations
@@ -42,6 +43,8 @@ TICKS = 720_000
 MOST_NUMBERS = 64
 """Maximum numbers of an observation, of an action, and of a command; a tick takes about 15 µs."""
 LEAST_TICKS, LEAST_EPISODES = 1_000, 20
+FEW = TICKS // 10
+"""With fewer ticks that determine the bounds, usual episodes of a rare kind are missing among them."""
 TIMELY = 0.35
 """Greatest deviation of the time between two observations from the period [periods] at which an answer is judged."""
 _HIDDEN = 96
@@ -49,6 +52,7 @@ _MEMORY = 0.2  # weight of the newest tick in a mean
 _RIDGE = 1e-3
 _RATES = np.array([0.05, 0.05, 0.05, 0.05, 0.4])  # false alarms of each chart in `TICKS` ticks
 _TAILS = 0.1, 0.05, 0.02, 0.01  # shares of the episodes' maxima that tails are fitted to; the highest bound counts
+_LASTING = 0.75  # share of the time limit for which a rare usual episode may be unusual
 _NEAR = 0.75  # share of the time limit above which the bound of the duration is in the last tick
 _NOT_FINITE = 1e6  # level of an observation with NaN
 _LONGEST = 10.0  # of a whitened error, per square root of a number
@@ -256,8 +260,12 @@ class Detector:
 
     def values(self, rollout: Rollout) -> Array:
         """The charts at each tick of an episode. Shape: (T, 5) float64."""
-        leverage, white, judged = surprises(self.model, rollout)
-        self.begin(rollout.pace)
+        return self._charted(surprises(self.model, rollout), rollout.pace)
+
+    def _charted(self, found_at: tuple[Array, Array, Array], pace: float) -> Array:
+        """`values`, of the surprises of an episode."""
+        leverage, white, judged = found_at
+        self.begin(pace)
         found = []
         for t, one in enumerate(leverage.tolist()):
             self._advance(one, white[t - 1] if t and judged[t - 1] else None)
@@ -353,9 +361,10 @@ def make_detector(*kinds: Iterable[Rollout], limit: float | None = None, seed: i
     used = [kind for kind in used if len(kind) >= LEAST_EPISODES]
     kept = [kind[2::5] + kind[3::5] + kind[4::5] for kind in used]
     model = _learnt([one for kind in used for one in kind[0::5] + kind[1::5]], sizes[0], np.random.default_rng(seed))
-    found = [surprises(model, one) for kind in kept for one in kind]
-    leverage = np.concatenate([one for one, _, _ in found])
-    square = np.concatenate([np.square(white[judged]).mean(axis=1) for _, white, judged in found])
+    found = [[(surprises(model, one), one.pace) for one in kind] for kind in kept]
+    every_one = [one for kind in found for one, _ in kind]
+    leverage = np.concatenate([one for one, _, _ in every_one])
+    square = np.concatenate([np.square(white[judged]).mean(axis=1) for _, white, judged in every_one])
     parts = zip((leverage, square), _USUAL, strict=True)
     usual = [np.quantile(np.log1p(one), shares) if len(one) else np.zeros(2) for one, shares in parts]
     drift, cut = np.array(usual, np.float32).T
@@ -363,10 +372,13 @@ def make_detector(*kinds: Iterable[Rollout], limit: float | None = None, seed: i
     failed = [one.pace * len(one.actions) for kind in every for one in kind if one.success is False]
     longest = max(failed, default=math.inf) if limit is None else limit
     bounds = []
-    for kind in kept:
-        maxima = np.array([detector.values(one).max(axis=0) for one in kind])
-        bounds.append(_bounds(maxima, len(kind) * TICKS / sum(len(one.actions) for one in kind), longest))
+    for kind in found:
+        maxima = np.array([detector._charted(*one).max(axis=0) for one in kind])
+        episodes = len(kind) * TICKS / sum(len(one[0]) for one, _ in kind)
+        bounds.append(_bounds(maxima, episodes, longest))
     bound = np.max(bounds, axis=0)
+    if len(leverage) < FEW and math.isfinite(longest):
+        bound[2:4] = np.maximum(bound[2:4], _LASTING * longest * (cut - drift))
     if longest - 0.5 < max(failed, default=0.0) or _NEAR * longest < bound[4] < longest:
         bound[4] = longest - 0.5  # others, as slow, may succeed in their last tick
     return Detector(replace(detector.model, bounds=bound.astype(np.float32)))

@@ -109,7 +109,8 @@ class TrainConfig(SettingsFlags):  # type: ignore[misc]
     print_config: bool = False
     """Print all settings of the run as JSON, and do not train."""
     out: _File = None
-    """Where the best checkpoint goes (default checkpoints/<env>-<algo>.zip); it may be s3://bucket/pick.zip."""
+    """Where the best checkpoint goes (default checkpoints/<env>-<algo>.zip); it may be s3://bucket/pick.zip.
+    Missing folders are made."""
     copy_to: Annotated[str | None, _unset("URL")] = None
     """Copy every checkpoint that goes to --out to an address too, such as s3://bucket/runs/."""
     resume: _File = None
@@ -161,7 +162,7 @@ class EvalConfig:
     json: bool = False
     """Print one JSON object on standard output instead of a table."""
     video: File = None
-    """Record the first episodes into this .gif or .mp4 file."""
+    """Record the first episodes into this .gif or .mp4 file; missing folders are made."""
     record: DataSetName = None
     """Add the episodes to this data set: a folder, or an address such as s3://bucket/pick."""
     video_episodes: Count = 3
@@ -263,7 +264,7 @@ class DeployConfig:
     """Show the robot in a window."""
     record: DataSetOrFile = None
     """Record every tick into this .mcap file, or add the episodes to this data set: a folder, an address, or a name
-    without a suffix. By default a live robot is recorded into a new file in recordings/."""
+    without a suffix. By default a live robot is recorded into a new file in recordings/. Missing folders are made."""
     no_record: bool = False
     """Do not record a live robot."""
     json: bool = False
@@ -314,9 +315,10 @@ class ReplayConfig:
     env: EnvId = None
     """Environment that the checkpoint belongs to; needed for some_module:Env-v0."""
     plot: File = None
-    """Draw states, commands, actions, status and latencies into this .png file."""
+    """Draw states, commands, actions, status and latencies into this .png file; missing folders are made."""
     video: File = None
-    """Make a .gif or .mp4 of the recorded pictures; without any, of the simulated robot in the recorded states."""
+    """Make a .gif or .mp4 of the recorded pictures; without any, of the simulated robot in the recorded states.
+    Missing folders are made."""
     json: bool = False
     """Print one JSON object on standard output instead of a few lines."""
 
@@ -334,7 +336,7 @@ class ExportConfig:
     env: EnvId = None
     """Environment it was trained on; by default what the directory says."""
     out: File = None
-    """Where the checkpoint goes (default checkpoints/<env>-rllib-<algo>.zip)."""
+    """Where the checkpoint goes (default checkpoints/<env>-rllib-<algo>.zip); missing folders are made."""
     algo: Name = None
     """Algorithm that trained it; by default what the directory says."""
     policy: Name = None

@@ -30,9 +30,12 @@ def train(config: TrainConfig) -> int:
     """Run the program with its parsed flags; returns the exit status."""
     from bam_train.checkpoint import Checkpoint
     from bam_train.env_location import addresses
+    from bam_train.errors import SettingsError
     from bam_train.settings import NAMES, merge, read_assignments, read_config
     from bam_train.trainers.resolve_settings import read_preset, resolve, resolve_resumed
 
+    if config.resume is not None and not config.resume.expanduser().exists():
+        raise SettingsError(f"--resume {config.resume}: no such file. Check the name; a run keeps runs/NAME/last.zip")
     checkpoint = None if config.resume is None else Checkpoint.open(config.resume)
     file = {} if config.config is None else read_config(config.config)
     flags = {name: getattr(config, name) for name in NAMES if getattr(config, name) is not None}

@@ -193,18 +193,22 @@ class FlightLog:
         self._pictures = [name for name, array in observed.items() if _is_picture(array)]
         self._numbers = [name for name in observed if name not in self._pictures]
         arrays = {name.removeprefix(OBSERVATION).lstrip("/"): observed[name] for name in self._numbers}
-        layout, truth = {}, {} if state is None else _numeric(state.truth)
+        layout, truth, units = {}, {} if state is None else _numeric(state.truth), {}
         if state is not None:
             spec = self._robot.spec
             present = [signal for signal in spec.signals if signal.name in state.signals]
             signals = [f"{signal.name}.{label}" for signal in present for label in signal.labels]
             layout = {"/state": ["stamp", *signals], "/truth": _named(truth), "/command": list(spec.command.labels)}
+            measured = [unit for signal in present for unit in signal.units]
+            units = {"/state": dict(zip(signals, measured, strict=True))}
+            units["/command"] = dict(zip(spec.command.labels, spec.command.units, strict=True))
         pictures = {name.removeprefix(f"{OBSERVATION}/") for name in self._pictures}
         layout["/observation"] = _named(arrays, [one for one in labels.get("observation", ()) if one not in pictures])
         layout["/action"] = _named({"": action}, labels.get("action"))
         layout |= {topic: list(names) for topic, names in _SCALARS.items()}
         kinds = {"truth": truth, "observation": arrays, "action": {"": action}}
         extra = {kind: json.dumps({name: _kind(array) for name, array in of.items()}) for kind, of in kinds.items()}
+        extra["units"] = json.dumps(units)
         self._recorder.declare({topic: names for topic, names in layout.items() if names}, extra)
 
     def _status(self) -> tuple[int, int]:

@@ -70,12 +70,20 @@ def _plots(recording: Recording) -> list[tuple[str, Callable[[Axes], None]]]:
             groups.setdefault(name.split(".", 1)[0], []).append(name)
     for group, names in groups.items():
         if len(names) <= MOST_LINES:
-            plots.append((group, partial(_lines, recording, "/state", names)))
+            plots.append((_titled(recording, "/state", names, group), partial(_lines, recording, "/state", names)))
     for topic in ("/command", "/action"):
         names = list(recording.tables[topic].names[1:]) if topic in recording.tables else []
         if 0 < len(names) <= MOST_LINES:
-            plots.append((topic[1:], partial(_lines, recording, topic, names)))
+            title = _titled(recording, topic, names, topic[1:])
+            plots.append((title, partial(_lines, recording, topic, names)))
     return [*plots, ("status", partial(_status, recording)), ("latency [ms]", partial(_latency, recording))]
+
+
+def _titled(recording: Recording, topic: str, names: list[str], title: str) -> str:
+    """The title with the units of the numbers, as far as the recording knows them."""
+    units = recording.units.get(topic, {})
+    found = dict.fromkeys(units[name] for name in names if units.get(name, "1") != "1")
+    return f"{title} [{', '.join(found)}]" if found else title
 
 
 def _seconds(recording: Recording, topic: str) -> NDArray[np.float64]:

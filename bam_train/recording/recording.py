@@ -68,6 +68,8 @@ class Recording:
     """Description of the deployment; see `bam_train.deploy.flight.deployment_facts`."""
     kinds: dict[str, dict[str, list[Any]]] = field(default_factory=dict)
     """Dtype and shape of each array of ``truth``, ``observation`` and ``action``."""
+    units: dict[str, dict[str, str]] = field(default_factory=dict)
+    """Topic to the unit of each number by name, 1 for none; empty in recordings of earlier versions."""
     tables: dict[str, Table] = field(default_factory=dict)
     """Topic to its numbers; all have the same number of ticks."""
     guards: list[str] = field(default_factory=list)
@@ -131,7 +133,9 @@ class Recording:
         if isinstance(record, Metadata) and record.name == "deployment":
             self.metadata = dict(record.metadata)
         elif isinstance(record, Metadata) and record.name == "layout":
-            self.kinds = {kind: json.loads(text) for kind, text in record.metadata.items()}
+            layout = {kind: json.loads(text) for kind, text in record.metadata.items()}
+            self.units = {topic: dict(units) for topic, units in dict(layout.pop("units", {})).items()}
+            self.kinds = layout
         elif isinstance(record, Footer):
             self.complete = True
         if not isinstance(record, tuple):

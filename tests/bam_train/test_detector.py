@@ -152,6 +152,16 @@ def test_a_rare_kind_of_usual_episodes_sets_the_bound():
     np.testing.assert_allclose(make_detector(episodes).model.bounds[4], 70 - 35 * np.log(share), rtol=1e-6)
 
 
+def test_from_few_ticks_a_sum_is_an_alarm_after_three_quarters_of_the_time_limit(monkeypatch):
+    episodes = rollouts(200, 0)
+    whole = make_detector(episodes).model  # no limit is known
+    few = make_detector(episodes, limit=400).model
+    np.testing.assert_allclose(few.bounds[2:4], 300 * (few.cut - few.drift), rtol=1e-6)
+    assert (few.bounds[2:4] > whole.bounds[2:4]).all()
+    monkeypatch.setattr("bam_train.checkpoint.detector.FEW", 6_000)  # 120 of the episodes determine the bounds
+    np.testing.assert_array_equal(make_detector(episodes, limit=400).model.bounds, whole.bounds)
+
+
 def test_a_bound_is_the_largest_of_the_kinds():
     kinds = [rollouts(200, 0), rollouts(200, 8, steps=70), rollouts(10, 9, steps=90)]
     plain, both = make_detector(kinds[0]), make_detector(*kinds)  # the third has too few

@@ -32,7 +32,7 @@ class ExportDataConfig:
     """minari (folder), d3rlpy (file .h5), lerobot (folder), rllib (folder of Parquet), hdf5 (file, as robomimic has it)
     or mcap (file, for Foxglove)."""
     out: Annotated[Path, tyro.conf.arg(metavar="PLACE")]
-    """Where it goes; nothing may be there yet."""
+    """Where it goes; nothing may be there yet, and missing folders are made."""
     where: Conditions = ()
     """Only episodes for which this holds, any number of times: success=true, "return>=10", policy~1f3a."""
 
@@ -129,7 +129,7 @@ class PlotConfig:
     place: DataPlace
     """The data set."""
     out: Annotated[Path, tyro.conf.arg(metavar="FILE")]
-    """The picture, a .png, .svg or .pdf file."""
+    """The picture, a .png, .svg or .pdf file; missing folders are made."""
     kind: Annotated[tuple[Kind, ...], tyro.conf.UseAppendAction, tyro.conf.arg(metavar="KIND")] = ()
     """What is drawn, any number of times: episodes (side by side), numbers (distributions of observations and actions),
     success (over time), table (where on the table it fails); by default all that the data set has."""
@@ -152,6 +152,6 @@ class ShowConfig:
     episode: Annotated[int, tyro.conf.arg(metavar="N")] = 0
     """Which one; -1 is the last."""
     out: Annotated[Path, tyro.conf.arg(metavar="FILE")] = Path("episode.gif")
-    """The film, a .gif or .mp4 file."""
+    """The film, a .gif or .mp4 file; missing folders are made."""
     camera: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
     """Recorded camera to show; by default the first."""

@@ -43,11 +43,12 @@ def run_agent(config: AgentConfig, signals: SignalMemory) -> int:
         ]
         versions = Versions(options.folder / "versions")
         stack.enter_context(versions.held())
-        refused = stack.enter_context(ExitStack())  # a start that is refused leaves nothing behind
+        refused = stack.enter_context(ExitStack())  # a start that is refused changes nothing
         refused.callback(_remove, new, options.folder)
         ran_before = (options.folder / "audit.jsonl").exists()
         if config.policy is not None:
             environment_of(Checkpoint.open(config.policy.expanduser()), config.env)  # before it becomes the champion
+        refused.callback(versions.undo())
         active = versions.first(config.policy)
         env_id, env_kwargs = environment_of(Checkpoint.open(active.path), config.env)
         if not options.robot:

@@ -81,10 +81,11 @@ class LateTicks(Share):
     def fault(self, tick: Tick) -> str | None:
         """Return None: this guard only warns."""
         late = self.count(tick)
-        if late > TICKS * self.limit_value or tick.pause > 2.0 * self._period:
+        if late > TICKS * self.limit_value + 1e-9:
             self.warning = (
-                f"{late} of the last {TICKS} commands were more than {1000 * self._by:.0f} ms late: the policy takes "
-                "too long, or the computer is busy"
+                f"{late} of the last {TICKS} commands were more than {1000 * self._by:.0f} ms late, and "
+                f"{TICKS * self.limit_value:g} may be: the robot moves unevenly, because the policy takes too long "
+                "or the computer is busy; end other programs, or use a faster policy"
             )
         elif not late:
             self.warning = ""

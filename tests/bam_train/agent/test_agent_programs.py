@@ -1,10 +1,12 @@
 """`bam-push`, and what `bam-agent` asks, against a real port with a fake agent behind it."""
 
 import json
+import socket
 from pathlib import Path
 
 import pytest
 
+from bam_train.agent.versions import Versions
 from bam_train.checkpoint import Checkpoint
 from bam_train.cli.live import live_agent as agent
 from bam_train.cli.live import push
@@ -12,6 +14,7 @@ from bam_train.errors import RequestRefused
 
 DIGEST = "3f2a91c0d7aa" + 52 * "0"
 PICK = Path(__file__).parents[3] / "checkpoints" / "pick-ppo.zip"
+REACH = PICK.with_name("reach-ppo.zip")
 STATUS = {
     "state": "trial",
     "why": "push by anna@laptop",
@@ -245,6 +248,18 @@ def test_a_refused_start_leaves_nothing(run, tmp_path, monkeypatch, flags, text)
     assert (status, out) == (1, "")
     assert text in err
     assert [*Path().iterdir()] == []
+
+
+def test_a_start_at_a_port_in_use_changes_no_version(run, tmp_path):
+    versions = Versions(tmp_path / "agent" / "versions")
+    versions.first(REACH)
+    before = versions.all()
+    with socket.create_server(("127.0.0.1", 0)) as used:
+        port = used.getsockname()[1]
+        status, _, err = run(agent.main, "--policy", PICK, "--folder", tmp_path / "agent", "--port", port)
+    text = f"Port {port} on 127.0.0.1 is in use. Stop the program there, or choose another port (0 takes a free one)."
+    assert (status, err) == (1, f"bam-agent: {text}\n")
+    assert versions.all() == before
 
 
 def test_a_refused_start_keeps_what_others_made_meanwhile(run, tmp_path, monkeypatch):

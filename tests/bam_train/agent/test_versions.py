@@ -190,6 +190,18 @@ def test_an_agent_that_is_started_again_goes_on_with_its_champion(versions, some
     assert versions.first(one.path).digest == one.digest
 
 
+def test_to_begin_with_a_version_can_be_undone(versions, some):
+    old = some(KEPT + 2)
+    versions.first(old[0].path)
+    for one in old[1:-1]:
+        versions.add(one)
+    for given in (old[-1], old[5], old[0]):  # a new one, one without a name, and the same again
+        before, undo = versions.all(), versions.undo()
+        versions.first(given.path)
+        undo()
+        assert versions.all() == before
+
+
 # Disk
 
 

@@ -73,7 +73,7 @@ def test_table_without_success(corridor_checkpoint, run):
 
 
 def test_film(corridor_checkpoint, starting_cell, run, tmp_path):
-    film = tmp_path / "film.gif"
+    film = tmp_path / "new" / "film.gif"
     arguments = ("--episodes", 4, "--seed", 7, "--video", film, "--video-episodes", 2, "--json")
     status, out, err = run(main, corridor_checkpoint(), *arguments)
     pictures = sum(5 - starting_cell(seed) for seed in (7, 8))

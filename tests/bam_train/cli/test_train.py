@@ -180,7 +180,10 @@ ERRORS = [  # one of each kind; the rest is in the tests of settings, hyperparam
         "/proc/version: cannot be written: /proc/version is a file, expected a folder. "
         "Choose another place with --runs",
     ),
-    ({"resume": Path("no.zip")}, "no.zip: no such file. Train one with bam-train, or check the name"),
+    (
+        {"resume": Path("no.zip")},
+        "--resume no.zip: no such file. Check the name; a run keeps runs/NAME/last.zip",
+    ),
     ({"steps": 0}, "steps: expected a whole number from 1 to 1000000000000000, found 0"),
 ]
 

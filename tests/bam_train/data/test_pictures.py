@@ -37,10 +37,10 @@ def test_plot_draws_what_there_is(kind, tmp_path, capsys):
     image = pytest.importorskip("PIL.Image")
     record(tmp_path / "a", kind, 3)
     record(tmp_path / "b", kind, 4)
-    given = ("plot", tmp_path / "a", "--out", tmp_path / "a.png")
-    drawn = f"{tmp_path}/a.png: episodes, numbers, success\n"
+    given = ("plot", tmp_path / "a", "--out", tmp_path / "new" / "a.png")
+    drawn = f"{tmp_path}/new/a.png: episodes, numbers, success\n"
     assert run(capsys, *given, "--against", tmp_path / "b") == (0, drawn, "")
-    with image.open(tmp_path / "a.png") as picture:
+    with image.open(tmp_path / "new" / "a.png") as picture:
         assert picture.size[0] == 1200
     reach(tmp_path / "c")
     status, _, err = run(capsys, *given, "--against", tmp_path / "c")
@@ -61,8 +61,8 @@ def test_a_film_of_recorded_pictures(tmp_path, capsys):
     data = record(tmp_path / "a", "nested", 3)
     found = list(frames(data, 1, "camera"))
     np.testing.assert_array_equal(found, data[1].observations["camera"])
-    status, out, _ = run(capsys, "show", tmp_path / "a", "--episode", "-2", "--out", tmp_path / "e.gif")
-    assert (status, out.partition(", return")[0]) == (0, f"{tmp_path}/e.gif: episode 1, 5 pictures")
+    status, out, _ = run(capsys, "show", tmp_path / "a", "--episode", "-2", "--out", tmp_path / "new" / "e.gif")
+    assert (status, out.partition(", return")[0]) == (0, f"{tmp_path}/new/e.gif: episode 1, 5 pictures")
     with pytest.raises(SettingsError, match="has no 'kamera'"):
         next(frames(data, 0, "kamera"))
     status, _, err = run(capsys, "show", tmp_path / "a", "--episode", "3", "--out", tmp_path / "e.gif")

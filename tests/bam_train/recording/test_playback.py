@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from matplotlib.axes import Axes
 from mcap.records import Channel, Message, Metadata
 from mcap.stream_reader import StreamReader
 from mcap.writer import Writer
@@ -248,7 +249,9 @@ def test_somebody_elses_mcap_file_is_refused(tmp_path, topic, content):
         Recording.open(path)
 
 
-def test_a_recording_is_drawn(small_chunks, tmp_path, capsys):
+def test_a_recording_is_drawn(small_chunks, tmp_path, capsys, monkeypatch):
+    titles = []
+    monkeypatch.setattr(Axes, "set_ylabel", lambda axes, text, **_: titles.append(text))
     plot, video, cut = tmp_path / "new" / "a.png", tmp_path / "new" / "too" / "a.gif", tmp_path / "cut.mcap"
     cut.write_bytes(small_chunks[:20_000])
     ticks = Recording.open(cut).ticks
@@ -258,6 +261,9 @@ def test_a_recording_is_drawn(small_chunks, tmp_path, capsys):
         f"bam-replay: {plot}: drawn",
         f"bam-replay: {video}: {ticks} ticks",
     ]
+    quantities = ["joint_position [rad]", "joint_velocity [rad/s]", "gripper_width [m]", "object_position [m]"]
+    others = ["object_quaternion", "command [rad, m]", "action", "status", "latency [ms]"]
+    assert titles == quantities + others
     assert plot.read_bytes().startswith(b"\x89PNG")
     assert video.read_bytes().startswith(b"GIF8")
     for flag, name in (("--plot", "a.png"), ("--video", "a.gif")):
