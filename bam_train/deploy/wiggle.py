@@ -12,12 +12,11 @@ from numpy.typing import NDArray
 
 from bam_envs.core.errors import SafetyStop
 from bam_envs.core.robot import Initial, RobotSpec, RobotState, SignalSpec
+from bam_envs.live.robot_checks import FACTORS, Check, check, driven
 from bam_envs.safety.first_motion import PROOF
 from bam_envs.safety.gate import SafeRobot
 from bam_envs.safety.guard import is_base, measured_places
 from bam_train.deploy.checkpoint_admission import SHADOW
-from bam_train.deploy.contract_table import Check, check
-from bam_train.deploy.robot_checks import FACTORS, driven
 from bam_train.recording.recording import Recording
 
 Array = NDArray[np.float64]

@@ -15,11 +15,11 @@ from bam_train.signals import SignalMemory
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from bam_envs.live.diagnosis import Diagnosis, DiagnosisStep
+    from bam_envs.live.diagnosis import Diagnosis, DiagnosisStep, Findings
+    from bam_envs.live.examination import Inspection
     from bam_train.checkpoint import Checkpoint
     from bam_train.cli.flags import DoctorConfig
-    from bam_train.deploy.contract_table import Contract
-    from bam_train.env_location import EnvLocation
+    from bam_train.deploy.contract import Contract
 
 CONTRACT = "contract"
 """Name of the last step, with a checkpoint."""
@@ -38,7 +38,8 @@ def examine(config: DoctorConfig, signals: SignalMemory) -> int:
         robot = None if subject is None else subject.env.unwrapped.robot
         diagnosis = Diagnosis(config.url, robot, profile=config.profile, seconds=config.seconds, **files)
         try:
-            for step in _shown(_all_steps(diagnosis, subject), config):
+            more = [] if subject is None else [(CONTRACT, subject.examine)]
+            for step in _shown(diagnosis.steps(*more), config):
                 steps.append(step)
                 signals.raise_again()
             if subject is not None and subject.contract is not None and not config.json:
@@ -75,9 +76,22 @@ class _Subject:
 
     checkpoint: Checkpoint
     env: Any
-    place: EnvLocation
     contract: Contract | None = None
     """The contract, once it was checked."""
+
+    def examine(self, inspection: Inspection) -> Findings:
+        """Compare the checkpoint with the robot; the last step, which fails if they do not fit."""
+        from bam_envs.core.errors import NotReady
+        from bam_envs.core.wording import listed
+        from bam_train.deploy.contract import contract_with
+
+        self.contract = contract = contract_with(self.checkpoint, self.env, inspection)
+        try:
+            contract.require(f"{self.checkpoint.path} and the robot")
+        except ContractRefused as error:
+            raise NotReady(str(error)) from error
+        unknown = [line.what for line in contract.checks if line.verdict == "unknown"]
+        return [f"{len(contract.checks)} lines"], [f"unknown: {listed(unknown)}"] if unknown else []
 
     @classmethod
     def of(cls, config: DoctorConfig, files: dict[str, Any]) -> _Subject | None:
@@ -91,32 +105,7 @@ class _Subject:
         checkpoint = Checkpoint.open(config.checkpoint)
         env_id, env_kwargs = environment_of(checkpoint, config.env)
         place = EnvLocation(config.url, profile=config.profile, **files)
-        return cls(checkpoint, make_env(env_id, env_kwargs, place=place), place)
-
-
-def _all_steps(diagnosis: Diagnosis, subject: _Subject | None) -> Iterator[DiagnosisStep]:
-    """The steps of the diagnosis; then, if none failed, the contract of the checkpoint."""
-    from bam_envs.core.errors import BamEnvsError
-    from bam_envs.core.wording import listed
-    from bam_envs.live.diagnosis import DiagnosisStep
-
-    passed = True
-    for step in diagnosis.steps():
-        yield step
-        passed = step.verdict != "failed"
-    if not passed or subject is None:
-        return
-    from bam_train.deploy.contract import check_contract
-
-    try:
-        subject.contract = contract = check_contract(subject.checkpoint, subject.env, subject.place)
-        contract.require(f"{subject.checkpoint.path} and the robot")
-    except (BamEnvsError, ContractRefused) as error:
-        yield DiagnosisStep(CONTRACT, "failed", str(error))
-        return
-    unknown = [line.what for line in contract.checks if line.verdict == "unknown"]
-    warnings = [f"unknown: {listed(unknown)}"] if unknown else []
-    yield DiagnosisStep(CONTRACT, "warning" if warnings else "ok", f"{len(contract.checks)} lines", tuple(warnings))
+        return cls(checkpoint, make_env(env_id, env_kwargs, place=place))
 
 
 def _shown(steps: Iterator[DiagnosisStep], config: DoctorConfig) -> Iterator[DiagnosisStep]:
@@ -147,16 +136,17 @@ def _write_measured(config: DoctorConfig, diagnosis: Diagnosis) -> dict[str, Any
     if config.measure is None:
         return None
     from bam_envs.core.errors import InvalidValue
+    from bam_envs.live.examination import measured_link
     from bam_train.errors import OutputError
     from bam_train.files.atomic_file import replacing
 
-    measurement, path = diagnosis.measurement, config.measure.expanduser()
-    if measurement is None:
+    inspection, path = diagnosis.inspection, config.measure.expanduser()
+    if inspection is None:
         say(f"bam-doctor: {path} was not written: the link was not measured")
         return None
-    about = f"{config.url}, {len(measurement.trips)} pings in {measurement.seconds:.1f} s"
+    about = f"{config.url}, {len(inspection.trips)} pings in {inspection.seconds:.1f} s"
     try:
-        link = measurement.profile(about)
+        link = measured_link(inspection.trips, inspection.copies, next(iter(inspection.readings.values())), about)
         with replacing(path) as temporary:
             temporary.write_text(link.to_json() + "\n")
     except InvalidValue as error:

@@ -11,10 +11,12 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from bam_envs.core.errors import ProtocolError
 from bam_envs.core.kinematics import UR5E_GRIPPER, UR_JOINTS, quaternions
 from bam_envs.core.robot import RobotState
-from bam_envs.live.inspection import TOOL_POSE, Inspection
+from bam_envs.live.examination import TOOL_POSE, Inspection
 from bam_envs.live.state import Letter
+from bam_envs.live.urdf import read_urdf
 from bam_envs.robots.mir100 import base_spec
 from bam_envs.robots.profile import load_profile
 from bam_envs.robots.ur import UR_MODELS
@@ -23,11 +25,9 @@ from bam_envs.ros.codec import RobotInfo, encode_state
 from bam_envs.ros.messages import write_stamp
 from bam_envs.safety.guard import Limits
 from bam_train.checkpoint import Checkpoint
-from bam_train.deploy.contract import fit_checks, live_checks
-from bam_train.deploy.contract_table import Contract
-from bam_train.deploy.urdf import read_urdf
+from bam_train.deploy.contract import Contract, fit_checks, live_checks
 from bam_train.environments import make_env
-from bam_train.errors import ContractRefused, FormatError
+from bam_train.errors import ContractRefused
 
 PICK = Path(__file__).parents[3] / "checkpoints" / "pick-ppo.zip"
 JOINTS = np.array([-0.27, -1.54, 1.89, -1.93, -1.47, -1.84])
@@ -49,7 +49,7 @@ class Watched:
     def contract(self):
         robot = SimpleNamespace(spec=self.spec, limits=Limits())
         env = SimpleNamespace(unwrapped=SimpleNamespace(robot=robot, task=self.task))
-        return Contract(tuple(live_checks(env, self.profile, self.inspection())))
+        return Contract(tuple(live_checks(env, self.inspection())))
 
     def inspection(self):
         names = {signal.name for signal in self.spec.signals} | {*TOOL_POSE}
@@ -71,7 +71,8 @@ class Watched:
         if self.urdf is not None:
             letters["/robot_description"] = [Letter({"data": self.urdf}, BEGIN, 1)]
         letters = {topic: tuple(found) for topic, found in letters.items()}
-        return Inspection(self.info, sources, sinks, types, letters, self.seconds, WALL - BEGIN, -self.clock)
+        facts = self.seconds, WALL - BEGIN, -self.clock
+        return Inspection(self.profile, self.info, sources, sinks, types, letters, *facts)
 
     def noisy(self, values, scale):
         values = np.asarray(values, float)
@@ -552,7 +553,7 @@ def test_the_kinematics_of_a_urdf():
     ],
 )
 def test_what_is_no_urdf(text):
-    with pytest.raises(FormatError, match=r"^the robot's description is no URDF"):
+    with pytest.raises(ProtocolError, match=r"^the robot's description is no URDF"):
         read_urdf(text)
 
 

@@ -1,24 +1,24 @@
-"""Checks of the topics of a live robot against a task: pure functions of collected messages.
+"""Checks of a live robot against a task, one line each: its topics, rates, ages, units, ranges and commands.
 
-A topic whose messages cannot be read is refused in its own line, and its signals have no further lines.
+Pure functions of collected messages. A topic whose messages cannot be read is refused in its own line, and its signals
+have no further lines.
 """
 
 import math
-import statistics
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from bam_envs.core.errors import ProtocolError
 from bam_envs.core.robot import RobotSpec, SignalSpec
-from bam_envs.live.inspection import Inspection
-from bam_envs.live.state import SIMULATED_BEFORE, Letter, SourceAge, concerns
-from bam_envs.ros.codec import decode_source
-from bam_envs.ros.messages import Message, bare_type, has_header, number_at, read_stamp, same_type
-from bam_envs.ros.profile_tables import RobotProfile, Source
+from bam_envs.live.examination import Inspection, Reading
+from bam_envs.live.state import SIMULATED_BEFORE
+from bam_envs.ros.messages import Message, bare_type, has_header, number_at, same_type
+from bam_envs.ros.profile_tables import Source
 from bam_envs.safety.guards import MeasuredLimits
-from bam_train.deploy.contract_table import Check, check
 
 Array = NDArray[np.float64]
 STATES_PER_COMMAND = 0.8
@@ -34,118 +34,97 @@ AHEAD = 0.5
 SPEED_OF = {"joint_velocity": "joint_position", "base_velocity": "base_pose"}
 _SCAN_OFF, _RANGE_OFF = 0.02, 10.0  # relative tolerance of an angle, factor of tolerance of a range
 _SHORTEST = 0.05  # minimum time over which a speed is compared [s]
+Verdict = Literal["ok", "refused", "unknown"]
 
 
-def readings(inspection: Inspection, source: Source, size: int) -> tuple[Array, Array]:
-    """Arrival times (k,) [s] and values (k, size) [SI] of a signal; `ProtocolError` for an unreadable message."""
-    letters = [letter for letter in inspection.letters.get(source.topic, ()) if concerns(source, letter.message)]
-    values = [decode_source(source, letter.message, size) for letter in letters]
-    return np.array([letter.arrived for letter in letters]), np.array(values).reshape(-1, size)
+@dataclass(frozen=True)
+class Check:
+    """One line of an examination."""
+
+    what: str
+    expected: str
+    found: str
+    verdict: Verdict
+    """``"unknown"`` if the robot's messages do not decide the line, which then does not refuse the robot."""
+    passes: bool = False
+    """Whether a busy computer or network changes the line, so that another look may find another value."""
 
 
-def robot_checks(profile: RobotProfile, spec: RobotSpec, inspection: Inspection) -> Iterator[Check]:
+def check(what: str, expected: str, found: str, *, fits: bool | None, passes: bool = False) -> Check:
+    """One line; `fits` is None for an unknown result."""
+    return Check(what, expected, found, "unknown" if fits is None else "ok" if fits else "refused", passes)
+
+
+def robot_checks(spec: RobotSpec, inspection: Inspection) -> Iterator[Check]:
     """The lines about topics, rates, ages, units, ranges and commands of a live robot."""
-    sizes = {signal.name: len(signal.labels) for signal in spec.signals}
-    required = [source for source in inspection.sources if source.signal in sizes]
-    lockstep = inspection.info is not None and inspection.info.lockstep
-    readable: dict[str, tuple[Array, Array]] = {}
-    for topic in dict.fromkeys(source.topic for source in required):
-        sources = [source for source in required if source.topic == topic]
-        problem, found = _read_topic(inspection, sources, sizes)
-        yield check(f"topic {topic}", sources[0].type, problem or sources[0].type, fits=not problem)
+    names = [signal.name for signal in spec.signals]
+    required = [reading for name, reading in inspection.readings.items() if name in names]
+    lockstep, readable = inspection.is_lockstep, dict[str, Reading]()
+    for topic in dict.fromkeys(reading.source.topic for reading in required):
+        readings = [reading for reading in required if reading.source.topic == topic]
+        source = readings[0].source
+        problem = _unreadable(inspection, readings)
+        yield check(f"topic {topic}", source.type, problem or source.type, fits=not problem)
         if problem:
             continue
-        readable |= found
+        readable |= {reading.source.signal: reading for reading in readings}
         if not lockstep:
-            yield from _timing(profile, spec, inspection, sources[0])
-        yield from _scan_geometry(sources[0], inspection.letters[topic][-1].message)
+            yield from _timing(spec, inspection, readings[0])
+        yield from _scan_geometry(source, inspection.letters[topic][-1].message)
     for signal in spec.signals:
         if signal.name in readable:
-            lines = list(_range(signal, readable[signal.name][1]))
+            lines = list(_range(signal, readable[signal.name].values))
             yield from lines
             if lines[0].verdict == "refused":
                 del readable[signal.name]
     for speed, position in SPEED_OF.items():
         if speed in readable and position in readable and not lockstep:
             simulated = inspection.info is not None and inspection.info.simulated
-            yield _speed(speed, position, *readable[speed], *readable[position], simulated)
+            yield _speed(readable[speed], readable[position], simulated)
     yield from _commands(inspection)
-    if inspection.info is not None and inspection.info.lockstep and inspection.info.period is not None:
+    if inspection.info is not None and lockstep and inspection.info.period is not None:
         period = inspection.info.period
         yield check("robot's period", f"{spec.period:g} s", f"{period:g} s", fits=period == spec.period)
 
 
-def _read_topic(
-    inspection: Inspection, sources: Sequence[Source], sizes: dict[str, int]
-) -> tuple[str, dict[str, tuple[Array, Array]]]:
-    """Why the messages of a topic cannot be used, or ""; and the readings of its signals."""
-    topic, expected = sources[0].topic, sources[0].type
-    if inspection.types is not None:
-        kind = inspection.types[topic]
-        if not kind:
-            return "nobody publishes it", {}
-        if not same_type(kind, expected):
-            return bare_type(kind), {}
-    found: dict[str, tuple[Array, Array]] = {}
-    for source in sources:
-        try:
-            times, values = readings(inspection, source, sizes[source.signal])
-        except ProtocolError as error:
-            return str(error).removeprefix(f"{topic}: ").removesuffix("."), {}
-        if not len(times):
-            return f"no message in {inspection.seconds:.1f} s", {}
-        found[source.signal] = times, values
-    return "", found
+def _unreadable(inspection: Inspection, readings: Sequence[Reading]) -> str:
+    """Why the messages of a topic cannot be used, or ""."""
+    topic, expected = readings[0].source.topic, readings[0].source.type
+    kind = expected if inspection.types is None else inspection.types[topic]
+    if not kind:
+        return "nobody publishes it"
+    if not same_type(kind, expected):
+        return bare_type(kind)
+    for reading in readings:
+        if reading.error:
+            return reading.error.removeprefix(f"{topic}: ").removesuffix(".")
+        if not reading.count:
+            return f"no message in {inspection.seconds:.1f} s"
+    return ""
 
 
-def _timing(profile: RobotProfile, spec: RobotSpec, inspection: Inspection, source: Source) -> Iterator[Check]:
-    """Rate and age of the messages of a topic."""
-    letters = [letter for letter in inspection.letters[source.topic] if concerns(source, letter.message)]
-    allowed = source.max_age or profile.max_age
+def _timing(spec: RobotSpec, inspection: Inspection, reading: Reading) -> Iterator[Check]:
+    """Rate, age and stamps of the messages of a topic."""
+    source, rate = reading.source, reading.rate
+    allowed = source.max_age or inspection.profile.max_age
     least = 1 / allowed if source.max_age else max(1 / allowed, STATES_PER_COMMAND / spec.period)
-    try:
-        new, ages = _new_and_ages(inspection, source, letters)
-    except ProtocolError as error:
-        yield check(f"rate of {source.topic}", f"at least {least:.3g} Hz", str(error), fits=False)
-        return
-    rate = (len(new) - 1) / (new[-1] - new[0]) if len(new) > 1 and new[-1] > new[0] else 0.0
-    what = f"{rate:.3g} Hz" if rate else f"{len(new)} new in {inspection.seconds:.1f} s"
+    what = f"{rate:.3g} Hz" if rate else f"{reading.new} new in {inspection.seconds:.1f} s"
     yield check(f"rate of {source.topic}", f"at least {least:.3g} Hz", what, fits=rate >= least, passes=True)
     if rate >= least:
-        age = statistics.median(ages)
+        age = max(0.0, float(np.median(reading.delays)))
         found = f"{age:.3f} s"
         yield check(f"age of {source.topic}", f"at most {allowed:g} s", found, fits=age <= allowed, passes=True)
-    yield from _stamps(inspection, source, letters)
-
-
-def _stamps(inspection: Inspection, source: Source, letters: Sequence[Letter]) -> Iterator[Check]:
-    """A line about stamps that do not tell when a message was measured, from which its age would be judged."""
-    stamps = [read_stamp(letter.message, source.topic) for letter in letters]
-    found = ""
-    if has_header(source.type) and None in stamps:
+    found = ""  # of stamps that do not tell when a message was measured, from which its age would be judged
+    if has_header(source.type) and None in reading.stamps:
         found = "0: ages are judged by arrival alone, and a driver that repeats old states is not noticed"
-    offset, clock = (
-        inspection.server_offset or 0.0,
-        "this computer" if inspection.server_offset is None else "the bridge",
-    )
-    rows = zip(stamps, letters, strict=True)
-    ahead = [at - (one.arrived + inspection.wall_ahead - offset) for at, one in rows if at and at >= SIMULATED_BEFORE]
-    if ahead and statistics.median(ahead) > AHEAD:
-        found = f"{statistics.median(ahead):.1f} s ahead of the clock of {clock}: set the clock of the robot"
+    clock = "this computer" if inspection.server_offset is None else "the bridge"
+    behind = inspection.wall_ahead - (inspection.server_offset or 0.0)
+    rows = zip(reading.stamps, reading.arrived, strict=True)
+    ahead = [at - (arrived + behind) for at, arrived in rows if at and at >= SIMULATED_BEFORE]
+    if ahead and np.median(ahead) > AHEAD:
+        found = f"{np.median(ahead):.1f} s ahead of the clock of {clock}: set the clock of the robot"
     if found:
         yield check(f"stamps of {source.topic}", "the time of the measurement", found, fits=None)
-
-
-def _new_and_ages(inspection: Inspection, source: Source, letters: Sequence[Letter]) -> tuple[list[float], list[float]]:
-    """Arrival times of messages with a new stamp [s], and the age of each message at its arrival [s]."""
-    tracker, new, ages, before = SourceAge(inspection.wall_ahead), [], [], math.nan
-    for letter in letters:
-        tracker.look(letter, source.topic, inspection.server_offset)
-        ages.append(max(0.0, tracker.at(letter.arrived)))
-        if tracker.stamp is None or tracker.stamp != before:
-            new.append(letter.arrived)
-        before = math.nan if tracker.stamp is None else tracker.stamp
-    return new, ages
 
 
 def _scan_geometry(source: Source, message: Message) -> Iterator[Check]:
@@ -206,28 +185,25 @@ def _other_unit(signal: SignalSpec, values: Array) -> str:
     return ""
 
 
-def _speed(
-    speed: str, position: str, times: Array, speeds: Array, at: Array, positions: Array, simulated: bool
-) -> Check:
+def _speed(speed: Reading, position: Reading, simulated: bool) -> Check:
     """Compare the measured speeds with the change of the measured positions.
 
     A simulated gripper at rest on an object may chatter: its measured speed is then not that of a motion.
     """
-    what, expected = f"{speed} against {position}", f"equal within {RATE_OFF:g}"
-    if len(at) < 2 or at[-1] - at[0] < _SHORTEST:
+    name, times, at, positions = position.source.signal, speed.arrived, position.arrived, position.values
+    what, expected = f"{speed.source.signal} against {name}", f"equal within {RATE_OFF:g}"
+    if at[-1] - at[0] < _SHORTEST:
         return check(what, expected, "too few messages", fits=None)
-    change = positions[-1] - positions[0]
-    if position == "base_pose":
-        change = driven(positions)[-1]
+    change = driven(positions)[-1] if name == "base_pose" else positions[-1] - positions[0]
     changed = change / (at[-1] - at[0])
     inside = (times >= at[0]) & (times <= at[-1])
-    measured = speeds[inside].mean(axis=0) if inside.any() else speeds.mean(axis=0)
+    measured = speed.values[inside if inside.any() else slice(None)].mean(axis=0)
     off = np.abs(measured - changed) - RATE_OFF * np.abs(changed)
     worst = int(off.argmax())
     still = np.abs(changed).max() < RATE_OFF and (simulated or off[worst] <= RATE_OFF)
     if still:
         return check(what, expected, "not shown at rest", fits=None)
-    found = f"{measured[worst]:.3g} measured, {changed[worst]:.3g} from {position}"
+    found = f"{measured[worst]:.3g} measured, {changed[worst]:.3g} from {name}"
     return check(what, expected, found, fits=bool(off[worst] <= RATE_OFF))
 
 

@@ -15,12 +15,10 @@ from numpy.typing import NDArray
 from bam_envs.core.errors import ProtocolError
 from bam_envs.core.kinematics import UR5E_GRIPPER, UR_JOINTS, ArmGeometry, angle_between, quaternions
 from bam_envs.core.robot import RobotSpec
-from bam_envs.live.inspection import DESCRIPTION, Inspection
+from bam_envs.live.examination import DESCRIPTION, TOOL_POSE, Inspection
+from bam_envs.live.robot_checks import FACTORS, Check, check
+from bam_envs.live.urdf import Urdf, read_urdf
 from bam_envs.robots.ur import UR_MODELS
-from bam_train.deploy.contract_table import Check, check
-from bam_train.deploy.robot_checks import FACTORS, readings
-from bam_train.deploy.urdf import Urdf, read_urdf
-from bam_train.errors import FormatError
 
 Array = NDArray[np.float64]
 OFF_AXIS, ROTATION = 0.015, 0.06
@@ -84,28 +82,20 @@ def arm_checks(spec: RobotSpec, geometry: ArmGeometry, margin: float, inspection
 def measured_joints(inspection: Inspection, spec: RobotSpec) -> Array | None:
     """The measured joints (k, 6) [rad], or None if they are outside their range or unreadable."""
     signal = next(signal for signal in spec.signals if signal.name == "joint_position")
-    source = next(source for source in inspection.sources if source.signal == "joint_position")
-    try:
-        values = readings(inspection, source, len(signal.labels))[1]
-    except ProtocolError:
-        return None
-    inside = (values >= np.array(signal.low)).all() and (values <= np.array(signal.high)).all()
-    return values if len(values) and inside else None
+    reading = inspection.readings["joint_position"]
+    inside = (reading.values >= np.array(signal.low)).all() and (reading.values <= np.array(signal.high)).all()
+    return reading.values if len(reading.values) and not reading.error and inside else None
 
 
 def _tool_pose(inspection: Inspection) -> tuple[Pose | None, str]:
     """The measured pose of the tool; or None, and why it is not known."""
     found: dict[str, Array] = {}
-    for name, size in (("tool_position", 3), ("tool_quaternion", 4)):
-        source = next((source for source in inspection.sources if source.signal == name), None)
-        if source is None:
-            continue
-        try:
-            values = readings(inspection, source, size)[1]
-        except ProtocolError as error:
-            return None, str(error).removesuffix(".")
-        if len(values):
-            found[name] = np.median(values, axis=0)
+    for name in TOOL_POSE:
+        reading = inspection.readings.get(name)
+        if reading is not None and reading.error:
+            return None, reading.error.removesuffix(".")
+        if reading is not None and reading.count:
+            found[name] = np.median(reading.values, axis=0)
     if "tool_position" not in found:
         return None, "the robot does not report the pose of its tool"
     quaternion = found.get("tool_quaternion")
@@ -190,7 +180,7 @@ def _description(inspection: Inspection) -> tuple[Urdf | None, str]:
     message: Any = letters[-1].message
     try:
         return read_urdf(message.get("data") if isinstance(message, dict) else None), ""
-    except FormatError as error:
+    except ProtocolError as error:
         return None, str(error)
 
 

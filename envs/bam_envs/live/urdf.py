@@ -9,7 +9,7 @@ from xml.etree import ElementTree
 import numpy as np
 from numpy.typing import NDArray
 
-from bam_train.errors import FormatError
+from bam_envs.core.errors import ProtocolError
 
 Array = NDArray[np.float64]
 LARGEST = 8 * 2**20
@@ -59,15 +59,15 @@ def read_urdf(text: object) -> Urdf:
     """The joints in the text of a URDF.
 
     Raises:
-        FormatError: The text is not a URDF.
+        ProtocolError: The text is not a URDF.
     """
     if not isinstance(text, str) or len(text) > LARGEST or "<!" in text.replace("<!--", ""):  # no declared entities
-        raise FormatError("the robot's description is no URDF")
+        raise ProtocolError("the robot's description is no URDF")
     try:
         root = ElementTree.fromstring(text)  # without entity declarations nothing is expanded
         return Urdf({str(element.get("name")): _joint(element) for element in root.findall("joint")})
     except (ElementTree.ParseError, ValueError, AttributeError) as error:
-        raise FormatError(f"the robot's description is no URDF: {error}") from error
+        raise ProtocolError(f"the robot's description is no URDF: {error}") from error
 
 
 def _joint(element: Any) -> UrdfJoint:
