@@ -213,6 +213,8 @@ class Diagnosis:
                 found.append(f"{reading.source.topic} {reading.rate:.4g} Hz, age {_p50_p99(reading.ages)}")
                 warnings += _warnings_about(reading, limit, period)
             seen.add(key)
+        if inspection.busy:
+            warnings.append(f"{inspection.busy}; close other programs, or the robot will be held")
         return found, warnings
 
     # ---- the link
@@ -321,10 +323,13 @@ def _why_old(reading: Reading, limit: float, inspection: Inspection) -> str:
     """The cause of states that are older than `limit` [s], and its remedy, in sentences."""
     if reading.delays[-1] - reading.delays[0] > (reading.arrived[-1] - reading.arrived[0]) / 2:
         return "Their stamp stands still: the driver repeats an old measurement. Start it again."
-    if reading.rate < 2 / limit:
+    trips, late, rarely = inspection.round_trips, float(np.median(reading.delays)), reading.rate < 2 / limit
+    way = float(np.median(trips)) / 2 if len(trips) else 0.0
+    simulated = inspection.info is not None and inspection.info.simulated
+    if inspection.busy and (simulated or (late <= limit and not rarely)):
+        return f"But {inspection.busy}, and the robot may be in time: close other programs, and measure again."
+    if rarely:
         return "They come too rarely: raise the rate of their driver."
-    trips = inspection.round_trips
-    late, way = float(np.median(reading.delays)), float(np.median(trips)) / 2 if len(trips) else 0.0
     if late <= limit:
         return "They come in bursts, with pauses between: the network, or a busy computer on the way, holds them back."
     old = f"They are {_ms(late)} old when they arrive, so that a higher rate would change nothing"

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from bam_envs.core.errors import InvalidValue, LinkLost, ProtocolError
 from bam_envs.core.robot import RobotSpec
-from bam_envs.core.timing import Deadline, Pacer
+from bam_envs.core.timing import BUSY, Deadline, Pacer, is_disturbed
 from bam_envs.live.bringup import TIMEOUT, TopicTypes, ask, least_interval, tagged_sinks
 from bam_envs.live.command_proof import CommandProof, needed_proof
 from bam_envs.live.robot_identity import robot_identity
@@ -68,7 +68,7 @@ class Reading:
     rate: float
     """Those a second [Hz]; 0 for fewer than two."""
     ages: Array
-    """Age of the newest message at each tick of the examination [s]; none before the first message."""
+    """Age of the newest message at each tick that began in time, or at all if none did [s]."""
     error: str
     """Error of the first unreadable message; "" for none."""
 
@@ -105,6 +105,8 @@ class Inspection:
     """Serial number or name of the robot; empty if neither is known."""
     ticks: Array = field(default_factory=lambda: np.empty(0))
     """When a task would have read the state [s, monotonic clock], once a period."""
+    late: NDArray[np.bool_] = field(default_factory=lambda: np.empty(0, np.bool_))
+    """Which of the ticks began late, which is this computer's fault and not the robot's."""
     trips: Array = field(default_factory=lambda: np.empty(0))
     """Round trip of each ping, in order [s]; NaN for a lost ping; empty if the server echoes none. Shape: (pings,)."""
     copies: int = 0
@@ -119,6 +121,12 @@ class Inspection:
     def is_lockstep(self) -> bool:
         """Whether the robot's time advances with commands only, so that its states have neither rate nor age."""
         return self.info is not None and self.info.lockstep
+
+    @property
+    def busy(self) -> str:
+        """How busy this computer was, in words; empty if few ticks came late."""
+        count, late = len(self.ticks), int(self.late.sum())
+        return f"this computer is busy: {late} of {count} ticks came late" if late > BUSY * count else ""
 
     @property
     def lost(self) -> float:
@@ -148,8 +156,9 @@ class Inspection:
             delays.append(tracker.at(letter.arrived))
             stamps.append(tracker.stamp)
         times, late = np.array(arrived), np.array(delays)
-        newest = np.searchsorted(times, self.ticks, side="right") - 1
-        ages = (self.ticks - (times - late)[newest])[newest >= 0] if arrived else np.empty(0)
+        ticks = self.ticks if self.late.all() else self.ticks[~self.late]
+        newest = np.searchsorted(times, ticks, side="right") - 1
+        ages = (ticks - (times - late)[newest])[newest >= 0] if arrived else np.empty(0)
         rate = (len(new) - 1) / (new[-1] - new[0]) if len(new) > 1 and new[-1] > new[0] else 0.0
         rows = np.array(values).reshape(-1, size)
         return Reading(source, len(letters), times, tuple(stamps), late, rows, len(new), rate, ages, error)
@@ -257,10 +266,12 @@ def inspect_robot(
             link.subscribe(link.namespace + topic, kind, listener, throttle_ms=least, queue_length=length)
     awaited = {source.topic for source in required} & inbox.letters.keys()
     inbox.wait_for(lambda: all(inbox.letters[topic] for topic in awaited) or not link.is_up, timeout)
-    name, sent, pacer, begun = secrets.token_hex(4), list[float](), Pacer(spec.period), time.monotonic()
+    name, sent, ticks, late = secrets.token_hex(4), list[float](), list[float](), list[bool]()
+    pacer, enough = Pacer(spec.period), Deadline(listen)
     pacer.start()
-    while link.is_up and time.monotonic() < begun + listen:
-        pacer.wait()
+    while link.is_up and not enough.passed:
+        late.append(is_disturbed(pacer.wait(), spec.period))
+        ticks.append(time.monotonic())
         if are_echoed:
             sent.append(time.monotonic())
             link.publish(link.namespace + PING_TOPIC, {"data": f"{name} {len(sent) - 1}"})
@@ -271,7 +282,7 @@ def inspect_robot(
         raise LinkLost(f"{link.url}: the link dropped while the robot's topics were checked.")
     return Inspection(
         *(profile, info, (*required, *extra), sinks, types, letters, end - start, ahead, link.clock_offset),
-        *(proof, identity, np.arange(begun, end, spec.period), trips, copies),
+        *(proof, identity, np.array(ticks), np.array(late, np.bool_), trips, copies),
     )
 
 

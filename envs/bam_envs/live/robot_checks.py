@@ -108,12 +108,14 @@ def _timing(spec: RobotSpec, inspection: Inspection, reading: Reading) -> Iterat
     source, rate = reading.source, reading.rate
     allowed = source.max_age or inspection.profile.max_age
     least = 1 / allowed if source.max_age else max(1 / allowed, STATES_PER_COMMAND / spec.period)
+    busy = inspection.busy and f"; {inspection.busy}"
     what = f"{rate:.3g} Hz" if rate else f"{reading.new} new in {inspection.seconds:.1f} s"
-    yield check(f"rate of {source.topic}", f"at least {least:.3g} Hz", what, fits=rate >= least, passes=True)
-    if rate >= least:
+    what += "" if (fits := rate >= least) else busy
+    yield check(f"rate of {source.topic}", f"at least {least:.3g} Hz", what, fits=fits, passes=True)
+    if fits:
         age = max(0.0, float(np.median(reading.delays)))
-        found = f"{age:.3f} s"
-        yield check(f"age of {source.topic}", f"at most {allowed:g} s", found, fits=age <= allowed, passes=True)
+        found = f"{age:.3f} s{'' if (fits := age <= allowed) else busy}"
+        yield check(f"age of {source.topic}", f"at most {allowed:g} s", found, fits=fits, passes=True)
     found = ""  # of stamps that do not tell when a message was measured, from which its age would be judged
     if has_header(source.type) and None in reading.stamps:
         found = "0: ages are judged by arrival alone, and a driver that repeats old states is not noticed"

@@ -2,6 +2,7 @@
 
 import asyncio
 import contextlib
+import re
 import socket
 import threading
 import time
@@ -11,7 +12,8 @@ import pytest
 from websockets.asyncio.server import serve
 
 from bam_envs.core.errors import InvalidValue
-from bam_envs.live import bringup
+from bam_envs.core.timing import Pacer
+from bam_envs.live import bringup, examination
 from bam_envs.live.diagnosis import STEPS, Diagnosis
 from bam_envs.live.examination import Reading, measured_link
 from bam_envs.robots.profile import load_profile
@@ -221,6 +223,37 @@ def test_states_that_come_too_rarely(server, robot_on):
     robot.mangle = lambda topic, message: message if next(numbers) % 60 < 3 else None
     why = failure(diagnose(server.url)[1])[1]
     assert why.endswith("Hz. They come too rarely: raise the rate of their driver.")
+
+
+@pytest.fixture
+def busy(monkeypatch):
+    """A computer on which every other tick comes 0.1 s late, as far as the pacer tells."""
+
+    class Late(Pacer):
+        def wait(self):
+            return super().wait() + 0.1 * (self.ticks % 2)
+
+    monkeypatch.setattr(examination, "Pacer", Late)
+
+
+BUSY = r"this computer is busy: (\d+) of (\d+) ticks came late"
+
+
+def test_late_states_on_a_busy_computer_are_not_the_robots_fault(server, robot_on, busy):
+    robot, numbers = robot_on(server), iter(range(10**6))
+    robot.mangle = lambda topic, message: message if next(numbers) % 105 < 60 else None  # pauses of 0.15 s
+    name, why = failure(diagnose(server.url, profile="ur5e")[1])
+    assert name == "rates and ages"
+    assert re.search(f"Hz. But {BUSY}, and the robot may be in time: close other programs, and measure again.$", why)
+
+
+def test_a_busy_computer_is_a_warning_where_states_are_in_time(server, robot_on, patient, busy):
+    robot_on(server)
+    warnings = diagnose(server.url, profile=patient())[1]["rates and ages"].warnings
+    late, count = map(
+        int, re.fullmatch(f"{BUSY}; close other programs, or the robot will be held", warnings[-1]).groups()
+    )
+    assert late >= count // 2
 
 
 def without_elbow(message):

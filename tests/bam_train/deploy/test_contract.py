@@ -41,7 +41,7 @@ class Watched:
         self.profile, self.spec = load_profile(profile), load_profile(profile).spec(spec)
         self.rng, self.noise = np.random.default_rng(seed), 0.0
         self.rate, self.seconds, self.delay, self.clock, self.frozen = 100.0, 0.5, 0.001, 0.0, False
-        self.ahead = 0.0
+        self.ahead, self.late = 0.0, np.zeros(10, np.bool_)
         self.mangle = lambda topic, message: message
         self.types, self.info, self.urdf, self.task = {}, None, None, SimpleNamespace()
         self.changes = {}
@@ -72,7 +72,8 @@ class Watched:
             letters["/robot_description"] = [Letter({"data": self.urdf}, BEGIN, 1)]
         letters = {topic: tuple(found) for topic, found in letters.items()}
         facts = self.seconds, WALL - BEGIN, -self.clock
-        return Inspection(self.profile, self.info, sources, sinks, types, letters, *facts)
+        ticks = {"ticks": np.arange(len(self.late)) * 0.05, "late": self.late}
+        return Inspection(self.profile, self.info, sources, sinks, types, letters, *facts, **ticks)
 
     def noisy(self, values, scale):
         values = np.asarray(values, float)
@@ -423,6 +424,13 @@ def test_stamps_that_tell_nothing_are_named(mutate, found):
     lines = {one.what: one for one in arm.contract().checks}
     assert (lines["stamps of /joint_states"].found, lines["stamps of /joint_states"].verdict) == (found, "unknown")
     assert "stamps of /joint_states" not in {one.what for one in Arm().contract().checks}
+
+
+def test_a_busy_computer_is_named_beside_what_it_changes():
+    arm = Arm()
+    arm.delay, arm.late = 0.4, np.arange(10) < 2
+    text = "0.400 s; this computer is busy: 2 of 10 ticks came late"
+    assert refused(arm.contract())["age of /joint_states"] == text
 
 
 def test_a_joint_at_zero_does_not_show_its_sense():
