@@ -41,7 +41,7 @@ class Watched:
         self.profile, self.spec = load_profile(profile), load_profile(profile).spec(spec)
         self.rng, self.noise = np.random.default_rng(seed), 0.0
         self.rate, self.seconds, self.delay, self.clock, self.frozen = 100.0, 0.5, 0.001, 0.0, False
-        self.ahead, self.late = 0.0, np.zeros(10, np.bool_)
+        self.ahead, self.late, self.stall, self.listening = 0.0, np.zeros(10, np.bool_), 0.0, 0.0
         self.mangle = lambda topic, message: message
         self.types, self.info, self.urdf, self.task = {}, None, None, SimpleNamespace()
         self.changes = {}
@@ -62,12 +62,14 @@ class Watched:
             signals = {name: np.atleast_2d(one).astype(float) for name, one in self.signals(at).items()}
             signals |= {name: change(signals[name]) for name, change in self.changes.items()}
             state = RobotState(signals, np.zeros(1), np.zeros((1, len(self.spec.command.labels))))
-            stamp = write_stamp(WALL + self.clock + self.ahead + (0.0 if self.frozen else at))
+            wall = at + (self.stall if 2 * at > self.seconds else 0.0)
+            stamp = write_stamp(WALL + self.clock + self.ahead + (0.0 if self.frozen else wall))
             for topic, _, message in encode_state(self.profile, state, 0, stamp):
                 message = self.mangle(topic, copy.deepcopy(message))
                 if topic in letters and message is not None:
                     late = self.delay + self.noise * abs(self.rng.normal(0.0, 0.002))
-                    letters[topic].append(Letter(message, BEGIN + at + late, len(letters[topic]) + 1))
+                    arrived = BEGIN + max(wall + late, self.listening)
+                    letters[topic].append(Letter(message, arrived, len(letters[topic]) + 1))
         if self.urdf is not None:
             letters["/robot_description"] = [Letter({"data": self.urdf}, BEGIN, 1)]
         letters = {topic: tuple(found) for topic, found in letters.items()}
@@ -406,6 +408,17 @@ def test_a_simulated_gripper_that_chatters_on_an_object_is_no_wrong_speed():
     altered(joint_velocity=lambda x: x + 0.66)(arm)
     arm.info = RobotInfo("ur5e", simulated=True)
     assert "joint_velocity against joint_position" not in refused(arm.contract())
+
+
+@pytest.mark.parametrize("late", [{"stall": 0.3}, {"listening": 0.3}])  # of a simulation, of this computer
+def test_a_pause_of_a_busy_computer_is_no_wrong_speed(late):
+    arm = Arm()
+    arm.speed = 0.8
+    having(**late)(arm)
+    speed = next(one for one in arm.contract().checks if one.what == "joint_velocity against joint_position")
+    assert (speed.verdict, speed.found) == ("ok", "0.8 measured, 0.8 from joint_position")
+    altered(joint_velocity=lambda x: 0.7 * x)(arm)
+    assert refused(arm.contract())[speed.what] == "0.56 measured, 0.8 from joint_position"
 
 
 @pytest.mark.parametrize(
