@@ -12,7 +12,7 @@ from typing import Any
 from bam_envs.live.arm_checks import arm_checks, geometry_of
 from bam_envs.live.bringup import TIMEOUT
 from bam_envs.live.examination import Inspection, inspect_robot
-from bam_envs.live.robot_checks import Check, check, robot_checks
+from bam_envs.live.robot_checks import Check, robot_checks
 from bam_envs.robots.profile import load_profile, profile_for
 from bam_envs.rosbridge.client import RosbridgeLink
 from bam_envs.rosbridge.endpoint import Endpoint
@@ -65,7 +65,9 @@ class Contract:
 
     def to_json(self) -> list[dict[str, Any]]:
         """The lines as plain values."""
-        return [{name: value for name, value in vars(line).items() if name != "passes"} for line in self.checks]
+        return [
+            {name: getattr(line, name) for name in ("what", "expected", "found", "verdict")} for line in self.checks
+        ]
 
     def require(self, who: str, moved: str = "nothing has moved") -> None:
         """Raise `ContractRefused`, which names the first refused line, if a line is refused.
@@ -129,14 +131,14 @@ def live_checks(env: Any, inspection: Inspection) -> Iterator[Check]:
 def fit_checks(checkpoint: Checkpoint, env: Any) -> Iterator[Check]:
     """The lines about the environment: its spaces, signals and period as the checkpoint has them."""
     env_id = env.spec.id if env.spec is not None else checkpoint.manifest.env
-    yield check("environment", checkpoint.manifest.env, env_id, fits=True)
+    yield Check("environment", checkpoint.manifest.env, env_id, fits=True)
     for name, saved, present in fit_pairs(checkpoint, env):
         what, difference = name.replace("_", " "), first_difference(saved, present, "")
         if difference is None:
-            yield check(what, _in_short(saved), _in_short(present), fits=True)
+            yield Check(what, _in_short(saved), _in_short(present), fits=True)
         else:
             at, expected, found = difference
-            yield check(f"{what}{at}", short_json(expected), short_json(found), fits=False)
+            yield Check(f"{what}{at}", short_json(expected), short_json(found), fits=False)
 
 
 def _in_short(value: Any) -> str:

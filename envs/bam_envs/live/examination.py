@@ -5,9 +5,8 @@ No command is sent. Pings have a topic of their own, so that the robot receives 
 
 import math
 import secrets
-import threading
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import groupby
@@ -21,12 +20,11 @@ from bam_envs.core.timing import BUSY, Deadline, Pacer, is_disturbed
 from bam_envs.live.bringup import TIMEOUT, TopicTypes, ask, least_interval, tagged_sinks
 from bam_envs.live.command_proof import CommandProof, needed_proof
 from bam_envs.live.robot_identity import robot_identity
-from bam_envs.live.state import Letter, SourceAge, concerns
+from bam_envs.live.state import Letter, Mailbox, SourceAge, concerns
 from bam_envs.robots.linked import LinkProfile
 from bam_envs.ros.codec import INFO_SERVICE, RobotInfo, decode_source, read_info
 from bam_envs.ros.messages import same_type
 from bam_envs.ros.profile_tables import RobotProfile, Sink, Source
-from bam_envs.rosbridge.bus import Caller, Listener, Message
 from bam_envs.rosbridge.client import RosbridgeLink
 
 Array = NDArray[np.float64]
@@ -193,28 +191,6 @@ def measured_link(trips: Array, copies: int, state: Reading, about: str = "") ->
     return LinkProfile(command, state_delay, loss, loss, burst, doubled, nulls, about)
 
 
-class _Inbox:
-    """Collects messages by topic; its listeners run on the network thread."""
-
-    def __init__(self) -> None:
-        self.letters: dict[str, list[Letter]] = {}
-        self._changed = threading.Condition()
-
-    def listener(self, topic: str) -> Listener:
-        letters = self.letters.setdefault(topic, [])
-
-        def listen(message: Message, caller: Caller) -> None:
-            with self._changed:
-                letters.append(Letter(message, time.monotonic(), len(letters) + 1))
-                self._changed.notify_all()
-
-        return listen
-
-    def wait_for(self, ready: Callable[[], bool], timeout: float) -> bool:
-        with self._changed:
-            return self._changed.wait_for(ready, timeout)
-
-
 def inspect_robot(
     link: RosbridgeLink,
     profile: RobotProfile,
@@ -254,9 +230,9 @@ def inspect_robot(
     types = _types(link, TopicTypes(link, profile, timeout), wanted, needed, timeout)
     identity = robot_identity(endpoint, profile, info)
     proof = needed_proof(link, info, narrowed, sinks, endpoint, identity)
-    inbox = _Inbox()
+    inbox = Mailbox(keeps_all=True)
     are_echoed = pings and _are_echoed(link, inbox, timeout)
-    start, commands = time.monotonic(), {sink.topic for sink in sinks}
+    start, commands, heard = time.monotonic(), {sink.topic for sink in sinks}, set[str]()
     for topic, expected in wanted.items():
         kind = expected if types is None else types[topic]
         if topic not in commands and kind and same_type(kind, expected):
@@ -264,8 +240,9 @@ def inspect_robot(
             least = 0 if topic == DESCRIPTION else least
             listener, length = inbox.listener(topic), 1 if least else 0
             link.subscribe(link.namespace + topic, kind, listener, throttle_ms=least, queue_length=length)
-    awaited = {source.topic for source in required} & inbox.letters.keys()
-    inbox.wait_for(lambda: all(inbox.letters[topic] for topic in awaited) or not link.is_up, timeout)
+            heard.add(topic)
+    awaited = {source.topic for source in required} & heard
+    inbox.wait_for(lambda slots: awaited <= slots.keys() or not link.is_up, timeout)
     name, sent, ticks, late = secrets.token_hex(4), list[float](), list[float](), list[bool]()
     pacer, enough = Pacer(spec.period), Deadline(listen)
     pacer.start()
@@ -276,7 +253,7 @@ def inspect_robot(
             sent.append(time.monotonic())
             link.publish(link.namespace + PING_TOPIC, {"data": f"{name} {len(sent) - 1}"})
     end, ahead = time.monotonic(), time.time() - time.monotonic()
-    letters = {topic: tuple(collected) for topic, collected in inbox.letters.items() if topic != PING_TOPIC}
+    letters = {topic: tuple(inbox.letters[topic]) for topic in heard}
     trips, copies = _round_trips(inbox, name, sent)
     if not link.is_up or link.epoch != epoch:
         raise LinkLost(f"{link.url}: the link dropped while the robot's topics were checked.")
@@ -297,31 +274,31 @@ def _types(
     return found if types.answers else None
 
 
-def _are_echoed(link: RosbridgeLink, inbox: _Inbox, timeout: float) -> bool:
+def _are_echoed(link: RosbridgeLink, inbox: Mailbox, timeout: float) -> bool:
     """Send pings until the first echo; False without one within `timeout` [s]."""
     topic = link.namespace + PING_TOPIC
     link.advertise(topic, "std_msgs/String")
     link.subscribe(topic, "std_msgs/String", inbox.listener(PING_TOPIC))
     for _ in range(max(1, round(timeout / _RETRY))):  # a bridge loses messages until its nodes know each other
         link.publish(topic, {"data": secrets.token_hex(4)})
-        if inbox.wait_for(lambda: bool(inbox.letters[PING_TOPIC]), _RETRY):
+        if inbox.wait_for(lambda slots: PING_TOPIC in slots, _RETRY):
             return True
     return False
 
 
-def _round_trips(inbox: _Inbox, name: str, sent: Sequence[float]) -> tuple[Array, int]:
+def _round_trips(inbox: Mailbox, name: str, sent: Sequence[float]) -> tuple[Array, int]:
     """Wait for the last echoes; the round trip of each ping [s], NaN for a lost ping, and the number of copies."""
     pings = {f"{name} {number}": at for number, at in enumerate(sent)}
 
     def echoes() -> dict[str, list[float]]:
         found: dict[str, list[float]] = {}
-        for letter in inbox.letters.get(PING_TOPIC, ()):
+        for letter in inbox.letters[PING_TOPIC]:
             ping = letter.message.get("data") if isinstance(letter.message, Mapping) else None
             if ping in pings:
                 found.setdefault(ping, []).append(letter.arrived)
         return found
 
-    inbox.wait_for(lambda: len(echoes()) == len(pings), _LAST_ECHOES)
+    inbox.wait_for(lambda slots: len(echoes()) == len(pings), _LAST_ECHOES)
     found = echoes()
     trips = [found.get(ping, [math.nan])[0] - at for ping, at in pings.items()]
     return np.array(trips), sum(len(arrived) - 1 for arrived in found.values())

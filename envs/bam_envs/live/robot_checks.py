@@ -6,8 +6,7 @@ have no further lines.
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
-from typing import Literal
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -35,7 +34,6 @@ SPEED_OF = {"joint_velocity": "joint_position", "base_velocity": "base_pose"}
 _SCAN_OFF, _RANGE_OFF = 0.02, 10.0  # relative tolerance of an angle, factor of tolerance of a range
 _SHORTEST = 0.05  # minimum time over which a speed is compared [s]
 _PAUSE = 3.0  # multiple of the usual time between two stamps from which on it is a pause
-Verdict = Literal["ok", "refused", "unknown"]
 
 
 @dataclass(frozen=True)
@@ -45,15 +43,15 @@ class Check:
     what: str
     expected: str
     found: str
-    verdict: Verdict
-    """``"unknown"`` if the robot's messages do not decide the line, which then does not refuse the robot."""
+    fits: bool | None = field(kw_only=True)
+    """None if the robot's messages do not decide the line, which then does not refuse the robot."""
     passes: bool = False
     """Whether a busy computer or network changes the line, so that another look may find another value."""
 
-
-def check(what: str, expected: str, found: str, *, fits: bool | None, passes: bool = False) -> Check:
-    """One line; `fits` is None for an unknown result."""
-    return Check(what, expected, found, "unknown" if fits is None else "ok" if fits else "refused", passes)
+    @property
+    def verdict(self) -> str:
+        """``"ok"``, ``"refused"`` or ``"unknown"``."""
+        return "unknown" if self.fits is None else "ok" if self.fits else "refused"
 
 
 def robot_checks(spec: RobotSpec, inspection: Inspection) -> Iterator[Check]:
@@ -65,7 +63,7 @@ def robot_checks(spec: RobotSpec, inspection: Inspection) -> Iterator[Check]:
         readings = [reading for reading in required if reading.source.topic == topic]
         source = readings[0].source
         problem = _unreadable(inspection, readings)
-        yield check(f"topic {topic}", source.type, problem or source.type, fits=not problem)
+        yield Check(f"topic {topic}", source.type, problem or source.type, fits=not problem)
         if problem:
             continue
         readable |= {reading.source.signal: reading for reading in readings}
@@ -85,7 +83,7 @@ def robot_checks(spec: RobotSpec, inspection: Inspection) -> Iterator[Check]:
     yield from _commands(inspection)
     if inspection.info is not None and lockstep and inspection.info.period is not None:
         period = inspection.info.period
-        yield check("robot's period", f"{spec.period:g} s", f"{period:g} s", fits=period == spec.period)
+        yield Check("robot's period", f"{spec.period:g} s", f"{period:g} s", fits=period == spec.period)
 
 
 def _unreadable(inspection: Inspection, readings: Sequence[Reading]) -> str:
@@ -112,11 +110,11 @@ def _timing(spec: RobotSpec, inspection: Inspection, reading: Reading) -> Iterat
     busy = inspection.busy and f"; {inspection.busy}"
     what = f"{rate:.3g} Hz" if rate else f"{reading.new} new in {inspection.seconds:.1f} s"
     what += "" if (fits := rate >= least) else busy
-    yield check(f"rate of {source.topic}", f"at least {least:.3g} Hz", what, fits=fits, passes=True)
+    yield Check(f"rate of {source.topic}", f"at least {least:.3g} Hz", what, fits=fits, passes=True)
     if fits:
         age = max(0.0, float(np.median(reading.delays)))
         found = f"{age:.3f} s{'' if (fits := age <= allowed) else busy}"
-        yield check(f"age of {source.topic}", f"at most {allowed:g} s", found, fits=fits, passes=True)
+        yield Check(f"age of {source.topic}", f"at most {allowed:g} s", found, fits=fits, passes=True)
     found = ""  # of stamps that do not tell when a message was measured, from which its age would be judged
     if has_header(source.type) and None in reading.stamps:
         found = "0: ages are judged by arrival alone, and a driver that repeats old states is not noticed"
@@ -127,7 +125,7 @@ def _timing(spec: RobotSpec, inspection: Inspection, reading: Reading) -> Iterat
     if ahead and np.median(ahead) > AHEAD:
         found = f"{np.median(ahead):.1f} s ahead of the clock of {clock}: set the clock of the robot"
     if found:
-        yield check(f"stamps of {source.topic}", "the time of the measurement", found, fits=None)
+        yield Check(f"stamps of {source.topic}", "the time of the measurement", found, fits=None)
 
 
 def _scan_geometry(source: Source, message: Message) -> Iterator[Check]:
@@ -140,7 +138,7 @@ def _scan_geometry(source: Source, message: Message) -> Iterator[Check]:
         try:
             value = number_at(message, name, source.topic)
         except ProtocolError as error:
-            yield check(what, wanted, str(error).removeprefix(f"{source.topic}: ").removesuffix("."), fits=None)
+            yield Check(what, wanted, str(error).removeprefix(f"{source.topic}: ").removesuffix("."), fits=None)
             continue
         if angle:
             fits, hint = math.isclose(value, expected, rel_tol=_SCAN_OFF), " (degrees?)"
@@ -148,7 +146,7 @@ def _scan_geometry(source: Source, message: Message) -> Iterator[Check]:
         else:
             fits, hint = expected / _RANGE_OFF < value < expected * _RANGE_OFF, " (millimetres?)"
             other = math.isclose(value / FACTORS["m"]["millimetres"], expected, rel_tol=_SCAN_OFF)
-        yield check(what, wanted, f"{value:.4g}{hint if other and not fits else ''}", fits=fits)
+        yield Check(what, wanted, f"{value:.4g}{hint if other and not fits else ''}", fits=fits)
 
 
 def _range(signal: SignalSpec, values: Array) -> Iterator[Check]:
@@ -166,11 +164,11 @@ def _range(signal: SignalSpec, values: Array) -> Iterator[Check]:
         expected = f"{signal.labels[at]} in {_span(low[at], high[at])} {signal.units[at]}".removesuffix(" 1")
     else:
         found = _span(values.min(axis=0), values.max(axis=0))
-    yield check(signal.name, expected, found, fits=not outside.any())
+    yield Check(signal.name, expected, found, fits=not outside.any())
     if signal.name.endswith("quaternion") and not outside.any():
         lengths = np.linalg.norm(values, axis=1)
         worst = float(lengths[np.abs(lengths - 1.0).argmax()])
-        yield check(f"length of {signal.name}", "1", f"{worst:.3f}", fits=abs(worst - 1.0) <= BEYOND)
+        yield Check(f"length of {signal.name}", "1", f"{worst:.3f}", fits=abs(worst - 1.0) <= BEYOND)
 
 
 def _span(low: ArrayLike, high: ArrayLike) -> str:
@@ -203,7 +201,7 @@ def _speed(speed: Reading, position: Reading, simulated: bool) -> Check:
     usual = np.median(steps[steps > 0]) if stamped and (steps > 0).any() else np.inf
     known = steps <= _PAUSE * usual
     if (duration := steps[known].sum()) < _SHORTEST:
-        return check(what, expected, "too few messages", fits=None)
+        return Check(what, expected, "too few messages", fits=None)
     path = driven(position.values) if name == "base_pose" else position.values
     speeds = np.stack([np.interp(at, times, column) for column in speed.values.T], axis=1)
     changed = np.diff(path, axis=0)[known].sum(axis=0) / duration
@@ -212,9 +210,9 @@ def _speed(speed: Reading, position: Reading, simulated: bool) -> Check:
     worst = int(off.argmax())
     still = np.abs(changed).max() < RATE_OFF and (simulated or off[worst] <= RATE_OFF)
     if still:
-        return check(what, expected, "not shown at rest", fits=None)
+        return Check(what, expected, "not shown at rest", fits=None)
     found = f"{measured[worst]:.3g} measured, {changed[worst]:.3g} from {name}"
-    return check(what, expected, found, fits=bool(off[worst] <= RATE_OFF))
+    return Check(what, expected, found, fits=bool(off[worst] <= RATE_OFF))
 
 
 def driven(poses: Array) -> Array:
@@ -232,12 +230,12 @@ def _commands(inspection: Inspection) -> Iterator[Check]:
         kind = None if inspection.types is None else inspection.types[sink.topic]
         found = "unknown" if kind is None else bare_type(kind) or "nobody listens"
         fits = None if kind is None else bare_type(kind) == bare_type(sink.type)
-        yield check(f"command {sink.topic}", sink.type, found, fits=fits)
+        yield Check(f"command {sink.topic}", sink.type, found, fits=fits)
     proof = inspection.proof
     if proof is not None:
         found = proof.fault or (f"proved on {proof.since}" if proof.is_known else "to be proved in the first motion")
         fits = False if proof.fault else True if proof.is_known else None
-        yield check("joints of the commands", "those that are meant", found, fits=fits)
+        yield Check("joints of the commands", "those that are meant", found, fits=fits)
         for name in proof.from_measured:
             found = "where the arm is measured: jerky; set interpolate_from_desired_state of the controller to true"
-            yield check(f"trajectories of {name}", "begin at the last set point", found, fits=None)
+            yield Check(f"trajectories of {name}", "begin at the last set point", found, fits=None)

@@ -14,9 +14,9 @@ import pytest
 from bam_envs.core.errors import ProtocolError
 from bam_envs.core.kinematics import UR5E_GRIPPER, UR_JOINTS, quaternions
 from bam_envs.core.robot import RobotState
+from bam_envs.live.arm_checks import read_urdf
 from bam_envs.live.examination import TOOL_POSE, Inspection
 from bam_envs.live.state import Letter
-from bam_envs.live.urdf import read_urdf
 from bam_envs.robots.mir100 import base_spec
 from bam_envs.robots.profile import load_profile
 from bam_envs.robots.ur import UR_MODELS
