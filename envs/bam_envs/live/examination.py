@@ -10,6 +10,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import groupby
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -232,35 +233,25 @@ def inspect_robot(
     proof = needed_proof(link, info, narrowed, sinks, endpoint, identity)
     inbox = Mailbox(keeps_all=True)
     are_echoed = pings and _are_echoed(link, inbox, timeout)
-    start, commands, heard = time.monotonic(), {sink.topic for sink in sinks}, set[str]()
+    unheard, start = {sink.topic for sink in sinks}, time.monotonic()
     for topic, expected in wanted.items():
         kind = expected if types is None else types[topic]
-        if topic not in commands and kind and same_type(kind, expected):
-            least = least_interval(profile, spec.period, topic, describes_itself=info is not None)
-            least = 0 if topic == DESCRIPTION else least
-            listener, length = inbox.listener(topic), 1 if least else 0
-            link.subscribe(link.namespace + topic, kind, listener, throttle_ms=least, queue_length=length)
-            heard.add(topic)
-    awaited = {source.topic for source in required} & heard
+        if topic in unheard or not same_type(kind or "", expected):
+            unheard.add(topic)
+            continue
+        least = least_interval(profile, spec.period, topic, describes_itself=info is not None)
+        least = 0 if topic == DESCRIPTION else least
+        name, listener, length = link.namespace + topic, inbox.listener(topic), 1 if least else 0
+        link.subscribe(name, kind, listener, throttle_ms=least, queue_length=length)
+    awaited = {source.topic for source in required} - unheard
     inbox.wait_for(lambda slots: awaited <= slots.keys() or not link.is_up, timeout)
-    name, sent, ticks, late = secrets.token_hex(4), list[float](), list[float](), list[bool]()
-    pacer, enough = Pacer(spec.period), Deadline(listen)
-    pacer.start()
-    while link.is_up and not enough.passed:
-        late.append(is_disturbed(pacer.wait(), spec.period))
-        ticks.append(time.monotonic())
-        if are_echoed:
-            sent.append(time.monotonic())
-            link.publish(link.namespace + PING_TOPIC, {"data": f"{name} {len(sent) - 1}"})
-    end, ahead = time.monotonic(), time.time() - time.monotonic()
-    letters = {topic: tuple(inbox.letters[topic]) for topic in heard}
-    trips, copies = _round_trips(inbox, name, sent)
+    measured = _measure(link, inbox, spec.period, listen, pings=are_echoed)
     if not link.is_up or link.epoch != epoch:
         raise LinkLost(f"{link.url}: the link dropped while the robot's topics were checked.")
-    return Inspection(
-        *(profile, info, (*required, *extra), sinks, types, letters, end - start, ahead, link.clock_offset),
-        *(proof, identity, np.array(ticks), np.array(late, np.bool_), trips, copies),
-    )
+    letters = {topic: tuple(inbox.letters[topic]) for topic in wanted.keys() - unheard}
+    seconds, ahead = time.monotonic() - start, time.time() - time.monotonic()
+    facts = letters, seconds, ahead, link.clock_offset, proof, identity
+    return Inspection(profile, info, (*required, *extra), sinks, types, *facts, **measured)
 
 
 def _types(
@@ -286,19 +277,29 @@ def _are_echoed(link: RosbridgeLink, inbox: Mailbox, timeout: float) -> bool:
     return False
 
 
-def _round_trips(inbox: Mailbox, name: str, sent: Sequence[float]) -> tuple[Array, int]:
-    """Wait for the last echoes; the round trip of each ping [s], NaN for a lost ping, and the number of copies."""
-    pings = {f"{name} {number}": at for number, at in enumerate(sent)}
+def _measure(link: RosbridgeLink, inbox: Mailbox, period: float, seconds: float, *, pings: bool) -> dict[str, Any]:
+    """Tick for `seconds` while messages come, with a ping in each tick; the fields of `Inspection` about that."""
+    name, sent, ticks, late = secrets.token_hex(4), dict[str, float](), list[float](), list[bool]()
+    pacer, enough = Pacer(period), Deadline(seconds)
+    pacer.start()
+    while link.is_up and not enough.passed:
+        late.append(is_disturbed(pacer.wait(), period))
+        ticks.append(time.monotonic())
+        if pings:
+            ping = f"{name} {len(sent)}"
+            sent[ping] = time.monotonic()
+            link.publish(link.namespace + PING_TOPIC, {"data": ping})
 
     def echoes() -> dict[str, list[float]]:
         found: dict[str, list[float]] = {}
         for letter in inbox.letters[PING_TOPIC]:
-            ping = letter.message.get("data") if isinstance(letter.message, Mapping) else None
-            if ping in pings:
+            ping = str(letter.message.get("data")) if isinstance(letter.message, Mapping) else ""
+            if ping in sent:
                 found.setdefault(ping, []).append(letter.arrived)
         return found
 
-    inbox.wait_for(lambda slots: len(echoes()) == len(pings), _LAST_ECHOES)
+    inbox.wait_for(lambda slots: len(echoes()) == len(sent), _LAST_ECHOES)
     found = echoes()
-    trips = [found.get(ping, [math.nan])[0] - at for ping, at in pings.items()]
-    return np.array(trips), sum(len(arrived) - 1 for arrived in found.values())
+    trips = np.array([found.get(ping, [math.nan])[0] - at for ping, at in sent.items()])
+    copies = sum(len(arrived) - 1 for arrived in found.values())
+    return {"ticks": np.array(ticks), "late": np.array(late, np.bool_), "trips": trips, "copies": copies}
