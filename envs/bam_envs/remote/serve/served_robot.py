@@ -23,6 +23,8 @@ CATCH_UP = 1.2
 """Speed at which a robot whose clock stood still catches up with its commands, as a multiple of theirs."""
 LONGEST_LOST = 0.5
 """Longest time that a robot catches up [s]."""
+_STEP = 1e-4
+"""Least change between two commands that tells their speed [rad, m]."""
 PARTS = 5
 """Ticks per period of robots that can be stepped in parts (`slices`); others are stepped a period at a time."""
 
@@ -131,6 +133,8 @@ class ServedRobot:
                 early = count - 1 + (0.0 <= now - self._followed < period / 2)
                 caught = min(early * period, self._lost) if now <= self._lost_until else 0.0
                 self._lost, self._behind, self._followed = self._lost - caught, self._behind + caught, now
+                if self._behind and not early:
+                    self._behind = min(self._behind, self._time_to(command) - period)
             self._target = command
             self._expires, self.resting = now + self.command_timeout, False
             self._orders += 1
@@ -176,6 +180,14 @@ class ServedRobot:
             self._lost, self._lost_until = min(lost, LONGEST_LOST), now + self.spec.period
         self._ticked = now
         return now
+
+    def _time_to(self, command: Array) -> float:
+        """Time to a `command` (n, m) at the speed of the commands [s]; infinite if it is the command before again."""
+        step, setpoint = np.abs(command - self._target), getattr(self._robot, "setpoint", command)
+        moving = step > _STEP
+        if not moving.any():
+            return math.inf
+        return self.spec.period * max(1.0, float((np.abs(command - setpoint)[moving] / step[moving]).max()))
 
     def _reachable(self) -> Array:
         """The target, limited to the distance that the robot may move in a period. Shape: (n, m)."""

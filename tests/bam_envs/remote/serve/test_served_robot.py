@@ -100,7 +100,8 @@ def test_in_real_time_a_command_takes_a_period_of_ticks(serve, arm, hands):
 
 
 @pytest.mark.parametrize("burst", [1, 2])  # the commands of the lost time come in one tick, or in two
-def test_a_robot_whose_clock_stood_still_catches_up_slowly(serve, hands, burst):
+@pytest.mark.parametrize("held", [0, 3])  # periods in which the last of them comes again
+def test_a_robot_whose_clock_stood_still_catches_up_slowly(serve, hands, burst, held):
     served, step, speeds, pan = serve(SimulatedArm(1), realtime=True), 0.02, [], np.eye(6)[:1]
     served.command_timeout = 0.5
 
@@ -117,7 +118,7 @@ def test_a_robot_whose_clock_stood_still_catches_up_slowly(serve, hands, burst):
     if burst == 2:
         period(9 * step, parts=1)
     period(11 * step, count=4 - burst)
-    for i in range(12, 40):
+    for i in [*[11] * held, *range(12, 40)]:
         period(i * step)
     assert max(speeds) < 1.3 * usual
     np.testing.assert_allclose(served.target(), command(39 * step * pan))
