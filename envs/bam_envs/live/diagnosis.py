@@ -17,7 +17,6 @@ from bam_envs.core.errors import BamEnvsError, LinkLost, NotReady, ProtocolError
 from bam_envs.live import bringup
 from bam_envs.live.building import live_robot, require_robot_address
 from bam_envs.live.examination import PING_TOPIC, Array, Inspection, Reading, inspect_robot
-from bam_envs.live.state import LiveState
 from bam_envs.robots.profile import load_profile, profile_for, shipped_profiles
 from bam_envs.ros.codec import INFO_SERVICE, read_info
 from bam_envs.ros.profile_tables import RobotProfile
@@ -148,7 +147,7 @@ class Diagnosis:
         if self.robot is None:
             self.robot = live_robot(self.endpoint.url, profile=profile, **self._credentials)
         types = bringup.TopicTypes(link, profile, self._timeout)
-        sources = LiveState(profile, self.robot.spec).sources
+        sources = [profile.source(signal.name) for signal in self.robot.spec.signals]
         topics = {source.topic: source.type for source in sources}
         for topic, kind in topics.items():
             types.check(link.namespace + topic, kind)
