@@ -13,13 +13,13 @@ import gymnasium as gym
 
 from bam_envs.core.robot import RobotSpec
 from bam_envs.core.wording import listed
-from bam_envs.live.inspection import Inspection
+from bam_envs.live.examination import Inspection
 from bam_envs.safety.guard import is_base
 from bam_train.agent.agent_states import State
 from bam_train.checkpoint import Checkpoint
 from bam_train.cli.console import say
 from bam_train.deploy.checkpoint_admission import bring_up, has_real_robot
-from bam_train.deploy.contract_table import Contract
+from bam_train.deploy.contract import Contract, check_contract
 from bam_train.env_location import EnvLocation
 from bam_train.environments import environment_of, make_env, require_fit
 from bam_train.errors import SettingsError
@@ -102,8 +102,6 @@ def required_contract(checkpoint: Checkpoint, env: Any, place: EnvLocation, moti
     if place.robot is None:
         require_fit(checkpoint, env, place)
         return Contract(())
-    from bam_train.deploy.contract import check_contract  # only for live robots
-
     contract = check_contract(checkpoint, env, place)
     info = None if contract.inspection is None else contract.inspection.info
     shown = contract.lines(whole=False) if contract.refused or info is None or not info.simulated else []
@@ -123,7 +121,7 @@ def required_contract(checkpoint: Checkpoint, env: Any, place: EnvLocation, moti
 
 def require_motion(env: Any, who: str, inspection: Inspection) -> None:
     """Move each axis a little; raises `ContractRefused` if an axis does not move as commanded."""
-    from bam_train.deploy.arm_checks import measured_joints
+    from bam_envs.live.arm_checks import measured_joints
     from bam_train.deploy.wiggle import wiggle
 
     robot = env.unwrapped.robot

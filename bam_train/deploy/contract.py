@@ -1,24 +1,87 @@
 """The contract between a checkpoint and a live robot, checked before anything moves.
 
 The checkpoint's environment, spaces, signals and period are compared with the environment as made; its topics, units,
-ranges, rates and kinematics with the messages of the robot, which is sent no command.
+ranges, rates and kinematics with the messages of the robot, which is sent no command. Each line of its table has its
+subject, the expected and the found value, and a verdict.
 """
 
 from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
 from typing import Any
 
-from bam_envs.core.robot import RobotSpec
+from bam_envs.live.arm_checks import arm_checks, geometry_of
 from bam_envs.live.bringup import TIMEOUT
-from bam_envs.live.inspection import Inspection, inspect_robot
+from bam_envs.live.examination import Inspection, inspect_robot
+from bam_envs.live.robot_checks import Check, robot_checks
 from bam_envs.robots.profile import load_profile, profile_for
+from bam_envs.rosbridge.client import RosbridgeLink
 from bam_envs.rosbridge.endpoint import Endpoint
 from bam_envs.safety.guard import is_base
 from bam_train.checkpoint import Checkpoint
-from bam_train.deploy.arm_checks import arm_checks, geometry_of
-from bam_train.deploy.contract_table import Check, Contract, check
-from bam_train.deploy.robot_checks import robot_checks
 from bam_train.env_location import EnvLocation
 from bam_train.environments import first_difference, fit_pairs, short_json
+from bam_train.errors import ContractRefused
+
+_WIDEST = 60
+"""Maximum width of a column, so that a long text does not widen the table [characters]."""
+
+
+@dataclass(frozen=True)
+class Contract:
+    """The comparison of a checkpoint with a robot."""
+
+    checks: tuple[Check, ...]
+    inspection: Inspection | None = field(default=None, repr=False)
+    """The messages of the robot that were compared."""
+
+    @property
+    def refused(self) -> tuple[Check, ...]:
+        """The lines that do not fit; a robot moves only if there are none."""
+        return tuple(line for line in self.checks if line.verdict == "refused")
+
+    def lines(self, *, whole: bool = True) -> list[str]:
+        """The table as text, with a header.
+
+        With `whole`, only refused lines are never shortened. Without, lines that fit are counted, and no other is
+        shortened.
+        """
+        shown = [line for line in self.checks if whole or line.verdict != "ok"]
+        rows = [("what", "expected", "found", "verdict")] if shown else []
+        rows += [(line.what, line.expected, line.found, line.verdict) for line in shown]
+        fit = len(self.checks) - len(shown)
+        rest = [f"{fit} lines fit; bam-deploy --print-contract shows them"] if fit else []
+        if not rows:
+            return rest
+        widths = [min(_WIDEST, max(len(row[column]) for row in rows)) for column in range(3)]
+
+        def cell(text: str, width: int, *, whole: bool) -> str:
+            return text.ljust(width) if len(text) <= width or whole else f"{text[: width - 3]}..."
+
+        never = ("refused",) if whole else ("refused", "unknown")
+        lines = [
+            "  ".join([*(cell(row[i], widths[i], whole=row[3] in never) for i in range(3)), row[3]]) for row in rows
+        ]
+        return [*lines, *rest]
+
+    def to_json(self) -> list[dict[str, Any]]:
+        """The lines as plain values."""
+        return [
+            {name: getattr(line, name) for name in ("what", "expected", "found", "verdict")} for line in self.checks
+        ]
+
+    def require(self, who: str, moved: str = "nothing has moved") -> None:
+        """Raise `ContractRefused`, which names the first refused line, if a line is refused.
+
+        Args:
+            who: Checkpoint and robot, for the message.
+            moved: Motion of the robot so far, for the message.
+        """
+        if self.refused:
+            first, *others = self.refused
+            more = f" (and {len(others)} more)" if others else ""
+            text = f"{first.what}: expected {first.expected}, found {first.found}{more}"
+            text = f"{who} do not fit: {text}; correct the robot or its profile; {moved}"
+            raise ContractRefused(first.what, text, passes=all(line.passes for line in self.refused))
 
 
 def check_contract(
@@ -38,19 +101,28 @@ def check_contract(
         LinkLost: The link dropped.
         InvalidValue: The robot is another one than `place` names.
     """
-    spec: RobotSpec = env.unwrapped.robot.spec
+    spec = env.unwrapped.robot.spec
     profile = profile_for(spec) if place.profile is None else load_profile(place.profile)
     endpoint = Endpoint.with_token_file(
         place.robot or "", ca_file=place.ca_file, token_file=place.token_file, robot_name=place.robot_name
     )
-    inspection = inspect_robot(endpoint, profile, spec, listen=listen, timeout=timeout)
-    return Contract((*fit_checks(checkpoint, env), *live_checks(env, profile, inspection)), inspection)
+    link = RosbridgeLink(endpoint, name="contract")
+    try:
+        link.connect()
+        return contract_with(checkpoint, env, inspect_robot(link, profile, spec, listen=listen, timeout=timeout))
+    finally:
+        link.close()
 
 
-def live_checks(env: Any, profile: Any, inspection: Inspection) -> Iterator[Check]:
+def contract_with(checkpoint: Checkpoint, env: Any, inspection: Inspection) -> Contract:
+    """The lines of the checkpoint, and those of the robot as inspected; `env` is the checkpoint's environment."""
+    return Contract((*fit_checks(checkpoint, env), *live_checks(env, inspection)), inspection)
+
+
+def live_checks(env: Any, inspection: Inspection) -> Iterator[Check]:
     """The lines about the robot itself: `inspection` against the robot and the task of `env`."""
     robot = env.unwrapped.robot
-    yield from robot_checks(profile, robot.spec, inspection)
+    yield from robot_checks(robot.spec, inspection)
     geometry = geometry_of(env)
     if not is_base(robot.spec) and geometry is not None:
         yield from arm_checks(robot.spec, geometry, robot.limits.position_margin, inspection)
@@ -59,14 +131,14 @@ def live_checks(env: Any, profile: Any, inspection: Inspection) -> Iterator[Chec
 def fit_checks(checkpoint: Checkpoint, env: Any) -> Iterator[Check]:
     """The lines about the environment: its spaces, signals and period as the checkpoint has them."""
     env_id = env.spec.id if env.spec is not None else checkpoint.manifest.env
-    yield check("environment", checkpoint.manifest.env, env_id, fits=True)
+    yield Check("environment", checkpoint.manifest.env, env_id, fits=True)
     for name, saved, present in fit_pairs(checkpoint, env):
         what, difference = name.replace("_", " "), first_difference(saved, present, "")
         if difference is None:
-            yield check(what, _in_short(saved), _in_short(present), fits=True)
+            yield Check(what, _in_short(saved), _in_short(present), fits=True)
         else:
             at, expected, found = difference
-            yield check(f"{what}{at}", short_json(expected), short_json(found), fits=False)
+            yield Check(f"{what}{at}", short_json(expected), short_json(found), fits=False)
 
 
 def _in_short(value: Any) -> str:

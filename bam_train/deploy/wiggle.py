@@ -12,12 +12,11 @@ from numpy.typing import NDArray
 
 from bam_envs.core.errors import SafetyStop
 from bam_envs.core.robot import Initial, RobotSpec, RobotState, SignalSpec
+from bam_envs.live.robot_checks import FACTORS, Check, driven
 from bam_envs.safety.first_motion import PROOF
 from bam_envs.safety.gate import SafeRobot
 from bam_envs.safety.guard import is_base, measured_places
 from bam_train.deploy.checkpoint_admission import SHADOW
-from bam_train.deploy.contract_table import Check, check
-from bam_train.deploy.robot_checks import FACTORS, driven
 from bam_train.recording.recording import Recording
 
 Array = NDArray[np.float64]
@@ -53,7 +52,7 @@ def wiggle(robot: SafeRobot, joints: Array | None) -> Iterator[Check]:
             label = axis
             states.append(robot.step(goal[None]))
     except SafetyStop as stop:
-        yield check(f"motion of {label}", "as commanded", str(stop), fits=False)
+        yield Check(f"motion of {label}", "as commanded", str(stop), fits=False)
         return
     finally:
         robot.halt()
@@ -78,7 +77,7 @@ def recorded_motion(path: Path, spec: RobotSpec, address: str, identity: str = "
     if SHADOW in metadata.get("marks", ""):
         found = "a shadow, which sends nothing"
     fits = found.rstrip("/") == wanted.rstrip("/")
-    yield check(f"recording {path.name}", wanted, found, fits=fits)
+    yield Check(f"recording {path.name}", wanted, found, fits=fits)
     episodes = recording.episodes()
     if not fits or not episodes:
         return
@@ -112,7 +111,7 @@ def motion_checks(command: SignalSpec, commanded: Array, measured: Array, period
             found = "it is not measured", None
         elif moved[i]:
             found = _motion(command, i, commanded, measured[:, i], moved, round(_MAX_LAG / period))
-        yield check(f"motion of {label}", "as commanded", found[0], fits=found[1])
+        yield Check(f"motion of {label}", "as commanded", found[0], fits=found[1])
 
 
 def _motion(

@@ -103,8 +103,8 @@ class RemoteRobot:
         result: Array = np.where(np.isnan(command), high, command)  # a gripper that is not measured is taken as open
         return result
 
-    def follow(self, command: Array, *, at_once: bool = False) -> None:
-        """Let the resident send `command` (1, m) through the guards."""
+    def follow(self, command: Array, *, at_once: bool = False, count: int = 1) -> None:
+        """Let the resident send `command` (1, m) through the guards; for `count` see `ServedRobot.follow`."""
         driver = self._driver()
         if driver is not None:
             self._target = command

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import json as json_module
-from dataclasses import asdict, dataclass
+from contextlib import ExitStack
+from dataclasses import asdict
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -15,11 +16,11 @@ from bam_train.signals import SignalMemory
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from bam_envs.live.diagnosis import Diagnosis, DiagnosisStep
+    from bam_envs.live.diagnosis import Diagnosis, DiagnosisStep, Findings
+    from bam_envs.live.examination import Inspection
     from bam_train.checkpoint import Checkpoint
     from bam_train.cli.flags import DoctorConfig
-    from bam_train.deploy.contract_table import Contract
-    from bam_train.env_location import EnvLocation
+    from bam_train.deploy.contract import Contract
 
 CONTRACT = "contract"
 """Name of the last step, with a checkpoint."""
@@ -32,23 +33,23 @@ def examine(config: DoctorConfig, signals: SignalMemory) -> int:
 
     paths = {"ca_file": config.ca_file, "token_file": config.token_file}
     files: dict[str, Any] = {name: None if path is None else str(path) for name, path in paths.items()}
-    subject = _Subject.of(config, files)
-    steps: list[DiagnosisStep] = []
-    try:
-        robot = None if subject is None else subject.env.unwrapped.robot
+    contracts: list[Contract] = []  # one, once it was checked
+    with ExitStack() as opened:
+        robot, more = None, []
+        if config.checkpoint is not None:
+            checkpoint, env = _opened(config, files)
+            opened.callback(env.close)
+            robot = env.unwrapped.robot
+            more = [(CONTRACT, lambda inspection: _contract(checkpoint, env, inspection, contracts))]
         diagnosis = Diagnosis(config.url, robot, profile=config.profile, seconds=config.seconds, **files)
-        try:
-            for step in _shown(_all_steps(diagnosis, subject), config):
-                steps.append(step)
-                signals.raise_again()
-            if subject is not None and subject.contract is not None and not config.json:
-                tell(*(f"  {line}" for line in subject.contract.lines()))
-        finally:
-            diagnosis.close()
-    finally:
-        if subject is not None:
-            subject.env.close()
-    names = [*STEPS, *([] if subject is None else [CONTRACT])]
+        opened.callback(diagnosis.close)
+        steps: list[DiagnosisStep] = []
+        for step in _shown(diagnosis.steps(*more), config):
+            steps.append(step)
+            signals.raise_again()
+    if contracts and not config.json:
+        tell(*(f"  {line}" for line in contracts[0].lines()))
+    names = [*STEPS, *(name for name, _ in more)]
     failed = next((step for step in steps if step.verdict == "failed"), None)
     measured = _write_measured(config, diagnosis)
     if config.json:
@@ -58,65 +59,40 @@ def examine(config: DoctorConfig, signals: SignalMemory) -> int:
             "steps": [asdict(step) for step in steps],
             "not_tried": names[len(steps) :],
             "failed": None if failed is None else failed.name,
-            "contract": None if subject is None or subject.contract is None else subject.contract.to_json(),
+            "contract": contracts[0].to_json() if contracts else None,
             "measured": measured,
         }
         tell(json_module.dumps(report, allow_nan=False))
     if failed is None:
         return 1 if config.measure is not None and measured is None else 0
     say(f"bam-doctor: {failed.name} failed: {failed.found}")
-    refused = subject is not None and subject.contract is not None and subject.contract.refused
-    return ContractRefused.exit_status if refused else 1
+    return ContractRefused.exit_status if contracts and contracts[0].refused else 1
 
 
-@dataclass
-class _Subject:
-    """The checkpoint, and its environment for the robot, not connected."""
+def _opened(config: DoctorConfig, files: dict[str, Any]) -> tuple[Checkpoint, Any]:
+    """The checkpoint of the flags, and its environment for the robot, not connected."""
+    from bam_train.checkpoint import Checkpoint
+    from bam_train.env_location import EnvLocation
+    from bam_train.environments import environment_of, make_env
 
-    checkpoint: Checkpoint
-    env: Any
-    place: EnvLocation
-    contract: Contract | None = None
-    """The contract, once it was checked."""
-
-    @classmethod
-    def of(cls, config: DoctorConfig, files: dict[str, Any]) -> _Subject | None:
-        """Open the checkpoint of the flags and make its environment; None without a checkpoint."""
-        if config.checkpoint is None:
-            return None
-        from bam_train.checkpoint import Checkpoint
-        from bam_train.env_location import EnvLocation
-        from bam_train.environments import environment_of, make_env
-
-        checkpoint = Checkpoint.open(config.checkpoint)
-        env_id, env_kwargs = environment_of(checkpoint, config.env)
-        place = EnvLocation(config.url, profile=config.profile, **files)
-        return cls(checkpoint, make_env(env_id, env_kwargs, place=place), place)
+    checkpoint = Checkpoint.open(config.checkpoint or "")
+    place = EnvLocation(config.url, profile=config.profile, **files)
+    return checkpoint, make_env(*environment_of(checkpoint, config.env), place=place)
 
 
-def _all_steps(diagnosis: Diagnosis, subject: _Subject | None) -> Iterator[DiagnosisStep]:
-    """The steps of the diagnosis; then, if none failed, the contract of the checkpoint."""
-    from bam_envs.core.errors import BamEnvsError
+def _contract(checkpoint: Checkpoint, env: Any, inspection: Inspection, contracts: list[Contract]) -> Findings:
+    """The last step, which fails if the checkpoint and the robot do not fit; adds the contract to `contracts`."""
+    from bam_envs.core.errors import NotReady
     from bam_envs.core.wording import listed
-    from bam_envs.live.diagnosis import DiagnosisStep
+    from bam_train.deploy.contract import contract_with
 
-    passed = True
-    for step in diagnosis.steps():
-        yield step
-        passed = step.verdict != "failed"
-    if not passed or subject is None:
-        return
-    from bam_train.deploy.contract import check_contract
-
+    contracts.append(contract := contract_with(checkpoint, env, inspection))
     try:
-        subject.contract = contract = check_contract(subject.checkpoint, subject.env, subject.place)
-        contract.require(f"{subject.checkpoint.path} and the robot")
-    except (BamEnvsError, ContractRefused) as error:
-        yield DiagnosisStep(CONTRACT, "failed", str(error))
-        return
+        contract.require(f"{checkpoint.path} and the robot")
+    except ContractRefused as error:
+        raise NotReady(str(error)) from error
     unknown = [line.what for line in contract.checks if line.verdict == "unknown"]
-    warnings = [f"unknown: {listed(unknown)}"] if unknown else []
-    yield DiagnosisStep(CONTRACT, "warning" if warnings else "ok", f"{len(contract.checks)} lines", tuple(warnings))
+    return [f"{len(contract.checks)} lines"], [f"unknown: {listed(unknown)}"] if unknown else []
 
 
 def _shown(steps: Iterator[DiagnosisStep], config: DoctorConfig) -> Iterator[DiagnosisStep]:
@@ -147,16 +123,17 @@ def _write_measured(config: DoctorConfig, diagnosis: Diagnosis) -> dict[str, Any
     if config.measure is None:
         return None
     from bam_envs.core.errors import InvalidValue
+    from bam_envs.live.examination import measured_link
     from bam_train.errors import OutputError
     from bam_train.files.atomic_file import replacing
 
-    measurement, path = diagnosis.measurement, config.measure.expanduser()
-    if measurement is None:
+    inspection, path = diagnosis.inspection, config.measure.expanduser()
+    if inspection is None:
         say(f"bam-doctor: {path} was not written: the link was not measured")
         return None
-    about = f"{config.url}, {len(measurement.trips)} pings in {measurement.seconds:.1f} s"
+    about = f"{config.url}, {len(inspection.trips)} pings in {inspection.seconds:.1f} s"
     try:
-        link = measurement.profile(about)
+        link = measured_link(inspection.trips, inspection.copies, next(iter(inspection.readings.values())), about)
         with replacing(path) as temporary:
             temporary.write_text(link.to_json() + "\n")
     except InvalidValue as error:

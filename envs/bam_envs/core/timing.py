@@ -147,6 +147,11 @@ class Pacer:
         return Lateness(float(p50), float(p99), self._latest)
 
 
+def is_disturbed(late: float, period: float) -> bool:
+    """Whether a tick that began `late` [s] after its deadline shows that the computer was busy; `period` is in s."""
+    return late > max(_LATE_BY * period, _JITTER)
+
+
 class TickTimes:
     """The times of the last ticks of a deployment.
 
@@ -179,7 +184,7 @@ class TickTimes:
             return False
         self._computed.append(computed)
         is_policy = late <= acted and computed >= SLOW * self.period
-        self._disturbed.append(late > max(_LATE_BY * self.period, _JITTER) and not is_policy)
+        self._disturbed.append(is_disturbed(late, self.period) and not is_policy)
         self.slow += (is_slow := missed > 0 and is_policy)
         return is_slow
 

@@ -19,7 +19,7 @@ from bam_envs.ros.codec import RobotInfo, has_room
 from bam_envs.ros.freshness import Tagger, read_tag
 from bam_envs.ros.messages import bare_type, same_type, tag_text
 from bam_envs.ros.profile_tables import Readiness, RobotProfile, Sink
-from bam_envs.rosbridge.bus import Caller, Listener, Message, namespaces_with
+from bam_envs.rosbridge.bus import Caller, Message, namespaces_with
 from bam_envs.rosbridge.ros_bus import RosBus
 from bam_envs.rosbridge.sessions import LEASE_TOPIC, LEAVE, RENEW, SESSION_SERVICE, is_forbidden, read_session
 
@@ -189,7 +189,7 @@ class LiveReadiness:
             every = self._profile.readiness
             self._subscribed = tuple(one for one in every if self._types.may_be(link.namespace + one.topic, one.type))
             for one in self._subscribed:
-                link.subscribe(link.namespace + one.topic, one.type, self._listener(one.topic))
+                link.subscribe(link.namespace + one.topic, one.type, self.mailbox.listener(one.topic))
             for sink in self._sinks:
                 kind = self._types.type_of(link.namespace + sink.topic) or sink.type
                 if has_room(kind):
@@ -208,9 +208,6 @@ class LiveReadiness:
     def has_rival(self) -> bool:
         """Whether somebody else has just commanded the robot."""
         return time.monotonic() - self._rival_at < _RIVAL_TIME
-
-    def _listener(self, topic: str) -> Listener:
-        return lambda message, caller: self.mailbox.put([topic], message)
 
     def owns(self, status: Mapping[str, Any], namespace: str) -> bool:
         """Whether a `status` of the server is about these topics, which a server need not offer."""

@@ -8,7 +8,7 @@ import math
 import time
 from collections.abc import Callable, Iterator
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
@@ -16,11 +16,9 @@ import numpy as np
 from bam_envs.core.errors import BamEnvsError, LinkLost, NotReady, ProtocolError, StaleState
 from bam_envs.live import bringup
 from bam_envs.live.building import live_robot, require_robot_address
-from bam_envs.live.link_measurement import PING_TOPIC, Array, LinkMeasurement, Reading, measure_link
-from bam_envs.live.robot_identity import robot_identity
-from bam_envs.live.state import LiveState
+from bam_envs.live.examination import PING_TOPIC, Array, Inspection, Reading, inspect_robot
 from bam_envs.robots.profile import load_profile, profile_for, shipped_profiles
-from bam_envs.ros.codec import INFO_SERVICE, RobotInfo, read_info
+from bam_envs.ros.codec import INFO_SERVICE, read_info
 from bam_envs.ros.profile_tables import RobotProfile
 from bam_envs.rosbridge.bus import namespaces_with
 from bam_envs.rosbridge.client import RosbridgeLink
@@ -41,6 +39,8 @@ LOSS_WARNING, LOSS_FAILURE = 0.05, 0.10
 _HANDSHAKE = 2**20
 """Maximum message size of the connection that tests the handshake [bytes]."""
 Verdict = Literal["ok", "warning", "failed"]
+Findings = tuple[list[str], list[str]]
+"""What a step found, and its warnings."""
 
 
 @dataclass(frozen=True)
@@ -53,14 +53,6 @@ class DiagnosisStep:
     """The findings; for a failed step its cause and the remedy."""
     warnings: tuple[str, ...] = ()
     """Problems that do not fail the step."""
-
-
-@dataclass
-class _Findings:
-    """Findings of one step."""
-
-    text: list[str] = field(default_factory=list)
-    warnings: list[str] = field(default_factory=list)
 
 
 class Diagnosis:
@@ -94,28 +86,24 @@ class Diagnosis:
         self.endpoint = endpoint = Endpoint.with_token_file(url, ca_file=ca_file, token_file=token_file)
         self._credentials: dict[str, Any] = {"ca_file": ca_file, "token_file": token_file}
         self.robot, self.seconds = robot, seconds
-        self.measurement: LinkMeasurement | None = None
-        """The measured link; None before the step ``"rates and ages"``."""
+        self.inspection: Inspection | None = None
+        """The messages of the robot and the measured link; None before the step ``"rates and ages"``."""
         self.profile: RobotProfile | None = None if profile is None else load_profile(profile)
         if profile is None and robot is not None:
             self.profile = profile_for(robot.spec)
-        self._info: RobotInfo | None = None
-        self._has_rosapi = False
         self._link = RosbridgeLink(endpoint, name="doctor")
         self._timeout = endpoint.timeout or bringup.TIMEOUT
 
-    def steps(self) -> Iterator[DiagnosisStep]:
-        """Run the steps in order, up to the first failure."""
-        for name in STEPS:
-            check: Callable[[_Findings], None] = getattr(self, f"_{name.replace(' ', '_')}")
-            findings = _Findings()
+    def steps(self, *more: tuple[str, Callable[[Inspection], Findings]]) -> Iterator[DiagnosisStep]:
+        """Run the steps in order, up to the first failure; then `more` of them, which look at the inspection."""
+        own = [(name, getattr(self, f"_{name.replace(' ', '_')}")) for name in STEPS]
+        for name, step in (*own, *((name, lambda step=step: step(self.inspected)) for name, step in more)):
             try:
-                check(findings)
+                found, warnings = step()
             except BamEnvsError as error:
                 yield DiagnosisStep(name, "failed", str(error))
                 return
-            verdict: Verdict = "warning" if findings.warnings else "ok"
-            yield DiagnosisStep(name, verdict, "; ".join(findings.text), tuple(findings.warnings))
+            yield DiagnosisStep(name, "warning" if warnings else "ok", "; ".join(found), tuple(warnings))
 
     def close(self) -> None:
         """Close all links; the robot is not halted, because it was not moved."""
@@ -125,12 +113,12 @@ class Diagnosis:
 
     # ---- the server
 
-    def _port(self, findings: _Findings) -> None:
+    def _port(self) -> Findings:
         address, start = self.endpoint.address, time.monotonic()
         asyncio.run(open_port(address, self._timeout)).close()
-        findings.text.append(f"{address.host}:{address.port} is open, connected in {_ms(time.monotonic() - start)}")
+        return [f"{address.host}:{address.port} is open, connected in {_ms(time.monotonic() - start)}"], []
 
-    def _websocket(self, findings: _Findings) -> None:
+    def _websocket(self) -> Findings:
         start = time.monotonic()
 
         async def shake_hands() -> float:
@@ -140,25 +128,26 @@ class Diagnosis:
             return duration
 
         kind = "with TLS, " if self.endpoint.address.secure else ""
-        findings.text.append(f"a WebSocket server, {kind}opened in {_ms(asyncio.run(shake_hands()))}")
+        return [f"a WebSocket server, {kind}opened in {_ms(asyncio.run(shake_hands()))}"], []
 
-    def _rosbridge(self, findings: _Findings) -> None:
+    def _rosbridge(self) -> Findings:
         self._link.connect()
         service, ros = self._link.namespace + INFO_SERVICE, self._link.ros
-        findings.text.append("answers" + ("" if ros is None else f" as ROS {ros[-1]}"))
+        found = ["answers" + ("" if ros is None else f" as ROS {ros[-1]}")]
         answer = bringup.ask(self._link, service)
         if answer is not None:
-            self._info = read_info(answer.get("message"), service)
-            findings.text.append(f"the robot describes itself: {self._info.text or self._info.name}")
+            info = read_info(answer.get("message"), service)
+            found.append(f"the robot describes itself: {info.text or info.name}")
+        return found, []
 
     # ---- states
 
-    def _topics(self, findings: _Findings) -> None:
+    def _topics(self) -> Findings:
         profile, link = self._chosen_profile(), self._link
         if self.robot is None:
             self.robot = live_robot(self.endpoint.url, profile=profile, **self._credentials)
         types = bringup.TopicTypes(link, profile, self._timeout)
-        sources = LiveState(profile, self.robot.spec).sources
+        sources = [profile.source(signal.name) for signal in self.robot.spec.signals]
         topics = {source.topic: source.type for source in sources}
         for topic, kind in topics.items():
             types.check(link.namespace + topic, kind)
@@ -170,12 +159,10 @@ class Diagnosis:
                     "(--profile); with --checkpoint only those of its task are needed."
                     f"{namespaces_with(link, 'topics', topic, topics)}{self._another_robot(profile)}"
                 )
-        findings.text.append(f"profile {profile.name}: {', '.join(topics)}")
-        self._has_rosapi = types.answers
+        found = [f"profile {profile.name}: {', '.join(topics)}"]
         if types.answers:
-            findings.text.append("all of the expected types")
-        else:
-            findings.warnings.append("the server has no rosapi node, so that types of topics cannot be checked")
+            return [*found, "all of the expected types"], []
+        return found, ["the server has no rosapi node, so that types of topics cannot be checked"]
 
     def _chosen_profile(self) -> RobotProfile:
         if self.profile is None:
@@ -207,60 +194,51 @@ class Diagnosis:
             "profile for it."
         )
 
-    def _rates_and_ages(self, findings: _Findings) -> None:
+    def _rates_and_ages(self) -> Findings:
         robot, profile = self._robot_and_profile()
-        period, info = robot.spec.period, self._info
-        state = LiveState(profile, robot.spec)
-        self.measurement = measure_link(
-            self._link,
-            profile,
-            state,
-            period=period,
-            seconds=self.seconds,
-            timeout=self._timeout,
-            describes_itself=info is not None,
+        period, seconds = robot.spec.period, self.seconds
+        self.inspection = inspection = inspect_robot(
+            self._link, profile, robot.spec, listen=seconds, timeout=self._timeout, pings=True
         )
-        if info is not None and info.lockstep:
-            findings.text.append("its time advances with commands only, so that states have neither rate nor age")
-            return
-        seen = set()
-        for reading in self.measurement.readings:
+        if inspection.is_lockstep:
+            return ["its time advances with commands only, so that states have neither rate nor age"], []
+        found, warnings, seen = list[str](), list[str](), set()
+        for signal in robot.spec.signals:
+            reading = inspection.readings[signal.name]
             key = (reading.source.topic, reading.source.names)
             limit = max(reading.source.max_age or 0.0, profile.max_age)
-            _require_states(reading, limit, self.seconds, profile, self.measurement.round_trips)
+            _require_states(reading, limit, seconds, inspection)
             if key not in seen:
-                findings.text.append(f"{reading.source.topic} {reading.rate:.4g} Hz, age {_p50_p99(reading.ages)}")
-                _warn_about_states(reading, limit, period, findings.warnings)
+                found.append(f"{reading.source.topic} {reading.rate:.4g} Hz, age {_p50_p99(reading.ages)}")
+                warnings += _warnings_about(reading, limit, period)
             seen.add(key)
+        if inspection.busy:
+            warnings.append(f"{inspection.busy}; close other programs, or the robot will be held")
+        return found, warnings
 
     # ---- the link
 
-    def _clock(self, findings: _Findings) -> None:
+    def _clock(self) -> Findings:
         offset = self._link.clock_offset
         if offset is None:
-            findings.text.append("the server does not report its time")
-            findings.warnings.append("ages of states are relative to the quickest message")
-            return
+            return ["the server does not report its time"], ["ages of states are relative to the quickest message"]
         side = "behind" if offset > 0 else "ahead of"
-        findings.text.append(f"the server's clock is {_ms(abs(offset))} {side} this computer's")
-        if abs(offset) > MAX_CLOCK_OFFSET:
-            findings.warnings.append("set both clocks by the same NTP server, or recordings of both cannot be compared")
+        apart = ["set both clocks by the same NTP server, or recordings of both cannot be compared"]
+        found = f"the server's clock is {_ms(abs(offset))} {side} this computer's"
+        return [found], apart if abs(offset) > MAX_CLOCK_OFFSET else []
 
-    def _round_trip(self, findings: _Findings) -> None:
+    def _round_trip(self) -> Findings:
         robot, profile = self._robot_and_profile()
-        measured, life = self._measured(), profile.command_life(robot.spec.period)
-        if not len(measured.trips):
+        measured, life, warnings = self.inspected, profile.command_life(robot.spec.period), []
+        count, lost = len(measured.trips), measured.lost
+        if not count:
             raise ProtocolError(
                 f"what is published on {self._link.namespace}{PING_TOPIC} does not come back in {self._timeout:g} s, "
                 "so that commands may not arrive either. Does the server let clients use this topic (topics_glob)?"
             )
-        findings.text.append(
-            f"{_p50_p99(measured.round_trips)} of {len(measured.trips)} pings, one every {_ms(robot.spec.period)}; "
-            f"{measured.lost:.2%} lost, {measured.copies} doubled"
-        )
-        if measured.lost > LOSS_FAILURE:
+        if lost > LOSS_FAILURE:
             raise LinkLost(
-                f"{measured.lost:.1%} of {len(measured.trips)} pings did not come back, and {LOSS_FAILURE:.0%} may. "
+                f"{lost:.1%} of {count} pings did not come back, and {LOSS_FAILURE:.0%} may. "
                 "Use a cable, or a network that is less busy."
             )
         p50, p99 = np.percentile(measured.round_trips, [50, 99])
@@ -269,40 +247,41 @@ class Diagnosis:
                 f"one way takes {_ms(p50 / 2)} (half of p50 of the round trip), and a command is valid for "
                 f"{_ms(life)}: none would be executed. Use a cable, or run the policy nearer to the robot."
             )
-        if measured.lost > LOSS_WARNING:
-            findings.warnings.append(f"{measured.lost:.1%} of the pings were lost; a cable loses none")
+        if lost > LOSS_WARNING:
+            warnings.append(f"{lost:.1%} of the pings were lost; a cable loses none")
         if p99 - p50 / 2 > life:
-            findings.warnings.append(f"more than 1 % of the commands come later than {_ms(life)}, and are dropped")
+            warnings.append(f"more than 1 % of the commands come later than {_ms(life)}, and are dropped")
+        pings = f"{_p50_p99(measured.round_trips)} of {count} pings, one every {_ms(robot.spec.period)}"
+        return [pings, f"{lost:.2%} lost, {measured.copies} doubled"], warnings
 
     # ---- commands, without sending one
 
-    def _command_path(self, findings: _Findings) -> None:
+    def _command_path(self) -> Findings:
         robot, _ = self._robot_and_profile()
         robot.connect()  # checks types and listeners of all command topics and opens the connection that halts
         why = robot.not_ready()
         if why is not None:
             raise NotReady(f"{why}. Run this again when the robot takes commands")
-        if self._has_rosapi:
-            findings.text.append("the topics of commands have listeners")
-        else:
-            findings.warnings.append("without a rosapi node the server cannot report whether anybody listens")
-        findings.text.append("the connection that halts is open; ready; nothing was sent")
+        found = ["the connection that halts is open; ready; nothing was sent"]
+        if self.inspected.types is None:
+            return found, ["without a rosapi node the server cannot report whether anybody listens"]
+        return ["the topics of commands have listeners", *found], []
 
-    def _guards(self, findings: _Findings) -> None:
-        robot, profile = self._robot_and_profile()
-        findings.text.append(f"{len(robot.report())} guards; bam-deploy --print-guards shows them")
-        told = robot_identity(self.endpoint, profile, self._info)
-        findings.text.append(f"the robot is {told}" if told else "the robot does not tell which one it is")
-        findings.warnings.extend(robot.warnings)
-        spec, newest = robot.spec, {reading.source.signal: reading.values for reading in self._measured().readings}
+    def _guards(self) -> Findings:
+        robot, _ = self._robot_and_profile()
+        spec, told = robot.spec, self.inspected.identity
+        found = [f"{len(robot.report())} guards; bam-deploy --print-guards shows them"]
+        found.append(f"the robot is {told}" if told else "the robot does not tell which one it is")
+        warnings = list(robot.warnings)
         low, high = (np.asarray(bound, float) for bound in position_range(spec, robot.limits))
         for place, name, column in measured_places(spec, spec.command.units):
-            value, label = float(newest[name][column]), spec.command.labels[place]
+            value, label = float(self.inspected.readings[name].values[-1, column]), spec.command.labels[place]
             if spec.command.units[place] == "rad" and not low[place] <= value <= high[place]:
-                findings.warnings.append(
+                warnings.append(
                     f"{label} is at {value:.3f} rad, beyond {low[place]:.3f} to {high[place]:.3f} rad: jog it back, or "
                     "the first command brings it to that limit"
                 )
+        return found, warnings
 
     # ---- results of earlier steps
 
@@ -311,19 +290,21 @@ class Diagnosis:
             raise StaleState("the topics of the robot have not been checked yet")
         return self.robot, self.profile
 
-    def _measured(self) -> LinkMeasurement:
-        if self.measurement is None:
+    @property
+    def inspected(self) -> Inspection:
+        """The messages of the robot; raises `StaleState` before the step ``"rates and ages"``."""
+        if self.inspection is None:
             raise StaleState("the link has not been measured yet")
-        return self.measurement
+        return self.inspection
 
 
-def _require_states(reading: Reading, limit: float, seconds: float, profile: RobotProfile, round_trips: Array) -> None:
+def _require_states(reading: Reading, limit: float, seconds: float, inspection: Inspection) -> None:
     """Raise an error unless a deployment could use these states; `limit` is their maximum age [s]."""
     topic, kind = reading.source.topic, reading.source.type
     if not reading.count:
         raise StaleState(
             f"{topic} ({kind}): no message in {seconds:g} s. Does its driver run? Topics are in the profile of "
-            f"{profile.name} (--profile); with --checkpoint only those of its task are needed."
+            f"{inspection.profile.name} (--profile); with --checkpoint only those of its task are needed."
         )
     if reading.unread == reading.count:
         raise ProtocolError(reading.error)
@@ -331,19 +312,23 @@ def _require_states(reading: Reading, limit: float, seconds: float, profile: Rob
     if p99 > limit:
         raise StaleState(
             f"{topic}: the newest state is up to {_ms(p99)} old (p99), and {_ms(limit)} is the limit (max_age in the "
-            f"profile), at {reading.rate:.3g} Hz. {_why_old(reading, limit, round_trips)}",
+            f"profile), at {reading.rate:.3g} Hz. {_why_old(reading, limit, inspection)}",
             p99,
             limit,
         )
 
 
-def _why_old(reading: Reading, limit: float, round_trips: Array) -> str:
+def _why_old(reading: Reading, limit: float, inspection: Inspection) -> str:
     """The cause of states that are older than `limit` [s], and its remedy, in sentences."""
-    if reading.rate < 2 / limit:
-        return "They come too rarely: raise the rate of their driver."
-    late, way = float(np.median(reading.arrival)), float(np.median(round_trips)) / 2 if len(round_trips) else 0.0
-    if reading.arrival[-1] - reading.arrival[0] > len(reading.arrival) / reading.rate / 2:
+    if reading.delays[-1] - reading.delays[0] > (reading.arrived[-1] - reading.arrived[0]) / 2:
         return "Their stamp stands still: the driver repeats an old measurement. Start it again."
+    trips, late, rarely = inspection.round_trips, float(np.median(reading.delays)), reading.rate < 2 / limit
+    way = float(np.median(trips)) / 2 if len(trips) else 0.0
+    simulated = inspection.info is not None and inspection.info.simulated
+    if inspection.busy and (simulated or (late <= limit and not rarely)):
+        return f"But {inspection.busy}, and the robot may be in time: close other programs, and measure again."
+    if rarely:
+        return "They come too rarely: raise the rate of their driver."
     if late <= limit:
         return "They come in bursts, with pauses between: the network, or a busy computer on the way, holds them back."
     old = f"They are {_ms(late)} old when they arrive, so that a higher rate would change nothing"
@@ -356,14 +341,14 @@ def _why_old(reading: Reading, limit: float, round_trips: Array) -> str:
     )
 
 
-def _warn_about_states(reading: Reading, limit: float, period: float, warnings: list[str]) -> None:
+def _warnings_about(reading: Reading, limit: float, period: float) -> Iterator[str]:
     topic, worst = reading.source.topic, float(reading.ages.max())
     if reading.unread:
-        warnings.append(f"{topic}: {reading.unread} of {reading.count} messages cannot be read: {reading.error}")
+        yield f"{topic}: {reading.unread} of {reading.count} messages cannot be read: {reading.error}"
     if worst > limit:
-        warnings.append(f"{topic}: once {_ms(worst)} old, and {_ms(limit)} is the limit; the robot would be held")
+        yield f"{topic}: once {_ms(worst)} old, and {_ms(limit)} is the limit; the robot would be held"
     if reading.rate < 0.95 / period:
-        warnings.append(f"{topic}: fewer than one state in each period of {_ms(period)}")
+        yield f"{topic}: fewer than one state in each period of {_ms(period)}"
 
 
 def _ms(seconds: float) -> str:

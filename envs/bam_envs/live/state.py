@@ -9,6 +9,7 @@ the local one: the offset comes from the server's clock if the link knows it, an
 import math
 import threading
 import time
+from collections import defaultdict
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -44,11 +45,23 @@ class Letter:
 
 
 class Mailbox:
-    """The newest message of each signal, by name, for threads that read or wait; `clock` is monotonic [s]."""
+    """The newest message of each signal or topic, by name, for threads that read or wait.
 
-    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
+    Args:
+        clock: Monotonic [s].
+        keeps_all: Whether older messages are kept too.
+    """
+
+    def __init__(self, clock: Callable[[], float] = time.monotonic, *, keeps_all: bool = False) -> None:
         self._clock, self._changed = clock, threading.Condition()
         self._slots: dict[str, Letter] = {}
+        self._keeps_all = keeps_all
+        self.letters: defaultdict[str, list[Letter]] = defaultdict(list)
+        """All messages of each slot, in order, with `keeps_all`."""
+
+    def listener(self, name: str) -> Listener:
+        """A listener that puts messages into the slot `name`."""
+        return lambda message, caller: self.put([name], message)
 
     def put(self, names: Iterable[str], message: Any) -> None:
         """Replace the content of the slots `names` by `message`, which arrives now."""
@@ -56,7 +69,9 @@ class Mailbox:
             arrived = self._clock()
             for name in names:
                 before = self._slots.get(name)
-                self._slots[name] = Letter(message, arrived, 1 if before is None else before.number + 1)
+                self._slots[name] = letter = Letter(message, arrived, 1 if before is None else before.number + 1)
+                if self._keeps_all:
+                    self.letters[name].append(letter)
             self._changed.notify_all()
 
     def newest(self) -> dict[str, Letter]:

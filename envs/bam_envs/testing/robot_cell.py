@@ -264,7 +264,7 @@ class CellRobot:
         """The command that the robot executes. Shape: (1, m)."""
         return self._target + 0.0
 
-    def follow(self, command: Array, *, at_once: bool = True) -> None:
+    def follow(self, command: Array, *, at_once: bool = True, count: int = 1) -> None:
         """Send a command (1, m)."""
         self._target = command
         _send(self._wire, ("follow", (command,)))

@@ -12,7 +12,7 @@ import pytest
 from bam_envs.core.errors import InvalidValue, LinkLost
 from bam_train.checkpoint import Checkpoint
 from bam_train.cli.experiment import TrainingFlags, environment_of, open_env, require_place, signals_ask
-from bam_train.deploy.contract_table import Contract
+from bam_train.deploy.contract import Contract
 from bam_train.environments import make_env
 from bam_train.errors import SettingsError
 from bam_train.signals import Terminated

@@ -11,9 +11,11 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from bam_envs.core.errors import ProtocolError
 from bam_envs.core.kinematics import UR5E_GRIPPER, UR_JOINTS, quaternions
 from bam_envs.core.robot import RobotState
-from bam_envs.live.inspection import TOOL_POSE, Inspection
+from bam_envs.live.arm_checks import read_urdf
+from bam_envs.live.examination import TOOL_POSE, Inspection
 from bam_envs.live.state import Letter
 from bam_envs.robots.mir100 import base_spec
 from bam_envs.robots.profile import load_profile
@@ -23,11 +25,9 @@ from bam_envs.ros.codec import RobotInfo, encode_state
 from bam_envs.ros.messages import write_stamp
 from bam_envs.safety.guard import Limits
 from bam_train.checkpoint import Checkpoint
-from bam_train.deploy.contract import fit_checks, live_checks
-from bam_train.deploy.contract_table import Contract
-from bam_train.deploy.urdf import read_urdf
+from bam_train.deploy.contract import Contract, fit_checks, live_checks
 from bam_train.environments import make_env
-from bam_train.errors import ContractRefused, FormatError
+from bam_train.errors import ContractRefused
 
 PICK = Path(__file__).parents[3] / "checkpoints" / "pick-ppo.zip"
 JOINTS = np.array([-0.27, -1.54, 1.89, -1.93, -1.47, -1.84])
@@ -41,7 +41,7 @@ class Watched:
         self.profile, self.spec = load_profile(profile), load_profile(profile).spec(spec)
         self.rng, self.noise = np.random.default_rng(seed), 0.0
         self.rate, self.seconds, self.delay, self.clock, self.frozen = 100.0, 0.5, 0.001, 0.0, False
-        self.ahead = 0.0
+        self.ahead, self.late, self.stall, self.listening = 0.0, np.zeros(10, np.bool_), 0.0, 0.0
         self.mangle = lambda topic, message: message
         self.types, self.info, self.urdf, self.task = {}, None, None, SimpleNamespace()
         self.changes = {}
@@ -49,7 +49,7 @@ class Watched:
     def contract(self):
         robot = SimpleNamespace(spec=self.spec, limits=Limits())
         env = SimpleNamespace(unwrapped=SimpleNamespace(robot=robot, task=self.task))
-        return Contract(tuple(live_checks(env, self.profile, self.inspection())))
+        return Contract(tuple(live_checks(env, self.inspection())))
 
     def inspection(self):
         names = {signal.name for signal in self.spec.signals} | {*TOOL_POSE}
@@ -62,16 +62,20 @@ class Watched:
             signals = {name: np.atleast_2d(one).astype(float) for name, one in self.signals(at).items()}
             signals |= {name: change(signals[name]) for name, change in self.changes.items()}
             state = RobotState(signals, np.zeros(1), np.zeros((1, len(self.spec.command.labels))))
-            stamp = write_stamp(WALL + self.clock + self.ahead + (0.0 if self.frozen else at))
+            wall = at + (self.stall if 2 * at > self.seconds else 0.0)
+            stamp = write_stamp(WALL + self.clock + self.ahead + (0.0 if self.frozen else wall))
             for topic, _, message in encode_state(self.profile, state, 0, stamp):
                 message = self.mangle(topic, copy.deepcopy(message))
                 if topic in letters and message is not None:
                     late = self.delay + self.noise * abs(self.rng.normal(0.0, 0.002))
-                    letters[topic].append(Letter(message, BEGIN + at + late, len(letters[topic]) + 1))
+                    arrived = BEGIN + max(wall + late, self.listening)
+                    letters[topic].append(Letter(message, arrived, len(letters[topic]) + 1))
         if self.urdf is not None:
             letters["/robot_description"] = [Letter({"data": self.urdf}, BEGIN, 1)]
         letters = {topic: tuple(found) for topic, found in letters.items()}
-        return Inspection(self.info, sources, sinks, types, letters, self.seconds, WALL - BEGIN, -self.clock)
+        facts = self.seconds, WALL - BEGIN, -self.clock
+        ticks = {"ticks": np.arange(len(self.late)) * 0.05, "late": self.late}
+        return Inspection(self.profile, self.info, sources, sinks, types, letters, *facts, **ticks)
 
     def noisy(self, values, scale):
         values = np.asarray(values, float)
@@ -406,6 +410,17 @@ def test_a_simulated_gripper_that_chatters_on_an_object_is_no_wrong_speed():
     assert "joint_velocity against joint_position" not in refused(arm.contract())
 
 
+@pytest.mark.parametrize("late", [{"stall": 0.3}, {"listening": 0.3}])  # of a simulation, of this computer
+def test_a_pause_of_a_busy_computer_is_no_wrong_speed(late):
+    arm = Arm()
+    arm.speed = 0.8
+    having(**late)(arm)
+    speed = next(one for one in arm.contract().checks if one.what == "joint_velocity against joint_position")
+    assert (speed.verdict, speed.found) == ("ok", "0.8 measured, 0.8 from joint_position")
+    altered(joint_velocity=lambda x: 0.7 * x)(arm)
+    assert refused(arm.contract())[speed.what] == "0.56 measured, 0.8 from joint_position"
+
+
 @pytest.mark.parametrize(
     ("mutate", "found"),
     [
@@ -422,6 +437,13 @@ def test_stamps_that_tell_nothing_are_named(mutate, found):
     lines = {one.what: one for one in arm.contract().checks}
     assert (lines["stamps of /joint_states"].found, lines["stamps of /joint_states"].verdict) == (found, "unknown")
     assert "stamps of /joint_states" not in {one.what for one in Arm().contract().checks}
+
+
+def test_a_busy_computer_is_named_beside_what_it_changes():
+    arm = Arm()
+    arm.delay, arm.late = 0.4, np.arange(10) < 2
+    text = "0.400 s; this computer is busy: 2 of 10 ticks came late"
+    assert refused(arm.contract())["age of /joint_states"] == text
 
 
 def test_a_joint_at_zero_does_not_show_its_sense():
@@ -552,7 +574,7 @@ def test_the_kinematics_of_a_urdf():
     ],
 )
 def test_what_is_no_urdf(text):
-    with pytest.raises(FormatError, match=r"^the robot's description is no URDF"):
+    with pytest.raises(ProtocolError, match=r"^the robot's description is no URDF"):
         read_urdf(text)
 
 

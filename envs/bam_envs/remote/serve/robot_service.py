@@ -60,6 +60,8 @@ class Order:
     """`Tag.echo` of the newest message."""
     client: str = ""
     """The client that sent them."""
+    count: int = 0
+    """Number of complete commands."""
 
 
 class CommandSlot:
@@ -73,7 +75,7 @@ class CommandSlot:
         with self._lock:
             old = self._order if self._order.client == new.client else Order()
             values, complete = {**old.values, **new.values}, old.complete or new.complete
-            self._order = Order(values, complete, new.tag or old.tag, new.client)
+            self._order = Order(values, complete, new.tag or old.tag, new.client, old.count + new.complete)
 
     def take(self, *, complete: bool = False) -> Order:
         """Remove and return the order; it has no values if none came or, with `complete`, it is not complete yet."""
@@ -261,7 +263,7 @@ class RobotService:
                     if lockstep:
                         self._robot.step(command)
                     else:
-                        self._robot.follow(command, at_once=order.complete)
+                        self._robot.follow(command, at_once=order.complete, count=order.count)
                     self._answered = order.tag
                 except RobotFault as fault:
                     _log.warning("%s: %s", self._profile.name, fault)

@@ -19,6 +19,12 @@ from bam_envs.core.robot import EnvIds, Initial, Robot, RobotState, checked_comm
 
 Array = NDArray[np.float64]
 
+CATCH_UP = 1.2
+"""Speed at which a robot whose clock stood still catches up with its commands, as a multiple of theirs."""
+LONGEST_LOST = 0.5
+"""Longest time that a robot catches up [s]."""
+_STEP = 1e-4
+"""Least change between two commands that tells their speed [rad, m]."""
 PARTS = 5
 """Ticks per period of robots that can be stepped in parts (`slices`); others are stepped a period at a time."""
 
@@ -63,6 +69,9 @@ class ServedRobot:
         self._left = 0  # parts of this period still to come
         self._midway = False  # whether the last period was not executed to its end
         self._orders = self._begun = self._done = 0  # commands given, begun, executed over a whole period
+        self._ticked = self._followed = math.inf  # when the last tick was, and the last command came
+        self._lost, self._lost_until = 0.0, -math.inf  # time for which the clock stood still, and until when it counts
+        self._behind = 0.0  # time by which the robot is behind its commands
 
     def __getattr__(self, name: str) -> Any:
         """Other attributes of the robot, such as `connect`, `render` and `state_dict`."""
@@ -83,6 +92,7 @@ class ServedRobot:
             self.fault = None
             self.state = self._robot.reset(env_ids, initial)
             self._target, self.resting, self._expires = self.state.command.copy(), True, -math.inf
+            self._behind = 0.0
             return self.state
 
     def step(self, command: Array) -> RobotState:
@@ -110,14 +120,23 @@ class ServedRobot:
                 raise ResetNeeded("The served robot was closed.")
             return self.state
 
-    def follow(self, command: Array, *, at_once: bool = True) -> None:
+    def follow(self, command: Array, *, at_once: bool = True, count: int = 1) -> None:
         """Execute the finite `command` (n, m) from the next tick on, at most for the command timeout.
 
-        With `at_once` it does not wait for the end of the current period.
+        With `at_once` it does not wait for the end of the current period. It is the last of `count` commands that came
+        since the last tick. After the clock has stood still, as on a busy computer, the commands of that time come all
+        at once: a real robot, whose clock does not stop, has executed them one after the other.
         """
         with self._changed:
+            now, period = self._pass_time(), self.spec.period
+            if count:
+                early = count - 1 + (0.0 <= now - self._followed < period / 2)
+                caught = min(early * period, self._lost) if now <= self._lost_until else 0.0
+                self._lost, self._behind, self._followed = self._lost - caught, self._behind + caught, now
+                if self._behind and not early:
+                    self._behind = min(self._behind, self._time_to(command) - period)
             self._target = command
-            self._expires, self.resting = self._now() + self.command_timeout, False
+            self._expires, self.resting = now + self.command_timeout, False
             self._orders += 1
             # A command that came slightly early must not drop the last part of a period.
             if at_once and self._left != 1:
@@ -133,7 +152,9 @@ class ServedRobot:
         with self._changed:
             if self.state is None or self.fault is not None:
                 return
-            if not self.resting and self._now() > self._expires:
+            now = self._pass_time()
+            self._behind = max(0.0, self._behind - (CATCH_UP - 1) * self.tick_period)
+            if not self.resting and now > self._expires:
                 self.halt()
             try:
                 if not self._left:
@@ -151,15 +172,35 @@ class ServedRobot:
                 self._done = self._begun
                 self._changed.notify_all()
 
+    def _pass_time(self) -> float:
+        """Note for how long the clock stood still; returns the time [s]."""
+        now = self._now()
+        lost = now - self._ticked - self.tick_period
+        if lost > self.tick_period:
+            self._lost, self._lost_until = min(lost, LONGEST_LOST), now + self.spec.period
+        self._ticked = now
+        return now
+
+    def _time_to(self, command: Array) -> float:
+        """Time to a `command` (n, m) at the speed of the commands [s]; infinite if it is the command before again."""
+        step, setpoint = np.abs(command - self._target), getattr(self._robot, "setpoint", command)
+        moving = step > _STEP
+        if not moving.any():
+            return math.inf
+        return self.spec.period * max(1.0, float((np.abs(command - setpoint)[moving] / step[moving]).max()))
+
     def _reachable(self) -> Array:
         """The target, limited to the distance that the robot may move in a period. Shape: (n, m)."""
-        # The robot limits the change from its last command, of which an early command finds only a part executed.
         rate, setpoint = self.spec.command.max_rate, getattr(self._robot, "setpoint", None)
-        if not self._midway or rate is None or setpoint is None:
-            return self._target
-        reach = np.array(rate) * self.spec.period
-        near: Array = np.clip(self._target, setpoint - reach, setpoint + reach)
-        return near
+        target = self._target
+        if setpoint is None:
+            return target
+        # The robot limits the change from its last command, of which an early command finds only a part executed.
+        if self._midway and rate is not None:
+            reach = np.array(rate) * self.spec.period
+            target = np.clip(target, setpoint - reach, setpoint + reach)
+        share = CATCH_UP / (1 + self._behind / self.spec.period)
+        return target if share >= 1 else setpoint + share * (target - setpoint)
 
     def _drop_parts(self) -> None:
         """Drop the rest of this period; a step that waits for it ends with the next one."""
@@ -188,7 +229,7 @@ class ServedRobot:
             if self.state is None:
                 return
             self._drop_parts()
-            self._target, self.resting = self._rest(self.state), True
+            self._target, self.resting, self._behind = self._rest(self.state), True, 0.0
 
     def _rest(self, state: RobotState) -> Array:
         """The command that keeps a halted robot at rest. Shape: (n, m)."""

@@ -583,5 +583,5 @@ def test_messages_of_one_command_come_together_and_the_newest_wins():
     slot.put(Order({6: 0.01}, False, "", "a"))
     assert slot.take(complete=True) == Order()
     slot.put(Order({0: 1.0}, True, "second", "a"))
-    assert slot.take(complete=True) == Order({6: 0.01, 0: 1.0}, True, "second", "a")
+    assert slot.take(complete=True) == Order({6: 0.01, 0: 1.0}, True, "second", "a", 1)
     assert slot.take(complete=True) == Order()

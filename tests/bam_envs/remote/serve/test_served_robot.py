@@ -99,6 +99,33 @@ def test_in_real_time_a_command_takes_a_period_of_ticks(serve, arm, hands):
     np.testing.assert_allclose(served.state.stamp, [0.05])
 
 
+@pytest.mark.parametrize("burst", [1, 2])  # the commands of the lost time come in one tick, or in two
+@pytest.mark.parametrize("held", [0, 3])  # periods in which the last of them comes again
+def test_a_robot_whose_clock_stood_still_catches_up_slowly(serve, hands, burst, held):
+    served, step, speeds, pan = serve(SimulatedArm(1), realtime=True), 0.02, [], np.eye(6)[:1]
+    served.command_timeout = 0.5
+
+    def period(change, parts=PARTS, count=1):
+        served.follow(command(change * pan), count=count)
+        for _ in range(parts):
+            ticks(served, hands, 1)
+            speeds.append(np.abs(served.state.signals["joint_velocity"]).max())
+
+    for i in range(1, 9):
+        period(i * step)
+    usual, speeds[:] = max(speeds), []
+    hands.now += 3 * 0.05  # commands 9, 10 and 11 come meanwhile
+    if burst == 2:
+        period(9 * step, parts=1)
+    period(11 * step, count=4 - burst)
+    for i in [*[11] * held, *range(12, 40)]:
+        period(i * step)
+    assert max(speeds) < 1.3 * usual
+    np.testing.assert_allclose(served.target(), command(39 * step * pan))
+    ticks(served, hands, 4 * PARTS)
+    np.testing.assert_allclose(served.state.signals["joint_position"], HOME + 39 * step * pan, atol=0.005)
+
+
 def test_a_robot_without_parts_is_stepped_a_period_at_a_time(serve, hands):
     robot = FakeRobot(1)
     served = serve(Without(robot, "slices"), realtime=True)

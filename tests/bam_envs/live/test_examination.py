@@ -1,5 +1,6 @@
 """Listening to a robot: what it publishes is collected, and nothing is sent to it."""
 
+import contextlib
 import socket
 from dataclasses import replace
 
@@ -7,9 +8,10 @@ import numpy as np
 import pytest
 
 from bam_envs.core.errors import NoServer
-from bam_envs.live.inspection import DESCRIPTION, inspect_robot
+from bam_envs.live.examination import DESCRIPTION, inspect_robot
 from bam_envs.robots.profile import load_profile
 from bam_envs.robots.ur5e import arm_spec
+from bam_envs.rosbridge.client import RosbridgeLink
 from bam_envs.rosbridge.endpoint import Endpoint
 
 SPEC, PROFILE = arm_spec("ur5e", with_object=True), load_profile("ur5e")
@@ -18,8 +20,10 @@ COMMANDS = ["/gripper/commands", "/scaled_joint_trajectory_controller/joint_traj
 TOOL = "/tcp_pose_broadcaster/pose"
 
 
-def listened(url, **options):
-    return inspect_robot(Endpoint(url), PROFILE, SPEC, **{"listen": 0.1, "timeout": 5.0, **options})
+def listened(url, profile=PROFILE, spec=SPEC, **options):
+    with contextlib.closing(RosbridgeLink(Endpoint(url))) as link:
+        link.connect()
+        return inspect_robot(link, profile, spec, **{"listen": 0.1, "timeout": 5.0, **options})
 
 
 def test_what_a_robot_publishes_is_collected(server, robot_on, simulation):
@@ -100,7 +104,7 @@ def test_a_base_tells_its_name_and_a_simulated_robot_the_one_that_it_was_given(s
     server.advertise("/robot_status", "mir_msgs/RobotStatus", latch=True)
     server.publish("/robot_status", {"robot_name": "MiR_R1234", "state_id": 3})
     base = load_profile("mir100")
-    assert inspect_robot(Endpoint(server.url), base, scripted.spec, listen=0.1).identity == "MiR_R1234"
+    assert listened(server.url, base, scripted.spec).identity == "MiR_R1234"
     robot_on(server, namespace="/cell", info=replace(simulation, identity="left arm"))
     assert listened(f"{server.url}/cell").identity == "left arm"
 

@@ -6,8 +6,9 @@ difference reveals swapped and mirrored joints, other units, and another arm.
 
 import itertools
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
+from xml.etree import ElementTree
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,18 +16,17 @@ from numpy.typing import NDArray
 from bam_envs.core.errors import ProtocolError
 from bam_envs.core.kinematics import UR5E_GRIPPER, UR_JOINTS, ArmGeometry, angle_between, quaternions
 from bam_envs.core.robot import RobotSpec
-from bam_envs.live.inspection import DESCRIPTION, Inspection
+from bam_envs.live.examination import DESCRIPTION, TOOL_POSE, Inspection
+from bam_envs.live.robot_checks import FACTORS, Check
 from bam_envs.robots.ur import UR_MODELS
-from bam_train.deploy.contract_table import Check, check
-from bam_train.deploy.robot_checks import FACTORS, readings
-from bam_train.deploy.urdf import Urdf, read_urdf
-from bam_train.errors import FormatError
 
 Array = NDArray[np.float64]
 OFF_AXIS, ROTATION = 0.015, 0.06
 """Tolerance of the tool's pose: distance from the flange's axis [m], and angle [rad]; calibrations are smaller."""
 LONGEST_TOOL = 0.4
 """Longest tool of a robot whose policy moves the flange [m]."""
+LARGEST_URDF = 8 * 2**20
+"""Maximum length of a URDF [characters]."""
 _STILL = 0.05  # maximum motion of a joint at rest [rad]
 
 
@@ -35,6 +35,50 @@ class Pose(NamedTuple):
 
     position: Array  # (3,) [m]
     quaternion: Array | None  # x, y, z, w, or None if it is not measured
+
+
+class UrdfJoint(NamedTuple):
+    """A joint of a robot's URDF (its description in XML)."""
+
+    kind: str
+    """``revolute``, ``continuous``, ``prismatic``, ``fixed``."""
+    parent: str
+    child: str
+    low: float
+    """Lowest position [rad, m]; -inf without a limit."""
+    high: float
+    """Highest position [rad, m]."""
+    origin: Array
+    """Pose of the child at position 0 in the parent. Shape: (4, 4)."""
+    axis: Array
+    """Unit vector. Shape: (3,)."""
+
+    def pose(self, position: float) -> Array:
+        """Pose of the child in the parent at `position` [rad, m]. Shape: (4, 4)."""
+        moved = np.eye(4)
+        if self.kind in ("revolute", "continuous"):
+            moved[:3, :3] = _rotation(self.axis, position)
+        elif self.kind == "prismatic":
+            moved[:3, 3] = position * self.axis
+        pose: Array = self.origin @ moved
+        return pose
+
+
+class Urdf(dict[str, UrdfJoint]):
+    """The joints of a robot by name."""
+
+    def pose(self, base: str, link: str, positions: Mapping[str, float]) -> tuple[Array, Array] | None:
+        """Position (3,) [m] and rotation (3, 3) of `link` in `base`; None if a joint or link between them is missing.
+
+        `positions` are those of the joints that move [rad, m].
+        """
+        by_child, pose = {joint.child: (name, joint) for name, joint in self.items()}, np.eye(4)
+        for _ in range(len(self)):
+            name, joint = by_child.get(link, ("", None))
+            if link == base or joint is None or (joint.kind != "fixed" and name not in positions):
+                break
+            pose, link = joint.pose(positions.get(name, 0.0)) @ pose, joint.parent
+        return (pose[:3, 3], pose[:3, :3]) if link == base else None
 
 
 def geometry_of(env: Any) -> ArmGeometry | None:
@@ -67,16 +111,16 @@ def arm_checks(spec: RobotSpec, geometry: ArmGeometry, margin: float, inspection
     if np.ptp(joints, axis=0).max() > _STILL:
         pose, why = None, "the arm moves"
     if pose is None:
-        yield check("tool pose", expected, why, fits=None)
-        yield check("sense of the joints", "as the arm has it", "not shown without the tool's pose", fits=None)
+        yield Check("tool pose", expected, why, fits=None)
+        yield Check("sense of the joints", "as the arm has it", "not shown without the tool's pose", fits=None)
         return
     q = np.median(joints, axis=0)
     beside, along, turned = _gap(geometry, q, pose)
     if not _near(beside, turned):
-        yield check("tool pose", expected, _explained(geometry, q, pose), fits=False)
+        yield Check("tool pose", expected, _explained(geometry, q, pose), fits=False)
         return
     text = f"{beside:.3f} m, {math.degrees(turned):.1f} degrees" if pose.quaternion is not None else f"{beside:.3f} m"
-    yield check("tool pose", expected, text, fits=True)
+    yield Check("tool pose", expected, text, fits=True)
     yield _tool_length(geometry, along)
     yield _senses(geometry, q, pose)
 
@@ -84,28 +128,20 @@ def arm_checks(spec: RobotSpec, geometry: ArmGeometry, margin: float, inspection
 def measured_joints(inspection: Inspection, spec: RobotSpec) -> Array | None:
     """The measured joints (k, 6) [rad], or None if they are outside their range or unreadable."""
     signal = next(signal for signal in spec.signals if signal.name == "joint_position")
-    source = next(source for source in inspection.sources if source.signal == "joint_position")
-    try:
-        values = readings(inspection, source, len(signal.labels))[1]
-    except ProtocolError:
-        return None
-    inside = (values >= np.array(signal.low)).all() and (values <= np.array(signal.high)).all()
-    return values if len(values) and inside else None
+    reading = inspection.readings["joint_position"]
+    inside = (reading.values >= np.array(signal.low)).all() and (reading.values <= np.array(signal.high)).all()
+    return reading.values if len(reading.values) and not reading.error and inside else None
 
 
 def _tool_pose(inspection: Inspection) -> tuple[Pose | None, str]:
     """The measured pose of the tool; or None, and why it is not known."""
     found: dict[str, Array] = {}
-    for name, size in (("tool_position", 3), ("tool_quaternion", 4)):
-        source = next((source for source in inspection.sources if source.signal == name), None)
-        if source is None:
-            continue
-        try:
-            values = readings(inspection, source, size)[1]
-        except ProtocolError as error:
-            return None, str(error).removesuffix(".")
-        if len(values):
-            found[name] = np.median(values, axis=0)
+    for name in TOOL_POSE:
+        reading = inspection.readings.get(name)
+        if reading is not None and reading.error:
+            return None, reading.error.removesuffix(".")
+        if reading is not None and reading.count:
+            found[name] = np.median(reading.values, axis=0)
     if "tool_position" not in found:
         return None, "the robot does not report the pose of its tool"
     quaternion = found.get("tool_quaternion")
@@ -142,7 +178,7 @@ def _tool_length(geometry: ArmGeometry, along: float) -> Check:
         f": if its gripper is that of the policy, set the tool centre point (TCP) to {geometry.tool:g} m; for another "
     )
     hint += "gripper, train a policy with its length"
-    return check("tool length", expected, f"{along:.3f} m{'' if fits else hint}", fits=fits)
+    return Check("tool length", expected, f"{along:.3f} m{'' if fits else hint}", fits=fits)
 
 
 def _senses(geometry: ArmGeometry, q: Array, pose: Pose) -> Check:
@@ -153,7 +189,7 @@ def _senses(geometry: ArmGeometry, q: Array, pose: Pose) -> Check:
         if not hidden
         else f"not shown at 0 or 180 degrees: {', '.join(hidden)}; move it a little and try again"
     )
-    return check("sense of the joints", "as the arm has it", found, fits=None if hidden else True)
+    return Check("sense of the joints", "as the arm has it", found, fits=None if hidden else True)
 
 
 def _explained(geometry: ArmGeometry, q: Array, pose: Pose) -> str:
@@ -190,7 +226,7 @@ def _description(inspection: Inspection) -> tuple[Urdf | None, str]:
     message: Any = letters[-1].message
     try:
         return read_urdf(message.get("data") if isinstance(message, dict) else None), ""
-    except FormatError as error:
+    except ProtocolError as error:
         return None, str(error)
 
 
@@ -199,7 +235,7 @@ def _limits(spec: RobotSpec, margin: float, urdf: Urdf | None, why: str) -> Iter
     command = spec.command
     joints = [(i, urdf[name]) for i, name in enumerate(command.labels) if urdf is not None and name in urdf]
     if not joints:
-        yield check("joint limits", "as in the profile", why or f"{DESCRIPTION} has none of the joints", fits=None)
+        yield Check("joint limits", "as in the profile", why or f"{DESCRIPTION} has none of the joints", fits=None)
     for i, joint in joints:
         low, high = command.low[i], command.high[i]
         enough = joint.low <= low + margin + 1e-6 and joint.high >= high - margin - 1e-6
@@ -208,7 +244,7 @@ def _limits(spec: RobotSpec, margin: float, urdf: Urdf | None, why: str) -> Iter
         what, expected = f"limits of {command.labels[i]}", f"{low:.4g} to {high:.4g} {command.units[i]}"
         found = f"{joint.low:.4g} to {joint.high:.4g}" if joint.kind in kinds else f"a {joint.kind} joint"
         hint = "" if sane else " (degrees?)" if command.units[i] == "rad" else " (millimetres?)"
-        yield check(what, expected, found + hint, fits=joint.kind in kinds and enough and sane)
+        yield Check(what, expected, found + hint, fits=joint.kind in kinds and enough and sane)
 
 
 def _described_kinematics(geometry: ArmGeometry, joints: Array, urdf: Urdf) -> Iterator[Check]:
@@ -221,7 +257,7 @@ def _described_kinematics(geometry: ArmGeometry, joints: Array, urdf: Urdf) -> I
     beside, along, turned = _gap(geometry, q, pose)
     fits = _near(beside, turned) and abs(along) <= OFF_AXIS
     found = f"{math.hypot(beside, along):.3f} m" if fits else _explained_model(geometry, q, pose)
-    yield check(f"kinematics in {DESCRIPTION}", f"flange within {OFF_AXIS:g} m", found, fits=fits)
+    yield Check(f"kinematics in {DESCRIPTION}", f"flange within {OFF_AXIS:g} m", found, fits=fits)
 
 
 def _explained_model(geometry: ArmGeometry, q: Array, pose: Pose) -> str:
@@ -232,3 +268,43 @@ def _explained_model(geometry: ArmGeometry, q: Array, pose: Pose) -> str:
     ]
     beside, along, _ = _gap(geometry, q, pose)
     return f"those of a {names[0]}" if names else f"{math.hypot(beside, along):.3f} m away"
+
+
+def read_urdf(text: object) -> Urdf:
+    """The joints in the text of a URDF.
+
+    Raises:
+        ProtocolError: The text is not a URDF.
+    """
+    if not isinstance(text, str) or len(text) > LARGEST_URDF or "<!" in text.replace("<!--", ""):  # declared entities
+        raise ProtocolError("the robot's description is no URDF")
+    try:
+        root = ElementTree.fromstring(text)  # without entity declarations nothing is expanded
+        return Urdf({str(element.get("name")): _joint(element) for element in root.findall("joint")})
+    except (ElementTree.ParseError, ValueError, AttributeError) as error:
+        raise ProtocolError(f"the robot's description is no URDF: {error}") from error
+
+
+def _joint(element: Any) -> UrdfJoint:
+    kind, limit, low, high = str(element.get("type")), element.find("limit"), -math.inf, math.inf
+    if limit is not None and kind != "continuous":
+        low, high = float(limit.get("lower", 0.0)), float(limit.get("upper", 0.0))
+    parent, child = (element.find(end).get("link") for end in ("parent", "child"))
+    place, axis, origin = element.find("origin"), _vector(element.find("axis"), "xyz", "1 0 0"), np.eye(4)
+    roll, pitch, yaw = (_rotation(about, angle) for about, angle in zip(np.eye(3), _vector(place, "rpy"), strict=True))
+    origin[:3, :3], origin[:3, 3] = yaw @ pitch @ roll, _vector(place, "xyz")
+    return UrdfJoint(kind, parent, child, low, high, origin, axis / max(float(np.linalg.norm(axis)), 1e-9))
+
+
+def _vector(element: Any, name: str, default: str = "0 0 0") -> Array:
+    values = np.array([float(text) for text in (default if element is None else element.get(name, default)).split()])
+    if values.shape != (3,):
+        raise ValueError(f"{name} has {len(values)} numbers instead of 3")
+    return values
+
+
+def _rotation(axis: Array, angle: float) -> Array:
+    """Rodrigues' formula: 1 + sin(a) K + (1 - cos(a)) K^2, where K x = axis x x. Shape: (3, 3)."""
+    cross = np.cross(np.eye(3), axis)
+    turned: Array = np.eye(3) + math.sin(angle) * cross + (1 - math.cos(angle)) * (cross @ cross)
+    return turned
