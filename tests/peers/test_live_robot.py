@@ -11,6 +11,7 @@ from bam_envs.core.errors import LinkLost, NoServer, NotReady, SafetyStop, Stale
 from bam_envs.core.robot import Initial
 from bam_envs.live.building import live_robot, profile_limits
 from bam_envs.live.diagnosis import STEPS, Diagnosis
+from bam_envs.live.examination import measured_link
 from bam_envs.robots.profile import load_profile
 from bam_envs.robots.ur5e import arm_spec
 from bam_train.checkpoint import Checkpoint
@@ -215,7 +216,8 @@ def test_a_diagnosis_finds_it_well_and_moves_nothing(rosbridge, robot_node):
     assert all(step.verdict != "failed" for step in steps), steps
     assert diagnosis.profile.name == "ur5e"
     assert robot_node.ask("report")["received"] == []
-    link = diagnosis.measurement.profile()
+    inspection = diagnosis.inspection
+    link = measured_link(inspection.trips, inspection.copies, inspection.readings["joint_position"])
     assert link.command_loss < 0.1
     assert 0.0 < link.command_delay[50] < 0.1
 
