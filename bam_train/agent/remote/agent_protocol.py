@@ -9,7 +9,7 @@ grow, is answered by ``{"id": N, "ok": true, "result": {...}}`` or
 
 from __future__ import annotations
 
-from typing import Annotated, ClassVar, Literal, TypeVar
+from typing import Annotated, ClassVar, Literal
 
 import msgspec
 from msgspec import Meta
@@ -95,7 +95,7 @@ class HandBack(Request, tag="hand_back"):
 
 
 class Jog(Request, tag="jog", kw_only=True):
-    """A twist for the owner's robot, without an answer; see `bam_train.agent.jog.Jogger.put`."""
+    """A twist for the owner's robot, without an answer; see `bam_train.agent.front.jog.Jogger.put`."""
 
     role: ClassVar[Role] = "drive"
     seq: Annotated[int, Meta(ge=0, le=2**53)]
@@ -148,26 +148,7 @@ class _Head(msgspec.Struct):
     id: int | None = None
 
 
-AnyRequest = TypeVar("AnyRequest", bound=Request)
-_KINDS: tuple[type[Request], ...] = (
-    *(
-        Status,
-        ListVersions,
-        ReadAudit,
-        Watch,
-        Stop,
-        Pause,
-        Resume,
-        Take,
-        HandBack,
-        Jog,
-        Push,
-        Use,
-        Rollback,
-        StreamTransitions,
-    ),
-)
-OPS: dict[str, type[Request]] = {str(kind.__struct_config__.tag): kind for kind in _KINDS}
+OPS: dict[str, type[Request]] = {str(kind.__struct_config__.tag): kind for kind in Request.__subclasses__()}
 """Each op with its request."""
 _DECODERS = {op: msgspec.json.Decoder(kind) for op, kind in OPS.items()}
 _HEAD = msgspec.json.Decoder(_Head)

@@ -168,7 +168,7 @@ class FakeAgent:
         self.jogger.release()
 
     def jog(self, message, person):
-        if self.driver == person.connection and self.jogger.put(message):
+        if self.driver == person.connection and self.jogger.put(**message):
             self.twists.append((time.monotonic(), message))
 
     def stop(self, person, why):

@@ -107,6 +107,26 @@ def test_errors_are_one_line_with_their_kind(hub, new_raw, caplog):
             None,
             "This is no request: Expected `array` of length >= 4 - at `$.twist`.",
         ),
+        (
+            b'{"op": "jog", "seq": 1, "twist": [1e999, 0, 0, 0]}',
+            None,
+            "This is no request: Number out of range - at `$.twist[0]`.",
+        ),
+        (
+            b'{"op": "jog", "seq": "1", "twist": [0, 0, 0, 0]}',
+            None,
+            "This is no request: Expected `int`, got `str` - at `$.seq`.",
+        ),
+        (
+            b'{"op": "jog", "seq": 1, "twist": [0, 0, 0, 0], "gripper": 2}',
+            None,
+            "This is no request: Invalid enum value 2 - at `$.gripper`.",
+        ),
+        (
+            b'{"op": "jog", "seq": 1, "twist": [0, 0, 0, 0], "sent": "now"}',
+            None,
+            "This is no request: Expected `float | null`, got `str` - at `$.sent`.",
+        ),
         (b" " * 65_537, None, "A request has at most 65536 bytes; this one has 65537."),
     ],
 )
