@@ -17,6 +17,7 @@ import socket
 import time
 from collections.abc import Callable, Coroutine, Mapping
 from concurrent.futures import CancelledError, Future, wait
+from concurrent.futures import TimeoutError as NoResult
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, TypeVar
@@ -107,7 +108,7 @@ class AgentClient:
         """Close the connection. Idempotent."""
 
         async def hang_up() -> None:
-            self._end(LinkLost(f"{self.url}: this client is closed."))
+            self.error = LinkLost(f"{self.url}: this client is closed.")
             await self._socket.close()
 
         with suppress(BamEnvsError):
@@ -175,22 +176,21 @@ class AgentClient:
 
     def _run(self, task: Coroutine[Any, Any, T]) -> T:
         """The result of `task` in the network thread; `LinkLost` if the connection ends before."""
-        loop = self._thread.loop
-        if self.error is not None or loop is None:
+        running, loop = None, self._thread.loop
+        if self.error is None and loop is not None:
+            with suppress(RuntimeError):  # it was closed a moment ago
+                running = asyncio.run_coroutine_threadsafe(task, loop)
+        if running is None:
             task.close()
             raise self.error or LinkLost(f"{self.url}: not connected: call connect().")
-        running = asyncio.run_coroutine_threadsafe(task, loop)
         try:
-            while not wait([running], _ENDED_POLL_PERIOD).done:
-                if self._thread.loop is None:  # it ended before the task began
-                    break
-            else:
-                return running.result()
-        except CancelledError:
-            pass
+            while not wait([running], _ENDED_POLL_PERIOD).done and self._thread.loop is not None:
+                pass
+            return running.result(0)
+        except (CancelledError, NoResult):  # the connection ended, perhaps before the task began
+            raise self.error or LinkLost(f"{self.url}: the link dropped.") from None
         finally:
             running.cancel()  # after Ctrl-C
-        raise self.error or LinkLost(f"{self.url}: the link dropped.")
 
     # ---- the network thread
 
@@ -236,7 +236,7 @@ class AgentClient:
         return LinkLost(f"{self.url}: no answer to {op} within {within:g} s.")
 
     async def _send(self, data: str | bytes) -> None:
-        with suppress(ConnectionClosed):  # `_main` learns of it too, and answers what waits
+        with suppress(ConnectionClosed):  # `_main` learns of it too, and its end cancels what waits
             await self._socket.send(data)
 
     async def _main(self, ready: Future[None]) -> None:
@@ -246,10 +246,11 @@ class AgentClient:
             while True:
                 self._take(json.loads(await self._socket.recv()))
         except ConnectionClosed as end:
-            self._end(LinkLost(f"{self.url}: the link dropped: {_reason(end)}."))
+            self.error = self.error or LinkLost(f"{self.url}: the link dropped: {_reason(end)}.")
         except (ValueError, KeyError, TypeError) as error:
-            self._end(LinkLost(f"{self.url}: the server sent what is no message of an agent: {brief(str(error))}."))
-        finally:
+            reason = f"the server sent what is no message of an agent: {brief(str(error))}."
+            self.error = LinkLost(f"{self.url}: {reason}")
+        finally:  # the end of this task cancels those of `_run`
             await self._socket.close()
 
     async def _open(self) -> ClientConnection:
@@ -342,12 +343,6 @@ class AgentClient:
         else:
             kind = str(message["kind"])
             answer.set_exception(AgentRefused(kind, str(message["error"]), REFUSED if kind in _REFUSALS else 1))
-
-    def _end(self, error: BamEnvsError) -> None:
-        self.error = self.error or error
-        for answer, _ in tuple(self._answers.values()):
-            if not answer.done():
-                answer.set_exception(self.error)
 
 
 _NO_AGENT = (
