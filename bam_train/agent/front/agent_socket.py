@@ -12,13 +12,9 @@ import contextlib
 import logging
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from functools import partial
-from pathlib import Path
-from typing import Any, Protocol
-
-import msgspec
-import numpy as np
+from typing import Any
 
 from bam_envs import __version__
 from bam_envs.core.errors import BamEnvsError, InvalidValue, NotInCommand, ProtocolError
@@ -26,9 +22,8 @@ from bam_envs.rosbridge.bus import Caller
 from bam_envs.rosbridge.server.client_session import Packet
 from bam_envs.rosbridge.server.refusals import Refusals
 from bam_envs.rosbridge.server.server_connection import BridgeConnection
-from bam_envs.rosbridge.server.site import Handler
 from bam_envs.rosbridge.threads import Workers
-from bam_envs.rosbridge.tokens import Role
+from bam_train.agent.front.hub import AgentHub, Person
 from bam_train.agent.front.upload import Upload, remove_leftovers
 from bam_train.agent.remote import agent_protocol as protocol
 from bam_train.errors import BamTrainError, RequestRefused, RoleTooLow
@@ -46,73 +41,22 @@ _NEWEST = {"status": 1, "telemetry": 1}
 """Most events of a kind that wait for a slow client; of others, as many as the server lets."""
 
 
-@dataclass(frozen=True)
-class Person:
-    """Somebody at the other end of an agent socket."""
-
-    name: str
-    """As they call themselves, such as anna@laptop; else the address."""
-    address: str
-    """Network address with the port."""
-    role: Role
-    connection: str
-    """Unique name of the socket."""
-    silence: Callable[[], float] = field(default=lambda: 0.0, compare=False)
-    """Time since the last sign of life of the socket [s]."""
-
-
-Event = Mapping[str, Any]
-Progress = Callable[[str], None]
-
-
-class Hub(Protocol):
-    """The agent behind the socket."""
-
-    incoming: Path
-    """Folder for uploads."""
-
-    def ask(self, op: str, arguments: dict[str, Any], person: Person, progress: Progress) -> dict[str, Any]:
-        """Do what is asked for, in a worker thread, and return the result; tell `progress` in lines of text.
-
-        For ``push``, ``path`` in `arguments` is the complete upload, whose digest was compared; it is removed
-        afterwards if it is still there. Raises `BamTrainError` or `BamEnvsError`, of one line.
-        """
-
-    def stop(self, person: Person, why: str) -> dict[str, Any]:
-        """Halt, in the network thread: must return at once."""
-
-    def jog(self, message: dict[str, Any], person: Person) -> None:
-        """Take a twist, in the network thread: must return at once. Raises as `ask`."""
-
-    def listen(self, kind: str, listener: Callable[[Event], None]) -> Callable[[], None]:
-        """Call `listener`, in any thread, with each event of a kind: status, telemetry, transitions."""
-
-    def left(self, person: Person) -> None:
-        """The socket has closed; in the network thread: must return at once."""
-
-
 class AgentSocket:
     """Serves the agent socket; `serve` is its handler for a `Site`, at `agent_protocol.PATH`.
 
     Args:
-        hub: The agent behind it.
+        hub: The agent behind it. Its `stop` and `jog` are called in the network thread.
         most_upload: Most bytes of an upload.
         stalled: Longest time between two pieces of an upload [s].
     """
 
-    def __init__(self, hub: Hub, *, most_upload: int = 256 * 2**20, stalled: float = _STALLED) -> None:
+    def __init__(self, hub: AgentHub, *, most_upload: int = 256 * 2**20, stalled: float = _STALLED) -> None:
         self.hub, self.most_upload, self.stalled = hub, most_upload, stalled
         self.refusals = Refusals(_log)
         self.pushes = 0  # uploads, and pushes without an answer yet
         self.learner: Person | None = None  # who gets the transitions
-        self._workers = Workers(_THREADS, "bam-agent-ask")
-        self._feeds = {kind: _Feed(hub, kind) for kinds in _EVENTS.values() for kind in kinds}
+        self.workers = Workers(_THREADS, "bam-agent-ask")
         remove_leftovers(hub.incoming)
-
-    @property
-    def sockets(self) -> dict[str, Handler]:
-        """For a `Site`, which lets them in always: a client without a place may stop the robot."""
-        return {protocol.PATH: self.serve}
 
     async def serve(self, connection: BridgeConnection, caller: Caller) -> None:
         """Serve one socket until it closes."""
@@ -120,56 +64,20 @@ class AgentSocket:
 
     def close(self) -> None:
         """End the worker threads."""
-        self._workers.close()
-
-    def work(self, task: Callable[[], None]) -> None:
-        """Run `task`, which must not raise, in a worker thread; called in the network thread."""
-        self._workers.submit(task)
-
-    def feed(self, kind: str, client: _Client, on: bool) -> None:
-        """Send a client the events of a kind, or no longer."""
-        (self._feeds[kind].add if on else self._feeds[kind].discard)(client)
-
-
-class _Feed:
-    """The clients that want one kind of events; the hub is asked for these only while there is one."""
-
-    def __init__(self, hub: Hub, kind: str) -> None:
-        self._hub, self._kind, self._clients = hub, kind, set[_Client]()
-        self._unlisten: Callable[[], None] = lambda: None
-
-    def add(self, client: _Client) -> None:
-        if not self._clients:
-            loop = asyncio.get_running_loop()
-            self._unlisten = self._hub.listen(self._kind, partial(self._pass_on, loop))
-        self._clients.add(client)
-
-    def discard(self, client: _Client) -> None:
-        if client in self._clients:
-            self._clients.discard(client)
-            if not self._clients:
-                self._unlisten()
-
-    def _pass_on(self, loop: asyncio.AbstractEventLoop, event: Event) -> None:
-        packet = Packet((_encode(event),), text=True, stream=self._kind)
-        with contextlib.suppress(RuntimeError):  # the server was closed a moment ago
-            loop.call_soon_threadsafe(self._send, packet)
-
-    def _send(self, packet: Packet) -> None:
-        for client in self._clients:
-            client.send(packet, _NEWEST.get(self._kind, 0))
+        self.workers.close()
 
 
 class _Client:
     """One socket."""
 
     def __init__(self, owner: AgentSocket, connection: BridgeConnection, caller: Caller) -> None:
-        self._owner, self._hub, self._connection, self._caller = owner, owner.hub, connection, caller
-        self._person = Person(caller.address, caller.address, caller.role, caller.name, caller.silence)
+        self._owner, self._hub, self._connection = owner, owner.hub, connection
+        self._person = Person(**vars(caller), who=caller.address)
         self._loop = asyncio.get_running_loop()
         self._last = -1  # id of the last request
         self._running = 0  # requests that worker threads execute
         self._pushes = 0  # its share of the owner's
+        self._ends: dict[str, Callable[[], None]] = {}  # of the kinds of events that it gets
         self._upload: Upload | None = None
         self._push: protocol.Push | None = None
         self._skip = 0  # bytes of an upload that failed, which are still on their way
@@ -177,7 +85,7 @@ class _Client:
 
     async def run(self) -> None:
         """Take messages until the socket closes."""
-        hello = {"event": "hello", "protocol": protocol.PROTOCOL, "agent": __version__, "role": self._caller.role}
+        hello = {"event": "hello", "protocol": protocol.PROTOCOL, "agent": __version__, "role": self._person.role}
         self._send(hello)
         try:
             while True:
@@ -197,9 +105,8 @@ class _Client:
             self._leave()
 
     def _leave(self) -> None:
-        for kinds in _EVENTS.values():
-            for kind in kinds:
-                self._owner.feed(kind, self, False)
+        for op in _EVENTS:
+            self._switch(op, False)
         if self._learns:
             self._owner.learner = None
         if self._upload is not None:
@@ -228,7 +135,7 @@ class _Client:
                     raise protocol.BadRequest(f"The id {number} is not above {self._last}: ids grow.", number)
                 self._last = number
             if request.name:
-                self._person = replace(self._person, name=request.name)
+                self._person = replace(self._person, who=request.name)
             self._require_role(request)
             await self._do(request)
         except protocol.BadRequest as error:
@@ -240,12 +147,12 @@ class _Client:
             self._refuse(number, error)
 
     def _require_role(self, request: protocol.Request) -> None:
-        op, role = request.__struct_config__.tag, self._caller.role
+        op, role = request.__struct_config__.tag, self._person.role
         if not protocol.may(role, type(request)):
             raise RoleTooLow(f"{op} needs a token of the role {request.role}; the token shown has the role {role}.")
-        if self._caller.full and not isinstance(request, (protocol.Stop, protocol.Status)):
-            raise RequestRefused(f"{self._caller.full} This connection can stop the robot, and look at its status.")
-        if isinstance(request, protocol.Take) and request.force and not self._caller.operator:
+        if self._person.full and not isinstance(request, (protocol.Stop, protocol.Status)):
+            raise RequestRefused(f"{self._person.full} This connection can stop the robot, and look at its status.")
+        if isinstance(request, protocol.Take) and request.force and not self._person.operator:
             raise RoleTooLow("Taking command by force needs a token of the role administer (bam-agent --token-file).")
 
     async def _do(self, request: protocol.Request) -> None:
@@ -267,12 +174,20 @@ class _Client:
 
     def _switch(self, op: str, on: bool) -> None:
         for kind in _EVENTS[op]:
-            self._owner.feed(kind, self, on)
+            if on and kind not in self._ends:
+                self._ends[kind] = self._hub.listen(kind, partial(self._pass_on, kind))
+            elif not on and kind in self._ends:
+                self._ends.pop(kind)()
+
+    def _pass_on(self, kind: str, event: bytes) -> None:
+        """Send an event; called in any thread."""
+        packet = Packet((event,), text=True, stream=kind)
+        self._post(lambda: self._send_packet(packet, _NEWEST.get(kind, 0)))
 
     def _learn(self, on: bool) -> None:
         learner = self._owner.learner
         if on and learner is not None and not self._learns:
-            who = learner.name if learner.name == learner.address else f"{learner.name} ({learner.address})"
+            who = learner.who if learner.who == learner.address else f"{learner.who} ({learner.address})"
             raise NotInCommand(f"{who} learns from this robot already, and there is one learner at a time.")
         if on or self._learns:
             self._owner.learner = self._person if on else None
@@ -281,7 +196,7 @@ class _Client:
     @property
     def _learns(self) -> bool:
         learner = self._owner.learner
-        return learner is not None and learner.connection == self._caller.name
+        return learner is not None and learner.name == self._person.name
 
     def _ask(self, request: protocol.Request, arguments: dict[str, Any], upload: Upload | None = None) -> None:
         """Let a worker thread execute a request and answer it."""
@@ -312,7 +227,7 @@ class _Client:
                 self._note(f"{op}: {' '.join(str(error).split())}")
                 self._refuse(number, error)
 
-        self._owner.work(work)
+        self._owner.workers.submit(work)
 
     # ---- uploads
 
@@ -368,9 +283,9 @@ class _Client:
         self._send({"id": number, "ok": False, "error": text, "kind": type(error).__name__})
 
     def _send(self, message: Mapping[str, Any]) -> None:
-        self.send(Packet((_encode(message),), text=True), 0)
+        self._send_packet(Packet((protocol.encode_message(message),), text=True), 0)
 
-    def send(self, packet: Packet, keep: int) -> None:
+    def _send_packet(self, packet: Packet, keep: int) -> None:
         """Send a packet, or let it wait for a slow client."""
         self._connection.put(packet, keep)
         self._connection.flush()
@@ -380,18 +295,8 @@ class _Client:
             self._loop.call_soon_threadsafe(work)
 
     def _note(self, why: str) -> None:
-        self._owner.refusals.note(self._caller.address, why)
+        self._owner.refusals.note(self._person.address, why)
 
 
 def _arguments(request: protocol.Request) -> dict[str, Any]:
     return {name: getattr(request, name) for name in request.__struct_fields__ if name not in ("id", "name")}
-
-
-def _encode(message: Mapping[str, Any]) -> bytes:
-    return msgspec.json.encode(message, enc_hook=_plain)
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, (np.ndarray, np.generic)):
-        return value.tolist()
-    raise TypeError(f"{type(value).__name__} cannot be sent")

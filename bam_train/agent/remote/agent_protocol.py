@@ -9,9 +9,11 @@ grow, is answered by ``{"id": N, "ok": true, "result": {...}}`` or
 
 from __future__ import annotations
 
-from typing import Annotated, ClassVar, Literal
+from collections.abc import Mapping
+from typing import Annotated, Any, ClassVar, Literal
 
 import msgspec
+import numpy as np
 from msgspec import Meta
 
 from bam_envs.core.errors import ProtocolError
@@ -175,6 +177,17 @@ def decode_request(data: bytes) -> Request:
 def printable(text: str) -> str:
     """A text of somebody else for logs and screens: ? in place of control characters."""
     return "".join(one if one.isprintable() else "?" for one in text)
+
+
+def encode_message(message: Mapping[str, Any]) -> bytes:
+    """A message to a client as a text frame; what is not finite becomes null."""
+    return msgspec.json.encode(message, enc_hook=_plain)
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, (np.ndarray, np.generic)):
+        return value.tolist()
+    raise TypeError(f"{type(value).__name__} cannot be sent")
 
 
 def may(role: Role, request: type[Request]) -> bool:

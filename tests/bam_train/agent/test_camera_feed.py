@@ -15,7 +15,6 @@ from bam_envs.rosbridge.server import BridgeServer, Site
 from bam_envs.rosbridge.tokens import Tokens
 from bam_train.agent.agent_messages import Front
 from bam_train.agent.front.camera_feed import CameraFeed, PagePace, jpeg
-from bam_train.agent.front.hub import AgentHub
 from bam_train.agent.front.robot_front import FrontProcess
 
 DEADLINE = 10.0
@@ -175,5 +174,5 @@ def test_the_console_shows_the_cameras_that_the_policy_sees(tmp_path, env_kwargs
     front = FrontProcess(options, lambda message: None)
     assert front.seen() == seen
     assert {name: camera.source.name for name, camera in front.cameras().items()} == dict(zip(seen, seen, strict=True))
-    status = AgentHub(front, by_force=False).status()
+    status = front.status()
     assert (status["name"], status["address"]) == ("ur5e", "ws://127.0.0.1:9090")
