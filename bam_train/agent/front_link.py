@@ -6,6 +6,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import msgspec
@@ -34,13 +35,14 @@ class FrontLink:
     """The front process of a live agent.
 
     Args:
-        options: How it listens; a port 0 becomes the one that it takes.
+        front: The agent as the process needs to know it.
         take: Called with each of its messages, in a thread of this object.
         lost: Called when it died, before it is started again.
     """
 
-    def __init__(self, options: Front, take: Callable[[Any], None], lost: Callable[[], None]) -> None:
-        self.options = options
+    def __init__(self, front: Front, take: Callable[[Any], None], lost: Callable[[], None]) -> None:
+        self._front, self.port = front, front.agent.port
+        """Where it listens; a port 0 becomes the one that it takes."""
         self._take, self._lost = take, lost
         self._channel: Channel | None = None
         self._process: subprocess.Popen[bytes] | None = None
@@ -95,7 +97,8 @@ class FrontLink:
                 env=child_environment(),
                 start_new_session=True,  # Ctrl-C at the terminal is for the resident alone
             )
-        ours.send(msgspec.msgpack.encode(self.options))
+        agent = replace(self._front.agent, port=self.port)  # the same one, if it is started again
+        ours.send(msgspec.structs.replace(self._front, agent=agent).to_bytes())
         self._channel = Channel(ours, self._receive, self._died).start()
 
     def _receive(self, message: Any) -> None:
@@ -104,7 +107,7 @@ class FrontLink:
             return
         self._error = message.error
         if not message.error:
-            self.options = msgspec.structs.replace(self.options, port=message.port)
+            self.port = message.port
             if self._status is not None:
                 self.send(self._status)
         self._listening.set()

@@ -43,11 +43,12 @@ def main() -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the resident ends it
     begin_log("bam-agent")
     end = adopted(int(sys.argv[1]))
-    options = msgspec.msgpack.decode(end.recv(2**20), type=Front)
+    about = Front.from_bytes(end.recv(2**20))
+    options = about.agent
     receivers: list[Callable[[Any], None]] = []
     channel = Channel(end, lambda message: receivers[0](message), lambda: front.stop())
     try:
-        front = FrontProcess(options, channel.send)
+        front = FrontProcess(about, channel.send)
         hub = AgentHub(front)
         console, pictures = AgentSocket(hub), CameraFeed(front.cameras(), front.seen())
         # A client without a place may stop the robot.

@@ -6,7 +6,6 @@ import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -48,9 +47,9 @@ class AgentHub:
 
     def __init__(self, front: FrontProcess) -> None:
         self._front, self.listen = front, front.listen
-        self.incoming = Path(front.options.folder) / "incoming"
+        self.incoming = front.options.folder / "incoming"
         """Folder for uploads."""
-        self._versions = Versions(Path(front.options.folder) / "versions")
+        self._versions = Versions(front.options.folder / "versions")
         shadow = front.shadow
         model = getattr(front.task, "model", None)  # of a Universal Robots arm of any size
         geometry = None if model is None else model.geometry
@@ -89,7 +88,7 @@ class AgentHub:
         if op == "versions":
             return {"versions": [one.to_json() for one in self._versions.all()], "names": self._versions.names}
         if op == "audit":
-            return {"lines": tail(Path(front.options.folder) / "audit.jsonl")}
+            return {"lines": tail(front.options.folder / "audit.jsonl")}
         if op == "take":
             front.take_over(person, person.who, f"{person.who} ({person.address})", force=arguments["force"])
             return front.status()

@@ -9,6 +9,7 @@ import time
 from collections.abc import Callable
 from concurrent.futures import Future
 from concurrent.futures import TimeoutError as NoAnswer
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -39,7 +40,6 @@ from bam_train.agent.front.agent_lease import SILENT_LINK_TIMEOUT, AgentLease
 from bam_train.agent.front.remote_robot import RemoteRobot
 from bam_train.agent.remote.agent_protocol import encode_message, printable
 from bam_train.agent.transitions import EVENT, TransitionLog, encode
-from bam_train.env_location import EnvLocation
 from bam_train.environments import make_env
 from bam_train.errors import BamTrainError, CandidateRefused, RequestRefused, TrialsNeeded, UnknownVersion
 
@@ -55,26 +55,20 @@ class FrontProcess:
     """The port of a live agent, and the hub of its agent socket.
 
     Args:
-        options: Where it listens, and where the robot is.
+        about: Where it listens, and where the robot is.
         send: Sends a message to the resident.
     """
 
-    def __init__(self, options: Front, send: Callable[[Message], None]) -> None:
-        self.options, self.send = options, send
+    def __init__(self, about: Front, send: Callable[[Message], None]) -> None:
+        self.options, self.send, self._command_timeout = about.agent, send, about.command_timeout
         self._report: dict[str, Any] = {"state": "waiting for the robot", "why": "it starts", "active": None}
         self._report |= {"owner": None, "names": {}}  # the last one of the resident
-        place = EnvLocation(
-            options.robot,
-            profile=options.profile,
-            ca_file=options.ca_file,
-            token_file=options.robot_token_file,
-            shadow=True,
-        )
-        env: Any = make_env(options.env, options.env_kwargs, place=place)
+        place = replace(about.agent.place(trial=False), shadow=True)
+        env: Any = make_env(about.env, about.env_kwargs, place=place)
         self.shadow, self.task = env.unwrapped.robot, env.unwrapped.task
-        self.lease = AgentLease(options.lease)
+        self.lease = AgentLease(about.agent.lease)
         self.robot = RemoteRobot(
-            self.shadow, send, lambda: self.lease.holder, self._ask_now, options.command_timeout, self._describe
+            self.shadow, send, lambda: self.lease.holder, self._ask_now, about.command_timeout, self._describe
         )
         self._service: RobotService | None = None
         self._pending: dict[int, tuple[Future[Any], Callable[[str], None]]] = {}
@@ -292,7 +286,7 @@ class FrontProcess:
     def _info(self) -> RobotInfo:
         """The description of the robot for programs that take over; until it is known, that of a real one."""
         robot, period = self.shadow.info, self.shadow.spec.period
-        watchdog, text = max(self.options.command_timeout, 1.5 * period), f"{robot.text or self.options.robot}"
+        watchdog, text = max(self._command_timeout, 1.5 * period), f"{robot.text or self.options.robot}"
         text = f"{text}, driven by a live agent, from which you take over"
         identity = str(self._report.get("identity", ""))
         return RobotInfo(self.shadow.profile.name, robot.simulated, False, period, text, watchdog, True, identity)
