@@ -1,7 +1,6 @@
 """The messages between the tick of a live agent and its front process, over a pair of sockets."""
 
 import contextlib
-import os
 import queue
 import socket
 import sys
@@ -174,8 +173,3 @@ class Channel:
                 break
             self._take(_decoder.decode(data))
         self._lost()
-
-
-def child_environment() -> dict[str, str]:
-    """The environment of a child process, which finds the same packages."""
-    return {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}

@@ -254,10 +254,7 @@ class AgentClient:
             await self._socket.close()
 
     async def _open(self) -> ClientConnection:
-        try:
-            socket = await self._open_socket()
-        except NoServer as error:
-            raise self._better(error) from error.__cause__
+        socket = await self._open_socket()
         try:
             first = await asyncio.wait_for(self._hello(socket), self.timeout)
             problem = self._problem(first)
@@ -271,7 +268,13 @@ class AgentClient:
     async def _open_socket(self) -> ClientConnection:
         endpoint, address, timeout = self._endpoint, self._endpoint.address, self.timeout
         context, deadline = endpoint.tls_context(), time.monotonic() + timeout
-        plain = await open_port(address, timeout)  # and so that websockets uses no proxy
+        try:
+            plain = await open_port(address, timeout)  # and so that websockets uses no proxy
+        except NoServer as error:
+            if isinstance(error.__cause__, ConnectionRefusedError):
+                reason = "refused: nothing listens there. Does bam-agent run there, with this port?"
+                raise NoServer(address.url, reason) from error.__cause__
+            raise
         try:
             return await connect(
                 f"{address.url}{PATH}",
@@ -288,7 +291,8 @@ class AgentClient:
                 logger=_QUIET,
             )
         except InvalidStatus as error:
-            refusal = http_refusal(error.response.status_code, bytes(error.response.body or b""))
+            status = error.response.status_code
+            refusal = _NO_AGENT if status == 404 else http_refusal(status, bytes(error.response.body or b""))
             raise NoServer(address.url, refusal) from error
         except TimeoutError as error:
             raise NoServer(address.url, silent(address, timeout)) from error
@@ -319,14 +323,6 @@ class AgentClient:
             f"the agent there is {age}: bam-train {brief(self.agent)} has version {brief(found)} of the protocol, "
             f"and bam-train {__version__} here {PROTOCOL}. Install one version on both computers."
         )
-
-    def _better(self, error: NoServer) -> NoServer:
-        cause = error.__cause__
-        if isinstance(cause, InvalidStatus) and cause.response.status_code == 404:
-            return NoServer(self.url, _NO_AGENT)
-        if isinstance(cause, ConnectionRefusedError):
-            return NoServer(self.url, "refused: nothing listens there. Does bam-agent run there, with this port?")
-        return error
 
     def _take(self, message: dict[str, Any]) -> None:
         if "event" in message:

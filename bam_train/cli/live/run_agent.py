@@ -24,9 +24,8 @@ def run_agent(config: AgentConfig, signals: SignalMemory) -> int:
     """Run the program with its parsed flags; returns 128 + the signal that ended it."""
     from bam_train.agent.agent_messages import Front
     from bam_train.agent.audit import Audit
-    from bam_train.agent.front_link import FrontLink
+    from bam_train.agent.child_processes import FrontLink, SimulatedBox
     from bam_train.agent.resident import COMMAND_LIFETIME, Resident
-    from bam_train.agent.simulated_box import SimulatedBox
     from bam_train.agent.versions import Versions
     from bam_train.checkpoint import Checkpoint
     from bam_train.deploy.deployment import Stopped
