@@ -60,7 +60,7 @@ class AgentSocket:
     def __init__(self, hub: AgentHub, *, most_upload: int = 256 * 2**20, stalled: float = _STALLED) -> None:
         self.hub, self.most_upload, self.stalled = hub, most_upload, stalled
         self.refusals = Refusals(_log)
-        self.pushes = 0  # uploads, and pushes without an answer yet
+        self.pushing: list[_Client] = []  # by their uploads, and by pushes without an answer yet
         self.learner: Person | None = None  # who gets the transitions
         self.workers = Workers(_THREADS, "bam-agent-ask")
         remove_leftovers(hub.incoming)
@@ -83,10 +83,8 @@ class _Client:
         self._loop = asyncio.get_running_loop()
         self._last = -1  # id of the last request
         self._running = 0  # requests that worker threads execute
-        self._pushes = 0  # its share of the owner's
         self._ends: dict[str, Callable[[], None]] = {}  # of the kinds of events that it gets
         self._upload: Upload | None = None
-        self._push: protocol.Push | None = None
         self._skip = 0  # bytes of an upload that failed, which are still on their way
         self._room, self._at = _BURST, time.monotonic()  # messages that may come at once, and when that was so
 
@@ -96,11 +94,13 @@ class _Client:
         self._send(hello)
         try:
             while True:
+                upload, stalled = self._upload, self._owner.stalled
                 try:
-                    limit = None if self._upload is None else self._owner.stalled
+                    limit = None if upload is None else stalled
                     data, is_text = await asyncio.wait_for(self._connection.next_data(), limit)
                 except asyncio.TimeoutError:
-                    self._end_upload(ProtocolError(f"The upload stood still for {self._owner.stalled:g} s."))
+                    if upload is not None:
+                        self._end_upload(upload, ProtocolError(f"The upload stood still for {stalled:g} s."))
                     continue
                 if (is_text or (self._upload is None and self._skip <= 0)) and not self._has_room():
                     reason = f"More than {_RATE:g} messages a second came."
@@ -118,12 +118,8 @@ class _Client:
             self._owner.learner = None
         if self._upload is not None:
             self._upload.remove()
-        self._count_push(-self._pushes)
+        self._owner.pushing[:] = [one for one in self._owner.pushing if one is not self]
         self._hub.left(self._person)
-
-    def _count_push(self, change: int) -> None:
-        self._pushes += change
-        self._owner.pushes += change
 
     def _has_room(self) -> bool:
         now = time.monotonic()
@@ -226,8 +222,8 @@ class _Client:
 
         def finish(result: dict[str, Any], error: Exception | None) -> None:
             self._running -= 1
-            if upload is not None and self._pushes:
-                self._count_push(-1)
+            if upload is not None and self in self._owner.pushing:
+                self._owner.pushing.remove(self)
             if error is None:
                 self._answer(number, result)
             else:
@@ -239,44 +235,40 @@ class _Client:
     # ---- uploads
 
     async def _begin_upload(self, push: protocol.Push) -> None:
-        if self._upload is not None or self._owner.pushes >= _PUSHES:
+        pushing = self._owner.pushing
+        if self._upload is not None or len(pushing) >= _PUSHES:
             whose = "of this socket" if self._upload is not None else "of others"
             raise InvalidValue(f"Uploads {whose} are not done yet; push again when they are.")
-        make = partial(Upload, self._hub.incoming, push.size, push.sha256, self._owner.most_upload)
-        self._upload, self._push = await self._loop.run_in_executor(None, make), push
-        self._count_push(1)
+        pushing.append(self)
+        try:
+            make = partial(Upload, self._hub.incoming, push, self._owner.most_upload)
+            self._upload = await self._loop.run_in_executor(None, make)
+        except BaseException:
+            pushing.remove(self)
+            raise
         self._send({"id": push.id, "progress": "the agent takes the upload"})
 
     async def _take_piece(self, data: bytes) -> None:
-        upload, push = self._upload, self._push
-        if upload is None or push is None:
+        upload = self._upload
+        if upload is None:
             self._skip -= len(data)
             if self._skip < 0:
                 self._note("It sent bytes that belong to no upload.")
                 self._refuse(None, ProtocolError("Binary frames belong to an upload, and none has begun: push first."))
             return
         try:
-            complete = await self._loop.run_in_executor(None, upload.write, data)
+            if await self._loop.run_in_executor(None, upload.write, data):
+                self._ask(upload.push, {**_arguments(upload.push), "path": upload.path}, upload)
+                self._upload = None
         except (BamTrainError, BamEnvsError) as error:
-            self._end_upload(error)
-            return
-        if complete:
-            self._upload = None
-            try:
-                self._ask(push, {**_arguments(push), "path": upload.path}, upload)
-            except BamEnvsError as error:
-                upload.remove()
-                self._count_push(-1)
-                self._refuse(push.id, error)
+            self._end_upload(upload, error)
 
-    def _end_upload(self, error: Exception) -> None:
-        upload, push, self._upload = self._upload, self._push, None
-        if upload is not None and push is not None:
-            upload.remove()
-            self._count_push(-1)
-            self._skip = upload.size - upload.received
-            self._note(f"push: {error}")
-            self._refuse(push.id, error)
+    def _end_upload(self, upload: Upload, error: Exception) -> None:
+        upload.remove()
+        self._upload, self._skip = None, upload.push.size - upload.received
+        self._owner.pushing.remove(self)
+        self._note(f"push: {error}")
+        self._refuse(upload.push.id, error)
 
     # ---- answers
 
@@ -310,18 +302,17 @@ def _arguments(request: protocol.Request) -> dict[str, Any]:
 
 
 class Upload:
-    """Takes `size` bytes with a digest into a new file in `folder`. Its content is never opened here.
+    """Takes the bytes that a push announces into a new file in `folder`. Its content is never opened here.
 
     Raises:
         InvalidValue: The upload is larger than `most` bytes, or than the disk has room for.
         OutputError: The file cannot be written.
     """
 
-    def __init__(self, folder: Path, size: int, sha256: str, most: int) -> None:
-        if size > most:
+    def __init__(self, folder: Path, push: protocol.Push, most: int) -> None:
+        if (size := push.size) > most:
             raise InvalidValue(f"The upload has {_mb(size)}, and {_mb(most)} is the most that this agent takes.")
-        self.size, self.received = size, 0
-        self._announced, self._digest = sha256, hashlib.sha256()
+        self.push, self.received, self._digest = push, 0, hashlib.sha256()
         with _on_disk(folder):
             folder.mkdir(parents=True, exist_ok=True)
             free = shutil.disk_usage(folder).free
@@ -336,18 +327,18 @@ class Upload:
     def write(self, data: bytes) -> bool:
         """Add a piece; True if the upload is complete, and is what was announced. Otherwise the file is removed."""
         try:
-            if self.received + len(data) > self.size:
-                raise ProtocolError(f"The upload is longer than the {self.size} bytes that were announced.")
+            if self.received + len(data) > self.push.size:
+                raise ProtocolError(f"The upload is longer than the {self.push.size} bytes that were announced.")
             with _on_disk(self.path.parent):
                 self._file.write(data)
                 self.received += len(data)
                 self._digest.update(data)
-                if self.received < self.size:
+                if self.received < self.push.size:
                     return False
                 self._file.close()
-            if (found := self._digest.hexdigest()) != self._announced:
+            if (found := self._digest.hexdigest()) != self.push.sha256:
                 raise ProtocolError(
-                    f"The upload has the SHA-256 {found[:12]}, and {self._announced[:12]} was announced. Push again."
+                    f"The upload has the SHA-256 {found[:12]}, and {self.push.sha256[:12]} was announced. Push again."
                 )
         except BaseException:
             self.remove()
