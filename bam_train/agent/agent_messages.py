@@ -1,7 +1,6 @@
 """The messages between the tick of a live agent and its front process, over a pair of sockets."""
 
 import contextlib
-import os
 import queue
 import socket
 import sys
@@ -11,28 +10,30 @@ from typing import Any
 
 import msgspec
 
+from bam_train.agent.agent_options import AgentOptions
+
 _KIND = socket.SOCK_SEQPACKET if sys.platform == "linux" else socket.SOCK_DGRAM  # each keeps messages apart
 _LARGEST = 2**20  # [bytes]
 _WAITING = 200  # messages that may be left out, above which they are
 
 
-class Front(msgspec.Struct, tag=True, frozen=True):
-    """How the front process listens, and where it reads the robot's states; the first message to it."""
+class Front(msgspec.Struct, frozen=True):
+    """The agent as its front process needs to know it; the first message to that, on the bare socket."""
 
     env: str
     env_kwargs: dict[str, Any]
-    robot: str
-    profile: str | None
-    ca_file: str | None
-    robot_token_file: str | None
-    bind: str
-    port: int
-    cert: str | None
-    key: str | None
-    token_file: str | None
-    folder: str
-    lease: float
+    agent: AgentOptions
     command_timeout: float
+    """Time after which the robot rests without a command [s]."""
+
+    def to_bytes(self) -> bytes:
+        """The message as it is sent."""
+        return msgspec.msgpack.encode(self, enc_hook=str)
+
+    @classmethod
+    def from_bytes(cls, data: bytes) -> "Front":
+        """The message that was sent."""
+        return msgspec.msgpack.decode(data, type=cls, dec_hook=lambda kind, text: kind(text))  # a Path
 
 
 class Listening(msgspec.Struct, tag=True, frozen=True):
@@ -102,7 +103,7 @@ class Rows(msgspec.Struct, tag=True, frozen=True):
     event: dict[str, Any]
 
 
-Message = Front | Listening | Ask | Answer | RequestProgress | Halt | Drive | Report | Sent | Rows
+Message = Listening | Ask | Answer | RequestProgress | Halt | Drive | Report | Sent | Rows
 _encoder, _decoder = msgspec.msgpack.Encoder(), msgspec.msgpack.Decoder(Message)
 
 
@@ -172,8 +173,3 @@ class Channel:
                 break
             self._take(_decoder.decode(data))
         self._lost()
-
-
-def child_environment() -> dict[str, str]:
-    """The environment of a child process, which finds the same packages."""
-    return {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}

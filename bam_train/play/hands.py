@@ -121,7 +121,7 @@ class JointHand(Hand):
         """The joints' action that moves the tool for one period, or holds the arm. Shape: (a,) float32."""
         state = self._env.state
         self._now, self._count = self._now + self._period, self._count + 1
-        self._jogger.put({"seq": self._count, "twist": list(twist), "gripper": grip})
+        self._jogger.put(self._count, twist, grip)
         command = self._jogger.command(state) if any(twist) or grip else None
         if command is None:
             self._jogger.release()

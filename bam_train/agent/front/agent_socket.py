@@ -9,16 +9,17 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import hashlib
 import logging
+import os
+import shutil
+import tempfile
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any, Protocol
-
-import msgspec
-import numpy as np
+from typing import Any
 
 from bam_envs import __version__
 from bam_envs.core.errors import BamEnvsError, InvalidValue, NotInCommand, ProtocolError
@@ -26,12 +27,10 @@ from bam_envs.rosbridge.bus import Caller
 from bam_envs.rosbridge.server.client_session import Packet
 from bam_envs.rosbridge.server.refusals import Refusals
 from bam_envs.rosbridge.server.server_connection import BridgeConnection
-from bam_envs.rosbridge.server.site import Handler
 from bam_envs.rosbridge.threads import Workers
-from bam_envs.rosbridge.tokens import Role
-from bam_train.agent.front.upload import Upload, remove_leftovers
+from bam_train.agent.front.hub import AgentHub, Person
 from bam_train.agent.remote import agent_protocol as protocol
-from bam_train.errors import BamTrainError, RequestRefused, RoleTooLow
+from bam_train.errors import BamTrainError, OutputError, RequestRefused, RoleTooLow
 
 _log = logging.getLogger(__name__)
 _THREADS = 64
@@ -44,75 +43,27 @@ _EVENTS = {"watch": ("status", "telemetry"), "transitions": ("transitions",)}
 """Request to the kinds of events that it turns on."""
 _NEWEST = {"status": 1, "telemetry": 1}
 """Most events of a kind that wait for a slow client; of others, as many as the server lets."""
-
-
-@dataclass(frozen=True)
-class Person:
-    """Somebody at the other end of an agent socket."""
-
-    name: str
-    """As they call themselves, such as anna@laptop; else the address."""
-    address: str
-    """Network address with the port."""
-    role: Role
-    connection: str
-    """Unique name of the socket."""
-    silence: Callable[[], float] = field(default=lambda: 0.0, compare=False)
-    """Time since the last sign of life of the socket [s]."""
-
-
-Event = Mapping[str, Any]
-Progress = Callable[[str], None]
-
-
-class Hub(Protocol):
-    """The agent behind the socket."""
-
-    incoming: Path
-    """Folder for uploads."""
-
-    def ask(self, op: str, arguments: dict[str, Any], person: Person, progress: Progress) -> dict[str, Any]:
-        """Do what is asked for, in a worker thread, and return the result; tell `progress` in lines of text.
-
-        For ``push``, ``path`` in `arguments` is the complete upload, whose digest was compared; it is removed
-        afterwards if it is still there. Raises `BamTrainError` or `BamEnvsError`, of one line.
-        """
-
-    def stop(self, person: Person, why: str) -> dict[str, Any]:
-        """Halt, in the network thread: must return at once."""
-
-    def jog(self, message: dict[str, Any], person: Person) -> None:
-        """Take a twist, in the network thread: must return at once. Raises as `ask`."""
-
-    def listen(self, kind: str, listener: Callable[[Event], None]) -> Callable[[], None]:
-        """Call `listener`, in any thread, with each event of a kind: status, telemetry, transitions."""
-
-    def left(self, person: Person) -> None:
-        """The socket has closed; in the network thread: must return at once."""
+_PREFIX, _SUFFIX = "upload-", ".part"
+_RESERVE = 128 * 2**20
+"""Space that stays free on the disk for recordings and logs [bytes]."""
 
 
 class AgentSocket:
     """Serves the agent socket; `serve` is its handler for a `Site`, at `agent_protocol.PATH`.
 
     Args:
-        hub: The agent behind it.
+        hub: The agent behind it. Its `stop` and `jog` are called in the network thread.
         most_upload: Most bytes of an upload.
         stalled: Longest time between two pieces of an upload [s].
     """
 
-    def __init__(self, hub: Hub, *, most_upload: int = 256 * 2**20, stalled: float = _STALLED) -> None:
+    def __init__(self, hub: AgentHub, *, most_upload: int = 256 * 2**20, stalled: float = _STALLED) -> None:
         self.hub, self.most_upload, self.stalled = hub, most_upload, stalled
         self.refusals = Refusals(_log)
-        self.pushes = 0  # uploads, and pushes without an answer yet
+        self.pushing: list[_Client] = []  # by their uploads, and by pushes without an answer yet
         self.learner: Person | None = None  # who gets the transitions
-        self._workers = Workers(_THREADS, "bam-agent-ask")
-        self._feeds = {kind: _Feed(hub, kind) for kinds in _EVENTS.values() for kind in kinds}
+        self.workers = Workers(_THREADS, "bam-agent-ask")
         remove_leftovers(hub.incoming)
-
-    @property
-    def sockets(self) -> dict[str, Handler]:
-        """For a `Site`, which lets them in always: a client without a place may stop the robot."""
-        return {protocol.PATH: self.serve}
 
     async def serve(self, connection: BridgeConnection, caller: Caller) -> None:
         """Serve one socket until it closes."""
@@ -120,72 +71,36 @@ class AgentSocket:
 
     def close(self) -> None:
         """End the worker threads."""
-        self._workers.close()
-
-    def work(self, task: Callable[[], None]) -> None:
-        """Run `task`, which must not raise, in a worker thread; called in the network thread."""
-        self._workers.submit(task)
-
-    def feed(self, kind: str, client: _Client, on: bool) -> None:
-        """Send a client the events of a kind, or no longer."""
-        (self._feeds[kind].add if on else self._feeds[kind].discard)(client)
-
-
-class _Feed:
-    """The clients that want one kind of events; the hub is asked for these only while there is one."""
-
-    def __init__(self, hub: Hub, kind: str) -> None:
-        self._hub, self._kind, self._clients = hub, kind, set[_Client]()
-        self._unlisten: Callable[[], None] = lambda: None
-
-    def add(self, client: _Client) -> None:
-        if not self._clients:
-            loop = asyncio.get_running_loop()
-            self._unlisten = self._hub.listen(self._kind, partial(self._pass_on, loop))
-        self._clients.add(client)
-
-    def discard(self, client: _Client) -> None:
-        if client in self._clients:
-            self._clients.discard(client)
-            if not self._clients:
-                self._unlisten()
-
-    def _pass_on(self, loop: asyncio.AbstractEventLoop, event: Event) -> None:
-        packet = Packet((_encode(event),), text=True, stream=self._kind)
-        with contextlib.suppress(RuntimeError):  # the server was closed a moment ago
-            loop.call_soon_threadsafe(self._send, packet)
-
-    def _send(self, packet: Packet) -> None:
-        for client in self._clients:
-            client.send(packet, _NEWEST.get(self._kind, 0))
+        self.workers.close()
 
 
 class _Client:
     """One socket."""
 
     def __init__(self, owner: AgentSocket, connection: BridgeConnection, caller: Caller) -> None:
-        self._owner, self._hub, self._connection, self._caller = owner, owner.hub, connection, caller
-        self._person = Person(caller.address, caller.address, caller.role, caller.name, caller.silence)
+        self._owner, self._hub, self._connection = owner, owner.hub, connection
+        self._person = Person(**vars(caller), who=caller.address)
         self._loop = asyncio.get_running_loop()
         self._last = -1  # id of the last request
         self._running = 0  # requests that worker threads execute
-        self._pushes = 0  # its share of the owner's
+        self._ends: dict[str, Callable[[], None]] = {}  # of the kinds of events that it gets
         self._upload: Upload | None = None
-        self._push: protocol.Push | None = None
         self._skip = 0  # bytes of an upload that failed, which are still on their way
         self._room, self._at = _BURST, time.monotonic()  # messages that may come at once, and when that was so
 
     async def run(self) -> None:
         """Take messages until the socket closes."""
-        hello = {"event": "hello", "protocol": protocol.PROTOCOL, "agent": __version__, "role": self._caller.role}
+        hello = {"event": "hello", "protocol": protocol.PROTOCOL, "agent": __version__, "role": self._person.role}
         self._send(hello)
         try:
             while True:
+                upload, stalled = self._upload, self._owner.stalled
                 try:
-                    limit = None if self._upload is None else self._owner.stalled
+                    limit = None if upload is None else stalled
                     data, is_text = await asyncio.wait_for(self._connection.next_data(), limit)
                 except asyncio.TimeoutError:
-                    self._end_upload(ProtocolError(f"The upload stood still for {self._owner.stalled:g} s."))
+                    if upload is not None:
+                        self._end_upload(upload, ProtocolError(f"The upload stood still for {stalled:g} s."))
                     continue
                 if (is_text or (self._upload is None and self._skip <= 0)) and not self._has_room():
                     reason = f"More than {_RATE:g} messages a second came."
@@ -197,19 +112,14 @@ class _Client:
             self._leave()
 
     def _leave(self) -> None:
-        for kinds in _EVENTS.values():
-            for kind in kinds:
-                self._owner.feed(kind, self, False)
+        for op in _EVENTS:
+            self._switch(op, False)
         if self._learns:
             self._owner.learner = None
         if self._upload is not None:
             self._upload.remove()
-        self._count_push(-self._pushes)
+        self._owner.pushing[:] = [one for one in self._owner.pushing if one is not self]
         self._hub.left(self._person)
-
-    def _count_push(self, change: int) -> None:
-        self._pushes += change
-        self._owner.pushes += change
 
     def _has_room(self) -> bool:
         now = time.monotonic()
@@ -228,7 +138,7 @@ class _Client:
                     raise protocol.BadRequest(f"The id {number} is not above {self._last}: ids grow.", number)
                 self._last = number
             if request.name:
-                self._person = replace(self._person, name=request.name)
+                self._person = replace(self._person, who=request.name)
             self._require_role(request)
             await self._do(request)
         except protocol.BadRequest as error:
@@ -240,12 +150,12 @@ class _Client:
             self._refuse(number, error)
 
     def _require_role(self, request: protocol.Request) -> None:
-        op, role = request.__struct_config__.tag, self._caller.role
+        op, role = request.__struct_config__.tag, self._person.role
         if not protocol.may(role, type(request)):
             raise RoleTooLow(f"{op} needs a token of the role {request.role}; the token shown has the role {role}.")
-        if self._caller.full and not isinstance(request, (protocol.Stop, protocol.Status)):
-            raise RequestRefused(f"{self._caller.full} This connection can stop the robot, and look at its status.")
-        if isinstance(request, protocol.Take) and request.force and not self._caller.operator:
+        if self._person.full and not isinstance(request, (protocol.Stop, protocol.Status)):
+            raise RequestRefused(f"{self._person.full} This connection can stop the robot, and look at its status.")
+        if isinstance(request, protocol.Take) and request.force and not self._person.operator:
             raise RoleTooLow("Taking command by force needs a token of the role administer (bam-agent --token-file).")
 
     async def _do(self, request: protocol.Request) -> None:
@@ -267,12 +177,20 @@ class _Client:
 
     def _switch(self, op: str, on: bool) -> None:
         for kind in _EVENTS[op]:
-            self._owner.feed(kind, self, on)
+            if on and kind not in self._ends:
+                self._ends[kind] = self._hub.listen(kind, partial(self._pass_on, kind))
+            elif not on and kind in self._ends:
+                self._ends.pop(kind)()
+
+    def _pass_on(self, kind: str, event: bytes) -> None:
+        """Send an event; called in any thread."""
+        packet = Packet((event,), text=True, stream=kind)
+        self._post(lambda: self._send_packet(packet, _NEWEST.get(kind, 0)))
 
     def _learn(self, on: bool) -> None:
         learner = self._owner.learner
         if on and learner is not None and not self._learns:
-            who = learner.name if learner.name == learner.address else f"{learner.name} ({learner.address})"
+            who = learner.who if learner.who == learner.address else f"{learner.who} ({learner.address})"
             raise NotInCommand(f"{who} learns from this robot already, and there is one learner at a time.")
         if on or self._learns:
             self._owner.learner = self._person if on else None
@@ -281,7 +199,7 @@ class _Client:
     @property
     def _learns(self) -> bool:
         learner = self._owner.learner
-        return learner is not None and learner.connection == self._caller.name
+        return learner is not None and learner.name == self._person.name
 
     def _ask(self, request: protocol.Request, arguments: dict[str, Any], upload: Upload | None = None) -> None:
         """Let a worker thread execute a request and answer it."""
@@ -304,57 +222,53 @@ class _Client:
 
         def finish(result: dict[str, Any], error: Exception | None) -> None:
             self._running -= 1
-            if upload is not None and self._pushes:
-                self._count_push(-1)
+            if upload is not None and self in self._owner.pushing:
+                self._owner.pushing.remove(self)
             if error is None:
                 self._answer(number, result)
             else:
                 self._note(f"{op}: {' '.join(str(error).split())}")
                 self._refuse(number, error)
 
-        self._owner.work(work)
+        self._owner.workers.submit(work)
 
     # ---- uploads
 
     async def _begin_upload(self, push: protocol.Push) -> None:
-        if self._upload is not None or self._owner.pushes >= _PUSHES:
+        pushing = self._owner.pushing
+        if self._upload is not None or len(pushing) >= _PUSHES:
             whose = "of this socket" if self._upload is not None else "of others"
             raise InvalidValue(f"Uploads {whose} are not done yet; push again when they are.")
-        make = partial(Upload, self._hub.incoming, push.size, push.sha256, self._owner.most_upload)
-        self._upload, self._push = await self._loop.run_in_executor(None, make), push
-        self._count_push(1)
+        pushing.append(self)
+        try:
+            make = partial(Upload, self._hub.incoming, push, self._owner.most_upload)
+            self._upload = await self._loop.run_in_executor(None, make)
+        except BaseException:
+            pushing.remove(self)
+            raise
         self._send({"id": push.id, "progress": "the agent takes the upload"})
 
     async def _take_piece(self, data: bytes) -> None:
-        upload, push = self._upload, self._push
-        if upload is None or push is None:
+        upload = self._upload
+        if upload is None:
             self._skip -= len(data)
             if self._skip < 0:
                 self._note("It sent bytes that belong to no upload.")
                 self._refuse(None, ProtocolError("Binary frames belong to an upload, and none has begun: push first."))
             return
         try:
-            complete = await self._loop.run_in_executor(None, upload.write, data)
+            if await self._loop.run_in_executor(None, upload.write, data):
+                self._ask(upload.push, {**_arguments(upload.push), "path": upload.path}, upload)
+                self._upload = None
         except (BamTrainError, BamEnvsError) as error:
-            self._end_upload(error)
-            return
-        if complete:
-            self._upload = None
-            try:
-                self._ask(push, {**_arguments(push), "path": upload.path}, upload)
-            except BamEnvsError as error:
-                upload.remove()
-                self._count_push(-1)
-                self._refuse(push.id, error)
+            self._end_upload(upload, error)
 
-    def _end_upload(self, error: Exception) -> None:
-        upload, push, self._upload = self._upload, self._push, None
-        if upload is not None and push is not None:
-            upload.remove()
-            self._count_push(-1)
-            self._skip = upload.size - upload.received
-            self._note(f"push: {error}")
-            self._refuse(push.id, error)
+    def _end_upload(self, upload: Upload, error: Exception) -> None:
+        upload.remove()
+        self._upload, self._skip = None, upload.push.size - upload.received
+        self._owner.pushing.remove(self)
+        self._note(f"push: {error}")
+        self._refuse(upload.push.id, error)
 
     # ---- answers
 
@@ -368,9 +282,9 @@ class _Client:
         self._send({"id": number, "ok": False, "error": text, "kind": type(error).__name__})
 
     def _send(self, message: Mapping[str, Any]) -> None:
-        self.send(Packet((_encode(message),), text=True), 0)
+        self._send_packet(Packet((protocol.encode_message(message),), text=True), 0)
 
-    def send(self, packet: Packet, keep: int) -> None:
+    def _send_packet(self, packet: Packet, keep: int) -> None:
         """Send a packet, or let it wait for a slow client."""
         self._connection.put(packet, keep)
         self._connection.flush()
@@ -380,18 +294,80 @@ class _Client:
             self._loop.call_soon_threadsafe(work)
 
     def _note(self, why: str) -> None:
-        self._owner.refusals.note(self._caller.address, why)
+        self._owner.refusals.note(self._person.address, why)
 
 
 def _arguments(request: protocol.Request) -> dict[str, Any]:
     return {name: getattr(request, name) for name in request.__struct_fields__ if name not in ("id", "name")}
 
 
-def _encode(message: Mapping[str, Any]) -> bytes:
-    return msgspec.json.encode(message, enc_hook=_plain)
+class Upload:
+    """Takes the bytes that a push announces into a new file in `folder`. Its content is never opened here.
+
+    Raises:
+        InvalidValue: The upload is larger than `most` bytes, or than the disk has room for.
+        OutputError: The file cannot be written.
+    """
+
+    def __init__(self, folder: Path, push: protocol.Push, most: int) -> None:
+        if (size := push.size) > most:
+            raise InvalidValue(f"The upload has {_mb(size)}, and {_mb(most)} is the most that this agent takes.")
+        self.push, self.received, self._digest = push, 0, hashlib.sha256()
+        with _on_disk(folder):
+            folder.mkdir(parents=True, exist_ok=True)
+            free = shutil.disk_usage(folder).free
+            if free < size + _RESERVE:
+                raise InvalidValue(
+                    f"The disk of the robot's computer has {_mb(free)} free, and the upload of {_mb(size)} needs "
+                    f"{_mb(size + _RESERVE)}. Make room in {folder}."
+                )
+            number, name = tempfile.mkstemp(_SUFFIX, _PREFIX, folder)  # readable by this user alone
+        self.path, self._file = Path(name), os.fdopen(number, "wb")
+
+    def write(self, data: bytes) -> bool:
+        """Add a piece; True if the upload is complete, and is what was announced. Otherwise the file is removed."""
+        try:
+            if self.received + len(data) > self.push.size:
+                raise ProtocolError(f"The upload is longer than the {self.push.size} bytes that were announced.")
+            with _on_disk(self.path.parent):
+                self._file.write(data)
+                self.received += len(data)
+                self._digest.update(data)
+                if self.received < self.push.size:
+                    return False
+                self._file.close()
+            if (found := self._digest.hexdigest()) != self.push.sha256:
+                raise ProtocolError(
+                    f"The upload has the SHA-256 {found[:12]}, and {self.push.sha256[:12]} was announced. Push again."
+                )
+        except BaseException:
+            self.remove()
+            raise
+        return True
+
+    def remove(self) -> None:
+        """Close and remove the file, if it is still there. Idempotent."""
+        with contextlib.suppress(OSError):
+            self._file.close()
+        with contextlib.suppress(OSError):
+            self.path.unlink()
 
 
-def _plain(value: Any) -> Any:
-    if isinstance(value, (np.ndarray, np.generic)):
-        return value.tolist()
-    raise TypeError(f"{type(value).__name__} cannot be sent")
+def remove_leftovers(folder: Path) -> None:
+    """Remove the uploads of a process that was killed."""
+    for path in folder.glob(f"{_PREFIX}*{_SUFFIX}"):
+        with contextlib.suppress(OSError):
+            path.unlink()
+
+
+class _on_disk(contextlib.AbstractContextManager[None]):  # noqa: N801 - reads as a phrase
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+
+    def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
+        if isinstance(error, OSError):
+            raise OutputError(f"The upload cannot be written to {self._folder}: {error.strerror or error}.") from error
+
+
+def _mb(size: int) -> str:
+    return f"{size / 1e6:.1f} MB"

@@ -12,14 +12,13 @@ import json
 import threading
 import time
 from collections.abc import Callable, Mapping
-from typing import Protocol
 
 import msgspec
 import numpy as np
 from websockets.exceptions import ConnectionClosed
 
 from bam_envs.core.errors import BamEnvsError, MissingExtra
-from bam_envs.live.camera import CameraImage, Pixels
+from bam_envs.live.camera import LiveCamera, Pixels
 from bam_envs.rosbridge.bus import Caller
 from bam_envs.rosbridge.server.server_connection import BridgeConnection
 
@@ -29,22 +28,6 @@ _QUICK, _LONGEST = 0.02, 0.5
 """Time to draw a picture above which pictures give way, and longest pause between two of them [s]."""
 _QUALITY = 80
 """Quality of pictures that arrive uncompressed, and are sent as JPEG."""
-
-
-class FeedCamera(Protocol):
-    """What `LiveCamera` has."""
-
-    def connect(self) -> None:
-        """Connect, and wait for a first image."""
-
-    def latest(self) -> CameraImage:
-        """The newest image."""
-
-    def file(self) -> tuple[int, str, bytes] | None:
-        """Number, kind and bytes of the newest image, as it arrived."""
-
-    def close(self) -> None:
-        """Drop the connection."""
 
 
 class CameraFeed:
@@ -59,7 +42,7 @@ class CameraFeed:
         seen: Width and height of the images that the policy sees [pixels], by the camera's name.
     """
 
-    def __init__(self, cameras: Mapping[str, FeedCamera], seen: Mapping[str, tuple[int, int]] | None = None) -> None:
+    def __init__(self, cameras: Mapping[str, LiveCamera], seen: Mapping[str, tuple[int, int]] | None = None) -> None:
         self._names, self._readers = list(cameras), [_Reader(one) for one in cameras.values()]
         self._seen = dict(seen or {})
         self._viewers = 0
@@ -167,7 +150,7 @@ async def _listen(connection: BridgeConnection, page: PagePace, cameras: int) ->
 class _Reader:
     """Reads one camera in a thread of its own."""
 
-    def __init__(self, camera: FeedCamera) -> None:
+    def __init__(self, camera: LiveCamera) -> None:
         self._camera = camera
         self._stopped, self._thread = threading.Event(), threading.Thread()
         self.newest: tuple[int, bytes] = (0, b"")

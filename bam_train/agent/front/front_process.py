@@ -8,13 +8,14 @@ from __future__ import annotations
 
 import signal
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from pathlib import Path
 from typing import Any
 
 import msgspec
 
 from bam_envs.core.errors import BamEnvsError
-from bam_envs.rosbridge.server import BridgeServer, ServerOptions
+from bam_envs.rosbridge.server import BridgeServer, Page, ServerOptions, read_pages
 from bam_envs.rosbridge.server.site import Site
 from bam_envs.rosbridge.tokens import TokenFile, Tokens
 from bam_train.agent.agent_messages import Channel, Front, Listening, adopted
@@ -22,9 +23,19 @@ from bam_train.agent.front.agent_socket import AgentSocket
 from bam_train.agent.front.camera_feed import CameraFeed
 from bam_train.agent.front.hub import AgentHub
 from bam_train.agent.front.robot_front import FrontProcess
-from bam_train.agent.front.site_pages import console_pages
+from bam_train.agent.remote.agent_protocol import PATH
 from bam_train.errors import BamTrainError
 from bam_train.files.log_lines import begin_log
+
+CONSOLE = Path(__file__).parents[1] / "console"
+"""The files of the web console: plain HTML, CSS and modules."""
+LIBRARY = CONSOLE / "uplot"
+"""Where the installation puts uPlot (``hatch_build.py``); the console works without it, but for its charts."""
+
+
+def console_pages() -> Mapping[str, Page]:
+    """The pages of the console by their path; ``/`` is the console."""
+    return {**read_pages(CONSOLE), **(read_pages(LIBRARY) if LIBRARY.is_dir() else {})}
 
 
 def main() -> None:
@@ -32,16 +43,16 @@ def main() -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the resident ends it
     begin_log("bam-agent")
     end = adopted(int(sys.argv[1]))
-    options = msgspec.msgpack.decode(end.recv(2**20), type=Front)
+    about = Front.from_bytes(end.recv(2**20))
+    options = about.agent
     receivers: list[Callable[[Any], None]] = []
     channel = Channel(end, lambda message: receivers[0](message), lambda: front.stop())
     try:
-        front = FrontProcess(options, channel.send)
-        hub = front.watchers = AgentHub(front, by_force=options.token_file is not None)
-        console = AgentSocket(hub)
-        pictures = CameraFeed(front.cameras(), front.seen())
-        sockets = {**console.sockets, "/camera": pictures.serve}
-        site = Site(console_pages(), sockets, always=frozenset(console.sockets))
+        front = FrontProcess(about, channel.send)
+        hub = AgentHub(front)
+        console, pictures = AgentSocket(hub), CameraFeed(front.cameras(), front.seen())
+        # A client without a place may stop the robot.
+        site = Site(console_pages(), {PATH: console.serve, "/camera": pictures.serve}, always=frozenset((PATH,)))
         tokens = Tokens(otherwise="administer") if options.token_file is None else TokenFile(options.token_file)
         network = ServerOptions(open_timeout=2.0, max_clients=64)
         where: Any = {"cert": options.cert, "key": options.key, "tokens": tokens, "site": site, "options": network}

@@ -6,17 +6,15 @@ the browser or the network that sent it.
 
 import math
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from bam_envs.core.errors import InvalidValue, ProtocolError
+from bam_envs.core.errors import InvalidValue
 from bam_envs.core.kinematics import UR5E_GRIPPER, UR_JOINTS, ArmGeometry, turned
 from bam_envs.core.robot import RobotSpec, RobotState
-from bam_envs.core.wording import brief
 from bam_envs.safety.guard import columns_in, is_base, measured_places
 
 Array = NDArray[np.float64]
@@ -78,31 +76,20 @@ class Jogger:
         self.sent: Array | None = None
         """Command of the tick before, from which a motion goes on (m,); None if nothing was sent."""
 
-    def put(self, message: Mapping[str, Any]) -> bool:
+    def put(self, seq: int, twist: Sequence[float], gripper: int = 0, sent: float | None = None) -> bool:
         """Take a twist; False if it came late or out of order, and has no effect.
 
         Args:
-            message: ``seq``, which grows; ``twist``: vx, vy, vz [m/s] and wz [rad/s] in ``base_link``, or v, 0, 0, wz
-                of a base; ``gripper``: 1 closes it, -1 opens it, 0 (or none) leaves it. With ``sent``, the sender's
-                time [s], a twist that was on its way for `JOG_LIFETIME` longer than the quickest one counts as late.
-
-        Raises:
-            ProtocolError: A number is missing, or is none.
+            seq: Its number, which grows.
+            twist: vx, vy, vz [m/s] and wz [rad/s] in ``base_link``, or v, 0, 0, wz of a base. Shape: (4,), finite.
+            gripper: 1 closes the gripper, -1 opens it, 0 leaves it.
+            sent: The sender's time [s]: a twist that was on its way for `JOG_LIFETIME` longer than the quickest one
+                counts as late.
         """
-        numbers = message.get("twist")
-        if not (isinstance(numbers, list) and len(numbers) == 4 and all(map(_is_number, numbers))):
-            raise ProtocolError(f"twist: expected four numbers, vx, vy, vz [m/s] and wz [rad/s], not {brief(numbers)}.")
-        seq, grip, sent = message.get("seq"), message.get("gripper", 0), message.get("sent")
-        if not isinstance(seq, int) or isinstance(seq, bool):
-            raise ProtocolError(f"seq: expected an integer, not {brief(seq)}.")
-        if grip not in (-1, 0, 1):
-            raise ProtocolError(f"gripper: expected -1, 0 or 1, not {brief(grip)}.")
-        if not (sent is None or _is_number(sent)):
-            raise ProtocolError(f"sent: expected a time [s], not {brief(sent)}.")
         now = self._clock()
         if seq <= self._newest.seq or (sent is not None and self._is_late(now - sent, now)):
             return False
-        self._newest = _Twist(seq, now, _limited(numbers), int(grip))
+        self._newest = _Twist(seq, now, _limited(twist), gripper)
         return True
 
     def _is_late(self, delay: float, now: float) -> bool:
@@ -169,11 +156,7 @@ class Jogger:
         return inside
 
 
-def _is_number(value: object) -> bool:
-    return isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
-
-
-def _limited(twist: list[float]) -> tuple[float, ...]:
+def _limited(twist: Sequence[float]) -> tuple[float, ...]:
     """The twist, as fast as a person may jog, in its own direction."""
     *way, turn = twist
     share = min(1.0, SPEED / max(math.hypot(*way), 1e-9))

@@ -6,12 +6,15 @@ import itertools
 import logging
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from concurrent.futures import Future
 from concurrent.futures import TimeoutError as NoAnswer
-from typing import Any, Protocol
+from dataclasses import replace
+from typing import Any
 
-from bam_envs.core.errors import BamEnvsError, LinkLost, NotInCommand, RemoteError
+import numpy as np
+
+from bam_envs.core.errors import BamEnvsError, LinkLost, NotInCommand, ProtocolError, RemoteError
 from bam_envs.live.camera import LiveCamera
 from bam_envs.remote.serve.robot_service import RobotService
 from bam_envs.ros.codec import AGENT_STEP_TOPIC, AGENT_TOPIC, HALT_TOPIC, RobotInfo
@@ -35,61 +38,37 @@ from bam_train.agent.agent_messages import (
 )
 from bam_train.agent.front.agent_lease import SILENT_LINK_TIMEOUT, AgentLease
 from bam_train.agent.front.remote_robot import RemoteRobot
-from bam_train.agent.remote.agent_protocol import printable
-from bam_train.agent.transitions import EVENT
-from bam_train.env_location import EnvLocation
+from bam_train.agent.remote.agent_protocol import encode_message, printable
+from bam_train.agent.transitions import EVENT, TransitionLog, encode
 from bam_train.environments import make_env
 from bam_train.errors import BamTrainError, CandidateRefused, RequestRefused, TrialsNeeded, UnknownVersion
 
 _log = logging.getLogger(__name__)
+Listener = Callable[[bytes], None]
 _LEASE_POLL_PERIOD = 0.1  # time between two looks at the lease [s]
 _HALT_LATE = 1.0  # longest time for which a halt comes after the end of its sender's lease [s]
 _REFUSALS = {one.__name__: one for one in (NotInCommand, CandidateRefused, TrialsNeeded, UnknownVersion)}
 _ANSWER_TIMEOUT = 10.0  # longest wait for an answer of the resident, unless it needs longer [s]
 
 
-class Watchers(Protocol):
-    """Who listens to what happens."""
-
-    @property
-    def has_learner(self) -> bool:
-        """Whether a learner listens."""
-
-    def tell(self, kind: str, event: dict[str, Any]) -> None:
-        """Give an event to those who listen to events of this kind."""
-
-    def tell_step(self, row: Mapping[str, Any], episode: int) -> None:
-        """Pass on a step of a person's program; raises ProtocolError."""
-
-
 class FrontProcess:
     """The port of a live agent, and the hub of its agent socket.
 
     Args:
-        options: Where it listens, and where the robot is.
+        about: Where it listens, and where the robot is.
         send: Sends a message to the resident.
     """
 
-    watchers: Watchers
-    """Who listens to what happens; to be set before `serve`."""
-
-    def __init__(self, options: Front, send: Callable[[Message], None]) -> None:
-        self.options, self.send = options, send
-        self.status: dict[str, Any] = {"state": "waiting for the robot", "why": "it starts", "active": None}
-        self.status |= {"owner": None, "names": {}}
-        """The last report of the resident."""
-        place = EnvLocation(
-            options.robot,
-            profile=options.profile,
-            ca_file=options.ca_file,
-            token_file=options.robot_token_file,
-            shadow=True,
-        )
-        env: Any = make_env(options.env, options.env_kwargs, place=place)
+    def __init__(self, about: Front, send: Callable[[Message], None]) -> None:
+        self.options, self.send, self._command_timeout = about.agent, send, about.command_timeout
+        self._report: dict[str, Any] = {"state": "waiting for the robot", "why": "it starts", "active": None}
+        self._report |= {"owner": None, "names": {}}  # the last one of the resident
+        place = replace(about.agent.place(trial=False), shadow=True)
+        env: Any = make_env(about.env, about.env_kwargs, place=place)
         self.shadow, self.task = env.unwrapped.robot, env.unwrapped.task
-        self.lease = AgentLease(options.lease)
+        self.lease = AgentLease(about.agent.lease)
         self.robot = RemoteRobot(
-            self.shadow, send, lambda: self.lease.holder, self._ask_now, options.command_timeout, self._describe
+            self.shadow, send, lambda: self.lease.holder, self._ask_now, about.command_timeout, self._describe
         )
         self._service: RobotService | None = None
         self._pending: dict[int, tuple[Future[Any], Callable[[str], None]]] = {}
@@ -100,8 +79,7 @@ class FrontProcess:
         self._handing: dict[str, bool | None] = {}  # clients that hand back -> whether the policy goes on
         self.sent: list[float] | None = None
         """The command that was sent last."""
-        self.changed: Callable[[], None] = lambda: None
-        """Called when the status has changed."""
+        self._listeners: dict[str, list[Listener]] = {}
         self._stopped = threading.Event()
 
     # ---- the resident
@@ -109,7 +87,7 @@ class FrontProcess:
     def take(self, message: Any) -> None:
         """Take a message of the resident, in the reading thread."""
         if isinstance(message, Report):
-            self._report(message.status)
+            self._take_report(message.status)
         elif isinstance(message, Sent):
             self.sent = message.command
         elif isinstance(message, Answer):
@@ -117,7 +95,7 @@ class FrontProcess:
             if waiting is not None:
                 waiting[0].set_result(message)
         elif isinstance(message, Rows):
-            self.watchers.tell(EVENT, message.event)
+            self.tell(EVENT, message.event)
         elif isinstance(message, RequestProgress) and message.number in self._pending:
             self._pending[message.number][1](message.text)
 
@@ -125,16 +103,55 @@ class FrontProcess:
         """End the process: the resident is gone."""
         self._stopped.set()
 
-    def _report(self, status: dict[str, Any]) -> None:
+    def _take_report(self, status: dict[str, Any]) -> None:
         ended, state = status.pop("ended", None), status["state"]
         if ended is not None and self.lease.holder == ended:
             self._handing[ended] = None
             self.lease.release(ended)
-        self.status = status
+        self._report = status
         self._describe()
         drivable = state not in ("waiting for the robot", "stopped by a guard")
         self.robot.why_not = "" if drivable else f"the agent is {state}: {status.get('why')}"
-        self.changed()
+        self.tell("status", {"event": "status", "status": self.status()})
+
+    def status(self) -> dict[str, Any]:
+        """The last status of the resident, with the name and the address of the robot, and the lease."""
+        lease, name = self.lease, self._report.get("identity") or self.shadow.profile.name
+        owner, robot = lease.owner, {"name": name, "address": self.options.robot}
+        until = None if owner is None else round(lease.left, 1)
+        return {**self._report, **robot, "owner": owner, "owner_until": until}
+
+    # ---- events
+
+    def listen(self, kind: str, listener: Listener) -> Callable[[], None]:
+        """Call `listener`, in any thread, with each event of a kind: status, telemetry, transitions.
+
+        It gets the event as a text frame. Returns a function that ends this.
+        """
+        listeners = self._listeners.setdefault(kind, [])
+        listeners.append(listener)
+        if kind == EVENT:
+            self.send(Ask(0, "transitions", {"on": True}, "a learner", ""))
+
+        def end() -> None:
+            listeners.remove(listener)
+            if kind == EVENT and not listeners:
+                self.send(Ask(0, "transitions", {"on": False}, "a learner", ""))
+
+        return end
+
+    def listens(self, kind: str) -> bool:
+        """Whether anybody listens to events of a kind."""
+        return bool(self._listeners.get(kind))
+
+    def tell(self, kind: str, event: dict[str, Any]) -> None:
+        """Give an event to those who listen."""
+        if self.listens(kind):
+            data = encode_message(event)
+            for listener in tuple(self._listeners[kind]):
+                listener(data)
+
+    # ---- requests to the resident
 
     def ask(
         self,
@@ -213,20 +230,24 @@ class FrontProcess:
                 None if self.lease.holder in (None, caller.client) and self.lease.owner is None else self.lease.owner
             )
             refusal = None if owner is None else self.lease.refusal()
-            return {"owner": owner, "refusal": refusal, "state": self.status["state"]}
+            return {"owner": owner, "refusal": refusal, "state": self._report["state"]}
         if do == "take":
-            self.lease.grant(caller.client, caller, shown=who)
-            try:
-                self.ask("take", {"lease": caller.client}, who, caller.address)
-            except (BamTrainError, BamEnvsError):
-                self.lease.release(caller.client)
-                raise
+            self.take_over(caller, who, who)
             self._episode += 1
-            return {"state": self.status["state"], "learner": self.watchers.has_learner}
+            return {"state": self._report["state"], "learner": self.listens(EVENT)}
         if do == "hand_back":
             self.hand_back(caller.client, who, caller.address)
-            return {"state": self.status["state"]}
+            return {"state": self._report["state"]}
         raise RemoteError(f"{AGENT_TOPIC}: expected look, take or hand_back, found {do!r:.40}.")
+
+    def take_over(self, caller: Caller, who: str, shown: str, *, force: bool = False) -> None:
+        """Give `caller` the lease; other clients see the name `shown`."""
+        self.lease.grant(caller.client, caller, force=force, shown=shown)
+        try:
+            self.ask("take", {"lease": caller.client}, who, caller.address)
+        except (BamTrainError, BamEnvsError):
+            self.lease.release(caller.client)
+            raise
 
     def hand_back(self, client: str, who: str, address: str, resume: bool | None = None) -> None:
         """End a lease; the policy goes on if `resume`, or the agent's setting, says so."""
@@ -265,9 +286,9 @@ class FrontProcess:
     def _info(self) -> RobotInfo:
         """The description of the robot for programs that take over; until it is known, that of a real one."""
         robot, period = self.shadow.info, self.shadow.spec.period
-        watchdog, text = max(self.options.command_timeout, 1.5 * period), f"{robot.text or self.options.robot}"
+        watchdog, text = max(self._command_timeout, 1.5 * period), f"{robot.text or self.options.robot}"
         text = f"{text}, driven by a live agent, from which you take over"
-        identity = str(self.status.get("identity", ""))
+        identity = str(self._report.get("identity", ""))
         return RobotInfo(self.shadow.profile.name, robot.simulated, False, period, text, watchdog, True, identity)
 
     def _describe(self) -> None:
@@ -275,9 +296,22 @@ class FrontProcess:
             self._service.info = self._info()
 
     def _on_step(self, message: Fields, caller: Caller) -> None:
-        """A step of the program that has taken over, over the connection on which it took the lease."""
-        if caller.name == self.lease.connection and self.lease.holder is not None:
-            self.watchers.tell_step(load_json(message.get("data"), AGENT_STEP_TOPIC), self._episode)
+        """A step of the program that has taken over, over the connection on which it took: an intervention."""
+        if caller.name != self.lease.connection or self.lease.holder is None:
+            return
+        row, log = load_json(message.get("data"), AGENT_STEP_TOPIC), TransitionLog()
+        try:
+            arrays = [np.array(row[name], np.float32) for name in ("observation", "action", "next_observation")]
+            flags = bool(row["terminated"]), False, bool(row["success"]), True
+            reward, step = float(row["reward"]), int(row["step"])
+        except (KeyError, TypeError, ValueError) as error:
+            raise ProtocolError(f"{AGENT_STEP_TOPIC}: expected the numbers of a step: {error!r:.80}") from error
+        if not all(np.isfinite(array).all() for array in arrays) or not np.isfinite(reward):
+            raise ProtocolError(f"{AGENT_STEP_TOPIC}: expected finite numbers.")
+        log.add(arrays[0], arrays[1], reward, arrays[2], *flags, self._episode, step, "")
+        rows = log.take()
+        if rows is not None:
+            self.tell(EVENT, encode(rows))
 
     def cameras(self) -> dict[str, LiveCamera]:
         """The cameras of the robot's profile that are not optional, or that the task sees; not connected yet."""

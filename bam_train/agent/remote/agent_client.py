@@ -14,12 +14,11 @@ import logging
 import math
 import re
 import socket
-import threading
 import time
-from collections.abc import Callable, Mapping
-from concurrent.futures import Future, wait
+from collections.abc import Callable, Coroutine, Mapping
+from concurrent.futures import CancelledError, Future, wait
+from concurrent.futures import TimeoutError as NoResult
 from contextlib import suppress
-from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -52,7 +51,7 @@ _LARGEST = 64 * 2**20
 _SILENT_SERVER_TIMEOUT = 1.0  # time after which a silent server is asked whether it is one of rosbridge [s]
 _PING, _PONG = 5.0, 20.0  # time between two pings, and longest time for their answer [s]
 _CLOSE = 1.0  # longest time for a closing handshake [s]
-_CLOSED_POLL_PERIOD = 0.5  # time between two looks whether the connection has ended [s]
+_ENDED_POLL_PERIOD = 0.5  # time between two looks whether the network thread has ended [s]
 _IS_IT_ROSBRIDGE = '{"op": "call_service", "service": "/rosapi/get_time", "id": "agent?"}'
 
 _QUIET = logging.getLogger(f"{__name__}.websockets")
@@ -91,11 +90,10 @@ class AgentClient:
         self.error: BamEnvsError | None = None
         """Why the connection ended; None before."""
         self._numbers = itertools.count(1)
-        self._answers: dict[int, tuple[Future[dict[str, Any]], Progress]] = {}
+        self._answers: dict[int, tuple[asyncio.Future[dict[str, Any]], Progress]] = {}
         self._listeners: dict[str, list[Callable[[Event], None]]] = {}
-        self._order = threading.Lock()
         self._thread = LoopThread("bam-agent-client", self.url)
-        self._socket: ClientConnection | None = None
+        self._socket: ClientConnection
 
     def connect(self) -> AgentClient:
         """Connect; returns itself.
@@ -108,7 +106,13 @@ class AgentClient:
 
     def close(self) -> None:
         """Close the connection. Idempotent."""
-        self._thread.post(self._hang_up)
+
+        async def hang_up() -> None:
+            self.error = LinkLost(f"{self.url}: this client is closed.")
+            await self._socket.close()
+
+        with suppress(BamEnvsError):
+            self._run(hang_up())
         self._thread.join(2.0)
 
     def __enter__(self) -> AgentClient:
@@ -130,11 +134,7 @@ class AgentClient:
             AgentRefused: The agent refuses, or failed.
             LinkLost: The connection ended, or no answer came in time.
         """
-        number, answer = self._begin(op, arguments, progress or (lambda text: None))
-        try:
-            return self._wait(answer, op, within or self.timeout)
-        finally:
-            self._answers.pop(number, None)
+        return self._run(self._ask(op, arguments, progress or (lambda text: None), within or self.timeout))
 
     def push(
         self,
@@ -161,25 +161,11 @@ class AgentClient:
             data = Path(path).read_bytes()
         except OSError as error:
             raise NotACheckpoint(path, f"cannot be read: {error.strerror}. Give a checkpoint.zip.") from error
-        go: Future[None] = Future()
-
-        def heard(text: str) -> None:
-            if go.done():
-                progress(text)
-            else:
-                go.set_result(None)  # the agent takes the upload
-
-        about = {"size": len(data), "sha256": hashlib.sha256(data).hexdigest()}
-        choice = {"stage": stage, "when": when, "wait": wait, "file": Path(path).name[:100], "why": why}
-        number, answer = self._begin("push", {**about, **choice}, heard)
-        answer.add_done_callback(lambda _: None if go.done() else go.set_result(None))
-        try:
-            self._wait(go, "push", self.timeout)
-            if not answer.done():
-                self._upload(data, answer, progress)
-            return self._wait(answer, "push", math.inf)  # a trial takes as long as it takes; a dead link is noticed
-        finally:
-            self._answers.pop(number, None)
+        about = {"size": len(data), "sha256": hashlib.sha256(data).hexdigest(), "file": Path(path).name[:100]}
+        result: dict[str, Any] = self._run(
+            self._push(data, {**about, "stage": stage, "when": when, "wait": wait, "why": why}, progress)
+        )
+        return result
 
     def listen(self, op: str, listener: Callable[[Event], None]) -> None:
         """Call `listener` in the network thread with each event of ``watch`` or ``transitions``, until it closes."""
@@ -188,66 +174,87 @@ class AgentClient:
             self._listeners.setdefault(kind, []).append(listener)
         self.ask(op, on=True)
 
-    # ---- inside: the caller's thread
-
-    def _begin(self, op: str, arguments: Mapping[str, Any], progress: Progress) -> tuple[int, Future[dict[str, Any]]]:
-        answer: Future[dict[str, Any]] = Future()
-        with self._order:  # requests are sent in the order of their numbers
-            number = next(self._numbers)
-            self._answers[number] = answer, progress
-            text = json.dumps({"id": number, "op": op, "name": self.name, **arguments})
-            if self.error is not None or not self._thread.post(partial(self._send, text)):
-                raise self.error or LinkLost(f"{self.url}: not connected: call connect().")
-        return number, answer
-
-    def _wait(self, answer: Future[T], op: str, within: float) -> T:
-        end = time.monotonic() + within
-        while not wait([answer], max(0.0, min(_CLOSED_POLL_PERIOD, end - time.monotonic()))).done:
-            if self.error is not None:  # it ended before this was sent
-                raise self.error
-            if time.monotonic() > end:
-                raise LinkLost(f"{self.url}: no answer to {op} within {within:g} s.")
-        return answer.result()
-
-    def _upload(self, data: bytes, answer: Future[dict[str, Any]], progress: Progress) -> None:
-        told = time.monotonic()
-        for start in range(0, len(data), CHUNK):
-            sent: Future[None] = Future()
-            piece = data[start : start + CHUNK]
-            if not self._thread.post(partial(self._send, piece, sent)):
-                break
-            self._wait(sent, "push", math.inf)
-            if answer.done():  # refused while it was on its way
-                break
-            if time.monotonic() - told > 1.0:
-                told = time.monotonic()
-                progress(f"sent {(start + len(piece)) / 1e6:.1f} of {len(data) / 1e6:.1f} MB")
+    def _run(self, task: Coroutine[Any, Any, T]) -> T:
+        """The result of `task` in the network thread; `LinkLost` if the connection ends before."""
+        running, loop = None, self._thread.loop
+        if self.error is None and loop is not None:
+            with suppress(RuntimeError):  # it was closed a moment ago
+                running = asyncio.run_coroutine_threadsafe(task, loop)
+        if running is None:
+            task.close()
+            raise self.error or LinkLost(f"{self.url}: not connected: call connect().")
+        try:
+            while not wait([running], _ENDED_POLL_PERIOD).done and self._thread.loop is not None:
+                pass
+            return running.result(0)
+        except (CancelledError, NoResult):  # the connection ended, perhaps before the task began
+            raise self.error or LinkLost(f"{self.url}: the link dropped.") from None
+        finally:
+            running.cancel()  # after Ctrl-C
 
     # ---- the network thread
 
+    async def _ask(self, op: str, arguments: Mapping[str, Any], progress: Progress, within: float) -> dict[str, Any]:
+        answer = asyncio.get_running_loop().create_future()
+        number = next(self._numbers)
+        self._answers[number] = answer, progress
+        try:
+            await self._send(json.dumps({"id": number, "op": op, "name": self.name, **arguments}))
+            result: dict[str, Any] = await asyncio.wait_for(answer, None if within == math.inf else within)
+            return result
+        except asyncio.TimeoutError as error:
+            raise self._late(op, within) from error
+        finally:
+            del self._answers[number]
+
+    async def _push(self, data: bytes, about: Mapping[str, Any], progress: Progress) -> dict[str, Any]:
+        go = asyncio.Event()  # the agent takes the upload, or has answered
+
+        def heard(text: str) -> None:
+            progress(text) if go.is_set() else go.set()
+
+        # A trial takes as long as it takes; a dead link is noticed.
+        answer = asyncio.create_task(self._ask("push", about, heard, math.inf))
+        answer.add_done_callback(lambda _: go.set())
+        try:
+            await asyncio.wait_for(go.wait(), self.timeout)
+            told = time.monotonic()
+            for start in range(0, len(data), CHUNK):
+                if answer.done():  # refused while it was on its way
+                    break
+                await self._send(data[start : start + CHUNK])
+                if time.monotonic() - told > 1.0:
+                    told = time.monotonic()
+                    tell(progress, f"sent {min(start + CHUNK, len(data)) / 1e6:.1f} of {len(data) / 1e6:.1f} MB")
+            return await answer
+        except asyncio.TimeoutError as error:
+            raise self._late("push", self.timeout) from error
+        finally:
+            answer.cancel()
+
+    def _late(self, op: str, within: float) -> LinkLost:
+        return LinkLost(f"{self.url}: no answer to {op} within {within:g} s.")
+
+    async def _send(self, data: str | bytes) -> None:
+        with suppress(ConnectionClosed):  # `_main` learns of it too, and its end cancels what waits
+            await self._socket.send(data)
+
     async def _main(self, ready: Future[None]) -> None:
-        self._loop, self._tasks = asyncio.get_running_loop(), set[asyncio.Task[None]]()
-        socket = await self._open()
-        self._socket = socket
+        self._socket = await self._open()
         ready.set_result(None)
-        pings = asyncio.create_task(self._ping(socket))
         try:
             while True:
-                self._take(json.loads(await socket.recv()))
+                self._take(json.loads(await self._socket.recv()))
         except ConnectionClosed as end:
-            self._end(LinkLost(f"{self.url}: the link dropped: {_reason(end)}."))
+            self.error = self.error or LinkLost(f"{self.url}: the link dropped: {_reason(end)}.")
         except (ValueError, KeyError, TypeError) as error:
-            self._end(LinkLost(f"{self.url}: the server sent what is no message of an agent: {brief(str(error))}."))
-        finally:
-            pings.cancel()
-            with suppress(ConnectionClosed):
-                await socket.close()
+            reason = f"the server sent what is no message of an agent: {brief(str(error))}."
+            self.error = LinkLost(f"{self.url}: {reason}")
+        finally:  # the end of this task cancels those of `_run`
+            await self._socket.close()
 
     async def _open(self) -> ClientConnection:
-        try:
-            socket = await self._open_socket()
-        except NoServer as error:
-            raise self._better(error) from error.__cause__
+        socket = await self._open_socket()
         try:
             first = await asyncio.wait_for(self._hello(socket), self.timeout)
             problem = self._problem(first)
@@ -261,7 +268,13 @@ class AgentClient:
     async def _open_socket(self) -> ClientConnection:
         endpoint, address, timeout = self._endpoint, self._endpoint.address, self.timeout
         context, deadline = endpoint.tls_context(), time.monotonic() + timeout
-        plain = await open_port(address, timeout)  # and so that websockets uses no proxy
+        try:
+            plain = await open_port(address, timeout)  # and so that websockets uses no proxy
+        except NoServer as error:
+            if isinstance(error.__cause__, ConnectionRefusedError):
+                reason = "refused: nothing listens there. Does bam-agent run there, with this port?"
+                raise NoServer(address.url, reason) from error.__cause__
+            raise
         try:
             return await connect(
                 f"{address.url}{PATH}",
@@ -272,12 +285,14 @@ class AgentClient:
                 compression=None,  # deflate costs more time than a fast network saves
                 open_timeout=deadline - time.monotonic(),
                 close_timeout=_CLOSE,
-                ping_interval=None,
+                ping_interval=_PING,
+                ping_timeout=_PONG,
                 max_size=_LARGEST,
                 logger=_QUIET,
             )
         except InvalidStatus as error:
-            refusal = http_refusal(error.response.status_code, bytes(error.response.body or b""))
+            status = error.response.status_code
+            refusal = _NO_AGENT if status == 404 else http_refusal(status, bytes(error.response.body or b""))
             raise NoServer(address.url, refusal) from error
         except TimeoutError as error:
             raise NoServer(address.url, silent(address, timeout)) from error
@@ -309,14 +324,6 @@ class AgentClient:
             f"and bam-train {__version__} here {PROTOCOL}. Install one version on both computers."
         )
 
-    def _better(self, error: NoServer) -> NoServer:
-        cause = error.__cause__
-        if isinstance(cause, InvalidStatus) and cause.response.status_code == 404:
-            return NoServer(self.url, _NO_AGENT)
-        if isinstance(cause, ConnectionRefusedError):
-            return NoServer(self.url, "refused: nothing listens there. Does bam-agent run there, with this port?")
-        return error
-
     def _take(self, message: dict[str, Any]) -> None:
         if "event" in message:
             for listener in tuple(self._listeners.get(message["event"], ())):
@@ -332,40 +339,6 @@ class AgentClient:
         else:
             kind = str(message["kind"])
             answer.set_exception(AgentRefused(kind, str(message["error"]), REFUSED if kind in _REFUSALS else 1))
-
-    def _send(self, data: str | bytes, sent: Future[None] | None = None) -> None:
-        async def send() -> None:
-            with suppress(ConnectionClosed):  # `_main` learns of it too
-                if self._socket is not None:
-                    await self._socket.send(data)
-            if sent is not None:
-                sent.set_result(None)
-
-        task = self._loop.create_task(send())
-        self._tasks.add(task)
-        task.add_done_callback(self._tasks.discard)
-
-    async def _ping(self, socket: ClientConnection) -> None:
-        with suppress(ConnectionClosed):
-            while True:
-                await asyncio.sleep(_PING)
-                try:
-                    await asyncio.wait_for(await socket.ping(), _PONG)
-                except asyncio.TimeoutError:
-                    self._end(LinkLost(f"{self.url}: the link dropped: the agent was silent for {_PONG:g} s."))
-                    socket.transport.abort()
-
-    def _end(self, error: BamEnvsError) -> None:
-        self.error = self.error or error
-        for answer, _ in tuple(self._answers.values()):
-            if not answer.done():
-                answer.set_exception(self.error)
-
-    def _hang_up(self) -> None:
-        self._end(LinkLost(f"{self.url}: this client is closed."))
-        if self._socket is not None:
-            task = self._loop.create_task(self._socket.close())
-            self._tasks.add(task)
 
 
 _NO_AGENT = (
@@ -389,6 +362,8 @@ def _whoami() -> str:
 
 
 def _reason(end: ConnectionClosed) -> str:
+    if end.sent is not None and end.sent.reason == "keepalive ping timeout":  # as `websockets` says it
+        return f"the agent was silent for {_PONG:g} s"
     if end.rcvd is not None:
         return f"the agent closed it with {', '.join(filter(None, (f'code {end.rcvd.code}', end.rcvd.reason)))}"
     return "the connection was cut"

@@ -9,9 +9,11 @@ grow, is answered by ``{"id": N, "ok": true, "result": {...}}`` or
 
 from __future__ import annotations
 
-from typing import Annotated, ClassVar, Literal, TypeVar
+from collections.abc import Mapping
+from typing import Annotated, Any, ClassVar, Literal
 
 import msgspec
+import numpy as np
 from msgspec import Meta
 
 from bam_envs.core.errors import ProtocolError
@@ -95,7 +97,7 @@ class HandBack(Request, tag="hand_back"):
 
 
 class Jog(Request, tag="jog", kw_only=True):
-    """A twist for the owner's robot, without an answer; see `bam_train.agent.jog.Jogger.put`."""
+    """A twist for the owner's robot, without an answer; see `bam_train.agent.front.jog.Jogger.put`."""
 
     role: ClassVar[Role] = "drive"
     seq: Annotated[int, Meta(ge=0, le=2**53)]
@@ -148,26 +150,7 @@ class _Head(msgspec.Struct):
     id: int | None = None
 
 
-AnyRequest = TypeVar("AnyRequest", bound=Request)
-_KINDS: tuple[type[Request], ...] = (
-    *(
-        Status,
-        ListVersions,
-        ReadAudit,
-        Watch,
-        Stop,
-        Pause,
-        Resume,
-        Take,
-        HandBack,
-        Jog,
-        Push,
-        Use,
-        Rollback,
-        StreamTransitions,
-    ),
-)
-OPS: dict[str, type[Request]] = {str(kind.__struct_config__.tag): kind for kind in _KINDS}
+OPS: dict[str, type[Request]] = {str(kind.__struct_config__.tag): kind for kind in Request.__subclasses__()}
 """Each op with its request."""
 _DECODERS = {op: msgspec.json.Decoder(kind) for op, kind in OPS.items()}
 _HEAD = msgspec.json.Decoder(_Head)
@@ -194,6 +177,17 @@ def decode_request(data: bytes) -> Request:
 def printable(text: str) -> str:
     """A text of somebody else for logs and screens: ? in place of control characters."""
     return "".join(one if one.isprintable() else "?" for one in text)
+
+
+def encode_message(message: Mapping[str, Any]) -> bytes:
+    """A message to a client as a text frame; what is not finite becomes null."""
+    return msgspec.json.encode(message, enc_hook=_plain)
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, (np.ndarray, np.generic)):
+        return value.tolist()
+    raise TypeError(f"{type(value).__name__} cannot be sent")
 
 
 def may(role: Role, request: type[Request]) -> bool:

@@ -22,10 +22,10 @@ if TYPE_CHECKING:
 
 def run_agent(config: AgentConfig, signals: SignalMemory) -> int:
     """Run the program with its parsed flags; returns 128 + the signal that ended it."""
+    from bam_train.agent.agent_messages import Front
     from bam_train.agent.audit import Audit
-    from bam_train.agent.front_link import FrontLink
-    from bam_train.agent.resident import Resident
-    from bam_train.agent.simulated_box import SimulatedBox
+    from bam_train.agent.child_processes import FrontLink, SimulatedBox
+    from bam_train.agent.resident import COMMAND_LIFETIME, Resident
     from bam_train.agent.versions import Versions
     from bam_train.checkpoint import Checkpoint
     from bam_train.deploy.deployment import Stopped
@@ -63,7 +63,7 @@ def run_agent(config: AgentConfig, signals: SignalMemory) -> int:
         stack.callback(audit.close)
         resident: Resident
         front = FrontLink(
-            _front(options, env_id, env_kwargs),
+            Front(env_id, env_kwargs, options, COMMAND_LIFETIME),
             lambda message: resident.take(message),
             lambda: resident.front_died(),
         )
@@ -83,7 +83,7 @@ def run_agent(config: AgentConfig, signals: SignalMemory) -> int:
         audit.write("started", begun, who="the agent", digest=active.digest)
         stack.callback(audit.write, "ended", f"process {os.getpid()}", who="the agent")
         scheme = "wss" if options.cert else "ws"
-        at = f"{options.bind}:{front.options.port}"
+        at = f"{options.bind}:{front.port}"
         tell(f"listens on {scheme}://{at}; the console is at {scheme.replace('ws', 'http')}://{at}")
         if options.warning is not None:
             tell(options.warning)
@@ -169,25 +169,3 @@ def _options(config: AgentConfig) -> AgentOptions:
 
 def _text(path: Path | None) -> str | None:
     return None if path is None else str(path.expanduser())
-
-
-def _front(options: AgentOptions, env_id: str, env_kwargs: dict[str, Any]) -> Any:
-    from bam_train.agent.agent_messages import Front
-    from bam_train.agent.resident import COMMAND_LIFETIME
-
-    return Front(
-        env=env_id,
-        env_kwargs=env_kwargs,
-        robot=options.robot,
-        profile=options.profile,
-        ca_file=options.ca_file,
-        robot_token_file=options.robot_token_file,
-        bind=options.bind,
-        port=options.port,
-        cert=options.cert,
-        key=options.key,
-        token_file=options.token_file,
-        folder=str(options.folder),
-        lease=options.lease,
-        command_timeout=COMMAND_LIFETIME,
-    )

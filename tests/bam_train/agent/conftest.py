@@ -16,6 +16,7 @@ from bam_envs.rosbridge.server import BridgeServer, Page, Site
 from bam_envs.rosbridge.tokens import Tokens
 from bam_train.agent.front.agent_socket import AgentSocket
 from bam_train.agent.remote.agent_client import AgentClient
+from bam_train.agent.remote.agent_protocol import PATH, encode_message
 from bam_train.errors import CandidateRefused
 from tests.tls_certificates import certificates
 
@@ -70,7 +71,7 @@ class FakeHub:
 
     def tell(self, kind, **event):
         for listener in tuple(self.listeners.get(kind, ())):
-            listener({"event": kind, **event})
+            listener(encode_message({"event": kind, **event}))
 
     def _add(self, where, what):
         with self.changed:
@@ -130,7 +131,7 @@ def new_server(hub):
             agent = AgentSocket(hub, **more)
             stack.callback(agent.close)
             page = Page("text/html; charset=utf-8", b"the console")
-            site = Site({"/": page}, agent.sockets, always=frozenset(agent.sockets))
+            site = Site({"/": page}, {PATH: agent.serve}, always=frozenset((PATH,)))
             return stack.enter_context(BridgeServer(port=0, tokens=tokens, site=site, options=options, **network))
 
         yield make

@@ -17,9 +17,10 @@ from bam_envs.safety.guard import Limits
 from bam_envs.testing import ARM_HOME
 from bam_train.agent.front.agent_socket import AgentSocket
 from bam_train.agent.front.camera_feed import CameraFeed
+from bam_train.agent.front.front_process import console_pages
 from bam_train.agent.front.jog import Jogger
-from bam_train.agent.front.site_pages import console_pages
 from bam_train.agent.front.telemetry import Telemetry
+from bam_train.agent.remote.agent_protocol import PATH, encode_message
 from bam_train.errors import RequestRefused
 
 SPEC = arm_spec("ur5e", with_object=False)
@@ -78,7 +79,7 @@ class FakeAgent:
         self._folder = tempfile.TemporaryDirectory()
         self.incoming = Path(self._folder.name)
         self._socket = AgentSocket(self)
-        site = Site(console_pages(), {**self._socket.sockets, "/camera": self.feed.serve})
+        site = Site(console_pages(), {PATH: self._socket.serve, "/camera": self.feed.serve})
         self.server = BridgeServer(port=port, tokens=tokens or Tokens(otherwise="administer"), site=site)
         self.jogger = Jogger(SPEC, SPEC.period)
         self.telemetry = Telemetry(SPEC, Limits())
@@ -147,7 +148,7 @@ class FakeAgent:
 
     def tell(self, kind, event):
         for listener in self._listeners.get(kind, []):
-            listener({"event": kind, **event})
+            listener(encode_message({"event": kind, **event}))
 
     def _show(self):
         """The events, for those who watch."""
@@ -160,7 +161,7 @@ class FakeAgent:
                 self.tell("status", {"status": self.status()})
 
     def left(self, person):
-        if self.driver == person.connection:
+        if self.driver == person.name:
             self.end_driving("paused")
 
     def end_driving(self, state):
@@ -168,7 +169,7 @@ class FakeAgent:
         self.jogger.release()
 
     def jog(self, message, person):
-        if self.driver == person.connection and self.jogger.put(message):
+        if self.driver == person.name and self.jogger.put(**message):
             self.twists.append((time.monotonic(), message))
 
     def stop(self, person, why):
@@ -193,9 +194,9 @@ class FakeAgent:
 
     def _obey(self, op, arguments, person):
         if op == "take":
-            if self.driver not in (None, person.connection) and not arguments["force"]:
+            if self.driver not in (None, person.name) and not arguments["force"]:
                 raise NotInCommand(f"{self.owner} drives this robot.")
-            self.driver, self.owner, self.state = person.connection, f"{person.name} ({person.address})", "taken over"
+            self.driver, self.owner, self.state = person.name, f"{person.who} ({person.address})", "taken over"
             self.jogger.release()
         elif op == "pause":
             self.end_driving("paused")

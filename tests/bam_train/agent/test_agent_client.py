@@ -34,7 +34,7 @@ def test_a_request(hub, new_agent):
     assert agent.ask("status") == {"state": "paused", "active": None, "owner": None}
     agent.ask("resume", why="lunch is over")
     assert [(op, arguments) for op, arguments, _ in hub.asked] == [("status", {}), ("resume", {"why": "lunch is over"})]
-    assert {person.name for _, _, person in hub.asked} == {"anna@laptop"}
+    assert {person.who for _, _, person in hub.asked} == {"anna@laptop"}
 
 
 def test_progress_and_patience(hub, new_agent):

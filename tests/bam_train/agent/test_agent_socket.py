@@ -13,7 +13,7 @@ from websockets.exceptions import ConnectionClosed, InvalidStatus
 from bam_envs import __version__
 from bam_envs.rosbridge.server import ServerOptions
 from bam_envs.rosbridge.tokens import Tokens
-from bam_train.agent.front.agent_socket import Person
+from bam_train.agent.front.hub import Person
 from bam_train.agent.remote.agent_protocol import OPS
 
 DEADLINE = 10.0
@@ -30,15 +30,15 @@ def test_the_greeting_and_a_request(hub, new_raw):
     assert answer == {"id": 1, "ok": True, "result": {"state": "paused", "active": None, "owner": None}}
     (op, arguments, person), address = hub.asked[0], "{}:{}".format(*raw.socket.local_address[:2])
     assert (op, arguments) == ("status", {})
-    assert person == Person("anna@laptop", address, "drive", person.connection)
+    assert person == Person(person.name, address, role="drive", who="anna@laptop")
 
 
 def test_without_a_name_a_person_is_the_address(hub, new_raw):
     new_raw().ask("status", name="")
     person = hub.asked[0][2]
-    assert person.name == person.address
+    assert person.who == person.address
     new_raw().ask("status", name="anna\x1b[31m\n")
-    assert hub.asked[1][2].name == "anna?[31m?"
+    assert hub.asked[1][2].who == "anna?[31m?"
 
 
 def test_texts_of_others_have_no_control_characters(hub, new_raw):
@@ -106,6 +106,26 @@ def test_errors_are_one_line_with_their_kind(hub, new_raw, caplog):
             b'{"op": "jog", "seq": 1, "twist": [0, 0, 0]}',
             None,
             "This is no request: Expected `array` of length >= 4 - at `$.twist`.",
+        ),
+        (
+            b'{"op": "jog", "seq": 1, "twist": [1e999, 0, 0, 0]}',
+            None,
+            "This is no request: Number out of range - at `$.twist[0]`.",
+        ),
+        (
+            b'{"op": "jog", "seq": "1", "twist": [0, 0, 0, 0]}',
+            None,
+            "This is no request: Expected `int`, got `str` - at `$.seq`.",
+        ),
+        (
+            b'{"op": "jog", "seq": 1, "twist": [0, 0, 0, 0], "gripper": 2}',
+            None,
+            "This is no request: Invalid enum value 2 - at `$.gripper`.",
+        ),
+        (
+            b'{"op": "jog", "seq": 1, "twist": [0, 0, 0, 0], "sent": "now"}',
+            None,
+            "This is no request: Expected `float | null`, got `str` - at `$.sent`.",
         ),
         (b" " * 65_537, None, "A request has at most 65536 bytes; this one has 65537."),
     ],
@@ -178,7 +198,7 @@ def test_force_needs_a_token_that_administers(hub, new_server, new_raw):
 def test_stop_and_jog_go_to_the_hub_at_once(hub, new_raw):
     watcher, driver = new_raw("w"), new_raw("d")
     assert watcher.ask("stop", name="eve")["result"]["state"] == "paused"
-    assert [(person.name, why) for person, why in hub.stops] == [("eve", "")]
+    assert [(person.who, why) for person, why in hub.stops] == [("eve", "")]
     driver.socket.send('{"op": "jog", "seq": 12, "twist": [0.1, 0, 0, 0], "gripper": 1, "sent": 4.5}')
     driver.ask("status")
     assert hub.jogs == [{"seq": 12, "twist": [0.1, 0.0, 0.0, 0.0], "gripper": 1, "sent": 4.5}]
@@ -272,7 +292,7 @@ def test_the_hub_learns_who_left(hub, new_raw):
     raw = new_raw("d")
     raw.ask("status", name="anna")
     raw.close()
-    hub.wait_for(lambda: [person.name for person in hub.gone] == ["anna"])
+    hub.wait_for(lambda: [person.who for person in hub.gone] == ["anna"])
 
 
 def test_a_flood_of_messages_ends_its_socket_only(hub, new_raw, caplog):

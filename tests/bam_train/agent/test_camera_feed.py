@@ -14,8 +14,8 @@ from bam_envs.live.camera import CameraImage
 from bam_envs.rosbridge.server import BridgeServer, Site
 from bam_envs.rosbridge.tokens import Tokens
 from bam_train.agent.agent_messages import Front
+from bam_train.agent.agent_options import AgentOptions
 from bam_train.agent.front.camera_feed import CameraFeed, PagePace, jpeg
-from bam_train.agent.front.hub import AgentHub
 from bam_train.agent.front.robot_front import FrontProcess
 
 DEADLINE = 10.0
@@ -169,11 +169,12 @@ def test_greys_distances_and_what_is_transparent():
     ],
 )
 def test_the_console_shows_the_cameras_that_the_policy_sees(tmp_path, env_kwargs, seen):
-    where = {"robot": "ws://127.0.0.1:9090", "bind": "127.0.0.1", "port": 0, "folder": str(tmp_path)}
-    files = dict.fromkeys(("profile", "ca_file", "robot_token_file", "cert", "key", "token_file"))
-    options = Front("bam/pick-v0", env_kwargs, **where, **files, lease=30.0, command_timeout=0.2)
-    front = FrontProcess(options, lambda message: None)
+    agent = AgentOptions("ws://127.0.0.1:9090", tmp_path, guards=(("joint_speed", 0.3),), robot_name="arm 7")
+    front = FrontProcess(
+        Front.from_bytes(Front("bam/pick-v0", env_kwargs, agent, 0.2).to_bytes()), lambda message: None
+    )
+    assert (front.options, front.shadow.limits.joint_speed) == (agent, 0.3)
     assert front.seen() == seen
     assert {name: camera.source.name for name, camera in front.cameras().items()} == dict(zip(seen, seen, strict=True))
-    status = AgentHub(front, by_force=False).status()
+    status = front.status()
     assert (status["name"], status["address"]) == ("ur5e", "ws://127.0.0.1:9090")

@@ -127,7 +127,7 @@ def test_the_buttons(page, agent):
     page.click("roll-back")
     page.click("yes")
     page.shows("run", "previous bbbbbbbbbbbb")
-    orders = [(op, arguments.get("resume"), person.name) for op, _, arguments, person in agent.orders]
+    orders = [(op, arguments.get("resume"), person.who) for op, _, arguments, person in agent.orders]
     expected = [("pause", None), ("resume", None), ("take", None), ("hand_back", False), ("take", None)]
     expected += [("hand_back", True), ("rollback", None)]
     assert orders == [(*order, "console") for order in expected]
@@ -350,7 +350,7 @@ def test_a_token_is_asked_for_kept_in_this_tab_and_never_in_an_address(page):
         page.shows("state", "running")
         page.click("pause")
         page.shows("state", "paused")
-        assert agent.orders[0][3].name == "Anna B"
+        assert agent.orders[0][3].who == "Anna B"
         assert page.run("return [sessionStorage.token, localStorage.length, document.cookie]") == ["secret", 0, ""]
         page.browser.refresh()
         page.shows("state", "paused")

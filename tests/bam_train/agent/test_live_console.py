@@ -144,7 +144,8 @@ def test_a_page_that_is_left_in_mid_jog_leaves_the_robot_at_rest(driven, agent, 
     time.sleep(REST)
     assert not robot.moves
     np.testing.assert_allclose(robot.tool, here, atol=2e-3)
-    assert agent.agent.ask("status")["state"] in ("taken over", "paused")
+    # On a busy computer, a guard may stop the robot first.
+    assert agent.agent.ask("status")["state"] in ("taken over", "paused", "stopped by a guard")
 
 
 def test_a_frozen_page_leaves_the_robot_at_rest_and_the_policy_does_not_go_on(driven, agent, robot):

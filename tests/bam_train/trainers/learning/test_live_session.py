@@ -10,6 +10,7 @@ import pytest
 from bam_envs.rosbridge.server import BridgeServer, Site
 from bam_envs.rosbridge.tokens import Tokens
 from bam_train.agent.front.agent_socket import AgentSocket
+from bam_train.agent.remote.agent_protocol import PATH, encode_message
 from bam_train.agent.transitions import encode
 from bam_train.checkpoint import Checkpoint
 from bam_train.errors import AgentRefused, SettingsError
@@ -54,7 +55,9 @@ def hub(tmp_path):
 def agent(hub, port=0):
     socket = AgentSocket(hub)
     try:
-        with BridgeServer(port=port, tokens=Tokens({"secret": "administer"}), site=Site({}, socket.sockets)) as server:
+        with BridgeServer(
+            port=port, tokens=Tokens({"secret": "administer"}), site=Site({}, {PATH: socket.serve})
+        ) as server:
             yield server
     finally:
         socket.close()
@@ -104,7 +107,7 @@ def until(condition):
 def tell(hub, transitions):
     until(lambda: hub.listeners)
     for listener in tuple(hub.listeners):
-        listener(encode(transitions))
+        listener(encode_message(encode(transitions)))
 
 
 @pytest.fixture(autouse=True)

@@ -5,7 +5,7 @@ import re
 
 import pytest
 
-from bam_train.agent.front.site_pages import console_pages
+from bam_train.agent.front.front_process import console_pages
 
 EVERY = {path: page.body.decode() for path, page in console_pages().items()}
 LIBRARY = {"/uPlot.iife.min.js", "/uPlot.min.css", "/uPlot.LICENSE.txt"}

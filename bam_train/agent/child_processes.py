@@ -1,0 +1,178 @@
+"""The child processes of a live agent: the front process, started again if it dies, and the simulated robot."""
+
+import json
+import logging
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from typing import Any
+
+import msgspec
+
+from bam_envs.remote.serve.serve_options import ServeOptions
+from bam_envs.remote.serve.served_environment import ServedEnvironment
+from bam_train.agent.agent_messages import Channel, Front, Listening, Message, Report, Rows, socket_pair
+from bam_train.environments import make_env
+from bam_train.errors import SettingsError
+from bam_train.files.log_lines import begin_log
+
+_log = logging.getLogger(__name__)
+_START = 30.0  # longest start [s]
+_PAUSE = 1.0  # time before a dead process is started again [s]
+
+
+class FrontLink:
+    """The front process of a live agent.
+
+    Args:
+        front: The agent as the process needs to know it.
+        take: Called with each of its messages, in a thread of this object.
+        lost: Called when it died, before it is started again.
+    """
+
+    def __init__(self, front: Front, take: Callable[[Any], None], lost: Callable[[], None]) -> None:
+        self._front, self.port = front, front.agent.port
+        """Where it listens; a port 0 becomes the one that it takes."""
+        self._take, self._lost = take, lost
+        self._channel: Channel | None = None
+        self._process: subprocess.Popen[bytes] | None = None
+        self._listening = threading.Event()
+        self._error, self._closing = "", False
+        self._status: Report | None = None
+
+    def start(self) -> None:
+        """Start the process; returns when clients can connect. Raises SettingsError if it cannot listen."""
+        self._spawn()
+        if not self._listening.wait(_START):
+            self._error = f"the front process did not start in {_START:g} s"
+        if self._error:
+            self.close()
+            raise SettingsError(self._error)
+
+    def send(self, message: Message) -> None:
+        """Send a message to it; while it is away, only the newest status is kept."""
+        if isinstance(message, Report):
+            self._status = message
+        channel = self._channel
+        if channel is not None:
+            channel.send(message, can_wait=not isinstance(message, (Report, Rows)))
+
+    def close(self) -> None:
+        """End it. Idempotent."""
+        self._closing = True
+        channel, self._channel = self._channel, None
+        if channel is not None:
+            channel.close()
+        if self._process is not None:
+            _await_end(self._process)
+
+    def _spawn(self) -> None:
+        ours, theirs = socket_pair()
+        with theirs:
+            theirs.set_inheritable(True)
+            self._process = _child(
+                "front.front_process", str(theirs.fileno()), pass_fds=[theirs.fileno()], stdout=subprocess.DEVNULL
+            )
+        agent = replace(self._front.agent, port=self.port)  # the same one, if it is started again
+        ours.send(msgspec.structs.replace(self._front, agent=agent).to_bytes())
+        self._channel = Channel(ours, self._receive, self._died).start()
+
+    def _receive(self, message: Any) -> None:
+        if not isinstance(message, Listening):
+            self._take(message)
+            return
+        self._error = message.error
+        if not message.error:
+            self.port = message.port
+            if self._status is not None:
+                self.send(self._status)
+        self._listening.set()
+
+    def _died(self) -> None:
+        """Called in the reading thread when the process is gone."""
+        if self._closing:
+            return
+        if not self._listening.is_set():
+            self._error = self._error or "the front process ended while it started; its log says why"
+            self._listening.set()
+            return
+        self._lost()
+        _log.warning("The front process died; it is started again.")
+        if self._process is not None:
+            self._process.wait()
+        time.sleep(_PAUSE)
+        if not self._closing:
+            self._spawn()
+
+
+class SimulatedBox:
+    """A simulated robot behind a rosbridge server on this computer, in its own process.
+
+    Args:
+        env_id: Its environment.
+        env_kwargs: Arguments of the environment.
+    """
+
+    def __init__(self, env_id: str, env_kwargs: Mapping[str, Any]) -> None:
+        self._what = json.dumps([env_id, dict(env_kwargs)])
+        self._process: subprocess.Popen[str] | None = None
+        self.url = ""
+        """Address of the robot, once it is started."""
+
+    def start(self) -> None:
+        """Start the process; returns when the robot can be reached. Raises SettingsError if it cannot be simulated."""
+        self._process = _child("child_processes", self._what, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+        self.url = self._process.stdout.readline().strip() if self._process.stdout else ""
+        if not self.url:
+            self._process.wait()
+            raise SettingsError("The simulated robot did not start; its log is above.")
+
+    def close(self) -> None:
+        """End the process. Idempotent."""
+        if self._process is not None and self._process.stdin is not None:
+            self._process.stdin.close()  # which ends it, as the end of this process does
+            _await_end(self._process)
+            if self._process.stdout is not None:
+                self._process.stdout.close()
+
+
+def main() -> None:
+    """Run the simulated robot, in its process, until the standard input ends."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    begin_log("bam-agent: simulated robot", logging.ERROR)
+    env_id, env_kwargs = json.loads(sys.argv[1])
+    with ServedEnvironment(make_env(env_id, env_kwargs), ServeOptions(port=0)) as served:
+        print(served.bus.url, flush=True)  # type: ignore[union-attr]  # noqa: T201 - read by the parent
+        threading.Thread(target=_end_with_parent, daemon=True).start()
+        threading.Event().wait()
+
+
+def _end_with_parent() -> None:
+    sys.stdin.read()
+    os._exit(0)
+
+
+def _child(module: str, argument: str, **options: Any) -> "subprocess.Popen[Any]":
+    """Start ``main`` of a module of this package with an argument, in a process that finds the same packages."""
+    # Without the folder it is started in, whose files could hide ours.
+    program = f"import sys; sys.path[:] = filter(None, sys.path); import bam_train.agent.{module} as it; it.main()"
+    return subprocess.Popen(
+        [sys.executable, "-c", program, argument],
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
+        start_new_session=True,  # Ctrl-C at the terminal is for the resident alone
+        **{"stdin": subprocess.DEVNULL, **options},
+    )
+
+
+def _await_end(process: "subprocess.Popen[Any]") -> None:
+    """Wait for the end of a process, which was told to end; kill it if that takes long."""
+    try:
+        process.wait(5.0)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        process.wait()
