@@ -208,6 +208,21 @@ def test_a_candidate_is_pushed_once_the_gate_lets_it_pass(hub, server, run, monk
     assert text.format(candidate) in err
 
 
+def test_a_candidate_that_the_gate_finds_worse_is_not_pushed(hub, server, run, monkeypatch):
+    """What the gate finds is a test of the gate."""
+    digest = Checkpoint.open(PICK).digest
+    monkeypatch.setattr(push, "_GATE", "print('worse: a against b'); raise SystemExit(2)")
+    refused = run(push.main, PICK, server.url, "--gate", PICK)[2]
+    assert f"{digest[:12]}, and the agent's champion 111111111111; give that one's file to --gate" in refused
+    monkeypatch.setitem(STATUS, "names", {"champion": digest})
+    status, _, err = run(push.main, PICK, server.url, "--gate", PICK)
+    assert (status, [op for op, *_ in hub.asked].count("push")) == (3, 0)
+    assert err.splitlines()[-2:] == [
+        "bam-push: worse: a against b",
+        f"bam-push: {PICK}: bam-gate finds it worse against {PICK}, so it was not pushed",
+    ]
+
+
 def test_roll_back(hub, server, run):
     status, out, _ = run(push.main, "--rollback", server.url, "--why", "it drops the cube")
     assert (status, out.splitlines()[0].split()[0]) == (0, "trial")

@@ -9,7 +9,6 @@ from onnx import TensorProto, helper, numpy_helper
 from bam_train.checkpoint import GOLDEN, POLICY, safetensors_file
 from bam_train.checkpoint.checkpoint import write_checkpoint
 from bam_train.cli.data import run_gate as gate
-from bam_train.cli.live import push
 
 
 @pytest.fixture
@@ -126,26 +125,3 @@ def test_a_bug_is_no_verdict(right, run, monkeypatch):
     status, _, err = run(gate.main, right, right)
     assert status == 4
     assert err.endswith("ZeroDivisionError: division by zero\n")
-
-
-class Asked:
-    """An agent with this champion."""
-
-    def __init__(self, champion):
-        self.champion = champion
-
-    def ask(self, op):
-        return {"names": {"champion": self.champion}}
-
-
-def test_bam_push_asks_it(left, right, capsys):
-    from bam_train.checkpoint import Checkpoint
-    from bam_train.errors import CandidateRefused
-
-    digest = Checkpoint.open(left).digest
-    push._pass_gate(Asked(digest), right, left)
-    assert capsys.readouterr().err.startswith(f"bam-push: better: {right} against {left}\n")
-    with pytest.raises(CandidateRefused, match=f"{digest[:12]}, and the agent's champion none; give that one's file"):
-        push._pass_gate(Asked(None), right, left)
-    with pytest.raises(CandidateRefused, match="bam-gate finds it worse against "):
-        push._pass_gate(Asked(Checkpoint.open(right).digest), left, right)
