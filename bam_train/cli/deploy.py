@@ -184,13 +184,15 @@ def _add_to_data_set(
     config: DeployConfig, checkpoint: Checkpoint, env: gym.Env[Any, Any], recorder: Recorder | None
 ) -> None:
     """Add the recorded episodes to the data set of ``--record``; the recording stays, whatever happens."""
+    if recorder is None or config.record is None:
+        return
+    from bam_train.data.record_dataset import info_of
     from bam_train.data.recordings import add_recording, is_data_set
     from bam_train.errors import BamTrainError
     from bam_train.recording.recording import Recording
 
-    if recorder is None or config.record is None or not is_data_set(str(config.record)):
+    if not is_data_set(str(config.record)):
         return
-    from bam_train.data.record_dataset import info_of
 
     manifest = checkpoint.manifest
     try:
