@@ -8,7 +8,7 @@ Send is ``env.step``: the task makes a command of the action, the guards pass, c
 what they let through. Nothing else in this loop reaches the robot.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from time import perf_counter, thread_time
 from typing import Any, Protocol
@@ -138,7 +138,8 @@ class EpisodeLoop:
     def _decide(self, step: EpisodeStep) -> None:
         begun, computed = perf_counter(), thread_time()
         arrays = {name.removeprefix(f"{OBSERVATION}/"): array[0].copy() for name, array in step.arrays.items()}
-        action = np.asarray(self.policy.act(arrays.get(OBSERVATION, arrays)))
+        observation = arrays[OBSERVATION] if OBSERVATION in step.arrays else arrays
+        action = np.asarray(self.policy.act(observation))
         step.acted, step.computed = self._took = perf_counter() - begun, thread_time() - computed
         if not step.is_last:
             require_finite_action(action, step.number, f"the episode with seed {step.seed}")
@@ -177,7 +178,7 @@ def named_arrays(observation: Any, space: gym.Space[Any], name: str = OBSERVATIO
     if isinstance(observation, Mapping):
         parts = [named_arrays(value, space[key], f"{name}/{key}") for key, value in observation.items()]  # type: ignore[index]
         return {path: array for part in parts for path, array in part.items()}
-    array = np.asarray(None if isinstance(observation, Sequence) else observation)
+    array = np.asarray(None if isinstance(observation, (tuple, str)) else observation)
     if array.dtype.kind not in "fiub":
         raise ValueMismatch(
             f"{name!r}: expected an array, a number or a dict of them, found a {type(observation).__name__}; "

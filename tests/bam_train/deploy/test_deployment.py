@@ -426,6 +426,33 @@ def test_a_signal_inside_the_sink(corridor, number):
     assert pieces == [0]
 
 
+def test_the_policy_gets_the_parts_of_an_observation_by_name():
+    class Parts(gym.ObservationWrapper):
+        observation_space = gym.spaces.Dict(
+            {
+                "env_obs": gym.spaces.Box(-np.inf, np.inf, (1,)),
+                "arm": gym.spaces.Dict({"q": gym.spaces.Box(-1, 1, (2,), np.float64)}),
+            }
+        )
+
+        def observation(self, observation):
+            return {"env_obs": observation, "arm": {"q": (0.5, 1)}}
+
+    seen = []
+    policy = SimpleNamespace(reset=lambda: None, act=lambda observation: seen.append(observation) or 1)
+    assert run(gym.wrappers.TimeLimit(Parts(Endless()), 1), policy, episodes=1)[0] == Ending(
+        "fault: 'env_obs/arm/q': expected an array, a number or a dict of them, found a tuple; "
+        "wrap the environment, for example in gymnasium.wrappers.FlattenObservation.",
+        1,
+    )
+    Parts.observation = lambda self, observation: {"env_obs": observation, "arm": {"q": [0.5, 1]}}
+    assert run(gym.wrappers.TimeLimit(Parts(Endless()), 1), policy, episodes=1)[0] == DONE
+    assert [{name: part.tolist() for name, part in one.items()} for one in seen] == [
+        {"env_obs": [0.0], "arm/q": [0.5, 1.0]},
+        {"env_obs": [1.0], "arm/q": [0.5, 1.0]},
+    ]
+
+
 def test_agents_of_ones_own_see_each_step(corridor, starting_cell):
     """Those behind the policy may read its action at the end, too."""
     sees = Sees()
