@@ -47,7 +47,7 @@ KINDS = {
         "bam_train/trainers/rllib",
         "bam_train/trainers/sb3",
         "bam_train/cli/test_train.py",
-        "bam_train/files/test_stand_ins.py",
+        "bam_train/files/test_addresses.py",
         "bam_train/cli/test_elsewhere.py",
     ),
 }

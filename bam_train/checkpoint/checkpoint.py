@@ -44,6 +44,7 @@ from bam_train.checkpoint.zip_members import (
 )
 from bam_train.errors import AlteredCheckpoint, CheckpointError, CheckpointMismatch, FormatError, OutputError
 from bam_train.files.atomic_file import replacing
+from bam_train.files.place import local_path
 
 POLICY = "bam/policy.onnx"
 GOLDEN = "bam/golden.safetensors"
@@ -64,15 +65,16 @@ class Checkpoint:
         """Verify the manifest, the list of members, and every member but those below ``bam/resume/``.
 
         Args:
-            path: The file.
+            path: The file, also at an address such as ``s3://bucket/pick.zip``.
             members: False: leave the members to `read`, which verifies each of them anyway.
 
         Raises:
+            PlaceError: An address that it cannot be fetched from.
             NotACheckpoint: No such file, not a zip, truncated, too large, or no manifest in it.
             NewerFormat: Written by a newer bam-train.
             AlteredCheckpoint: A member was changed, is missing, was added or is too large.
         """
-        path = Path(path).expanduser()
+        path = local_path(path)
         with open_zip(path) as archive:
             infos = list_members(path, archive)
             data = b"".join(chunks(path, archive, infos[MANIFEST]))

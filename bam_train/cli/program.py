@@ -26,7 +26,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
 from bam_train.cli.console import drop, say, show_logs_and_tracebacks, tell
-from bam_train.files.stand_ins import standing_in
+from bam_train.files.place import standing_in
 from bam_train.signals import SignalMemory, Terminated
 
 Config = TypeVar("Config")

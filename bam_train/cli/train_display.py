@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shlex
 import time
 from collections.abc import Callable
@@ -10,6 +11,7 @@ from typing import TYPE_CHECKING, Any, TextIO
 
 from bam_train.cli.console import count, drop, duration, make_console, number, percent, rich_text, say
 from bam_train.errors import OutputError
+from bam_train.files.place import with_addresses
 
 if TYPE_CHECKING:
     from bam_train.evaluation import EvaluationReport
@@ -185,5 +187,4 @@ def say_next(settings: TrainSettings, outcome: Outcome) -> None:
 
 def _short(path: Path) -> str:
     """The shortest form of the path for a shell in this folder."""
-    absolute, here = path.resolve(), Path.cwd()
-    return shlex.quote(str(absolute.relative_to(here) if absolute.is_relative_to(here) else absolute))
+    return shlex.quote(with_addresses(str(path.resolve())).removeprefix(f"{Path.cwd()}{os.sep}"))

@@ -137,8 +137,7 @@ class Files:
         target = f"{folder}/{name.replace('/', '-')}"
         copies = itertools.chain([target], (f"{target}.{k}" for k in itertools.count(2)))
         free = next(one for one in copies if not self.exists(one))
-        with (self.root / name).local_copy() as path:
-            (self.root / free).put(path)
+        self.write(free, (self.root / name).read_bytes())
         return [free]
 
     def delete(self, name: str) -> None:

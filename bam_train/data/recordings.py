@@ -26,7 +26,7 @@ from bam_train.data.record_dataset import info_of
 from bam_train.data.recorded_episode import Array, DataSetInfo, Episode, digest_of, leaves_of, nested
 from bam_train.environments import make_env, must_be_named, require_env_kwargs
 from bam_train.errors import BadDataSet, BadRecording
-from bam_train.files.place import Place
+from bam_train.files.place import Place, local_path
 from bam_train.recording.recording import Recording
 
 _CUT, _NO_END = "cut off", "it has no end, and is taken as truncated"
@@ -214,9 +214,8 @@ def _rows(source: Path, columns: list[str]) -> Arrow:
 
     if Files(source).exists(INFO):
         raise BadDataSet(f"{source}: is a data set already; add it to another one with bam-data merge")
-    place = Place(source)
     try:
-        files = pq.ParquetDataset(place.path, filesystem=place.filesystem)
+        files = pq.ParquetDataset(local_path(source))
         if missing := [name for name in columns if name not in files.schema.names]:
             text = f"lacks the column {', '.join(missing)}; it has {', '.join(files.schema.names) or 'none'}"
             raise BadDataSet(f"{source}: {text}")

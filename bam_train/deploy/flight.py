@@ -26,7 +26,7 @@ from bam_train.deploy.episode import OBSERVATION, EpisodeStep
 from bam_train.deploy.journal import Journal
 from bam_train.env_location import EnvLocation
 from bam_train.environments import control_period
-from bam_train.files.stand_ins import with_addresses
+from bam_train.files.place import with_addresses
 from bam_train.recording.recorder import WARNING, Recorder
 
 STAGES = ("step", "wait", "late", "policy", "age", "record")

@@ -4,7 +4,7 @@ import logging
 from collections.abc import Callable
 from typing import Any
 
-from bam_train.files.stand_ins import with_addresses
+from bam_train.files.place import with_addresses
 
 
 def shown(text: str) -> str:

@@ -1,145 +1,98 @@
-"""Places: a path on this computer, or ``s3://bucket/key``, ``gs://bucket/key`` and ``file:///folder``, read alike.
+"""Places: a path on this computer, or an address that fsspec knows, such as ``s3://bucket/key``, read alike.
 
-Other computers are reached through `pyarrow.fs`, imported on use; a path needs nothing. Credentials are found as every
-tool of the service finds them: the environment, ``~/.aws``, the role of the computer; none may stand in an address. An
-S3 service other than Amazon's is named by ``AWS_ENDPOINT_URL``, or by ``?endpoint_override=http://host:port``.
+Addresses are reached through `fsspec` and the package of their service (s3fs for ``s3://``), imported on use; a path
+needs nothing. Credentials are found as every tool of the service finds them: the environment, ``~/.aws``, the role of
+the computer; none may stand in an address. An S3 service other than Amazon's is named by ``AWS_ENDPOINT_URL``, or by
+``?endpoint_override=http://host:port``.
 
 What is written appears whole or not at all: on a disk by a rename, in a bucket because an object appears when its
-upload is complete. A request that fails is tried ``ATTEMPTS`` times, and each waits a bounded time for an answer.
+upload is complete. A request that fails is tried again, and each waits a bounded time for an answer.
+
+Programs that need a file on this computer get a copy: `local_path` and `standing_in`. What changes in a copy is put to
+its address: at once where a file is replaced in one step, as checkpoints, and at the end of the program.
 """
 
 from __future__ import annotations
 
+import atexit
 import contextlib
-import functools
-import os
+import dataclasses
 import re
 import shutil
 import tempfile
 from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path, PurePosixPath
-from typing import IO, Any, cast
+from typing import IO, Any, TypeVar, cast
 from urllib.parse import parse_qsl, urlsplit
 from urllib.request import url2pathname
 
 from bam_train.errors import NoSuchPlace, PlaceError
-from bam_train.files.atomic_file import replacing
+from bam_train.files.atomic_file import REPLACED, replacing
 
-ATTEMPTS = 4
-"""Tries of a request, the first one included."""
+Config = TypeVar("Config")
+ATTEMPTS = 2
+"""Tries of a request by botocore; s3fs repeats five times those that are cut or not answered in time."""
 CONNECT_TIMEOUT = 3.0
 """Longest wait for a connection [s]."""
 REQUEST_TIMEOUT = 10.0
 """Longest time without a byte of an answer [s]."""
-_OPTIONS = {"s3": ("endpoint_override", "region", "scheme"), "gs": ("endpoint_override", "scheme")}
-_SCHEME = re.compile(r"([A-Za-z][A-Za-z0-9+.-]+):/")
+_OPTIONS = {"endpoint_override": "endpoint_url", "region": "region_name"}
+"""Options that may follow an address of S3 after ``?``, and botocore's names of them."""
+_ADDRESS = re.compile(r"([A-Za-z][A-Za-z0-9+.-]+):/")
 
 
 class Place:
-    """A file or folder, here or in a bucket; immutable, and equal to another one of the same text.
-
-    A place on this computer is a path for `open` and the like; of one in a bucket, `local_copy` makes one.
+    """A file or folder, here or at an address; immutable, and equal to another one of the same path.
 
     Args:
         text: A path (``~`` is expanded), or an address.
+        path: What `path` is, if it is known.
 
     Raises:
-        PlaceError: An address that nothing can be read from.
+        PlaceError: An address that nothing can be read from, or whose package is not installed.
     """
 
-    __slots__ = ("_query", "_scheme", "local", "path", "text")
+    __slots__ = ("path", "text")
 
     text: str
     """What the user gave."""
-    local: Path | None
-    """The path on this computer; None in a bucket."""
-    path: str
-    """The path as `filesystem` has it: ``bucket/key``, or a path on this computer."""
+    path: Any
+    """A `pathlib.Path` on this computer, or else a `upath.UPath`."""
 
-    def __init__(self, text: str | Path | Place) -> None:
+    def __init__(self, text: str | Path | Place, path: Any = None) -> None:
         # A Path has made one slash of two
-        self.text = (
-            re.sub(r"(?i)(\b(?:s3|gs|gcs|https?)):/(?!/)", r"\1://", str(text)) if isinstance(text, Path) else str(text)
-        )
-        self._scheme, self._query = "", ""
-        found = _SCHEME.match(self.text)
+        self.text = re.sub(r"(?i)(?<!file)(?<=\w\w):/(?!/)", "://", str(text)) if isinstance(text, Path) else str(text)
+        found = _ADDRESS.match(self.text)
         scheme = found[1].lower() if found else ""
-        if scheme in ("", "file"):
-            self.local = (_file_path(self.text) if scheme else Path(self.text)).expanduser()
-            self.path = str(self.local)
-            return
-        self.local, self._scheme = None, "gs" if scheme == "gcs" else scheme
-        address, _, self._query = self.text.partition("?")
-        self.path = address[len(scheme) + 3 :].strip("/")
-        self._require_sane(scheme)
-
-    def _require_sane(self, scheme: str) -> None:
-        if self._scheme not in _OPTIONS:
-            raise PlaceError(self, f"{scheme}:// is unknown. Give a path, or an address with s3://, gs:// or file://")
-        if not self.text[len(scheme) :].startswith("://") or not self.bucket:
-            raise PlaceError(self, f"expected {scheme}://BUCKET/NAME. Give the name of a bucket after {scheme}://")
-        if "@" in self.bucket:
-            self.text = f"{scheme}://...@{self.path.partition('@')[2]}"  # no secret in a message
-            raise PlaceError(self, "holds credentials. Give them in the environment or in ~/.aws instead")
-        unknown = sorted(self._options.keys() - set(_OPTIONS[self._scheme]))
-        if unknown:
-            raise PlaceError(self, f"unknown option {unknown[0]}; there are {', '.join(_OPTIONS[self._scheme])}")
+        if path is not None or isinstance(text, Place):
+            self.path = text.path if isinstance(text, Place) else path
+        elif scheme in ("", "file"):
+            self.path = (_file_path(self.text) if scheme else Path(self.text)).expanduser()
+        else:
+            self.path = _at_address(self, scheme)
 
     @property
-    def bucket(self) -> str:
-        """Name of the bucket; empty for a place on this computer."""
-        return "" if self.local is not None else self.path.partition("/")[0]
-
-    @property
-    def _options(self) -> dict[str, str]:
-        return dict(parse_qsl(self._query, keep_blank_values=True))
-
-    @property
-    def filesystem(self) -> Any:
-        """The `pyarrow.fs.FileSystem` that knows `path`; one for all places of a bucket.
-
-        Raises:
-            PlaceError: pyarrow is not installed, or a region or an endpoint is malformed.
-        """
-        with self._errors("opened"):
-            # pyarrow looks at neither variable
-            endpoint = os.environ.get("AWS_ENDPOINT_URL_S3") or os.environ.get("AWS_ENDPOINT_URL") or ""
-            return _filesystem(self._scheme, self.bucket, self._query, endpoint)
-
-    # What a path has
+    def local(self) -> Path | None:
+        """The path on this computer; None at an address."""
+        return self.path if isinstance(self.path, Path) else None
 
     @property
     def name(self) -> str:
         """The last part."""
-        return PurePosixPath(self.path).name if self.local is None else self.local.name
-
-    @property
-    def stem(self) -> str:
-        """The last part without its suffix."""
-        return PurePosixPath(self.name).stem
+        return str(self.path.name)
 
     @property
     def suffix(self) -> str:
         """Suffix of the last part, such as ``.zip``."""
-        return PurePosixPath(self.name).suffix
+        return str(self.path.suffix)
 
     @property
     def parent(self) -> Place:
         """The folder that holds this place; a bucket is its own."""
-        if self.local is not None:
-            return Place(self.local.parent)
-        above = self.path.rpartition("/")[0] or self.path
-        return Place(f"{self._scheme}://{above}{self._query and '?'}{self._query}")
-
-    def with_name(self, name: str) -> Place:
-        """Another place in the same folder."""
-        return self.parent / name
+        return Place(str(self.path.parent), self.path.parent)
 
     def __truediv__(self, name: str) -> Place:
-        if self.local is not None:
-            return Place(self.local / name)
-        return Place(f"{self._scheme}://{self.path}/{name}{self._query and '?'}{self._query}")
+        return Place(str(self.path / name), self.path / name)
 
     def __str__(self) -> str:
         return self.text
@@ -148,54 +101,45 @@ class Place:
         return f"Place({self.text!r})"
 
     def __eq__(self, other: object) -> bool:
-        return isinstance(other, Place) and (self._scheme, self.path, self._query) == (
-            other._scheme,
-            other.path,
-            other._query,
-        )
+        return isinstance(other, Place) and self.path == other.path
 
     def __hash__(self) -> int:
-        return hash((self._scheme, self.path))
-
-    def __fspath__(self) -> str:
-        if self.local is None:
-            raise PlaceError(self, "a file on this computer is needed here. Copy it first, and give that file")
-        return str(self.local)
+        return hash(str(self.path))
 
     # What is there
 
     def exists(self) -> bool:
         """Whether a file or a folder is there."""
-        return self.local.exists() if self.local is not None else self._kind() != "NotFound"
+        return self.local.exists() if self.local is not None else self._kind() != ""
 
     def is_dir(self) -> bool:
         """Whether a folder is there."""
-        return self.local.is_dir() if self.local is not None else self._kind() == "Directory"
+        return self.local.is_dir() if self.local is not None else self._kind() == "directory"
 
     def size(self) -> int:
         """Size of the file [bytes]."""
         with self._errors("read"):
-            size = self.local.stat().st_size if self.local is not None else self._info().size
-        if size is None:
-            raise NoSuchPlace(self, self._why_missing())
-        return size
+            return int(self.path.stat().st_size if self.local is not None else self._call("info")["size"])
 
     def list(self) -> list[Place]:
         """What is in the folder, by name; raises NoSuchPlace if there is no folder."""
         with self._errors("listed"):
             if self.local is not None:
-                return [Place(path) for path in sorted(self.local.iterdir())]
-            from pyarrow.fs import FileSelector
-
-            found = self.filesystem.get_file_info(FileSelector(self.path))
-            return [self / info.base_name for info in sorted(found, key=lambda info: str(info.base_name))]
+                return [self / path.name for path in sorted(self.local.iterdir())]
+            found = {path.rstrip("/") for path in self._call("ls", detail=False)}
+            found.discard(self.path.path.rstrip("/"))  # an empty object that marks the folder
+            return [self / PurePosixPath(path).name for path in sorted(found)]
 
     def _kind(self) -> str:
-        with self._errors("read"):
-            return str(self._info().type.name)
+        try:
+            with self._errors("read"):
+                return str(self._call("info")["type"])
+        except NoSuchPlace:
+            return ""
 
-    def _info(self) -> Any:
-        return self.filesystem.get_file_info(self.path)
+    def _call(self, method: str, *arguments: Any, **options: Any) -> Any:
+        """Call a method of the file system that has this address."""
+        return getattr(self.path.fs, method)(self.path.path, *arguments, **options)
 
     # Reading
 
@@ -209,84 +153,35 @@ class Place:
         with self._errors("read"):
             if self.local is not None:
                 return self.local.open("rb")
-            return cast("IO[bytes]", _Reading(self, self.filesystem.open_input_file(self.path)))
+            return cast("IO[bytes]", _Reading(self, self._call("open", "rb", cache_type="none")))
 
     def read_bytes(self) -> bytes:
         """Everything in the file; raises as `open_input`."""
-        with self.open_input() as file:
-            return file.read()
-
-    @contextlib.contextmanager
-    def local_copy(self) -> Iterator[Path]:
-        """Yield a path on this computer with the same content: the place itself, or a copy until the block ends."""
-        if self.local is not None:
-            yield self.local
-            return
-        with tempfile.TemporaryDirectory(prefix="bam-") as folder:
-            target = Path(folder, self.name)
-            self.copy_to(target)
-            yield target
-
-    def copy_to(self, target: Path) -> None:
-        """Copy the file, or the folder with all that is in it, to a path on this computer."""
-        if self.is_dir():
-            target.mkdir(parents=True, exist_ok=True)
-            for one in self.list():
-                one.copy_to(target / one.name)
-            return
-        with self.open_input() as source, target.open("wb") as file:
-            shutil.copyfileobj(source, file, 2**20)
-
-    # Writing
-
-    @contextlib.contextmanager
-    def replacing(self, suffix: str = ".tmp") -> Iterator[Path]:
-        """Yield a temporary file on this computer; it becomes this file at the end, or is removed on error.
-
-        Missing folders are made; a missing bucket is not.
-        """
-        if self.local is not None:
-            with self._errors("written"), replacing(self.local, suffix) as path:
-                yield path
-            return
-        with tempfile.TemporaryDirectory(prefix="bam-") as folder:
-            path = Path(folder, f"{self.stem or 'file'}{suffix}")
-            path.touch()
-            yield path
-            self.put(path)
-
-    def put(self, path: Path) -> None:
-        """Make this file a copy of the one at `path`, in one step."""
-        if self.local is not None:
-            with self.replacing() as temporary:
-                shutil.copyfile(path, temporary)
-            return
-        # Whoever closes the stream of an object shows what it has so far, and so does an exception in between. The
-        # thread knows no interrupts, and what it writes is one piece.
-        with self._errors("written"), ThreadPoolExecutor(1) as thread:
-            thread.submit(_upload, path, self.filesystem, self.path).result()
-
-    @contextlib.contextmanager
-    def open_output(self) -> Iterator[IO[bytes]]:
-        """Yield a file to write to; it appears at this place when the block ends, unless it fails."""
-        with self.replacing() as path, path.open("wb") as file:
-            yield file
-            file.flush()
+        with self._errors("read"):
+            return bytes(self.path.read_bytes() if self.local is not None else self._call("cat_file"))
 
     def write_bytes(self, data: bytes) -> None:
-        """Make this file hold `data`, in one step."""
-        with self.replacing() as path:
-            path.write_bytes(data)
+        """Make this file hold `data`, in one step; missing folders are made, a missing bucket is not."""
+        with self._errors("written"):
+            if self.local is None:
+                self._call("pipe_file", data)
+                return
+            with replacing(self.local) as path:
+                path.write_bytes(data)
+
+    def put(self, path: Path) -> None:
+        """Make this file a copy of the one at `path`, as `write_bytes`."""
+        with self._errors("written"):
+            if self.local is None:
+                self.path.fs.put_file(str(path), self.path.path)
+                return
+            with replacing(self.local) as temporary:
+                shutil.copyfile(path, temporary)
 
     def delete(self) -> None:
-        """Remove the file, or the folder with all that is in it."""
+        """Remove the file."""
         with self._errors("removed"):
-            if self.local is not None:
-                shutil.rmtree(self.local) if self.local.is_dir() else self.local.unlink()
-            elif self.is_dir():
-                self.filesystem.delete_dir(self.path)
-            else:
-                self.filesystem.delete_file(self.path)
+            self.local.unlink() if self.local is not None else self._call("rm_file")
 
     @contextlib.contextmanager
     def _errors(self, done: str) -> Iterator[None]:
@@ -296,50 +191,26 @@ class Place:
         except PlaceError:
             raise
         except FileNotFoundError as error:
-            raise NoSuchPlace(self, self._why_missing()) from error
-        except ModuleNotFoundError as error:
-            text = (
-                'a place on another computer needs pyarrow, which is not installed. Run: pip install "bam-train[data]"'
-            )
-            raise PlaceError(self, text) from error
-        except (OSError, ValueError) as error:  # ValueError: pyarrow's ArrowInvalid
+            why = _explained(error, self) if self.local is None else ""
+            raise NoSuchPlace(self, why or "no such file or folder. Check the name") from error
+        except Exception as error:  # each kind of service has its own exceptions
             if self.local is None:
-                raise PlaceError(self, f"cannot be {done}: {_explained(self._told(error), self)}") from error
-            if isinstance(error, ValueError):
+                why = _explained(error, self) or " ".join(f"{type(error).__name__}: {error}".split())
+                raise PlaceError(self, f"cannot be {done}: {why}") from error
+            if not isinstance(error, OSError):
                 raise
             raise PlaceError(self, f"cannot be {done}: {error.strerror or error}. Check its permissions") from error
 
-    def _told(self, error: Exception) -> str:
-        """The text of an error; the answer to a HEAD request has no reason, that of a list has."""
-        if re.search(r"HTTP status 4.* during HeadObject|ACCESS_DENIED", str(error)):
-            from pyarrow.fs import FileSelector
-
-            try:
-                self.filesystem.get_file_info(FileSelector(f"{self.bucket}/.bam"))
-            except OSError as reason:
-                return str(reason)
-        return str(error)
-
-    def _why_missing(self) -> str:
-        if self.local is None and self._kind_of_bucket() == "NotFound":
-            return _NO_BUCKET.format(bucket=self.bucket)
-        return "no such file or folder. Check the name"
-
-    def _kind_of_bucket(self) -> str:
-        with contextlib.suppress(OSError):  # who may read one object may not look at the bucket
-            return str(self.filesystem.get_file_info(self.bucket).type.name)
-        return ""
-
 
 class _Reading:
-    """A file of `pyarrow.fs` whose failures are those of its place."""
+    """An open file of `fsspec` whose failures are those of its place."""
 
     def __init__(self, place: Place, file: Any) -> None:
         self._place, self._file = place, file
 
     def read(self, size: int = -1) -> bytes:
         with self._place._errors("read"):
-            return bytes(self._file.read(None if size is None or size < 0 else size))
+            return bytes(self._file.read(size))
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._file, name)
@@ -351,17 +222,6 @@ class _Reading:
         self._file.close()
 
 
-def _upload(path: Path, filesystem: Any, target: str) -> None:
-    import pyarrow
-
-    content: Any = b""
-    if path.stat().st_size:
-        with pyarrow.memory_map(str(path)) as file:
-            content = file.read_buffer()
-    with filesystem.open_output_stream(target) as stream:
-        stream.write(content)
-
-
 def _file_path(text: str) -> Path:
     parts = urlsplit(text)
     if parts.netloc not in ("", "localhost") or not parts.path.startswith("/"):
@@ -369,53 +229,213 @@ def _file_path(text: str) -> Path:
     return Path(url2pathname(parts.path))
 
 
-@functools.lru_cache
-def _filesystem(scheme: str, bucket: str, query: str, endpoint: str) -> Any:
-    import pyarrow.fs
+def _at_address(place: Place, scheme: str) -> Any:
+    """The `upath.UPath` of an address."""
+    address, _, query = place.text.partition("?")
+    bucket = address[len(scheme) :].removeprefix("://").partition("/")[0]
+    if "@" in bucket:
+        place.text = f"{scheme}://...@{address.partition('@')[2]}"  # no secret in a message
+        raise PlaceError(place, "holds credentials. Give them in the environment or in ~/.aws instead")
+    if not address[len(scheme) :].startswith("://") or not bucket:
+        raise PlaceError(place, f"expected {scheme}://BUCKET/NAME. Give the name of a bucket after {scheme}://")
+    given: dict[str, str] = dict(parse_qsl(query, keep_blank_values=True)) if scheme == "s3" else {}
+    if unknown := sorted(given.keys() - _OPTIONS.keys()):
+        raise PlaceError(place, f"unknown option {unknown[0]}; there are {' and '.join(_OPTIONS)}")
+    options: dict[str, Any] = {}
+    if scheme == "s3":
+        waits = {"connect_timeout": CONNECT_TIMEOUT, "read_timeout": REQUEST_TIMEOUT}
+        tries = {"retries": {"mode": "standard", "total_max_attempts": ATTEMPTS}}
+        found = {_OPTIONS[name]: value for name, value in given.items()}
+        options = {"client_kwargs": found, "config_kwargs": {**waits, **tries}, "use_listings_cache": False}
+    try:
+        from fsspec import get_filesystem_class
+        from upath import UPath
 
-    options = dict(parse_qsl(query))
-    if not scheme:
-        return pyarrow.fs.LocalFileSystem()
-    if scheme == "gs":
-        from datetime import timedelta
-
-        return pyarrow.fs.GcsFileSystem(retry_time_limit=timedelta(seconds=REQUEST_TIMEOUT), **options)
-    if endpoint:
-        options.setdefault("endpoint_override", endpoint)
-    if "endpoint_override" not in options and not {"AWS_REGION", "AWS_DEFAULT_REGION"} & os.environ.keys():
-        options.setdefault("region", pyarrow.fs.resolve_s3_region(bucket))
-    return pyarrow.fs.S3FileSystem(
-        retry_strategy=pyarrow.fs.AwsStandardS3RetryStrategy(max_attempts=ATTEMPTS),
-        connect_timeout=CONNECT_TIMEOUT,
-        request_timeout=REQUEST_TIMEOUT,
-        allow_delayed_open=True,  # one request for a small object
-        tls_ca_file_path=os.environ.get("AWS_CA_BUNDLE") or None,
-        **options,
-    )
+        get_filesystem_class(scheme)
+        return UPath(address if scheme == "s3" else place.text, **options)
+    except ImportError as error:
+        missing = error if isinstance(error, ModuleNotFoundError) else error.__cause__
+        package = str(getattr(missing, "name", None) or "a package").partition(".")[0]
+        what = '"bam-train[data]"' if package in ("fsspec", "s3fs", "upath") else package
+        raise PlaceError(place, f"needs {package}, which is not installed. Run: pip install {what}") from error
+    except ValueError as error:
+        text = f"{scheme}:// is unknown. Give a path, or an address that fsspec knows, such as s3:// or gs://"
+        raise PlaceError(place, text) from error
 
 
-_NO_BUCKET = "there is no bucket {bucket}. Check the name and the endpoint, or make the bucket"
 _CREDENTIALS = "Check AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY, or ~/.aws/credentials"
+_NO_CONNECTION = "no connection ({detail}). Check the network and the endpoint (AWS_ENDPOINT_URL)"
+_NOT_ALLOWED = (
+    f"not allowed with these credentials. Ask the owner of {{bucket}} for the right, or give others. {_CREDENTIALS}"
+)
+_REDIRECTED = "the bucket is in another region. Set AWS_REGION"
+_BUSY = "the service is busy or broken. Try again later"
 _EXPLAINED = {
-    r"NO_SUCH_BUCKET|Bucket .* not found": _NO_BUCKET,
-    r"RequestTimeTooSkewed|REQUEST_TIME_TOO_SKEWED": "the clock of this computer is wrong by minutes. Set it",
-    r"INVALID_ACCESS_KEY_ID|InvalidAccessKeyId|UNRECOGNIZED_CLIENT": f"the access key is unknown there. {_CREDENTIALS}",
-    r"SIGNATURE_DOES_NOT_MATCH|SignatureDoesNotMatch": f"the secret key does not fit the access key. {_CREDENTIALS}",
-    r"EXPIRED_TOKEN|ExpiredToken": "the session token has expired. Get a new one",
-    r"ACCESS_DENIED|AccessDenied|HTTP status 403": "not allowed with these credentials. Ask the owner of {bucket} "
-    f"for the right, or give others. {_CREDENTIALS}",
-    r"PERMANENT_REDIRECT|PermanentRedirect|HTTP status 301": "the bucket is in another region. Set AWS_REGION",
-    r"OAuth2 access token": "no credentials of Google. Set GOOGLE_APPLICATION_CREDENTIALS to the file with them",
-    r"NETWORK_CONNECTION|curlCode": "no connection ({detail}). Check the network and the endpoint (AWS_ENDPOINT_URL)",
-    r"SLOW_DOWN|SERVICE_UNAVAILABLE|INTERNAL_FAILURE|status 5\d\d": "the service is busy or broken. Try again later",
+    "NoSuchBucket": "there is no bucket {bucket}. Check the name and the endpoint, or make the bucket",
+    "RequestTimeTooSkewed": "the clock of this computer is wrong by minutes. Set it",
+    "InvalidAccessKeyId": f"the access key is unknown there. {_CREDENTIALS}",
+    "SignatureDoesNotMatch": f"the secret key does not fit the access key. {_CREDENTIALS}",
+    "ExpiredToken": "the session token has expired. Get a new one",
+    **dict.fromkeys(("AccessDenied", "403", "PermissionError"), _NOT_ALLOWED),
+    **dict.fromkeys(("PermanentRedirect", "301"), _REDIRECTED),
+    **dict.fromkeys(("SlowDown", "ServiceUnavailable", "InternalError", "500", "503"), _BUSY),
+    **dict.fromkeys(("NoCredentialsError", "PartialCredentialsError"), f"no credentials. {_CREDENTIALS}"),
+    "DefaultCredentialsError": "no credentials of Google. Set GOOGLE_APPLICATION_CREDENTIALS to the file with them",
+    **dict.fromkeys(("ConnectionError", "HTTPClientError", "ClientPayloadError", "TimeoutError"), _NO_CONNECTION),
 }
-"""Texts of pyarrow's errors and what a user should know; the first match counts."""
+"""Codes of S3's errors, and classes of exceptions, with what a user should know; codes count first."""
 
 
-def _explained(text: str, place: Place) -> str:
-    line = " ".join(text.split())
-    for pattern, known in _EXPLAINED.items():
-        if re.search(pattern, line):
-            detail = re.search(r"curlCode: \d+, ([^;]*)", line)
-            return known.format(bucket=place.bucket, detail=detail[1] if detail else line)
-    return line
+def _explained(error: BaseException, place: Place) -> str:
+    """What a user should know about an exception; empty if it is not known."""
+    chain: list[BaseException] = []
+    cause: BaseException | None = error
+    while cause is not None:
+        chain.append(cause)
+        cause = cause.__cause__ or cause.__context__
+    answers = [found for one in chain if isinstance(found := getattr(one, "response", None), dict)]
+    codes = [str(found.get("Error", {}).get("Code")) for found in answers]
+    bucket = str(getattr(place.path, "drive", ""))
+    if codes[:1] in (["400"], ["403"]):  # the answer to a HEAD request has no reason; that of a list has
+        try:
+            place.path.fs.ls(f"{bucket}/.bam")
+        except Exception as reason:  # as above
+            codes = [str(getattr(reason.__cause__, "response", {}).get("Error", {}).get("Code")), *codes]
+    names = (*codes, *(kind.__name__ for one in chain for kind in type(one).__mro__))
+    known = next((_EXPLAINED[name] for name in names if name in _EXPLAINED), "")
+    return known.format(bucket=bucket, detail=" ".join(str(error).split()))
+
+
+# Copies on this computer
+
+READ = ("checkpoint", "resume", "policy", "candidate", "champion", "gate", "file", "directory", "recording")
+"""Flags of files that a program reads, which may be at an address."""
+WRITTEN = ("out", "runs", "record")
+"""Flags of what a program writes, which may be at an address; `record` is an .mcap file or the place of a data set,
+which needs no copy."""
+_COPIES: list[_Copy] = []
+
+
+def local_path(text: str | Path) -> Path:
+    """A path on this computer with the same content: of an address, a copy that lasts until the program's end.
+
+    Raises:
+        PlaceError: It cannot be fetched.
+    """
+    place = Place(text)
+    if place.local is not None:
+        return place.local
+    found = next((one for one in _COPIES if one.place == place), None)
+    return (found or _Copy(place)).path
+
+
+@contextlib.contextmanager
+def standing_in(config: Config) -> Iterator[Config]:
+    """Yield the configuration of a program with paths on this computer in place of addresses.
+
+    Raises:
+        PlaceError: A file cannot be fetched or put, or a flag takes no address; what could not be put is kept.
+    """
+    try:
+        changed: dict[str, Any] = {}
+        for name in (one.name for one in dataclasses.fields(config)):  # type: ignore[arg-type]
+            value = getattr(config, name)
+            is_file = isinstance(value, Path) or (name == "record" and str(value).partition("?")[0].endswith(".mcap"))
+            if is_file and _ADDRESS.match(str(value)):
+                place = Place(value)
+                if place.local is None and name not in READ + WRITTEN:
+                    raise PlaceError(place, f"--{name.replace('_', '-')} takes a path on this computer")
+                path = _Copy(place, name).path if place.local is None and name in WRITTEN else local_path(value)
+                changed[name] = str(path) if isinstance(value, str) else path
+        yield dataclasses.replace(config, **changed) if changed else config  # type: ignore[type-var]
+    finally:
+        failures = [error for one in _COPIES if (error := one.close()) is not None]
+        _COPIES.clear()
+        if failures:
+            raise failures[0]
+
+
+def with_addresses(text: str) -> str:
+    """A message that shows addresses instead of the copies on this computer."""
+    for one in _COPIES:
+        text = text.replace(f"{one.folder}/", f"{str(one.above).rstrip('/')}/")
+    return text
+
+
+class _Copy:
+    """A folder on this computer in place of one at an address, which holds the place of a flag, or is it (``--runs``).
+
+    What is read is fetched. Of what is `written`, there is an empty file or folder for each name that is taken, and
+    whether it may be written is known before any work is done.
+    """
+
+    def __init__(self, place: Place, written: str = "") -> None:
+        self.place, self.above = place, place if written == "runs" else place.parent
+        self.folder = Path(tempfile.mkdtemp(prefix="bam-")).resolve()
+        self.path = self.folder if written == "runs" else self.folder / place.name
+        self._known: dict[Path, Any] = {}
+        atexit.register(self._remove)
+        try:
+            if written:
+                self._take_names()
+            else:
+                with place._errors("read"):
+                    place._call("get", str(self.path), recursive=True)
+        except BaseException:
+            self._remove()
+            raise
+        self._known = {path: _state(path) for path in self._files()}
+        _COPIES.append(self)  # a whole one: what was fetched in part must never be put
+
+    def _take_names(self) -> None:
+        with contextlib.suppress(NoSuchPlace):  # as yet
+            for one in self.above.list():
+                taken = self.folder / one.name
+                taken.mkdir() if self.path == self.folder else taken.touch()
+        probe = self.above / ".bam-train"
+        probe.write_bytes(b"")
+        probe.delete()
+
+    def put(self) -> None:
+        """Put what has changed since."""
+        for path in self._files():
+            if self._known.get(path) != (state := _state(path)):
+                target = self.above
+                for part in path.relative_to(self.folder).parts:
+                    target /= part
+                target.put(path)
+                self._known[path] = state
+
+    def close(self) -> PlaceError | None:
+        """Put what is left, and remove the folder; returns an error that says where it is kept instead."""
+        atexit.unregister(self._remove)
+        try:
+            self.put()
+        except PlaceError as error:
+            kept = PlaceError(self.above, f"{error.why.rstrip('.')}. What belongs there is kept in {self.folder}")
+            kept.__cause__ = error
+            return kept
+        self._remove()
+        return None
+
+    def _remove(self) -> None:
+        shutil.rmtree(self.folder, ignore_errors=True)
+
+    def _files(self) -> list[Path]:
+        """What is there, without what is being written, which has a name with a dot at its beginning."""
+        found = (path for path in sorted(self.folder.rglob("*")) if path.is_file())
+        return [one for one in found if not any(p.startswith(".") for p in one.relative_to(self.folder).parts)]
+
+
+def _state(path: Path) -> tuple[int, int]:
+    found = path.stat()
+    return found.st_mtime_ns, found.st_size
+
+
+def _put_replaced(path: Path) -> None:
+    for one in _COPIES:
+        if path.is_relative_to(one.folder):
+            one.put()
+
+
+REPLACED.append(_put_replaced)

@@ -9,14 +9,12 @@
     learning-curve.png  return and success over steps
     traceback.txt       where the code of the environment failed, if it did
 
-`Copies` stores the best checkpoint at an fsspec address too, such as a bucket, in case the computer is lost.
+`Copies` stores the best checkpoint at an address too, such as a bucket, in case the computer is lost.
 """
 
 import contextlib
-import importlib
 import itertools
 import json
-import posixpath
 import shutil
 import tempfile
 import threading
@@ -166,43 +164,18 @@ class Copies:
     """A place to which checkpoints are copied.
 
     Args:
-        url: A `Place` in a bucket, ``s3://bucket/runs/``, or another fsspec address, ``file:///mnt/share/pick.zip``: a
-            file if it ends in ``.zip``, else a folder. Raises OutputError if it is malformed.
+        url: Address of a `Place`: a file if it ends in ``.zip``, else a folder, such as ``s3://bucket/runs/``. Raises
+            OutputError if it is malformed.
     """
 
     def __init__(self, url: str) -> None:
-        self.url = url
         if "://" not in url:
             raise OutputError(f"{url}: --copy-to expects an address, such as s3://bucket/runs/, or a file's: file:///…")
-        self._place = Place(url) if url.startswith(("s3://", "gs://", "gcs://")) else None
-        if self._place is not None:
-            return
-        try:
-            fsspec: Any = importlib.import_module("fsspec.core")
-        except ModuleNotFoundError as error:
-            raise OutputError("--copy-to needs fsspec, which is not installed. Run: pip install fsspec") from error
-        try:
-            self._files, self._path = fsspec.url_to_fs(url)
-        except (ImportError, ValueError) as error:  # a package that is missing, a protocol that is not known
-            raise OutputError(f"{url}: cannot be copied to: {' '.join(str(error).split())}") from error
+        self._place = Place(url)
 
     def copy(self, checkpoint: Path) -> None:
         """Copy a checkpoint there and overwrite an earlier copy; raises OutputError if that fails."""
-        if self._place is not None:
-            (self._place if self._place.suffix == ".zip" else self._place / checkpoint.name).put(checkpoint)
-            return
-        target = self._path if self._path.endswith(".zip") else posixpath.join(self._path, checkpoint.name)
-        try:
-            if "file" not in self._files.protocol:
-                self._files.put_file(str(checkpoint), target)
-                return
-            # A file appears in a bucket when it is complete, in a folder as soon as it is opened.
-            self._files.makedirs(posixpath.dirname(target), exist_ok=True)
-            self._files.put_file(str(checkpoint), f"{target}.tmp")
-            self._files.mv(f"{target}.tmp", target)
-        except Exception as error:  # each kind of storage has its own exceptions
-            why = f"{type(error).__name__}: {' '.join(str(error).split())}"
-            raise OutputError(f"{self.url}: {checkpoint} could not be copied there: {why}") from error
+        (self._place if self._place.suffix == ".zip" else self._place / checkpoint.name).put(checkpoint)
 
 
 class TensorBoardFiles:

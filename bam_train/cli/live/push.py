@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 from bam_train.cli.console import say, tell
 from bam_train.cli.live.ask_agent import SHORT, status_lines, with_agent
 from bam_train.cli.program import run_program
+from bam_train.files.place import local_path
 from bam_train.signals import SignalMemory
 
 if TYPE_CHECKING:
@@ -68,7 +69,7 @@ def _arguments(config: PushConfig) -> tuple[Path | None, str]:
     if first is None or url is None:
         missing = "CHECKPOINT and URL are" if first is None else "CHECKPOINT is" if "://" in first else "URL is"
         raise _misused(f"{missing} missing: bam-push CHECKPOINT URL")
-    return Path(first).expanduser(), url
+    return local_path(first), url
 
 
 def _pass_gate(agent: AgentClient, candidate: Path, champion: Path) -> None:

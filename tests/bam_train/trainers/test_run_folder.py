@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import shutil
-import sys
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -125,18 +124,20 @@ def test_under_a_name_of_its_own_and_into_a_bucket(checkpoint, tmp_path, fsspec)
 
 
 def test_a_copy_that_cannot_be_made(checkpoint, tmp_path):
-    url = f"file://{checkpoint}/in/a/file"
     with pytest.raises(OutputError) as caught:
-        Copies(url).copy(checkpoint)
-    assert str(caught.value).startswith(f"{url}: {checkpoint} could not be copied there: NotADirectoryError: ")
-    assert "\n" not in str(caught.value)
+        Copies(f"file://{checkpoint}/in/a/file").copy(checkpoint)
+    where = checkpoint / "in/a/file/pick-ppo.zip"
+    assert str(caught.value) == f"{where}: cannot be written: Not a directory. Check its permissions"
 
 
 @pytest.mark.parametrize(
     ("url", "text"),
     [
         ("/mnt/share", "/mnt/share: --copy-to expects an address, such as s3://bucket/runs/, or a file's: file:///…"),
-        ("nowhere://x/", "nowhere://x/: cannot be copied to: Protocol not known: nowhere"),
+        (
+            "nowhere://x/",
+            "nowhere://x/: nowhere:// is unknown. Give a path, or an address that fsspec knows, such as s3:// or gs://",
+        ),
     ],
 )
 def test_addresses_that_cannot_be(fsspec, url, text):
@@ -145,25 +146,9 @@ def test_addresses_that_cannot_be(fsspec, url, text):
     assert str(caught.value) == text
 
 
-def test_without_fsspec(monkeypatch):
-    monkeypatch.setitem(sys.modules, "fsspec.core", None)
-    with pytest.raises(
-        OutputError, match=r"^--copy-to needs fsspec, which is not installed\. Run: pip install fsspec$"
-    ):
-        Copies("abfs://bucket/")
-
-
-def test_a_kind_of_address_whose_package_is_missing(fsspec, monkeypatch):
-    monkeypatch.setitem(sys.modules, "adlfs", None)
-    with pytest.raises(OutputError, match=r"^abfs://bucket/: cannot be copied to: .*adlfs"):
-        Copies("abfs://bucket/")
-
-
 def test_into_a_bucket_of_s3(checkpoint, bucket):
     for url in (f"{bucket}/runs/", f"{bucket}/best.zip"):
         Copies(url).copy(checkpoint)
     assert (Place(bucket) / "runs" / "pick-ppo.zip").read_bytes() == (Place(bucket) / "best.zip").read_bytes() == b"one"
-    with pytest.raises(
-        OutputError, match=r"^s3://none-such/pick-ppo\.zip: cannot be written: there is no bucket none-such\."
-    ):
+    with pytest.raises(OutputError, match=r"^s3://none-such/pick-ppo\.zip: there is no bucket none-such\."):
         Copies("s3://none-such").copy(checkpoint)
