@@ -115,7 +115,7 @@ class Files:
 
     def write(self, name: str, content: bytes) -> None:
         """Replace a file."""
-        (self.root / name).write_bytes(content)
+        (self.root / name).write(content)
 
     def write_json(self, name: str, value: dict[str, Any]) -> None:
         """Replace a JSON file."""
@@ -185,7 +185,7 @@ class WriterLock:
             who = self._note.read_bytes().decode() if self._note.exists() else ""
             if who and _may_live(who):
                 self._refuse(who, f". If that has ended: remove {self._note}")
-            self._note.write_bytes(me.encode())
+            self._note.write(me.encode())
         else:
             self._file = self._locked(self._note.local)
             self._file.truncate(0)

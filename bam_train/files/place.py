@@ -16,12 +16,13 @@ from __future__ import annotations
 
 import atexit
 import contextlib
-import dataclasses
 import re
 import shutil
 import tempfile
 from collections.abc import Iterator
-from pathlib import Path, PurePosixPath
+from copy import copy
+from dataclasses import dataclass, field, fields, replace
+from pathlib import Path, PurePath, PurePosixPath
 from typing import IO, Any, TypeVar, cast
 from urllib.parse import parse_qsl, urlsplit
 from urllib.request import url2pathname
@@ -41,35 +42,37 @@ _OPTIONS = {"endpoint_override": "endpoint_url", "region": "region_name"}
 _ADDRESS = re.compile(r"([A-Za-z][A-Za-z0-9+.-]+):/")
 
 
+@dataclass(init=False, unsafe_hash=True)
 class Place:
-    """A file or folder, here or at an address; immutable, and equal to another one of the same path.
+    """A file or folder, here or at an address; equal to another one of the same path.
 
     Args:
         text: A path (``~`` is expanded), or an address.
-        path: What `path` is, if it is known.
 
     Raises:
         PlaceError: An address that nothing can be read from, or whose package is not installed.
     """
 
-    __slots__ = ("path", "text")
-
-    text: str
+    text: str = field(compare=False)
     """What the user gave."""
-    path: Any
-    """A `pathlib.Path` on this computer, or else a `upath.UPath`."""
+    path: PurePath
+    """A `pathlib.Path` on this computer, or else the path that `files` knows, ``bucket/key``."""
+    files: Any
+    """The `fsspec` file system that has an address; None on this computer."""
 
-    def __init__(self, text: str | Path | Place, path: Any = None) -> None:
+    def __init__(self, text: str | Path | Place) -> None:
         # A Path has made one slash of two
-        self.text = re.sub(r"(?i)(?<!file)(?<=\w\w):/(?!/)", "://", str(text)) if isinstance(text, Path) else str(text)
+        is_path = isinstance(text, Path)
+        self.text = re.sub(r"(?i)(?<!file)(?<=\w\w):/(?!/)", "://", str(text)) if is_path else str(text)
         found = _ADDRESS.match(self.text)
         scheme = found[1].lower() if found else ""
-        if path is not None or isinstance(text, Place):
-            self.path = text.path if isinstance(text, Place) else path
+        if isinstance(text, Place):
+            self.path, self.files = text.path, text.files
         elif scheme in ("", "file"):
-            self.path = (_file_path(self.text) if scheme else Path(self.text)).expanduser()
+            self.path, self.files = (_file_path(self.text) if scheme else Path(self.text)).expanduser(), None
         else:
-            self.path = _at_address(self, scheme)
+            self.files, path = _at_address(self, scheme)
+            self.path = PurePosixPath(path)
 
     @property
     def local(self) -> Path | None:
@@ -79,32 +82,28 @@ class Place:
     @property
     def name(self) -> str:
         """The last part."""
-        return str(self.path.name)
+        return self.path.name
 
     @property
     def suffix(self) -> str:
         """Suffix of the last part, such as ``.zip``."""
-        return str(self.path.suffix)
+        return self.path.suffix
 
     @property
     def parent(self) -> Place:
-        """The folder that holds this place; a bucket is its own."""
-        return Place(str(self.path.parent), self.path.parent)
+        """The folder that holds this place."""
+        return self._with(self.path.parent)
 
     def __truediv__(self, name: str) -> Place:
-        return Place(str(self.path / name), self.path / name)
+        return self._with(self.path / name)
 
     def __str__(self) -> str:
         return self.text
 
-    def __repr__(self) -> str:
-        return f"Place({self.text!r})"
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, Place) and self.path == other.path
-
-    def __hash__(self) -> int:
-        return hash(str(self.path))
+    def _with(self, path: PurePath) -> Place:
+        other = copy(self)
+        other.path, other.text = path, str(path if self.files is None else self.files.unstrip_protocol(str(path)))
+        return other
 
     # What is there
 
@@ -119,7 +118,7 @@ class Place:
     def size(self) -> int:
         """Size of the file [bytes]."""
         with self._errors("read"):
-            return int(self.path.stat().st_size if self.local is not None else self._call("info")["size"])
+            return int(self.local.stat().st_size if self.local is not None else self._call("info")["size"])
 
     def list(self) -> list[Place]:
         """What is in the folder, by name; raises NoSuchPlace if there is no folder."""
@@ -127,7 +126,7 @@ class Place:
             if self.local is not None:
                 return [self / path.name for path in sorted(self.local.iterdir())]
             found = {path.rstrip("/") for path in self._call("ls", detail=False)}
-            found.discard(self.path.path.rstrip("/"))  # an empty object that marks the folder
+            found.discard(str(self.path))  # an empty object that marks the folder
             return [self / PurePosixPath(path).name for path in sorted(found)]
 
     def _kind(self) -> str:
@@ -139,44 +138,38 @@ class Place:
 
     def _call(self, method: str, *arguments: Any, **options: Any) -> Any:
         """Call a method of the file system that has this address."""
-        return getattr(self.path.fs, method)(self.path.path, *arguments, **options)
+        return getattr(self.files, method)(str(self.path), *arguments, **options)
 
-    # Reading
+    # Reading and writing
 
     def open_input(self) -> IO[bytes]:
-        """Open the file for reading, with `seek`; only what is read is transferred.
+        """Open the file at an address for reading, with `seek`; only what is read is transferred.
 
         Raises:
             NoSuchPlace: There is no such file.
             PlaceError: It cannot be read.
         """
         with self._errors("read"):
-            if self.local is not None:
-                return self.local.open("rb")
             return cast("IO[bytes]", _Reading(self, self._call("open", "rb", cache_type="none")))
 
     def read_bytes(self) -> bytes:
         """Everything in the file; raises as `open_input`."""
         with self._errors("read"):
-            return bytes(self.path.read_bytes() if self.local is not None else self._call("cat_file"))
+            return self.local.read_bytes() if self.local is not None else bytes(self._call("cat_file"))
 
-    def write_bytes(self, data: bytes) -> None:
-        """Make this file hold `data`, in one step; missing folders are made, a missing bucket is not."""
-        with self._errors("written"):
-            if self.local is None:
-                self._call("pipe_file", data)
-                return
-            with replacing(self.local) as path:
-                path.write_bytes(data)
+    def write(self, content: bytes | Path) -> None:
+        """Make this file hold bytes, or what the file at a path holds, in one step.
 
-    def put(self, path: Path) -> None:
-        """Make this file a copy of the one at `path`, as `write_bytes`."""
+        Missing folders are made; a missing bucket is not.
+        """
         with self._errors("written"):
-            if self.local is None:
-                self.path.fs.put_file(str(path), self.path.path)
-                return
-            with replacing(self.local) as temporary:
-                shutil.copyfile(path, temporary)
+            if self.local is not None:
+                with replacing(self.local) as path:
+                    path.write_bytes(content) if isinstance(content, bytes) else shutil.copyfile(content, path)
+            elif isinstance(content, bytes):
+                self._call("pipe_file", content)
+            else:
+                self.files.put_file(str(content), str(self.path))
 
     def delete(self) -> None:
         """Remove the file."""
@@ -195,7 +188,7 @@ class Place:
             raise NoSuchPlace(self, why or "no such file or folder. Check the name") from error
         except Exception as error:  # each kind of service has its own exceptions
             if self.local is None:
-                why = _explained(error, self) or " ".join(f"{type(error).__name__}: {error}".split())
+                why = _explained(error, self) or _line(error)
                 raise PlaceError(self, f"cannot be {done}: {why}") from error
             if not isinstance(error, OSError):
                 raise
@@ -215,12 +208,6 @@ class _Reading:
     def __getattr__(self, name: str) -> Any:
         return getattr(self._file, name)
 
-    def __enter__(self) -> _Reading:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._file.close()
-
 
 def _file_path(text: str) -> Path:
     parts = urlsplit(text)
@@ -229,8 +216,8 @@ def _file_path(text: str) -> Path:
     return Path(url2pathname(parts.path))
 
 
-def _at_address(place: Place, scheme: str) -> Any:
-    """The `upath.UPath` of an address."""
+def _at_address(place: Place, scheme: str) -> tuple[Any, str]:
+    """The `fsspec` file system of an address, and the path that it knows."""
     address, _, query = place.text.partition("?")
     bucket = address[len(scheme) :].removeprefix("://").partition("/")[0]
     if "@" in bucket:
@@ -248,18 +235,19 @@ def _at_address(place: Place, scheme: str) -> Any:
         found = {_OPTIONS[name]: value for name, value in given.items()}
         options = {"client_kwargs": found, "config_kwargs": {**waits, **tries}, "use_listings_cache": False}
     try:
-        from fsspec import get_filesystem_class
-        from upath import UPath
+        from fsspec import available_protocols, url_to_fs
 
-        get_filesystem_class(scheme)
-        return UPath(address if scheme == "s3" else place.text, **options)
+        files, path = url_to_fs(address if scheme == "s3" else place.text, **options)
+        return files, str(path)
     except ImportError as error:
         missing = error if isinstance(error, ModuleNotFoundError) else error.__cause__
         package = str(getattr(missing, "name", None) or "a package").partition(".")[0]
-        what = '"bam-train[data]"' if package in ("fsspec", "s3fs", "upath") else package
+        what = '"bam-train[data]"' if package in ("fsspec", "s3fs") else package
         raise PlaceError(place, f"needs {package}, which is not installed. Run: pip install {what}") from error
-    except ValueError as error:
+    except Exception as error:  # each kind of service has its own
         text = f"{scheme}:// is unknown. Give a path, or an address that fsspec knows, such as s3:// or gs://"
+        if scheme in available_protocols():
+            text = f"cannot be opened: {_line(error)}"
         raise PlaceError(place, text) from error
 
 
@@ -286,6 +274,10 @@ _EXPLAINED = {
 """Codes of S3's errors, and classes of exceptions, with what a user should know; codes count first."""
 
 
+def _line(error: Exception) -> str:
+    return " ".join(f"{type(error).__name__}: {error}".split())
+
+
 def _explained(error: BaseException, place: Place) -> str:
     """What a user should know about an exception; empty if it is not known."""
     chain: list[BaseException] = []
@@ -295,10 +287,10 @@ def _explained(error: BaseException, place: Place) -> str:
         cause = cause.__cause__ or cause.__context__
     answers = [found for one in chain if isinstance(found := getattr(one, "response", None), dict)]
     codes = [str(found.get("Error", {}).get("Code")) for found in answers]
-    bucket = str(getattr(place.path, "drive", ""))
+    bucket = place.path.parts[0]
     if codes[:1] in (["400"], ["403"]):  # the answer to a HEAD request has no reason; that of a list has
         try:
-            place.path.fs.ls(f"{bucket}/.bam")
+            place.files.ls(f"{bucket}/.bam")
         except Exception as reason:  # as above
             codes = [str(getattr(reason.__cause__, "response", {}).get("Error", {}).get("Code")), *codes]
     names = (*codes, *(kind.__name__ for one in chain for kind in type(one).__mro__))
@@ -338,7 +330,7 @@ def standing_in(config: Config) -> Iterator[Config]:
     """
     try:
         changed: dict[str, Any] = {}
-        for name in (one.name for one in dataclasses.fields(config)):  # type: ignore[arg-type]
+        for name in (one.name for one in fields(config)):  # type: ignore[arg-type]
             value = getattr(config, name)
             is_file = isinstance(value, Path) or (name == "record" and str(value).partition("?")[0].endswith(".mcap"))
             if is_file and _ADDRESS.match(str(value)):
@@ -347,7 +339,7 @@ def standing_in(config: Config) -> Iterator[Config]:
                     raise PlaceError(place, f"--{name.replace('_', '-')} takes a path on this computer")
                 path = _Copy(place, name).path if place.local is None and name in WRITTEN else local_path(value)
                 changed[name] = str(path) if isinstance(value, str) else path
-        yield dataclasses.replace(config, **changed) if changed else config  # type: ignore[type-var]
+        yield replace(config, **changed) if changed else config  # type: ignore[type-var]
     finally:
         failures = [error for one in _COPIES if (error := one.close()) is not None]
         _COPIES.clear()
@@ -373,7 +365,6 @@ class _Copy:
         self.place, self.above = place, place if written == "runs" else place.parent
         self.folder = Path(tempfile.mkdtemp(prefix="bam-")).resolve()
         self.path = self.folder if written == "runs" else self.folder / place.name
-        self._known: dict[Path, Any] = {}
         atexit.register(self._remove)
         try:
             if written:
@@ -384,7 +375,7 @@ class _Copy:
         except BaseException:
             self._remove()
             raise
-        self._known = {path: _state(path) for path in self._files()}
+        self._known = self._states()
         _COPIES.append(self)  # a whole one: what was fetched in part must never be put
 
     def _take_names(self) -> None:
@@ -393,17 +384,14 @@ class _Copy:
                 taken = self.folder / one.name
                 taken.mkdir() if self.path == self.folder else taken.touch()
         probe = self.above / ".bam-train"
-        probe.write_bytes(b"")
+        probe.write(b"")
         probe.delete()
 
     def put(self) -> None:
         """Put what has changed since."""
-        for path in self._files():
-            if self._known.get(path) != (state := _state(path)):
-                target = self.above
-                for part in path.relative_to(self.folder).parts:
-                    target /= part
-                target.put(path)
+        for path, state in self._states().items():
+            if self._known.get(path) != state:
+                (self.above / path.relative_to(self.folder).as_posix()).write(path)
                 self._known[path] = state
 
     def close(self) -> PlaceError | None:
@@ -421,15 +409,11 @@ class _Copy:
     def _remove(self) -> None:
         shutil.rmtree(self.folder, ignore_errors=True)
 
-    def _files(self) -> list[Path]:
-        """What is there, without what is being written, which has a name with a dot at its beginning."""
+    def _states(self) -> dict[Path, tuple[int, int]]:
+        """Each file's state, without files that are being written, which have names with a dot at the beginning."""
         found = (path for path in sorted(self.folder.rglob("*")) if path.is_file())
-        return [one for one in found if not any(p.startswith(".") for p in one.relative_to(self.folder).parts)]
-
-
-def _state(path: Path) -> tuple[int, int]:
-    found = path.stat()
-    return found.st_mtime_ns, found.st_size
+        whole = [one for one in found if not any(p.startswith(".") for p in one.relative_to(self.folder).parts)]
+        return {path: (state.st_mtime_ns, state.st_size) for path in whole for state in [path.stat()]}
 
 
 def _put_replaced(path: Path) -> None:

@@ -175,7 +175,7 @@ class Copies:
 
     def copy(self, checkpoint: Path) -> None:
         """Copy a checkpoint there and overwrite an earlier copy; raises OutputError if that fails."""
-        (self._place if self._place.suffix == ".zip" else self._place / checkpoint.name).put(checkpoint)
+        (self._place if self._place.suffix == ".zip" else self._place / checkpoint.name).write(checkpoint)
 
 
 class TensorBoardFiles:

@@ -61,7 +61,7 @@ def import_(config: ImportConfig) -> None:
     env_kwargs = read_env_kwargs(config.set)
     for path in config.recordings:
         if recordings.is_rows(path):
-            if os.path.abspath(str(Place(path).path)) == os.path.abspath(str(Place(config.place).path)):
+            if os.path.abspath(Place(path).path) == os.path.abspath(Place(config.place).path):
                 raise SettingsError(f"{config.place}: has the Parquet rows; give another PLACE for the data set")
             info = recordings.info_of_rows(path, config.env, env_kwargs)
             episodes = recordings.episodes_of_rows(path, info)

@@ -69,7 +69,7 @@ def test_damage_in_a_bucket_is_mended(bucket):
         write(place, [number])
     whole = {one: (place / one).read_bytes() for one in ("meta/info.json", "meta/bam.json")}
     name = "meta/episodes/chunk-000/file-001.parquet"
-    (place / name).write_bytes(b"PAR1")
+    (place / name).write(b"PAR1")
     (place / "meta/bam.json").delete()
     assert mend(Files(place)).problems == ["meta/bam.json is missing", f"{name} is not as it was written"]
     assert [one.facts["seed"] for one in DataSet.open(place)] == [0, 1, 2]

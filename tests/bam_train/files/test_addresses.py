@@ -56,7 +56,7 @@ def names(place):
 
 
 def test_a_checkpoint_in_a_bucket_is_evaluated_signed_and_verified(bucket, run, tmp_path):
-    Place(f"{bucket}/reach.zip").put(SHIPPED)
+    Place(f"{bucket}/reach.zip").write(SHIPPED)
     status, out, _ = run(eval.main, f"{bucket}/reach.zip", "--episodes", 2, "--json")
     assert (status, json.loads(out)["checkpoint"]) == (0, f"{bucket}/reach.zip")
     assert run(sign.main, "keygen", tmp_path / "me.key", "--name", "me")[0] == 0
@@ -125,7 +125,7 @@ def test_what_cannot_be_put_at_the_end_is_kept(bucket):
                 config.out.write_bytes(b"picture")
                 proxy.cuts = 10**6
 
-        kept = r"^s3://bam-lab/: cannot be written: no connection .*\. What belongs there is kept in /\S+$"
+        kept = r"^s3://bam-lab: cannot be written: no connection .*\. What belongs there is kept in /\S+$"
         with pytest.raises(PlaceError, match=kept) as caught:
             write(f"{bucket}/plot.png?endpoint_override={proxy.endpoint}")
     kept = Path(str(caught.value).rpartition(" ")[2])
@@ -134,7 +134,7 @@ def test_what_cannot_be_put_at_the_end_is_kept(bucket):
 
 
 def test_what_was_fetched_in_part_is_never_put(bucket, run):
-    Place(f"{bucket}/whole.zip").put(SHIPPED)
+    Place(f"{bucket}/whole.zip").write(SHIPPED)
     service = urlsplit(os.environ["AWS_ENDPOINT_URL"])
     with Proxy((service.hostname, service.port), after=20_000, cuts=10**6) as proxy:
         status, _, err = run(eval.main, f"{bucket}/whole.zip?endpoint_override={proxy.endpoint}")
