@@ -50,7 +50,7 @@ from bam_train.environments import first_difference, short_json
 from bam_train.errors import BadDataSet, PlaceError
 from bam_train.files.place import Place
 
-MOST_BYTES = 2**26
+MOST_BYTES = 2**24
 """Bytes of a file that are in memory together, unless one episode has more."""
 
 

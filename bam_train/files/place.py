@@ -102,8 +102,14 @@ class Place:
 
     def _with(self, path: PurePath) -> Place:
         other = copy(self)
-        other.path, other.text = path, str(path if self.files is None else self.files.unstrip_protocol(str(path)))
+        other.path = path
+        other.text = str(path) if self.files is None else self.files.unstrip_protocol(other._key)
         return other
+
+    @property
+    def _key(self) -> str:
+        """The path as `files` has it."""
+        return re.sub(r"^(https?):/", r"\1://", str(self.path))
 
     # What is there
 
@@ -138,7 +144,7 @@ class Place:
 
     def _call(self, method: str, *arguments: Any, **options: Any) -> Any:
         """Call a method of the file system that has this address."""
-        return getattr(self.files, method)(str(self.path), *arguments, **options)
+        return getattr(self.files, method)(self._key, *arguments, **options)
 
     # Reading and writing
 
@@ -169,7 +175,7 @@ class Place:
             elif isinstance(content, bytes):
                 self._call("pipe_file", content)
             else:
-                self.files.put_file(str(content), str(self.path))
+                self.files.put_file(str(content), self._key)
 
     def delete(self) -> None:
         """Remove the file."""
@@ -306,6 +312,8 @@ WRITTEN = ("out", "runs", "record")
 """Flags of what a program writes, which may be at an address; `record` is an .mcap file or the place of a data set,
 which needs no copy."""
 _COPIES: list[_Copy] = []
+_ADDRESSES: dict[str, str] = {}
+"""Folders of copies, and the addresses for which they stand; also of copies that have been removed."""
 
 
 def local_path(text: str | Path) -> Path:
@@ -332,7 +340,8 @@ def standing_in(config: Config) -> Iterator[Config]:
         changed: dict[str, Any] = {}
         for name in (one.name for one in fields(config)):  # type: ignore[arg-type]
             value = getattr(config, name)
-            is_file = isinstance(value, Path) or (name == "record" and str(value).partition("?")[0].endswith(".mcap"))
+            is_recording = name == "record" and str(value).partition("?")[0].endswith(".mcap")
+            is_file = isinstance(value, Path) or name == "profile" or is_recording
             if is_file and _ADDRESS.match(str(value)):
                 place = Place(value)
                 if place.local is None and name not in READ + WRITTEN:
@@ -349,8 +358,8 @@ def standing_in(config: Config) -> Iterator[Config]:
 
 def with_addresses(text: str) -> str:
     """A message that shows addresses instead of the copies on this computer."""
-    for one in _COPIES:
-        text = text.replace(f"{one.folder}/", f"{str(one.above).rstrip('/')}/")
+    for folder, address in _ADDRESSES.items():
+        text = text.replace(folder, address)
     return text
 
 
@@ -365,13 +374,14 @@ class _Copy:
         self.place, self.above = place, place if written == "runs" else place.parent
         self.folder = Path(tempfile.mkdtemp(prefix="bam-")).resolve()
         self.path = self.folder if written == "runs" else self.folder / place.name
+        _ADDRESSES[f"{self.folder}/"] = f"{str(self.above).rstrip('/')}/"
         atexit.register(self._remove)
         try:
             if written:
                 self._take_names()
             else:
                 with place._errors("read"):
-                    place._call("get", str(self.path), recursive=True)
+                    place._call("get", str(self.path), recursive=place.is_dir())
         except BaseException:
             self._remove()
             raise
@@ -400,6 +410,7 @@ class _Copy:
         try:
             self.put()
         except PlaceError as error:
+            del _ADDRESSES[f"{self.folder}/"]
             kept = PlaceError(self.above, f"{error.why.rstrip('.')}. What belongs there is kept in {self.folder}")
             kept.__cause__ = error
             return kept

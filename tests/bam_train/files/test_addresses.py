@@ -88,6 +88,11 @@ def test_training_in_a_bucket_and_going_on_from_there(bucket, run, corridor, tmp
 @pytest.mark.parametrize(
     ("main", "flags", "message"),
     [
+        (
+            train.main,
+            ["--env", "bam/reach", "--out", "{bucket}/x"],
+            "bam-train: {bucket}/x: expected a file name that ",
+        ),
         (eval.main, ["{bucket}/none.zip"], "bam-eval: {bucket}/none.zip: no such file or folder. Check the name"),
         (replay.main, ["s3://none-such/a.mcap"], "bam-replay: s3://none-such/a.mcap: there is no bucket none-such. "),
         (
