@@ -25,7 +25,6 @@ from dataclasses import dataclass, field, fields, replace
 from pathlib import Path, PurePath, PurePosixPath
 from typing import IO, Any, TypeVar, cast
 from urllib.parse import parse_qsl, urlsplit
-from urllib.request import url2pathname
 
 from bam_train.errors import NoSuchPlace, PlaceError
 from bam_train.files.atomic_file import REPLACED, replacing
@@ -216,6 +215,8 @@ class _Reading:
 
 
 def _file_path(text: str) -> Path:
+    from urllib.request import url2pathname  # imports much
+
     parts = urlsplit(text)
     if parts.netloc not in ("", "localhost") or not parts.path.startswith("/"):
         raise PlaceError(text, "expected file:///FOLDER/NAME, a path on this computer")
@@ -225,11 +226,11 @@ def _file_path(text: str) -> Path:
 def _at_address(place: Place, scheme: str) -> tuple[Any, str]:
     """The `fsspec` file system of an address, and the path that it knows."""
     address, _, query = place.text.partition("?")
-    bucket = address[len(scheme) :].removeprefix("://").partition("/")[0]
-    if "@" in bucket:
+    separator, rest = address[len(scheme) :][:3], address[len(scheme) + 3 :]
+    if "@" in rest.partition("/")[0]:
         place.text = f"{scheme}://...@{address.partition('@')[2]}"  # no secret in a message
         raise PlaceError(place, "holds credentials. Give them in the environment or in ~/.aws instead")
-    if not address[len(scheme) :].startswith("://") or not bucket:
+    if separator != "://" or not rest.strip("/"):
         raise PlaceError(place, f"expected {scheme}://BUCKET/NAME. Give the name of a bucket after {scheme}://")
     given: dict[str, str] = dict(parse_qsl(query, keep_blank_values=True)) if scheme == "s3" else {}
     if unknown := sorted(given.keys() - _OPTIONS.keys()):
@@ -319,14 +320,18 @@ _ADDRESSES: dict[str, str] = {}
 def local_path(text: str | Path) -> Path:
     """A path on this computer with the same content: of an address, a copy that lasts until the program's end.
 
+    A file that was replaced since is fetched again.
+
     Raises:
         PlaceError: It cannot be fetched.
     """
     place = Place(text)
     if place.local is not None:
         return place.local
-    found = next((one for one in _COPIES if one.place == place), None)
-    return (found or _Copy(place)).path
+    with place._errors("read"):
+        version = place._call("ukey")
+    found = (one.path for one in _COPIES if (one.place, one.version) == (place, version))
+    return next(found, None) or _Copy(place, version=version).path
 
 
 @contextlib.contextmanager
@@ -370,8 +375,9 @@ class _Copy:
     whether it may be written is known before any work is done.
     """
 
-    def __init__(self, place: Place, written: str = "") -> None:
-        self.place, self.above = place, place if written == "runs" else place.parent
+    def __init__(self, place: Place, written: str = "", version: str = "") -> None:
+        self.place, self.version = place, version
+        self.above = place if written == "runs" else place.parent
         self.folder = Path(tempfile.mkdtemp(prefix="bam-")).resolve()
         self.path = self.folder if written == "runs" else self.folder / place.name
         _ADDRESSES[f"{self.folder}/"] = f"{str(self.above).rstrip('/')}/"

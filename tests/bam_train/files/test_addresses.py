@@ -90,7 +90,7 @@ def test_training_in_a_bucket_and_going_on_from_there(bucket, run, corridor, tmp
     [
         (
             train.main,
-            ["--env", "bam/reach", "--out", "{bucket}/x"],
+            ["--env", "bam/reach", "--algo", "ppo", "--out", "{bucket}/x"],
             "bam-train: {bucket}/x: expected a file name that ",
         ),
         (eval.main, ["{bucket}/none.zip"], "bam-eval: {bucket}/none.zip: no such file or folder. Check the name"),

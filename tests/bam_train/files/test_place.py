@@ -39,7 +39,11 @@ def test_files_of_any_place(folder):
         stream = file.open_input()
         assert (stream.seek(1), stream.read(3), stream.tell()) == (1, b"ell", 4)
         stream.close()
-    assert (local_path(str(folder)) / "a" / "one.txt").read_text() == "hello"
+    copy = local_path(str(folder / "a" / "one.txt"))
+    assert local_path(file.text) == copy
+    file.write(b"another")
+    assert local_path(str(file)).read_text() == "another"
+    assert (local_path(str(folder)) / "a" / "one.txt").read_text() == "another"
     file.delete()
     assert not file.exists()
 
