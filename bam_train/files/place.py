@@ -227,7 +227,7 @@ def _at_address(place: Place, scheme: str) -> tuple[Any, str]:
     """The `fsspec` file system of an address, and the path that it knows."""
     address, _, query = place.text.partition("?")
     separator, rest = address[len(scheme) :][:3], address[len(scheme) + 3 :]
-    if "@" in rest.partition("/")[0]:
+    if ":" in rest.partition("/")[0].rpartition("@")[0]:
         place.text = f"{scheme}://...@{address.partition('@')[2]}"  # no secret in a message
         raise PlaceError(place, "holds credentials. Give them in the environment or in ~/.aws instead")
     if separator != "://" or not rest.strip("/"):

@@ -83,6 +83,10 @@ def test_training_in_a_bucket_and_going_on_from_there(bucket, run, corridor, tmp
     assert str(tmp_path) not in out + err
     assert (names(f"{bucket}/out"), names(f"{bucket}/runs")) == (["c-2.zip", "c.zip"], [first, f"{first}-2"])
     assert Checkpoint.open(f"{bucket}/out/c-2.zip").manifest.steps == 96
+    status, out, err = run(train.main, *new, "--steps", 64, "--start", f"{bucket}/out/c.zip", "--print-config")
+    assert (status, json.loads(out)["start"]) == (0, f"{bucket}/out/c.zip"), err
+    status, _, err = run(train.main, *new, "--steps", 64, "--start", f"{bucket}/c.zip")
+    assert (status, err) == (1, f"bam-train: {bucket}/c.zip: no such file or folder. Check the name\n")
 
 
 @pytest.mark.parametrize(
