@@ -232,15 +232,15 @@ def _at_address(place: Place, scheme: str) -> tuple[Any, str]:
         raise PlaceError(place, "holds credentials. Give them in the environment or in ~/.aws instead")
     if separator != "://" or not rest.strip("/"):
         raise PlaceError(place, f"expected {scheme}://BUCKET/NAME. Give the name of a bucket after {scheme}://")
-    given: dict[str, str] = dict(parse_qsl(query, keep_blank_values=True)) if scheme == "s3" else {}
-    if unknown := sorted(given.keys() - _OPTIONS.keys()):
-        raise PlaceError(place, f"unknown option {unknown[0]}; there are {' and '.join(_OPTIONS)}")
     options: dict[str, Any] = {}
     if scheme == "s3":
-        waits = {"connect_timeout": CONNECT_TIMEOUT, "read_timeout": REQUEST_TIMEOUT}
-        tries = {"retries": {"mode": "standard", "total_max_attempts": ATTEMPTS}}
+        given = dict(parse_qsl(query, keep_blank_values=True))
+        if unknown := sorted(given.keys() - _OPTIONS.keys()):
+            raise PlaceError(place, f"unknown option {unknown[0]}; there are {' and '.join(_OPTIONS)}")
+        waits: dict[str, Any] = {"connect_timeout": CONNECT_TIMEOUT, "read_timeout": REQUEST_TIMEOUT}
+        waits["retries"] = {"mode": "standard", "total_max_attempts": ATTEMPTS}
         found = {_OPTIONS[name]: value for name, value in given.items()}
-        options = {"client_kwargs": found, "config_kwargs": {**waits, **tries}, "use_listings_cache": False}
+        options = {"client_kwargs": found, "config_kwargs": waits, "use_listings_cache": False}
     try:
         from fsspec import available_protocols, url_to_fs
 
