@@ -9,6 +9,7 @@ Longer than most files: it is one object with one state, and every request that 
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import threading
 import time
@@ -32,7 +33,7 @@ from bam_train.agent.versions import Versions
 from bam_train.checkpoint import Checkpoint
 from bam_train.deploy.deployment import StopSwitch, fault_text
 from bam_train.deploy.journal import EpisodeRecord
-from bam_train.errors import BamTrainError, ContractRefused, PolicyError, RequestRefused
+from bam_train.errors import BadTrials, BamTrainError, ContractRefused, PolicyError, RequestRefused
 
 if TYPE_CHECKING:
     from bam_train.agent.audit import Audit
@@ -115,6 +116,7 @@ class Resident:
         self._command: Drive | None = None
         self._is_running, self._quitting = is_running, False
         self._stopped = self._paused = ""  # why, once a guard stopped the robot, and once a person or a fault paused it
+        self._last_stop = ""  # why a guard stopped the robot, until a person resumes it
         self._was_connected = self._holds = self._was_cut_short = False
         self._seed, self._reported = options.seed, 0.0
         self._episodes: deque[int | None] = deque(maxlen=_RECENT_EPISODES)
@@ -349,7 +351,12 @@ class Resident:
         before = self.succession.active
         replaced = self.succession.activate(choice)
         if self.session is not None:
-            self.session.deployment.swap(choice.policy)
+            deployment = self.session.deployment
+            if deployment.trials is not None:
+                with contextlib.suppress(BadTrials):  # then the episode counts for the version that began it
+                    deployment.trials.end(False, f"another version acts: {choice.why}", void=True)
+            deployment.trials = self.succession.trials()  # an episode on its way to its start is one of this version
+            deployment.swap(choice.policy)
         self._stage = choice.stage or self._stage
         after = choice.version.digest[:12]
         self.note("swap", f"{after} acts instead of {before.digest[:12]}: {choice.why}", choice.who)
@@ -488,7 +495,8 @@ class Resident:
         if self.driver is not None:
             self._end_driving(self.driver, text)
         if stopped:  # also by the age of its state: only a person lets it move again
-            self._stopped, self._is_running = text, False
+            self._stopped = self._last_stop = text
+            self._is_running = False
             self._change(State.STOPPED, text)
         elif isinstance(error, (LinkLost, RemoteError, NotReady)):  # or somebody else drives: it goes on when it can
             self._change(State.WAITING, text)
@@ -506,7 +514,9 @@ class Resident:
     def _pause(self, who: str, address: str, why: str = "") -> dict[str, Any]:
         self.halt()
         self._is_running, self._stopped = False, ""
-        self._paused = f"paused by {who}{f': {why}' if why else ''}"
+        self._paused = (
+            f"paused by {who}{f': {why}' if why else ''}{f'; before that: {self._last_stop}' * bool(self._last_stop)}"
+        )
         if self.driver is not None:
             self._end_driving(self.driver, f"paused by {who}")
         if self.session is None:
@@ -520,9 +530,9 @@ class Resident:
             raise RequestRefused(
                 f"{self.driver.who} drives the robot; take it back first, or wait until it is handed back"
             )
-        if self._stopped:
-            self.note("resume", f"{who} lets the robot move again after: {self._stopped}", who, address)
-        self._stopped, self._paused, self._is_running = "", "", True
+        if self._last_stop:
+            self.note("resume", f"{who} lets the robot move again after: {self._last_stop}", who, address)
+        self._stopped, self._last_stop, self._paused, self._is_running = "", "", "", True
         text = f"resumed by {who}{f': {why}' if why else ''}"
         if self.session is None:
             self.note("resume", text, who, address)
@@ -562,7 +572,7 @@ class Resident:
         self._end_driving(driver, text)
         self._is_running = goes_on
         if goes_on:
-            self._paused = ""
+            self._paused = self._last_stop = ""
             self._change(self._driving, text, who, address)
         else:
             self._change(State.PAUSED, "; ".join(filter(None, (text, self._paused))), who, address)
@@ -582,7 +592,11 @@ class Resident:
         signals.pop("object_pose", None)
         if pose is not None:
             signals["object_pose"] = np.array(pose)
-        robot.reset(np.array([0]), Initial(signals, np.array([seed])))
+        try:
+            robot.reset(np.array([0]), Initial(signals, np.array([seed])))
+        except _Interrupted:  # such as the end of the link of the person who drives
+            robot.halt()
+            raise RequestRefused("Another request ended the way to the start pose; the robot holds.") from None
 
     def _stream(self, who: str, address: str, on: bool) -> None:
         """Send the transitions to a learner from now on, or no longer."""

@@ -224,6 +224,42 @@ def test_a_stop_while_a_request_is_executed_is_a_state_and_is_written_down_once(
     ]
 
 
+def test_a_request_that_comes_on_the_way_to_a_scene_ends_that_and_not_the_agent(bench):
+    def connect(*arguments, **more):
+        session = Session(running.agent, running.faults)
+
+        def reset(env_ids, initial):
+            running.agent.post(lambda: running.agent._cut("the front", "", "it", "was cut"))  # as of a killed program
+            session.observer(SimpleNamespace(command=[0.0], age=0.0, approach=True), None)
+
+        session.robot.reset = reset
+        return session
+
+    running = bench(connect=connect)
+    with running:
+        running.state(State.RUNNING)
+        running.ask("take", who="a program", lease="it")
+        answer = running.ask("scene", who="a program", pose=None, seed=1)
+        assert answer.error == "Another request ended the way to the start pose; the robot holds."
+        assert running.ask("resume").kind == "RequestRefused"  # it is alive
+        assert running.status["why"] == "the link of a program was cut; the robot holds"
+
+
+def test_a_pause_does_not_hide_a_stop(bench):
+    with bench() as running:
+        running.state(State.RUNNING)
+        running.fail(STOP, STOPPED)
+        why = running.state(State.STOPPED)
+        running.ask("pause", why="the table is full")
+        assert running.state(State.PAUSED) == f"paused by anna: the table is full; before that: {why}"
+        running.ask("resume")
+        running.state(State.RUNNING)
+        running.ask("pause")
+        assert running.state(State.PAUSED) == "paused by anna"
+    resumed = [text for what, text, *_ in running.events if what == "resume"]
+    assert resumed == [f"anna lets the robot move again after: {why}"]
+
+
 # Whose fault it is
 
 
@@ -231,11 +267,11 @@ def test_a_stop_while_a_request_is_executed_is_a_state_and_is_written_down_once(
 def candidate(forge, tmp_path):
     """Lets another version act as a candidate."""
 
-    def act(running):
+    def act(running, trials=None):
         path = tmp_path / "candidate.zip"
         path.write_bytes(PICK.read_bytes())
         version = running.agent.succession.versions.add(Checkpoint.open(forge(path, seed=7)))
-        choice = Choice(version, None, {CANDIDATE: version.digest}, "push by anna", "anna")
+        choice = Choice(version, None, {CANDIDATE: version.digest}, "push by anna", "anna", trials=trials)
         running.agent.choose(choice)
         assert choice.active.wait(DEADLINE)
         return choice
@@ -276,6 +312,70 @@ def test_a_candidate_is_rolled_back_for_its_own_stops_only(bench, candidate, sto
         assert choice.outcome.is_set() is is_back
     excused = [text for what, text, *_ in running.events if what == "trial"]
     assert len(excused) == (0 if is_back else 2)
+
+
+class BookedTrials:
+    """The trials of a candidate, as they are written down."""
+
+    threshold, evidence = 0.9, SimpleNamespace(is_enough=True, trials=1, text="1 of 1")
+
+    def __init__(self):
+        self.rows, self._runs = [], False
+
+    def next_seed(self, first):
+        return first
+
+    def begin(self, seed):
+        self.rows.append("begun")
+        self._runs = True
+
+    def end(self, success, reason, *, void=False):
+        if self._runs:
+            self.rows.append((success, reason, void))
+        self._runs = False
+
+
+@pytest.mark.parametrize("at", ["on the way to its start", "in mid-episode"])
+def test_an_episode_of_another_version_is_no_trial_of_a_candidate(bench, candidate, at):
+    """A roll-back that comes on the way to the start pose, or in mid-episode: the champion plays what remains."""
+    trials, played = BookedTrials(), []
+
+    def connect(*arguments, **more):
+        session = Session(running.agent, running.faults)
+
+        def episode(watcher, seed):
+            deployment, agent = session.deployment, running.agent
+            record, is_trial = deployment.journal.begin(seed), deployment.trials is trials
+            if is_trial and at == "in mid-episode":
+                deployment.trials.begin(seed)
+            if is_trial:
+                agent.choose(agent.succession.back("anna", "rolled back"))
+                if at == "in mid-episode":
+                    agent.between_ticks()
+                else:
+                    agent.post(lambda: None)
+                    session.observer(SimpleNamespace(command=[0.0], age=0.0, approach=True), None)
+            if deployment.trials is not None and at != "in mid-episode":
+                deployment.trials.begin(seed)
+            while not (is_trial or played or agent.between_ticks() or deployment.trials is not None):
+                pass  # until the candidate is pushed
+            if deployment.trials is not None:
+                deployment.trials.end(True, "terminated")
+            played.extend([True] * is_trial)
+            return record
+
+        session.deployment.episode = episode
+        return session
+
+    running = bench(connect=connect)
+    with running:
+        running.state(State.RUNNING)
+        choice = candidate(running, trials)
+        assert choice.outcome.wait(DEADLINE)
+        running.state(State.RUNNING)
+    assert played
+    ended = [(False, "another version acts: rolled back: rolled back", True)] if at == "in mid-episode" else []
+    assert trials.rows == (["begun", *ended] if at == "in mid-episode" else ended)
 
 
 def test_what_a_person_drives_into_is_not_the_candidates_fault(bench, candidate):
