@@ -1,6 +1,7 @@
 """The folders show the architecture: packages in one order, no circles, files that are easy to find."""
 
 import ast
+import functools
 from collections import Counter
 from graphlib import TopologicalSorter
 from pathlib import Path
@@ -61,12 +62,16 @@ SOURCES = {
 }
 
 
+TREES = {module: ast.parse(path.read_text()) for module, path in SOURCES.items()}
+
+
+@functools.cache
 def imports(module, *, types=True):
     """The modules of ours that a module imports, at its top or in a function, and with `types` for types only."""
     path = SOURCES[module]
     package = module.split(".") if path.name == "__init__.py" else module.split(".")[:-1]
     found = set()
-    for node in walk(ast.parse(path.read_text()), types):
+    for node in walk(TREES[module], types):
         if isinstance(node, ast.Import):
             names = [alias.name for alias in node.names]
         elif isinstance(node, ast.ImportFrom):
@@ -84,7 +89,7 @@ def imports(module, *, types=True):
 
 def walk(tree, types):
     for node in ast.iter_child_nodes(tree):
-        if types or not (isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test)):
+        if types or not (isinstance(node, ast.If) and "TYPE_CHECKING" in ast.dump(node.test)):
             yield node
             yield from walk(node, types)
 
@@ -142,8 +147,8 @@ def test_no_file_of_leftovers(name):
 def test_a_class_has_a_name_of_its_own():
     classes = Counter(
         node.name
-        for path in SOURCES.values()
-        for node in ast.parse(path.read_text()).body
+        for tree in TREES.values()
+        for node in tree.body
         if isinstance(node, ast.ClassDef) and not node.name.startswith("_")
     )
     assert [name for name, number in classes.items() if number > 1] == []

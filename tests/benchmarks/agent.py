@@ -28,8 +28,8 @@ PERIOD, SWAP_EVERY = 0.01, 0.1
 def trained(folder):
     """Another checkpoint of the same environment, trained for a moment."""
     path = folder / "new.zip"
-    flags = ("--env", "bam/pick", "--algo", "ppo", "--steps", 4096, "--out", path, "--runs", folder)
-    subprocess.run(program("train", *flags), check=True, capture_output=True)
+    flags = ("--env", "bam/pick", "--algo", "ppo", "--steps", 4096, "--eval-episodes", 1)
+    subprocess.run(program("train", *flags, "--out", path, "--runs", folder), check=True, capture_output=True)
     return path
 
 

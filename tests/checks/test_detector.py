@@ -3,8 +3,9 @@
 from tests.checks import detector
 
 
-def test_episodes_of_training_and_behind_guards_are_usual_and_a_frozen_encoder_is_not():
-    flags = detector.Flags(ticks=640, like_live=640, guarded=300, steps=640, shift="elbow")
+def test_episodes_of_training_and_behind_guards_are_usual_and_a_frozen_encoder_is_not(monkeypatch):
+    monkeypatch.setattr(detector, "SIDE_BY_SIDE", 8)
+    flags = detector.Flags(ticks=80, like_live=80, guarded=100, steps=800, shift="elbow")
     lines = list(detector.measure_detector(flags))
     kinds = ("no shift", "as of live robots", "behind guards, at full speed", "behind guards, on trial")
     for line, where in zip(lines[1:5], kinds, strict=True):

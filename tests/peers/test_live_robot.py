@@ -44,6 +44,20 @@ def own_proofs(tmp_path_factory):
         yield
 
 
+@pytest.fixture(scope="module")
+def connected(rosbridge, running_robot):
+    """A robot whose commands are proved in its first motion."""
+    with live(rosbridge) as robot:
+        yield robot
+
+
+@pytest.fixture
+def driven(connected, robot_node):
+    """The one that is connected, after a stop too."""
+    yield connected
+    connected.resume()
+
+
 def start(robot, position=HOME):
     return robot.reset(ROW, Initial({"joint_position": position}, np.zeros(1, np.int64)))
 
@@ -52,61 +66,67 @@ def received(node, topic):
     return [entry["values"] for entry in node.ask("report")["received"] if entry["topic"] == topic]
 
 
-def test_its_state_is_what_the_node_publishes_by_name(rosbridge, robot_node):
-    with live(rosbridge) as robot:
-        signals = start(robot).signals
-        np.testing.assert_allclose(signals["joint_position"], HOME, atol=0.02)
-        np.testing.assert_allclose(signals["object_position"], [[0.5, 0.1, 0.02]])
-        np.testing.assert_allclose(signals["object_quaternion"], [[1.0, 0.0, 0.0, 0.0]])
-        np.testing.assert_allclose(signals["gripper_width"], [[0.085]], atol=2e-3)
-        assert robot.age() < 0.1
+def test_its_state_is_what_the_node_publishes_by_name(driven):
+    signals = start(driven).signals
+    np.testing.assert_allclose(signals["joint_position"], HOME, atol=0.02)
+    np.testing.assert_allclose(signals["object_position"], [[0.5, 0.1, 0.02]])
+    np.testing.assert_allclose(signals["object_quaternion"], [[1.0, 0.0, 0.0, 0.0]])
+    np.testing.assert_allclose(signals["gripper_width"], [[0.085]], atol=2e-3)
+    assert driven.age() < 0.1
 
 
-@pytest.mark.parametrize("command", ["trajectory", "position"])  # the first proves what the second needs
-def test_it_moves_where_it_is_told(command, rosbridge, robot_node):
-    with live(rosbridge, command=command) as robot:
-        target = start(robot).command.copy()
-        target[0, 0] += 0.1
-        target[0, 6] = 0.05
-        for _ in range(30):
-            state = robot.step(target)
-        np.testing.assert_allclose(state.signals["joint_position"], target[:, :6], atol=1e-3)
-        np.testing.assert_allclose(state.signals["gripper_width"], [[0.05]], atol=1e-3)
-        joints = received(robot_node, POSITIONS if command == "position" else TRAJECTORY)
-        np.testing.assert_allclose(joints[-1], target[0, :6])
-        assert received(robot_node, GRIPPER)[-1] == pytest.approx([0.05])
+def require_moves(robot, node, topic):
+    """It moves where it is told, by commands on a topic."""
+    target = start(robot).command.copy()
+    target[0, 0] += 0.1
+    target[0, 6] = 0.05
+    for _ in range(30):
+        state = robot.step(target)
+    np.testing.assert_allclose(state.signals["joint_position"], target[:, :6], atol=1e-3)
+    np.testing.assert_allclose(state.signals["gripper_width"], [[0.05]], atol=1e-3)
+    np.testing.assert_allclose(received(node, topic)[-1], target[0, :6])
+    assert received(node, GRIPPER)[-1] == pytest.approx([0.05])
 
 
-def test_the_start_pose_is_reached_slowly(rosbridge, robot_node):
+def test_it_moves_where_a_trajectory_leads(driven, robot_node):
+    require_moves(driven, robot_node, TRAJECTORY)
+
+
+def test_the_start_pose_is_reached_slowly(driven, robot_node):
     away = HOME + 0.1
-    with live(rosbridge) as robot:
-        np.testing.assert_allclose(start(robot, away).signals["joint_position"], away, atol=0.02)
-        steps = np.diff(received(robot_node, TRAJECTORY), axis=0)
-        assert np.abs(steps).max() <= robot.limits.reset_speed * SPEC.period + 1e-9
-        np.testing.assert_allclose(start(robot).signals["joint_position"], HOME, atol=0.02)
+    np.testing.assert_allclose(start(driven, away).signals["joint_position"], away, atol=0.02)
+    steps = np.diff(received(robot_node, TRAJECTORY), axis=0)
+    assert np.abs(steps).max() <= driven.limits.reset_speed * SPEC.period + 1e-9
+    np.testing.assert_allclose(start(driven).signals["joint_position"], HOME, atol=0.02)
 
 
-def test_no_number_that_is_not_finite_reaches_the_node(rosbridge, robot_node):
-    with live(rosbridge) as robot:
-        command = start(robot).command
-        robot_node.ask("forget")
-        bad = np.where(np.arange(7) == 2, np.nan, command)
-        for _ in range(robot.limits.bad_ticks - 1):
-            np.testing.assert_allclose(robot.step(bad).command, command, atol=1e-3)
-        with pytest.raises(SafetyStop):
-            robot.step(bad)
-        values = [value for kind in (TRAJECTORY, GRIPPER) for row in received(robot_node, kind) for value in row]
-        assert values
-        assert all(isinstance(value, float) for value in values)
+def test_no_number_that_is_not_finite_reaches_the_node(driven, robot_node):
+    command = start(driven).command
+    robot_node.ask("forget")
+    bad = np.where(np.arange(7) == 2, np.nan, command)
+    for _ in range(driven.limits.bad_ticks - 1):
+        np.testing.assert_allclose(driven.step(bad).command, command, atol=1e-3)
+    with pytest.raises(SafetyStop):
+        driven.step(bad)
+    values = [value for kind in (TRAJECTORY, GRIPPER) for row in received(robot_node, kind) for value in row]
+    assert values
+    assert all(isinstance(value, float) for value in values)
 
 
-def test_halt_stops_the_node(rosbridge, robot_node, wait_until):
-    with live(rosbridge) as robot:
-        start(robot)  # which halts it first
-        wait_until(lambda: robot_node.ask("report")["halts"] > 0, True)
-        before = robot_node.ask("report")["halts"]
-        robot.halt()
-        wait_until(lambda: robot_node.ask("report")["halts"] > before, True)
+def test_halt_stops_the_node(driven, robot_node, wait_until):
+    start(driven)  # which halts it first
+    wait_until(lambda: robot_node.ask("report")["halts"] > 0, True)
+    before = robot_node.ask("report")["halts"]
+    driven.halt()
+    wait_until(lambda: robot_node.ask("report")["halts"] > before, True)
+
+
+# Each from here on connects by itself: the one above would find that somebody else commands the robot.
+
+
+def test_it_moves_to_positions_that_a_trajectory_proved(rosbridge, robot_node):
+    with live(rosbridge, command="position") as robot:
+        require_moves(robot, robot_node, POSITIONS)
 
 
 def test_a_hundred_commands_a_second_arrive(rosbridge, robot_node, wait_until):

@@ -144,22 +144,16 @@ def folders_of(processes):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("number", "send", "status", "runners"),
-    [
-        (signal.SIGINT, os.killpg, 130, 1),
-        (signal.SIGTERM, as_timeout_does, 143, 0),
-    ],
-)
-def test_a_signal_saves_and_leaves_no_process(here, start, number, send, status, runners):
-    process = start("--eval-every", "100000000", runners=runners)
+def test_a_signal_saves_and_leaves_no_process(here, start):
+    """Ctrl-C does the same: `test_two_signals_quit_at_once_and_leave_no_process` has its beginning."""
+    process = start("--eval-every", "100000000", runners=1)
     process.wait_for("steps/s")
     processes = psutil.Process(process.pid).children(recursive=True)
     assert len(processes) > 5
     (rays,) = folders_of(processes)
-    send(process.pid, number)  # a terminal sends Ctrl-C to the whole group
-    found, err = process.end()
-    assert found == status, err
+    as_timeout_does(process.pid, signal.SIGTERM)
+    status, err = process.end()
+    assert status == 143, err
     assert "finishing the update and saving" in err
     assert "Traceback" not in err
     assert err.splitlines()[-1] == "  bam-train --resume runs/reach-rllib-ppo/last.zip"

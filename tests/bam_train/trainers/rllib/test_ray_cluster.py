@@ -62,27 +62,37 @@ def folders(processes):
 STUBBORN = "import signal, time; signal.signal(15, signal.SIG_IGN); print(flush=True); time.sleep(60)"
 
 
-def test_one_of_its_own_is_here_alone_and_gone_afterwards(home, started, capfd):
+def test_one_of_its_own_is_here_alone_and_gone_after_another_ctrl_c(home, started, capfd, monkeypatch):
     environment, handlers, came = dict(os.environ), logging.getLogger("ray").handlers[:], []
     before = signal.signal(signal.SIGTERM, lambda number, _: came.append(number))
-    handler = signal.getsignal(signal.SIGTERM)
+    handler, shutdown = signal.getsignal(signal.SIGTERM), ray.shutdown
+
+    def disturbed(**given):
+        signal.raise_signal(signal.SIGINT)
+        shutdown(**given)
+
     try:
-        with cluster(settings()):
-            processes = started()
-            assert len(processes) >= 5
-            assert os.getpgrp() not in {os.getpgid(process.pid) for process in processes}
-            assert listening([psutil.Process(), *processes]) == {"127.0.0.1"}
-            assert ray.cluster_resources()["CPU"] == cores()
-            assert signal.getsignal(signal.SIGTERM) is handler
-            (folder,) = folders(processes)
-            assert Path(folder).is_dir()
-            with cluster(settings()):  # one that runs in this process is used, and stays
-                assert len(started()) == len(processes)
-            assert ray.is_initialized()
-            with pytest.raises(SettingsError, match="in the cluster"), cluster(settings(num_env_runners=1000)):
-                pass
-            stubborn = subprocess.Popen([sys.executable, "-c", STUBBORN], stdout=subprocess.PIPE)
-            stubborn.stdout.readline()
+        try:
+            with monkeypatch.context() as patch, cluster(settings()):
+                processes = started()
+                assert len(processes) >= 5
+                assert os.getpgrp() not in {os.getpgid(process.pid) for process in processes}
+                assert listening([psutil.Process(), *processes]) == {"127.0.0.1"}
+                assert ray.cluster_resources()["CPU"] == cores()
+                assert signal.getsignal(signal.SIGTERM) is handler
+                (folder,) = folders(processes)
+                assert Path(folder).is_dir()
+                with cluster(settings()):  # one that runs in this process is used, and stays
+                    assert len(started()) == len(processes)
+                assert ray.is_initialized()
+                with pytest.raises(SettingsError, match="in the cluster"), cluster(settings(num_env_runners=1000)):
+                    pass
+                stubborn = subprocess.Popen([sys.executable, "-c", STUBBORN], stdout=subprocess.PIPE)
+                stubborn.stdout.readline()
+                patch.setattr(ray, "shutdown", disturbed)
+                raise SystemExit
+        except KeyboardInterrupt:
+            came.append(signal.SIGINT)
         assert not psutil.pid_exists(stubborn.pid)
         stubborn.wait()  # whose status is known already
         stubborn.stdout.close()
@@ -96,7 +106,7 @@ def test_one_of_its_own_is_here_alone_and_gone_afterwards(home, started, capfd):
         assert capfd.readouterr() == ("", "")
         assert is_caught(signal.SIGTERM)
         signal.raise_signal(signal.SIGTERM)
-        assert came == [signal.SIGTERM]
+        assert came == [signal.SIGINT, signal.SIGTERM]
     finally:
         signal.signal(signal.SIGTERM, before)
 
@@ -108,29 +118,6 @@ def is_caught(number):
         return True
     mask = re.search(r"SigCgt:\s+(\w+)", status.read_text())[1]
     return bool(int(mask, 16) >> (number - 1) & 1)
-
-
-def test_another_ctrl_c_at_the_end_leaves_nothing_either(started, monkeypatch):
-    processes, found, shutdown = [], [], ray.shutdown
-
-    def disturbed(**given):
-        signal.raise_signal(signal.SIGINT)
-        shutdown(**given)
-
-    def interrupted():
-        with monkeypatch.context() as patch, cluster(settings()):
-            processes.extend(started())
-            found.extend(folders(processes))
-            patch.setattr(ray, "shutdown", disturbed)
-            raise SystemExit
-
-    with pytest.raises(KeyboardInterrupt):
-        interrupted()
-    assert not ray.is_initialized()
-    assert processes
-    assert not any(process.is_running() for process in processes)
-    assert len(found) == 1
-    assert not Path(found[0]).exists()
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGHUP])

@@ -77,9 +77,9 @@ def test_a_checkpoint_without_them_goes_on_too(checkpoint):
 def test_it_goes_on_with_any_number_of_runners(tmp_path):
     """Each takes its first samples with the learner's weights and statistics, and counts what it saw exactly."""
     hyper = {**ON_POLICY, "model_config": {**SMALL, "free_log_std": True}, "log_std_init": -1.5}
-    given = {"num_env_runners": 1, "normalize": True, "env_kwargs": {"randomize": True}, "hyper": hyper}
+    given = {"normalize": True, "env_kwargs": {"randomize": True}, "hyper": hyper}
     trainer, path, pushes = made(**given), tmp_path / "a.zip", []
-    for runners, steps in ((0, 64), (1, 128), (None, 192)):
+    for runners, steps in ((1, 64), (0, 128), (None, 192)):
         with contextlib.closing(trainer):
             _require_same_everywhere(trainer)
             trainer.train(steps, lambda progress: True)
