@@ -15,8 +15,9 @@ from bam_envs.live.command_proof import CommandProof, Controllers
 from bam_envs.robots.mir100 import base_spec
 from bam_envs.robots.profile import load_profile
 from bam_envs.robots.ur5e import arm_spec
-from bam_envs.safety.first_motion import FASTEST, MOST
+from bam_envs.safety.first_motion import FASTEST, MOST, FirstMotion
 from bam_envs.safety.gate import SafeRobot
+from bam_envs.safety.guard import Tick
 
 HOME = np.array([-0.27, -1.54, 1.89, -1.93, -1.57, -1.84])
 ROW, PARTS = np.zeros(1, np.int64), 10
@@ -368,6 +369,25 @@ def test_speeds_that_are_not_the_change_of_the_positions_stop_the_first_motion(s
         turned(robot, arm, 4.0),
     )
     assert np.abs(arm.joints[5]) < 0.6
+
+
+@pytest.mark.parametrize(("scale", "stops"), [(1.0, False), (0.4, True), (-1.0, True)])
+@pytest.mark.parametrize("frozen", [0, 8], ids=["in time", "a robot that stands still for 0.4 s"])
+def test_states_that_stay_away_are_no_speed_that_is_wrong(scale, stops, frozen):
+    """As of a simulated robot on a busy computer: it stands still, and its last state tells its last speed."""
+    spec = WiredArm(known=True).spec
+    guard, period, joints, faults = FirstMotion(spec), spec.period, np.zeros(6), []
+    size, still, age = len(spec.command.labels), 0, 0.0
+    for at in range(200):
+        still = frozen if at % 12 == 2 else max(0, still - 1)
+        age = age + period if still else 0.0
+        joints = joints if still else joints + 0.5 * period
+        numbers = [*joints, *[0.085] * (size - 6)]
+        signals = {"joint_position": joints[None], "joint_velocity": np.full((1, 6), 0.5 * scale)}
+        row = dict.fromkeys(("goal", "command", "last", "measured", "before"), numbers)
+        tick = Tick(**row, last_step=[0.0] * size, velocity=[0.5] * size, age=age, period=period, pause=period)
+        faults.append(guard.fault(replace(tick, signals=signals)))
+    assert any(faults) is stops
 
 
 @pytest.mark.parametrize("width_of", [lambda width: 0.085 - width, lambda width: (0.085 - width) * 8.0 / 0.085])

@@ -198,7 +198,7 @@ def test_the_cut_link_of_the_owner_holds_the_robot_and_pauses_the_policy(running
     running.run()
     program = (
         "import sys, time, gymnasium as gym, bam_envs\n"
-        "while True:\n"
+        "for attempt in range(20):\n"
         f"    env = gym.make('bam/pick-v0', robot={running.url!r}, disable_env_checker=True)\n"
         "    try:\n"
         "        env.unwrapped.robot.connect()\n"
@@ -206,6 +206,8 @@ def test_the_cut_link_of_the_owner_holds_the_robot_and_pauses_the_policy(running
         "        break\n"
         "    except (bam_envs.core.errors.LinkLost, bam_envs.core.errors.StaleState):\n"  # on a busy computer
         "        env.close()\n"
+        "else:\n"
+        "    sys.exit('nobody could take over')\n"
         "print('driving', flush=True)\n"
         "time.sleep(60)\n"
     )
