@@ -2,6 +2,8 @@
 
 At the end, for any reason (all episodes done, Ctrl-C, SIGTERM, a fault), the robot is halted and closed before anything
 is reported.
+
+Longer than most files: signals, loop and end are one object, as each must know of the others to halt the robot.
 """
 
 import contextlib

@@ -10,6 +10,8 @@ upload is complete. A request that fails is tried again, and each waits a bounde
 
 Programs that need a file on this computer get a copy: `local_path` and `standing_in`. What changes in a copy is put to
 its address: at once where a file is replaced in one step, as checkpoints, and at the end of the program.
+
+Longer than most files: one class, its copies, and the one table of what goes wrong in services.
 """
 
 from __future__ import annotations

@@ -1,4 +1,7 @@
-"""A frozen policy: raw observation in, deterministic action out, without torch and without unpickling anything."""
+"""A frozen policy: raw observation in, deterministic action out, without torch and without unpickling anything.
+
+Longer than most files: a policy and the arrays that it takes are one subject.
+"""
 
 from __future__ import annotations
 

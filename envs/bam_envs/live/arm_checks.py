@@ -2,6 +2,8 @@
 
 The pose of the tool, as measured by the arm's own controller, is compared with the pose computed from the joints. A
 difference reveals swapped and mirrored joints, other units, and another arm.
+
+Longer than most files: the checks of an arm, and the URDF that they read.
 """
 
 import itertools

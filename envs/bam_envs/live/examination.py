@@ -1,6 +1,8 @@
 """Examine a live robot by listening: its description, topics, types and messages, and the link to it.
 
 No command is sent. Pings have a topic of their own, so that the robot receives nothing.
+
+Longer than most files: messages and pings are collected by one subscription.
 """
 
 import math

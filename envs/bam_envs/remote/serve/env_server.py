@@ -2,6 +2,8 @@
 
 The environment runs in the calling thread, one request at a time under `EnvServer.lock`. A separate thread would cost
 two hand-overs a step, more than a step through TCP, and only rendering, which is not served, would need it.
+
+Longer than most files: a server and the transport to it in the same process share every check.
 """
 
 import re
