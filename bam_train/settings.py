@@ -1,4 +1,4 @@
-"""Settings of a training run: one frozen dataclass, merged from presets, files and flags.
+"""Settings of a training run: a frozen dataclass for each trainer, merged from presets, files and flags.
 
 Later layers override earlier ones: the trainer's defaults, the preset of the environment and algorithm, the
 ``--config`` file, ``--set`` and flags. Every field but the tables is a flag of `bam-train`, with its docstring as help.
@@ -21,6 +21,8 @@ from msgspec import Meta
 from bam_train.errors import SettingsError
 
 if TYPE_CHECKING:
+    from typing_extensions import Self
+
     from bam_train.env_location import EnvLocation
 
 tomllib: Any = importlib.import_module("tomllib" if sys.version_info >= (3, 11) else "tomli")
@@ -36,7 +38,7 @@ _Share = Annotated[float, Meta(gt=0, le=1, description="a share above 0 and at m
 
 @dataclass(frozen=True)
 class TrainSettings:
-    """All settings of a run; saved as JSON in ``config.json`` and in every checkpoint.
+    """The settings that every run has; each trainer's own are in the subclass that `SETTINGS` names.
 
     Upper limits of numbers that cost memory, processes or time are larger than any run needs.
     """
@@ -61,10 +63,6 @@ class TrainSettings:
     trainer: str = "sb3"
     """Library that trains: sb3 (default), rllib, offline (default with --data), imitation (default for dagger) or
     bandit (default for grasp-q)."""
-    start: str | None = None
-    """Checkpoint whose weights a new run of sb3 begins with: to harden a policy with env_kwargs.randomize, say."""
-    teacher: str | None = None
-    """Whom dagger imitates: a checkpoint of the same environment, with or without its cameras, or scripted."""
     until_success: _Share | None = None
     """Stop once this share of evaluation episodes succeeds, such as 0.99."""
     stop_reward: Annotated[float, Meta(ge=-_MOST, le=_MOST, description="a finite number, such as 475")] | None = None
@@ -83,17 +81,6 @@ class TrainSettings:
     """Certificates that wss:// trusts instead of the system's."""
     token_file: str | None = None
     """File with the token that the servers ask for."""
-    num_env_runners: Annotated[int, Meta(ge=0, le=10_000)] = 0
-    """Processes of rllib that collect samples (default 0: the trainer's own process)."""
-    num_learners: _Processes = 0
-    """Processes of rllib that update the weights (default 0: the trainer's own process)."""
-    num_gpus: _Processes | None = None
-    """GPUs that learners of rllib use in all (default RLLIB_NUM_GPUS, else 0)."""
-    address: str | None = None
-    """Ray cluster that rllib trains on; by default it starts one on this computer, for this run."""
-    data: str | None = None
-    """Data set to learn from, without its environment, which it names; also at an address, such as s3://bucket/pick.
-    With --trainer rllib for bc, marwil, cql and iql."""
     normalize: bool | dict[str, Any] = False
     """Normalise observations and rewards by running statistics; a table gives VecNormalize's arguments. Images and
     choices among the observations stay as they are."""
@@ -101,8 +88,11 @@ class TrainSettings:
     """Arguments of the algorithm."""
 
     @classmethod
-    def from_mapping(cls, values: Mapping[str, Any], source: str = "settings") -> TrainSettings:
-        """Make settings from JSON values; names, types and ranges are checked, and errors name the `source`."""
+    def from_mapping(cls, values: Mapping[str, Any], source: str = "settings") -> Self:
+        """Make settings, those of the trainer that `values` name, from JSON values; errors name the `source`.
+
+        Names, types and ranges are checked. A setting of another trainer has to be at its default.
+        """
         check_names(values, source)
         for name in ("env", "algo"):
             if values.get(name) is None:
@@ -110,7 +100,11 @@ class TrainSettings:
         checked = _checked(values)
         for name in sorted(TABLES):
             _require_finite(name, values.get(name))
-        settings = cls(**json.loads(json.dumps(checked)))  # a deep copy: nothing shares the caller's tables
+        kind: Any = SETTINGS.get(checked.get("trainer", "sb3"), AllSettings)
+        for name in [name for name in checked if name not in kind.__dataclass_fields__]:
+            if checked.pop(name) != getattr(AllSettings, name):
+                raise SettingsError(f"{name}: {_NO_USE[name].format(**{'trainer': 'sb3', **checked})}")
+        settings: Self = kind(**json.loads(json.dumps(checked)))  # a deep copy: nothing shares the caller's tables
         settings.place.require_sane()
         return settings
 
@@ -122,8 +116,71 @@ class TrainSettings:
         return EnvLocation(transport=tuple(self.transport), ca_file=self.ca_file, token_file=self.token_file)
 
     def to_mapping(self) -> dict[str, Any]:
-        """The settings as plain JSON values, in the order of the fields."""
-        return asdict(self)
+        """The settings as plain JSON values, with the defaults of those that belong to other trainers."""
+        return asdict(AllSettings(**vars(self)))
+
+
+@dataclass(frozen=True)
+class SB3Settings(TrainSettings):
+    """Settings of a run of stable-baselines3, and of a learner on a live robot."""
+
+    start: str | None = None
+    """Checkpoint whose weights a new run of sb3 begins with: to harden a policy with env_kwargs.randomize, say."""
+
+
+@dataclass(frozen=True)
+class ImitationSettings(TrainSettings):
+    """Settings of a run that imitates a teacher."""
+
+    teacher: str | None = None
+    """Whom dagger imitates: a checkpoint of the same environment, with or without its cameras, or scripted."""
+
+
+@dataclass(frozen=True)
+class OfflineSettings(TrainSettings):
+    """Settings of a run that learns from recorded episodes."""
+
+    data: str | None = None
+    """Data set to learn from, without its environment, which it names; also at an address, such as s3://bucket/pick.
+    With --trainer rllib for bc, marwil, cql and iql."""
+
+
+@dataclass(frozen=True)
+class RLlibSettings(OfflineSettings):
+    """Settings of a run of RLlib, whose processes may be on several computers."""
+
+    num_env_runners: Annotated[int, Meta(ge=0, le=10_000)] = 0
+    """Processes of rllib that collect samples (default 0: the trainer's own process)."""
+    num_learners: _Processes = 0
+    """Processes of rllib that update the weights (default 0: the trainer's own process)."""
+    num_gpus: _Processes | None = None
+    """GPUs that learners of rllib use in all (default RLLIB_NUM_GPUS, else 0)."""
+    address: str | None = None
+    """Ray cluster that rllib trains on; by default it starts one on this computer, for this run."""
+
+
+@dataclass(frozen=True)
+class AllSettings(SB3Settings, ImitationSettings, RLlibSettings):
+    """Every setting of every trainer, as ``config.json``, checkpoints and the flags of `bam-train` have them."""
+
+
+SETTINGS: dict[str, type[TrainSettings]] = {
+    "bandit": TrainSettings,
+    "imitation": ImitationSettings,
+    "live": SB3Settings,
+    "offline": OfflineSettings,
+    "rllib": RLlibSettings,
+    "sb3": SB3Settings,
+}
+"""The settings of each trainer."""
+NAMES = tuple(AllSettings.__dataclass_fields__)
+"""Names of all top-level settings."""
+_NO_USE = {
+    **dict.fromkeys(NAMES, "the {trainer} trainer has no use for it; leave it out, or add --trainer rllib"),
+    "start": "the {trainer} trainer has no use for it; leave it out",
+    "data": "{algo} of {trainer} learns in the environment; leave --data or --trainer out",
+    "teacher": "{algo} has none; leave it out, or give --algo dagger",
+}
 
 
 def check_names(values: Mapping[str, Any], source: str) -> None:
@@ -135,15 +192,11 @@ def check_names(values: Mapping[str, Any], source: str) -> None:
             raise SettingsError(f"{source}: unknown setting {name!r}. {did_you_mean(name, NAMES)}")
 
 
-NAMES = tuple(TrainSettings.__dataclass_fields__)
-"""Names of all top-level settings."""
-
-
 def _checked(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
     """Top-level settings, each of its type and in its range."""
     from bam_envs.core.validation import check, type_hints  # imports Gymnasium, and --help reads this file
 
-    hints = type_hints(TrainSettings)
+    hints = type_hints(AllSettings)
     return {name: check(value, hints[name], prefix + name, SettingsError) for name, value in values.items()}
 
 

@@ -20,7 +20,7 @@ from bam_envs.tasks.scripted import ScriptedPolicy, Sight, Take, tool_actions
 from bam_train.agent.transitions import TransitionLog
 from bam_train.evaluation import evaluate, wilson_interval
 from bam_train.policy import FrozenPolicy
-from bam_train.settings import TrainSettings
+from bam_train.settings import SB3Settings
 from bam_train.trainers.learning.live_learner import LiveLearner
 
 ENV, SHIPPED = "bam/pick-v0", str(Path(__file__).parents[1] / "checkpoints" / "pick-ppo.zip")
@@ -103,7 +103,7 @@ def measure(what: str, policy: Any, name: str, episodes: int) -> None:
 def learn(name: str, args: argparse.Namespace) -> None:
     """Learn on a robot, and print the success of the policy every so often, and at the end."""
     learner = LiveLearner.create(
-        TrainSettings(ENV, "rlpd", steps=args.steps, seed=args.seed, trainer="live", start=SHIPPED)
+        SB3Settings(ENV, "rlpd", steps=args.steps, seed=args.seed, trainer="live", start=SHIPPED)
     )
     log, driver, said, seen = TransitionLog(), FrozenPolicy.load(SHIPPED), 0, learner.experience
     with closing(make_robot(name)) as env:

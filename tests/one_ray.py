@@ -30,11 +30,11 @@ class SharedRay:
     def start(self):
         ray = pytest.importorskip("ray")
         if not ray.is_initialized():
-            from bam_train.settings import TrainSettings
+            from bam_train.settings import RLlibSettings
             from bam_train.trainers.rllib.ray_cluster import cluster
 
             make_connectors_quickly()
-            self._stack.enter_context(cluster(TrainSettings(env="bam/reach-v0", algo="ppo", trainer="rllib")))
+            self._stack.enter_context(cluster(RLlibSettings(env="bam/reach-v0", algo="ppo", trainer="rllib")))
 
     def stop(self):
         self._stack.close()

@@ -12,7 +12,7 @@ from typing import Annotated, Any, ClassVar, Literal, get_type_hints
 import tyro
 from msgspec import Meta
 
-from bam_train.settings import TABLES, TrainSettings
+from bam_train.settings import TABLES, AllSettings
 
 Count = Annotated[int, Meta(ge=1)]
 Seed = Annotated[int, Meta(ge=0)]
@@ -55,16 +55,16 @@ _METAVARS = {
 
 
 def _settings_flags() -> Any:
-    """`TrainSettings` with flags for fields: None means not given; then ``--config``, the preset or a default applies.
+    """`AllSettings` with flags for fields: None means not given; then ``--config``, the preset or a default applies.
 
     Tables have no flags: ``--set`` changes their entries.
     """
     flags: list[tuple[str, Any, None]] = []
-    for name, hint in get_type_hints(TrainSettings, include_extras=True).items():
+    for name, hint in get_type_hints(AllSettings, include_extras=True).items():
         metavar = _METAVARS.get(name, "N" if "int" in repr(hint) else "NAME")
         hidden, kind = Annotated[None, tyro.conf.Suppress], str if name == "transport" else hint
         flags.append((name, hidden if name in TABLES else Annotated[kind | None, _unset(metavar)], None))
-    return make_dataclass("SettingsFlags", flags, bases=(TrainSettings,), frozen=True)
+    return make_dataclass("SettingsFlags", flags, bases=(AllSettings,), frozen=True)
 
 
 SettingsFlags: Any = _settings_flags()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Callable, Mapping
-from dataclasses import fields, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,7 +15,16 @@ from bam_train.checkpoint import Checkpoint
 from bam_train.checkpoint.manifest import require_no_place
 from bam_train.environments import environment_of, make_env, require_env_kwargs, require_fit
 from bam_train.errors import CheckpointMismatch, SettingsError
-from bam_train.settings import TrainSettings, check_names, differences, file_stem, merge, parse_config
+from bam_train.settings import (
+    ImitationSettings,
+    SB3Settings,
+    TrainSettings,
+    check_names,
+    differences,
+    file_stem,
+    merge,
+    parse_config,
+)
 from bam_train.trainers.algorithms import ALGORITHMS, EXTRAS, RLLIB_ALGORITHMS, load_trainer, require_algorithm
 from bam_train.trainers.rllib_arguments import require_plausible
 from bam_train.trainers.sb3_hyperparameters import complete_settings
@@ -33,9 +42,6 @@ CHANGEABLE = frozenset(
 )
 """Settings that may change in a resumed run: when to stop, how to evaluate, where to compute, where the environment
 runs and where the teacher lies; not what to learn."""
-
-OF_RLLIB = ("num_env_runners", "num_learners", "num_gpus", "address")
-"""Settings of the rllib trainer only."""
 
 OFFLINE_STEPS = 20_000
 """Updates of a run on a data set without a preset; of an algorithm of d3rlpy, some minutes of CPU time."""
@@ -62,12 +68,11 @@ def resolve(given: Mapping[str, Any], tell: Tell = lambda text: None) -> TrainSe
     """
     given = {**_of_data(given), **_of_algorithm(given), **given}
     asked = TrainSettings.from_mapping(given)
-    env = _resolve_env(asked.env, elsewhere=bool(asked.transport or asked.data))
+    env = _resolve_env(asked.env, elsewhere=bool(asked.transport or given.get("data")))
     require_algorithm(asked.trainer, asked.algo)
     preset = read_preset(env, asked.algo, asked.trainer)
     usual = {"steps": OFFLINE_STEPS} if asked.trainer == "offline" else {}
     settings = TrainSettings.from_mapping(merge({**usual, **preset}, given, {"env": env}))
-    _require_of_trainer(settings)
     require_env_kwargs(env, settings.env_kwargs)
     if "link" in settings.env_kwargs and entry_of(env) is not None:
         settings = replace(settings, env_kwargs={**settings.env_kwargs, "link": portable(settings.env_kwargs["link"])})
@@ -90,9 +95,9 @@ def resolve(given: Mapping[str, Any], tell: Tell = lambda text: None) -> TrainSe
 
 def _require_checkpoints(settings: TrainSettings) -> None:
     """Refuse a checkpoint that a new run cannot begin with, and a teacher's that cannot be opened."""
-    if settings.teacher not in (None, "scripted"):
+    if isinstance(settings, ImitationSettings) and settings.teacher not in (None, "scripted"):
         Checkpoint.open(Path(str(settings.teacher)).expanduser())
-    if settings.start is not None:
+    if isinstance(settings, SB3Settings) and settings.start is not None:
         checkpoint = require_start(settings, settings.start)
         if not settings.transport:
             with contextlib.closing(make_env(settings.env, settings.env_kwargs)) as env:
@@ -126,21 +131,6 @@ def _of_algorithm(given: Mapping[str, Any]) -> dict[str, Any]:
     """The trainer of an algorithm that no other one has."""
     trainers = [trainer for trainer in ("imitation", "bandit") if given.get("algo") in ALGORITHMS[trainer]]
     return {"trainer": trainers[0]} if trainers else {}
-
-
-def _require_of_trainer(settings: TrainSettings) -> None:
-    """Refuse settings that belong to the other trainer."""
-    if settings.trainer == "sb3" and settings.data is not None:
-        raise SettingsError(f"data: {settings.algo} of sb3 learns in the environment; leave --data or --trainer out")
-    if settings.trainer != "rllib":
-        for field in fields(TrainSettings):
-            if field.name in OF_RLLIB and getattr(settings, field.name) != field.default:
-                text = f"the {settings.trainer} trainer has no use for it; leave it out, or add --trainer rllib"
-                raise SettingsError(f"{field.name}: {text}")
-    if settings.trainer != "sb3" and settings.start is not None:
-        raise SettingsError(f"start: the {settings.trainer} trainer has no use for it; leave it out")
-    if settings.trainer != "imitation" and settings.teacher is not None:
-        raise SettingsError(f"teacher: {settings.algo} has none; leave it out, or give --algo dagger")
 
 
 def _complete(settings: TrainSettings, tell: Tell) -> TrainSettings:
@@ -207,7 +197,6 @@ def resolve_resumed(given: Mapping[str, Any], checkpoint: Checkpoint, tell: Tell
     require_algorithm(settings.trainer, settings.algo)
     fixed = [row for row in differences(asked, own) if row[0] not in CHANGEABLE]
     _require_same([row for row in fixed if row[2] is not None], checkpoint)
-    _require_of_trainer(settings)
     completed = _complete(settings, tell)  # refuses names that the algorithm does not have
     _require_same(fixed, checkpoint)
     done = checkpoint.manifest.steps

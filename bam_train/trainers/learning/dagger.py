@@ -19,7 +19,7 @@ from torch.nn import functional
 from bam_train.environments import make_vector_env
 from bam_train.errors import SettingsError
 from bam_train.finite_envs import FiniteVectorEnv
-from bam_train.settings import TrainSettings
+from bam_train.settings import ImitationSettings
 from bam_train.trainers.learning.networks import Descent, Encoders, LearntPolicy, Numbers, two_layers
 from bam_train.trainers.learning.replay_memory import ActionCode, ReplayMemory
 from bam_train.trainers.learning.teacher import Teacher
@@ -56,12 +56,12 @@ class Dagger:
     """Units of each of the two hidden layers."""
 
 
-class DaggerTrainer(TorchTrainer):
+class DaggerTrainer(TorchTrainer[ImitationSettings]):
     """Made by `create` or `load`; the policy that is played acts as the learner or, in some episodes, the teacher."""
 
     Options = Dagger
 
-    def __init__(self, settings: TrainSettings) -> None:
+    def __init__(self, settings: ImitationSettings) -> None:
         super().__init__(settings)
         envs = make_vector_env(settings.env, settings.env_kwargs, settings.num_envs, settings.place)
         self.envs = FiniteVectorEnv(envs, settings.env)
@@ -90,7 +90,7 @@ class DaggerTrainer(TorchTrainer):
         self._taught = self._draw_taught(envs.num_envs, 0.0)  # where the teacher acts in this episode
 
     @classmethod
-    def complete(cls, settings: TrainSettings) -> TrainSettings:
+    def complete(cls, settings: ImitationSettings) -> ImitationSettings:
         """Check the settings, and add the defaults of the algorithm."""
         if settings.teacher is None:
             raise SettingsError(

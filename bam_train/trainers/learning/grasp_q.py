@@ -50,7 +50,7 @@ class GraspQ:
     """Share of random grasps after that."""
 
 
-class GraspTrainer(TorchTrainer):
+class GraspTrainer(TorchTrainer[TrainSettings]):
     """Made by `create` or `load`; the policy that is played chooses what to try."""
 
     Options, recent = GraspQ, 200
@@ -79,9 +79,8 @@ class GraspTrainer(TorchTrainer):
     def complete(cls, settings: TrainSettings) -> TrainSettings:
         """Check the environment's spaces, and add the defaults."""
         settings = super().complete(settings)
-        if settings.data is not None or settings.normalize:
-            name = "normalize" if settings.data is None else "data"
-            raise SettingsError(f"{name}: the bandit trainer has no use for it; leave it out")
+        if settings.normalize:
+            raise SettingsError("normalize: the bandit trainer has no use for it; leave it out")
         return dataclasses.replace(settings, eval_every=settings.eval_every or max(1000, settings.steps // 20))
 
     def advance(self, total: int) -> None:

@@ -27,7 +27,7 @@ from bam_train.environments import make_env, make_vector_env, require_fit
 from bam_train.errors import CheckpointMismatch, SettingsError, TrainingFailed
 from bam_train.policy import FrozenPolicy
 from bam_train.rollout import play
-from bam_train.settings import TrainSettings
+from bam_train.settings import SB3Settings
 from bam_train.trainers.frozen_network import FrozenNetwork, action_head
 from bam_train.trainers.learning.experience import Experience
 from bam_train.trainers.learning.networks import Descent
@@ -109,12 +109,12 @@ def require_spaces(observed: Any, acted: Any) -> tuple[spaces.Box, spaces.Box]:
     return observed, acted
 
 
-class LiveLearner(TorchLearner):
+class LiveLearner(TorchLearner[SB3Settings]):
     """Made by `create` or `load`."""
 
     Options = Hyperparameters
 
-    def __init__(self, settings: TrainSettings) -> None:
+    def __init__(self, settings: SB3Settings) -> None:
         super().__init__(settings)
         with contextlib.closing(make_env(settings.env, settings.env_kwargs)) as env:
             self.spaces = require_spaces(env.observation_space, env.action_space)
@@ -133,7 +133,7 @@ class LiveLearner(TorchLearner):
         self.parts = {"rlpd": self.rlpd, "experience": self.experience, "rng": self._rng}
 
     @classmethod
-    def create(cls, settings: TrainSettings) -> LiveLearner:
+    def create(cls, settings: SB3Settings) -> LiveLearner:
         """A new learner, whose policy is a copy of that of the checkpoint `start`, if there is one."""
         learner = cls(settings)
         if settings.start is not None:

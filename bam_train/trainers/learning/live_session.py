@@ -24,7 +24,7 @@ from bam_train.agent.transitions import decode
 from bam_train.checkpoint import Checkpoint
 from bam_train.environments import require_env_kwargs
 from bam_train.errors import AgentRefused, BamTrainError, OutputError, SettingsError, TrainingFailed
-from bam_train.settings import TrainSettings, file_stem, merge
+from bam_train.settings import SB3Settings, file_stem, merge
 from bam_train.trainers.best_checkpoint import choose_output
 from bam_train.trainers.learning.live_learner import ALGORITHM, TRAINER, LiveLearner
 from bam_train.trainers.run_folder import RunFolder, require_room
@@ -234,7 +234,7 @@ class LiveSession:
             self._tell(str(error))
 
 
-def live_settings(given: Mapping[str, Any], checkpoint: Checkpoint | None) -> TrainSettings:
+def live_settings(given: Mapping[str, Any], checkpoint: Checkpoint | None) -> SB3Settings:
     """Complete settings of a learner; of one that goes on, only ``steps`` and ``threads`` may change.
 
     Raises:
@@ -252,7 +252,7 @@ def live_settings(given: Mapping[str, Any], checkpoint: Checkpoint | None) -> Tr
     elif given.get("env") is None:
         raise SettingsError("env: expected a name, found nothing. Give --env NAME, that of the agent's checkpoint")
     values = merge({"steps": STEPS}, own, given, {"algo": ALGORITHM, "trainer": TRAINER})
-    settings = TrainSettings.from_mapping({**values, "env": resolve_id(values["env"])})
+    settings = SB3Settings.from_mapping({**values, "env": resolve_id(values["env"])})
     require_env_kwargs(settings.env, settings.env_kwargs)
     return settings
 

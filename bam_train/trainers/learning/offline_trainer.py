@@ -26,7 +26,7 @@ from bam_train.checkpoint.detector import Rollout
 from bam_train.data import DataSet
 from bam_train.environments import make_env, make_vector_env
 from bam_train.errors import SettingsError
-from bam_train.settings import TrainSettings, differences
+from bam_train.settings import OfflineSettings, differences
 from bam_train.trainers.algorithms import OFFLINE_ALGORITHMS
 from bam_train.trainers.detection import WANTED, recorded
 from bam_train.trainers.learning.implicit_q import Cloning, ImplicitQ, ImplicitQLearner
@@ -71,13 +71,15 @@ def transitions(
     return memory, scale
 
 
-class OfflineTrainer(TorchTrainer):
+class OfflineTrainer(TorchTrainer[OfflineSettings]):
     """Made by `create` or `load`; `indices` are those of the training episodes.
 
     Online, the policy that is played is the learner with noise.
     """
 
-    def __init__(self, settings: TrainSettings, data: DataSet | None = None, indices: list[int] | None = None) -> None:
+    def __init__(
+        self, settings: OfflineSettings, data: DataSet | None = None, indices: list[int] | None = None
+    ) -> None:
         super().__init__(settings)
         self._data = data = data or _open(settings)
         self._indices = list(range(len(data))) if indices is None else indices
@@ -109,7 +111,7 @@ class OfflineTrainer(TorchTrainer):
             )
 
     @classmethod
-    def read_options(cls, settings: TrainSettings) -> Any:
+    def read_options(cls, settings: OfflineSettings) -> Any:
         """The hyperparameters with their defaults: a dataclass, of an algorithm of d3rlpy a dict."""
         if settings.algo in _OWN:
             return read_table(_OWN[settings.algo], settings.hyperparameters, "hyperparameters", SettingsError)
@@ -118,7 +120,7 @@ class OfflineTrainer(TorchTrainer):
         return complete(settings.algo, settings.hyperparameters)
 
     @classmethod
-    def complete(cls, settings: TrainSettings) -> TrainSettings:
+    def complete(cls, settings: OfflineSettings) -> OfflineSettings:
         """Check the settings against the data set, and add the defaults of the algorithm."""
         data = _open(settings)
         for name in ("until_success", "stop_reward"):
@@ -133,14 +135,14 @@ class OfflineTrainer(TorchTrainer):
         return dataclasses.replace(settings, hyperparameters=values, env_kwargs=env_kwargs, eval_every=every)
 
     @classmethod
-    def load(cls, checkpoint: Checkpoint, settings: TrainSettings | None = None) -> OfflineTrainer:
+    def load(cls, checkpoint: Checkpoint, settings: OfflineSettings | None = None) -> OfflineTrainer:
         """Set up a run that continues from a checkpoint, on the same episodes, or online.
 
         Raises:
             CheckpointMismatch: The data set lacks an episode that the checkpoint was trained on.
         """
         own = own_settings(checkpoint, elsewhere=True) if settings is None else {}
-        settings = settings or TrainSettings.from_mapping(own, str(checkpoint.path))
+        settings = settings or OfflineSettings.from_mapping(own, str(checkpoint.path))
         data = _open(settings)
         trainer = cls(settings, data, learnt_episodes(checkpoint, data))
         trainer.restore(checkpoint)
@@ -233,7 +235,7 @@ class OfflineTrainer(TorchTrainer):
                 return
 
 
-def _open(settings: TrainSettings) -> DataSet:
+def _open(settings: OfflineSettings) -> DataSet:
     """The data set of a run; raises SettingsError if there is none, or it is of another environment."""
     if settings.data is None:
         raise SettingsError(f"data: {settings.algo} learns from a data set, found none. Give its place with --data")
@@ -248,7 +250,7 @@ def _open(settings: TrainSettings) -> DataSet:
     return data
 
 
-def _is_here(settings: TrainSettings) -> bool:
+def _is_here(settings: OfflineSettings) -> bool:
     """Whether the environment can be made on this computer."""
     with contextlib.suppress(SettingsError, BamEnvsError):
         env: Any = make_env(settings.env, settings.env_kwargs)

@@ -15,7 +15,7 @@ from bam_train.checkpoint import Checkpoint
 from bam_train.environments import first_difference, short_json
 from bam_train.errors import CheckpointMismatch
 from bam_train.policy import FrozenPolicy
-from bam_train.settings import TrainSettings
+from bam_train.settings import ImitationSettings
 
 SCRIPTED = "scripted"
 
@@ -30,7 +30,7 @@ class Teacher:
         InvalidValue: The environment has no scripted policy.
     """
 
-    def __init__(self, settings: TrainSettings, envs: VectorEnv[Any, Any, Any]) -> None:
+    def __init__(self, settings: ImitationSettings, envs: VectorEnv[Any, Any, Any]) -> None:
         task = getattr(envs.unwrapped, "task", None)
         self._envs: Any = envs.unwrapped
         self._observe = getattr(task, "state_observation", None)

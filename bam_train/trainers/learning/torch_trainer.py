@@ -9,7 +9,7 @@ import json
 from collections import deque
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Generic, TypeVar
 
 import numpy as np
 import torch
@@ -33,6 +33,7 @@ from bam_train.trainers.run_folder import TensorBoardFiles
 if TYPE_CHECKING:
     from typing_extensions import Self
 
+Settings = TypeVar("Settings", bound=TrainSettings)
 Count = Annotated[int, Meta(ge=1, le=100_000)]
 Positive = Annotated[float, Meta(gt=0, le=1e6)]
 Share = Annotated[float, Meta(ge=0, le=1)]
@@ -64,7 +65,7 @@ def restore(part: Any, state: Any) -> None:
         part.load_state_dict(state)
 
 
-class TorchLearner:
+class TorchLearner(Generic[Settings]):
     """Base class of a learner; a subclass sets `spaces` and `parts`, and defines `policy`."""
 
     Options: Any
@@ -74,7 +75,7 @@ class TorchLearner:
     parts: dict[str, Any]
     """Networks, optimisers and random generators by name; see `state_of`."""
 
-    def __init__(self, settings: TrainSettings) -> None:
+    def __init__(self, settings: Settings) -> None:
         torch.set_num_threads(settings.threads)
         torch.manual_seed(settings.seed)
         self.settings, self.options = settings, self.read_options(settings)
@@ -115,19 +116,20 @@ class TorchLearner:
         return {}
 
     @classmethod
-    def read_options(cls, settings: TrainSettings) -> Any:
+    def read_options(cls, settings: Settings) -> Any:
         """The hyperparameters with their defaults; raises SettingsError if one is unknown or does not fit."""
         return read_table(cls.Options, settings.hyperparameters, "hyperparameters", SettingsError)
 
     @classmethod
-    def create(cls, settings: TrainSettings) -> Self:
+    def create(cls, settings: Settings) -> Self:
         """Set up a new run of complete settings."""
         return cls(settings)
 
     @classmethod
-    def load(cls, checkpoint: Checkpoint, settings: TrainSettings | None = None) -> Self:
+    def load(cls, checkpoint: Checkpoint, settings: Settings | None = None) -> Self:
         """Set up a run that continues from a checkpoint."""
-        trainer = cls(settings or TrainSettings.from_mapping(own_settings(checkpoint), str(checkpoint.path)))
+        own: Any = settings or TrainSettings.from_mapping(own_settings(checkpoint), str(checkpoint.path))
+        trainer = cls(own)
         trainer.restore(checkpoint)
         return trainer
 
@@ -183,7 +185,7 @@ class TorchLearner:
             torch.set_rng_state(before)
 
 
-class TorchTrainer(TorchLearner):
+class TorchTrainer(TorchLearner[Settings]):
     """Base class of a `Trainer`; a subclass sets `envs`, if it has any, and defines `advance`.
 
     Where its environments are played, it is the policy that is played; see `BatchPolicy`.
@@ -195,7 +197,7 @@ class TorchTrainer(TorchLearner):
     envs: Any = None
     """The environments of training, closed at the end; None for none."""
 
-    def __init__(self, settings: TrainSettings) -> None:
+    def __init__(self, settings: Settings) -> None:
         super().__init__(settings)
         self.notices: list[str] = []
         self.metrics: dict[str, float] = {}
@@ -235,7 +237,7 @@ class TorchTrainer(TorchLearner):
         """Nothing: it has no memory of an episode."""
 
     @classmethod
-    def complete(cls, settings: TrainSettings) -> TrainSettings:
+    def complete(cls, settings: Settings) -> Settings:
         """Check the environment's spaces and the settings, and add the defaults of the algorithm."""
         with contextlib.closing(make_env(settings.env, settings.env_kwargs)) as env:
             algorithm = ALGORITHMS[settings.trainer][settings.algo]

@@ -26,7 +26,7 @@ import ray
 import ray.rllib  # sets up its loggers
 
 from bam_train.errors import SettingsError, TrainingFailed
-from bam_train.settings import TrainSettings
+from bam_train.settings import RLlibSettings
 from bam_train.signals import at_quit, interrupt, waiting
 from bam_train.trainers.rllib.ray_resources import cores, gpus, require_resources
 
@@ -47,7 +47,7 @@ _MODE, _TOKENS = "RAY_AUTH_MODE", ("RAY_AUTH_TOKEN", "RAY_AUTH_TOKEN_PATH")
 
 
 @contextlib.contextmanager
-def cluster(settings: TrainSettings) -> Iterator[None]:
+def cluster(settings: RLlibSettings) -> Iterator[None]:
     """Within the ``with`` block, Ray runs: an instance of this process, the cluster at `address`, or a private one.
 
     Raises:
@@ -68,7 +68,7 @@ def cluster(settings: TrainSettings) -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def _private(settings: TrainSettings) -> Iterator[None]:
+def _private(settings: RLlibSettings) -> Iterator[None]:
     before = set(psutil.Process().children())
     with (
         _new_folder() as folder,

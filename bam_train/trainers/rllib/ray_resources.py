@@ -6,13 +6,13 @@ import time
 import ray
 
 from bam_train.errors import SettingsError
-from bam_train.settings import TrainSettings
+from bam_train.settings import RLlibSettings
 
 VARIABLE = "RLLIB_NUM_GPUS"
 LONGEST_BUSY = 10.0  # s to wait for CPUs and GPUs that others in the cluster use
 
 
-def gpus(settings: TrainSettings) -> int:
+def gpus(settings: RLlibSettings) -> int:
     """GPUs that the learners of a run use in all: ``--num-gpus``, else RLLIB_NUM_GPUS, else 0.
 
     Raises:
@@ -26,7 +26,7 @@ def gpus(settings: TrainSettings) -> int:
     return int(text)
 
 
-def learners(settings: TrainSettings) -> tuple[int, int]:
+def learners(settings: RLlibSettings) -> tuple[int, int]:
     """RLlib's ``num_learners``, where 0 is the trainer's own process, and ``num_gpus_per_learner``.
 
     Raises:
@@ -48,7 +48,7 @@ def cores() -> int:
     return os.cpu_count() or 1
 
 
-def require_resources(settings: TrainSettings) -> None:
+def require_resources(settings: RLlibSettings) -> None:
     """Refuse a run that needs more CPUs or GPUs than the joined cluster, or else this computer, has.
 
     Each runner and each learner without a GPU needs a CPU; a learner with a GPU needs only that.
@@ -79,7 +79,7 @@ def require_resources(settings: TrainSettings) -> None:
         _require_free(wanted)
 
 
-def _require_gpus(settings: TrainSettings, wanted: int, there: int, where: str) -> None:
+def _require_gpus(settings: RLlibSettings, wanted: int, there: int, where: str) -> None:
     if wanted > there:
         unset = settings.num_gpus is None
         remedy = f"Set it to {there}, or unset it" if unset else f"Give --num-gpus {there}"

@@ -23,7 +23,7 @@ from ray.rllib.utils.spaces.space_utils import normalize_action
 from bam_envs.core.spaces import space_to_json
 from bam_train.data import DataSet
 from bam_train.errors import SettingsError
-from bam_train.settings import TrainSettings
+from bam_train.settings import RLlibSettings
 from bam_train.trainers.rllib import register_foreign
 from bam_train.trainers.zero_based_spaces import less_start
 
@@ -35,7 +35,7 @@ _BLOCK_STEPS = 20_000
 _BLOCKS = 8
 
 
-def add_data(config: Any, settings: TrainSettings, observation_space: Space[Any], action_space: Space[Any]) -> Any:
+def add_data(config: Any, settings: RLlibSettings, observation_space: Space[Any], action_space: Space[Any]) -> Any:
     """Configure learning from recorded episodes; returns the configuration.
 
     Raises:

@@ -27,7 +27,7 @@ from bam_envs.core.validation import Finite, PositiveInt, check
 from bam_envs.core.wording import brief
 from bam_train.environments import is_batched
 from bam_train.errors import BamTrainError, SettingsError
-from bam_train.settings import NAMES, TrainSettings
+from bam_train.settings import NAMES, RLlibSettings
 from bam_train.trainers.algorithms import RLLIB_ALGORITHMS, Algorithm
 from bam_train.trainers.library_arguments import fit, fits, require_known
 from bam_train.trainers.rllib import register_foreign
@@ -213,7 +213,7 @@ STEPS_AT_LEAST = 200
 """Minimum steps of an iteration of an algorithm that updates after a few steps, for a small overhead."""
 
 
-def make_config(settings: TrainSettings, observation_space: Space[Any], action_space: Space[Any], seed: int) -> Any:
+def make_config(settings: RLlibSettings, observation_space: Space[Any], action_space: Space[Any], seed: int) -> Any:
     """The configuration of a run with complete settings; the spaces are the environment's."""
     algorithm, values = RLLIB_ALGORITHMS[settings.algo], settings.hyperparameters
     number, gpus_each = learners(settings)
@@ -253,7 +253,7 @@ def make_config(settings: TrainSettings, observation_space: Space[Any], action_s
     )
 
 
-def envs_each(settings: TrainSettings) -> int:
+def envs_each(settings: RLlibSettings) -> int:
     """Environments of each runner: an equal share of `num_envs`, to the nearest whole number from 1."""
     return max(1, round(settings.num_envs / max(1, settings.num_env_runners)))
 
@@ -281,7 +281,7 @@ _REFUSALS = (
 
 
 @contextlib.contextmanager
-def refusals(settings: TrainSettings) -> Iterator[None]:
+def refusals(settings: RLlibSettings) -> Iterator[None]:
     """Turn RLlib's errors about settings that cannot work into SettingsError."""
     try:
         yield

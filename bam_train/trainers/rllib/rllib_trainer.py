@@ -27,7 +27,7 @@ from bam_train.data import DataSet
 from bam_train.environments import control_period, make_env, require_fit
 from bam_train.errors import SettingsError, TrainingFailed
 from bam_train.policy import FrozenPolicy
-from bam_train.settings import TrainSettings
+from bam_train.settings import RLlibSettings
 from bam_train.trainers.algorithms import RLLIB_ALGORITHMS
 from bam_train.trainers.base import OnProgress, Progress, Statistics, manifest
 from bam_train.trainers.resolve_settings import learnt_episodes, own_settings
@@ -54,7 +54,7 @@ class RLlibTrainer:
 
     evaluations = "choose"
 
-    def __init__(self, settings: TrainSettings, seed: int) -> None:
+    def __init__(self, settings: RLlibSettings, seed: int) -> None:
         self.settings = settings
         self.notices: list[str] = []
         with contextlib.closing(make_env(settings.env, settings.env_kwargs)) as env:
@@ -90,7 +90,7 @@ class RLlibTrainer:
             self._open = stack.pop_all()
 
     @classmethod
-    def complete(cls, settings: TrainSettings) -> TrainSettings:
+    def complete(cls, settings: RLlibSettings) -> RLlibSettings:
         """Check the algorithm's settings and add its defaults."""
         algorithm = RLLIB_ALGORITHMS[settings.algo]
         _require_fitting(settings)
@@ -115,7 +115,7 @@ class RLlibTrainer:
         )
 
     @classmethod
-    def create(cls, settings: TrainSettings) -> RLlibTrainer:
+    def create(cls, settings: RLlibSettings) -> RLlibTrainer:
         """Set up a new run of complete settings."""
         trainer = cls(settings, settings.seed)
         values = settings.hyperparameters
@@ -126,9 +126,9 @@ class RLlibTrainer:
         return trainer
 
     @classmethod
-    def load(cls, checkpoint: Checkpoint, settings: TrainSettings | None = None) -> RLlibTrainer:
+    def load(cls, checkpoint: Checkpoint, settings: RLlibSettings | None = None) -> RLlibTrainer:
         """Set up a run that continues from a checkpoint, with the checkpoint's settings or with `settings`."""
-        settings = settings or TrainSettings.from_mapping(own_settings(checkpoint), str(checkpoint.path))
+        settings = settings or RLlibSettings.from_mapping(own_settings(checkpoint), str(checkpoint.path))
         with contextlib.closing(make_env(settings.env, settings.env_kwargs)) as env:
             require_fit(checkpoint, env)
         if settings.data is not None:
@@ -294,7 +294,7 @@ class RLlibTrainer:
         self._open.close()
 
 
-def _require_fitting(settings: TrainSettings) -> None:
+def _require_fitting(settings: RLlibSettings) -> None:
     """Refuse settings that the rllib trainer does not support."""
     if settings.transport:
         raise SettingsError(

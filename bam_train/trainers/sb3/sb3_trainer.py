@@ -26,7 +26,7 @@ from bam_train.data.record_dataset import RecordVectorDataset, info_of
 from bam_train.environments import control_period, require_fit
 from bam_train.errors import SettingsError, TrainingFailed
 from bam_train.policy import FrozenPolicy
-from bam_train.settings import TrainSettings
+from bam_train.settings import SB3Settings
 from bam_train.trainers import sb3_hyperparameters as hyperparameters
 from bam_train.trainers.algorithms import SB3_ALGORITHMS
 from bam_train.trainers.base import OnProgress, Progress, Statistics, manifest
@@ -51,7 +51,7 @@ class SB3Trainer:
 
     evaluations = "choose"
 
-    def __init__(self, settings: TrainSettings, model: Any, venv: VecEnv) -> None:
+    def __init__(self, settings: SB3Settings, model: Any, venv: VecEnv) -> None:
         self.settings, self.model, self.venv = settings, model, venv
         self.notices: list[str] = []
         env = one_env(venv)
@@ -69,7 +69,7 @@ class SB3Trainer:
     complete = staticmethod(hyperparameters.complete_settings)
 
     @classmethod
-    def create(cls, settings: TrainSettings) -> SB3Trainer:
+    def create(cls, settings: SB3Settings) -> SB3Trainer:
         """Set up a new run of complete settings."""
         trainer = cls._made(settings)
         if settings.start is not None:
@@ -79,7 +79,7 @@ class SB3Trainer:
         return trainer
 
     @classmethod
-    def _made(cls, settings: TrainSettings) -> SB3Trainer:
+    def _made(cls, settings: SB3Settings) -> SB3Trainer:
         torch.set_num_threads(settings.threads)
         venv = make_training_env(settings.env, settings.env_kwargs, settings.num_envs, settings.place)
         model, notices = make_model(settings, venv)
@@ -89,9 +89,9 @@ class SB3Trainer:
         return trainer
 
     @classmethod
-    def load(cls, checkpoint: Checkpoint, settings: TrainSettings | None = None) -> SB3Trainer:
+    def load(cls, checkpoint: Checkpoint, settings: SB3Settings | None = None) -> SB3Trainer:
         """Set up a run that continues from a checkpoint, with the checkpoint's settings or with `settings`."""
-        settings = settings or TrainSettings.from_mapping(own_settings(checkpoint), str(checkpoint.path))
+        settings = settings or SB3Settings.from_mapping(own_settings(checkpoint), str(checkpoint.path))
         trainer = cls._made(settings)
         require_fit(checkpoint, one_env(trainer.venv), settings.place)
         trainer._waiting = resume.load(checkpoint, trainer.model, trainer.venv, trainer._normaliser)

@@ -3,7 +3,7 @@ import numpy as np
 import pytest
 
 from bam_train.agent.transitions import TransitionLog
-from bam_train.settings import TrainSettings
+from bam_train.settings import SB3Settings
 
 ENV = "LiveLine-v0"
 
@@ -44,7 +44,7 @@ def settings():
         small |= {"average": 0.05, "blur": 0.02, "advantage_weight": 1.0}
         small |= changes.pop("hyperparameters", {})
         values = {"env": ENV, "algo": "rlpd", "trainer": "live", "steps": 200, "hyperparameters": small}
-        return TrainSettings(**{**values, **changes})
+        return SB3Settings(**{**values, **changes})
 
     return make
 

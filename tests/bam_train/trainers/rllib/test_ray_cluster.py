@@ -18,7 +18,7 @@ import psutil
 import ray
 
 from bam_train.errors import SettingsError, TrainingFailed
-from bam_train.settings import TrainSettings
+from bam_train.settings import RLlibSettings
 from bam_train.signals import Terminated
 from bam_train.trainers.rllib.ray_cluster import cluster, reach
 from bam_train.trainers.rllib.ray_resources import cores
@@ -27,7 +27,7 @@ pytestmark = pytest.mark.slow
 
 
 def settings(**given):
-    return TrainSettings.from_mapping({"env": "bam/reach-v0", "algo": "ppo", "trainer": "rllib", **given})
+    return RLlibSettings.from_mapping({"env": "bam/reach-v0", "algo": "ppo", "trainer": "rllib", **given})
 
 
 @pytest.fixture(autouse=True)
@@ -172,13 +172,13 @@ cluster.shutdown()
 JOIN = """
 import sys, ray
 from bam_train.cli.program import guarded
-from bam_train.settings import TrainSettings
+from bam_train.settings import RLlibSettings
 from bam_train.trainers.rllib.ray_cluster import cluster
 given = {"env": "bam/reach-v0", "algo": "ppo", "trainer": "rllib", "address": sys.argv[1]}
 def join():
-    with cluster(TrainSettings.from_mapping(given)):
+    with cluster(RLlibSettings.from_mapping(given)):
         print(int(ray.cluster_resources()["CPU"]), "CPU")
-    with cluster(TrainSettings.from_mapping(given | {"num_env_runners": 2})):
+    with cluster(RLlibSettings.from_mapping(given | {"num_env_runners": 2})):
         pass
 sys.exit(guarded(join, "bam-train"))
 """

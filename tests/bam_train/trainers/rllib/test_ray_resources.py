@@ -9,7 +9,7 @@ pytest.importorskip("ray.rllib")
 import ray
 
 from bam_train.errors import SettingsError
-from bam_train.settings import TrainSettings
+from bam_train.settings import RLlibSettings
 from bam_train.trainers.rllib import ray_resources as resources
 from bam_train.trainers.rllib.ray_resources import gpus, learners, require_resources
 
@@ -34,7 +34,7 @@ def four_cpus(monkeypatch):
 
 
 def settings(**given):
-    return TrainSettings.from_mapping({"env": "bam/pick-v0", "algo": "ppo", "trainer": "rllib", **given})
+    return RLlibSettings.from_mapping({"env": "bam/pick-v0", "algo": "ppo", "trainer": "rllib", **given})
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,7 @@ import pytest
 pytest.importorskip("ray")
 
 from bam_train.errors import SettingsError
-from bam_train.settings import TrainSettings
+from bam_train.settings import RLlibSettings
 from bam_train.trainers.algorithms import RLLIB_ALGORITHMS
 from bam_train.trainers.resolve_settings import resolve
 from bam_train.trainers.rllib import rllib_hyperparameters as hyperparameters
@@ -20,7 +20,7 @@ pytestmark = pytest.mark.filterwarnings("ignore:.*:DeprecationWarning:ray")  # R
 def test_runners_share_the_environments(number, runners, each):
     assert (
         hyperparameters.envs_each(
-            TrainSettings(env="bam/reach-v0", algo="ppo", num_envs=number, num_env_runners=runners)
+            RLlibSettings(env="bam/reach-v0", algo="ppo", num_envs=number, num_env_runners=runners)
         )
         == each
     )
