@@ -6,34 +6,36 @@ import contextlib
 import io
 import pkgutil
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from gymnasium import spaces
 
 from bam_envs.core.errors import MissingExtra
+from bam_envs.core.spaces import leaves_by_path
 from bam_envs.core.wording import did_you_mean
 from bam_train.errors import SettingsError
 
 if TYPE_CHECKING:
     from bam_train.trainers.base import Trainer
 
-TRAINERS: dict[str, str] = {
-    "bandit": "bam_train.trainers.learning.grasp_q:GraspTrainer",
-    "imitation": "bam_train.trainers.learning.dagger:DaggerTrainer",
-    "offline": "bam_train.trainers.learning.offline_trainer:OfflineTrainer",
-    "rllib": "bam_train.trainers.rllib.rllib_trainer:RLlibTrainer",
-    "sb3": "bam_train.trainers.sb3.sb3_trainer:SB3Trainer",
-}
-"""``"module:Class"`` of each trainer, by name."""
 
-EXTRAS: dict[str, str] = {
-    "bandit": "train",
-    "imitation": "train",
-    "offline": "offline",
-    "rllib": "rllib",
-    "sb3": "train",
+class TrainerRow(NamedTuple):
+    """A trainer in the table."""
+
+    reference: str
+    """``"module:Class"``."""
+    extra: str = "train"
+    """Extra of bam-train that installs its packages."""
+
+
+TRAINERS: dict[str, TrainerRow] = {
+    "bandit": TrainerRow("bam_train.trainers.learning.grasp_q:GraspTrainer"),
+    "imitation": TrainerRow("bam_train.trainers.learning.dagger:DaggerTrainer"),
+    "offline": TrainerRow("bam_train.trainers.learning.offline_trainer:OfflineTrainer", "offline"),
+    "rllib": TrainerRow("bam_train.trainers.rllib.rllib_trainer:RLlibTrainer", "rllib"),
+    "sb3": TrainerRow("bam_train.trainers.sb3.sb3_trainer:SB3Trainer"),
 }
-"""Extra of bam-train that installs the packages of each trainer, by name."""
+"""Trainers by name; `bam_train.settings.SETTINGS` has their settings, `ALGORITHMS` their algorithms."""
 
 
 @dataclass(frozen=True)
@@ -72,24 +74,15 @@ class Algorithm:
 
     def require_observations(self, env: str, space: Any, several: tuple[type, ...] = (spaces.Dict,)) -> None:
         """Refuse `env` if an observation, also in one of `several`, is neither a Box nor a choice."""
-        for name, leaf in _observations(space, several):
+        for path, leaf in leaves_by_path(space, lambda part: not isinstance(part, several)):
             if type(leaf).__name__ not in ANY:
-                kinds = (
-                    f"{', '.join(ANY[:-1])} or {ANY[-1]}, or a {' or '.join(one.__name__ for one in several)} of them"
-                )
+                name = f"observation {path[-1]!r}" if path else "the observation"
+                nested = " or ".join(kind.__name__ for kind in several)
                 raise SettingsError(
-                    f"{self.name} does not fit {env}: {name} is a {type(leaf).__name__}, expected {kinds}. "
+                    f"{self.name} does not fit {env}: {name} is a {type(leaf).__name__}, expected "
+                    f"{', '.join(ANY[:-1])} or {ANY[-1]}, or a {nested} of them. "
                     "Leave it out, or turn it into numbers, in the environment"
                 )
-
-
-def _observations(space: Any, several: tuple[type, ...], name: str = "the observation") -> list[tuple[str, Any]]:
-    """What is observed, by name, without the spaces of `several`."""
-    if not isinstance(space, several):
-        return [(name, space)]
-    whole: Any = space
-    parts = whole.items() if isinstance(whole, spaces.Dict) else enumerate(whole)
-    return [one for key, part in parts for one in _observations(part, several, f"observation {key!r}")]
 
 
 _BOX = ("Box",)
@@ -97,56 +90,52 @@ _DISCRETE = ("Discrete",)
 _CHOICES = ("Box", "Discrete", "MultiDiscrete")
 ANY = (*_CHOICES, "MultiBinary")
 
-_SB3 = (
-    Algorithm("ppo", "stable_baselines3:PPO", ANY, on_policy=True),
-    Algorithm("a2c", "stable_baselines3:A2C", ANY, on_policy=True),
-    Algorithm("sac", "stable_baselines3:SAC", _BOX),
-    Algorithm("td3", "stable_baselines3:TD3", _BOX),
-    Algorithm("ddpg", "stable_baselines3:DDPG", _BOX),
-    Algorithm("dqn", "stable_baselines3:DQN", _DISCRETE),
-    Algorithm("tqc", "sb3_contrib:TQC", _BOX),
-    Algorithm("trpo", "sb3_contrib:TRPO", ANY, on_policy=True),
-    Algorithm("qrdqn", "sb3_contrib:QRDQN", _DISCRETE),
-    Algorithm("crossq", "sb3_contrib:CrossQ", _BOX),
-    Algorithm("recurrent-ppo", "sb3_contrib:RecurrentPPO", ANY, on_policy=True, recurrent=True),
-)
-_RLLIB = (
-    Algorithm("ppo", "ray.rllib.algorithms.ppo:PPOConfig", _CHOICES, on_policy=True),
-    Algorithm("appo", "ray.rllib.algorithms.appo:APPOConfig", _CHOICES, on_policy=True),
-    Algorithm("impala", "ray.rllib.algorithms.impala:IMPALAConfig", _CHOICES, on_policy=True),
-    Algorithm("sac", "ray.rllib.algorithms.sac:SACConfig", ("Box", "Discrete")),
-    Algorithm("tqc", "ray.rllib.algorithms.tqc:TQCConfig", _BOX),
-    Algorithm("dqn", "ray.rllib.algorithms.dqn:DQNConfig", _DISCRETE),
-    Algorithm("bc", "ray.rllib.algorithms.bc:BCConfig", _CHOICES, offline=True),
-    Algorithm("marwil", "ray.rllib.algorithms.marwil:MARWILConfig", _CHOICES, offline=True),
-    Algorithm("cql", "ray.rllib.algorithms.cql:CQLConfig", _BOX, offline=True),
-    Algorithm("iql", "ray.rllib.algorithms.iql:IQLConfig", _BOX, offline=True),
-)
-_OFFLINE = (
-    Algorithm("bc", "bam_train.trainers.learning.implicit_q:Cloning", ("Box", "Discrete"), offline=True),
-    Algorithm("iql", "bam_train.trainers.learning.implicit_q:ImplicitQ", ("Box", "Discrete"), offline=True),
-    Algorithm("awac", "d3rlpy.algos:AWACConfig", _BOX, offline=True),
-    Algorithm("cal-ql", "d3rlpy.algos:CalQLConfig", _BOX, offline=True),
-    Algorithm("cql", "d3rlpy.algos:CQLConfig", _BOX, offline=True),
-    Algorithm("plas", "d3rlpy.algos:PLASConfig", _BOX, offline=True),
-    Algorithm("rebrac", "d3rlpy.algos:ReBRACConfig", _BOX, offline=True),
-    Algorithm("td3bc", "d3rlpy.algos:TD3PlusBCConfig", _BOX, offline=True),
-)
-_BANDIT = (Algorithm("grasp-q", "bam_train.trainers.learning.grasp_q:GraspQ", ("MultiDiscrete",)),)
-BANDIT_ALGORITHMS = {algorithm.name: algorithm for algorithm in _BANDIT}
-_IMITATION = (Algorithm("dagger", "bam_train.trainers.learning.dagger:Dagger", ("Box", "Discrete")),)
-IMITATION_ALGORITHMS = {algorithm.name: algorithm for algorithm in _IMITATION}
-SB3_ALGORITHMS = {algorithm.name: algorithm for algorithm in _SB3}
-RLLIB_ALGORITHMS = {algorithm.name: algorithm for algorithm in _RLLIB}
-OFFLINE_ALGORITHMS = {algorithm.name: algorithm for algorithm in _OFFLINE}
+
+def _table(*rows: Algorithm) -> dict[str, Algorithm]:
+    return {row.name: row for row in rows}
+
+
 ALGORITHMS = {
-    "bandit": BANDIT_ALGORITHMS,
-    "imitation": IMITATION_ALGORITHMS,
-    "offline": OFFLINE_ALGORITHMS,
-    "rllib": RLLIB_ALGORITHMS,
-    "sb3": SB3_ALGORITHMS,
+    "bandit": _table(Algorithm("grasp-q", "bam_train.trainers.learning.grasp_q:GraspQ", ("MultiDiscrete",))),
+    "imitation": _table(Algorithm("dagger", "bam_train.trainers.learning.dagger:Dagger", ("Box", "Discrete"))),
+    "offline": _table(
+        Algorithm("bc", "bam_train.trainers.learning.implicit_q:Cloning", ("Box", "Discrete"), offline=True),
+        Algorithm("iql", "bam_train.trainers.learning.implicit_q:ImplicitQ", ("Box", "Discrete"), offline=True),
+        Algorithm("awac", "d3rlpy.algos:AWACConfig", _BOX, offline=True),
+        Algorithm("cal-ql", "d3rlpy.algos:CalQLConfig", _BOX, offline=True),
+        Algorithm("cql", "d3rlpy.algos:CQLConfig", _BOX, offline=True),
+        Algorithm("plas", "d3rlpy.algos:PLASConfig", _BOX, offline=True),
+        Algorithm("rebrac", "d3rlpy.algos:ReBRACConfig", _BOX, offline=True),
+        Algorithm("td3bc", "d3rlpy.algos:TD3PlusBCConfig", _BOX, offline=True),
+    ),
+    "rllib": _table(
+        Algorithm("ppo", "ray.rllib.algorithms.ppo:PPOConfig", _CHOICES, on_policy=True),
+        Algorithm("appo", "ray.rllib.algorithms.appo:APPOConfig", _CHOICES, on_policy=True),
+        Algorithm("impala", "ray.rllib.algorithms.impala:IMPALAConfig", _CHOICES, on_policy=True),
+        Algorithm("sac", "ray.rllib.algorithms.sac:SACConfig", ("Box", "Discrete")),
+        Algorithm("tqc", "ray.rllib.algorithms.tqc:TQCConfig", _BOX),
+        Algorithm("dqn", "ray.rllib.algorithms.dqn:DQNConfig", _DISCRETE),
+        Algorithm("bc", "ray.rllib.algorithms.bc:BCConfig", _CHOICES, offline=True),
+        Algorithm("marwil", "ray.rllib.algorithms.marwil:MARWILConfig", _CHOICES, offline=True),
+        Algorithm("cql", "ray.rllib.algorithms.cql:CQLConfig", _BOX, offline=True),
+        Algorithm("iql", "ray.rllib.algorithms.iql:IQLConfig", _BOX, offline=True),
+    ),
+    "sb3": _table(
+        Algorithm("ppo", "stable_baselines3:PPO", ANY, on_policy=True),
+        Algorithm("a2c", "stable_baselines3:A2C", ANY, on_policy=True),
+        Algorithm("sac", "stable_baselines3:SAC", _BOX),
+        Algorithm("td3", "stable_baselines3:TD3", _BOX),
+        Algorithm("ddpg", "stable_baselines3:DDPG", _BOX),
+        Algorithm("dqn", "stable_baselines3:DQN", _DISCRETE),
+        Algorithm("tqc", "sb3_contrib:TQC", _BOX),
+        Algorithm("trpo", "sb3_contrib:TRPO", ANY, on_policy=True),
+        Algorithm("qrdqn", "sb3_contrib:QRDQN", _DISCRETE),
+        Algorithm("crossq", "sb3_contrib:CrossQ", _BOX),
+        Algorithm("recurrent-ppo", "sb3_contrib:RecurrentPPO", ANY, on_policy=True, recurrent=True),
+    ),
 }
 """Algorithms by trainer and name."""
+RLLIB_ALGORITHMS, SB3_ALGORITHMS = ALGORITHMS["rllib"], ALGORITHMS["sb3"]
 
 
 def without_notice() -> contextlib.AbstractContextManager[object]:
@@ -163,9 +152,9 @@ def load_trainer(name: str) -> type[Trainer]:
         raise SettingsError(f"Unknown trainer {name!r}. {did_you_mean(name, TRAINERS)}")
     try:
         with without_notice():
-            trainer: type[Trainer] = pkgutil.resolve_name(TRAINERS[name])
+            trainer: type[Trainer] = pkgutil.resolve_name(TRAINERS[name].reference)
     except ModuleNotFoundError as error:
-        raise MissingExtra(str(error.name).partition(".")[0], EXTRAS[name], f"The {name} trainer") from error
+        raise MissingExtra(str(error.name).partition(".")[0], TRAINERS[name].extra, f"The {name} trainer") from error
     return trainer
 
 

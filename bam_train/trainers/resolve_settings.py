@@ -25,8 +25,8 @@ from bam_train.settings import (
     merge,
     parse_config,
 )
-from bam_train.trainers.algorithms import ALGORITHMS, EXTRAS, RLLIB_ALGORITHMS, load_trainer, require_algorithm
-from bam_train.trainers.rllib_arguments import require_plausible
+from bam_train.trainers.algorithms import ALGORITHMS, RLLIB_ALGORITHMS, TRAINERS, load_trainer, require_algorithm
+from bam_train.trainers.rllib_arguments import take_hyperparameters
 from bam_train.trainers.sb3_hyperparameters import complete_settings
 
 if TYPE_CHECKING:
@@ -139,9 +139,11 @@ def _complete(settings: TrainSettings, tell: Tell) -> TrainSettings:
         if settings.trainer == "sb3":
             return complete_settings(settings)
         if settings.trainer == "rllib":
-            require_plausible(RLLIB_ALGORITHMS[settings.algo], settings.hyperparameters)
+            take_hyperparameters(RLLIB_ALGORITHMS[settings.algo], settings.hyperparameters)
     except ModuleNotFoundError as error:
-        raise MissingExtra(str(error.name), EXTRAS[settings.trainer], f"The {settings.trainer} trainer") from error
+        raise MissingExtra(
+            str(error.name), TRAINERS[settings.trainer].extra, f"The {settings.trainer} trainer"
+        ) from error
     tell(f"{settings.algo} on {settings.env}: the {settings.trainer} trainer is loaded, which takes a few seconds")
     return load_trainer(settings.trainer).complete(settings)
 

@@ -1,14 +1,51 @@
-"""Arguments of RLlib's algorithms: which are hyperparameters here, and their ranges; imports no RLlib."""
+"""Arguments of RLlib's algorithms that are hyperparameters here, with their types and ranges; imports no RLlib."""
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, Literal
 
-from bam_envs.core.validation import Finite, Fraction, NonNegative, Positive, PositiveInt, check
+from bam_envs.core.validation import Fraction, NonNegative, NonNegativeInt, Positive, PositiveInt, check
+from bam_envs.core.wording import brief
 from bam_train.errors import SettingsError
 from bam_train.settings import NAMES
 from bam_train.trainers.algorithms import Algorithm
-from bam_train.trainers.library_arguments import require_known
-from bam_train.trainers.library_source import inherited
+from bam_train.trainers.library_arguments import fits, inherited, require_known
+
+HYPERPARAMETERS: dict[str, Any] = {
+    **dict.fromkeys(("gamma", "lambda_", "tau", "expectile", "epsilon"), Fraction),
+    **dict.fromkeys(("lr", "actor_lr", "critic_lr", "alpha_lr", "value_lr", "adam_epsilon"), Positive),
+    **dict.fromkeys(("clip_param", "kl_target", "initial_alpha", "temperature"), Positive),
+    **dict.fromkeys(("grad_clip", "vf_clip_param"), Positive | None),
+    **dict.fromkeys(("action_init_scale", "entropy_coeff", "vf_loss_coeff", "vf_coeff"), NonNegative),
+    **dict.fromkeys(("kl_coeff", "beta", "sigma0"), NonNegative),
+    **dict.fromkeys(("bc_logstd_coeff", "lagrangian_thresh", "log_std_init", "min_q_weight"), float),
+    **dict.fromkeys(("moving_average_sqd_adv_norm_start", "moving_average_sqd_adv_norm_update_rate"), float),
+    **dict.fromkeys(("target_worker_clipping", "v_max", "v_min"), float),
+    **dict.fromkeys(("vtrace_clip_pg_rho_threshold", "vtrace_clip_rho_threshold"), float | None),
+    **dict.fromkeys(("train_batch_size_per_learner", "num_epochs", "num_atoms", "n_quantiles", "n_step"), PositiveInt),
+    **dict.fromkeys(("n_critics", "num_actions", "broadcast_interval", "simple_queue_size"), PositiveInt),
+    **dict.fromkeys(("circular_buffer_num_batches", "circular_buffer_iterations_per_batch"), PositiveInt),
+    **dict.fromkeys(("num_steps_sampled_before_learning_starts", "target_network_update_freq"), NonNegativeInt),
+    "top_quantiles_to_drop_per_net": NonNegativeInt,
+    **dict.fromkeys(("burn_in_len", "burnin_len"), int),
+    "minibatch_size": PositiveInt | None,
+    "rollout_fragment_length": PositiveInt | Literal["auto"],
+    "target_entropy": float | Literal["auto"] | None,
+    **dict.fromkeys(("clip_actions", "deterministic_backup", "double_q", "dueling", "lagrangian", "noisy"), bool),
+    **dict.fromkeys(("shuffle_batch_per_epoch", "twin_q", "use_circular_buffer", "use_critic", "use_gae"), bool),
+    **dict.fromkeys(("use_kl_loss", "vtrace"), bool),
+    **dict.fromkeys(("grad_clip_by", "td_error_loss_fn"), str),
+    **dict.fromkeys(("model_config", "replay_buffer_config"), dict),
+}
+"""Type and range of every hyperparameter; with some other values RLlib hangs."""
+SCHEDULES = frozenset({"lr", "actor_lr", "critic_lr", "alpha_lr", "value_lr", "entropy_coeff", "epsilon"})
+"""Hyperparameters that may be a schedule ``[[step, value], ...]`` too, whose range is that of its first value."""
+OURS: dict[str, Any] = {
+    "model_config": {},
+    "rollout_fragment_length": "auto",
+    "log_std_init": None,
+    "action_init_scale": 1.0,
+}
+"""Hyperparameters that ``training()`` does not take, with their defaults where RLlib has none."""
 
 _GPUS, _CPUS = "env runners use no GPU, and --num-gpus is for the learners", "each env runner has one CPU"
 _ENVS = "use --num-envs, which is of all runners together"
@@ -33,62 +70,47 @@ ELSEWHERE = {
     "log_level": "RLlib's log is off",
     **dict.fromkeys(("horizon", "soft_horizon"), "the environment ends its episodes"),
     "framework": "RLlib has nothing but torch any more",
-    **dict.fromkeys(
-        (
-            *("optimizer", "learner_class", "learner_connector", "add_default_connectors_to_learner_pipeline"),
-            *("learner_config_dict", "num_aggregator_actors_per_learner", "store_buffer_in_checkpoints", "decay"),
-            *("max_requests_in_flight_per_aggregator_actor", "max_requests_in_flight_per_aggregator_worker"),
-            *("max_requests_in_flight_per_sampler_worker", "num_aggregation_workers", "before_learn_on_batch"),
-            *("categorical_distribution_temperature", "num_gpu_loader_threads", "num_multi_gpu_tower_stacks"),
-            *("minibatch_buffer_size", "replay_proportion", "replay_buffer_num_slots", "learner_queue_size"),
-            *("learner_queue_timeout", "timeout_s_sampler_manager", "timeout_s_aggregator_manager", "opt_type"),
-            *("momentum", "target_update_frequency", "training_intensity", "bc_iters"),
-        ),
-        "it belongs to RLlib's old API stack, or bam-train takes care of it",
-    ),
 }
-"""Arguments of RLlib that are not hyperparameters here, many of its old API stack, and the replacement or reason."""
-
-OLD_HERE = {"impala": {"epsilon"}, "appo": {"epsilon", "use_critic"}}
-"""Arguments by algorithm that belong to its old API stack, and are current in other algorithms."""
-
-OURS = ("model_config", "rollout_fragment_length", "log_std_init", "action_init_scale")
-"""Hyperparameters that ``training()`` does not take."""
-
-# Ranges of numbers, schedules and layers with which an algorithm can learn; with some others RLlib hangs
-
-_RATES = (
-    *("lr", "actor_lr", "critic_lr", "alpha_lr", "value_lr", "adam_epsilon"),
-    *("grad_clip", "clip_param", "vf_clip_param", "kl_target", "initial_alpha", "temperature"),
-)
-_COUNTS = (
-    *("train_batch_size_per_learner", "minibatch_size", "num_epochs", "rollout_fragment_length", "n_step"),
-    *("num_atoms", "n_quantiles", "n_critics", "num_actions", "broadcast_interval", "simple_queue_size"),
-    *("circular_buffer_num_batches", "circular_buffer_iterations_per_batch"),
-)
-_WEIGHTS = (
-    *("action_init_scale", "entropy_coeff", "vf_loss_coeff", "vf_coeff", "kl_coeff", "beta", "sigma0"),
-    *("num_steps_sampled_before_learning_starts", "target_network_update_freq", "top_quantiles_to_drop_per_net"),
-)
-LAST: dict[str, Any] = {
-    **dict.fromkeys(("gamma", "lambda_", "tau", "expectile", "epsilon"), Fraction),
-    **dict.fromkeys((*_RATES, *_WEIGHTS), NonNegative),
-}
-"""Ranges of later values of a schedule, where a rate may be 0."""
-RANGES = LAST | dict.fromkeys(_RATES, Positive) | dict.fromkeys(_COUNTS, PositiveInt)
-"""Ranges of numbers, and of the first values of schedules; with some others RLlib hangs."""
+"""Arguments of RLlib that are not hyperparameters here, and the replacement or reason."""
+_OLD = "it belongs to RLlib's old API stack, or bam-train takes care of it"
+_OLD_HERE = {"impala": {"epsilon"}, "appo": {"epsilon", "use_critic"}}
+"""Arguments by algorithm that belong to its old API stack, and are hyperparameters of other algorithms."""
 
 
-def require_plausible(algorithm: Algorithm, given: Mapping[str, Any]) -> None:
-    """Refuse unknown names and numbers out of range at once: importing RLlib takes many seconds."""
-    found = {name for one in inherited(algorithm.reference, "training") for name in one}
-    known = [name for name in found if name not in left_out(algorithm) and not name.startswith("_")]
-    require_known(given, [*known, *OURS], f"{algorithm.name} hyperparameter", ELSEWHERE, NAMES)
-    for name, value in given.items():
-        if isinstance(value, (int, float)) and not isinstance(value, bool):
-            check(value, RANGES.get(name, Finite), name, SettingsError)
+def hyperparameters_of(algorithm: Algorithm) -> tuple[dict[str, Any], dict[str, str]]:
+    """Types of an algorithm's hyperparameters by name, and the reason why each other name of RLlib is none."""
+    taken = {name: None for one in inherited(algorithm.reference, "training") for name in one} | OURS
+    known = HYPERPARAMETERS.keys() - _OLD_HERE.get(algorithm.name, set())
+    return {name: HYPERPARAMETERS[name] for name in taken if name in known}, {
+        **{name: _OLD for name in taken if name not in known and name != "self" and not name.startswith("_")},
+        **ELSEWHERE,
+    }
 
 
-def left_out(algorithm: Algorithm) -> set[str]:
-    """Arguments of ``training()`` that are no hyperparameters of an algorithm."""
-    return {*ELSEWHERE, *OLD_HERE.get(algorithm.name, ()), "self", "kwargs"}
+def take_hyperparameters(algorithm: Algorithm, given: Mapping[str, Any]) -> dict[str, Any]:
+    """Check hyperparameters by name, type and range at once: importing RLlib takes many seconds.
+
+    Raises:
+        SettingsError: An unknown name (with the closest match), a wrong type or a number out of range.
+    """
+    kinds, elsewhere = hyperparameters_of(algorithm)
+    require_known(given, kinds, f"{algorithm.name} hyperparameter", elsewhere, NAMES)
+    return {name: value if value is None else _fitting(name, value, kinds[name]) for name, value in given.items()}
+
+
+def _fitting(name: str, value: Any, kind: Any) -> Any:
+    if name == "n_step" and isinstance(value, list):  # drawn between two numbers
+        if not (fits(value, tuple[int, int]) and 1 <= value[0] <= value[1]):
+            raise SettingsError(f"{name}: expected [least, most] of at least 1, found {value!r}")
+        return value
+    if name not in SCHEDULES or (isinstance(value, (int, float)) and not isinstance(value, bool)):
+        return check(value, kind, name, SettingsError)
+    if not fits(value, list[list[int | float]]):
+        raise SettingsError(f"{name}: expected a number or a schedule [[step, value], ...], found {brief(value)}")
+    steps = [pair[0] for pair in value if len(pair) == 2]
+    if len(steps) < max(2, len(value)) or steps[0] != 0 or sorted(set(steps)) != steps:
+        text = "expected a number or a schedule [[0, value], [step, value], ...] with rising steps"
+        raise SettingsError(f"{name}: {text}, found {value!r}")
+    for place, (_, number) in enumerate(value):  # a rate may fall to 0
+        check(number, NonNegative if place and kind is Positive else kind, name, SettingsError)
+    return value

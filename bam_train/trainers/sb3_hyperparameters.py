@@ -21,8 +21,7 @@ from bam_train.environments import make_env, make_vector_env
 from bam_train.errors import SettingsError
 from bam_train.settings import NAMES, TrainSettings
 from bam_train.trainers.algorithms import SB3_ALGORITHMS, Algorithm
-from bam_train.trainers.library_arguments import fit, linear_start, require_known
-from bam_train.trainers.library_source import parameters, table
+from bam_train.trainers.library_arguments import linear_start, parameters, table, take
 
 ELSEWHERE = {
     "seed": "use --seed",
@@ -99,14 +98,12 @@ def complete_settings(settings: TrainSettings) -> TrainSettings:
 def complete(algorithm: Algorithm, given: Mapping[str, Any], observation_space: spaces.Space[Any]) -> dict[str, Any]:
     """Check hyperparameters by name, type and range, and add defaults for missing ones."""
     known = {name: one for name, one in parameters(algorithm.reference).items() if name not in ELSEWHERE}
-    require_known(given, known, f"{algorithm.name} hyperparameter", ELSEWHERE, NAMES)
+    hints = {name: _Noise | None if name == "action_noise" else one.annotation for name, one in known.items()}
     values: dict[str, Any] = {"policy": default_policy(algorithm, observation_space)}
-    for name, parameter in known.items():
-        if name in given:
-            hint = _Noise | None if name == "action_noise" else parameter.annotation
-            values[name] = fit(name, given[name], hint)
-        elif name != "policy":
-            values[name] = list(parameter.default) if isinstance(parameter.default, tuple) else parameter.default
+    for name, one in known.items():
+        if name != "policy":
+            values[name] = list(one.default) if isinstance(one.default, tuple) else one.default
+    values |= take(given, hints, f"{algorithm.name} hyperparameter", ELSEWHERE, NAMES)
     policies, policy = table(algorithm.reference, "policy_aliases"), values["policy"]
     if policy not in policies:
         raise SettingsError(f"policy: unknown policy {policy!r} of {algorithm.name}. {did_you_mean(policy, policies)}")
@@ -169,9 +166,9 @@ def complete_normalize(
         return {"gamma": gamma} if len(numbers) == len(seen) else {"gamma": gamma, "norm_obs_keys": numbers}
     if given is False:
         return False
-    known = {name: one for name, one in parameters(NORMALISER).items() if name not in ("self", "venv", "training")}
-    require_known(given, known, "normalize argument", ELSEWHERE)
-    fitted = {name: fit(f"normalize.{name}", value, known[name].annotation) for name, value in given.items()}
+    known = parameters(NORMALISER).items()
+    hints = {name: one.annotation for name, one in known if name not in ("self", "venv", "training")}
+    fitted = take(given, hints, "normalize argument", ELSEWHERE, prefix="normalize.")
     _check_ranges(fitted)
     if fitted.get("norm_obs", True):
         _require_normalisable(fitted.get("norm_obs_keys"), seen, numbers)
@@ -211,12 +208,10 @@ def _check_ranges(values: Mapping[str, Any]) -> None:
 
 
 def _checked_policy(policy: str, given: Mapping[str, Any]) -> dict[str, Any]:
-    known = {name: one for name, one in parameters(policy).items() if name not in _POLICY_ELSEWHERE}
-    require_known(given, known, "policy_kwargs argument", ELSEWHERE)
-    values = {}
-    for name, value in given.items():
-        values[name] = fit(f"policy_kwargs.{name}", value, known[name].annotation)
-        if name in CLASSES and values[name].lower() not in map(str.lower, CLASSES[name]):
+    hints = {name: one.annotation for name, one in parameters(policy).items() if name not in _POLICY_ELSEWHERE}
+    values = take(given, hints, "policy_kwargs argument", ELSEWHERE, prefix="policy_kwargs.")
+    for name, value in values.items():
+        if name in CLASSES and value.lower() not in map(str.lower, CLASSES[name]):
             close = did_you_mean(value.lower(), map(str.lower, CLASSES[name]))
             raise SettingsError(f"policy_kwargs.{name}: unknown {value!r}. {close}")
     return values

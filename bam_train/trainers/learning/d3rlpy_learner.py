@@ -15,10 +15,10 @@ from torch import nn
 
 from bam_envs.core.errors import MissingExtra
 from bam_train.errors import SettingsError, TrainingFailed
-from bam_train.trainers.algorithms import OFFLINE_ALGORITHMS, without_notice
+from bam_train.trainers.algorithms import ALGORITHMS, without_notice
 from bam_train.trainers.frozen_network import Layer
 from bam_train.trainers.learning.replay_memory import ActionCode, ReplayMemory
-from bam_train.trainers.library_arguments import fit, require_known
+from bam_train.trainers.library_arguments import take
 
 
 def _config_class(algorithm: str) -> Any:
@@ -31,7 +31,7 @@ def _config_class(algorithm: str) -> Any:
     import structlog
 
     structlog.configure(logger_factory=structlog.ReturnLoggerFactory())  # it writes on standard output
-    name = OFFLINE_ALGORITHMS[algorithm].reference.rpartition(":")[2]
+    name = ALGORITHMS["offline"][algorithm].reference.rpartition(":")[2]
     return getattr(d3rlpy.algos, name)
 
 
@@ -47,8 +47,7 @@ def _defaults(kind: Any) -> dict[str, Any]:
 def complete(algorithm: str, given: Mapping[str, Any]) -> dict[str, Any]:
     """Check hyperparameters by name and type, and add d3rlpy's defaults."""
     defaults = _defaults(_config_class(algorithm))
-    require_known(given, defaults, f"{algorithm} hyperparameter", {}, ())
-    return {name: fit(name, given[name], type(one)) if name in given else one for name, one in defaults.items()}
+    return defaults | take(given, {name: type(one) for name, one in defaults.items()}, f"{algorithm} hyperparameter")
 
 
 class D3rlpyLearner:

@@ -27,7 +27,7 @@ from bam_train.data import DataSet
 from bam_train.environments import make_env, make_vector_env
 from bam_train.errors import SettingsError
 from bam_train.settings import OfflineSettings, differences
-from bam_train.trainers.algorithms import OFFLINE_ALGORITHMS
+from bam_train.trainers.algorithms import ALGORITHMS
 from bam_train.trainers.detection import WANTED, recorded
 from bam_train.trainers.learning.implicit_q import Cloning, ImplicitQ, ImplicitQLearner
 from bam_train.trainers.learning.networks import Encoders, LearntPolicy
@@ -126,7 +126,7 @@ class OfflineTrainer(TorchTrainer[OfflineSettings]):
         for name in ("until_success", "stop_reward"):
             if getattr(settings, name) is not None and settings.hyperparameters.get("online_from") is None:
                 raise SettingsError(f"{name}: nothing is chosen by simulation while learning from data; leave it out")
-        OFFLINE_ALGORITHMS[settings.algo].require_actions(settings.env, type(data.info.action_space).__name__)
+        ALGORITHMS["offline"][settings.algo].require_actions(settings.env, type(data.info.action_space).__name__)
         Encoders(data.info.observation_space, _LEAST), ActionCode(data.info.action_space)
         options = cls.read_options(settings)
         values = options if isinstance(options, dict) else dataclasses.asdict(options)

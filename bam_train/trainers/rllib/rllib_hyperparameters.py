@@ -23,13 +23,12 @@ from ray.rllib.core.rl_module.default_model_config import DefaultModelConfig
 from ray.rllib.utils.error import UnsupportedSpaceException
 from ray.rllib.utils.replay_buffers import EpisodeReplayBuffer, PrioritizedEpisodeReplayBuffer
 
-from bam_envs.core.validation import Finite, PositiveInt, check
-from bam_envs.core.wording import brief
+from bam_envs.core.validation import PositiveInt, check
 from bam_train.environments import is_batched
 from bam_train.errors import BamTrainError, SettingsError
-from bam_train.settings import NAMES, RLlibSettings
+from bam_train.settings import RLlibSettings
 from bam_train.trainers.algorithms import RLLIB_ALGORITHMS, Algorithm
-from bam_train.trainers.library_arguments import fit, fits, require_known
+from bam_train.trainers.library_arguments import fits, require_known, take
 from bam_train.trainers.rllib import register_foreign
 from bam_train.trainers.rllib.mean_std_filter import MeanStdFilter
 from bam_train.trainers.rllib.ray_resources import learners
@@ -41,7 +40,7 @@ from bam_train.trainers.rllib.runner_deaths import (
     ReportingEnvRunner,
     first_cause_of_death,
 )
-from bam_train.trainers.rllib_arguments import ELSEWHERE, LAST, OURS, RANGES, left_out
+from bam_train.trainers.rllib_arguments import ELSEWHERE, OURS, hyperparameters_of, take_hyperparameters
 
 _OF_CONNECTORS = frozenset({"self", "kwargs", "multi_agent", "update_stats"})
 
@@ -59,24 +58,25 @@ def complete(algorithm: Algorithm, given: Mapping[str, Any], *, is_continuous: b
     Raises:
         SettingsError: An unknown name (with the closest match), a wrong type or a number out of range.
     """
+    given, kinds = take_hyperparameters(algorithm, given), hyperparameters_of(algorithm)[0]
     config, clones = algorithm.load()(), algorithm.name in ("bc", "marwil")
     if clones:
         config.training(**_CLONING)
-    defaults = _defaults(algorithm, config)
-    require_known(given, [*defaults, "model_config"], f"{algorithm.name} hyperparameter", ELSEWHERE, NAMES)
-    values = {
-        name: _fit(name, given[name], _hint(name, hint, default)) if name in given else _plain(default)
-        for name, (hint, default) in defaults.items()
-    }
-    if isinstance(given.get("replay_buffer_config"), Mapping):
-        values["replay_buffer_config"] = _complete_buffer(config, given["replay_buffer_config"])
+    defaults = {name: _plain(getattr(config, name, OURS.get(name))) for name in kinds}
+    if "actor_lr" in kinds:  # RLlib refuses any other value, although its CQL has one
+        defaults["lr"] = None
+    for name, value in given.items():
+        if value is None and defaults[name] is not None and not fits(None, kinds[name]):
+            check(value, kinds[name], name, SettingsError)
+    values = {**defaults, **given}
+    if "replay_buffer_config" in given:
+        values["replay_buffer_config"] = _complete_buffer(
+            defaults["replay_buffer_config"], given["replay_buffer_config"]
+        )
     free = {"free_log_std": True} if clones and is_continuous else {}
-    values["model_config"] = _complete_model(
-        config, {**free, **fit("model_config", given.get("model_config", {}), dict)}
-    )
+    values["model_config"] = _complete_model(config, {**free, **given.get("model_config", {})})
     if values["log_std_init"] is not None and not values["model_config"]["free_log_std"]:
         raise SettingsError("log_std_init: only a free standard deviation has one; add model_config.free_log_std=true")
-    _require_ranges(values)
     return values
 
 
@@ -85,59 +85,8 @@ def complete_normalize(given: bool | Mapping[str, Any]) -> bool | dict[str, Any]
     if isinstance(given, bool):
         return given
     known = inspect.signature(MeanStdFilter).parameters.keys() - _OF_CONNECTORS
-    require_known(given, known, "normalize argument", ELSEWHERE)
-    return {
-        name: fit(f"normalize.{name}", value, float if name == "clip_by_value" else bool)
-        for name, value in given.items()
-    }
-
-
-def _defaults(algorithm: Algorithm, config: Any) -> dict[str, tuple[Any, Any]]:
-    """Annotation and default of every hyperparameter, by name."""
-    found: dict[str, tuple[Any, Any]] = {}
-    for owner in type(config).__mro__:
-        method = vars(owner).get("training")
-        for name, row in inspect.signature(method).parameters.items() if method else ():
-            if name not in left_out(algorithm) and not name.startswith("_") and name not in found:
-                found[name] = row.annotation, getattr(config, name, None)
-    if "entropy_coeff" in found:  # PPO takes a schedule too, unlike its annotation
-        found["entropy_coeff"] = found["lr"][0], found["entropy_coeff"][1]
-    if "actor_lr" in found:  # RLlib refuses any other value, although its CQL has one
-        found["lr"] = found["lr"][0], None
-    found["rollout_fragment_length"] = typing.Union[int, str], config.rollout_fragment_length  # noqa: UP007
-    found["log_std_init"] = typing.Optional[float], None  # noqa: UP045
-    found["action_init_scale"] = float, 1.0
-    return found
-
-
-def _fit(name: str, value: Any, hint: Any) -> Any:
-    """`fit`, with a readable message for a schedule instead of RLlib's annotation."""
-    if hint is Any or not fits(_SCHEDULE, hint) or fits(value, hint):
-        return fit(name, value, hint)
-    raise SettingsError(f"{name}: expected a number or a schedule [[step, value], ...], found {brief(value)}")
-
-
-_SCHEDULE = [[0, 3e-4], [1000000, 0.0]]
-
-_MAY_BE_NONE = frozenset(
-    {"grad_clip", "vf_clip_param", "minibatch_size", "target_entropy"}
-    | {"vtrace_clip_rho_threshold", "vtrace_clip_pg_rho_threshold"}
-)
-"""Hyperparameters whose default is a number, and for which None has a meaning."""
-
-
-def _hint(name: str, hint: Any, default: Any) -> Any:
-    """The annotation, unless RLlib's default does not fit it (``grad_clip: Optional[int] = 40.0``).
-
-    RLlib's Optional means "not given"; if there is a default, None is refused.
-    """
-    if hint is inspect.Parameter.empty:
-        return Any
-    plain = _plain(default)
-    hint = hint if fits(plain, hint) else typing.Optional[type(plain)]  # noqa: UP045
-    if plain is None or name in _MAY_BE_NONE or typing.get_origin(hint) is not typing.Union:
-        return hint
-    return typing.Union[tuple(kind for kind in typing.get_args(hint) if kind is not type(None))]  # noqa: UP007
+    hints = {name: float if name == "clip_by_value" else bool for name in known}
+    return take(given, hints, "normalize argument", ELSEWHERE, prefix="normalize.")
 
 
 def _plain(value: Any) -> Any:
@@ -148,9 +97,8 @@ def _plain(value: Any) -> Any:
 _BUFFERS = {buffer.__name__: buffer for buffer in (EpisodeReplayBuffer, PrioritizedEpisodeReplayBuffer)}
 
 
-def _complete_buffer(config: Any, given: Mapping[str, Any]) -> dict[str, Any]:
+def _complete_buffer(default: Mapping[str, Any], given: Mapping[str, Any]) -> dict[str, Any]:
     """Check the names in ``replay_buffer_config``, as RLlib does not, and add the defaults."""
-    default = _plain(config.replay_buffer_config)
     values = {**default, **given}
     if default["type"] not in _BUFFERS:  # CQL does not use it
         return values
@@ -160,7 +108,7 @@ def _complete_buffer(config: Any, given: Mapping[str, Any]) -> dict[str, Any]:
     known = {*inspect.signature(buffer).parameters, *default} - _OF_CONNECTORS
     require_known(given, known, "replay_buffer_config argument", ELSEWHERE)
     name = "replay_buffer_config.capacity"
-    return {**values, "capacity": check(fit(name, values["capacity"], int), PositiveInt, name, SettingsError)}
+    return {**values, "capacity": check(values["capacity"], PositiveInt, name, SettingsError)}
 
 
 def _complete_model(config: Any, given: Mapping[str, Any]) -> dict[str, Any]:
@@ -168,43 +116,14 @@ def _complete_model(config: Any, given: Mapping[str, Any]) -> dict[str, Any]:
     hints = typing.get_type_hints(DefaultModelConfig)
     hints |= {name: typing.Optional[str] for name in hints if name.endswith("_initializer")}  # noqa: UP045 - no function
     defaults = dataclasses.asdict(DefaultModelConfig()) | config._model_config_auto_includes
-    require_known(given, hints, "model_config argument", ELSEWHERE)
-    return {
-        name: fit(f"model_config.{name}", given[name], _hint(name, hints[name], defaults[name]))
-        if name in given
-        else _plain(defaults[name])
-        for name in hints
-    }
-
-
-def _require_ranges(values: Mapping[str, Any]) -> None:
-    """Refuse complete hyperparameters with which no algorithm can learn."""
-    for name, value in values.items():
-        if isinstance(value, bool):
-            continue
-        if isinstance(value, (int, float)):
-            check(value, RANGES.get(name, Finite), name, SettingsError)
-        elif name == "rollout_fragment_length" and value != "auto":
-            raise SettingsError(f"{name}: expected a whole number or 'auto', found {value!r}")
-        elif name == "target_entropy" and value not in (None, "auto"):
-            raise SettingsError(f"{name}: expected a number or 'auto', found {value!r}")
-        elif name == "n_step" and value is not None:  # drawn between two numbers
-            if not 1 <= value[0] <= value[1]:
-                raise SettingsError(f"{name}: expected [least, most] of at least 1, found {value!r}")
-        elif isinstance(value, list):
-            steps = [pair[0] for pair in value if len(pair) == 2]
-            if len(steps) < max(2, len(value)) or steps[0] != 0 or sorted(set(steps)) != steps:
-                text = "expected a number or a schedule [[0, value], [step, value], ...] with rising steps"
-                raise SettingsError(f"{name}: {text}, found {value!r}")
-            check(value[0][1], RANGES.get(name, Finite), name, SettingsError)
-            for _, number in value[1:]:
-                check(number, LAST.get(name, Finite), name, SettingsError)
-    for name, sizes in values["model_config"].items():
-        if not name.endswith("_hiddens") or sizes is None:
+    taken = take(given, hints, "model_config argument", ELSEWHERE, prefix="model_config.")
+    for name, sizes in taken.items():
+        if not name.endswith("_hiddens"):
             continue
         if any(size < 1 for size in sizes) or (name == "fcnet_hiddens" and not sizes):
             wanted = "one size of a layer or more, each" if name == "fcnet_hiddens" else "sizes of layers of"
             raise SettingsError(f"model_config.{name}: expected {wanted} at least 1, found {sizes!r}")
+    return {name: _plain(defaults[name]) for name in hints} | taken
 
 
 # The configuration of a run

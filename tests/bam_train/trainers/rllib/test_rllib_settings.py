@@ -11,7 +11,7 @@ from bam_train.settings import RLlibSettings
 from bam_train.trainers.algorithms import RLLIB_ALGORITHMS
 from bam_train.trainers.resolve_settings import resolve
 from bam_train.trainers.rllib import rllib_hyperparameters as hyperparameters
-from bam_train.trainers.rllib_arguments import require_plausible
+from bam_train.trainers.rllib_arguments import hyperparameters_of, take_hyperparameters
 
 pytestmark = pytest.mark.filterwarnings("ignore:.*:DeprecationWarning:ray")  # Ray's own, of its data library
 
@@ -41,8 +41,8 @@ WRONG = [
     ("ppo", "lr", [[0, 1e-3], [9, 0.0], [8, 0.0]], SCHEDULE.format("lr")),
     ("ppo", "entropy_coeff", [[0, 1e-3], [9]], SCHEDULE.format("entropy_coeff")),
     ("ppo", "lr", [[0, 1e-3], [9, -1]], "lr: expected a number of at least 0, found -1"),
-    ("ppo", "gamma", None, "gamma: expected a number, found None"),
-    ("ppo", "num_epochs", None, "num_epochs: expected a whole number, found None"),
+    ("ppo", "gamma", None, "gamma: expected a number from 0 to 1, found None"),
+    ("ppo", "num_epochs", None, "num_epochs: expected a whole number of at least 1, found None"),
     ("ppo", "model_config", 5, "model_config: expected a table of named values, found 5"),
     ("ppo", "model_config", {"fcnet_hiddens": []}, "model_config.fcnet_hiddens: expected one"),
     ("ppo", "model_config", {"fcnet_hiddens": [8, -3]}, "model_config.fcnet_hiddens: expected one"),
@@ -64,13 +64,33 @@ EARLY = [row for row in WRONG if isinstance(row[2], (int, float)) and row[1] != 
 @pytest.mark.parametrize(("algo", "name", "value", "text"), EARLY)
 def test_hyperparameters_are_refused_before_rllib_is_imported(algo, name, value, text):
     with pytest.raises(SettingsError) as caught:
-        require_plausible(RLLIB_ALGORITHMS[algo], {name: value})
+        take_hyperparameters(RLLIB_ALGORITHMS[algo], {name: value})
     assert text in str(caught.value)
 
 
 @pytest.mark.parametrize("name", sorted(RLLIB_ALGORITHMS))
 def test_every_hyperparameter_is_plausible(name):
-    require_plausible(RLLIB_ALGORITHMS[name], hyperparameters.complete(RLLIB_ALGORITHMS[name], {}))
+    take_hyperparameters(RLLIB_ALGORITHMS[name], hyperparameters.complete(RLLIB_ALGORITHMS[name], {}))
+
+
+def test_a_new_version_of_rllib_has_no_other_arguments():
+    """What is neither a hyperparameter here nor replaced by one is old, or bam-train's business."""
+    without = set()
+    for algorithm in RLLIB_ALGORITHMS.values():
+        kinds, reasons = hyperparameters_of(algorithm)
+        assert not kinds.keys() & reasons.keys()
+        without |= {name for name, reason in reasons.items() if "old API stack" in reason}
+    assert sorted(without) == [
+        *("add_default_connectors_to_learner_pipeline", "bc_iters", "before_learn_on_batch"),
+        *("categorical_distribution_temperature", "decay", "epsilon", "learner_class", "learner_config_dict"),
+        *("learner_connector", "learner_queue_size", "learner_queue_timeout"),
+        *("max_requests_in_flight_per_aggregator_actor", "max_requests_in_flight_per_aggregator_worker"),
+        *("max_requests_in_flight_per_sampler_worker", "minibatch_buffer_size", "momentum"),
+        *("num_aggregation_workers", "num_aggregator_actors_per_learner", "num_gpu_loader_threads"),
+        *("num_multi_gpu_tower_stacks", "opt_type", "optimizer", "replay_buffer_num_slots", "replay_proportion"),
+        *("store_buffer_in_checkpoints", "target_update_frequency", "timeout_s_aggregator_manager"),
+        *("timeout_s_sampler_manager", "training_intensity", "use_critic"),
+    ]
 
 
 @pytest.mark.parametrize(("algo", "name", "value", "text"), WRONG)

@@ -19,8 +19,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 
 from bam_train.errors import SettingsError
 from bam_train.trainers.algorithms import SB3_ALGORITHMS
-from bam_train.trainers.library_arguments import as_written
-from bam_train.trainers.library_source import Other, parameters, table
+from bam_train.trainers.library_arguments import Other, as_written, parameters, table
 from bam_train.trainers.sb3.sb3_model import build
 from bam_train.trainers.sb3_hyperparameters import (
     NORMALISER,
