@@ -54,6 +54,24 @@ _METAVARS = {
 """Metavars of flags that are neither numbers nor names."""
 
 
+@dataclass(frozen=True, kw_only=True)
+class JsonFlag:
+    """The flag of a program that can print JSON."""
+
+    json: bool = False
+    """Print one JSON object on standard output instead of text."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class EpisodeFlags:
+    """The flags of a program that plays a policy in simulated environments."""
+
+    set: Assignments = ()
+    """An argument of the environment, any number of times: randomize=true, link=wifi. It wins over the checkpoint's."""
+    num_envs: Annotated[Count | None, tyro.conf.arg(metavar="N")] = None
+    """Environments stepped side by side; by default as many as is quick."""
+
+
 def _settings_flags() -> Any:
     """`AllSettings` with flags for fields: None means not given; then ``--config``, the preset or a default applies.
 
@@ -129,7 +147,7 @@ class TrainConfig(SettingsFlags):  # type: ignore[misc]
 
 
 @dataclass(frozen=True)
-class EvalConfig:
+class EvalConfig(EpisodeFlags, JsonFlag):
     """Evaluate the frozen policy of a checkpoint over seeded episodes, or on recorded ones.
 
     Examples:
@@ -155,12 +173,6 @@ class EvalConfig:
     stable-baselines3 zip."""
     algo: Name = None
     """Refuse the checkpoint unless it was trained by this algorithm; needed for a plain stable-baselines3 zip."""
-    set: Assignments = ()
-    """An argument of the environment, any number of times: randomize=true, link=wifi. It wins over the checkpoint's."""
-    num_envs: Annotated[Count | None, tyro.conf.arg(metavar="N")] = None
-    """Environments stepped side by side; by default as many as is quick."""
-    json: bool = False
-    """Print one JSON object on standard output instead of a table."""
     video: File = None
     """Record the first episodes into this .gif or .mp4 file; missing folders are made."""
     record: DataSetName = None
@@ -301,7 +313,7 @@ class DoctorConfig:
 
 
 @dataclass(frozen=True)
-class ReplayConfig:
+class ReplayConfig(JsonFlag):
     """Summarise a recording of bam-deploy, play it through its environment with a policy, and draw it.
 
     Examples:
@@ -319,8 +331,6 @@ class ReplayConfig:
     video: File = None
     """Make a .gif or .mp4 of the recorded pictures; without any, of the simulated robot in the recorded states.
     Missing folders are made."""
-    json: bool = False
-    """Print one JSON object on standard output instead of a few lines."""
 
 
 @dataclass(frozen=True)
@@ -350,7 +360,7 @@ class ExportConfig:
 
 
 @dataclass(frozen=True)
-class EnvsConfig:
+class EnvsConfig(JsonFlag):
     """List our environments, or describe one (any Gymnasium id): spaces, rate, name and unit of every number.
 
     Examples:
@@ -360,8 +370,6 @@ class EnvsConfig:
 
     env: Annotated[tyro.conf.Positional[str | None], tyro.conf.arg(metavar="[ID]")] = None
     """The environment to describe, e.g. bam/pick; without it, all of ours are listed."""
-    json: bool = False
-    """Print JSON."""
 
 
 @dataclass(frozen=True)

@@ -245,7 +245,8 @@ def help_text(config: type[Any], prog: str, description: str) -> str:
     known = {field.name: field for field in fields(config) if not is_hidden(hints[field.name])}
     first = [name for name in known if is_positional(hints[name])]
     groups = getattr(config, "GROUPS", {})
-    rest = [name for name in known if name not in {*first, *itertools.chain(*groups.values())}]
+    own_first = dict.fromkeys(name for owner in config.__mro__ for name in inspect.get_annotations(owner))
+    rest = [name for name in own_first if name in known.keys() - {*first, *itertools.chain(*groups.values())}]
     usage = " ".join([prog, *(_metavar(hints[name]) for name in first), "[OPTIONS]"])
     parser = argparse.ArgumentParser(
         prog, usage, description, formatter_class=lambda prog: _Paragraphs(prog, max_help_position=26), add_help=False

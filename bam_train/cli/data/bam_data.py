@@ -4,40 +4,34 @@ from __future__ import annotations
 
 import pkgutil
 import sys
-from dataclasses import dataclass
+from typing import NamedTuple
 
 from bam_train.cli.console import say, tell
 from bam_train.cli.program import run_program
 
 
-@dataclass(frozen=True)
-class Command:
+class Command(NamedTuple):
     """A command of `bam-data`."""
 
     help: str
     flags: str
-    """Its configuration, ``"module:Class"``."""
+    """Its configuration, a class of `bam_train.cli.data.data_flags`."""
     run: str
-    """Takes the configuration and returns an exit status, ``"module:function"``; imported once the flags are read."""
+    """``"module:function"`` in this folder; takes the configuration and returns an exit status."""
 
 
-_RECORDED, _OPENED = "bam_train.cli.data.recorded", "bam_train.cli.data.opened"
-_FLAGS, _VIEW = "bam_train.cli.data.data_flags", "bam_train.cli.data.view_flags"
-_SEEN = "bam_train.cli.data.pictures"
 COMMANDS = {
-    "collect": Command("run a policy in simulation and record it", f"{_FLAGS}:CollectConfig", f"{_RECORDED}:collect"),
-    "import": Command("add episodes of recordings or Parquet rows", f"{_FLAGS}:ImportConfig", f"{_RECORDED}:import_"),
-    "check": Command("say what is whole, and mend the rest", f"{_FLAGS}:CheckConfig", f"{_RECORDED}:check"),
-    "info": Command("what it is of, and how much is in it", f"{_VIEW}:InfoConfig", f"{_OPENED}:show_info"),
-    "stats": Command(
-        "success by groups, and the size of every number", f"{_VIEW}:StatsConfig", f"{_OPENED}:show_stats"
-    ),
-    "export": Command("write it for another library", f"{_VIEW}:ExportDataConfig", f"{_OPENED}:export_data"),
-    "merge": Command("add the episodes of several to one", f"{_VIEW}:MergeConfig", f"{_OPENED}:merge_data"),
-    "split": Command("split it in two, for training and for testing", f"{_VIEW}:SplitConfig", f"{_OPENED}:split_data"),
-    "filter": Command("copy the episodes for which something holds", f"{_VIEW}:FilterConfig", f"{_OPENED}:filter_data"),
-    "plot": Command("draw episodes, distributions, success and failures", f"{_VIEW}:PlotConfig", f"{_SEEN}:plot_data"),
-    "show": Command("play an episode as a film", f"{_VIEW}:ShowConfig", f"{_SEEN}:show_episode"),
+    "collect": Command("run a policy in simulation and record it", "CollectConfig", "recorded:collect"),
+    "import": Command("add episodes of recordings or Parquet rows", "ImportConfig", "recorded:import_"),
+    "check": Command("say what is whole, and mend the rest", "CheckConfig", "recorded:check"),
+    "info": Command("what it is of, and how much is in it", "InfoConfig", "opened:show_info"),
+    "stats": Command("success by groups, and the size of every number", "StatsConfig", "opened:show_stats"),
+    "export": Command("write it for another library", "ExportDataConfig", "opened:export_data"),
+    "merge": Command("add the episodes of several to one", "MergeConfig", "opened:merge_data"),
+    "split": Command("split it in two, for training and for testing", "SplitConfig", "opened:split_data"),
+    "filter": Command("copy the episodes for which something holds", "FilterConfig", "opened:filter_data"),
+    "plot": Command("draw episodes, distributions, success and failures", "PlotConfig", "opened:plot_data"),
+    "show": Command("play an episode as a film", "ShowConfig", "opened:show_episode"),
 }
 
 
@@ -61,8 +55,8 @@ def main(arguments: list[str] | None = None) -> None:
     command = COMMANDS[name]
     run_program(
         f"bam-data {name}",
-        command.flags,
-        lambda config, _: pkgutil.resolve_name(command.run)(config),
+        f"bam_train.cli.data.data_flags:{command.flags}",
+        lambda config, _: pkgutil.resolve_name(f"bam_train.cli.data.{command.run}")(config),
         given[1:],
     )
 

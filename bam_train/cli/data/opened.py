@@ -1,4 +1,4 @@
-"""The commands of `bam-data` that read data sets: export, info, merge, split, filter and stats."""
+"""The commands of `bam-data` that read data sets: export, info, merge, split, filter, stats, plot and show."""
 
 from __future__ import annotations
 
@@ -9,17 +9,16 @@ from typing import TYPE_CHECKING, Any
 from bam_train.cli.console import count, duration, number, percent, tell
 
 if TYPE_CHECKING:
-    from bam_train.cli.data import view_flags as flags
+    from bam_train.cli.data import data_flags as flags
     from bam_train.data import DataSet
 
 
 def export_data(config: flags.ExportDataConfig) -> None:
     """Write a data set in another format."""
-    from bam_train.data import DataSet
     from bam_train.data.export import export
     from bam_train.data.selection import choose
 
-    data = DataSet.open(config.place)
+    data = _open(config.place)
     chosen = choose(data, config.where)
     opened = export(data, config.to, config.out, chosen)
     tell(f"{config.out}: {_episodes(len(chosen))} as {config.to}", f"  open it with  {opened}")
@@ -27,10 +26,9 @@ def export_data(config: flags.ExportDataConfig) -> None:
 
 def show_info(config: flags.InfoConfig) -> None:
     """Say what a data set is of."""
-    from bam_train.data import DataSet
     from bam_train.data.views.summary import groups
 
-    data = DataSet.open(config.place)
+    data = _open(config.place)
     info, found = data.info, groups(data) if len(data) else []
     facts = [data.facts(i) for i in range(len(data))]
     dates = sorted(str(one["date"]) for one in facts if "date" in one)
@@ -107,6 +105,37 @@ def show_stats(config: flags.StatsConfig) -> None:
     keys = ("min", "q01", "q50", "q99", "max", "mean", "std")
     rows = [[one["column"], one["name"], one["unit"], *(number(one[key]) for key in keys)] for one in each]
     tell(*aligned([["column", "name", "unit", *keys], *rows]))
+
+
+def plot_data(config: flags.PlotConfig) -> None:
+    """Draw a data set."""
+    from bam_train.data.views.figures import plot, require_picture_path
+    from bam_train.files.atomic_file import require_writable
+
+    path = require_writable(require_picture_path(config.out))
+    against = None if config.against is None else _open(config.against)
+    drawn = plot(_open(config.place), path, config.kind, against, config.episodes)
+    tell(f"{path}: {', '.join(drawn)}")
+
+
+def show_episode(config: flags.ShowConfig) -> None:
+    """Make a film of an episode."""
+    from bam_train.data.views.film import frames
+    from bam_train.errors import SettingsError
+    from bam_train.files.video import open_video, require_video_path
+
+    path = require_video_path(config.out)
+    data = _open(config.place)
+    if not -len(data) <= config.episode < len(data):
+        raise SettingsError(f"--episode: {config.place} has {len(data)} episodes, and there is no {config.episode}")
+    pictures = 0
+    with open_video(path, 1 / data.info.period) as add:
+        for frame in frames(data, config.episode, config.camera):
+            add(frame)
+            pictures += 1
+    facts = data.facts(config.episode)
+    end = {True: "success", False: "failure", None: "success not known"}[facts["success"]]
+    tell(f"{path}: episode {config.episode % len(data)}, {pictures} pictures, return {facts['return']:.4g}, {end}")
 
 
 def _open(place: str) -> DataSet:

@@ -12,7 +12,7 @@ from bam_train.cli.program import run_program
 from bam_train.signals import SignalMemory
 
 if TYPE_CHECKING:
-    from bam_train.cli.data.gate_flags import GateConfig
+    from bam_train.cli.data.data_flags import GateConfig
     from bam_train.estimation.release_gate import Comparison, DataComparison
 
 STATUSES = {"better": 0, "not worse": 1, "worse": 2, "undecided": 3}
@@ -107,7 +107,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         return decided[0]
 
     try:
-        run_program("bam-gate", "bam_train.cli.data.gate_flags:GateConfig", run, arguments)
+        run_program("bam-gate", "bam_train.cli.data.data_flags:GateConfig", run, arguments)
     except SystemExit as stop:
         if stop.code in (1, 2) and not decided:
             raise SystemExit(FAILED) from None
