@@ -96,11 +96,11 @@ def _table(*rows: Algorithm) -> dict[str, Algorithm]:
 
 
 ALGORITHMS = {
-    "bandit": _table(Algorithm("grasp-q", "bam_train.trainers.learning.grasp_q:GraspQ", ("MultiDiscrete",))),
-    "imitation": _table(Algorithm("dagger", "bam_train.trainers.learning.dagger:Dagger", ("Box", "Discrete"))),
+    "bandit": _table(Algorithm("grasp-q", "bam_train.trainers.learner_hyperparameters:GraspQ", ("MultiDiscrete",))),
+    "imitation": _table(Algorithm("dagger", "bam_train.trainers.learner_hyperparameters:Dagger", ("Box", "Discrete"))),
     "offline": _table(
-        Algorithm("bc", "bam_train.trainers.learning.implicit_q:Cloning", ("Box", "Discrete"), offline=True),
-        Algorithm("iql", "bam_train.trainers.learning.implicit_q:ImplicitQ", ("Box", "Discrete"), offline=True),
+        Algorithm("bc", "bam_train.trainers.learner_hyperparameters:Cloning", ("Box", "Discrete"), offline=True),
+        Algorithm("iql", "bam_train.trainers.learner_hyperparameters:ImplicitQ", ("Box", "Discrete"), offline=True),
         Algorithm("awac", "d3rlpy.algos:AWACConfig", _BOX, offline=True),
         Algorithm("cal-ql", "d3rlpy.algos:CalQLConfig", _BOX, offline=True),
         Algorithm("cql", "d3rlpy.algos:CQLConfig", _BOX, offline=True),

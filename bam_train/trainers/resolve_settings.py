@@ -26,6 +26,7 @@ from bam_train.settings import (
     parse_config,
 )
 from bam_train.trainers.algorithms import ALGORITHMS, RLLIB_ALGORITHMS, TRAINERS, load_trainer, require_algorithm
+from bam_train.trainers.learner_hyperparameters import HYPERPARAMETERS, read_hyperparameters
 from bam_train.trainers.rllib_arguments import take_hyperparameters
 from bam_train.trainers.sb3_hyperparameters import complete_settings
 
@@ -140,6 +141,8 @@ def _complete(settings: TrainSettings, tell: Tell) -> TrainSettings:
             return complete_settings(settings)
         if settings.trainer == "rllib":
             take_hyperparameters(RLLIB_ALGORITHMS[settings.algo], settings.hyperparameters)
+        elif settings.algo in HYPERPARAMETERS:
+            read_hyperparameters(settings.algo, settings.hyperparameters)
     except ModuleNotFoundError as error:
         raise MissingExtra(
             str(error.name), TRAINERS[settings.trainer].extra, f"The {settings.trainer} trainer"

@@ -7,7 +7,16 @@ import json
 import pytest
 
 from bam_train.errors import SettingsError
-from bam_train.settings import TrainSettings, differences, file_stem, merge, read_assignments, read_config
+from bam_train.settings import (
+    RLlibSettings,
+    SB3Settings,
+    TrainSettings,
+    differences,
+    file_stem,
+    merge,
+    read_assignments,
+    read_config,
+)
 
 BASE = {"env": "bam/pick-v0", "algo": "ppo"}
 
@@ -40,6 +49,20 @@ def test_bad_settings_say_what_is_wrong(extra, message):
     with pytest.raises(SettingsError) as caught:
         TrainSettings.from_mapping({**BASE, **extra})
     assert str(caught.value) == message
+
+
+def test_a_setting_of_another_trainer_is_at_its_default():
+    """As in checkpoints and ``config.json``, which have the settings of every trainer."""
+    whole = TrainSettings.from_mapping(BASE).to_mapping()
+    assert (whole["num_env_runners"], whole["teacher"]) == (0, None)
+    settings = TrainSettings.from_mapping(whole)
+    assert type(settings) is SB3Settings
+    assert not hasattr(settings, "num_env_runners")
+    given = {**whole, "trainer": "rllib", "num_env_runners": 2}
+    assert TrainSettings.from_mapping(given) == RLlibSettings(**BASE, trainer="rllib", num_env_runners=2)
+    for name, value in (("start", "a.zip"), ("num_learners", 1)):
+        with pytest.raises(SettingsError, match=f"^{name}: the bandit trainer has no use for it; leave it out"):
+            TrainSettings.from_mapping({**whole, "trainer": "bandit", name: value})
 
 
 @pytest.mark.parametrize(

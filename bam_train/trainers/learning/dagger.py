@@ -8,11 +8,10 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Iterable
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
 import torch
-from msgspec import Meta
 from torch import nn
 from torch.nn import functional
 
@@ -23,9 +22,8 @@ from bam_train.settings import ImitationSettings
 from bam_train.trainers.learning.networks import Descent, Encoders, LearntPolicy, Numbers, two_layers
 from bam_train.trainers.learning.replay_memory import ActionCode, ReplayMemory
 from bam_train.trainers.learning.teacher import Teacher
-from bam_train.trainers.learning.torch_trainer import Positive, Share, TorchTrainer, Weight, state_of
+from bam_train.trainers.learning.torch_trainer import TorchTrainer, state_of
 
-_Count = Annotated[int, Meta(ge=1, le=10_000_000)]
 _KNEE = 0.1  # errors above are punished in proportion, below by their square
 _LAST_RATE = 0.02  # of the learning rate, at the end of the run
 _LEAST = 1e-2  # standard deviation of numbers that hardly change
@@ -34,32 +32,8 @@ _NO_MEMORY = (
 )
 
 
-@dataclasses.dataclass(frozen=True)
-class Dagger:
-    """Hyperparameters of DAgger."""
-
-    learning_rate: Positive = 1e-3
-    """At the beginning; it falls to a fiftieth over the run."""
-    batch_size: _Count = 128
-    """Steps that one update learns from."""
-    passes: Positive = 16.0
-    """How many times each step is learnt from, on average."""
-    teacher_share: Share = 0.25
-    """Share of the run over which the teacher acts in fewer and fewer episodes, from all of them to none."""
-    memory: _Count = 50_000
-    """Newest steps that are learnt from."""
-    guess_weight: Weight = 1.0
-    """Weight of guessing the state that the teacher sees, where the learner sees images instead."""
-    channels: _Count = 16
-    """Channels of the first convolution; the others have twice as many."""
-    width: _Count = 256
-    """Units of each of the two hidden layers."""
-
-
 class DaggerTrainer(TorchTrainer[ImitationSettings]):
     """Made by `create` or `load`; the policy that is played acts as the learner or, in some episodes, the teacher."""
-
-    Options = Dagger
 
     def __init__(self, settings: ImitationSettings) -> None:
         super().__init__(settings)

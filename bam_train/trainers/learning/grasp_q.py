@@ -8,11 +8,10 @@ candidates is tried. A step of the run is a grasp.
 from __future__ import annotations
 
 import dataclasses
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
 import torch
-from msgspec import Meta
 from torch.nn import functional
 
 from bam_train.environments import make_vector_env
@@ -22,7 +21,7 @@ from bam_train.settings import TrainSettings
 from bam_train.trainers.learning.grasp_network import HEIGHT_UNIT, Bytes, GraspNetwork, GraspPolicy, Grid
 from bam_train.trainers.learning.networks import Descent, cosine
 from bam_train.trainers.learning.replay_memory import ReplayMemory
-from bam_train.trainers.learning.torch_trainer import Count, Share, TorchTrainer
+from bam_train.trainers.learning.torch_trainer import TorchTrainer
 
 _ABOVE = 20  # least height of a place that is tried, in units of `HEIGHT_UNIT`
 _ANYWHERE = 0.1  # share of candidates at any place
@@ -30,30 +29,10 @@ _GOLDEN = 4  # pictures in a checkpoint
 _GRASPS = ("patches", "widths", "rewards")
 
 
-@dataclasses.dataclass(frozen=True)
-class GraspQ:
-    """Hyperparameters."""
-
-    learning_rate: Annotated[float, Meta(gt=0, le=1)] = 2e-3
-    """At the beginning; it falls to 0 along a cosine."""
-    batch_size: Count = 64
-    """Grasps that one update learns from."""
-    channels: Count = 16
-    """Channels of the first convolutions; the last have twice as many."""
-    reuse: Annotated[float, Meta(gt=0, le=1000)] = 24.0
-    """How often each grasp is learnt from, on average, before as many others have followed."""
-    candidates: Count = 128
-    """Random grasps of a picture, of which the best is tried."""
-    random_grasps: Annotated[int, Meta(ge=0)] = 1000
-    """Grasps at random before the network chooses."""
-    exploration: Share = 0.1
-    """Share of random grasps after that."""
-
-
 class GraspTrainer(TorchTrainer[TrainSettings]):
     """Made by `create` or `load`; the policy that is played chooses what to try."""
 
-    Options, recent = GraspQ, 200
+    recent = 200
 
     def __init__(self, settings: TrainSettings) -> None:
         super().__init__(settings)

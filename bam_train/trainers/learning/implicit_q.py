@@ -13,58 +13,16 @@ of the final values.
 from __future__ import annotations
 
 import copy
-from dataclasses import dataclass
-from typing import Annotated, Any
+from typing import Any
 
 import torch
-from msgspec import Meta
 from torch.nn import functional
 
+from bam_train.trainers.learner_hyperparameters import Cloning, ImplicitQ
 from bam_train.trainers.learning.networks import Descent, Ensemble, cosine, follow, two_layers
 from bam_train.trainers.learning.replay_memory import ActionCode, Batch, ReplayMemory
-from bam_train.trainers.learning.torch_trainer import Count, Positive, Share, Weight
 
 _MOST = 100.0  # greatest weight of an action
-
-
-@dataclass(frozen=True)
-class Cloning:
-    """Hyperparameters of behaviour cloning."""
-
-    learning_rate: Positive = 1e-3
-    """At the beginning; it falls to 0 along a cosine."""
-    batch_size: Count = 256
-    width: Count = 256
-    """Units of each of the actor's two hidden layers."""
-    weight_decay: Weight = 0.0
-    """Share of the actor's weights that each gradient pulls them back by; few episodes are cloned better with some."""
-    loss: Annotated[str, Meta(pattern="^(absolute|squared)$")] = "squared"
-    """Error of a Box action: squared (the mean of what was done; default of bc) or absolute (the median)."""
-
-
-@dataclass(frozen=True)
-class ImplicitQ(Cloning):
-    """Hyperparameters of implicit Q-learning."""
-
-    loss: Annotated[str, Meta(pattern="^(absolute|squared)$")] = "absolute"
-    """As of cloning; among actions of which many are bad, the median is the better guess."""
-    gamma: Share = 0.98
-    """Discount of a step."""
-    expectile: Share = 0.7
-    """0.5: the value of what was done; 1: of the best that was done."""
-    advantage_scale: Positive = 1.0
-    """Exponent of an action's weight for an advantage of one standard deviation."""
-    tau: Share = 0.005
-    """Share of the critics that the target critics take over at each update."""
-    critic_width: Count = 128
-    critic_share: Share = 0.7
-    """Share of the updates that go to the critics, before the actor's."""
-    update_ratio: Positive = 0.5
-    """Online: updates for each step of the environments."""
-    exploration: Positive = 0.1
-    """Online: deviation of the noise of Box actions, whose range is 2; share of random Discrete actions."""
-    online_from: Annotated[int, Meta(ge=0)] | None = None
-    """Step at which --resume went online; bam-train sets it."""
 
 
 class ImplicitQLearner:

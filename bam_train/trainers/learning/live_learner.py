@@ -32,7 +32,7 @@ from bam_train.trainers.frozen_network import FrozenNetwork, action_head
 from bam_train.trainers.learning.experience import Experience
 from bam_train.trainers.learning.networks import Descent
 from bam_train.trainers.learning.replay_memory import ActionCode
-from bam_train.trainers.learning.rlpd import Actor, Hyperparameters, Rlpd
+from bam_train.trainers.learning.rlpd import Actor, Rlpd
 from bam_train.trainers.learning.torch_trainer import STATE, TorchLearner
 
 ALGORITHM, TRAINER = "rlpd", "live"
@@ -111,8 +111,6 @@ def require_spaces(observed: Any, acted: Any) -> tuple[spaces.Box, spaces.Box]:
 
 class LiveLearner(TorchLearner[SB3Settings]):
     """Made by `create` or `load`."""
-
-    Options = Hyperparameters
 
     def __init__(self, settings: SB3Settings) -> None:
         super().__init__(settings)

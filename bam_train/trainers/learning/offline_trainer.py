@@ -20,7 +20,6 @@ from gymnasium import spaces
 
 from bam_envs.core.errors import BamEnvsError
 from bam_envs.core.registry import are_same
-from bam_envs.core.validation import read_table
 from bam_train.checkpoint import Checkpoint
 from bam_train.checkpoint.detector import Rollout
 from bam_train.data import DataSet
@@ -29,13 +28,13 @@ from bam_train.errors import SettingsError
 from bam_train.settings import OfflineSettings, differences
 from bam_train.trainers.algorithms import ALGORITHMS
 from bam_train.trainers.detection import WANTED, recorded
-from bam_train.trainers.learning.implicit_q import Cloning, ImplicitQ, ImplicitQLearner
+from bam_train.trainers.learner_hyperparameters import HYPERPARAMETERS
+from bam_train.trainers.learning.implicit_q import ImplicitQLearner
 from bam_train.trainers.learning.networks import Encoders, LearntPolicy
 from bam_train.trainers.learning.replay_memory import ActionCode, ReplayMemory
 from bam_train.trainers.learning.torch_trainer import TorchTrainer, restore, state_of
 from bam_train.trainers.resolve_settings import learnt_episodes, own_settings
 
-_OWN: dict[str, type[Cloning]] = {"bc": Cloning, "iql": ImplicitQ}
 _REPORT_EVERY = 50  # updates between two reports of progress
 _LEAST = 1e-3  # standard deviation of a value that was (almost) constant in the data
 _LARGEST = 200_000  # transitions of its own that are kept online
@@ -92,7 +91,7 @@ class OfflineTrainer(TorchTrainer[OfflineSettings]):
             "steps": len(memory),
         }
         made_of = self.options, self._encoders.outputs, self._code, memory
-        if settings.algo in _OWN:
+        if settings.algo in HYPERPARAMETERS:
             self.learner: Any = ImplicitQLearner(*made_of)
         else:
             from bam_train.trainers.learning.d3rlpy_learner import D3rlpyLearner
@@ -113,8 +112,8 @@ class OfflineTrainer(TorchTrainer[OfflineSettings]):
     @classmethod
     def read_options(cls, settings: OfflineSettings) -> Any:
         """The hyperparameters with their defaults: a dataclass, of an algorithm of d3rlpy a dict."""
-        if settings.algo in _OWN:
-            return read_table(_OWN[settings.algo], settings.hyperparameters, "hyperparameters", SettingsError)
+        if settings.algo in HYPERPARAMETERS:
+            return super().read_options(settings)
         from bam_train.trainers.learning.d3rlpy_learner import complete
 
         return complete(settings.algo, settings.hyperparameters)

@@ -15,74 +15,20 @@ critics count only where a setting says so: ``advantage_weight`` for what they v
 import copy
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Annotated, Any
+from typing import Any
 
 import torch
-from msgspec import Meta
 from torch import nn
 from torch.nn import functional
 
 from bam_train.trainers.frozen_network import Layer
+from bam_train.trainers.learner_hyperparameters import RlpdHyperparameters
 from bam_train.trainers.learning.networks import Descent, Ensemble, follow, two_layers
 from bam_train.trainers.learning.replay_memory import Batch
-from bam_train.trainers.learning.torch_trainer import Count, Positive, Share, Weight, restore, state_of
+from bam_train.trainers.learning.torch_trainer import restore, state_of
 
 _DRAWS = 2  # actions that the usual value of an observation is the mean of
 _MOST = 3.0  # greatest exponent of the weight of an action
-
-
-@dataclass(frozen=True)
-class Hyperparameters:
-    """Arguments of the algorithm."""
-
-    gamma: Share = 0.98
-    """Discount of a step."""
-    ahead: Count = 5
-    """Steps whose rewards are added before the critics' value of what follows."""
-    tau: Share = 0.005
-    """Share of the critics that the target critics take over at each update."""
-    learning_rate: Positive = 1e-4
-    """Three times as much unlearns, over ten thousand steps, a part of what a good policy can do already."""
-    batch_size: Count = 256
-    update_ratio: Annotated[float, Meta(gt=0, le=100)] = 2.0
-    """Updates of the critics for each step of the robot."""
-    actor_every: Count = 2
-    """Updates of the critics for each one of the actor."""
-    critics: Annotated[int, Meta(ge=2, le=100)] = 5
-    """Size of the ensemble."""
-    subset: Annotated[int, Meta(ge=1, le=100)] = 2
-    """Critics of which the least value is the target, drawn for each update."""
-    blur: Annotated[float, Meta(ge=0, le=10)] = 0.1
-    """Standard deviation of the noise on what the actor sees while it imitates, by that of each number in the batch: a
-    few demonstrations are then learnt for what is around them too."""
-    average: Annotated[float, Meta(gt=0, le=1)] = 0.002
-    """Share of the actor that its average, which drives the robot, takes over at each update of the actor."""
-    critic_width: Count = 128
-    actor_width: Count = 256
-    history: Annotated[int, Meta(ge=0, le=64)] = 5
-    """Last actions that the policy remembers, so that it can act on a robot that is late."""
-    reward_scale: Positive = 0.1
-    deviation: Positive = 0.15
-    """Standard deviation of the first explorations, before the squashing of actions to [-1, 1]."""
-    target_entropy: float = -10.0
-    temperature: Positive = 0.002
-    """The first weight of the entropy."""
-    demonstration_share: Share = 0.5
-    """Share of a batch that are demonstrations: half of them of a person, half of the robot's own successes."""
-    imitation_weight: Weight = 1.0
-    """Weight of the imitation of demonstrations in the actor's loss."""
-    advantage_weight: Weight = 0.0
-    """Weight of the imitation of experience, each action by the exponential of its advantage; about 1 where there is no
-    person and success is rare. Without it, and without `value_weight`, no critics are learnt."""
-    advantage_scale: Weight = 1.0
-    """Exponent of that for an advantage of one standard deviation."""
-    value_weight: Weight = 0.0
-    """Weight of SAC's own loss, value and entropy of drawn actions, relative to the mean value."""
-    warmup: Annotated[int, Meta(ge=0, le=10**9)] = 6000
-    """Updates of the critics before they count for the actor."""
-    actor_after: Annotated[int, Meta(ge=0, le=10**9)] = 300
-    """Steps of policies, not of a person, before the actor changes and the first candidate is pushed."""
 
 
 class Actor(Layer):
@@ -120,7 +66,7 @@ class Rlpd:
         settings: The hyperparameters.
     """
 
-    def __init__(self, inputs: int, actions: int, settings: Hyperparameters) -> None:
+    def __init__(self, inputs: int, actions: int, settings: RlpdHyperparameters) -> None:
         self.settings, self.updates = settings, 0
         self.actor = Actor(inputs, actions, settings.actor_width, settings.deviation)
         self.average = copy.deepcopy(self.actor).requires_grad_(False)

@@ -9,24 +9,23 @@ import json
 from collections import deque
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Generic, TypeVar
+from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 import numpy as np
 import torch
 from gymnasium.vector import VectorEnv
-from msgspec import Meta
 
 from bam_envs.core.spaces import space_to_json
-from bam_envs.core.validation import read_table
 from bam_train.checkpoint import GOLDEN, POLICY, Checkpoint, write_checkpoint
 from bam_train.checkpoint.safetensors_file import pack
 from bam_train.environments import control_period, make_env, require_fit
-from bam_train.errors import SettingsError, TrainingFailed
+from bam_train.errors import TrainingFailed
 from bam_train.policy import FrozenPolicy
 from bam_train.rollout import PlayedEpisode, play
 from bam_train.settings import TrainSettings
 from bam_train.trainers.algorithms import ALGORITHMS
 from bam_train.trainers.base import OnProgress, Progress, Statistics, manifest
+from bam_train.trainers.learner_hyperparameters import read_hyperparameters
 from bam_train.trainers.resolve_settings import own_settings
 from bam_train.trainers.run_folder import TensorBoardFiles
 
@@ -34,10 +33,6 @@ if TYPE_CHECKING:
     from typing_extensions import Self
 
 Settings = TypeVar("Settings", bound=TrainSettings)
-Count = Annotated[int, Meta(ge=1, le=100_000)]
-Positive = Annotated[float, Meta(gt=0, le=1e6)]
-Share = Annotated[float, Meta(ge=0, le=1)]
-Weight = Annotated[float, Meta(ge=0, le=1e6)]
 
 STATE, NOTES = "bam/resume/state", "bam/resume/notes.json"
 _LOGGED = 200  # entries of TensorBoard in a run
@@ -68,8 +63,6 @@ def restore(part: Any, state: Any) -> None:
 class TorchLearner(Generic[Settings]):
     """Base class of a learner; a subclass sets `spaces` and `parts`, and defines `policy`."""
 
-    Options: Any
-    """Dataclass of the hyperparameters."""
     spaces: tuple[Any, Any]
     """Spaces of observations and actions of one environment."""
     parts: dict[str, Any]
@@ -118,7 +111,7 @@ class TorchLearner(Generic[Settings]):
     @classmethod
     def read_options(cls, settings: Settings) -> Any:
         """The hyperparameters with their defaults; raises SettingsError if one is unknown or does not fit."""
-        return read_table(cls.Options, settings.hyperparameters, "hyperparameters", SettingsError)
+        return read_hyperparameters(settings.algo, settings.hyperparameters)
 
     @classmethod
     def create(cls, settings: Settings) -> Self:

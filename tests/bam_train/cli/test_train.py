@@ -74,8 +74,11 @@ def test_settings_are_checked_before_torch_and_ray_are_imported():
     code = """
 import sys
 from bam_train.cli import train
-for words in (["--set", "gamma=2"], ["--set", "gama=1"], ["--trainer", "rllib", "--set", "lr=-1"], ["--print-config"]):
-    try: train.main(["--env", "bam/reach", "--algo", "ppo", *words])
+for words in (
+    "ppo --set gamma=2", "ppo --set gama=1", "ppo --trainer rllib --set lr=-1",
+    "sac --trainer rllib --set actor_lr=fast", "dagger --teacher scripted --set width=0", "ppo --print-config",
+):
+    try: train.main(["--env", "bam/reach", "--algo", *words.split()])
     except SystemExit as end: print(end.code, *{'torch', 'ray', 'stable_baselines3'} & {*sys.modules}, file=sys.stderr)
 """
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
@@ -85,6 +88,10 @@ for words in (["--set", "gamma=2"], ["--set", "gama=1"], ["--trainer", "rllib", 
         "bam-train: Unknown ppo hyperparameter 'gama'. Did you mean 'gamma'?",
         "1",
         "bam-train: lr: expected a number above 0, found -1",
+        "1",
+        "bam-train: actor_lr: expected a number or a schedule [[step, value], ...], found 'fast'",
+        "1",
+        "bam-train: hyperparameters: width: expected a whole number from 1 to 10000000, found 0",
         "1",
         "0",
     ]
