@@ -97,14 +97,12 @@ class TrainSettings:
         for name in ("env", "algo"):
             if values.get(name) is None:
                 raise SettingsError(f"{name}: expected a name, found nothing. Give --{name} NAME")
-        checked = _checked(values)
-        for name in sorted(TABLES):
-            _require_finite(name, values.get(name))
+        checked = check_values(values)
         kind: Any = SETTINGS.get(checked.get("trainer", "sb3"), AllSettings)
         for name in [name for name in checked if name not in kind.__dataclass_fields__]:
             if checked.pop(name) != getattr(AllSettings, name):
                 raise SettingsError(f"{name}: {_NO_USE[name].format(**{'trainer': 'sb3', **checked})}")
-        settings: Self = kind(**json.loads(json.dumps(checked)))  # a deep copy: nothing shares the caller's tables
+        settings: Self = kind(**checked)
         settings.place.require_sane()
         return settings
 
@@ -192,12 +190,16 @@ def check_names(values: Mapping[str, Any], source: str) -> None:
             raise SettingsError(f"{source}: unknown setting {name!r}. {did_you_mean(name, NAMES)}")
 
 
-def _checked(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Top-level settings, each of its type and in its range."""
+def check_values(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Top-level settings, each of its type and in its range, as JSON has them; nothing shares the caller's tables."""
     from bam_envs.core.validation import check, type_hints  # imports Gymnasium, and --help reads this file
 
     hints = type_hints(AllSettings)
-    return {name: check(value, hints[name], prefix + name, SettingsError) for name, value in values.items()}
+    checked = {name: check(value, hints[name], prefix + name, SettingsError) for name, value in values.items()}
+    for name in sorted(TABLES):
+        _require_finite(prefix + name, checked.get(name))
+    copy: dict[str, Any] = json.loads(json.dumps(checked))
+    return copy
 
 
 def _require_finite(name: str, value: Any) -> None:
@@ -297,7 +299,7 @@ def parse_config(name: str, text: str) -> dict[str, Any]:
     if not isinstance(values, dict):
         raise SettingsError(f"{name}: expected a table of settings, found a {type(values).__name__}")
     check_names(values, name)
-    _checked({setting: value for setting, value in values.items() if value is not None}, f"{name}: ")
+    check_values({setting: value for setting, value in values.items() if value is not None}, f"{name}: ")
     return values  # a flag may replace None
 
 

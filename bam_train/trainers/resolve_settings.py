@@ -20,6 +20,7 @@ from bam_train.settings import (
     SB3Settings,
     TrainSettings,
     check_names,
+    check_values,
     differences,
     file_stem,
     merge,
@@ -67,13 +68,15 @@ def resolve(given: Mapping[str, Any], tell: Tell = lambda text: None) -> TrainSe
 
     Raises UnknownName for an unknown environment, SettingsError for any other setting that is unknown or does not fit.
     """
-    given = {**_of_data(given), **_of_algorithm(given), **given}
-    asked = TrainSettings.from_mapping(given)
-    env = _resolve_env(asked.env, elsewhere=bool(asked.transport or given.get("data")))
+    run = {name: value for name, value in given.items() if name != "hyperparameters"}
+    run = {**_of_data(run), **_of_algorithm(run), **run}
+    asked = TrainSettings.from_mapping(run)
+    env = _resolve_env(asked.env, elsewhere=bool(asked.transport or run.get("data")))
     require_algorithm(asked.trainer, asked.algo)
     preset = read_preset(env, asked.algo, asked.trainer)
     usual = {"steps": OFFLINE_STEPS} if asked.trainer == "offline" else {}
-    settings = TrainSettings.from_mapping(merge({**usual, **preset}, given, {"env": env}))
+    tuned = preset.pop("hyperparameters", {})
+    settings = TrainSettings.from_mapping(merge({**usual, **preset}, run, {"env": env}))
     require_env_kwargs(env, settings.env_kwargs)
     if "link" in settings.env_kwargs and entry_of(env) is not None:
         settings = replace(settings, env_kwargs={**settings.env_kwargs, "link": portable(settings.env_kwargs["link"])})
@@ -87,7 +90,8 @@ def resolve(given: Mapping[str, Any], tell: Tell = lambda text: None) -> TrainSe
             "give its arguments to bam-serve there"
         )
     _require_checkpoints(settings)
-    completed = _complete(settings, tell)
+    own = check_values({"hyperparameters": given.get("hyperparameters", {})})["hyperparameters"]
+    completed = _complete(replace(settings, hyperparameters=merge(tuned, own)), tell)
     if given.get("num_envs", completed.num_envs) != completed.num_envs:
         there = f"there are {completed.num_envs} at {settings.place.text}"
         raise SettingsError(f"num_envs: {settings.num_envs} were asked for, and {there}; leave it out")

@@ -48,7 +48,7 @@ RobotName = Annotated[
 NonEmpty = Annotated[str, Meta(min_length=1, description="non-empty text")]
 
 
-def check(value: object, kind: Any, name: str, error: type[Exception] = InvalidValue) -> Any:
+def check(value: Any, kind: Any, name: str, error: type[Exception] = InvalidValue) -> Any:
     """`value` as a `kind`: an int becomes a float if one is expected, a whole float (1e6) an int, a list a tuple.
 
     Args:
@@ -60,7 +60,8 @@ def check(value: object, kind: Any, name: str, error: type[Exception] = InvalidV
     Raises:
         error: ``name: expected ..., found ...``; in a list or table with the place, ``name[2]``, ``name.key``.
     """
-    value = _plain(value)
+    if type(value).__module__ == "numpy" and getattr(value, "ndim", None) == 0:  # a number as Python's
+        value = value.item()
     try:
         return msgspec.convert(value, kind)
     except msgspec.ValidationError:
@@ -177,12 +178,6 @@ def _plural(text: str) -> str:
     if noun is None:
         return f"({text})"
     return f"{text[: noun.start()].removeprefix('a ')}{noun[0]}s{text[noun.end() :]}"
-
-
-def _plain(value: Any) -> Any:
-    """A NumPy number as a Python number."""
-    is_number = type(value).__module__ == "numpy" and getattr(value, "ndim", None) == 0
-    return value.item() if is_number else value
 
 
 def _fits(value: object, kind: Any) -> bool:
