@@ -33,12 +33,6 @@ DataSetOrFile = Annotated[str | None, tyro.conf.arg(metavar="FILE|PLACE")]
 DataSetName = Annotated[str | None, tyro.conf.arg(metavar="PLACE")]
 
 
-def _unset(metavar: str) -> object:
-    """Annotation of a flag whose help shows `metavar` and no default."""
-    return tyro.conf.arg(metavar=metavar, help_behavior_hint="")
-
-
-_File = Annotated[Path | None, _unset("FILE")]
 _METAVARS = {
     "until_success": "SHARE",
     "stop_reward": "R",
@@ -81,7 +75,7 @@ def _settings_flags() -> Any:
     for name, hint in get_type_hints(AllSettings, include_extras=True).items():
         metavar = _METAVARS.get(name, "N" if "int" in repr(hint) else "NAME")
         hidden, kind = Annotated[None, tyro.conf.Suppress], str if name == "transport" else hint
-        flags.append((name, hidden if name in TABLES else Annotated[kind | None, _unset(metavar)], None))
+        flags.append((name, hidden if name in TABLES else Annotated[kind | None, tyro.conf.arg(metavar=metavar)], None))
     return make_dataclass("SettingsFlags", flags, bases=(AllSettings,), frozen=True)
 
 
@@ -119,27 +113,27 @@ class TrainConfig(SettingsFlags):  # type: ignore[misc]
     }
     """What to write for an option that there is not, and what to add to the error of any other one."""
 
-    config: _File = None
+    config: File = None
     """File of settings, .toml or .json, such as --print-config writes."""
     set: Assignments = ()
     """One setting, any number of times: learning_rate=lin_3e-4, policy_kwargs.net_arch=[64,64],
     env_kwargs.randomize=true."""
     print_config: bool = False
     """Print all settings of the run as JSON, and do not train."""
-    out: _File = None
+    out: File = None
     """Where the best checkpoint goes (default checkpoints/<env>-<algo>.zip); it may be s3://bucket/pick.zip.
     Missing folders are made."""
-    copy_to: Annotated[str | None, _unset("URL")] = None
+    copy_to: Url = None
     """Copy every checkpoint that goes to --out to an address too, such as s3://bucket/runs/."""
-    resume: _File = None
+    resume: File = None
     """Checkpoint to go on from, with its settings and up to --steps in all."""
     force: bool = False
     """Overwrite the checkpoint at --out instead of adding a number to its name."""
     runs: Annotated[Path, tyro.conf.arg(metavar="FOLDER")] = Path("runs")
     """Folder in which the run's own folder is made; it may be s3://bucket/runs."""
-    record: Annotated[str | None, _unset("PLACE")] = None
+    record: DataSetName = None
     """Add the episodes of training to this data set; of --trainer sb3 with an environment of bam_envs."""
-    learner: Annotated[str | None, _unset("URL")] = None
+    learner: Url = None
     """Learn from the robot of the live agent at this address, such as ws://robot:9095, while it runs (algorithm rlpd);
     candidates are pushed to it. --token-file and --ca-file are those of the agent."""
     push_every: Count = 10
@@ -181,7 +175,7 @@ class EvalConfig(EpisodeFlags, JsonFlag):
     """How many episodes the video shows."""
     trust_pickle: bool = False
     """Load a plain stable-baselines3 zip, which runs whatever code is in it."""
-    data: Annotated[str | None, tyro.conf.arg(metavar="PLACE")] = None
+    data: DataSetName = None
     """Play nothing, and estimate from the recorded episodes of this data set how good the policy is; then only --env,
     --seed, --json, --seen and --by count."""
     seen: Literal["refuse", "skip", "use"] = "refuse"

@@ -150,13 +150,7 @@ class RlpdHyperparameters:
     """Steps of policies, not of a person, before the actor changes and the first candidate is pushed."""
 
 
-HYPERPARAMETERS: dict[str, Any] = {
-    "bc": Cloning,
-    "dagger": Dagger,
-    "grasp-q": GraspQ,
-    "iql": ImplicitQ,
-    "rlpd": RlpdHyperparameters,
-}
+HYPERPARAMETERS = {"bc": Cloning, "dagger": Dagger, "grasp-q": GraspQ, "iql": ImplicitQ, "rlpd": RlpdHyperparameters}
 """The dataclass of each algorithm."""
 
 

@@ -7,6 +7,7 @@ can be written and read; a schedule is ``"lin_3e-4"``, linear to 0.
 
 import ast
 import builtins
+import contextlib
 import functools
 import importlib.util
 import inspect
@@ -171,23 +172,15 @@ def inherited(reference: str, method: str) -> Iterator[dict[str, inspect.Paramet
 
 def table(reference: str, name: str) -> dict[str, str]:
     """A table of classes in a class, as references: ``{"MlpPolicy": "module:Class"}``."""
-    try:
-        return next(_tables(reference, name))
-    except (LookupError, StopIteration):
-        found = getattr(pkgutil.resolve_name(reference), name)
-        return {key: f"{kind.__module__}:{kind.__qualname__}" for key, kind in found.items()}
-
-
-def _tables(reference: str, name: str) -> Iterator[dict[str, str]]:
-    for one in bases(source_of(reference)):
-        for node in one.node.body:
-            if (
-                isinstance(node, ast.AnnAssign)
-                and ast.unparse(node.target) == name
-                and isinstance(node.value, ast.Dict)
-            ):
-                pairs = zip(node.value.keys, node.value.values, strict=True)
-                yield {str(ast.literal_eval(key)): f"{one.module}:{ast.unparse(kind)}" for key, kind in pairs if key}
+    with contextlib.suppress(LookupError):
+        for one in bases(source_of(reference)):
+            for node in one.node.body:
+                rows = node.value if isinstance(node, ast.AnnAssign) and ast.unparse(node.target) == name else None
+                if isinstance(rows, ast.Dict):
+                    pairs = zip(rows.keys, rows.values, strict=True)
+                    return {ast.literal_eval(key): f"{one.module}:{ast.unparse(kind)}" for key, kind in pairs if key}
+    found = getattr(pkgutil.resolve_name(reference), name)
+    return {key: f"{kind.__module__}:{kind.__qualname__}" for key, kind in found.items()}
 
 
 def source_of(reference: str) -> LibrarySource:

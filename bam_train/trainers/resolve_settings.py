@@ -69,7 +69,7 @@ def resolve(given: Mapping[str, Any], tell: Tell = lambda text: None) -> TrainSe
     Raises UnknownName for an unknown environment, SettingsError for any other setting that is unknown or does not fit.
     """
     run = {name: value for name, value in given.items() if name != "hyperparameters"}
-    run = {**_of_data(run), **_of_algorithm(run), **run}
+    run = {**_implied(run), **run}
     asked = TrainSettings.from_mapping(run)
     env = _resolve_env(asked.env, elsewhere=bool(asked.transport or run.get("data")))
     require_algorithm(asked.trainer, asked.algo)
@@ -119,10 +119,11 @@ def require_start(settings: TrainSettings, path: str) -> Checkpoint:
     return checkpoint
 
 
-def _of_data(given: Mapping[str, Any]) -> dict[str, Any]:
-    """Settings that follow from a data set: its trainer, environment and arguments."""
-    if given.get("data") is None:
-        return {}
+def _implied(given: Mapping[str, Any]) -> dict[str, Any]:
+    """The trainer of an algorithm that no other one has; or the trainer, environment and arguments of a data set."""
+    trainers = [trainer for trainer in ("imitation", "bandit") if given.get("algo") in ALGORITHMS[trainer]]
+    if trainers or given.get("data") is None:
+        return {"trainer": trainers[0]} if trainers else {}
     from bam_train.data import DataSet
 
     trainer = given.get("trainer", "offline")
@@ -130,12 +131,6 @@ def _of_data(given: Mapping[str, Any]) -> dict[str, Any]:
         return {}  # the trainer checks whether they fit
     info = DataSet.open(given["data"]).info
     return {"trainer": trainer, "env": info.env, **({"env_kwargs": info.env_kwargs} if info.env_kwargs else {})}
-
-
-def _of_algorithm(given: Mapping[str, Any]) -> dict[str, Any]:
-    """The trainer of an algorithm that no other one has."""
-    trainers = [trainer for trainer in ("imitation", "bandit") if given.get("algo") in ALGORITHMS[trainer]]
-    return {"trainer": trainers[0]} if trainers else {}
 
 
 def _complete(settings: TrainSettings, tell: Tell) -> TrainSettings:

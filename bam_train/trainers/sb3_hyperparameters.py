@@ -143,12 +143,8 @@ def _require_policy(policy: str, given: Mapping[str, Any], space: spaces.Space[A
         elif not is_large(space):
             wanted = f"images of at least {SMALLEST_IMAGE} pixels along the shorter side"
     if wanted:
-        raise SettingsError(f"policy: {policy} is for {wanted}, found {brief_space(space)}. Leave policy out")
-
-
-def brief_space(space: spaces.Space[Any]) -> str:
-    """An observation space in a few words."""
-    return f"a Dict of {listed(space.spaces)}" if isinstance(space, spaces.Dict) else space_text(space)
+        found = f"a Dict of {listed(space.spaces)}" if isinstance(space, spaces.Dict) else space_text(space)
+        raise SettingsError(f"policy: {policy} is for {wanted}, found {found}. Leave policy out")
 
 
 def complete_normalize(
