@@ -243,6 +243,6 @@ def _value(node: ast.expr) -> Any:
 
 
 def _hint(node: ast.expr) -> Any:
-    """The annotation that is written in a node, with or without quotation marks."""
+    """The annotation that is written in a node, with or without quotation marks; evaluated, as an import would."""
     hint = eval(compile(ast.Expression(node), "<annotation>", "eval"), {}, _NAMES)
     return _hint(ast.parse(hint, mode="eval").body) if isinstance(hint, str) else hint

@@ -17,8 +17,8 @@ from bam_envs.remote.serve.tcp_server import TcpServer
 from bam_envs.robots.linked import link_profile
 from bam_train.checkpoint import write_checkpoint
 from bam_train.errors import AlteredCheckpoint, CheckpointMismatch, NotACheckpoint, OutputError, SettingsError
-from bam_train.settings import file_stem
-from bam_train.trainers import load_trainer, require_algorithm
+from bam_train.settings import SETTINGS, file_stem
+from bam_train.trainers import TRAINERS, load_trainer, require_algorithm
 from bam_train.trainers.algorithms import ALGORITHMS
 from bam_train.trainers.best_checkpoint import choose_output
 from bam_train.trainers.resolve_settings import PRESETS, read_preset, resolve, resolve_resumed
@@ -107,6 +107,7 @@ def test_the_table_of_trainers():
         SettingsError, match=r"^Unknown trainer 'x'\. Choose from: bandit, imitation, offline, rllib, sb3\.$"
     ):
         load_trainer("x")
+    assert TRAINERS.keys() == ALGORITHMS.keys() == SETTINGS.keys() - {"live"}
     require_algorithm("sb3", "recurrent-ppo")
     assert load_trainer("sb3").__name__ == "SB3Trainer"
 

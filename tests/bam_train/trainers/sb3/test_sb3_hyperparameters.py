@@ -63,6 +63,16 @@ def test_a_class_without_a_source_is_imported(monkeypatch):
     assert policies["MlpPolicy"] == "stable_baselines3.common.policies:ActorCriticPolicy"
 
 
+def test_annotations_are_read_without_what_they_import(tmp_path, monkeypatch):
+    taken = "self, a: 'int | None' = None, b: type[th.nn.Module] = th.nn.ReLU, c: Wave = 2"
+    (tmp_path / "no_torch_here.py").write_text(f"class Kind:\n    def __init__({taken}): ...")
+    monkeypatch.syspath_prepend(tmp_path)
+    found = parameters("no_torch_here:Kind")
+    hints = [as_written(found[name].annotation) for name in "abc"]
+    assert (hints, [found[name].default for name in "abc"]) == ([int | None, str, Other], [None, Other, 2])
+    assert "no_torch_here" not in sys.modules
+
+
 @pytest.mark.parametrize("name", SB3_ALGORITHMS)
 def test_defaults_are_json_and_complete_twice_is_once(name):
     values = complete(SB3_ALGORITHMS[name], {}, NUMBERS)
