@@ -23,7 +23,7 @@ from bam_train.errors import SettingsError
 if TYPE_CHECKING:
     from typing_extensions import Self
 
-    from bam_train.env_location import EnvLocation
+    from bam_envs.core.location import Location
 
 tomllib: Any = importlib.import_module("tomllib" if sys.version_info >= (3, 11) else "tomli")
 
@@ -103,15 +103,17 @@ class TrainSettings:
             if checked.pop(name) != getattr(AllSettings, name):
                 raise SettingsError(f"{name}: {_NO_USE[name].format(**{'trainer': 'sb3', **checked})}")
         settings: Self = kind(**checked)
-        settings.place.require_sane()
+        settings.place  # noqa: B018 - made here to refuse settings that exclude each other
         return settings
 
     @property
-    def place(self) -> EnvLocation:
-        """Where the environment runs."""
-        from bam_train.env_location import EnvLocation
+    def place(self) -> Location:
+        """Where the environment runs; `SettingsError` for settings that exclude each other."""
+        from bam_envs.core.location import Credentials, location_of
+        from bam_envs.core.wording import as_flag
 
-        return EnvLocation(transport=tuple(self.transport), ca_file=self.ca_file, token_file=self.token_file)
+        credentials = Credentials.of(self.ca_file, self.token_file)
+        return location_of({"transport": tuple(self.transport)}, credentials, as_flag, SettingsError)
 
     def to_mapping(self) -> dict[str, Any]:
         """The settings as plain JSON values, with the defaults of those that belong to other trainers."""

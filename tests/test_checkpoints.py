@@ -4,8 +4,8 @@ from pathlib import Path
 
 import pytest
 
+from bam_envs.core.location import SIMULATED
 from bam_train.checkpoint import Checkpoint
-from bam_train.env_location import SIMULATED
 from bam_train.evaluation import evaluate
 from bam_train.policy import FrozenPolicy
 

@@ -29,7 +29,6 @@ ORDER = {
         *(
             "errors",
             "signals",
-            "env_location",
             "settings",
             "finite_envs",
             "foreign_env",

@@ -3,27 +3,23 @@
 from dataclasses import dataclass
 from pathlib import Path
 
+from bam_envs.core.location import LiveRobot
 from bam_envs.rosbridge.endpoint import is_loopback
-from bam_train.env_location import EnvLocation
 
 
 @dataclass(frozen=True)
 class AgentOptions:
     """What a live agent drives, what it listens to, and where it keeps its versions."""
 
-    robot: str
-    """Address of the robot behind rosbridge."""
+    robot: LiveRobot
+    """Where the robot is; the `stage` below counts, not the one in it."""
     folder: Path
     """Folder of the versions, the audit file and the recordings."""
-    profile: str | None = None
-    guards: tuple[tuple[str, float], ...] = ()
-    ca_file: str | None = None
-    robot_token_file: str | None = None
     bind: str = "127.0.0.1"
     port: int = 9095
-    cert: str | None = None
-    key: str | None = None
-    token_file: str | None = None
+    cert: Path | None = None
+    key: Path | None = None
+    token_file: Path | None = None
     keys: Path | None = None
     allow_unsigned: bool = False
     stage: str | None = None
@@ -38,10 +34,8 @@ class AgentOptions:
     """Number of stops by guards after which a candidate is rolled back."""
     unusual: str = "warn"
     """What unusual observations lead to: ``"warn"``, ``"hold"`` or ``"stop"``."""
-    record: bool = True
-    robot_name: str = ""
-    """Name of the robot, where it does not tell its serial number or a name."""
-    data: str | None = None
+    no_record: bool = False
+    record: str | None = None
     """Data set to which the episodes of each recording are added at its end."""
 
     @property
@@ -50,15 +44,3 @@ class AgentOptions:
         if is_loopback(self.bind) or self.cert:
             return None
         return f"tokens and commands go over {self.bind} unencrypted: give --cert and --key, or trust that network"
-
-    def place(self, *, trial: bool | None) -> EnvLocation:
-        """The place of the robot."""
-        return EnvLocation(
-            self.robot,
-            profile=self.profile,
-            ca_file=self.ca_file,
-            token_file=self.robot_token_file,
-            guards=self.guards,
-            trial=trial,
-            robot_name=self.robot_name,
-        )

@@ -19,6 +19,7 @@ import msgspec
 import numpy as np
 
 from bam_envs.core.errors import BamEnvsError
+from bam_envs.core.location import SIMULATED
 from bam_envs.core.registry import are_same, entry_of
 from bam_envs.core.spaces import space_from_json
 from bam_train.agent.candidate import CandidateRequest, Verdict
@@ -27,7 +28,6 @@ from bam_train.checkpoint import GOLDEN, POLICY, Checkpoint
 from bam_train.checkpoint.manifest import WHERE
 from bam_train.checkpoint.signature import trusted_folder, verify
 from bam_train.deploy.checkpoint_admission import UNSIGNED
-from bam_train.env_location import SIMULATED
 from bam_train.environments import first_difference, interface_pairs, short_json
 from bam_train.errors import (
     BadKey,

@@ -384,7 +384,7 @@ class Resident:
 
     def _require_link(self) -> None:
         if self.session is not None and not self.session.is_up:
-            self._failed(LinkLost(f"{self.options.robot}: no state came for more than a second."))
+            self._failed(LinkLost(f"{self.options.robot.text}: no state came for more than a second."))
 
     def _drive(self) -> None:
         """Send the newest command of the person who has taken over, or rest while there is none."""
@@ -470,7 +470,7 @@ class Resident:
         self.session.deployment.swap(self.succession.policy())
         self.succession.load_previous()
         self.session.robot.observe(self._sent)
-        self.note("connected", f"{self.options.robot}: the robot fits, stage {self.session.stage}")
+        self.note("connected", f"{self.options.robot.text}: the robot fits, stage {self.session.stage}")
         if self._stopped:
             self._change(State.STOPPED, self._stopped)
         elif not self._is_running:
@@ -654,8 +654,8 @@ class Resident:
             "trial": self.succession.progress,
             "stage": None if session is None else session.stage,
             "owner": None if self.driver is None else self.driver.who,
-            "robot": self.options.robot if session is None else session.robot.info.text,
-            "identity": self.options.robot_name if session is None else session.identity,
+            "robot": self.options.robot.text if session is None else session.robot.info.text,
+            "identity": self.options.robot.robot_name if session is None else session.identity,
             "simulated": None if session is None else not session.is_real,
             "env": self.succession.active.env,
             "period": None if session is None else session.robot.spec.period,

@@ -7,11 +7,13 @@ import shutil
 import threading
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
 import gymnasium as gym
 
+from bam_envs.core.location import LiveRobot
 from bam_envs.core.timing import Pacer
 from bam_train.agent.agent_options import AgentOptions
 from bam_train.checkpoint import Checkpoint
@@ -21,7 +23,6 @@ from bam_train.deploy.deployment import Deployment, StopSwitch
 from bam_train.deploy.episode import EpisodeStep
 from bam_train.deploy.flight import deployment_facts, flight_recorder, recording_names, watch_cameras
 from bam_train.deploy.journal import Journal
-from bam_train.env_location import EnvLocation
 from bam_train.environments import control_period, environment_of, interface_of, make_env
 from bam_train.errors import BamTrainError
 from bam_train.recording.recorder import Recorder
@@ -80,9 +81,9 @@ class RobotSession:
     ) -> None:
         self.checkpoint, self._options = checkpoint, options
         self.env_id, self.env_kwargs = environment_of(checkpoint)
-        at = options.place(trial=True if stage == "trial" else None)
+        at = replace(options.robot, stage="trial" if stage == "trial" else None)
 
-        def examine(env: Any, place: EnvLocation) -> str:
+        def examine(env: Any, place: Any) -> str:
             contract = check_contract(checkpoint, env, place)
             contract.require(f"{checkpoint.path} and the robot at {place.text}")
             return "" if contract.inspection is None else contract.inspection.identity
@@ -95,7 +96,7 @@ class RobotSession:
             """The stage at which the robot moves."""
             record = options.folder / "trials.jsonl"
             admission = Admission(checkpoint, options.keys, options.allow_unsigned, record, options.i_know)
-            if place.trial is None:
+            if isinstance(place, LiveRobot) and place.stage is None:
                 admission.record = None
             lines = admission(self._env, place, known)
             self.identity = admission.identity
@@ -104,7 +105,7 @@ class RobotSession:
             self.policy, self.marks = admission.policy, admission.marks
             self.robot.react(options.unusual)
             self.interface = interface_of(self._env)
-            self.recorder = self._start_recorder() if options.record else None
+            self.recorder = self._start_recorder() if not options.no_record else None
             self.deployment = Deployment(
                 HeldOpen(self._env),
                 self.policy,
@@ -183,7 +184,7 @@ class RobotSession:
 
     def _end_recording(self, recorder: Recorder) -> None:
         recorder.close()
-        data = self._options.data
+        data = self._options.record
         if data is None:
             return
         from bam_train.data.record_dataset import info_of  # not above: the tick's process needs neither before
@@ -200,7 +201,7 @@ class RobotSession:
         """The recorder, started; without room for a recording the agent goes on."""
         options, checkpoint = self._options, self.checkpoint
         names = [options.folder / name for name in recording_names(self.env_id)]
-        facts = {**deployment_facts(checkpoint, self._env), "address": options.robot, "identity": self.identity}
+        facts = {**deployment_facts(checkpoint, self._env), "address": options.robot.text, "identity": self.identity}
         facts["marks"] = ", ".join(self.marks)
         recorder = flight_recorder(names[0], self._env, facts, names[1:])
         try:
@@ -212,6 +213,6 @@ class RobotSession:
             self._not_recorded = why
             return None
         with contextlib.suppress(BamTrainError):
-            for warning in watch_cameras(recorder, options.place(trial=None)):
+            for warning in watch_cameras(recorder, options.robot):
                 _log.warning("%s", warning)
         return recorder

@@ -256,7 +256,7 @@ class Succession:
     def _made(self, version: Version, ask: Ask) -> Choice:
         resident, digest = self._resident, version.digest
         session, policy = resident.session, self._policies.get(digest) or load_policy(version)
-        stage, address = ask.arguments.get("stage", "auto"), resident.options.robot
+        stage, address = ask.arguments.get("stage", "auto"), resident.options.robot.text
         identity = "" if session is None else session.identity
         is_real = session is not None and session.is_real
         checkpoint = Checkpoint.open(version.path, members=False)

@@ -11,6 +11,7 @@ from typing import Any
 
 import gymnasium as gym
 
+from bam_envs.core.location import LiveRobot, Location, Remote
 from bam_envs.core.robot import RobotSpec
 from bam_envs.core.wording import listed
 from bam_envs.live.examination import Inspection
@@ -20,7 +21,6 @@ from bam_train.checkpoint import Checkpoint
 from bam_train.cli.console import say
 from bam_train.deploy.checkpoint_admission import bring_up, has_real_robot
 from bam_train.deploy.contract import Contract, check_contract
-from bam_train.env_location import EnvLocation
 from bam_train.environments import environment_of, make_env, require_fit
 from bam_train.errors import SettingsError
 from bam_train.signals import SignalMemory
@@ -28,7 +28,7 @@ from bam_train.signals import SignalMemory
 
 def connected_env(
     checkpoint: Checkpoint | None,
-    place: EnvLocation,
+    place: Location,
     signals: SignalMemory,
     *,
     who: str,
@@ -37,7 +37,7 @@ def connected_env(
     render: bool | str = False,
     named: str | None = None,
     env_kwargs: Mapping[str, Any] | None = None,
-    admit: Callable[[gym.Env[Any, Any], EnvLocation, str], Sequence[str]] = lambda env, place, identity: (),
+    admit: Callable[[gym.Env[Any, Any], Location, str], Sequence[str]] = lambda env, place, identity: (),
     motion: Path | None = None,
     wiggle: bool = False,
 ) -> gym.Env[Any, Any]:
@@ -64,24 +64,25 @@ def connected_env(
     """
     env_id, saved = named or "", dict[str, Any]()
     if checkpoint is not None:
-        env_id, saved = environment_of(checkpoint, named, elsewhere=bool(place.transport))
+        env_id, saved = environment_of(checkpoint, named, elsewhere=isinstance(place, Remote))
     mode = "human" if render is True else render or None
     make = partial(make_env, env_id, {**saved, **(env_kwargs or {})}, render_mode=mode)
 
-    def examine(env: Any, place: EnvLocation) -> Contract:
+    def examine(env: Any, place: Location) -> Contract:
         return Contract(()) if checkpoint is None else required_contract(checkpoint, env, place, motion)
 
     env: gym.Env[Any, Any]
     env, place, contract = bring_up(make, place, examine, raise_again=signals.raise_again)
     try:
         known = "" if contract.inspection is None else contract.inspection.identity
+        is_shadow = isinstance(place, LiveRobot) and place.stage == "shadow"
         plan = [*plan_lines(env, env_id, place.text, episodes, wiggle=wiggle), *admit(env, place, known)]
         signals.raise_again()
-        if not place.shadow:
+        if not is_shadow:
             actor = "a person" if checkpoint is None else checkpoint.path
             require_consent(env, f"{who}: {actor}", yes=yes, plan=plan)
         signals.raise_again()
-        if wiggle and contract.inspection is not None and not place.shadow:
+        if wiggle and contract.inspection is not None and not is_shadow:
             require_motion(env, f"{actor} and the robot at {place.text}", contract.inspection)
             signals.raise_again()
     except BaseException:
@@ -90,7 +91,7 @@ def connected_env(
     return env
 
 
-def required_contract(checkpoint: Checkpoint, env: Any, place: EnvLocation, motion: Path | None = None) -> Contract:
+def required_contract(checkpoint: Checkpoint, env: Any, place: Location, motion: Path | None = None) -> Contract:
     """The contract of a checkpoint with a live robot, shown in short if it is real or refused; moves nothing.
 
     For any other environment, only spaces and signals are compared, and the contract is empty.
@@ -99,7 +100,7 @@ def required_contract(checkpoint: Checkpoint, env: Any, place: EnvLocation, moti
         ContractRefused: They do not fit; the table is shown.
         CheckpointMismatch: An environment without a live robot does not fit.
     """
-    if place.robot is None:
+    if not isinstance(place, LiveRobot):
         require_fit(checkpoint, env, place)
         return Contract(())
     contract = check_contract(checkpoint, env, place)
@@ -109,7 +110,7 @@ def required_contract(checkpoint: Checkpoint, env: Any, place: EnvLocation, moti
         from bam_train.deploy.wiggle import recorded_motion
 
         known = "" if contract.inspection is None else contract.inspection.identity
-        lines = recorded_motion(motion, env.unwrapped.robot.spec, place.robot, known)
+        lines = recorded_motion(motion, env.unwrapped.robot.spec, place.text, known)
         moved = Contract(tuple(lines))
         contract = replace(contract, checks=(*contract.checks, *moved.checks))
         shown += moved.lines()

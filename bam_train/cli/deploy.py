@@ -22,11 +22,11 @@ if TYPE_CHECKING:
 
     import gymnasium as gym
 
+    from bam_envs.core.location import LiveRobot, Location
     from bam_train.checkpoint import Checkpoint
     from bam_train.cli.flags import DeployConfig
     from bam_train.deploy.checkpoint_admission import Admission
     from bam_train.deploy.deployment import Deployment
-    from bam_train.env_location import EnvLocation
     from bam_train.recording.recorder import Recorder
 
 
@@ -47,6 +47,7 @@ def deploy_checkpoint(config: DeployConfig, signals: SignalMemory) -> int:
     if config.rehearse is not None:
         return _rehearse(config, config.rehearse)
     place = _checked_place(config)
+    from bam_envs.core.location import LiveRobot
     from bam_envs.core.timing import Pacer
     from bam_train.checkpoint import Checkpoint
     from bam_train.checkpoint.detector import DETECTOR
@@ -59,7 +60,7 @@ def deploy_checkpoint(config: DeployConfig, signals: SignalMemory) -> int:
     checkpoint = Checkpoint.open(config.checkpoint)
     if config.print_guards:
         return print_guards(config, checkpoint, place)
-    if config.print_contract:
+    if config.print_contract and isinstance(place, LiveRobot):
         return _print_contract(config, checkpoint, place)
     if config.unusual is not None and not checkpoint.has(DETECTOR):
         remedy = f"Add one: bam-eval {checkpoint.path} --add-detector"
@@ -87,7 +88,7 @@ def deploy_checkpoint(config: DeployConfig, signals: SignalMemory) -> int:
     return _run(config, checkpoint, place, deployment, signals, admission, seed)
 
 
-def print_guards(config: DeployConfig, checkpoint: Checkpoint, place: EnvLocation) -> int:
+def print_guards(config: DeployConfig, checkpoint: Checkpoint, place: Location) -> int:
     """Print the guards between a live robot and the policy of `checkpoint`; nothing is connected."""
     from bam_envs.core.registry import entry_of
     from bam_train.deploy.guard_table import guard_lines, in_force
@@ -107,7 +108,7 @@ def print_guards(config: DeployConfig, checkpoint: Checkpoint, place: EnvLocatio
     return 0
 
 
-def _print_contract(config: DeployConfig, checkpoint: Checkpoint, place: EnvLocation) -> int:
+def _print_contract(config: DeployConfig, checkpoint: Checkpoint, place: LiveRobot) -> int:
     """Print the whole contract of `checkpoint` with the live robot at `place`; nothing moves."""
     from bam_train.deploy.contract import check_contract
     from bam_train.environments import environment_of, make_env
@@ -123,8 +124,8 @@ def _rehearse(config: DeployConfig, link: str) -> int:
     """Rehearse the deployment in simulation, and report it."""
     from bam_envs.core.wording import as_flag
     from bam_train.checkpoint import Checkpoint
+    from bam_train.deploy.guard_table import read_guards
     from bam_train.deploy.rehearsal import Rehearsal
-    from bam_train.env_location import read_guards
     from bam_train.errors import SettingsError
     from bam_train.policy import FrozenPolicy
 
@@ -133,7 +134,7 @@ def _rehearse(config: DeployConfig, link: str) -> int:
             raise SettingsError(f"--rehearse simulates the robot, its link and its time; leave out {as_flag(name)}")
     checkpoint = Checkpoint.open(config.checkpoint)
     policy = FrozenPolicy.from_checkpoint(checkpoint)
-    limits: Any = {"profile": config.profile, "guards": dict(read_guards(config.guard))}
+    limits: Any = {"profile": config.profile, "guards": read_guards(config.guard)}
     with closing(Rehearsal(checkpoint, link, named=config.env, **limits)) as rehearsal:
         report = rehearsal.run(
             policy,
@@ -148,7 +149,7 @@ def _rehearse(config: DeployConfig, link: str) -> int:
 def _run(
     config: DeployConfig,
     checkpoint: Checkpoint,
-    place: EnvLocation,
+    place: Location,
     deployment: Deployment,
     signals: SignalMemory,
     admission: Admission,
@@ -175,7 +176,7 @@ def _run(
         for warning in report.warnings():
             say(f"bam-deploy: warning: {warning}")
         tell(*([json_module.dumps(report.to_json(), allow_nan=False)] if config.json else report.lines()))
-        say_agent_rests(env, "bam-deploy", place.robot)
+        say_agent_rests(env, "bam-deploy", config.robot)
         _add_to_data_set(config, checkpoint, env, deployment.recorder)
     return ending.status
 
@@ -205,13 +206,10 @@ def _add_to_data_set(
     say(f"bam-deploy: {recorder.path} is in {config.record} now")
 
 
-def _checked_place(config: DeployConfig) -> EnvLocation:
+def _checked_place(config: DeployConfig) -> Location:
     """The place of the environment by the flags; invalid flags are refused before anything is loaded."""
-    from bam_envs.core.wording import as_flag
-    from bam_train.env_location import EnvLocation, addresses, read_guards
     from bam_train.errors import SettingsError
 
-    ca_file, token_file = (None if path is None else str(path) for path in (config.ca_file, config.token_file))
     if config.print_guards and config.transport is not None:
         raise SettingsError("--print-guards shows the guards of a live robot, and --transport has none; leave it out")
     if config.print_contract and (config.robot is None or config.print_guards):
@@ -220,49 +218,17 @@ def _checked_place(config: DeployConfig) -> EnvLocation:
         )
     if config.print_guards and config.shadow:
         raise SettingsError("--print-guards shows what limits commands, and --shadow sends none; give one of the two")
-    robot = ANY_ROBOT if config.print_guards and config.robot is None else config.robot
-    place = EnvLocation(
-        robot,
-        addresses(config.transport),
-        config.profile,
-        ca_file,
-        token_file,
-        config.timeout,
-        read_guards(config.guard),
-        trial=None if config.stage is None else config.stage == "trial",
-        shadow=config.shadow,
-        robot_name=config.robot_name,
-    )
     if config.record is not None and config.no_record:
         raise SettingsError("--record and --no-record exclude each other; give one of the two")
     if config.record is not None:
         _require_recordable(config.record)
     if config.rate is not None and config.fast:
         raise SettingsError("--fast does not wait for deadlines, so --rate has no meaning with it; give one of the two")
-    if config.transport is not None and not place.transport:
-        raise SettingsError("--transport: expected an address, found none; leave it out for the simulation here")
-    place.require_sane()
-    if config.robot is not None and (config.rate is not None or config.fast):
-        flag = "--fast" if config.fast else "--rate"
-        raise SettingsError(f"a live robot is driven at the rate that its policy was made for; leave out {flag}")
-    for name in ("stage", "trials", "keys", "allow_unsigned", "unusual"):
-        if robot is None and getattr(config, name):
-            raise SettingsError(f"{as_flag(name)} is for a live robot; give its address with --robot too")
-    if config.shadow and robot is None:
-        raise SettingsError("--shadow is for a live robot; give its address with --robot too")
-    if config.shadow and (moving := [name for name in ("stage", "wiggle", "trials") if getattr(config, name)]):
-        raise SettingsError(f"--shadow moves nothing; leave out {' and '.join(map(as_flag, moving))}")
-    if config.shadow and config.unusual:
-        raise SettingsError("--shadow sends nothing, and --unusual is about what is sent; leave --unusual out")
-    if config.i_know and config.stage != "full":
-        raise SettingsError("--i-know is for --stage full alone; leave it out")
-    if config.robot is None and (config.wiggle or config.motion is not None):
-        flag = "--wiggle" if config.wiggle else "--motion"
-        raise SettingsError(f"{flag} is about the axes of a live robot; give its address with --robot too")
+    place = config.location(robot=ANY_ROBOT if config.print_guards and config.robot is None else config.robot)
     if config.render:
         from bam_train.cli.consent import require_screen
 
-        require_screen(remote=place.is_remote)
+        require_screen(remote=bool(place.text))
     return place
 
 
@@ -280,10 +246,10 @@ def _require_recordable(place: str) -> None:
 
 
 def _recorder(
-    config: DeployConfig, checkpoint: Checkpoint, place: EnvLocation, env: gym.Env[Any, Any], facts: Mapping[str, Any]
+    config: DeployConfig, checkpoint: Checkpoint, place: Location, env: gym.Env[Any, Any], facts: Mapping[str, Any]
 ) -> Recorder | None:
     """The recorder that the flags ask for, started; None for none."""
-    if config.record is None and (config.no_record or place.robot is None):
+    if config.record is None and (config.no_record or config.robot is None):
         return None
     from bam_train.data.recordings import is_data_set
     from bam_train.deploy.checkpoint_admission import has_real_robot

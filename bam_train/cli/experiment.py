@@ -8,6 +8,7 @@ from typing import Any
 
 import gymnasium as gym
 
+from bam_envs.core.location import HERE, LiveRobot
 from bam_envs.core.timing import Pacer
 from bam_envs.live.building import require_robot_address
 from bam_train.checkpoint import Checkpoint
@@ -16,7 +17,7 @@ from bam_train.cli.console import say
 from bam_train.cli.flags import EnvId, File, Url
 from bam_train.deploy.deployment import Deployment
 from bam_train.deploy.journal import EpisodeRecord, Journal
-from bam_train.env_location import EnvLocation
+from bam_train.environments.made_env import with_live_robot
 from bam_train.signals import SignalMemory, handled, interrupt
 
 
@@ -54,7 +55,7 @@ def require_place(env_id: str, robot: str | None, render: bool) -> None:
     """Refuse an invalid ``--robot`` and a ``--render`` without a screen; makes and connects nothing."""
     if robot is not None:
         require_robot_address(robot)
-        EnvLocation(robot).robot_kwargs(env_id, {})
+        with_live_robot(env_id, {}, LiveRobot(robot))
     if render:
         require_screen(remote=robot is not None)
 
@@ -92,7 +93,8 @@ def open_env(
     """
     require_place(checkpoint.manifest.env, robot, render)
     with SignalMemory() as signals:
-        env = connected_env(checkpoint, EnvLocation(robot), signals, render=render, **asked)
+        place = HERE if robot is None else LiveRobot(robot, stage="full")
+        env = connected_env(checkpoint, place, signals, render=render, **asked)
         with contextlib.closing(env):
             yield env
 

@@ -7,12 +7,15 @@ Programs import this after they have begun to handle signals, because importing 
 import sys
 from dataclasses import dataclass, make_dataclass
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal, get_type_hints
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, get_type_hints
 
 import tyro
 from msgspec import Meta
 
 from bam_train.settings import TABLES, AllSettings
+
+if TYPE_CHECKING:
+    from bam_envs.core.location import Credentials, Location
 
 Count = Annotated[int, Meta(ge=1)]
 Seed = Annotated[int, Meta(ge=0)]
@@ -64,6 +67,72 @@ class EpisodeFlags:
     """An argument of the environment, any number of times: randomize=true, link=wifi. It wins over the checkpoint's."""
     num_envs: Annotated[Count | None, tyro.conf.arg(metavar="N")] = None
     """Environments stepped side by side; by default as many as is quick."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class CredentialFlags:
+    """Flags of the files by which a client trusts a server, and is trusted."""
+
+    ca_file: File = None
+    """Certificates that wss:// trusts instead of the system's."""
+    token_file: File = None
+    """File with the token that the server asks for."""
+
+    @property
+    def credentials(self) -> "Credentials":
+        """The files of the flags."""
+        from bam_envs.core.location import Credentials
+
+        return Credentials.of(self.ca_file, self.token_file)
+
+
+@dataclass(frozen=True, kw_only=True)
+class LiveRobotFlags(CredentialFlags):
+    """Flags of a live robot, and of how it may move."""
+
+    robot: Url = None
+    """Live robot behind rosbridge, such as ws://10.0.0.5:9090; by default a simulated one here."""
+    robot_name: Annotated[str, tyro.conf.arg(metavar="NAME")] = ""
+    """Name of the live robot, where it does not tell its serial number or a name: trials count for the robot of that
+    name. A robot that tells another name is refused."""
+    profile: Name = None
+    """Topics and limits of the live robot: a shipped profile's name, or a .toml or .yaml file."""
+    guard: Assignments = ()
+    """One limit of the live robot's guards, any number of times: joint_speed=0.3; see bam-deploy --print-guards."""
+    stage: Annotated[Literal["trial", "full"] | None, tyro.conf.arg(metavar="trial|full")] = None
+    """trial (default on a real robot): a quarter of the speed, in a box around the start; full: at its limits."""
+    yes: bool = False
+    """Do not ask before a real robot moves."""
+    keys: Folder = None
+    """Public keys that a real robot trusts; $BAM_TRUSTED_KEYS or ~/.config/bam-train/trusted by default."""
+    allow_unsigned: bool = False
+    """Let a checkpoint without a trusted signature move a real robot; every status shows UNSIGNED."""
+
+    def location(self, *without: str, **instead: Any) -> "Location":
+        """Where the environment runs; flags that exclude each other are refused.
+
+        Args:
+            without: Flags that need no live robot here.
+            instead: Values instead of those of the flags.
+        """
+        from bam_envs.core.location import location_of
+        from bam_envs.core.wording import as_flag
+        from bam_train.deploy.guard_table import read_guards
+        from bam_train.errors import SettingsError
+
+        given = {**vars(self), "guard": read_guards(self.guard), **instead}
+        given = {name: value for name, value in given.items() if name not in without}
+        return location_of(given, self.credentials, as_flag, SettingsError)
+
+
+@dataclass(frozen=True, kw_only=True)
+class LocationFlags(LiveRobotFlags):
+    """Flags of where an environment runs."""
+
+    transport: Url = None
+    """Whole environment that runs elsewhere: ws://10.0.0.5:9090/bam_001 (GymAPI), tcp://10.0.0.5:9091."""
+    timeout: Annotated[Positive | None, tyro.conf.arg(metavar="S")] = None
+    """Longest wait for an answer of --transport [s]; 30 by default."""
 
 
 def _settings_flags() -> Any:
@@ -189,7 +258,7 @@ class EvalConfig(EpisodeFlags, JsonFlag):
 
 
 @dataclass(frozen=True)
-class DeployConfig:
+class DeployConfig(LocationFlags):
     """Run the frozen policy of a checkpoint on a robot, simulated here or live, at the rate it was made for.
 
     Examples:
@@ -217,42 +286,17 @@ class DeployConfig:
     that no trial of this checkpoint on this robot has had."""
     env: EnvId = None
     """Refuse the checkpoint unless it was trained on this environment; needed for some_module:Env-v0."""
-    robot: Url = None
-    """Live robot behind rosbridge, such as ws://10.0.0.5:9090; by default the simulated one here."""
-    robot_name: Annotated[str, tyro.conf.arg(metavar="NAME")] = ""
-    """Name of the live robot, where it does not tell its serial number or a name: trials count for the robot of that
-    name. A robot that tells another name is refused."""
-    transport: Url = None
-    """Whole environment that runs elsewhere: ws://10.0.0.5:9090/bam_001 (GymAPI), tcp://10.0.0.5:9091."""
-    profile: Name = None
-    """Topics and limits of the live robot: a shipped profile's name, or a .toml or .yaml file."""
-    guard: Assignments = ()
-    """One limit of the live robot's guards, any number of times: joint_speed=0.3; --print-guards has their names."""
     print_guards: bool = False
     """Print the guards that a live robot would have, with their limits and what they do; connect and move nothing."""
     print_contract: bool = False
     """Print every line of the contract with the live robot, and move nothing; status 3 if one is refused."""
-    ca_file: File = None
-    """Certificates that wss:// trusts instead of the system's."""
-    token_file: File = None
-    """File with the token that the server asks for."""
-    timeout: Annotated[Positive | None, tyro.conf.arg(metavar="S")] = None
-    """Longest wait for an answer of --transport [s]; 30 by default."""
     rehearse: Annotated[str | None, tyro.conf.arg(metavar="LINK")] = None
     """Rehearse in simulated time: the simulated robot behind a link (wifi, lte, bad or a .json file of bam-doctor) and
     the guards of a live robot."""
-    yes: bool = False
-    """Do not ask before a real robot moves."""
-    keys: Folder = None
-    """Public keys that a real robot trusts; $BAM_TRUSTED_KEYS or ~/.config/bam-train/trusted by default."""
-    allow_unsigned: bool = False
-    """Let a checkpoint without a trusted signature move a real robot; every status line shows UNSIGNED."""
     motion: File = None
     """Recording (.mcap) of this robot in which each axis must have moved as commanded."""
     wiggle: bool = False
     """Move each axis of a live robot a little and back first, to check that it moves as commanded."""
-    stage: Annotated[Literal["trial", "full"] | None, tyro.conf.arg(metavar="trial|full")] = None
-    """trial (default on a real robot): a quarter of the speed, in a box around the start; full: at its limits."""
     i_know: bool = False
     """Let --stage full run before trials on this robot have shown that the policy succeeds."""
     shadow: bool = False
@@ -278,7 +322,7 @@ class DeployConfig:
 
 
 @dataclass(frozen=True)
-class DoctorConfig:
+class DoctorConfig(CredentialFlags):
     """Check a live robot step by step without moving it, name the first failing step, and measure its link.
 
     Examples:
@@ -294,10 +338,6 @@ class DoctorConfig:
     """Refuse the checkpoint unless it was trained on this environment; needed for some_module:Env-v0."""
     profile: Name = None
     """Topics and limits of the robot: a shipped profile's name, or a .toml or .yaml file; by default the best fit."""
-    ca_file: File = None
-    """Certificates that wss:// trusts instead of the system's."""
-    token_file: File = None
-    """File with the token that the server asks for."""
     seconds: Annotated[Positive, tyro.conf.arg(metavar="S")] = 5.0
     """Duration of the measurement of states and link [s]."""
     measure: File = None
@@ -367,7 +407,7 @@ class EnvsConfig(JsonFlag):
 
 
 @dataclass(frozen=True)
-class ServeConfig:
+class ServeConfig(CredentialFlags):
     """Serve a Gymnasium environment, and the topics of its simulated robot, to clients of rosbridge, TCP or ROS 2.
 
     Examples:
@@ -415,14 +455,12 @@ class ServeConfig:
     """Certificate in PEM, for wss:// instead of ws://."""
     key: Annotated[str | None, tyro.conf.arg(metavar="FILE")] = None
     """Its key, if it is in another file."""
-    token_file: Annotated[str | None, tyro.conf.arg(metavar="FILE")] = None
+    token_file: File = None
     """File with a secret that clients must show; with --via, the one to show there."""
     operator_token_file: Annotated[str | None, tyro.conf.arg(metavar="FILE")] = None
     """File with another secret: who shows that one may take command from others."""
     no_token: bool = False
     """Listen on a network without a token: anybody who reaches this computer may command what is served."""
-    ca_file: Annotated[str | None, tyro.conf.arg(metavar="FILE")] = None
-    """With --via wss://: certificates to trust instead of the system's."""
     image_format: Annotated[str, tyro.conf.arg(metavar="png|jpeg")] = "png"
     """Images as png, which keeps every bit, or jpeg."""
     gymapi_version: Annotated[str | None, tyro.conf.arg(metavar="VERSION")] = None
@@ -456,7 +494,7 @@ class SignConfig:
 
 
 @dataclass(frozen=True)
-class AgentConfig:
+class AgentConfig(LiveRobotFlags):
     """Stay on a robot's computer and run a policy, episode after episode; people watch, pause, take over, push others.
 
     Without --robot it brings a simulated robot. The console is at http://127.0.0.1:9095, in any browser.
@@ -479,11 +517,6 @@ class AgentConfig:
 
     policy: File = None
     """The checkpoint.zip to begin with; started again with the same one or none, an agent goes on with its champion."""
-    robot: Url = None
-    """Live robot behind rosbridge, such as ws://127.0.0.1:9090; by default a simulated one."""
-    robot_name: Annotated[str, tyro.conf.arg(metavar="NAME")] = ""
-    """Name of the live robot, where it does not tell its serial number or a name: trials count for the robot of that
-    name. A robot that tells another name is refused."""
     port: Port = 9095
     """Port for people and programs; 0 takes a free one."""
     bind: Annotated[str, tyro.conf.arg(metavar="ADDRESS")] = "127.0.0.1"
@@ -500,24 +533,10 @@ class AgentConfig:
     """Refuse the checkpoint unless it was trained on this environment; needed for some_module:Env-v0."""
     set: Assignments = ()
     """One keyword argument of the simulated robot's environment, any number of times: randomize=true."""
-    profile: Name = None
-    """Topics and limits of the live robot: a shipped profile's name, or a .toml or .yaml file."""
-    guard: Assignments = ()
-    """One limit of the live robot's guards, any number of times: joint_speed=0.3."""
-    ca_file: File = None
-    """Certificates that a wss:// robot is trusted by instead of the system's."""
     robot_token_file: File = None
     """File with the token that the robot's rosbridge server asks for."""
-    keys: Folder = None
-    """Public keys that a real robot trusts; $BAM_TRUSTED_KEYS or ~/.config/bam-train/trusted by default."""
-    allow_unsigned: bool = False
-    """Let a checkpoint without a trusted signature move a real robot; every status shows UNSIGNED."""
-    stage: Annotated[Literal["trial", "full"] | None, tyro.conf.arg(metavar="trial|full")] = None
-    """trial (default on a real robot): a quarter of the speed, in a box around the start; full: at its limits."""
     i_know: bool = False
     """Let --stage full run before trials on this robot have shown that the policy succeeds."""
-    yes: bool = False
-    """Do not ask before a real robot moves."""
     paused: bool = False
     """Start paused, as an agent does that ran before in its folder."""
     resume: bool = False
@@ -534,3 +553,10 @@ class AgentConfig:
     """Do not record what the robot does."""
     record: DataSetName = None
     """Add the episodes to this data set too, whenever a recording ends."""
+
+    @property
+    def credentials(self) -> "Credentials":
+        """The files for the server of the live robot; `token_file` has the tokens of people."""
+        from bam_envs.core.location import Credentials
+
+        return Credentials.of(self.ca_file, None if self.robot is None else self.robot_token_file)

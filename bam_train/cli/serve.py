@@ -30,7 +30,8 @@ def serve(config: ServeConfig, signals: SignalMemory) -> None:
         raise SettingsError(
             f"--bind: expected an address without a port, found {config.bind!r}; give --bind {host} --port {port}"
         )
-    options = ServeOptions(**{name: getattr(config, name) for name in ServeOptions.__dataclass_fields__})
+    given = {name: getattr(config, name) for name in ServeOptions.__dataclass_fields__}
+    options = ServeOptions(**{**given, **vars(config.credentials)})
     options.require_sane()
     handler = logging.StreamHandler()
     handler.setFormatter(ShownFormatter("bam-serve: %(message)s"))

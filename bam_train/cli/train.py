@@ -28,8 +28,8 @@ _KEPT: list[contextlib.ExitStack] = []
 
 def train(config: TrainConfig) -> int:
     """Run the program with its parsed flags; returns the exit status."""
+    from bam_envs.core.location import addresses
     from bam_train.checkpoint import Checkpoint
-    from bam_train.env_location import addresses
     from bam_train.errors import SettingsError
     from bam_train.settings import NAMES, merge, read_assignments, read_config
     from bam_train.trainers.resolve_settings import read_preset, resolve, resolve_resumed

@@ -8,6 +8,7 @@ from typing import Any, TypeVar
 import gymnasium as gym
 
 from bam_envs.core.config_folder import config_folder
+from bam_envs.core.location import LiveRobot, Location
 from bam_envs.core.robot_env import robot_of
 from bam_envs.live.robot_identity import is_one_robot
 from bam_envs.rosbridge.endpoint import Endpoint
@@ -15,7 +16,6 @@ from bam_envs.safety.guard import TRIAL_SPEED
 from bam_train.checkpoint import Checkpoint
 from bam_train.deploy.agreement import Shadow
 from bam_train.deploy.trials import Subject, TrialRecord, Trials
-from bam_train.env_location import EnvLocation
 from bam_train.errors import SettingsError, TrialsNeeded, UntrustedCheckpoint
 from bam_train.policy import FrozenPolicy
 
@@ -34,12 +34,12 @@ def has_real_robot(env: Any) -> bool:
 
 def bring_up(
     make: Callable[..., Any],
-    place: EnvLocation,
-    examine: Callable[[Any, EnvLocation], Found],
+    place: Location,
+    examine: Callable[[Any, Location], Found],
     *,
     trial_if_real: bool = True,
     raise_again: Callable[[], None] = lambda: None,
-) -> tuple[Any, EnvLocation, Found]:
+) -> tuple[Any, Location, Found]:
     """The connected environment, its place, and what `examine` found.
 
     A robot that turns out to be real, at a place that names no stage, is made again: its limits are fixed when it is
@@ -56,9 +56,9 @@ def bring_up(
     try:
         found = examine(env, place)
         _connect(env, raise_again)
-        if place.robot is not None and place.trial is None and not place.shadow and has_real_robot(env):
+        if isinstance(place, LiveRobot) and place.stage is None and has_real_robot(env):
             env.close()
-            place = replace(place, trial=trial_if_real)
+            place = replace(place, stage="trial" if trial_if_real else "full")
             env = make(place=place)
             _connect(env, raise_again)
     except BaseException:
@@ -97,10 +97,10 @@ class Admission:
     policy: FrozenPolicy = field(init=False)
     """The frozen policy, once it is admitted."""
 
-    def __call__(self, env: gym.Env[Any, Any], place: EnvLocation, identity: str = "") -> list[str]:
+    def __call__(self, env: gym.Env[Any, Any], place: Location, identity: str = "") -> list[str]:
         """Check signature and trials if the robot is real, and load the policy; returns lines for the operator.
 
-        A simulated robot needs no signature, and trials only if `place.trial` is set. For `identity` see `Inspection`.
+        A simulated robot needs no signature, and trials only if `place` names a stage. For `identity` see `Inspection`.
 
         Raises:
             UntrustedCheckpoint: The robot is real, and the checkpoint has no trusted signature.
@@ -111,21 +111,21 @@ class Admission:
                 is not on trial.
         """
         self.identity = identity
-        is_real = has_real_robot(env)
+        is_real, stage = has_real_robot(env), place.stage if isinstance(place, LiveRobot) else None
         lines = [f"  robot: {self.identity}"] if self.identity else []
-        if is_real and place.robot is not None and not self.identity:
+        if is_real and isinstance(place, LiveRobot) and not self.identity:
             lines = ["  robot: it does not tell which one it is; --robot-name NAME names it"]
         lines += self._signature() if is_real else []
-        if place.shadow:
+        if stage == "shadow":
             robot: Any = env.unwrapped.robot  # type: ignore[attr-defined]
             robot.watch = self.shadow = Shadow(robot.spec, robot.limits)
             self.marks = (*self.marks, SHADOW)
-        elif place.robot is not None and place.trial is not None:
-            lines += self._stage(place.robot, is_trial=place.trial, simulated=not has_real_robot(env))
+        elif stage is not None:
+            lines += self._stage(place.text, is_trial=stage == "trial", simulated=not is_real)
         elif self.record is not None:
             raise SettingsError("--trials: a simulated robot is on trial only with --stage trial; give that too")
         self.policy = FrozenPolicy.from_checkpoint(self.checkpoint)
-        if place.shadow:
+        if stage == "shadow":
             self.policy.detector = None  # the robot answers somebody else's actions
         return lines
 

@@ -9,6 +9,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
+from bam_envs.core.location import LiveRobot
 from bam_envs.live.arm_checks import arm_checks, geometry_of
 from bam_envs.live.bringup import TIMEOUT
 from bam_envs.live.examination import Inspection, inspect_robot
@@ -18,7 +19,6 @@ from bam_envs.rosbridge.client import RosbridgeLink
 from bam_envs.rosbridge.endpoint import Endpoint
 from bam_envs.safety.guard import is_base
 from bam_train.checkpoint import Checkpoint
-from bam_train.env_location import EnvLocation
 from bam_train.environments import first_difference, fit_pairs, short_json
 from bam_train.errors import ContractRefused
 
@@ -85,7 +85,7 @@ class Contract:
 
 
 def check_contract(
-    checkpoint: Checkpoint, env: Any, place: EnvLocation, *, listen: float | None = None, timeout: float = TIMEOUT
+    checkpoint: Checkpoint, env: Any, place: LiveRobot, *, listen: float | None = None, timeout: float = TIMEOUT
 ) -> Contract:
     """Compare a checkpoint with the live robot at `place`; sends nothing, moves nothing.
 
@@ -103,10 +103,7 @@ def check_contract(
     """
     spec = env.unwrapped.robot.spec
     profile = profile_for(spec) if place.profile is None else load_profile(place.profile)
-    endpoint = Endpoint.with_token_file(
-        place.robot or "", ca_file=place.ca_file, token_file=place.token_file, robot_name=place.robot_name
-    )
-    link = RosbridgeLink(endpoint, name="contract")
+    link = RosbridgeLink(Endpoint.of(place), name="contract")
     try:
         link.connect()
         return contract_with(checkpoint, env, inspect_robot(link, profile, spec, listen=listen, timeout=timeout))

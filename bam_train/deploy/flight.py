@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bam_envs.core.errors import BamEnvsError
+from bam_envs.core.location import LiveRobot, Location
 from bam_envs.core.robot import RobotState
 from bam_envs.core.robot_env import RobotEnv, robot_of
 from bam_envs.live.camera import LiveCamera
@@ -24,7 +25,6 @@ from bam_envs.safety.guard import Tick
 from bam_train.checkpoint import Checkpoint
 from bam_train.deploy.episode import OBSERVATION, EpisodeStep
 from bam_train.deploy.journal import Journal
-from bam_train.env_location import EnvLocation
 from bam_train.environments import control_period
 from bam_train.files.place import with_addresses
 from bam_train.recording.recorder import WARNING, Recorder
@@ -81,13 +81,13 @@ def deployment_facts(checkpoint: Checkpoint, env: gym.Env[Any, Any]) -> dict[str
     }
 
 
-def watch_cameras(recorder: Recorder, place: EnvLocation) -> list[str]:
+def watch_cameras(recorder: Recorder, place: Location) -> list[str]:
     """Connect and record the cameras of the live robot's profile; returns a warning for each camera left out."""
-    left_out = []
-    cameras = load_profile(place.profile).cameras if place.robot and place.profile else ()
-    for source in (one for one in cameras if not one.optional):
-        endpoint = Endpoint.with_token_file(place.robot or "", ca_file=place.ca_file, token_file=place.token_file)
-        camera = LiveCamera(endpoint, source)
+    left_out: list[str] = []
+    if not isinstance(place, LiveRobot) or place.profile is None:
+        return left_out
+    for source in (one for one in load_profile(place.profile).cameras if not one.optional):
+        camera = LiveCamera(Endpoint.of(place), source)
         try:
             camera.connect()
         except BamEnvsError as error:

@@ -1,11 +1,13 @@
 """The tables of ``bam-deploy --print-guards``: every guard, and every limit that ``--guard`` changes."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict
 from typing import Any
 
+from bam_envs.core.errors import BamEnvsError
 from bam_envs.core.robot import RobotSpec
 from bam_envs.safety.guard import BOUNDS, Limits, is_base, limits_of
+from bam_train.errors import SettingsError
 
 OUTSIDE_THE_GATE = (
     "G1   contract, signature  compared and verified before a live robot moves (exit status 3 or 1)",
@@ -57,3 +59,27 @@ def _aligned(rows: Sequence[Sequence[str]]) -> list[str]:
     """Each row as one line, in aligned columns."""
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     return ["  ".join(text.ljust(width) for text, width in zip(row, widths, strict=True)).rstrip() for row in rows]
+
+
+def read_guards(texts: Iterable[str]) -> dict[str, float]:
+    """Parse the texts of ``--guard NAME=VALUE``.
+
+    Raises:
+        SettingsError: A limit is unknown, repeated or outside its bounds, or two limits contradict each other.
+    """
+    values: dict[str, float] = {}
+    for text in texts:
+        name, _, typed = (part.strip() for part in text.partition("="))
+        try:
+            value = float(typed)
+        except ValueError as error:
+            example = "joint_speed=0.3"
+            raise SettingsError(f"--guard {text}: expected NAME=NUMBER, such as --guard {example}") from error
+        if name in values:
+            raise SettingsError(f"--guard: {name} comes twice ({values[name]:g} and {value:g}); give it once")
+        values[name] = value
+    try:
+        Limits().changed(values)
+    except BamEnvsError as error:
+        raise SettingsError(f"--guard: {error}") from error
+    return values

@@ -10,12 +10,12 @@ import numpy as np
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 from bam_envs.core.errors import SafetyStop, StaleState
+from bam_envs.core.location import SIMULATED
 from bam_envs.core.registry import entry_of
 from bam_envs.live.rehearsed_robot import rehearsed_robot, time_to_stop
 from bam_envs.robots.linked import LinkedRobot
 from bam_train.checkpoint import Checkpoint
 from bam_train.deploy.journal import EpisodeRecord
-from bam_train.env_location import SIMULATED
 from bam_train.environments import environment_of, make_env, require_fit
 from bam_train.errors import SettingsError
 from bam_train.evaluation import wilson_interval

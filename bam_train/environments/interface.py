@@ -9,9 +9,9 @@ import gymnasium as gym
 from gymnasium.vector import VectorEnv
 
 from bam_envs.core import registry
+from bam_envs.core.location import HERE, Location, Remote
 from bam_envs.core.spaces import space_to_json
 from bam_train.checkpoint import Checkpoint, Manifest
-from bam_train.env_location import HERE, EnvLocation
 from bam_train.errors import CheckpointMismatch
 
 AnyEnv = gym.Env[Any, Any] | VectorEnv[Any, Any, Any]
@@ -26,7 +26,7 @@ def control_period(env: gym.Env[Any, Any]) -> float | None:
     return 1.0 / float(rate) if rate else None
 
 
-def require_fit(checkpoint: Checkpoint, env: AnyEnv, place: EnvLocation = HERE, env_id: str | None = None) -> None:
+def require_fit(checkpoint: Checkpoint, env: AnyEnv, place: Location = HERE, env_id: str | None = None) -> None:
     """Check that `env` fits the checkpoint's policy.
 
     Both spaces, the name and unit of every signal, and the control period are compared, where both sides give them.
@@ -47,8 +47,8 @@ def require_fit(checkpoint: Checkpoint, env: AnyEnv, place: EnvLocation = HERE, 
             f"was trained on {checkpoint.manifest.env}, where {name} is {short_json(theirs)}, and it is "
             f"{short_json(ours)} in {env_id}; give a checkpoint of {env_id}",
         )
-    place_text = f"at {place.text}" if place.transport else f"in {checkpoint.manifest.env} as installed"
-    remedy = "serve the version" if place.transport else "install the version"
+    place_text = f"at {place.text}" if isinstance(place, Remote) else f"in {checkpoint.manifest.env} as installed"
+    remedy = "serve the version" if isinstance(place, Remote) else "install the version"
     raise CheckpointMismatch(
         checkpoint.path,
         f"{name} is {short_json(theirs)} in the checkpoint and {short_json(ours)} {place_text}; "

@@ -14,14 +14,14 @@ from bam_envs.aliases.robo_gym_names import ROBO_GYM
 from bam_envs.core import registry
 from bam_envs.core.env_options import in_our_words, require_kinds
 from bam_envs.core.errors import BamEnvsError, InvalidValue, UnknownName
+from bam_envs.core.location import HERE, SIMULATED, LiveRobot, Location, Remote
 from bam_envs.core.registry import entry_of, resolve_id
 from bam_envs.core.wording import did_you_mean
 from bam_envs.robo_gym.making import constructor_options, require_values
 from bam_envs.robots.linked import link_profile
+from bam_envs.safety.guard import TRIAL_SPEED
 from bam_envs.tasks.wrappers.late_actions import read_delay
 from bam_train.checkpoint import Checkpoint
-from bam_train.checkpoint.manifest import WHERE
-from bam_train.env_location import HERE, EnvLocation
 from bam_train.errors import BamTrainError, CheckpointMismatch, SettingsError
 from bam_train.foreign_env import ForeignEnv, described
 
@@ -88,9 +88,7 @@ def require_env_kwargs(env: str, given: Mapping[str, Any]) -> None:
             f"found {limit}; use {entry.id} for longer ones"
         )
     taken, refused = constructor_options(theirs) if theirs else (frozenset(), frozenset())
-    # Without options that are no settings, and without those of the place, which have their own flags.
-    make_options = set(registry.MAKE_OPTIONS) - {"render_mode", "timeout"} - WHERE
-    known = make_options | taken | options.keys() | {"max_episode_steps"}
+    known = SIMULATED.keys() | taken | options.keys() | {"max_episode_steps"}  # the place has its own flags
     for name in given:
         if name not in known | refused:  # the constructor explains why it refuses these
             raise SettingsError(
@@ -117,7 +115,7 @@ def make_env(
     env_kwargs: Mapping[str, Any] | None = None,
     *,
     render_mode: str | None = None,
-    place: EnvLocation = HERE,
+    place: Location = HERE,
 ) -> gym.Env[Any, Any]:
     """One environment, with its time limit and without Gymnasium's (slow) checker; nothing is connected yet.
 
@@ -126,19 +124,38 @@ def make_env(
     Raises:
         SettingsError: It cannot be made: a package is missing, it does not take these arguments, or its code fails.
     """
-    if place.transport:
+    if isinstance(place, Remote):
         from bam_envs.remote.remote_env import make_remote_env
 
-        if len(place.transport) > 1:
-            raise SettingsError(
-                f"--transport: expected one address, found {len(place.transport)}: {', '.join(place.transport)}"
-            )
-        return make_remote_env(env_id, place.transport[0], **place.link_options)
-    kwargs = dict(env_kwargs or {}) if place.robot is None else place.robot_kwargs(env_id, env_kwargs or {})
+        if len(place.urls) > 1:
+            raise SettingsError(f"--transport: expected one address, found {len(place.urls)}: {place.text}")
+        return make_remote_env(env_id, place)
+    kwargs = dict(env_kwargs or {})
+    if isinstance(place, LiveRobot):
+        kwargs = with_live_robot(env_id, kwargs, place)
     if render_mode is not None:
         kwargs["render_mode"] = render_mode
     env: gym.Env[Any, Any] = _made(env_id, lambda: gym.make(env_id, disable_env_checker=True, **kwargs))
     return env if is_batched(env_id) else ForeignEnv(env, env_id)
+
+
+def with_live_robot(env_id: str, env_kwargs: Mapping[str, Any], robot: LiveRobot) -> dict[str, Any]:
+    """Keyword arguments that make `env_id` with the live robot; on trial, with more steps for the lower speed.
+
+    Raises:
+        SettingsError: The environment is not one of `bam_envs`, and has no robot to exchange.
+    """
+    entry = entry_of(env_id)
+    if entry is None:
+        raise SettingsError(
+            f"{env_id} has no robot that --robot could exchange; serve it next to the robot with "
+            f"bam-serve --env {env_id}, and give --transport"
+        )
+    kwargs = {name: value for name, value in env_kwargs.items() if name not in SIMULATED}
+    if robot.stage == "trial":
+        steps = kwargs.get("max_episode_steps") or entry.max_episode_steps
+        kwargs["max_episode_steps"] = -1 if steps == -1 else round(steps / TRIAL_SPEED)
+    return {**kwargs, "robot": robot}
 
 
 def parity_if_needed(
@@ -164,17 +181,17 @@ def parity_if_needed(
 
 
 def make_vector_env(
-    env_id: str, env_kwargs: Mapping[str, Any] | None, num_envs: int, place: EnvLocation = HERE
+    env_id: str, env_kwargs: Mapping[str, Any] | None, num_envs: int, place: Location = HERE
 ) -> VectorEnv[Any, Any, Any]:
     """`num_envs` environments stepped together, with automatic resets in the same step.
 
     Those of `bam_envs` are one batched simulation; others are `num_envs` Python environments, stepped in turn (their
     vector environments differ in resets and seeds). At a transport, the servers determine the number.
     """
-    if place.transport:
+    if isinstance(place, Remote):
         from bam_envs.remote.remote_env import make_remote_vector_env
 
-        return make_remote_vector_env(env_id, place.transport, **place.link_options)
+        return make_remote_vector_env(env_id, place)
     if is_batched(env_id):
         return _made(env_id, lambda: gym.make_vec(env_id, num_envs=num_envs, **(env_kwargs or {})))
     arguments = {"disable_env_checker": True, **(env_kwargs or {})}

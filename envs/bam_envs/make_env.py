@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING, Any
 import gymnasium as gym
 
 from bam_envs.core.errors import InvalidValue, UnknownName
-from bam_envs.core.registry import ENVIRONMENTS, EnvEntry, entry_of, own_options
+from bam_envs.core.location import Credentials, LiveRobot, Location, Remote, location_of
+from bam_envs.core.registry import ENVIRONMENTS, MAKE_OPTIONS, EnvEntry, entry_of, own_options
 from bam_envs.core.validation import PositiveInt, check
 
 if TYPE_CHECKING:
@@ -52,7 +53,7 @@ def make_env(
             them, drawn for each episode.
         robot: Address of a live robot behind rosbridge, such as ``"ws://10.0.0.5:9090"``, instead of the simulated one.
             The task runs in this process. A path in the address is the namespace of the robot's topics. Or a connected
-            `roslibpy.Ros` of the asyncio transport; see `live_robot`.
+            `roslibpy.Ros` of the asyncio transport; or a `LiveRobot` with all that the next five arguments say.
         transport: Address of a whole environment that runs elsewhere, such as ``"ws://10.0.0.5:9090/bam_001"`` or
             ``"tcp://10.0.0.5:9091"``; then this process has no robot and no task.
         profile: Profile of the live robot: a shipped name or a file; by default that of the simulated robot.
@@ -68,48 +69,38 @@ def make_env(
     Raises:
         InvalidValue: Arguments that exclude each other.
     """
-    if robot is not None and transport is not None:
-        raise InvalidValue("robot= and transport= exclude each other: the task runs here, or with the robot elsewhere.")
-    if robot is None:
-        _refuse_for_simulations(profile, guards, trial, shadow, robot_name)
-    if trial and shadow:
-        raise InvalidValue("trial=True and shadow=True exclude each other: a shadow sends nothing. Give one of them.")
-    _check_place(robot, transport, timeout, render_mode, randomize, link, action_delay, task_options)
-    if transport is not None:
+    where = {"robot": robot, "transport": transport, "profile": profile, "guards": guards, "robot_name": robot_name}
+    where |= {"trial": trial, "shadow": shadow, "timeout": timeout, "ca_file": ca_file, "token_file": token_file}
+    where |= {"render_mode": render_mode, "randomize": randomize, "link": link, "action_delay": action_delay}
+    place = _location(where, task_options)
+    if isinstance(place, Remote):
         from bam_envs.remote.remote_env import make_remote_env
 
-        return make_remote_env(env_id, transport, ca_file=ca_file, token_file=token_file, timeout=timeout)
+        return make_remote_env(env_id, place)
     from bam_envs.core.robot_env import RobotEnv
 
     entry, task_options = _named(env_id, task_options)
     _require_robot(entry, robot=robot, randomize=randomize or None, link=link, action_delay=action_delay)
     task = entry.make_task(1, task_options)
-    simulated = entry.make_robot(1, randomize, task_options)
-    if robot is None:
-        return RobotEnv(_behind(link, simulated), _late(action_delay, task), render_mode=render_mode)
+    simulation = entry.make_robot(1, randomize, task_options)
+    if not isinstance(place, LiveRobot):
+        return RobotEnv(_behind(link, simulation), _late(action_delay, task), render_mode=render_mode)
     from bam_envs.live.building import live_robot, shadow_robot
 
-    where: dict[str, Any] = {"profile": profile, "guards": guards, "ca_file": ca_file, "token_file": token_file}
-    where["robot_name"] = robot_name
-    if shadow:
-        return RobotEnv(shadow_robot(robot, simulated.spec, **where), task, render_mode=render_mode)
-    tool = getattr(simulated, "tool_position", None)  # forward kinematics of an arm that is no UR5e
+    if place.stage == "shadow":
+        return RobotEnv(shadow_robot(place, simulation.spec), task)
+    tool = getattr(simulation, "tool_position", None)  # forward kinematics of an arm that is no UR5e
     straight = getattr(task, "moves_straight", False)
-    live = live_robot(robot, simulated.spec, trial=trial, tool_position=tool, straight=straight, **where)
-    return RobotEnv(live, task, render_mode=render_mode)
+    return RobotEnv(live_robot(place, simulation.spec, tool_position=tool, straight=straight), task)
 
 
-def _refuse_for_simulations(profile: object, guards: object, trial: bool, shadow: bool, robot_name: object) -> None:
-    """Refuse options that only a live robot has."""
-    if profile is not None:
-        raise InvalidValue(f"profile={profile!r} describes a live robot; give its address with robot= too.")
-    if robot_name:
-        raise InvalidValue(f"robot_name={robot_name!r} names a live robot; give its address with robot= too.")
-    if guards is not None:
-        raise InvalidValue("guards= changes the limits of a live robot; give its address with robot= too.")
-    if trial or shadow:
-        name = "trial" if trial else "shadow"
-        raise InvalidValue(f"{name}=True is for a live robot; give its address with robot= too.")
+def _location(options: Mapping[str, Any], task_options: Mapping[str, Any]) -> Location:
+    """Where the `MAKE_OPTIONS` of an environment put it; a task elsewhere takes no options from here."""
+    place = location_of(options, Credentials(options["ca_file"], options["token_file"]))
+    if isinstance(place, Remote) and task_options:
+        names = ", ".join(task_options)
+        raise InvalidValue(f"{names}: the task runs at {place.text}; give its options to bam-serve there.")
+    return place
 
 
 def _named(env_id: str, options: Mapping[str, Any]) -> tuple[EnvEntry, dict[str, Any]]:
@@ -151,48 +142,19 @@ def _late(action_delay: Any, task: Task) -> Task:
     return late  # type: ignore[no-any-return]
 
 
-def _check_place(
-    robot: str | Any | None,
-    transport: object,
-    timeout: float | None,
-    render_mode: str | None,
-    randomize: bool,
-    link: object,
-    action_delay: object,
-    task_options: Mapping[str, Any],
-) -> None:
-    """Refuse options that do not apply where the environment runs."""
-    if transport is None and timeout is not None:
-        raise InvalidValue(f"timeout={timeout!r} limits the wait for an answer of transport=; leave it out.")
-    if transport is not None and task_options:
-        names = ", ".join(task_options)
-        raise InvalidValue(f"{names}: the task runs at {transport}; give its options to bam-serve there.")
-    elsewhere = robot if transport is None else transport
-    given = {"render_mode": render_mode, "randomize": randomize or None, "link": link, "action_delay": action_delay}
-    flags = [name for name, value in given.items() if value is not None]
-    if elsewhere is not None and flags:
-        raise InvalidValue(f"{', '.join(flags)}: only the simulation here has that, and not {elsewhere}; leave it out.")
-
-
 def make_vector_env(
     env_id: str,
     num_envs: int = 1,
     *,
     max_episode_steps: int | None = None,
-    render_mode: str | None = None,
-    randomize: bool = False,
-    link: Any = None,
-    action_delay: Any = None,
     robot: str | None = None,
     transport: str | Sequence[str] | None = None,
-    ca_file: str | None = None,
-    token_file: str | None = None,
-    timeout: float | None = None,
-    **task_options: Any,
+    **options: Any,
 ) -> RobotVectorEnv | RemoteVectorEnv:
     """Simulated robots and their task, stepped together; the entry point of `gymnasium.make_vec`.
 
-    With `transport`, one address or several, they run elsewhere; each server steps its environments in one request.
+    With `transport`, one address or several, they run elsewhere; each server steps its environments in one request. The
+    other `options` are those of `make_env`.
 
     Raises:
         InvalidValue: Arguments that exclude each other, or environments that are not there.
@@ -200,20 +162,20 @@ def make_vector_env(
     check(num_envs, PositiveInt, "num_envs")
     if robot is not None:
         raise InvalidValue("A live robot is one environment, which nothing may reset unasked; use gymnasium.make.")
-    _check_place(None, transport, timeout, render_mode, randomize, link, action_delay, task_options)
-    if transport is not None:
+    given = {name: options.pop(name, None) for name in MAKE_OPTIONS}
+    place = _location({**given, "transport": transport}, options)
+    if isinstance(place, Remote):
         from bam_envs.remote.remote_env import make_remote_vector_env
 
-        return make_remote_vector_env(
-            env_id, transport, num_envs, ca_file=ca_file, token_file=token_file, timeout=timeout
-        )
+        return make_remote_vector_env(env_id, place, num_envs)
     from bam_envs.core.robot_env import RobotVectorEnv
 
-    entry, task_options = _named(env_id, task_options)
+    entry, task_options = _named(env_id, options)
+    link, action_delay, randomize = given["link"], given["action_delay"], given["randomize"] or False
     _require_robot(entry, randomize=randomize or None, link=link, action_delay=action_delay)
     return RobotVectorEnv(
         _behind(link, entry.make_robot(num_envs, randomize, task_options)),
         _late(action_delay, entry.make_task(num_envs, task_options)),
         max_episode_steps=max_episode_steps,
-        render_mode=render_mode,
+        render_mode=given["render_mode"],
     )

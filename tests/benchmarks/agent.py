@@ -74,6 +74,7 @@ class FastAgent:
     """A resident at 100 Hz, or without waiting, in this process, for a number of ticks."""
 
     def __init__(self, url, folder, new, *, record):
+        from bam_envs.core.location import LiveRobot
         from bam_train.agent.agent_options import AgentOptions
         from bam_train.agent.audit import Audit
         from bam_train.agent.resident import Resident
@@ -85,7 +86,7 @@ class FastAgent:
         self.versions.point({CHAMPION: self.digests[0]})
         self.audit = Audit(folder / "audit.jsonl")
         quiet = {name: lambda *_: None for name in ("send", "tell", "admit")}
-        options = AgentOptions(url or "a simulated robot", folder, record=record)
+        options = AgentOptions(LiveRobot(url or "a simulated robot"), folder, no_record=not record)
         more = {"is_running": True, "connect": fast_session(url)}
         self.agent = Resident(options, self.versions, self.audit, **quiet, **more)
 

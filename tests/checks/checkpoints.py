@@ -16,11 +16,11 @@ from pathlib import Path
 
 import tyro
 
+from bam_envs.core.location import SIMULATED
 from bam_envs.core.registry import entry_of
 from bam_train.checkpoint import Checkpoint
 from bam_train.cli.console import duration
 from bam_train.cli.flags import Count
-from bam_train.env_location import SIMULATED
 from bam_train.environments import held_out
 from bam_train.evaluation import FIRST_SEED, evaluate
 from bam_train.policy import FrozenPolicy

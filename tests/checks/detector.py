@@ -22,6 +22,7 @@ import numpy as np
 import tyro
 
 from bam_envs.core.errors import SafetyStop
+from bam_envs.core.location import SIMULATED
 from bam_envs.core.registry import ENVIRONMENTS
 from bam_envs.core.robot import EnvIds, RobotState
 from bam_envs.core.robot_env import RobotVectorEnv
@@ -35,7 +36,6 @@ from bam_envs.tasks.pick import PickTask
 from bam_envs.tasks.wrappers.late_actions import LateActions
 from bam_train.checkpoint import Checkpoint
 from bam_train.checkpoint.detector import Detector, Rollout
-from bam_train.env_location import SIMULATED
 from bam_train.environments import environment_of, make_env, make_vector_env
 from bam_train.errors import NoDetector
 from bam_train.policy import FrozenPolicy

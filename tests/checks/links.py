@@ -12,12 +12,12 @@ from pathlib import Path
 
 import tyro
 
+from bam_envs.core.location import SIMULATED
 from bam_envs.core.registry import entry_of
 from bam_envs.robots.linked import PROFILES
 from bam_train.checkpoint import Checkpoint
 from bam_train.cli.flags import Count
 from bam_train.deploy.rehearsal import Rehearsal
-from bam_train.env_location import SIMULATED
 from bam_train.errors import BamTrainError
 from bam_train.evaluation import evaluate
 from bam_train.policy import FrozenPolicy

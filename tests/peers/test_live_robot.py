@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from bam_envs.core.errors import LinkLost, NoServer, NotReady, SafetyStop, StaleState
+from bam_envs.core.location import LiveRobot
 from bam_envs.core.robot import Initial
 from bam_envs.live.building import live_robot, profile_limits
 from bam_envs.live.diagnosis import STEPS, Diagnosis
@@ -16,7 +17,6 @@ from bam_envs.robots.profile import load_profile
 from bam_envs.robots.ur5e import arm_spec
 from bam_train.checkpoint import Checkpoint
 from bam_train.deploy.contract import check_contract
-from bam_train.env_location import EnvLocation
 from bam_train.environments import make_env
 
 ROW = np.zeros(1, np.int64)
@@ -246,7 +246,7 @@ STATES = ("/joint_states", "/gripper/joint_states", "/object_pose")
 
 
 def test_the_contract_is_compared_without_a_command(rosbridge, robot_node):
-    env, place = make_env("bam/pick-v0", place=EnvLocation(robot=rosbridge.url)), EnvLocation(robot=rosbridge.url)
+    env, place = make_env("bam/pick-v0", place=LiveRobot(rosbridge.url)), LiveRobot(rosbridge.url)
     robot_node.ask("forget")
     contract = check_contract(Checkpoint.open(PICK), env, place)
     assert [(one.what, one.found) for one in contract.refused] == []
@@ -256,5 +256,5 @@ def test_the_contract_is_compared_without_a_command(rosbridge, robot_node):
         verdicts["command /scaled_joint_trajectory_controller/joint_trajectory"] == "unknown"
     )  # this bridge has no rosapi
     assert robot_node.ask("report")["received"] == []
-    elsewhere = check_contract(Checkpoint.open(PICK), env, EnvLocation(robot=f"{rosbridge.url}/cell"), timeout=0.5)
+    elsewhere = check_contract(Checkpoint.open(PICK), env, LiveRobot(f"{rosbridge.url}/cell"), timeout=0.5)
     assert [one.what for one in elsewhere.refused] == [f"topic {topic}" for topic in STATES]

@@ -63,7 +63,7 @@ class FrontProcess:
         self.options, self.send, self._command_timeout = about.agent, send, about.command_timeout
         self._report: dict[str, Any] = {"state": "waiting for the robot", "why": "it starts", "active": None}
         self._report |= {"owner": None, "names": {}}  # the last one of the resident
-        place = replace(about.agent.place(trial=False), shadow=True)
+        place = replace(about.agent.robot, stage="shadow")
         env: Any = make_env(about.env, about.env_kwargs, place=place)
         self.shadow, self.task = env.unwrapped.robot, env.unwrapped.task
         self.lease = AgentLease(about.agent.lease)
@@ -117,7 +117,7 @@ class FrontProcess:
     def status(self) -> dict[str, Any]:
         """The last status of the resident, with the name and the address of the robot, and the lease."""
         lease, name = self.lease, self._report.get("identity") or self.shadow.profile.name
-        owner, robot = lease.owner, {"name": name, "address": self.options.robot}
+        owner, robot = lease.owner, {"name": name, "address": self.options.robot.text}
         until = None if owner is None else round(lease.left, 1)
         return {**self._report, **robot, "owner": owner, "owner_until": until}
 
@@ -286,7 +286,7 @@ class FrontProcess:
     def _info(self) -> RobotInfo:
         """The description of the robot for programs that take over; until it is known, that of a real one."""
         robot, period = self.shadow.info, self.shadow.spec.period
-        watchdog, text = max(self._command_timeout, 1.5 * period), f"{robot.text or self.options.robot}"
+        watchdog, text = max(self._command_timeout, 1.5 * period), f"{robot.text or self.options.robot.text}"
         text = f"{text}, driven by a live agent, from which you take over"
         identity = str(self._report.get("identity", ""))
         return RobotInfo(self.shadow.profile.name, robot.simulated, False, period, text, watchdog, True, identity)
@@ -315,8 +315,7 @@ class FrontProcess:
 
     def cameras(self) -> dict[str, LiveCamera]:
         """The cameras of the robot's profile that are not optional, or that the task sees; not connected yet."""
-        options, seen = self.options, self.seen()
-        endpoint = Endpoint.with_token_file(options.robot, ca_file=options.ca_file, token_file=options.robot_token_file)
+        endpoint, seen = Endpoint.of(self.options.robot), self.seen()
         shown = [one for one in self.shadow.profile.cameras if one.name in seen or not one.optional]
         return {one.name: LiveCamera(endpoint, one) for one in shown}
 

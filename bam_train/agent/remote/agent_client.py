@@ -27,6 +27,7 @@ from websockets.exceptions import ConnectionClosed, InvalidStatus, WebSocketExce
 
 from bam_envs import __version__
 from bam_envs.core.errors import BamEnvsError, LinkLost, NoServer
+from bam_envs.core.location import Credentials
 from bam_envs.core.wording import brief
 from bam_envs.rosbridge.bus import tell
 from bam_envs.rosbridge.dialing import http_refusal, no_connection, open_port, silent
@@ -82,7 +83,7 @@ class AgentClient:
         name: str | None = None,
     ) -> None:
         full = agent_url(url)
-        self._endpoint = Endpoint.with_token_file(full, ca_file=ca_file, token_file=token_file)
+        self._endpoint = Endpoint(full, Credentials.of(ca_file, token_file))
         address = self._endpoint.address
         self.url, self.host, self.timeout, self.name = address.url, address.host, timeout, name or _whoami()
         self.role, self.agent = "", ""

@@ -5,13 +5,25 @@ from typing import Annotated, Literal
 
 import tyro
 
-from bam_train.cli.flags import File, Positive
+from bam_train.cli.flags import CredentialFlags, File, Positive
 
 Seconds = Annotated[Positive, tyro.conf.arg(metavar="S")]
 
 
-@dataclass(frozen=True)
-class AskConfig:
+@dataclass(frozen=True, kw_only=True)
+class AgentClientFlags(CredentialFlags):
+    """Flags of a client of a live agent."""
+
+    why: str = ""
+    """The reason, for the agent's audit file and for other people."""
+    timeout: Seconds = 10.0
+    """Longest time to connect, and to wait for the first answer [s]."""
+    json: bool = False
+    """Print one JSON object on standard output, with at least state, active (a digest) and owner."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class AskConfig(AgentClientFlags):
     """Ask the live agent on a robot's computer for its state or its versions, or let it pause, resume or stop.
 
     Exit status: 0 done, 1 the agent cannot be reached, or failed, 2 wrong usage, 3 the agent refuses.
@@ -31,18 +43,10 @@ class AskConfig:
     """Address of the agent, such as ws://robot:9095 (wss:// with TLS)."""
     token_file: File = None
     """File with one token of the agent: status, versions and stop need the role watch, the others drive."""
-    ca_file: File = None
-    """Certificates that wss:// trusts instead of the system's."""
-    why: str = ""
-    """The reason, for the agent's audit file and for other people."""
-    timeout: Seconds = 10.0
-    """Longest time to connect, and to wait for the answer [s]."""
-    json: bool = False
-    """Print one JSON object on standard output, with at least state, active (a digest) and owner."""
 
 
-@dataclass(frozen=True)
-class PushConfig:
+@dataclass(frozen=True, kw_only=True)
+class PushConfig(AgentClientFlags):
     """Push a checkpoint to a live agent, which checks it and tries it as the candidate; or roll back.
 
     Exit status: 0 done, 1 the file is no whole checkpoint, the agent cannot be reached, or failed, 2 wrong usage, 3 the
@@ -60,8 +64,6 @@ class PushConfig:
     """Address of the agent, such as ws://robot:9095 (wss:// with TLS)."""
     token_file: File = None
     """File with one token of the agent, of the role administer."""
-    ca_file: File = None
-    """Certificates that wss:// trusts instead of the system's."""
     stage: Literal["auto", "trial", "full"] = "auto"
     """trial: it acts as the candidate until its trials decide, at trial speed on a real robot; full: it is the champion
     at once, on a real robot only after enough trials; auto: as trial, at full speed on a simulated robot."""
@@ -73,9 +75,3 @@ class PushConfig:
     """The agent's champion as a file: push only if bam-gate finds the candidate better than it, or not worse."""
     rollback: bool = False
     """Push nothing, and go back: from a candidate to the champion, from the champion to the version before it."""
-    why: str = ""
-    """The reason, for the agent's audit file and for other people."""
-    timeout: Seconds = 10.0
-    """Longest time to connect, and to wait for a first answer [s]."""
-    json: bool = False
-    """Print one JSON object on standard output, with at least state, active (a digest) and owner."""

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from bam_train.agent.remote.agent_client import AgentClient
-    from bam_train.cli.live.agent_flags import AskConfig, PushConfig
+    from bam_train.cli.live.agent_flags import AgentClientFlags, AskConfig
 
 SHORT = 12
 """Digits of a digest that people see."""
@@ -51,7 +51,7 @@ def _rest(agent: AgentClient) -> dict[str, Any]:
 
 
 def with_agent(
-    config: AskConfig | PushConfig,
+    config: AgentClientFlags,
     url: str,
     do: Callable[[AgentClient], dict[str, Any]],
     checkpoints: Sequence[Path] = (),
@@ -69,8 +69,7 @@ def with_agent(
     try:
         for path in checkpoints:
             Checkpoint.open(path)
-        files: dict[str, Any] = {"token_file": config.token_file, "ca_file": config.ca_file}
-        with AgentClient(url, timeout=config.timeout, **files) as agent:
+        with AgentClient(url, timeout=config.timeout, **vars(config.credentials)) as agent:
             result = {**nothing, **do(agent)}
     except (BamTrainError, BamEnvsError) as error:
         if config.json:

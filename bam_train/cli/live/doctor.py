@@ -16,6 +16,7 @@ from bam_train.signals import SignalMemory
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
+    from bam_envs.core.location import LiveRobot
     from bam_envs.live.diagnosis import Diagnosis, DiagnosisStep, Findings
     from bam_envs.live.examination import Inspection
     from bam_train.checkpoint import Checkpoint
@@ -29,19 +30,19 @@ CONTRACT = "contract"
 def examine(config: DoctorConfig, signals: SignalMemory) -> int:
     """Run the program with its parsed flags; returns the exit status, also 1 if --measure wrote no file."""
     _require_valid(config)
+    from bam_envs.core.location import LiveRobot
     from bam_envs.live.diagnosis import STEPS, Diagnosis
 
-    paths = {"ca_file": config.ca_file, "token_file": config.token_file}
-    files: dict[str, Any] = {name: None if path is None else str(path) for name, path in paths.items()}
+    place = LiveRobot(config.url, config.credentials, config.profile)
     contracts: list[Contract] = []  # one, once it was checked
     with ExitStack() as opened:
         robot, more = None, []
         if config.checkpoint is not None:
-            checkpoint, env = _opened(config, files)
+            checkpoint, env = _opened(config, place)
             opened.callback(env.close)
             robot = env.unwrapped.robot
             more = [(CONTRACT, lambda inspection: _contract(checkpoint, env, inspection, contracts))]
-        diagnosis = Diagnosis(config.url, robot, profile=config.profile, seconds=config.seconds, **files)
+        diagnosis = Diagnosis(place, robot, seconds=config.seconds)
         opened.callback(diagnosis.close)
         steps: list[DiagnosisStep] = []
         for step in _shown(diagnosis.steps(*more), config):
@@ -69,14 +70,12 @@ def examine(config: DoctorConfig, signals: SignalMemory) -> int:
     return ContractRefused.exit_status if contracts and contracts[0].refused else 1
 
 
-def _opened(config: DoctorConfig, files: dict[str, Any]) -> tuple[Checkpoint, Any]:
+def _opened(config: DoctorConfig, place: LiveRobot) -> tuple[Checkpoint, Any]:
     """The checkpoint of the flags, and its environment for the robot, not connected."""
     from bam_train.checkpoint import Checkpoint
-    from bam_train.env_location import EnvLocation
     from bam_train.environments import environment_of, make_env
 
     checkpoint = Checkpoint.open(config.checkpoint or "")
-    place = EnvLocation(config.url, profile=config.profile, **files)
     return checkpoint, make_env(*environment_of(checkpoint, config.env), place=place)
 
 

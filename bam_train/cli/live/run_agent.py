@@ -19,6 +19,9 @@ if TYPE_CHECKING:
     from bam_train.agent.agent_options import AgentOptions
     from bam_train.cli.flags import AgentConfig
 
+FOR_ANY_ROBOT = ("robot_name", "stage", "i_know", "keys", "allow_unsigned", "unusual")
+"""Flags of a robot that the simulated one of an agent has too."""
+
 
 def run_agent(config: AgentConfig, signals: SignalMemory) -> int:
     """Run the program with its parsed flags; returns 128 + the signal that ended it."""
@@ -35,7 +38,7 @@ def run_agent(config: AgentConfig, signals: SignalMemory) -> int:
 
     if config.record is not None:
         import pyarrow  # noqa: F401 - it is needed when a recording ends
-    options = _options(config)
+    options = options_of(config)
     tell = begin_log("bam-agent")
     with ExitStack() as stack:
         new = [
@@ -51,14 +54,14 @@ def run_agent(config: AgentConfig, signals: SignalMemory) -> int:
         refused.callback(versions.undo())
         active = versions.first(config.policy)
         env_id, env_kwargs = environment_of(Checkpoint.open(active.path), config.env)
-        if not options.robot:
+        if config.robot is None:
             given = {
                 ".".join(path): value for path, value in (parse_assignment(one, "randomize=true") for one in config.set)
             }
             box = SimulatedBox(env_id, {**env_kwargs, **given})
             stack.callback(box.close)
             box.start()
-            options = replace(options, robot=box.url)
+            options = replace(options, robot=replace(options.robot, url=box.url))
         audit = Audit(options.folder / "audit.jsonl")
         stack.callback(audit.close)
         resident: Resident
@@ -79,7 +82,7 @@ def run_agent(config: AgentConfig, signals: SignalMemory) -> int:
         stack.callback(front.close)
         front.start()
         refused.pop_all()
-        begun = f"bam-agent {version('bam-train')} (process {os.getpid()}) at {options.robot}"
+        begun = f"bam-agent {version('bam-train')} (process {os.getpid()}) at {options.robot.text}"
         audit.write("started", begun, who="the agent", digest=active.digest)
         stack.callback(audit.write, "ended", f"process {os.getpid()}", who="the agent")
         scheme = "wss" if options.cert else "ws"
@@ -119,17 +122,14 @@ def _admit(config: AgentConfig, signals: SignalMemory, env: Any, lines: Sequence
     signals.raise_again()
 
 
-def _options(config: AgentConfig) -> AgentOptions:
+def options_of(config: AgentConfig) -> AgentOptions:
     """The options of the agent by its flags; invalid flags are refused."""
     from bam_envs.rosbridge.endpoint import is_loopback
     from bam_train.agent.agent_options import AgentOptions
-    from bam_train.env_location import read_guards
     from bam_train.errors import SettingsError
 
     if config.robot is None:
-        for name, value in (("--profile", config.profile), ("--ca-file", config.ca_file), ("--guard", config.guard)):
-            if value:
-                raise SettingsError(f"{name} is for a live robot; give its address with --robot too")
+        config.location(*FOR_ANY_ROBOT)
     elif config.set:
         raise SettingsError("--set changes the simulated robot, and --robot names another one; leave one of them out")
     if not is_loopback(config.bind) and config.token_file is None:
@@ -138,34 +138,7 @@ def _options(config: AgentConfig) -> AgentOptions:
         )
     if config.cert is None and config.key is not None:
         raise SettingsError("--key means something only with --cert")
-    options = AgentOptions(
-        config.robot or "",
-        config.folder.expanduser(),
-        profile=config.profile,
-        guards=read_guards(config.guard),
-        ca_file=_text(config.ca_file),
-        robot_token_file=_text(config.robot_token_file),
-        bind=config.bind,
-        port=config.port,
-        cert=_text(config.cert),
-        key=_text(config.key),
-        token_file=_text(config.token_file),
-        keys=config.keys,
-        allow_unsigned=config.allow_unsigned,
-        stage=config.stage,
-        i_know=config.i_know,
-        seed=config.seed,
-        resume=config.resume,
-        lease=config.lease,
-        unusual=config.unusual or "warn",
-        guard_stops=config.guard_stops,
-        record=not config.no_record,
-        robot_name=config.robot_name,
-        data=config.record,
-    )
-    options.place(trial=None).require_sane()
-    return options
-
-
-def _text(path: Path | None) -> str | None:
-    return None if path is None else str(path.expanduser())
+    given = {name: getattr(config, name) for name in AgentOptions.__dataclass_fields__}
+    given = {name: value.expanduser() if isinstance(value, Path) else value for name, value in given.items()}
+    robot = config.location("i_know", robot=config.robot or "")
+    return AgentOptions(**{**given, "robot": robot, "unusual": config.unusual or "warn"})

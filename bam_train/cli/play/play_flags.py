@@ -5,11 +5,11 @@ from typing import Annotated, ClassVar, Literal
 
 import tyro
 
-from bam_train.cli.flags import Assignments, Count, DataSetName, File, Folder, Groups, Name, Positive, Seed, Url
+from bam_train.cli.flags import Assignments, Count, DataSetName, File, Groups, LocationFlags, Seed
 
 
 @dataclass(frozen=True)
-class PlayConfig:
+class PlayConfig(LocationFlags):
     """Drive any environment, or a live robot, by keyboard or gamepad; the key ? shows the keys.
 
     Examples:
@@ -40,28 +40,3 @@ class PlayConfig:
     """Play in a window with a picture, instead of a terminal."""
     set: Assignments = ()
     """One argument of the environment, any number of times: max_episode_steps=400."""
-    robot: Url = None
-    """Live robot behind rosbridge, such as ws://10.0.0.5:9090; by default the simulated one here."""
-    robot_name: Annotated[str, tyro.conf.arg(metavar="NAME")] = ""
-    """Name of the live robot, where it does not tell its serial number or a name: trials of --policy on the robot of
-    that name count. A robot that tells another name is refused."""
-    transport: Url = None
-    """Whole environment that runs elsewhere: ws://10.0.0.5:9090/bam_001 (GymAPI), tcp://10.0.0.5:9091."""
-    profile: Name = None
-    """Topics and limits of the live robot: a shipped profile's name, or a .toml or .yaml file."""
-    guard: Assignments = ()
-    """One limit of the live robot's guards, any number of times: joint_speed=0.3."""
-    stage: Annotated[Literal["trial", "full"] | None, tyro.conf.arg(metavar="trial|full")] = None
-    """trial (default on a real robot): a quarter of the speed, in a box around the start; full: at its limits."""
-    ca_file: File = None
-    """Certificates that wss:// trusts instead of the system's."""
-    token_file: File = None
-    """File with the token that the server asks for."""
-    timeout: Annotated[Positive | None, tyro.conf.arg(metavar="S")] = None
-    """Longest wait for an answer of --transport [s]; 30 by default."""
-    keys: Folder = None
-    """Public keys that a real robot trusts --policy by; $BAM_TRUSTED_KEYS or ~/.config/bam-train/trusted by default."""
-    allow_unsigned: bool = False
-    """Let a --policy without a trusted signature move a real robot."""
-    yes: bool = False
-    """Do not ask before a real robot moves."""

@@ -16,10 +16,10 @@ from bam_train.errors import NoTerminal, SettingsError
 from bam_train.signals import SignalMemory
 
 if TYPE_CHECKING:
+    from bam_envs.core.location import Location
     from bam_train.checkpoint import Checkpoint
     from bam_train.cli.play.gamepad import Gamepad
     from bam_train.cli.play.play_flags import PlayConfig
-    from bam_train.env_location import EnvLocation
     from bam_train.play.session import Session
 
 DEMONSTRATIONS = 20
@@ -49,18 +49,18 @@ def play(config: PlayConfig, signals: SignalMemory) -> int:
     checkpoint = None if config.policy is None else Checkpoint.open(config.policy)
     env, policy = _connected(config, place, checkpoint, signals)
     try:
-        hand = hand_for(env, is_live=place.robot is not None)
+        hand = hand_for(env, is_live=config.robot is not None)
         env_id = env.spec.id if env.spec is not None else config.env or "environment"
         if config.record is not None:
             env = _recorded(config, env, env_id, checkpoint)
-        options: Any = {"policy": policy, "is_live": place.robot is not None, "speed": float(config.speed)}
+        options: Any = {"policy": policy, "is_live": config.robot is not None, "speed": float(config.speed)}
         session = Session(env, hand, seed=config.seed, **options)
         with _screen(config, env_id) as screen, closing(Gamepad()) as pad:
             try:
                 session.begin()
                 _drive(session, screen, pad, f"{env_id}{place.text and f' at {place.text}'}", config.episodes)
             finally:
-                if place.robot is not None:
+                if config.robot is not None:
                     env.unwrapped.robot.halt()  # first of all: a terminal or a data set may be slow to close
     except DependencyNotInstalled as error:  # of Gymnasium's own environments, at the first picture
         raise SettingsError(f"--render: {error}") from error
@@ -72,7 +72,7 @@ def play(config: PlayConfig, signals: SignalMemory) -> int:
         if config.record is not None and hasattr(env, "discard"):
             env.discard()  # what is not whole
         env.close()
-        say_agent_rests(env, "bam-play", place.robot)
+        say_agent_rests(env, "bam-play", config.robot)
     recorded = f", recorded in {config.record}" if config.record is not None else ""
     tell(f"{session.episodes} episode{'' if session.episodes == 1 else 's'}, {session.successes} succeeded{recorded}")
     if config.record is not None:
@@ -90,29 +90,23 @@ def _next_of(place: str) -> str:
     return f"bam-play: clone them with  bam-train --data {place} --algo bc"
 
 
-def _checked_place(config: PlayConfig) -> EnvLocation:
+def _checked_place(config: PlayConfig) -> Location:
     """The place of the environment by the flags."""
-    from bam_train.env_location import EnvLocation, addresses, read_guards
+    from bam_envs.core.location import Remote
 
-    ca_file, token_file = (None if path is None else str(path) for path in (config.ca_file, config.token_file))
-    trial = None if config.stage is None else config.stage == "trial"
-    link = (config.robot, addresses(config.transport), config.profile, ca_file, token_file, config.timeout)
-    place = EnvLocation(*link, read_guards(config.guard), trial=trial, robot_name=config.robot_name)
-    place.require_sane()
-    if config.env is None and config.policy is None and not place.transport:
+    place = config.location("keys", "allow_unsigned")
+    if config.env is None and config.policy is None and not isinstance(place, Remote):
         raise SettingsError(
             "which environment? Give its id, such as bam-play bam/reach, or --policy; bam-envs lists them"
         )
-    if config.stage is not None and config.robot is None:
-        raise SettingsError("--stage is for a live robot; give its address with --robot too")
     if config.render:
         from bam_train.cli.consent import require_screen
 
-        require_screen(remote=place.is_remote)
+        require_screen(remote=bool(place.text))
     return place
 
 
-def _connected(config: PlayConfig, place: EnvLocation, checkpoint: Checkpoint | None, signals: SignalMemory) -> Any:
+def _connected(config: PlayConfig, place: Location, checkpoint: Checkpoint | None, signals: SignalMemory) -> Any:
     """The environment, connected and with consent, and the policy, if there is one."""
     from bam_envs.core.registry import resolve_id
     from bam_train.cli.consent import connected_env

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
-from bam_train.env_location import HERE, EnvLocation
+from bam_envs.core.location import HERE, Location, Remote
 from bam_train.environments import is_batched, make_env, make_vector_env
 from bam_train.errors import SettingsError
 from bam_train.finite_envs import FiniteEnv, FiniteVectorEnv
@@ -22,9 +22,9 @@ Observations = Any
 """An array (n, …), or a mapping of them."""
 
 
-def make_training_env(env_id: str, env_kwargs: Mapping[str, Any], num_envs: int, place: EnvLocation = HERE) -> VecEnv:
+def make_training_env(env_id: str, env_kwargs: Mapping[str, Any], num_envs: int, place: Location = HERE) -> VecEnv:
     """Make `num_envs` environments to train on; those of `bam_envs` can save and restore their state."""
-    if is_batched(env_id) or place.transport:
+    if is_batched(env_id) or isinstance(place, Remote):
         return BatchVecEnv(make_vector_env(env_id, env_kwargs, num_envs, place), env_id)
     envs = (FiniteEnv(make_env(env_id, env_kwargs), env_id, index) for index in range(num_envs))
     return DummyVecEnv([functools.partial(Monitor, from_zero(env)) for env in envs])

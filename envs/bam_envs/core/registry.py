@@ -15,28 +15,14 @@ import gymnasium as gym
 
 from bam_envs.core.env_options import CAMERA_OPTIONS, constructor_options, read_cameras, require_kinds, require_known
 from bam_envs.core.errors import InvalidValue, UnknownName
+from bam_envs.core.location import SIMULATED, WHERE
 from bam_envs.core.robot import CameraSpec
 
 if TYPE_CHECKING:
     from bam_envs.core.robot import Robot
     from bam_envs.core.task import Task
 
-MAKE_OPTIONS = (
-    "render_mode",
-    "randomize",
-    "link",
-    "action_delay",
-    "robot",
-    "transport",
-    "profile",
-    "guards",
-    "trial",
-    "shadow",
-    "robot_name",
-    "ca_file",
-    "token_file",
-    "timeout",
-)
+MAKE_OPTIONS = ("render_mode", *SIMULATED, *WHERE, "timeout")
 """Arguments of `gymnasium.make` for every environment here, besides the options of its task."""
 
 

@@ -9,7 +9,7 @@ import math
 import os
 import sys
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from typing import Any
 
 import gymnasium as gym
@@ -21,6 +21,7 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
 from bam_envs.core.errors import InvalidValue, ResetNeeded, UnknownName
+from bam_envs.core.location import LiveRobot
 from bam_envs.core.robot import EnvIds, Robot, RobotState
 from bam_envs.core.spaces import indexed
 from bam_envs.core.task import Label, Score, Task
@@ -146,10 +147,11 @@ class RobotEnv(_RobotAndTask, gym.Env[Any, Any]):
 
     @spec.setter
     def spec(self, spec: EnvSpec | None) -> None:
-        ros: Any = None if spec is None else spec.kwargs.get("robot")
+        robot: Any = None if spec is None else spec.kwargs.get("robot")
+        ros = robot.url if isinstance(robot, LiveRobot) else robot
         if spec is not None and hasattr(ros, "factory"):
-            spec = copy.copy(spec)
-            spec.kwargs = {**spec.kwargs, "robot": ros.factory.url}
+            spec, url = copy.copy(spec), ros.factory.url
+            spec.kwargs = {**spec.kwargs, "robot": replace(robot, url=url) if isinstance(robot, LiveRobot) else url}
         self._made_by = spec
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:

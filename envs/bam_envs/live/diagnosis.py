@@ -8,12 +8,13 @@ import math
 import time
 from collections.abc import Callable, Iterator
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
 
 from bam_envs.core.errors import BamEnvsError, LinkLost, NotReady, ProtocolError, StaleState
+from bam_envs.core.location import LiveRobot
 from bam_envs.live import bringup
 from bam_envs.live.building import live_robot, require_robot_address
 from bam_envs.live.examination import PING_TOPIC, Array, Inspection, Reading, inspect_robot
@@ -59,12 +60,9 @@ class Diagnosis:
     """The checks of one robot; call `close` at the end.
 
     Args:
-        url: Its address, ``ws://host:port`` or ``wss://host:port``, and the namespace of its topics.
-        robot: The robot of a task at that address, not connected; None: the robot of `profile`.
-        profile: Its profile, a shipped name or a file; None: the profile of the task's robot, or the shipped one with
-            the largest share of its topics on the server.
-        ca_file: PEM file of the authorities to trust instead of the system's.
-        token_file: File with the server's shared secret.
+        at: Where it is, or its address; without a profile, it is that of the task's robot, or the shipped one with the
+            largest share of its topics on the server.
+        robot: The robot of a task at that address, not connected; None: the robot of the profile.
         seconds: Duration of the measurement [s].
 
     Raises:
@@ -74,22 +72,19 @@ class Diagnosis:
 
     def __init__(
         self,
-        url: str,
+        at: LiveRobot | str,
         robot: SafeRobot | None = None,
         *,
-        profile: str | None = None,
-        ca_file: str | None = None,
-        token_file: str | None = None,
         seconds: float = 5.0,
     ) -> None:
-        require_robot_address(url)
-        self.endpoint = endpoint = Endpoint.with_token_file(url, ca_file=ca_file, token_file=token_file)
-        self._credentials: dict[str, Any] = {"ca_file": ca_file, "token_file": token_file}
+        self._at = at if isinstance(at, LiveRobot) else LiveRobot(at)
+        require_robot_address(self._at.url)
+        self.endpoint = endpoint = Endpoint.of(self._at)
         self.robot, self.seconds = robot, seconds
         self.inspection: Inspection | None = None
         """The messages of the robot and the measured link; None before the step ``"rates and ages"``."""
-        self.profile: RobotProfile | None = None if profile is None else load_profile(profile)
-        if profile is None and robot is not None:
+        self.profile: RobotProfile | None = None if self._at.profile is None else load_profile(self._at.profile)
+        if self._at.profile is None and robot is not None:
             self.profile = profile_for(robot.spec)
         self._link = RosbridgeLink(endpoint, name="doctor")
         self._timeout = endpoint.timeout or bringup.TIMEOUT
@@ -145,7 +140,7 @@ class Diagnosis:
     def _topics(self) -> Findings:
         profile, link = self._chosen_profile(), self._link
         if self.robot is None:
-            self.robot = live_robot(self.endpoint.url, profile=profile, **self._credentials)
+            self.robot = live_robot(replace(self._at, profile=profile))
         types = bringup.TopicTypes(link, profile, self._timeout)
         sources = [profile.source(signal.name) for signal in self.robot.spec.signals]
         topics = {source.topic: source.type for source in sources}

@@ -2,7 +2,7 @@
 
 import importlib
 import inspect
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import gymnasium as gym
@@ -10,9 +10,9 @@ from gymnasium import Space
 
 from bam_envs.core.close_at_exit import close_at_exit
 from bam_envs.core.errors import InvalidValue, ResetNeeded, UnknownName
+from bam_envs.core.location import NO_CREDENTIALS, Credentials, Remote
 from bam_envs.remote.remote_vector_env import Described, RemoteVectorEnv
 from bam_envs.remote.wire.transport import EnvSpecMessage, Info, Transport
-from bam_envs.rosbridge.endpoint import Endpoint
 
 __all__ = ["RemoteEnv", "RemoteVectorEnv", "make_remote_env", "make_remote_vector_env", "open_transport"]
 
@@ -112,40 +112,48 @@ class RemoteEnv(Described, gym.Env[Any, Any]):
         self.transport.close()
 
 
-def make_remote_env(env_id: str, transport: Where, **options: Any) -> RemoteEnv:
-    """The environment `env_id` that runs at `transport`; connects on first use.
+def make_remote_env(env_id: str, at: Remote | Where, **options: Any) -> RemoteEnv:
+    """The environment `env_id` that runs elsewhere; connects on first use.
 
     Args:
         env_id: Its id; a server with another environment refuses. "" for any environment.
-        transport: A transport, or a URL for `open_transport`, which takes the `options` and raises InvalidValue.
-        options: Options such as ``timeout`` and ``token_file``.
+        at: Where it runs; or a transport, or a URL for `open_transport`, which takes the `options` and raises
+            InvalidValue.
+        options: Options such as ``timeout`` and ``credentials``.
     """
-    opened = open_transport(transport, env_id=env_id, **options) if isinstance(transport, str) else transport
-    return RemoteEnv(opened)
+    opened = _opened(env_id, at, options)
+    if len(opened) != 1:
+        raise InvalidValue(f"transport= of one environment is one address, and these are {len(opened)}; give one.")
+    return RemoteEnv(opened[0])
 
 
 def make_remote_vector_env(
-    env_id: str, transport: Where | Sequence[Where], num_envs: int | None = None, **options: Any
+    env_id: str, at: Remote | Where | Sequence[Where], num_envs: int | None = None, **options: Any
 ) -> RemoteVectorEnv:
-    """The environments `env_id` that run at `transport`, stepped together; see `make_remote_env`.
+    """The environments `env_id` that run elsewhere, stepped together; see `make_remote_env`.
 
     Args:
         env_id: Their id.
-        transport: One, or several, which are stepped at the same time; each may have many environments.
+        at: As for `make_remote_env`, or several, which are stepped at the same time; each may have many environments.
         num_envs: Expected total number of environments; None for any.
         options: As for `make_remote_env`.
     """
-    several = [transport] if isinstance(transport, (str, Transport)) else transport
-    opened = [open_transport(one, env_id=env_id, **options) if isinstance(one, str) else one for one in several]
-    return RemoteVectorEnv(opened, num_envs)
+    return RemoteVectorEnv(_opened(env_id, at, options), num_envs)
+
+
+def _opened(env_id: str, at: Remote | Where | Sequence[Where], options: Mapping[str, Any]) -> list[Transport]:
+    if isinstance(at, Remote):
+        options = {**options, "credentials": at.credentials, "timeout": at.timeout}
+        at = at.urls
+    several = [at] if isinstance(at, (str, Transport)) else at
+    return [open_transport(one, env_id=env_id, **options) if isinstance(one, str) else one for one in several]
 
 
 def open_transport(
     url: str,
     *,
     env_id: str = "",
-    ca_file: str | None = None,
-    token_file: str | None = None,
+    credentials: Credentials = NO_CREDENTIALS,
     timeout: float | None = None,
     **options: Any,
 ) -> Transport:
@@ -163,8 +171,7 @@ def open_transport(
     Args:
         url: `space` is a ROS namespace and may be left out.
         env_id: The requested environment; "" for the one that is served.
-        ca_file: PEM file of the authorities that wss:// trusts.
-        token_file: A file that holds the server's secret.
+        credentials: Files of certificates and of the server's token.
         timeout: Longest wait for an answer [s]; None for the default of the transport's class.
         options: Other keywords of that class, such as ``connect_timeout``.
 
@@ -177,9 +184,7 @@ def open_transport(
     if scheme not in _CLASSES:
         schemes = ", ".join(f"{one}://" for one in _CLASSES)
         raise InvalidValue(f"{url}: {UnknownName('transport', scheme, _CLASSES)} It must be one of {schemes}.")
-    endpoint = Endpoint.with_token_file(url, ca_file=ca_file, token_file=token_file)
-    arguments = {"ca_file": ca_file, "token": endpoint.token, "timeout": timeout}
-    options |= {name: value for name, value in arguments.items() if value is not None}
+    options |= {"credentials": credentials} | ({} if timeout is None else {"timeout": timeout})
     module, _, name = _CLASSES[scheme].partition(":")
     make: Any = getattr(importlib.import_module(module), name)
     # A class that passes options on to its parent takes the parent's options too.

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from typing import Any, Literal
 
 from bam_envs.core.errors import InvalidValue, LinkLost, NoServer
+from bam_envs.core.location import NO_CREDENTIALS
 from bam_envs.core.timing import Deadline
 from bam_envs.remote.rosbridge_transport import RosbridgeTransport
 from bam_envs.remote.wire.gymapi_messages import base_name, service_name
@@ -24,7 +25,7 @@ class RclpyTransport(RosbridgeTransport):
         env_id: The requested environment; "" for the one that is served.
         channel: ``"topics"``, a pair of std_msgs/String, or ``"service"``, for racks; that needs the package bam_msgs.
         domain: ROS domain; None for the environment variable ROS_DOMAIN_ID.
-        options: Other options of `RosbridgeTransport`, except ``ca_file`` and ``token``.
+        options: Other options of `RosbridgeTransport`, except ``credentials`` and ``token``.
     """
 
     def __init__(
@@ -36,8 +37,9 @@ class RclpyTransport(RosbridgeTransport):
         domain: int | None = None,
         **options: Any,
     ) -> None:
-        for name in ("ca_file", "token"):
-            if options.pop(name, None) is not None:
+        given = {**vars(options.pop("credentials", NO_CREDENTIALS)), "token": options.pop("token", None)}
+        for name, value in given.items():
+            if value is not None:
                 raise InvalidValue(f"{url}: ROS 2 has no {name}; it is for ws:// and wss://.")
         self._domain = domain
         super().__init__(url, env_id, channel=channel, **options)

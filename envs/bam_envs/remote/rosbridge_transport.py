@@ -11,6 +11,7 @@ import gymnasium as gym
 from gymnasium import Space
 
 from bam_envs.core.errors import LinkLost, NoServer, ProtocolError, RemoteError, UnknownName
+from bam_envs.core.location import NO_CREDENTIALS, Credentials
 from bam_envs.core.registry import resolve_id
 from bam_envs.core.validation import PositiveInt, check
 from bam_envs.remote.wire.gymapi_codec import DEFAULT, EnvCodec
@@ -52,8 +53,8 @@ class RosbridgeTransport:
         timeout: Longest time for a request [s]; a rack's pick takes seconds.
         connect_timeout: Longest time to connect [s].
         name: The name of this client, shown to others; computer and process by default.
-        ca_file: PEM file of the authorities to trust instead of the system's.
-        token: The server's shared secret, if it has one.
+        credentials: Files of certificates and of the server's token.
+        token: The server's shared secret, if it has one and it is not in a file.
         take: Take command from the client that has it.
         observation_space: Of a single environment. This and the following are for racks that do not describe their
             environment; they are sent only the fields that racks know.
@@ -78,7 +79,7 @@ class RosbridgeTransport:
         timeout: float = 30.0,
         connect_timeout: float = 3.0,
         name: str | None = None,
-        ca_file: str | None = None,
+        credentials: Credentials = NO_CREDENTIALS,
         token: str | None = None,
         take: bool = False,
         observation_space: Space[Any] | None = None,
@@ -89,7 +90,7 @@ class RosbridgeTransport:
         gymapi_version: str | None = None,
         autoreset: bool | None = None,
     ) -> None:
-        self.endpoint = Endpoint(url, ca_file, token, connect_timeout, timeout)
+        self.endpoint = Endpoint(url, credentials, token, connect_timeout, timeout)
         self.channel = check(channel, Literal["service", "topics"], "channel")
         self.url, self.env_id, self.timeout, self.take = url, env_id, timeout, take
         self._spaces, self._num_envs = (observation_space, action_space), check(num_envs, PositiveInt, "num_envs")

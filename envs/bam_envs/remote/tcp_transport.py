@@ -9,6 +9,7 @@ from typing import Any
 from urllib.parse import urlsplit
 
 from bam_envs.core.errors import InvalidValue, LinkLost, NoServer, ProtocolError, RemoteError
+from bam_envs.core.location import NO_CREDENTIALS, Credentials
 from bam_envs.remote.wire.tcp_wire import (
     FrameSocket,
     Hello,
@@ -40,7 +41,8 @@ class TcpTransport:
         env_id: The requested environment; "" for the one that is served.
         timeout: Longest time for a request [s].
         connect_timeout: Longest time to connect [s].
-        token: The server's shared secret, if it has one. Nothing is encrypted.
+        credentials: The file of the server's token. Nothing is encrypted.
+        token: The server's shared secret, if it has one and it is not in a file.
         name: The name of this client, shown to others; computer and process by default.
         take: Take command from the client that has it.
 
@@ -55,11 +57,12 @@ class TcpTransport:
         env_id: str = "",
         timeout: float = 30.0,
         connect_timeout: float = 3.0,
+        credentials: Credentials = NO_CREDENTIALS,
         token: str | None = None,
         name: str | None = None,
         take: bool = False,
     ) -> None:
-        self.endpoint = Endpoint(url, None, token, connect_timeout, timeout)
+        self.endpoint = Endpoint(url, credentials, token, connect_timeout, timeout)
         self.url, self.env_id, self.timeout, self.take = url, env_id, timeout, take
         try:
             parts = urlsplit(url)

@@ -5,11 +5,11 @@ import re
 import ssl
 from dataclasses import dataclass, field
 from functools import cached_property
-from pathlib import Path
 from typing import NamedTuple
 from urllib.parse import urlsplit
 
 from bam_envs.core.errors import InvalidValue
+from bam_envs.core.location import NO_CREDENTIALS, Credentials, LiveRobot
 from bam_envs.core.validation import RobotName, check
 from bam_envs.rosbridge.tokens import read_token
 
@@ -45,15 +45,15 @@ def is_loopback(host: str) -> bool:
 class Endpoint:
     """The address of a rosbridge server (``ws://``, ``wss://``) or of a whole environment (``tcp://``, …).
 
-    `InvalidValue` for an address, a token, a name or a timeout that is not valid, and for `ca_file` without TLS.
+    `InvalidValue` for an address, a token, a name or a timeout that is not valid, and for a `ca_file` without TLS.
     """
 
     url: str
     """``ws://host:port/namespace`` or ``wss://…`` (TLS); transports also take ``tcp://host:port`` and ``ros2://…``."""
-    ca_file: str | None = None
-    """PEM file of the certificate authorities that ``wss://`` trusts instead of the system's."""
+    credentials: Credentials = NO_CREDENTIALS
+    """The files of certificates and of the token."""
     token: str | None = field(default=None, repr=False)
-    """Shared secret of the server; sent as a bearer token."""
+    """Shared secret of the server, sent as a bearer token; by default the one in the token file."""
     connect_timeout: float = 3.0
     """Longest time to connect [s]."""
     timeout: float | None = None
@@ -62,6 +62,8 @@ class Endpoint:
     """Name of the robot there, as its operator knows it; empty if the robot tells it, or none is known."""
 
     def __post_init__(self) -> None:
+        if self.token is None and self.credentials.token_file is not None:
+            object.__setattr__(self, "token", read_token(self.credentials.token_file))
         if self.url.startswith(("ws://", "wss://")):
             self.address  # noqa: B018 - parsed here to report a wrong one at once
             if self.token is not None and not re.fullmatch(r"[!-~]+", self.token):
@@ -69,7 +71,7 @@ class Endpoint:
                     "The token is empty, or contains blanks, line ends or characters beyond ASCII, which HTTP headers "
                     "cannot carry. Read a token file without its line end."
                 )
-        if self.ca_file is not None and not self.url.startswith("wss://"):
+        if self.credentials.ca_file is not None and not self.url.startswith("wss://"):
             raise InvalidValue(
                 f"{self.url}: ca_file is for wss:// only, and this address is without TLS; leave it out."
             )
@@ -79,17 +81,9 @@ class Endpoint:
                 raise InvalidValue(f"{name}: expected a time above 0 s, found {value!r}.")
 
     @classmethod
-    def with_token_file(
-        cls,
-        url: str,
-        *,
-        ca_file: str | Path | None = None,
-        token_file: str | Path | None = None,
-        robot_name: str = "",
-    ) -> "Endpoint":
-        """An endpoint with the token in `token_file`, as command lines and ``gym.make`` take it."""
-        token = None if token_file is None else read_token(token_file)
-        return cls(url, None if ca_file is None else str(ca_file), token, robot_name=robot_name)
+    def of(cls, robot: LiveRobot) -> "Endpoint":
+        """The server of a live robot with an address."""
+        return cls(robot.url, robot.credentials, robot_name=robot.robot_name)
 
     @cached_property
     def address(self) -> Address:
@@ -127,9 +121,9 @@ class Endpoint:
         if not self.address.secure:
             return None
         try:
-            return ssl.create_default_context(cafile=self.ca_file)
+            return ssl.create_default_context(cafile=self.credentials.ca_file)
         except OSError as error:
             reason = error.strerror or error
             raise InvalidValue(
-                f"CA file {self.ca_file!r} cannot be used: {reason}. Give a file of certificates in PEM."
+                f"CA file {self.credentials.ca_file!r} cannot be used: {reason}. Give a file of certificates in PEM."
             ) from error

@@ -227,17 +227,18 @@ def test_the_time_limit_of_robo_gym_cannot_be_put_off(make, env_id, parity, step
     [
         (
             {"robot": "ws://a:1", "transport": "ws://b:2"},
-            "robot= and transport= exclude each other: the task runs here, or with the robot elsewhere.",
+            "robot= and transport= exclude each other: the task runs here, or over there; give one.",
         ),
         (
             {"transport": "ws://b:2", "tolerance": 0.1},
             "tolerance: the task runs at ws://b:2; give its options to bam-serve there.",
         ),
-        ({"profile": "ur5e"}, "profile='ur5e' describes a live robot; give its address with robot= too."),
-        ({"timeout": 5.0}, "timeout=5.0 limits the wait for an answer of transport=; leave it out."),
+        ({"profile": "ur5e"}, "profile= describes a live robot; give its address with robot= too."),
+        ({"token_file": "t"}, "token_file= is for a link, and the robot is simulated here; give robot= or transport=."),
+        ({"timeout": 5.0}, "timeout= limits the wait for an answer of transport=; leave it out."),
         (
             {"robot": "ws://a:1", "timeout": 5.0},
-            "timeout=5.0 limits the wait for an answer of transport=; leave it out.",
+            "timeout= limits the wait for an answer of transport=; leave it out.",
         ),
     ],
 )
@@ -252,7 +253,7 @@ def test_how_long_an_environment_elsewhere_is_waited_for():
     assert env.unwrapped.transport.timeout == 2.5
     rows = make_vector_env("bam/reach-v0", 2, transport=["tcp://a:1", "ws://b:2"], timeout=2.5)
     assert [transport.timeout for transport in rows.transports] == [2.5, 2.5]
-    with pytest.raises(InvalidValue, match=r"^timeout=2.5 limits the wait for an answer of transport="):
+    with pytest.raises(InvalidValue, match=r"^timeout= limits the wait for an answer of transport="):
         make_vector_env("bam/reach-v0", 2, timeout=2.5)
 
 

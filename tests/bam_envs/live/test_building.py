@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from bam_envs.core.errors import InvalidValue, LinkLost, ProtocolError, SafetyStop, UnknownName
+from bam_envs.core.location import Credentials
 from bam_envs.core.robot import EnvIds, Initial, Robot, RobotState
 from bam_envs.core.timing import Deadline
 from bam_envs.live.building import live_robot, profile_limits
@@ -122,11 +123,11 @@ def test_an_address_of_something_else(url, text):
 
 def test_certificates_without_tls():
     with pytest.raises(InvalidValue) as caught:
-        live_robot("ws://robot", ca_file="ca.pem")
+        live_robot("ws://robot", credentials=Credentials("ca.pem"))
     assert str(caught.value) == (
         "ws://robot: ca_file is for wss:// only, and this address is without TLS; leave it out."
     )
-    live_robot("wss://robot", ca_file="ca.pem")
+    live_robot("wss://robot", credentials=Credentials("ca.pem"))
 
 
 def test_its_profile():
@@ -219,12 +220,12 @@ def test_what_its_guards_did_is_published_in_every_tick(server, robot_on, start_
 def test_its_token(tmp_path, robot_on, start_pose):
     path = tmp_path / "token"
     with pytest.raises(InvalidValue, match=r"^The token file .* cannot be read: "):
-        live_robot("ws://robot", token_file=str(path))
+        live_robot("ws://robot", credentials=Credentials(token_file=str(path)))
     path.touch(0o600)
     path.write_text("secret\n")
     with BridgeServer(port=0, token="secret") as server:
         robot_on(server)
-        robot = live_robot(server.url, token_file=str(path))
+        robot = live_robot(server.url, credentials=Credentials(token_file=str(path)))
         robot.connect()
         robot.reset(ROW, start_pose)
         robot.close()

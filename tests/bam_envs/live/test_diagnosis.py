@@ -12,6 +12,7 @@ import pytest
 from websockets.asyncio.server import serve
 
 from bam_envs.core.errors import InvalidValue
+from bam_envs.core.location import LiveRobot
 from bam_envs.core.timing import Pacer
 from bam_envs.live import bringup, examination
 from bam_envs.live.diagnosis import STEPS, Diagnosis
@@ -39,9 +40,9 @@ def patient(tmp_path):
     return write
 
 
-def diagnose(url, robot=None, **options):
+def diagnose(url, robot=None, profile=None):
     """The diagnosis, which is closed, and its steps by name."""
-    diagnosis = Diagnosis(url, robot, seconds=0.6, **options)
+    diagnosis = Diagnosis(LiveRobot(url, profile=profile), robot, seconds=0.6)
     try:
         return diagnosis, {step.name: step for step in diagnosis.steps()}
     finally:

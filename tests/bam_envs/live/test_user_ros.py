@@ -2,6 +2,7 @@
 
 import contextlib
 import threading
+from dataclasses import replace
 
 import gymnasium as gym
 import numpy as np
@@ -9,6 +10,7 @@ import pytest
 import roslibpy
 
 from bam_envs.core.errors import InvalidValue, LinkLost, NoServer
+from bam_envs.core.location import LiveRobot
 from bam_envs.remote.serve.serve_options import ServeOptions
 from bam_envs.remote.serve.served_environment import ServedEnvironment
 from bam_envs.ros.codec import HALT_TOPIC
@@ -43,10 +45,13 @@ def test_it_is_driven_halted_and_lost_as_over_an_address(served, ros):
     drivers, halts, halted = set(), set(), threading.Event()
     served.bus.subscribe(HALT_TOPIC, "std_msgs/Empty", lambda _, caller: (halts.add(caller.name), halted.set()))
     served.bus.subscribe(COMMANDS, "trajectory_msgs/JointTrajectory", lambda _, caller: drivers.add(caller.name))
-    with contextlib.closing(gym.make("bam/pick-v0", robot=ros)) as env:
+    robot = LiveRobot(ros, guards={"joint_speed": 0.3})
+    with contextlib.closing(gym.make("bam/pick-v0", robot=robot)) as env:
         assert env.reset(seed=1)[0].shape == (18,)
         env.step(STILL)
-        assert env.spec.kwargs["robot"] == served.bus.url  # a copy of the specification cannot have the connection
+        assert env.spec.kwargs["robot"] == replace(
+            robot, url=served.bus.url
+        )  # a copy of the specification cannot have the connection
         env.unwrapped.robot.halt()
         assert halted.wait(10.0)
         closed(ros, ros.close)
@@ -63,6 +68,8 @@ def test_a_ros_that_is_not_connected_and_options_of_an_address_are_refused(serve
     text = "ca_file= and token_file= are for an address; a roslibpy.Ros has made its connection."
     assert str(raised.value) == text
     closed(ros, ros.close)
-    with contextlib.closing(gym.make("bam/pick-v0", robot=ros)) as env, pytest.raises(NoServer) as raised:
-        env.reset()
+    with contextlib.closing(gym.make("bam/pick-v0", robot=ros)) as env:
+        assert env.spec.kwargs["robot"] == served.bus.url
+        with pytest.raises(NoServer) as raised:
+            env.reset()
     assert str(raised.value) == f"{served.bus.url}: the roslibpy.Ros is not connected: call its run() before."

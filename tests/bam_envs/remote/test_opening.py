@@ -3,6 +3,7 @@
 import pytest
 
 from bam_envs.core.errors import InvalidValue
+from bam_envs.core.location import Credentials
 from bam_envs.remote.remote_env import open_transport
 from bam_envs.remote.rosbridge_transport import RosbridgeTransport
 from bam_envs.remote.tcp_transport import TcpTransport
@@ -47,16 +48,16 @@ def test_options_that_a_transport_does_not_have():
     with pytest.raises(InvalidValue) as caught:
         open_transport("tcp://x:1", channel="topics")
     assert str(caught.value) == (
-        "tcp://x:1 takes no channel; its options are timeout, connect_timeout, token, name, take."
+        "tcp://x:1 takes no channel; its options are timeout, connect_timeout, credentials, token, name, take."
     )
 
 
 @pytest.mark.parametrize("url", ["tcp://x:1", "ws://x:1"])
 def test_certificates_without_tls(url):
     with pytest.raises(InvalidValue) as caught:
-        open_transport(url, ca_file="ca.pem")
+        open_transport(url, credentials=Credentials("ca.pem"))
     assert str(caught.value) == (f"{url}: ca_file is for wss:// only, and this address is without TLS; leave it out.")
-    open_transport("wss://x:1", ca_file="ca.pem")
+    open_transport("wss://x:1", credentials=Credentials("ca.pem"))
 
 
 @pytest.mark.parametrize("url", ["tcp://x:1", "ws://x:1", "ros2://x"])
@@ -69,9 +70,9 @@ def test_a_token_file(tmp_path):
     path = tmp_path / "token"
     path.touch(0o600)
     path.write_text("geheim\n")
-    assert open_transport("tcp://x:1", token_file=str(path)).endpoint.token == "geheim"
+    assert open_transport("tcp://x:1", credentials=Credentials.of(token_file=path)).endpoint.token == "geheim"
     with pytest.raises(InvalidValue) as caught:
-        open_transport("tcp://x:1", token_file=str(tmp_path / "none"))
+        open_transport("tcp://x:1", credentials=Credentials.of(token_file=tmp_path / "none"))
     assert str(caught.value) == (
         f"The token file {tmp_path / 'none'} cannot be read: No such file or directory. "
         "Write a secret into a file that only you can read."

@@ -137,7 +137,7 @@ def test_a_limit_that_was_asked_for_is_not_told(made_here, recwarn, limit, steps
 
 def test_making_it_of_a_url(make):
     with TcpServer(EnvServer(make("bam/reach-v0"))) as server:
-        env = make_remote_env("bam/reach", server.url, timeout=5.0, ca_file=None, token_file=None)
+        env = make_remote_env("bam/reach", server.url, timeout=5.0)
         assert env.reset(seed=0)[0].shape == env.observation_space.shape
         env.close()
         with pytest.raises(LinkLost) as caught:

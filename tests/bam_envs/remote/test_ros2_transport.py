@@ -6,6 +6,7 @@ import pytest
 
 import bam_envs  # noqa: F401 - registers the environments
 from bam_envs.core.errors import InvalidValue, LinkLost, NoServer
+from bam_envs.core.location import Credentials
 from bam_envs.remote.remote_env import open_transport
 from bam_envs.remote.ros2_transport import RclpyTransport
 from bam_envs.remote.serve.env_server import EnvServer
@@ -73,7 +74,7 @@ def test_nobody_there_for_the_service(ros_domain):
     ("url", "options", "text"),
     [
         ("ros2://a", {"token": "x"}, "ros2://a: ROS 2 has no token; it is for ws:// and wss://."),
-        ("ros2://a", {"ca_file": "x"}, "ros2://a: ROS 2 has no ca_file; it is for ws:// and wss://."),
+        ("ros2://a", {"credentials": Credentials("x")}, "ros2://a: ROS 2 has no ca_file; it is for ws:// and wss://."),
         ("ros2:a", {}, "An address in a ROS 2 graph is ros2://namespace, not 'ros2:a'."),
         ("ws://a", {}, "An address in a ROS 2 graph is ros2://namespace, not 'ws://a'."),
     ],

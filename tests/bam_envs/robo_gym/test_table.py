@@ -45,7 +45,7 @@ import sys, bam_envs
 print(sorted(name for name in sys.modules if name.startswith("bam_envs.")))
 """
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    core = ("env_options", "errors", "registry", "robot", "validation", "wording")
+    core = ("env_options", "errors", "location", "registry", "robot", "validation", "wording")
     others = ("aliases", "aliases.bam_names", "aliases.robo_gym_names")
     modules = [*others, "core", *(f"core.{name}" for name in core)]
     assert done.stdout.strip() == str([f"bam_envs.{name}" for name in modules])

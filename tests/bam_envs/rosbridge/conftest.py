@@ -205,7 +205,7 @@ def new_link():
 
     def make(server, connect=True, **options):
         url = server if isinstance(server, str) else server.url
-        names = ("ca_file", "token", "connect_timeout")
+        names = ("credentials", "token", "connect_timeout")
         endpoint = Endpoint(url, **{name: options.pop(name) for name in names if name in options})
         made.append(RosbridgeLink(endpoint, **options))
         if connect:

@@ -8,6 +8,7 @@ from contextlib import contextmanager
 import pytest
 
 from bam_envs.core.errors import InvalidValue, NoServer
+from bam_envs.core.location import Credentials
 from bam_envs.rosbridge.client import RosbridgeLink
 from bam_envs.rosbridge.endpoint import Address, Endpoint
 
@@ -130,7 +131,7 @@ def test_a_token_that_is_refused_is_shown_once(new_scripted, status, caplog):
 def test_tls_with_the_authority_of_the_certificate(new_scripted, new_link, certificates):
     ca_file, context = certificates("127.0.0.1")
     server = new_scripted(context=context)
-    link = new_link(server, ca_file=ca_file, token="secret")
+    link = new_link(server, credentials=Credentials(str(ca_file)), token="secret")
     assert (link.is_up, link.url, server.headers) == (True, server.url, [("/", "Bearer secret")])
 
 
@@ -145,7 +146,7 @@ def test_tls_that_fails(new_scripted, scripted, certificates):
         "(connection closed while reading HTTP status line). If it has TLS, use wss://."
     )
     ca_file, context = certificates("robot.example")
-    assert failure(new_scripted(context=context).url, ca_file=ca_file) == (
+    assert failure(new_scripted(context=context).url, credentials=Credentials(str(ca_file))) == (
         "the certificate is not for '127.0.0.1': "
         "IP address mismatch, certificate is not valid for '127.0.0.1'. Use a name that is in it."
     )
@@ -163,7 +164,7 @@ def test_a_ca_file_that_is_none(scripted, tmp_path, content, reason):
     path = tmp_path / "ca.pem"
     if content is not None:
         path.write_text(content)
-    link = RosbridgeLink(Endpoint(scripted.url.replace("ws://", "wss://"), ca_file=str(path)))
+    link = RosbridgeLink(Endpoint(scripted.url.replace("ws://", "wss://"), credentials=Credentials(str(path))))
     with pytest.raises(InvalidValue) as raised:
         link.connect()
     assert str(raised.value).startswith(f"CA file {str(path)!r} cannot be used: {reason}")
@@ -217,7 +218,10 @@ def test_an_address_that_is_none(url, text):
 @pytest.mark.parametrize(
     ("options", "text"),
     [
-        ({"ca_file": "ca.pem"}, "ca_file is for wss:// only, and this address is without TLS; leave it out."),
+        (
+            {"credentials": Credentials("ca.pem")},
+            "ca_file is for wss:// only, and this address is without TLS; leave it out.",
+        ),
         ({"connect_timeout": 0}, "connect_timeout: expected a time above 0 s, found 0."),
         ({"timeout": float("nan")}, "timeout: expected a time above 0 s, found nan."),
         *(
@@ -235,5 +239,5 @@ def test_what_does_not_fit_the_address_is_refused(options, text):
 def test_a_token_from_a_file_is_not_shown(tmp_path):
     (tmp_path / "token").touch(0o600)
     (tmp_path / "token").write_text("hush\n")
-    endpoint = Endpoint.with_token_file("tcp://a:1", token_file=tmp_path / "token")
+    endpoint = Endpoint("tcp://a:1", Credentials.of(token_file=tmp_path / "token"))
     assert (endpoint.token, "hush" in repr(endpoint)) == ("hush", False)

@@ -3,6 +3,7 @@ import os
 import pytest
 
 from bam_envs.core.errors import InvalidValue
+from bam_envs.core.location import Credentials
 from bam_envs.rosbridge.endpoint import Endpoint
 from bam_envs.rosbridge.tokens import Guesses, TokenFile, Tokens, read_token, read_tokens
 
@@ -32,10 +33,10 @@ def test_a_token_file_is_its_users_alone(tmp_path, mode):
     path.write_text("secret")
     path.chmod(mode)
     with pytest.raises(InvalidValue) as error:
-        Endpoint.with_token_file("ws://10.0.0.5:9090", token_file=path)
+        Endpoint("ws://10.0.0.5:9090", Credentials.of(token_file=path))
     assert str(error.value) == f"The token file {path} is open to other users of this computer. Run: chmod 600 {path}"
     path.chmod(0o600)
-    assert Endpoint.with_token_file("ws://10.0.0.5:9090", token_file=path).token == "secret"
+    assert Endpoint("ws://10.0.0.5:9090", Credentials.of(token_file=path)).token == "secret"
 
 
 def test_roles():

@@ -6,10 +6,14 @@ from pathlib import Path
 
 import pytest
 
+from bam_envs.core.location import Credentials, LiveRobot
 from bam_train.agent.versions import Versions
 from bam_train.checkpoint import Checkpoint
+from bam_train.cli.flags import AgentConfig
 from bam_train.cli.live import live_agent as agent
 from bam_train.cli.live import push
+from bam_train.cli.live.run_agent import options_of
+from bam_train.cli.program import parse
 from bam_train.errors import RequestRefused
 
 DIGEST = "3f2a91c0d7aa" + 52 * "0"
@@ -254,6 +258,8 @@ def test_wrong_usage_has_status_2(run, arguments, text):
         ([], "has no version yet; give a checkpoint with --policy"),
         (["--policy", PICK, "--env", "bam/reach"], "was trained on bam/pick-v0"),
         (["--policy", PICK, "--bind", "192.0.2.1"], "192.0.2.1"),
+        (["--ca-file", "ca.pem"], "--ca-file is for a link, and the robot is simulated here; give --robot\n"),
+        (["--guard", "joint_speed=0.3"], "--guard changes a limit of a live robot; give its address with --robot too"),
     ],
 )
 def test_a_refused_start_leaves_nothing(run, tmp_path, monkeypatch, flags, text):
@@ -263,6 +269,16 @@ def test_a_refused_start_leaves_nothing(run, tmp_path, monkeypatch, flags, text)
     assert (status, out) == (1, "")
     assert text in err
     assert [*Path().iterdir()] == []
+
+
+def test_the_token_of_the_robot_is_not_the_file_of_those_of_people():
+    flags = ["--robot", "wss://a:1", "--ca-file", "ca", "--robot-token-file", "arm", "--token-file", "people"]
+    more = ["--guard", "joint_speed=0.3", "--robot-name", "arm 7", "--stage", "trial", "--cert", "c"]
+    options = options_of(parse(AgentConfig, "bam-agent", [*flags, *more]))
+    robot = LiveRobot("wss://a:1", Credentials("ca", "arm"), None, {"joint_speed": 0.3}, "trial", "arm 7")
+    assert (options.robot, options.token_file, options.cert) == (robot, Path("people"), Path("c"))
+    simulated = options_of(parse(AgentConfig, "bam-agent", ["--token-file", "people", "--robot-token-file", "arm"]))
+    assert (simulated.robot, simulated.token_file, simulated.unusual) == (LiveRobot(""), Path("people"), "warn")
 
 
 def test_a_start_at_a_port_in_use_changes_no_version(run, tmp_path):

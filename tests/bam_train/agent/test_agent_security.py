@@ -25,6 +25,7 @@ from websockets.sync.client import connect
 
 import bam_envs  # noqa: F401 - registers the environments
 from bam_envs.core.errors import RemoteError
+from bam_envs.core.location import LiveRobot
 from bam_train.agent.agent_options import AgentOptions
 
 DEADLINE = 60.0
@@ -494,7 +495,7 @@ def test_a_pickle_is_never_opened(agent, refusals, tmp_path, wrapped):
 )
 def test_tls_is_recommended_where_other_computers_connect(bind, cert, warns):
     text = "tokens and commands go over 0.0.0.0 unencrypted: give --cert and --key, or trust that network"
-    options = AgentOptions("ws://robot:9090", Path("agent"), bind=bind, cert=cert)
+    options = AgentOptions(LiveRobot("ws://robot:9090"), Path("agent"), bind=bind, cert=cert)
     assert options.warning == (text if warns else None)
 
 

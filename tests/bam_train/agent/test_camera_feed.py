@@ -10,6 +10,7 @@ from PIL import Image
 from websockets.sync.client import connect
 
 from bam_envs.core.errors import StaleState
+from bam_envs.core.location import LiveRobot
 from bam_envs.live.camera import CameraImage
 from bam_envs.rosbridge.server import BridgeServer, Site
 from bam_envs.rosbridge.tokens import Tokens
@@ -169,7 +170,7 @@ def test_greys_distances_and_what_is_transparent():
     ],
 )
 def test_the_console_shows_the_cameras_that_the_policy_sees(tmp_path, env_kwargs, seen):
-    agent = AgentOptions("ws://127.0.0.1:9090", tmp_path, guards=(("joint_speed", 0.3),), robot_name="arm 7")
+    agent = AgentOptions(LiveRobot("ws://127.0.0.1:9090", guards={"joint_speed": 0.3}, robot_name="arm 7"), tmp_path)
     front = FrontProcess(
         Front.from_bytes(Front("bam/pick-v0", env_kwargs, agent, 0.2).to_bytes()), lambda message: None
     )

@@ -14,13 +14,13 @@ import pytest
 from gymnasium.spaces import Box
 from onnx import TensorProto, helper, numpy_helper
 
+from bam_envs.core.location import LiveRobot
 from bam_envs.core.spaces import space_to_json
 from bam_train.agent.candidate import CandidateRequest, check_candidate
 from bam_train.agent.candidate_checks import examine
 from bam_train.agent.versions import Versions, load_policy
 from bam_train.checkpoint import GOLDEN, POLICY, Checkpoint, safetensors_file, write_checkpoint
 from bam_train.checkpoint.signature import make_key, sign, trust
-from bam_train.env_location import EnvLocation
 from bam_train.environments import interface_of, make_env
 
 SEEN = np.random.default_rng(0).normal(size=(20, 4)).astype(np.float32)
@@ -92,7 +92,7 @@ def test_a_good_candidate_is_kept_and_its_policy_loaded(asked, candidate):
 
 def test_a_shipped_checkpoint_fits_its_environment_with_a_live_robot(asked):
     manifest = Checkpoint.open(CHECKPOINTS / "pick-ppo.zip").manifest
-    env = make_env(manifest.env, manifest.env_kwargs, place=EnvLocation(robot="ws://127.0.0.1:9090", trial=False))
+    env = make_env(manifest.env, manifest.env_kwargs, place=LiveRobot("ws://127.0.0.1:9090", stage="full"))
     others = {"env": manifest.env, "env_kwargs": {"max_episode_steps": 400}, "interface": interface_of(env)}
     verdict = check_candidate(asked(CHECKPOINTS / "pick-ppo.zip", **others))
     assert (verdict.ok, verdict.reason) == (True, "")

@@ -6,6 +6,7 @@ import threading
 import numpy as np
 import pytest
 
+from bam_envs.core.location import LiveRobot
 from bam_envs.core.robot import RobotState
 from bam_envs.testing import ARM_HOME
 from bam_train.agent.agent_messages import Answer, Ask, Drive, Front
@@ -51,7 +52,7 @@ def front(sent, tmp_path):
         if isinstance(message, Ask):
             front.take(Answer(message.number, result={}))
 
-    agent = AgentOptions("ws://127.0.0.1:9090", tmp_path)
+    agent = AgentOptions(LiveRobot("ws://127.0.0.1:9090"), tmp_path)
     front = FrontProcess(Front("bam/pick-v0", {}, agent, 0.2), send)
     front.robot = RestingArm()
     return front

@@ -9,6 +9,7 @@ from types import SimpleNamespace
 import pytest
 
 from bam_envs.core.errors import LinkLost, NotReady, ProtocolError, SafetyStop, StaleState, StartNotReached
+from bam_envs.core.location import LiveRobot
 from bam_envs.core.timing import TickTimes
 from bam_train.agent.agent_messages import Answer, Ask, Drive, Halt, Report
 from bam_train.agent.agent_options import AgentOptions
@@ -93,7 +94,7 @@ class Bench:
         self.faults, self.events, self._answers = deque(), [], queue.Queue()
         self._number, self._changed, self.reports, self._seen = 0, threading.Condition(), [{}], 0
         self.agent = Resident(
-            AgentOptions("ws://127.0.0.1:1", folder, **options),
+            AgentOptions(LiveRobot("ws://127.0.0.1:1"), folder, **options),
             versions,
             SimpleNamespace(write=self._write, fault=""),
             send=self._take,

@@ -8,6 +8,7 @@ from types import SimpleNamespace
 
 import pytest
 
+from bam_envs.core.location import LiveRobot
 from bam_envs.remote.serve.serve_options import ServeOptions
 from bam_envs.remote.serve.served_environment import ServedEnvironment
 from bam_train.agent import robot_session
@@ -31,7 +32,7 @@ def session(tmp_path, monkeypatch):
         def make(**options):
             made.append(
                 RobotSession(
-                    AgentOptions(served.bus.url, tmp_path, **options),
+                    AgentOptions(LiveRobot(served.bus.url), tmp_path, **options),
                     Checkpoint.open(REACH),
                     None,
                     between_ticks=lambda: next(ticks) % 6 == 5,  # an episode ends after some ticks
@@ -100,6 +101,6 @@ def test_where_no_recording_can_begin_one_does_once_there_is_room(session, tmp_p
 
 
 def test_without_recordings_none_begins(session):
-    session = session(record=False)
+    session = session(no_record=True)
     play(session)
     assert (session.recorder, session.recording_fault, session.record_again()) == (None, "", "")

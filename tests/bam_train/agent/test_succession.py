@@ -6,6 +6,7 @@ from types import SimpleNamespace
 
 import pytest
 
+from bam_envs.core.location import LiveRobot
 from bam_train.agent.agent_messages import Ask, RequestProgress
 from bam_train.agent.agent_options import AgentOptions
 from bam_train.agent.agent_states import State
@@ -24,7 +25,7 @@ class Agent:
     """A resident without a robot: what was chosen acts at once."""
 
     def __init__(self, folder, given=PICK):
-        self.options = AgentOptions("ws://127.0.0.1:9090", folder)
+        self.options = AgentOptions(LiveRobot("ws://127.0.0.1:9090"), folder)
         versions = Versions(folder / "versions")
         env = versions.first(given).env
         interface = interface_of(make_env(env))

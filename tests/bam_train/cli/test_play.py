@@ -18,6 +18,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
+from bam_envs.core.location import LiveRobot
 from bam_envs.remote.serve.serve_options import ServeOptions
 from bam_envs.remote.serve.served_environment import ServedEnvironment
 from bam_train.cli.consent import connected_env, guards_of
@@ -25,7 +26,6 @@ from bam_train.cli.play import run_play, terminal
 from bam_train.cli.play.gamepad import Gamepad
 from bam_train.cli.play.terminal import Terminal, keys_in
 from bam_train.data import DataSet
-from bam_train.env_location import EnvLocation
 from bam_train.environments import make_env
 from bam_train.play.hands import hand_for
 from bam_train.play.key_map import moved
@@ -255,7 +255,7 @@ def test_ctrl_c_gives_the_terminal_back(tty, tmp_path):
 def test_a_live_robot_moves_through_its_guards_while_a_key_is_fresh_and_else_holds():
     options = ServeOptions(port=0, fast=True)
     with ServedEnvironment(make_env("bam/pick-v0", {}), options) as served, SignalMemory() as signals:
-        place = EnvLocation(served.bus.url, trial=None)
+        place = LiveRobot(served.bus.url)
         env = connected_env(None, place, signals, who="bam-play", episodes=0, named="bam/pick-v0")
         with closing(env):
             session = Session(env, hand_for(env, is_live=True), is_live=True)

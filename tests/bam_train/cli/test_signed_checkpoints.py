@@ -13,11 +13,11 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from bam_envs.core.location import HERE
 from bam_train.checkpoint import MANIFEST, POLICY, Checkpoint, safetensors_file, write_checkpoint
 from bam_train.checkpoint.signature import make_key, public_path, sign, trust, verify
 from bam_train.cli.sign import main
 from bam_train.deploy.checkpoint_admission import Admission
-from bam_train.env_location import HERE
 from bam_train.errors import AlteredCheckpoint, BadKey, CheckpointError, OutputError, UntrustedCheckpoint
 from bam_train.policy import onnx_session
 

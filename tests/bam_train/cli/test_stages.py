@@ -10,6 +10,7 @@ import gymnasium as gym
 import pytest
 
 from bam_envs.core.errors import InvalidValue, LinkLost
+from bam_envs.core.location import HERE, LiveRobot
 from bam_envs.live import rosbridge_robot
 from bam_envs.remote.serve.serve_options import ServeOptions
 from bam_envs.remote.serve.served_environment import ServedEnvironment
@@ -19,7 +20,7 @@ from bam_train.checkpoint import Checkpoint
 from bam_train.cli.deploy import main as deploy
 from bam_train.deploy.checkpoint_admission import Admission
 from bam_train.deploy.trials import Subject, TrialRecord, Trials
-from bam_train.env_location import HERE, EnvLocation
+from bam_train.environments.made_env import with_live_robot
 from bam_train.errors import BadTrials, SettingsError, TrialsNeeded
 from bam_train.recording.recording import Recording
 from tests.bam_train.deploy.test_deployment import Driven, raises
@@ -29,7 +30,7 @@ REACH = Path(__file__).parents[3] / "checkpoints" / "reach-ppo.zip"
 URL = "ws://10.0.0.5:9090"
 SIMULATED = SimpleNamespace(unwrapped=SimpleNamespace(robot=SimpleNamespace(info=SimpleNamespace(simulated=True))))
 REAL = SimpleNamespace(unwrapped=SimpleNamespace(robot=SimpleNamespace(info=SimpleNamespace(simulated=False))))
-ON_TRIAL, FULL = EnvLocation(robot=URL, trial=True), EnvLocation(robot=f"{URL}/", trial=False)
+ON_TRIAL, FULL = LiveRobot(URL, stage="trial"), LiveRobot(f"{URL}/", stage="full")
 
 
 @pytest.fixture(autouse=True)
@@ -85,7 +86,7 @@ def test_another_checkpoint_or_robot_begins_anew(admission):
     one(SIMULATED, ON_TRIAL)
     try_it(one.trials, *[True] * 33)
     with pytest.raises(TrialsNeeded, match="0 of 0 trials succeeded"):
-        admission()(SIMULATED, replace(FULL, robot="ws://10.0.0.6:9090"))
+        admission()(SIMULATED, replace(FULL, url="ws://10.0.0.6:9090"))
     with pytest.raises(
         TrialsNeeded, match="0 of 0 trials succeeded; 7 more without a failure would show more than 60 %"
     ):
@@ -127,7 +128,7 @@ def test_an_edited_record_is_refused_at_every_stage(admission, tmp_path):
 
 
 def test_a_simulated_robot_has_no_stage_unless_one_is_asked_for(admission):
-    for place in (HERE, EnvLocation(robot=URL, trial=None)):
+    for place in (HERE, LiveRobot(URL)):
         one = admission()
         with pytest.raises(SettingsError, match="a simulated robot is on trial only with --stage trial; give that too"):
             one(SIMULATED, place)
@@ -151,13 +152,13 @@ def test_the_limits_of_a_robot_on_trial():
 
 
 def test_an_episode_on_trial_may_take_four_times_as_long():
-    assert ON_TRIAL.robot_kwargs("bam/pick-v0", {})["max_episode_steps"] == 400
-    assert ON_TRIAL.robot_kwargs("bam/pick-v0", {"max_episode_steps": 7})["max_episode_steps"] == 28
-    assert ON_TRIAL.robot_kwargs("bam/pick-v0", {"max_episode_steps": -1})["max_episode_steps"] == -1
-    assert "max_episode_steps" not in FULL.robot_kwargs("bam/pick-v0", {})
-    with pytest.raises(InvalidValue, match=r"^trial=True is for a live robot; give its address with robot= too\.$"):
+    assert with_live_robot("bam/pick-v0", {}, ON_TRIAL)["max_episode_steps"] == 400
+    assert with_live_robot("bam/pick-v0", {"max_episode_steps": 7}, ON_TRIAL)["max_episode_steps"] == 28
+    assert with_live_robot("bam/pick-v0", {"max_episode_steps": -1}, ON_TRIAL)["max_episode_steps"] == -1
+    assert "max_episode_steps" not in with_live_robot("bam/pick-v0", {}, FULL)
+    with pytest.raises(InvalidValue, match=r"^trial= is for a live robot; give its address with robot= too\.$"):
         gym.make("bam/pick-v0", trial=True)
-    with pytest.raises(InvalidValue, match=r"^trial=True and shadow=True exclude each other: a shadow sends nothing"):
+    with pytest.raises(InvalidValue, match=r"^shadow= moves nothing; leave out trial=\.$"):
         gym.make("bam/pick-v0", robot=URL, trial=True, shadow=True)
 
 

@@ -4,6 +4,7 @@ import re
 from dataclasses import dataclass
 
 from bam_envs.core.errors import InvalidValue
+from bam_envs.core.location import Credentials
 from bam_envs.core.validation import Port, Positive, RobotName, check_fields
 from bam_envs.core.wording import as_flag
 from bam_envs.remote.serve.command_lease import LEASE_SECONDS
@@ -14,9 +15,12 @@ _NAMESPACE = re.compile(r"(/[A-Za-z]\w*)*")
 _EXCLUDE = (("realtime", "fast"), ("via", "rclpy"), ("via", "cert"), ("rclpy", "cert"), ("no_token", "token_file"))
 
 
-@dataclass(frozen=True)
-class ServeOptions:
-    """The addresses of a served environment, and how its time passes."""
+@dataclass(frozen=True, kw_only=True)
+class ServeOptions(Credentials):
+    """The addresses of a served environment, and how its time passes.
+
+    The token file has a secret that clients must show; with `via`, that of the server there, which `ca_file` is for.
+    """
 
     port: Port = 9090
     """Port of the rosbridge server; 0 takes a free one."""
@@ -42,14 +46,10 @@ class ServeOptions:
     """Certificate in PEM, for wss:// instead of ws://."""
     key: str | None = None
     """Its key, if it is in another file."""
-    token_file: str | None = None
-    """File with a secret that clients must show; with --via, the secret of that server."""
     operator_token_file: str | None = None
     """File with another secret: clients that show it may take command from others."""
     no_token: bool = False
     """Listen on a network without a token: anybody who reaches this computer may command the environment."""
-    ca_file: str | None = None
-    """With --via wss://: certificates to trust instead of the system's."""
     image_format: str = "png"
     """Images as png, which keeps every bit, or jpeg."""
     gymapi_version: str | None = None

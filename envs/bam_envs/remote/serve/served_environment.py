@@ -8,6 +8,7 @@ from contextlib import ExitStack
 from typing import Any
 
 from bam_envs.core.errors import InvalidValue, RemoteError
+from bam_envs.core.location import Credentials
 from bam_envs.remote.serve.command_lease import CommandLease
 from bam_envs.remote.serve.env_server import Env, EnvServer
 from bam_envs.remote.serve.gymapi_service import GymApiService
@@ -139,7 +140,7 @@ class ServedEnvironment:
             node.start()
             return node
         if options.via is not None:
-            link = RosbridgeLink(Endpoint(options.via, options.ca_file, self._token), name="serve")
+            link = RosbridgeLink(Endpoint(options.via, Credentials(options.ca_file, options.token_file)), name="serve")
             started.callback(link.close)
             link.on_down(
                 lambda error: self._tell(f"{error} It is tried again until it is back; the robot rests meanwhile.")

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from gymnasium.vector import AutoresetMode, VectorEnv
 
+from bam_envs.core.location import Remote
 from bam_train.trainers.sb3 import sb3_trainer as trainer_module
 from bam_train.trainers.sb3 import sb3_vec_env as vec_env
 
@@ -98,7 +99,7 @@ def walk(monkeypatch):
     real = vec_env.make_training_env
 
     def make(env_id, env_kwargs, num_envs, place):
-        if place.transport:
+        if isinstance(place, Remote):
             return real(env_id, env_kwargs, num_envs, place)
         return vec_env.BatchVecEnv(Walk(num_envs, **env_kwargs))
 
