@@ -30,7 +30,7 @@ from bam_train.trainers.rllib.rllib_freezing import (
     parts_of,
     require_layout_only,
 )
-from bam_train.trainers.rllib.state_pickles import read_state, unpacked_array
+from bam_train.trainers.rllib.rllib_state import read_state, unpacked_array
 
 
 @dataclass(frozen=True)

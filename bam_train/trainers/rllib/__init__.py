@@ -13,6 +13,7 @@ a runner in one batched simulation: ``.env_runners(env_runner_cls=RobotEnvRunner
 
 import functools
 import importlib.util
+import os
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
@@ -29,6 +30,9 @@ if TYPE_CHECKING:
     from bam_train.trainers.rllib.robot_env_runner import RobotEnvRunner
 
 __all__ = ["RobotEnvRunner"]
+
+# Ray prints every death of a process on standard output, whatever its log level; it reads this when it is imported.
+os.environ.setdefault("RAY_DEDUP_LOGS_SKIP_REGEX", "A worker died or was killed while executing a task")
 
 
 def register() -> None:

@@ -1,4 +1,4 @@
-"""Ray for one training run: a private instance on this computer, or an existing cluster.
+"""Ray for one training run: a private instance on this computer, or an existing cluster; and its CPUs and GPUs.
 
 The private instance listens on the loopback device only, requires a secret token, and is removed when the run ends for
 any reason. A cluster is joined, and not changed. Ray tries an address without an answer for minutes and may end the
@@ -19,7 +19,9 @@ import subprocess
 import sys
 import tempfile
 import threading
+import time
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import ray
@@ -28,7 +30,6 @@ import ray.rllib  # sets up its loggers
 from bam_train.errors import SettingsError, TrainingFailed
 from bam_train.settings import RLlibSettings
 from bam_train.signals import at_quit, interrupt, waiting
-from bam_train.trainers.rllib.ray_resources import cores, gpus, require_resources
 
 psutil: Any = importlib.import_module("psutil")  # Ray brings its own copy
 
@@ -41,9 +42,11 @@ SOCKET_TIMEOUT = 5.0
 REACH_TIMEOUT = 13.0
 """Longest time for joining the cluster after that [s]; about 2 s are usual."""
 
+VARIABLE = "RLLIB_NUM_GPUS"
+LONGEST_BUSY = 10.0  # s to wait for CPUs and GPUs that others in the cluster use
+
 _TOKEN = secrets.token_hex(32)
 _LOGGERS = ("ray", "ray.rllib", "ray.tune", "ray.train", "ray.data")
-_MODE, _TOKENS = "RAY_AUTH_MODE", ("RAY_AUTH_TOKEN", "RAY_AUTH_TOKEN_PATH")
 
 
 @contextlib.contextmanager
@@ -60,7 +63,7 @@ def cluster(settings: RLlibSettings) -> Iterator[None]:
             reach(place)
             stack.callback(_shut_down)
             with _starting():
-                ray.init(address=place, log_to_driver=False, configure_logging=False)
+                ray.init(address=place, log_to_driver=False, logging_level=logging.CRITICAL)
         require_resources(settings)
         if not ray.is_initialized():
             stack.enter_context(_private(settings))
@@ -69,15 +72,17 @@ def cluster(settings: RLlibSettings) -> Iterator[None]:
 
 @contextlib.contextmanager
 def _private(settings: RLlibSettings) -> Iterator[None]:
+    if not any(name in os.environ for name in ("RAY_AUTH_MODE", "RAY_AUTH_TOKEN", "RAY_AUTH_TOKEN_PATH")):
+        # Ray would write a token, readable by others, into the home folder. It reads the token once in a process, so
+        # the variable stays for a later `ray.init`.
+        os.environ["RAY_AUTH_TOKEN"] = _TOKEN
     before = set(psutil.Process().children())
-    with (
-        _new_folder() as folder,
-        at_quit(lambda: _kill_at_once(before, folder)),
-        _private_token(),
-    ):
-        try:
+    # Paths of Ray's sockets must be short; a forked process would remove a `tempfile.TemporaryDirectory`.
+    folder = tempfile.mkdtemp(prefix="bam-ray-", dir="/tmp" if os.path.isdir("/tmp") else None)
+    try:
+        with at_quit(lambda: _kill_at_once(before, folder)):
             try:
-                with _starting(), loopback_only(), _out_of_the_group():
+                with _starting(), contained():
                     ray.init(
                         address="local",
                         num_cpus=cores(),
@@ -85,7 +90,7 @@ def _private(settings: RLlibSettings) -> Iterator[None]:
                         object_store_memory=OBJECT_STORE,
                         include_dashboard=False,
                         log_to_driver=False,
-                        configure_logging=False,
+                        logging_level=logging.CRITICAL,
                         _temp_dir=folder,
                     )
             except Exception as error:  # Ray has no common class for failures of its processes
@@ -93,27 +98,17 @@ def _private(settings: RLlibSettings) -> Iterator[None]:
                 text = f"Ray does not start on this computer: {why}. Is there enough memory and disk?"
                 raise TrainingFailed(text) from error
             yield
-        finally:
-            # Another Ctrl-C waits, as it would leave a part of Ray running, unless its handler quits at once.
-            quits = signal.getsignal(signal.SIGINT) is not signal.default_int_handler
-            with contextlib.nullcontext() if quits else waiting():
-                started = _started_since(before)  # with their children: once a parent is gone, they cannot be found
-                with contextlib.suppress(Exception):  # after any failure its processes are killed below
-                    _shut_down(wait_for_processes=True)
-                _, alive = psutil.wait_procs(started, timeout=GRACE)
-                _kill(alive)
-                psutil.wait_procs(alive, timeout=GRACE)
-
-
-@contextlib.contextmanager
-def _new_folder() -> Iterator[str]:
-    """A folder for Ray's files; a forked process leaves it alone, which `tempfile.TemporaryDirectory` does not."""
-    root = "/tmp" if os.path.isdir("/tmp") else None  # paths of Ray's sockets must be short
-    folder = tempfile.mkdtemp(prefix="bam-ray-", dir=root)
-    try:
-        yield folder
     finally:
-        shutil.rmtree(folder, ignore_errors=True)
+        # Another Ctrl-C waits, as it would leave a part of Ray running, unless its handler quits at once.
+        quits = signal.getsignal(signal.SIGINT) is not signal.default_int_handler
+        with contextlib.nullcontext() if quits else waiting():
+            started = _started_since(before)  # with their children: once a parent is gone, they cannot be found
+            with contextlib.suppress(Exception):  # after any failure its processes are killed below
+                _shut_down(wait_for_processes=True)
+            _, alive = psutil.wait_procs(started, timeout=GRACE)
+            _kill(alive)
+            psutil.wait_procs(alive, timeout=GRACE)
+            shutil.rmtree(folder, ignore_errors=True)
 
 
 def _started_since(before: set[Any]) -> list[Any]:
@@ -151,26 +146,6 @@ def _kill(processes: list[Any]) -> None:
 
 
 @contextlib.contextmanager
-def _private_token() -> Iterator[None]:
-    """Give the private Ray a token of this process, instead of one that Ray would write into the home folder."""
-    if any(name in os.environ for name in (_MODE, *_TOKENS)):
-        yield  # the user has configured the token
-        return
-    raylet: Any = importlib.import_module("ray._raylet")
-
-    def read_again() -> None:  # Ray reads mode and token once, when it is imported
-        raylet.Config.initialize("")
-        raylet.AuthenticationTokenLoader.instance().reset_cache()
-
-    try:
-        with _environment(**{_MODE: "token", _TOKENS[0]: _TOKEN}):
-            read_again()
-            yield
-    finally:
-        read_again()
-
-
-@contextlib.contextmanager
 def _environment(**variables: str) -> Iterator[None]:
     """Set environment variables within the ``with`` block, for this process and those that it starts."""
     before = {name: os.environ.get(name) for name in variables}
@@ -179,51 +154,31 @@ def _environment(**variables: str) -> Iterator[None]:
         yield
     finally:
         for name, value in before.items():
-            if value is None:
-                os.environ.pop(name, None)
-            else:
+            os.environ.pop(name)
+            if value is not None:
                 os.environ[name] = value
 
 
 @contextlib.contextmanager
-def loopback_only() -> Iterator[None]:
-    """Within the ``with`` block, Ray starts with 127.0.0.1 as its address, to which all its servers bind.
+def contained() -> Iterator[None]:
+    """Within the ``with`` block, Ray starts on 127.0.0.1 alone, and its processes in sessions of their own.
 
-    Ray has no public option for this: it replaces `ray.init(_node_ip_address="127.0.0.1")` by an address that others
-    can reach, unless this constant, which it reads when it is imported, is unset.
+    The only private names of Ray here, as its options do neither. `ray.init` replaces ``_node_ip_address="127.0.0.1"``
+    by an address that others can reach, and with 127.0.0.2 its servers bind to all addresses; it reads the environment
+    variable when it is imported. ``timeout``, batch systems and terminals signal the whole process group: Ray's
+    processes would end before the update is finished and saved. Starting Ray from a process of its own takes 2 s more.
     """
-    from ray._private import ray_constants
+    from ray._private import ray_constants, services
 
-    before = ray_constants.ENABLE_RAY_CLUSTER
+    before = ray_constants.ENABLE_RAY_CLUSTER, services.ConsolePopen
     ray_constants.ENABLE_RAY_CLUSTER = False
+    if sys.platform == "linux":  # which kills them with this process; elsewhere they stay in the group
+        services.ConsolePopen = functools.partial(before[1], start_new_session=True)
     try:
-        with _environment(**{ray_constants.ENABLE_RAY_CLUSTERS_ENV_VAR: "0"}):
+        with _environment(RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER="0"):
             yield
     finally:
-        ray_constants.ENABLE_RAY_CLUSTER = before
-
-
-@contextlib.contextmanager
-def _out_of_the_group() -> Iterator[None]:
-    """Within the ``with`` block, Ray's processes start in sessions of their own; Linux kills them with this process.
-
-    ``timeout``, batch systems and terminals signal the whole process group: Ray's processes would end before the update
-    is finished and saved, and Ray has no public option for this. On other systems they stay in the group.
-    """
-    from ray._private import services, utils
-
-    if not (sys.platform == "linux" and utils.detect_fate_sharing_support()):
-        yield
-        return
-    before = services.ConsolePopen
-    services.ConsolePopen = functools.partial(before, start_new_session=True)
-    try:
-        yield
-    finally:
-        services.ConsolePopen = before
-
-
-# Private instances and clusters
+        ray_constants.ENABLE_RAY_CLUSTER, services.ConsolePopen = before
 
 
 @contextlib.contextmanager
@@ -231,7 +186,8 @@ def _quiet() -> Iterator[None]:
     """Silence the loggers of Ray and RLlib within the ``with`` block: `RunnerWatch` and exceptions inform the user."""
     loggers = [logging.getLogger(name) for name in _LOGGERS]
     before = [(logger, logger.handlers[:], logger.propagate) for logger in loggers]
-    _hush()
+    for logger in loggers:
+        logger.handlers[:], logger.propagate = [logging.NullHandler()], False
     try:
         yield
     finally:
@@ -239,24 +195,17 @@ def _quiet() -> Iterator[None]:
             logger.handlers[:], logger.propagate = handlers, propagate
 
 
-def _hush() -> None:
-    """Silence the loggers of Ray, which `ray.init` changes."""
-    for name in _LOGGERS:
-        logger = logging.getLogger(name)
-        logger.handlers[:], logger.propagate = [logging.NullHandler()], False
-
-
 @contextlib.contextmanager
 def _starting() -> Iterator[None]:
-    """Around `ray.init`: silence its C++ part, which reports this on standard error, and delay signals.
+    """Around `ray.init`: silence its C++ part, which reports even this on standard error, and delay signals.
 
     An exception of a signal handler would make the C++ part abort. `ray.init` handles SIGTERM itself, by SystemExit.
     """
     sys.stderr.flush()
-    kept, nowhere = os.dup(2), os.open(os.devnull, os.O_WRONLY)
+    kept = os.dup(2)
     try:
-        with waiting(), _environment(RAY_BACKEND_LOG_LEVEL="fatal"):
-            os.dup2(nowhere, 2)
+        with waiting(), _environment(RAY_BACKEND_LOG_LEVEL="fatal"), open(os.devnull, "w") as nowhere:
+            os.dup2(nowhere.fileno(), 2)
             try:
                 yield
             finally:
@@ -265,8 +214,6 @@ def _starting() -> Iterator[None]:
         interrupt(int(end.code or signal.SIGTERM))
     finally:
         os.close(kept)
-        os.close(nowhere)
-        _hush()
 
 
 def _shut_down(**options: bool) -> None:
@@ -293,9 +240,8 @@ def find(address: str) -> str:
     if address == "auto" and (variable := os.environ.get("RAY_ADDRESS")):
         place, name = variable, "RAY_ADDRESS"
     if place == "auto":
-        from ray._private.utils import read_ray_address  # the address that ``ray start`` wrote
-
-        place = read_ray_address() or ""
+        written = Path(os.environ.get("RAY_TMPDIR") or tempfile.gettempdir()) / "ray/ray_current_cluster"
+        place = written.read_text().strip() if written.is_file() else ""  # the address that ``ray start`` wrote
         if not place:
             raise TrainingFailed(
                 "no Ray cluster was started on this computer, so --address auto finds none. Start one with "
@@ -315,14 +261,11 @@ def find(address: str) -> str:
 _PROBE = """
 import logging, sys
 import ray
-from ray._raylet import GcsClient
-GcsClient(address=sys.argv[1])
-print("known", flush=True)
 ray.init(address=sys.argv[1], log_to_driver=False, logging_level=logging.CRITICAL)
 print("joined", flush=True)
 ray.shutdown()
 """
-"""Program that joins a cluster, and prints each step that succeeded."""
+"""Program that joins a cluster, and prints a line when it has."""
 
 
 def reach(place: str, timeout: float = REACH_TIMEOUT) -> None:
@@ -340,11 +283,10 @@ def reach(place: str, timeout: float = REACH_TIMEOUT) -> None:
             f"{place}: no Ray cluster answers there ({why}). Check --address, and that ray start --head runs there "
             "and no firewall is between"
         ) from error
-    command = [sys.executable, "-c", _PROBE, place]
+    pipes: dict[str, Any] = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT}
     try:
-        output = subprocess.run(
-            command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, timeout=timeout, check=False
-        ).stdout
+        command = [sys.executable, "-c", _PROBE, place]
+        output = subprocess.run(command, **pipes, timeout=timeout, check=False).stdout
     except subprocess.TimeoutExpired as error:
         output = error.stdout or b""
     text = output.decode(errors="replace")
@@ -361,9 +303,106 @@ def reason(output: str) -> str:
         )
     if "ersion mismatch" in output:
         return "the cluster runs another Python or Ray than this computer. Install the same versions everywhere"
-    if "known" not in output.splitlines():
-        return "something answers there, but it is no Ray cluster. Check the port: that of ray start --head is 6379"
     return (
-        f"the cluster is there, but could not be joined within {REACH_TIMEOUT:.0f} s: this computer is not part of it, "
-        "or busy. Run ray start --address=HOST:PORT here first, or run bam-train on one of its computers"
+        f"what answers there could not be joined within {REACH_TIMEOUT:.0f} s: it is not a Ray cluster (whose port is "
+        "6379 by default), or this computer is not part of the cluster, or busy. Run ray start --address=HOST:PORT "
+        "here first, or run bam-train on one of its computers"
     )
+
+
+# CPUs and GPUs: RLlib would silently wait for more than exist
+
+
+def gpus(settings: RLlibSettings) -> int:
+    """GPUs that the learners of a run use in all: ``--num-gpus``, else RLLIB_NUM_GPUS, else 0.
+
+    Raises:
+        SettingsError: RLLIB_NUM_GPUS is not a whole number of at least 0.
+    """
+    if settings.num_gpus is not None:
+        return settings.num_gpus
+    text = os.environ.get(VARIABLE, "").strip() or "0"
+    if not (text.isascii() and text.isdigit()):
+        raise SettingsError(f"{VARIABLE}: expected a whole number of GPUs, such as 1, found {text!r}. Mend or unset it")
+    return int(text)
+
+
+def learners(settings: RLlibSettings) -> tuple[int, int]:
+    """RLlib's ``num_learners``, where 0 is the trainer's own process, and ``num_gpus_per_learner``.
+
+    Raises:
+        SettingsError: The GPUs cannot be shared evenly among the learners.
+    """
+    number, wanted = settings.num_learners, gpus(settings)
+    if number == 0:
+        return (0, wanted) if wanted <= 1 else (wanted, 1)
+    if wanted not in (0, number):
+        name = VARIABLE if settings.num_gpus is None else "num_gpus"
+        raise SettingsError(f"{name}: {number} learners use 0 or {number} GPUs, one each, found {wanted}")
+    return number, int(wanted > 0)
+
+
+def cores() -> int:
+    """CPUs that this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+def require_resources(settings: RLlibSettings) -> None:
+    """Refuse a run that needs more CPUs or GPUs than the joined cluster, or else this computer, has.
+
+    Each runner and each learner without a GPU needs a CPU; a learner with a GPU needs only that.
+
+    Raises:
+        SettingsError: The message gives the wanted and the existing numbers, and a remedy.
+    """
+    import torch
+
+    number, gpus_each = learners(settings)
+    own_gpus = torch.cuda.device_count()
+    if number == 0:
+        _require_gpus(settings, gpus_each, own_gpus, "on this computer")
+    joined = ray.is_initialized()
+    where = "in the cluster" if joined else "on this computer"
+    there = ray.cluster_resources() if joined else {"CPU": cores(), "GPU": own_gpus}
+    wanted = {"CPU": settings.num_env_runners + number * (gpus_each == 0), "GPU": number * gpus_each}
+    _require_gpus(settings, wanted["GPU"], int(there.get("GPU", 0)), where)
+    if wanted["CPU"] > there.get("CPU", 0):
+        for_what = [_number(settings.num_env_runners, "env runner")] * (settings.num_env_runners > 0)
+        for_what += [_number(number, "learner")] * (number > 0 and not gpus_each)
+        add = "add computers with ray start" if joined else "join a cluster with --address"
+        raise SettingsError(
+            f"{' and '.join(for_what)} ask for {_number(wanted['CPU'], 'CPU')}, {int(there.get('CPU', 0))} {where}. "
+            f"Lower --num-env-runners or --num-learners, or {add}"
+        )
+    if joined:
+        _require_free(wanted)
+
+
+def _require_gpus(settings: RLlibSettings, wanted: int, there: int, where: str) -> None:
+    if wanted > there:
+        unset = settings.num_gpus is None
+        remedy = f"Set it to {there}, or unset it" if unset else f"Give --num-gpus {there}"
+        name = VARIABLE if unset else "num_gpus"
+        raise SettingsError(f"{name}: {_number(wanted, 'GPU')} asked for, {there} {where}. {remedy}")
+
+
+def _require_free(wanted: dict[str, int]) -> None:
+    """Wait some seconds for CPUs and GPUs that others in the cluster use, such as a run that has just ended."""
+    end = time.monotonic() + LONGEST_BUSY
+    while True:
+        free = ray.available_resources()
+        name = next((name for name, number in wanted.items() if number > free.get(name, 0)), None)
+        if name is None:
+            return
+        if time.monotonic() > end:
+            raise SettingsError(
+                f"{_number(wanted[name], name)} asked for, and {int(free.get(name, 0))} of the cluster's "
+                f"{int(ray.cluster_resources()[name])} not in use by others. Ask for less, or wait for them"
+            )
+        time.sleep(0.2)
+
+
+def _number(number: int, of_what: str) -> str:
+    return f"{number} {of_what}{'' if number == 1 else 's'}"

@@ -21,7 +21,7 @@ from torch import nn
 
 from bam_train.errors import PolicyError, SettingsError
 from bam_train.trainers.frozen_network import FrozenNetwork, Layer, Normalised, OneHot, action_head, pack, to
-from bam_train.trainers.rllib.state_pickles import unpacked_array
+from bam_train.trainers.rllib.rllib_state import unpacked_array
 from bam_train.trainers.zero_based_spaces import less_start, plus_start
 
 Array = NDArray[Any]
@@ -249,7 +249,7 @@ class _Network(Layer):
     def forward(self, x: torch.Tensor) -> torch.Tensor:
         module = self.module
         if not hasattr(module, "af"):
-            outputs = module._forward_inference({"obs": x})
+            outputs = module.forward_inference({"obs": x})
             if "action_dist_inputs" not in outputs:
                 raise PolicyError(f"{type(module).__name__} gives no action_dist_inputs and cannot be frozen")
             found = outputs["action_dist_inputs"]
@@ -284,6 +284,13 @@ class _Flat(Layer):
 # RLlib's own actions
 
 
+def input_spaces(env_spaces: tuple[AnySpace, AnySpace]) -> dict[str, Any]:
+    """The spaces of an environment as RLlib's pipelines of connectors take them."""
+    from ray.rllib.env import INPUT_ENV_SINGLE_SPACES, INPUT_ENV_SPACES
+
+    return {INPUT_ENV_SPACES: env_spaces, INPUT_ENV_SINGLE_SPACES: env_spaces}
+
+
 class RLlibPolicy:
     """RLlib's own actions for raw observations; holds copies, independent of the trainer.
 
@@ -307,11 +314,9 @@ class RLlibPolicy:
         *,
         explore: bool = False,
     ) -> None:
-        from ray.rllib.env import INPUT_ENV_SINGLE_SPACES, INPUT_ENV_SPACES
-
         if module.is_stateful():
             raise SettingsError("a recurrent policy cannot explore here; let it take its best actions")
-        given = {INPUT_ENV_SPACES: env_spaces, INPUT_ENV_SINGLE_SPACES: env_spaces}
+        given = input_spaces(env_spaces)
         self._module, self._spaces, self._explore = copy.deepcopy(module), env_spaces, explore
         self._before = copy.deepcopy(env_to_module) or config.build_env_to_module_connector(env=None, spaces=given)
         for connector in self._before.connectors:

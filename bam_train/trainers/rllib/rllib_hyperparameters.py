@@ -30,15 +30,16 @@ from bam_train.settings import RLlibSettings
 from bam_train.trainers.algorithms import RLLIB_ALGORITHMS, Algorithm
 from bam_train.trainers.library_arguments import fits, require_known, take
 from bam_train.trainers.rllib import register_foreign
-from bam_train.trainers.rllib.mean_std_filter import MeanStdFilter
-from bam_train.trainers.rllib.ray_resources import learners
-from bam_train.trainers.rllib.robot_env_runner import RobotEnvRunner, log_end
-from bam_train.trainers.rllib.runner_deaths import (
+from bam_train.trainers.rllib.ray_cluster import learners
+from bam_train.trainers.rllib.robot_env_runner import (
+    CAUSES,
     PROBE_TIMEOUT,
     RESTART_DELAY,
     SAMPLE_TIMEOUT,
+    MeanStdFilter,
     ReportingEnvRunner,
-    first_cause_of_death,
+    RobotEnvRunner,
+    log_end,
 )
 from bam_train.trainers.rllib_arguments import ELSEWHERE, OURS, hyperparameters_of, take_hyperparameters
 
@@ -208,8 +209,11 @@ def refusals(settings: RLlibSettings) -> Iterator[None]:
         raise
     except _REFUSALS as error:
         why = " ".join(str(error).partition("To suppress all validation errors")[0].split()) or type(error).__name__
-        text = first_cause_of_death(settings.num_env_runners) or why  # RLlib's message is only that runners are missing
-        raise SettingsError(f"{settings.algo} on {settings.env} cannot be set up: {text:.400}") from error
+        if CAUSES.known:  # RLlib's message is only that runners are missing
+            index, cause = min(CAUSES.known.items())
+            why = f"env runner {index} died ({cause})"
+            CAUSES.known.clear()
+        raise SettingsError(f"{settings.algo} on {settings.env} cannot be set up: {why:.400}") from error
 
 
 class NotesEnds(RLlibCallback):  # type: ignore[misc]

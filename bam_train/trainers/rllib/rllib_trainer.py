@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import contextlib
-import copy
 import dataclasses
 import functools
 import logging
 import math
 import random
+import time
 import warnings
 from collections import deque
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, cast
 
@@ -19,13 +19,14 @@ import numpy as np
 import torch
 from gymnasium import spaces
 from gymnasium.vector import VectorEnv
-from ray.rllib.core import DEFAULT_MODULE_ID
+from ray.exceptions import RayError
+from ray.rllib.core import COMPONENT_ENV_TO_MODULE_CONNECTOR, DEFAULT_MODULE_ID
 
 from bam_envs.core.spaces import space_to_json
 from bam_train.checkpoint import Checkpoint, write_checkpoint
 from bam_train.data import DataSet
 from bam_train.environments import control_period, make_env, require_fit
-from bam_train.errors import SettingsError, TrainingFailed
+from bam_train.errors import ProcessesLost, SettingsError, TrainingFailed
 from bam_train.policy import FrozenPolicy
 from bam_train.settings import RLlibSettings
 from bam_train.trainers.algorithms import RLLIB_ALGORITHMS
@@ -33,7 +34,7 @@ from bam_train.trainers.base import OnProgress, Progress, Statistics, manifest
 from bam_train.trainers.resolve_settings import learnt_episodes, own_settings
 from bam_train.trainers.rllib import rllib_state
 from bam_train.trainers.rllib.ray_cluster import cluster
-from bam_train.trainers.rllib.rllib_freezing import FrozenModule, RLlibPolicy, golden, parts_of
+from bam_train.trainers.rllib.rllib_freezing import FrozenModule, RLlibPolicy, golden, input_spaces, parts_of
 from bam_train.trainers.rllib.rllib_hyperparameters import (
     complete,
     complete_normalize,
@@ -41,12 +42,18 @@ from bam_train.trainers.rllib.rllib_hyperparameters import (
     make_config,
     refusals,
 )
-from bam_train.trainers.rllib.robot_env_runner import ENDS
-from bam_train.trainers.rllib.runner_deaths import RunnerWatch
+from bam_train.trainers.rllib.robot_env_runner import CAUSES, ENDS
 from bam_train.trainers.run_folder import TensorBoardFiles
+from bam_train.trainers.zero_based_spaces import space_from_zero
 
 _EPISODES = 100
 """Training episodes behind the means of `Statistics`."""
+
+
+MOST_DEATHS, WINDOW = 5, 20
+"""Most deaths of one runner within a number of updates; updates without any runner do not count."""
+
+LONGEST_ALONE = 180.0  # longest wait while all runners are dead [s]; a busy computer starts one in half a minute
 
 
 class RLlibTrainer:
@@ -68,7 +75,6 @@ class RLlibTrainer:
         """Metrics of RLlib's learner for the last iteration."""
         self._steps = 0
         self._tensorboard: TensorBoardFiles | None = None
-        self._spare: Any = None
         runners, each = settings.num_env_runners, envs_each(settings)
         if runners and each * runners != settings.num_envs:
             self.notices.append(
@@ -211,31 +217,33 @@ class RLlibTrainer:
             metrics=self._metrics(),
         )
 
+    @functools.cached_property
+    def _policy(self) -> tuple[Any, Any]:
+        """A module in this process, and the connectors before it; not those that learn or collect."""
+        observed, acted = map(space_from_zero, self._spaces)
+        before = self._config.build_env_to_module_connector(env=None, spaces=input_spaces((observed, acted)))
+        given = {DEFAULT_MODULE_ID: (before.observation_space, acted)}
+        with self.undisturbed():
+            return self._config.get_rl_module_spec(spaces=given, inference_only=True).build(), before
+
     def _module(self) -> Any:
-        """A module in this process, with the newest weights."""
-        group, runner = self.algorithm.learner_group, self.algorithm.env_runner
-        if group.is_local:
-            return group._learner.module[DEFAULT_MODULE_ID].unwrapped()
-        if runner is not None:
-            module = runner.module
-        else:  # a module kept for this purpose
-            if self._spare is None:
-                spec = self._config.get_rl_module_spec(spaces={DEFAULT_MODULE_ID: self._spaces}, inference_only=True)
-                self._spare = spec.build()
-            module = self._spare
+        """The module of `_policy`, with the newest weights."""
+        group = self.algorithm.learner_group
         weights = group.get_state(components=f"learner/rl_module/{DEFAULT_MODULE_ID}", inference_only=True)
-        module.set_state(weights["learner"]["rl_module"][DEFAULT_MODULE_ID])
-        return module
+        self._policy[0].set_state(weights["learner"]["rl_module"][DEFAULT_MODULE_ID])
+        return self._policy[0]
 
     def _of(self, kind: Any, module: Any, **options: Any) -> Any:
         """Call `kind`, which is `parts_of` or `RLlibPolicy`, for the module."""
-        runner = self.algorithm.env_runner
-        return kind(module, None if runner is None else runner._env_to_module, self._config, self._spaces, **options)
+        if (runner := self.algorithm.env_runner) is not None:
+            state = runner.get_state(components=COMPONENT_ENV_TO_MODULE_CONNECTOR)
+            self._policy[1].set_state(state[COMPONENT_ENV_TO_MODULE_CONNECTOR])
+        return kind(module, self._policy[1], self._config, self._spaces, **options)
 
     def save(self, path: Path, scores: Mapping[str, Any], notes: Mapping[str, Any]) -> Checkpoint:
         """Write a checkpoint that can be resumed and deployed."""
         with self.undisturbed():
-            module = copy.deepcopy(self._module())  # appo and impala continue to learn in a thread
+            module = self._module()
             frozen = FrozenModule(self._of(parts_of, module))
             members = {
                 "bam/policy.onnx": frozen.onnx_file(),
@@ -319,3 +327,85 @@ def _require_fitting(settings: RLlibSettings) -> None:
         raise SettingsError(f"num_env_runners: {settings.algo} learns from recorded episodes alone; leave it out")
     if offline and settings.normalize:
         raise SettingsError(f"normalize: {settings.algo} takes recorded observations as they are; leave it out")
+
+
+class RunnerWatch:
+    """Watches the runners of an algorithm of `make_config`, which must then be trained by `train`.
+
+    Runners are checked before each training step and after the last of an iteration. `clock` is monotonic time [s];
+    `cause_of` returns the cause of death of the runner with an index.
+    """
+
+    def __init__(
+        self,
+        algorithm: Any,
+        clock: Callable[[], float] = time.monotonic,
+        cause_of: Callable[[int], str | None] = CAUSES.pop,
+    ) -> None:
+        self._algorithm, self._clock, self._cause_of = algorithm, clock, cause_of
+        self._group = algorithm.env_runner_group
+        self._all = set(range(1, 1 + (self._group.num_remote_env_runners() if self._group else 0)))
+        self._gone: set[int] = set()
+        self._deaths: dict[int, deque[int]] = {index: deque(maxlen=MOST_DEATHS + 1) for index in self._all}
+        self._update = 0
+        self._seen_at = clock()
+        self._cause = ""
+        self._lines: list[str] = []
+        if self._all:
+            self._rllibs_restore = algorithm.restore_env_runners
+            algorithm.restore_env_runners = self._restore  # without samples, an algorithm may never leave its loop
+
+    def train(self) -> tuple[dict[str, Any], list[str]]:
+        """Train one iteration; returns RLlib's result, and messages about runners for the user, one line each.
+
+        Raises:
+            ProcessesLost: A runner dies repeatedly, or all runners are lost; the message has the cause if it is known.
+            TrainingFailed: A learner or the cluster died.
+        """
+        try:
+            result: dict[str, Any] = self._algorithm.train()
+        except RayError as error:
+            if isinstance(cause := getattr(error, "cause", None), SettingsError):  # of recorded episodes, in a learner
+                raise cause from error
+            why = " ".join(str(error).split())
+            raise TrainingFailed(f"a process of the cluster that training needs is gone ({why:.300})") from error
+        self._look()
+        self._update += len(self._gone) < len(self._all)
+        lines, self._lines = self._lines, []
+        return result, lines
+
+    def _restore(self, group: Any) -> list[int]:
+        """Replacement of the algorithm's `restore_env_runners`, which it calls."""
+        if group is not self._group:
+            return list(self._rllibs_restore(group))
+        self._look()
+        back = list(self._rllibs_restore(group))
+        self._gone -= set(back)
+        self._lines += [f"env runner {index} is back" for index in sorted(back)]
+        now = self._clock()
+        if self._gone < self._all:
+            self._seen_at = now
+        elif (waited := now - self._seen_at) > LONGEST_ALONE:
+            text = f"all {len(self._all)} env runners died{self._cause}, and none came back in {waited:.0f} s"
+            raise ProcessesLost(text)
+        return back
+
+    def _look(self) -> None:
+        """Record the runners that died since the last check."""
+        died = self._all - set(self._group.healthy_env_runner_ids()) - self._gone if self._all else set()
+        if not died:
+            return
+        self._gone |= died
+        for index in sorted(died):
+            why = self._cause_of(index)
+            self._cause = f" ({why})" if why else ""
+            self._lines.append(f"env runner {index} died{self._cause}: what it had not delivered yet is lost")
+            deaths = self._deaths[index]
+            deaths.append(self._update)
+            updates = self._update - deaths[0] + 1
+            if len(deaths) > MOST_DEATHS and updates <= WINDOW:
+                within = f"{updates} update{'s' if updates > 1 else ''}"
+                raise ProcessesLost(f"env runner {index} died {len(deaths)} times within {within}{self._cause}")
+        left = len(self._all) - len(self._gone)
+        goes_on = f"training goes on with {left} of {len(self._all)} env runners"
+        self._lines.append(goes_on if left else "no env runner is left: waiting for one to come back")

@@ -20,8 +20,7 @@ import ray
 from bam_train.errors import SettingsError, TrainingFailed
 from bam_train.settings import RLlibSettings
 from bam_train.signals import Terminated
-from bam_train.trainers.rllib.ray_cluster import cluster, reach
-from bam_train.trainers.rllib.ray_resources import cores
+from bam_train.trainers.rllib.ray_cluster import cluster, cores, reach
 
 pytestmark = pytest.mark.slow
 
@@ -102,7 +101,8 @@ def test_one_of_its_own_is_here_alone_and_gone_after_another_ctrl_c(home, starte
         assert not ray.is_initialized()
         assert logging.getLogger("ray").handlers == handlers
         changed = {name for name in os.environ if environment.get(name) != os.environ[name]}
-        assert changed <= {"RAY_USAGE_STATS_ENABLED", "RAY_CLIENT_MODE", "PYTHONBREAKPOINT"}
+        of_ray = {"RAY_AUTH_MODE", "RAY_AUTH_TOKEN", "RAY_USAGE_STATS_ENABLED", "RAY_CLIENT_MODE"}
+        assert changed <= {*of_ray, "PYTHONBREAKPOINT"}
         assert capfd.readouterr() == ("", "")
         assert is_caught(signal.SIGTERM)
         signal.raise_signal(signal.SIGTERM)
@@ -170,14 +170,21 @@ cluster.shutdown()
 """
 
 JOIN = """
-import sys, ray
+import os, sys
 from bam_train.cli.program import guarded
 from bam_train.settings import RLlibSettings
 from bam_train.trainers.rllib.ray_cluster import cluster
+import ray
+@ray.remote(max_retries=0)
+def crash():
+    os.kill(os.getpid(), 9)
 given = {"env": "bam/reach-v0", "algo": "ppo", "trainer": "rllib", "address": sys.argv[1]}
 def join():
     with cluster(RLlibSettings.from_mapping(given)):
-        print(int(ray.cluster_resources()["CPU"]), "CPU")
+        try:
+            ray.get(crash.remote())
+        except ray.exceptions.WorkerCrashedError:
+            print(int(ray.cluster_resources()["CPU"]), "CPU")
     with cluster(RLlibSettings.from_mapping(given | {"num_env_runners": 2})):
         pass
 sys.exit(guarded(join, "bam-train"))

@@ -21,7 +21,7 @@ from ray.cluster_utils import Cluster
 from bam_train.checkpoint import Checkpoint
 from bam_train.errors import ProcessesLost, SettingsError
 from bam_train.trainers.resolve_settings import resolve
-from bam_train.trainers.rllib.ray_cluster import loopback_only
+from bam_train.trainers.rllib.ray_cluster import contained
 from bam_train.trainers.rllib.rllib_trainer import RLlibTrainer
 
 pytestmark = pytest.mark.slow
@@ -34,11 +34,10 @@ PATIENCE = 240.0
 @pytest.fixture
 def nodes(no_ray, monkeypatch):
     """A cluster of two nodes with one CPU each, and its second node."""
-    for name in ("RAY_AUTH_MODE", "RAY_AUTH_TOKEN", "RAY_ADDRESS"):
-        monkeypatch.delenv(name, raising=False)
+    monkeypatch.delenv("RAY_ADDRESS", raising=False)
     memory = {"num_cpus": 1, "object_store_memory": 100 * 2**20}
     head = {**memory, "include_dashboard": False, "_system_config": {"health_check_period_ms": 500}}  # of dead nodes
-    with loopback_only():
+    with contained():
         cluster = Cluster(initialize_head=True, head_node_args=head)
         try:
             yield cluster, cluster.add_node(**memory)
@@ -140,7 +139,7 @@ def registered(one_ray):
 
 
 def test_a_runner_that_dies_again_and_again(registered, tmp_path, monkeypatch):
-    monkeypatch.setattr("bam_train.trainers.rllib.runner_deaths.MOST_DEATHS", 1)
+    monkeypatch.setattr("bam_train.trainers.rllib.rllib_trainer.MOST_DEATHS", 1)
     settings = train_settings(None, 256, env=registered(Broken), num_envs=1, num_env_runners=1)
     with contextlib.closing(RLlibTrainer.create(settings)) as trainer:
         with pytest.raises(ProcessesLost) as caught:

@@ -10,14 +10,14 @@ import ray
 
 from bam_train.errors import SettingsError
 from bam_train.settings import RLlibSettings
-from bam_train.trainers.rllib import ray_resources as resources
-from bam_train.trainers.rllib.ray_resources import gpus, learners, require_resources
+from bam_train.trainers.rllib import ray_cluster
+from bam_train.trainers.rllib.ray_cluster import gpus, learners, require_resources
 
 
 @pytest.fixture(autouse=True)
 def two_cores(monkeypatch, no_ray):
     monkeypatch.delenv("RLLIB_NUM_GPUS", raising=False)
-    monkeypatch.setattr(resources, "cores", lambda: 2)
+    monkeypatch.setattr(ray_cluster, "cores", lambda: 2)
     monkeypatch.setattr("torch.cuda.device_count", lambda: 0)
 
 
@@ -119,7 +119,7 @@ def test_too_much_for_a_cluster(four_cpus):
 def test_what_others_use(four_cpus, monkeypatch):
     four_cpus[:] = [1.0, 1.0, 4.0]
     require_resources(settings(num_env_runners=4))
-    monkeypatch.setattr(resources, "LONGEST_BUSY", 0.1)
+    monkeypatch.setattr(ray_cluster, "LONGEST_BUSY", 0.1)
     four_cpus[:] = [1.0]
     with pytest.raises(SettingsError) as caught:
         require_resources(settings(num_env_runners=4))

@@ -19,9 +19,8 @@ from bam_train.checkpoint import Checkpoint, write_checkpoint
 from bam_train.errors import AlteredCheckpoint, CheckpointMismatch
 from bam_train.trainers.resolve_settings import resolve, resolve_resumed
 from bam_train.trainers.rllib import rllib_state as state
-from bam_train.trainers.rllib.rllib_state import extras_of
+from bam_train.trainers.rllib.rllib_state import extras_of, read_state
 from bam_train.trainers.rllib.rllib_trainer import RLlibTrainer
-from bam_train.trainers.rllib.state_pickles import read_state
 
 SMALL = {"fcnet_hiddens": [8]}
 ON_POLICY = {"train_batch_size_per_learner": 64, "minibatch_size": 64, "num_epochs": 1, "model_config": SMALL}

@@ -12,7 +12,7 @@ pytest.importorskip("ray.rllib")
 from ray.exceptions import RayError
 
 from bam_train.errors import ProcessesLost, TrainingFailed
-from bam_train.trainers.rllib.runner_deaths import RunnerWatch
+from bam_train.trainers.rllib.rllib_trainer import RunnerWatch
 
 
 class Algorithm:

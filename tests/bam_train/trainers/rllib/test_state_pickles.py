@@ -14,7 +14,7 @@ import pytest
 from gymnasium import spaces
 
 from bam_train.errors import FormatError
-from bam_train.trainers.rllib.state_pickles import RefusedPickle, Unread, read_state, unpacked_array
+from bam_train.trainers.rllib.rllib_state import RefusedPickle, Unread, read_state, unpacked_array
 
 
 class Call:
