@@ -13,7 +13,6 @@ from typing import Annotated, Any, Literal
 import msgspec
 from msgspec import Meta, Struct
 
-from bam_envs.core import location
 from bam_train.errors import AlteredCheckpoint, CheckpointError, NewerFormat
 
 FORMAT = 1
@@ -23,8 +22,11 @@ MOST_MANIFEST = 8 * 2**20
 """Maximum bytes of a manifest, which is read before anything is verified."""
 MOST_NUMBERS = 2**26
 """Maximum numbers of an observation or action; a colour picture of 3840 x 2160 pixels has 25 million."""
-WHERE = frozenset({*location.WHERE, "rs_address"})
-"""`bam_envs.core.location.WHERE`, and robo-gym's name of a robot's address."""
+WHERE = frozenset(
+    {"robot", "robot_name", "transport", "profile", "guards", "trial", "shadow", "ca_file", "token_file", "rs_address"}
+)
+"""Arguments of an environment that determine where it runs, `bam_envs.core.location.WHERE`, and robo-gym's name of a
+robot's address. Spelt here, because a policy runs where nothing of `bam_envs` is imported."""
 
 _Count = Annotated[int, Meta(ge=0, le=2**63 - 1)]
 _Digest = Annotated[str, Meta(pattern="^[0-9a-f]{64}$")]

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from bam_envs.core import location
 from bam_train.checkpoint import MANIFEST, Checkpoint, safetensors_file, write_checkpoint
 from bam_train.checkpoint.manifest import WHERE
 from bam_train.errors import (
@@ -465,3 +466,7 @@ def test_killed_while_writing_leaves_the_old_file_whole(path: Path):
         remove_orphans(path)
         assert sorted(path.parent.glob("*.tmp")) == sorted([*others, alive])
     assert not alive.exists()
+
+
+def test_a_file_names_no_argument_of_where_an_environment_runs():
+    assert {*location.WHERE, "rs_address"} == WHERE
