@@ -53,6 +53,11 @@ _HALTING_REQUESTS = ("pause", "take")
 """Requests for which the robot is halted before they are executed."""
 
 
+def _advised(error: Exception) -> str:
+    """The exception in one line, which says what ends a stop of the agent's robot."""
+    return fault_text(error).replace("call resume()", "resume the agent")
+
+
 class _Interrupted(BaseException):
     """A request ends the way to the start pose."""
 
@@ -243,7 +248,7 @@ class Resident:
                 result = do()
                 answer = Answer(number, result=result or {})
             except (BamTrainError, BamEnvsError) as error:
-                answer = Answer(number, error=" ".join(str(error).split()), kind=type(error).__name__)
+                answer = Answer(number, error=_advised(error), kind=type(error).__name__)
             if number:
                 self.send(answer)
 
@@ -487,13 +492,11 @@ class Resident:
 
     def _failed(self, error: Exception) -> None:
         """What a fault while the robot moved leads to: waiting for the robot, stopped by a guard, or paused."""
-        text = fault_text(error).replace("call resume()", "resume the agent")
-        session = self.session
+        text, session = _advised(error), self.session
         stopped = isinstance(error, SafetyStop) or (session is not None and session.robot.stopped is not None)
         self.halt()
         self._drop(text)
-        if self.driver is not None:
-            self._end_driving(self.driver, text)
+        driver, self.driver = self.driver, None
         if stopped:  # also by the age of its state: only a person lets it move again
             self._stopped = self._last_stop = text
             self._is_running = False
@@ -508,6 +511,8 @@ class Resident:
                 return
             self._is_running, self._paused = False, f"paused by a fault: {text}"
             self._change(State.PAUSED, self._paused)
+        if driver is not None:  # who drove hears of the stop first, and then that the lease has ended
+            self._end_driving(driver, text)
 
     # ---- requests, in the main thread
 

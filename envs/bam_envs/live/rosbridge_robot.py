@@ -25,6 +25,7 @@ from bam_envs.core.errors import (
     NotReady,
     RemoteError,
     ResetNeeded,
+    SafetyStop,
     StaleState,
 )
 from bam_envs.core.robot import EnvIds, Initial, RobotSpec, RobotState
@@ -284,7 +285,7 @@ class RosbridgeRobot:
             _LOG.debug("%s: %s", self.url, text)
             if not any(reason in text for reason in _LATE):
                 refusal = NotInCommand if " in command" in text else RemoteError
-                error = refusal(f"{self.url}: {text}")
+                error = SafetyStop.told(text) or refusal(f"{self.url}: {text}")
                 self._session_over |= is_over(error)
                 if not self._refusals:  # the first one is raised, however many a server sends
                     self._refusals.append(error)
@@ -297,6 +298,7 @@ class RosbridgeRobot:
             LinkLost: The link is down.
             NotReady: The robot reports that it cannot move now.
             RemoteError: The other end refused the scene.
+            SafetyStop: A guard of a live agent stopped the robot meanwhile.
             StaleState: No fresh state came.
         """
         control = self._wait_up()
@@ -346,6 +348,7 @@ class RosbridgeRobot:
             LinkLost: A connection dropped, before or during this step; nothing more is sent until `reset`.
             NotReady: The robot reports that it cannot move now.
             RemoteError: The robot's side refused a command; `NotInCommand` if another client is in command.
+            SafetyStop: A guard of a live agent has stopped the robot.
             StaleState: The robot did not answer in time.
             ProtocolError: The state differs from the profile.
         """

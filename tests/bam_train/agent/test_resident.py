@@ -214,8 +214,8 @@ def test_a_stop_while_a_request_is_executed_is_a_state_and_is_written_down_once(
         running.state(State.RUNNING)
         running.ask("take", who="a program", lease="it")
         answer = running.ask("scene", who="a program", pose=None, seed=1)
-        assert answer.error == f"The robot was stopped by {STOPPED}. When it is safe, call resume()."
         why = f"The robot was stopped by {STOPPED}. When it is safe, resume the agent."
+        assert (answer.error, answer.kind) == (why, "SafetyStop")
         assert running.state(State.STOPPED) == why
         assert running.status["owner"] is None
         assert running.ask("take", who="a program", lease="it").kind == "NotInCommand"

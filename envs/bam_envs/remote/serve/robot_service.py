@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from bam_envs.core.errors import LinkLost, NotInCommand, ProtocolError, RemoteError, RobotFault
+from bam_envs.core.errors import LinkLost, NotInCommand, ProtocolError, RemoteError, RobotFault, SafetyStop
 from bam_envs.core.robot import RobotState
 from bam_envs.core.timing import Ticker
 from bam_envs.remote.serve.command_lease import CommandLease
@@ -179,6 +179,8 @@ class RobotService:
             if not low - _ROUNDING <= value <= high + _ROUNDING:
                 label, unit = command.labels[place], command.units[place]
                 raise ProtocolError(f"{topic}: {label} must be {low:g} to {high:g} {unit}, not {value:g} {unit}.")
+        if isinstance(self._robot.fault, SafetyStop):
+            raise self._robot.fault
         if self._robot.fault is not None:
             raise RemoteError(f"{self._profile.name} failed, and needs a reset: {self._robot.fault}")
         if tag is not None:
