@@ -31,7 +31,7 @@ from bam_train.agent.succession import Choice, Succession
 from bam_train.agent.transitions import TransitionCollector, TransitionLog, encode
 from bam_train.agent.versions import Versions
 from bam_train.checkpoint import Checkpoint
-from bam_train.deploy.deployment import StopSwitch, fault_text
+from bam_train.deploy.deployment import Stopped, StopSwitch, fault_text
 from bam_train.deploy.journal import EpisodeRecord
 from bam_train.errors import BadTrials, BamTrainError, ContractRefused, PolicyError, RequestRefused
 
@@ -302,12 +302,16 @@ class Resident:
         except _Interrupted:
             self.halt()
             return
+        except Stopped:
+            self.succession.interrupted("the agent was ended")
+            raise
         except Exception as error:
             self._failed(error)
             if journal.begun > begun:  # else the policy has not acted: the arm was on its way to its start pose
                 self._judge(session, journal.records[-1], error)
             return
         if record.end == "stopped":
+            self.succession.interrupted(self._why_cut_short)
             return
         self._completed += 1
         self._successes += record.success is True
@@ -321,6 +325,15 @@ class Resident:
             self.succession.cut_short(record, self._stopped, excuse)
         elif isinstance(error, LinkLost):
             self.succession.cut_short(record, excuse="the link to the robot was lost")
+        elif isinstance(error, NotInCommand):
+            self.succession.cut_short(record, excuse="somebody else drives the robot")
+
+    @property
+    def _why_cut_short(self) -> str:
+        """Why the episode was ended between two ticks: by what a person asked for."""
+        if self._quitting:
+            return "the agent was ended"
+        return self.why if self._chosen is None else f"another version acts: {self._chosen.why}"
 
     @property
     def _driving(self) -> State:

@@ -1,6 +1,8 @@
 """Stages of a roll-out: on trial, slow and in a box, until trials have shown enough for full speed."""
 
 import json
+import os
+import signal
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
@@ -9,7 +11,7 @@ from types import SimpleNamespace
 import gymnasium as gym
 import pytest
 
-from bam_envs.core.errors import InvalidValue, LinkLost
+from bam_envs.core.errors import InvalidValue, LinkLost, NotInCommand
 from bam_envs.core.location import HERE, LiveRobot
 from bam_envs.live import rosbridge_robot
 from bam_envs.remote.serve.serve_options import ServeOptions
@@ -191,6 +193,21 @@ def test_an_episode_that_is_cut_short_has_failed(corridor, trials):
     assert reasons(trials)[-1] == "link lost: the link dropped"
 
 
+def press_ctrl_c():
+    os.kill(os.getpid(), signal.SIGINT)
+
+
+@pytest.mark.parametrize("happens", [press_ctrl_c, raises(NotInCommand("anna is in command"))], ids=["ctrl-c", "taken"])
+def test_an_episode_that_a_person_ends_is_no_trial(corridor, trials, happens):
+    run_deployment(Driven(gym.make(corridor, slow=True), happens, at=12), trials=trials)
+    assert (trials.evidence.trials, trials.evidence.void) == (1, 1)
+    assert trials.evidence.text == (
+        "0 of 1 trial succeeded (1 more do not count: a person, the computer or the link ended them); 57 more without "
+        "a failure would show more than 90 %"
+    )
+    assert trials.next_seed(7) == 9  # and its seed does not come again
+
+
 def test_nothing_moves_if_a_trial_cannot_be_recorded(corridor, tmp_path):
     (tmp_path / "file").write_text("")
     trials = Trials(TrialRecord(tmp_path / "file" / "trials.jsonl", tmp_path), Subject("ab12", URL), 0.9, {})
@@ -283,7 +300,7 @@ def test_trials_are_run_recorded_and_reported(served, run, tmp_path):
     report = json.loads(out)
     assert (status, report["marks"]) == (0, ["UNSIGNED", "trial"]), err
     assert Recording.open(recording).metadata["marks"] == "UNSIGNED, trial"
-    counted = {"successes": 1, "trials": 1, "repeated": 0, "nameless": 0}
+    counted = {"successes": 1, "trials": 1, "repeated": 0, "nameless": 0, "void": 0}
     assert report["trials"] == {**counted, "threshold": 0.9, "is_enough": False}
     assert (report["identity"], report["seed"]) == ("left arm", 1_000_000)
     assert Recording.open(recording).metadata["identity"] == "left arm"
