@@ -331,7 +331,7 @@ class Resident:
     @property
     def _why_cut_short(self) -> str:
         """Why the episode was ended between two ticks: by what a person asked for."""
-        if self._quitting:
+        if self._quitting and self._is_running:
             return "the agent was ended"
         return self.why if self._chosen is None else f"another version acts: {self._chosen.why}"
 

@@ -401,7 +401,6 @@ def test_an_episode_that_a_person_ends_is_no_trial_of_the_candidate(bench, candi
         assert trials.began.wait(DEADLINE)
         if isinstance(ask, Halt):
             running.agent.take(ask)
-            running.state(State.PAUSED)
         elif ask != "quit":
             running.ask(ask[0], **ask[1])
             running.ask("transitions", on=False)  # in a later turn: the episode has ended
