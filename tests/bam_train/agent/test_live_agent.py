@@ -298,7 +298,8 @@ def test_every_recorded_action_is_one_of_the_two_policies(start, tmp_path, forge
     first.ticks(10)
     active = first.agent.push(candidate, stage="full", when="tick")["digest"]
     first.ticks(10)
-    recorded = first.state()["recording"]
+    before = first.state()
+    recorded = before["recording"]
     assert first.end(signal.SIGTERM) == 128 + signal.SIGTERM
     recording = Recording.open(recorded)
     observations, actions = recording.arrays("observation")[""], recording.arrays("action")[""]
@@ -313,6 +314,7 @@ def test_every_recorded_action_is_one_of_the_two_policies(start, tmp_path, forge
     again.line("so it starts paused")
     status = again.state("paused")
     assert (status["active"], status["ticks"]) == (active, 0)
+    assert before["identity"] == status["identity"] == "simulated bam-pick-v0"  # its trials count on
 
 
 def test_a_lost_robot_is_waited_for_and_checked_again(start, tmp_path, serve_program):
