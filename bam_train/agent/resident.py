@@ -398,7 +398,8 @@ class Resident:
 
     def _record_again(self) -> None:
         if self.session is not None and (name := self.session.record_again()):
-            self.note("recording", f"the recording goes on in {name}")
+            acts = f"{self.succession.active.digest[:12]} acts"  # which `Recording.policies` reads
+            self.note("recording", f"the recording goes on in {name}; {acts}")
 
     def _require_link(self) -> None:
         if self.session is not None and not self.session.is_up:

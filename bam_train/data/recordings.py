@@ -27,7 +27,7 @@ from bam_train.data.recorded_episode import Array, DataSetInfo, Episode, digest_
 from bam_train.environments import make_env, must_be_named, require_env_kwargs
 from bam_train.errors import BadDataSet, BadRecording
 from bam_train.files.place import Place, local_path
-from bam_train.recording.recording import Recording
+from bam_train.recording.recording import DIGEST, Recording
 
 _CUT, _NO_END = "cut off", "it has no end, and is taken as truncated"
 
@@ -151,7 +151,8 @@ def episodes_of(recording: Recording, info: DataSetInfo) -> Iterator[tuple[Episo
     observed, [actions] = recording.arrays("observation"), recording.arrays("action").values()
     leaves = leaves_of(info.observation_space, "observation")
     pictures = _pictures(recording, [("/".join(map(str, one.path)), one.shape) for one in leaves if one.is_image])
-    table, seed = recording.tables["/episode"], recording.seed
+    table, seed, acted = recording.tables["/episode"], recording.seed, recording.policies()
+    own = recording.metadata.get("checkpoint_sha256", "")
     for number, ticks in enumerate(recording.episodes()):
         first, last = ticks[0], ticks[-1]
         end = {name: bool(table.column(name)[last]) for name in ("terminated", "truncated")}
@@ -160,7 +161,9 @@ def episodes_of(recording: Recording, info: DataSetInfo) -> Iterator[tuple[Episo
             "recording": recording.path.name,
             "number": number,
             "seed": seed + number,
-            "policy": recording.metadata.get("checkpoint_sha256", ""),
+            "policy": ", ".join(
+                dict.fromkeys(own if own[:DIGEST] == name else name for name in acted[first : last + 1])
+            ),
             "robot": recording.metadata.get("profile", ""),
             "date": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime(table.times[first] / 1e9)),
         }

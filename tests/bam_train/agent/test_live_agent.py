@@ -310,6 +310,7 @@ def test_every_recorded_action_is_one_of_the_two_policies(start, tmp_path, forge
     assert [old or new for old, new in acted] == [True] * len(acted)
     swap = [old for old, _ in acted].index(False)
     assert [(old, new) for old, new in acted[swap:]] == [(False, True)] * (len(acted) - swap)
+    assert [name == active[:12] for name in recording.policies()] == [k >= swap for k in range(len(acted))]
     again = start(tmp_path)
     again.line("so it starts paused")
     status = again.state("paused")
