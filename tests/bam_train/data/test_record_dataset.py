@@ -13,6 +13,7 @@ from bam_envs.robots.physics.rendering import RenderingUnavailable, find_backend
 from bam_train.cli.data import bam_data
 from bam_train.data import DataSet, RecordDataset
 from bam_train.data.collect import collect
+from bam_train.data.views.summary import numbers
 from bam_train.errors import BadDataSet, SettingsError
 
 pytest.importorskip("pyarrow")
@@ -186,6 +187,11 @@ def test_collect(tmp_path):
     again = collect(tmp_path / "d", "scripted", "bam/reach", episodes=5, num_envs=2, random=0.3, noise=0.1, seed=7)
     assert (found.repeated, again.repeated) == (0, 5)
     assert data.info.contract["command"][0]["unit"] == "rad"
+    rows = numbers(DataSet.open(tmp_path / "d"))
+    units = [
+        {row["unit"] for row in rows if row["column"] == one} for one in ("observation.state", "action", "command")
+    ]
+    assert units == [{"scaled"}, {"scaled"}, {"rad", "m"}]
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
