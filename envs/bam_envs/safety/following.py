@@ -2,7 +2,8 @@
 
 A joint follows if it is behind its commands by no more than its lag at its measured speed. The rest of the gap is the
 distance that it would jump when released: at most its limit for one period, so that a released joint never moves faster
-than that. A joint that moves away from its commands stops the robot at once: what moves is not what was commanded.
+than that. A joint that moves away from its commands stops a real robot at once: what moves is not what was commanded. A
+simulated arm, whose controllers are softer, is also pushed that far by the objects that it touches.
 """
 
 import math
@@ -57,9 +58,16 @@ class Following(Guard):
         self._strikes, self._good, self._forgiven = 0, 0, ticks_of(FORGIVEN, spec)
         self._spec, self._own_lag = spec, self._lag
         self._ended: Numbers = []  # see Tick
+        self._yields = False
 
-    def relayed(self, delay: float) -> None:
-        """Explain that the robot gets commands later by `delay` [s], from a live agent that has guards of its own."""
+    def connected(self, delay: float, *, yields: bool) -> None:
+        """Take what is known of the robot now.
+
+        Args:
+            delay: Time by which it gets commands later, from a live agent that has guards of its own [s].
+            yields: Whether it is simulated, and yields to what it touches.
+        """
+        self._yields = yields
         self._lag = self._own_lag + delay
         self._recent = 2 + ticks_of(self._lag, self._spec)
         self._sent = deque(maxlen=self._recent + ticks_of(OLD_STATE, self._spec))
@@ -176,7 +184,7 @@ class JointFollowing(Following):
             return None
         at = max(range(len(off)), key=lambda column: abs(off[column]) / allowed[column])
         moved = measured[at] - self._pick(tick.before)[at]  # NaN in a first tick
-        away = moved * off[at] < 0.0 and abs(moved) > allowed[at] / 2
+        away = moved * off[at] < 0.0 and abs(moved) > allowed[at] / 2 and not self._yields
         self.is_struck(over, at_once=away)
         if away:
             return (

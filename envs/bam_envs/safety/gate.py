@@ -336,7 +336,8 @@ class SafeRobot(metaclass=Sealed):
         watchdog, has_agent = getattr(self.info, "watchdog", None), getattr(self.info, "agent", False)
         for guard in self._guards:
             if isinstance(guard, Following):
-                guard.relayed(RELAYED * self.spec.period if has_agent else 0.0)
+                yields = not self._is_real() and not getattr(self._live, "stands_for_a_real_one", False)
+                guard.connected(RELAYED * self.spec.period if has_agent else 0.0, yields=yields)
             # A live agent halts the robot by itself, and the watchdog behind it is the agent's concern.
             if isinstance(guard, Watchdog) and not has_agent and (watchdog is not None or self._is_real()):
                 guard.connected(watchdog)

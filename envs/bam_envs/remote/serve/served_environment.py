@@ -103,7 +103,7 @@ class ServedEnvironment:
             if isinstance(bus, RosbridgeLink):
                 self._require_own_names(bus)
             self.robot_service = RobotService(
-                robot, profile, bus, self.lease, namespace=self.prefix, identity=options.name
+                robot, profile, bus, self.lease, namespace=self.prefix, identity=options.name, paced=options.paced
             )
             started.callback(self.robot_service.close)
             self.robot_service.start()
