@@ -153,9 +153,8 @@ def main() -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     begin_log("bam-agent: simulated robot", logging.ERROR)
     env_id, env_kwargs, name = json.loads(sys.argv[1])
-    with ServedEnvironment(
-        make_env(env_id, env_kwargs), ServeOptions(port=0, name=name, fast=True, paced=True)
-    ) as served:
+    options = ServeOptions(port=0, name=name, fast=True)
+    with ServedEnvironment(make_env(env_id, env_kwargs), options, paced=True) as served:
         print(served.bus.url, flush=True)  # type: ignore[union-attr]  # noqa: T201 - read by the parent
         threading.Thread(target=_end_with_parent, daemon=True).start()
         threading.Event().wait()

@@ -23,6 +23,7 @@ import numpy as np
 from bam_envs import __version__
 from bam_envs.core.errors import BamEnvsError, LinkLost, NotInCommand, NotReady, RemoteError, SafetyStop
 from bam_envs.core.robot import Initial
+from bam_envs.safety.guard import TIMING_GUARDS
 from bam_train.agent.agent_messages import Answer, Ask, Drive, Halt, Message, Report, Rows, Sent
 from bam_train.agent.agent_options import AgentOptions
 from bam_train.agent.agent_states import TRANSITIONS, State
@@ -47,8 +48,6 @@ COMMAND_LIFETIME = 0.2
 ROBOT_FITS = "the robot is there, and fits"
 """Why the agent no longer waits."""
 _RECENT_EPISODES = 20  # episodes in the status
-_TIMING_GUARDS = (3, 4, 15, 16)
-"""Codes of the guards that look at when states, answers and commands come, and not at what the robot does."""
 _HALTING_REQUESTS = ("pause", "take")
 """Requests for which the robot is halted before they are executed."""
 
@@ -321,7 +320,7 @@ class Resident:
     def _judge(self, session: RobotSession, record: EpisodeRecord, error: Exception) -> None:
         """Judge the policy whose episode ended with `error`: by a stop of a guard, or by the loss of the link."""
         if self._stopped:
-            excuse = session.deployment.times.excuse(by_time=session.robot.code in _TIMING_GUARDS)
+            excuse = session.deployment.times.excuse(by_time=session.robot.code in TIMING_GUARDS)
             self.succession.cut_short(record, self._stopped, excuse)
         elif isinstance(error, LinkLost):
             self.succession.cut_short(record, excuse="the link to the robot was lost")

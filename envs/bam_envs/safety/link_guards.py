@@ -117,8 +117,8 @@ class LinkQuality(Share):
         if self._counted[-1] == self._tick or bad <= TICKS * (1.0 - self.limit_value) + 1e-9:
             return None
         return (
-            f"{good}, and {TICKS * self.limit_value:.0f} are needed: look at the network and at the load of the "
-            "robot's computer, or come nearer to its access point"
+            f"{good}, and {TICKS * self.limit_value:.0f} are needed: look at the load of this computer and of the "
+            "robot's, and at the network, or come nearer to its access point"
         )
 
 

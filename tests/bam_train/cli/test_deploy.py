@@ -17,7 +17,6 @@ from bam_envs.remote.serve.serve_options import ServeOptions
 from bam_envs.remote.serve.served_environment import ServedEnvironment
 from bam_train.cli.deploy import main
 
-
 CHECKPOINTS = Path(__file__).parents[3] / "checkpoints"
 
 

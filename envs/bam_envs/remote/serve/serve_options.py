@@ -40,9 +40,6 @@ class ServeOptions(Credentials):
     """Time passes in real time: the default of an environment with a robot."""
     fast: bool = False
     """Time passes only with steps and commands, as fast as they come: the default of other environments."""
-    paced: bool = False
-    """With `fast`: commands are executed no faster than in real time. A robot stands still until the next one comes, so
-    that a busy computer makes it slow, and does not falsify its motion."""
     lease: Positive = LEASE_SECONDS
     """Time without a sign of life after which a client may lose command to another one [s]."""
     cert: str | None = None
