@@ -623,6 +623,8 @@ class Resident:
     def _roll_back(self, who: str, address: str, why: str = "") -> dict[str, Any]:
         text = f"{who}{f': {why}' if why else ''}"
         choice = self.succession.back(who, text)
+        if self.succession.choice is not None:  # who waits for its outcome hears that, not that it was replaced
+            self.succession.choice.result = self.succession.choice.result or choice.why
         self._chosen = choice
         if not self._plays():
             self._activate()

@@ -410,6 +410,17 @@ def test_an_episode_that_a_person_ends_is_no_trial_of_the_candidate(bench, candi
     assert running.agent.status()["trial"]["done"] == 1
 
 
+def test_who_waits_for_the_trials_hears_that_a_person_rolled_back(bench, candidate):
+    with bench() as running:
+        running.state(State.RUNNING)
+        choice = candidate(running)
+        running.ask("pause")
+        running.ask("rollback", why="it drops the cube")
+        assert choice.outcome.wait(DEADLINE)
+        assert choice.result == "rolled back: anna: it drops the cube"
+        assert running.ask("rollback").error.startswith("There is no version to roll back to")
+
+
 def test_what_a_person_drives_into_is_not_the_candidates_fault(bench, candidate):
     with bench() as running:
         running.state(State.RUNNING)
