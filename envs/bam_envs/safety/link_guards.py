@@ -54,6 +54,11 @@ class Share(Guard):
         self._counted.clear()
         self.warning = ""
 
+    @property
+    def counted(self) -> int:
+        """Number of counted ticks among the last 100."""
+        return len(self._counted)
+
     def count(self, tick: Tick) -> int:
         """Number of counted ticks among the last 100, this one included."""
         self._tick += 1
@@ -61,7 +66,7 @@ class Share(Guard):
             self._counted.append(self._tick)
         if self._counted and self._counted[0] <= self._tick - TICKS:
             self._counted.popleft()
-        return len(self._counted)
+        return self.counted
 
 
 class LateTicks(Share):
