@@ -133,6 +133,7 @@ class RosbridgeRobot:
         self._refusals: list[BamEnvsError] = []
         self._status = ""  # of this tick, as JSON
         self._sent: Array | None = None
+        self._sent_tag: Tag | None = None
         self._sent_at, self._sent_after = -math.inf, 0  # when, and after how many halts
         self._answers = False  # whether it reports the commands it has executed, in real time
         self._owed: dict[int, float] = {}  # number of each command without an answer -> when it was sent [s]
@@ -368,6 +369,8 @@ class RosbridgeRobot:
         self._pacer.tick()
         self._send(control, values, tag, halts, until)
         self._publish_status(control)
+        if lockstep and self._sent_tag != tag:  # a halt came before it: nothing will answer
+            return self.measure()
         if not lockstep:
             self._wait(self._pacer.slack - self._lead, halts)
             self._ended_at = self._clock()
@@ -417,6 +420,7 @@ class RosbridgeRobot:
                 self._session.drive()
                 control.publish_all([(self.namespace + topic, message) for topic, _, message in envelopes])
                 self._sent, self._sent_at, self._sent_after = command.copy(), self._clock(), halts
+                self._sent_tag = tag
                 if self._answers:
                     self._owed[tag.sequence] = self._sent_at
 
