@@ -223,6 +223,24 @@ def test_lockstep_without_an_answer(server, robot_on, connect, simulation):
     )
 
 
+def test_lockstep_with_a_halt_just_before_the_command_waits_for_no_answer(server, robot_on, connect, simulation):
+    """As of a person who takes over: the command is not sent, and the next one is."""
+    scripted = robot_on(server, info=simulation)
+    halting = []
+
+    def clock():
+        if halting and threading.current_thread() is threading.main_thread():
+            halting.pop().halt()
+        return time.monotonic()
+
+    robot, gate = connect(server.url, clock=clock)
+    halting.append(robot)
+    gate.step(gate.state.command)
+    assert halting == []
+    gate.step(gate.state.command)
+    assert [topic for topic, *_ in scripted.commands if topic != HALT_TOPIC] == [GRIPPER_COMMANDS, JOINT_COMMANDS]
+
+
 def test_another_period(server, robot_on):
     robot_on(server, info=RobotInfo("box", simulated=True, lockstep=True, period=0.1))
     robot = robot_at(server.url)
