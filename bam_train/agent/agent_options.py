@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from bam_envs.core.location import LiveRobot
+from bam_envs.rosbridge.dialing import AGENT_PORT
 from bam_envs.rosbridge.endpoint import is_loopback
 
 
@@ -16,7 +17,7 @@ class AgentOptions:
     folder: Path
     """Folder of the versions, the audit file and the recordings."""
     bind: str = "127.0.0.1"
-    port: int = 9095
+    port: int = AGENT_PORT
     cert: Path | None = None
     key: Path | None = None
     token_file: Path | None = None

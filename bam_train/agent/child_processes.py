@@ -1,8 +1,10 @@
 """The child processes of a live agent: the front process, started again if it dies, and the simulated robot."""
 
+import hashlib
 import json
 import logging
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -116,10 +118,15 @@ class SimulatedBox:
     Args:
         env_id: Its environment.
         env_kwargs: Arguments of the environment.
+        name: What it tells as its name; by default one that the same environment and arguments always have, as its
+            address, another one at each start, would lose it its trials.
     """
 
-    def __init__(self, env_id: str, env_kwargs: Mapping[str, Any]) -> None:
-        self._what = json.dumps([env_id, dict(env_kwargs)])
+    def __init__(self, env_id: str, env_kwargs: Mapping[str, Any], name: str = "") -> None:
+        settings = json.dumps(dict(env_kwargs), sort_keys=True)
+        digest = f" {hashlib.sha256(settings.encode()).hexdigest()[:8]}" if env_kwargs else ""
+        own = f"simulated {re.sub(r'[^a-zA-Z0-9.]+', '-', env_id)[-40:].strip('-.')}{digest}"
+        self._what = json.dumps([env_id, dict(env_kwargs), name or own])
         self._process: subprocess.Popen[str] | None = None
         self.url = ""
         """Address of the robot, once it is started."""
@@ -145,8 +152,9 @@ def main() -> None:
     """Run the simulated robot, in its process, until the standard input ends."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     begin_log("bam-agent: simulated robot", logging.ERROR)
-    env_id, env_kwargs = json.loads(sys.argv[1])
-    with ServedEnvironment(make_env(env_id, env_kwargs), ServeOptions(port=0)) as served:
+    env_id, env_kwargs, name = json.loads(sys.argv[1])
+    options = ServeOptions(port=0, name=name, fast=True)
+    with ServedEnvironment(make_env(env_id, env_kwargs), options, paced=True) as served:
         print(served.bus.url, flush=True)  # type: ignore[union-attr]  # noqa: T201 - read by the parent
         threading.Thread(target=_end_with_parent, daemon=True).start()
         threading.Event().wait()

@@ -23,6 +23,7 @@ import numpy as np
 from bam_envs import __version__
 from bam_envs.core.errors import BamEnvsError, LinkLost, NotInCommand, NotReady, RemoteError, SafetyStop
 from bam_envs.core.robot import Initial
+from bam_envs.safety.guard import TIMING_GUARDS
 from bam_train.agent.agent_messages import Answer, Ask, Drive, Halt, Message, Report, Rows, Sent
 from bam_train.agent.agent_options import AgentOptions
 from bam_train.agent.agent_states import TRANSITIONS, State
@@ -31,7 +32,7 @@ from bam_train.agent.succession import Choice, Succession
 from bam_train.agent.transitions import TransitionCollector, TransitionLog, encode
 from bam_train.agent.versions import Versions
 from bam_train.checkpoint import Checkpoint
-from bam_train.deploy.deployment import StopSwitch, fault_text
+from bam_train.deploy.deployment import Stopped, StopSwitch, fault_text
 from bam_train.deploy.journal import EpisodeRecord
 from bam_train.errors import BadTrials, BamTrainError, ContractRefused, PolicyError, RequestRefused
 
@@ -47,10 +48,13 @@ COMMAND_LIFETIME = 0.2
 ROBOT_FITS = "the robot is there, and fits"
 """Why the agent no longer waits."""
 _RECENT_EPISODES = 20  # episodes in the status
-_TIMING_GUARDS = (3, 4, 15, 16)
-"""Codes of the guards that look at when states, answers and commands come, and not at what the robot does."""
 _HALTING_REQUESTS = ("pause", "take")
 """Requests for which the robot is halted before they are executed."""
+
+
+def _advised(error: Exception) -> str:
+    """The exception in one line, which says what ends a stop of the agent's robot."""
+    return fault_text(error).replace("call resume()", "resume the agent")
 
 
 class _Interrupted(BaseException):
@@ -243,7 +247,7 @@ class Resident:
                 result = do()
                 answer = Answer(number, result=result or {})
             except (BamTrainError, BamEnvsError) as error:
-                answer = Answer(number, error=" ".join(str(error).split()), kind=type(error).__name__)
+                answer = Answer(number, error=_advised(error), kind=type(error).__name__)
             if number:
                 self.send(answer)
 
@@ -297,12 +301,16 @@ class Resident:
         except _Interrupted:
             self.halt()
             return
+        except Stopped:
+            self.succession.interrupted("the agent was ended")
+            raise
         except Exception as error:
             self._failed(error)
             if journal.begun > begun:  # else the policy has not acted: the arm was on its way to its start pose
                 self._judge(session, journal.records[-1], error)
             return
         if record.end == "stopped":
+            self.succession.interrupted(self._why_cut_short)
             return
         self._completed += 1
         self._successes += record.success is True
@@ -312,10 +320,19 @@ class Resident:
     def _judge(self, session: RobotSession, record: EpisodeRecord, error: Exception) -> None:
         """Judge the policy whose episode ended with `error`: by a stop of a guard, or by the loss of the link."""
         if self._stopped:
-            excuse = session.deployment.times.excuse(by_time=session.robot.code in _TIMING_GUARDS)
+            excuse = session.deployment.times.excuse(by_time=session.robot.code in TIMING_GUARDS)
             self.succession.cut_short(record, self._stopped, excuse)
         elif isinstance(error, LinkLost):
             self.succession.cut_short(record, excuse="the link to the robot was lost")
+        elif isinstance(error, NotInCommand):
+            self.succession.cut_short(record, excuse="somebody else drives the robot")
+
+    @property
+    def _why_cut_short(self) -> str:
+        """Why the episode was ended between two ticks: by what a person asked for."""
+        if self._quitting and self._is_running:
+            return "the agent was ended"
+        return self.why if self._chosen is None else f"another version acts: {self._chosen.why}"
 
     @property
     def _driving(self) -> State:
@@ -380,7 +397,8 @@ class Resident:
 
     def _record_again(self) -> None:
         if self.session is not None and (name := self.session.record_again()):
-            self.note("recording", f"the recording goes on in {name}")
+            acts = f"{self.succession.active.digest[:12]} acts"  # which `Recording.policies` reads
+            self.note("recording", f"the recording goes on in {name}; {acts}")
 
     def _require_link(self) -> None:
         if self.session is not None and not self.session.is_up:
@@ -487,13 +505,11 @@ class Resident:
 
     def _failed(self, error: Exception) -> None:
         """What a fault while the robot moved leads to: waiting for the robot, stopped by a guard, or paused."""
-        text = fault_text(error).replace("call resume()", "resume the agent")
-        session = self.session
+        text, session = _advised(error), self.session
         stopped = isinstance(error, SafetyStop) or (session is not None and session.robot.stopped is not None)
         self.halt()
         self._drop(text)
-        if self.driver is not None:
-            self._end_driving(self.driver, text)
+        driver, self.driver = self.driver, None
         if stopped:  # also by the age of its state: only a person lets it move again
             self._stopped = self._last_stop = text
             self._is_running = False
@@ -508,6 +524,8 @@ class Resident:
                 return
             self._is_running, self._paused = False, f"paused by a fault: {text}"
             self._change(State.PAUSED, self._paused)
+        if driver is not None:  # who drove hears of the stop first, and then that the lease has ended
+            self._end_driving(driver, text)
 
     # ---- requests, in the main thread
 
@@ -605,6 +623,8 @@ class Resident:
     def _roll_back(self, who: str, address: str, why: str = "") -> dict[str, Any]:
         text = f"{who}{f': {why}' if why else ''}"
         choice = self.succession.back(who, text)
+        if self.succession.choice is not None:  # who waits for its outcome hears that, not that it was replaced
+            self.succession.choice.result = self.succession.choice.result or choice.why
         self._chosen = choice
         if not self._plays():
             self._activate()

@@ -357,12 +357,27 @@ class Succession:
             return
         if excuse:
             stopped_by = ""
-            whose = f"the episode that was cut short does not count against {self.active.digest[:12]}"
-            self._resident.note("trial", f"{whose}: {excuse}")
-            if (trials := self.trials()) is not None:
-                with contextlib.suppress(BadTrials):  # then it counts
-                    trials.end(False, excuse, void=True)
+            self._excuse(excuse)
         self._judged(self.probation.ended(None, stopped_by, slow=record.slow, ticks=record.length))
+
+    def interrupted(self, why: str) -> None:
+        """Take that a person ended the episode, for the reason `why`: it is no trial of the policy."""
+        if self.trials() is not None:
+            self._excuse(why)
+
+    def _excuse(self, why: str) -> None:
+        """Note why the episode that was cut short does not count, also in the record of the trials."""
+        self._resident.note(
+            "trial", f"the episode that was cut short does not count against {self.active.digest[:12]}: {why}"
+        )
+        trials, choice = self.trials(), self.choice
+        if trials is None or choice is None:
+            return
+        try:
+            trials.end(False, why, void=True)
+            choice.progress = _progress(trials.evidence)
+        except BadTrials as error:  # then it counts
+            _log.warning("%s", error)
 
     def policy_failed(self, text: str) -> bool:
         """Judge the active version after a fault of its policy; whether another one acts now."""

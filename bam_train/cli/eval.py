@@ -97,7 +97,7 @@ def _recorded(config: EvalConfig, subject: _Subject, envs: Any) -> AbstractConte
     def is_counted(number: int, seed: int | None) -> bool:
         return seed is not None and seed < end
 
-    return closing(RecordVectorDataset(envs, config.record, info, {"policy": policy}, is_counted))
+    return RecordVectorDataset(envs, config.record, info, {"policy": policy}, is_counted).whole()
 
 
 def _on_data(config: EvalConfig, place: str) -> None:

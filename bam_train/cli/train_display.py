@@ -125,7 +125,9 @@ class LiveDisplay(PlainDisplay):
 
 
 def _steps(progress: Progress) -> str:
-    return f"{count(progress.steps)} of {count(progress.total)} steps"
+    """The steps done, and those to be done while they are more: the last rollout is whole, and goes beyond them."""
+    more = f" of {count(progress.total)}" if progress.steps < progress.total else ""
+    return f"{count(progress.steps)}{more} steps"
 
 
 _REASONS = {
@@ -152,7 +154,7 @@ def summarise(settings: TrainSettings, outcome: Outcome, folder: RunFolder, seco
     if outcome.checkpoint is not None and outcome.checkpoint.exists():
         if outcome.best is not None:
             say(f"  best        {_score_text(outcome.best)}")
-        say(f"  checkpoint  {_short(outcome.checkpoint)} ({outcome.checkpoint.stat().st_size / 1000:,.0f} kB)")
+        say(f"  checkpoint  {_short(outcome.checkpoint)}")
     if outcome.last is not None:
         older = "" if outcome.last_steps == outcome.steps else f" (after {count(outcome.last_steps)} steps)"
         say(f"  last state  {_short(outcome.last)}{older}")
@@ -169,7 +171,7 @@ def _score_text(best: Scores) -> str:
 
 
 def say_next(settings: TrainSettings, outcome: Outcome) -> None:
-    """Print the commands that use what the run has left."""
+    """Print the size of the checkpoint, now that it is complete, and the commands that use what the run has left."""
     from bam_train.environments import is_batched, must_be_named
 
     commands = []
@@ -181,6 +183,8 @@ def say_next(settings: TrainSettings, outcome: Outcome) -> None:
             commands.append(f"bam-deploy {_short(usable)}{named}")
     if outcome.reason == "stopped" and outcome.last is not None:
         commands.append(f"bam-train --resume {_short(outcome.last)}{named}")
+    if outcome.checkpoint is not None and outcome.checkpoint.exists():
+        say(f"  size        {outcome.checkpoint.stat().st_size / 1000:,.0f} kB")
     for line in ["next:", *(f"  {command}" for command in commands)] if commands else []:
         say(line)
 

@@ -15,6 +15,7 @@ from bam_envs.core.registry import resolve_id
 from bam_envs.core.wording import brief
 from bam_envs.tasks.scripted import scripted_policy
 from bam_train.checkpoint import Checkpoint
+from bam_train.data.data_set import DataSet
 from bam_train.data.record_dataset import RecordVectorDataset, info_of
 from bam_train.data.recorded_episode import Array
 from bam_train.environments import environment_of, make_vector_env, require_env_kwargs, require_fit
@@ -34,6 +35,8 @@ class Collected:
     episodes: int = 0
     steps: int = 0
     successes: int = 0
+    repeated: int = 0
+    """Episodes that the data set had already, as of the same seed."""
 
 
 class RandomPolicy:
@@ -82,6 +85,8 @@ def collect(
 ) -> Collected:
     """Record the first `episodes` that begin, whole, into the data set at `place`.
 
+    After an error, or Ctrl-C, the episodes that are whole are there.
+
     Args:
         place: The data set; episodes are added to those that are there.
         policy: A checkpoint, ``"scripted"`` or ``"random"``.
@@ -120,12 +125,15 @@ def collect(
             envs, place, info_of(envs, env_id, kwargs), told, keep=lambda number, _: number < episodes
         )
         recorded.extra = acting.columns
-        with closing(recorded):
+        with recorded.whole():
             for episode in rollout(recorded, acting, seed=seed, keep=lambda number: number < episodes):
                 done.episodes += 1
                 done.steps += episode.length
                 done.successes += bool(episode.success)
                 on_progress(done.episodes, episodes)
+        digests = DataSet.open(place).digests
+        there = set(digests[: -done.episodes])
+        done.repeated = sum(digest in there for digest in digests[-done.episodes :])
         return done
 
 

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -395,6 +396,16 @@ class RecordVectorDataset(VectorWrapper):
         if ended.any():
             self._tracks.begin(np.flatnonzero(ended).tolist(), observations)
         return observations, rewards, terminated, truncated, infos
+
+    @contextlib.contextmanager
+    def whole(self) -> Iterator[RecordVectorDataset]:
+        """Close it after the ``with`` block; if that ends early, as by Ctrl-C, without the episodes that run."""
+        with contextlib.closing(self):
+            try:
+                yield self
+            except BaseException:
+                self._tracks.discard(range(self.num_envs))
+                raise
 
     def close(self, **kwargs: Any) -> None:
         """Write what is left, and close the environments."""

@@ -27,7 +27,7 @@ from bam_train.data.recorded_episode import Array, DataSetInfo, Episode, digest_
 from bam_train.environments import make_env, must_be_named, require_env_kwargs
 from bam_train.errors import BadDataSet, BadRecording
 from bam_train.files.place import Place, local_path
-from bam_train.recording.recording import Recording
+from bam_train.recording.recording import DIGEST, Recording
 
 _CUT, _NO_END = "cut off", "it has no end, and is taken as truncated"
 
@@ -86,21 +86,31 @@ def info_of_rows(source: Path, env: str | None, env_kwargs: Mapping[str, Any]) -
     return info
 
 
-def add_recording(recording: Recording, place: str | Path | Place, info: DataSetInfo, **facts: Any) -> list[str]:
+def add_recording(recording: Recording, place: str | Path | Place, info: DataSetInfo, **options: Any) -> list[str]:
     """Add the episodes of a recording to a data set, as `add_episodes`."""
-    return add_episodes(recording.path, episodes_of(recording, info), place, info, **facts)
+    return add_episodes(recording.path, episodes_of(recording, info), place, info, **options)
 
 
 def add_episodes(
-    source: Path, episodes: Iterable[tuple[Episode, str]], place: str | Path | Place, info: DataSetInfo, **facts: Any
+    source: Path,
+    episodes: Iterable[tuple[Episode, str]],
+    place: str | Path | Place,
+    info: DataSetInfo,
+    *,
+    again: bool = False,
+    **facts: Any,
 ) -> list[str]:
     """Add the episodes of a recording or of rows to a data set, but for those that it has already.
+
+    An episode of rows is there already if the data set has one with the same steps and end, with rewards as float32,
+    which rows keep.
 
     Args:
         source: The recording or the rows.
         episodes: What `episodes_of` or `episodes_of_rows` gives.
         place: The data set.
         info: What all its episodes have in common.
+        again: Whether to add those too that it has already.
         facts: Further facts of every episode.
 
     Returns:
@@ -109,12 +119,20 @@ def add_episodes(
     notes: dict[str, list[int]] = {}
     with DataSetWriter(place, info) as writer:
         data = DataSet.open(place)
-        recorded = [(row.get("recording"), row.get("number")) for row in map(data.facts, range(len(data)))]
-        there: Counter[Any] = Counter([*recorded, *data.digests])
+        known = [data.facts(i) for i in range(len(data))]
+        there: Counter[Any] = Counter((row.get("recording"), row.get("number")) for row in known)
+        if is_rows(source):
+            episodes = list(episodes)
+            lengths = {len(episode) for episode, _ in episodes}
+            alike = [i for i, row in enumerate(known) if row["length"] in lengths]
+            there = Counter(_in_rows(episode, info) for episode in data.episodes(alike))
         for episode, note in episodes:
-            key = episode.digest or (episode.facts["recording"], episode.facts["number"])
-            is_there, there[key] = there[key] > 0, there[key] - 1
-            for text in (note, f"is in {place} already" if is_there else ""):
+            key = _in_rows(episode, info) if is_rows(source) else (episode.facts["recording"], episode.facts["number"])
+            is_there, there[key] = not again and there[key] > 0, there[key] - 1
+            for text in (
+                note,
+                f"is in {place} already; bam-data import --again adds it all the same" if is_there else "",
+            ):
                 notes.setdefault(text, []).append(episode.facts["number"])
             if len(episode) and not is_there and "left out" not in note:
                 writer.add(replace(episode, facts={**episode.facts, **facts}))
@@ -133,7 +151,8 @@ def episodes_of(recording: Recording, info: DataSetInfo) -> Iterator[tuple[Episo
     observed, [actions] = recording.arrays("observation"), recording.arrays("action").values()
     leaves = leaves_of(info.observation_space, "observation")
     pictures = _pictures(recording, [("/".join(map(str, one.path)), one.shape) for one in leaves if one.is_image])
-    table, seed = recording.tables["/episode"], recording.seed
+    table, seed, acted = recording.tables["/episode"], recording.seed, recording.policies()
+    own = recording.metadata.get("checkpoint_sha256", "")
     for number, ticks in enumerate(recording.episodes()):
         first, last = ticks[0], ticks[-1]
         end = {name: bool(table.column(name)[last]) for name in ("terminated", "truncated")}
@@ -142,7 +161,9 @@ def episodes_of(recording: Recording, info: DataSetInfo) -> Iterator[tuple[Episo
             "recording": recording.path.name,
             "number": number,
             "seed": seed + number,
-            "policy": recording.metadata.get("checkpoint_sha256", ""),
+            "policy": ", ".join(
+                dict.fromkeys(own if own[:DIGEST] == name else name for name in acted[first : last + 1])
+            ),
             "robot": recording.metadata.get("profile", ""),
             "date": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime(table.times[first] / 1e9)),
         }
@@ -170,8 +191,22 @@ def episodes_of(recording: Recording, info: DataSetInfo) -> Iterator[tuple[Episo
         )
 
 
+def _in_rows(episode: Episode, info: DataSetInfo) -> str:
+    """Digest of what Parquet rows keep of an episode."""
+    parts = (
+        ("observation", info.observation_space, episode.observations),
+        ("action", info.action_space, episode.actions),
+    )
+    arrays = {
+        leaf.column: np.asarray(leaf.of(values)) for name, space, values in parts for leaf in leaves_of(space, name)
+    }
+    return digest_of(
+        {**arrays, "reward": episode.rewards.astype(np.float32)}, bool(episode.terminated), bool(episode.truncated)
+    )
+
+
 def episodes_of_rows(source: Path, info: DataSetInfo) -> list[tuple[Episode, str]]:
-    """Each episode of a Parquet file or a folder of them, with its digest, and what is odd about it.
+    """Each episode of a Parquet file or a folder of them, and what is odd about it.
 
     The rows of an episode follow each other, also from one file to the next; it ends where it terminates, is truncated,
     or another ``eps_id`` begins.
@@ -201,8 +236,7 @@ def episodes_of_rows(source: Path, info: DataSetInfo) -> list[tuple[Episode, str
             facts["end"] = _CUT
             cut_off.add(ids[start])
         actions, rewards = rows["actions"][start:stop], rows["rewards"][start:stop]
-        digest = digest_of({observed.column: observations, acted.column: actions, "reward": rewards}, *end, None)
-        episode = Episode(observations, actions, rewards, *end, facts=facts, digest=digest)
+        episode = Episode(observations, actions, rewards, *end, facts=facts)
         found.append((episode, "" if ends[stop - 1] else _NO_END))
     return found
 

@@ -100,7 +100,7 @@ class Admission:
     def __call__(self, env: gym.Env[Any, Any], place: Location, identity: str = "") -> list[str]:
         """Check signature and trials if the robot is real, and load the policy; returns lines for the operator.
 
-        A simulated robot needs no signature, and trials only if `place` names a stage. For `identity` see `Inspection`.
+        A simulated robot needs no signature, and has trials only if it is on trial. For `identity` see `Inspection`.
 
         Raises:
             UntrustedCheckpoint: The robot is real, and the checkpoint has no trusted signature.
@@ -120,7 +120,7 @@ class Admission:
             robot: Any = env.unwrapped.robot  # type: ignore[attr-defined]
             robot.watch = self.shadow = Shadow(robot.spec, robot.limits)
             self.marks = (*self.marks, SHADOW)
-        elif stage is not None:
+        elif stage == "trial" or (stage is not None and is_real):
             lines += self._stage(place.text, is_trial=stage == "trial", simulated=not is_real)
         elif self.record is not None:
             raise SettingsError("--trials: a simulated robot is on trial only with --stage trial; give that too")

@@ -16,7 +16,7 @@ from typing import Any
 
 import gymnasium as gym
 
-from bam_envs.core.errors import BamEnvsError, LinkLost, SafetyStop
+from bam_envs.core.errors import BamEnvsError, LinkLost, NotInCommand, SafetyStop
 from bam_envs.core.robot import RobotState
 from bam_envs.core.robot_env import halt_and_close, robot_of
 from bam_envs.core.timing import Pacer, TickTimes
@@ -157,7 +157,10 @@ class Deployment:
         self._loop.policy = policy
 
     def episode(self, watcher: Watcher, *, seed: int) -> EpisodeRecord:
-        """Run one episode; afterwards the robot is halted, and stays connected. After an exception it is closed."""
+        """Run one episode; afterwards the robot is halted, and stays connected. After an exception it is closed.
+
+        The trial of an episode that `between_ticks` ended is left to the caller.
+        """
         self._closed = False
         try:
             record = self._loop.run(watcher, seed=seed, begins=self._begins)
@@ -166,7 +169,7 @@ class Deployment:
                 self._close()
             raise
         self._halt()  # the sink and the next reset may be slow
-        if self.trials is not None:
+        if self.trials is not None and record.end != "stopped":
             self.trials.end(record.success is True, record.end)
         self._flush()
         return record
@@ -221,6 +224,7 @@ class Deployment:
             self.recorder.close()
 
     def _run(self, watcher: Watcher, seed: int) -> Ending:
+        by_person = False
         try:
             try:
                 self.switch.armed = True
@@ -231,16 +235,17 @@ class Deployment:
                 self.switch.armed = False
             ending = Ending("episodes done", 0)
         except Stopped:
-            ending = Ending("interrupted", 128 + self.switch.came[0])
+            ending, by_person = Ending("interrupted", 128 + self.switch.came[0]), True
         except Exception as error:  # after any fault, the robot must be halted and the report made
-            ending = ending_of(error)
+            ending, by_person = ending_of(error), isinstance(error, NotInCommand)
         except BaseException:
             if not self._closing:
                 self._halt()
             raise
         ending = _unless_it_fails(ending, "closing", self._close)
         if self.trials is not None:
-            ended = partial(self.trials.end, False, ending.reason)  # of an episode that was cut short
+            # Of an episode that was cut short: one that a person ended says nothing of the policy.
+            ended = partial(self.trials.end, False, ending.reason, void=by_person)
             ending = _unless_it_fails(ending, "recording the trial", ended)
         return _unless_it_fails(ending, "recording", self._flush)  # of an episode that was cut short
 

@@ -58,6 +58,8 @@ class Evidence:
     """Trials that do not count, because they repeated the seed of another one."""
     nameless: int = 0
     """Trials at the same address that do not count, because their record does not say that the robot was this one."""
+    void: int = 0
+    """Trials that do not count, because a person, the computer or the link ended them."""
 
     @property
     def value(self) -> float:
@@ -93,6 +95,8 @@ class Evidence:
         above = f"more than {100 * self.threshold:g} %"
         if self.repeated:
             done = f"{done} ({self.repeated} more repeated a seed, and a seed counts once)"
+        if self.void:
+            done = f"{done} ({self.void} more do not count: a person, the computer or the link ended them)"
         text = f"{done}; {self.missing} more without a failure would show {above}"
         if self.is_enough:
             text = f"{done}, which shows {above} (error probability at most {100 * ALPHA:g} %)"
@@ -136,7 +140,8 @@ class TrialRecord:
         void = {row.get("ended") for row in lines if row.get("void") is True}
         succeeded = {row.get("ended") for row in lines if row.get("success") is True}
         starts: dict[Any, bool] = {}  # seed of each start -> whether every trial with it succeeded
-        begun = [row for row in lines if "begun" in row and _subject_of(row) == subject and row["begun"] not in void]
+        every = [row for row in lines if "begun" in row and _subject_of(row) == subject]
+        begun = [row for row in every if row["begun"] not in void]
         for row in begun:
             start = row.get("seed", row["begun"])
             starts[start] = starts.get(start, True) and row["begun"] in succeeded
@@ -144,7 +149,8 @@ class TrialRecord:
         if subject.address not in ("", subject.robot):
             elsewhere = Subject(subject.checkpoint, subject.address, subject.simulated)
             nameless = sum("begun" in row and _subject_of(row) == elsewhere for row in lines)
-        return Evidence(sum(starts.values()), len(starts), threshold, len(begun) - len(starts), nameless)
+        uncounted = {"repeated": len(begun) - len(starts), "nameless": nameless, "void": len(every) - len(begun)}
+        return Evidence(sum(starts.values()), len(starts), threshold, **uncounted)
 
     def next_seed(self, subject: Subject, first: int) -> int:
         """The least seed from `first` on that is above those of all trials of `subject`; raises as `evidence`."""

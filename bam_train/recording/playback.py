@@ -1,7 +1,8 @@
 """Play a recording: the recorded states pass through the environment again, and a policy acts on them."""
 
-from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field
 from typing import Any
 
 import gymnasium as gym
@@ -14,7 +15,7 @@ from bam_envs.robots.replay_robot import ReplayRobot
 from bam_train.checkpoint import Checkpoint
 from bam_train.environments import environment_of, make_env
 from bam_train.errors import BadRecording, CheckpointMismatch
-from bam_train.recording.recording import Recording
+from bam_train.recording.recording import DIGEST, Recording
 
 ROBOT_OPTIONS = ("randomize", "link", "guards", "trial")
 """Arguments of an environment for its robot, which is replaced."""
@@ -32,6 +33,8 @@ class Playback:
     """Ticks with the same action, bit for bit."""
     worst: float = 0.0
     """Largest difference between a component of an action and the recorded one."""
+    others: dict[str, int] = field(default_factory=dict)
+    """Ticks that were not compared, by the first characters of the digest of the policy that acted in them."""
 
     @property
     def same(self) -> bool:
@@ -57,6 +60,20 @@ def require_same_env(recording: Recording, checkpoint: Checkpoint) -> None:
     if recorded and not are_same(recorded, trained):
         text = f"was trained on {trained}, and {recording.path} is of {recorded}. Give a checkpoint of {recorded}"
         raise CheckpointMismatch(checkpoint.path, text)
+
+
+def acts_in(recording: Recording, checkpoint: Checkpoint) -> list[bool]:
+    """Whether `checkpoint` is compared with each tick: of a recording of several policies, with its own ticks.
+
+    Raises:
+        CheckpointMismatch: It acted in none of the ticks, and several others did.
+    """
+    acted, own = recording.policies(), checkpoint.digest[:DIGEST]
+    counts = Counter(acted)
+    if len(counts) > 1 and own not in counts:
+        others = ", ".join(f"{name or 'unknown'} in {count} ticks" for name, count in counts.items())
+        raise CheckpointMismatch(checkpoint.path, f"{own} acted in no tick of {recording.path}; there acted {others}")
+    return [len(counts) < 2 or name == own for name in acted]
 
 
 def replay_env(
@@ -93,7 +110,11 @@ def replay_env(
 
 
 def play(
-    recording: Recording, env: gym.Env[Any, Any], policy: Any, on_tick: Callable[[], None] = lambda: None
+    recording: Recording,
+    env: gym.Env[Any, Any],
+    policy: Any,
+    on_tick: Callable[[], None] = lambda: None,
+    acts: Sequence[bool] | None = None,
 ) -> Playback:
     """Let `policy` act on every recorded tick; the environment is stepped with the recorded action.
 
@@ -102,15 +123,20 @@ def play(
         env: The environment from `replay_env`.
         policy: Has ``reset()`` and ``act(observation)``.
         on_tick: Called at each tick, to take a picture.
+        acts: Whether it is compared with each tick; by default with all. See `acts_in`.
     """
-    played, seed = Playback(), recording.seed
+    acts = acts or [True] * recording.ticks
+    played, seed = _begun(recording, acts), recording.seed
     observations, [actions] = recording.arrays("observation"), recording.arrays("action").values()
     for number, ticks in enumerate(recording.episodes()):
         policy.reset()
         observation, _ = env.reset(seed=seed + number)
         for k in ticks:
             on_tick()
-            played.compare(_same(observation, observations, k), policy.act(observation), actions[k])
+            if acts[k]:
+                if k > ticks[0] and not acts[k - 1]:
+                    policy.reset()  # as when it began to act
+                played.compare(_same(observation, observations, k), policy.act(observation), actions[k])
             if k == ticks[-1]:
                 break
             try:
@@ -125,16 +151,21 @@ def play(
     return played
 
 
-def play_observations(recording: Recording, policy: Any) -> Playback:
+def play_observations(recording: Recording, policy: Any, acts: Sequence[bool]) -> Playback:
     """Let `policy` act on every recorded observation, for an environment without a robot; pictures are left out."""
-    played, [actions] = Playback(), recording.arrays("action").values()
+    played, [actions] = _begun(recording, acts), recording.arrays("action").values()
     observed = recording.arrays("observation")
     for ticks in recording.episodes():
         policy.reset()
-        for k in ticks:
+        for k in (k for k in ticks if acts[k]):
             parts = {name: array[k] for name, array in observed.items()}
             played.compare(True, policy.act(parts.get("", parts)), actions[k])
     return played
+
+
+def _begun(recording: Recording, acts: Sequence[bool]) -> Playback:
+    others = Counter(name for name, own in zip(recording.policies(), acts, strict=True) if not own)
+    return Playback(others=dict(others))
 
 
 def _same(observation: Any, recorded: Mapping[str, Any], k: int) -> bool:

@@ -1,6 +1,7 @@
 """Read a recording; one that was cut off or damaged is read up to that place."""
 
 import json
+import re
 import struct
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -31,6 +32,10 @@ _DAMAGE = (McapError, ZstdError, msgspec.MsgspecError, struct.error, ValueError,
 _FOREIGN = (msgspec.MsgspecError, ValueError, LookupError, TypeError, OverflowError, RecursionError)
 """Exceptions for messages with unexpected content."""
 _decode = msgspec.json.Decoder().decode
+DIGEST = 12
+"""Characters of a digest in texts for people, and so in events."""
+_ACTS = re.compile(rf"\b([0-9a-f]{{{DIGEST}}}) acts\b")
+"""In the event in which a live agent says which version acts from the next tick on."""
 
 
 @dataclass
@@ -169,6 +174,16 @@ class Recording:
         if not text.isdecimal():
             raise BadRecording(f"{self.path}: its metadata says seed {text!r}, which is no number. Get the file again")
         return int(text)
+
+    def policies(self) -> list[str]:
+        """The first `DIGEST` characters of the digest of the policy that acted at each tick; "" if that is unknown."""
+        times = self.tables["/episode"].times if self.ticks else np.array([])
+        acts = [self.metadata.get("checkpoint_sha256", "")[:DIGEST]] * self.ticks
+        for event in self.events:
+            if (found := _ACTS.search(event.text)) is not None:  # of a live agent
+                first = int(np.searchsorted(times, event.time))
+                acts[first:] = [found[1]] * (self.ticks - first)
+        return acts
 
     def episodes(self) -> list[range]:
         """The ticks of each episode; the first one of each is the reset."""

@@ -50,7 +50,7 @@ class AgentLease(CommandLease):
         """Who drives, until when, and how to ask."""
         return (
             f"{self.owner} drives this robot; the lease ends {self.left:.1f} s after its last use. Ask for it to be "
-            "handed back, or take it by force with an operator's token."
+            "handed back, or take it by force on the console, with a token of the role administer."
         )
 
     @property

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bam_envs.core.errors import BamEnvsError, RobotFault
+from bam_envs.core.errors import BamEnvsError, RobotFault, SafetyStop
 from bam_envs.core.robot import RobotState
 from bam_envs.live.shadow_robot import ShadowRobot
 from bam_train.agent.agent_messages import Drive, Halt, Message
@@ -59,7 +59,7 @@ class RemoteRobot:
     @property
     def fault(self) -> RobotFault | None:
         """Why commands are refused, or None."""
-        return RobotFault(self.why_not) if self.why_not else None
+        return (SafetyStop.told(self.why_not) or RobotFault(self.why_not)) if self.why_not else None
 
     def start(self) -> None:
         """Connect to the robot, now or when it is there, and again after each loss."""

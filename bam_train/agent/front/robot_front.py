@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from bam_envs.core.errors import BamEnvsError, LinkLost, NotInCommand, ProtocolError, RemoteError
+from bam_envs.core.errors import BamEnvsError, LinkLost, NotInCommand, ProtocolError, RemoteError, SafetyStop
 from bam_envs.live.camera import LiveCamera
 from bam_envs.remote.serve.robot_service import RobotService
 from bam_envs.ros.codec import AGENT_STEP_TOPIC, AGENT_TOPIC, HALT_TOPIC, RobotInfo
@@ -173,6 +173,8 @@ class FrontProcess:
         finally:
             self._pending.pop(number, None)
         if answer.result is None:
+            if answer.kind == SafetyStop.__name__ and (stop := SafetyStop.told(answer.error)) is not None:
+                raise stop
             raise _REFUSALS.get(answer.kind, RequestRefused)(answer.error)
         return answer.result
 

@@ -30,13 +30,13 @@ from bam_envs.core.errors import BamEnvsError, LinkLost, NoServer
 from bam_envs.core.location import Credentials
 from bam_envs.core.wording import brief
 from bam_envs.rosbridge.bus import tell
-from bam_envs.rosbridge.dialing import http_refusal, no_connection, open_port, silent
+from bam_envs.rosbridge.dialing import AGENT_PORT, http_refusal, no_connection, open_port, silent
 from bam_envs.rosbridge.endpoint import Endpoint
 from bam_envs.rosbridge.threads import LoopThread
 from bam_train.agent.remote.agent_protocol import CHUNK, PATH, PROTOCOL, Stage, When
 from bam_train.errors import AgentRefused, NotACheckpoint
 
-PORT = 9095
+PORT = AGENT_PORT
 """Default port of an agent."""
 _REFUSALS = frozenset(
     (

@@ -93,6 +93,8 @@ class ImportConfig(DataFlags):
     """An argument of the environment of Parquet rows, any number of times: randomize=true."""
     task: Annotated[str | None, tyro.conf.arg(metavar="TEXT")] = None
     """What the episodes are about, as a sentence; by default the environment's id."""
+    again: bool = False
+    """Add episodes all the same that the data set has already."""
     group: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
     """Fact of every episode, by which evaluations are divided, such as the object or the site."""
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 import time
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from bam_train.cli.console import percent, say, tell
 
@@ -17,31 +17,46 @@ def collect(config: CollectConfig) -> None:
     """Collect episodes in simulation."""
     from bam_train.data import collect as collecting
     from bam_train.settings import read_env_kwargs
+    from bam_train.signals import Terminated
 
-    last = time.monotonic()
+    last, kept = time.monotonic(), 0
 
     def on_progress(done: int, episodes: int) -> None:
-        nonlocal last
+        nonlocal last, kept
+        kept = done
         if done < episodes and time.monotonic() - last > 5:
             last = time.monotonic()
             say(f"bam-data: {done} of {episodes} episodes")
 
-    found = collecting.collect(
-        config.place,
-        config.policy,
-        config.env,
-        read_env_kwargs(config.set),
-        episodes=config.episodes,
-        seed=config.seed,
-        noise=config.noise,
-        random=config.random,
-        num_envs=config.num_envs,
-        facts={} if config.task is None else {"task": config.task},
-        on_progress=on_progress,
-    )
+    try:
+        found = collecting.collect(
+            config.place,
+            config.policy,
+            config.env,
+            read_env_kwargs(config.set),
+            episodes=config.episodes,
+            seed=config.seed,
+            noise=config.noise,
+            random=config.random,
+            num_envs=config.num_envs,
+            facts={} if config.task is None else {"task": config.task},
+            on_progress=on_progress,
+        )
+    except KeyboardInterrupt as stop:
+        seed = config.seed + max(config.episodes, config.num_envs or 0)  # which no environment had
+        text = (
+            f"interrupted: {kept} whole episodes of {config.episodes} are in {config.place}; for the others, run it "
+            f"again with --episodes {config.episodes - kept} --seed {seed}"
+        )
+        if isinstance(stop, Terminated):
+            say(f"bam-data: {text}")
+            raise
+        raise KeyboardInterrupt(text) from stop
     if config.json:
         tell(json.dumps({"place": config.place, **vars(found)}))
         return
+    if found.repeated:
+        say(f"bam-data: note: {found.repeated} of them were in {config.place} already: another --seed gives others")
     share = percent(found.successes / found.episodes)
     tell(f"{config.place}: {found.episodes} episodes, {found.steps} steps added; {share} of them succeeded")
 
@@ -54,7 +69,10 @@ def import_(config: ImportConfig) -> None:
     from bam_train.recording.recording import Recording
     from bam_train.settings import read_env_kwargs
 
-    facts = {name: value for name in ("task", "group") if (value := getattr(config, name)) is not None}
+    options: dict[str, Any] = {
+        name: value for name in ("task", "group") if (value := getattr(config, name)) is not None
+    }
+    options["again"] = config.again
     if not config.recordings:
         say("bam-data import: RECORDING is missing. Run bam-data import --help")
         raise SystemExit(2)
@@ -65,13 +83,13 @@ def import_(config: ImportConfig) -> None:
                 raise SettingsError(f"{config.place}: has the Parquet rows; give another PLACE for the data set")
             info = recordings.info_of_rows(path, config.env, env_kwargs)
             episodes = recordings.episodes_of_rows(path, info)
-            notes = recordings.add_episodes(path, episodes, config.place, info, **facts)
+            notes = recordings.add_episodes(path, episodes, config.place, info, **options)
         elif env_kwargs:
             raise SettingsError(f"--set: {path} says the arguments of its environment; leave --set out")
         else:
             recording = Recording.open(path)
             info = recordings.info_of_recording(recording, config.env)
-            notes = recordings.add_recording(recording, config.place, info, **facts)
+            notes = recordings.add_recording(recording, config.place, info, **options)
         for note in notes:
             say(f"bam-data: note: {note}")
     data = DataSet.open(config.place)

@@ -68,16 +68,16 @@ def _checkpoint(config: ReplayConfig, recording: Recording) -> Checkpoint | str:
 def _play(config: ReplayConfig, recording: Recording, checkpoint: Checkpoint) -> Playback:
     from bam_train.environments import environment_of
     from bam_train.policy import FrozenPolicy
-    from bam_train.recording.playback import play, play_observations, replay_env, require_same_env
+    from bam_train.recording.playback import acts_in, play, play_observations, replay_env, require_same_env
 
     require_same_env(recording, checkpoint)
     if config.env is not None:
         environment_of(checkpoint, config.env, elsewhere=True)
-    policy = FrozenPolicy.from_checkpoint(checkpoint)
+    acts, policy = acts_in(recording, checkpoint), FrozenPolicy.from_checkpoint(checkpoint)
     if "/state" not in recording.tables:
-        return play_observations(recording, policy)
+        return play_observations(recording, policy, acts)
     with closing(replay_env(recording, checkpoint, config.env)) as env:
-        return play(recording, env, policy)
+        return play(recording, env, policy, acts=acts)
 
 
 def _played_lines(played: Playback | None, why: str) -> list[str]:
@@ -85,6 +85,9 @@ def _played_lines(played: Playback | None, why: str) -> list[str]:
         return [f"not played: {why}"]
     lines = [f"played: the same observation in {played.observations} of {played.ticks} ticks, "]
     lines[0] += f"the same action in {played.actions}" + ("" if played.same else f", at most {played.worst:.3g} apart")
+    if played.others:
+        others = ", ".join(f"{name} in {count}" for name, count in played.others.items())
+        lines.append(f"not compared: the ticks in which another policy acted: {others}")
     return lines
 
 

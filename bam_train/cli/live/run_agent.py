@@ -58,7 +58,7 @@ def run_agent(config: AgentConfig, signals: SignalMemory) -> int:
             given = {
                 ".".join(path): value for path, value in (parse_assignment(one, "randomize=true") for one in config.set)
             }
-            box = SimulatedBox(env_id, {**env_kwargs, **given})
+            box = SimulatedBox(env_id, {**env_kwargs, **given}, options.robot.robot_name)
             stack.callback(box.close)
             box.start()
             options = replace(options, robot=replace(options.robot, url=box.url))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -47,10 +47,13 @@ def _group(name: str, rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
 
 
 def numbers(data: DataSet) -> list[dict[str, Any]]:
-    """A row for each number of a step: column, name, unit, min, q01, q50, q99, max, mean and std."""
+    """A row for each number of a step: column, name, unit, min, q01, q50, q99, max, mean and std.
+
+    A number that is scaled (`Label.scale`) has no unit any more, and its row says so.
+    """
     stats = data.stats()
     units = {
-        column: [str(one.get("unit") or "") for one in data.info.contract.get(kind) or ()]
+        column: [_unit(one) for one in data.info.contract.get(kind) or ()]
         for column, kind in (("observation.state", "observation"), ("action", "action"), ("command", "command"))
     }
     rows = []
@@ -63,3 +66,8 @@ def numbers(data: DataSet) -> list[dict[str, Any]]:
             values = {key: float(flat[key][i]) for key in ("min", "q01", "q50", "q99", "max", "mean", "std")}
             rows.append({"column": column, "name": name, "unit": unit, **values})
     return rows
+
+
+def _unit(row: Mapping[str, Any]) -> str:
+    """The unit of the numbers of a column as they are recorded, by its row in the contract."""
+    return str(row.get("unit") or "") if row.get("scale", "1") == "1" else "scaled"

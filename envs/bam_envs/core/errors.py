@@ -22,9 +22,12 @@
 Third-party errors are converted to these, with the cause kept by ``from``.
 """
 
+import re
 from collections.abc import Iterable
 
 from bam_envs.core.wording import closest, did_you_mean
+
+_STOPPED_BY = re.compile(r"The robot (?:was|is still) stopped by ([^:(]+?) \(")
 
 
 class BamEnvsError(Exception):
@@ -160,3 +163,9 @@ class SafetyStop(RobotFault):
     def __init__(self, guard: str, message: str) -> None:
         self.guard = guard
         super().__init__(message)
+
+    @classmethod
+    def told(cls, text: str) -> "SafetyStop | None":
+        """The stop of a guard at the robot's side, as a text from there tells it; None if it tells of none."""
+        found = _STOPPED_BY.search(text)
+        return None if found is None else cls(found[1], text[found.start() :])

@@ -30,7 +30,7 @@ class RehearsedRobot:
         live: The spec of its live counterpart, whose way to follow commands the guards expect.
     """
 
-    needs_clearance = True
+    needs_clearance = stands_for_a_real_one = True
 
     def __init__(self, robot: LinkedRobot, live: RobotSpec) -> None:
         self.robot, self.num_robots = robot, robot.num_robots

@@ -25,6 +25,7 @@ from bam_envs.core.errors import (
     NotReady,
     RemoteError,
     ResetNeeded,
+    SafetyStop,
     StaleState,
 )
 from bam_envs.core.robot import EnvIds, Initial, RobotSpec, RobotState
@@ -132,6 +133,7 @@ class RosbridgeRobot:
         self._refusals: list[BamEnvsError] = []
         self._status = ""  # of this tick, as JSON
         self._sent: Array | None = None
+        self._sent_tag: Tag | None = None
         self._sent_at, self._sent_after = -math.inf, 0  # when, and after how many halts
         self._answers = False  # whether it reports the commands it has executed, in real time
         self._owed: dict[int, float] = {}  # number of each command without an answer -> when it was sent [s]
@@ -284,7 +286,7 @@ class RosbridgeRobot:
             _LOG.debug("%s: %s", self.url, text)
             if not any(reason in text for reason in _LATE):
                 refusal = NotInCommand if " in command" in text else RemoteError
-                error = refusal(f"{self.url}: {text}")
+                error = SafetyStop.told(text) or refusal(f"{self.url}: {text}")
                 self._session_over |= is_over(error)
                 if not self._refusals:  # the first one is raised, however many a server sends
                     self._refusals.append(error)
@@ -297,6 +299,7 @@ class RosbridgeRobot:
             LinkLost: The link is down.
             NotReady: The robot reports that it cannot move now.
             RemoteError: The other end refused the scene.
+            SafetyStop: A guard of a live agent stopped the robot meanwhile.
             StaleState: No fresh state came.
         """
         control = self._wait_up()
@@ -346,6 +349,7 @@ class RosbridgeRobot:
             LinkLost: A connection dropped, before or during this step; nothing more is sent until `reset`.
             NotReady: The robot reports that it cannot move now.
             RemoteError: The robot's side refused a command; `NotInCommand` if another client is in command.
+            SafetyStop: A guard of a live agent has stopped the robot.
             StaleState: The robot did not answer in time.
             ProtocolError: The state differs from the profile.
         """
@@ -365,6 +369,8 @@ class RosbridgeRobot:
         self._pacer.tick()
         self._send(control, values, tag, halts, until)
         self._publish_status(control)
+        if lockstep and self._sent_tag != tag:  # a halt came before it: nothing will answer
+            return self.measure()
         if not lockstep:
             self._wait(self._pacer.slack - self._lead, halts)
             self._ended_at = self._clock()
@@ -414,6 +420,7 @@ class RosbridgeRobot:
                 self._session.drive()
                 control.publish_all([(self.namespace + topic, message) for topic, _, message in envelopes])
                 self._sent, self._sent_at, self._sent_after = command.copy(), self._clock(), halts
+                self._sent_tag = tag
                 if self._answers:
                     self._owed[tag.sequence] = self._sent_at
 

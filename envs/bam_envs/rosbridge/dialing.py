@@ -9,6 +9,8 @@ from bam_envs.rosbridge.endpoint import Address
 
 _HOST_MISMATCH = (62, 64)  # X509_V_ERR_HOSTNAME_MISMATCH, X509_V_ERR_IP_ADDRESS_MISMATCH
 
+AGENT_PORT = 9095
+"""Default port of a live agent, which serves its robot there."""
 _LAUNCH = "ros2 launch rosbridge_server rosbridge_websocket_launch.xml"
 
 
@@ -59,6 +61,8 @@ def no_connection(address: Address, error: OSError | asyncio.TimeoutError, timeo
         return f"the name {address.host!r} is not known: {error.strerror}. Try the IP address."
     if isinstance(error, ConnectionRefusedError):
         here = f"Start one with `bam-serve --env bam/pick --port {address.port}` or `{_LAUNCH}`."
+        if address.port == AGENT_PORT:
+            start = start or f"{AGENT_PORT} is the port of bam-agent: does it run there? {here}"
         return f"refused: nothing listens there. Is the port open? {start or here}"
     if isinstance(error, ConnectionError):
         hint = "If the server has no TLS, use ws://." if address.secure else "Is it the right port?"

@@ -13,7 +13,7 @@ from collections import OrderedDict
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
-from bam_envs.core.errors import ProtocolError, RemoteError
+from bam_envs.core.errors import BamEnvsError, ProtocolError, RemoteError
 from bam_envs.ros.freshness import StampFreshness, Tag, Tagger, new_session, signature
 from bam_envs.rosbridge.bus import Caller, Message
 
@@ -87,7 +87,7 @@ class Sessions:
             self._sessions.pop(name, None)
 
 
-def is_over(error: RemoteError) -> bool:
+def is_over(error: BamEnvsError) -> bool:
     """Whether `error` is a refusal after which a new session is needed."""
     return _NOT_OPEN in str(error) or _ELSEWHERE in str(error)
 

@@ -16,7 +16,7 @@ from concurrent.futures import TimeoutError as NoAnswer  # not the builtin befor
 from dataclasses import replace
 from typing import Any
 
-from bam_envs.core.errors import BamEnvsError, LinkLost, NotInCommand, ProtocolError, RemoteError
+from bam_envs.core.errors import BamEnvsError, LinkLost, NotInCommand, ProtocolError, RemoteError, SafetyStop
 from bam_envs.ros.freshness import FreshnessCheck, Tagger, read_tag
 from bam_envs.rosbridge.bus import Bus, Caller, Handler, Message, answer
 from bam_envs.rosbridge.encoding import MOST_ITEMS, dump_json, load_json
@@ -53,6 +53,7 @@ class StringRpc:
             InvalidValue: `payload` is not plain finite JSON; nothing was sent.
             LinkLost: The link is down or dropped, or there was no reply in time: whether it was executed is unknown.
             RemoteError: The other end refused or failed; `NotInCommand` if another client is in command there.
+            SafetyStop: A guard stopped the robot there.
         """
         deadline, epoch = time.monotonic() + timeout, self._link.epoch
         tag = self._tagger.next(epoch, timeout)
@@ -94,7 +95,9 @@ class StringRpc:
 
     def _payload_of(self, reply: dict[str, Any]) -> dict[str, Any]:
         if "error" in reply:
-            raise (NotInCommand if reply.get("kind") == NotInCommand.__name__ else RemoteError)(str(reply["error"]))
+            text, kind = str(reply["error"]), reply.get("kind")
+            stop = SafetyStop.told(text) if kind == SafetyStop.__name__ else None
+            raise stop or (NotInCommand if kind == NotInCommand.__name__ else RemoteError)(text)
         payload = reply.get("payload")
         if not isinstance(payload, dict):
             raise ProtocolError(f"{self.name}/reply: payload must be an object, not {type(payload).__name__}.")

@@ -2,7 +2,8 @@
 
 A joint follows if it is behind its commands by no more than its lag at its measured speed. The rest of the gap is the
 distance that it would jump when released: at most its limit for one period, so that a released joint never moves faster
-than that. A joint that moves away from its commands stops the robot at once: what moves is not what was commanded.
+than that. A joint that moves away from its commands stops a real robot at once: what moves is not what was commanded. A
+simulated arm, whose controllers are softer, is also pushed that far by the objects that it touches.
 """
 
 import math
@@ -36,8 +37,6 @@ SLOWEST_GAIN, GAIN_TIME = 0.25, 0.2
 """Least acceleration of a base that follows [m/s^2, rad/s^2], and the time over which it is measured [s]."""
 OLD_STATE = 0.1
 """Longest age of a state for which it is compared with older commands [s]: it says where the robot was then."""
-LATE_COMMAND = 1.5
-"""Periods after the last command from which a command is called late in a message."""
 LIKELY = (
     "look for a protective stop, a paused program, an inactive controller, a low speed slider, or something in its way"
 )
@@ -57,9 +56,16 @@ class Following(Guard):
         self._strikes, self._good, self._forgiven = 0, 0, ticks_of(FORGIVEN, spec)
         self._spec, self._own_lag = spec, self._lag
         self._ended: Numbers = []  # see Tick
+        self._yields = False
 
-    def relayed(self, delay: float) -> None:
-        """Explain that the robot gets commands later by `delay` [s], from a live agent that has guards of its own."""
+    def connected(self, delay: float, *, yields: bool) -> None:
+        """Take what is known of the robot now.
+
+        Args:
+            delay: Time by which it gets commands later, from a live agent that has guards of its own [s].
+            yields: Whether it is simulated, and yields to what it touches.
+        """
+        self._yields = yields
         self._lag = self._own_lag + delay
         self._recent = 2 + ticks_of(self._lag, self._spec)
         self._sent = deque(maxlen=self._recent + ticks_of(OLD_STATE, self._spec))
@@ -97,15 +103,6 @@ class Following(Guard):
             low, high = min(commands), max(commands)
             off[at] = low - value if value < low else high - value if value > high else 0.0  # NaN: it is not measured
         return off
-
-    def busy(self, tick: Tick) -> str:
-        """What else a gap can be, as the end of a message: an old state, or a late command; empty if neither was so."""
-        period, what = self._spec.period, ""
-        if tick.age > period:
-            what = f"the newest state was {tick.age:.2f} s old"
-        elif tick.pause > LATE_COMMAND * period:
-            what = f"the last command was sent {tick.pause:.2f} s ago"
-        return what and f"; {what}: this computer or the link is busy"
 
     def is_struck(self, over: bool, *, at_once: bool = False) -> bool:
         """Count a tick whose gap is `over` the limit; after `STRIKES` of them, or `at_once`, the robot is stopped."""
@@ -176,17 +173,17 @@ class JointFollowing(Following):
             return None
         at = max(range(len(off)), key=lambda column: abs(off[column]) / allowed[column])
         moved = measured[at] - self._pick(tick.before)[at]  # NaN in a first tick
-        away = moved * off[at] < 0.0 and abs(moved) > allowed[at] / 2
+        away = moved * off[at] < 0.0 and abs(moved) > allowed[at] / 2 and not self._yields
         self.is_struck(over, at_once=away)
         if away:
             return (
                 f"{self._labels[at]} moved {moved:+.3f} rad within a period, away from its commands: what moves is not "
-                f"what was commanded, or something pushes the arm{self.busy(tick)}"
+                f"what was commanded, or something pushes the arm"
             )
         return (
             f"{self._labels[at]} does not follow its commands: it is {measured[at] - sent[at]:+.3f} rad from the last "
             f"one, and beyond a lag of {self._lag:g} s it may be {allowed[at]:.3f} rad, and the tool "
-            f"{SHARE * self._tool_reach:.3f} m: {LIKELY}{self.busy(tick)}"
+            f"{SHARE * self._tool_reach:.3f} m: {LIKELY}"
         )
 
     def pick_from(self, command: Numbers) -> Numbers:
@@ -300,7 +297,7 @@ class BaseFollowing(Following):
         return (
             f"the base does not follow its commands: it goes at {measured[at]:.3f} {self.unit}, and was sent "
             f"{sent[at]:.3f} {self.unit}; beyond a lag of {self._lag:g} s it may be off by {self._allowed[at]:.3f} "
-            f"{self.unit}: {LIKELY}{self.busy(tick)}"
+            f"{self.unit}: {LIKELY}"
         )
 
     def pick_from(self, command: Numbers) -> Numbers:

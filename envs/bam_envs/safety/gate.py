@@ -22,6 +22,7 @@ from bam_envs.core.robot import EnvIds, Initial, Robot, RobotSpec, RobotState
 from bam_envs.safety.first_motion import OPENS_WITHIN, PROOF, FirstMotion, NotAsCommanded, ProofMotion
 from bam_envs.safety.following import Following, JointFollowing
 from bam_envs.safety.guard import (
+    TIMING_GUARDS,
     Guard,
     Limits,
     Numbers,
@@ -35,7 +36,7 @@ from bam_envs.safety.guard import (
     require_bounded,
 )
 from bam_envs.safety.guards import LATE, CommandShape, Freshness, MeasuredLimits, default_guards
-from bam_envs.safety.link_guards import Share, Watchdog
+from bam_envs.safety.link_guards import TICKS, LateTicks, Share, Watchdog
 from bam_envs.safety.unusual import UnusualObservations
 
 __all__ = ["ClearedCommand", "Limits", "SafeRobot"]
@@ -43,6 +44,8 @@ __all__ = ["ClearedCommand", "Limits", "SafeRobot"]
 Array = NDArray[np.float64]
 Observer = Callable[[Tick, RobotState], None]
 """See `SafeRobot.observe`."""
+LATE_COMMAND = 1.5
+"""Periods after the last command from which a command is called late in a message."""
 RELAYED = 2.0
 """Longest time for which a live agent keeps a command of whoever has taken over: the tick in which it came, and the one
 in which its own guards execute it [periods]."""
@@ -336,7 +339,8 @@ class SafeRobot(metaclass=Sealed):
         watchdog, has_agent = getattr(self.info, "watchdog", None), getattr(self.info, "agent", False)
         for guard in self._guards:
             if isinstance(guard, Following):
-                guard.relayed(RELAYED * self.spec.period if has_agent else 0.0)
+                yields = not self._is_real() and not getattr(self._live, "stands_for_a_real_one", False)
+                guard.connected(RELAYED * self.spec.period if has_agent else 0.0, yields=yields)
             # A live agent halts the robot by itself, and the watchdog behind it is the agent's concern.
             if isinstance(guard, Watchdog) and not has_agent and (watchdog is not None or self._is_real()):
                 guard.connected(watchdog)
@@ -512,12 +516,25 @@ class SafeRobot(metaclass=Sealed):
         self._bad += 1
         if self._bad >= guard.patience:
             once = self._bad == 1 or isinstance(guard, Share)
-            self._stop(guard, reason if once else f"{reason}, {self._bad} ticks in a row")
+            busy = "" if guard.code in TIMING_GUARDS else self._busy(tick)
+            self._stop(guard, f"{reason}{'' if once else f', {self._bad} ticks in a row'}{busy}")
         if self._is_base:
             tick.command = [0.0] * len(tick.last)
         else:
             tick.command = tick.last.copy() if guard in self._further else guard.hold(tick)
         tick.last = tick.command  # at rest: the next command begins there
+
+    def _busy(self, tick: Tick) -> str:
+        """What else can be behind a fault, as the end of a message: an old state, or late commands; empty for none."""
+        period, what = self._spec.period, ""
+        late = next(guard.counted for guard in self._guards if isinstance(guard, LateTicks))
+        if tick.age > period:
+            what = f"the newest state was {tick.age:.2f} s old"
+        elif tick.pause > LATE_COMMAND * period:
+            what = f"the last command was sent {tick.pause:.2f} s ago"
+        elif late:
+            what = f"{late} of the last {TICKS} commands were late"
+        return what and f"; {what}: this computer or the link is busy"
 
     def _send(self, tick: Tick, halts: int) -> RobotState:
         """Send the command; halt the robot if that fails."""

@@ -319,6 +319,10 @@ class Tick:
     """The newest measured signals, with shape (1, k) each; to be read only."""
 
 
+TIMING_GUARDS = (3, 4, 15, 16)
+"""Codes of the guards that look at when states, answers and commands come, and not at what the robot does."""
+
+
 class Sealed(type):
     """A class whose attributes cannot be replaced."""
 

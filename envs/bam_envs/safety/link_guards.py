@@ -54,6 +54,11 @@ class Share(Guard):
         self._counted.clear()
         self.warning = ""
 
+    @property
+    def counted(self) -> int:
+        """Number of counted ticks among the last 100."""
+        return len(self._counted)
+
     def count(self, tick: Tick) -> int:
         """Number of counted ticks among the last 100, this one included."""
         self._tick += 1
@@ -61,7 +66,7 @@ class Share(Guard):
             self._counted.append(self._tick)
         if self._counted and self._counted[0] <= self._tick - TICKS:
             self._counted.popleft()
-        return len(self._counted)
+        return self.counted
 
 
 class LateTicks(Share):
@@ -117,8 +122,8 @@ class LinkQuality(Share):
         if self._counted[-1] == self._tick or bad <= TICKS * (1.0 - self.limit_value) + 1e-9:
             return None
         return (
-            f"{good}, and {TICKS * self.limit_value:.0f} are needed: look at the network and at the load of the "
-            "robot's computer, or come nearer to its access point"
+            f"{good}, and {TICKS * self.limit_value:.0f} are needed: look at the load of this computer and of the "
+            "robot's, and at the network, or come nearer to its access point"
         )
 
 

@@ -4,6 +4,7 @@ import multiprocessing
 import threading
 import time
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -16,6 +17,7 @@ from bam_envs.core.errors import (
     ProtocolError,
     RemoteError,
     ResetNeeded,
+    SafetyStop,
     StaleState,
     UnknownName,
 )
@@ -219,6 +221,24 @@ def test_lockstep_without_an_answer(server, robot_on, connect, simulation):
     assert raised(StaleState, lambda: gate.step(gate.state.command)) == (
         f"{server.url}: no state answered the command in 0.2 s. Does the simulation run?"
     )
+
+
+def test_lockstep_with_a_halt_just_before_the_command_waits_for_no_answer(server, robot_on, connect, simulation):
+    """As of a person who takes over: the command is not sent, and the next one is."""
+    scripted = robot_on(server, info=simulation)
+    halting = []
+
+    def clock():
+        if halting and threading.current_thread() is threading.main_thread():
+            halting.pop().halt()
+        return time.monotonic()
+
+    robot, gate = connect(server.url, clock=clock)
+    halting.append(robot)
+    gate.step(gate.state.command)
+    assert halting == []
+    gate.step(gate.state.command)
+    assert [topic for topic, *_ in scripted.commands if topic != HALT_TOPIC] == [GRIPPER_COMMANDS, JOINT_COMMANDS]
 
 
 def test_another_period(server, robot_on):
@@ -509,9 +529,10 @@ def test_a_refused_command_and_a_late_one(server, robot_on, connect):
     for kind, text in (
         (RemoteError, "the elbow is broken"),
         (NotInCommand, "a is in command, not b; it passes on when a leaves."),
+        (partial(SafetyStop, "following"), "The robot was stopped by following (G23): elbow. When it is safe, resume."),
     ):
         said.append(kind(text))
-        assert text in raised(kind, lambda: [gate.step(gate.state.command) for _ in range(10)])
+        assert text in raised(type(said[-1]), lambda: [gate.step(gate.state.command) for _ in range(10)])
 
 
 def test_a_scene_is_set_before_the_state_is_measured(server, robot_on, connect, simulation):

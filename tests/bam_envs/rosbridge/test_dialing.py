@@ -10,6 +10,7 @@ import pytest
 from bam_envs.core.errors import InvalidValue, NoServer
 from bam_envs.core.location import Credentials
 from bam_envs.rosbridge.client import RosbridgeLink
+from bam_envs.rosbridge.dialing import AGENT_PORT, no_connection
 from bam_envs.rosbridge.endpoint import Address, Endpoint
 
 
@@ -51,6 +52,13 @@ def test_refused(free_port):
         "refused: nothing listens there. Is the port open? "
         f"Start one with `bam-serve --env bam/pick --port {free_port}` "
         "or `ros2 launch rosbridge_server rosbridge_websocket_launch.xml`."
+    )
+
+
+def test_refused_at_the_port_of_live_agents():
+    address = Endpoint(f"ws://10.0.0.5:{AGENT_PORT}").address
+    assert no_connection(address, ConnectionRefusedError(), 1.0).startswith(
+        "refused: nothing listens there. Is the port open? 9095 is the port of bam-agent: does it run there? Start one "
     )
 
 

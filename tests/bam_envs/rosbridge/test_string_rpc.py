@@ -5,7 +5,7 @@ import threading
 
 import pytest
 
-from bam_envs.core.errors import InvalidValue, LinkLost, NotInCommand, ProtocolError, RemoteError
+from bam_envs.core.errors import InvalidValue, LinkLost, NotInCommand, ProtocolError, RemoteError, SafetyStop
 from bam_envs.ros.freshness import Tag
 from bam_envs.rosbridge.bus import UNKNOWN_CALLER
 from bam_envs.rosbridge.string_rpc import StringRpc, StringRpcService
@@ -123,6 +123,19 @@ def test_an_error_over_there_is_one_here(pair, caplog, handler, kind, text):
     with pytest.raises(kind) as caught:
         rpc.call({}, 5)
     assert (type(caught.value), str(caught.value)) == (kind, text)
+
+
+def test_a_stop_of_a_guard_over_there_is_a_stop_here(pair):
+    text = "The robot was stopped by following (G23): elbow. When it is safe, resume the agent."
+    stop = SafetyStop("following", text)
+
+    def stopped(payload):
+        raise stop
+
+    rpc, _, _ = pair(stopped)
+    with pytest.raises(SafetyStop) as caught:
+        rpc.call({}, 5)
+    assert (caught.value.guard, str(caught.value)) == ("following", text)
 
 
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), {1, 2}])

@@ -74,8 +74,8 @@ def test_a_bad_link_is_a_warning_and_then_a_stop_when_it_is_back(good, bad):
         assert guard.warning == (quality if number > 5 else "")
     assert guard.fault(tick_of(**bad)) is None, "others hold the robot while the link is down"
     assert guard.fault(tick_of(**good)) == (
-        "only 89 of the last 100 ticks had a state and an answer in time, and 90 are needed: look at the network and "
-        "at the load of the robot's computer, or come nearer to its access point"
+        "only 89 of the last 100 ticks had a state and an answer in time, and 90 are needed: look at the load of this "
+        "computer and of the robot's, and at the network, or come nearer to its access point"
     )
     guard.restart()
     assert guard.fault(tick_of(**good)), "a motion that begins again does not make the link better"

@@ -24,6 +24,7 @@ from bam_envs.core.robot import Initial, Robot, RobotState
 from bam_envs.robots.fake import FakeRobot
 from bam_envs.robots.physics.kinematic_base import SimulatedBase
 from bam_envs.robots.ur5e import GEOMETRY
+from bam_envs.ros.codec import RobotInfo
 from bam_envs.safety.arm_guards import JointSpeed
 from bam_envs.safety.arm_tubes import ArmTubes
 from bam_envs.safety.gate import ClearedCommand, SafeRobot
@@ -324,9 +325,10 @@ class Opener(Guard):
         return True
 
 
-def turning_arm():
+def turning_arm(*, simulated=False):
     """A lagging arm behind its guards that has turned a joint for six periods, and its state."""
     arm = LaggingArm()
+    arm.info = RobotInfo("ur5e", simulated)
     robot = SafeRobot(arm, clock=arm.clock, limits=Limits(lag=0.05))
     robot.connect()
     arm.place(ARM_HOME)
@@ -350,9 +352,10 @@ def test_an_arm_that_still_moves_when_the_next_motion_begins_follows_its_command
     assert (following["held"], following["stopped"]) == (0, 0)
 
 
-def test_a_command_before_a_rest_explains_no_motion():
-    """Somebody moves the arm by hand; a joint that then jumps towards its old command stops it at once."""
-    arm, robot, state = turning_arm()
+@pytest.mark.parametrize("simulated", [False, True])
+def test_a_command_before_a_rest_explains_no_motion(simulated):
+    """Somebody moves the arm by hand; a joint that then jumps towards its old command stops a real one at once."""
+    arm, robot, state = turning_arm(simulated=simulated)
     robot.halt()
     arm.now += 2.0
     moved = [*ARM_HOME[:5], ARM_HOME[5] - 0.3]
@@ -360,6 +363,10 @@ def test_a_command_before_a_rest_explains_no_motion():
     state = robot.reset(FIRST, start_at(moved))
     arm.behind = np.array([[*moved[:5], moved[5] + 0.045, 0.085]])
     state = robot.step(turned(state, -0.005))
+    if simulated:  # something that it touched has pushed it: it is held, and stopped if that goes on
+        robot.step(turned(state, -0.005))
+        assert (robot.status, robot.is_held) == ("following (G23)", True)
+        return
     with pytest.raises(
         SafetyStop, match=r"G23\): wrist_3_joint moved \+0\.045 rad within a period, away from its commands"
     ):
@@ -668,6 +675,7 @@ def test_a_live_arm_that_is_there_is_sent_nothing():
         (0.05, 0.0, ""),
         (0.06, 0.0, "; the newest state was 0.06 s old: this computer or the link is busy"),
         (0.05, 0.03, "; the last command was sent 0.08 s ago: this computer or the link is busy"),
+        (0.05, 0.02, "; 12 of the last 100 commands were late: this computer or the link is busy"),
     ],
 )
 def test_a_joint_that_is_blocked_on_the_way_to_the_start_stops_the_arm(old, late, else_):

@@ -6,12 +6,14 @@ import threading
 import numpy as np
 import pytest
 
+from bam_envs.core.errors import SafetyStop
 from bam_envs.core.location import LiveRobot
 from bam_envs.core.robot import RobotState
 from bam_envs.testing import ARM_HOME
 from bam_train.agent.agent_messages import Answer, Ask, Drive, Front
 from bam_train.agent.agent_options import AgentOptions
 from bam_train.agent.front.hub import AgentHub, Person
+from bam_train.agent.front.remote_robot import RemoteRobot
 from bam_train.agent.front.robot_front import FrontProcess
 
 DEADLINE = 10.0
@@ -85,3 +87,17 @@ def test_a_twist_moves_the_robot_for_its_own_driver_only(front, hub, sent):
     front.robot.wait_for_looks(2)
     assert {one.driver for one in sent if isinstance(one, Drive)} == {anna.client}
     assert [(one.op, one.who) for one in sent if isinstance(one, Ask)] == [("take", "anna"), ("take", "boss")]
+
+
+STOP = "The robot was stopped by following (G23): elbow. When it is safe, resume the agent."
+
+
+def test_a_stop_of_a_guard_is_one_for_the_program_that_drives_whenever_it_comes(front, hub):
+    """In the reset of a take-over, and later: `bam-deploy` ends with exit status 3."""
+    front.send = lambda message: front.take(Answer(message.number, error=STOP, kind="SafetyStop"))
+    robot = RemoteRobot(front.shadow, front.send, lambda: None, front._ask_now, 0.2, lambda: None)
+    with pytest.raises(SafetyStop) as stopped:
+        robot.place_object(None, np.zeros(1, np.int64))
+    robot.why_not = f"the agent is stopped by a guard: {STOP}"
+    assert {str(stopped.value), str(robot.fault)} == {STOP}
+    assert {stopped.value.guard, robot.fault.guard} == {"following"}

@@ -298,7 +298,8 @@ def test_every_recorded_action_is_one_of_the_two_policies(start, tmp_path, forge
     first.ticks(10)
     active = first.agent.push(candidate, stage="full", when="tick")["digest"]
     first.ticks(10)
-    recorded = first.state()["recording"]
+    before = first.state()
+    recorded = before["recording"]
     assert first.end(signal.SIGTERM) == 128 + signal.SIGTERM
     recording = Recording.open(recorded)
     observations, actions = recording.arrays("observation")[""], recording.arrays("action")[""]
@@ -309,10 +310,12 @@ def test_every_recorded_action_is_one_of_the_two_policies(start, tmp_path, forge
     assert [old or new for old, new in acted] == [True] * len(acted)
     swap = [old for old, _ in acted].index(False)
     assert [(old, new) for old, new in acted[swap:]] == [(False, True)] * (len(acted) - swap)
+    assert [name == active[:12] for name in recording.policies()] == [k >= swap for k in range(len(acted))]
     again = start(tmp_path)
     again.line("so it starts paused")
     status = again.state("paused")
     assert (status["active"], status["ticks"]) == (active, 0)
+    assert before["identity"] == status["identity"] == "simulated bam-pick-v0"  # its trials count on
 
 
 def test_a_lost_robot_is_waited_for_and_checked_again(start, tmp_path, serve_program):

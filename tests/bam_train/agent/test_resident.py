@@ -58,6 +58,8 @@ class Session:
 
     def _episode(self, watcher, seed):
         record = self.deployment.journal.begin(seed)
+        if self.deployment.trials is not None:
+            self.deployment.trials.begin(seed)
         while not self._agent.between_ticks():
             if self._faults:
                 self._fail(*self._faults.popleft())
@@ -214,8 +216,8 @@ def test_a_stop_while_a_request_is_executed_is_a_state_and_is_written_down_once(
         running.state(State.RUNNING)
         running.ask("take", who="a program", lease="it")
         answer = running.ask("scene", who="a program", pose=None, seed=1)
-        assert answer.error == f"The robot was stopped by {STOPPED}. When it is safe, call resume()."
         why = f"The robot was stopped by {STOPPED}. When it is safe, resume the agent."
+        assert (answer.error, answer.kind) == (why, "SafetyStop")
         assert running.state(State.STOPPED) == why
         assert running.status["owner"] is None
         assert running.ask("take", who="a program", lease="it").kind == "NotInCommand"
@@ -321,7 +323,7 @@ class BookedTrials:
     threshold, evidence = 0.9, SimpleNamespace(is_enough=True, trials=1, text="1 of 1")
 
     def __init__(self):
-        self.rows, self._runs = [], False
+        self.rows, self._runs, self.began = [], False, threading.Event()
 
     def next_seed(self, first):
         return first
@@ -329,6 +331,7 @@ class BookedTrials:
     def begin(self, seed):
         self.rows.append("begun")
         self._runs = True
+        self.began.set()
 
     def end(self, success, reason, *, void=False):
         if self._runs:
@@ -377,6 +380,45 @@ def test_an_episode_of_another_version_is_no_trial_of_a_candidate(bench, candida
     assert played
     ended = [(False, "another version acts: rolled back: rolled back", True)] if at == "in mid-episode" else []
     assert trials.rows == (["begun", *ended] if at == "in mid-episode" else ended)
+
+
+@pytest.mark.parametrize(
+    ("ask", "why"),
+    [
+        (("pause", {"why": "look"}), "paused by anna: look"),
+        (("take", {"lease": "1"}), "taken over by anna"),
+        (Halt("anna", stop=True), "paused by anna: the stop button"),
+        ("quit", "the agent was ended"),
+    ],
+    ids=["pause", "take over", "stop", "quit"],
+)
+def test_an_episode_that_a_person_ends_is_no_trial_of_the_candidate(bench, candidate, ask, why):
+    trials, running = BookedTrials(), bench(is_running=False)
+    with running:
+        running.state(State.PAUSED)
+        candidate(running, trials)
+        running.ask("resume")
+        assert trials.began.wait(DEADLINE)
+        if isinstance(ask, Halt):
+            running.agent.take(ask)
+        elif ask != "quit":
+            running.ask(ask[0], **ask[1])
+            running.ask("transitions", on=False)  # in a later turn: the episode has ended
+    assert trials.rows == ["begun", (False, why, True)]
+    (text,) = (text for what, text, *_ in running.events if what == "trial")
+    assert text.endswith(f": {why}")
+    assert running.agent.status()["trial"]["done"] == 1
+
+
+def test_who_waits_for_the_trials_hears_that_a_person_rolled_back(bench, candidate):
+    with bench() as running:
+        running.state(State.RUNNING)
+        choice = candidate(running)
+        running.ask("pause")
+        running.ask("rollback", why="it drops the cube")
+        assert choice.outcome.wait(DEADLINE)
+        assert choice.result == "rolled back: anna: it drops the cube"
+        assert running.ask("rollback").error.startswith("There is no version to roll back to")
 
 
 def test_what_a_person_drives_into_is_not_the_candidates_fault(bench, candidate):

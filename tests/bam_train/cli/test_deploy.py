@@ -6,13 +6,18 @@ import signal
 import subprocess
 import sys
 import weakref
+from pathlib import Path
 from types import SimpleNamespace
 
 import gymnasium as gym
 import pytest
 
 from bam_envs.core.errors import MissingExtra
+from bam_envs.remote.serve.serve_options import ServeOptions
+from bam_envs.remote.serve.served_environment import ServedEnvironment
 from bam_train.cli.deploy import main
+
+CHECKPOINTS = Path(__file__).parents[3] / "checkpoints"
 
 
 def corridor_class(corridor):
@@ -74,6 +79,17 @@ def test_the_rate_and_its_deadlines_are_reported(corridor_checkpoint, run, flags
     report = json.loads(out)
     assert (status, report["target_rate_hz"], sorted(report["lateness_ms"])) == (0, rate, ["max", "p50", "p99"])
     assert err.startswith(f"{said}episode 1/1 ")
+
+
+def test_a_simulated_arm_that_the_cube_pushes_is_not_stopped(run):
+    """In the episode with this seed the closing gripper presses on the cube, which turns a wrist by 0.02 rad."""
+    with ServedEnvironment(
+        gym.make("bam/pick-v0", disable_env_checker=True), ServeOptions(port=0, fast=True)
+    ) as served:
+        flags = ("--robot", served.bus.url, "--seed", 1_000_053, "--episodes", 1, "--no-record", "--json")
+        status, out, err = run(main, CHECKPOINTS / "pick-ppo.zip", *flags)
+    assert (status, json.loads(out)["successes"]) == (0, 1), err
+    assert json.loads(out)["guards"]["following"]["held"] > 0
 
 
 def test_a_recording_that_cannot_be_made_is_one_line_and_nothing_moves(corridor_checkpoint, corridor, run, monkeypatch):

@@ -1,6 +1,8 @@
 """Stages of a roll-out: on trial, slow and in a box, until trials have shown enough for full speed."""
 
 import json
+import os
+import signal
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
@@ -9,7 +11,7 @@ from types import SimpleNamespace
 import gymnasium as gym
 import pytest
 
-from bam_envs.core.errors import InvalidValue, LinkLost
+from bam_envs.core.errors import InvalidValue, LinkLost, NotInCommand
 from bam_envs.core.location import HERE, LiveRobot
 from bam_envs.live import rosbridge_robot
 from bam_envs.remote.serve.serve_options import ServeOptions
@@ -46,7 +48,7 @@ def admission(corridor_checkpoint, tmp_path):
 
     def make(*, i_know=False, **settings):
         checkpoint = Checkpoint.open(corridor_checkpoint(settings=settings))
-        return Admission(checkpoint, record=tmp_path / "trials.jsonl", i_know=i_know)
+        return Admission(checkpoint, allow_unsigned=True, record=tmp_path / "trials.jsonl", i_know=i_know)
 
     return make
 
@@ -59,15 +61,15 @@ def try_it(trials, *outcomes):
 
 def test_on_trial_until_trials_show_enough_for_full_speed(admission):
     one = admission()
-    assert one(SIMULATED, ON_TRIAL) == [
+    assert one(REAL, ON_TRIAL)[-1:] == [
         "  stage trial, at 25 % of the speed limits: 0 of 0 trials succeeded; 33 more without a failure would show "
         "more than 90 %"
     ]
-    assert one.marks == ("trial",)
+    assert one.marks == ("UNSIGNED", "trial")
     try_it(one.trials, *[True] * 32)
     early = admission()
     with pytest.raises(TrialsNeeded) as caught:
-        early(SIMULATED, FULL)
+        early(REAL, FULL)
     assert str(caught.value) == (
         f"--stage full: {early.checkpoint.path} on {URL}/: 32 of 32 trials succeeded; 1 more without a failure would "
         "show more than 90 %. Run more with --stage trial, or give --i-know"
@@ -75,60 +77,59 @@ def test_on_trial_until_trials_show_enough_for_full_speed(admission):
     assert not hasattr(early, "policy")
     try_it(one.trials, True)
     full = admission()
-    assert full(SIMULATED, FULL) == [
+    assert full(REAL, FULL)[-1:] == [
         "  stage full: 33 of 33 trials succeeded, which shows more than 90 % (error probability at most 5 %)"
     ]
-    assert (full.marks, full.trials) == ((), None)
+    assert (full.marks, full.trials) == (("UNSIGNED",), None)
 
 
 def test_another_checkpoint_or_robot_begins_anew(admission):
     one = admission()
-    one(SIMULATED, ON_TRIAL)
+    one(REAL, ON_TRIAL)
     try_it(one.trials, *[True] * 33)
     with pytest.raises(TrialsNeeded, match="0 of 0 trials succeeded"):
-        admission()(SIMULATED, replace(FULL, url="ws://10.0.0.6:9090"))
+        admission()(REAL, replace(FULL, url="ws://10.0.0.6:9090"))
     with pytest.raises(
         TrialsNeeded, match="0 of 0 trials succeeded; 7 more without a failure would show more than 60 %"
     ):
-        admission(trial_threshold=0.6)(SIMULATED, FULL)
+        admission(trial_threshold=0.6)(REAL, FULL)
 
 
 def test_trials_in_simulation_say_nothing_of_a_real_robot_at_that_address(admission):
     one = admission()
     one(SIMULATED, ON_TRIAL)
     try_it(one.trials, *[True] * 33)
-    real = admission()
-    real.allow_unsigned = True
+    assert '"simulated": true' in one.record.read_text()
     with pytest.raises(TrialsNeeded, match="0 of 0 trials succeeded"):
-        real(REAL, FULL)
+        admission()(REAL, FULL)
 
 
 def test_who_knows_may_go_at_full_speed_and_every_line_says_so(admission):
     one = admission(i_know=True)
-    assert one(SIMULATED, FULL) == [
+    assert one(REAL, FULL)[-1:] == [
         "  UNPROVEN: 0 of 0 trials succeeded; 33 more without a failure would show more than 90 %"
     ]
-    assert one.marks == ("UNPROVEN",)
+    assert one.marks == ("UNSIGNED", "UNPROVEN")
 
 
 @pytest.mark.parametrize("threshold", [None, 7, "0.5", 0.0, True])
 def test_a_threshold_that_is_none_is_the_usual_one(admission, threshold):
-    assert "33 more" in admission(trial_threshold=threshold)(SIMULATED, ON_TRIAL)[0]
+    assert "33 more" in admission(trial_threshold=threshold)(REAL, ON_TRIAL)[-1]
 
 
 def test_an_edited_record_is_refused_at_every_stage(admission, tmp_path):
     one = admission()
-    one(SIMULATED, ON_TRIAL)
+    one(REAL, ON_TRIAL)
     try_it(one.trials, False)
     path = tmp_path / "trials.jsonl"
-    path.write_text(path.read_text().replace("false", "true"))
+    path.write_text(path.read_text().replace('"success": false', '"success": true'))
     for place in (ON_TRIAL, FULL):
         with pytest.raises(BadTrials, match="line 3 was edited"):
-            admission(i_know=True)(SIMULATED, place)
+            admission(i_know=True)(REAL, place)
 
 
-def test_a_simulated_robot_has_no_stage_unless_one_is_asked_for(admission):
-    for place in (HERE, LiveRobot(URL)):
+def test_a_simulated_robot_is_on_trial_only_if_that_is_asked_for_and_needs_none_for_full_speed(admission):
+    for place in (HERE, LiveRobot(URL), FULL):
         one = admission()
         with pytest.raises(SettingsError, match="a simulated robot is on trial only with --stage trial; give that too"):
             one(SIMULATED, place)
@@ -189,6 +190,21 @@ def test_an_episode_that_is_cut_short_has_failed(corridor, trials):
     assert ending.status == 4
     assert (trials.evidence.successes, trials.evidence.trials) == (trials.evidence.trials - 1, trials.evidence.trials)
     assert reasons(trials)[-1] == "link lost: the link dropped"
+
+
+def press_ctrl_c():
+    os.kill(os.getpid(), signal.SIGINT)
+
+
+@pytest.mark.parametrize("happens", [press_ctrl_c, raises(NotInCommand("anna is in command"))], ids=["ctrl-c", "taken"])
+def test_an_episode_that_a_person_ends_is_no_trial(corridor, trials, happens):
+    run_deployment(Driven(gym.make(corridor, slow=True), happens, at=12), trials=trials)
+    assert (trials.evidence.trials, trials.evidence.void) == (1, 1)
+    assert trials.evidence.text == (
+        "0 of 1 trial succeeded (1 more do not count: a person, the computer or the link ended them); 57 more without "
+        "a failure would show more than 90 %"
+    )
+    assert trials.next_seed(7) == 9  # and its seed does not come again
 
 
 def test_nothing_moves_if_a_trial_cannot_be_recorded(corridor, tmp_path):
@@ -283,7 +299,7 @@ def test_trials_are_run_recorded_and_reported(served, run, tmp_path):
     report = json.loads(out)
     assert (status, report["marks"]) == (0, ["UNSIGNED", "trial"]), err
     assert Recording.open(recording).metadata["marks"] == "UNSIGNED, trial"
-    counted = {"successes": 1, "trials": 1, "repeated": 0, "nameless": 0}
+    counted = {"successes": 1, "trials": 1, "repeated": 0, "nameless": 0, "void": 0}
     assert report["trials"] == {**counted, "threshold": 0.9, "is_enough": False}
     assert (report["identity"], report["seed"]) == ("left arm", 1_000_000)
     assert Recording.open(recording).metadata["identity"] == "left arm"

@@ -67,7 +67,8 @@ def test_a_whole_run(bam_train, here):
     ]
     assert any(line.startswith("evaluation at 64 steps: return ") for line in lines)
     assert any(line.startswith("ppo on CartPole-v1: all steps done at 128 steps, ") for line in lines)
-    assert lines[-2:] == ["next:", "  bam-eval checkpoints/CartPole-v1-ppo.zip"]
+    size = f"  size        {checkpoint.path.stat().st_size / 1000:,.0f} kB"
+    assert lines[-3:] == [size, "next:", "  bam-eval checkpoints/CartPole-v1-ppo.zip"]
 
 
 def test_settings_are_checked_before_torch_and_ray_are_imported():

@@ -36,7 +36,7 @@ def test_plain_lines_about_once_a_second(capsys):
 @pytest.mark.parametrize(("left", "text"), [(-0.6, "at most 0.0 s left"), (None, "time left: not known yet")])
 def test_without_success_and_past_the_end(capsys, left, text):
     PlainDisplay("").training(progress(303_104), statistics(None), 5000.0, left)
-    assert capsys.readouterr().err == f"303.1k of 300k steps  5,000 steps/s  return 1.235  {text}\n"
+    assert capsys.readouterr().err == f"303.1k steps  5,000 steps/s  return 1.235  {text}\n"
 
 
 @pytest.mark.parametrize(("best", "end"), [(True, ", the best so far"), (False, "")])

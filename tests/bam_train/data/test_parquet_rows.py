@@ -56,8 +56,22 @@ def test_exported_rows_come_back_bit_for_bit(observation, action, import_):
         assert_same_value(one.actions, other.actions)
         facts = {"recording": "rows", "number": number, "eps_id": f"{number:06d}", "group": "cell-7"}
         assert one.facts == facts
-    note = "bam-data: note: rows: episode 0 and 2 more: is in back already\n"
+    note = (
+        "bam-data: note: rows: episode 0 and 2 more: is in back already; bam-data import --again adds it all the same\n"
+    )
     assert import_("back", *given) == (0, "back: 3 episodes, 4503 steps now\n", note)
+    assert import_("back", *given, "--again") == (0, "back: 6 episodes, 9006 steps now\n", "")
+
+
+def test_rows_of_episodes_whose_rewards_and_success_they_do_not_keep_are_recognised(import_):
+    info = DataSetInfo(ENV, {}, SPACES["box"], SPACES["discrete"], 1.0)
+    rewards = np.random.default_rng(1).normal(size=5)  # no float32 has these values
+    write("data", info, [episode(info, 5, 1, rewards=rewards, success=True), episode(info, 5, 2, rewards=rewards)])
+    export(DataSet.open("data"), "rllib", Path("rows"))
+    note = (
+        "bam-data: note: rows: episode 0 and 1 more: is in data already; bam-data import --again adds it all the same\n"
+    )
+    assert import_("data", "rows", "--env", ENV) == (0, "data: 2 episodes, 10 steps now\n", note)
 
 
 def rows(**changes):

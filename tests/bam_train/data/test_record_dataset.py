@@ -1,5 +1,6 @@
 """What happens in an environment is what is in the data set, in one and in several side by side."""
 
+import signal
 import sys
 
 import gymnasium as gym
@@ -9,8 +10,10 @@ from gymnasium.vector import AutoresetMode
 
 import bam_envs  # noqa: F401
 from bam_envs.robots.physics.rendering import RenderingUnavailable, find_backend
+from bam_train.cli.data import bam_data
 from bam_train.data import DataSet, RecordDataset
 from bam_train.data.collect import collect
+from bam_train.data.views.summary import numbers
 from bam_train.errors import BadDataSet, SettingsError
 
 pytest.importorskip("pyarrow")
@@ -181,7 +184,46 @@ def test_collect(tmp_path):
             np.testing.assert_array_equal(one.observations, np.stack(seen))
     env.close()
     assert data.facts(0)["policy"] == "scripted"
+    again = collect(tmp_path / "d", "scripted", "bam/reach", episodes=5, num_envs=2, random=0.3, noise=0.1, seed=7)
+    assert (found.repeated, again.repeated) == (0, 5)
     assert data.info.contract["command"][0]["unit"] == "rad"
+    rows = numbers(DataSet.open(tmp_path / "d"))
+    units = [
+        {row["unit"] for row in rows if row["column"] == one} for one in ("observation.state", "action", "command")
+    ]
+    assert units == [{"scaled"}, {"scaled"}, {"rad", "m"}]
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_collecting_that_is_interrupted_keeps_whole_episodes_and_says_how_to_go_on(
+    tmp_path, counting, capsys, monkeypatch, number
+):
+    monkeypatch.chdir(tmp_path)
+    step, taken = Counting.step, iter(range(100))
+
+    def interrupted(self, action):
+        if next(taken) == 15:
+            signal.raise_signal(number)
+        return step(self, action)
+
+    monkeypatch.setattr(Counting, "step", interrupted)
+    flags = ["--env", counting, "--policy", "random", "--episodes", "10", "--num-envs", "2", "--seed", "5"]
+    with pytest.raises(SystemExit) as stop:
+        bam_data.main(["collect", "data", *flags])
+    assert stop.value.code == 128 + number
+    data = DataSet.open("data")
+    assert [row.get("end") for row in map(data.facts, range(len(data)))] == [None] * len(data)
+    text = (
+        f"interrupted: {len(data)} whole episodes of 10 are in data; for the others, run it again with "
+        f"--episodes {10 - len(data)} --seed 15\n"
+    )
+    said = (
+        f"bam-data collect: {text}"
+        if number == signal.SIGINT
+        else f"bam-data: {text}bam-data collect: ended by SIGTERM\n"
+    )
+    assert capsys.readouterr().err == said
+    assert len(data) > 0
 
 
 @pytest.mark.parametrize(("env", "propensity"), [("CartPole-v1", 1 / 2), ("Pendulum-v1", 1 / 4)])

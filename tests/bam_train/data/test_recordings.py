@@ -55,7 +55,10 @@ def test_deployed_and_evaluated_episodes_are_the_same(folder):
 def test_recordings_are_imported_once_and_up_to_their_cut(folder, capsys):
     [recording] = (folder / "recordings").glob("*.mcap")
     assert run(bam_data.main, "import", folder / "deployed", recording) == 0
-    assert capsys.readouterr().err.endswith(f": episode 0 and 1 more: is in {folder / 'deployed'} already\n")
+    said = (
+        f": episode 0 and 1 more: is in {folder / 'deployed'} already; bam-data import --again adds it all the same\n"
+    )
+    assert capsys.readouterr().err.endswith(said)
     assert len(DataSet.open(folder / "deployed")) == 2
     cut, data = folder / "cut.mcap", recording.read_bytes()
     whole = list(DataSet.open(folder / "deployed"))

@@ -18,6 +18,7 @@ from bam_train.cli.deploy import main as deploy
 from bam_train.cli.deploy_display import PlainDeployment
 from bam_train.cli.live.replay import facts_of
 from bam_train.cli.live.replay import main as replay
+from bam_train.data.recordings import episodes_of, info_of_recording
 from bam_train.deploy.deployment import Deployment
 from bam_train.deploy.flight import deployment_facts, flight_recorder
 from bam_train.deploy.journal import Journal
@@ -27,7 +28,7 @@ from bam_train.policy import FrozenPolicy
 from bam_train.recording.drawing import frames
 from bam_train.recording.playback import play, replay_env
 from bam_train.recording.recorder import Recorder
-from bam_train.recording.recording import Recording
+from bam_train.recording.recording import Event, Recording
 
 CHECKPOINTS = Path(__file__).parents[3] / "checkpoints"
 PICK = CHECKPOINTS / "pick-ppo.zip"
@@ -48,23 +49,33 @@ def pick(tmp_path_factory):
     return path
 
 
-@pytest.fixture(scope="module")
-def small_chunks(pick):
-    """The bytes of that recording with a chunk for each tick, as in a file that is being written."""
+def rewritten(recording, events=(), **options):
+    """The bytes of a recording, written anew with further events."""
     file, channels = io.BytesIO(), {}
-    writer = Writer(file, chunk_size=1500)
+    writer = Writer(file, **options)
     writer.start()
-    with pick.open("rb") as original:
+
+    def add(channel, data, time, sequence=0):
+        writer.add_message(channel, data=data, sequence=sequence, log_time=time, publish_time=time)
+
+    with recording.open("rb") as original:
         for record in StreamReader(original).records:
             if isinstance(record, Metadata):
                 writer.add_metadata(record.name, record.metadata)
             elif isinstance(record, Channel) and record.id not in channels:
                 channels[record.id] = writer.register_channel(record.topic, "json", 0)
+                for event in events if record.topic == "/events" else ():
+                    add(channels[record.id], json.dumps({"level": 2, "message": event.text}).encode(), event.time)
             elif isinstance(record, Message):
-                times = {"log_time": record.log_time, "publish_time": record.publish_time}
-                writer.add_message(channels[record.channel_id], data=record.data, sequence=record.sequence, **times)
+                add(channels[record.channel_id], record.data, record.log_time, record.sequence)
     writer.finish()
     return file.getvalue()
+
+
+@pytest.fixture(scope="module")
+def small_chunks(pick):
+    """The bytes of that recording with a chunk for each tick, as in a file that is being written."""
+    return rewritten(pick, chunk_size=1500)
 
 
 def test_the_numbers_are_there_again(pick):
@@ -121,6 +132,36 @@ def test_another_policy_is_compared(pick):
     assert played.worst == np.abs(action).max()
 
 
+def test_of_a_recording_of_several_policies_a_checkpoint_is_compared_with_its_own_ticks(pick, tmp_path, forge, capsys):
+    other = tmp_path / "other.zip"
+    other.write_bytes(PICK.read_bytes())
+    own, other = Checkpoint.open(PICK).digest, Checkpoint.open(forge(other, seed=7)).digest
+    times, with_swaps = Recording.open(pick).tables["/episode"].times.tolist(), tmp_path / "agent.mcap"
+    texts = [f"{other[:12]} acts instead of {own[:12]}: push by anna (anna)"]
+    texts += [f"{own[:12]} acts instead of {other[:12]}: rolled back: bob (bob)"]
+    events = [Event(times[at] - 1, 2, text) for at, text in zip((20, 50), texts, strict=True)]
+    with_swaps.write_bytes(rewritten(pick, events))
+
+    assert Recording.open(with_swaps).policies() == [own[:12]] * 20 + [other[:12]] * 30 + [own[:12]] * 20
+    assert call(replay, with_swaps) == 0
+    said = capsys.readouterr().out.splitlines()
+    assert "played: the same observation in 40 of 40 ticks, the same action in 40" in said
+    assert said[said.index("played: the same observation in 40 of 40 ticks, the same action in 40") + 1] == (
+        f"not compared: the ticks in which another policy acted: {other[:12]} in 30"
+    )
+    third = tmp_path / "third.zip"
+    third.write_bytes(PICK.read_bytes())
+    third = Checkpoint.open(forge(third, seed=8))
+    assert call(replay, with_swaps, "--checkpoint", third.path) == 1
+    assert capsys.readouterr().err == (
+        f"bam-replay: {third.path}: {third.digest[:12]} acted in no tick of {with_swaps}; there acted {own[:12]} in 40 "
+        f"ticks, {other[:12]} in 30 ticks\n"
+    )
+    info = info_of_recording(Recording.open(with_swaps))
+    policies = [episode.facts["policy"] for episode, _ in episodes_of(Recording.open(with_swaps), info)]
+    assert policies == [f"{own}, {other[:12]}", f"{other[:12]}, {own}"]
+
+
 def test_summary_for_people_and_programs(pick, capsys):
     assert call(replay, pick) == 0
     lines = capsys.readouterr().out.splitlines()
@@ -137,7 +178,14 @@ def test_summary_for_people_and_programs(pick, capsys):
     assert lines[-1] == "played: the same observation in 70 of 70 ticks, the same action in 70"
     assert call(replay, pick, "--json") == 0
     report = json.loads(capsys.readouterr().out)
-    assert report["played"] == {"ticks": 70, "observations": 70, "actions": 70, "worst": 0.0, "same": True}
+    assert report["played"] == {
+        "ticks": 70,
+        "observations": 70,
+        "actions": 70,
+        "worst": 0.0,
+        "others": {},
+        "same": True,
+    }
     assert [row["length"] for row in report["per_episode"]] == [35, 33]
     assert report["complete"] is True
 

@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from bam_envs.core.errors import LinkLost, NotInCommand, ProtocolError, RemoteError, RobotFault
+from bam_envs.core.errors import LinkLost, NotInCommand, ProtocolError, RemoteError, RobotFault, SafetyStop
 from bam_envs.core.robot import RobotState
 from bam_envs.core.timing import Ticker
 from bam_envs.remote.serve.command_lease import CommandLease
@@ -44,6 +44,9 @@ _log = logging.getLogger(__name__)
 
 IDLE_PERIOD = 0.05
 """Time between two states in lockstep without commands [s]."""
+PACE = 0.9
+"""Least time between two commands of a robot in lockstep that is paced, as a share of a period: one that comes each
+period, a little early or late, is not held up."""
 _ROUNDING = 1e-9
 """Tolerance of limits, for numbers that were converted to text and other units."""
 
@@ -97,6 +100,7 @@ class RobotService:
         namespace: Prefix of every topic, such as ``/cell_1``; or empty.
         identity: The name that tells it from other robots; or empty.
         info: Its description for clients; None: that of a simulated robot.
+        paced: Whether a robot in lockstep executes no command sooner than `PACE` of a period after the one before.
     """
 
     def __init__(
@@ -109,6 +113,7 @@ class RobotService:
         namespace: str = "",
         identity: str = "",
         info: RobotInfo | None = None,
+        paced: bool = False,
     ) -> None:
         profile = profile.narrowed(robot.spec.command.labels)
         self._robot, self._profile, self._bus, self._lease = robot, profile, bus, lease
@@ -131,6 +136,7 @@ class RobotService:
         images = {name for camera in robot.spec.cameras for name in camera.spaces()}
         self._cameras = [camera for camera in profile.cameras if camera.name in images]
         self._shown: dict[str, Any] = {}  # the images that were published last
+        self._pause, self._free_at = PACE * robot.spec.period if paced else 0.0, 0.0  # between commands; until when [s]
         self._moving = threading.Lock()  # an order is begun before a halt, or not at all
         self._unsubscribe: list[Callable[[], None]] = []
         self._scene = StringRpcService(bus, namespace + SCENE_TOPIC, self._set_scene, self.sessions)
@@ -179,6 +185,8 @@ class RobotService:
             if not low - _ROUNDING <= value <= high + _ROUNDING:
                 label, unit = command.labels[place], command.units[place]
                 raise ProtocolError(f"{topic}: {label} must be {low:g} to {high:g} {unit}, not {value:g} {unit}.")
+        if isinstance(self._robot.fault, SafetyStop):
+            raise self._robot.fault
         if self._robot.fault is not None:
             raise RemoteError(f"{self._profile.name} failed, and needs a reset: {self._robot.fault}")
         if tag is not None:
@@ -253,6 +261,8 @@ class RobotService:
     def tick(self) -> None:
         """Advance the robot, called by the clock: in lockstep a period if a command is complete, else part of one."""
         lockstep = self.info.lockstep
+        if (early := self._free_at - time.monotonic()) > 0:
+            time.sleep(early)  # without the lock: a halt need not wait
         with self._moving:
             order = self._slot.take(complete=lockstep)
             if order.values and order.client == self._lease.holder:  # it may have changed since
@@ -261,6 +271,7 @@ class RobotService:
                 command = np.minimum(np.maximum(command, self._low), self._high)  # np.clip takes three times as long
                 try:
                     if lockstep:
+                        self._free_at = time.monotonic() + self._pause
                         self._robot.step(command)
                     else:
                         self._robot.follow(command, at_once=order.complete, count=order.count)

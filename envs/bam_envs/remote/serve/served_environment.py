@@ -41,13 +41,17 @@ class ServedEnvironment:
         env: The environment; it is closed at the end.
         options: Its addresses and modes.
         tell: Called with one line of text when another client takes command, and when a link is lost.
+        paced: With the option `fast`: the robot executes commands no faster than in real time. It stands still until
+            the next one comes, so that a busy computer makes it slow, and does not falsify its motion.
 
     Raises:
         InvalidValue: Options that exclude each other.
         RemoteError: On entering: the server of `via` carries no usable topic or service.
     """
 
-    def __init__(self, env: Env, options: ServeOptions, tell: Callable[[str], None] = lambda line: None) -> None:
+    def __init__(
+        self, env: Env, options: ServeOptions, tell: Callable[[str], None] = lambda line: None, *, paced: bool = False
+    ) -> None:
         options.require_sane()
         self.env, self.options = env, options
         self.endpoints: list[str] = []
@@ -58,7 +62,7 @@ class ServedEnvironment:
         """The bus for topics and services."""
         self.tcp: TcpServer | None = None
         """The TCP transport, if there is one."""
-        self._tell, self._stack = tell, ExitStack()
+        self._tell, self._stack, self._paced = tell, ExitStack(), paced
         self.robot_service: RobotService | None = None
         """The topics of its robot, if it has any."""
         self._refusals: dict[str, str] = {}  # id of a declaration -> why the server of `via` does not carry it
@@ -103,7 +107,7 @@ class ServedEnvironment:
             if isinstance(bus, RosbridgeLink):
                 self._require_own_names(bus)
             self.robot_service = RobotService(
-                robot, profile, bus, self.lease, namespace=self.prefix, identity=options.name
+                robot, profile, bus, self.lease, namespace=self.prefix, identity=options.name, paced=self._paced
             )
             started.callback(self.robot_service.close)
             self.robot_service.start()

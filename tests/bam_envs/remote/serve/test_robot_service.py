@@ -480,6 +480,23 @@ def test_only_the_client_in_command_sets_the_scene(serve, bus):
     bus.wait_for("/bam/scene/reply", lambda message: text in message["data"])
 
 
+def test_a_paced_robot_in_lockstep_executes_no_command_sooner(serve):
+    """However fast they come, such as on the way to a start pose."""
+    steps, stepped = [], threading.Semaphore(0)
+
+    class Timed(FakeRobot):
+        def step(self, command):
+            steps.append(time.monotonic())
+            stepped.release()
+            return super().step(command)
+
+    service = serve(Timed(1), paced=True)
+    for k in range(3):
+        assert service.send(command(0.01 * k)) is None
+        assert stepped.acquire(timeout=10)
+    assert min(np.diff(steps)) > 0.8 * service.robot.spec.period
+
+
 class Failing(FakeRobot):
     def step(self, command):
         raise PhysicsDiverged("The simulated state of environments [0] is not finite. Reset them.")
