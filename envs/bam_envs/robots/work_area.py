@@ -16,6 +16,8 @@ from bam_envs.robots.description import ArmDescription
 Array = NDArray[np.float64]
 BOX = np.array([[-0.20, -0.25, 0.016], [0.20, 0.25, 0.35]])
 """Full work area about its middle: lowest and highest x, y, z [m]. A smaller arm has a smaller one of the same shape."""
+TABLE_END = 0.88
+"""Farthest x of a work area: the table ends at 0.95 m."""
 YAW = 1.2
 """Farthest turn of the gripper from straight ahead [rad]."""
 _SCALES = (1.0, 0.9, 0.8, 0.7, 0.6, 0.5, 0.42, 0.35, 0.3, 0.25)
@@ -73,7 +75,8 @@ def _boxes(chain: SerialChain, scale: float) -> Iterator[Array]:
         box = BOX * scale
         box[:, 0] += round(float(middle), 3)
         box[:, 2] = BOX[0, 2], max(0.06, height * box[1, 2])
-        yield box
+        if box[1, 0] <= TABLE_END:
+            yield box
 
 
 def _middle(box: Array) -> Array:
