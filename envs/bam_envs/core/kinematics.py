@@ -172,6 +172,12 @@ class ArmGeometry:
         rows += [[-cosine * beside, cosine * x5 + sine * z5, -sine * beside, *axis], [0.0, 0.0, 0.0, *out]]
         return rows
 
+    def tool_jacobian(self, q: Sequence[float]) -> Array:
+        """Velocity of the tool [m/rad] and axis of each joint in ``base_link`` at the joints `q` (6,). Shape: (6, 6)."""
+        rows = np.array(self.jacobian(q)).reshape(1, 6, 2, 3)
+        jacobian: Array = turned(rows, np.cos(q[:1]), np.sin(q[:1]))[0].reshape(6, 6).T
+        return jacobian
+
     def reach_down(self, position: Array, yaw: Array, near: Array | None = None) -> Array:
         """Joint positions that put the tool at `position`, pointing straight down, its x axis at `yaw` from world x.
 

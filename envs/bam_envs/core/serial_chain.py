@@ -17,15 +17,36 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from bam_envs.core.kinematics import ArmGeometry
+from bam_envs.core.validation import Finite, NonNegativeInt, Positive
+
 Array = NDArray[np.float64]
 TILT_LEVER = 0.3
 """Error of the tool's position that weighs as much as 1 rad of its orientation [m/rad]."""
+HAND = 0.15
+"""Length of the gripper in pictures [m]."""
 HOMING = 0.1
 """Share of the way to the home pose that the joints go in each iteration, where the tool leaves them free."""
 _DAMPING = 1e-7
 _CLOSE = 1e-7  # error at which an iteration from afar ends [m]
 _TRACKING, _SEARCHING = 2, 60  # iterations from joints nearby, and from the home pose
-_CROSS = np.array([[[0, 0, 0], [0, 0, -1], [0, 1, 0]], [[0, 0, 1], [0, 0, 0], [-1, 0, 0]], [[0, -1, 0], [1, 0, 0], [0, 0, 0]]])
+_CROSS = np.array(
+    [[[0, 0, 0], [0, 0, -1], [0, 1, 0]], [[0, 0, 1], [0, 0, 0], [-1, 0, 0]], [[0, -1, 0], [1, 0, 0], [0, 0, 0]]]
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Capsule:
+    """A segment with a radius, fixed to a link."""
+
+    link: NonNegativeInt
+    """0 for the base, k for what joint k turns, one more than the joints for the gripper (in the tool's frame)."""
+    start: tuple[Finite, Finite, Finite] = (0.0, 0.0, 0.0)
+    """One end, in the link's frame [m]."""
+    end: tuple[Finite, Finite, Finite] = (0.0, 0.0, 0.0)
+    """The other end [m]."""
+    radius: Positive
+    """Radius [m]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,6 +61,9 @@ class SerialChain:
         high: Highest joint positions [rad]. Shape: (k,).
         home: Joint positions near the middle of the work, with the tool pointing down [rad]. Shape: (k,).
         turns: Whether the yaw of the tool can be chosen while it points down.
+        capsules: Its outline; () if it is not known.
+        slack: Two links, and how far their capsules overlap before the links themselves touch [m].
+        mount: Pose of the base, for the capsules of link 0. Shape: (4, 4).
     """
 
     placements: Array
@@ -49,6 +73,9 @@ class SerialChain:
     high: Array
     home: Array
     turns: bool = True
+    capsules: tuple[Capsule, ...] = ()
+    slack: tuple[tuple[int, int, float], ...] = ()
+    mount: Array = field(default_factory=lambda: np.eye(4))
     _motion: Array = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
@@ -96,6 +123,16 @@ class SerialChain:
         x, y, z = np.moveaxis(frames[:, -1:, :3, 3] - frames[:, :-1, :3, 3], 2, 0)
         u, v, w = np.moveaxis(axes, 2, 0)
         return frames, np.stack([v * z - w * y, w * x - u * z, u * y - v * x, u, v, w], axis=1)
+
+    def tool_jacobian(self, q: Sequence[float]) -> Array:
+        """Velocity of the tool [m/rad] and axis of each joint in ``base_link`` at the joints `q` (k,). Shape: (6, k)."""
+        jacobian: Array = self.jacobians(np.array([q]))[1][0]
+        return jacobian
+
+    def flange_pose(self, q: Array) -> tuple[Array, Array]:
+        """Pose of a gripper of `HAND` length that ends at the tool; see `ArmGeometry.flange_pose`. (n, 3), (n, 3, 3)."""
+        tool = self.link_frames(q)[:, -1]
+        return tool[:, :3, 3] - HAND * tool[:, :3, 2], tool[:, :3, :3]
 
     def reach_down(self, position: Array, yaw: Array, near: Array | None = None) -> Array:
         """Joint positions that put the tool at `position`, pointing straight down, its x axis at `yaw` from world x.
@@ -147,3 +184,14 @@ class SerialChain:
         rest = error - np.einsum("nij,nj->ni", jacobian, homing)
         step = homing + np.einsum("nji,nj->ni", jacobian, np.linalg.solve(square, rest[:, :, None])[:, :, 0])
         return np.minimum(np.maximum(q + step, self.low), self.high), float(np.sqrt(squared.max()))
+
+
+Arm = ArmGeometry | SerialChain
+"""Kinematics of an arm, in closed form or as a chain."""
+
+
+def arm_of(tool_position: object) -> Arm | None:
+    """The arm whose ``tool_position`` this is; None for any other function."""
+    owner = getattr(tool_position, "__self__", None)
+    known = isinstance(owner, SerialChain) or type(owner) is ArmGeometry
+    return owner if known and tool_position == owner.tool_position else None

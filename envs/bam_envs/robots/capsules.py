@@ -5,8 +5,7 @@ import itertools
 import numpy as np
 from numpy.typing import NDArray
 
-from bam_envs.core.serial_chain import SerialChain
-from bam_envs.robots.description import ArmDescription, Capsule
+from bam_envs.core.serial_chain import Capsule, SerialChain
 
 Array = NDArray[np.float64]
 _DIRECTIONS = 500
@@ -135,19 +134,17 @@ class Outline:
     """The capsules of an arm in many postures: which pairs can touch, and how near they are.
 
     Args:
-        description: The arm.
-        chain: Its kinematics.
+        chain: The arm, with capsules.
     """
 
-    def __init__(self, description: ArmDescription) -> None:
-        self.chain: SerialChain = description.chain
-        capsules = description.capsules
+    def __init__(self, chain: SerialChain) -> None:
+        self.chain, capsules = chain, chain.capsules
         self.links = np.array([capsule.link for capsule in capsules])
         self.radius = np.array([capsule.radius for capsule in capsules])
         self._ends = np.array([(capsule.start, capsule.end) for capsule in capsules]).reshape(-1, 2, 3)
-        self._mount = description.mount.matrix()
-        self._slack = {(one, other): slack for one, other, slack in description.slack}
-        self.pairs = self._pairs(description)
+        self._mount = chain.mount
+        self._slack = {(one, other): slack for one, other, slack in chain.slack}
+        self.pairs = self._pairs()
 
     def segments(self, q: Array) -> Array:
         """Ends of the capsules' segments at the joints `q` (n, k) [rad]. Shape: (n, capsules, 2, 3)."""
@@ -177,12 +174,14 @@ class Outline:
         distances: Array = gap - self.radius[one] - self.radius[other] + np.array(slack)
         return distances
 
-    def _pairs(self, description: ArmDescription) -> NDArray[np.int64]:
+    def _pairs(self) -> NDArray[np.int64]:
         """Pairs of capsules on links with a joint between them that are apart in some posture, and not in all."""
         links = self.links
-        rows = [pair for pair in itertools.combinations(range(len(links)), 2) if abs(links[pair[0]] - links[pair[1]]) > 1]
+        rows = [
+            pair for pair in itertools.combinations(range(len(links)), 2) if abs(links[pair[0]] - links[pair[1]]) > 1
+        ]
         # The gripper is fixed to the last link.
-        last = description.num_joints
+        last = self.chain.num_joints
         rows = [(i, j) for i, j in rows if not {int(links[i]), int(links[j])} <= {last - 1, last, last + 1}]
         self.pairs = np.array(rows, dtype=np.int64).reshape(-1, 2)
         if not rows:
@@ -208,4 +207,3 @@ def segment_distances(start: Array, end: Array, other_start: Array, other_end: A
     apart = gap + share[..., None] * way - other[..., None] * other_way
     distance: Array = np.sqrt(np.einsum("...i,...i", apart, apart))
     return distance
-

@@ -25,7 +25,7 @@ from bam_envs.core.config_folder import config_folder
 from bam_envs.core.errors import InvalidValue, UnknownName
 from bam_envs.core.kinematics import ArmGeometry
 from bam_envs.core.robot import RobotSpec, SignalSpec
-from bam_envs.core.serial_chain import SerialChain
+from bam_envs.core.serial_chain import Arm, Capsule, SerialChain
 from bam_envs.core.validation import Finite, NonEmpty, NonNegative, NonNegativeInt, Positive, check, read_table
 
 tomllib: Any = importlib.import_module("tomllib" if sys.version_info >= (3, 11) else "tomli")
@@ -105,20 +105,6 @@ class Gripper:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Capsule:
-    """A segment with a radius, fixed to a link."""
-
-    link: NonNegativeInt
-    """0 for the base, k for what joint k turns, one more than the joints for the gripper (in the tool's frame)."""
-    start: Vector = (0.0, 0.0, 0.0)
-    """One end, in the link's frame [m]."""
-    end: Vector = (0.0, 0.0, 0.0)
-    """The other end [m]."""
-    radius: Positive
-    """Radius [m]."""
-
-
-@dataclass(frozen=True, kw_only=True)
 class ArmDescription:
     """An arm with its gripper. Positions in ``base_link``: x forward, z up, z = 0 on the table that it stands on."""
 
@@ -157,7 +143,9 @@ class ArmDescription:
             if not row.low < row.high:
                 raise InvalidValue(f"{self.name}: {row.name}: low must be below high.")
             if not row.low <= home <= row.high:
-                raise InvalidValue(f"{self.name}: home: {row.name} is {home:g} rad, outside {row.low:g} to {row.high:g}.")
+                raise InvalidValue(
+                    f"{self.name}: home: {row.name} is {home:g} rad, outside {row.low:g} to {row.high:g}."
+                )
         if not all(low < high for low, high in zip(*self.workspace, strict=True)):
             raise InvalidValue(f"{self.name}: workspace: the lowest corner must come first.")
         for capsule in self.capsules:
@@ -183,10 +171,11 @@ class ArmDescription:
         axes /= np.linalg.norm(axes, axis=1, keepdims=True)
         low, high = (np.array([getattr(row, end) for row in self.joints]) for end in ("low", "high"))
         home, tool = np.array(self.home), self.tool.matrix()
-        return SerialChain(placements, axes, tool, low, high, home, turns=self.num_joints > 5)
+        mount, turns = self.mount.matrix(), self.num_joints > 5
+        return SerialChain(placements, axes, tool, low, high, home, turns, self.capsules, self.slack, mount)
 
     @cached_property
-    def arm(self) -> "ArmGeometry | SerialChain":
+    def arm(self) -> Arm:
         """Its kinematics: the closed form where there is one, else the chain."""
         if not self.geometry:
             return self.chain
@@ -196,9 +185,7 @@ class ArmDescription:
     def spec(self, *, with_object: bool) -> RobotSpec:
         """The signals of the arm with its gripper, and those of a tracked object if there is one."""
         names, size = self.joint_names, self.num_joints
-        low, high, speed = (
-            tuple(getattr(row, key) for row in self.joints) for key in ("low", "high", "velocity")
-        )
+        low, high, speed = (tuple(getattr(row, key) for row in self.joints) for key in ("low", "high", "velocity"))
         width = self.gripper.open
         signals = [
             SignalSpec("joint_position", names, ("rad",) * size, low, high),
@@ -234,8 +221,9 @@ class ArmDescription:
 
 
 def cube_edge(description: ArmDescription) -> float:
-    """Edge of the cube that an arm's gripper is given to grasp: 4 cm, or less for a small gripper [m]."""
-    return min(0.04, round(0.55 * description.gripper.open, 3))
+    """Edge of the cube that an arm is given to grasp: 4 cm, or less for a small gripper, or for one that cannot turn [m]."""
+    share = 0.55 if description.chain.turns else 0.4
+    return min(0.04, round(share * description.gripper.open, 3))
 
 
 OBJECT_SIGNALS = [
@@ -248,7 +236,9 @@ OBJECT_SIGNALS = [
 
 
 def _leaves(value: Any, name: str = "") -> Iterator[tuple[str, Any]]:
-    pairs = value.items() if isinstance(value, Mapping) else enumerate(value) if isinstance(value, (tuple, list)) else ()
+    pairs = (
+        value.items() if isinstance(value, Mapping) else enumerate(value) if isinstance(value, (tuple, list)) else ()
+    )
     if not pairs:
         yield name, value
     for key, part in pairs:

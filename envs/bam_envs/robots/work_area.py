@@ -23,7 +23,7 @@ YAW = 1.2
 _SCALES = (1.0, 0.9, 0.8, 0.7, 0.6, 0.5, 0.42, 0.35, 0.3, 0.25)
 _HEIGHTS = (1.0, 0.6)
 _MARGIN = 0.05  # from the ends of a joint's travel [rad]
-_CLEAR = 0.0  # of the table and of the arm itself [m]
+_CLEAR = 0.006  # of the table and of the arm itself, more than the guards keep [m]
 _REACHED = 1e-4  # [m], and as far in rad
 _TRIES = 240  # start poses of the search for a home pose
 _STEPS = 12  # from the middle of the area to a point of it
@@ -47,7 +47,7 @@ def find_work_area(description: ArmDescription) -> WorkArea:
     Raises:
         InvalidValue: It reaches no such area with its tool pointing down.
     """
-    chain, outline = description.chain, Outline(description)
+    chain, outline = description.chain, Outline(description.chain)
     for scale in _SCALES:
         best: tuple[float, WorkArea] | None = None
         for box in _boxes(chain, scale):
@@ -56,7 +56,7 @@ def find_work_area(description: ArmDescription) -> WorkArea:
                 if best is not None and margin <= best[0]:
                     break
                 here = dataclasses.replace(chain, home=home)
-                if _covers(here, outline, box):
+                if covers(here, outline, box):
                     best = margin, WorkArea(home, box, scale)
                     break
         if best is not None:
@@ -69,7 +69,9 @@ def find_work_area(description: ArmDescription) -> WorkArea:
 
 def _boxes(chain: SerialChain, scale: float) -> Iterator[Array]:
     """Boxes of one size at growing distances from the base."""
-    length = float(np.linalg.norm(chain.placements[:, :3, 3], axis=1).sum() + np.linalg.norm(chain.tool_placement[:3, 3]))
+    length = float(
+        np.linalg.norm(chain.placements[:, :3, 3], axis=1).sum() + np.linalg.norm(chain.tool_placement[:3, 3])
+    )
     nearest = 0.5 * (BOX[1, 0] - BOX[0, 0]) * scale + 0.08
     for middle, height in itertools.product(np.arange(nearest, length, max(0.02, 0.05 * length)), _HEIGHTS):
         box = BOX * scale
@@ -116,7 +118,7 @@ def _solve(chain: SerialChain, seeds: Array, position: Array, yaw: Array) -> Arr
     return q
 
 
-def _covers(chain: SerialChain, outline: Outline, box: Array) -> bool:
+def covers(chain: SerialChain, outline: Outline, box: Array) -> bool:
     """Whether the arm follows straight lines from the middle of `box` to all sides of it, with the gripper turned."""
     sides = [np.linspace(low, high, 3) for low, high in box.T]
     points = np.stack(np.meshgrid(*sides, indexing="ij"), axis=-1).reshape(-1, 3)

@@ -1,14 +1,20 @@
-"""The links of a Universal Robots arm as tubes: their distances from each other and from the table.
+"""The links of an arm as tubes: their distances from each other and from the table.
 
-All points are in the arm's vertical plane (radial, sideways, height), which turns with joint 1: neither that joint nor
-the last one changes a distance. The tubes and pairs are those of the simulation (`ArmContacts`); the last tube reaches
-to the end of the tool where there is one.
+Points of `ArmTubes`, for Universal Robots arms, are in the arm's vertical plane (radial, sideways, height), which turns
+with joint 1: neither that joint nor the last one changes a distance. The tubes and pairs are those of the simulation
+(`ArmContacts`); the last tube reaches to the end of the tool where there is one. `ChainTubes` are the capsules of any
+other described arm, in ``base_link``.
 """
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 
-from bam_envs.core.kinematics import ArmGeometry, ArmOutline
+import numpy as np
+
+from bam_envs.core.kinematics import ArmGeometry, ArmOutline, turned
+from bam_envs.core.serial_chain import Arm, SerialChain
+from bam_envs.robots.capsules import Outline
 
 Point = tuple[float, float, float]
 Tube = tuple[Point, Point, float]
@@ -79,6 +85,12 @@ class ArmTubes:
                 self._near[place] = self._distance(tubes, first, other)
         return self.least < margin
 
+    def drawn(self, q: Sequence[float]) -> list[list[float]]:
+        """The tubes in ``base_link``: two ends, x, y, z [m] each, and the radius [m]."""
+        tubes = self.tubes(q)
+        ends = turned(np.array([[[start, end] for start, end, _ in tubes]]), np.cos(q[:1]), np.sin(q[:1]))[0]
+        return [[*two.ravel().tolist(), radius] for two, (*_, radius) in zip(ends, tubes, strict=True)]
+
     @property
     def least(self) -> float:
         """Lower bound on the smallest distance of two tubes at the joints of `nearer_than` [m]."""
@@ -105,6 +117,59 @@ class ArmTubes:
         starts = (0.0, 0.0, 0.0), shoulder, beside, inside, wrist, wrist_1, wrist_2, elbow
         ends = shoulder, beside, elbow, wrist, wrist_1, wrist_2, tool, inside
         return list(zip(starts, ends, self._radii, strict=True))
+
+
+class ChainTubes:
+    """Distances of the capsules of a described arm, with the methods of `ArmTubes`; `tool` is whether its gripper is."""
+
+    def __init__(self, chain: SerialChain, *, tool: bool) -> None:
+        size = chain.num_joints
+        kept = tuple(one for one in chain.capsules if tool or one.link <= size)
+        self._outline = Outline(replace(chain, capsules=kept))
+        self.least = -math.inf
+        # A turn of a joint moves what is beyond it by at most its angle times the greatest distance from it.
+        extent = [0.0] * (size + 2)
+        for one in kept:
+            farthest = max(math.hypot(*one.start), math.hypot(*one.end)) + one.radius
+            extent[one.link] = max(extent[one.link], farthest)
+        steps = [math.hypot(*place[:3, 3]) for place in (*chain.placements[1:], chain.tool_placement)]
+        self._levers = [0.0] * size
+        beyond = extent[size + 1]
+        for joint in reversed(range(size)):
+            beyond = max(extent[joint + 1], steps[joint] + beyond)
+            self._levers[joint] = beyond
+
+    def lowest(self, q: Sequence[float]) -> float:
+        """Height of the lowest point of the links at the joints `q` (k,) [rad], from the second to the flange [m]."""
+        return float(self._outline.lowest(np.array([q]))[0])
+
+    def nearest(self, q: Sequence[float]) -> float:
+        """Smallest distance of two capsules at the joints `q` (k,) [rad], in m; below 0 if their links overlap."""
+        return float(self._outline.nearest(np.array([q]))[0])
+
+    def change(self, here: Sequence[float], there: Sequence[float]) -> float:
+        """Upper bound on the change of `lowest` and of any distance [m] between two sets of joints (k,) [rad]."""
+        return sum(lever * abs(one - other) for lever, one, other in zip(self._levers, here, there, strict=True))
+
+    def nearer_than(self, margin: float, q: Sequence[float]) -> bool:
+        """Whether two capsules are nearer than `margin` [m] at the joints `q` (k,) [rad]."""
+        self.least = self.nearest(q)
+        return self.least < margin
+
+    def drawn(self, q: Sequence[float]) -> list[list[float]]:
+        """The capsules in ``base_link``: two ends, x, y, z [m] each, and the radius [m]."""
+        ends = self._outline.segments(np.array([q]))[0]
+        return [[*two.ravel().tolist(), float(radius)] for two, radius in zip(ends, self._outline.radius, strict=True)]
+
+
+Tubes = ArmTubes | ChainTubes
+
+
+def tubes_of(arm: Arm, *, tool: bool) -> Tubes | None:
+    """The tubes of an arm, with its gripper or without; None if its outline is not known."""
+    if isinstance(arm, SerialChain):
+        return ChainTubes(arm, tool=tool) if arm.capsules else None
+    return ArmTubes(arm, arm.outline, tool=tool) if arm.outline is not None else None
 
 
 def segment_distance2(start: Point, end: Point, other_start: Point, other_end: Point) -> float:

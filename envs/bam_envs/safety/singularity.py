@@ -5,8 +5,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from bam_envs.core.kinematics import ArmGeometry
 from bam_envs.core.robot import RobotSpec
+from bam_envs.core.serial_chain import Arm, SerialChain
 from bam_envs.safety.guard import Guard, Limits, Tick, columns_in
 
 _SMALLEST, _LARGEST = (2.0, 1.1, 0.5, 1.1), (0.9, 1.2, 1.6, 1.6)
@@ -24,19 +24,29 @@ class Singularity(Guard):
 
     number, name, unit, setting = "G13", "singularity", "condition number", "singularity_stop"
 
-    def __init__(self, spec: RobotSpec, limits: Limits, geometry: ArmGeometry) -> None:
+    def __init__(self, spec: RobotSpec, limits: Limits, arm: Arm) -> None:
         self._slow, self.limit_value = limits.singularity_slow, limits.singularity_stop
-        self._arm, self._joints = geometry, columns_in(spec.command, "rad")
-        self._unit = (abs(geometry.a2) + abs(geometry.a3)) / 2.0
-        self._at: Sequence[float] = [math.inf] * 6
-        self._rates = [least + most / self._slow for least, most in zip(_SMALLEST, _LARGEST, strict=True)]
+        self._arm, self._joints = arm, columns_in(spec.command, "rad")
+        size = len(self._joints)
+        if isinstance(arm, SerialChain):
+            lengths = np.linalg.norm(arm.placements[1:, :3, 3], axis=1)
+            self._unit = max(float(lengths.sum()), 0.1) / 2.0
+            # A turn changes each column of the Jacobian by at most its length, so a singular value by the root of all.
+            reach = float(lengths.sum() + np.linalg.norm(arm.tool_placement[:3, 3])) / self._unit
+            bound = math.sqrt(size * (1.0 + reach**2))
+            self._rates = [0.0, *[bound * (1.0 + 1.0 / self._slow)] * (size - 1)]
+        else:
+            self._unit = (abs(arm.a2) + abs(arm.a3)) / 2.0
+            self._rates = [least + most / self._slow for least, most in zip(_SMALLEST, _LARGEST, strict=True)]
+            self._rates = [0.0, *self._rates, 0.0]
+        self._at: Sequence[float] = [math.inf] * size
         self._room = 0.0  # smallest singular value minus the largest one divided by `singularity_slow`, at least
 
     def limit(self, tick: Tick) -> bool:
         """Shorten the step of all joints, except on the way to a start pose, which is not a straight line."""
         wanted = [tick.command[at] for at in self._joints]
-        for joint, rate in enumerate(self._rates, 1):
-            self._room -= rate * abs(wanted[joint] - self._at[joint])
+        for rate, here, there in zip(self._rates, wanted, self._at, strict=True):
+            self._room -= rate * abs(here - there) if rate else 0.0
         self._at = wanted
         if self._room > 0.0 or tick.approach:
             return False
@@ -52,8 +62,12 @@ class Singularity(Guard):
         return True
 
     def condition(self, q: Sequence[float]) -> float:
-        """Condition number of the Jacobian at the joints `q` (6,) [rad]."""
-        rows = [[value / self._unit for value in row[:3]] + row[3:] for row in self._arm.jacobian(q)]
-        values = np.linalg.svd(np.array(rows), compute_uv=False).tolist()
+        """Condition number of the Jacobian at the joints `q` (k,) [rad]."""
+        if isinstance(self._arm, SerialChain):
+            scaled = self._arm.tool_jacobian(q)
+            scaled[:3] /= self._unit
+        else:
+            scaled = np.array([[value / self._unit for value in row[:3]] + row[3:] for row in self._arm.jacobian(q)])
+        values = np.linalg.svd(scaled, compute_uv=False).tolist()
         self._room = values[-1] - values[0] / self._slow
         return float(values[0] / max(values[-1], 1e-12))

@@ -19,7 +19,6 @@ TABLE_EDGE = -0.03
 """An object below this height has left the table [m]."""
 
 
-
 class CubeTable(WorkSpace):
     """The table with the cube before an arm: where cube and tool begin, sized to the work area and the gripper."""
 
@@ -50,7 +49,9 @@ class CubeTable(WorkSpace):
             Label("object_dx", "object from the tool, forward", "m", "/ 0.1", -2, 2),
             Label("object_dy", "object from the tool, to the left", "m", "/ 0.1", -2, 2),
             Label("object_dz", "object from the tool, up", "m", "/ 0.1", -2, 2),
-            Label("object_yaw_cos", "cos(4 yaw) of the object seen from the gripper; a cube repeats every 90 degrees", "1"),
+            Label(
+                "object_yaw_cos", "cos(4 yaw) of the object seen from the gripper; a cube repeats every 90 degrees", "1"
+            ),
             Label("object_yaw_sin", "sin(4 yaw) of the object seen from the gripper", "1"),
         )
 
@@ -98,6 +99,7 @@ class PickTask(Memory):
 
     def __init__(self, num_envs: int = 1, *, robot_model: str = DEFAULT_MODEL) -> None:
         self.num_envs, self.table = num_envs, CubeTable(model_called(robot_model))
+        self.arm = self.table.arm
         self.action_labels = self.table.action_labels
         self.observation_labels = self.labels(self.table)
         self.robot_labels = (*self.table.hand_labels, *self.table.joint_labels)

@@ -67,6 +67,7 @@ class ReachTask(Memory):
 
     def __init__(self, num_envs: int = 1, *, robot_model: str = DEFAULT_MODEL) -> None:
         self.num_envs, self.space = num_envs, GoalSpace(model_called(robot_model))
+        self.arm = self.space.arm
         joints = self.space.description.joint_names
         self.action_labels = tuple(Label(f"d_{joint}", f"turn {joint}", "rad", "/ 0.05") for joint in joints)
         self.observation_labels = self.labels(self.space)
@@ -83,10 +84,16 @@ class ReachTask(Memory):
         middle = "(from the middle of the goals) / 0.3"
         return (
             *(Label(one, "joint position from the home pose", "rad", "- home", -4, 4) for one in names),
-            *(Label(f"target_{one}", "commanded joint position from measured", "rad", "/ 0.15", -2, 2) for one in names),
+            *(
+                Label(f"target_{one}", "commanded joint position from measured", "rad", "/ 0.15", -2, 2)
+                for one in names
+            ),
             *(Label(f"tool_{axis}", f"tool, {axis}", "m", middle, -4, 4) for axis in "xyz"),
             *(Label(f"goal_d{axis}", f"goal from the tool, {axis}", "m", "/ 0.3", -4, 4) for axis in "xyz"),
-            *(Label(f"goal_near_d{axis}", f"goal from the tool, {axis}, near", "m", "/ 0.05, clipped") for axis in "xyz"),
+            *(
+                Label(f"goal_near_d{axis}", f"goal from the tool, {axis}, near", "m", "/ 0.05, clipped")
+                for axis in "xyz"
+            ),
         )
 
     def sample_initial(self, env_ids: EnvIds, rngs: Sequence[np.random.Generator]) -> Initial:

@@ -62,7 +62,9 @@ class Sight:
         self.lead = LEASH * take("target_dx", "target_dy", "target_dz")  # tool target from the tool [m] (n, 3)
         self.lift = table.lift * take("object_lift")[:, 0]  # object above where it lay [m] (n,)
         cosine, sine = take("object_yaw_cos", "object_yaw_sin").T
-        self.turn: Array = np.arctan2(sine, cosine) / 4 * table.turns  # object's yaw from the gripper's, the nearest of four [rad]
+        self.turn: Array = (
+            np.arctan2(sine, cosine) / 4 * table.turns
+        )  # object's yaw from the gripper's, the nearest of four [rad]
         grip, width = take("grip", "gripper_width").T
         # Whether the gripper was commanded to close on the object, and whether it stopped at the object's width. (n,)
         self.closed: Flags = (grip > 0) & (np.linalg.norm(self.offset, axis=1) < table.near)

@@ -26,7 +26,6 @@ LEASH = 0.03
 YAW_LIMIT = 1.2  # farthest the gripper turns from straight ahead [rad]; a cube needs pi/4
 
 
-
 class WorkSpace:
     """The work area of an arm on its table, and what observations are scaled by."""
 

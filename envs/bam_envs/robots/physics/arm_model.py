@@ -8,7 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from bam_envs.robots.description import ArmDescription, Capsule, Placed, cube_edge
+from bam_envs.core.serial_chain import Capsule
+from bam_envs.robots.description import ArmDescription, Placed, cube_edge
 from bam_envs.robots.physics.mujoco_batch import MODELS, mujoco
 
 CUBE_DENSITY = 0.08 / 0.04**3
@@ -98,7 +99,7 @@ def _gripper(description: ArmDescription) -> list[str]:
         f'<body name="gripper" pos="{pos}" quat="{quat}" childclass="gripper" gravcomp="1">',
         f'<camera name="wrist" pos="0 {-0.075 * size:g} 0.03" xyaxes="1 0 0 0 -0.97 0.24" fovy="78"/>',
         f'<geom name="palm" size="{wide:g} {deep:g} {palm:g}" pos="0 0 {palm:g}" mass="{0.8 * mass:g}"/>',
-        f'<site name="tool" pos="0 0 {2 * palm + 0.06 * size:g}" size="0.004" rgba="0.9 0.2 0.2 0"/>',
+        f'<site name="tool" pos="0 0 {2 * palm + 0.06 * size!r}" size="0.004" rgba="0.9 0.2 0.2 0"/>',
     ]
     for name, side in (("left", 1), ("right", -1)):
         lines += [

@@ -51,7 +51,9 @@ class Cameras:
         random: Whether light, colours, the table's texture and the cameras' poses are drawn for each episode.
     """
 
-    def __init__(self, scene: Callable[[], Any], physics: Physics, specs: Sequence[CameraSpec], *, random: bool) -> None:
+    def __init__(
+        self, scene: Callable[[], Any], physics: Physics, specs: Sequence[CameraSpec], *, random: bool
+    ) -> None:
         self._scene, self._physics, self._specs, self._random = scene, physics, tuple(specs), random
         self.draws: Array = np.full((physics.num_envs, _DRAWS), 0.5)
         """Random numbers in [0, 1) that decide the looks of each environment. Shape: (n, 64)."""

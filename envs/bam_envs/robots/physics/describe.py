@@ -64,7 +64,7 @@ def describe(name: str, model: str, gripper: str | None, site: str | None) -> tu
 
 def _slack(description: ArmDescription, shapes: Shapes) -> Iterator[tuple[int, int, float]]:
     """For two links, how far their capsules overlap while their shapes are apart [m], if it matters."""
-    outline, chain = Outline(description), description.chain
+    outline, chain = Outline(description.chain), description.chain
     rng = np.random.default_rng(0)
     low, high = np.maximum(chain.low, -np.pi), np.minimum(chain.high, np.pi)
     q = low + rng.random((_POSTURES, len(low))) * (high - low)
@@ -113,7 +113,9 @@ def _joints(read: ReadArm) -> tuple[JointRow, ...]:
                 mass=round(read.mass[at], 3),
             )
         )
-    read.notes.append(f"all {size} joints: no acceleration or jerk in the files, so {ACCELERATION:g} rad/s^2, {JERK:g} rad/s^3")
+    read.notes.append(
+        f"all {size} joints: no acceleration or jerk in the files, so {ACCELERATION:g} rad/s^2, {JERK:g} rad/s^3"
+    )
     return tuple(rows)
 
 
@@ -149,8 +151,16 @@ def as_toml(description: ArmDescription, notes: list[str]) -> str:
     lines = [f"# {note}" for note in notes] + [""] * bool(notes)
     for key in ("name", "title", "geometry"):
         lines += [f"{key} = {_toml(table[key])}"] if table[key] else []
-    lines += [f"home = {_toml(table['home'])}", f"slack = {_toml(table['slack'])}", f"workspace = {_toml(table['workspace'])}"]
-    lines += [f"tool = {_toml(table['tool'])}", f"mount = {_toml(table['mount'])}", f"gripper = {_toml(table['gripper'])}"]
+    lines += [
+        f"home = {_toml(table['home'])}",
+        f"slack = {_toml(table['slack'])}",
+        f"workspace = {_toml(table['workspace'])}",
+    ]
+    lines += [
+        f"tool = {_toml(table['tool'])}",
+        f"mount = {_toml(table['mount'])}",
+        f"gripper = {_toml(table['gripper'])}",
+    ]
     for key in ("joints", "capsules"):
         lines += [f"{key} = [", *(f"  {_toml(row)}," for row in table[key]), "]"]
     lines += ["", "[sources]", *(f"{name} = {_toml(value)}" for name, value in description.sources.items())]
@@ -161,7 +171,9 @@ def _toml(value: object) -> str:
     if isinstance(value, str):
         return '"' + value.replace("\\", "\\\\").replace('"', '\\"') + '"'
     if isinstance(value, dict):
-        kept = {key: one for key, one in value.items() if one not in ((0.0,) * 3, (1.0, 0.0, 0.0, 0.0)) or key == "axis"}
+        kept = {
+            key: one for key, one in value.items() if one not in ((0.0,) * 3, (1.0, 0.0, 0.0, 0.0)) or key == "axis"
+        }
         return "{ " + ", ".join(f"{key} = {_toml(one)}" for key, one in kept.items()) + " }"
     if isinstance(value, (tuple, list)):
         return "[" + ", ".join(map(_toml, value)) + "]"

@@ -4,6 +4,7 @@ What a file does not say gets a default, and a note that says so.
 """
 
 import contextlib
+import importlib
 import itertools
 import re
 import xml.etree.ElementTree as ElementTree
@@ -85,7 +86,7 @@ def _spec(name: str) -> tuple[Any, dict[str, tuple[float | None, float | None]]]
         raise InvalidValue(f"There is no file {name}. Give an MJCF or URDF file, or menagerie:NAME.")
     limits: dict[str, tuple[float | None, float | None]] = {}
     try:
-        if path.suffix == ".urdf" or b"<robot" in path.read_bytes()[:4000]:
+        if path.suffix in (".urdf", ".xacro") or b"<robot" in path.read_bytes()[:4000]:
             text, limits = _urdf(path)
             spec = mujoco.MjSpec.from_string(text)
         else:
@@ -97,11 +98,11 @@ def _spec(name: str) -> tuple[Any, dict[str, tuple[float | None, float | None]]]
 
 def _menagerie(name: str) -> Any:
     try:
-        import mujoco_menagerie
+        menagerie: Any = importlib.import_module("mujoco_menagerie")
     except ImportError as error:
         raise MissingExtra("mujoco_menagerie", "robots", f"menagerie:{name}") from error
     try:
-        return mujoco_menagerie.get(name).spec()
+        return menagerie.get(name).spec()
     except Exception as error:  # its errors, and those of the network, are many
         raise InvalidValue(
             f"menagerie:{name}: {_line(error)}. Look at the name, or give a folder with the models: MENAGERIE_ROOT=."
@@ -114,7 +115,7 @@ def _line(error: BaseException) -> str:
 
 def _urdf(path: Path) -> tuple[str, dict[str, tuple[float | None, float | None]]]:
     """The text of an URDF with the files of its meshes found, and velocity and effort of its joints."""
-    root = ElementTree.fromstring(path.read_text(encoding="utf-8"))
+    root = ElementTree.fromstring(_expanded(path) if path.suffix == ".xacro" else path.read_text(encoding="utf-8"))
     for mesh in root.iter("mesh"):
         mesh.set("filename", _mesh_file(path, mesh.get("filename", "")))
     for link in root.iter("link"):
@@ -132,6 +133,18 @@ def _urdf(path: Path) -> tuple[str, dict[str, tuple[float | None, float | None]]
             speed, effort = (float(limit.get(key, 0.0)) or None for key in ("velocity", "effort"))
             limits[joint.get("name", "")] = speed, effort
     return ElementTree.tostring(root, encoding="unicode"), limits
+
+
+def _expanded(path: Path) -> str:
+    """The URDF of a xacro file."""
+    try:
+        xacrodoc: Any = importlib.import_module("xacrodoc")
+    except ImportError as error:
+        raise MissingExtra("xacrodoc", "robots", f"The xacro file {path}") from error
+    try:
+        return str(xacrodoc.XacroDoc.from_file(str(path)).to_urdf_string())
+    except Exception as error:  # of its parser, of packages that are not found
+        raise InvalidValue(f"{path} cannot be expanded: {_line(error)}.") from error
 
 
 def _mesh_file(path: Path, name: str) -> str:
@@ -333,6 +346,7 @@ class _Reader:
         bodies = owner == link
         flange = np.eye(4)
         flange[:3, :3], flange[:3, 3] = data.xmat[self._end].reshape(3, 3), data.xpos[self._end]
+        grip: list[Array]
         if self._parallel is not None:
             length = 0.10 + 0.5 * self._parallel
             tool = flange.copy()
@@ -348,7 +362,8 @@ class _Reader:
             moved = _moved_bodies(model, self._finger_joints(bodies)) & bodies
             back = np.linalg.inv(tool)
             fingers = _finger_groups(model, moved, lambda body: _body_points(model, data, body))
-            grip = [self._points(bodies & ~moved, tool), *(one @ back[:3, :3].T + back[:3, 3] for one in fingers)]
+            body = self._points(bodies & ~moved, tool)
+            grip = [body, *(one @ back[:3, :3].T + back[:3, 3] for one in fingers)]
         arm.tool = np.linalg.inv(last) @ tool
         if self._parallel is None and self._pivot is not None:  # the last link is also the fixed finger of a jaw
             back = np.linalg.inv(arm.tool)
@@ -413,7 +428,8 @@ class _Reader:
         back = np.linalg.inv(flange)
 
         def cloud(body: int) -> Array:
-            return _body_points(model, data, body) @ back[:3, :3].T + back[:3, 3]
+            points: Array = _body_points(model, data, body) @ back[:3, :3].T + back[:3, 3]
+            return points
 
         groups = _finger_groups(model, moved, cloud)
         if len(groups) == 1:  # one jaw moves against a fixed one
@@ -518,7 +534,12 @@ def _geom_points(model: Any, data: Any, geom: int) -> Array:
         points = np.concatenate([points, _between(points[model.mesh_face[faces[0] : sum(faces)]])])
     elif kind == int(kinds.mjGEOM_BOX):
         points = _box(-size, size)
-    elif kind in (int(kinds.mjGEOM_SPHERE), int(kinds.mjGEOM_CAPSULE), int(kinds.mjGEOM_CYLINDER), int(kinds.mjGEOM_ELLIPSOID)):
+    elif kind in (
+        int(kinds.mjGEOM_SPHERE),
+        int(kinds.mjGEOM_CAPSULE),
+        int(kinds.mjGEOM_CYLINDER),
+        int(kinds.mjGEOM_ELLIPSOID),
+    ):
         turn = np.linspace(0.0, 2 * np.pi, 16, endpoint=False)
         rise = np.linspace(-0.5 * np.pi, 0.5 * np.pi, 7)
         ball = np.array([[np.cos(r) * np.cos(t), np.cos(r) * np.sin(t), np.sin(r)] for r in rise for t in turn])
@@ -551,5 +572,7 @@ def _between(triangles: Array) -> Array:
     for corners, longest in zip(triangles[length > 0.03], length[length > 0.03], strict=True):
         parts = min(20, int(longest / 0.02) + 1)
         shares = [(i / parts, j / parts) for i in range(parts + 1) for j in range(parts + 1 - i)]
-        points += [np.array([corners[0] + i * (corners[1] - corners[0]) + j * (corners[2] - corners[0]) for i, j in shares])]
+        points += [
+            np.array([corners[0] + i * (corners[1] - corners[0]) + j * (corners[2] - corners[0]) for i, j in shares])
+        ]
     return np.concatenate(points)

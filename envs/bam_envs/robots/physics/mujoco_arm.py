@@ -146,7 +146,11 @@ class SimulatedArm:
             half = pose[:, 2] / 2
             object_pose[env_ids, :2] = pose[:, :2]
             object_pose[env_ids, 2] = [physics.model_of(int(env)).geom_size[geom, 2] for env in env_ids]
-            object_pose[env_ids, 3], object_pose[env_ids, 4:6], object_pose[env_ids, 6] = np.cos(half), 0.0, np.sin(half)
+            object_pose[env_ids, 3], object_pose[env_ids, 4:6], object_pose[env_ids, 6] = (
+                np.cos(half),
+                0.0,
+                np.sin(half),
+            )
         return self._measure(env_ids)
 
     def step(self, command: Array) -> RobotState:
