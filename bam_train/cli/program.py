@@ -90,7 +90,7 @@ class Command:
 
 
 def run_commands(prog: str, what: str, commands: Mapping[str, Command], arguments: list[str] | None = None) -> None:
-    """Run the command that the first argument names, with the others as its flags; `what` the program does, for help."""
+    """Run the command that the first argument names, with the others as its flags; `what` is the text of the help."""
     given = sys.argv[1:] if arguments is None else arguments
     name = given[0] if given else ""
     if name in ("-h", "--help"):

@@ -18,6 +18,7 @@ from bam_envs.core.location import HERE, SIMULATED, LiveRobot, Location, Remote
 from bam_envs.core.registry import entry_of, resolve_id
 from bam_envs.core.wording import did_you_mean
 from bam_envs.robo_gym.making import constructor_options, require_values
+from bam_envs.robots.description import require_same_arm, robot_model
 from bam_envs.robots.linked import link_profile
 from bam_envs.safety.guard import TRIAL_SPEED
 from bam_envs.tasks.wrappers.late_actions import read_delay
@@ -61,6 +62,10 @@ def environment_of(
         require_env_kwargs(env_id, env_kwargs)
     except (UnknownName, SettingsError) as error:
         raise SettingsError(f"{checkpoint.path}: its manifest: {error}") from error
+    try:
+        require_same_arm(env_kwargs.get("robot_model"))
+    except InvalidValue as error:
+        raise CheckpointMismatch(checkpoint.path, f"was trained for another arm: {error}") from error
     return env_id, dict(env_kwargs)
 
 
@@ -99,9 +104,11 @@ def require_env_kwargs(env: str, given: Mapping[str, Any]) -> None:
         entry.read_cameras(given)
         if given.get("link") is not None:
             link_profile(given["link"])
+        if "robot_model" in given:
+            robot_model(given["robot_model"])
         if given.get("action_delay") is not None:
             read_delay(given["action_delay"])
-    except InvalidValue as error:
+    except (InvalidValue, UnknownName) as error:
         raise SettingsError(f"env_kwargs: {error}") from error
 
 

@@ -173,7 +173,7 @@ class ArmGeometry:
         return rows
 
     def tool_jacobian(self, q: Sequence[float]) -> Array:
-        """Velocity of the tool [m/rad] and axis of each joint in ``base_link`` at the joints `q` (6,). Shape: (6, 6)."""
+        """Velocity of the tool [m/rad] and axes of the joints, in ``base_link``, at the joints `q` (6,). (6, 6)."""
         rows = np.array(self.jacobian(q)).reshape(1, 6, 2, 3)
         jacobian: Array = turned(rows, np.cos(q[:1]), np.sin(q[:1]))[0].reshape(6, 6).T
         return jacobian

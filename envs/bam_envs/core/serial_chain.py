@@ -1,8 +1,8 @@
 """Kinematics of any serial chain of revolute joints, batched in NumPy: forward, Jacobian and damped inverse.
 
 It has the interface of `bam_envs.core.kinematics.ArmGeometry`, whose closed form serves Universal Robots arms. A chain
-is plain data: for each joint its frame in the frame of the joint before, and its axis. Positions are in the frame of the
-base, x forward and z up, in metres; angles in radians. The tool's z axis points out of the gripper, and its fingers
+is plain data: for each joint its frame in the frame of the joint before, and its axis. Positions are in the frame of
+the base, x forward and z up, in metres; angles in radians. The tool's z axis points out of the gripper, and its fingers
 close along its x axis.
 
 The inverse is the Levenberg-Marquardt method of Sugihara, "Solvability-unconcerned inverse kinematics by the
@@ -13,6 +13,7 @@ seven joints, goes to the home pose.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -92,7 +93,7 @@ class SerialChain:
         return len(self.axes)
 
     def link_frames(self, q: Array) -> Array:
-        """Poses of the joints' frames, which turn with them, then of the tool. Shape: (n, k) [rad] -> (n, k + 1, 4, 4)."""
+        """Poses of the joints' frames, which turn with them, then of the tool. Shape: (n, k) -> (n, k + 1, 4, 4)."""
         sine, rest = np.sin(q)[:, :, None, None], (1.0 - np.cos(q))[:, :, None, None]
         steps = self._motion[0] + sine * self._motion[1] + rest * self._motion[2]
         frames = np.empty((len(q), q.shape[1] + 1, 4, 4))
@@ -125,12 +126,12 @@ class SerialChain:
         return frames, np.stack([v * z - w * y, w * x - u * z, u * y - v * x, u, v, w], axis=1)
 
     def tool_jacobian(self, q: Sequence[float]) -> Array:
-        """Velocity of the tool [m/rad] and axis of each joint in ``base_link`` at the joints `q` (k,). Shape: (6, k)."""
+        """Velocity of the tool [m/rad] and axes of the joints, in ``base_link``, at the joints `q` (k,). (6, k)."""
         jacobian: Array = self.jacobians(np.array([q]))[1][0]
         return jacobian
 
     def flange_pose(self, q: Array) -> tuple[Array, Array]:
-        """Pose of a gripper of `HAND` length that ends at the tool; see `ArmGeometry.flange_pose`. (n, 3), (n, 3, 3)."""
+        """Pose of a gripper of `HAND` length that ends at the tool, as `ArmGeometry.flange_pose`. (n, 3), (n, 3, 3)."""
         tool = self.link_frames(q)[:, -1]
         return tool[:, :3, 3] - HAND * tool[:, :3, 2], tool[:, :3, :3]
 
@@ -192,6 +193,6 @@ Arm = ArmGeometry | SerialChain
 
 def arm_of(tool_position: object) -> Arm | None:
     """The arm whose ``tool_position`` this is; None for any other function."""
-    owner = getattr(tool_position, "__self__", None)
+    owner: Any = getattr(tool_position, "__self__", None)
     known = isinstance(owner, SerialChain) or type(owner) is ArmGeometry
     return owner if known and tool_position == owner.tool_position else None

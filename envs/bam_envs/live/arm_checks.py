@@ -85,7 +85,7 @@ class Urdf(dict[str, UrdfJoint]):
 
 
 def arm_in(task: object, spec: RobotSpec) -> Arm | None:
-    """The arm that `task` is made for; a UR5e with a gripper for a task that does not say, if its joints have the names."""
+    """The arm that `task` is made for; if it does not say, a UR5e with a gripper for joints with those names."""
     arm: Arm | None = getattr(task, "arm", None)
     return UR5E_GRIPPER if arm is None and spec.command.labels[:6] == UR_JOINTS else arm
 

@@ -53,7 +53,8 @@ def _outermost(points: Array) -> Array:
     rng = np.random.default_rng(0)
     ways = rng.standard_normal((_DIRECTIONS, 3))
     others = rng.choice(len(points), _DIRECTIONS, replace=False)
-    return points[np.unique(np.concatenate([(points @ ways.T).argmax(axis=0), others]))]
+    outermost: Array = points[np.unique(np.concatenate([(points @ ways.T).argmax(axis=0), others]))]
+    return outermost
 
 
 def _capsule(points: Array) -> _Fit:
@@ -164,7 +165,8 @@ class Outline:
         """Distance of the nearest pair of capsules that can touch [m]; negative if they overlap. Shape: (n,)."""
         if not len(self.pairs):
             return np.full(len(q), np.inf)
-        return self.distances(q).min(axis=1)
+        nearest: Array = self.distances(q).min(axis=1)
+        return nearest
 
     def distances(self, q: Array) -> Array:
         """Distance of each of `pairs` [m]. Shape: (n, pairs)."""
@@ -189,10 +191,11 @@ class Outline:
         rng = np.random.default_rng(0)
         low, high = self.chain.low, self.chain.high
         gaps = self.distances(low + rng.random((2000, len(low))) * (high - low))
-        # Capsules on both sides of a wrist or an elbow overlap nearly always: limits of the joints keep their links apart.
+        # Capsules on both sides of a wrist or an elbow overlap nearly always: limits of joints keep their links apart.
         near = np.diff(np.minimum(links[self.pairs], last), axis=1)[:, 0] == 2
         share = (gaps < 0.0).mean(axis=0)
-        return self.pairs[(share > 0.0) & ~(near & (share > _NEARLY_ALWAYS))]
+        kept: NDArray[np.int64] = self.pairs[(share > 0.0) & ~(near & (share > _NEARLY_ALWAYS))]
+        return kept
 
 
 def segment_distances(start: Array, end: Array, other_start: Array, other_end: Array) -> Array:

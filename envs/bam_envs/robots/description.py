@@ -2,12 +2,13 @@
 
 Simulation, kinematics, guards and live profiles all read the same description, so that an arm is described once. Those
 in the folder ``descriptions`` are shipped; ``./robots`` and this user's configuration folder hold a user's own, and
-installed packages offer theirs by the entry point group ``bam_envs.robots`` (a folder of files). No simulator is needed.
+installed packages offer theirs by the entry point group ``bam_envs.robots``. No simulator is needed.
 """
 
 import dataclasses
 import hashlib
 import importlib
+import json
 import sys
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
@@ -38,8 +39,11 @@ ModelName = Annotated[
 ]
 ENTRY_POINTS = "bam_envs.robots"
 """Entry point group of packages with descriptions: each names a package that holds ``NAME.toml`` files."""
+MOVING = ("joints", "home", "tool", "gripper", "mount", "workspace")
+"""Tables that decide how an arm moves."""
 DEFAULT_MODEL = "ur5e"
 """The arm of an environment without another ``robot_model``."""
+_MOST = 8  # differences that are listed
 _SHIPPED = resources.files("bam_envs.robots") / "descriptions"
 
 
@@ -206,22 +210,21 @@ class ArmDescription:
 
     @cached_property
     def digest(self) -> str:
-        """SHA-256 of what decides how the arm moves: joints, home, tool, gripper, mount and work area, in hexadecimal."""
+        """SHA-256 of `MOVING`, what decides how the arm moves, in hexadecimal."""
         table = dataclasses.asdict(self)
-        moving = {key: table[key] for key in ("joints", "home", "tool", "gripper", "mount", "workspace")}
+        moving = {key: table[key] for key in MOVING}
         return hashlib.sha256(repr(moving).encode()).hexdigest()
 
     def differences(self, other: "ArmDescription") -> Iterator[tuple[str, Any, Any]]:
         """What differs from `other` in what decides how the arm moves: name, value here, value there."""
         here, there = (dict(_leaves(dataclasses.asdict(one))) for one in (self, other))
         for name in sorted({*here, *there}):
-            if name.split(".")[0] in ("joints", "home", "tool", "gripper", "mount", "workspace"):
-                if here.get(name) != there.get(name):
-                    yield name, here.get(name), there.get(name)
+            if name.split(".")[0] in MOVING and here.get(name) != there.get(name):
+                yield name, here.get(name), there.get(name)
 
 
 def cube_edge(description: ArmDescription) -> float:
-    """Edge of the cube that an arm is given to grasp: 4 cm, or less for a small gripper, or for one that cannot turn [m]."""
+    """Edge of the cube that an arm grasps: 4 cm, or less for a small gripper or one that cannot turn [m]."""
     share = 0.55 if description.chain.turns else 0.4
     return min(0.04, round(share * description.gripper.open, 3))
 
@@ -296,15 +299,18 @@ def known_models() -> dict[str, Any]:
     return known
 
 
-def robot_model(name: "str | ArmDescription") -> ArmDescription:
-    """The arm called `name`, or the one in a file ``NAME.toml``; a description is returned as it is.
+def robot_model(name: "str | Mapping[str, Any] | ArmDescription") -> ArmDescription:
+    """The arm called `name`, or in a file ``NAME.toml``, or in a table; a description is returned as it is.
 
     Raises:
         UnknownName: There is none; with the closest match.
-        InvalidValue: Its file does not fit.
+        InvalidValue: Its file or table does not fit.
     """
     if isinstance(name, ArmDescription):
         return name
+    if isinstance(name, Mapping):
+        return _in_table(name)
+    check(name, NonEmpty, "robot_model")
     path = Path(name)
     if path.suffix == ".toml":
         return read_description(path)
@@ -312,6 +318,45 @@ def robot_model(name: "str | ArmDescription") -> ArmDescription:
     if name not in known:
         raise UnknownName("robot model", name, known)
     return _read_once(known[name])
+
+
+def portable_model(name: "str | Mapping[str, Any] | ArmDescription") -> str | dict[str, Any]:
+    """`name`, or the whole description in its place, for a checkpoint: any but the default one, with its digest."""
+    arm = robot_model(name)
+    if arm.name == DEFAULT_MODEL and name == DEFAULT_MODEL:
+        return DEFAULT_MODEL
+    table = dataclasses.asdict(arm)
+    return {**json.loads(json.dumps(table)), "digest": arm.digest}
+
+
+def _in_table(table: Mapping[str, Any]) -> ArmDescription:
+    """The description in a table of a checkpoint; `InvalidValue` if it is not the one with its digest."""
+    plain = {key: value for key, value in table.items() if key != "digest"}
+    arm = description_of(plain, "robot_model")
+    if "digest" in table and table["digest"] != arm.digest:
+        raise InvalidValue(f"robot_model: the description of {arm.name} was changed: it does not have its digest.")
+    return arm
+
+
+def require_same_arm(table: object) -> None:
+    """Refuse a description in a checkpoint if the one of that name here is of another arm.
+
+    Raises:
+        InvalidValue: What differs, in the checkpoint and here.
+    """
+    if not isinstance(table, Mapping):
+        return
+    there = robot_model(table)
+    path = known_models().get(there.name)
+    here = there if path is None else _read_once(path)
+    if here.digest == there.digest:
+        return
+    rows = [f"{name}: {theirs}, here {ours}" for name, theirs, ours in there.differences(here)]
+    more = f", and {len(rows) - _MOST} more" if len(rows) > _MOST else ""
+    raise InvalidValue(
+        f"{there.name} is another arm here ({path}): {'; '.join(rows[:_MOST])}{more}. Give the description with which "
+        "the policy was trained another name, or train a policy for this one."
+    )
 
 
 @lru_cache(maxsize=32)

@@ -15,7 +15,7 @@ from bam_envs.robots.description import ArmDescription
 
 Array = NDArray[np.float64]
 BOX = np.array([[-0.20, -0.25, 0.016], [0.20, 0.25, 0.35]])
-"""Full work area about its middle: lowest and highest x, y, z [m]. A smaller arm has a smaller one of the same shape."""
+"""Full work area about its middle: lowest and highest x, y, z [m]; a smaller arm has a smaller one."""
 TABLE_END = 0.88
 """Farthest x of a work area: the table ends at 0.95 m."""
 YAW = 1.2
@@ -92,16 +92,16 @@ def _homes(chain: SerialChain, outline: Outline, box: Array) -> list[tuple[float
     seeds = low + rng.random((_TRIES, chain.num_joints)) * (high - low)
     wanted = np.tile(_middle(box), (_TRIES, 1))
     q = _solve(chain, seeds, wanted, np.zeros(_TRIES))
-    good = _reaches(chain, q, wanted, np.zeros(_TRIES)) & (outline.lowest(q) > _CLEAR) & (outline.nearest(q) > _CLEAR)
-    q = q[good]
+    clear = np.minimum(outline.lowest(q), outline.nearest(q)) > _CLEAR
+    q = q[clear & _reaches(chain, q, wanted, np.zeros(_TRIES))]
     if not len(q):
         return []
     room = np.minimum(q - chain.low, chain.high - q).min(axis=1)
     _, jacobian = chain.jacobians(q)
     least = np.linalg.svd(jacobian[:, : 6 if chain.turns else 5], compute_uv=False)[:, -1]
-    clear = np.minimum(np.minimum(outline.nearest(q), outline.lowest(q)), 0.1)
+    gap = np.minimum(np.minimum(outline.nearest(q), outline.lowest(q)), 0.1)
     aside = np.sqrt(np.mean((q - 0.5 * (low + high)) ** 2, axis=1))
-    scores = np.minimum(room, 1.0) + 4.0 * np.minimum(least, 0.25) + 5.0 * clear - 0.4 * aside
+    scores = np.minimum(room, 1.0) + 4.0 * np.minimum(least, 0.25) + 5.0 * gap - 0.4 * aside
     order = np.argsort(-scores)
     picked: list[tuple[float, Array]] = []
     for at in order:
@@ -135,12 +135,12 @@ def covers(chain: SerialChain, outline: Outline, box: Array) -> bool:
     return bool(_reaches(chain, q, goals, turns).all())
 
 
-def _reaches(chain: SerialChain, q: Array, position: Array, yaw: Array) -> Array:
+def _reaches(chain: SerialChain, q: Array, position: Array, yaw: Array) -> NDArray[np.bool_]:
     """Whether the tool is at `position` pointing down at `yaw`, with all joints clear of their limits. (n,) bool."""
     frames = chain.link_frames(q)[:, -1]
     off = np.linalg.norm(frames[:, :3, 3] - position, axis=1)
     down = np.linalg.norm(frames[:, :3, 2] - [0.0, 0.0, -1.0], axis=1)
     turned = np.abs(np.angle(np.exp(1j * (np.arctan2(frames[:, 1, 0], frames[:, 0, 0]) - yaw)))) if chain.turns else 0.0
     room = np.minimum(q - chain.low, chain.high - q).min(axis=1)
-    reached: Array = (off < _REACHED) & (down < _REACHED) & (turned < _REACHED) & (room > _MARGIN)
+    reached: NDArray[np.bool_] = (off < _REACHED) & (down < _REACHED) & (turned < _REACHED) & (room > _MARGIN)
     return reached

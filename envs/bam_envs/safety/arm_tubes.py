@@ -120,7 +120,7 @@ class ArmTubes:
 
 
 class ChainTubes:
-    """Distances of the capsules of a described arm, with the methods of `ArmTubes`; `tool` is whether its gripper is."""
+    """Distances of the capsules of a described arm, with the methods of `ArmTubes`; `tool`: with its gripper."""
 
     def __init__(self, chain: SerialChain, *, tool: bool) -> None:
         size = chain.num_joints

@@ -97,7 +97,7 @@ class PickTask(Memory):
     memory: Mapping[str, str] = {"rest_height": "rest_height", "held": "held"}
     moves_straight = True  # the tool, along straight lines: singularities count
 
-    def __init__(self, num_envs: int = 1, *, robot_model: str = DEFAULT_MODEL) -> None:
+    def __init__(self, num_envs: int = 1, *, robot_model: Any = DEFAULT_MODEL) -> None:
         self.num_envs, self.table = num_envs, CubeTable(model_called(robot_model))
         self.arm = self.table.arm
         self.action_labels = self.table.action_labels

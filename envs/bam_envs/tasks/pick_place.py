@@ -56,7 +56,7 @@ class PickPlaceTask(PickTask):
 
     memory: Mapping[str, str] = {**PickTask.memory, "goal": "goal", "picked": "picked"}
 
-    def __init__(self, num_envs: int = 1, *, robot_model: str = DEFAULT_MODEL) -> None:
+    def __init__(self, num_envs: int = 1, *, robot_model: Any = DEFAULT_MODEL) -> None:
         super().__init__(num_envs, robot_model=robot_model)
         (x, _, _), (half_x, half_y, _) = self.table.middle, self.table.half
         self.robot_labels = (

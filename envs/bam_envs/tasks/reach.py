@@ -1,6 +1,7 @@
 """Reach: bring the tool within 2 cm of a point, with actions that turn the joints."""
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 from gymnasium import spaces
@@ -42,8 +43,8 @@ class ReachTask(Memory):
     """Bring the tool within `GOAL_RADIUS` of a goal.
 
     Args:
-        robot_model: The arm: the name of a description, or its file. Lengths below are for a UR5e; another arm has goals
-            in its own work area, in the same proportions.
+        robot_model: The arm: the name of a description, or its file. Lengths below are for a UR5e; another arm has
+            goals in its own work area, in the same proportions.
 
     Start:
         Each joint is within 0.1 rad of the home pose, in which the tool is at about (0.5, 0, 0.2) m and points down.
@@ -65,7 +66,7 @@ class ReachTask(Memory):
 
     memory: Mapping[str, str] = {"goal": "goal"}
 
-    def __init__(self, num_envs: int = 1, *, robot_model: str = DEFAULT_MODEL) -> None:
+    def __init__(self, num_envs: int = 1, *, robot_model: Any = DEFAULT_MODEL) -> None:
         self.num_envs, self.space = num_envs, GoalSpace(model_called(robot_model))
         self.arm = self.space.arm
         joints = self.space.description.joint_names
@@ -126,7 +127,7 @@ class ReachTask(Memory):
         ]
 
     def command(self, action: Floats, state: RobotState) -> Array:
-        """Joint positions [rad] within `TOOL_STEP` and `JOINT_STEP`, and the open gripper [m]. Shape: (n, joints + 1)."""
+        """Joints [rad] within `TOOL_STEP` and `JOINT_STEP`, and the open gripper [m]. Shape: (n, joints + 1)."""
         measured, sent = state.signals["joint_position"], state.command[:, :-1]
         wanted = sent + limited(action, -1.0, 1.0).astype(np.float64) * JOINT_STEP
         wanted = limited(limited(wanted, measured - LEASH, measured + LEASH), self.space.low, self.space.high)

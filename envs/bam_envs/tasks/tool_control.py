@@ -55,7 +55,7 @@ class WorkSpace:
     @property
     def hand_labels(self) -> tuple[Label, ...]:
         """Meaning of the first numbers of an observation."""
-        (x, y, z), (half_x, half_y, half_z) = self.middle, self.half
+        (x, _, z), (half_x, half_y, half_z) = self.middle, self.half
         labels = (
             Label("tool_x", "tool, forward", "m", f"(x - {x:g}) / {half_x:g}", -2, 2),
             Label("tool_y", "tool, to the left", "m", f"y / {half_y:g}", -2, 2),

@@ -88,7 +88,7 @@ def _geom(capsule: Capsule, mass: float, more: str) -> str:
 
 
 def _gripper(description: ArmDescription) -> list[str]:
-    """The gripper's body at the tool's orientation, 15 cm (for one of 85 mm) before the tool's point, and its fingers."""
+    """The gripper's body, turned as the tool and 15 cm before its point if it opens to 85 mm, and its fingers."""
     tool, width, mass = description.tool.matrix(), description.gripper.open, description.gripper.mass
     size = float(np.clip(width / 0.085, 0.4, 1.2))
     palm = max(0.01, min(0.045 * size, 0.5 * (float(np.linalg.norm(tool[:3, 3])) - 0.06 * size)))

@@ -1,4 +1,4 @@
-"""Read an arm and its gripper from MJCF or URDF files, with MuJoCo's `MjSpec`: joints, limits, tool, points of the links.
+"""Read an arm and its gripper from MJCF or URDF files, with MuJoCo's `MjSpec`: joints, limits, tool, shapes.
 
 What a file does not say gets a default, and a note that says so.
 """
@@ -170,8 +170,7 @@ def _named_body(spec: Any, site: str | None, model: str) -> Any:
         return bodies[name]
     if name not in sites:
         raise UnknownName("site or body", name, [*sites, *bodies])
-    holder = sites[name].parent.add_body(name=f"{name}_end", pos=sites[name].pos, quat=sites[name].quat)
-    return holder
+    return sites[name].parent.add_body(name=f"{name}_end", pos=sites[name].pos, quat=sites[name].quat)
 
 
 def _few(names: list[str]) -> str:
@@ -353,8 +352,8 @@ class _Reader:
             tool[:3, 3] += length * flange[:3, 2]
             half = 0.5 * self._parallel + 0.012
             palm = _box(np.array([-0.03, -0.03, -length]), np.array([0.03, 0.03, -0.06]))
-            fingers = _box(np.array([-half, -0.011, -0.06]), np.array([half, 0.011, 0.014]))
-            arm.width, arm.gripper_mass, grip = self._parallel, 0.5, [palm, fingers]
+            pads = _box(np.array([-half, -0.011, -0.06]), np.array([half, 0.011, 0.014]))
+            arm.width, arm.gripper_mass, grip = self._parallel, 0.5, [palm, pads]
             self._notes.append(f"the gripper is {length:.3f} m long from the end of the arm to the middle of its pads")
         else:
             tool, arm.width = self._fingers(bodies, flange)
@@ -378,7 +377,7 @@ class _Reader:
         joints = self._finger_joints(bodies)
         if not joints:
             raise InvalidValue(
-                f"{self._where}: no joint moves a finger. Give the gripper: --gripper FILE, or --gripper parallel:WIDTH."
+                f"{self._where}: no joint moves a finger. Give the gripper: --gripper FILE or --gripper parallel:WIDTH."
             )
         moved = _moved_bodies(model, joints) & bodies
         shapes = [self._tips(moved, bodies, flange, state) for state in self._gripper_states(joints)]
@@ -547,7 +546,7 @@ def _geom_points(model: Any, data: Any, geom: int) -> Array:
             points = ball * size
         elif kind == int(kinds.mjGEOM_CYLINDER):
             ring = np.stack([np.cos(turn), np.sin(turn), np.zeros(16)], axis=1) * size[0]
-            points = np.concatenate([ring + [0, 0, z] for z in np.linspace(-size[1], size[1], 8)])
+            points = np.concatenate([ring + np.array([0.0, 0.0, z]) for z in np.linspace(-size[1], size[1], 8)])
         else:
             half = size[1] if kind == int(kinds.mjGEOM_CAPSULE) else 0.0
             points = np.concatenate([ball * size[0] + [0, 0, z] for z in np.linspace(-half, half, 8 if half else 1)])

@@ -17,7 +17,6 @@ from bam_envs.robots.description import robot_model as model_called
 from bam_envs.robots.physics.shapes import marked
 
 if TYPE_CHECKING:
-    from bam_envs.robots.description import ArmDescription
     from bam_envs.robots.physics.cameras import Cameras
     from bam_envs.robots.physics.domain_randomization import Imperfection
     from bam_envs.robots.physics.mujoco_batch import Physics
@@ -42,7 +41,7 @@ class SimulatedArm:
         with_object: Whether there is a cube, measured by a tracker.
         randomize: Masses, friction, sizes and gains that differ each episode, a noisy tracker and delayed commands.
         cameras: Its cameras, ``front`` and ``wrist``, whose images are signals.
-        robot_model: The arm: the name of a description, its file, or an `ArmDescription`.
+        robot_model: The arm; see `bam_envs.robots.description.robot_model`.
         looks: ``"random"`` for light, colours, texture and poses of cameras that differ each episode, or ``"fixed"``.
     """
 
@@ -54,7 +53,7 @@ class SimulatedArm:
         randomize: bool = False,
         cameras: tuple[CameraSpec, ...] = (),
         looks: str = "fixed",
-        robot_model: str | ArmDescription = DEFAULT_MODEL,
+        robot_model: Any = DEFAULT_MODEL,
     ) -> None:
         self.num_robots, self.description = num_robots, model_called(robot_model)
         self.randomize, self._looks = randomize, looks
@@ -154,7 +153,7 @@ class SimulatedArm:
         return self._measure(env_ids)
 
     def step(self, command: Array) -> RobotState:
-        """Send `command` (n, joints + 1): joint positions [rad] and the gripper's width [m]; one period later, measure."""
+        """Send `command` (n, joints + 1), joint positions [rad] and the gripper's width [m]; measure a period later."""
         return next(self.slices(command, 1))
 
     def slices(self, command: Array, parts: int) -> Iterator[RobotState]:
