@@ -136,16 +136,17 @@ class Outline:
 
     Args:
         chain: The arm, with capsules.
+        every: Whether pairs count too that overlap in most postures, and whose slack is not known.
     """
 
-    def __init__(self, chain: SerialChain) -> None:
+    def __init__(self, chain: SerialChain, *, every: bool = False) -> None:
         self.chain, capsules = chain, chain.capsules
         self.links = np.array([capsule.link for capsule in capsules])
         self.radius = np.array([capsule.radius for capsule in capsules])
         self._ends = np.array([(capsule.start, capsule.end) for capsule in capsules]).reshape(-1, 2, 3)
         self._mount = chain.mount
         self._slack = {(one, other): slack for one, other, slack in chain.slack}
-        self.pairs = self._pairs()
+        self.pairs = self._pairs(every)
 
     def segments(self, q: Array) -> Array:
         """Ends of the capsules' segments at the joints `q` (n, k) [rad]. Shape: (n, capsules, 2, 3)."""
@@ -176,7 +177,7 @@ class Outline:
         distances: Array = gap - self.radius[one] - self.radius[other] + np.array(slack)
         return distances
 
-    def _pairs(self) -> NDArray[np.int64]:
+    def _pairs(self, every: bool) -> NDArray[np.int64]:
         """Pairs of capsules on links with a joint between them that are apart in some posture, and not in all."""
         links = self.links
         rows = [
@@ -193,8 +194,9 @@ class Outline:
         gaps = self.distances(low + rng.random((2000, len(low))) * (high - low))
         # Capsules on both sides of a wrist or an elbow overlap nearly always: limits of joints keep their links apart.
         near = np.diff(np.minimum(links[self.pairs], last), axis=1)[:, 0] == 2
+        near &= [(int(links[i]), int(links[j])) not in self._slack for i, j in self.pairs]
         share = (gaps < 0.0).mean(axis=0)
-        kept: NDArray[np.int64] = self.pairs[(share > 0.0) & ~(near & (share > _NEARLY_ALWAYS))]
+        kept: NDArray[np.int64] = self.pairs[(share > 0.0) & (every | ~(near & (share > _NEARLY_ALWAYS)))]
         return kept
 
 

@@ -16,7 +16,10 @@ SPEED, ACCELERATION, JERK = 1.5, 6.0, 60.0
 """Limits of a joint where the files name none [rad/s, rad/s^2, rad/s^3]: below those of every arm that is shipped."""
 EFFORT_PER_REACH = 60.0
 """Torque of a joint where the files name none [N m], for each metre from the joint to the tool."""
-_POSTURES, _ENOUGH, _COMPARED = 5000, 20, 250  # in which links are compared; least of a pair; most of a pair
+_POSTURES, _ENOUGH = 10_000, 20
+"""Postures in which the outline is compared with the links, and the least number in which a pair overlaps."""
+_COMPARED = 1200  # of those, most for a pair
+_USELESS = 0.1  # share of postures in which capsules with one link between them would still alarm: not compared
 _TOUCH = 0.0045  # depth from which shapes touch, and what is kept of the slack [m]
 _SURE = 0.001
 _FARTHEST = 3.0  # an arm longer than this has its lengths in another unit [m]
@@ -64,7 +67,7 @@ def describe(name: str, model: str, gripper: str | None, site: str | None) -> tu
 
 def _slack(description: ArmDescription, shapes: Shapes) -> Iterator[tuple[int, int, float]]:
     """For two links, how far their capsules overlap while their shapes are apart [m], if it matters."""
-    outline, chain = Outline(description.chain), description.chain
+    outline, chain = Outline(description.chain, every=True), description.chain
     rng = np.random.default_rng(0)
     low, high = np.maximum(chain.low, -np.pi), np.minimum(chain.high, np.pi)
     q = low + rng.random((_POSTURES, len(low))) * (high - low)
@@ -72,14 +75,15 @@ def _slack(description: ArmDescription, shapes: Shapes) -> Iterator[tuple[int, i
     for one, other in sorted({(int(i), int(j)) for i, j in links}):
         gap = gaps[:, (links == [one, other]).all(axis=1)].min(axis=1)
         overlapping = np.flatnonzero(gap < 0.0)
-        if len(overlapping) < _ENOUGH:
+        if len(overlapping) < _ENOUGH or not shapes.are_known(one, other):
             continue
         overlapping = overlapping[np.argsort(-gap[overlapping])]  # the slightest first
         picked = overlapping[np.unique(np.linspace(0, len(overlapping) - 1, _COMPARED).astype(int))]
         deepest = float(gap[picked].min())
         touching = next((float(gap[at]) for at in picked if shapes.distance(one, other, q[at]) < -_TOUCH), deepest)
         slack = max(0.0, -touching - _SURE)
-        if slack > 0.002:
+        useless = (gap < -slack).mean() > _USELESS and min(other, description.num_joints) - one == 2
+        if slack > 0.002 and not useless:
             yield one, other, round(slack, 3)
 
 

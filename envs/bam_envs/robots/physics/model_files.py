@@ -203,6 +203,10 @@ class Shapes:
         self._model, self._data, self._where = model, data, model.jnt_qposadr[joints]
         self._geoms = [_solid(model, owner == link) for link in range(len(joints) + 2)]
 
+    def are_known(self, one: int, other: int) -> bool:
+        """Whether both links have shapes in the model."""
+        return bool(self._geoms[one] and self._geoms[other])
+
     def distance(self, one: int, other: int, q: Array) -> float:
         """Distance of two links at the joints `q` (k,) [rad], at most 5 cm; negative if they overlap."""
         self._data.qpos[:] = 0.0
