@@ -21,7 +21,7 @@ import sys
 import textwrap
 import types
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import MISSING, Field, dataclass, fields
+from dataclasses import MISSING, Field, dataclass, fields, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
@@ -201,6 +201,10 @@ def parse(
     except InvalidValue as error:
         _complain(prog, f"{error}. {remedy}")
         raise SystemExit(2) from error
+    arm = getattr(parsed, "robot_model", None)
+    if arm is not None and hasattr(parsed, "set"):  # one flag more for one argument of the environment
+        given: Any = parsed
+        return replace(given, set=(f"{given.SET}={arm}", *given.set))  # type: ignore[no-any-return]
     return parsed
 
 
