@@ -99,7 +99,7 @@ def details(name: str, arm: str | None = None) -> dict[str, Any]:
 
 def _cannot(env: Any) -> str | None:
     """What the arm of an environment cannot do, if anything."""
-    from bam_envs.core.serial_chain import SerialChain
+    from bam_envs.arms.serial_chain import SerialChain
 
     arm = getattr(getattr(env, "task", None), "arm", None)
     if not isinstance(arm, SerialChain) or arm.turns:

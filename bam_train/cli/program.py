@@ -203,8 +203,8 @@ def parse(
         raise SystemExit(2) from error
     arm = getattr(parsed, "robot_model", None)
     if arm is not None and hasattr(parsed, "set"):  # one flag more for one argument of the environment
-        given: Any = parsed
-        return replace(given, set=(f"{given.SET}={arm}", *given.set))  # type: ignore[no-any-return]
+        flagged: Any = parsed
+        return replace(flagged, set=(f"{flagged.SET}={arm}", *flagged.set))  # type: ignore[no-any-return]
     return parsed
 
 

@@ -11,6 +11,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 
 import bam_envs  # noqa: F401 - registers our environments with Gymnasium
 from bam_envs.aliases.robo_gym_names import ROBO_GYM
+from bam_envs.arms.description import require_same_arm, robot_model
 from bam_envs.core import registry
 from bam_envs.core.env_options import in_our_words, require_kinds
 from bam_envs.core.errors import BamEnvsError, InvalidValue, UnknownName
@@ -18,7 +19,6 @@ from bam_envs.core.location import HERE, SIMULATED, LiveRobot, Location, Remote
 from bam_envs.core.registry import entry_of, resolve_id
 from bam_envs.core.wording import did_you_mean
 from bam_envs.robo_gym.making import constructor_options, require_values
-from bam_envs.robots.description import require_same_arm, robot_model
 from bam_envs.robots.linked import link_profile
 from bam_envs.safety.guard import TRIAL_SPEED
 from bam_envs.tasks.wrappers.late_actions import read_delay

@@ -12,10 +12,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from bam_envs.arms.serial_chain import Arm
 from bam_envs.core.errors import InvalidValue
 from bam_envs.core.kinematics import UR5E_GRIPPER, UR_JOINTS
 from bam_envs.core.robot import RobotSpec, RobotState
-from bam_envs.core.serial_chain import Arm
 from bam_envs.safety.guard import columns_in, is_base, measured_places
 
 Array = NDArray[np.float64]

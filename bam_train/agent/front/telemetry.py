@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from bam_envs.arms.serial_chain import Arm
 from bam_envs.core.kinematics import UR5E_GRIPPER, UR_JOINTS, quaternions
 from bam_envs.core.robot import RobotSpec, RobotState, SignalSpec
-from bam_envs.core.serial_chain import Arm
 from bam_envs.safety.arm_tubes import tubes_of
 from bam_envs.safety.base_guards import LaserZones
 from bam_envs.safety.guard import Limits, columns_in, is_base, measured_places, position_range

@@ -187,7 +187,7 @@ class ArmGeometry:
         Args:
             position: Tool position [m]. Shape: (n, 3).
             yaw: Angle of the tool's x axis about world z [rad]. Shape: (n,).
-            near: Not needed: for `bam_envs.core.serial_chain.SerialChain`.
+            near: Not needed: for `bam_envs.arms.serial_chain.SerialChain`.
 
         Returns:
             Joint positions [rad], the last of which follows `yaw` without a jump. Shape: (n, 6).

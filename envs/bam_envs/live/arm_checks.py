@@ -15,10 +15,10 @@ from xml.etree import ElementTree
 import numpy as np
 from numpy.typing import NDArray
 
+from bam_envs.arms.serial_chain import Arm
 from bam_envs.core.errors import ProtocolError
 from bam_envs.core.kinematics import UR5E_GRIPPER, UR_JOINTS, ArmGeometry, angle_between, quaternions
 from bam_envs.core.robot import RobotSpec
-from bam_envs.core.serial_chain import Arm
 from bam_envs.live.examination import DESCRIPTION, TOOL_POSE, Inspection
 from bam_envs.live.robot_checks import FACTORS, Check
 from bam_envs.robots.ur import UR_MODELS

@@ -12,9 +12,9 @@ from dataclasses import replace
 
 import numpy as np
 
+from bam_envs.arms.capsules import Outline
+from bam_envs.arms.serial_chain import Arm, SerialChain
 from bam_envs.core.kinematics import ArmGeometry, ArmOutline, turned
-from bam_envs.core.serial_chain import Arm, SerialChain
-from bam_envs.robots.capsules import Outline
 
 Point = tuple[float, float, float]
 Tube = tuple[Point, Point, float]

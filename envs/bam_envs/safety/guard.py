@@ -17,9 +17,9 @@ import numpy as np
 from msgspec import Meta
 from numpy.typing import NDArray
 
+from bam_envs.arms.serial_chain import arm_of
 from bam_envs.core.errors import InvalidValue, UnknownName
 from bam_envs.core.robot import RobotSpec, SignalSpec
-from bam_envs.core.serial_chain import arm_of
 from bam_envs.core.validation import check
 from bam_envs.core.wording import brief
 

@@ -11,10 +11,10 @@ from operator import le
 import numpy as np
 from numpy.typing import NDArray
 
+from bam_envs.arms.serial_chain import arm_of
 from bam_envs.core.errors import InvalidValue
 from bam_envs.core.kinematics import UR5E_GRIPPER, UR_JOINTS
 from bam_envs.core.robot import RobotSpec, RobotState, SignalSpec
-from bam_envs.core.serial_chain import arm_of
 from bam_envs.safety import arm_guards as arm
 from bam_envs.safety.arm_tubes import tubes_of
 from bam_envs.safety.base_guards import LaserZones

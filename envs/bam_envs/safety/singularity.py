@@ -5,8 +5,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from bam_envs.arms.serial_chain import Arm, SerialChain
 from bam_envs.core.robot import RobotSpec
-from bam_envs.core.serial_chain import Arm, SerialChain
 from bam_envs.safety.guard import Guard, Limits, Tick, columns_in
 
 _SMALLEST, _LARGEST = (2.0, 1.1, 0.5, 1.1), (0.9, 1.2, 1.6, 1.6)

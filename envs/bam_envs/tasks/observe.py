@@ -5,9 +5,9 @@ from collections.abc import Sequence
 import numpy as np
 from gymnasium import spaces
 
+from bam_envs.arms.description import DEFAULT_MODEL, robot_model
 from bam_envs.core.robot import EnvIds, Initial, RobotState
 from bam_envs.core.task import Array, Floats, Label, Memory, Score, draw_seeds, labelled_box, limited
-from bam_envs.robots.description import DEFAULT_MODEL, robot_model
 from bam_envs.tasks.pick import CubeTable
 from bam_envs.tasks.reach import START_NOISE
 

@@ -6,11 +6,11 @@ from typing import Any
 import numpy as np
 from gymnasium import spaces
 
+from bam_envs.arms.description import DEFAULT_MODEL, ArmDescription, cube_edge
+from bam_envs.arms.description import robot_model as model_called
 from bam_envs.core.kinematics import cube_yaw_phase
 from bam_envs.core.robot import EnvIds, Initial, RobotState
 from bam_envs.core.task import Array, Floats, Label, Memory, Score, draw_seeds, labelled_box, limited
-from bam_envs.robots.description import DEFAULT_MODEL, ArmDescription, cube_edge
-from bam_envs.robots.description import robot_model as model_called
 from bam_envs.tasks.tool_control import ToolControl, WorkSpace, hand_state
 
 HOLD_STEPS = 5

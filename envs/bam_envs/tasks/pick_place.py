@@ -5,9 +5,9 @@ from typing import Any
 
 import numpy as np
 
+from bam_envs.arms.description import DEFAULT_MODEL
 from bam_envs.core.robot import EnvIds, Initial, RobotState
 from bam_envs.core.task import Array, Floats, Label, Score, limited
-from bam_envs.robots.description import DEFAULT_MODEL
 from bam_envs.tasks.pick import TABLE_EDGE, CubeSense, CubeTable, PickTask
 
 GOAL_RADIUS = 0.02  # the object lies at the goal within this distance [m]

@@ -6,10 +6,10 @@ from typing import Any
 import numpy as np
 from gymnasium import spaces
 
+from bam_envs.arms.description import DEFAULT_MODEL, ArmDescription
+from bam_envs.arms.description import robot_model as model_called
 from bam_envs.core.robot import EnvIds, Initial, RobotState
 from bam_envs.core.task import Array, Floats, Label, Memory, Score, draw_seeds, labelled_box, limited
-from bam_envs.robots.description import DEFAULT_MODEL, ArmDescription
-from bam_envs.robots.description import robot_model as model_called
 from bam_envs.tasks.tool_control import JOINT_STEP, TOOL_STEP, WorkSpace
 
 START_NOISE = 0.1

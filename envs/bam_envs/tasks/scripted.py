@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 
+from bam_envs.arms.description import DEFAULT_MODEL, ArmDescription, robot_model
 from bam_envs.core.errors import InvalidValue, UnknownName
 from bam_envs.core.registry import ENVIRONMENTS
 from bam_envs.core.task import Array, Flags, Floats, Label
-from bam_envs.robots.description import DEFAULT_MODEL, ArmDescription, robot_model
 from bam_envs.tasks.grasping.scripted_grasps import ScriptedGrasps
 from bam_envs.tasks.pick import CubeTable, PickTask
 from bam_envs.tasks.pick_place import CARRY, PickPlaceTask

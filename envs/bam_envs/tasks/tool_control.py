@@ -11,9 +11,9 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from bam_envs.arms.description import ArmDescription
 from bam_envs.core.robot import EnvIds, RobotState
 from bam_envs.core.task import Array, Floats, Label, Memory, limited
-from bam_envs.robots.description import ArmDescription
 
 TOOL_STEP = 0.0124
 """Maximum motion of the tool target in 0.05 s [m]; the tool stays below 0.25 m/s, as in a UR's recovery mode."""

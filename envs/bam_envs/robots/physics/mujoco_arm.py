@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from bam_envs.arms.description import DEFAULT_MODEL
+from bam_envs.arms.description import robot_model as model_called
 from bam_envs.core.errors import InvalidValue, PhysicsDiverged, ResetNeeded
 from bam_envs.core.robot import CameraSpec, EnvIds, Initial, RobotState, checked_command
-from bam_envs.robots.description import DEFAULT_MODEL
-from bam_envs.robots.description import robot_model as model_called
 from bam_envs.robots.physics.shapes import marked
 
 if TYPE_CHECKING:
@@ -41,7 +41,7 @@ class SimulatedArm:
         with_object: Whether there is a cube, measured by a tracker.
         randomize: Masses, friction, sizes and gains that differ each episode, a noisy tracker and delayed commands.
         cameras: Its cameras, ``front`` and ``wrist``, whose images are signals.
-        robot_model: The arm; see `bam_envs.robots.description.robot_model`.
+        robot_model: The arm; see `bam_envs.arms.description.robot_model`.
         looks: ``"random"`` for light, colours, texture and poses of cameras that differ each episode, or ``"fixed"``.
     """
 

@@ -8,10 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from bam_envs.arms.capsules import Outline
+from bam_envs.arms.description import ArmDescription
+from bam_envs.arms.serial_chain import SerialChain
 from bam_envs.core.errors import InvalidValue
-from bam_envs.core.serial_chain import SerialChain
-from bam_envs.robots.capsules import Outline
-from bam_envs.robots.description import ArmDescription
 
 Array = NDArray[np.float64]
 BOX = np.array([[-0.20, -0.25, 0.016], [0.20, 0.25, 0.35]])

@@ -6,11 +6,11 @@ from pathlib import Path
 
 import numpy as np
 
+from bam_envs.arms.capsules import Outline, fitted_capsules
+from bam_envs.arms.description import ArmDescription, Gripper, JointRow, Placed
+from bam_envs.arms.work_area import find_work_area
 from bam_envs.core.errors import InvalidValue
-from bam_envs.robots.capsules import Outline, fitted_capsules
-from bam_envs.robots.description import ArmDescription, Gripper, JointRow, Placed
-from bam_envs.robots.physics.model_files import Array, ReadArm, Shapes, read_arm
-from bam_envs.robots.work_area import find_work_area
+from bam_envs.robots.modelling.model_files import Array, ReadArm, Shapes, read_arm
 
 SPEED, ACCELERATION, JERK = 1.5, 6.0, 60.0
 """Limits of a joint where the files name none [rad/s, rad/s^2, rad/s^3]: below those of every arm that is shipped."""

@@ -21,12 +21,12 @@ import numpy as np
 from msgspec import Meta
 from numpy.typing import NDArray
 
+from bam_envs.arms.serial_chain import Arm, Capsule, SerialChain
 from bam_envs.core import kinematics
 from bam_envs.core.config_folder import config_folder
 from bam_envs.core.errors import InvalidValue, UnknownName
 from bam_envs.core.kinematics import ArmGeometry
 from bam_envs.core.robot import RobotSpec, SignalSpec
-from bam_envs.core.serial_chain import Arm, Capsule, SerialChain
 from bam_envs.core.validation import Finite, NonEmpty, NonNegative, NonNegativeInt, Positive, check, read_table
 
 tomllib: Any = importlib.import_module("tomllib" if sys.version_info >= (3, 11) else "tomli")
@@ -44,7 +44,7 @@ MOVING = ("joints", "home", "tool", "gripper", "mount", "workspace")
 DEFAULT_MODEL = "ur5e"
 """The arm of an environment without another ``robot_model``."""
 _MOST = 8  # differences that are listed
-_SHIPPED = resources.files("bam_envs.robots") / "descriptions"
+_SHIPPED = resources.files("bam_envs.arms") / "descriptions"
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -5,7 +5,7 @@ import itertools
 import numpy as np
 from numpy.typing import NDArray
 
-from bam_envs.core.serial_chain import Capsule, SerialChain
+from bam_envs.arms.serial_chain import Capsule, SerialChain
 
 Array = NDArray[np.float64]
 _DIRECTIONS = 500

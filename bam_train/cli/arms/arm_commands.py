@@ -1,86 +1,27 @@
-"""`bam-robots COMMAND`: describe arms once, for simulation, guards and live robots."""
+"""What the commands of `bam-robots` do."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from functools import partial
-from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import tyro
 
 from bam_envs.core.errors import InvalidValue
 from bam_train.cli.console import tell
-from bam_train.cli.flags import File, Groups
-from bam_train.cli.program import Command, run_commands
 
 if TYPE_CHECKING:
-    from bam_envs.robots.description import ArmDescription
+    from pathlib import Path
 
-ModelName = Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="NAME")]
-ModelFile = Annotated[str | None, tyro.conf.arg(metavar="FILE|menagerie:NAME")]
+    from bam_envs.arms.description import ArmDescription
+    from bam_train.cli.arms.bam_robots import AddArmConfig, CheckArmConfig, ListArmsConfig
+
 _PICTURES = (".png", ".jpg")
 _POSTURES = 2000  # in which kinematics are compared with MuJoCo's
 
 
-@dataclass(frozen=True)
-class AddConfig:
-    """Describe an arm and its gripper from model files: joints, limits, outline, tool, and where it can work.
-
-    The description is one file, robots/NAME.toml, which simulation, guards and live robots read. What the files do not
-    say gets a default, and a comment at the head of the description says so.
-
-    Examples:
-      bam-robots add lab --urdf lab_arm.urdf --tip tool0 --gripper parallel:0.08
-      bam-robots add fr3b --mjcf menagerie:franka_fr3 --gripper menagerie:robotiq_2f85 --site attachment_site
-      bam-train --env bam/pick --robot-model lab --algo ppo
-    """
-
-    GROUPS: ClassVar[Groups] = {"The model": ("mjcf", "urdf", "site", "tip", "gripper"), "The file": ("out", "force")}
-
-    name: ModelName
-    """Name of the arm."""
-    mjcf: ModelFile = None
-    """MJCF file of the arm, or menagerie:NAME."""
-    urdf: Annotated[str | None, tyro.conf.arg(metavar="FILE")] = None
-    """URDF or xacro file of the arm."""
-    site: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
-    """Site or body at the end of the arm, where the gripper is fixed (default: the first of the usual names)."""
-    tip: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
-    """The same for a URDF: the link at the end of the arm."""
-    gripper: Annotated[str | None, tyro.conf.arg(metavar="FILE|menagerie:NAME|parallel:WIDTH")] = None
-    """The gripper: a model file, or two parallel pads that open to a width in metres (default: the joints behind the
-    end of the arm)."""
-    out: Annotated[Path, tyro.conf.arg(metavar="FOLDER")] = Path("robots")
-    """Folder of the description."""
-    force: bool = False
-    """Replace a description of that name."""
-
-
-@dataclass(frozen=True)
-class CheckConfig:
-    """Show an arm: limits, reach, kinematics against MuJoCo, gripper, outline and the area where it works.
-
-    Examples:
-      bam-robots check lab
-      bam-robots check lab --picture lab.png
-    """
-
-    name: ModelName
-    """Name of the arm, or the file of its description."""
-    picture: File = None
-    """Draw it in its home pose, as an image."""
-
-
-@dataclass(frozen=True)
-class ListConfig:
-    """List the arms that are known here: a project's, this user's, those of packages and the shipped ones."""
-
-
-def add(config: AddConfig) -> int | None:
+def add(config: AddArmConfig) -> int | None:
     """Write the description of an arm."""
-    from bam_envs.robots.physics.describe import describe, write_description
+    from bam_envs.robots.modelling.describe import describe, write_description
 
     if (config.mjcf is None) == (config.urdf is None):
         raise InvalidValue("Give the model of the arm: --mjcf FILE or --urdf FILE.")
@@ -103,9 +44,9 @@ def add(config: AddConfig) -> int | None:
     return None
 
 
-def check(config: CheckConfig) -> int | None:
+def check(config: CheckArmConfig) -> int | None:
     """Show an arm."""
-    from bam_envs.robots.description import robot_model
+    from bam_envs.arms.description import robot_model
     from bam_train.cli.envs import aligned
 
     arm = robot_model(config.name)
@@ -127,8 +68,8 @@ def check(config: CheckConfig) -> int | None:
 
 def _facts(arm: ArmDescription) -> list[tuple[str, str, bool]]:
     """What is measured of an arm: name, text, and whether it is as it should be."""
-    from bam_envs.robots.capsules import Outline
-    from bam_envs.robots.work_area import covers
+    from bam_envs.arms.capsules import Outline
+    from bam_envs.arms.work_area import covers
 
     chain, outline = arm.chain, Outline(arm.chain)
     rng = np.random.default_rng(0)
@@ -193,9 +134,9 @@ def _draw(arm: ArmDescription, path: Path) -> None:
         robot.close()
 
 
-def list_models(config: ListConfig) -> int | None:
+def list_models(config: ListArmsConfig) -> int | None:
     """List the arms."""
-    from bam_envs.robots.description import known_models, read_description
+    from bam_envs.arms.description import known_models, read_description
     from bam_train.cli.envs import aligned
 
     rows = [["name", "joints", "what", "file"]]
@@ -204,15 +145,3 @@ def list_models(config: ListConfig) -> int | None:
         rows.append([name, str(arm.num_joints), arm.title, str(path)])
     tell(*aligned(rows), "", "Another arm: bam-robots add NAME --urdf FILE --gripper parallel:0.08")
     return None
-
-
-_HERE = "bam_train.cli.robots"
-COMMANDS = {
-    "add": Command("describe an arm and its gripper from model files", f"{_HERE}:AddConfig", f"{_HERE}:add"),
-    "check": Command("limits, reach, kinematics and work area of an arm", f"{_HERE}:CheckConfig", f"{_HERE}:check"),
-    "list": Command("the arms that are known here", f"{_HERE}:ListConfig", f"{_HERE}:list_models"),
-}
-main = partial(run_commands, "bam-robots", "Describe arms once, for simulation, guards and live robots.", COMMANDS)
-
-if __name__ == "__main__":
-    main()
