@@ -24,7 +24,7 @@ class AddArmConfig:
     Examples:
       bam-robots add lab --urdf lab_arm.urdf --tip tool0 --gripper parallel:0.08
       bam-robots add fr3b --mjcf menagerie:franka_fr3 --gripper menagerie:robotiq_2f85 --site attachment_site
-      bam-train --env bam/pick --robot-model lab --algo ppo
+      bam-robots add so101b --urdf so101.urdf --tip gripper_link
     """
 
     GROUPS: ClassVar[Groups] = {"The model": ("mjcf", "urdf", "site", "tip", "gripper"), "The file": ("out", "force")}

@@ -11,7 +11,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from bam_envs.arms.description import ArmDescription
+from bam_envs.arms.description import DEFAULT_MODEL, ArmDescription, robot_model
 from bam_envs.core.robot import EnvIds, RobotState
 from bam_envs.core.task import Array, Floats, Label, Memory, limited
 
@@ -76,12 +76,17 @@ class WorkSpace:
         return tuple(Label(joint, "joint position", "rad", "/ pi", -2, 2) for joint in self.description.joint_names)
 
 
+_DEFAULT = WorkSpace(robot_model(DEFAULT_MODEL))
+ACTION_LABELS, HAND_LABELS = _DEFAULT.action_labels, _DEFAULT.hand_labels
+"""Labels of the default arm."""
+
+
 class ToolControl(Memory):
     """The commanded tool of n environments: target, yaw, commanded joints, gripper."""
 
     memory: Mapping[str, str] = {"target": "target", "yaw": "yaw", "closed": "closed", "joints": "_joints"}
 
-    def __init__(self, num_envs: int, space: WorkSpace) -> None:
+    def __init__(self, num_envs: int, space: WorkSpace = _DEFAULT) -> None:
         self.space, self._arm = space, space.arm
         self._low, self._high = space.box
         self.target = np.zeros((num_envs, 3))
