@@ -228,7 +228,7 @@ def usage_error(box: str, config: type[Any]) -> str:
         if name in instead:
             return f"{match[1]} is no option: {instead[name]}."
         close = closest(name, flags)
-        choice = f"; there are {', '.join(flags[:-1])} and {flags[-1]}." if len(flags) < 4 else f"{instead.get('', '')}."
+        choice = f"; there are {' and '.join(flags)}." if len(flags) < 3 else f"{instead.get('', '')}."
         return f"unknown option {match[1]}{f', did you mean {close}?' if close else choice}"
     if match := re.search(r"Error parsing (\S+?):? .*(?:from \[|: )'(.*?)'", text):
         flag, found = match.groups()
