@@ -173,9 +173,13 @@ class Outline:
         """Distance of each of `pairs` [m]. Shape: (n, pairs)."""
         ends, (one, other) = self.segments(q), self.pairs.T
         gap = segment_distances(ends[:, one, 0], ends[:, one, 1], ends[:, other, 0], ends[:, other, 1])
-        slack = [self._slack.get((int(self.links[i]), int(self.links[j])), 0.0) for i, j in self.pairs]
-        distances: Array = gap - self.radius[one] - self.radius[other] + np.array(slack)
+        distances: Array = gap - self.radius[one] - self.radius[other] + self.slack
         return distances
+
+    @property
+    def slack(self) -> Array:
+        """How far the capsules of each of `pairs` may overlap [m]. Shape: (pairs,)."""
+        return np.array([self._slack.get((int(self.links[i]), int(self.links[j])), 0.0) for i, j in self.pairs])
 
     def _pairs(self, every: bool) -> NDArray[np.int64]:
         """Pairs of capsules on links with a joint between them that are apart in some posture, and not in all."""

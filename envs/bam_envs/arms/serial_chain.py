@@ -11,8 +11,10 @@ position out of reach gets the joints nearest to it. What the tool's pose leaves
 seven joints, goes to the home pose.
 """
 
-from collections.abc import Sequence
+import math
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -113,9 +115,29 @@ class SerialChain:
         return self.link_frames(q)[:, -1, :3, 3]
 
     def tool_point(self, q: Sequence[float]) -> tuple[float, float, float]:
-        """`tool_position` of one pose (k,) [rad] in plain numbers: x, y, z [m]."""
-        x, y, z = self.link_frames(np.array([q]))[0, -1, :3, 3].tolist()
-        return x, y, z
+        """`tool_position` of one pose (k,) [rad] in plain numbers, which take a fifth of the time; x, y, z [m]."""
+        return self._point(q)
+
+    @cached_property
+    def _point(self) -> Callable[[Sequence[float]], tuple[float, float, float]]:
+        """`tool_point` as straight-line code: from the tool to the base, without the zeros of the placements."""
+        turns = np.array([_towards(axis) for axis in self.axes])
+        names: dict[str, Any] = {"cos": math.cos, "sin": math.sin}
+        x, y, z = (repr(float(one)) for one in (turns[-1].T @ self.tool_placement)[:3, 3])
+        lines = ["def point(q):"]
+        for joint in reversed(range(self.num_joints)):
+            place = self.placements[joint] @ turns[joint]
+            if joint:
+                place = turns[joint - 1].T @ place
+            lines += [
+                f" c = cos(q[{joint}]); s = sin(q[{joint}])",
+                f" x, y, z = c * {x} - s * {y}, s * {x} + c * {y}, {z}",
+            ]
+            lines.append(" x, y, z = " + ", ".join(_sum(row) for row in place[:3]))
+            x, y, z = "x", "y", "z"
+        exec("\n".join([*lines, " return x, y, z"]), names)
+        point: Callable[[Sequence[float]], tuple[float, float, float]] = names["point"]
+        return point
 
     def jacobians(self, q: Array) -> tuple[Array, Array]:
         """Poses as `link_frames` gives them, and velocities of the tool: linear [m/rad], then angular. (n, 6, k)."""
@@ -185,6 +207,22 @@ class SerialChain:
         rest = error - np.einsum("nij,nj->ni", jacobian, homing)
         step = homing + np.einsum("nji,nj->ni", jacobian, np.linalg.solve(square, rest[:, :, None])[:, :, 0])
         return np.minimum(np.maximum(q + step, self.low), self.high), float(np.sqrt(squared.max()))
+
+
+def _towards(axis: Array) -> Array:
+    """A rotation that takes z to `axis`. Shape: (4, 4)."""
+    turn = np.eye(4)
+    other = np.eye(3)[np.abs(axis).argmin()]
+    x = np.cross(other, axis) if abs(axis[2]) < 1.0 else np.array([1.0, 0.0, 0.0])
+    x = x / np.linalg.norm(x)
+    turn[:3, 0], turn[:3, 1], turn[:3, 2] = x, np.cross(axis, x), axis
+    return turn
+
+
+def _sum(row: Array) -> str:
+    """Code of a row of a placement times x, y, z and 1."""
+    terms = [f"{value!r} * {name}" for value, name in zip(row[:3].tolist(), "xyz", strict=True) if abs(value) > 1e-15]
+    return " + ".join([*terms, repr(float(row[3]))])
 
 
 Arm = ArmGeometry | SerialChain

@@ -11,11 +11,13 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from bam_envs.arms.capsules import Outline
-from bam_envs.arms.serial_chain import Arm, SerialChain
+from bam_envs.arms.serial_chain import Arm, Capsule, SerialChain
 from bam_envs.core.kinematics import ArmGeometry, ArmOutline, turned
 
+Array = NDArray[np.float64]
 Point = tuple[float, float, float]
 Tube = tuple[Point, Point, float]
 """The two ends and the radius [m]."""
@@ -125,23 +127,29 @@ class ChainTubes:
     def __init__(self, chain: SerialChain, *, tool: bool) -> None:
         size = chain.num_joints
         kept = tuple(one for one in chain.capsules if tool or one.link <= size)
-        self._outline = Outline(replace(chain, capsules=kept))
-        self.least = -math.inf
-        # A turn of a joint moves what is beyond it by at most its angle times the greatest distance from it.
-        extent = [0.0] * (size + 2)
-        for one in kept:
-            farthest = max(math.hypot(*one.start), math.hypot(*one.end)) + one.radius
-            extent[one.link] = max(extent[one.link], farthest)
-        steps = [math.hypot(*place[:3, 3]) for place in (*chain.placements[1:], chain.tool_placement)]
-        self._levers = [0.0] * size
-        beyond = extent[size + 1]
-        for joint in reversed(range(size)):
-            beyond = max(extent[joint + 1], steps[joint] + beyond)
-            self._levers[joint] = beyond
+        self._chain, self._outline = chain, Outline(replace(chain, capsules=kept))
+        outline = self._outline
+        ends = [[(*one.start, 1.0), (*one.end, 1.0)] for one in kept]
+        self._links, self._ends = outline.links, np.array(ends).transpose(0, 2, 1)
+        self._low = np.flatnonzero((self._links > 1) & (self._links <= size))
+        one, other = outline.pairs.T
+        self._beyond = np.minimum(self._links[one], size), np.minimum(self._links[other], size)
+        self._kept = (outline.radius[one] + outline.radius[other] - outline.slack).tolist()
+        self._levers = _levers(chain, kept)
+        self._near, self._at = np.full(len(outline.pairs), -math.inf), np.zeros(size)
+        self._mount = chain.mount[None]
+        self._placed: tuple[list[float], Array] = [], np.empty(0)
+
+    @property
+    def least(self) -> float:
+        """Lower bound on the smallest distance of two capsules at the joints of `nearer_than` [m]."""
+        return float(self._near.min(initial=math.inf))
 
     def lowest(self, q: Sequence[float]) -> float:
         """Height of the lowest point of the links at the joints `q` (k,) [rad], from the second to the flange [m]."""
-        return float(self._outline.lowest(np.array([q]))[0])
+        places = self._places(q)[self._low]
+        lows: Array = places[:, 2].min(axis=1) - self._outline.radius[self._low]
+        return float(lows.min(initial=math.inf))
 
     def nearest(self, q: Sequence[float]) -> float:
         """Smallest distance of two capsules at the joints `q` (k,) [rad], in m; below 0 if their links overlap."""
@@ -149,17 +157,52 @@ class ChainTubes:
 
     def change(self, here: Sequence[float], there: Sequence[float]) -> float:
         """Upper bound on the change of `lowest` and of any distance [m] between two sets of joints (k,) [rad]."""
-        return sum(lever * abs(one - other) for lever, one, other in zip(self._levers, here, there, strict=True))
+        rows = zip(self._levers.tolist(), here, there, strict=True)
+        return float(sum(lever * abs(one - other) for lever, one, other in rows))
 
     def nearer_than(self, margin: float, q: Sequence[float]) -> bool:
-        """Whether two capsules are nearer than `margin` [m] at the joints `q` (k,) [rad]."""
-        self.least = self.nearest(q)
+        """Whether two capsules are nearer than `margin` [m] at the joints `q` (k,) [rad].
+
+        A pair is computed again only when the joints between its links have turned far enough since the last time to
+        bring it within the margin.
+        """
+        moved = np.zeros(len(self._levers) + 1)
+        np.cumsum(self._levers * np.abs(np.array(q) - self._at), out=moved[1:])
+        self._near -= moved[self._beyond[1]] - moved[self._beyond[0]]
+        self._at = np.array(q)
+        due = np.flatnonzero(self._near < margin)
+        if len(due):
+            places = self._places(q).transpose(0, 2, 1).tolist()
+            for pair in due.tolist():
+                one, other = self._outline.pairs[pair].tolist()
+                gap = math.sqrt(segment_distance2(*places[one], *places[other]))
+                self._near[pair] = gap - self._kept[pair]
         return self.least < margin
 
     def drawn(self, q: Sequence[float]) -> list[list[float]]:
         """The capsules in ``base_link``: two ends, x, y, z [m] each, and the radius [m]."""
         ends = self._outline.segments(np.array([q]))[0]
         return [[*two.ravel().tolist(), float(radius)] for two, radius in zip(ends, self._outline.radius, strict=True)]
+
+    def _places(self, q: Sequence[float]) -> Array:
+        """Ends of the capsules as columns [m]. Shape: (capsules, 3, 2)."""
+        if self._placed[0] != q:
+            frames = np.concatenate([self._mount, self._chain.link_frames(np.array([q]))[0]])
+            self._placed = list(q), frames[self._links, :3] @ self._ends
+        return self._placed[1]
+
+
+def _levers(chain: SerialChain, capsules: Sequence[Capsule]) -> Array:
+    """How far a turn of each joint moves what is beyond it at most [m/rad]. Shape: (k,)."""
+    size = chain.num_joints
+    extent = [0.0] * (size + 2)
+    for one in capsules:
+        extent[one.link] = max(extent[one.link], math.hypot(*one.start) + one.radius, math.hypot(*one.end) + one.radius)
+    steps = [math.hypot(*place[:3, 3]) for place in (*chain.placements[1:], chain.tool_placement)]
+    levers, beyond = np.zeros(size), extent[size + 1]
+    for joint in reversed(range(size)):
+        levers[joint] = beyond = max(extent[joint + 1], steps[joint] + beyond)
+    return levers
 
 
 Tubes = ArmTubes | ChainTubes
