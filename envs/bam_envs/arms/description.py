@@ -15,7 +15,7 @@ from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
 from importlib import metadata, resources
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, TypeVar
 
 import numpy as np
 from msgspec import Meta
@@ -24,13 +24,14 @@ from numpy.typing import NDArray
 from bam_envs.arms.serial_chain import Arm, Capsule, SerialChain
 from bam_envs.core import kinematics
 from bam_envs.core.config_folder import config_folder
-from bam_envs.core.errors import InvalidValue, UnknownName
+from bam_envs.core.errors import BamEnvsError, InvalidValue, UnknownName
 from bam_envs.core.kinematics import ArmGeometry
 from bam_envs.core.robot import RobotSpec, SignalSpec
 from bam_envs.core.validation import Finite, NonEmpty, NonNegative, NonNegativeInt, Positive, check, read_table
 
 tomllib: Any = importlib.import_module("tomllib" if sys.version_info >= (3, 11) else "tomli")
 
+T = TypeVar("T")
 Array = NDArray[np.float64]
 Vector = tuple[Finite, Finite, Finite]
 Quaternion = tuple[Finite, Finite, Finite, Finite]
@@ -44,7 +45,8 @@ MOVING = ("joints", "home", "tool", "gripper", "mount", "workspace")
 DEFAULT_MODEL = "ur5e"
 """The arm of an environment without another ``robot_model``."""
 _MOST = 8  # differences that are listed
-_SHIPPED = resources.files("bam_envs.arms") / "descriptions"
+SHIPPED = resources.files("bam_envs.arms") / "descriptions"
+"""The folder of the shipped descriptions."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,7 +56,11 @@ class Placed:
     xyz: Vector = (0.0, 0.0, 0.0)
     """Position [m]."""
     quat: Quaternion = (1.0, 0.0, 0.0, 0.0)
-    """Orientation, a quaternion w, x, y, z of any length."""
+    """Orientation, a quaternion w, x, y, z of any length but 0."""
+
+    def __post_init__(self) -> None:
+        if not any(self.quat):
+            raise InvalidValue("quat: the quaternion 0, 0, 0, 0 is no orientation; leave it out for none.")
 
     def matrix(self) -> Array:
         """The pose as a homogeneous matrix. Shape: (4, 4)."""
@@ -90,6 +96,11 @@ class JointRow(Placed):
     """Greatest torque [N m]."""
     mass: Positive
     """Mass of the link [kg]."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not any(self.axis):
+            raise InvalidValue(f"{self.name}: axis: 0, 0, 0 is no direction.")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -139,22 +150,42 @@ class ArmDescription:
         size = len(self.joints)
         if not 4 <= size <= 8:
             raise InvalidValue(f"{self.name}: an arm has 4 to 8 joints, and this one has {size}.")
-        check(list(self.home), Annotated[list[float], Meta(min_length=size, max_length=size)], f"{self.name}: home")
-        names = [row.name for row in self.joints]
-        if len(set(names)) < size:
-            raise InvalidValue(f"{self.name}: two joints have the same name.")
+        if len(self.home) != size:
+            raise InvalidValue(f"{self.name}: home: expected {size} numbers, one a joint, found {len(self.home)}.")
+        for name in self.joint_names:
+            if self.joint_names.count(name) > 1:
+                raise InvalidValue(f"{self.name}: joints: two of them are called {name!r}.")
         for row, home in zip(self.joints, self.home, strict=True):
             if not row.low < row.high:
-                raise InvalidValue(f"{self.name}: {row.name}: low must be below high.")
+                raise InvalidValue(f"{self.name}: joints: {row.name}: low must be below high.")
             if not row.low <= home <= row.high:
                 raise InvalidValue(
                     f"{self.name}: home: {row.name} is {home:g} rad, outside {row.low:g} to {row.high:g}."
                 )
         if not all(low < high for low, high in zip(*self.workspace, strict=True)):
             raise InvalidValue(f"{self.name}: workspace: the lowest corner must come first.")
-        for capsule in self.capsules:
-            if capsule.link > size + 1:
-                raise InvalidValue(f"{self.name}: a capsule names the link {capsule.link}; the last is {size + 1}.")
+        named = [("capsules", one.link) for one in self.capsules]
+        named += [("slack", link) for one, other, _ in self.slack for link in (one, other)]
+        for key, link in named:
+            if link > size + 1:
+                raise InvalidValue(f"{self.name}: {key}: there is no link {link}; the last is {size + 1}.")
+        if self.geometry:
+            self._check_geometry()
+
+    def _check_geometry(self) -> None:
+        """Refuse a closed form that is not that of the joints."""
+        forms = [key for key, one in vars(kinematics).items() if type(one) is ArmGeometry]
+        if self.geometry not in forms:
+            raise UnknownName("geometry", self.geometry, forms)
+        q = np.array(self.home) + np.linspace(-1.0, 1.0, 5)[:, None] * np.arange(1, 1 + self.num_joints)
+        fits = self.num_joints == 6
+        pairs = zip(self.arm.tool_pose(q), self.chain.tool_pose(q), strict=True) if fits else []
+        off = max([float(np.abs(closed - chain).max()) for closed, chain in pairs], default=1.0)
+        if off > 1e-6:
+            raise InvalidValue(
+                f"{self.name}: geometry: the closed form {self.geometry} is not that of these joints and this tool; "
+                "leave the key out."
+            )
 
     @property
     def joint_names(self) -> tuple[str, ...]:
@@ -273,10 +304,19 @@ def description_of(table: Mapping[str, Any], where: str) -> ArmDescription:
         rows = read[key]
         if key in ("joints", "capsules"):
             rows = check(rows, list[dict[str, Any]], f"{where}: {key}")
-            read[key] = tuple(read_table(kind, row, f"{where}: {key}[{at}]") for at, row in enumerate(rows))
+            read[key] = tuple(_read(kind, row, f"{where}: {key}[{at}]") for at, row in enumerate(rows))
         else:
-            read[key] = read_table(kind, rows, f"{where}: {key}")
-    return read_table(ArmDescription, read, where)
+            read[key] = _read(kind, rows, f"{where}: {key}")
+    return _read(ArmDescription, read, where)
+
+
+def _read(kind: type[T], table: object, where: str) -> T:
+    """`read_table`; also an error in what several values mean together begins with `where`."""
+    try:
+        return read_table(kind, table, where)
+    except BamEnvsError as error:
+        text = str(error)
+        raise InvalidValue(text if text.startswith(where) else f"{where}: {text}") from error
 
 
 def description_folders() -> Iterator[Any]:
@@ -285,7 +325,7 @@ def description_folders() -> Iterator[Any]:
     yield config_folder() / "robots"
     for point in metadata.entry_points(group=ENTRY_POINTS):
         yield resources.files(point.value)
-    yield _SHIPPED
+    yield SHIPPED
 
 
 def known_models() -> dict[str, Any]:

@@ -1,14 +1,14 @@
 """The simulated model of any described arm: its links as capsules on the table, with a gripper of two parallel pads.
 
 A gripper is the one of ``ur5e_gripper.xml``, in the size of the description's. Each link's mass is spread over its
-capsules. The UR5e has a model of its own, from before descriptions, with the published moments of inertia.
+capsules. The shipped UR5e has a model of its own, from before descriptions, with the published moments of inertia.
 """
 
 from typing import Any
 
 import numpy as np
 
-from bam_envs.arms.description import ArmDescription, Placed, cube_edge
+from bam_envs.arms.description import SHIPPED, ArmDescription, Placed, cube_edge, read_description
 from bam_envs.arms.serial_chain import Capsule
 from bam_envs.robots.physics.mujoco_batch import MODELS, mujoco
 
@@ -22,7 +22,7 @@ _ARMATURE = 0.003  # inertia of the motor, by its torque [kg m^2 / (N m)]
 
 def scene_spec(description: ArmDescription, *, with_object: bool) -> Any:
     """The `mujoco.MjSpec` of the arm on its table, and of a cube if there is one."""
-    if description.name == "ur5e" and description.geometry:
+    if description.digest == read_description(SHIPPED / "ur5e.toml").digest:
         return mujoco.MjSpec.from_file(str(MODELS / ("ur5e_cube.xml" if with_object else "ur5e_gripper.xml")))
     text = arm_mjcf(description, with_object=with_object)
     return mujoco.MjSpec.from_string(text, {"table.xml": (MODELS / "table.xml").read_bytes()})
