@@ -69,15 +69,17 @@ def find_work_area(description: ArmDescription) -> WorkArea:
 
 def _boxes(chain: SerialChain, scale: float) -> Iterator[Array]:
     """Boxes of one size at growing distances from the base."""
-    length = float(
-        np.linalg.norm(chain.placements[:, :3, 3], axis=1).sum() + np.linalg.norm(chain.tool_placement[:3, 3])
-    )
+    links = np.linalg.norm(chain.placements[:, :3, 3], axis=1)
+    place, out = chain.tool_placement[:3, 3], chain.tool_placement[:3, 2]
+    length, up = float(links.sum() + np.linalg.norm(place)), float(place @ out)
+    span = links[1:].sum() + np.linalg.norm(place - up * out)  # from the first joint to `up` above the tool, at most
     nearest = 0.5 * (BOX[1, 0] - BOX[0, 0]) * scale + 0.08
     for middle, height in itertools.product(np.arange(nearest, length, max(0.02, 0.05 * length)), _HEIGHTS):
         box = BOX * scale
         box[:, 0] += round(float(middle), 3)
         box[:, 2] = BOX[0, 2], max(0.06, height * box[1, 2])
-        if box[1, 0] <= TABLE_END:
+        corners = np.array(list(itertools.product(*box.T))) + [0.0, 0.0, up] - chain.placements[0, :3, 3]
+        if box[1, 0] <= TABLE_END and np.linalg.norm(corners, axis=1).max() < span:
             yield box
 
 

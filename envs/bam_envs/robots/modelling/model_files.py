@@ -275,7 +275,10 @@ class _Reader:
             notes=self._notes,
         )
         self._grip(arm, owner, frames[-1])
-        arm.shapes = Shapes(model, data, joints, owner)
+        gripper = len(joints) + 1
+        arm.shapes = Shapes(
+            model, data, joints, owner if self._parallel is None else np.where(owner == gripper, -1, owner)
+        )
         return arm
 
     def _chain(self) -> list[int]:
@@ -357,7 +360,8 @@ class _Reader:
             half = 0.5 * self._parallel + 0.012
             palm = _box(np.array([-0.03, -0.03, -length]), np.array([0.03, 0.03, -0.06]))
             pads = _box(np.array([-half, -0.011, -0.06]), np.array([half, 0.011, 0.014]))
-            arm.width, arm.gripper_mass, grip = self._parallel, 0.5, [palm, pads]
+            fixed = self._points(bodies & ~_moved_bodies(model, self._finger_joints(bodies)), tool)
+            arm.width, arm.gripper_mass, grip = self._parallel, 0.5, [fixed, palm, pads]
             self._notes.append(f"the gripper is {length:.3f} m long from the end of the arm to the middle of its pads")
         else:
             tool, arm.width = self._fingers(bodies, flange)
