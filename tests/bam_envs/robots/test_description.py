@@ -17,7 +17,7 @@ SO101 = SHIPPED["so101"].read_text(encoding="utf-8")
 
 @pytest.fixture
 def read(tmp_path):
-    """The description of a text in a file ``lab.toml``; an error is one line, and is returned without the file's name."""
+    """The description of a text in a file ``lab.toml``, or the text of the error."""
     path = tmp_path / "lab.toml"
 
     def read(text):
@@ -25,9 +25,7 @@ def read(tmp_path):
         try:
             return read_description(path)
         except InvalidValue as error:
-            assert str(error).startswith(str(path))
-            assert "\n" not in str(error)
-            return str(error).removeprefix(str(path)).removeprefix(":").strip()
+            return str(error).replace(str(path), "lab.toml")
 
     return read
 
@@ -129,12 +127,15 @@ def test_signals_are_the_arms_own():
 )
 def test_a_mistake_is_one_line_with_file_and_key(read, old, new, message):
     assert re.search(old, SO101), "the text that is replaced"
-    assert read(re.sub(old, new, SO101, count=1)) == message
+    colon = "" if message.startswith("is not TOML") else ":"
+    assert read(re.sub(old, new, SO101, count=1)) == f"lab.toml{colon} {message}"
 
 
 def test_a_closed_form_must_be_that_of_the_joints(read):
     """Another length, or a tilted mount, and the same key: the tasks would steer an arm that is not there."""
-    message = "ur5e: geometry: the closed form UR5E is not that of these joints and this tool; leave the key out."
+    message = (
+        "lab.toml: ur5e: geometry: the closed form UR5E is not that of these joints and this tool; leave the key out."
+    )
     text = SHIPPED["ur5e"].read_text(encoding="utf-8")
     assert read(text) == robot_model("ur5e")
     longer = text.replace("-0.425", "-0.426")

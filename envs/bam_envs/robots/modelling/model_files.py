@@ -91,6 +91,8 @@ def _spec(name: str) -> tuple[Any, dict[str, tuple[float | None, float | None]]]
             spec = mujoco.MjSpec.from_string(text)
         else:
             spec = mujoco.MjSpec.from_file(str(path))
+    except InvalidValue:
+        raise
     except (ValueError, OSError, ElementTree.ParseError) as error:
         raise InvalidValue(f"MuJoCo cannot read {name}: {_line(error)}.") from error
     return spec, limits
@@ -105,7 +107,7 @@ def _menagerie(name: str) -> Any:
         return menagerie.get(name).spec()
     except Exception as error:  # its errors, and those of the network, are many
         raise InvalidValue(
-            f"menagerie:{name}: {_line(error)}. Look at the name, or give a folder with the models: MENAGERIE_ROOT=."
+            f"menagerie:{name} ({_line(error)}): look at the name, or give a folder with the models: MENAGERIE_ROOT=."
         ) from error
 
 
@@ -130,7 +132,8 @@ def _urdf(path: Path) -> tuple[str, dict[str, tuple[float | None, float | None]]
     for joint in root.findall("joint"):
         limit = joint.find("limit")
         if limit is not None:
-            speed, effort = (float(limit.get(key, 0.0)) or None for key in ("velocity", "effort"))
+            given = [float(limit.get(key, 0.0)) for key in ("velocity", "effort")]
+            speed, effort = (value if 0.0 < value < np.inf else None for value in given)
             limits[joint.get("name", "")] = speed, effort
     return ElementTree.tostring(root, encoding="unicode"), limits
 
@@ -307,19 +310,19 @@ class _Reader:
         return low, high
 
     def _effort(self, joint: int, name: str) -> float | None:
-        model = self._model
-        if self._limits.get(name, (None, None))[1]:
-            return float(self._limits[name][1])
+        """The torque of a joint [N m], from the first place that names one; None if none does."""
+        model, ranges = self._model, []
         if model.jnt_actfrclimited[joint]:
-            return float(np.abs(model.jnt_actfrcrange[joint]).max())
+            ranges.append(model.jnt_actfrcrange[joint])
         for actuator in range(model.nu):
             of_joint = model.actuator_trntype[actuator] == mujoco.mjtTrn.mjTRN_JOINT
             if of_joint and model.actuator_trnid[actuator, 0] == joint:
                 if model.actuator_forcelimited[actuator]:
-                    return float(np.abs(model.actuator_forcerange[actuator]).max())
-                if model.actuator_gaintype[actuator] == 0 and model.actuator_biastype[actuator] == 0:
-                    return float(np.abs(model.actuator_ctrlrange[actuator]).max()) or None
-        return None
+                    ranges.append(model.actuator_forcerange[actuator])
+                elif model.actuator_gaintype[actuator] == 0 and model.actuator_biastype[actuator] == 0:
+                    ranges.append(model.actuator_ctrlrange[actuator])
+        efforts = [self._limits.get(name, (None, None))[1], *(float(np.abs(one).max()) for one in ranges)]
+        return next((one for one in efforts if one is not None and 0.0 < one < np.inf), None)
 
     def _owners(self, joints: list[int]) -> NDArray[np.int64]:
         """For each body the link it is fixed to: 0 the base, k what joint k turns, k + 1 the gripper, -1 other."""
@@ -331,11 +334,32 @@ class _Reader:
             parent = int(owner[model.body_parentid[body]])
             if body in links:
                 owner[body] = links[body]
-            elif body == self._end or parent == gripper or model.body_jntnum[body]:
+            elif body == self._end or parent == gripper:
+                owner[body] = gripper
+            elif not model.body_jntnum[body]:
+                owner[body] = parent
+            elif parent == len(joints):
                 owner[body] = gripper
             else:
-                owner[body] = parent
+                name = model.body(body).name
+                raise InvalidValue(f"{self._where}: {name!r} moves beside the arm; give a file with one arm alone.")
+        self._check_free(joints, owner)
         return owner
+
+    def _check_free(self, joints: list[int], owner: NDArray[np.int64]) -> None:
+        """Refuse an arm with a joint that follows another, or with links that are tied together."""
+        model, kinds = self._model, mujoco.mjtEq
+        for row in range(model.neq):
+            kind, ends = int(model.eq_type[row]), [int(model.eq_obj1id[row]), int(model.eq_obj2id[row])]
+            if kind == int(kinds.mjEQ_JOINT) and ends[0] in joints:
+                name = model.joint(ends[0]).name
+                raise InvalidValue(f"{self._where}: the joint {name!r} follows another; each joint needs a drive.")
+            if kind in (int(kinds.mjEQ_CONNECT), int(kinds.mjEQ_WELD)):
+                sites = int(model.eq_objtype[row]) == int(mujoco.mjtObj.mjOBJ_SITE)
+                bodies = model.site_bodyid[ends] if sites else ends
+                one, other = sorted(int(owner[body]) for body in bodies)
+                if one != other <= len(joints):
+                    raise InvalidValue(f"{self._where}: its links form a loop; an arm is one chain of joints.")
 
     def _points(self, bodies: Any, frame: Array) -> Array:
         """Points of the geoms of these bodies in `frame`: vertices of meshes, points on other shapes. Shape: (n, 3)."""
