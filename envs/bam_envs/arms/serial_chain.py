@@ -174,9 +174,12 @@ class SerialChain:
         c, s, zero = np.cos(yaw), np.sin(yaw), np.zeros(len(yaw))
         wanted = np.array([[c, s, zero], [s, -c, zero], [zero, zero, zero - 1.0]]).transpose(2, 1, 0)
         q = np.tile(self.home, (len(yaw), 1)) if near is None else near.copy()
+        there = np.zeros((len(q), 1), dtype=bool)  # each alone, so that a result does not depend on the others
         for _ in range(_SEARCHING if near is None else _TRACKING):
-            q, error = self._nearer(q, position, wanted)
-            if error < _CLOSE:
+            nearer, error = self._nearer(q, position, wanted)
+            q = np.where(there, q, nearer)
+            there |= error < _CLOSE
+            if there.all():
                 break
         return q
 
@@ -185,8 +188,8 @@ class SerialChain:
         joints: list[float] = self.reach_down(np.array([[x, y, z]]), np.array([yaw]), np.array([near]))[0].tolist()
         return joints
 
-    def _nearer(self, q: Array, position: Array, wanted: Array) -> tuple[Array, float]:
-        """One iteration towards `position` (n, 3) and the axes `wanted` (n, 3, 3), and the largest error before it."""
+    def _nearer(self, q: Array, position: Array, wanted: Array) -> tuple[Array, Array]:
+        """One iteration towards `position` (n, 3) and the axes `wanted` (n, 3, 3), and the errors before it (n, 1)."""
         frames, jacobian = self.jacobians(q)
         error = np.empty((len(q), 6))
         error[:, :3] = position - frames[:, -1, :3, 3]
@@ -206,7 +209,7 @@ class SerialChain:
         square[:, diagonal, diagonal] += (0.5 * squared + _DAMPING)[:, None]
         rest = error - np.einsum("nij,nj->ni", jacobian, homing)
         step = homing + np.einsum("nji,nj->ni", jacobian, np.linalg.solve(square, rest[:, :, None])[:, :, 0])
-        return np.minimum(np.maximum(q + step, self.low), self.high), float(np.sqrt(squared.max()))
+        return np.minimum(np.maximum(q + step, self.low), self.high), np.sqrt(squared)[:, None]
 
 
 def _towards(axis: Array) -> Array:

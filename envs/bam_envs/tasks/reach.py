@@ -109,7 +109,7 @@ class ReachTask(Memory):
         """Do nothing: commands continue from the one that was actually sent last."""
 
     def observe(self, state: RobotState) -> Floats:
-        """See `observation_labels`. Shape: (n, 3 joints + 9) float32."""
+        """See `observation_labels`. Shape: (n, 2 joints + 9) float32."""
         observation = np.concatenate(self.robot_columns(state), axis=1).astype(np.float32)
         return limited(observation, self.observation_space.low, self.observation_space.high)
 
