@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from bam_envs.arms.description import robot_model
 from bam_envs.core.robot import EnvIds, Initial, Robot, RobotState
-from bam_envs.robots.description import robot_model
 from bam_envs.robots.fake import FakeRobot
 from bam_envs.robots.physics.mujoco_arm import SimulatedArm
 from bam_envs.safety.gate import SafeRobot

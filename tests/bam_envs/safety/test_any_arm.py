@@ -6,10 +6,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from bam_envs.arms.description import known_models, robot_model
 from bam_envs.core.errors import SafetyStop
 from bam_envs.core.robot import Initial
 from bam_envs.core.robot_env import RobotEnv
-from bam_envs.robots.description import known_models, robot_model
 from bam_envs.robots.physics.mujoco_arm import SimulatedArm
 from bam_envs.safety.arm_tubes import ChainTubes, tubes_of
 from bam_envs.safety.gate import SafeRobot

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
 
+from bam_envs.arms.description import robot_model
 from bam_envs.core.registry import ENVIRONMENTS
-from bam_envs.robots.description import robot_model
 from bam_envs.robots.ur import UR_MODELS
 from bam_envs.tasks.isaac_reach import DEFAULT
 from bam_envs.tasks.pick import PickTask

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
 
+from bam_envs.arms.description import cube_edge, known_models, robot_model
 from bam_envs.core.errors import InvalidValue, UnknownName
 from bam_envs.core.robot import CameraSpec
-from bam_envs.robots.description import cube_edge, known_models, robot_model
 from bam_envs.robots.physics.mujoco_arm import SimulatedArm
 from bam_envs.robots.physics.rendering import RenderingUnavailable, find_backend
 from bam_envs.tasks.pick import PickTask

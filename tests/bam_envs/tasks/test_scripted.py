@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
+from bam_envs.arms.description import known_models
 from bam_envs.core.errors import InvalidValue, UnknownName
 from bam_envs.core.registry import ENVIRONMENTS
-from bam_envs.robots.description import known_models
 from bam_envs.tasks.scripted import GRASP, SCRIPTED, scripted_policy
 from tests.bam_envs.making import solved
 

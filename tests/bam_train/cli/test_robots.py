@@ -2,8 +2,8 @@
 
 import pytest
 
-from bam_envs.robots.description import SHIPPED, known_models
-from bam_train.cli.robots import main
+from bam_envs.arms.description import SHIPPED, known_models
+from bam_train.cli.arms.bam_robots import main
 
 
 def test_list(run):

@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from bam_envs.arms.description import robot_model
 from bam_envs.core.errors import InvalidValue, ResetNeeded
 from bam_envs.core.robot import Initial, Robot
-from bam_envs.robots.description import robot_model
 from bam_envs.robots.physics.mujoco_arm import SimulatedArm, arm_scene, cube_scene
 from bam_envs.robots.ur5e import GEOMETRY
 from bam_envs.testing import ARM_HOME

@@ -6,9 +6,9 @@ import mujoco
 import numpy as np
 import pytest
 
+from bam_envs.arms.description import known_models, robot_model
+from bam_envs.arms.serial_chain import HAND, arm_of
 from bam_envs.core.kinematics import ArmGeometry
-from bam_envs.core.serial_chain import HAND, arm_of
-from bam_envs.robots.description import known_models, robot_model
 from bam_envs.robots.physics.arm_model import scene_spec
 
 ARMS = ("fr3", "gen3", "so101", "ur10e", "ur16e", "ur3e", "ur5e", "xarm7")

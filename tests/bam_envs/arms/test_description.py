@@ -7,9 +7,9 @@ from importlib import metadata
 import numpy as np
 import pytest
 
+from bam_envs.arms import description
+from bam_envs.arms.description import known_models, read_description, robot_model
 from bam_envs.core.errors import InvalidValue, UnknownName
-from bam_envs.robots import description
-from bam_envs.robots.description import known_models, read_description, robot_model
 
 SHIPPED = known_models()
 SO101 = SHIPPED["so101"].read_text(encoding="utf-8")

@@ -8,12 +8,12 @@ import mujoco
 import numpy as np
 import pytest
 
+from bam_envs.arms.capsules import Outline
+from bam_envs.arms.description import read_description
+from bam_envs.arms.work_area import covers
 from bam_envs.core.errors import InvalidValue, UnknownName
-from bam_envs.robots.capsules import Outline
-from bam_envs.robots.description import read_description
-from bam_envs.robots.physics.describe import as_toml, describe, write_description
-from bam_envs.robots.physics.model_files import read_arm
-from bam_envs.robots.work_area import covers
+from bam_envs.robots.modelling.describe import as_toml, describe, write_description
+from bam_envs.robots.modelling.model_files import read_arm
 from bam_envs.tasks.scripted import scripted_policy
 from tests.bam_envs.making import solved
 
