@@ -305,7 +305,7 @@ def scaled(text, factor):
             six_joints(),
             None,
             None,
-            "{}: no joint moves a finger. Give the gripper: --gripper FILE, or --gripper parallel:WIDTH.",
+            "{}: no joint moves a finger. Give the gripper: --gripper FILE or --gripper parallel:WIDTH.",
         ),
         *(
             (
