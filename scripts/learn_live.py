@@ -75,17 +75,18 @@ def make_robot(name: str, n: int = 1) -> Any:
 
 def scripted_person(take: Take) -> Any:
     """The scripted pick of somebody who knows that the robot is late: a flatter funnel, and a gentle wrist."""
-    sight = Sight(take)
+    sight = Sight(take, TABLE)
     across = np.hypot(sight.offset[:, 0], sight.offset[:, 1])
     astray = np.maximum((across - 0.012) / 0.04, (np.abs(sight.turn) - 0.08) / 0.15)
     travel, grip = sight.offset - sight.lead, (astray < 0.3) & (np.abs(sight.offset[:, 2]) < 0.01) | sight.closed
     travel[:, 2] += 0.05 * np.clip(astray, 0.0, 1.0)
     travel[sight.closed], travel[sight.holding] = 0.0, (0.0, 0.0, 1.0)
     turn = np.where(sight.closed, 0.0, 0.3 * (sight.turn - 0.05 * take("target_dyaw")[:, 0]))
-    return tool_actions(travel, turn, np.where(grip, 1.0, -1.0))
+    return tool_actions(travel, turn, np.where(grip, 1.0, -1.0), TABLE)
 
 
-PERSON = ScriptedPolicy(PickTask.observation_labels, scripted_person)
+TABLE = PickTask().table
+PERSON = ScriptedPolicy(PickTask.labels(TABLE), scripted_person)
 
 
 def tell(what: str, successes: int, episodes: int) -> None:

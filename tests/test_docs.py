@@ -146,6 +146,9 @@ DRIVING = (
 """Numbers in the reward of a base."""
 
 
+TABLE, GOALS = pick.PickTask().table, reach.ReachTask().space.goals
+
+
 def metres(value):
     return f"{100 * value:g} cm"
 
@@ -154,10 +157,10 @@ def metres(value):
     ("task", "section", "facts"),
     [
         (reach.ReachTask, "Success", [metres(reach.GOAL_RADIUS)]),
-        (reach.ReachTask, "Start", [f"{reach.START_NOISE} rad", *(f"{x:.2f}" for x in reach.GOAL_AREA.ravel())]),
-        (pick.PickTask, "Success", [metres(pick.LIFT), f"{pick.HOLD_STEPS} steps", f"{pick.HOLD_STEPS / 20} s"]),
-        (pick.PickTask, "Start", [metres(pick.CUBE_EDGE), *(f"{x:.2f}" for x in pick.CUBE_AREA.ravel())]),
-        (pick.PickTask, "Start", [f"{x:.2f}" for x in pick.START_AREA.ravel()]),
+        (reach.ReachTask, "Start", [f"{reach.START_NOISE} rad", *(f"{x:.2f}" for x in GOALS.ravel())]),
+        (pick.PickTask, "Success", [metres(TABLE.lift), f"{pick.HOLD_STEPS} steps", f"{pick.HOLD_STEPS / 20} s"]),
+        (pick.PickTask, "Start", [metres(TABLE.edge), *(f"{x:.2f}" for x in TABLE.cube_area.ravel())]),
+        (pick.PickTask, "Start", [f"{x:.2f}" for x in TABLE.start_area.ravel()]),
         (pick.PickTask, "End", [f"{metres(-pick.TABLE_EDGE)} below"]),
         (pick_place.PickPlaceTask, "Start", [metres(pick_place.GOAL_DISTANCE)]),
         (pick_place.PickPlaceTask, "Success", [metres(pick_place.GOAL_RADIUS), metres(pick_place.PICKED)]),
@@ -196,7 +199,12 @@ def test_every_field_of_a_table_has_its_meaning(make_docs):
 
 
 @pytest.mark.parametrize(
-    "program", [*sorted(PROGRAMS.keys() - {"bam-data"}), *(f"bam-data {command}" for command in DATA_COMMANDS)]
+    "program",
+    [
+        *sorted(PROGRAMS.keys() - {"bam-data", "bam-robots"}),
+        *(f"bam-data {command}" for command in DATA_COMMANDS),
+        *("bam-robots add", "bam-robots check"),
+    ],
 )
 def test_flags_on_the_site_are_the_flags_of_the_programs(make_docs, program, monkeypatch, capsys):
     words = program.split()
@@ -227,7 +235,7 @@ def test_help_has_examples_that_are_accepted_and_every_flag_in_one_group(config)
         program, *words = shlex.split(line)
         asks = program == "bam-agent" and not words[0].startswith("-")
         wanted = resolve("bam_train.cli.live.agent_flags:AskConfig") if asks else config
-        parse(wanted, program, words[program == "bam-data" :])
+        parse(wanted, program, words[program in ("bam-data", "bam-robots") :])
     text = help_text(config, "prog", description)
     assert examples
     assert "default: None" not in text

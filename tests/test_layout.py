@@ -12,6 +12,7 @@ ROOT = Path(__file__).parents[1]
 ORDER = {
     "bam_envs": [
         "core",
+        "arms",
         "aliases",
         "ros",
         "rosbridge",

@@ -178,6 +178,9 @@ def require_no_place(env_kwargs: Mapping[str, Any]) -> None:
     for name in sorted(env_kwargs.keys() & (WHERE | {"env_id", "id"})):
         what = "where the environment runs" if name in WHERE else "which environment it is"
         raise ValueError(f"env_kwargs.{name} says {what}: flags such as --robot say that, never a file")
+    arm = env_kwargs.get("robot_model")
+    if isinstance(arm, str) and arm.endswith(".toml"):
+        raise ValueError(f"env_kwargs.robot_model names the file {arm}; a checkpoint holds the content instead")
     link = env_kwargs.get("link")
     if isinstance(link, str) and link.endswith(".json"):
         raise ValueError(f"env_kwargs.link names the file {link}, of which a checkpoint holds the content instead")

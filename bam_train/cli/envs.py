@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 def show_environments(config: EnvsConfig) -> None:
     """Run the program with its parsed flags."""
-    facts: Any = overview() if config.env is None else details(config.env)
+    facts: Any = overview() if config.env is None else details(config.env, config.robot_model)
     if config.json:
         tell(*json_module.dumps(facts, indent=2, allow_nan=False).split("\n"))
     else:
@@ -64,17 +64,19 @@ def aligned(table: list[list[str]]) -> list[str]:
     return ["  ".join(map(str.ljust, cells, widths)).rstrip() for cells in table]
 
 
-def details(name: str) -> dict[str, Any]:
-    """All facts of one environment, as JSON values; makes it, so it needs its simulator."""
+def details(name: str, arm: str | None = None) -> dict[str, Any]:
+    """All facts of one environment with the arm of that name, as JSON values; makes it, so it needs its simulator."""
     from bam_envs.aliases.robo_gym_names import ROBO_GYM
     from bam_envs.core.registry import entry_of, resolve_id
     from bam_envs.core.spaces import space_to_json
-    from bam_train.environments import control_period, make_env
+    from bam_train.environments import control_period, make_env, require_env_kwargs
 
     env_id = resolve_id(name)
     entry, theirs = entry_of(env_id), ROBO_GYM.get(env_id)
     steps = None if entry is None else entry.max_episode_steps
-    env = make_env(theirs.twin if theirs is not None and theirs.is_live else env_id)
+    kwargs = {} if arm is None else {"robot_model": arm}
+    require_env_kwargs(env_id, kwargs)
+    env = make_env(theirs.twin if theirs is not None and theirs.is_live else env_id, kwargs)
     try:
         describe = getattr(env.unwrapped, "describe", None)
         period = control_period(env)
@@ -89,9 +91,20 @@ def details(name: str) -> dict[str, Any]:
             "action_space": space_to_json(env.action_space),
             "cameras": [] if entry is None else list(entry.cameras),
             "signals": {} if describe is None else describe(),
+            "note": _cannot(env.unwrapped),
         }
     finally:
         env.close()  # type: ignore[no-untyped-call]
+
+
+def _cannot(env: Any) -> str | None:
+    """What the arm of an environment cannot do, if anything."""
+    from bam_envs.arms.serial_chain import SerialChain
+
+    arm = getattr(getattr(env, "task", None), "arm", None)
+    if not isinstance(arm, SerialChain) or arm.turns:
+        return None
+    return f"this arm has {arm.num_joints} joints and cannot turn its gripper while it points down: there is no dyaw"
 
 
 def detail_lines(facts: dict[str, Any]) -> list[str]:
@@ -105,6 +118,8 @@ def detail_lines(facts: dict[str, Any]) -> list[str]:
     count = facts["episode_steps"]
     steps = "no time limit" if count is None else f"{count} step{'s' * (count > 1)} an episode"
     lines.append(f"{steps}, {'no rate given' if facts['rate_hz'] is None else format(facts['rate_hz'], 'g') + ' Hz'}")
+    if facts["note"]:
+        lines.append(facts["note"])
     if facts["cameras"]:
         lines.append(f"images: camera={' or '.join(facts['cameras'])}, such as --set env_kwargs.camera=front")
     if not facts["signals"]:

@@ -60,7 +60,18 @@ class JsonFlag:
 
 
 @dataclass(frozen=True, kw_only=True)
-class EpisodeFlags:
+class RobotModelFlag:
+    """The flag of the arm of an environment, which is short for ``--set robot_model=NAME``."""
+
+    SET: ClassVar[str] = "robot_model"
+    """What ``--set`` calls it."""
+
+    robot_model: Name = None
+    """Arm of the environment: a name of bam-robots list, or the file of its description."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class EpisodeFlags(RobotModelFlag):
     """The flags of a program that plays a policy in simulated environments."""
 
     set: Assignments = ()
@@ -152,7 +163,7 @@ SettingsFlags: Any = _settings_flags()
 
 
 @dataclass(frozen=True)
-class TrainConfig(SettingsFlags):  # type: ignore[misc]
+class TrainConfig(SettingsFlags, RobotModelFlag):  # type: ignore[misc]
     """Train a policy and keep the best as one checkpoint.zip.
 
     Settings come from the preset of environment and algorithm, --config, --set and the options, the later ones first.
@@ -165,7 +176,8 @@ class TrainConfig(SettingsFlags):  # type: ignore[misc]
     """
 
     GROUPS: ClassVar[Groups] = {
-        "What is learnt": ("env", "algo", "steps", "seed", "until_success", "set", "config", "print_config"),
+        "What is learnt": ("env", "robot_model", "algo", "steps", "seed", "until_success"),
+        "Settings": ("set", "config", "print_config"),
         "Files": ("out", "force", "runs", "resume", "start", "copy_to", "record"),
         "Evaluations": ("eval_every", "eval_episodes", "trial_threshold"),
         "From a data set, a teacher or a robot": ("data", "teacher", "learner", "push_every"),
@@ -181,6 +193,8 @@ class TrainConfig(SettingsFlags):  # type: ignore[misc]
         "": "; an argument of the algorithm is --set NAME=VALUE",
     }
     """What to write for an option that there is not, and what to add to the error of any other one."""
+
+    SET: ClassVar[str] = "env_kwargs.robot_model"
 
     config: File = None
     """File of settings, .toml or .json, such as --print-config writes."""
@@ -394,12 +408,13 @@ class ExportConfig:
 
 
 @dataclass(frozen=True)
-class EnvsConfig(JsonFlag):
+class EnvsConfig(RobotModelFlag, JsonFlag):
     """List our environments, or describe one (any Gymnasium id): spaces, rate, name and unit of every number.
 
     Examples:
       bam-envs
       bam-envs bam/pick
+      bam-envs bam/pick --robot-model so101
     """
 
     env: Annotated[tyro.conf.Positional[str | None], tyro.conf.arg(metavar="[ID]")] = None
@@ -407,7 +422,7 @@ class EnvsConfig(JsonFlag):
 
 
 @dataclass(frozen=True)
-class ServeConfig(CredentialFlags):
+class ServeConfig(CredentialFlags, RobotModelFlag):
     """Serve a Gymnasium environment, and the topics of its simulated robot, to clients of rosbridge, TCP or ROS 2.
 
     Examples:
@@ -416,7 +431,9 @@ class ServeConfig(CredentialFlags):
     """
 
     GROUPS: ClassVar[Groups] = {
-        "What is served": ("env", "num_envs", "set", "realtime", "fast", "image_format", "gymapi_version", "yes"),
+        "What is served": (
+            *("env", "robot_model", "num_envs", "set", "realtime", "fast", "image_format", "gymapi_version", "yes"),
+        ),
         "Where": ("port", "bind", "tcp", "via", "rclpy", "namespace"),
         "Who may connect": ("token_file", "operator_token_file", "no_token", "lease", "cert", "key", "ca_file"),
     }

@@ -20,8 +20,8 @@ import signal
 import sys
 import textwrap
 import types
-from collections.abc import Callable, Sequence
-from dataclasses import MISSING, Field, fields
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import MISSING, Field, dataclass, fields, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
@@ -46,6 +46,8 @@ EXTRAS = {
     "mujoco": "sim",
     "PIL": "video",
     "imageio": "video",
+    "mujoco_menagerie": "robots",
+    "xacrodoc": "robots",
 }
 """Optional package to the extra of bam-train that brings it."""
 
@@ -74,6 +76,38 @@ def run_program(
             return main(config, signals)
 
     sys.exit(guarded(run, prog, signals))
+
+
+@dataclass(frozen=True)
+class Command:
+    """One command of a program that has several."""
+
+    help: str
+    flags: str
+    """Its configuration, ``"module:Class"``."""
+    run: str
+    """Takes the configuration and returns an exit status, ``"module:function"``; imported once the flags are read."""
+
+
+def run_commands(prog: str, what: str, commands: Mapping[str, Command], arguments: list[str] | None = None) -> None:
+    """Run the command that the first argument names, with the others as its flags; `what` is the text of the help."""
+    given = sys.argv[1:] if arguments is None else arguments
+    name = given[0] if given else ""
+    if name in ("-h", "--help"):
+        tell(f"usage: {prog} COMMAND [OPTIONS]", "", what, "")
+        tell(*(f"  {command:<10}{row.help}" for command, row in commands.items()))
+        tell("", f"{prog} COMMAND --help shows the options of one.")
+        raise SystemExit(0)
+    if name not in commands:
+        from bam_envs.core.wording import closest
+
+        close = closest(name, commands)
+        error = "COMMAND is missing" if not name else f"there is no command {name!r}"
+        choice = f", did you mean {close!r}?" if close else f"; there are {', '.join(commands)}."
+        say(f"{prog}: {error}{choice} Run {prog} --help")
+        raise SystemExit(2)
+    command = commands[name]
+    run_program(f"{prog} {name}", command.flags, lambda config, _: pkgutil.resolve_name(command.run)(config), given[1:])
 
 
 def guarded(main: Callable[[], int | None], prog: str, signals: SignalMemory | None = None) -> int:
@@ -167,6 +201,10 @@ def parse(
     except InvalidValue as error:
         _complain(prog, f"{error}. {remedy}")
         raise SystemExit(2) from error
+    arm = getattr(parsed, "robot_model", None)
+    if arm is not None and hasattr(parsed, "set"):  # one flag more for one argument of the environment
+        flagged: Any = parsed
+        return replace(flagged, set=(f"{flagged.SET}={arm}", *flagged.set))  # type: ignore[no-any-return]
     return parsed
 
 

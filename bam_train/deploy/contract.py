@@ -9,15 +9,15 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
+from bam_envs.core.kinematics import ArmGeometry
 from bam_envs.core.location import LiveRobot
-from bam_envs.live.arm_checks import arm_checks, geometry_of
+from bam_envs.live.arm_checks import arm_checks, arm_in
 from bam_envs.live.bringup import TIMEOUT
 from bam_envs.live.examination import Inspection, inspect_robot
 from bam_envs.live.robot_checks import Check, robot_checks
 from bam_envs.robots.profile import load_profile, profile_for
 from bam_envs.rosbridge.client import RosbridgeLink
 from bam_envs.rosbridge.endpoint import Endpoint
-from bam_envs.safety.guard import is_base
 from bam_train.checkpoint import Checkpoint
 from bam_train.environments import first_difference, fit_pairs, short_json
 from bam_train.errors import ContractRefused
@@ -120,8 +120,8 @@ def live_checks(env: Any, inspection: Inspection) -> Iterator[Check]:
     """The lines about the robot itself: `inspection` against the robot and the task of `env`."""
     robot = env.unwrapped.robot
     yield from robot_checks(robot.spec, inspection)
-    geometry = geometry_of(env)
-    if not is_base(robot.spec) and geometry is not None:
+    geometry = arm_in(env.unwrapped.task, robot.spec)
+    if isinstance(geometry, ArmGeometry):
         yield from arm_checks(robot.spec, geometry, robot.limits.position_margin, inspection)
 
 

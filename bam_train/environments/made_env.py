@@ -11,6 +11,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 
 import bam_envs  # noqa: F401 - registers our environments with Gymnasium
 from bam_envs.aliases.robo_gym_names import ROBO_GYM
+from bam_envs.arms.description import require_same_arm, robot_model
 from bam_envs.core import registry
 from bam_envs.core.env_options import in_our_words, require_kinds
 from bam_envs.core.errors import BamEnvsError, InvalidValue, UnknownName
@@ -61,6 +62,10 @@ def environment_of(
         require_env_kwargs(env_id, env_kwargs)
     except (UnknownName, SettingsError) as error:
         raise SettingsError(f"{checkpoint.path}: its manifest: {error}") from error
+    try:
+        require_same_arm(env_kwargs.get("robot_model"))
+    except InvalidValue as error:
+        raise CheckpointMismatch(checkpoint.path, f"was trained for another arm: {error}") from error
     return env_id, dict(env_kwargs)
 
 
@@ -99,9 +104,11 @@ def require_env_kwargs(env: str, given: Mapping[str, Any]) -> None:
         entry.read_cameras(given)
         if given.get("link") is not None:
             link_profile(given["link"])
+        if "robot_model" in given:
+            robot_model(given["robot_model"])
         if given.get("action_delay") is not None:
             read_delay(given["action_delay"])
-    except InvalidValue as error:
+    except (InvalidValue, UnknownName) as error:
         raise SettingsError(f"env_kwargs: {error}") from error
 
 

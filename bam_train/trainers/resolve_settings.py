@@ -8,6 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from bam_envs.arms.description import portable_model
 from bam_envs.core.errors import MissingExtra, UnknownName
 from bam_envs.core.registry import entry_of, resolve_id
 from bam_envs.robots.linked import portable
@@ -78,6 +79,9 @@ def resolve(given: Mapping[str, Any], tell: Tell = lambda text: None) -> TrainSe
     tuned = preset.pop("hyperparameters", {})
     settings = TrainSettings.from_mapping(merge({**usual, **preset}, run, {"env": env}))
     require_env_kwargs(env, settings.env_kwargs)
+    if "robot_model" in settings.env_kwargs and entry_of(env) is not None:
+        arm = portable_model(settings.env_kwargs["robot_model"])
+        settings = replace(settings, env_kwargs={**settings.env_kwargs, "robot_model": arm})
     if "link" in settings.env_kwargs and entry_of(env) is not None:
         settings = replace(settings, env_kwargs={**settings.env_kwargs, "link": portable(settings.env_kwargs["link"])})
     try:

@@ -26,6 +26,19 @@ def make_task(env_id, num_envs=1, **options):
     return ENVIRONMENTS[env_id].make_task(num_envs, options)
 
 
+def solved(envs, policy):
+    """In how many environments of `envs` (closed after it) the first episode of `policy` is a success."""
+    observation, _ = envs.reset(seed=0)
+    done = success = np.zeros(envs.num_envs, bool)
+    while not done.all():
+        observation, _, terminated, truncated, info = envs.step(policy.act_batch(observation))
+        if "final_info" in info:
+            success = success | (~done & info["final_info"]["is_success"])
+        done = done | terminated | truncated
+    envs.close()
+    return int(success.sum())
+
+
 def arm_state(joints, velocity=(0.0,) * 6, collision=False, obstacle=(0.0, 0.0, 1.9)):
     """One arm that was told to be at `joints`, and is; its obstacle is out of the way."""
     joints = np.array([joints], dtype=float)

@@ -13,8 +13,9 @@ import numpy as np
 from bam_envs.core.errors import InvalidValue, NotInCommand, RemoteError
 from bam_envs.core.robot import RobotState
 from bam_envs.core.timing import Ticker
+from bam_envs.live.arm_checks import arm_in
 from bam_envs.rosbridge.bus import Caller
-from bam_envs.tasks.tool_control import WORKSPACE, ToolControl
+from bam_envs.tasks.tool_control import ToolControl
 from bam_train.agent.agent_messages import Drive, Halt
 from bam_train.agent.audit import tail
 from bam_train.agent.front.jog import Jogger
@@ -51,9 +52,8 @@ class AgentHub:
         """Folder for uploads."""
         self._versions = Versions(front.options.folder / "versions")
         shadow = front.shadow
-        model = getattr(front.task, "model", None)  # of a Universal Robots arm of any size
-        geometry = None if model is None else model.geometry
-        workspace = WORKSPACE if isinstance(getattr(front.task, "control", None), ToolControl) else None
+        geometry, control = arm_in(front.task, shadow.spec), getattr(front.task, "control", None)
+        workspace = control.space.box if isinstance(control, ToolControl) else None
         self._telemetry = Telemetry(shadow.spec, shadow.limits, geometry=geometry, workspace=workspace)
         try:
             self._jogger: Jogger | None = Jogger(shadow.spec, shadow.spec.period, geometry=geometry)

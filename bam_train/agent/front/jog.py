@@ -12,8 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from bam_envs.arms.serial_chain import Arm
 from bam_envs.core.errors import InvalidValue
-from bam_envs.core.kinematics import UR5E_GRIPPER, UR_JOINTS, ArmGeometry, turned
+from bam_envs.core.kinematics import UR5E_GRIPPER, UR_JOINTS
 from bam_envs.core.robot import RobotSpec, RobotState
 from bam_envs.safety.guard import columns_in, is_base, measured_places
 
@@ -46,7 +47,7 @@ class Jogger:
     """Turns the newest twist into commands.
 
     Args:
-        spec: The robot: a base, or a Universal Robots arm that is commanded by its six joints.
+        spec: The robot: a base, or an arm that is commanded by its joints.
         period: Time between two commands [s].
         geometry: Kinematics of the arm; None: those of a UR5e with a gripper.
         clock: Monotonic clock [s].
@@ -60,12 +61,16 @@ class Jogger:
         spec: RobotSpec,
         period: float,
         *,
-        geometry: ArmGeometry | None = None,
+        geometry: Arm | None = None,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self._spec, self._period, self._clock = spec, period, clock
         self._geometry, self._joints = geometry or UR5E_GRIPPER, columns_in(spec.command, "rad")
-        if not is_base(spec) and tuple(spec.command.labels[at] for at in self._joints) != UR_JOINTS:
+        if (
+            geometry is None
+            and not is_base(spec)
+            and tuple(spec.command.labels[at] for at in self._joints) != UR_JOINTS
+        ):
             raise InvalidValue(f"{spec.name} cannot be jogged: its kinematics are not known. Drive it by a program.")
         self._measured = measured_places(spec, spec.command.units)
         self.release()
@@ -140,12 +145,12 @@ class Jogger:
         return math.dist(tool(one[self._joints].tolist()), tool(other[self._joints].tolist()))
 
     def _step(self, joints: Array) -> Array:
-        """Turn of the joints in one period, by damped least squares. Shape: (6,) [rad]."""
+        """Turn of the joints in one period, by damped least squares. Shape: (k,) [rad]."""
         vx, vy, vz, wz = self._newest.twist
-        away = turned(np.array([[vx, vy, vz]]), np.cos(joints[:1]), np.sin(joints[:1]))[0]
-        left, values, right = np.linalg.svd(np.array(self._geometry.jacobian(joints.tolist())).T)
+        jacobian = self._geometry.tool_jacobian(joints.tolist())
+        left, values, right = np.linalg.svd(jacobian, full_matrices=False)
         damping = _DAMPING * max(0.0, 1.0 - (values[-1] / _SINGULAR) ** 2) ** 0.5
-        speeds = right.T @ (values / (values**2 + damping**2) * (left.T @ [*away, 0.0, 0.0, wz]))
+        speeds = right.T @ (values / (values**2 + damping**2) * (left.T @ [vx, vy, vz, 0.0, 0.0, wz]))
         speeds *= min(1.0, JOINT_SPEED / max(float(np.abs(speeds).max()), 1e-9))
         step: Array = speeds * self._period
         return step

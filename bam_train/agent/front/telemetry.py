@@ -7,9 +7,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bam_envs.core.kinematics import UR5E_GRIPPER, UR_JOINTS, ArmGeometry, quaternions, turned
+from bam_envs.arms.serial_chain import Arm
+from bam_envs.core.kinematics import UR5E_GRIPPER, UR_JOINTS, quaternions
 from bam_envs.core.robot import RobotSpec, RobotState, SignalSpec
-from bam_envs.safety.arm_tubes import ArmTubes
+from bam_envs.safety.arm_tubes import tubes_of
 from bam_envs.safety.base_guards import LaserZones
 from bam_envs.safety.guard import Limits, columns_in, is_base, measured_places, position_range
 
@@ -38,7 +39,7 @@ class Telemetry:
         spec: RobotSpec,
         limits: Limits,
         *,
-        geometry: ArmGeometry | None = None,
+        geometry: Arm | None = None,
         workspace: Array | None = None,
     ) -> None:
         self._spec, self._signals = spec, [one for one in spec.signals if len(one.labels) <= _MOST]
@@ -80,16 +81,13 @@ class Telemetry:
 class _Arm:
     """An arm, whose kinematics may be unknown."""
 
-    def __init__(self, spec: RobotSpec, limits: Limits, geometry: ArmGeometry | None, workspace: Array | None) -> None:
+    def __init__(self, spec: RobotSpec, limits: Limits, geometry: Arm | None, workspace: Array | None) -> None:
         self._limits, self._joints = limits, columns_in(spec.command, "rad")
         if geometry is None and tuple(spec.command.labels[at] for at in self._joints) == UR_JOINTS:
             geometry = UR5E_GRIPPER
         self._geometry, self._has_gripper = geometry, (has_gripper := "m" in spec.command.units)
-        outline = None if geometry is None else geometry.outline
-        self._tubes = self._drawn = None
-        if geometry is not None and outline is not None:
-            self._tubes = ArmTubes(geometry, outline, tool=has_gripper)
-            self._drawn = ArmTubes(geometry, outline, tool=False)
+        self._tubes = None if geometry is None else tubes_of(geometry, tool=has_gripper)
+        self._drawn = None if geometry is None else tubes_of(geometry, tool=False)
         self._positions = [row for row in measured_places(spec, spec.command.units) if row[0] in self._joints]
         speeds = measured_places(spec, [f"{unit}/s" for unit in spec.command.units])
         self._speeds = [row for row in speeds if row[0] in self._joints]
@@ -110,9 +108,7 @@ class _Arm:
         shown: dict[str, Any] = {"tool": _plain(geometry.tool_point(q))}
         if self._drawn is None:
             return shown
-        tubes = self._drawn.tubes(q)
-        ends = turned(np.array([[[start, end] for start, end, _ in tubes]]), np.cos(q[:1]), np.sin(q[:1]))[0]
-        shown["tubes"] = [_plain([*two.ravel(), radius]) for two, (*_, radius) in zip(ends, tubes, strict=True)]
+        shown["tubes"] = [_plain(tube) for tube in self._drawn.drawn(q)]
         if self._has_gripper:
             position, rotation = geometry.flange_pose(np.array([q]))
             shown["hand"] = _plain([*position[0], *quaternions(rotation)[0]])
@@ -133,7 +129,7 @@ class _Arm:
         if geometry is None:
             return near
         if moves:
-            velocity = np.array(geometry.jacobian(q))[:, :3].T @ speeds
+            velocity = geometry.tool_jacobian(q)[:3] @ speeds
             near["tool speed"] = _below(float(np.linalg.norm(velocity)), limits.tool_speed, "m/s")
         rows = zip(geometry.tool_point(q), self._low, self._high, strict=True)
         near["workspace box"] = _above(min(min(at - low, high - at) for at, low, high in rows), 0.0, "m", _SPAN)

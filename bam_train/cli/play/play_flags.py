@@ -5,11 +5,11 @@ from typing import Annotated, ClassVar, Literal
 
 import tyro
 
-from bam_train.cli.flags import Assignments, Count, DataSetName, File, Groups, LocationFlags, Seed
+from bam_train.cli.flags import Assignments, Count, DataSetName, File, Groups, LocationFlags, RobotModelFlag, Seed
 
 
 @dataclass(frozen=True)
-class PlayConfig(LocationFlags):
+class PlayConfig(LocationFlags, RobotModelFlag):
     """Drive any environment, or a live robot, by keyboard or gamepad; the key ? shows the keys.
 
     Examples:
@@ -19,7 +19,7 @@ class PlayConfig(LocationFlags):
     """
 
     GROUPS: ClassVar[Groups] = {
-        "What is played": ("policy", "set", "seed", "episodes", "speed", "render", "record"),
+        "What is played": ("robot_model", "policy", "set", "seed", "episodes", "speed", "render", "record"),
         "Where": ("robot", "transport", "profile", "ca_file", "token_file", "timeout"),
         "How a live robot may move": ("stage", "guard", "yes", "keys", "allow_unsigned"),
     }

@@ -172,7 +172,13 @@ class ArmGeometry:
         rows += [[-cosine * beside, cosine * x5 + sine * z5, -sine * beside, *axis], [0.0, 0.0, 0.0, *out]]
         return rows
 
-    def reach_down(self, position: Array, yaw: Array) -> Array:
+    def tool_jacobian(self, q: Sequence[float]) -> Array:
+        """Velocity of the tool [m/rad] and axes of the joints, in ``base_link``, at the joints `q` (6,). (6, 6)."""
+        rows = np.array(self.jacobian(q)).reshape(1, 6, 2, 3)
+        jacobian: Array = turned(rows, np.cos(q[:1]), np.sin(q[:1]))[0].reshape(6, 6).T
+        return jacobian
+
+    def reach_down(self, position: Array, yaw: Array, near: Array | None = None) -> Array:
         """Joint positions that put the tool at `position`, pointing straight down, its x axis at `yaw` from world x.
 
         The elbow is up, the wrist is not flipped. A position out of reach gets the stretched arm in its direction, so
@@ -181,6 +187,7 @@ class ArmGeometry:
         Args:
             position: Tool position [m]. Shape: (n, 3).
             yaw: Angle of the tool's x axis about world z [rad]. Shape: (n,).
+            near: Not needed: for `bam_envs.arms.serial_chain.SerialChain`.
 
         Returns:
             Joint positions [rad], the last of which follows `yaw` without a jump. Shape: (n, 6).
@@ -198,7 +205,7 @@ class ArmGeometry:
         q2 = q2 - 2 * np.pi * np.rint((q2 + np.pi / 2) / (2 * np.pi))  # the branch around -90 degrees
         return _rows(q1, q2, q3, -np.pi / 2 - q2 - q3, -np.pi / 2, q1 - yaw - np.pi / 2)
 
-    def joints_down(self, x: float, y: float, z: float, yaw: float) -> list[float]:
+    def joints_down(self, x: float, y: float, z: float, yaw: float, near: object = None) -> list[float]:
         """`reach_down` of one tool position in plain numbers: the same bits, by the same functions of NumPy."""
         radial = math.sqrt(max(x * x + y * y - self.d4**2, 1e-12))
         q1 = float(np.arctan2(y, x) - np.arctan2(self.d4, radial))

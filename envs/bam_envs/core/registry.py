@@ -128,10 +128,11 @@ _CAMERAS = ("front", "wrist")
 _ENTRIES = (
     EnvEntry(
         "bam/reach-v0",
-        "move the tool of a UR5e to a point, with joint-space actions",
+        "move the tool of an arm to a point, with joint-space actions",
         "bam_envs.tasks.reach:ReachTask",
         "bam_envs.robots.physics.mujoco_arm:arm_scene",
         max_episode_steps=100,
+        robot_options=("robot_model",),
         cameras=_CAMERAS,
     ),
     EnvEntry(
@@ -140,6 +141,7 @@ _ENTRIES = (
         "bam_envs.tasks.pick:PickTask",
         "bam_envs.robots.physics.mujoco_arm:cube_scene",
         max_episode_steps=100,
+        robot_options=("robot_model",),
         cameras=_CAMERAS,
     ),
     EnvEntry(
@@ -148,6 +150,7 @@ _ENTRIES = (
         "bam_envs.tasks.pick_place:PickPlaceTask",
         "bam_envs.robots.physics.mujoco_arm:cube_scene",
         max_episode_steps=200,
+        robot_options=("robot_model",),
         cameras=_CAMERAS,
     ),
     EnvEntry(

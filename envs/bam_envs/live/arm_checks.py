@@ -15,6 +15,7 @@ from xml.etree import ElementTree
 import numpy as np
 from numpy.typing import NDArray
 
+from bam_envs.arms.serial_chain import Arm
 from bam_envs.core.errors import ProtocolError
 from bam_envs.core.kinematics import UR5E_GRIPPER, UR_JOINTS, ArmGeometry, angle_between, quaternions
 from bam_envs.core.robot import RobotSpec
@@ -83,13 +84,10 @@ class Urdf(dict[str, UrdfJoint]):
         return (pose[:3, 3], pose[:3, :3]) if link == base else None
 
 
-def geometry_of(env: Any) -> ArmGeometry | None:
-    """The geometry of the arm in the task of `env`; None for other robots."""
-    spec, model = env.unwrapped.robot.spec, getattr(env.unwrapped.task, "model", None)
-    if model is not None:
-        geometry: ArmGeometry = model.geometry
-        return geometry
-    return UR5E_GRIPPER if spec.command.labels[:6] == UR_JOINTS else None
+def arm_in(task: object, spec: RobotSpec) -> Arm | None:
+    """The arm that `task` is made for; if it does not say, a UR5e with a gripper for joints with those names."""
+    arm: Arm | None = getattr(task, "arm", None)
+    return UR5E_GRIPPER if arm is None and spec.command.labels[:6] == UR_JOINTS else arm
 
 
 def arm_checks(spec: RobotSpec, geometry: ArmGeometry, margin: float, inspection: Inspection) -> Iterator[Check]:

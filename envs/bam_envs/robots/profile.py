@@ -47,6 +47,7 @@ Age = Annotated[float, Meta(gt=0, le=BOUNDS["max_age"][1])]
 T = TypeVar("T")
 Topical = TypeVar("Topical", Source, Sink, CameraSource, Readiness)
 Converted = TypeVar("Converted", Source, Sink)
+_STATES = "sensor_msgs/JointState"
 _SUFFIXES = (".toml", ".yaml", ".yml")
 _SHIPPED = resources.files("bam_envs.robots") / "profiles"
 _AGES = {"arm": 0.1, "base": 0.5}
@@ -103,12 +104,57 @@ def load_profile(name_or_path: str | Path) -> RobotProfile:
 
 
 def profile_for(spec: RobotSpec) -> RobotProfile:
-    """The shipped profile that takes the commands of `spec`, else the first that takes more, narrowed to them."""
+    """The shipped profile that takes the commands of `spec`, else the first that takes more, narrowed to them.
+
+    A described arm without one has the usual topics of ros2_control: `usual_profile`.
+    """
     labels, shipped = spec.command.labels, [load_profile(name) for name in shipped_profiles()]
     for profile in sorted(shipped, key=lambda one: one.command.labels != labels):
         if labels and set(labels) <= set(profile.command.labels):
             return profile.narrowed(labels)
+    joints = next((one.labels for one in spec.signals if one.name == "joint_position"), ())
+    if joints and labels == (*joints, "gripper_width"):
+        return usual_profile(spec)
     raise InvalidValue(f"No shipped profile takes the commands of {spec.name}. Give its file: profile='my_robot.toml'.")
+
+
+def usual_profile(spec: RobotSpec) -> RobotProfile:
+    """Topics of a described arm as ros2_control names them: joint states, and a controller of joint trajectories.
+
+    Commands name their joints, so that the order in the controller does not matter.
+    """
+    joints, command = spec.command.labels[:-1], spec.command
+    topics = {"joint_position": "position", "joint_velocity": "velocity"}
+    states: list[Table] = [
+        {"signal": name, "topic": "/joint_states", "type": _STATES, "field": field, "names": list(joints)}
+        for name, field in topics.items()
+    ]
+    gripper, topic = "gripper_width", "/gripper/joint_states"
+    states.append({"signal": gripper, "topic": topic, "type": _STATES, "field": "position", "names": [gripper]})
+    pose: Table = {"topic": "/object_pose", "type": "geometry_msgs/PoseStamped", "frame": "base_link"}
+    for signal, part, axes in (("object_position", "position", "xyz"), ("object_quaternion", "orientation", "wxyz")):
+        states.append({**pose, "signal": signal, "fields": [f"pose.{part}.{axis}" for axis in axes]})
+    known = {signal.name for signal in spec.signals}
+    sink: Table = {"type": "trajectory_msgs/JointTrajectory", "controller": "joint_trajectory_controller"}
+    sink |= {"topic": "/joint_trajectory_controller/joint_trajectory", "labels": list(joints), "reach_periods": 1.5}
+    width: Table = {"topic": "/gripper/commands", "type": "std_msgs/Float64MultiArray", "labels": [gripper]}
+    table: Table = {
+        "name": spec.name,
+        "kind": "arm",
+        "period": spec.period,
+        "max_age": 0.1,
+        "controllers": "/controller_manager/list_controllers",
+        "signals": [_as_table(signal) for signal in spec.signals if signal.labels],
+        "command": {**_as_table(command), "max_rate": list(command.max_rate or ())},
+        "state": [state for state in states if state["signal"] in known],
+        "commands": {"trajectory": [{**width, "hold": "last"}, {**sink, "hold": "measured"}]},
+    }
+    del table["command"]["name"]
+    return _profile(f"usual profile of {spec.name}", table)
+
+
+def _as_table(signal: SignalSpec) -> Table:
+    return {key: list(value) if key != "name" else value for key, value in vars(signal).items() if value is not None}
 
 
 def shipped_profiles() -> list[str]:

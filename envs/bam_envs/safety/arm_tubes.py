@@ -1,15 +1,23 @@
-"""The links of a Universal Robots arm as tubes: their distances from each other and from the table.
+"""The links of an arm as tubes: their distances from each other and from the table.
 
-All points are in the arm's vertical plane (radial, sideways, height), which turns with joint 1: neither that joint nor
-the last one changes a distance. The tubes and pairs are those of the simulation (`ArmContacts`); the last tube reaches
-to the end of the tool where there is one.
+Points of `ArmTubes`, for Universal Robots arms, are in the arm's vertical plane (radial, sideways, height), which turns
+with joint 1: neither that joint nor the last one changes a distance. The tubes and pairs are those of the simulation
+(`ArmContacts`); the last tube reaches to the end of the tool where there is one. `ChainTubes` are the capsules of any
+other described arm, in ``base_link``.
 """
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 
-from bam_envs.core.kinematics import ArmGeometry, ArmOutline
+import numpy as np
+from numpy.typing import NDArray
 
+from bam_envs.arms.capsules import Outline
+from bam_envs.arms.serial_chain import Arm, Capsule, SerialChain
+from bam_envs.core.kinematics import ArmGeometry, ArmOutline, turned
+
+Array = NDArray[np.float64]
 Point = tuple[float, float, float]
 Tube = tuple[Point, Point, float]
 """The two ends and the radius [m]."""
@@ -79,6 +87,12 @@ class ArmTubes:
                 self._near[place] = self._distance(tubes, first, other)
         return self.least < margin
 
+    def drawn(self, q: Sequence[float]) -> list[list[float]]:
+        """The tubes in ``base_link``: two ends, x, y, z [m] each, and the radius [m]."""
+        tubes = self.tubes(q)
+        ends = turned(np.array([[[start, end] for start, end, _ in tubes]]), np.cos(q[:1]), np.sin(q[:1]))[0]
+        return [[*two.ravel().tolist(), radius] for two, (*_, radius) in zip(ends, tubes, strict=True)]
+
     @property
     def least(self) -> float:
         """Lower bound on the smallest distance of two tubes at the joints of `nearer_than` [m]."""
@@ -105,6 +119,100 @@ class ArmTubes:
         starts = (0.0, 0.0, 0.0), shoulder, beside, inside, wrist, wrist_1, wrist_2, elbow
         ends = shoulder, beside, elbow, wrist, wrist_1, wrist_2, tool, inside
         return list(zip(starts, ends, self._radii, strict=True))
+
+
+class ChainTubes:
+    """Distances of the capsules of a described arm, with the methods of `ArmTubes`; `tool`: with its gripper."""
+
+    def __init__(self, chain: SerialChain, *, tool: bool) -> None:
+        size = chain.num_joints
+        kept = tuple(one for one in chain.capsules if tool or one.link <= size)
+        self._chain, self._outline = chain, Outline(replace(chain, capsules=kept))
+        outline = self._outline
+        ends = [[(*one.start, 1.0), (*one.end, 1.0)] for one in kept]
+        self._links, self._ends = outline.links, np.array(ends).transpose(0, 2, 1)
+        self._low = np.flatnonzero((self._links > 1) & (self._links <= size))
+        one, other = outline.pairs.T
+        self._beyond = np.minimum(self._links[one], size), np.minimum(self._links[other], size)
+        self._kept = (outline.radius[one] + outline.radius[other] - outline.slack).tolist()
+        self._levers = _levers(chain, kept)
+        self._near, self._at = np.full(len(outline.pairs), -math.inf), np.zeros(size)
+        self._mount = chain.mount[None]
+        self._placed: tuple[list[float], Array] = [], np.empty(0)
+
+    @property
+    def least(self) -> float:
+        """Lower bound on the smallest distance of two capsules at the joints of `nearer_than` [m]."""
+        return float(self._near.min(initial=math.inf))
+
+    def lowest(self, q: Sequence[float]) -> float:
+        """Height of the lowest point of the links at the joints `q` (k,) [rad], from the second to the flange [m]."""
+        places = self._places(q)[self._low]
+        lows: Array = places[:, 2].min(axis=1) - self._outline.radius[self._low]
+        return float(lows.min(initial=math.inf))
+
+    def nearest(self, q: Sequence[float]) -> float:
+        """Smallest distance of two capsules at the joints `q` (k,) [rad], in m; below 0 if their links overlap."""
+        return float(self._outline.nearest(np.array([q]))[0])
+
+    def change(self, here: Sequence[float], there: Sequence[float]) -> float:
+        """Upper bound on the change of `lowest` and of any distance [m] between two sets of joints (k,) [rad]."""
+        rows = zip(self._levers.tolist(), here, there, strict=True)
+        return float(sum(lever * abs(one - other) for lever, one, other in rows))
+
+    def nearer_than(self, margin: float, q: Sequence[float]) -> bool:
+        """Whether two capsules are nearer than `margin` [m] at the joints `q` (k,) [rad].
+
+        A pair is computed again only when the joints between its links have turned far enough since the last time to
+        bring it within the margin.
+        """
+        moved = np.zeros(len(self._levers) + 1)
+        np.cumsum(self._levers * np.abs(np.array(q) - self._at), out=moved[1:])
+        self._near -= moved[self._beyond[1]] - moved[self._beyond[0]]
+        self._at = np.array(q)
+        due = np.flatnonzero(self._near < margin)
+        if len(due):
+            places = self._places(q).transpose(0, 2, 1).tolist()
+            for pair in due.tolist():
+                one, other = self._outline.pairs[pair].tolist()
+                gap = math.sqrt(segment_distance2(*places[one], *places[other]))
+                self._near[pair] = gap - self._kept[pair]
+        return self.least < margin
+
+    def drawn(self, q: Sequence[float]) -> list[list[float]]:
+        """The capsules in ``base_link``: two ends, x, y, z [m] each, and the radius [m]."""
+        ends = self._outline.segments(np.array([q]))[0]
+        return [[*two.ravel().tolist(), float(radius)] for two, radius in zip(ends, self._outline.radius, strict=True)]
+
+    def _places(self, q: Sequence[float]) -> Array:
+        """Ends of the capsules as columns [m]. Shape: (capsules, 3, 2)."""
+        if self._placed[0] != q:
+            frames = np.concatenate([self._mount, self._chain.link_frames(np.array([q]))[0]])
+            self._placed = list(q), frames[self._links, :3] @ self._ends
+        return self._placed[1]
+
+
+def _levers(chain: SerialChain, capsules: Sequence[Capsule]) -> Array:
+    """How far a turn of each joint moves what is beyond it at most [m/rad]. Shape: (k,)."""
+    size = chain.num_joints
+    extent = [0.0] * (size + 2)
+    for one in capsules:
+        extent[one.link] = max(extent[one.link], math.hypot(*one.start) + one.radius, math.hypot(*one.end) + one.radius)
+    steps = [math.hypot(*place[:3, 3]) for place in (*chain.placements[1:], chain.tool_placement)]
+    levers, beyond = np.zeros(size), extent[size + 1]
+    for joint in reversed(range(size)):
+        levers[joint] = beyond = max(extent[joint + 1], steps[joint] + beyond)
+    return levers
+
+
+Tubes = ArmTubes | ChainTubes
+
+
+def tubes_of(arm: Arm, *, tool: bool) -> Tubes | None:
+    """The tubes of an arm, with its gripper or without; None if its outline is not known."""
+    if isinstance(arm, SerialChain):
+        return ChainTubes(arm, tool=tool) if arm.capsules else None
+    return ArmTubes(arm, arm.outline, tool=tool) if arm.outline is not None else None
 
 
 def segment_distance2(start: Point, end: Point, other_start: Point, other_end: Point) -> float:

@@ -17,8 +17,8 @@ import numpy as np
 from msgspec import Meta
 from numpy.typing import NDArray
 
+from bam_envs.arms.serial_chain import arm_of
 from bam_envs.core.errors import InvalidValue, UnknownName
-from bam_envs.core.kinematics import ArmGeometry
 from bam_envs.core.robot import RobotSpec, SignalSpec
 from bam_envs.core.validation import check
 from bam_envs.core.wording import brief
@@ -416,17 +416,11 @@ def is_base(spec: RobotSpec) -> bool:
     return "m/s" in spec.command.units
 
 
-def geometry_of(tool_position: ToolPosition) -> ArmGeometry | None:
-    """The arm whose `ArmGeometry.tool_position` this is; None for any other function."""
-    owner = getattr(tool_position, "__self__", None)
-    return owner if type(owner) is ArmGeometry and tool_position == owner.tool_position else None
-
-
 def tool_point_of(tool_position: ToolPosition) -> ToolPoint:
     """`tool_position` for one pose in plain numbers, which is faster; fastest for that of an `ArmGeometry`."""
-    geometry = geometry_of(tool_position)
-    if geometry is not None:
-        return geometry.tool_point
+    known = arm_of(tool_position)
+    if known is not None:
+        return known.tool_point
 
     def tool_point(q: Sequence[float]) -> tuple[float, float, float]:
         x, y, z = tool_position(np.array([q]))[0].tolist()

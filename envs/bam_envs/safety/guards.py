@@ -11,11 +11,12 @@ from operator import le
 import numpy as np
 from numpy.typing import NDArray
 
+from bam_envs.arms.serial_chain import arm_of
 from bam_envs.core.errors import InvalidValue
 from bam_envs.core.kinematics import UR5E_GRIPPER, UR_JOINTS
 from bam_envs.core.robot import RobotSpec, RobotState, SignalSpec
 from bam_envs.safety import arm_guards as arm
-from bam_envs.safety.arm_tubes import ArmTubes
+from bam_envs.safety.arm_tubes import tubes_of
 from bam_envs.safety.base_guards import LaserZones
 from bam_envs.safety.first_motion import FirstMotion
 from bam_envs.safety.following import BaseFollowing, JointFollowing
@@ -27,7 +28,6 @@ from bam_envs.safety.guard import (
     ToolPosition,
     clip,
     columns_in,
-    geometry_of,
     is_base,
     max_rate,
     picker,
@@ -260,7 +260,7 @@ def default_guards(
         spec: An arm is commanded in rad, a base in m/s and rad/s.
         limits: The limits of the guards.
         tool_position: Forward kinematics, (n, k) [rad] to (n, 3) [m]; None only for a UR5e. If it is that of an
-            `ArmGeometry` with an outline, collisions are guarded too.
+            `ArmGeometry` or a `SerialChain` with an outline, collisions are guarded too.
         straight: Whether the commands move the tool along straight lines; then singularities are guarded too.
 
     Raises:
@@ -326,10 +326,11 @@ def _region_guards(
     kept_out: list[Guard] = [WorkspaceBox(spec, limits, low, high, tool_point_of(position))]
     if limits.trial_box is not None:
         kept_out.append(TrialBox(spec, limits, limits.trial_box, tool_point_of(position)))
-    geometry = geometry_of(position)
-    if geometry is not None and geometry.outline is not None:
-        kept_out.append(Collision(spec, limits, ArmTubes(geometry, geometry.outline, tool=has_gripper)))
-    return [Singularity(spec, limits, geometry)] if straight and geometry is not None else [], kept_out
+    known = arm_of(position)
+    tubes = None if known is None else tubes_of(known, tool=has_gripper)
+    if tubes is not None:
+        kept_out.append(Collision(spec, limits, tubes))
+    return [Singularity(spec, limits, known)] if straight and known is not None else [], kept_out
 
 
 def _kinematics(spec: RobotSpec, tool_position: ToolPosition | None) -> ToolPosition:

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 
 from bam_envs.core.errors import InvalidValue
 from bam_envs.core.robot import RobotSpec
-from bam_envs.safety.arm_tubes import ArmTubes
+from bam_envs.safety.arm_tubes import Tubes
 from bam_envs.safety.guard import Guard, Limits, Numbers, Tick, ToolPoint, columns_in, picker
 
 _HALVINGS = 6
@@ -116,10 +116,10 @@ class Collision(ForbiddenRegion):
 
     number, name, unit, setting = "G24", "collision", "m", "clearance"
 
-    def __init__(self, spec: RobotSpec, limits: Limits, tubes: ArmTubes) -> None:
+    def __init__(self, spec: RobotSpec, limits: Limits, tubes: Tubes) -> None:
         super().__init__(spec, limits)
         self.limit_value, self._tubes, self._table = limits.clearance, tubes, limits.table_height
-        self._at: Sequence[float] = [math.inf] * 6  # where it was computed last
+        self._at: Sequence[float] = [math.inf] * len(self._joints)  # where it was computed last
         self._room = 0.0  # the distance to anything may shrink by this before the next computation [m]
 
     def depth(self, joints: Sequence[float]) -> float:

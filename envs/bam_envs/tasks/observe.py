@@ -5,11 +5,14 @@ from collections.abc import Sequence
 import numpy as np
 from gymnasium import spaces
 
+from bam_envs.arms.description import DEFAULT_MODEL, robot_model
 from bam_envs.core.robot import EnvIds, Initial, RobotState
 from bam_envs.core.task import Array, Floats, Label, Memory, Score, draw_seeds, labelled_box, limited
-from bam_envs.robots.ur5e import GRIPPER_OPEN, JOINTS
-from bam_envs.tasks.pick import CUBE_AREA
-from bam_envs.tasks.reach import HOME, START_NOISE
+from bam_envs.tasks.pick import CubeTable
+from bam_envs.tasks.reach import START_NOISE
+
+_TABLE = CubeTable(robot_model(DEFAULT_MODEL))
+HOME, JOINTS = np.array(_TABLE.description.home), _TABLE.description.joint_names
 
 
 class ObserveTask(Memory):
@@ -47,10 +50,11 @@ class ObserveTask(Memory):
         self.observation_space: spaces.Box = labelled_box(self.observation_labels)
 
     def sample_initial(self, env_ids: EnvIds, rngs: Sequence[np.random.Generator]) -> Initial:
-        """Joint positions about `HOME`, and a cube in `CUBE_AREA`."""
+        """Joint positions about `HOME`, and a cube on the table."""
+        area = _TABLE.cube_area
         draws = np.stack([rng.random(9) for rng in rngs])
         cube = np.empty((len(env_ids), 3))
-        cube[:, :2] = CUBE_AREA[0] + draws[:, 6:8] * (CUBE_AREA[1] - CUBE_AREA[0])
+        cube[:, :2] = area[0] + draws[:, 6:8] * (area[1] - area[0])
         cube[:, 2] = (2 * draws[:, 8] - 1) * np.pi
         joints = HOME + START_NOISE * (2 * draws[:, :6] - 1)
         return Initial({"joint_position": joints, "object_pose": cube}, draw_seeds(rngs))
@@ -65,7 +69,7 @@ class ObserveTask(Memory):
 
     def robot_columns(self, state: RobotState) -> list[Array]:
         """Joints and gripper, not clipped. Shape: (n, k) each."""
-        return [state.signals["joint_position"] - HOME, state.signals["gripper_width"] * (2 / GRIPPER_OPEN) - 1]
+        return [state.signals["joint_position"] - HOME, state.signals["gripper_width"] * (2 / _TABLE.open) - 1]
 
     def command(self, action: Floats, state: RobotState) -> Array:
         """The command that was sent last, again. Shape: (n, 7)."""

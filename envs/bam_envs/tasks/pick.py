@@ -6,59 +6,73 @@ from typing import Any
 import numpy as np
 from gymnasium import spaces
 
+from bam_envs.arms.description import DEFAULT_MODEL, ArmDescription, cube_edge
+from bam_envs.arms.description import robot_model as model_called
 from bam_envs.core.kinematics import cube_yaw_phase
 from bam_envs.core.robot import EnvIds, Initial, RobotState
 from bam_envs.core.task import Array, Floats, Label, Memory, Score, draw_seeds, labelled_box, limited
-from bam_envs.robots.ur5e import GEOMETRY
-from bam_envs.tasks.tool_control import (
-    ACTION_LABELS,
-    HALF,
-    HAND_LABELS,
-    JOINT_LABELS,
-    MIDDLE,
-    ToolControl,
-    hand_state,
-)
+from bam_envs.tasks.tool_control import ToolControl, WorkSpace, hand_state
 
-CUBE_AREA = np.array([[0.35, -0.20], [0.65, 0.20]])
-"""Range of the cube at the start: lowest and highest x, y [m]."""
-CUBE_EDGE = 0.04
-"""Edge of the cube [m]."""
-START_AREA = np.array([[0.45, -0.05, 0.17], [0.55, 0.05, 0.23]])
-"""Range of the tool at the start: lowest and highest x, y, z [m]."""
-NEAR = 0.03
-"""The object is within the gripper's reach at this distance from the tool [m]."""
-LIFT = 0.10  # height to which the cube must be lifted [m]
 HOLD_STEPS = 5
 """Steps for which it must be held there: 0.25 s at 20 Hz."""
 TABLE_EDGE = -0.03
 """An object below this height has left the table [m]."""
 
-OBJECT_LABELS = (
-    Label("object_x", "object, forward", "m", "(x - 0.5) / 0.2", -2, 2),
-    Label("object_y", "object, to the left", "m", "y / 0.25", -2, 2),
-    Label("object_lift", "object above where it lay", "m", "/ 0.1", -2, 2),
-    Label("object_dx", "object from the tool, forward", "m", "/ 0.1", -2, 2),
-    Label("object_dy", "object from the tool, to the left", "m", "/ 0.1", -2, 2),
-    Label("object_dz", "object from the tool, up", "m", "/ 0.1", -2, 2),
-    Label("object_yaw_cos", "cos(4 yaw) of the object seen from the gripper; a cube repeats every 90 degrees", "1"),
-    Label("object_yaw_sin", "sin(4 yaw) of the object seen from the gripper", "1"),
-)
+
+class CubeTable(WorkSpace):
+    """The table with the cube before an arm: where cube and tool begin, sized to the work area and the gripper."""
+
+    def __init__(self, description: ArmDescription) -> None:
+        super().__init__(description)
+        length, height = self.half[0] / 0.2, self.box[1, 2] - self.box[0, 2]
+        self.cube_area = np.round(self.box[:, :2] + np.array([[0.05], [-0.05]]) * length, 6)
+        """Range of the cube at the start: lowest and highest x, y [m]. Shape: (2, 2)."""
+        across = np.round(self.middle[:2] + np.array([[-0.05], [0.05]]) * length, 6)
+        up = np.round(self.box[0, 2] + np.array([[0.154], [0.214]]) * height / 0.334, 6)
+        self.start_area = np.concatenate([across, up], axis=1)
+        """Range of the tool at the start: lowest and highest x, y, z [m]. Shape: (2, 3)."""
+        self.edge = cube_edge(description)
+        """Edge of the cube [m]."""
+        self.near = round(0.75 * self.edge, 6)
+        """The object is within the gripper's reach at this distance from the tool [m]."""
+        self.lift = round(min(0.10, 0.6 * height), 3)
+        """Height to which the cube must be lifted [m]."""
+
+    @property
+    def object_labels(self) -> tuple[Label, ...]:
+        """Meaning of the object's numbers in an observation."""
+        (x, _, _), (half_x, half_y, _) = self.middle, self.half
+        return (
+            Label("object_x", "object, forward", "m", f"(x - {x:g}) / {half_x:g}", -2, 2),
+            Label("object_y", "object, to the left", "m", f"y / {half_y:g}", -2, 2),
+            Label("object_lift", "object above where it lay", "m", f"/ {self.lift:g}", -2, 2),
+            Label("object_dx", "object from the tool, forward", "m", "/ 0.1", -2, 2),
+            Label("object_dy", "object from the tool, to the left", "m", "/ 0.1", -2, 2),
+            Label("object_dz", "object from the tool, up", "m", "/ 0.1", -2, 2),
+            Label(
+                "object_yaw_cos", "cos(4 yaw) of the object seen from the gripper; a cube repeats every 90 degrees", "1"
+            ),
+            Label("object_yaw_sin", "sin(4 yaw) of the object seen from the gripper", "1"),
+        )
 
 
 class CubeSense:
     """Tool and cube in the last state, computed once for `observe`, `command` and `score`."""
 
-    def __init__(self, state: RobotState) -> None:
+    def __init__(self, state: RobotState, table: CubeTable) -> None:
         self.state = state
-        self.tool, self.x_axis = GEOMETRY.tool_pose(state.signals["joint_position"])
+        self.tool, self.x_axis = table.arm.tool_pose(state.signals["joint_position"])
         self.object = state.signals["object_position"]
         self.offset = self.object - self.tool
         self.distance: Array = np.sqrt(np.einsum("ij,ij->i", self.offset, self.offset))
 
 
 class PickTask(Memory):
-    """Grasp the cube, lift it by `LIFT` and hold it for `HOLD_STEPS`.
+    """Grasp the cube, lift it by 10 cm and hold it for `HOLD_STEPS`.
+
+    Args:
+        robot_model: The arm: the name of a description, or its file. Lengths below are for a UR5e; another arm has a
+            work area, a cube and a lift of its own size, in the same proportions.
 
     Start:
         The tool is between x 0.45 and 0.55 m, y -0.05 and 0.05 m, z 0.17 and 0.23 m, pointing straight down, the
@@ -81,31 +95,38 @@ class PickTask(Memory):
     """
 
     memory: Mapping[str, str] = {"rest_height": "rest_height", "held": "held"}
-    action_labels = ACTION_LABELS
     moves_straight = True  # the tool, along straight lines: singularities count
-    observation_labels: tuple[Label, ...] = HAND_LABELS + OBJECT_LABELS
-    robot_labels: tuple[Label, ...] = HAND_LABELS + JOINT_LABELS
 
-    def __init__(self, num_envs: int = 1) -> None:
-        self.num_envs = num_envs
+    def __init__(self, num_envs: int = 1, *, robot_model: Any = DEFAULT_MODEL) -> None:
+        self.num_envs, self.table = num_envs, CubeTable(model_called(robot_model))
+        self.arm = self.table.arm
+        self.action_labels = self.table.action_labels
+        self.observation_labels = self.labels(self.table)
+        self.robot_labels = (*self.table.hand_labels, *self.table.joint_labels)
         self.action_space: spaces.Box = labelled_box(self.action_labels)
         self.observation_space: spaces.Box = labelled_box(self.observation_labels)
-        self.control = ToolControl(num_envs)
+        self.control = ToolControl(num_envs, self.table)
         self.rest_height = np.zeros(num_envs)
         """Height of the object where it lay [m]. Shape: (n,)."""
         self.held = np.zeros(num_envs, dtype=np.int64)
         """Number of steps in a row with the object high enough. Shape: (n,)."""
         self._sense: CubeSense | None = None
 
+    @staticmethod
+    def labels(table: CubeTable) -> tuple[Label, ...]:
+        """Meaning of an observation at `table`."""
+        return (*table.hand_labels, *table.object_labels)
+
     def sample_initial(self, env_ids: EnvIds, rngs: Sequence[np.random.Generator]) -> Initial:
         """A tool position above the table, a cube pose on it."""
         draws = np.stack([rng.random(6) for rng in rngs])
         seeds = draw_seeds(rngs)
-        tool = START_AREA[0] + draws[:, :3] * (START_AREA[1] - START_AREA[0])
+        start, area = self.table.start_area, self.table.cube_area
+        tool = start[0] + draws[:, :3] * (start[1] - start[0])
         cube = np.empty((len(env_ids), 3))
-        cube[:, :2] = CUBE_AREA[0] + draws[:, 3:5] * (CUBE_AREA[1] - CUBE_AREA[0])
+        cube[:, :2] = area[0] + draws[:, 3:5] * (area[1] - area[0])
         cube[:, 2] = (2 * draws[:, 5] - 1) * np.pi
-        joints = GEOMETRY.reach_down(tool, np.zeros(len(env_ids)))
+        joints = self.table.arm.reach_down(tool, np.zeros(len(env_ids)))
         return Initial({"joint_position": joints, "object_pose": cube}, seeds)
 
     def on_reset(self, env_ids: EnvIds, state: RobotState) -> None:
@@ -117,7 +138,7 @@ class PickTask(Memory):
     def sense(self, state: RobotState) -> CubeSense:
         """Tool and cube of `state`, computed once."""
         if self._sense is None or self._sense.state is not state:
-            self._sense = CubeSense(state)
+            self._sense = CubeSense(state, self.table)
         return self._sense
 
     def lift(self, sense: CubeSense) -> Array:
@@ -125,7 +146,7 @@ class PickTask(Memory):
         return sense.object[:, 2] - self.rest_height
 
     def observe(self, state: RobotState) -> Floats:
-        """See `observation_labels`. Shape: (n, 18) float32."""
+        """See `observation_labels`. Shape: (n, k) float32."""
         observation = np.concatenate(self._columns(state), axis=1).astype(np.float32)
         return limited(observation, self.observation_space.low, self.observation_space.high)
 
@@ -137,8 +158,8 @@ class PickTask(Memory):
         phase = cube_yaw_phase(state.signals["object_quaternion"]) * (axis * axis) ** 2
         return [
             *hand_state(state, self.control, sense.tool, sense.x_axis),
-            (sense.object[:, :2] - MIDDLE[:2]) / HALF[:2],
-            self.lift(sense)[:, None] / LIFT,
+            (sense.object[:, :2] - self.table.middle[:2]) / self.table.half[:2],
+            self.lift(sense)[:, None] / self.table.lift,
             sense.offset / 0.1,
             phase.real[:, None],
             phase.imag[:, None],
@@ -151,26 +172,27 @@ class PickTask(Memory):
         return [*hand, state.signals["joint_position"] / np.pi]
 
     def command(self, action: Floats, state: RobotState) -> Array:
-        """Joint positions [rad] and gripper width [m]. Shape: (n, 7)."""
-        return self.control.command(action, self.sense(state).tool, state.command[:, :6])
+        """Joint positions [rad] and gripper width [m]. Shape: (n, joints + 1)."""
+        return self.control.command(action, self.sense(state).tool, state.command[:, :-1])
 
     def grasped(self, sense: CubeSense) -> Any:
         """Whether the closed gripper is stopped by the object between its pads. Shape: (n,) bool."""
         width = sense.state.signals["gripper_width"][:, 0]
-        return self.control.closed & (width > 0.6 * CUBE_EDGE) & (width < 1.6 * CUBE_EDGE) & (sense.distance < NEAR)
+        edge = self.table.edge
+        return self.control.closed & (width > 0.6 * edge) & (width < 1.6 * edge) & (sense.distance < self.table.near)
 
     def score(self, state: RobotState, action: Floats) -> Score:
         """Reward proximity to the cube, squeezing it and lifting it; success pays as much as holding it."""
         sense = self.sense(state)
         lift, grasped = self.lift(sense), self.grasped(sense)
-        self.held = np.where(lift >= LIFT, self.held + 1, 0)
+        self.held = np.where(lift >= self.table.lift, self.held + 1, 0)
         success = self.held >= HOLD_STEPS
         fallen = sense.object[:, 2] < TABLE_EDGE
-        early = self.control.closed & (sense.distance > NEAR)
+        early = self.control.closed & (sense.distance > self.table.near)
         reward = (
             0.1 * (1 - np.tanh(5 * sense.distance))
             - 0.05 * early
-            + grasped * (0.1 + 0.5 * limited(lift / LIFT, 0.0, 1.0))
+            + grasped * (0.1 + 0.5 * limited(lift / self.table.lift, 0.0, 1.0))
         )
         reward = reward + 30.0 * success - 5.0 * fallen
         return Score(reward, success | fallen, success, {"distance": sense.distance, "lift": lift})

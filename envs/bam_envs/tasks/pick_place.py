@@ -5,11 +5,10 @@ from typing import Any
 
 import numpy as np
 
+from bam_envs.arms.description import DEFAULT_MODEL
 from bam_envs.core.robot import EnvIds, Initial, RobotState
 from bam_envs.core.task import Array, Floats, Label, Score, limited
-from bam_envs.robots.ur5e import GRIPPER_OPEN
-from bam_envs.tasks.pick import CUBE_AREA, CUBE_EDGE, NEAR, TABLE_EDGE, CubeSense, PickTask
-from bam_envs.tasks.tool_control import HALF, MIDDLE
+from bam_envs.tasks.pick import TABLE_EDGE, CubeSense, CubeTable, PickTask
 
 GOAL_RADIUS = 0.02  # the object lies at the goal within this distance [m]
 GOAL_DISTANCE = 0.10  # least distance of a goal from the start of the cube [m]
@@ -56,27 +55,35 @@ class PickPlaceTask(PickTask):
     """
 
     memory: Mapping[str, str] = {**PickTask.memory, "goal": "goal", "picked": "picked"}
-    observation_labels = PickTask.observation_labels + GOAL_LABELS
-    robot_labels = (
-        *PickTask.robot_labels,
-        Label("goal_x", "goal, forward", "m", "(x - 0.5) / 0.2", -2, 2),
-        Label("goal_y", "goal, to the left", "m", "y / 0.25", -2, 2),
-    )
 
-    def __init__(self, num_envs: int = 1) -> None:
-        super().__init__(num_envs)
+    def __init__(self, num_envs: int = 1, *, robot_model: Any = DEFAULT_MODEL) -> None:
+        super().__init__(num_envs, robot_model=robot_model)
+        (x, _, _), (half_x, half_y, _) = self.table.middle, self.table.half
+        self.robot_labels = (
+            *self.robot_labels,
+            Label("goal_x", "goal, forward", "m", f"(x - {x:g}) / {half_x:g}", -2, 2),
+            Label("goal_y", "goal, to the left", "m", f"y / {half_y:g}", -2, 2),
+        )
+        self.goal_apart = min(GOAL_DISTANCE, float(0.6 * (self.table.cube_area[1] - self.table.cube_area[0]).min()))
+        """Least distance of a goal from the start of the cube [m]."""
         self.goal = np.zeros((num_envs, 2))
         """Goals on the table [m]. Shape: (n, 2)."""
         self.picked = np.zeros(num_envs, dtype=bool)
         """Whether the object has been lifted by `PICKED` in this episode. Shape: (n,)."""
 
+    @staticmethod
+    def labels(table: CubeTable) -> tuple[Label, ...]:
+        """Meaning of an observation at `table`."""
+        return (*PickTask.labels(table), *GOAL_LABELS)
+
     def sample_initial(self, env_ids: EnvIds, rngs: Sequence[np.random.Generator]) -> Initial:
         """As for picking, and a goal at least `GOAL_DISTANCE` from the cube."""
         initial = super().sample_initial(env_ids, rngs)
+        area = self.table.cube_area
         for env, rng, cube in zip(env_ids, rngs, initial.signals["object_pose"], strict=True):
             goal = cube[:2]
-            while np.hypot(*(goal - cube[:2])) < GOAL_DISTANCE:
-                goal = CUBE_AREA[0] + rng.random(2) * (CUBE_AREA[1] - CUBE_AREA[0])
+            while np.hypot(*(goal - cube[:2])) < self.goal_apart:
+                goal = area[0] + rng.random(2) * (area[1] - area[0])
             self.goal[env] = goal
         return initial
 
@@ -91,7 +98,7 @@ class PickPlaceTask(PickTask):
 
     def robot_columns(self, state: RobotState) -> list[Array]:
         """As for picking, and the goal, which the task gives."""
-        return [*super().robot_columns(state), (self.goal - MIDDLE[:2]) / HALF[:2]]
+        return [*super().robot_columns(state), (self.goal - self.table.middle[:2]) / self.table.half[:2]]
 
     def goal_distance(self, sense: CubeSense) -> Array:
         """Distance of the object from where it would lie at the goal [m]. Shape: (n,)."""
@@ -106,10 +113,11 @@ class PickPlaceTask(PickTask):
         opening, width = ~self.control.closed, state.signals["gripper_width"][:, 0]
         self.picked = self.picked | (grasped & (lift > PICKED))
         there = self.picked & (distance < GOAL_RADIUS)
-        self.held = np.where(there & opening & (width > 0.6 * GRIPPER_OPEN), self.held + 1, 0)
+        self.held = np.where(there & opening & (width > 0.6 * self.table.open), self.held + 1, 0)
         success = self.held >= REST_STEPS
         fallen = sense.object[:, 2] < TABLE_EDGE
-        openness = limited((width - CUBE_EDGE) / (GRIPPER_OPEN - CUBE_EDGE), 0.0, 1.0)
+        edge = self.table.edge
+        openness = limited((width - edge) / (self.table.open - edge), 0.0, 1.0)
         reward = np.where(there & opening, 0.9 + 0.6 * openness, self._shaping(sense, lift, grasped) + 0.04 * there)
         reward = reward + 75.0 * success - 2.0 * fallen
         info = {"distance": sense.distance, "lift": lift, "goal_distance": distance}
@@ -122,7 +130,7 @@ class PickPlaceTask(PickTask):
         height = CARRY * limited((across - 0.01) / FUNNEL, 0.0, 1.0)
         inside, near = 1 - np.tanh(25 * np.abs(lift - height)), 1 - np.tanh(5 * across)
         reach: Array = 0.04 * (1 - np.tanh(5 * sense.distance))
-        early = 0.02 * (self.control.closed & (sense.distance > NEAR))
+        early = 0.02 * (self.control.closed & (sense.distance > self.table.near))
         shaping: Array = reach - early + grasped * (0.04 + 0.1 * inside + 0.25 * inside * near * self.picked)
         return shaping
 

@@ -1,32 +1,50 @@
 """Reach: bring the tool within 2 cm of a point, with actions that turn the joints."""
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 from gymnasium import spaces
 
+from bam_envs.arms.description import DEFAULT_MODEL, ArmDescription
+from bam_envs.arms.description import robot_model as model_called
 from bam_envs.core.robot import EnvIds, Initial, RobotState
 from bam_envs.core.task import Array, Floats, Label, Memory, Score, draw_seeds, labelled_box, limited
-from bam_envs.robots.ur5e import GEOMETRY, GRIPPER_OPEN, JOINTS
-from bam_envs.tasks.tool_control import JOINT_STEP, TOOL_STEP
+from bam_envs.tasks.tool_control import JOINT_STEP, TOOL_STEP, WorkSpace
 
-HOME = np.array([-0.27, -1.54, 1.89, -1.93, -1.57, -1.84])
-"""Joint positions with the tool at about (0.5, 0, 0.2) m, pointing down [rad]."""
 START_NOISE = 0.1
-"""The start differs from `HOME` by at most this much in each joint [rad]."""
-GOAL_AREA = np.array([[0.30, -0.30, 0.10], [0.65, 0.30, 0.45]])
-"""Range of the goals: lowest and highest x, y, z [m]."""
+"""The start differs from the home pose by at most this much in each joint [rad]."""
 GOAL_RADIUS = 0.02  # the tool has arrived within this distance of the goal [m]
-LOWEST_TOOL = 0.04  # commands that would bring the tool lower than this are not followed [m]
 JOINT_MARGIN = 0.1  # commands stay this far from the joint limits [rad]
 LEASH = 0.15
 """Farthest distance of the commanded joints from the measured ones [rad]."""
 
-_LOW = np.array([-2 * np.pi, -2 * np.pi, -np.pi, -2 * np.pi, -2 * np.pi, -2 * np.pi]) + JOINT_MARGIN
+
+class GoalSpace(WorkSpace):
+    """The work area of an arm with the goals of the tool, which are in it, somewhat to its sides and above it."""
+
+    def __init__(self, description: ArmDescription) -> None:
+        super().__init__(description)
+        (x, _, z), (far, side, top) = self.box
+        rise = (top - z) / 0.334
+        self.home = np.array(description.home)
+        """Joint positions about which an episode begins [rad]. Shape: (k,)."""
+        low, high = [x, -1.2 * side, z + 0.084 * rise], [x + 0.875 * (far - x), 1.2 * side, z + 0.434 * rise]
+        self.goals = np.round([low, high], 6)
+        """Range of the goals: lowest and highest x, y, z [m]. Shape: (2, 3)."""
+        self.lowest = round(z + 0.024 * rise, 6)
+        """Commands that would bring the tool lower than this are not followed [m]."""
+        rows = description.joints
+        self.low = np.array([row.low for row in rows]) + JOINT_MARGIN
+        self.high = np.array([row.high for row in rows]) - JOINT_MARGIN
 
 
 class ReachTask(Memory):
     """Bring the tool within `GOAL_RADIUS` of a goal.
+
+    Args:
+        robot_model: The arm: the name of a description, or its file. Lengths below are for a UR5e; another arm has
+            goals in its own work area, in the same proportions.
 
     Start:
         Each joint is within 0.1 rad of the home pose, in which the tool is at about (0.5, 0, 0.2) m and points down.
@@ -47,79 +65,94 @@ class ReachTask(Memory):
     """
 
     memory: Mapping[str, str] = {"goal": "goal"}
-    action_labels = tuple(Label(f"d_{joint}", f"turn {joint}", "rad", "/ 0.05") for joint in JOINTS)
-    observation_labels = (
-        *(Label(joint, "joint position from the home pose", "rad", "- home", -4, 4) for joint in JOINTS),
-        *(Label(f"target_{one}", "commanded joint position from measured", "rad", "/ 0.15", -2, 2) for one in JOINTS),
-        *(Label(f"tool_{axis}", f"tool, {axis}", "m", "(from the middle of the goals) / 0.3", -4, 4) for axis in "xyz"),
-        *(Label(f"goal_d{axis}", f"goal from the tool, {axis}", "m", "/ 0.3", -4, 4) for axis in "xyz"),
-        *(Label(f"goal_near_d{axis}", f"goal from the tool, {axis}, near", "m", "/ 0.05, clipped") for axis in "xyz"),
-    )
 
-    robot_labels = observation_labels  # no tracker is needed, and the task gives the goal
-
-    def __init__(self, num_envs: int = 1) -> None:
-        self.num_envs = num_envs
+    def __init__(self, num_envs: int = 1, *, robot_model: Any = DEFAULT_MODEL) -> None:
+        self.num_envs, self.space = num_envs, GoalSpace(model_called(robot_model))
+        self.arm = self.space.arm
+        joints = self.space.description.joint_names
+        self.action_labels = tuple(Label(f"d_{joint}", f"turn {joint}", "rad", "/ 0.05") for joint in joints)
+        self.observation_labels = self.labels(self.space)
+        self.robot_labels = self.observation_labels  # no tracker is needed, and the task gives the goal
         self.action_space: spaces.Box = labelled_box(self.action_labels)
         self.observation_space: spaces.Box = labelled_box(self.observation_labels)
         self.goal = np.zeros((num_envs, 3))
         """Goals [m]. Shape: (n, 3)."""
 
+    @staticmethod
+    def labels(space: GoalSpace) -> tuple[Label, ...]:
+        """Meaning of an observation."""
+        names = space.description.joint_names
+        middle = "(from the middle of the goals) / 0.3"
+        return (
+            *(Label(one, "joint position from the home pose", "rad", "- home", -4, 4) for one in names),
+            *(
+                Label(f"target_{one}", "commanded joint position from measured", "rad", "/ 0.15", -2, 2)
+                for one in names
+            ),
+            *(Label(f"tool_{axis}", f"tool, {axis}", "m", middle, -4, 4) for axis in "xyz"),
+            *(Label(f"goal_d{axis}", f"goal from the tool, {axis}", "m", "/ 0.3", -4, 4) for axis in "xyz"),
+            *(
+                Label(f"goal_near_d{axis}", f"goal from the tool, {axis}, near", "m", "/ 0.05, clipped")
+                for axis in "xyz"
+            ),
+        )
+
     def sample_initial(self, env_ids: EnvIds, rngs: Sequence[np.random.Generator]) -> Initial:
-        """Joint positions about `HOME`; a goal in `GOAL_AREA`."""
-        draws = np.stack([rng.random(9) for rng in rngs])
+        """Joint positions about the home pose; a goal."""
+        size, goals = self.space.size, self.space.goals
+        draws = np.stack([rng.random(size + 3) for rng in rngs])
         seeds = draw_seeds(rngs)
-        self.goal[env_ids] = GOAL_AREA[0] + draws[:, 6:] * (GOAL_AREA[1] - GOAL_AREA[0])
-        return Initial({"joint_position": HOME + START_NOISE * (2 * draws[:, :6] - 1)}, seeds)
+        self.goal[env_ids] = goals[0] + draws[:, size:] * (goals[1] - goals[0])
+        return Initial({"joint_position": self.space.home + START_NOISE * (2 * draws[:, :size] - 1)}, seeds)
 
     def on_reset(self, env_ids: EnvIds, state: RobotState) -> None:
         """Do nothing: commands continue from the one that was actually sent last."""
 
     def observe(self, state: RobotState) -> Floats:
-        """See `observation_labels`. Shape: (n, 21) float32."""
+        """See `observation_labels`. Shape: (n, 2 joints + 9) float32."""
         observation = np.concatenate(self.robot_columns(state), axis=1).astype(np.float32)
         return limited(observation, self.observation_space.low, self.observation_space.high)
 
     def robot_columns(self, state: RobotState) -> list[Array]:
         """See `robot_labels`: the observation, not clipped. Shape: (n, k) each."""
         joints = state.signals["joint_position"]
-        tool = GEOMETRY.tool_position(joints)
+        tool = self.space.arm.tool_position(joints)
         offset = self.goal - tool
         return [
-            joints - HOME,
-            (state.command[:, :6] - joints) / LEASH,
-            (tool - GOAL_AREA.mean(axis=0)) / 0.3,
+            joints - self.space.home,
+            (state.command[:, :-1] - joints) / LEASH,
+            (tool - self.space.goals.mean(axis=0)) / 0.3,
             offset / 0.3,
             offset / 0.05,
         ]
 
     def command(self, action: Floats, state: RobotState) -> Array:
-        """Joint positions [rad] within `TOOL_STEP` and `JOINT_STEP`, and the open gripper [m]. Shape: (n, 7)."""
-        measured, sent = state.signals["joint_position"], state.command[:, :6]
+        """Joints [rad] within `TOOL_STEP` and `JOINT_STEP`, and the open gripper [m]. Shape: (n, joints + 1)."""
+        measured, sent = state.signals["joint_position"], state.command[:, :-1]
         wanted = sent + limited(action, -1.0, 1.0).astype(np.float64) * JOINT_STEP
-        wanted = limited(limited(wanted, measured - LEASH, measured + LEASH), _LOW, -_LOW)
+        wanted = limited(limited(wanted, measured - LEASH, measured + LEASH), self.space.low, self.space.high)
         travel = wanted - sent
         travel *= np.minimum(1.0, 0.999 * JOINT_STEP / np.maximum(np.abs(travel).max(axis=1), 1e-9))[:, None]
-        tool = GEOMETRY.tool_position(sent)
+        tool = self.space.arm.tool_position(sent)
         for _ in range(3):
-            step = GEOMETRY.tool_position(sent + travel) - tool
+            step = self.space.arm.tool_position(sent + travel) - tool
             length = np.sqrt(np.einsum("ij,ij->i", step, step))
             if length.max() <= TOOL_STEP:
                 break
             travel *= np.where(length > TOOL_STEP, 0.99 * TOOL_STEP / np.maximum(length, 1e-9), 1.0)[:, None]
-        sinks = (tool[:, 2] + step[:, 2] < LOWEST_TOOL) & (step[:, 2] < 0)
+        sinks = (tool[:, 2] + step[:, 2] < self.space.lowest) & (step[:, 2] < 0)
         joints = sent + np.where(sinks[:, None], 0.0, travel)
-        return np.concatenate([joints, np.full((self.num_envs, 1), GRIPPER_OPEN)], axis=1)
+        return np.concatenate([joints, np.full((self.num_envs, 1), self.space.open)], axis=1)
 
     def action_for(self, command: Array, state: RobotState) -> Floats:
-        """The action that leads to `command` (n, 7), or as far that way as it can. Shape: (n, 6)."""
-        turn = (command[:, :6] - state.command[:, :6]) / JOINT_STEP
+        """The action that leads to `command` (n, joints + 1), or as far that way as it can. Shape: (n, joints)."""
+        turn = (command[:, :-1] - state.command[:, :-1]) / JOINT_STEP
         action: Floats = (turn / np.maximum(1.0, np.abs(turn).max(axis=1, keepdims=True))).astype(np.float32)
         return action
 
     def score(self, state: RobotState, action: Floats) -> Score:
         """Reward proximity; success pays as much as staying at the goal."""
-        offset = self.goal - GEOMETRY.tool_position(state.signals["joint_position"])
+        offset = self.goal - self.space.arm.tool_position(state.signals["joint_position"])
         distance = np.sqrt(np.einsum("ij,ij->i", offset, offset))
         success = distance < GOAL_RADIUS
         reward = 0.2 * (1 - np.tanh(3 * distance)) + 10.0 * success

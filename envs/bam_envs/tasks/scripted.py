@@ -4,17 +4,18 @@ They have no memory, so they act on any number of observations in any order, lik
 """
 
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import numpy as np
 
+from bam_envs.arms.description import DEFAULT_MODEL, ArmDescription, robot_model
 from bam_envs.core.errors import InvalidValue, UnknownName
 from bam_envs.core.registry import ENVIRONMENTS
 from bam_envs.core.task import Array, Flags, Floats, Label
-from bam_envs.robots.ur5e import GEOMETRY, JOINTS
 from bam_envs.tasks.grasping.scripted_grasps import ScriptedGrasps
-from bam_envs.tasks.pick import PickTask
+from bam_envs.tasks.pick import CubeTable, PickTask
 from bam_envs.tasks.pick_place import CARRY, PickPlaceTask
-from bam_envs.tasks.reach import HOME, ReachTask
+from bam_envs.tasks.reach import GoalSpace, ReachTask
 from bam_envs.tasks.tool_control import JOINT_STEP, LEASH, TOOL_STEP, YAW_STEP
 
 HOVER = 0.08  # height above the object from which the tool approaches [m]
@@ -38,13 +39,14 @@ class ScriptedPolicy:
         """Do nothing: there is no memory."""
 
 
-def reach(take: Take) -> Floats:
+def reach(take: Take, space: GoalSpace) -> Floats:
     """Turn the joints along the damped pseudo-inverse of the arm's Jacobian."""
-    joints = take(*JOINTS) + HOME
+    position = space.arm.tool_position
+    joints = take(*space.description.joint_names) + space.home
     offset = 0.3 * take("goal_dx", "goal_dy", "goal_dz")
     step = 1e-6 * np.eye(joints.shape[1])
-    ahead = [GEOMETRY.tool_position(joints + one) - GEOMETRY.tool_position(joints - one) for one in step]
-    jacobian = np.stack(ahead, axis=2) / 2e-6  # of the tool position [m/rad]; shape (n, 3, 6)
+    ahead = [position(joints + one) - position(joints - one) for one in step]
+    jacobian = np.stack(ahead, axis=2) / 2e-6  # of the tool position [m/rad]; shape (n, 3, joints)
     square = jacobian @ jacobian.transpose(0, 2, 1) + DAMPING**2 * np.eye(3)
     turn = (jacobian.transpose(0, 2, 1) @ np.linalg.solve(square, offset[:, :, None]))[:, :, 0]
     actions: Floats = (turn / np.maximum(np.abs(turn).max(axis=1, keepdims=True), JOINT_STEP)).astype(np.float32)
@@ -54,15 +56,18 @@ def reach(take: Take) -> Floats:
 class Sight:
     """Hand and object in the observations of n environments, in SI units."""
 
-    def __init__(self, take: Take) -> None:
+    def __init__(self, take: Take, table: CubeTable) -> None:
+        self.table = table
         self.offset = 0.1 * take("object_dx", "object_dy", "object_dz")  # object from the tool [m] (n, 3)
         self.lead = LEASH * take("target_dx", "target_dy", "target_dz")  # tool target from the tool [m] (n, 3)
-        self.lift = 0.1 * take("object_lift")[:, 0]  # object above where it lay [m] (n,)
+        self.lift = table.lift * take("object_lift")[:, 0]  # object above where it lay [m] (n,)
         cosine, sine = take("object_yaw_cos", "object_yaw_sin").T
-        self.turn: Array = np.arctan2(sine, cosine) / 4  # object's yaw from the gripper's, the nearest of four [rad]
+        self.turn: Array = (
+            np.arctan2(sine, cosine) / 4 * table.turns
+        )  # object's yaw from the gripper's, the nearest of four [rad]
         grip, width = take("grip", "gripper_width").T
         # Whether the gripper was commanded to close on the object, and whether it stopped at the object's width. (n,)
-        self.closed: Flags = (grip > 0) & (np.linalg.norm(self.offset, axis=1) < 0.03)
+        self.closed: Flags = (grip > 0) & (np.linalg.norm(self.offset, axis=1) < table.near)
         self.holding: Flags = self.closed & (width < 0.1)
 
 
@@ -81,31 +86,32 @@ def grasp(sight: Sight) -> tuple[Array, Array, Array]:
     return travel, np.where(sight.closed, 0.0, sight.turn), grip
 
 
-def tool_actions(travel: Array, turn: Array, grip: Array) -> Floats:
-    """Actions (n, 5) that move the tool target by `travel` [m] and `turn` [rad], at most one step."""
-    actions = np.concatenate([travel / TOOL_STEP, turn[:, None] / YAW_STEP, grip[:, None]], axis=1)
+def tool_actions(travel: Array, turn: Array, grip: Array, table: CubeTable) -> Floats:
+    """Actions (n, a) that move the tool target by `travel` [m] and `turn` [rad], at most one step."""
+    turns = [turn[:, None] / YAW_STEP] if table.turns else []
+    actions = np.concatenate([travel / TOOL_STEP, *turns, grip[:, None]], axis=1)
     clipped: Floats = np.clip(actions, -1.0, 1.0).astype(np.float32)
     return clipped
 
 
-def pick(take: Take) -> Floats:
+def pick(take: Take, table: CubeTable) -> Floats:
     """Grasp the cube and lift it."""
-    sight = Sight(take)
+    sight = Sight(take, table)
     travel, turn, grip = grasp(sight)
     travel[sight.holding] = (0.0, 0.0, 1.0)
-    return tool_actions(travel, turn, grip)
+    return tool_actions(travel, turn, grip, table)
 
 
-def pick_place(take: Take) -> Floats:
+def pick_place(take: Take, table: CubeTable) -> Floats:
     """Grasp the cube, carry it to the goal, put it down and let go."""
-    sight, goal = Sight(take), 0.2 * take("goal_dx", "goal_dy")
+    sight, goal = Sight(take, table), 0.2 * take("goal_dx", "goal_dy")
     travel, turn, grip = grasp(sight)
     over = np.hypot(goal[:, 0], goal[:, 1]) < 0.006
     travel[sight.holding] = carry(sight, goal, over)[sight.holding]
     there = (np.hypot(goal[:, 0], goal[:, 1]) < 0.015) & (sight.lift < PUT_DOWN)
     done = there & (~sight.closed | over)
     travel[done], turn[done], grip[done] = 0.0, 0.0, -1.0
-    return tool_actions(travel, turn, grip)
+    return tool_actions(travel, turn, grip, table)
 
 
 def carry(sight: Sight, goal: Array, over: Flags) -> Array:
@@ -117,17 +123,22 @@ def carry(sight: Sight, goal: Array, over: Flags) -> Array:
     return travel
 
 
-SCRIPTED: dict[str, tuple[type[ReachTask | PickTask], Callable[[Take], Floats]]] = {
-    "bam/reach-v0": (ReachTask, reach),
-    "bam/pick-v0": (PickTask, pick),
-    "bam/pick-place-v0": (PickPlaceTask, pick_place),
+SCRIPTED: dict[str, tuple[type[Any], Callable[[ArmDescription], Any], Callable[[Take, Any], Floats]]] = {
+    "bam/reach-v0": (ReachTask, GoalSpace, reach),
+    "bam/pick-v0": (PickTask, CubeTable, pick),
+    "bam/pick-place-v0": (PickPlaceTask, CubeTable, pick_place),
 }
-"""Task and action function of each arm's environment that has a scripted policy."""
+"""Task, space and action function of each arm's environment that has a scripted policy."""
 GRASP = "bam/grasp-xyr-v0"
 
 
-def scripted_policy(env_id: str) -> ScriptedPolicy | ScriptedGrasps:
-    """The scripted policy for `env_id`; `InvalidValue` if it has none, `UnknownName` if it is no environment."""
+def scripted_policy(env_id: str, arm: str = DEFAULT_MODEL) -> ScriptedPolicy | ScriptedGrasps:
+    """The scripted policy for `env_id` with the arm of that name.
+
+    Raises:
+        InvalidValue: The environment has none.
+        UnknownName: There is no such environment, or no such arm.
+    """
     known = (*SCRIPTED, GRASP)
     if env_id in ENVIRONMENTS and env_id not in known:
         raise InvalidValue(f"{env_id} has no scripted policy. These have one: {', '.join(known)}.")
@@ -135,5 +146,6 @@ def scripted_policy(env_id: str) -> ScriptedPolicy | ScriptedGrasps:
         raise UnknownName("scripted policy", env_id, known)
     if env_id == GRASP:
         return ScriptedGrasps()
-    task, act = SCRIPTED[env_id]
-    return ScriptedPolicy(task.observation_labels, act)
+    task, kind, act = SCRIPTED[env_id]
+    space = kind(robot_model(arm))
+    return ScriptedPolicy(task.labels(space), lambda take: act(take, space))

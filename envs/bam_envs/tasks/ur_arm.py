@@ -75,6 +75,7 @@ class UrTask(Memory):
                 "At least one of the six joints must be free to move: set one of the fix_ options False."
             )
         self.num_envs, self.model, self.rs_state_to_info = num_envs, model_called(ur_model), rs_state_to_info
+        self.arm = self.model.geometry
         self.speed: Array = self.velocity_scale * self.model.max_velocity
         """Speeds of the joints [rad/s]. Shape: (6,)."""
         self.free = np.flatnonzero(~np.array(fixed, dtype=bool))

@@ -173,13 +173,15 @@ class TaskContract(AnyTaskContract):
     """Maximum motion of a commanded joint in a period [rad]."""
     tool_step = 0.0125
     """Maximum motion of the commanded tool in a period [m]."""
+    joints = 6
+    """Number of joints of the arm, the first numbers of a command."""
 
     def make_robot(self, num_robots: int) -> Robot:
         """Hook: robots for the task."""
         return FakeRobot(num_robots)
 
     def tool_position(self, joints: Array) -> Array:
-        """Hook: forward kinematics, (n, 6) [rad] -> (n, 3) [m]."""
+        """Hook: forward kinematics, (n, joints) [rad] -> (n, 3) [m]; that of a UR5e."""
         return GEOMETRY.tool_position(joints)
 
     def actions(self, task: Task, first: int = 0) -> Iterator[NDArray[np.float32]]:
@@ -235,10 +237,10 @@ class TaskContract(AnyTaskContract):
 
     def check_pace(self, last: Array, command: Array) -> None:
         """Hook: assert that the step from `last` to `command`, both (n, m), is allowed in a period."""
-        last = last[:, :6]
-        turn = np.abs(command[:, :6] - last).max()
+        last, command = last[:, : self.joints], command[:, : self.joints]
+        turn = np.abs(command - last).max()
         assert turn <= self.joint_step * (1 + 1e-9), f"a joint turned {turn} rad in a period"
-        tool = np.linalg.norm(self.tool_position(command[:, :6]) - self.tool_position(last), axis=1).max()
+        tool = np.linalg.norm(self.tool_position(command) - self.tool_position(last), axis=1).max()
         assert tool <= self.tool_step * (1 + 1e-9), f"the tool went {tool} m in a period"
 
     def test_actions_beyond_the_space_are_cut(self) -> None:

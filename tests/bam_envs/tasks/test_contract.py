@@ -4,10 +4,12 @@ import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
 
+from bam_envs.arms.description import robot_model
 from bam_envs.core.registry import ENVIRONMENTS
 from bam_envs.robots.ur import UR_MODELS
 from bam_envs.tasks.isaac_reach import DEFAULT
 from bam_envs.tasks.pick import PickTask
+from bam_envs.tasks.scripted import SCRIPTED
 from bam_envs.testing import TaskContract
 from tests.bam_envs.making import ROBOTS, make_task
 
@@ -63,6 +65,10 @@ class Simulated(TaskContract):
         ("bam/isaac-reach-v0", {}, False),
         ("bam/mir100-navigation-v0", {}, False),
         ("bam/mir100-avoidance-v0", PARITY, False),
+        ("bam/pick-v0", {"robot_model": "so101"}, False),
+        ("bam/pick-v0", {"robot_model": "fr3"}, True),
+        ("bam/pick-place-v0", {"robot_model": "ur10e"}, False),
+        ("bam/reach-v0", {"robot_model": "fr3"}, False),
         *(
             pytest.param(*one, marks=pytest.mark.slow)
             for one in (
@@ -83,6 +89,11 @@ class Simulated(TaskContract):
                 ),
                 ("bam/mir100-navigation-v0", PARITY, False),
                 ("bam/mir100-avoidance-v0", {}, False),
+                ("bam/reach-v0", {"robot_model": "so101"}, True),
+                ("bam/reach-v0", {"robot_model": "ur10e"}, False),
+                ("bam/pick-v0", {"robot_model": "ur10e"}, True),
+                ("bam/pick-place-v0", {"robot_model": "so101"}, True),
+                ("bam/pick-place-v0", {"robot_model": "fr3"}, False),
             )
         ),
     ],
@@ -91,6 +102,8 @@ class TestSimulated(Simulated):
     @pytest.fixture(autouse=True)
     def chosen(self, env_id, options, randomize):
         self.id, self.options, self.randomize = env_id, options, randomize
+        arm = robot_model(options.get("robot_model", "ur5e"))
+        self.joints, self.tool_position = arm.num_joints, arm.arm.tool_position
 
 
 class TestIsaacReachInParity(Simulated):
@@ -127,9 +140,10 @@ def test_the_contract_finds_a_task_that_changes_a_state():
 
 VARIANTS = [(env_id, {flag: True}) for env_id, entry in ENVIRONMENTS.items() for flag in entry.variants]
 SIZES = [("bam/ur-reach-v0", {"ur_model": model}) for model in UR_MODELS]
+ARMS = [(env_id, {"robot_model": model}) for env_id in SCRIPTED for model in ("fr3", "so101", "ur10e")]
 
 
-@pytest.mark.parametrize(("env_id", "options"), [*((env_id, {}) for env_id in ROBOTS), *VARIANTS, *SIZES])
+@pytest.mark.parametrize(("env_id", "options"), [*((env_id, {}) for env_id in ROBOTS), *VARIANTS, *SIZES, *ARMS])
 @pytest.mark.filterwarnings("ignore:.*A Box observation space m(ini|axi)mum value is -?infinity")  # robo-gym's bounds
 @pytest.mark.filterwarnings("ignore:.*we recommend using a symmetric and normalized space")  # Isaac Lab's actions
 @pytest.mark.filterwarnings("ignore:.*maximum and minimum values are equal")  # an elbow that sees nothing

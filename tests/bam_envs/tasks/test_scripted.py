@@ -1,11 +1,13 @@
-"""The scripted policies: what they see, and that they need no memory. How often they succeed: tests/scripts."""
+"""The scripted policies: what they see, and that they need no memory, and that any arm solves the tasks with them."""
 
 import numpy as np
 import pytest
 
+from bam_envs.arms.description import known_models
 from bam_envs.core.errors import InvalidValue, UnknownName
 from bam_envs.core.registry import ENVIRONMENTS
 from bam_envs.tasks.scripted import GRASP, SCRIPTED, scripted_policy
+from tests.bam_envs.making import solved
 
 IDS = tuple(SCRIPTED)
 
@@ -23,6 +25,18 @@ def test_actions_are_in_their_space_and_do_not_depend_on_other_rows(make_rows, e
         np.testing.assert_allclose(alone, actions, atol=1e-6)
         policy.reset()
         observation, *_ = envs.step(actions)
+
+
+@pytest.mark.parametrize("env_id", IDS)
+@pytest.mark.parametrize("arm", known_models())
+def test_they_solve_their_tasks_with_every_shipped_arm(make_rows, env_id, arm):
+    assert solved(make_rows(env_id, 16, robot_model=arm), scripted_policy(env_id, arm)) == 16
+
+
+def test_no_policy_for_an_arm_that_is_not_known():
+    with pytest.raises(UnknownName) as caught:
+        scripted_policy("bam/pick-v0", "fr4")
+    assert str(caught.value) == "Unknown robot model 'fr4'. Did you mean 'fr3'?"
 
 
 def test_no_policy_for_other_environments():

@@ -298,7 +298,7 @@ OUT_OF_RANGE = [
     (serve, ["--port", "99999"], "--port: expected a whole number from 0 to 65535, found 99999"),
     (serve, ["--port", "abc"], "--port: expected a whole number from 0 to 65535, found 'abc'"),
     (train, ["--steps", "0"], "--steps: expected a whole number from 1 to 1000000000000000, found 0"),
-    (envs, ["--lst"], "unknown option --lst; there are --json and --help"),
+    (envs, ["--lst"], "unknown option --lst"),
     (deploy, ["x.zip", "--stage", "slow"], "--stage: expected full or trial, found 'slow'"),
     (envs, ["a", "b"], "unexpected argument b"),
     (train, ["--normalize"], "--normalize is no option: give --set normalize=true"),

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import copy
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bam_envs.core.robot import FARTHEST, SEGMENTS, Array, CameraSpec, EnvIds
-from bam_envs.robots.physics.mujoco_batch import MODELS, Physics, mujoco
+from bam_envs.robots.physics.mujoco_batch import Physics, mujoco
 from bam_envs.robots.physics.rendering import FastCamera
 
 Images = dict[str, NDArray[Any]]
@@ -45,13 +45,15 @@ class Cameras:
     More threads are no faster: they wait for each other in OpenGL.
 
     Args:
-        scene: The MJCF model in ``models/``.
+        scene: Makes the `mujoco.MjSpec` of the robots.
         physics: The robots.
         specs: The cameras.
         random: Whether light, colours, the table's texture and the cameras' poses are drawn for each episode.
     """
 
-    def __init__(self, scene: str, physics: Physics, specs: Sequence[CameraSpec], *, random: bool) -> None:
+    def __init__(
+        self, scene: Callable[[], Any], physics: Physics, specs: Sequence[CameraSpec], *, random: bool
+    ) -> None:
         self._scene, self._physics, self._specs, self._random = scene, physics, tuple(specs), random
         self.draws: Array = np.full((physics.num_envs, _DRAWS), 0.5)
         """Random numbers in [0, 1) that decide the looks of each environment. Shape: (n, 64)."""
@@ -99,9 +101,9 @@ class Cameras:
         return {**self.__dict__, "_painter": None, "_thread": None}
 
 
-def _visual_model(scene: str, width: int, height: int) -> Any:
+def _visual_model(scene: Callable[[], Any], width: int, height: int) -> Any:
     """The model of a scene with cheap graphics, surroundings, and textures for its table."""
-    spec = mujoco.MjSpec.from_file(str(MODELS / scene))
+    spec = scene()
     quality = spec.visual.quality
     quality.offsamples, quality.numslices, quality.numstacks = 0, 12, 6
     spec.visual.global_.offwidth, spec.visual.global_.offheight = width, height
@@ -122,7 +124,7 @@ def _visual_model(scene: str, width: int, height: int) -> Any:
 class _Painter:
     """An OpenGL context of the thread that makes it, and a model of its own, for one environment after the other."""
 
-    def __init__(self, scene: str, specs: Sequence[CameraSpec]) -> None:
+    def __init__(self, scene: Callable[[], Any], specs: Sequence[CameraSpec]) -> None:
         self._specs, width, height = specs, specs[0].width, specs[0].height
         self._model: Any = _visual_model(scene, width, height)
         self._nominal = copy.copy(self._model)

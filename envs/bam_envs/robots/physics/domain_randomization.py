@@ -16,7 +16,6 @@ from bam_envs.core.task import Memory
 from bam_envs.robots.physics.mujoco_batch import Physics
 
 Array = NDArray[np.float64]
-ARM_COORDINATES = 8  # six joints and two fingers; the object follows
 TAPE = 256  # steps of noise drawn at once
 
 
@@ -59,7 +58,7 @@ class Imperfection(Memory):
         self._sent = np.zeros((num_envs, self.ranges.max_delay + 1, nu))
         self.seen = np.zeros((num_envs, 7))
         """Object poses measured by the tracker: position [m], quaternion w, x, y, z. Shape: (n, 7)."""
-        self._has_object = physics.model.nq > ARM_COORDINATES
+        self._has_object = physics.model.nq > physics.model.nv  # an object has one coordinate more than velocities
 
     def reset(self, env: int, seed: int, command: Array) -> None:
         """Draw the differences of a new episode; `command` (m,) is the robot's command at its start."""

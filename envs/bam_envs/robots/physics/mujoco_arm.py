@@ -1,4 +1,4 @@
-"""A UR5e with a parallel gripper, simulated: position control, 20 Hz commands, 5 ms physics."""
+"""An arm with a parallel gripper, simulated: position control, 20 Hz commands, 5 ms physics."""
 
 from __future__ import annotations
 
@@ -10,10 +10,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from bam_envs.arms.description import DEFAULT_MODEL
+from bam_envs.arms.description import robot_model as model_called
 from bam_envs.core.errors import InvalidValue, PhysicsDiverged, ResetNeeded
 from bam_envs.core.robot import CameraSpec, EnvIds, Initial, RobotState, checked_command
 from bam_envs.robots.physics.shapes import marked
-from bam_envs.robots.ur5e import COMMAND, GRIPPER_OPEN, GRIPPER_SPEED, arm_spec
 
 if TYPE_CHECKING:
     from bam_envs.robots.physics.cameras import Cameras
@@ -23,8 +24,6 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 
-LOWEST, HIGHEST = np.array(COMMAND.low), np.array(COMMAND.high)
-MAX_RATE = np.array(COMMAND.max_rate)
 GRIPPER_LEASH = 0.011
 """Farthest distance of the gripper's set point ahead of its fingers [m]: enough for full force, and to open at once."""
 LAG = 0.05  # delay of the joints behind their set points [s]: damping by stiffness of the actuators
@@ -32,7 +31,7 @@ PHYSICS_STEPS = 10  # per period
 
 
 class SimulatedArm:
-    """n simulated UR5e arms, each on a separate table.
+    """n simulated arms, each on a separate table.
 
     The joint set points move linearly from the last command to the new one within a period, as a UR controller
     interpolates; the gripper's set point moves at `GRIPPER_SPEED`.
@@ -42,6 +41,7 @@ class SimulatedArm:
         with_object: Whether there is a cube, measured by a tracker.
         randomize: Masses, friction, sizes and gains that differ each episode, a noisy tracker and delayed commands.
         cameras: Its cameras, ``front`` and ``wrist``, whose images are signals.
+        robot_model: The arm; see `bam_envs.arms.description.robot_model`.
         looks: ``"random"`` for light, colours, texture and poses of cameras that differ each episode, or ``"fixed"``.
     """
 
@@ -53,34 +53,44 @@ class SimulatedArm:
         randomize: bool = False,
         cameras: tuple[CameraSpec, ...] = (),
         looks: str = "fixed",
+        robot_model: Any = DEFAULT_MODEL,
     ) -> None:
-        self.num_robots = num_robots
+        self.num_robots, self.description = num_robots, model_called(robot_model)
         self.randomize, self._looks = randomize, looks
-        self.spec = replace(arm_spec("ur5e", with_object=with_object), lag=LAG, cameras=cameras)
+        self.spec = replace(self.description.spec(with_object=with_object), lag=LAG, cameras=cameras)
+        self._joints, self._open = self.description.num_joints, self.description.gripper.open
+        command = self.spec.command
+        self._lowest, self._highest, self._max_rate = map(np.array, (command.low, command.high, command.max_rate))
         self._with_object = with_object
-        self._scene = "ur5e_cube.xml" if with_object else "ur5e_gripper.xml"
         self._physics: Physics | None = None
         self._imperfection: Imperfection | None = None
         self._cameras: Cameras | None = None
         self._view: OffScreen | Window | None = None
         self._all = np.arange(num_robots)
-        self._setpoint = np.zeros((num_robots, 7))
-        self._command = np.zeros((num_robots, 7))
+        self._setpoint = np.zeros((num_robots, self._joints + 1))
+        self._command = np.zeros((num_robots, self._joints + 1))
         self._ramp = (np.arange(1, PHYSICS_STEPS + 1) / PHYSICS_STEPS)[None, :, None]
 
     def connect(self) -> None:
         """Build the physics."""
         if self._physics is not None:
             return
+        from bam_envs.robots.physics.arm_model import scene_spec
         from bam_envs.robots.physics.domain_randomization import Imperfection
         from bam_envs.robots.physics.mujoco_batch import Physics
 
-        self._physics = Physics(self._scene, self.num_robots, varied=self.randomize)
+        scene = partial(scene_spec, self.description, with_object=self._with_object)
+        self._physics = Physics(scene().compile(), self.num_robots, varied=self.randomize)
         self._imperfection = Imperfection(self._physics) if self.randomize else None
         if self.spec.cameras:
             from bam_envs.robots.physics.cameras import Cameras
 
-            self._cameras = Cameras(self._scene, self._physics, self.spec.cameras, random=self._looks == "random")
+            self._cameras = Cameras(scene, self._physics, self.spec.cameras, random=self._looks == "random")
+
+    @property
+    def tool_position(self) -> Any:
+        """Forward kinematics: the function of joint positions (n, k) [rad] that gives those of the tool (n, 3) [m]."""
+        return self.description.arm.tool_position
 
     @property
     def physics(self) -> Physics:
@@ -91,7 +101,7 @@ class SimulatedArm:
 
     @property
     def setpoint(self) -> Array:
-        """Current set points: joint positions [rad] and the gripper's width [m]. Shape: (n, 7)."""
+        """Current set points: joint positions [rad] and the gripper's width [m]. Shape: (n, joints + 1)."""
         setpoint: Array = self._setpoint.copy()
         return setpoint
 
@@ -100,8 +110,9 @@ class SimulatedArm:
         physics, joints = self.physics, initial.signals["joint_position"]
         physics.state = physics.state.copy()  # states returned earlier are views of the old array
         physics.time[env_ids], physics.qvel[env_ids] = 0.0, 0.0
-        physics.qpos[env_ids, :6], physics.qpos[env_ids, 6:8] = joints, GRIPPER_OPEN / 2
-        self._setpoint[env_ids, :6], self._setpoint[env_ids, 6] = joints, GRIPPER_OPEN
+        size = self._joints
+        physics.qpos[env_ids, :size], physics.qpos[env_ids, size : size + 2] = joints, self._open / 2
+        self._setpoint[env_ids, :size], self._setpoint[env_ids, size] = joints, self._open
         self._command = self._command.copy()  # so does the command
         self._command[env_ids] = self._setpoint[env_ids]
         return self._begin(env_ids, initial.signals["object_pose"] if self._with_object else None, initial.seeds)
@@ -118,7 +129,7 @@ class SimulatedArm:
         if pose is not None and not self._with_object:
             raise InvalidValue(f"The robot {self.spec.name!r} has no object that could be placed.")
         physics.state = physics.state.copy()  # states returned earlier are views of the old array
-        physics.qvel[:, : 8 if pose is None else None] = 0.0
+        physics.qvel[:, : self._joints + 2 if pose is None else None] = 0.0
         return self._begin(self._all, pose, seeds)
 
     def _begin(self, env_ids: EnvIds, pose: Array | None, seeds: NDArray[np.int64]) -> RobotState:
@@ -130,18 +141,23 @@ class SimulatedArm:
         if self._cameras is not None:
             self._cameras.begin(env_ids, seeds)
         if pose is not None:
-            qpos, geom, half = physics.qpos, physics.model.geom("object").id, pose[:, 2] / 2
-            qpos[env_ids, 8:10] = pose[:, :2]
-            qpos[env_ids, 10] = [physics.model_of(int(env)).geom_size[geom, 2] for env in env_ids]
-            qpos[env_ids, 11], qpos[env_ids, 12:14], qpos[env_ids, 14] = np.cos(half), 0.0, np.sin(half)
+            object_pose, geom = physics.qpos[:, self._joints + 2 :], physics.model.geom("object").id
+            half = pose[:, 2] / 2
+            object_pose[env_ids, :2] = pose[:, :2]
+            object_pose[env_ids, 2] = [physics.model_of(int(env)).geom_size[geom, 2] for env in env_ids]
+            object_pose[env_ids, 3], object_pose[env_ids, 4:6], object_pose[env_ids, 6] = (
+                np.cos(half),
+                0.0,
+                np.sin(half),
+            )
         return self._measure(env_ids)
 
     def step(self, command: Array) -> RobotState:
-        """Send `command` (n, 7): six joint positions [rad] and the gripper's width [m]; one period later, measure."""
+        """Send `command` (n, joints + 1), joint positions [rad] and the gripper's width [m]; measure a period later."""
         return next(self.slices(command, 1))
 
     def slices(self, command: Array, parts: int) -> Iterator[RobotState]:
-        """Send `command` (n, 7), and yield the state after each of `parts` equal parts of the period.
+        """Send `command` (n, joints + 1), and yield the state after each of `parts` equal parts of the period.
 
         Set points and the last state are those of `step`, except for the last bits: in a contact, the solver of the
         physics restarts with each part. A halt between two parts holds for the rest of the period. If the iteration is
@@ -152,20 +168,21 @@ class SimulatedArm:
         """
         if parts not in range(1, PHYSICS_STEPS + 1) or PHYSICS_STEPS % parts:
             raise InvalidValue(f"A period has {PHYSICS_STEPS} physics steps; it cannot be divided into {parts!r}.")
-        return self._slices(self._travel(checked_command(command, (self.num_robots, 7))), parts)
+        return self._slices(self._travel(checked_command(command, self._command.shape)), parts)
 
     def _travel(self, command: Array) -> Array:
-        """Change of the set points in this period, if `command` is sent now. Shape: (n, 7)."""
-        reach = MAX_RATE * self.spec.period
+        """Change of the set points in this period, if `command` is sent now. Shape: (n, joints + 1)."""
+        reach, last = self._max_rate * self.spec.period, self._joints
         within = np.clip(command, self._command - reach, self._command + reach)  # no faster than the arm can
-        within[:, 6] = command[:, 6]  # the gripper takes a width and goes there at its own speed
-        self._command = np.clip(within, LOWEST, HIGHEST)
+        within[:, last] = command[:, last]  # the gripper takes a width and goes there at its own speed
+        self._command = np.clip(within, self._lowest, self._highest)
         arriving = self._command if self._imperfection is None else self._imperfection.delayed(self._command)
         travel = arriving - self._setpoint
         # The gripper's set point goes at its own speed, and stays near the fingers.
-        fingers, limit = self.physics.qpos[:, 6] + self.physics.qpos[:, 7], GRIPPER_SPEED * self.spec.period
-        width = self._setpoint[:, 6] + np.clip(travel[:, 6], -limit, limit)
-        travel[:, 6] = np.clip(width, fingers - GRIPPER_LEASH, fingers + GRIPPER_LEASH) - self._setpoint[:, 6]
+        qpos = self.physics.qpos
+        fingers, limit = qpos[:, last] + qpos[:, last + 1], reach[last]
+        width = self._setpoint[:, last] + np.clip(travel[:, last], -limit, limit)
+        travel[:, last] = np.clip(width, fingers - GRIPPER_LEASH, fingers + GRIPPER_LEASH) - self._setpoint[:, last]
         return travel
 
     def _slices(self, travel: Array, parts: int) -> Iterator[RobotState]:
@@ -180,15 +197,15 @@ class SimulatedArm:
 
     def _measure(self, fresh: EnvIds) -> RobotState:
         """The state of all environments; a noisy tracker and cameras measure only the `fresh` ones again."""
-        physics = self.physics
+        physics, size = self.physics, self._joints
         qpos, qvel = physics.qpos, physics.qvel
         if not np.isfinite(physics.state.sum()):
             env_ids = np.flatnonzero(~np.isfinite(physics.state).all(axis=1)).tolist()
             raise PhysicsDiverged(f"The simulated state of environments {env_ids} is not finite. Reset them.")
-        signals = {"joint_position": qpos[:, :6], "joint_velocity": qvel[:, :6]}
-        signals["gripper_width"] = qpos[:, 6:7] + qpos[:, 7:8]
+        signals = {"joint_position": qpos[:, :size], "joint_velocity": qvel[:, :size]}
+        signals["gripper_width"] = qpos[:, size : size + 1] + qpos[:, size + 1 : size + 2]
         if self._with_object:
-            pose = qpos[:, 8:15]
+            pose = qpos[:, size + 2 :]
             if self._imperfection is not None:
                 self._imperfection.look(fresh, pose[fresh])
                 pose = self._imperfection.seen.copy()
@@ -202,7 +219,7 @@ class SimulatedArm:
         physics, imperfection = self._physics, self._imperfection  # `close` may come from another thread
         if physics is None:
             return
-        setpoint = np.concatenate([physics.qpos[:, :6], self._setpoint[:, 6:]], axis=1)
+        setpoint = np.concatenate([physics.qpos[:, : self._joints], self._setpoint[:, self._joints :]], axis=1)
         self._setpoint, self._command = setpoint, setpoint.copy()
         if imperfection is not None:
             imperfection.forget(setpoint)
@@ -230,10 +247,11 @@ class SimulatedArm:
 
     def show(self, state: RobotState) -> None:
         """Put the arm and object of the one environment where `state` measured them, to draw it."""
-        physics, signals = self.physics, state.signals
-        physics.qpos[:, :6], physics.qpos[:, 6:8] = signals["joint_position"], signals["gripper_width"] / 2
+        signals, size = state.signals, self._joints
+        joints, fingers, thing = np.split(self.physics.qpos, [size, size + 2], axis=1)
+        joints[:], fingers[:] = signals["joint_position"], signals["gripper_width"] / 2
         if self._with_object:
-            physics.qpos[:, 8:11], physics.qpos[:, 11:15] = signals["object_position"], signals["object_quaternion"]
+            thing[:, :3], thing[:, 3:] = signals["object_position"], signals["object_quaternion"]
 
     def state_dict(self) -> dict[str, Any]:
         """The complete state of the simulated robots."""

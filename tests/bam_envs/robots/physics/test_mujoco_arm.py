@@ -1,8 +1,11 @@
 """The simulated UR5e: set points, limits, gripper, halt."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
+from bam_envs.arms.description import robot_model
 from bam_envs.core.errors import InvalidValue, ResetNeeded
 from bam_envs.core.robot import Initial, Robot
 from bam_envs.robots.physics.mujoco_arm import SimulatedArm, arm_scene, cube_scene
@@ -52,6 +55,22 @@ def test_reset_puts_everything_where_it_is_told(arm):
     np.testing.assert_allclose(state.signals["object_quaternion"], [[np.cos(0.15), 0, 0, np.sin(0.15)]])
     np.testing.assert_array_equal(state.stamp, [0.0])
     np.testing.assert_array_equal(state.command, hold())
+
+
+def test_a_tool_of_another_length_is_simulated():
+    """Also that of a project's own ``ur5e``, which has the name of the one with a model of its own."""
+    arm = robot_model("ur5e")
+    longer = replace(arm, tool=replace(arm.tool, xyz=(0.0, 0.0, arm.tool.xyz[2] + 0.05)))
+    heights = []
+    for one in (arm, longer):
+        robot = SimulatedArm(robot_model=one, with_object=False)
+        robot.connect()
+        begin(robot)
+        site = robot.physics.data_of(0).site("tool").xpos
+        np.testing.assert_allclose(site, robot.tool_position(np.array([ARM_HOME]))[0], atol=1e-9)
+        heights.append(site[2])
+        robot.close()
+    assert heights[1] < heights[0] - 0.04
 
 
 def test_it_holds_still(arm):

@@ -1,0 +1,147 @@
+"""What the commands of `bam-robots` do."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from bam_envs.core.errors import InvalidValue
+from bam_train.cli.console import tell
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from bam_envs.arms.description import ArmDescription
+    from bam_train.cli.arms.bam_robots import AddArmConfig, CheckArmConfig, ListArmsConfig
+
+_PICTURES = (".png", ".jpg")
+_POSTURES = 2000  # in which kinematics are compared with MuJoCo's
+
+
+def add(config: AddArmConfig) -> int | None:
+    """Write the description of an arm."""
+    from bam_envs.robots.modelling.describe import describe, write_description
+
+    if (config.mjcf is None) == (config.urdf is None):
+        raise InvalidValue("Give the model of the arm: --mjcf FILE or --urdf FILE.")
+    if config.site is not None and config.tip is not None:
+        raise InvalidValue("--site and --tip name the same thing, the end of the arm; give one of them.")
+    path = config.out / f"{config.name}.toml"
+    if path.exists() and not config.force:
+        raise InvalidValue(f"{path} exists; give another name, or --force to replace it.")
+    model = config.mjcf or config.urdf or ""
+    arm, notes = describe(config.name, model, config.gripper, config.site or config.tip)
+    write_description(arm, notes, path)
+    tell(f"wrote {path}: {arm.num_joints} joints, gripper {1000 * arm.gripper.open:.0f} mm, {_area(arm)}")
+    if notes:
+        tell("assumed, and written at its head:", *(f"  {note}" for note in notes))
+    tell(
+        "next:",
+        f"  bam-robots check {config.name}",
+        f"  bam-train --env bam/pick --robot-model {config.name} --algo ppo",
+    )
+    return None
+
+
+def check(config: CheckArmConfig) -> int | None:
+    """Show an arm."""
+    from bam_envs.arms.description import robot_model
+    from bam_train.cli.envs import aligned
+
+    arm = robot_model(config.name)
+    tell(f"{arm.name}: {arm.title}", "")
+    head = ["joint", "from", "to", "speed", "acceleration", "jerk", "torque", "home"]
+    units = ["", "rad", "rad", "rad/s", "rad/s^2", "rad/s^3", "N m", "rad"]
+    rows = [
+        [row.name, *(f"{one:.4g}" for one in (row.low, row.high, row.velocity, row.acceleration, row.jerk, row.effort))]
+        for row in arm.joints
+    ]
+    tell(*aligned([head, units, *([*row, f"{home:.3f}"] for row, home in zip(rows, arm.home, strict=True))]), "")
+    facts = _facts(arm)
+    tell(*aligned([[name, text] for name, text, _ in facts]))
+    if config.picture is not None:
+        _draw(arm, config.picture)
+        tell(f"drawn in {config.picture}")
+    return 0 if all(fits for *_, fits in facts) else 1
+
+
+def _facts(arm: ArmDescription) -> list[tuple[str, str, bool]]:
+    """What is measured of an arm: name, text, and whether it is as it should be."""
+    from bam_envs.arms.capsules import Outline
+    from bam_envs.arms.work_area import covers
+
+    chain, outline = arm.chain, Outline(arm.chain)
+    rng = np.random.default_rng(0)
+    q = chain.low + rng.random((_POSTURES, arm.num_joints)) * (chain.high - chain.low)
+    reach = float(np.linalg.norm(chain.tool_position(q) - chain.placements[0, :3, 3], axis=1).max())
+    off = _simulated_gap(arm, q)
+    clear = float(min(outline.nearest(chain.home[None])[0], outline.lowest(chain.home[None])[0]))
+    reached = covers(chain, outline, np.array(arm.workspace))
+    share = float((outline.nearest(q) < 0.0).mean())
+    turns = "position and turn of the gripper" if chain.turns else "position only: this arm cannot turn its gripper"
+    return [
+        ("reach", f"{reach:.3f} m from the first joint", True),
+        ("kinematics", f"within {off:.1e} m of MuJoCo's in {_POSTURES} postures", off < 1e-9),
+        ("tool", f"{turns}", True),
+        ("gripper", f"opens to {1000 * arm.gripper.open:.0f} mm at {arm.gripper.speed:g} m/s", True),
+        ("home pose", f"{clear:.3f} m from itself and from the table", clear > 0.0),
+        (
+            "outline",
+            f"{len(arm.capsules)} capsules, {len(outline.pairs)} pairs; {share:.0%} of all postures touch",
+            True,
+        ),
+        ("work area", _area(arm) + ("" if reached else ": not all of it is reached"), reached),
+        ("limits from", "; ".join(f"{name}: {text}" for name, text in arm.sources.items()), True),
+    ]
+
+
+def _area(arm: ArmDescription) -> str:
+    (x, y, z), (far, side, top) = arm.workspace
+    return f"works from x {x:g} to {far:g}, y {y:g} to {side:g}, z {z:g} to {top:g} m"
+
+
+def _simulated_gap(arm: ArmDescription, q: Any) -> float:
+    """Greatest distance of the tool from where MuJoCo's kinematics have it [m]."""
+    from bam_envs.robots.physics.arm_model import scene_spec
+    from bam_envs.robots.physics.mujoco_batch import mujoco
+
+    model = scene_spec(arm, with_object=False).compile()
+    data, site = mujoco.MjData(model), model.site("tool").id
+    places = []
+    for joints in q:
+        data.qpos[: len(joints)] = joints
+        mujoco.mj_kinematics(model, data)
+        places.append(data.site_xpos[site].copy())
+    return float(np.abs(np.array(places) - arm.chain.tool_position(q)).max())
+
+
+def _draw(arm: ArmDescription, path: Path) -> None:
+    """Write a picture of the arm in its home pose, on its table."""
+    from PIL import Image
+
+    from bam_envs.core.robot import Initial
+    from bam_envs.robots.physics.mujoco_arm import SimulatedArm
+
+    if path.suffix.lower() not in _PICTURES:
+        raise InvalidValue(f"--picture {path}: expected a name that ends in {' or '.join(_PICTURES)}.")
+    robot = SimulatedArm(1, with_object=False, robot_model=arm)
+    robot.connect()
+    try:
+        robot.reset(np.arange(1), Initial({"joint_position": np.array([arm.home])}, np.zeros(1, np.int64)))
+        Image.fromarray(robot.render("rgb_array", [])).save(path)
+    finally:
+        robot.close()
+
+
+def list_models(config: ListArmsConfig) -> int | None:
+    """List the arms."""
+    from bam_envs.arms.description import known_models, read_description
+    from bam_train.cli.envs import aligned
+
+    rows = [["name", "joints", "what", "file"]]
+    for name, path in sorted(known_models().items()):
+        arm = read_description(path)
+        rows.append([name, str(arm.num_joints), arm.title, str(path)])
+    tell(*aligned(rows), "", "Another arm: bam-robots add NAME --urdf FILE --gripper parallel:0.08")
+    return None

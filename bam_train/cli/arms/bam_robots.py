@@ -1,0 +1,80 @@
+"""`bam-robots COMMAND`: describe arms once, for simulation, guards and live robots."""
+
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Annotated, ClassVar
+
+import tyro
+
+from bam_train.cli.flags import File, Groups
+from bam_train.cli.program import Command, run_commands
+
+ModelName = Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="NAME")]
+ModelFile = Annotated[str | None, tyro.conf.arg(metavar="FILE|menagerie:NAME")]
+
+
+@dataclass(frozen=True)
+class AddArmConfig:
+    """Describe an arm and its gripper from model files: joints, limits, outline, tool, and where it can work.
+
+    The description is one file, robots/NAME.toml, which simulation, guards and live robots read. What the files do not
+    say gets a default, and a comment at the head of the description says so.
+
+    Examples:
+      bam-robots add lab --urdf lab_arm.urdf --tip tool0 --gripper parallel:0.08
+      bam-robots add fr3b --mjcf menagerie:franka_fr3 --gripper menagerie:robotiq_2f85 --site attachment_site
+      bam-robots add so101b --urdf so101.urdf --tip gripper_link
+    """
+
+    GROUPS: ClassVar[Groups] = {"The model": ("mjcf", "urdf", "site", "tip", "gripper"), "The file": ("out", "force")}
+
+    name: ModelName
+    """Name of the arm."""
+    mjcf: ModelFile = None
+    """MJCF file of the arm, or menagerie:NAME."""
+    urdf: Annotated[str | None, tyro.conf.arg(metavar="FILE")] = None
+    """URDF or xacro file of the arm."""
+    site: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
+    """Site or body at the end of the arm, where the gripper is fixed (default: the first of the usual names)."""
+    tip: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
+    """The same for a URDF: the link at the end of the arm."""
+    gripper: Annotated[str | None, tyro.conf.arg(metavar="FILE|menagerie:NAME|parallel:WIDTH")] = None
+    """The gripper: a model file, or two parallel pads that open to a width in metres (default: the joints behind the
+    end of the arm)."""
+    out: Annotated[Path, tyro.conf.arg(metavar="FOLDER")] = Path("robots")
+    """Folder of the description."""
+    force: bool = False
+    """Replace a description of that name."""
+
+
+@dataclass(frozen=True)
+class CheckArmConfig:
+    """Show an arm: limits, reach, kinematics against MuJoCo, gripper, outline and the area where it works.
+
+    Examples:
+      bam-robots check lab
+      bam-robots check lab --picture lab.png
+    """
+
+    name: ModelName
+    """Name of the arm, or the file of its description."""
+    picture: File = None
+    """Draw it in its home pose, as an image."""
+
+
+@dataclass(frozen=True)
+class ListArmsConfig:
+    """List the arms that are known here: a project's, this user's, those of packages and the shipped ones."""
+
+
+_FLAGS, _HERE = "bam_train.cli.arms.bam_robots", "bam_train.cli.arms.arm_commands"
+COMMANDS = {
+    "add": Command("describe an arm and its gripper from model files", f"{_FLAGS}:AddArmConfig", f"{_HERE}:add"),
+    "check": Command("limits, reach, kinematics and work area of an arm", f"{_FLAGS}:CheckArmConfig", f"{_HERE}:check"),
+    "list": Command("the arms that are known here", f"{_FLAGS}:ListArmsConfig", f"{_HERE}:list_models"),
+}
+main = partial(run_commands, "bam-robots", "Describe arms once, for simulation, guards and live robots.", COMMANDS)
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,1 @@
+"""Arms as data: their descriptions, kinematics, outlines and work areas; no simulator is needed."""

@@ -1,0 +1,148 @@
+"""Where an arm can work on a table before it: its home pose, and the largest box that it reaches with the tool down."""
+
+import dataclasses
+import itertools
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bam_envs.arms.capsules import Outline
+from bam_envs.arms.description import ArmDescription
+from bam_envs.arms.serial_chain import SerialChain
+from bam_envs.core.errors import InvalidValue
+
+Array = NDArray[np.float64]
+BOX = np.array([[-0.20, -0.25, 0.016], [0.20, 0.25, 0.35]])
+"""Full work area about its middle: lowest and highest x, y, z [m]; a smaller arm has a smaller one."""
+TABLE_END = 0.88
+"""Farthest x of a work area: the table ends at 0.95 m."""
+YAW = 1.2
+"""Farthest turn of the gripper from straight ahead [rad]."""
+_SCALES = (1.0, 0.9, 0.8, 0.7, 0.6, 0.5, 0.42, 0.35, 0.3, 0.25)
+_HEIGHTS = (1.0, 0.6)
+_MARGIN = 0.05  # from the ends of a joint's travel [rad]
+_CLEAR = 0.006  # of the table and of the arm itself, more than the guards keep [m]
+_REACHED = 1e-4  # [m], and as far in rad
+_TRIES = 240  # start poses of the search for a home pose
+_STEPS = 12  # from the middle of the area to a point of it
+
+
+@dataclass(frozen=True)
+class WorkArea:
+    """A home pose and the box about it."""
+
+    home: Array
+    """Joint positions with the tool pointing down over the middle [rad]. Shape: (k,)."""
+    box: Array
+    """Lowest and highest x, y, z of the tool [m]. Shape: (2, 3)."""
+    scale: float
+    """Its size, 1 for `BOX`."""
+
+
+def find_work_area(description: ArmDescription) -> WorkArea:
+    """The largest work area of an arm, straight before it, with the home pose farthest from all limits.
+
+    Raises:
+        InvalidValue: It reaches no such area with its tool pointing down.
+    """
+    chain, outline = description.chain, Outline(description.chain)
+    for scale in _SCALES:
+        best: tuple[float, WorkArea] | None = None
+        for box in _boxes(chain, scale):
+            homes = _homes(chain, outline, box)
+            for margin, home in homes[:4]:
+                if best is not None and margin <= best[0]:
+                    break
+                here = dataclasses.replace(chain, home=home)
+                if covers(here, outline, box):
+                    best = margin, WorkArea(home, box, scale)
+                    break
+        if best is not None:
+            return best[1]
+    raise InvalidValue(
+        f"{description.name}: nowhere on the table before it does the tool point down in an area of "
+        f"{0.4 * _SCALES[-1]:.2f} m. Look at the tool (--site, --gripper) and at the limits of the joints."
+    )
+
+
+def _boxes(chain: SerialChain, scale: float) -> Iterator[Array]:
+    """Boxes of one size at growing distances from the base."""
+    links = np.linalg.norm(chain.placements[:, :3, 3], axis=1)
+    place, out = chain.tool_placement[:3, 3], chain.tool_placement[:3, 2]
+    length, up = float(links.sum() + np.linalg.norm(place)), float(place @ out)
+    span = links[1:].sum() + np.linalg.norm(place - up * out)  # from the first joint to `up` above the tool, at most
+    nearest = 0.5 * (BOX[1, 0] - BOX[0, 0]) * scale + 0.08
+    for middle, height in itertools.product(np.arange(nearest, length, max(0.02, 0.05 * length)), _HEIGHTS):
+        box = BOX * scale
+        box[:, 0] += round(float(middle), 3)
+        box[:, 2] = BOX[0, 2], max(0.06, height * box[1, 2])
+        corners = np.array(list(itertools.product(*box.T))) + [0.0, 0.0, up] - chain.placements[0, :3, 3]
+        if box[1, 0] <= TABLE_END and np.linalg.norm(corners, axis=1).max() < span:
+            yield box
+
+
+def _middle(box: Array) -> Array:
+    return np.array([box[:, 0].mean(), 0.0, box[0, 2] + 0.55 * (box[1, 2] - box[0, 2])])
+
+
+def _homes(chain: SerialChain, outline: Outline, box: Array) -> list[tuple[float, Array]]:
+    """Poses with the tool down over the middle of `box`, those farthest from limits, table and itself first."""
+    rng = np.random.default_rng(0)
+    low, high = np.maximum(chain.low, -np.pi), np.minimum(chain.high, np.pi)
+    seeds = low + rng.random((_TRIES, chain.num_joints)) * (high - low)
+    wanted = np.tile(_middle(box), (_TRIES, 1))
+    q = _solve(chain, seeds, wanted, np.zeros(_TRIES))
+    clear = np.minimum(outline.lowest(q), outline.nearest(q)) > _CLEAR
+    q = q[clear & _reaches(chain, q, wanted, np.zeros(_TRIES))]
+    if not len(q):
+        return []
+    room = np.minimum(q - chain.low, chain.high - q).min(axis=1)
+    _, jacobian = chain.jacobians(q)
+    least = np.linalg.svd(jacobian[:, : 6 if chain.turns else 5], compute_uv=False)[:, -1]
+    gap = np.minimum(np.minimum(outline.nearest(q), outline.lowest(q)), 0.1)
+    aside = np.sqrt(np.mean((q - 0.5 * (low + high)) ** 2, axis=1))
+    scores = np.minimum(room, 1.0) + 4.0 * np.minimum(least, 0.25) + 5.0 * gap - 0.4 * aside
+    order = np.argsort(-scores)
+    picked: list[tuple[float, Array]] = []
+    for at in order:
+        if all(np.abs(q[at] - other).max() > 0.2 for _, other in picked):
+            picked.append((float(scores[at]), np.round(q[at], 4)))
+    return picked
+
+
+def _solve(chain: SerialChain, seeds: Array, position: Array, yaw: Array) -> Array:
+    """Inverse kinematics from `seeds` (n, k), which stay near themselves where the tool leaves joints free."""
+    q = seeds
+    for _ in range(40):
+        q = chain.reach_down(position, yaw, q)
+    return q
+
+
+def covers(chain: SerialChain, outline: Outline, box: Array) -> bool:
+    """Whether the arm follows straight lines from the middle of `box` to all sides of it, with the gripper turned."""
+    sides = [np.linspace(low, high, 3) for low, high in box.T]
+    points = np.stack(np.meshgrid(*sides, indexing="ij"), axis=-1).reshape(-1, 3)
+    yaws = np.array([-YAW, 0.0, YAW] if chain.turns else [0.0])
+    goals, turns = np.repeat(points, len(yaws), axis=0), np.tile(yaws, len(points))
+    middle = _middle(box)
+    q = np.tile(chain.home, (len(goals), 1))
+    for step in range(1, _STEPS + 1):
+        share = step / _STEPS
+        wanted = middle + share * (goals - middle)
+        q = chain.reach_down(wanted, share * turns, chain.reach_down(wanted, share * turns, q))
+        if (outline.nearest(q) < _CLEAR).any() or (outline.lowest(q) < _CLEAR - 1e-3).any():
+            return False
+    return bool(_reaches(chain, q, goals, turns).all())
+
+
+def _reaches(chain: SerialChain, q: Array, position: Array, yaw: Array) -> NDArray[np.bool_]:
+    """Whether the tool is at `position` pointing down at `yaw`, with all joints clear of their limits. (n,) bool."""
+    frames = chain.link_frames(q)[:, -1]
+    off = np.linalg.norm(frames[:, :3, 3] - position, axis=1)
+    down = np.linalg.norm(frames[:, :3, 2] - [0.0, 0.0, -1.0], axis=1)
+    turned = np.abs(np.angle(np.exp(1j * (np.arctan2(frames[:, 1, 0], frames[:, 0, 0]) - yaw)))) if chain.turns else 0.0
+    room = np.minimum(q - chain.low, chain.high - q).min(axis=1)
+    reached: NDArray[np.bool_] = (off < _REACHED) & (down < _REACHED) & (turned < _REACHED) & (room > _MARGIN)
+    return reached

@@ -1,0 +1,1 @@
+"""From model files, MJCF or URDF, to the description of an arm."""

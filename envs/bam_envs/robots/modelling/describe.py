@@ -1,0 +1,184 @@
+"""Make the description of an arm from its model files, and write it with what had to be assumed."""
+
+import dataclasses
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+from bam_envs.arms.capsules import Outline, fitted_capsules
+from bam_envs.arms.description import ArmDescription, Gripper, JointRow, Placed
+from bam_envs.arms.work_area import find_work_area
+from bam_envs.core.errors import InvalidValue
+from bam_envs.robots.modelling.model_files import Array, ReadArm, Shapes, read_arm
+
+SPEED, ACCELERATION, JERK = 1.5, 6.0, 60.0
+"""Limits of a joint where the files name none [rad/s, rad/s^2, rad/s^3]: below those of every arm that is shipped."""
+EFFORT_PER_REACH = 60.0
+"""Torque of a joint where the files name none [N m], for each metre from the joint to the tool."""
+_POSTURES, _ENOUGH = 10_000, 20
+"""Postures in which the outline is compared with the links, and the least number in which a pair overlaps."""
+_COMPARED = 1200  # of those, most for a pair
+_USELESS = 0.1  # share of postures in which capsules with one link between them would still alarm: not compared
+_TOUCH = 0.0045  # depth from which shapes touch, and what is kept of the slack [m]
+_SURE = 0.001
+_FARTHEST = 3.0  # an arm longer than this has its lengths in another unit [m]
+
+
+def describe(name: str, model: str, gripper: str | None, site: str | None) -> tuple[ArmDescription, list[str]]:
+    """The description of the arm in the file `model` with `gripper`, and one note for each thing that is assumed.
+
+    Args:
+        name: Its name.
+        model: An MJCF or URDF file, or ``menagerie:NAME``.
+        gripper: As `model`, or ``parallel:WIDTH`` [m]; None if the joints behind `site` are the gripper.
+        site: Site or body at the end of the arm; None for the first of the usual names that is there.
+
+    Raises:
+        InvalidValue: The files hold no arm that could work; one line that says why.
+    """
+    read = read_arm(model, gripper, site)
+    reach = float(np.linalg.norm(read.placements[:, :3, 3], axis=1).sum())
+    if not 0.15 < reach < _FARTHEST:
+        raise InvalidValue(f"{model}: the arm is {reach:.3g} m long; are its lengths in metres?")
+    joints = _joints(read)
+    tool = _placed(read.tool)
+    capsules = [one for link, points in enumerate(read.points) for one in fitted_capsules(points, link)]
+    capsules += [one for points in read.grip for one in fitted_capsules(points, len(joints) + 1)]
+    width = read.width
+    first = ArmDescription(
+        name=name,
+        title=f"{name}, from {Path(model).name}",
+        joints=joints,
+        home=tuple(0.5 * (row.low + row.high) for row in joints),
+        tool=tool,
+        gripper=Gripper(open=width, mass=round(read.gripper_mass, 3)),
+        workspace=((0.3, -0.25, 0.016), (0.7, 0.25, 0.35)),
+        capsules=tuple(capsules),
+        sources={"model": model, **({"gripper": gripper} if gripper else {})},
+    )
+    first = dataclasses.replace(first, slack=tuple(_slack(first, read.shapes)) if read.shapes else ())
+    area = find_work_area(first)
+    x, y = (tuple(round(float(one), 4) for one in corner) for corner in area.box)
+    home = tuple(float(one) for one in area.home)
+    found = dataclasses.replace(first, home=home, workspace=(x, y))  # type: ignore[arg-type]
+    return found, read.notes
+
+
+def _slack(description: ArmDescription, shapes: Shapes) -> Iterator[tuple[int, int, float]]:
+    """For two links, how far their capsules overlap while their shapes are apart [m], if it matters."""
+    outline, chain = Outline(description.chain, every=True), description.chain
+    rng = np.random.default_rng(0)
+    low, high = np.maximum(chain.low, -np.pi), np.minimum(chain.high, np.pi)
+    q = low + rng.random((_POSTURES, len(low))) * (high - low)
+    gaps, links = outline.distances(q), outline.links[outline.pairs]
+    for one, other in sorted({(int(i), int(j)) for i, j in links}):
+        gap = gaps[:, (links == [one, other]).all(axis=1)].min(axis=1)
+        overlapping = np.flatnonzero(gap < 0.0)
+        if len(overlapping) < _ENOUGH or not shapes.are_known(one, other):
+            continue
+        overlapping = overlapping[np.argsort(-gap[overlapping])]  # the slightest first
+        picked = overlapping[np.unique(np.linspace(0, len(overlapping) - 1, _COMPARED).astype(int))]
+        deepest = float(gap[picked].min())
+        touching = next((float(gap[at]) for at in picked if shapes.distance(one, other, q[at]) < -_TOUCH), deepest)
+        slack = max(0.0, -touching - _SURE)
+        useless = (gap < -slack).mean() > _USELESS and min(other, description.num_joints) - one == 2
+        if slack > 0.002 and not useless:
+            yield one, other, round(slack, 3)
+
+
+def _joints(read: ReadArm) -> tuple[JointRow, ...]:
+    """The joints, with defaults for the limits that the files do not name."""
+    rows, size = [], len(read.names)
+    lengths = np.linalg.norm(read.placements[:, :3, 3], axis=1)
+    for at, name in enumerate(read.names):
+        placed = _placed(read.placements[at])
+        beyond = float(lengths[at + 1 :].sum() + np.linalg.norm(read.tool[:3, 3]))
+        effort, velocity = read.effort[at], read.velocity[at]
+        if effort is None:
+            effort = round(EFFORT_PER_REACH * max(beyond, 0.1), 1)
+            read.notes.append(f"{name}: no torque in the files, so {effort:g} N m")
+        if velocity is None:
+            velocity = SPEED
+            read.notes.append(f"{name}: no speed in the files, so {velocity:g} rad/s")
+        axis = tuple(round(float(one), 9) + 0.0 for one in read.axes[at])
+        rows.append(
+            JointRow(
+                name=name,
+                xyz=placed.xyz,
+                quat=placed.quat,
+                axis=axis,  # type: ignore[arg-type]
+                low=round(read.low[at], 5),
+                high=round(read.high[at], 5),
+                velocity=velocity,
+                acceleration=ACCELERATION,
+                jerk=JERK,
+                effort=effort,
+                mass=round(read.mass[at], 3),
+            )
+        )
+    read.notes.append(
+        f"all {size} joints: no acceleration or jerk in the files, so {ACCELERATION:g} rad/s^2, {JERK:g} rad/s^3"
+    )
+    return tuple(rows)
+
+
+def _placed(matrix: Array) -> Placed:
+    """A homogeneous matrix as a pose, its quaternion to 12 digits."""
+    m = matrix[:3, :3]
+    square = np.array(
+        [
+            [m[0, 0] - m[1, 1] - m[2, 2], 0, 0, 0],
+            [m[0, 1] + m[1, 0], m[1, 1] - m[0, 0] - m[2, 2], 0, 0],
+            [m[0, 2] + m[2, 0], m[1, 2] + m[2, 1], m[2, 2] - m[0, 0] - m[1, 1], 0],
+            [m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1], m[0, 0] + m[1, 1] + m[2, 2]],
+        ]
+    )
+    x, y, z, w = np.linalg.eigh(square / 3)[1][:, -1]
+    quat = np.array([w, x, y, z]) * (1.0 if w >= 0 else -1.0)
+    return Placed(xyz=_plain(matrix[:3, 3]), quat=_plain(quat))  # type: ignore[arg-type]
+
+
+def _plain(values: Array) -> tuple[float, ...]:
+    return tuple(round(float(one), 12) + 0.0 for one in values)
+
+
+def write_description(description: ArmDescription, notes: list[str], path: Path) -> None:
+    """Write `path`, a TOML file, with the notes as comments at its head."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(as_toml(description, notes), encoding="utf-8")
+
+
+def as_toml(description: ArmDescription, notes: list[str]) -> str:
+    """The text of a description's file."""
+    table = dataclasses.asdict(description)
+    lines = [f"# {note}" for note in notes] + [""] * bool(notes)
+    for key in ("name", "title", "geometry"):
+        lines += [f"{key} = {_toml(table[key])}"] if table[key] else []
+    lines += [
+        f"home = {_toml(table['home'])}",
+        f"slack = {_toml(table['slack'])}",
+        f"workspace = {_toml(table['workspace'])}",
+    ]
+    lines += [
+        f"tool = {_toml(table['tool'])}",
+        f"mount = {_toml(table['mount'])}",
+        f"gripper = {_toml(table['gripper'])}",
+    ]
+    for key in ("joints", "capsules"):
+        lines += [f"{key} = [", *(f"  {_toml(row)}," for row in table[key]), "]"]
+    lines += ["", "[sources]", *(f"{name} = {_toml(value)}" for name, value in description.sources.items())]
+    return "\n".join(lines) + "\n"
+
+
+def _toml(value: object) -> str:
+    if isinstance(value, str):
+        return '"' + value.replace("\\", "\\\\").replace('"', '\\"') + '"'
+    if isinstance(value, dict):
+        kept = {
+            key: one for key, one in value.items() if one not in ((0.0,) * 3, (1.0, 0.0, 0.0, 0.0)) or key == "axis"
+        }
+        return "{ " + ", ".join(f"{key} = {_toml(one)}" for key, one in kept.items()) + " }"
+    if isinstance(value, (tuple, list)):
+        return "[" + ", ".join(map(_toml, value)) + "]"
+    return repr(value)

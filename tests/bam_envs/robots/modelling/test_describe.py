@@ -1,0 +1,437 @@
+"""What `describe` finds in model files that these tests write: arms of five, six and seven joints, and bad ones."""
+
+import itertools
+import re
+
+import gymnasium as gym
+import mujoco
+import numpy as np
+import pytest
+
+from bam_envs.arms.capsules import Outline
+from bam_envs.arms.description import read_description
+from bam_envs.arms.work_area import covers
+from bam_envs.core.errors import InvalidValue, UnknownName
+from bam_envs.robots.modelling.describe import as_toml, describe, write_description
+from bam_envs.robots.modelling.model_files import read_arm
+from bam_envs.tasks.scripted import scripted_policy
+from tests.bam_envs.making import solved
+
+HALF = np.pi / 2
+
+
+def six_joints():
+    """An URDF of cylinders and boxes, with the lengths of a UR5e."""
+    box, short = '<box size="0.05 0.05 0.08"/>', '<cylinder radius="0.03" length="0.03"/>'
+    links = {
+        "base_link": ('<cylinder radius="0.05" length="0.08"/>', "0 0 0.04", "0 0 0"),
+        "shoulder": ('<cylinder radius="0.04" length="0.08"/>', "0 0 0", "0 0 0"),
+        "upper": ('<cylinder radius="0.035" length="0.425"/>', "-0.2125 0 0.12", f"0 {HALF} 0"),
+        "fore": ('<cylinder radius="0.03" length="0.392"/>', "-0.196 0 0.02", f"0 {HALF} 0"),
+        "wrist_1": (box, "0 0 0", "0 0 0"),
+        "wrist_2": (box, "0 0 0", "0 0 0"),
+        "wrist_3": (short, "0 0 -0.015", "0 0 0"),
+    }
+    joints = (
+        ("pan", "0 0 0.1625", f"0 0 {np.pi}", 3.1, 80),
+        ("lift", "0 0 0", f"{HALF} 0 0", 3.0, 80),
+        ("elbow", "-0.425 0 0", "0 0 0", 2.8, 80),
+        ("w1", "-0.392 0 0.133", "0 0 0", 3.1, 20),
+        ("w2", "0 -0.0997 0", f"{HALF} 0 0", 3.1, 20),
+        ("w3", "0 0.0996 0", f"{-HALF} 0 0", 3.1, 20),
+    )
+    inertia = '<mass value="2"/><inertia ixx="0.01" iyy="0.01" izz="0.01" ixy="0" ixz="0" iyz="0"/>'
+    lines = [
+        f'<link name="{name}"><inertial>{inertia}</inertial><collision><origin xyz="{xyz}" rpy="{rpy}"/>'
+        f"<geometry>{shape}</geometry></collision></link>"
+        for name, (shape, xyz, rpy) in links.items()
+    ]
+    for (name, xyz, rpy, limit, effort), (parent, child) in zip(joints, itertools.pairwise(links), strict=True):
+        lines.append(
+            f'<joint name="{name}" type="revolute"><parent link="{parent}"/><child link="{child}"/>'
+            f'<origin xyz="{xyz}" rpy="{rpy}"/><axis xyz="0 0 1"/>'
+            f'<limit lower="{-limit}" upper="{limit}" velocity="2.5" effort="{effort}"/></joint>'
+        )
+    flange = '<joint name="flange" type="fixed"><parent link="wrist_3"/><child link="tool0"/></joint>'
+    return "\n".join(['<robot name="lab">', *lines, '<link name="tool0"/>', flange, "</robot>"])
+
+
+def seven_joints():
+    """An MJCF of capsules, with the lengths of a Franka arm."""
+    rows = (
+        ("0 0 0.333", "1 0 0 0", (-2.7, 2.7), "0 0 -0.2 0 0 0"),
+        ("0 0 0", "1 -1 0 0", (-1.7, 1.7), "0 0 0 0 -0.12 0"),
+        ("0 -0.316 0", "1 1 0 0", (-2.9, 2.9), "0 0 -0.12 0.08 0 0"),
+        ("0.0825 0 0", "1 1 0 0", (-3.0, -0.15), "0 0 0 -0.08 0.08 0"),
+        ("-0.0825 0.384 0", "1 -1 0 0", (-2.8, 2.8), "0 0 -0.25 0 0 0"),
+        ("0 0 0", "1 1 0 0", (0.5, 4.5), "0 0 0 0.085 0 0"),
+        ("0.088 0 0", "1 1 0 0", (-3.0, 3.0), "0 0 0.03 0 0 0.08"),
+    )
+    bodies = "".join(
+        f'<body name="link{at}" pos="{pos}" quat="{quat}"><joint name="j{at}" range="{low} {high}" '
+        'actuatorfrcrange="-87 87"/>'
+        f'<geom type="capsule" mass="2" size="0.04" fromto="{ends}"/>'
+        for at, (pos, quat, (low, high), ends) in enumerate(rows, 1)
+    )
+    return (
+        '<mujoco><compiler angle="radian"/><worldbody><body name="base">'
+        f'<geom type="capsule" size="0.06" fromto="0 0 0.06 -0.05 0 0.06"/>{bodies}'
+        f'<site name="attachment_site" pos="0 0 0.107"/>{"</body>" * 8}</worldbody></mujoco>'
+    )
+
+
+FINGER = 'type="slide" range="0 0.04"'
+HAND = f"""<mujoco><worldbody><body name="hand"><geom type="box" size="0.03 0.08 0.03" pos="0 0 0.03" mass="0.5"/>
+<body name="left" pos="0 0 0.06"><joint name="finger1" axis="0 1 0" {FINGER}/>
+<geom type="box" size="0.008 0.006 0.022" pos="0 0.006 0.022" mass="0.02"/></body>
+<body name="right" pos="0 0 0.06"><joint name="finger2" axis="0 -1 0" {FINGER}/>
+<geom type="box" size="0.008 0.006 0.022" pos="0 -0.006 0.022" mass="0.02"/></body></body></worldbody></mujoco>"""
+FIVE = """<mujoco><compiler angle="radian"/><worldbody><body name="base">
+<geom type="cylinder" size="0.04 0.03" pos="0 0 0.03"/>
+<body name="b1" pos="0 0 0.07"><joint name="pan" range="-1.9 1.9"/><geom type="cylinder" size="0.03 0.015"/>
+<body name="b2" pos="0 0 0.04"><joint name="lift" axis="0 1 0" range="-1.8 1.8"/>
+<geom type="capsule" size="0.018" fromto="0 0 0.02 0 0 0.14" mass="0.1"/>
+<body name="b3" pos="0 0 0.16"><joint name="elbow" axis="0 1 0" range="-0.5 2.6"/>
+<geom type="capsule" size="0.016" fromto="0 0 0.02 0 0 0.12" mass="0.1"/>
+<body name="b4" pos="0 0 0.14"><joint name="flex" axis="0 1 0" range="-1.9 1.9"/>
+<geom type="capsule" size="0.015" fromto="0 0 0.01 0 0 0.03" mass="0.1"/>
+<body name="b5" pos="0 0 0.06"><joint name="roll" range="-2.7 2.7"/>
+<geom type="box" size="0.012 0.02 0.01" mass="0.05"/>
+<geom type="box" size="0.006 0.01 0.04" pos="0.006 0 0.05" mass="0.02"/>
+<body name="jaw" pos="-0.02 0 0.01"><joint name="jaw" axis="0 -1 0" range="0 1"/>
+<geom type="box" size="0.006 0.01 0.04" pos="0.014 0 0.04" mass="0.02"/></body>
+</body></body></body></body></body></body></worldbody></mujoco>"""
+NO_JERK = "all {} joints: no acceleration or jerk in the files, so 6 rad/s^2, 60 rad/s^3"
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """A folder with the models."""
+    path = tmp_path_factory.mktemp("models")
+    for name, text in {
+        "six.urdf": six_joints(),
+        "seven.xml": seven_joints(),
+        "hand.xml": HAND,
+        "five.xml": FIVE,
+    }.items():
+        (path / name).write_text(text, encoding="utf-8")
+    return path
+
+
+@pytest.fixture(scope="module")
+def described(folder):
+    """Name of each arm to its description and notes."""
+    found = {
+        "six": describe("six", str(folder / "six.urdf"), "parallel:0.08", "tool0"),
+        "seven": describe("seven", str(folder / "seven.xml"), str(folder / "hand.xml"), None),
+        "five": describe("five", str(folder / "five.xml"), None, "b5"),
+    }
+    assert [arm.name for arm, _ in found.values()] == list(found)
+    return found
+
+
+ARMS = ("six", "seven", "five")
+
+
+def test_an_urdf_with_a_gripper_of_which_only_the_width_is_known(described, folder):
+    arm, notes = described["six"]
+    assert arm.joint_names == ("pan", "lift", "elbow", "w1", "w2", "w3")
+    assert [(row.low, row.high) for row in arm.joints] == [(-one, one) for one in (3.1, 3.0, 2.8, 3.1, 3.1, 3.1)]
+    assert [(row.velocity, row.effort, row.mass) for row in arm.joints] == [(2.5, 80.0, 2.0)] * 3 + [
+        (2.5, 20.0, 2.0)
+    ] * 3
+    assert {(row.acceleration, row.jerk) for row in arm.joints} == {(6.0, 60.0)}
+    assert arm.tool.xyz == pytest.approx((0.0, 0.0, 0.14))
+    assert arm.tool.quat == pytest.approx((1.0, 0.0, 0.0, 0.0))
+    assert (arm.gripper.open, arm.gripper.mass, arm.geometry) == (0.08, 0.5, "")
+    assert arm.sources == {"model": str(folder / "six.urdf"), "gripper": "parallel:0.08"}
+    length = "the gripper is 0.140 m long from the end of the arm to the middle of its pads"
+    assert notes == [length, NO_JERK.format(6)]
+
+
+def test_nothing_is_known_of_a_gripper_that_has_no_shapes_so_its_capsules_count_in_full(described):
+    """What may overlap was compared on shapes; those of a gripper given by its width are in no file."""
+    arm, _ = described["six"]
+    assert not [row for row in arm.slack if 7 in row[:2]]
+    assert all(slack < 0.02 for *_, slack in arm.slack)
+    outline = Outline(arm.chain)
+    assert any(7 in pair for pair in outline.links[outline.pairs])
+
+
+def test_an_mjcf_with_the_file_of_a_gripper(described):
+    arm, notes = described["seven"]
+    assert arm.joint_names == tuple(f"j{at}" for at in range(1, 8))
+    assert (arm.joints[3].low, arm.joints[3].high) == (-3.0, -0.15)
+    assert {(row.velocity, row.effort) for row in arm.joints} == {(1.5, 87.0)}
+    # The finger tips are 0.107 + 0.06 + 0.044 m out, and the tool is 15 mm before their ends; they close along y.
+    assert arm.tool.xyz == pytest.approx((0.0, 0.0, 0.196))
+    np.testing.assert_allclose(np.abs(arm.tool.matrix()[:3, 0]), [0, 1, 0], atol=1e-9)
+    np.testing.assert_allclose(arm.tool.matrix()[:3, 2], [0, 0, 1], atol=1e-9)
+    assert (arm.gripper.open, arm.gripper.mass) == (0.08, 0.54)
+    assert notes == [*(f"j{at}: no speed in the files, so 1.5 rad/s" for at in range(1, 8)), NO_JERK.format(7)]
+    assert arm.chain.turns
+
+
+def test_a_jaw_that_turns_against_a_fixed_finger(described):
+    arm, notes = described["five"]
+    assert arm.joint_names == ("pan", "lift", "elbow", "flex", "roll")
+    assert arm.joints[1].axis == (0.0, 1.0, 0.0)
+    assert not arm.chain.turns
+    # The fixed finger's inner side is at x 0 mm and its end at z 90 mm; the jaw closes on it.
+    assert arm.tool.xyz == pytest.approx((0.0, 0.0, 0.075), abs=1e-6)
+    np.testing.assert_allclose(np.abs(arm.tool.matrix()[:3, 0]), [1, 0, 0], atol=1e-9)
+    assert 0.03 < arm.gripper.open < 0.06
+    torques = [note for note in notes if "torque" in note]
+    assert torques[0] == "pan: no torque in the files, so 28.5 N m"
+    assert (len(torques), len(notes), notes[-1]) == (5, 11, NO_JERK.format(5))
+    assert [row.effort for row in arm.joints] == [28.5, 26.1, 16.5, 8.1, 6.0]
+
+
+@pytest.mark.parametrize("name", ARMS)
+def test_it_is_read_as_it_was_written(described, name, tmp_path):
+    arm, notes = described[name]
+    path = tmp_path / "robots" / f"{name}.toml"
+    write_description(arm, notes, path)
+    text = path.read_text(encoding="utf-8")
+    assert text == as_toml(arm, notes)
+    assert text.splitlines()[: len(notes)] == [f"# {note}" for note in notes]
+    again = read_description(path)
+    assert again == arm
+    assert again.digest == arm.digest
+
+
+@pytest.mark.parametrize("name", ARMS)
+def test_the_whole_work_area_is_reached(described, name):
+    arm, _ = described[name]
+    box = np.array(arm.workspace)
+    assert covers(arm.chain, Outline(arm.chain), box)
+    assert box[0, 2] == 0.016
+    assert (box[1] - box[0] >= [0.1, 0.12, 0.04]).all()
+
+
+@pytest.mark.parametrize(("name", "file"), [("six", "six.urdf"), ("seven", "seven.xml"), ("five", "five.xml")])
+def test_all_shapes_of_the_links_are_inside_the_capsules(described, folder, name, file):
+    """In a random posture of MuJoCo's own model: corners of boxes, rims of cylinders, caps of capsules."""
+    arm, _ = described[name]
+    model = mujoco.MjModel.from_xml_path(str(folder / file))
+    data, rng = mujoco.MjData(model), np.random.default_rng(0)
+    q = rng.uniform(arm.chain.low, arm.chain.high)
+    for joint, position in zip(arm.joint_names, q, strict=True):
+        data.joint(joint).qpos[0] = position
+    mujoco.mj_kinematics(model, data)
+    outline = Outline(arm.chain)
+    (start, end), radius = np.moveaxis(outline.segments(q[None])[0], 1, 0), outline.radius
+    directions = rng.standard_normal((200, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    for geom in range(model.ngeom):
+        kind, size = model.geom_type[geom], model.geom_size[geom]
+        round_part = directions[:, :2] / np.linalg.norm(directions[:, :2], axis=1, keepdims=True) * size[0]
+        sides = np.sign(directions)
+        points = {
+            mujoco.mjtGeom.mjGEOM_BOX: sides * size,
+            mujoco.mjtGeom.mjGEOM_CYLINDER: np.column_stack([round_part, sides[:, 2] * size[1]]),
+            mujoco.mjtGeom.mjGEOM_CAPSULE: directions * size[0] + [[0, 0, size[1]]] * sides[:, 2:],
+        }[mujoco.mjtGeom(kind)]
+        points = points @ data.geom_xmat[geom].reshape(3, 3).T + data.geom_xpos[geom]
+        if name == "five" and model.geom_bodyid[geom] == model.body("jaw").id:
+            continue  # it is outlined open, and this one is closed
+        way, gap = end - start, points[:, None] - start
+        share = np.clip(np.einsum("pci,ci->pc", gap, way) / np.maximum((way**2).sum(axis=1), 1e-12), 0, 1)
+        outside = np.linalg.norm(gap - share[..., None] * way, axis=2) - radius
+        assert outside.min(axis=1).max() < 1e-3, f"geom {geom}"
+
+
+@pytest.mark.parametrize("name", ARMS)
+def test_the_scripted_pick_succeeds_with_it(described, name, tmp_path):
+    path = tmp_path / f"{name}.toml"
+    write_description(*described[name], path)
+    envs = gym.make_vec("bam/pick-v0", num_envs=20, robot_model=str(path))
+    assert solved(envs, scripted_policy("bam/pick-v0", str(path))) == 20
+
+
+SPACES = re.compile(r'xyz="([^"]*)" rpy')
+MESH = '<mesh filename="package://lab_description/meshes/{}.stl"/>'
+TETRAHEDRON = '<mesh name="a" vertex="0 0 0 1 0 0 0 1 0 0 0 1"/>'
+GRIPPER = "parallel:0.08"
+REFUSED = "MuJoCo cannot read {}: XML Error: Schema violation: unrecognized attribute: 'foo' Element 'option', line 1."
+NEEDS_LIMITS = "{}: its joints have no position limits: add them to the file."
+
+
+def scaled(text, factor):
+    return SPACES.sub(lambda found: f'xyz="{" ".join(str(factor * float(one)) for one in found[1].split())}" rpy', text)
+
+
+@pytest.mark.parametrize(
+    ("model", "gripper", "site", "message"),
+    [
+        (None, GRIPPER, None, "There is no file {}. Give an MJCF or URDF file, or menagerie:NAME."),
+        (six_joints()[:-20], GRIPPER, None, "MuJoCo cannot read {}: unclosed token: line 16, column 58."),
+        ("", GRIPPER, None, "MuJoCo cannot read {}: ParseXML: empty file '{}'."),
+        (
+            six_joints().replace('<box size="0.05 0.05 0.08"/>', MESH.format("w"), 1),
+            GRIPPER,
+            None,
+            "{}: the mesh package://lab_description/meshes/w.stl is neither beside the file nor in a folder above it.",
+        ),
+        (
+            seven_joints().replace('<body name="base">', '<body name="base"><freejoint/>'),
+            GRIPPER,
+            None,
+            "{}: its base is free to move; give an arm with a fixed base.",
+        ),
+        (six_joints(), GRIPPER, "fore", "{}: 3 joints lead to 'fore'; an arm has 4 to 8. See --site."),
+        (
+            six_joints().replace('name="elbow" type="revolute"', 'name="elbow" type="prismatic"'),
+            GRIPPER,
+            None,
+            "{}: 'fore' has another joint than one revolute joint.",
+        ),
+        (
+            re.sub("<limit[^>]*>", "", six_joints()).replace('"revolute"', '"continuous"'),
+            GRIPPER,
+            None,
+            NEEDS_LIMITS,
+        ),
+        (re.sub(r' range="[^"]*"', "", seven_joints()), GRIPPER, None, NEEDS_LIMITS),
+        (six_joints(), GRIPPER, "tol0", "Unknown site or body 'tol0'. Did you mean 'tool0'?"),
+        (
+            six_joints().replace("tool0", "hand0"),
+            GRIPPER,
+            None,
+            "{}: give the end of the arm with --site, a site or body: world, base_link, shoulder, upper, fore, "
+            "wrist_1, wrist_2, wrist_3, hand0.",
+        ),
+        (
+            six_joints(),
+            None,
+            None,
+            "{}: no joint moves a finger. Give the gripper: --gripper FILE or --gripper parallel:WIDTH.",
+        ),
+        *(
+            (
+                six_joints(),
+                f"parallel:{width}",
+                None,
+                f"--gripper parallel:{width}: give the width of the open gripper in metres, from 0.005 to 0.3.",
+            )
+            for width in ("2", "nan", "wide")
+        ),
+        (
+            six_joints(),
+            "/no/hand.xml",
+            None,
+            "There is no file /no/hand.xml. Give an MJCF or URDF file, or menagerie:NAME.",
+        ),
+        (
+            seven_joints().replace(
+                '<site name="attachment_site" pos="0 0 0.107"/>',
+                re.search('<body name="hand">.*</body>', HAND, re.DOTALL)[0].replace("0.04", "0.0005"),
+            ),
+            None,
+            "hand",
+            "{}: its gripper does not open. Give --gripper parallel:WIDTH instead.",
+        ),
+        (scaled(six_joints(), 1000), GRIPPER, None, "{}: the arm is 1.2e+03 m long; are its lengths in metres?"),
+        (
+            seven_joints().replace("<worldbody>", '<option foo="1"/><worldbody>'),
+            GRIPPER,
+            None,
+            REFUSED,
+        ),
+        (
+            seven_joints().replace("<worldbody>", f"<asset>{TETRAHEDRON * 2}</asset><worldbody>"),
+            GRIPPER,
+            None,
+            "MuJoCo cannot read {}: XML Error: Error: repeated name 'a' in mesh Element 'mesh', line 1.",
+        ),
+        (
+            seven_joints().replace(
+                "</mujoco>", '<equality><connect body1="base" body2="link7" anchor="0 0 0"/></equality></mujoco>'
+            ),
+            GRIPPER,
+            None,
+            "{}: its links form a loop; an arm is one chain of joints.",
+        ),
+        (
+            six_joints().replace('effort="20"/>', 'effort="20"/><mimic joint="pan"/>', 1),
+            GRIPPER,
+            None,
+            "{}: the joint 'w1' follows another; each joint needs a drive.",
+        ),
+        (
+            seven_joints().replace(
+                "</worldbody>", '<body name="other"><joint name="o"/><geom size="0.1"/></body></worldbody>'
+            ),
+            GRIPPER,
+            None,
+            "{}: 'other' moves beside the arm; give a file with one arm alone.",
+        ),
+    ],
+)
+def test_a_model_that_cannot_work_is_one_line(tmp_path, model, gripper, site, message):
+    path = tmp_path / ("arm.urdf" if model is None or "<robot" in model else "arm.xml")
+    if model is not None:
+        path.write_text(model, encoding="utf-8")
+    with pytest.raises((InvalidValue, UnknownName)) as caught:
+        describe("lab", str(path), gripper, site)
+    assert str(caught.value) == message.format(path, path)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("<mujoco/>", "{}: there is no body in it."),
+        (
+            HAND.replace("<worldbody>", '<option foo="1"/><worldbody>'),
+            REFUSED,
+        ),
+    ],
+)
+def test_a_gripper_that_cannot_work_is_one_line(folder, tmp_path, text, message):
+    path = tmp_path / "hand.xml"
+    path.write_text(text, encoding="utf-8")
+    with pytest.raises(InvalidValue) as caught:
+        describe("lab", str(folder / "seven.xml"), str(path), None)
+    assert str(caught.value) == message.format(path)
+
+
+@pytest.mark.parametrize("name", ["package://lab_description/meshes/w.obj", "meshes/w.obj"])
+def test_a_mesh_that_is_beside_the_file_is_found(tmp_path, name):
+    """Also where the ROS package is not installed."""
+    path = tmp_path / "lab_description" / "urdf" / "lab.urdf"
+    for place in (path, tmp_path / "lab_description" / "meshes" / "w.obj"):
+        place.parent.mkdir(parents=True)
+    place.write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 2 3\nf 1 2 4\nf 1 3 4\nf 2 3 4\n")
+    text = six_joints().replace('<box size="0.05 0.05 0.08"/>', f'<mesh filename="{name}" scale="0.1 0.1 0.1"/>', 1)
+    path.write_text(text, encoding="utf-8")
+    read = read_arm(str(path), GRIPPER, "tool0")
+    assert read.points[4].shape[1] == 3
+    np.testing.assert_allclose(read.points[4].max(axis=0), [0.1, 0.1, 0.1], atol=1e-6)
+
+
+def test_a_joint_that_turns_without_end_is_noted(tmp_path):
+    path = tmp_path / "lab.urdf"
+    path.write_text(six_joints().replace('name="w3" type="revolute"', 'name="w3" type="continuous"'), encoding="utf-8")
+    read = read_arm(str(path), GRIPPER, None)
+    assert (read.low[5], read.high[5]) == (-2 * np.pi, 2 * np.pi)
+    assert (read.low[4], read.high[4]) == (-3.1, 3.1)
+    assert read.notes[0] == "w3 turns without end: its limits are +-2 pi"
+
+
+@pytest.mark.parametrize(("speed", "effort"), [("0", None), ("-2.5", 2.5), ("inf", None)])
+def test_a_speed_of_nothing_is_not_taken(tmp_path, speed, effort):
+    path = tmp_path / "lab.urdf"
+    path.write_text(six_joints().replace('velocity="2.5" effort="80"', f'velocity="{speed}" effort="{speed}"', 1))
+    read = read_arm(str(path), GRIPPER, None)
+    assert read.velocity == [None, *[2.5] * 5]
+    assert read.effort == [effort, 80, 80, 20, 20, 20]
+
+
+def test_a_name_that_the_menagerie_does_not_have():
+    pytest.importorskip("mujoco_menagerie")
+    with pytest.raises(InvalidValue) as caught:
+        describe("lab", "menagerie:frnka_fr3", GRIPPER, None)
+    assert str(caught.value) == (
+        "menagerie:frnka_fr3 (Unknown robot 'frnka_fr3'. Did you mean 'franka_fr3'?): look at the name, or give a "
+        "folder with the models: MENAGERIE_ROOT=."
+    )

@@ -1,0 +1,62 @@
+"""``bam-robots``: the list of arms, the table of one, and what `add` refuses."""
+
+import pytest
+
+from bam_envs.arms.description import SHIPPED, known_models
+from bam_train.cli.arms.bam_robots import main
+
+
+def test_list(run):
+    status, out, err = run(main, "list")
+    lines = out.splitlines()
+    assert (status, err) == (0, "")
+    assert lines[0].split() == ["name", "joints", "what", "file"]
+    assert [line.split()[0] for line in lines[1:9]] == list(known_models())
+    assert "SO-101 (5 joints) with its jaw" in lines[3]
+    assert lines[-1] == "Another arm: bam-robots add NAME --urdf FILE --gripper parallel:0.08"
+
+
+@pytest.mark.parametrize(("name", "joints"), [("so101", 5), ("fr3", 7)])
+def test_check(run, name, joints):
+    status, out, err = run(main, "check", name)
+    lines = [" ".join(line.split()) for line in out.splitlines()]
+    assert (status, err) == (0, "")
+    assert lines[0].startswith(f"{name}: ")
+    assert lines[2] == "joint from to speed acceleration jerk torque home"
+    assert lines[4 + joints] == ""
+    facts = {line.split(" ")[0] for line in lines[5 + joints :]}
+    assert {"reach", "kinematics", "tool", "gripper", "home", "outline", "work", "limits"} <= facts
+    turns = "position only: this arm cannot turn its gripper" if joints == 5 else "position and turn of the gripper"
+    assert f"tool {turns}" in lines
+
+
+def test_an_arm_that_does_not_reach_its_work_area_fails_its_check(run, tmp_path):
+    path = tmp_path / "lab.toml"
+    text = (SHIPPED / "so101.toml").read_text(encoding="utf-8")
+    path.write_text(text.replace("[0.261, 0.0625, 0.06]", "[0.561, 0.0625, 0.06]"), encoding="utf-8")
+    status, out, _ = run(main, "check", path)
+    assert status == 1
+    assert "z 0.016 to 0.06 m: not all of it is reached" in out
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("check", "fr4"), "Unknown robot model 'fr4'. Did you mean 'fr3'?"),
+        (("add", "lab"), "Give the model of the arm: --mjcf FILE or --urdf FILE."),
+        (("add", "lab", "--mjcf", "a.xml", "--urdf", "b.urdf"), "--mjcf FILE or --urdf FILE."),
+        (("add", "lab", "--urdf", "a.urdf", "--site", "a", "--tip", "b"), "the end of the arm; give one of them."),
+        (("add", "lab", "--urdf", "a.urdf"), "There is no file a.urdf. Give an MJCF or URDF file, or menagerie:NAME."),
+        (("add", "so101", "--urdf", "a.urdf"), "exists; give another name, or --force to replace it."),
+        (("check", "so101", "--picture", "arm.pdf"), "arm.pdf: expected a name that ends in .png or .jpg."),
+    ],
+)
+def test_what_is_refused_in_one_line(run, tmp_path, monkeypatch, arguments, message):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "robots").mkdir()
+    (tmp_path / "robots" / "so101.toml").write_bytes((SHIPPED / "so101.toml").read_bytes())
+    status, _, err = run(main, *arguments)
+    assert status == 1
+    assert err.count("\n") == 1
+    assert err.rstrip().rstrip(".").endswith(message.rstrip("."))
+    assert [one.name for one in (tmp_path / "robots").iterdir()] == ["so101.toml"]
