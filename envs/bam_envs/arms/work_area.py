@@ -78,7 +78,7 @@ def _boxes(chain: SerialChain, scale: float) -> Iterator[Array]:
         box = BOX * scale
         box[:, 0] += round(float(middle), 3)
         box[:, 2] = BOX[0, 2], max(0.06, height * box[1, 2])
-        corners = np.array(list(itertools.product(*box.T))) + [0.0, 0.0, up] - chain.placements[0, :3, 3]
+        corners = np.array(list(itertools.product(*box.T))) + (np.array([0.0, 0.0, up]) - chain.placements[0, :3, 3])
         if box[1, 0] <= TABLE_END and np.linalg.norm(corners, axis=1).max() < span:
             yield box
 
