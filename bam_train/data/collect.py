@@ -11,6 +11,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
+from bam_envs.arms.description import DEFAULT_MODEL
 from bam_envs.core.registry import resolve_id
 from bam_envs.core.wording import brief
 from bam_envs.tasks.scripted import scripted_policy
@@ -119,7 +120,7 @@ def collect(
             require_fit(checkpoint, envs)
         name = policy if checkpoint is None else checkpoint.digest
         told = {"policy": name, "noise": noise, "random": random, "num_envs": envs.num_envs, **(facts or {})}
-        actor = _policy(policy, checkpoint, env_id, envs, seed)
+        actor = _policy(policy, checkpoint, env_id, envs, seed, kwargs.get("robot_model", DEFAULT_MODEL))
         acting, done = Disturbance(actor, envs, noise, 1.0 if policy == RANDOM else random, seed), Collected()
         recorded = RecordVectorDataset(
             envs, place, info_of(envs, env_id, kwargs), told, keep=lambda number, _: number < episodes
@@ -137,12 +138,12 @@ def collect(
         return done
 
 
-def _policy(policy: str, checkpoint: Checkpoint | None, env_id: str, envs: Any, seed: int) -> BatchPolicy:
+def _policy(policy: str, checkpoint: Checkpoint | None, env_id: str, envs: Any, seed: int, arm: Any) -> BatchPolicy:
     if checkpoint is not None:
         return FrozenPolicy.from_checkpoint(checkpoint)
     if policy == RANDOM:
         return RandomPolicy(envs.action_space, seed)
-    scripted: Any = scripted_policy(env_id)
+    scripted: Any = scripted_policy(env_id, arm)
     has_images = hasattr(getattr(envs.unwrapped, "task", None), "state_observation")
     return StatePolicy(scripted, envs.unwrapped) if has_images else scripted
 

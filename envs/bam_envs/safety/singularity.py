@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Sequence
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +21,7 @@ _SAFETY = 1.5  # on the changes that were measured in `_SAMPLES` postures
 _SAMPLES = 300
 
 
+@lru_cache(maxsize=8)
 def _rates(chain: SerialChain, unit: float) -> tuple[list[float], list[float]]:
     """The most by which a turn of each joint changes the smallest and the largest singular value [1/rad], measured."""
     rng, size, step = np.random.default_rng(0), chain.num_joints, 1e-3

@@ -132,8 +132,8 @@ SCRIPTED: dict[str, tuple[type[Any], Callable[[ArmDescription], Any], Callable[[
 GRASP = "bam/grasp-xyr-v0"
 
 
-def scripted_policy(env_id: str, arm: str = DEFAULT_MODEL) -> ScriptedPolicy | ScriptedGrasps:
-    """The scripted policy for `env_id` with the arm of that name.
+def scripted_policy(env_id: str, arm: Any = DEFAULT_MODEL) -> ScriptedPolicy | ScriptedGrasps:
+    """The scripted policy for `env_id` with the arm of that name; see `bam_envs.arms.description.robot_model`.
 
     Raises:
         InvalidValue: The environment has none.

@@ -3,7 +3,7 @@
 import gymnasium as gym
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from bam_envs.arms.description import known_models, robot_model
@@ -156,6 +156,7 @@ def walk(chain, start, turns):
 
 @pytest.mark.parametrize("tool", [True, False])
 @pytest.mark.parametrize("name", CHAINS)
+@settings(max_examples=25)
 @given(st.integers(0, 10_000), TURNS)
 def test_no_distance_changes_by_more_than_the_bound(name, tool, start, turns):
     chain = robot_model(name).chain
@@ -165,13 +166,14 @@ def test_no_distance_changes_by_more_than_the_bound(name, tool, start, turns):
     for q in walk(chain, start, turns):
         now = np.array([tubes.nearest(q), tubes.lowest(q)])
         assert tubes.nearer_than(0.01, q) == (now[0] < 0.01)
-        assert tubes.least <= now[0]
+        assert tubes.least <= now[0] + 1e-12  # by another way to compute it
         if before is not None:
             assert (np.abs(now - before[1]) <= tubes.change(before[0], q) + 1e-12).all()
         before = q, now
 
 
 @pytest.mark.parametrize("name", CHAINS)
+@settings(max_examples=25)
 @given(st.integers(0, 10_000), TURNS)
 def test_collision_misses_nothing_between_two_computations(name, start, turns):
     arm = robot_model(name)
@@ -182,6 +184,7 @@ def test_collision_misses_nothing_between_two_computations(name, start, turns):
 
 
 @pytest.mark.parametrize("name", CHAINS)
+@settings(max_examples=25)
 @given(st.integers(0, 10_000), TURNS)
 def test_a_singularity_is_not_missed_between_two_computations(name, start, turns):
     arm = robot_model(name)

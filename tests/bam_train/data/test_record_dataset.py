@@ -150,6 +150,11 @@ def test_other_restarts_are_refused(tmp_path, counting):
         RecordDataset(envs, tmp_path / "d")
 
 
+def test_the_script_collects_with_any_arm(tmp_path):
+    found = collect(tmp_path / "d", "scripted", "bam/reach", {"robot_model": "so101"}, episodes=4)
+    assert (found.episodes, found.successes) == (4, 4)
+
+
 def test_a_script_that_sees_the_state_collects_images(tmp_path):
     try:
         find_backend()
