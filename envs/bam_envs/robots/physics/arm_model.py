@@ -16,6 +16,7 @@ CUBE_DENSITY = 0.08 / 0.04**3
 """Of beech [kg/m^3]."""
 SERVO_LAG = 0.05
 """Delay of a joint behind its set point: damping by stiffness of its actuator [s]."""
+_LOOKED_AT = np.array([0.3, 0.0, 0.25])  # by the camera of pictures, nearer or farther by the size of the arm [m]
 _STIFFNESS = 60.0  # of an actuator, by its torque [1/rad]
 _ARMATURE = 0.003  # inertia of the motor, by its torque [kg m^2 / (N m)]
 
@@ -25,7 +26,11 @@ def scene_spec(description: ArmDescription, *, with_object: bool) -> Any:
     if description.digest == read_description(SHIPPED / "ur5e.toml").digest:
         return mujoco.MjSpec.from_file(str(MODELS / ("ur5e_cube.xml" if with_object else "ur5e_gripper.xml")))
     text = arm_mjcf(description, with_object=with_object)
-    return mujoco.MjSpec.from_string(text, {"table.xml": (MODELS / "table.xml").read_bytes()})
+    spec = mujoco.MjSpec.from_string(text, {"table.xml": (MODELS / "table.xml").read_bytes()})
+    camera, chain = spec.camera("overview"), description.chain
+    length = float(np.linalg.norm(chain.placements[:, :3, 3], axis=1).sum())
+    camera.pos = _LOOKED_AT + float(np.clip(1.3 * length, 0.5, 2.5)) * (camera.pos - _LOOKED_AT)
+    return spec
 
 
 def arm_mjcf(description: ArmDescription, *, with_object: bool) -> str:
