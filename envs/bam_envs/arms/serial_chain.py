@@ -89,6 +89,10 @@ class SerialChain:
         motion[2, :, :3, :3] = motion[1, :, :3, :3] @ skew
         object.__setattr__(self, "_motion", motion)
 
+    def __getstate__(self) -> dict[str, Any]:
+        """Everything but the code of `tool_point`, which is made again."""
+        return {name: value for name, value in vars(self).items() if name != "_point"}
+
     @property
     def num_joints(self) -> int:
         """Number of joints."""

@@ -20,6 +20,7 @@ from typing import Annotated, Any, Literal, TypeVar, get_args
 import yaml
 from msgspec import Meta
 
+from bam_envs.arms.description import known_models, robot_model
 from bam_envs.core.errors import InvalidValue, UnknownName
 from bam_envs.core.robot import RobotSpec, SignalSpec
 from bam_envs.core.validation import Finite, NonEmpty, NonNegative, Positive, check, read_table, type_hints
@@ -275,8 +276,7 @@ def _identity(row: Table, where: str) -> IdentitySource:
 
 def _robot(where: str, file: _File) -> RobotSpec:
     """Signals, command and period: of the robot that the file names, and of its own tables."""
-    _require_known(where, "robot", [file.robot] if file.robot else [], _ROBOTS)
-    base = _ROBOTS[file.robot]() if file.robot else None
+    base = _named_robot(where, file.robot) if file.robot else None
     signals = [_signal(row, at) for row, at in _rows(f"{where}: signals", file.signals)]
     command = None if file.command is None else _signal(file.command, f"{where}: command")
     if base is None and (command is None or file.period is None):
@@ -288,6 +288,14 @@ def _robot(where: str, file: _File) -> RobotSpec:
     final = command or base.command  # type: ignore[union-attr]
     period = file.period or base.period  # type: ignore[union-attr]
     return RobotSpec(file.name, tuple(every), final, period, body=base.body if base else None)
+
+
+def _named_robot(where: str, name: str) -> RobotSpec:
+    """The UR5e or MiR100 that profiles are shipped for, or any described arm."""
+    if name in _ROBOTS:
+        return _ROBOTS[name]()
+    _require_known(where, "robot", [name], {*_ROBOTS, *known_models()})
+    return robot_model(name).spec(with_object=True)
 
 
 def _signal(row: Table, where: str) -> SignalSpec:

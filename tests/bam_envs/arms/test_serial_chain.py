@@ -1,6 +1,8 @@
 """Kinematics of every shipped arm as a chain: against MuJoCo, the closed form, differences and its own inverse."""
 
+import copy
 import itertools
+import pickle
 
 import mujoco
 import numpy as np
@@ -148,3 +150,10 @@ def test_which_arm_a_function_belongs_to():
     assert arm_of(closed.tool_position) is closed
     for other in (chain.tool_pose, len, None, lambda q: chain.tool_position(q)):
         assert arm_of(other) is None
+
+
+def test_a_chain_whose_code_was_made_can_be_copied_and_sent():
+    chain = robot_model("fr3").chain
+    place = chain.tool_point(chain.home.tolist())
+    assert pickle.loads(pickle.dumps(chain)).tool_point(chain.home.tolist()) == place
+    assert copy.deepcopy(chain).tool_point(chain.home.tolist()) == place

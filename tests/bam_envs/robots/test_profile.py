@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from bam_envs.arms.description import robot_model
 from bam_envs.core.errors import InvalidValue, UnknownName
 from bam_envs.robots.fake import FakeRobot
 from bam_envs.robots.mir100 import base_spec
@@ -355,3 +356,35 @@ def test_the_former_name_of_the_command_timeout(write):
     assert refusal(write('extends = "ur5e"\ncommand_timeout = 0.3\ndead_man = 0.2\n')) == (
         "FILE: command_timeout comes twice: dead_man is its former name. Give one of them."
     )
+
+
+def test_a_profile_of_a_described_arm_has_its_signals(write):
+    text = """
+name = "cell"
+kind = "arm"
+robot = "so101"
+[[state]]
+signal = "joint_position"
+topic = "/joint_states"
+type = "sensor_msgs/JointState"
+field = "position"
+names = ["1", "2", "3", "4", "5"]
+[[commands.position]]
+topic = "/commands"
+type = "std_msgs/Float64MultiArray"
+labels = ["shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll", "gripper_width"]
+"""
+    profile, arm = load_profile(write(text)), robot_model("so101").spec(with_object=True)
+    assert (profile.command, profile.signals) == (arm.command, arm.signals[:1])
+
+
+def test_a_described_arm_has_the_usual_topics_where_no_profile_is_shipped():
+    profile = profile_for(robot_model("fr3").spec(with_object=True))
+    assert [source.topic for source in profile.state] == [
+        *["/joint_states"] * 2,
+        "/gripper/joint_states",
+        *["/object_pose"] * 2,
+    ]
+    gripper, arm = profile.commands["trajectory"]
+    assert (gripper.topic, arm.topic) == ("/gripper/commands", "/joint_trajectory_controller/joint_trajectory")
+    assert (arm.type, arm.names) == ("trajectory_msgs/JointTrajectory", robot_model("fr3").joint_names)

@@ -34,7 +34,7 @@ class SimulatedArm:
     """n simulated arms, each on a separate table.
 
     The joint set points move linearly from the last command to the new one within a period, as a UR controller
-    interpolates; the gripper's set point moves at `GRIPPER_SPEED`.
+    interpolates; the gripper's set point moves at the speed of the description.
 
     Args:
         num_robots: Number of arms stepped together.
