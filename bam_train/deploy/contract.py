@@ -11,7 +11,7 @@ from typing import Any
 
 from bam_envs.core.kinematics import ArmGeometry
 from bam_envs.core.location import LiveRobot
-from bam_envs.live.arm_checks import arm_checks, arm_in
+from bam_envs.live.arm_checks import arm_checks, arm_in, described_checks
 from bam_envs.live.bringup import TIMEOUT
 from bam_envs.live.examination import Inspection, inspect_robot
 from bam_envs.live.robot_checks import Check, robot_checks
@@ -123,6 +123,8 @@ def live_checks(env: Any, inspection: Inspection) -> Iterator[Check]:
     geometry = arm_in(env.unwrapped.task, robot.spec)
     if isinstance(geometry, ArmGeometry):
         yield from arm_checks(robot.spec, geometry, robot.limits.position_margin, inspection)
+    elif geometry is not None:
+        yield from described_checks(robot.spec, geometry, robot.limits.position_margin, inspection)
 
 
 def fit_checks(checkpoint: Checkpoint, env: Any) -> Iterator[Check]:

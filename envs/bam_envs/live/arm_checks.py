@@ -15,7 +15,7 @@ from xml.etree import ElementTree
 import numpy as np
 from numpy.typing import NDArray
 
-from bam_envs.arms.serial_chain import Arm
+from bam_envs.arms.serial_chain import Arm, SerialChain
 from bam_envs.core.errors import ProtocolError
 from bam_envs.core.kinematics import UR5E_GRIPPER, UR_JOINTS, ArmGeometry, angle_between, quaternions
 from bam_envs.core.robot import RobotSpec
@@ -31,6 +31,11 @@ LONGEST_TOOL = 0.4
 LARGEST_URDF = 8 * 2**20
 """Maximum length of a URDF [characters]."""
 _STILL = 0.05  # maximum motion of a joint at rest [rad]
+
+
+AXES, AXES_TURN = 0.005, 0.02
+"""Tolerance of two axes of a described arm: their distance [m] and angle [rad]."""
+Axis = tuple[Array, Array]
 
 
 class Pose(NamedTuple):
@@ -69,6 +74,19 @@ class UrdfJoint(NamedTuple):
 
 class Urdf(dict[str, UrdfJoint]):
     """The joints of a robot by name."""
+
+    def axes(self, names: Sequence[str], positions: Sequence[float]) -> list[Axis]:
+        """A point (3,) [m] and the direction (3,) of the axes of some joints at `positions` [rad], in its root."""
+        parents, root = {joint.child: joint.parent for joint in self.values()}, self[names[0]].parent
+        for _ in range(len(self)):
+            root = parents.get(root, root)
+        at, found = dict(zip(names, positions, strict=True)), []
+        for name in names:
+            pose = self.pose(root, self[name].child, at)
+            if pose is None:  # a joint that is not named moves on the way
+                return [(np.full(3, np.nan), np.full(3, np.nan))] * len(names)
+            found.append((pose[0], pose[1] @ self[name].axis))
+        return found
 
     def pose(self, base: str, link: str, positions: Mapping[str, float]) -> tuple[Array, Array] | None:
         """Position (3,) [m] and rotation (3, 3) of `link` in `base`; None if a joint or link between them is missing.
@@ -125,12 +143,44 @@ def arm_checks(spec: RobotSpec, geometry: ArmGeometry, margin: float, inspection
     yield _senses(geometry, q, pose)
 
 
+def described_checks(spec: RobotSpec, chain: SerialChain, margin: float, inspection: Inspection) -> Iterator[Check]:
+    """Lines about limits and kinematics of a described arm: its URDF has the axes of the joints where they are here.
+
+    Every two axes are compared, by their angle and their distance, because frames of the same arm differ from file to
+    file. The tool is not compared.
+    """
+    urdf, why = _description(inspection)
+    yield from _limits(spec, margin, urdf, why)
+    names = [name for name, unit in zip(spec.command.labels, spec.command.units, strict=True) if unit == "rad"]
+    if urdf is None or not set(names) <= set(urdf):
+        return
+    expected = f"every two axes within {1000 * AXES:g} mm and {math.degrees(AXES_TURN):.0f} degree"
+    there, frames = urdf.axes(names, chain.home.tolist()), chain.link_frames(chain.home[None])[0]
+    here = [(frame[:3, 3], frame[:3, :3] @ axis) for frame, axis in zip(frames, chain.axes, strict=False)]
+    wrong = [
+        f"{names[one]} and {names[other]}"
+        for one, other in itertools.combinations(range(len(names)), 2)
+        if not np.allclose(_between(here[one], here[other]), _between(there[one], there[other]), 0.0, [AXES, AXES_TURN])
+    ]
+    found = f"another arm, mount or calibration: {', '.join(wrong[:3])} are not as in its description"
+    yield Check(f"kinematics in {DESCRIPTION}", expected, found if wrong else "as described", fits=not wrong)
+
+
 def measured_joints(inspection: Inspection, spec: RobotSpec) -> Array | None:
     """The measured joints (k, 6) [rad], or None if they are outside their range or unreadable."""
     signal = next(signal for signal in spec.signals if signal.name == "joint_position")
     reading = inspection.readings["joint_position"]
     inside = (reading.values >= np.array(signal.low)).all() and (reading.values <= np.array(signal.high)).all()
     return reading.values if len(reading.values) and not reading.error and inside else None
+
+
+def _between(one: Axis, other: Axis) -> tuple[float, float]:
+    """Distance [m] and angle [rad] of two axes."""
+    gap, normal = other[0] - one[0], np.cross(one[1], other[1])
+    sine, cosine = float(np.linalg.norm(normal)), float(one[1] @ other[1])
+    parallel = sine < 0.05
+    distance = np.linalg.norm(np.cross(gap, one[1])) if parallel else abs(gap @ normal) / sine
+    return float(distance), math.atan2(sine, cosine)
 
 
 def _tool_pose(inspection: Inspection) -> tuple[Pose | None, str]:

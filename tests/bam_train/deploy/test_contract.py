@@ -11,10 +11,11 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from bam_envs.arms.description import robot_model
 from bam_envs.core.errors import ProtocolError
 from bam_envs.core.kinematics import UR5E_GRIPPER, UR_JOINTS, quaternions
 from bam_envs.core.robot import RobotState
-from bam_envs.live.arm_checks import read_urdf
+from bam_envs.live.arm_checks import described_checks, read_urdf
 from bam_envs.live.examination import TOOL_POSE, Inspection
 from bam_envs.live.state import Letter
 from bam_envs.robots.mir100 import base_spec
@@ -582,3 +583,44 @@ def test_a_urdf_whose_links_form_a_circle_has_no_pose():
     joint = "<joint name='{0}' type='fixed'><parent link='{1}'/><child link='{2}'/></joint>"
     circle = "".join(joint.format(*one) for one in ("xab", "yba"))
     assert read_urdf(f"<robot>{circle}</robot>").pose("base_link", "a", {}) is None
+
+
+# ---- described arms
+
+
+def described_urdf(arm, lengths=1.0):
+    """A described arm as a URDF, its lengths changed by a factor."""
+    rows = []
+    for number, row in enumerate(arm.joints):
+        matrix, axis = row.matrix(), " ".join(map(repr, row.axis))
+        pitch = -math.asin(max(-1.0, min(1.0, matrix[2, 0])))
+        roll, yaw = math.atan2(matrix[2, 1], matrix[2, 2]), math.atan2(matrix[1, 0], matrix[0, 0])
+        if abs(matrix[2, 0]) > 1 - 1e-9:  # roll and yaw turn about the same axis
+            roll, yaw = math.atan2(-matrix[2, 0] * matrix[0, 1], -matrix[2, 0] * matrix[0, 2]), 0.0
+        xyz = " ".join(repr(lengths * one) for one in row.xyz)
+        rows.append(
+            f'<joint name="{row.name}" type="revolute"><parent link="l{number}"/><child link="l{number + 1}"/>'
+            f'<origin xyz="{xyz}" rpy="{roll!r} {pitch!r} {yaw!r}"/><axis xyz="{axis}"/>'
+            f'<limit lower="{row.low!r}" upper="{row.high!r}"/></joint>'
+        )
+    return f'<robot name="arm">{"".join(rows)}</robot>'
+
+
+def described(name, urdf):
+    arm = robot_model(name)
+    inspection = SimpleNamespace(letters={"/robot_description": [Letter({"data": urdf}, BEGIN, 1)]})
+    return list(described_checks(arm.spec(with_object=False), arm.chain, 0.02, inspection))
+
+
+@pytest.mark.parametrize("name", ["fr3", "so101", "gen3", "xarm7"])
+def test_the_urdf_of_a_described_arm_is_compared_axis_by_axis(name):
+    arm = robot_model(name)
+    *limits, same = described(name, described_urdf(arm))
+    assert [one.what for one in limits] == [f"limits of {joint}" for joint in arm.joint_names]
+    assert (same.what, same.found, same.fits) == ("kinematics in /robot_description", "as described", True)
+    *_, longer = described(name, described_urdf(arm, 1.1))
+    assert not longer.fits
+    assert longer.found.startswith("another arm, mount or calibration: ")
+    names = arm.joint_names
+    mirrored = described_urdf(arm).replace('<axis xyz="0.0 0.0 1.0"/>', '<axis xyz="0.0 0.0 -1.0"/>', 1)
+    assert f"{names[0]} and " in described(name, mirrored)[-1].found
