@@ -44,6 +44,7 @@ MOVING = ("joints", "home", "tool", "gripper", "mount", "workspace")
 """Tables that decide how an arm moves."""
 DEFAULT_MODEL = "ur5e"
 """The arm of an environment without another ``robot_model``."""
+_MOST_CAPSULES = 100
 _MOST = 8  # differences that are listed
 SHIPPED = resources.files("bam_envs.arms") / "descriptions"
 """The folder of the shipped descriptions."""
@@ -164,6 +165,8 @@ class ArmDescription:
                 )
         if not all(low < high for low, high in zip(*self.workspace, strict=True)):
             raise InvalidValue(f"{self.name}: workspace: the lowest corner must come first.")
+        if len(self.capsules) > _MOST_CAPSULES:
+            raise InvalidValue(f"{self.name}: capsules: at most {_MOST_CAPSULES}, found {len(self.capsules)}.")
         named = [("capsules", one.link) for one in self.capsules]
         named += [("slack", link) for one, other, _ in self.slack for link in (one, other)]
         for key, link in named:
