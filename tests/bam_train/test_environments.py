@@ -210,8 +210,8 @@ def test_the_module_that_is_imported_is_the_one_that_was_named(strange, corridor
         (
             {"timeout": 5.0},
             "env_kwargs: unknown setting 'timeout' of bam/pick-v0. "
-            "Choose from: action_delay, camera, depth, image_size, link, looks, max_episode_steps, randomize, robot_model, "
-            "segmentation.",
+            "Choose from: action_delay, camera, depth, image_size, link, looks, max_episode_steps, randomize, "
+            "robot_model, segmentation.",
         ),
         (
             {"action_delay": -2},
