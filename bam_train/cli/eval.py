@@ -204,7 +204,10 @@ def _table(report: EvaluationReport, subject: _Subject, path: Path) -> list[str]
     """The report for people, line by line."""
     from bam_envs.core.wording import brief
 
-    given = ", ".join(f"{name}={brief(value)}" for name, value in subject.env_kwargs.items())
+    kwargs = subject.env_kwargs
+    if isinstance(arm := kwargs.get("robot_model"), dict):  # a whole description
+        kwargs = {**kwargs, "robot_model": arm["name"]}
+    given = ", ".join(f"{name}={brief(value)}" for name, value in kwargs.items())
     success = "unknown: the environment does not report is_success"
     if report.success_rate is not None and report.success_interval is not None:
         interval = "95 % interval {:.1%} to {:.1%}".format(*report.success_interval)

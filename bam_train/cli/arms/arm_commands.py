@@ -21,15 +21,22 @@ _POSTURES = 2000  # in which kinematics are compared with MuJoCo's
 
 def add(config: AddArmConfig) -> int | None:
     """Write the description of an arm."""
+    from bam_envs.arms.description import ModelName, known_models
+    from bam_envs.core.validation import check as check_value
     from bam_envs.robots.modelling.describe import describe, write_description
 
     if (config.mjcf is None) == (config.urdf is None):
-        raise InvalidValue("Give the model of the arm: --mjcf FILE or --urdf FILE.")
+        raise InvalidValue("Give one model of the arm: --mjcf FILE or --urdf FILE.")
+    check_value(config.name, ModelName, "NAME")
     if config.site is not None and config.tip is not None:
         raise InvalidValue("--site and --tip name the same thing, the end of the arm; give one of them.")
     path = config.out / f"{config.name}.toml"
     if path.exists() and not config.force:
         raise InvalidValue(f"{path} exists; give another name, or --force to replace it.")
+    if config.name in known_models() and not config.force:
+        raise InvalidValue(
+            f"{config.name} is an arm already, which this one would hide; give another name, or --force."
+        )
     model = config.mjcf or config.urdf or ""
     arm, notes = describe(config.name, model, config.gripper, config.site or config.tip)
     write_description(arm, notes, path)
@@ -136,12 +143,21 @@ def _draw(arm: ArmDescription, path: Path) -> None:
 
 def list_models(config: ListArmsConfig) -> int | None:
     """List the arms."""
-    from bam_envs.arms.description import known_models, read_description
+    from bam_envs.arms.description import known_models
     from bam_train.cli.envs import aligned
 
-    rows = [["name", "joints", "what", "file"]]
-    for name, path in sorted(known_models().items()):
+    rows = [_row(name, path) for name, path in sorted(known_models().items())]
+    tell(*aligned([["name", "joints", "what", "file"], *rows]), "")
+    tell("Another arm: bam-robots add NAME --urdf FILE --gripper parallel:0.08")
+    return 1 if any(joints == "-" for _, joints, *_ in rows) else 0
+
+
+def _row(name: str, path: Any) -> list[str]:
+    """One arm of the list; a file that cannot be read does not hide the others."""
+    from bam_envs.arms.description import read_description
+
+    try:
         arm = read_description(path)
-        rows.append([name, str(arm.num_joints), arm.title, str(path)])
-    tell(*aligned(rows), "", "Another arm: bam-robots add NAME --urdf FILE --gripper parallel:0.08")
-    return None
+    except InvalidValue as error:
+        return [name, "-", f"cannot be read: {error}", str(path)]
+    return [name, str(arm.num_joints), arm.title, str(path)]

@@ -136,17 +136,16 @@ class Outline:
 
     Args:
         chain: The arm, with capsules.
-        every: Whether pairs count too that overlap in most postures, and whose slack is not known.
     """
 
-    def __init__(self, chain: SerialChain, *, every: bool = False) -> None:
+    def __init__(self, chain: SerialChain) -> None:
         self.chain, capsules = chain, chain.capsules
         self.links = np.array([capsule.link for capsule in capsules])
         self.radius = np.array([capsule.radius for capsule in capsules])
         self._ends = np.array([(capsule.start, capsule.end) for capsule in capsules]).reshape(-1, 2, 3)
         self._mount = chain.mount
         self._slack = {(one, other): slack for one, other, slack in chain.slack}
-        self.pairs = self._pairs(every)
+        self.pairs = self._pairs()
 
     def segments(self, q: Array) -> Array:
         """Ends of the capsules' segments at the joints `q` (n, k) [rad]. Shape: (n, capsules, 2, 3)."""
@@ -157,10 +156,14 @@ class Outline:
         return ends
 
     def lowest(self, q: Array) -> Array:
-        """Height of the lowest point of the links from the second to the flange [m]. Shape: (n,)."""
-        moving = (self.links > 1) & (self.links <= self.chain.num_joints)
-        lows: Array = (self.segments(q)[..., 2][:, moving].min(axis=2) - self.radius[moving]).min(axis=1)
-        return lows
+        """Height of the lowest point of the links from the third to the flange [m]. Shape: (n,).
+
+        The first two stand where the arm is mounted; the far end of the second is where the third begins.
+        """
+        moving = (self.links > 2) & (self.links <= self.chain.num_joints)
+        lows: Array = self.segments(q)[..., 2][:, moving].min(axis=2) - self.radius[moving]
+        lowest: Array = lows.min(axis=1, initial=np.inf)
+        return lowest
 
     def nearest(self, q: Array) -> Array:
         """Distance of the nearest pair of capsules that can touch [m]; negative if they overlap. Shape: (n,)."""
@@ -181,7 +184,7 @@ class Outline:
         """How far the capsules of each of `pairs` may overlap [m]. Shape: (pairs,)."""
         return np.array([self._slack.get((int(self.links[i]), int(self.links[j])), 0.0) for i, j in self.pairs])
 
-    def _pairs(self, every: bool) -> NDArray[np.int64]:
+    def _pairs(self) -> NDArray[np.int64]:
         """Pairs of capsules on links with a joint between them that are apart in some posture, and not in all."""
         links = self.links
         rows = [
@@ -198,9 +201,8 @@ class Outline:
         gaps = self.distances(low + rng.random((2000, len(low))) * (high - low))
         # Capsules on both sides of a wrist or an elbow overlap nearly always: limits of joints keep their links apart.
         near = np.diff(np.minimum(links[self.pairs], last), axis=1)[:, 0] == 2
-        near &= [(int(links[i]), int(links[j])) not in self._slack for i, j in self.pairs]
         share = (gaps < 0.0).mean(axis=0)
-        kept: NDArray[np.int64] = self.pairs[(share > 0.0) & (every | ~(near & (share > _NEARLY_ALWAYS)))]
+        kept: NDArray[np.int64] = self.pairs[(share > 0.0) & ~(near & (share > _NEARLY_ALWAYS))]
         return kept
 
 

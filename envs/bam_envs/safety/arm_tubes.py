@@ -131,7 +131,7 @@ class ChainTubes:
         outline = self._outline
         ends = [[(*one.start, 1.0), (*one.end, 1.0)] for one in kept]
         self._links, self._ends = outline.links, np.array(ends).transpose(0, 2, 1)
-        self._low = np.flatnonzero((self._links > 1) & (self._links <= size))
+        self._low = np.flatnonzero((self._links > 2) & (self._links <= size))
         one, other = outline.pairs.T
         self._beyond = np.minimum(self._links[one], size), np.minimum(self._links[other], size)
         self._kept = (outline.radius[one] + outline.radius[other] - outline.slack).tolist()
@@ -146,7 +146,7 @@ class ChainTubes:
         return float(self._near.min(initial=math.inf))
 
     def lowest(self, q: Sequence[float]) -> float:
-        """Height of the lowest point of the links at the joints `q` (k,) [rad], from the second to the flange [m]."""
+        """Height of the lowest point of the links at the joints `q` (k,) [rad], from the third to the flange [m]."""
         places = self._places(q)[self._low]
         lows: Array = places[:, 2].min(axis=1) - self._outline.radius[self._low]
         return float(lows.min(initial=math.inf))

@@ -43,7 +43,7 @@ def test_an_arm_that_does_not_reach_its_work_area_fails_its_check(run, tmp_path)
     ("arguments", "message"),
     [
         (("check", "fr4"), "Unknown robot model 'fr4'. Did you mean 'fr3'?"),
-        (("add", "lab"), "Give the model of the arm: --mjcf FILE or --urdf FILE."),
+        (("add", "lab"), "Give one model of the arm: --mjcf FILE or --urdf FILE."),
         (("add", "lab", "--mjcf", "a.xml", "--urdf", "b.urdf"), "--mjcf FILE or --urdf FILE."),
         (("add", "lab", "--urdf", "a.urdf", "--site", "a", "--tip", "b"), "the end of the arm; give one of them."),
         (("add", "lab", "--urdf", "a.urdf"), "There is no file a.urdf. Give an MJCF or URDF file, or menagerie:NAME."),

@@ -19,7 +19,8 @@ EFFORT_PER_REACH = 60.0
 _POSTURES, _ENOUGH = 10_000, 20
 """Postures in which the outline is compared with the links, and the least number in which a pair overlaps."""
 _COMPARED = 1200  # of those, most for a pair
-_USELESS = 0.1  # share of postures in which capsules with one link between them would still alarm: not compared
+_GIVEN_UP = 0.1
+_CLEARANCE = 0.005  # that the guards keep, so that they act where links touch [m]
 _TOUCH = 0.0045  # depth from which shapes touch, and what is kept of the slack [m]
 _SURE = 0.001
 _FARTHEST = 3.0  # an arm longer than this has its lengths in another unit [m]
@@ -58,32 +59,45 @@ def describe(name: str, model: str, gripper: str | None, site: str | None) -> tu
         sources={"model": model, **({"gripper": gripper} if gripper else {})},
     )
     first = dataclasses.replace(first, slack=tuple(_slack(first, read.shapes)) if read.shapes else ())
-    area = find_work_area(first)
+    try:
+        area = find_work_area(first)
+    except InvalidValue:
+        if read.shapes is None:
+            raise
+        # Capsules are thicker than a bent link: what the slightest of its collisions are is given up.
+        first = dataclasses.replace(first, slack=tuple(_slack(first, read.shapes, _GIVEN_UP)))
+        area = find_work_area(first)
+        read.notes.append(
+            f"collisions of the arm with itself: the slightest {_GIVEN_UP:.0%} of two links are not noticed"
+        )
     x, y = (tuple(round(float(one), 4) for one in corner) for corner in area.box)
     home = tuple(float(one) for one in area.home)
     found = dataclasses.replace(first, home=home, workspace=(x, y))  # type: ignore[arg-type]
     return found, read.notes
 
 
-def _slack(description: ArmDescription, shapes: Shapes) -> Iterator[tuple[int, int, float]]:
-    """For two links, how far their capsules overlap while their shapes are apart [m], if it matters."""
-    outline, chain = Outline(description.chain, every=True), description.chain
+def _slack(description: ArmDescription, shapes: Shapes, given_up: float = 0.0) -> Iterator[tuple[int, int, float]]:
+    """For two links, how far their capsules overlap while their shapes are apart [m], if it matters.
+
+    The share `given_up` of the slightest collisions does not count.
+    """
+    description = dataclasses.replace(description, slack=())
+    outline, chain = Outline(description.chain), description.chain
     rng = np.random.default_rng(0)
     low, high = np.maximum(chain.low, -np.pi), np.minimum(chain.high, np.pi)
     q = low + rng.random((_POSTURES, len(low))) * (high - low)
     gaps, links = outline.distances(q), outline.links[outline.pairs]
     for one, other in sorted({(int(i), int(j)) for i, j in links}):
         gap = gaps[:, (links == [one, other]).all(axis=1)].min(axis=1)
-        overlapping = np.flatnonzero(gap < 0.0)
+        overlapping = np.flatnonzero(gap < _CLEARANCE)
         if len(overlapping) < _ENOUGH or not shapes.are_known(one, other):
             continue
         overlapping = overlapping[np.argsort(-gap[overlapping])]  # the slightest first
         picked = overlapping[np.unique(np.linspace(0, len(overlapping) - 1, _COMPARED).astype(int))]
         deepest = float(gap[picked].min())
-        touching = next((float(gap[at]) for at in picked if shapes.distance(one, other, q[at]) < -_TOUCH), deepest)
-        slack = max(0.0, -touching - _SURE)
-        useless = (gap < -slack).mean() > _USELESS and min(other, description.num_joints) - one == 2
-        if slack > 0.002 and not useless:
+        touching = [float(gap[at]) for at in picked if shapes.distance(one, other, q[at]) < -_TOUCH] or [deepest]
+        slack = max(0.0, _CLEARANCE - touching[int(given_up * len(touching))] - _SURE)
+        if slack > 0.002:
             yield one, other, round(slack, 3)
 
 
