@@ -140,8 +140,8 @@ class Outline:
 
     def __init__(self, chain: SerialChain) -> None:
         self.chain, capsules = chain, chain.capsules
-        self.links = np.array([capsule.link for capsule in capsules])
-        self.radius = np.array([capsule.radius for capsule in capsules])
+        self.links = np.array([capsule.link for capsule in capsules], dtype=np.int64)
+        self.radius = np.array([capsule.radius for capsule in capsules], dtype=np.float64)
         self._ends = np.array([(capsule.start, capsule.end) for capsule in capsules]).reshape(-1, 2, 3)
         self._mount = chain.mount
         self._slack = {(one, other): slack for one, other, slack in chain.slack}

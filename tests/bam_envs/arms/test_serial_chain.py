@@ -1,6 +1,7 @@
 """Kinematics of every shipped arm as a chain: against MuJoCo, the closed form, differences and its own inverse."""
 
 import copy
+import dataclasses
 import itertools
 import pickle
 
@@ -8,8 +9,9 @@ import mujoco
 import numpy as np
 import pytest
 
+from bam_envs.arms.capsules import Outline
 from bam_envs.arms.description import known_models, robot_model
-from bam_envs.arms.serial_chain import HAND, arm_of
+from bam_envs.arms.serial_chain import HAND, Capsule, arm_of
 from bam_envs.core.kinematics import ArmGeometry
 from bam_envs.robots.physics.arm_model import scene_spec
 
@@ -157,3 +159,16 @@ def test_a_chain_whose_code_was_made_can_be_copied_and_sent():
     place = chain.tool_point(chain.home.tolist())
     assert pickle.loads(pickle.dumps(chain)).tool_point(chain.home.tolist()) == place
     assert copy.deepcopy(chain).tool_point(chain.home.tolist()) == place
+
+
+def test_an_arm_without_capsules_touches_nothing():
+    outline = Outline(dataclasses.replace(robot_model("fr3").chain, capsules=()))
+    q = robot_model("fr3").chain.home[None]
+    assert (outline.lowest(q).item(), outline.nearest(q).item()) == (np.inf, np.inf)
+
+
+def test_a_shoulder_that_stands_low_is_not_taken_for_an_arm_in_the_table():
+    chain = robot_model("fr3").chain
+    low = Capsule(link=2, radius=0.4)  # a shoulder whose outline reaches below the table, where it is mounted
+    outline = Outline(dataclasses.replace(chain, capsules=(low, *chain.capsules)))
+    assert outline.lowest(chain.home[None]) > 0.1

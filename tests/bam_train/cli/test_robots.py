@@ -16,6 +16,16 @@ def test_list(run):
     assert lines[-1] == "Another arm: bam-robots add NAME --urdf FILE --gripper parallel:0.08"
 
 
+def test_a_file_that_cannot_be_read_does_not_hide_the_others(run, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "robots").mkdir()
+    (tmp_path / "robots" / "bad.toml").write_text("home = 3", encoding="utf-8")
+    status, out, err = run(main, "list")
+    assert (status, err) == (1, "")
+    assert "cannot be read: robots/bad.toml: " in out.splitlines()[1]
+    assert [line.split()[0] for line in out.splitlines()[2:10]] == [one for one in known_models() if one != "bad"]
+
+
 @pytest.mark.parametrize(("name", "joints"), [("so101", 5), ("fr3", 7)])
 def test_check(run, name, joints):
     status, out, err = run(main, "check", name)
@@ -48,6 +58,8 @@ def test_an_arm_that_does_not_reach_its_work_area_fails_its_check(run, tmp_path)
         (("add", "lab", "--urdf", "a.urdf", "--site", "a", "--tip", "b"), "the end of the arm; give one of them."),
         (("add", "lab", "--urdf", "a.urdf"), "There is no file a.urdf. Give an MJCF or URDF file, or menagerie:NAME."),
         (("add", "so101", "--urdf", "a.urdf"), "exists; give another name, or --force to replace it."),
+        (("add", "../lab", "--urdf", "a.urdf"), "NAME: expected at most 64 letters, digits and . _ -, found '../lab'"),
+        (("add", "fr3", "--urdf", "a.urdf"), "which this one would hide; give another name, or --force."),
         (("check", "so101", "--picture", "arm.pdf"), "arm.pdf: expected a name that ends in .png or .jpg."),
     ],
 )
