@@ -102,10 +102,12 @@ def test_the_start_pose_is_reached_slowly(driven, robot_node):
 
 def test_no_number_that_is_not_finite_reaches_the_node(driven, robot_node):
     command = start(driven).command
+    for _ in range(10):  # until it rests there: a halt holds what is measured
+        driven.step(command)
     robot_node.ask("forget")
     bad = np.where(np.arange(7) == 2, np.nan, command)
     for _ in range(driven.limits.bad_ticks - 1):
-        np.testing.assert_allclose(driven.step(bad).command, command, atol=5e-3)
+        np.testing.assert_allclose(driven.step(bad).command, command, atol=1e-3)
     with pytest.raises(SafetyStop):
         driven.step(bad)
     values = [value for kind in (TRAJECTORY, GRIPPER) for row in received(robot_node, kind) for value in row]
