@@ -317,12 +317,16 @@ def differences(wanted: Mapping[str, Any], found: Mapping[str, Any], prefix: str
     return differing
 
 
-def file_stem(env: str, algo: str, trainer: str = "sb3") -> str:
+def file_stem(env: str, algo: str, trainer: str = "sb3", env_kwargs: Mapping[str, Any] | None = None) -> str:
     """A run's name in file names: ``bam/pick-v0`` and ppo make ``pick-ppo``; a foreign id keeps its version.
 
-    A trainer whose algorithms others have too is named: ``pick-rllib-ppo``.
+    A trainer whose algorithms others have too is named, ``pick-rllib-ppo``, and so is another robot than the default
+    one, whose description is in `env_kwargs`: ``pick-fr3-ppo``.
     """
     match = re.fullmatch(r"bam/(.+)-v\d+", env)
     name = match[1] if match else env
     run = algo if trainer in ("sb3", "imitation", "bandit") else f"{trainer}-{algo}"
+    robot = (env_kwargs or {}).get("robot_model")
+    if isinstance(robot, Mapping):
+        name = f"{name}-{robot['name']}"
     return re.sub(r"[^\w.-]+", "-", f"{name}-{run}").strip("-.")

@@ -8,7 +8,7 @@ import os
 import signal
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -66,7 +66,9 @@ def _train(config: TrainConfig, settings: TrainSettings, checkpoint: Checkpoint 
     from bam_train.trainers.run_folder import Copies, RunFolder, require_room
     from bam_train.trainers.training_run import TrainingRun
 
-    runs, title = config.runs.expanduser(), f"{settings.algo} on {settings.env}, seed {settings.seed}"
+    arm = settings.env_kwargs.get("robot_model")
+    robot = f" with {arm['name']}" if isinstance(arm, Mapping) else ""
+    runs, title = config.runs.expanduser(), f"{settings.algo} on {settings.env}{robot}, seed {settings.seed}"
     if checkpoint is not None:
         title += f", going on from {checkpoint.path} at {count(checkpoint.manifest.steps)} steps"
     require_room(runs)
@@ -85,7 +87,7 @@ def _train(config: TrainConfig, settings: TrainSettings, checkpoint: Checkpoint 
             settings = trainer.settings  # as the trainer completed them
             if config.record is not None:
                 trainer.record(config.record)  # type: ignore[attr-defined]
-            folder = RunFolder(runs, file_stem(settings.env, settings.algo, settings.trainer))
+            folder = RunFolder(runs, file_stem(settings.env, settings.algo, settings.trainer, settings.env_kwargs))
             folder.write_config(settings.to_mapping())
             trainer.log_to(folder.tensorboard)
             display = (LiveDisplay if can_draw() else PlainDisplay)(title)

@@ -39,7 +39,7 @@ def choose_output(settings: TrainSettings, out: Path | None, force: bool, resume
     A run that continues from `resumed` keeps its path. Temporary files of killed runs are removed.
     """
     earlier = None if resumed is None else _earlier_best(resumed)
-    usual = FOLDER / f"{file_stem(settings.env, settings.algo, settings.trainer)}.zip"
+    usual = FOLDER / f"{file_stem(settings.env, settings.algo, settings.trainer, settings.env_kwargs)}.zip"
     wanted = (out or (earlier.path if earlier else usual)).expanduser()
     if wanted.is_dir():
         raise OutputError(

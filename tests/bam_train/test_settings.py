@@ -151,4 +151,8 @@ def test_differences_look_into_tables_and_tell_true_from_one():
     ],
 )
 def test_file_stem(env, stem):
-    assert file_stem(env, "ppo") == stem
+    assert file_stem(env, "ppo", env_kwargs={"robot_model": "ur5e"}) == stem
+
+
+def test_the_name_of_a_run_says_which_arm_it_is_for():
+    assert file_stem("bam/pick-v0", "ppo", "rllib", {"robot_model": {"name": "lab"}}) == "pick-lab-rllib-ppo"

@@ -65,7 +65,7 @@ def command(manifest, name):
         words += ["--teacher", own["teacher"]]
     for setting, value, _ in differences(own, resolve(asked).to_mapping()):
         words += _words(setting, value)
-    if name != f"{file_stem(manifest.env, manifest.algorithm, manifest.trainer)}.zip":
+    if name != f"{file_stem(manifest.env, manifest.algorithm, manifest.trainer, manifest.env_kwargs)}.zip":
         words += ["--out", f"checkpoints/{name}"]
     return shlex.join(words)
 

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from bam_envs.core.errors import InvalidValue
+from bam_envs.core.errors import InvalidValue, UnknownName
 from bam_train.cli.console import tell
 
 if TYPE_CHECKING:
@@ -38,7 +38,7 @@ def add(config: AddArmConfig) -> int | None:
             f"{config.name} is an arm already, which this one would hide; give another name, or --force."
         )
     model = config.mjcf or config.urdf or ""
-    arm, notes = describe(config.name, model, config.gripper, config.site or config.tip)
+    arm, notes = describe(config.name, model, config.gripper, config.site or config.tip, tell=tell)
     write_description(arm, notes, path)
     tell(f"wrote {path}: {arm.num_joints} joints, gripper {1000 * arm.gripper.open:.0f} mm, {_area(arm)}")
     if notes:
@@ -56,7 +56,10 @@ def check(config: CheckArmConfig) -> int | None:
     from bam_envs.arms.description import robot_model
     from bam_train.cli.envs import aligned
 
-    arm = robot_model(config.name)
+    try:
+        arm = robot_model(config.name)
+    except UnknownName as error:
+        raise InvalidValue(f"{error} Another arm is described first: bam-robots add {config.name} ...") from error
     tell(f"{arm.name}: {arm.title}", "")
     head = ["joint", "from", "to", "speed", "acceleration", "jerk", "torque", "home"]
     units = ["", "rad", "rad", "rad/s", "rad/s^2", "rad/s^3", "N m", "rad"]

@@ -294,7 +294,7 @@ def learn(
     if checkpoint is None and settings.start is not None:
         tell(f"copies the policy of {settings.start}")
     learner = LiveLearner.create(settings) if checkpoint is None else LiveLearner.load(checkpoint, settings)
-    folder = RunFolder(runs, file_stem(settings.env, settings.algo))
+    folder = RunFolder(runs, file_stem(settings.env, settings.algo, env_kwargs=settings.env_kwargs))
     folder.write_config(settings.to_mapping())
     tell(f"the state of the run is in {folder.last}, from which --resume goes on")
     session = LiveSession(learner, connect, folder, output.path, push_every=push_every, tell=tell, stopped=stopped)

@@ -289,12 +289,19 @@ def read_description(path: Any) -> ArmDescription:
         InvalidValue: The file cannot be read, or a key or value does not fit; it names which.
     """
     try:
-        table = tomllib.loads(path.read_text(encoding="utf-8"))
+        text = path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
         raise InvalidValue(f"The robot description {path} cannot be read: {error}.") from error
+    return _in_text(text, str(path))
+
+
+@lru_cache(maxsize=32)
+def _in_text(text: str, where: str) -> ArmDescription:
+    try:
+        table = tomllib.loads(text)
     except ValueError as error:
-        raise InvalidValue(f"{path} is not TOML: {error}.") from error
-    return description_of(table, str(path))
+        raise InvalidValue(f"{where} is not TOML: {error}.") from error
+    return description_of(table, where)
 
 
 def description_of(table: Mapping[str, Any], where: str) -> ArmDescription:
@@ -360,7 +367,7 @@ def robot_model(name: "str | Mapping[str, Any] | ArmDescription") -> ArmDescript
     known = known_models()
     if name not in known:
         raise UnknownName("robot model", name, known)
-    return _read_once(known[name])
+    return read_description(known[name])
 
 
 def portable_model(name: "str | Mapping[str, Any] | ArmDescription") -> str | dict[str, Any]:
@@ -391,7 +398,7 @@ def require_same_arm(table: object) -> None:
         return
     there = robot_model(table)
     path = known_models().get(there.name)
-    here = there if path is None else _read_once(path)
+    here = there if path is None else read_description(path)
     if here.digest == there.digest:
         return
     rows = [f"{name}: {theirs}, here {ours}" for name, theirs, ours in there.differences(here)]
@@ -400,8 +407,3 @@ def require_same_arm(table: object) -> None:
         f"{there.name} is another arm here ({path}): {'; '.join(rows[:_MOST])}{more}. Give the description with which "
         "the policy was trained another name, or train a policy for this one."
     )
-
-
-@lru_cache(maxsize=32)
-def _read_once(path: Any) -> ArmDescription:
-    return read_description(path)

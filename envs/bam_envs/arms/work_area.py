@@ -3,7 +3,7 @@
 import dataclasses
 import itertools
 from collections.abc import Iterator
-from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,40 +29,31 @@ _TRIES = 240  # start poses of the search for a home pose
 _STEPS = 12  # from the middle of the area to a point of it
 
 
-@dataclass(frozen=True)
-class WorkArea:
-    """A home pose and the box about it."""
+def find_work_area(*arms: ArmDescription) -> ArmDescription:
+    """The first of `arms` that has the largest work area straight before it, with that area and its home pose.
 
-    home: Array
-    """Joint positions with the tool pointing down over the middle [rad]. Shape: (k,)."""
-    box: Array
-    """Lowest and highest x, y, z of the tool [m]. Shape: (2, 3)."""
-    scale: float
-    """Its size, 1 for `BOX`."""
-
-
-def find_work_area(description: ArmDescription) -> WorkArea:
-    """The largest work area of an arm, straight before it, with the home pose farthest from all limits.
+    They are one arm in several forms, such as with its gripper turned by half a turn. The home pose is the one farthest
+    from all limits.
 
     Raises:
         InvalidValue: It reaches no such area with its tool pointing down.
     """
-    chain, outline = description.chain, Outline(description.chain)
-    for scale in _SCALES:
-        best: tuple[float, WorkArea] | None = None
+    for scale, arm in itertools.product(_SCALES, arms):
+        chain, outline = arm.chain, Outline(arm.chain)
+        best: tuple[float, ArmDescription] | None = None
         for box in _boxes(chain, scale):
-            homes = _homes(chain, outline, box)
-            for margin, home in homes[:4]:
+            for margin, home in _homes(chain, outline, box)[:4]:
                 if best is not None and margin <= best[0]:
                     break
-                here = dataclasses.replace(chain, home=home)
-                if covers(here, outline, box):
-                    best = margin, WorkArea(home, box, scale)
+                if covers(dataclasses.replace(chain, home=home), outline, box):
+                    low, high = (tuple(round(float(one), 4) for one in corner) for corner in box)
+                    area: Any = {"home": tuple(map(float, home)), "workspace": (low, high)}
+                    best = margin, dataclasses.replace(arm, **area)
                     break
         if best is not None:
             return best[1]
     raise InvalidValue(
-        f"{description.name}: nowhere on the table before it does the tool point down in an area of "
+        f"{arms[0].name}: nowhere on the table before it does the tool point down in an area of "
         f"{0.4 * _SCALES[-1]:.2f} m. Look at the tool (--site, --gripper) and at the limits of the joints."
     )
 

@@ -52,11 +52,17 @@ def test_an_arm_that_does_not_reach_its_work_area_fails_its_check(run, tmp_path)
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (("check", "fr4"), "Unknown robot model 'fr4'. Did you mean 'fr3'?"),
+        (
+            ("check", "fr4"),
+            "Unknown robot model 'fr4'. Did you mean 'fr3'? Another arm is described first: bam-robots add fr4 ...",
+        ),
         (("add", "lab"), "Give one model of the arm: --mjcf FILE or --urdf FILE."),
         (("add", "lab", "--mjcf", "a.xml", "--urdf", "b.urdf"), "--mjcf FILE or --urdf FILE."),
         (("add", "lab", "--urdf", "a.urdf", "--site", "a", "--tip", "b"), "the end of the arm; give one of them."),
-        (("add", "lab", "--urdf", "a.urdf"), "There is no file a.urdf. Give an MJCF or URDF file, or menagerie:NAME."),
+        (
+            ("add", "lab", "--urdf", "a.urdf"),
+            "There is no model file a.urdf. Give an MJCF or URDF file, or menagerie:NAME.",
+        ),
         (("add", "so101", "--urdf", "a.urdf"), "exists; give another name, or --force to replace it."),
         (("add", "../lab", "--urdf", "a.urdf"), "NAME: expected at most 64 letters, digits and . _ -, found '../lab'"),
         (("add", "fr3", "--urdf", "a.urdf"), "which this one would hide; give another name, or --force."),

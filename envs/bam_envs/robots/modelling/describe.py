@@ -1,13 +1,13 @@
 """Make the description of an arm from its model files, and write it with what had to be assumed."""
 
 import dataclasses
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
 
 from bam_envs.arms.capsules import Outline, fitted_capsules
-from bam_envs.arms.description import ArmDescription, Gripper, JointRow, Placed
+from bam_envs.arms.description import ArmDescription, Gripper, JointRow, Placed, Vector
 from bam_envs.arms.work_area import find_work_area
 from bam_envs.core.errors import InvalidValue
 from bam_envs.robots.modelling.model_files import Array, ReadArm, Shapes, read_arm
@@ -26,7 +26,9 @@ _SURE = 0.001
 _FARTHEST = 3.0  # an arm longer than this has its lengths in another unit [m]
 
 
-def describe(name: str, model: str, gripper: str | None, site: str | None) -> tuple[ArmDescription, list[str]]:
+def describe(
+    name: str, model: str, gripper: str | None, site: str | None, *, tell: Callable[[str], None] = lambda _: None
+) -> tuple[ArmDescription, list[str]]:
     """The description of the arm in the file `model` with `gripper`, and one note for each thing that is assumed.
 
     Args:
@@ -34,10 +36,12 @@ def describe(name: str, model: str, gripper: str | None, site: str | None) -> tu
         model: An MJCF or URDF file, or ``menagerie:NAME``.
         gripper: As `model`, or ``parallel:WIDTH`` [m]; None if the joints behind `site` are the gripper.
         site: Site or body at the end of the arm; None for the first of the usual names that is there.
+        tell: Takes a line before each part that takes some seconds.
 
     Raises:
         InvalidValue: The files hold no arm that could work; one line that says why.
     """
+    tell(f"reading {model}")
     read = read_arm(model, gripper, site)
     reach = float(np.linalg.norm(read.placements[:, :3, 3], axis=1).sum())
     if not 0.15 < reach < _FARTHEST:
@@ -58,22 +62,36 @@ def describe(name: str, model: str, gripper: str | None, site: str | None) -> tu
         capsules=tuple(capsules),
         sources={"model": model, **({"gripper": gripper} if gripper else {})},
     )
-    first = dataclasses.replace(first, slack=tuple(_slack(first, read.shapes)) if read.shapes else ())
+    if read.shapes is not None:
+        tell(f"comparing {len(capsules)} capsules with the shapes of the links, in {_POSTURES} postures")
+        first = dataclasses.replace(first, slack=tuple(_slack(first, read.shapes)))
+    tell("looking for a work area before the arm")
     try:
-        area = find_work_area(first)
+        found = find_work_area(first, _turned(first))
     except InvalidValue:
         if read.shapes is None:
             raise
         # Capsules are thicker than a bent link: what the slightest of its collisions are is given up.
         first = dataclasses.replace(first, slack=tuple(_slack(first, read.shapes, _GIVEN_UP)))
-        area = find_work_area(first)
+        found = find_work_area(first, _turned(first))
         read.notes.append(
             f"collisions of the arm with itself: the slightest {_GIVEN_UP:.0%} of two links are not noticed"
         )
-    x, y = (tuple(round(float(one), 4) for one in corner) for corner in area.box)
-    home = tuple(float(one) for one in area.home)
-    found = dataclasses.replace(first, home=home, workspace=(x, y))  # type: ignore[arg-type]
     return found, read.notes
+
+
+def _turned(arm: ArmDescription) -> ArmDescription:
+    """The arm with the axes of its tool turned by half a turn, which two pads do not tell apart."""
+    half = np.diag([-1.0, -1.0, 1.0, 1.0])
+
+    def across(point: Vector) -> Vector:
+        return -point[0], -point[1], point[2]
+
+    capsules = tuple(
+        dataclasses.replace(one, start=across(one.start), end=across(one.end)) if one.link > arm.num_joints else one
+        for one in arm.capsules
+    )
+    return dataclasses.replace(arm, tool=_placed(arm.tool.matrix() @ half), capsules=capsules)
 
 
 def _slack(description: ArmDescription, shapes: Shapes, given_up: float = 0.0) -> Iterator[tuple[int, int, float]]:

@@ -22,10 +22,19 @@ from bam_envs.robots.physics.mujoco_batch import mujoco
 Array = NDArray[np.float64]
 SITES = ("attachment_site", "right_hand", "tool0", "flange", "ee_link", "link_tcp", "tcp", "gripper_frame_link")
 """Names of sites and bodies that are taken as the end of an arm if none is given."""
+_END = "_end"  # ends the name of the body at the end of an arm
 CONTINUOUS = 2 * np.pi
 """Limit of a joint that turns without end [rad]."""
 WIDEST = 0.10
 """Widest gripper that is simulated [m]."""
+_REMEDIES = {
+    "repeated name": "give each of them a name of its own",
+    "unrecognized": "the file is for another version of MuJoCo: take it out",
+    "no decoder": "MuJoCo reads STL, OBJ and MSH: convert the mesh, or give the link a shape",
+    "bad format": "write a number there",
+    "is empty": "fetch the mesh again; a repository with Git LFS holds a pointer in its place",
+}
+"""What to do about a file that MuJoCo refuses, by words in its text."""
 _SETTLING = 2.0  # time for a linkage to come to rest [s]
 _FINGERTIP = 0.03  # depth of a finger's tip along the gripper [m]
 
@@ -83,19 +92,25 @@ def _spec(name: str) -> tuple[Any, dict[str, tuple[float | None, float | None]]]
         return _menagerie(name.partition(":")[2]), {}
     path = Path(name)
     if not path.is_file():
-        raise InvalidValue(f"There is no file {name}. Give an MJCF or URDF file, or menagerie:NAME.")
+        raise InvalidValue(f"There is no model file {name}. Give an MJCF or URDF file, or menagerie:NAME.")
     limits: dict[str, tuple[float | None, float | None]] = {}
     try:
-        if path.suffix in (".urdf", ".xacro") or b"<robot" in path.read_bytes()[:4000]:
+        if _is_urdf(path):
             text, limits = _urdf(path)
             spec = mujoco.MjSpec.from_string(text)
         else:
             spec = mujoco.MjSpec.from_file(str(path))
     except InvalidValue:
         raise
-    except (ValueError, OSError, ElementTree.ParseError) as error:
-        raise InvalidValue(f"MuJoCo cannot read {name}: {_line(error)}.") from error
+    except ElementTree.ParseError as error:
+        raise InvalidValue(f"{name} is not XML: {_line(error)}. Is the file whole?") from error
+    except (ValueError, OSError) as error:
+        raise _refusal(f"MuJoCo cannot read {name}", error) from error
     return spec, limits
+
+
+def _is_urdf(path: Path) -> bool:
+    return path.suffix in (".urdf", ".xacro") or (path.is_file() and b"<robot" in path.read_bytes()[:4000])
 
 
 def _menagerie(name: str) -> Any:
@@ -106,13 +121,24 @@ def _menagerie(name: str) -> Any:
     try:
         return menagerie.get(name).spec()
     except Exception as error:  # its errors, and those of the network, are many
+        if "Unknown robot" in str(error):
+            raise InvalidValue(f"menagerie:{name}: {_line(error)}") from error
         raise InvalidValue(
-            f"menagerie:{name} ({_line(error)}): look at the name, or give a folder with the models: MENAGERIE_ROOT=."
+            f"menagerie:{name} cannot be fetched: {_line(error)}. Set the variable MENAGERIE_ROOT to a folder with the "
+            "models, or try again with a network."
         ) from error
 
 
+def _refusal(what: str, error: BaseException) -> InvalidValue:
+    """An error in the words of MuJoCo, with what to do about it."""
+    text = _line(error)
+    remedy = next((one for words, one in _REMEDIES.items() if words in text), "correct the file, or give another")
+    return InvalidValue(f"{what}: {text}. Remedy: {remedy}.")
+
+
 def _line(error: BaseException) -> str:
-    return " ".join(str(error).split()).removeprefix("Error: ").rstrip(".")
+    text = re.sub(r"<class '[\w.]+'>: |XML Error: |Error: ", "", " ".join(str(error).split()))
+    return text.rstrip(".")
 
 
 def _urdf(path: Path) -> tuple[str, dict[str, tuple[float | None, float | None]]]:
@@ -130,12 +156,21 @@ def _urdf(path: Path) -> tuple[str, dict[str, tuple[float | None, float | None]]
     ElementTree.SubElement(ElementTree.SubElement(root, "mujoco"), "compiler", options)
     limits = {}
     for joint in root.findall("joint"):
-        limit = joint.find("limit")
+        limit, name = joint.find("limit"), joint.get("name", "")
         if limit is not None:
-            given = [float(limit.get(key, 0.0)) for key in ("velocity", "effort")]
+            low, high, *given = (_number(path, name, limit, key) for key in ("lower", "upper", "velocity", "effort"))
+            if low > high:
+                raise InvalidValue(f"{path}: {name}: its lower limit {low:g} is above its upper limit {high:g}.")
             speed, effort = (value if 0.0 < value < np.inf else None for value in given)
-            limits[joint.get("name", "")] = speed, effort
+            limits[name] = speed, effort
     return ElementTree.tostring(root, encoding="unicode"), limits
+
+
+def _number(path: Path, joint: str, limit: ElementTree.Element, key: str) -> float:
+    try:
+        return float(limit.get(key, 0.0))
+    except ValueError as error:
+        raise InvalidValue(f"{path}: {joint}: {key} must be a number, not {limit.get(key)!r}.") from error
 
 
 def _expanded(path: Path) -> str:
@@ -147,7 +182,9 @@ def _expanded(path: Path) -> str:
     try:
         return str(xacrodoc.XacroDoc.from_file(str(path)).to_urdf_string())
     except Exception as error:  # of its parser, of packages that are not found
-        raise InvalidValue(f"{path} cannot be expanded: {_line(error)}.") from error
+        text = _line(error)
+        remedy = " Source the workspace of the package first, or give the URDF." if "ackage" in text else ""
+        raise InvalidValue(f"{path} cannot be expanded: {text}.{remedy}") from error
 
 
 def _mesh_file(path: Path, name: str) -> str:
@@ -158,7 +195,9 @@ def _mesh_file(path: Path, name: str) -> str:
         for tail in tails:
             if (folder / tail).is_file():
                 return str(folder / tail)
-    raise InvalidValue(f"{path}: the mesh {name} is neither beside the file nor in a folder above it.")
+    raise InvalidValue(
+        f"{path}: the mesh {name} is neither beside the file nor in a folder above it. Put its package there."
+    )
 
 
 def _named_body(spec: Any, site: str | None, model: str) -> Any:
@@ -166,14 +205,16 @@ def _named_body(spec: Any, site: str | None, model: str) -> Any:
     bodies = {body.name: body for body in spec.bodies if body.name}
     sites = {one.name: one for one in spec.sites if one.name}
     names = [site] if site else [name for name in SITES if name in sites or name in bodies]
+    named = [one for one in (*sites, *bodies) if one != "world"]
+    flag, kind = ("--tip", "link") if _is_urdf(Path(model)) else ("--site", "site or body")
     if not names:
-        raise InvalidValue(f"{model}: give the end of the arm with --site, a site or body: {_few([*sites, *bodies])}.")
+        raise InvalidValue(f"{model}: give the end of the arm with {flag}, a {kind}: {_few(named)}.")
     name = names[0]
     if name in bodies:
         return bodies[name]
     if name not in sites:
-        raise UnknownName("site or body", name, [*sites, *bodies])
-    return sites[name].parent.add_body(name=f"{name}_end", pos=sites[name].pos, quat=sites[name].quat)
+        raise UnknownName(kind, name, named)
+    return sites[name].parent.add_body(name=name + _END, pos=sites[name].pos, quat=sites[name].quat)
 
 
 def _few(names: list[str]) -> str:
@@ -189,7 +230,7 @@ def _attach(spec: Any, body: Any, gripper: str) -> None:
     try:
         body.add_frame().attach_body(roots[0], "gripper_", "")
     except ValueError as error:
-        raise InvalidValue(f"MuJoCo cannot join {gripper}: {_line(error)}.") from error
+        raise _refusal(f"MuJoCo cannot join {gripper}", error) from error
 
 
 class Shapes:
@@ -236,7 +277,7 @@ class _Reader:
         try:
             self._model = spec.compile()
         except ValueError as error:
-            raise InvalidValue(f"MuJoCo cannot build {where}: {_line(error)}.") from error
+            raise _refusal(f"MuJoCo cannot build {where}", error) from error
         self._data = mujoco.MjData(self._model)
         self._where, self._limits, self._parallel = where, limits, parallel
         self._end = self._model.body(end).id
@@ -294,12 +335,17 @@ class _Reader:
                 raise InvalidValue(f"{self._where}: its base is free to move; give an arm with a fixed base.")
             if any(kind != int(mujoco.mjtJoint.mjJNT_HINGE) for kind in kinds) or count > 1:
                 name = model.body(body).name
-                raise InvalidValue(f"{self._where}: {name!r} has another joint than one revolute joint.")
+                raise InvalidValue(
+                    f"{self._where}: {name!r} has another joint than one revolute joint; only such arms are served."
+                )
             joints += [int(first)] if count else []
             body = int(model.body_parentid[body])
         if not 4 <= len(joints) <= 8:
-            name = model.body(self._end).name
-            raise InvalidValue(f"{self._where}: {len(joints)} joints lead to {name!r}; an arm has 4 to 8. See --site.")
+            name, flag = model.body(self._end).name, "--tip" if _is_urdf(Path(self._where)) else "--site"
+            raise InvalidValue(
+                f"{self._where}: {len(joints)} joints lead to {name.removesuffix(_END)!r}; an arm has 4 to 8. If "
+                f"that is not its end, give {flag}."
+            )
         return joints[::-1]
 
     def _range(self, joint: int) -> tuple[float, float]:

@@ -142,7 +142,8 @@ def test_an_urdf_with_a_gripper_of_which_only_the_width_is_known(described, fold
     ] * 3
     assert {(row.acceleration, row.jerk) for row in arm.joints} == {(6.0, 60.0)}
     assert arm.tool.xyz == pytest.approx((0.0, 0.0, 0.14))
-    assert arm.tool.quat == pytest.approx((1.0, 0.0, 0.0, 0.0))
+    # Half a turn about the tool's axis: the arm reaches more so, and pads do not tell.
+    assert arm.tool.quat == pytest.approx((0.0, 0.0, 0.0, 1.0))
     assert (arm.gripper.open, arm.gripper.mass, arm.geometry) == (0.08, 0.5, "")
     assert arm.sources == {"model": str(folder / "six.urdf"), "gripper": "parallel:0.08"}
     length = "the gripper is 0.140 m long from the end of the arm to the middle of its pads"
@@ -253,7 +254,11 @@ SPACES = re.compile(r'xyz="([^"]*)" rpy')
 MESH = '<mesh filename="package://lab_description/meshes/{}.stl"/>'
 TETRAHEDRON = '<mesh name="a" vertex="0 0 0 1 0 0 0 1 0 0 0 1"/>'
 GRIPPER = "parallel:0.08"
-REFUSED = "MuJoCo cannot read {}: XML Error: Schema violation: unrecognized attribute: 'foo' Element 'option', line 1."
+REFUSED = (
+    "MuJoCo cannot read {}: Schema violation: unrecognized attribute: 'foo' Element 'option', line 1. Remedy: the "
+    "file is for another version of MuJoCo: take it out."
+)
+MODEL = "Give an MJCF or URDF file, or menagerie:NAME."
 NEEDS_LIMITS = "{}: its joints have no position limits: add them to the file."
 
 
@@ -264,14 +269,20 @@ def scaled(text, factor):
 @pytest.mark.parametrize(
     ("model", "gripper", "site", "message"),
     [
-        (None, GRIPPER, None, "There is no file {}. Give an MJCF or URDF file, or menagerie:NAME."),
-        (six_joints()[:-20], GRIPPER, None, "MuJoCo cannot read {}: unclosed token: line 16, column 58."),
-        ("", GRIPPER, None, "MuJoCo cannot read {}: ParseXML: empty file '{}'."),
+        (None, GRIPPER, None, "There is no model file {}. " + MODEL),
+        (six_joints()[:-20], GRIPPER, None, "{} is not XML: unclosed token: line 16, column 58. Is the file whole?"),
+        (
+            "",
+            GRIPPER,
+            None,
+            "MuJoCo cannot read {}: ParseXML: empty file '{}'. Remedy: correct the file, or give another.",
+        ),
         (
             six_joints().replace('<box size="0.05 0.05 0.08"/>', MESH.format("w"), 1),
             GRIPPER,
             None,
-            "{}: the mesh package://lab_description/meshes/w.stl is neither beside the file nor in a folder above it.",
+            "{}: the mesh package://lab_description/meshes/w.stl is neither beside the file nor in a folder above it. "
+            "Put its package there.",
         ),
         (
             seven_joints().replace('<body name="base">', '<body name="base"><freejoint/>'),
@@ -279,12 +290,17 @@ def scaled(text, factor):
             None,
             "{}: its base is free to move; give an arm with a fixed base.",
         ),
-        (six_joints(), GRIPPER, "fore", "{}: 3 joints lead to 'fore'; an arm has 4 to 8. See --site."),
+        (
+            six_joints(),
+            GRIPPER,
+            "fore",
+            "{}: 3 joints lead to 'fore'; an arm has 4 to 8. If that is not its end, give --tip.",
+        ),
         (
             six_joints().replace('name="elbow" type="revolute"', 'name="elbow" type="prismatic"'),
             GRIPPER,
             None,
-            "{}: 'fore' has another joint than one revolute joint.",
+            "{}: 'fore' has another joint than one revolute joint; only such arms are served.",
         ),
         (
             re.sub("<limit[^>]*>", "", six_joints()).replace('"revolute"', '"continuous"'),
@@ -293,12 +309,12 @@ def scaled(text, factor):
             NEEDS_LIMITS,
         ),
         (re.sub(r' range="[^"]*"', "", seven_joints()), GRIPPER, None, NEEDS_LIMITS),
-        (six_joints(), GRIPPER, "tol0", "Unknown site or body 'tol0'. Did you mean 'tool0'?"),
+        (six_joints(), GRIPPER, "tol0", "Unknown link 'tol0'. Did you mean 'tool0'?"),
         (
             six_joints().replace("tool0", "hand0"),
             GRIPPER,
             None,
-            "{}: give the end of the arm with --site, a site or body: world, base_link, shoulder, upper, fore, "
+            "{}: give the end of the arm with --tip, a link: base_link, shoulder, upper, fore, "
             "wrist_1, wrist_2, wrist_3, hand0.",
         ),
         (
@@ -320,7 +336,7 @@ def scaled(text, factor):
             six_joints(),
             "/no/hand.xml",
             None,
-            "There is no file /no/hand.xml. Give an MJCF or URDF file, or menagerie:NAME.",
+            "There is no model file /no/hand.xml. " + MODEL,
         ),
         (
             seven_joints().replace(
@@ -342,7 +358,8 @@ def scaled(text, factor):
             seven_joints().replace("<worldbody>", f"<asset>{TETRAHEDRON * 2}</asset><worldbody>"),
             GRIPPER,
             None,
-            "MuJoCo cannot read {}: XML Error: Error: repeated name 'a' in mesh Element 'mesh', line 1.",
+            "MuJoCo cannot read {}: repeated name 'a' in mesh Element 'mesh', line 1. Remedy: give each of them a "
+            "name of its own.",
         ),
         (
             seven_joints().replace(
@@ -351,6 +368,18 @@ def scaled(text, factor):
             GRIPPER,
             None,
             "{}: its links form a loop; an arm is one chain of joints.",
+        ),
+        (
+            six_joints().replace('lower="-3.1" upper="3.1"', 'lower="3.1" upper="-3.1"', 1),
+            GRIPPER,
+            None,
+            "{}: pan: its lower limit 3.1 is above its upper limit -3.1.",
+        ),
+        (
+            six_joints().replace('upper="3.1"', 'upper="pi"', 1),
+            GRIPPER,
+            None,
+            "{}: pan: upper must be a number, not 'pi'.",
         ),
         (
             six_joints().replace('effort="20"/>', 'effort="20"/><mimic joint="pan"/>', 1),
@@ -431,7 +460,4 @@ def test_a_name_that_the_menagerie_does_not_have():
     pytest.importorskip("mujoco_menagerie")
     with pytest.raises(InvalidValue) as caught:
         describe("lab", "menagerie:frnka_fr3", GRIPPER, None)
-    assert str(caught.value) == (
-        "menagerie:frnka_fr3 (Unknown robot 'frnka_fr3'. Did you mean 'franka_fr3'?): look at the name, or give a "
-        "folder with the models: MENAGERIE_ROOT=."
-    )
+    assert str(caught.value) == "menagerie:frnka_fr3: Unknown robot 'frnka_fr3'. Did you mean 'franka_fr3'?"
