@@ -22,6 +22,7 @@ from bam_envs.robots.physics.mujoco_batch import mujoco
 Array = NDArray[np.float64]
 SITES = ("attachment_site", "right_hand", "tool0", "flange", "ee_link", "link_tcp", "tcp", "gripper_frame_link")
 """Names of sites and bodies that are taken as the end of an arm if none is given."""
+_FEWEST_JOINTS, _MOST_JOINTS = 4, 8
 _END = "_end"  # ends the name of the body at the end of an arm
 CONTINUOUS = 2 * np.pi
 """Limit of a joint that turns without end [rad]."""
@@ -69,11 +70,11 @@ def read_arm(model: str, gripper: str | None, site: str | None) -> ReadArm:
         InvalidValue: A file is not there, MuJoCo refuses it, or the arm in it cannot work; one line that says why.
     """
     spec, limits = _spec(model)
-    arm = _named_body(spec, site, model)
+    arm, notes = _named_body(spec, site, model)
     parallel = _parallel(gripper)
     if gripper is not None and parallel is None:
         _attach(spec, arm, gripper)
-    return _Reader(spec, arm.name, parallel, model, limits).read()
+    return _Reader(spec, arm.name, parallel, model, limits, notes).read()
 
 
 def _parallel(gripper: str | None) -> float | None:
@@ -200,21 +201,36 @@ def _mesh_file(path: Path, name: str) -> str:
     )
 
 
-def _named_body(spec: Any, site: str | None, model: str) -> Any:
-    """The body that carries the gripper: that of the site, or the body, called `site`."""
+def _named_body(spec: Any, site: str | None, model: str) -> tuple[Any, list[str]]:
+    """The body that carries the gripper: that of the site, or the body, called `site`; and what was assumed."""
     bodies = {body.name: body for body in spec.bodies if body.name}
     sites = {one.name: one for one in spec.sites if one.name}
     names = [site] if site else [name for name in SITES if name in sites or name in bodies]
     named = [one for one in (*sites, *bodies) if one != "world"]
     flag, kind = ("--tip", "link") if _is_urdf(Path(model)) else ("--site", "site or body")
+    if not names and (end := _last_body(spec)) is not None:
+        return end, [f"the end of the arm is {end.name}, as {flag} was not given and none of the usual names is there"]
     if not names:
         raise InvalidValue(f"{model}: give the end of the arm with {flag}, a {kind}: {_few(named)}.")
     name = names[0]
     if name in bodies:
-        return bodies[name]
+        return bodies[name], []
     if name not in sites:
         raise UnknownName(kind, name, named)
-    return sites[name].parent.add_body(name=name + _END, pos=sites[name].pos, quat=sites[name].quat)
+    return sites[name].parent.add_body(name=name + _END, pos=sites[name].pos, quat=sites[name].quat), []
+
+
+def _last_body(spec: Any) -> Any:
+    """The body at the end of the one chain of revolute joints, before its fingers; None if unclear."""
+    hinge, joints, body = mujoco.mjtJoint.mjJNT_HINGE, 0, spec.worldbody
+    while True:
+        moved = [one for one in body.bodies if one.joints or any(below.joints for below in one.find_all("body"))]
+        following = moved if moved else list(body.bodies)
+        if len(following) != 1 or any(joint.type != hinge for joint in following[0].joints) or joints == _MOST_JOINTS:
+            break
+        body = following[0]
+        joints += len(body.joints)
+    return body if joints >= _FEWEST_JOINTS and body.name else None
 
 
 def _few(names: list[str]) -> str:
@@ -273,7 +289,9 @@ def _solid(model: Any, bodies: Any) -> list[int]:
 class _Reader:
     """Reads the compiled model of an arm that ends at the body `end`."""
 
-    def __init__(self, spec: Any, end: str, parallel: float | None, where: str, limits: dict[str, Any]) -> None:
+    def __init__(
+        self, spec: Any, end: str, parallel: float | None, where: str, limits: dict[str, Any], notes: list[str]
+    ) -> None:
         try:
             self._model = spec.compile()
         except ValueError as error:
@@ -281,7 +299,7 @@ class _Reader:
         self._data = mujoco.MjData(self._model)
         self._where, self._limits, self._parallel = where, limits, parallel
         self._end = self._model.body(end).id
-        self._notes: list[str] = []
+        self._notes = notes
         self._pivot: Array | None = None
 
     def read(self) -> ReadArm:
@@ -340,7 +358,7 @@ class _Reader:
                 )
             joints += [int(first)] if count else []
             body = int(model.body_parentid[body])
-        if not 4 <= len(joints) <= 8:
+        if not _FEWEST_JOINTS <= len(joints) <= _MOST_JOINTS:
             name, flag = model.body(self._end).name, "--tip" if _is_urdf(Path(self._where)) else "--site"
             raise InvalidValue(
                 f"{self._where}: {len(joints)} joints lead to {name.removesuffix(_END)!r}; an arm has 4 to 8. If "

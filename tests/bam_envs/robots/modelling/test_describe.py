@@ -150,6 +150,14 @@ def test_an_urdf_with_a_gripper_of_which_only_the_width_is_known(described, fold
     assert notes == [length, NO_JERK.format(6)]
 
 
+def test_the_end_of_the_one_chain_is_taken_where_no_name_tells_it(tmp_path):
+    (tmp_path / "lab.urdf").write_text(six_joints().replace("tool0", "hand0"), encoding="utf-8")
+    read = read_arm(str(tmp_path / "lab.urdf"), GRIPPER, None)
+    assert read.notes[0] == ("the end of the arm is hand0, as --tip was not given and none of the usual names is there")
+    (tmp_path / "hand.xml").write_text(seven_joints().replace("attachment_site", "end"), encoding="utf-8")
+    assert "the end of the arm is link7" in read_arm(str(tmp_path / "hand.xml"), GRIPPER, None).notes[0]
+
+
 def test_nothing_is_known_of_a_gripper_that_has_no_shapes_so_its_capsules_count_in_full(described):
     """What may overlap was compared on shapes; those of a gripper given by its width are in no file."""
     arm, _ = described["six"]
@@ -254,6 +262,7 @@ SPACES = re.compile(r'xyz="([^"]*)" rpy')
 MESH = '<mesh filename="package://lab_description/meshes/{}.stl"/>'
 TETRAHEDRON = '<mesh name="a" vertex="0 0 0 1 0 0 0 1 0 0 0 1"/>'
 GRIPPER = "parallel:0.08"
+BRANCH = '<body name="{}"><joint/><geom size="0.1"/></body>'
 REFUSED = (
     "MuJoCo cannot read {}: Schema violation: unrecognized attribute: 'foo' Element 'option', line 1. Remedy: the "
     "file is for another version of MuJoCo: take it out."
@@ -311,11 +320,12 @@ def scaled(text, factor):
         (re.sub(r' range="[^"]*"', "", seven_joints()), GRIPPER, None, NEEDS_LIMITS),
         (six_joints(), GRIPPER, "tol0", "Unknown link 'tol0'. Did you mean 'tool0'?"),
         (
-            six_joints().replace("tool0", "hand0"),
+            "<mujoco><worldbody>"
+            + "".join(BRANCH.format(name) for name in ("left", "right"))
+            + "</worldbody></mujoco>",
             GRIPPER,
             None,
-            "{}: give the end of the arm with --tip, a link: base_link, shoulder, upper, fore, "
-            "wrist_1, wrist_2, wrist_3, hand0.",
+            "{}: give the end of the arm with --site, a site or body: left, right.",
         ),
         (
             six_joints(),
