@@ -47,6 +47,7 @@ EXTRAS = {
     "PIL": "video",
     "imageio": "video",
     "mujoco_menagerie": "robots",
+    "trimesh": "robots",
     "xacrodoc": "robots",
 }
 """Optional package to the extra of bam-train that brings it."""

@@ -38,24 +38,28 @@ def find_work_area(*arms: ArmDescription) -> ArmDescription:
     Raises:
         InvalidValue: It reaches no such area with its tool pointing down.
     """
-    for scale, arm in itertools.product(_SCALES, arms):
-        chain, outline = arm.chain, Outline(arm.chain)
-        best: tuple[float, ArmDescription] | None = None
-        for box in _boxes(chain, scale):
-            for margin, home in _homes(chain, outline, box)[:4]:
-                if best is not None and margin <= best[0]:
-                    break
-                if covers(dataclasses.replace(chain, home=home), outline, box):
-                    low, high = (tuple(round(float(one), 4) for one in corner) for corner in box)
-                    area: Any = {"home": tuple(map(float, home)), "workspace": (low, high)}
-                    best = margin, dataclasses.replace(arm, **area)
-                    break
-        if best is not None:
-            return best[1]
-    raise InvalidValue(
-        f"{arms[0].name}: nowhere on the table before it does the tool point down in an area of "
-        f"{0.4 * _SCALES[-1]:.2f} m. Look at the tool (--site, --gripper) and at the limits of the joints."
-    )
+    if all(next(_areas(arm, _SCALES[-1]), None) is None for arm in arms):  # before the larger ones, which take long
+        raise InvalidValue(
+            f"{arms[0].name}: nowhere on the table before it does the tool point down in an area of "
+            f"{0.4 * _SCALES[-1]:.2f} m. Look at the tool (--site, --gripper) and at the limits of the joints."
+        )
+    searches = (_areas(arm, scale) for scale, arm in itertools.product(_SCALES, arms))
+    return next(areas[-1] for search in searches if (areas := list(search)))
+
+
+def _areas(arm: ArmDescription, scale: float) -> Iterator[ArmDescription]:
+    """The arm with areas of one size that it reaches, each with a better home pose than the ones before."""
+    chain, outline, best = arm.chain, Outline(arm.chain), -np.inf
+    for box in _boxes(chain, scale):
+        for margin, home in _homes(chain, outline, box)[:4]:
+            if margin <= best:
+                break
+            if covers(dataclasses.replace(chain, home=home), outline, box):
+                low, high = (tuple(round(float(one), 4) for one in corner) for corner in box)
+                area: Any = {"home": tuple(map(float, home)), "workspace": (low, high)}
+                yield dataclasses.replace(arm, **area)
+                best = margin
+                break
 
 
 def _boxes(chain: SerialChain, scale: float) -> Iterator[Array]:

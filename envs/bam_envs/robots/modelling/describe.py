@@ -23,6 +23,8 @@ _GIVEN_UP = 0.1
 _CLEARANCE = 0.005  # that the guards keep, so that they act where links touch [m]
 _TOUCH = 0.0045  # depth from which shapes touch, and what is kept of the slack [m]
 _SURE = 0.001
+_ANYWHERE = 5.6  # travel of a first joint with which an arm works in any direction [rad]
+_ASIDE = 0.02  # of the middle of all postures from the base, that tells the direction of an arm [m]
 _FARTHEST = 3.0  # an arm longer than this has its lengths in another unit [m]
 
 
@@ -65,6 +67,11 @@ def describe(
     if read.shapes is not None:
         tell(f"comparing {len(capsules)} capsules with the shapes of the links, in {_POSTURES} postures")
         first = dataclasses.replace(first, slack=tuple(_slack(first, read.shapes)))
+    quarters = _facing(first)
+    if quarters:
+        turn = np.pi / 4 * quarters
+        first = dataclasses.replace(first, mount=Placed(quat=(float(np.cos(turn)), 0.0, 0.0, float(np.sin(turn)))))
+        read.notes.append(f"the base is turned by {90 * quarters} degrees about z, so that the arm faces x (mount)")
     tell("looking for a work area before the arm")
     try:
         found = find_work_area(first, _turned(first))
@@ -72,12 +79,25 @@ def describe(
         if read.shapes is None:
             raise
         # Capsules are thicker than a bent link: what the slightest of its collisions are is given up.
+        read.shapes.trust_pads()
         first = dataclasses.replace(first, slack=tuple(_slack(first, read.shapes, _GIVEN_UP)))
         found = find_work_area(first, _turned(first))
         read.notes.append(
             f"collisions of the arm with itself: the slightest {_GIVEN_UP:.0%} of two links are not noticed"
         )
     return found, read.notes
+
+
+def _facing(arm: ArmDescription) -> int:
+    """Quarter turns about z of the base after which the arm is before x with its first joint in mid-travel."""
+    chain = arm.chain
+    if chain.high[0] - chain.low[0] > _ANYWHERE:
+        return 0
+    low, high = np.maximum(chain.low, -np.pi), np.minimum(chain.high, np.pi)
+    q = low + np.random.default_rng(0).random((1000, arm.num_joints)) * (high - low)
+    q[:, 0] = 0.5 * (chain.low[0] + chain.high[0])
+    x, y, _ = (chain.tool_position(q) - chain.placements[0, :3, 3]).mean(axis=0)
+    return round(-float(np.arctan2(y, x)) / (np.pi / 2)) if np.hypot(x, y) > _ASIDE else 0
 
 
 def _turned(arm: ArmDescription) -> ArmDescription:

@@ -7,6 +7,7 @@ import contextlib
 import importlib
 import itertools
 import re
+import tempfile
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
@@ -23,6 +24,9 @@ Array = NDArray[np.float64]
 SITES = ("attachment_site", "right_hand", "tool0", "flange", "ee_link", "link_tcp", "tcp", "gripper_frame_link")
 """Names of sites and bodies that are taken as the end of an arm if none is given."""
 _FEWEST_JOINTS, _MOST_JOINTS = 4, 8
+_MESHES = (".stl", ".obj", ".msh")
+_PAD, _BOX = "bam_pad", mujoco.mjtGeom.mjGEOM_BOX
+_FLUSH = 0.02  # shapes of the end that stand out less do not move the gripper [m]
 _END = "_end"  # ends the name of the body at the end of an arm
 CONTINUOUS = 2 * np.pi
 """Limit of a joint that turns without end [rad]."""
@@ -69,12 +73,25 @@ def read_arm(model: str, gripper: str | None, site: str | None) -> ReadArm:
     Raises:
         InvalidValue: A file is not there, MuJoCo refuses it, or the arm in it cannot work; one line that says why.
     """
-    spec, limits = _spec(model)
-    arm, notes = _named_body(spec, site, model)
     parallel = _parallel(gripper)
-    if gripper is not None and parallel is None:
-        _attach(spec, arm, gripper)
-    return _Reader(spec, arm.name, parallel, model, limits, notes).read()
+    with tempfile.TemporaryDirectory() as folder:  # of meshes that MuJoCo does not read itself
+        spec, limits = _spec(model, folder)
+        arm, notes = _named_body(spec, site, model, gripper)
+        if gripper is not None and parallel is None:
+            _attach(spec, arm, gripper, folder)
+        return _Reader(spec, arm.name, parallel, model, limits, notes).read()
+
+
+def _pads(width: float) -> list[tuple[Array, Array]]:
+    """Opposite corners of palm and open pads in the frame of the arm's end, which close along its x axis [m]."""
+    length, half = _length(width), 0.5 * width
+    palm = np.array([-0.03, -0.03, 0.0]), np.array([0.03, 0.03, length - 0.06])
+    return [palm, (np.array([-half - 0.012, -0.011, length - 0.06]), np.array([half + 0.012, 0.011, length + 0.014]))]
+
+
+def _length(width: float) -> float:
+    """From the end of the arm to the middle of the pads [m]."""
+    return 0.10 + 0.5 * width
 
 
 def _parallel(gripper: str | None) -> float | None:
@@ -87,7 +104,7 @@ def _parallel(gripper: str | None) -> float | None:
     raise InvalidValue(f"--gripper {gripper}: give the width of the open gripper in metres, from 0.005 to 0.3.")
 
 
-def _spec(name: str) -> tuple[Any, dict[str, tuple[float | None, float | None]]]:
+def _spec(name: str, folder: str) -> tuple[Any, dict[str, tuple[float | None, float | None]]]:
     """The model in a file as MuJoCo reads it, and the velocities and efforts in an URDF, by joint."""
     if name.startswith("menagerie:"):
         return _menagerie(name.partition(":")[2]), {}
@@ -97,7 +114,7 @@ def _spec(name: str) -> tuple[Any, dict[str, tuple[float | None, float | None]]]
     limits: dict[str, tuple[float | None, float | None]] = {}
     try:
         if _is_urdf(path):
-            text, limits = _urdf(path)
+            text, limits = _urdf(path, folder)
             spec = mujoco.MjSpec.from_string(text)
         else:
             spec = mujoco.MjSpec.from_file(str(path))
@@ -142,14 +159,18 @@ def _line(error: BaseException) -> str:
     return text.rstrip(".")
 
 
-def _urdf(path: Path) -> tuple[str, dict[str, tuple[float | None, float | None]]]:
+def _urdf(path: Path, folder: str) -> tuple[str, dict[str, tuple[float | None, float | None]]]:
     """The text of an URDF with the files of its meshes found, and velocity and effort of its joints."""
     root = ElementTree.fromstring(_expanded(path) if path.suffix == ".xacro" else path.read_text(encoding="utf-8"))
-    for mesh in root.iter("mesh"):
-        mesh.set("filename", _mesh_file(path, mesh.get("filename", "")))
     for link in root.iter("link"):
-        for visual in link.findall("visual"):
-            link.remove(visual)
+        drawn = link.findall("visual")
+        for visual in drawn:
+            if link.find("collision") is None or link.find("collision") in drawn:
+                visual.tag = "collision"  # a link is what is drawn of it, where nothing else is said
+            else:
+                link.remove(visual)
+    for mesh in root.iter("mesh"):
+        mesh.set("filename", _readable(_mesh_file(path, mesh.get("filename", "")), folder))
     for old in root.findall("mujoco"):
         root.remove(old)
     options = {"strippath": "false", "discardvisual": "true", "fusestatic": "false", "balanceinertia": "true"}
@@ -188,6 +209,26 @@ def _expanded(path: Path) -> str:
         raise InvalidValue(f"{path} cannot be expanded: {text}.{remedy}") from error
 
 
+def _readable(file: str, folder: str) -> str:
+    """The file of a mesh, converted into `folder` if MuJoCo does not read its kind, such as COLLADA."""
+    path = Path(file)
+    if path.suffix.lower() in _MESHES:
+        return file
+    try:
+        trimesh: Any = importlib.import_module("trimesh")
+    except ImportError as error:
+        raise MissingExtra("trimesh", "robots", f"The mesh {file}") from error
+    try:
+        mesh = trimesh.load_scene(file).to_mesh()
+        if mesh.units:
+            mesh.convert_units("meters")
+        converted = Path(folder, f"{path.stem}_{len(list(Path(folder).iterdir()))}.stl")
+        mesh.export(converted)
+    except Exception as error:  # of its many readers
+        raise InvalidValue(f"The mesh {file} cannot be read: {_line(error)}. Give it as STL or OBJ.") from error
+    return str(converted)
+
+
 def _mesh_file(path: Path, name: str) -> str:
     """The file of a mesh: ``package://NAME/...`` is looked for in the folders above the URDF."""
     package, rest = re.match(r"(?:package://([^/]+)/|file://)?(.*)", name).groups()  # type: ignore[union-attr]
@@ -201,14 +242,14 @@ def _mesh_file(path: Path, name: str) -> str:
     )
 
 
-def _named_body(spec: Any, site: str | None, model: str) -> tuple[Any, list[str]]:
+def _named_body(spec: Any, site: str | None, model: str, gripper: str | None) -> tuple[Any, list[str]]:
     """The body that carries the gripper: that of the site, or the body, called `site`; and what was assumed."""
     bodies = {body.name: body for body in spec.bodies if body.name}
     sites = {one.name: one for one in spec.sites if one.name}
     names = [site] if site else [name for name in SITES if name in sites or name in bodies]
     named = [one for one in (*sites, *bodies) if one != "world"]
     flag, kind = ("--tip", "link") if _is_urdf(Path(model)) else ("--site", "site or body")
-    if not names and (end := _last_body(spec)) is not None:
+    if not names and (end := _last_body(spec, gripper)) is not None:
         return end, [f"the end of the arm is {end.name}, as {flag} was not given and none of the usual names is there"]
     if not names:
         raise InvalidValue(f"{model}: give the end of the arm with {flag}, a {kind}: {_few(named)}.")
@@ -220,8 +261,11 @@ def _named_body(spec: Any, site: str | None, model: str) -> tuple[Any, list[str]
     return sites[name].parent.add_body(name=name + _END, pos=sites[name].pos, quat=sites[name].quat), []
 
 
-def _last_body(spec: Any) -> Any:
-    """The body at the end of the one chain of revolute joints, before its fingers; None if unclear."""
+def _last_body(spec: Any, gripper: str | None) -> Any:
+    """The body at the end of the one chain of revolute joints, before its fingers; None if unclear.
+
+    Without a `gripper`, a last joint to which nothing else is fixed is its jaw.
+    """
     hinge, joints, body = mujoco.mjtJoint.mjJNT_HINGE, 0, spec.worldbody
     while True:
         moved = [one for one in body.bodies if one.joints or any(below.joints for below in one.find_all("body"))]
@@ -230,6 +274,8 @@ def _last_body(spec: Any) -> Any:
             break
         body = following[0]
         joints += len(body.joints)
+    if gripper is None and body.joints and not body.bodies:
+        body, joints = body.parent, joints - 1
     return body if joints >= _FEWEST_JOINTS and body.name else None
 
 
@@ -237,9 +283,9 @@ def _few(names: list[str]) -> str:
     return ", ".join(names[:12]) + (", ..." if len(names) > 12 else "")
 
 
-def _attach(spec: Any, body: Any, gripper: str) -> None:
+def _attach(spec: Any, body: Any, gripper: str, folder: str) -> None:
     """Put the gripper in a file on `body`."""
-    other, _ = _spec(gripper)
+    other, _ = _spec(gripper, folder)
     roots = list(other.worldbody.bodies)
     if not roots:
         raise InvalidValue(f"{gripper}: there is no body in it.")
@@ -257,15 +303,23 @@ class Shapes:
         data: Its working memory.
         joints: The joints of the arm, in order.
         owner: The link of each body.
+        pads: Geoms of a gripper of which only the width is known; nothing is compared with its link.
     """
 
-    def __init__(self, model: Any, data: Any, joints: list[int], owner: NDArray[np.int64]) -> None:
+    def __init__(self, model: Any, data: Any, joints: list[int], owner: NDArray[np.int64], pads: list[int]) -> None:
         self._model, self._data, self._where = model, data, model.jnt_qposadr[joints]
         self._geoms = [_solid(model, owner == link) for link in range(len(joints) + 2)]
+        self._pads = pads
+
+    def trust_pads(self) -> None:
+        """Compare also with a gripper of which only the width is known, as its pads and palm are in simulation."""
+        self._geoms[-1] += self._pads
+        self._pads = []
 
     def are_known(self, one: int, other: int) -> bool:
         """Whether both links have shapes in the model."""
-        return bool(self._geoms[one] and self._geoms[other])
+        is_assumed = bool(self._pads) and max(one, other) == len(self._geoms) - 1
+        return bool(self._geoms[one] and self._geoms[other]) and not is_assumed
 
     def distance(self, one: int, other: int, q: Array) -> float:
         """Distance of two links at the joints `q` (k,) [rad], at most 5 cm; negative if they overlap."""
@@ -279,9 +333,13 @@ class Shapes:
         )
 
 
+def _is_pad(model: Any, geom: int) -> bool:
+    return str(model.geom(geom).name).startswith(_PAD)
+
+
 def _solid(model: Any, bodies: Any) -> list[int]:
-    """The geoms of these bodies that collide; all of them if none does."""
-    geoms = [geom for geom in range(model.ngeom) if bodies[model.geom_bodyid[geom]]]
+    """The geoms of these bodies that collide; all of them if none does. Assumed pads do not count."""
+    geoms = [geom for geom in range(model.ngeom) if bodies[model.geom_bodyid[geom]] and not _is_pad(model, geom)]
     solid = [geom for geom in geoms if model.geom_contype[geom] or model.geom_conaffinity[geom]]
     return solid or geoms
 
@@ -292,15 +350,44 @@ class _Reader:
     def __init__(
         self, spec: Any, end: str, parallel: float | None, where: str, limits: dict[str, Any], notes: list[str]
     ) -> None:
+        self._where, self._limits, self._parallel = where, limits, parallel
+        self._notes = notes
+        self._compile(spec, end)
+        self._way, self._begin = 1.0, 0.0  # of the gripper along the z axis of the end, and where it begins [m]
+        if parallel is not None:
+            self._way, self._begin = self._outwards()
+            for at, (low, high) in enumerate(_pads(parallel)):
+                pos = (0.5 * (low + high) + [0.0, 0.0, self._begin]) * [1.0, 1.0, self._way]
+                spec.body(end).add_geom(name=f"{_PAD}{at}", type=_BOX, pos=pos, size=0.5 * (high - low), mass=0.0)
+            self._compile(spec, end)
+        self._pivot: Array | None = None
+
+    def _compile(self, spec: Any, end: str) -> None:
         try:
             self._model = spec.compile()
         except ValueError as error:
-            raise _refusal(f"MuJoCo cannot build {where}", error) from error
+            raise _refusal(f"MuJoCo cannot build {self._where}", error) from error
         self._data = mujoco.MjData(self._model)
-        self._where, self._limits, self._parallel = where, limits, parallel
         self._end = self._model.body(end).id
-        self._notes = notes
-        self._pivot: Array | None = None
+
+    def _outwards(self) -> tuple[float, float]:
+        """1 if the z axis of the end points away from the joint before the last, else -1; how far its shapes go [m]."""
+        model, data = self._model, self._data
+        mujoco.mj_kinematics(model, data)
+        joints, name = self._chain(), model.body(self._end).name.removesuffix(_END)
+        way, z = data.xpos[self._end] - data.xanchor[joints[-2]], data.xmat[self._end].reshape(3, 3)[:, 2]
+        sign = 1.0 if way @ z > -0.5 * np.linalg.norm(way) else -1.0
+        if sign < 0.0:
+            self._notes.append(f"the gripper points along -z of {name}, away from the arm")
+        below = np.zeros(model.nbody, bool)
+        for body in range(self._end, model.nbody):
+            below[body] = body == self._end or (below[model.body_parentid[body]] and not model.body_jntnum[body])
+        points = self._points(below, np.eye(4)) - data.xpos[self._end]
+        begin = float((sign * points @ z).max(initial=0.0))
+        if begin < _FLUSH:
+            return sign, 0.0
+        self._notes.append(f"the gripper is fixed {begin:.3f} m from {name}, where its shapes end")
+        return sign, begin
 
     def read(self) -> ReadArm:
         model, data = self._model, self._data
@@ -337,10 +424,7 @@ class _Reader:
             notes=self._notes,
         )
         self._grip(arm, owner, frames[-1])
-        gripper = len(joints) + 1
-        arm.shapes = Shapes(
-            model, data, joints, owner if self._parallel is None else np.where(owner == gripper, -1, owner)
-        )
+        arm.shapes = Shapes(model, data, joints, owner, [at for at in range(model.ngeom) if _is_pad(model, at)])
         return arm
 
     def _chain(self) -> list[int]:
@@ -440,14 +524,13 @@ class _Reader:
         bodies = owner == link
         flange = np.eye(4)
         flange[:3, :3], flange[:3, 3] = data.xmat[self._end].reshape(3, 3), data.xpos[self._end]
+        flange[:3, 1:3] *= self._way
         grip: list[Array]
         if self._parallel is not None:
-            length = 0.10 + 0.5 * self._parallel
+            length = _length(self._parallel)
             tool = flange.copy()
-            tool[:3, 3] += length * flange[:3, 2]
-            half = 0.5 * self._parallel + 0.012
-            palm = _box(np.array([-0.03, -0.03, -length]), np.array([0.03, 0.03, -0.06]))
-            pads = _box(np.array([-half, -0.011, -0.06]), np.array([half, 0.011, 0.014]))
+            tool[:3, 3] += (self._begin + length) * flange[:3, 2]
+            palm, pads = (_box(low, high) - [0.0, 0.0, length] for low, high in _pads(self._parallel))
             fixed = self._points(bodies & ~_moved_bodies(model, self._finger_joints(bodies)), tool)
             arm.width, arm.gripper_mass, grip = self._parallel, 0.5, [fixed, palm, pads]
             self._notes.append(f"the gripper is {length:.3f} m long from the end of the arm to the middle of its pads")

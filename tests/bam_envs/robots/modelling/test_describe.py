@@ -434,6 +434,56 @@ def test_a_gripper_that_cannot_work_is_one_line(folder, tmp_path, text, message)
     assert str(caught.value) == message.format(path)
 
 
+def test_a_mesh_that_mujoco_does_not_read_is_converted(tmp_path):
+    trimesh = pytest.importorskip("trimesh")
+    pytest.importorskip("collada")
+    trimesh.creation.box((0.05, 0.05, 0.08)).export(tmp_path / "w.dae")
+    text = six_joints().replace('<box size="0.05 0.05 0.08"/>', '<mesh filename="w.dae"/>', 1)
+    (tmp_path / "lab.urdf").write_text(text, encoding="utf-8")
+    points = read_arm(str(tmp_path / "lab.urdf"), GRIPPER, None).points[4]
+    np.testing.assert_allclose(np.ptp(points, axis=0), (0.05, 0.05, 0.08), atol=1e-6)
+    (tmp_path / "w.dae").write_text("<COLLADA/>", encoding="utf-8")
+    with pytest.raises(InvalidValue, match=r"w\.dae cannot be read: .* Give it as STL or OBJ\."):
+        read_arm(str(tmp_path / "lab.urdf"), GRIPPER, None)
+
+
+def test_a_link_without_a_collision_shape_is_what_is_drawn_of_it(tmp_path):
+    text = six_joints()
+    (tmp_path / "lab.urdf").write_text(text.replace("collision>", "visual>", 2), encoding="utf-8")
+    (tmp_path / "both.urdf").write_text(text, encoding="utf-8")
+    drawn, both = (read_arm(str(tmp_path / name), GRIPPER, None) for name in ("lab.urdf", "both.urdf"))
+    assert all(np.array_equal(one, other) for one, other in zip(drawn.points, both.points, strict=True))
+
+
+def test_a_gripper_begins_where_the_shapes_of_the_end_do_and_points_away_from_the_arm(tmp_path):
+    back = six_joints().replace(
+        'name="flange" type="fixed">', f'name="flange" type="fixed"><origin rpy="{np.pi} 0 0"/>'
+    )
+    ball = '<visual><origin xyz="0 0 -0.05"/><geometry><sphere radius="0.01"/></geometry></visual>'
+    hand = f'<link name="tool0">{ball}</link>'
+    (tmp_path / "lab.urdf").write_text(back.replace('<link name="tool0"/>', hand), encoding="utf-8")
+    read = read_arm(str(tmp_path / "lab.urdf"), GRIPPER, None)
+    assert read.notes == [
+        "the gripper points along -z of tool0, away from the arm",
+        "the gripper is fixed 0.060 m from tool0, where its shapes end",
+        "the gripper is 0.140 m long from the end of the arm to the middle of its pads",
+    ]
+    np.testing.assert_allclose(read.tool[:3, 3], [0.0, 0.0, 0.2], atol=1e-6)
+    np.testing.assert_allclose(read.tool[:3, 2], [0.0, 0.0, 1.0], atol=1e-6)
+
+
+def test_an_arm_that_faces_another_way_is_turned_to_face_x(folder, tmp_path):
+    text = FIVE.replace('name="base"', 'name="base" quat="1 0 0 -1"')
+    (tmp_path / "five.xml").write_text(text, encoding="utf-8")
+    arm, notes = describe("five", str(tmp_path / "five.xml"), None, "b5")
+    assert notes[-1] == "the base is turned by 90 degrees about z, so that the arm faces x (mount)"
+    straight, _ = describe("five", str(folder / "five.xml"), None, "b5")
+    assert (arm.workspace, arm.joint_names) == (straight.workspace, straight.joint_names)
+    np.testing.assert_allclose(
+        arm.chain.tool_position(np.zeros((1, 5))), straight.chain.tool_position(np.zeros((1, 5))), atol=1e-9
+    )
+
+
 @pytest.mark.parametrize("name", ["package://lab_description/meshes/w.obj", "meshes/w.obj"])
 def test_a_mesh_that_is_beside_the_file_is_found(tmp_path, name):
     """Also where the ROS package is not installed."""
