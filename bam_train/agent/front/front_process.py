@@ -29,13 +29,19 @@ from bam_train.files.log_lines import begin_log
 
 CONSOLE = Path(__file__).parents[1] / "console"
 """The files of the web console: plain HTML, CSS and modules."""
-LIBRARY = CONSOLE / "uplot"
-"""Where the installation puts uPlot (``hatch_build.py``); the console works without it, but for its charts."""
+LIBRARIES = ("uplot", "three")
+"""Folders into which the installation puts what draws (``hatch_build.py``); without them the console only writes."""
+_BARE, _PLACED = b"from 'three';", b"from './three.module.min.js';"
+"""How a module of three.js names its library, and how a page finds it without an import map, which is inline script."""
 
 
 def console_pages() -> Mapping[str, Page]:
     """The pages of the console by their path; ``/`` is the console."""
-    return {**read_pages(CONSOLE), **(read_pages(LIBRARY) if LIBRARY.is_dir() else {})}
+    pages = read_pages(CONSOLE)
+    for name in LIBRARIES:
+        if (folder := CONSOLE / name).is_dir():
+            pages |= read_pages(folder)
+    return {path: page._replace(body=page.body.replace(_BARE, _PLACED)) for path, page in pages.items()}
 
 
 def main() -> None:

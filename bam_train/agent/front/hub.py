@@ -55,6 +55,8 @@ class AgentHub:
         geometry, control = arm_in(front.task, shadow.spec), getattr(front.task, "control", None)
         workspace = control.space.box if isinstance(control, ToolControl) else None
         self._telemetry = Telemetry(shadow.spec, shadow.limits, geometry=geometry, workspace=workspace)
+        self.scene = self._telemetry.scene
+        """What a page draws the robot from, sent to whoever begins to watch."""
         try:
             self._jogger: Jogger | None = Jogger(shadow.spec, shadow.spec.period, geometry=geometry)
         except InvalidValue:  # its kinematics are not known

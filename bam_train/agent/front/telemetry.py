@@ -7,8 +7,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bam_envs.arms.serial_chain import Arm
-from bam_envs.core.kinematics import UR5E_GRIPPER, UR_JOINTS, quaternions
+from bam_envs.arms.description import Gripper, cube_edge
+from bam_envs.arms.serial_chain import Arm, chain_of
+from bam_envs.core.kinematics import UR5E_GRIPPER, UR_JOINTS
 from bam_envs.core.robot import RobotSpec, RobotState, SignalSpec
 from bam_envs.safety.arm_tubes import tubes_of
 from bam_envs.safety.base_guards import LaserZones
@@ -46,6 +47,15 @@ class Telemetry:
         self._units = {one.name: dict(zip(one.labels, one.units, strict=True)) for one in self._signals}
         self._most_age = limits.max_age or (0.5 if is_base(spec) else 0.1)
         self._body = _Base(spec, limits) if is_base(spec) else _Arm(spec, limits, geometry, workspace)
+        self.scene: dict[str, Any] = {} if isinstance(self._body, _Base) else self._body.scene()
+        """What a page draws an arm from, told once; {} of a base, and of an arm whose outline is not known.
+
+        ``joints``: names of signal and label; ``mount``, ``placements``, ``axes`` and ``tool``: its kinematics, as in
+        `bam_envs.arms.serial_chain.SerialChain`, poses row by row; ``capsules``: link, two ends and radius [m];
+        ``gripper``: None or ``width`` when it is open, and ``boxes``: palm, finger and pad of the right side, middle
+        and half edges each, in the tool's frame [m]; ``cube``: edge of the object [m]; ``box``: lowest and highest x,
+        y, z of the tool [m]; ``table``: its height [m].
+        """
 
     def message(self, state: RobotState, t: float, *, command: Array | None = None, age: float = 0.0) -> dict[str, Any]:
         """The message about a state.
@@ -59,10 +69,8 @@ class Telemetry:
         Returns:
             ``event``; ``t``; ``state`` and ``units``: a mapping by label for each signal; ``command``: number by label;
             ``tool``: x, y, z [m], of an arm; ``near``: by the name of a guard, ``value``, ``limit``, ``unit`` and
-            ``share`` (0: far from it, 1: it acts); and to draw, ``tubes`` of an arm up to its flange (x, y, z of two
-            ends and a radius [m] each), ``hand`` (pose of the flange with a gripper: x, y, z [m] and a quaternion x, y,
-            z, w), ``object`` (pose of the tracked object), ``box`` (lowest and highest x, y, z of the tool [m]) and
-            ``table`` (its height [m]); or ``base`` (x, y [m], yaw [rad]), ``outline`` (front, back, side [m]) and
+            ``share`` (0: far from it, 1: it acts); and to draw, ``object`` (pose of the tracked object: x, y, z [m] and
+            a quaternion x, y, z, w); or ``base`` (x, y [m], yaw [rad]), ``outline`` (front, back, side [m]) and
             ``scan`` (points x, y in the base's frame [m]). What is not known, or not finite, is None or left out.
         """
         near = {"state age": _below(age, self._most_age, "s")} | self._body.near(state)
@@ -85,9 +93,8 @@ class _Arm:
         self._limits, self._joints = limits, columns_in(spec.command, "rad")
         if geometry is None and tuple(spec.command.labels[at] for at in self._joints) == UR_JOINTS:
             geometry = UR5E_GRIPPER
-        self._geometry, self._has_gripper = geometry, (has_gripper := "m" in spec.command.units)
+        self._spec, self._geometry, self._has_gripper = spec, geometry, (has_gripper := "m" in spec.command.units)
         self._tubes = None if geometry is None else tubes_of(geometry, tool=has_gripper)
-        self._drawn = None if geometry is None else tubes_of(geometry, tool=False)
         self._positions = [row for row in measured_places(spec, spec.command.units) if row[0] in self._joints]
         speeds = measured_places(spec, [f"{unit}/s" for unit in spec.command.units])
         self._speeds = [row for row in speeds if row[0] in self._joints]
@@ -101,21 +108,39 @@ class _Arm:
             box = np.stack([np.maximum(box[0], workspace[0]), np.minimum(box[1], workspace[1])])
         self._box = _plain(box.ravel())
 
-    def picture(self, state: RobotState) -> dict[str, Any]:
-        q, geometry = _numbers(state, self._positions), self._geometry
-        if geometry is None:
+    def scene(self) -> dict[str, Any]:
+        chain = None if self._geometry is None else chain_of(self._geometry)
+        if chain is None or not chain.capsules:
             return {}
-        shown: dict[str, Any] = {"tool": _plain(geometry.tool_point(q))}
-        if self._drawn is None:
-            return shown
-        shown["tubes"] = [_plain(tube) for tube in self._drawn.drawn(q)]
+        gripper, cube = None, cube_edge(math.inf, chain.turns)
         if self._has_gripper:
-            position, rotation = geometry.flange_pose(np.array([q]))
-            shown["hand"] = _plain([*position[0], *quaternions(rotation)[0]])
+            opening = self._spec.command.high[self._spec.command.units.index("m")]
+            length, boxes = Gripper(open=opening).boxes(chain.tool_placement)
+            from_tool = [[*middle[:2], middle[2] - length, *half] for middle, half in boxes]
+            gripper, cube = {"width": opening, "boxes": from_tool}, cube_edge(opening, chain.turns)
+        links = [one for one in chain.capsules if one.link <= chain.num_joints]
+        labels = {one.name: one.labels for one in self._spec.signals}
+        return {
+            "joints": [[signal, labels[signal][column]] for _, signal, column in self._positions],
+            "mount": chain.mount.ravel().tolist(),
+            "placements": chain.placements.reshape(-1, 16).tolist(),
+            "axes": chain.axes.tolist(),
+            "tool": chain.tool_placement.ravel().tolist(),
+            "capsules": [[one.link, *one.start, *one.end, one.radius] for one in links],
+            "gripper": gripper,
+            "cube": cube,
+            "box": self._box,
+            "table": self._limits.table_height,
+        }
+
+    def picture(self, state: RobotState) -> dict[str, Any]:
+        if self._geometry is None:
+            return {}
+        shown: dict[str, Any] = {"tool": _plain(self._geometry.tool_point(_numbers(state, self._positions)))}
         if {"object_position", "object_quaternion"} <= state.signals.keys():
             w, *xyz = state.signals["object_quaternion"][0]
             shown["object"] = _plain([*state.signals["object_position"][0], *xyz, w])
-        return {**shown, "box": self._box, "table": self._limits.table_height}
+        return shown
 
     def near(self, state: RobotState) -> dict[str, Row | None]:
         limits, geometry = self._limits, self._geometry

@@ -35,6 +35,8 @@ T = TypeVar("T")
 Array = NDArray[np.float64]
 Vector = tuple[Finite, Finite, Finite]
 Quaternion = tuple[Finite, Finite, Finite, Finite]
+Box = tuple[Vector, Vector]
+"""Middle and half edges [m]."""
 ModelName = Annotated[
     str, Meta(pattern=r"^[A-Za-z0-9][\w.-]{0,63}\Z", description="at most 64 letters, digits and . _ -")
 ]
@@ -118,6 +120,26 @@ class Gripper:
     """Mass [kg]."""
     joint: NonEmpty = "gripper_width"
     """Name of its joint in a live robot's messages."""
+
+    def boxes(self, tool: Array) -> tuple[float, tuple[Box, Box, Box]]:
+        """Its shape, of a Robotiq 2F-85 in the size of this one, with its palm on the arm's flange.
+
+        Args:
+            tool: Pose of the tool in the frame of the last joint. Shape: (4, 4).
+
+        Returns:
+            Distance of the palm's base from the tool [m]. Palm, right finger and its pad: middle and half edges [m],
+            from that base, in the tool's axes; finger and pad move along x with half the width, and the left ones
+            against it.
+        """
+        size = float(np.clip(self.open / 0.085, 0.4, 1.2))
+        palm = max(0.01, min(0.045 * size, 0.5 * (float(np.linalg.norm(tool[:3, 3])) - 0.06 * size)))
+        deep, first, second = 0.011 * size, 0.022 * size, 0.058 * size
+        return 2 * palm + 0.06 * size, (
+            ((0.0, 0.0, palm), (0.5 * self.open + 0.0075, 0.032 * size, palm)),
+            ((0.008, 0.0, 2 * palm + first), (0.006, deep, first)),
+            ((0.004, 0.0, 2 * palm + second), (0.004, deep, 0.014 * size)),
+        )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -257,10 +279,9 @@ class ArmDescription:
                 yield name, here.get(name), there.get(name)
 
 
-def cube_edge(description: ArmDescription) -> float:
+def cube_edge(opening: float, turns: bool) -> float:
     """Edge of the cube that an arm grasps: 4 cm, or less for a small gripper or one that cannot turn [m]."""
-    share = 0.55 if description.chain.turns else 0.4
-    return min(0.04, round(share * description.gripper.open, 3))
+    return min(0.04, round((0.55 if turns else 0.4) * opening, 3))
 
 
 OBJECT_SIGNALS = [

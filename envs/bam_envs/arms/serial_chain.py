@@ -236,6 +236,35 @@ Arm = ArmGeometry | SerialChain
 """Kinematics of an arm, in closed form or as a chain."""
 
 
+def chain_of(arm: Arm) -> SerialChain:
+    """The joints and the outline of `arm`, up to its flange if it is a closed form."""
+    if isinstance(arm, SerialChain):
+        return arm
+    ahead = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
+    placements = np.tile(np.eye(4), (6, 1, 1))
+    placements[:, :3, :3] = np.diag([-1.0, -1.0, 1.0]), ahead, np.eye(3), np.eye(3), ahead, ahead.T
+    placements[1, 2, 3], placements[2, 0, 3], placements[3, 0, 3] = arm.d1, arm.a2, arm.a3
+    placements[4, 2, 3], placements[5, 2, 3] = arm.d4, arm.d5
+    tool, turn = np.eye(4), np.full(6, 2 * math.pi)
+    tool[2, 3] = arm.d6 + arm.tool
+    capsules: list[Capsule] = []
+    if (shape := arm.outline) is not None:
+        upper, fore = shape.upper_arm_offset, shape.forearm_offset
+        rows: list[tuple[int, Any, Any, float]] = [
+            (0, (0.0, 0.0, 0.0), (0.0, 0.0, arm.d1), shape.base),
+            (1, (0.0, 0.0, arm.d1), (0.0, -upper, arm.d1), shape.upper_arm),
+            (2, (0.0, 0.0, upper), (arm.a2, 0.0, upper), shape.upper_arm),
+            (2, (arm.a2, 0.0, upper), (arm.a2, 0.0, fore), shape.forearm),
+            (3, (0.0, 0.0, fore), (arm.a3, 0.0, fore), shape.forearm),
+            (4, (0.0, 0.0, fore), (0.0, 0.0, arm.d4), shape.wrist),
+            (5, (0.0, 0.0, 0.0), (0.0, 0.0, arm.d5), shape.wrist),
+            (6, (0.0, 0.0, 0.0), (0.0, 0.0, arm.d6), shape.wrist),
+        ]
+        capsules = [Capsule(link=link, start=start, end=end, radius=radius) for link, start, end, radius in rows]
+    axes, home = np.tile([0.0, 0.0, 1.0], (6, 1)), np.zeros(6)
+    return SerialChain(placements, axes, tool, -turn, turn, home, capsules=tuple(capsules))
+
+
 def arm_of(tool_position: object) -> Arm | None:
     """The arm whose ``tool_position`` this is; None for any other function."""
     owner: Any = getattr(tool_position, "__self__", None)

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from bam_envs.arms.capsules import Outline
 from bam_envs.arms.serial_chain import Arm, Capsule, SerialChain
-from bam_envs.core.kinematics import ArmGeometry, ArmOutline, turned
+from bam_envs.core.kinematics import ArmGeometry, ArmOutline
 
 Array = NDArray[np.float64]
 Point = tuple[float, float, float]
@@ -86,12 +86,6 @@ class ArmTubes:
                 tubes = tubes or self.tubes(q)
                 self._near[place] = self._distance(tubes, first, other)
         return self.least < margin
-
-    def drawn(self, q: Sequence[float]) -> list[list[float]]:
-        """The tubes in ``base_link``: two ends, x, y, z [m] each, and the radius [m]."""
-        tubes = self.tubes(q)
-        ends = turned(np.array([[[start, end] for start, end, _ in tubes]]), np.cos(q[:1]), np.sin(q[:1]))[0]
-        return [[*two.ravel().tolist(), radius] for two, (*_, radius) in zip(ends, tubes, strict=True)]
 
     @property
     def least(self) -> float:
@@ -178,11 +172,6 @@ class ChainTubes:
                 gap = math.sqrt(segment_distance2(*places[one], *places[other]))
                 self._near[pair] = gap - self._kept[pair]
         return self.least < margin
-
-    def drawn(self, q: Sequence[float]) -> list[list[float]]:
-        """The capsules in ``base_link``: two ends, x, y, z [m] each, and the radius [m]."""
-        ends = self._outline.segments(np.array([q]))[0]
-        return [[*two.ravel().tolist(), float(radius)] for two, radius in zip(ends, self._outline.radius, strict=True)]
 
     def _places(self, q: Sequence[float]) -> Array:
         """Ends of the capsules as columns [m]. Shape: (capsules, 3, 2)."""

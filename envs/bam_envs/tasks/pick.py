@@ -31,7 +31,7 @@ class CubeTable(WorkSpace):
         up = np.round(self.box[0, 2] + np.array([[0.154], [0.214]]) * height / 0.334, 6)
         self.start_area = np.concatenate([across, up], axis=1)
         """Range of the tool at the start: lowest and highest x, y, z [m]. Shape: (2, 3)."""
-        self.edge = cube_edge(description)
+        self.edge = cube_edge(description.gripper.open, description.chain.turns)
         """Edge of the cube [m]."""
         self.near = round(0.75 * self.edge, 6)
         """The object is within the gripper's reach at this distance from the tool [m]."""

@@ -11,7 +11,7 @@ import pytest
 
 from bam_envs.arms.capsules import Outline
 from bam_envs.arms.description import known_models, robot_model
-from bam_envs.arms.serial_chain import HAND, Capsule, arm_of
+from bam_envs.arms.serial_chain import HAND, Capsule, arm_of, chain_of
 from bam_envs.core.kinematics import ArmGeometry
 from bam_envs.robots.physics.arm_model import scene_spec
 
@@ -70,6 +70,10 @@ def test_the_chain_of_an_ur_arm_is_its_closed_form(name):
         np.testing.assert_allclose(chain, closed, rtol=0, atol=1e-9)
     for chain, closed in zip(arm.chain.flange_pose(q[:20]), arm.arm.flange_pose(q[:20]), strict=True):
         assert chain.shape == closed.shape
+    other = chain_of(arm.arm)
+    np.testing.assert_allclose(other.link_frames(q), arm.chain.link_frames(q), rtol=0, atol=1e-9)
+    assert other.capsules == tuple(one for one in arm.capsules if one.link <= arm.num_joints)
+    assert chain_of(arm.chain) is arm.chain
 
 
 @pytest.mark.parametrize("name", ARMS)

@@ -49,7 +49,7 @@ def test_cube_start_and_lift_fit_the_arm(model):
     """The cube lies where the gripper reaches it, and what the task asks for is inside the work area."""
     arm, table = robot_model(model), PickTask(robot_model=model).table
     low, high = np.array(arm.workspace)
-    assert 0.015 <= table.edge == cube_edge(arm) <= 0.6 * arm.gripper.open
+    assert 0.015 <= table.edge == cube_edge(arm.gripper.open, arm.chain.turns) <= 0.6 * arm.gripper.open
     for area in (table.cube_area, table.start_area):
         assert (area[0] >= low[: area.shape[1]]).all()
         assert (area[1] <= high[: area.shape[1]]).all()

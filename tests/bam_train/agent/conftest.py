@@ -31,6 +31,7 @@ class FakeHub:
 
     def __init__(self, incoming):
         self.incoming, self.asked, self.jogs, self.stops, self.gone = incoming, [], [], [], []
+        self.scene = {"table": 0.0}
         self.go, self.listeners, self.threads = threading.Event(), {}, set()
         self.changed = threading.Condition()
 

@@ -83,6 +83,7 @@ class FakeAgent:
         self.server = BridgeServer(port=port, tokens=tokens or Tokens(otherwise="administer"), site=site)
         self.jogger = Jogger(SPEC, SPEC.period)
         self.telemetry = Telemetry(SPEC, Limits())
+        self.scene = self.telemetry.scene
         self.joints = np.array([[*ARM_HOME, 0.085]])
         self.state, self.owner, self.active = "running", None, "a" * 64
         self.orders, self.commands, self.twists = [], [], []

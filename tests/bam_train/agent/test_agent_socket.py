@@ -242,7 +242,7 @@ def test_stop_waits_for_no_request(hub, new_raw):
 
 def test_events(hub, new_raw, until):
     raw, other = new_raw("w"), new_raw("w")
-    assert raw.ask("watch", on=True)["result"] == {"on": True}
+    assert raw.ask("watch", on=True)["result"] == {"on": True, "scene": {"table": 0.0}}
     hub.tell("status", status={"state": "running"})
     assert raw.receive() == {"event": "status", "status": {"state": "running"}}
     hub.tell("telemetry", t=np.float64(1.5), state={"x": np.array([1.0, np.nan])})

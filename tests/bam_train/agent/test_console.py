@@ -8,12 +8,18 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from bam_envs.arms.description import robot_model
+from bam_envs.core.robot import RobotState
 from bam_envs.live.camera import CameraImage
+from bam_envs.robots.mir100 import base_spec
 from bam_envs.rosbridge.tokens import Tokens
+from bam_envs.safety.guard import Limits
 from bam_train.agent.agent_states import State
 from bam_train.agent.front.jog import JOG_LIFETIME
+from bam_train.agent.front.telemetry import Telemetry
 from tests.bam_train.agent.browsers import LEAVINGS, browser, page, until
 from tests.bam_train.agent.fake_agent import FakeAgent
+from tests.bam_train.agent.test_telemetry import base_state
 from tests.bam_train.cli.test_play import CODES, COMMANDS
 
 __all__ = ["browser", "page"]  # fixtures from elsewhere
@@ -50,12 +56,16 @@ def test_the_page_shows_everything_and_asks_nobody_else(page, agent):
         page.shows("run", text)
     assert page.text("warnings") == "⚠ link quality (G16): a warning"
     assert "✓ ✓ ✗ · ✓ ✓" in page.text("recent")
-    drawn = "const c = document.querySelector(arguments[0]);"
+    drawn = "const c = document.querySelector('#plots canvas');"
     drawn += "return c.getContext('2d').getImageData(0, 0, c.width, c.height).data.some((value) => value)"
-    for canvas in ("#picture", "#plots canvas"):
-        until(lambda canvas=canvas: page.run(drawn, canvas), f"a drawing on {canvas}")
+    until(lambda: page.run(drawn), "a chart")
+    until(lambda: len(colours(page.element("picture"))) > 500, "the robot")
     assert {url.split("/")[2] for url in page.requested()} == {f"127.0.0.1:{agent.server.port}"}
     assert page.complaints() == []
+
+
+def colours(canvas):
+    return set(Image.open(io.BytesIO(canvas.screenshot_as_png)).convert("RGB").getdata())
 
 
 def test_a_page_knows_the_state_before_the_agent_reports_again(page, agent):
@@ -64,29 +74,104 @@ def test_a_page_knows_the_state_before_the_agent_reports_again(page, agent):
     page.shows("why", "because a test says so")
 
 
-def test_without_the_library_of_the_charts_the_page_says_so_and_everything_else_works(page, agent):
+def test_without_the_libraries_that_draw_the_page_says_so_and_everything_else_works(page, agent):
     page.cdp("Network.enable")
-    page.cdp("Network.setBlockedURLs", urls=["*uPlot*"])
+    page.cdp("Network.setBlockedURLs", urls=["*uPlot*", "*three*"])
     page.open(agent.url).shows("plots", "The library that draws the charts is missing: install bam-train again")
+    page.shows("no-picture", "The robot is not drawn: the library for that did not come. Reload the page; ")
     page.shows("tool", "Tool at x, y, z:")
+    assert not page.element("picture").is_displayed()
     page.click("stop")
     page.shows("state", "❚❚ paused")
     page.cdp("Network.setBlockedURLs", urls=[])
     page.complaints()  # of the blocked files
 
 
-def test_the_picture_has_the_gripper_as_it_is_open_and_the_object_where_it_is(page, agent):
+def test_without_webgl_the_page_says_so_and_everything_else_works(page, agent):
+    without = "HTMLCanvasElement.prototype.getContext = ((get) => function (kind, ...more) {"
+    without += " return kind.startsWith('webgl') ? null : get.call(this, kind, ...more); })"
+    without += "(HTMLCanvasElement.prototype.getContext)"
+    made = page.cdp("Page.addScriptToEvaluateOnNewDocument", source=without)
+    why = "This browser has no WebGL 2, which draws the robot. Everything else works."
+    page.open(agent.url).shows("no-picture", why)
+    page.shows("tool", "Tool at x, y, z:")
+    page.shows("plots", "gripper_width")
+    page.click("stop")
+    page.shows("state", "❚❚ paused")
+    assert page.complaints() == []
+    page.cdp("Page.removeScriptToEvaluateOnNewDocument", **made)
+
+
+def test_a_robot_whose_shape_is_not_known_has_its_numbers(page, agent):
+    agent.scene = {}
+    page.open(agent.url).shows("no-picture", "This robot's shape is not known; see its numbers.")
+    page.shows("tool", "Tool at x, y, z:")
+    assert not page.element("picture").is_displayed()
+
+
+def drawn(page, agent, telemetry, states):
+    """What the page's picture has of each state: known, parts (pose and solids by name), differing pixels."""
     page.open(agent.url).shows("tool", "Tool at x, y, z:")
-    message = agent.telemetry.message(agent.robot_state(), 0.0)
-    cube = [0.45, -0.3, 0.02, 0, 0, 0, 1]
-    half, shut = ({**message, "state": {"gripper_width": {"gripper_width": width}}} for width in (0.04, 0.0))
-    others = message, half, shut, {**shut, "object": cube}, {**shut, "object": [None, *cube[1:]]}
-    shown = page.browser.execute_async_script(DRAWINGS, [{**message, "hand": None}, *others])
-    nothing, wide, narrow, closed, with_cube, unknown = shown
-    assert nothing == 0
-    assert wide > narrow > closed > 100
-    assert with_cube > closed + 100
-    assert unknown == closed
+    messages = [telemetry.message(state, 0.0) for state in states]
+    found = page.browser.execute_async_script(DRAWINGS, telemetry.scene, messages)
+    for one in found:
+        for part in one["parts"].values():
+            part["pose"] = np.array(part["pose"]).reshape(4, 4).T
+    assert page.complaints() == []
+    return found
+
+
+@pytest.mark.parametrize("name", ["fr3", "ur5e"])
+def test_the_picture_is_of_the_arm_that_is_meant_in_any_posture(page, agent, name):
+    arm = robot_model(name)
+    chain, size = arm.chain, arm.num_joints
+    telemetry = Telemetry(arm.spec(with_object=True), Limits(), geometry=arm.arm, workspace=np.array(arm.workspace))
+    q = chain.low + np.random.default_rng(0).random((3, size)) * (chain.high - chain.low)
+    states = []
+    for joints, width, x in zip(q, (arm.gripper.open, 0.01, 0.0), (0.5, np.nan, 0.4), strict=True):
+        signals = {"joint_position": joints, "joint_velocity": np.zeros(size), "gripper_width": [width]}
+        signals |= {"object_position": [x, -0.3, 0.02], "object_quaternion": [1.0, 0.0, 0.0, 0.0]}
+        signals = {key: np.array([values], dtype=float) for key, values in signals.items()}
+        states.append(RobotState(signals, np.zeros(1), np.zeros((1, size + 1))))
+    for state, frames, one in zip(states, chain.link_frames(q), drawn(page, agent, telemetry, states), strict=True):
+        parts = one["parts"]
+        names = [f"link {link}" for link in range(1, size + 1)] + ["tool"]
+        for part, frame in zip(names, frames, strict=True):
+            np.testing.assert_allclose(parts[part]["pose"], frame, atol=2e-4)
+        capsules = [sum(one.link == link for one in arm.capsules) for link in range(size + 1)]
+        assert [parts[f"link {link}"]["solids"] for link in range(size + 1)] == capsules
+        ends = [parts[f"pad {side}"]["pose"][:3, 3] for side in (1, -1)]
+        width = state.signals["gripper_width"][0, 0]
+        np.testing.assert_allclose(ends[0] - ends[1], (width + 0.008) * frames[-1, :3, 0], atol=2e-4)
+        assert ("object" in parts) == np.isfinite(state.signals["object_position"][0, 0])
+        assert "workspace" in parts
+
+
+def test_the_picture_changes_with_joints_gripper_and_object(page, agent):
+    arm = robot_model("ur5e")
+    telemetry = Telemetry(arm.spec(with_object=True), Limits(), geometry=arm.arm)
+
+    def state(turn=0.0, width=0.085, x=np.nan):
+        signals = {"joint_position": [turn, *arm.home[1:]], "joint_velocity": [0.0] * 6, "gripper_width": [width]}
+        signals |= {"object_position": [x, -0.3, 0.02], "object_quaternion": [1.0, 0.0, 0.0, 0.0]}
+        signals = {key: np.array([values], dtype=float) for key, values in signals.items()}
+        return RobotState(signals, np.zeros(1), np.zeros((1, 7)))
+
+    states = state(), state(), state(width=0.04), state(x=0.45), state(turn=0.5)
+    first, same, narrow, with_object, turned = (one["differing"] for one in drawn(page, agent, telemetry, states))
+    assert first == same == 0
+    assert 20 < narrow < turned
+    assert 100 < with_object < turned
+
+
+def test_a_base_is_drawn_where_it_is_with_what_it_sees(page, agent):
+    telemetry, here, there = Telemetry(base_spec(), Limits()), base_state(), base_state(2.0)
+    there.signals["base_pose"] = np.array([[3.0, -1.0, np.pi / 2]])
+    first, second = drawn(page, agent, telemetry, [here, there])
+    np.testing.assert_allclose(first["parts"]["base"]["pose"][:3, 3], [1.0, 2.0, 0.0], atol=1e-4)
+    np.testing.assert_allclose(second["parts"]["base"]["pose"][:2, [0, 3]], [[0.0, 3.0], [1.0, -1.0]], atol=1e-4)
+    assert first["known"]
+    assert second["differing"] > 100
 
 
 def test_the_stop_button_and_the_space_bar_stop_whatever_has_the_focus(page, agent):

@@ -7,6 +7,7 @@ import math
 import numpy as np
 import pytest
 
+from bam_envs.arms.description import robot_model
 from bam_envs.core.kinematics import UR10E
 from bam_envs.core.robot import RobotState
 from bam_envs.robots.mir100 import base_spec
@@ -34,8 +35,7 @@ def base_state(distance=5.0, speeds=(0.25, 0.0)):
 
 def test_the_message_of_an_arm():
     message = Telemetry(ARM, Limits()).message(arm_state(), 12.5, command=np.array([[*ARM_HOME, 0.08]]), age=0.02)
-    picture = ["tubes", "hand", "box", "table"]
-    assert list(message) == ["event", "t", "state", "units", "command", "tool", "near", *picture]
+    assert list(message) == ["event", "t", "state", "units", "command", "tool", "near"]
     assert (message["event"], message["t"]) == ("telemetry", 12.5)
     assert message["state"]["joint_position"]["elbow_joint"] == ARM_HOME[2]
     assert message["state"]["joint_velocity"]["elbow_joint"] == 0.0
@@ -46,28 +46,40 @@ def test_the_message_of_an_arm():
     assert message["near"]["state age"] == {"value": 0.02, "limit": 0.1, "unit": "s", "share": 0.2}
 
 
-def test_the_picture_of_an_arm_begins_at_its_base_and_ends_at_the_flange_on_which_the_gripper_is():
-    message = Telemetry(ARM, Limits()).message(arm_state(), 0.0)
-    assert [len(tube) for tube in message["tubes"]] == [7] * 8
-    assert message["tubes"][0] == [0.0, 0.0, 0.0, 0.0, 0.0, 0.1625, 0.07]
-    np.testing.assert_allclose(message["tubes"][6][3:6], message["hand"][:3], atol=2e-5)
-    x, y, z, w = message["hand"][3:]
-    way = np.array([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)])  # the z axis
-    np.testing.assert_allclose(message["hand"][:3] + GEOMETRY.tool * way, message["tool"], atol=2e-5)
-    assert "hand" not in Telemetry(ur_spec(ur_model("ur5e"), 0.05, False), Limits()).message(arm_state(), 0.0)
+def test_the_scene_of_an_arm_is_its_description():
+    arm, workspace = robot_model("fr3"), np.array([[0.3, -0.25, 0.016], [0.7, 0.25, 0.35]])
+    limits = Limits(box_x_max=0.6, table_height=-0.1)
+    scene = Telemetry(arm.spec(with_object=True), limits, geometry=arm.arm, workspace=workspace).scene
+    chain = arm.chain
+    assert scene["joints"] == [["joint_position", f"fr3_joint{joint}"] for joint in range(1, 8)]
+    assert scene["placements"] == chain.placements.reshape(7, 16).tolist()
+    assert (scene["mount"], scene["axes"]) == (np.eye(4).ravel().tolist(), chain.axes.tolist())
+    assert scene["tool"] == chain.tool_placement.ravel().tolist()
+    assert [one[0] for one in scene["capsules"]] == [0, 1, 2, 3, 4, 5, 6, 7]
+    assert scene["capsules"][0] == [0, -0.00391, -0.00054, 0.05154, -0.06326, 0.00168, 0.03796, 0.1078]
+    assert (scene["gripper"]["width"], scene["cube"]) == (0.08, 0.04)
+    palm, finger, pad = scene["gripper"]["boxes"]
+    size = 0.08 / 0.085  # of a Robotiq 2F-85
+    np.testing.assert_allclose(palm, [0, 0, -0.105 * size, 0.0475, 0.032 * size, 0.045 * size])
+    np.testing.assert_allclose(finger, [0.008, 0, -0.038 * size, 0.006, 0.011 * size, 0.022 * size])
+    np.testing.assert_allclose(pad, [0.004, 0, -0.002 * size, 0.004, 0.011 * size, 0.014 * size])
+    assert (scene["box"], scene["table"]) == ([0.3, -0.25, 0.016, 0.6, 0.25, 0.35], -0.1)
+    json.dumps(scene, allow_nan=False)
 
 
-def test_the_picture_has_the_object_the_table_and_the_box_in_which_the_tool_works():
-    state, limits = arm_state(), Limits(box_x_max=0.6, table_height=-0.1)
+def test_the_scene_of_an_arm_without_a_gripper_and_of_a_base():
+    scene = Telemetry(ur_spec(ur_model("ur5e"), 0.05, False), Limits()).scene
+    assert scene["gripper"] is None
+    assert scene["box"] == [-2.0, -2.0, None, 2.0, 2.0, 2.0]
+    assert Telemetry(BASE, Limits()).scene == {}
+
+
+def test_the_object_is_where_it_is_measured():
+    state = arm_state()
     state.signals |= {"object_position": np.array([[0.5, 0.1, 0.02]])}
     state.signals |= {"object_quaternion": np.array([[math.cos(0.2), 0.0, 0.0, math.sin(0.2)]])}
-    workspace = np.array([[0.3, -0.25, 0.016], [0.7, 0.25, 0.35]])
-    message = Telemetry(arm_spec("ur5e", with_object=True), limits, workspace=workspace).message(state, 0.0)
+    message = Telemetry(arm_spec("ur5e", with_object=True), Limits()).message(state, 0.0)
     assert message["object"] == [0.5, 0.1, 0.02, 0.0, 0.0, 0.19867, 0.98007]
-    assert (message["box"], message["table"]) == ([0.3, -0.25, 0.016, 0.6, 0.25, 0.35], -0.1)
-    anywhere = Telemetry(ARM, limits).message(arm_state(), 0.0)
-    assert anywhere["box"] == [-2.0, -2.0, -0.1, 0.6, 2.0, 2.0]
-    assert "object" not in anywhere
 
 
 def test_the_speed_of_the_tool_is_that_of_its_joints():
@@ -100,9 +112,9 @@ def test_an_arm_of_another_size_and_one_without_kinematics():
     position, velocity, width = ARM.signals
     signals = (*(dataclasses.replace(one, labels=labels[:6]) for one in (position, velocity)), width)
     other = dataclasses.replace(ARM, signals=signals, command=dataclasses.replace(ARM.command, labels=labels))
-    message = Telemetry(other, Limits(tool_speed=math.inf)).message(arm_state(), 0.0)
-    assert message["tool"] is None
-    assert "tubes" not in message
+    unknown = Telemetry(other, Limits(tool_speed=math.inf))
+    message = unknown.message(arm_state(), 0.0)
+    assert (message["tool"], unknown.scene) == (None, {})
     assert set(message["near"]) == {"state age", "position margin", "joint speed"}
 
 

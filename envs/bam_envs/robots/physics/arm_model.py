@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from bam_envs.arms.description import SHIPPED, ArmDescription, Placed, cube_edge, read_description
+from bam_envs.arms.description import SHIPPED, ArmDescription, Box, Placed, cube_edge, read_description
 from bam_envs.arms.serial_chain import Capsule
 from bam_envs.robots.physics.mujoco_batch import MODELS, mujoco
 
@@ -35,7 +35,7 @@ def scene_spec(description: ArmDescription, *, with_object: bool) -> Any:
 
 def arm_mjcf(description: ArmDescription, *, with_object: bool) -> str:
     """The MJCF text of the arm on its table."""
-    size = description.num_joints
+    size, chain = description.num_joints, description.chain
     mount = _pose(description.mount)
     lines = ['<mujoco model="arm">', '<include file="table.xml"/>', "<worldbody>"]
     lines += [f'<body name="base" {mount} childclass="arm">', *_capsules(description, 0, 4.0)]
@@ -50,7 +50,7 @@ def arm_mjcf(description: ArmDescription, *, with_object: bool) -> str:
         ]
     lines += [*_gripper(description), "</body>" * (size + 1)]
     if with_object:
-        half = cube_edge(description) / 2
+        half = cube_edge(description.gripper.open, chain.turns) / 2
         x, y = np.mean(np.array(description.workspace)[:, :2], axis=0).tolist()
         lines += [
             f'<body name="object" pos="{x:g} {y:g} {half:g}"><freejoint name="object"/>',
@@ -95,28 +95,31 @@ def _geom(capsule: Capsule, mass: float, more: str) -> str:
 def _gripper(description: ArmDescription) -> list[str]:
     """The gripper's body, turned as the tool and 15 cm before its point if it opens to 85 mm, and its fingers."""
     tool, width, mass = description.tool.matrix(), description.gripper.open, description.gripper.mass
-    size = float(np.clip(width / 0.085, 0.4, 1.2))
-    palm = max(0.01, min(0.045 * size, 0.5 * (float(np.linalg.norm(tool[:3, 3])) - 0.06 * size)))
-    root = tool[:3, 3] - (0.06 * size + 2 * palm) * tool[:3, 2]
+    length, (palm, finger, pad) = description.gripper.boxes(tool)
+    root, fingers = tool[:3, 3] - length * tool[:3, 2], 2 * palm[0][2]
     pos, quat = " ".join(map(repr, root.tolist())), " ".join(map(repr, description.tool.quat))
-    wide, deep = 0.5 * width + 0.0075, 0.032 * size
     lines = [
         f'<body name="gripper" pos="{pos}" quat="{quat}" childclass="gripper" gravcomp="1">',
-        f'<camera name="wrist" pos="0 {-0.075 * size:g} 0.03" xyaxes="1 0 0 0 -0.97 0.24" fovy="78"/>',
-        f'<geom name="palm" size="{wide:g} {deep:g} {palm:g}" pos="0 0 {palm:g}" mass="{0.8 * mass:g}"/>',
-        f'<site name="tool" pos="0 0 {2 * palm + 0.06 * size!r}" size="0.004" rgba="0.9 0.2 0.2 0"/>',
+        f'<camera name="wrist" pos="0 {-75 / 32 * palm[1][1]:g} 0.03" xyaxes="1 0 0 0 -0.97 0.24" fovy="78"/>',
+        f'<geom name="palm" {_box(palm)} mass="{0.8 * mass:g}"/>',
+        f'<site name="tool" pos="0 0 {length!r}" size="0.004" rgba="0.9 0.2 0.2 0"/>',
     ]
     for name, side in (("left", 1), ("right", -1)):
         lines += [
-            f'<body name="{name}_finger" pos="0 0 {2 * palm:g}" gravcomp="1">',
+            f'<body name="{name}_finger" pos="0 0 {fingers:g}" gravcomp="1">',
             f'<joint name="{name}_finger_joint" axis="{side} 0 0" range="0 {width / 2!r}"/>',
-            f'<geom size="0.006 {0.011 * size:g} {0.022 * size:g}" pos="{0.008 * side} 0 {0.022 * size:g}" '
-            f'mass="{0.05 * mass:g}"/>',
-            f'<geom class="pad" name="{name}_pad" size="0.004 {0.011 * size:g} {0.014 * size:g}" '
-            f'pos="{0.004 * side} 0 {0.058 * size:g}" mass="{0.05 * mass:g}"/>',
+            f'<geom {_box(finger, side, fingers)} mass="{0.05 * mass:g}"/>',
+            f'<geom class="pad" name="{name}_pad" {_box(pad, side, fingers)} mass="{0.05 * mass:g}"/>',
             "</body>",
         ]
     return [*lines, "</body>"]
+
+
+def _box(box: Box, side: int = 1, base: float = 0.0) -> str:
+    """Size and place of a box on one side, from a base at a height."""
+    (x, y, z), half = box
+    size = " ".join(f"{one:g}" for one in half)
+    return f'size="{size}" pos="{side * x:g} {y:g} {z - base:g}"'
 
 
 def _drives(description: ArmDescription) -> list[str]:

@@ -1,6 +1,7 @@
 """A site on the port of a rosbridge server: pages, WebSocket paths of its own, and who may open them."""
 
 import gzip
+import hashlib
 import re
 from collections.abc import Awaitable, Callable, Mapping
 from dataclasses import dataclass, field
@@ -40,9 +41,9 @@ _HEADERS = {
     "Referrer-Policy": "no-referrer",
     "Cross-Origin-Opener-Policy": "same-origin",
     "Cross-Origin-Resource-Policy": "same-origin",
-    "Cache-Control": "no-store",
+    "Cache-Control": "no-cache",
 }
-"""What keeps a page to its own server; scripts and styles stand in files, not in the page."""
+"""What keeps a page to its own server, which is asked each time; scripts and styles stand in files, not in it."""
 _GZIP = re.compile(r"\bgzip\b(?!\s*;\s*q=0(\.0*)?\s*(,|$))", re.IGNORECASE)
 """Finds gzip in a header Accept-Encoding that does not refuse it."""
 _IN_ADDRESS = "A token never stands in an address, which is logged: send the header 'Authorization: Bearer TOKEN'."
@@ -100,9 +101,12 @@ class Site:
         return None
 
     def response(self, request: Request) -> Response:
-        """The page that a request asks for, compressed if the client takes that and it is shorter."""
+        """The page that a request asks for, compressed if the client takes that; no body if it has the page already."""
         kind, body = self.pages[_path(request)]
         headers = {"Content-Type": kind, "Connection": "close", "Vary": "Accept-Encoding", **_HEADERS}
+        headers["ETag"] = _tag(body)
+        if headers["ETag"] in request.headers.get_all("If-None-Match"):
+            return Response(HTTPStatus.NOT_MODIFIED.value, HTTPStatus.NOT_MODIFIED.phrase, Headers(headers), b"")
         if _GZIP.search(",".join(request.headers.get_all("Accept-Encoding"))) and len(_packed(body)) < len(body):
             body, headers["Content-Encoding"] = _packed(body), "gzip"
         headers["Content-Length"] = str(len(body))
@@ -111,6 +115,11 @@ class Site:
     def socket(self, request: Request | None) -> Handler | None:
         """What serves the WebSocket of a request; None for that of rosbridge."""
         return None if request is None else self.sockets.get(_path(request))
+
+
+@lru_cache(maxsize=64)
+def _tag(body: bytes) -> str:
+    return f'W/"{hashlib.sha256(body).hexdigest()[:32]}"'
 
 
 @lru_cache(maxsize=64)

@@ -87,7 +87,7 @@ def test_a_page_is_kept_to_its_own_server(new_server):
     assert headers["Content-Security-Policy"].startswith("default-src 'none'; script-src 'self'; style-src 'self'; ")
     assert "frame-ancestors 'none'" in headers["Content-Security-Policy"]
     assert "unsafe" not in headers["Content-Security-Policy"]
-    assert (headers["X-Content-Type-Options"], headers["Cache-Control"]) == ("nosniff", "no-store")
+    assert (headers["X-Content-Type-Options"], headers["Cache-Control"]) == ("nosniff", "no-cache")
 
 
 @pytest.mark.parametrize(
@@ -116,6 +116,15 @@ def test_a_page_is_compressed_for_who_takes_that(new_server, accepts, encoding):
     assert (status, headers.get("Content-Encoding"), body) == (200, encoding, "hello " * 99)
     assert (int(headers["Content-Length"]) < 99, headers["Vary"]) == (encoding is not None, "Accept-Encoding")
     assert get(server, "/short", **accept)[2] == "hello"
+
+
+def test_a_page_that_a_client_has_already_is_not_sent_again(new_server):
+    server = new_server()
+    _, headers, _ = get(server, "/")
+    status, again, body = get(server, "/", **{"If-None-Match": headers["ETag"]})
+    assert (status, again["ETag"], body) == (304, headers["ETag"], "")
+    assert "default-src 'none'" in again["Content-Security-Policy"]
+    assert get(server, "/", **{"If-None-Match": 'W/"another"'})[::2] == (200, "<p>hello")
 
 
 def test_the_pages_of_a_folder(tmp_path):
