@@ -3,16 +3,12 @@
 import { showCameras } from "./cameras.js";
 import { Connection } from "./connection.js";
 import { Jogging, KEYS } from "./jogging.js";
-import { byId, say, showAudit, showNear, showStatus, showTelemetry, showVersions } from "./panels.js";
+import { MISSING, byId, restAfter, say, showAudit, showNear, showStatus, showTelemetry, showVersions } from "./panels.js";
 import { Plots } from "./plots.js";
 
 const LOOK = 2000; // time between two looks at versions and log [ms]
 const OLD = 1000; // age of the newest state from which on the page says that it is old [ms]
 const WRITE = 250; // least time between two sets of plots and numbers [ms]
-const BUSY = 50; // a drawing that takes longer, with its wait for the screen, shows that this computer is busy [ms]
-const GIVE_WAY = 4; // then the next one waits for so many times as long, so that buttons and keys are heard at once
-const LONGEST_WAIT = 1000; // at most [ms]
-
 let status = { state: "not connected" };
 let telemetry = null;
 let heard = -Infinity; // when it came
@@ -24,6 +20,7 @@ let owner = null; // how the status calls this page while it drives; "" until it
 let cameras = null;
 let picture = null; // once its library has come, after everything that stops the robot
 let scene = {}; // what it is drawn from
+let undrawn = ""; // why there is none
 
 const connection = new Connection("/agent", { open: connected, lost, event, token: askToken });
 const plots = new Plots(byId("plots"));
@@ -43,8 +40,7 @@ function connected() {
 
 function entered(watched) {
   scene = watched.scene;
-  if (picture) picture.show(scene);
-  else import("./picture.js").then(begin, () => noPicture("The robot is not drawn: the library for that did not come. Reload the page; if that does not help, install bam-train again, with a link to the npm registry."));
+  import("./picture.js").then(begin, () => noPicture(MISSING));
   byId("entry").hidden = true;
   byId("main").hidden = false;
   say("link", "");
@@ -55,18 +51,16 @@ function entered(watched) {
 }
 
 function begin({ Picture }) {
-  try {
-    picture ??= new Picture(byId("picture"));
-    picture.show(scene);
-    noPicture("");
-  } catch (error) {
-    noPicture(error.message);
-  }
+  if (picture === null) undrawn = "";
+  picture ??= new Picture(byId("picture"), noPicture);
+  picture.show(scene);
 }
 
-function noPicture(why) {
-  say("no-picture", why);
-  byId("picture").hidden = byId("legend").hidden = Boolean(why);
+function noPicture(why = undrawn) {
+  undrawn = why;
+  const shown = why || (scene.placements || telemetry?.base || !telemetry ? "" : "This robot's shape is not known; see its numbers.");
+  say("no-picture", shown);
+  byId("picture").hidden = byId("legend").hidden = Boolean(shown);
 }
 
 function lost(reason) {
@@ -104,6 +98,7 @@ function event(message) {
     telemetry = message;
     heard = performance.now();
     plots.add(message);
+    picture?.add(message);
     if (asked === null && heard >= rested) {
       asked = heard;
       requestAnimationFrame(draw);
@@ -126,18 +121,16 @@ function show(newest) {
 function draw() {
   const now = performance.now();
   try {
-    if (picture) noPicture(picture.draw(telemetry) ? "" : "This robot's shape is not known; see its numbers.");
+    noPicture();
+    picture?.draw(telemetry);
     if (now - written < WRITE) return;
     written = now;
     plots.draw();
     showTelemetry(telemetry);
     showNear(telemetry.near ?? {}, status.guards ?? {});
   } finally {
-    setTimeout(() => { // once it is on the screen
-      const took = performance.now() - asked;
-      rested = performance.now() + (took > BUSY ? Math.min(GIVE_WAY * took, LONGEST_WAIT) : 0);
-      asked = null;
-    });
+    rested = performance.now() + restAfter(performance.now() - asked);
+    asked = null;
   }
 }
 

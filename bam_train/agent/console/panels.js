@@ -5,6 +5,11 @@ const ICONS = {
 };
 export const byId = (id) => document.getElementById(id);
 const short = (digest) => (digest ? digest.slice(0, 12) : "-");
+const BUSY = 50; // a drawing that takes longer, with its wait for the screen, shows that this computer is busy [ms]
+const GIVE_WAY = 4; // then the next one waits for so many times as long, so that buttons and keys are heard at once
+const LONGEST_WAIT = 1000; // at most [ms]
+export const restAfter = (took) => (took > BUSY ? Math.min(GIVE_WAY * took, LONGEST_WAIT) : 0);
+export const MISSING = "The robot is not drawn: the library for that did not come. Reload the page; if that does not help, install bam-train again, with a link to the npm registry.";
 const NEAR = 0.8; // share of a limit from which on a guard is said to be near
 
 // Text only where it changed: a screen reader announces every change.

@@ -31,7 +31,7 @@ CONSOLE = Path(__file__).parents[1] / "console"
 """The files of the web console: plain HTML, CSS and modules."""
 LIBRARIES = ("uplot", "three")
 """Folders into which the installation puts what draws (``hatch_build.py``); without them the console only writes."""
-_BARE, _PLACED = b"from 'three';", b"from './three.module.min.js';"
+_BARE, _PLACED = b"from 'three';", b"from './three.core.min.js';"
 """How a module of three.js names its library, and how a page finds it without an import map, which is inline script."""
 
 

@@ -10,6 +10,7 @@ from bam_train.agent.front.front_process import console_pages
 EVERY = {path: page.body.decode() for path, page in console_pages().items()}
 CHARTS = {"/uPlot.iife.min.js", "/uPlot.min.css", "/uplot.LICENSE.txt"}
 SOLIDS = {"/three.module.min.js", "/three.core.min.js", "/OrbitControls.js", "/three.LICENSE.txt"}
+ROBOT = {"/picture.js", "/scene.js"}
 PAGES = {path: text for path, text in EVERY.items() if path not in CHARTS | SOLIDS}
 
 
@@ -21,7 +22,7 @@ def test_the_pages():
     assert set(EVERY) - set(PAGES) == CHARTS | SOLIDS, "install this project again: pip install -e ."
     first, later = (
         sum(len(gzip.compress(EVERY[path].encode())) for path in paths)
-        for paths in (set(EVERY) - SOLIDS - {"/picture.js"}, SOLIDS | {"/picture.js"})
+        for paths in (set(EVERY) - SOLIDS - ROBOT, SOLIDS | ROBOT)
     )
     assert first < 50_000, "what stops the robot comes at once, over a slow network too"
     assert later < 200_000
@@ -29,7 +30,7 @@ def test_the_pages():
 
 def test_every_file_that_a_page_names_is_there():
     named = re.findall(r'(?:href|src)="([^"]+)"', PAGES["/"])
-    pattern = r"""(?:from ?["']\./|import\("\./|fetch\(")([\w.]+)["']"""
+    pattern = r"""(?:from ?["']\./|import\("\./|fetch\("|Worker\(")([\w.]+)["']"""
     named += [name for path, text in EVERY.items() if path.endswith(".js") for name in re.findall(pattern, text)]
     licences = {"/uplot.LICENSE.txt", "/three.LICENSE.txt"}
     assert {f"/{name}" for name in named} == set(EVERY) - {"/", "/index.html"} - licences

@@ -24,9 +24,10 @@ _ARMATURE = 0.003  # inertia of the motor, by its torque [kg m^2 / (N m)]
 def scene_spec(description: ArmDescription, *, with_object: bool) -> Any:
     """The `mujoco.MjSpec` of the arm on its table, and of a cube if there is one."""
     if description.digest == read_description(SHIPPED / "ur5e.toml").digest:
-        return mujoco.MjSpec.from_file(str(MODELS / ("ur5e_cube.xml" if with_object else "ur5e_gripper.xml")))
-    text = arm_mjcf(description, with_object=with_object)
-    spec = mujoco.MjSpec.from_string(text, {"table.xml": (MODELS / "table.xml").read_bytes()})
+        spec = mujoco.MjSpec.from_file(str(MODELS / ("ur5e_cube.xml" if with_object else "ur5e_gripper.xml")))
+    else:
+        text = arm_mjcf(description, with_object=with_object)
+        spec = mujoco.MjSpec.from_string(text, {"table.xml": (MODELS / "table.xml").read_bytes()})
     camera, chain = spec.camera("overview"), description.chain
     length = float(np.linalg.norm(chain.placements[:, :3, 3], axis=1).sum())
     camera.pos = _LOOKED_AT + float(np.clip(1.3 * length, 0.5, 2.5)) * (camera.pos - _LOOKED_AT)
