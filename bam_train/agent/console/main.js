@@ -6,6 +6,7 @@ import { Jogging, KEYS } from "./jogging.js";
 import { MISSING, byId, restAfter, say, showAudit, showNear, showStatus, showTelemetry, showVersions } from "./panels.js";
 import { Plots } from "./plots.js";
 
+const DRAWS = ["scene.js", "three.core.min.js", "three.module.min.js", "OrbitControls.js"]; // asked for at once, for a slow network
 const LOOK = 2000; // time between two looks at versions and log [ms]
 const OLD = 1000; // age of the newest state from which on the page says that it is old [ms]
 const WRITE = 250; // least time between two sets of plots and numbers [ms]
@@ -40,6 +41,7 @@ function connected() {
 
 function entered(watched) {
   scene = watched.scene;
+  for (const href of picture ? [] : DRAWS) document.head.append(Object.assign(document.createElement("link"), { rel: "modulepreload", href }));
   import("./picture.js").then(begin, () => noPicture(MISSING));
   byId("entry").hidden = true;
   byId("main").hidden = false;

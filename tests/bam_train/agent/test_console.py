@@ -89,7 +89,7 @@ def test_without_the_libraries_that_draw_the_page_says_so_and_everything_else_wo
 
 
 def test_without_webgl_the_page_says_so_and_everything_else_works(agent):
-    with contextlib.closing(new_browser("--disable-3d-apis")) as browser:
+    with contextlib.closing(new_browser("--disable-software-rasterizer")) as browser:
         page = Page(browser).open(agent.url)
         page.shows("no-picture", "This browser has no WebGL 2, which draws the robot. Everything else works.")
         page.shows("tool", "Tool at x, y, z:")
