@@ -1,6 +1,5 @@
 """The console in a real browser: what it shows, what its buttons do, and that nothing moves once nobody holds a key."""
 
-import contextlib
 import io
 import time
 from pathlib import Path
@@ -89,7 +88,8 @@ def test_without_the_libraries_that_draw_the_page_says_so_and_everything_else_wo
 
 
 def test_without_webgl_the_page_says_so_and_everything_else_works(agent):
-    with contextlib.closing(new_browser("--disable-software-rasterizer")) as browser:
+    browser = new_browser("--disable-software-rasterizer")
+    try:
         page = Page(browser).open(agent.url)
         page.shows("no-picture", "This browser has no WebGL 2, which draws the robot. Everything else works.")
         page.shows("tool", "Tool at x, y, z:")
@@ -97,6 +97,7 @@ def test_without_webgl_the_page_says_so_and_everything_else_works(agent):
         page.click("stop")
         page.shows("state", "❚❚ paused")
         assert not page.element("picture").is_displayed()
+    finally:
         browser.quit()
 
 
