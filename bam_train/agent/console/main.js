@@ -219,10 +219,9 @@ function ask(text) {
   say("question-text", text);
   dialog.showModal();
   return new Promise((resolve) => {
-    dialog.onclose = () => resolve(dialog.returnValue === "yes");
-    byId("yes").onclick = () => dialog.close("yes");
-    byId("no").onclick = () => dialog.close("no");
-    dialog.oncancel = () => { dialog.returnValue = "no"; };
+    // Not by the event that it closed, which may come once the next question is there.
+    for (const [id, answer] of [["yes", true], ["no", false]]) byId(id).onclick = () => { dialog.close(); resolve(answer); };
+    dialog.oncancel = () => resolve(false);
   });
 }
 
