@@ -119,7 +119,7 @@ export class Scene {
     this.object = this.box(this.scene, [cube / 2, cube / 2, cube / 2], OBJECT);
     this.object.name = "object";
     this.object.visible = false;
-    if (known(box) && box.every((value) => Math.abs(value) < 2 * size)) {
+    if (known(box) && box.every((value) => Math.abs(value) < size)) {
       const [x, y, z, u, v, w] = box, edges = new three.EdgesGeometry(new three.BoxGeometry(u - x, v - y, w - z));
       const room = new three.LineSegments(edges, new three.LineDashedMaterial({ color: this.colours.box, dashSize: 0.02, gapSize: 0.015 }));
       room.position.set((x + u) / 2, (y + v) / 2, (z + w) / 2);
