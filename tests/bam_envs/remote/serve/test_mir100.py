@@ -8,7 +8,7 @@ import pytest
 from bam_envs.core.errors import InvalidValue
 from bam_envs.remote.serve.served_robot import ServedRobot
 
-NAVIGATION, AVOIDANCE = "bam/mir100-navigation-v0", "bam/mir100-avoidance-v0"
+NAVIGATION, AVOIDANCE = "bam/navigation-v0", "bam/avoidance-v0"
 FORWARD = np.array([1.0, 0.0], np.float32)
 
 
