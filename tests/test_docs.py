@@ -15,11 +15,12 @@ from pathlib import Path
 import pytest
 
 from bam_envs.core.registry import ENVIRONMENTS, resolve
+from bam_envs.robots.base_description import CLEARANCE, base_model
 from bam_envs.robots.physics.domain_randomization import Ranges
 from bam_envs.tasks import (
+    avoidance,
     isaac_reach,
-    mir100_avoidance,
-    mir100_navigation,
+    navigation,
     pick,
     pick_place,
     reach,
@@ -137,11 +138,11 @@ def test_guards_on_the_site(make_docs):
 
 
 DRIVING = (
-    mir100_navigation.NEARER,
-    mir100_navigation.ARRIVING,
-    mir100_navigation.FAILING,
-    mir100_navigation.TIME,
-    *mir100_navigation.POWER,
+    navigation.NEARER,
+    navigation.ARRIVING,
+    navigation.FAILING,
+    navigation.TIME,
+    *navigation.POWER,
 )
 """Numbers in the reward of a base."""
 
@@ -166,14 +167,14 @@ def metres(value):
         (pick_place.PickPlaceTask, "Success", [metres(pick_place.GOAL_RADIUS), metres(pick_place.PICKED)]),
         (pick_place.PickPlaceTask, "Success", [f"{pick_place.REST_STEPS} steps", f"{pick_place.REST_STEPS / 20} s"]),
         (pick_place.PickPlaceTask, "Reward", [metres(pick_place.CARRY), metres(pick_place.PICKED)]),
-        (mir100_navigation.Mir100NavigationTask, "Success", [metres(mir100_navigation.ARRIVED)]),
-        (mir100_navigation.Mir100NavigationTask, "Start", [f"at least {mir100_navigation.MIN_DISTANCE:g} m"]),
-        (mir100_navigation.Mir100NavigationTask, "End", [f"{2 * mir100_navigation.BOUNDARY:g} x "]),
-        (mir100_navigation.Mir100NavigationTask, "Reward", [f"{x:g}" for x in DRIVING]),
-        (mir100_avoidance.Mir100AvoidanceTask, "Success", [metres(mir100_navigation.ARRIVED)]),
-        (mir100_avoidance.Mir100AvoidanceTask, "Start", ["{} to {} m".format(*mir100_avoidance.SIDE)]),
-        (mir100_avoidance.Mir100AvoidanceTask, "End", [metres(mir100_avoidance.NEAREST)]),
-        (mir100_avoidance.Mir100AvoidanceTask, "Reward", [f"{x:g}" for x in DRIVING]),
+        (navigation.NavigationTask, "Success", [metres(navigation.ARRIVED)]),
+        (navigation.NavigationTask, "Start", [f"at least {navigation.MIN_DISTANCE:g} m"]),
+        (navigation.NavigationTask, "End", [f"{2 * navigation.BOUNDARY:g} x "]),
+        (navigation.NavigationTask, "Reward", [f"{x:g}" for x in DRIVING]),
+        (avoidance.AvoidanceTask, "Success", [metres(navigation.ARRIVED)]),
+        (avoidance.AvoidanceTask, "Start", ["{} to {} m".format(*avoidance.SIDE)]),
+        (avoidance.AvoidanceTask, "End", [metres(CLEARANCE), metres(base_model("mir100").lasers[0].contact)]),
+        (avoidance.AvoidanceTask, "Reward", [f"{x:g}" for x in DRIVING]),
         (ur_reach.UrReachTask, "Success", [metres(ur_reach.NEAR)]),
         (ur_reach.UrReachTask, "Start", [f"{x}" for x in ur_reach.START_OFFSET]),
         (ur_avoidance.UrAvoidanceTask, "Start", [str(list(ur_avoidance.POSE)).replace("0.0]", "0]")]),

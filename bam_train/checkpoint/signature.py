@@ -22,7 +22,7 @@ from typing import Annotated, Any, Literal
 import msgspec
 from msgspec import Meta
 
-from bam_envs.core.config_folder import config_folder
+from bam_envs.core.location import config_folder
 from bam_train.checkpoint.checkpoint import Checkpoint
 from bam_train.checkpoint.manifest import AGAIN, MANIFEST
 from bam_train.checkpoint.ownership import who_else

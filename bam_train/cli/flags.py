@@ -61,13 +61,13 @@ class JsonFlag:
 
 @dataclass(frozen=True, kw_only=True)
 class RobotModelFlag:
-    """The flag of the arm of an environment, which is short for ``--set robot_model=NAME``."""
+    """The flag of the robot of an environment, which is short for ``--set robot_model=NAME``."""
 
     SET: ClassVar[str] = "robot_model"
     """What ``--set`` calls it."""
 
     robot_model: Name = None
-    """Arm of the environment: a name of bam-robots list, or the file of its description."""
+    """Robot of the environment: a name of bam-robots list, or the file of its description."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -11,8 +11,8 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from bam_envs.arms.description import DEFAULT_MODEL
 from bam_envs.core.registry import resolve_id
+from bam_envs.core.robot_models import DEFAULT_ARM
 from bam_envs.core.wording import brief
 from bam_envs.tasks.scripted import scripted_policy
 from bam_train.checkpoint import Checkpoint
@@ -120,7 +120,7 @@ def collect(
             require_fit(checkpoint, envs)
         name = policy if checkpoint is None else checkpoint.digest
         told = {"policy": name, "noise": noise, "random": random, "num_envs": envs.num_envs, **(facts or {})}
-        actor = _policy(policy, checkpoint, env_id, envs, seed, kwargs.get("robot_model", DEFAULT_MODEL))
+        actor = _policy(policy, checkpoint, env_id, envs, seed, kwargs.get("robot_model", DEFAULT_ARM))
         acting, done = Disturbance(actor, envs, noise, 1.0 if policy == RANDOM else random, seed), Collected()
         recorded = RecordVectorDataset(
             envs, place, info_of(envs, env_id, kwargs), told, keep=lambda number, _: number < episodes

@@ -7,8 +7,7 @@ from typing import Any, TypeVar
 
 import gymnasium as gym
 
-from bam_envs.core.config_folder import config_folder
-from bam_envs.core.location import LiveRobot, Location
+from bam_envs.core.location import LiveRobot, Location, config_folder
 from bam_envs.core.robot_env import robot_of
 from bam_envs.live.robot_identity import is_one_robot
 from bam_envs.rosbridge.endpoint import Endpoint

@@ -91,7 +91,7 @@ def _compared(spec: RobotSpec, commands: Sequence[Array], measured: Sequence[Arr
     """`motion_checks` of the commands and the measurement after each."""
     sent, seen = np.array(commands), np.array(measured)
     if is_base(spec):
-        sent, seen = np.cumsum(sent * spec.period, axis=0), driven(seen)
+        sent, seen = np.cumsum(sent * spec.period, axis=0), driven(seen, sent.shape[1])
     yield from motion_checks(spec.command, sent, seen, spec.period)
 
 

@@ -11,12 +11,12 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 
 import bam_envs  # noqa: F401 - registers our environments with Gymnasium
 from bam_envs.aliases.robo_gym_names import ROBO_GYM
-from bam_envs.arms.description import require_same_arm, robot_model
 from bam_envs.core import registry
 from bam_envs.core.env_options import in_our_words, require_kinds
 from bam_envs.core.errors import BamEnvsError, InvalidValue, UnknownName
 from bam_envs.core.location import HERE, SIMULATED, LiveRobot, Location, Remote
 from bam_envs.core.registry import entry_of, resolve_id
+from bam_envs.core.robot_models import Description, find_model, require_same_robot
 from bam_envs.core.wording import did_you_mean
 from bam_envs.robo_gym.making import constructor_options, require_values
 from bam_envs.robots.linked import link_profile
@@ -63,9 +63,9 @@ def environment_of(
     except (UnknownName, SettingsError) as error:
         raise SettingsError(f"{checkpoint.path}: its manifest: {error}") from error
     try:
-        require_same_arm(env_kwargs.get("robot_model"))
+        require_same_robot(env_kwargs.get("robot_model"))
     except InvalidValue as error:
-        raise CheckpointMismatch(checkpoint.path, f"was trained for another arm: {error}") from error
+        raise CheckpointMismatch(checkpoint.path, f"was trained for another robot: {error}") from error
     return env_id, dict(env_kwargs)
 
 
@@ -87,6 +87,8 @@ def require_env_kwargs(env: str, given: Mapping[str, Any]) -> None:
         return
     given = registry.own_options(env, given)
     options, theirs = entry.options(), ROBO_GYM.get(env.rpartition(":")[2])
+    if theirs:  # robo-gym's ids name their robot
+        options.pop("robot_model", None)
     if theirs and limit is not None and not 1 <= limit <= entry.max_episode_steps:
         raise SettingsError(
             f"env_kwargs.max_episode_steps: episodes of {env} have at most {entry.max_episode_steps} steps, "
@@ -94,6 +96,11 @@ def require_env_kwargs(env: str, given: Mapping[str, Any]) -> None:
         )
     taken, refused = constructor_options(theirs) if theirs else (frozenset(), frozenset())
     known = SIMULATED.keys() | taken | options.keys() | {"max_episode_steps"}  # the place has its own flags
+    if "robot_model" in given and "robot_model" not in options:
+        own = "; its arm is --set env_kwargs.ur_model=ur10" if "ur_model" in options else ""
+        entries = [one for one in registry.ENVIRONMENTS.values() if "robot_model" in one.robot_options]
+        those = ", ".join(one.id.partition("-v")[0] for one in entries)
+        raise SettingsError(f"--robot-model: {env} takes none{own}. Leave it out; these take one: {those}")
     for name in given:
         if name not in known | refused:  # the constructor explains why it refuses these
             raise SettingsError(
@@ -105,7 +112,7 @@ def require_env_kwargs(env: str, given: Mapping[str, Any]) -> None:
         if given.get("link") is not None:
             link_profile(given["link"])
         if "robot_model" in given:
-            robot_model(given["robot_model"])
+            find_model(given["robot_model"], type(find_model(options["robot_model"], Description)))
         if given.get("action_delay") is not None:
             read_delay(given["action_delay"])
     except (InvalidValue, UnknownName) as error:
@@ -226,6 +233,8 @@ def _made(env_id: str, make: Callable[[], T]) -> T:
                 raise
             raise SettingsError(f"{env_id} cannot be made: {described(error)}") from error
         why = str(error).strip().partition("\n")[0].rstrip(".") or type(error).__name__
+        if isinstance(error, TypeError) and "unexpected keyword argument 'robot_model'" in why:
+            raise SettingsError(f"--robot-model: {env_id} takes none. Leave it out") from error
         if isinstance(error, TypeError):
             raise SettingsError(f"{env_id} cannot be made with these arguments: {why}") from error
         if isinstance(error, ModuleNotFoundError):

@@ -14,7 +14,7 @@ from bam_train.environments import control_period
 from bam_train.errors import SettingsError
 from bam_train.play.key_map import ARROWS, CHANGES, DIGITS, Twist, move_lines, short
 
-AXES = {"dx": 0, "dy": 1, "dz": 2, "dyaw": 3, "forward": 0, "turn": 3}
+AXES = {"dx": 0, "dy": 1, "dz": 2, "dyaw": 3, "forward": 0, "sideways": 1, "turn": 3}
 """Names of numbers of an action that are motions of a tool or a base, and their places in a twist."""
 GRIP = "grip"
 

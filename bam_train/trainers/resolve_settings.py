@@ -8,9 +8,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from bam_envs.arms.description import portable_model
 from bam_envs.core.errors import MissingExtra, UnknownName
 from bam_envs.core.registry import entry_of, resolve_id
+from bam_envs.core.robot_models import portable_model
 from bam_envs.robots.linked import portable
 from bam_train.checkpoint import Checkpoint
 from bam_train.checkpoint.manifest import require_no_place

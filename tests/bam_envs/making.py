@@ -7,7 +7,7 @@ from bam_envs.core.registry import ENVIRONMENTS, NO_ROBOT
 from bam_envs.core.robot import RobotState
 from bam_envs.ros.codec import encode_sink
 
-QUICK = ("bam/pick-v0", "bam/mir100-avoidance-v0", "bam/ur-empty-v0")
+QUICK = ("bam/pick-v0", "bam/avoidance-v0", "bam/ur-empty-v0")
 """An arm with a gripper, a base and an arm alone: the environments of `make quick`."""
 
 
@@ -20,6 +20,22 @@ ROBOTS = [env_id for env_id, entry in ENVIRONMENTS.items() if entry.has_robot]
 LOCAL = [env_id for env_id, entry in ENVIRONMENTS.items() if entry.robot == NO_ROBOT]
 """The environments without a robot."""
 EACH = each(ROBOTS)
+
+CART = {
+    "name": "cart",
+    "title": "a user's own omnidirectional cart",
+    "footprint": {"corners": [[0.3, -0.2], [0.3, 0.2], [0.0, 0.3], [-0.3, 0.2], [-0.3, -0.2]]},
+    "drive": {
+        "kind": "omnidirectional",
+        "speed": 0.6,
+        "sideways": 0.3,
+        "turn": 1.0,
+        "acceleration": 1.0,
+        "turn_acceleration": 2.0,
+    },
+    "lasers": [{"range": [0.1, 10.0], "angles": [-3.1, 3.1], "beams": 200}],
+}
+"""A description of a base with five corners that drives sideways."""
 
 
 def make_task(env_id, num_envs=1, **options):

@@ -1,5 +1,6 @@
 import json
 import sys
+from dataclasses import replace
 from importlib import metadata
 
 import gymnasium as gym
@@ -9,7 +10,9 @@ from gymnasium.vector import AutoresetMode
 
 from bam_envs.aliases.robo_gym_names import ROBO_GYM
 from bam_envs.core.registry import ENVIRONMENTS
+from bam_envs.core.robot_models import portable_model
 from bam_envs.core.spaces import space_to_json
+from bam_envs.robots.base_description import base_model
 from bam_train.checkpoint import Checkpoint
 from bam_train.environments import (
     ENTRY_POINTS,
@@ -19,6 +22,7 @@ from bam_train.environments import (
     is_batched,
     make_env,
     make_vector_env,
+    require_env_kwargs,
     require_fit,
 )
 from bam_train.errors import CheckpointMismatch, SettingsError
@@ -229,6 +233,54 @@ def test_a_manifest_that_does_not_fit_an_environment_of_ours(corridor_checkpoint
     with pytest.raises(SettingsError) as caught:
         environment_of(Checkpoint.open(path))
     assert str(caught.value).startswith(f"{path}: its manifest: {message}")
+
+
+THOSE = "Leave it out; these take one: bam/reach, bam/pick, bam/pick-place, bam/navigation, bam/avoidance"
+
+
+@pytest.mark.parametrize(
+    ("env_id", "model", "message"),
+    [
+        (
+            "bam/navigation-v0",
+            "fr3",
+            "env_kwargs: robot_model: fr3 is an arm, and a wheeled base is needed: husky",
+        ),
+        (
+            "bam/mir100-navigation-v0",
+            "fr3",
+            "env_kwargs: robot_model: fr3 is an arm, and a wheeled base is needed: husky",
+        ),
+        ("bam/pick-v0", "husky", "env_kwargs: robot_model: husky is a wheeled base, and an arm is needed: fr3, gen3"),
+        ("bam/grid-world-v0", "fr3", f"--robot-model: bam/grid-world-v0 takes none. {THOSE}"),
+        (
+            "bam/ur-reach-v0",
+            "fr3",
+            f"--robot-model: bam/ur-reach-v0 takes none; its arm is --set env_kwargs.ur_model=ur10. {THOSE}",
+        ),
+        (
+            "NoObstacleNavigationMir100Sim-v0",
+            "husky",
+            f"--robot-model: NoObstacleNavigationMir100Sim-v0 takes none. {THOSE}",
+        ),
+        ("CartPole-v1", "fr3", "--robot-model: CartPole-v1 takes none. Leave it out"),
+    ],
+)
+def test_a_robot_model_that_an_environment_does_not_take(env_id, model, message):
+    check = make_env if env_id == "CartPole-v1" else require_env_kwargs
+    with pytest.raises(SettingsError) as caught:
+        check(env_id, {"robot_model": model})
+    assert str(caught.value).startswith(message)
+
+
+def test_a_checkpoint_of_another_base_of_that_name_is_refused(corridor_checkpoint):
+    husky = base_model("husky")
+    wider = portable_model(replace(husky, footprint=replace(husky.footprint, width=0.7)))
+    path = corridor_checkpoint(env="bam/navigation-v0", env_kwargs={"robot_model": wider})
+    with pytest.raises(CheckpointMismatch) as caught:
+        environment_of(Checkpoint.open(path))
+    assert "was trained for another robot: husky is another robot here (" in str(caught.value)
+    assert "footprint.width: 0.7, here 0.67." in str(caught.value)
 
 
 def test_long_values_are_cut(corridor, corridor_checkpoint):

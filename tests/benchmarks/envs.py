@@ -20,8 +20,8 @@ from tests.benchmarks.harness import at_least, in_turns, ratio
 PICK = "bam/pick-v0"
 GOALS = {
     PICK: (64, 15_000.0),
-    "bam/mir100-navigation-v0": (4096, 300_000.0),
-    "bam/mir100-avoidance-v0": (256, 20_000.0),
+    "bam/navigation-v0": (4096, 300_000.0),
+    "bam/avoidance-v0": (256, 20_000.0),
     "bam/ur-reach-v0": (256, 30_000.0),
 }
 """Environment to its number in a batch, and the goal of the whole batch [steps/s]."""

@@ -86,7 +86,8 @@ class Jogger:
 
         Args:
             seq: Its number, which grows.
-            twist: vx, vy, vz [m/s] and wz [rad/s] in ``base_link``, or v, 0, 0, wz of a base. Shape: (4,), finite.
+            twist: vx, vy, vz [m/s] and wz [rad/s] in ``base_link``; of a base vx, vy if it drives sideways, and wz.
+                Shape: (4,), finite.
             gripper: 1 closes the gripper, -1 opens it, 0 leaves it.
             sent: The sender's time [s]: a twist that was on its way for `JOG_LIFETIME` longer than the quickest one
                 counts as late.
@@ -119,8 +120,9 @@ class Jogger:
 
     def _drive(self) -> Array:
         """Speeds of a base (m,)."""
-        speeds, units = {"m/s": self._newest.twist[0], "rad/s": self._newest.twist[3]}, self._spec.command.units
-        return self._inside(np.array([speeds[unit] for unit in units]))
+        forwards, left, _, turn = self._newest.twist
+        driven = iter((forwards, left))
+        return self._inside(np.array([next(driven) if unit == "m/s" else turn for unit in self._spec.command.units]))
 
     def _reach(self, state: RobotState) -> Array:
         """Joints and gripper of an arm, one step on (m,): from the last command, or from where the arm is."""

@@ -172,7 +172,8 @@ class _Base:
         self._zones = None if spec.body is None else LaserZones(spec, limits, spec.body)
         self._has_scans = self._zones is not None and math.isfinite(self._zones.limit_value)
         places = measured_places(spec, spec.command.units)
-        self._speeds = [(spec.command.units[place], [(place, signal, column)]) for place, signal, column in places]
+        units = dict.fromkeys(spec.command.units[place] for place, *_ in places)
+        self._speeds = [(unit, [one for one in places if spec.command.units[one[0]] == unit]) for unit in units]
 
     def picture(self, state: RobotState) -> dict[str, Any]:
         if self._body is None or "base_pose" not in state.signals:
@@ -186,8 +187,8 @@ class _Base:
         limits = {"m/s": ("base speed", self._limits.base_speed), "rad/s": ("turn speed", self._limits.turn_speed)}
         near = {}
         for unit, place in self._speeds:
-            (speed,), (name, limit) = _numbers(state, place), limits[unit]
-            near[name] = _below(abs(speed), limit, unit)
+            speed, (name, limit) = math.hypot(*_numbers(state, place)), limits[unit]
+            near[name] = _below(speed, limit, unit)
         if self._body is not None and self._has_scans:
             x, y = self._points(state)
             x = x[np.abs(y) <= self._body.side]  # what it meets when it drives straight on, or back

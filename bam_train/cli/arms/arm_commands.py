@@ -13,6 +13,8 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from bam_envs.arms.description import ArmDescription
+    from bam_envs.core.robot_models import Description
+    from bam_envs.robots.base_description import BaseDescription
     from bam_train.cli.arms.bam_robots import AddArmConfig, CheckArmConfig, ListArmsConfig
 
 _PICTURES = (".png", ".jpg")
@@ -21,7 +23,7 @@ _POSTURES = 2000  # in which kinematics are compared with MuJoCo's
 
 def add(config: AddArmConfig) -> int | None:
     """Write the description of an arm."""
-    from bam_envs.arms.description import ModelName, known_models
+    from bam_envs.core.robot_models import ModelName, known_models
     from bam_envs.core.validation import check as check_value
     from bam_envs.robots.modelling.describe import describe, write_description
 
@@ -35,7 +37,7 @@ def add(config: AddArmConfig) -> int | None:
         raise InvalidValue(f"{path} exists; give another name, or --force to replace it.")
     if config.name in known_models() and not config.force:
         raise InvalidValue(
-            f"{config.name} is an arm already, which this one would hide; give another name, or --force."
+            f"{config.name} is a robot already, which this one would hide; give another name, or --force."
         )
     model = config.mjcf or config.urdf or ""
     arm, notes = describe(config.name, model, config.gripper, config.site or config.tip, tell=tell)
@@ -52,28 +54,63 @@ def add(config: AddArmConfig) -> int | None:
 
 
 def check(config: CheckArmConfig) -> int | None:
-    """Show an arm."""
-    from bam_envs.arms.description import robot_model
+    """Show a robot."""
+    from bam_envs.arms.description import ArmDescription
+    from bam_envs.core.robot_models import Description, find_model
+    from bam_envs.robots.base_description import base_model
     from bam_train.cli.envs import aligned
 
     try:
-        arm = robot_model(config.name)
+        robot = find_model(config.name, Description)
     except UnknownName as error:
         raise InvalidValue(f"{error} Another arm is described first: bam-robots add {config.name} ...") from error
-    tell(f"{arm.name}: {arm.title}", "")
+    tell(f"{robot.name}: {robot.title}", "")
+    if isinstance(robot, ArmDescription):
+        table, facts = _joints(robot), _facts(robot)
+    else:
+        table, facts = _axes(base_model(robot)), _base_facts(base_model(robot))
+    facts.append(("limits from", "; ".join(f"{name}: {text}" for name, text in robot.sources.items()), True))
+    tell(*aligned(table), "", *aligned([[name, text] for name, text, _ in facts]))
+    if config.picture is not None:
+        _draw(robot, config.picture)
+        tell(f"drawn in {config.picture}")
+    return 0 if all(fits for *_, fits in facts) else 1
+
+
+def _joints(arm: ArmDescription) -> list[list[str]]:
+    """The joints of an arm, for `aligned`."""
     head = ["joint", "from", "to", "speed", "acceleration", "jerk", "torque", "home"]
     units = ["", "rad", "rad", "rad/s", "rad/s^2", "rad/s^3", "N m", "rad"]
     rows = [
         [row.name, *(f"{one:.4g}" for one in (row.low, row.high, row.velocity, row.acceleration, row.jerk, row.effort))]
         for row in arm.joints
     ]
-    tell(*aligned([head, units, *([*row, f"{home:.3f}"] for row, home in zip(rows, arm.home, strict=True))]), "")
-    facts = _facts(arm)
-    tell(*aligned([[name, text] for name, text, _ in facts]))
-    if config.picture is not None:
-        _draw(arm, config.picture)
-        tell(f"drawn in {config.picture}")
-    return 0 if all(fits for *_, fits in facts) else 1
+    return [head, units, *([*row, f"{home:.3f}"] for row, home in zip(rows, arm.home, strict=True))]
+
+
+def _axes(base: BaseDescription) -> list[list[str]]:
+    """The speeds of a base, for `aligned`."""
+    command = base.spec(with_scans=False).command
+    rows = zip(command.labels, command.high, command.units, command.max_rate or (), strict=True)
+    limits = [[name, f"{most:.4g} {unit}", f"{rate:.4g} {unit}^2"] for name, most, unit, rate in rows]
+    return [["axis", "speed", "acceleration"], *limits]
+
+
+def _base_facts(base: BaseDescription) -> list[tuple[str, str, bool]]:
+    """What is to be said of a base: name, text, and whether it is as it should be."""
+    body, foot = base.body, base.footprint
+    shape = f"circle of {foot.radius:g} m" if foot.radius else f"{len(body.corners)} corners"
+    length, width = body.front + body.back, body.reach(0.0, 1.0) + body.reach(0.0, -1.0)
+    facts = [
+        ("footprint", f"{shape}, {length:.3g} x {width:.3g} m, at most {body.size:.3f} m from its frame", True),
+        ("drive", base.drive.kind, True),
+    ]
+    for scanner in body.scanners:
+        (x, y, yaw), (low, high), bearings = scanner.pose, scanner.range, np.degrees(scanner.bearings)
+        text = f"{len(bearings)} rays from {bearings[0]:.0f} to {bearings[-1]:.0f} degrees, {low:g} to {high:g} m, "
+        text += f"at x {x:g}, y {y:g} m, yaw {np.degrees(yaw):.0f} degrees"
+        facts.append((f"laser {scanner.name}", text, True))
+    return facts if body.scanners else [*facts, ("lasers", "none: bam/avoidance needs one", True)]
 
 
 def _facts(arm: ArmDescription) -> list[tuple[str, str, bool]]:
@@ -102,7 +139,6 @@ def _facts(arm: ArmDescription) -> list[tuple[str, str, bool]]:
             True,
         ),
         ("work area", _area(arm) + ("" if reached else ": not all of it is reached"), reached),
-        ("limits from", "; ".join(f"{name}: {text}" for name, text in arm.sources.items()), True),
     ]
 
 
@@ -126,41 +162,51 @@ def _simulated_gap(arm: ArmDescription, q: Any) -> float:
     return float(np.abs(np.array(places) - arm.chain.tool_position(q)).max())
 
 
-def _draw(arm: ArmDescription, path: Path) -> None:
-    """Write a picture of the arm in its home pose, on its table."""
+def _draw(description: Description, path: Path) -> None:
+    """Write a picture of an arm in its home pose, on its table, or of a base among boxes."""
     from PIL import Image
 
+    from bam_envs.arms.description import ArmDescription
     from bam_envs.core.robot import Initial
+    from bam_envs.robots.physics.kinematic_base import SimulatedBase
     from bam_envs.robots.physics.mujoco_arm import SimulatedArm
 
     if path.suffix.lower() not in _PICTURES:
         raise InvalidValue(f"--picture {path}: expected a name that ends in {' or '.join(_PICTURES)}.")
-    robot = SimulatedArm(1, with_object=False, robot_model=arm)
+    robot: SimulatedArm | SimulatedBase
+    start: dict[str, Any] = {"obstacle_pose": np.array([[[1.5, 0.5, 0.3], [-0.5, -1.5, 1.0]]])}
+    if isinstance(description, ArmDescription):
+        robot = SimulatedArm(1, with_object=False, robot_model=description)
+        start = {"joint_position": np.array([description.home])}
+    else:
+        robot = SimulatedBase(robot_model=description, boxes=2)
     robot.connect()
     try:
-        robot.reset(np.arange(1), Initial({"joint_position": np.array([arm.home])}, np.zeros(1, np.int64)))
+        robot.reset(np.arange(1), Initial(start, np.zeros(1, np.int64)))
         Image.fromarray(robot.render("rgb_array", [])).save(path)
     finally:
         robot.close()
 
 
 def list_models(config: ListArmsConfig) -> int | None:
-    """List the arms."""
-    from bam_envs.arms.description import known_models
+    """List the robots."""
+    from bam_envs.core.robot_models import known_models
     from bam_train.cli.envs import aligned
 
     rows = [_row(name, path) for name, path in sorted(known_models().items())]
-    tell(*aligned([["name", "joints", "what", "file"], *rows]), "")
+    tell(*aligned([["name", "kind", "what", "file"], *rows]), "")
     tell("Another arm: bam-robots add NAME --urdf FILE --gripper parallel:0.08")
-    return 1 if any(joints == "-" for _, joints, *_ in rows) else 0
+    return 1 if any(kind == "-" for _, kind, *_ in rows) else 0
 
 
 def _row(name: str, path: Any) -> list[str]:
-    """One arm of the list; a file that cannot be read does not hide the others."""
-    from bam_envs.arms.description import read_description
+    """One robot of the list; a file that cannot be read does not hide the others."""
+    from bam_envs.arms.description import ArmDescription
+    from bam_envs.core.robot_models import read_description
 
     try:
-        arm = read_description(path)
+        robot = read_description(path)
     except InvalidValue as error:
         return [name, "-", f"cannot be read: {error}", str(path)]
-    return [name, str(arm.num_joints), arm.title, str(path)]
+    kind = f"{robot.num_joints} joints" if isinstance(robot, ArmDescription) else "base"
+    return [name, kind, robot.title, str(path)]

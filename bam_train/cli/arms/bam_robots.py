@@ -1,4 +1,4 @@
-"""`bam-robots COMMAND`: describe arms once, for simulation, guards and live robots."""
+"""`bam-robots COMMAND`: robots described once, for simulation, guards and live robots."""
 
 from dataclasses import dataclass
 from functools import partial
@@ -52,29 +52,31 @@ class AddArmConfig:
 class CheckArmConfig:
     """Show an arm: limits, reach, kinematics against MuJoCo, gripper, outline and the area where it works.
 
+    Of a wheeled base it shows limits, footprint and lasers.
+
     Examples:
       bam-robots check lab
       bam-robots check lab --picture lab.png
     """
 
     name: ModelName
-    """Name of the arm, or the file of its description."""
+    """Name of the robot, or the file of its description."""
     picture: File = None
-    """Draw it in its home pose, as an image."""
+    """Draw it, an arm in its home pose, as an image."""
 
 
 @dataclass(frozen=True)
 class ListArmsConfig:
-    """List the arms that are known here: a project's, this user's, those of packages and the shipped ones."""
+    """List the robots that are known here: a project's, this user's, those of packages and the shipped ones."""
 
 
 _FLAGS, _HERE = "bam_train.cli.arms.bam_robots", "bam_train.cli.arms.arm_commands"
 COMMANDS = {
     "add": Command("describe an arm and its gripper from model files", f"{_FLAGS}:AddArmConfig", f"{_HERE}:add"),
-    "check": Command("limits, reach, kinematics and work area of an arm", f"{_FLAGS}:CheckArmConfig", f"{_HERE}:check"),
-    "list": Command("the arms that are known here", f"{_FLAGS}:ListArmsConfig", f"{_HERE}:list_models"),
+    "check": Command("limits, shape, reach and sensors of a robot", f"{_FLAGS}:CheckArmConfig", f"{_HERE}:check"),
+    "list": Command("the robots that are known here", f"{_FLAGS}:ListArmsConfig", f"{_HERE}:list_models"),
 }
-main = partial(run_commands, "bam-robots", "Describe arms once, for simulation, guards and live robots.", COMMANDS)
+main = partial(run_commands, "bam-robots", "Describe robots once, for simulation, guards and live robots.", COMMANDS)
 
 if __name__ == "__main__":
     main()

@@ -9,7 +9,7 @@ import numpy as np
 from gymnasium.vector import VectorEnv
 from numpy.typing import NDArray
 
-from bam_envs.arms.description import DEFAULT_MODEL
+from bam_envs.core.robot_models import DEFAULT_ARM
 from bam_envs.core.spaces import space_to_json
 from bam_envs.tasks.scripted import scripted_policy
 from bam_train.checkpoint import Checkpoint
@@ -38,7 +38,7 @@ class Teacher:
         self.state_size = 0
         """How many numbers of the state it sees that the learner does not; 0 where both see the same."""
         if settings.teacher == SCRIPTED:
-            self._policy: Any = scripted_policy(settings.env, settings.env_kwargs.get("robot_model", DEFAULT_MODEL))
+            self._policy: Any = scripted_policy(settings.env, settings.env_kwargs.get("robot_model", DEFAULT_ARM))
             wanted = None
         else:
             checkpoint = Checkpoint.open(Path(str(settings.teacher)).expanduser())

@@ -1,4 +1,4 @@
-"""The ids of these environments in BAM's own package; importing this is cheap."""
+"""Other ids of these environments: those in BAM's own package, and former ones; importing this is cheap."""
 
 from bam_envs.core.registry import ENVIRONMENTS, Alias, register_alias
 
@@ -12,9 +12,14 @@ BAM_NAMES = {
     "ObsEnv-v0": Alias("bam/obs-v0"),
     "GraspXYR-v0": Alias("bam/grasp-xyr-v0"),
 }
+FORMER_NAMES = {
+    "bam/mir100-navigation-v0": Alias("bam/navigation-v0"),
+    "bam/mir100-avoidance-v0": Alias("bam/avoidance-v0"),
+}
+"""Ids from before these tasks were for any base, in checkpoints and in people's commands."""
 
 
 def register() -> None:
-    """Add BAM's ids; idempotent."""
-    for name, alias in BAM_NAMES.items():
+    """Add these ids; idempotent."""
+    for name, alias in {**BAM_NAMES, **FORMER_NAMES}.items():
         register_alias(name, alias, "bam_envs.make_env", ENVIRONMENTS[alias.env_id].time_limit)

@@ -40,8 +40,8 @@ class RoboGymId:
 
 
 _STEMS: tuple[tuple[str, str, Mapping[str, Any]], ...] = (
-    ("NoObstacleNavigationMir100", "bam/mir100-navigation-v0", {}),
-    ("ObstacleAvoidanceMir100", "bam/mir100-avoidance-v0", {}),
+    ("NoObstacleNavigationMir100", "bam/navigation-v0", {}),
+    ("ObstacleAvoidanceMir100", "bam/avoidance-v0", {}),
     ("EmptyEnvironmentUR", "bam/ur-empty-v0", _UR),
     ("EndEffectorPositioningUR", "bam/ur-reach-v0", _UR),
     ("BasicAvoidanceUR", "bam/ur-avoidance-v0", _UR),
@@ -59,8 +59,8 @@ ROBO_GYM: dict[str, RoboGymId] = {
 """By id, each ``Sim-v0`` followed by its ``Rob-v0``."""
 
 PARITY = {
-    "bam/mir100-navigation-v0": "bam_envs.robo_gym.parity:Mir100NavigationParity",
-    "bam/mir100-avoidance-v0": "bam_envs.robo_gym.parity:Mir100AvoidanceParity",
+    "bam/navigation-v0": "bam_envs.robo_gym.parity:Mir100NavigationParity",
+    "bam/avoidance-v0": "bam_envs.robo_gym.parity:Mir100AvoidanceParity",
     "bam/ur-reach-v0": "bam_envs.robo_gym.parity:UrReachParity",
     "bam/ur-empty-v0": "bam_envs.robo_gym.parity:UrEmptyParity",
     "bam/ur-avoidance-v0": "bam_envs.robo_gym.parity:UrAvoidanceParity",

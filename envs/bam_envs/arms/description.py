@@ -1,55 +1,28 @@
-"""Descriptions of arms: joints, limits, tool, gripper, outline and work area of one arm, as plain data in a TOML file.
-
-Simulation, kinematics, guards and live profiles all read the same description, so that an arm is described once. Those
-in the folder ``descriptions`` are shipped; ``./robots`` and this user's configuration folder hold a user's own, and
-installed packages offer theirs by the entry point group ``bam_envs.robots``. No simulator is needed.
-"""
+"""The description of an arm: joints, limits, tool, gripper, outline and work area, as plain data in a TOML file."""
 
 import dataclasses
-import hashlib
-import importlib
-import json
-import sys
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
-from functools import cached_property, lru_cache
-from importlib import metadata, resources
-from pathlib import Path
-from typing import Annotated, Any, TypeVar
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, ClassVar
 
 import numpy as np
-from msgspec import Meta
 from numpy.typing import NDArray
 
 from bam_envs.arms.serial_chain import Arm, Capsule, SerialChain
 from bam_envs.core import kinematics
-from bam_envs.core.config_folder import config_folder
-from bam_envs.core.errors import BamEnvsError, InvalidValue, UnknownName
+from bam_envs.core.errors import InvalidValue, UnknownName
 from bam_envs.core.kinematics import ArmGeometry
 from bam_envs.core.robot import RobotSpec, SignalSpec
-from bam_envs.core.validation import Finite, NonEmpty, NonNegative, NonNegativeInt, Positive, check, read_table
+from bam_envs.core.robot_models import Description, find_model
+from bam_envs.core.validation import Finite, NonEmpty, NonNegative, NonNegativeInt, Positive
 
-tomllib: Any = importlib.import_module("tomllib" if sys.version_info >= (3, 11) else "tomli")
-
-T = TypeVar("T")
 Array = NDArray[np.float64]
 Vector = tuple[Finite, Finite, Finite]
 Quaternion = tuple[Finite, Finite, Finite, Finite]
 Box = tuple[Vector, Vector]
 """Middle and half edges [m]."""
-ModelName = Annotated[
-    str, Meta(pattern=r"^[A-Za-z0-9][\w.-]{0,63}\Z", description="at most 64 letters, digits and . _ -")
-]
-ENTRY_POINTS = "bam_envs.robots"
-"""Entry point group of packages with descriptions: each names a package that holds ``NAME.toml`` files."""
-MOVING = ("joints", "home", "tool", "gripper", "mount", "workspace")
-"""Tables that decide how an arm moves."""
-DEFAULT_MODEL = "ur5e"
-"""The arm of an environment without another ``robot_model``."""
 _MOST_CAPSULES = 100
-_MOST = 8  # differences that are listed
-SHIPPED = resources.files("bam_envs.arms") / "descriptions"
-"""The folder of the shipped descriptions."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -143,12 +116,19 @@ class Gripper:
 
 
 @dataclass(frozen=True, kw_only=True)
-class ArmDescription:
+class ArmDescription(Description):
     """An arm with its gripper. Positions in ``base_link``: x forward, z up, z = 0 on the table that it stands on."""
 
-    name: ModelName
-    title: NonEmpty
-    """What the arm is, in a few words."""
+    WHAT: ClassVar[str] = "an arm"
+    PARTS: ClassVar[Mapping[str, type[Any]]] = {
+        "joints": JointRow,
+        "capsules": Capsule,
+        "tool": Placed,
+        "mount": Placed,
+        "gripper": Gripper,
+    }
+    MOVING: ClassVar[tuple[str, ...]] = ("joints", "home", "tool", "gripper", "mount", "workspace")
+
     joints: tuple[JointRow, ...]
     """From the base to the flange."""
     home: tuple[Finite, ...]
@@ -162,8 +142,6 @@ class ArmDescription:
     """Outline for collisions."""
     slack: tuple[tuple[NonNegativeInt, NonNegativeInt, NonNegative], ...] = ()
     """Two links, and how far their capsules overlap before the links themselves touch [m]."""
-    sources: Mapping[str, str] = field(default_factory=dict)
-    """Where lengths, limits and masses come from."""
     mount: Placed = Placed()
     """Pose of the base."""
     geometry: str = ""
@@ -264,20 +242,6 @@ class ArmDescription:
         )
         return RobotSpec(self.name, tuple(signals), command, period=0.05)
 
-    @cached_property
-    def digest(self) -> str:
-        """SHA-256 of `MOVING`, what decides how the arm moves, in hexadecimal."""
-        table = dataclasses.asdict(self)
-        moving = {key: table[key] for key in MOVING}
-        return hashlib.sha256(repr(moving).encode()).hexdigest()
-
-    def differences(self, other: "ArmDescription") -> Iterator[tuple[str, Any, Any]]:
-        """What differs from `other` in what decides how the arm moves: name, value here, value there."""
-        here, there = (dict(_leaves(dataclasses.asdict(one))) for one in (self, other))
-        for name in sorted({*here, *there}):
-            if name.split(".")[0] in MOVING and here.get(name) != there.get(name):
-                yield name, here.get(name), there.get(name)
-
 
 def cube_edge(opening: float, turns: bool) -> float:
     """Edge of the cube that an arm grasps: 4 cm, or less for a small gripper or one that cannot turn [m]."""
@@ -293,138 +257,6 @@ OBJECT_SIGNALS = [
 """Pose of a tracked object, in ``base_link``."""
 
 
-def _leaves(value: Any, name: str = "") -> Iterator[tuple[str, Any]]:
-    pairs = (
-        value.items() if isinstance(value, Mapping) else enumerate(value) if isinstance(value, (tuple, list)) else ()
-    )
-    if not pairs:
-        yield name, value
-    for key, part in pairs:
-        yield from _leaves(part, f"{name}.{key}" if name else str(key))
-
-
-def read_description(path: Any) -> ArmDescription:
-    """The description in the TOML file `path`.
-
-    Raises:
-        InvalidValue: The file cannot be read, or a key or value does not fit; it names which.
-    """
-    try:
-        text = path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise InvalidValue(f"The robot description {path} cannot be read: {error}.") from error
-    return _in_text(text, str(path))
-
-
-@lru_cache(maxsize=32)
-def _in_text(text: str, where: str) -> ArmDescription:
-    try:
-        table = tomllib.loads(text)
-    except ValueError as error:
-        raise InvalidValue(f"{where} is not TOML: {error}.") from error
-    return description_of(table, where)
-
-
-def description_of(table: Mapping[str, Any], where: str) -> ArmDescription:
-    """The description in `table`, with the tables in it; `where` begins errors."""
-    kinds = {"joints": JointRow, "capsules": Capsule, "tool": Placed, "mount": Placed, "gripper": Gripper}
-    read = dict(table)
-    for key, kind in kinds.items():
-        if key not in read:
-            continue
-        rows = read[key]
-        if key in ("joints", "capsules"):
-            rows = check(rows, list[dict[str, Any]], f"{where}: {key}")
-            read[key] = tuple(_read(kind, row, f"{where}: {key}[{at}]") for at, row in enumerate(rows))
-        else:
-            read[key] = _read(kind, rows, f"{where}: {key}")
-    return _read(ArmDescription, read, where)
-
-
-def _read(kind: type[T], table: object, where: str) -> T:
-    """`read_table`; also an error in what several values mean together begins with `where`."""
-    try:
-        return read_table(kind, table, where)
-    except BamEnvsError as error:
-        text = str(error)
-        raise InvalidValue(text if text.startswith(where) else f"{where}: {text}") from error
-
-
-def description_folders() -> Iterator[Any]:
-    """The folders that are searched, in order: the project's, this user's, those of packages, the shipped one."""
-    yield Path("robots")
-    yield config_folder() / "robots"
-    for point in metadata.entry_points(group=ENTRY_POINTS):
-        yield resources.files(point.value)
-    yield SHIPPED
-
-
-def known_models() -> dict[str, Any]:
-    """File of every description, by its name; the first folder that has a name wins."""
-    known: dict[str, Any] = {}
-    for folder in description_folders():
-        if folder.is_dir():
-            for entry in sorted(folder.iterdir(), key=lambda one: one.name):
-                if entry.name.endswith(".toml"):
-                    known.setdefault(entry.name.removesuffix(".toml"), entry)
-    return known
-
-
-def robot_model(name: "str | Mapping[str, Any] | ArmDescription") -> ArmDescription:
-    """The arm called `name`, or in a file ``NAME.toml``, or in a table; a description is returned as it is.
-
-    Raises:
-        UnknownName: There is none; with the closest match.
-        InvalidValue: Its file or table does not fit.
-    """
-    if isinstance(name, ArmDescription):
-        return name
-    if isinstance(name, Mapping):
-        return _in_table(name)
-    check(name, NonEmpty, "robot_model")
-    path = Path(name)
-    if path.suffix == ".toml":
-        return read_description(path)
-    known = known_models()
-    if name not in known:
-        raise UnknownName("robot model", name, known)
-    return read_description(known[name])
-
-
-def portable_model(name: "str | Mapping[str, Any] | ArmDescription") -> str | dict[str, Any]:
-    """`name`, or the whole description in its place, for a checkpoint: any but the default one, with its digest."""
-    arm = robot_model(name)
-    if arm.name == DEFAULT_MODEL and name == DEFAULT_MODEL:
-        return DEFAULT_MODEL
-    table = dataclasses.asdict(arm)
-    return {**json.loads(json.dumps(table)), "digest": arm.digest}
-
-
-def _in_table(table: Mapping[str, Any]) -> ArmDescription:
-    """The description in a table of a checkpoint; `InvalidValue` if it is not the one with its digest."""
-    plain = {key: value for key, value in table.items() if key != "digest"}
-    arm = description_of(plain, "robot_model")
-    if "digest" in table and table["digest"] != arm.digest:
-        raise InvalidValue(f"robot_model: the description of {arm.name} was changed: it does not have its digest.")
-    return arm
-
-
-def require_same_arm(table: object) -> None:
-    """Refuse a description in a checkpoint if the one of that name here is of another arm.
-
-    Raises:
-        InvalidValue: What differs, in the checkpoint and here.
-    """
-    if not isinstance(table, Mapping):
-        return
-    there = robot_model(table)
-    path = known_models().get(there.name)
-    here = there if path is None else read_description(path)
-    if here.digest == there.digest:
-        return
-    rows = [f"{name}: {theirs}, here {ours}" for name, theirs, ours in there.differences(here)]
-    more = f", and {len(rows) - _MOST} more" if len(rows) > _MOST else ""
-    raise InvalidValue(
-        f"{there.name} is another arm here ({path}): {'; '.join(rows[:_MOST])}{more}. Give the description with which "
-        "the policy was trained another name, or train a policy for this one."
-    )
+def robot_model(name: str | Mapping[str, Any] | Description) -> ArmDescription:
+    """The arm called `name`; see `bam_envs.core.robot_models.find_model`."""
+    return find_model(name, ArmDescription)

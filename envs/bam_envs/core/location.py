@@ -4,6 +4,7 @@
 knows which of them exclude each other; what a location cannot have is no field of it.
 """
 
+import os
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -19,6 +20,11 @@ SIMULATED: Mapping[str, Any] = {"randomize": False, "link": None, "action_delay"
 WHERE = ("robot", "transport", "profile", "guards", "trial", "shadow", "robot_name", "ca_file", "token_file")
 """Arguments of an environment that determine where it runs, and how far a live robot may go there; only a person gives
 them, never a file."""
+
+
+def config_folder() -> Path:
+    """This user's configuration folder: ``bam-train`` below ``$XDG_CONFIG_HOME`` or ``~/.config``."""
+    return Path(os.environ.get("XDG_CONFIG_HOME") or "~/.config").expanduser() / "bam-train"
 
 
 @dataclass(frozen=True)

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
@@ -50,25 +52,77 @@ class SignalSpec:
 class Scanner:
     """A laser scanner of a base, in a plane above the floor."""
 
+    name: str
+    """What it is called in labels."""
     signal: str
     """Name of the signal of its ranges [m]."""
     pose: tuple[float, float, float]
     """x, y [m] and yaw [rad] in the base's frame."""
     bearings: tuple[float, ...]
     """Direction of each ray in the scanner's frame [rad]."""
+    range: tuple[float, float]
+    """Least and greatest range that is measured [m]."""
+    contact: tuple[float, ...]
+    """Range of each ray below which the base touches, or nearly touches, what the ray meets [m]."""
+    least: tuple[float, ...]
+    """Range as which a shorter range of each ray, or one that is not measured, counts for the guards [m]."""
+    height: float
+    """Of its rays above the floor [m]."""
+    hidden: tuple[int, int] = (0, 0)
+    """Number of rays that the robot's body hides, before the first of `bearings` and behind the last."""
 
 
 @dataclass(frozen=True)
 class BaseBody:
-    """Shape of a base, a rectangle in its own frame, and its scanners."""
+    """Shape of a base in its own frame, a convex polygon or a circle, and its scanners."""
 
-    front: float
-    """Distance of its front ahead of its frame [m]."""
-    back: float
-    """Distance of its back behind its frame [m]."""
-    side: float
-    """Half its width [m]."""
+    corners: tuple[tuple[float, float], ...]
+    """Corners of the polygon, anticlockwise; or the middle of the circle alone [m]."""
+    radius: float
+    """Radius of the circle [m]; 0 for a polygon."""
     scanners: tuple[Scanner, ...]
+
+    def reach(self, x: float, y: float) -> float:
+        """How far the base extends from its frame in a direction, a unit vector [m]."""
+        return max(corner_x * x + corner_y * y for corner_x, corner_y in self.corners) + self.radius
+
+    @cached_property
+    def front(self) -> float:
+        """Distance of its front ahead of its frame [m]."""
+        return self.reach(1.0, 0.0)
+
+    @cached_property
+    def back(self) -> float:
+        """Distance of its back behind its frame [m]."""
+        return self.reach(-1.0, 0.0)
+
+    @cached_property
+    def side(self) -> float:
+        """Distance of its farther side from its frame [m]."""
+        return max(self.reach(0.0, 1.0), self.reach(0.0, -1.0))
+
+    @cached_property
+    def size(self) -> float:
+        """Distance of its farthest point from its frame [m]."""
+        return max(math.hypot(x, y) for x, y in self.corners) + self.radius
+
+    @cached_property
+    def sides(self) -> tuple[tuple[float, float, float], ...]:
+        """Outward unit vector x, y of each side of the polygon, and how far the side is from the frame [m]."""
+        pairs = zip(self.corners, (*self.corners[1:], self.corners[0]), strict=True)
+        normals = [(y - y0, x0 - x, math.dist((x, y), (x0, y0))) for (x0, y0), (x, y) in pairs]
+        return tuple((dx / far, dy / far, self.reach(dx / far, dy / far)) for dx, dy, far in normals if far)
+
+    def holds(self, x: Array, y: Array) -> NDArray[np.bool_]:
+        """Whether points in the base's frame [m] are inside it. Shapes: any, the same."""
+        if self.radius:
+            ((middle_x, middle_y),) = self.corners
+            inside: NDArray[np.bool_] = np.hypot(x - middle_x, y - middle_y) <= self.radius
+            return inside
+        inside = np.ones(np.shape(x), bool)
+        for dx, dy, far in self.sides:  # those of a rectangle are along x and y, which is quicker
+            inside &= (x * dx + y * dy if dx and dy else x * dx if dx else y * dy) <= far
+        return inside
 
 
 @dataclass(frozen=True)

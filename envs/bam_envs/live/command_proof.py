@@ -18,8 +18,8 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from bam_envs.core.config_folder import config_folder
 from bam_envs.core.errors import BamEnvsError, LinkLost, NotReady
+from bam_envs.core.location import config_folder
 from bam_envs.live.robot_identity import is_one_robot, robot_identity
 from bam_envs.ros.codec import RobotInfo
 from bam_envs.ros.profile_tables import RobotProfile, Sink

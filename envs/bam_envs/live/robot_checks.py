@@ -202,7 +202,7 @@ def _speed(speed: Reading, position: Reading, simulated: bool) -> Check:
     known = steps <= _PAUSE * usual
     if (duration := steps[known].sum()) < _SHORTEST:
         return Check(what, expected, "too few messages", fits=None)
-    path = driven(position.values) if name == "base_pose" else position.values
+    path = driven(position.values, speed.values.shape[1]) if name == "base_pose" else position.values
     speeds = np.stack([np.interp(at, times, column) for column in speed.values.T], axis=1)
     changed = np.diff(path, axis=0)[known].sum(axis=0) / duration
     measured = ((speeds[1:] + speeds[:-1]) / 2 * steps[:, None])[known].sum(axis=0) / duration
@@ -215,13 +215,17 @@ def _speed(speed: Reading, position: Reading, simulated: bool) -> Check:
     return Check(what, expected, found, fits=bool(off[worst] <= RATE_OFF))
 
 
-def driven(poses: Array) -> Array:
-    """Distance driven forwards [m] and angle turned [rad] since the first of the `poses` (k, 3). Shape: (k, 2)."""
+def driven(poses: Array, axes: int) -> Array:
+    """Distance driven forwards, to the left if there are 3 `axes`, [m] and angle turned [rad] since the first pose.
+
+    Shapes: (k, 3) -> (k, axes).
+    """
     steps = np.diff(poses, axis=0)
     turned = np.angle(np.exp(1j * steps[:, 2]))
     heading = poses[:-1, 2] + turned / 2
-    forwards = steps[:, 0] * np.cos(heading) + steps[:, 1] * np.sin(heading)
-    return np.concatenate([np.zeros((1, 2)), np.cumsum(np.stack([forwards, turned], axis=1), axis=0)])
+    cos, sin = np.cos(heading), np.sin(heading)
+    ways = [steps[:, 0] * cos + steps[:, 1] * sin, steps[:, 1] * cos - steps[:, 0] * sin][: axes - 1]
+    return np.concatenate([np.zeros((1, axes)), np.cumsum(np.stack([*ways, turned], axis=1), axis=0)])
 
 
 def _commands(inspection: Inspection) -> Iterator[Check]:

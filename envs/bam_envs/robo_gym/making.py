@@ -187,7 +187,9 @@ def require_values(entry: RoboGymId, given: Mapping[str, Any]) -> None:
 
 
 def _task_options(entry: RoboGymId) -> dict[str, Any]:
-    return ENVIRONMENTS[entry.env_id].options()
+    """The options of the task; robo-gym's ids name their robot."""
+    options = ENVIRONMENTS[entry.env_id].options()
+    return {name: value for name, value in options.items() if name != "robot_model"}
 
 
 def _window(given: Mapping[str, Any]) -> dict[str, Any]:

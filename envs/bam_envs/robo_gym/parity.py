@@ -9,11 +9,11 @@ from gymnasium import spaces
 from bam_envs.core.errors import ProtocolError
 from bam_envs.core.robot import EnvIds, Initial, RobotState
 from bam_envs.core.task import Array, Flags, Floats, Label, Score
-from bam_envs.robots.mir100 import BACK_RAYS, FOOTPRINT, FRONT_RAYS
+from bam_envs.robo_gym.rs_state import BACK_RAYS, FOOTPRINT, FRONT_RAYS
 from bam_envs.robots.ur import JOINTS, START
+from bam_envs.tasks.avoidance import AvoidanceTask
 from bam_envs.tasks.isaac_reach import TOOL1, IsaacReachTask
-from bam_envs.tasks.mir100_avoidance import NEAREST, Mir100AvoidanceTask
-from bam_envs.tasks.mir100_navigation import ARRIVED, BOUNDARY, MAX_STEPS, DriveTask, Mir100NavigationTask
+from bam_envs.tasks.navigation import ARRIVED, BOUNDARY, MAX_STEPS, DriveTask, NavigationTask
 from bam_envs.tasks.ur_arm import UrTask, in_frame, joint_labels, normalised, spherical
 from bam_envs.tasks.ur_avoidance import COLLISION, UrAvoidanceTask, UrObstacleTask, obstacle_labels
 from bam_envs.tasks.ur_empty import UrEmptyTask
@@ -24,6 +24,7 @@ _INF = np.inf
 _UNSCALED = ("1", "1", "1")
 NEARER, FAILING, POWER = 50.0, -200.0, (0.30, 0.03)
 """Rewards of a metre nearer and of failure; cost of full speed, forward and turning."""
+NEAREST = 0.15  # a ray shorter than this is a collision [m]
 SAFETY_RADIUS = 0.40  # a corner of the base nearer than this to the middle of a box is a collision [m]
 BEAMS = np.round(np.linspace(0, FRONT_RAYS + BACK_RAYS - 1, 16)).astype(np.int64)
 """The rays that are observed, out of those of the front and the back scanner."""
@@ -222,12 +223,18 @@ class DriveParity(DriveTask):
     """Observations in metres and radians; no reward for the first step's progress; 500 steps terminate."""
 
     success_reward: float
-    observation_labels: tuple[Label, ...] = (
-        Label("target_distance", "target from the base", "m", low=-_INF, high=_INF),
-        Label("target_bearing", "where the target is, seen from the base", "rad", low=-np.pi, high=np.pi),
-        Label("linear_velocity", "speed forward", "m/s", low=-1.1, high=1.1),
-        Label("angular_velocity", "speed of turning anticlockwise", "rad/s", low=-1.6, high=1.6),
-    )
+
+    def __init__(self, num_envs: int = 1, **options: Any) -> None:
+        super().__init__(num_envs, **options)
+        self.require_mir100("parity")
+
+    def _observation_labels(self) -> tuple[Label, ...]:
+        return (
+            Label("target_distance", "target from the base", "m", low=-_INF, high=_INF),
+            Label("target_bearing", "where the target is, seen from the base", "rad", low=-np.pi, high=np.pi),
+            Label("linear_velocity", "speed forward", "m/s", low=-1.1, high=1.1),
+            Label("angular_velocity", "speed of turning anticlockwise", "rad/s", low=-1.6, high=1.6),
+        )
 
     def on_reset(self, env_ids: EnvIds, state: RobotState) -> None:
         """Forget the previous distance."""
@@ -261,7 +268,7 @@ class DriveParity(DriveTask):
         return np.zeros((self.num_envs, 9))
 
 
-class Mir100NavigationParity(DriveParity, Mir100NavigationTask):
+class Mir100NavigationParity(DriveParity, NavigationTask):
     """robo-gym's NoObstacleNavigationMir100.
 
     With ``parity=True`` observation, reward and end are those of robo-gym's `NoObstacleNavigationMir100`: metres and
@@ -278,7 +285,7 @@ class Mir100NavigationParity(DriveParity, Mir100NavigationTask):
         return failed
 
 
-class Mir100AvoidanceParity(DriveParity, Mir100AvoidanceTask):
+class Mir100AvoidanceParity(DriveParity, AvoidanceTask):
     """robo-gym's ObstacleAvoidanceMir100.
 
     With ``parity=True`` observation, reward and end are those of robo-gym's `ObstacleAvoidanceMir100`: metres and
@@ -288,10 +295,10 @@ class Mir100AvoidanceParity(DriveParity, Mir100AvoidanceTask):
     """
 
     success_reward = 100.0
-    observation_labels = (
-        *DriveParity.observation_labels,
-        *(Label(f"range_{ray}", f"ray {ray} of both scanners", "m", low=0.0, high=29.0) for ray in BEAMS),
-    )
+
+    def _observation_labels(self) -> tuple[Label, ...]:
+        rays = (Label(f"range_{ray}", f"ray {ray} of both scanners", "m", low=0.0, high=29.0) for ray in BEAMS)
+        return (*DriveParity._observation_labels(self), *rays)
 
     def seen(self, state: RobotState) -> list[Floats]:
         """Single rays. Shape: (n, 16) in two parts."""

@@ -10,11 +10,17 @@ from numpy.typing import NDArray
 
 from bam_envs.core.errors import InvalidValue
 from bam_envs.core.robot import RobotState
-from bam_envs.robots.mir100 import BACK_RAYS, FRONT_RAYS
+from bam_envs.core.robot_models import SHIPPED, read_description
+from bam_envs.robots.base_description import base_model
 from bam_envs.tasks.ur_arm import POSITIONS, VELOCITIES, frame_keys
 
 Array = NDArray[np.float64]
-
+MIR100 = base_model(read_description(SHIPPED / "mir100.toml"))
+"""The base of robo-gym, as shipped."""
+FOOTPRINT = (MIR100.footprint.length, MIR100.footprint.width)
+"""Its length and width [m]."""
+FRONT_RAYS, BACK_RAYS = (len(scanner.bearings) for scanner in MIR100.body.scanners)
+"""Rays of its lasers: 501 and 511."""
 _OBJECT, _FLANGE, _FOREARM = frame_keys("object_0"), frame_keys("ee"), frame_keys("forearm")
 UR_KEYS = {
     "only_robot": (*POSITIONS, *VELOCITIES, *_FLANGE, "in_collision"),

@@ -20,11 +20,12 @@ from typing import Annotated, Any, Literal, TypeVar, get_args
 import yaml
 from msgspec import Meta
 
-from bam_envs.arms.description import known_models, robot_model
+from bam_envs.arms.description import ArmDescription
 from bam_envs.core.errors import InvalidValue, UnknownName
 from bam_envs.core.robot import RobotSpec, SignalSpec
+from bam_envs.core.robot_models import Description, find_model, known_models
 from bam_envs.core.validation import Finite, NonEmpty, NonNegative, Positive, check, read_table, type_hints
-from bam_envs.robots.mir100 import base_spec
+from bam_envs.robots.base_description import base_model
 from bam_envs.robots.ur5e import arm_spec
 from bam_envs.ros.codec import LISTED_TYPES
 from bam_envs.ros.messages import bare_type, has_header
@@ -38,7 +39,7 @@ from bam_envs.ros.profile_tables import (
     Source,
     Topic,
 )
-from bam_envs.safety.guard import BOUNDS, Limits
+from bam_envs.safety.guard import BOUNDS, Limits, is_base
 
 tomllib: Any = importlib.import_module("tomllib" if sys.version_info >= (3, 11) else "tomli")
 
@@ -52,10 +53,8 @@ _STATES = "sensor_msgs/JointState"
 _SUFFIXES = (".toml", ".yaml", ".yml")
 _SHIPPED = resources.files("bam_envs.robots") / "profiles"
 _AGES = {"arm": 0.1, "base": 0.5}
-_ROBOTS: dict[str, Callable[[], RobotSpec]] = {
-    "ur5e": lambda: arm_spec("ur5e", with_object=True),
-    "mir100": base_spec,
-}
+_AXES = {"linear_velocity": "linear.x", "lateral_velocity": "linear.y", "angular_velocity": "angular.z"}
+_ROBOTS: dict[str, Callable[[], RobotSpec]] = {"ur5e": lambda: arm_spec("ur5e", with_object=True)}
 
 
 @dataclass(frozen=True)
@@ -99,18 +98,24 @@ class _Signal:
 def load_profile(name_or_path: str | Path) -> RobotProfile:
     """The shipped profile of that name, or the one in a TOML or YAML file, checked.
 
-    `UnknownName` carries the closest match to a name, `InvalidValue` names the error in a file.
+    A described robot without a profile has the usual topics: `usual_profile`. `UnknownName` carries the closest match
+    to a name, `InvalidValue` names the error in a file.
     """
-    return _profile(*_read_file(str(name_or_path)))
+    name = str(name_or_path)
+    if name not in shipped_profiles() and name in known_models():
+        return usual_profile(_named_robot("robot profile", name))
+    return _profile(*_read_file(name))
 
 
 def profile_for(spec: RobotSpec) -> RobotProfile:
-    """The shipped profile that takes the commands of `spec`, else the first that takes more, narrowed to them.
+    """The shipped profile for `spec`: of its name, else one that takes its commands, or more and is narrowed to them.
 
-    A described arm without one has the usual topics of ros2_control: `usual_profile`.
+    A base, or a described arm, without one has the usual topics of ROS 2: `usual_profile`.
     """
     labels, shipped = spec.command.labels, [load_profile(name) for name in shipped_profiles()]
-    for profile in sorted(shipped, key=lambda one: one.command.labels != labels):
+    if is_base(spec) and set(labels) <= _AXES.keys() and spec.name not in shipped_profiles():
+        return usual_profile(spec)
+    for profile in sorted(shipped, key=lambda one: (one.name != spec.name, one.command.labels != labels)):
         if labels and set(labels) <= set(profile.command.labels):
             return profile.narrowed(labels)
     joints = next((one.labels for one in spec.signals if one.name == "joint_position"), ())
@@ -120,10 +125,14 @@ def profile_for(spec: RobotSpec) -> RobotProfile:
 
 
 def usual_profile(spec: RobotSpec) -> RobotProfile:
-    """Topics of a described arm as ros2_control names them: joint states, and a controller of joint trajectories.
+    """Topics of a described robot as ROS 2 usually names them.
 
-    Commands name their joints, so that the order in the controller does not matter.
+    Those of a base are ``/odom``, ``/cmd_vel`` (TwistStamped) and one for each laser. Those of an arm are as
+    ros2_control names them: joint states, and a controller of joint trajectories. Its commands name their joints, so
+    that the order in the controller does not matter.
     """
+    if is_base(spec):
+        return _usual_base(spec)
     joints, command = spec.command.labels[:-1], spec.command
     topics = {"joint_position": "position", "joint_velocity": "velocity"}
     states: list[Table] = [
@@ -152,6 +161,38 @@ def usual_profile(spec: RobotSpec) -> RobotProfile:
     }
     del table["command"]["name"]
     return _profile(f"usual profile of {spec.name}", table)
+
+
+def _usual_base(spec: RobotSpec) -> RobotProfile:
+    speeds = [_AXES[label] for label in spec.command.labels]
+    odometry: Table = {"topic": "/odom", "type": "nav_msgs/Odometry"}
+    pose = [f"pose.pose.{part}" for part in ("position.x", "position.y")]
+    states: list[Table] = [
+        {**odometry, "signal": "base_velocity", "fields": [f"twist.twist.{speed}" for speed in speeds]},
+        {**odometry, "signal": "base_pose", "fields": [*pose, "yaw(pose.pose.orientation)"]},
+    ]
+    for scanner in spec.body.scanners if spec.body is not None else ():
+        scan: Table = {"topic": f"/{scanner.signal}", "type": "sensor_msgs/LaserScan", "field": "ranges"}
+        (low, high), ((first, second), last) = scanner.range, (scanner.bearings[:2], scanner.bearings[-1])
+        step = second - first
+        ends = {"angle_min": first - scanner.hidden[0] * step, "angle_max": last + scanner.hidden[1] * step}
+        constants = {**ends, "angle_increment": step, "range_min": low, "range_max": high}
+        scan |= {"skip": list(scanner.hidden), "missing": high, "within": [low, high], "constants": constants}
+        states.append({**scan, "signal": scanner.signal})
+    known, command = {signal.name for signal in spec.signals}, spec.command
+    sink: Table = {"topic": "/cmd_vel", "type": "geometry_msgs/TwistStamped", "labels": list(command.labels)}
+    table: Table = {
+        "name": spec.name,
+        "kind": "base",
+        "period": spec.period,
+        "watchdog": 0.5,  # of ros2_control's drives and of a Create 3
+        "signals": [_as_table(signal) for signal in spec.signals],
+        "command": {**_as_table(command), "max_rate": list(command.max_rate or ())},
+        "state": [state for state in states if state["signal"] in known],
+        "commands": {"velocity": [{**sink, "fields": [f"twist.{speed}" for speed in speeds], "hold": "zero"}]},
+    }
+    del table["command"]["name"]
+    return replace(_profile(f"usual profile of {spec.name}", table), body=spec.body)
 
 
 def _as_table(signal: SignalSpec) -> Table:
@@ -219,6 +260,8 @@ def _profile(where: str, table: Table) -> RobotProfile:
             "driven: give its drive a time-out of 0.5 s or less, and set it here."
         )
     spec = _robot(where, file)
+    if is_base(spec) != (file.kind == "base"):
+        raise InvalidValue(f"{where}: kind is {file.kind}, and its commands are those of the other kind, arm or base.")
     state = _state(where, file, spec)
     commands = {mode: _sinks(where, mode, rows, spec.command) for mode, rows in file.commands.items()}
     if not commands:
@@ -280,7 +323,7 @@ def _robot(where: str, file: _File) -> RobotSpec:
     signals = [_signal(row, at) for row, at in _rows(f"{where}: signals", file.signals)]
     command = None if file.command is None else _signal(file.command, f"{where}: command")
     if base is None and (command is None or file.period is None):
-        raise InvalidValue(f"{where}: give robot ({', '.join(_ROBOTS)}), or [command] with max_rate, and period.")
+        raise InvalidValue(f"{where}: give robot (a name of bam-robots list), or [command] with max_rate, and period.")
     if command is not None and (command.name != "command" or command.max_rate is None):
         raise InvalidValue(f"{where}: command needs max_rate, and takes no name.")
     every = [*(base.signals if base else ()), *signals]
@@ -291,11 +334,12 @@ def _robot(where: str, file: _File) -> RobotSpec:
 
 
 def _named_robot(where: str, name: str) -> RobotSpec:
-    """The UR5e or MiR100 that profiles are shipped for, or any described arm."""
+    """The UR5e that profiles are shipped for, or any described robot."""
     if name in _ROBOTS:
         return _ROBOTS[name]()
     _require_known(where, "robot", [name], {*_ROBOTS, *known_models()})
-    return robot_model(name).spec(with_object=True)
+    robot = find_model(name, Description)
+    return robot.spec(with_object=True) if isinstance(robot, ArmDescription) else base_model(robot).spec()
 
 
 def _signal(row: Table, where: str) -> SignalSpec:

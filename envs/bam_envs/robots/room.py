@@ -4,13 +4,15 @@ Rays are cast in float32, many bases at a time, and written into scratch arrays 
 its 1012 rays takes about 10 µs.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
 
-from bam_envs.robots.mir100 import FOOTPRINT, FOOTPRINT_AHEAD, SCAN_RANGE, SCAN_RAYS, SCAN_SPAN
+from bam_envs.core.robot import BaseBody, Scanner
+from bam_envs.robots.base_description import MOST_RAYS
 
 Array = NDArray[np.float64]
 Floats = NDArray[np.float32]
@@ -21,9 +23,9 @@ BOX_EDGE = 0.5
 NOWHERE = (1000.0, 1000.0, 0.0)
 """Pose of a box that is not there: out of sight [m, m, rad]."""
 NOISE = 0.01  # standard deviation of a measured range [m]
-_HALF = (FOOTPRINT[0] / 2, FOOTPRINT[1] / 2)
 _CHUNK = 64
 _TAPE = 1 << 17
+_SIZE = 0.56733  # farthest point of a MiR100 from its frame [m]
 _ONE, _HALF_EDGE = np.float32(1.0), np.float32(BOX_EDGE / 2)
 
 
@@ -39,48 +41,55 @@ LAB = Room((-2.877, -3.836), (2.823, 3.864))
 """The inside of robo-gym's world ``lab_6x8``."""
 
 
-def touches(pose: Array, room: Room | None, boxes: Array) -> Flags:
+def room_for(body: BaseBody) -> float:
+    """How many times as large as `LAB` and the distances in it a room for this base is: 1 up to a MiR100's size."""
+    return max(1.0, round(body.size / _SIZE, 2))
+
+
+def touches(body: BaseBody, pose: Array, room: Room | None, boxes: Array) -> Flags:
     """Whether the footprint of each base touches a wall, if there is a `room`, or a box.
 
     Poses are x, y [m], yaw [rad]. Shapes: (n, 3), (n, b, 3) -> (n,).
     """
-    yaw = pose[:, 2].copy()
+    yaw = pose[:, 2:].copy()
     cos, sin = np.cos(yaw), np.sin(yaw)
-    x, y = pose[:, 0] + FOOTPRINT_AHEAD * cos, pose[:, 1] + FOOTPRINT_AHEAD * sin
+    own_x, own_y = np.array(body.corners).T
+    x, y = pose[:, :1] + own_x * cos - own_y * sin, pose[:, 1:2] + own_x * sin + own_y * cos
     hit = np.zeros(len(pose), dtype=bool)
     if room is not None:
-        reach_x = _HALF[0] * np.abs(cos) + _HALF[1] * np.abs(sin)
-        reach_y = _HALF[0] * np.abs(sin) + _HALF[1] * np.abs(cos)
-        hit |= (x - reach_x < room.low[0]) | (x + reach_x > room.high[0])
-        hit |= (y - reach_y < room.low[1]) | (y + reach_y > room.high[1])
+        for places, least, most in ((x, room.low[0], room.high[0]), (y, room.low[1], room.high[1])):
+            hit |= ((places < least + body.radius) | (places > most - body.radius)).any(axis=1)
     for box in range(boxes.shape[1]):
-        hit |= _overlaps(x, y, cos, sin, *np.ascontiguousarray(boxes[:, box].T))
+        hit |= _touches_box(body, x, y, pose, cos, sin, boxes[:, box])
     return hit
 
 
-def _overlaps(x: Array, y: Array, cos: Array, sin: Array, box_x: Array, box_y: Array, box_yaw: Array) -> Flags:
-    """Whether rectangle and square overlap: no side of either separates them. Shape: (n,) each."""
-    box_cos, box_sin = np.cos(box_yaw), np.sin(box_yaw)
-    dx, dy = box_x - x, box_y - y
-    turn_cos, turn_sin = np.abs(cos * box_cos + sin * box_sin), np.abs(cos * box_sin - sin * box_cos)
-    half = BOX_EDGE / 2
-    reach = half * (turn_cos + turn_sin)
-    apart = np.abs(dx * cos + dy * sin) > _HALF[0] + reach
-    apart |= np.abs(dy * cos - dx * sin) > _HALF[1] + reach
-    apart |= np.abs(dx * box_cos + dy * box_sin) > half + _HALF[0] * turn_cos + _HALF[1] * turn_sin
-    apart |= np.abs(dy * box_cos - dx * box_sin) > half + _HALF[0] * turn_sin + _HALF[1] * turn_cos
-    return ~apart
+def _touches_box(body: BaseBody, x: Array, y: Array, pose: Array, cos: Array, sin: Array, box: Array) -> Flags:
+    """Whether each base, with corners at `x` and `y` (n, c), touches a box (n, 3). Shape: (n,)."""
+    box_x, box_y, yaw = np.ascontiguousarray(box.T)[..., None]
+    box_cos, box_sin, half = np.cos(yaw), np.sin(yaw), BOX_EDGE / 2
+    dx, dy = x - box_x, y - box_y
+    in_box = (dx * box_cos + dy * box_sin, dy * box_cos - dx * box_sin)
+    if body.radius:
+        off_x, off_y = (np.maximum(np.abs(one[:, 0]) - half, 0.0) for one in in_box)
+        near: Flags = np.hypot(off_x, off_y) <= body.radius
+        return near
+    # Two convex polygons are apart if a side of one of them separates them.
+    apart = np.any([np.maximum(one.min(axis=1), -one.max(axis=1)) > half for one in in_box], axis=0)
+    side_x, side_y, side = np.array(body.sides).T
+    dx, dy = box_x - pose[:, :1], box_y - pose[:, 1:2]
+    turn_cos, turn_sin = cos * box_cos + sin * box_sin, sin * box_cos - cos * box_sin
+    reach = half * (np.abs(side_x * turn_cos - side_y * turn_sin) + np.abs(side_x * turn_sin + side_y * turn_cos))
+    away = (dx * cos + dy * sin) * side_x + (dy * cos - dx * sin) * side_y
+    touching: Flags = ~(apart | (away - side > reach).any(axis=1))
+    return touching
 
 
 class LaserScanner:
-    """One scanner at the pose `mount` on every base: x, y [m], yaw [rad] in its frame.
+    """The laser `scanner` on every base."""
 
-    The `masked` rays, which the base's body hides at the beginning and at the end, are left out.
-    """
-
-    def __init__(self, mount: tuple[float, float, float], masked: tuple[int, int]) -> None:
-        self._mount = mount
-        bearing = np.linspace(*SCAN_SPAN, SCAN_RAYS)[masked[0] : SCAN_RAYS - masked[1]]
+    def __init__(self, scanner: Scanner) -> None:
+        self._mount, bearing = scanner.pose, np.array(scanner.bearings)
         self._directions = (np.cos(bearing).astype(np.float32), np.sin(bearing).astype(np.float32))
         self._scratch = np.empty((6, _CHUNK, len(bearing)), np.float32)
         self._hits = np.empty((_CHUNK, len(bearing)), bool)
@@ -160,16 +169,19 @@ def _column(values: Array) -> Floats:
     return values.astype(np.float32)[:, None]
 
 
-def measured(ranges: Floats, deviates: Floats) -> Array:
-    """Measured ranges inside `SCAN_RANGE`, from true `ranges` (n, rays) [m] and `deviates` (n, rays) [m]."""
-    ranges = ranges + deviates
-    np.fmax(ranges, np.float32(SCAN_RANGE[0]), out=ranges)  # NaN becomes the least range
-    clipped: Array = np.minimum(ranges, np.float32(SCAN_RANGE[1]), out=ranges).astype(np.float64)
-    return clipped
+def measured(ranges: Floats, deviates: Floats, scanners: Sequence[Scanner]) -> Array:
+    """What `scanners` measure, from true `ranges` (n, rays) [m] and `deviates` (n, rays) [m]."""
+    ranges, begin = ranges + deviates, 0
+    for scanner in scanners:
+        part = ranges[:, begin : begin + len(scanner.bearings)]
+        np.fmax(part, np.float32(scanner.range[0]), out=part)  # NaN becomes the least range
+        np.minimum(part, np.float32(scanner.range[1]), out=part)
+        begin += part.shape[1]
+    return ranges.astype(np.float64)
 
 
 def noise(seeds: Seeds, count: Seeds, rays: int) -> Floats:
-    """Normal deviates of mean 0 and standard deviation `NOISE` [m]; `rays` are at most the 1012 of both scanners.
+    """Normal deviates of mean 0 and standard deviation `NOISE` [m]; `rays` are at most `MOST_RAYS`.
 
     Each scan is a section of one long tape, at a position given by the seed of its base and its number `count` in the
     episode: no environment needs a generator, and a scan costs one copy. Shapes: (n,), (n,) -> (n, rays).
@@ -181,7 +193,7 @@ def noise(seeds: Seeds, count: Seeds, rays: int) -> Floats:
 
 @cache
 def _tape() -> Floats:
-    deviates = np.random.Generator(np.random.PCG64(100)).standard_normal(_TAPE + 2 * SCAN_RAYS, dtype=np.float32)
+    deviates = np.random.Generator(np.random.PCG64(100)).standard_normal(_TAPE + MOST_RAYS, dtype=np.float32)
     tape: Floats = deviates * np.float32(NOISE)
     return tape
 

@@ -2,11 +2,12 @@
 
 from dataclasses import replace
 
-from bam_envs.arms.description import SHIPPED, read_description
+from bam_envs.arms.description import robot_model
 from bam_envs.core.kinematics import UR5E_GRIPPER
 from bam_envs.core.robot import RobotSpec
+from bam_envs.core.robot_models import SHIPPED, read_description
 
-_ARM = read_description(SHIPPED / "ur5e.toml")
+_ARM = robot_model(read_description(SHIPPED / "ur5e.toml"))
 JOINTS = _ARM.joint_names
 GRIPPER_OPEN = _ARM.gripper.open
 """Width of the open gripper [m] (Robotiq 2F-85)."""

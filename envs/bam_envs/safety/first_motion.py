@@ -193,9 +193,10 @@ class FirstMotion(Guard):
             names = next(signal.labels for signal in spec.signals if signal.name == "joint_position")
             self._ways = [_Way(f"joint_velocity of {name}", name, "rad", joint) for joint, name in enumerate(names)]
         if "base_pose" in sizes and "base_velocity" in sizes:
+            ways = ["the speed", *["the speed sideways"] * (sizes["base_velocity"] == 3), "the turn rate"]
             self._ways = [
-                _Way("the speed in base_velocity", "base_pose", "m", 0),
-                _Way("the turn rate in base_velocity", "base_pose", "rad", 1),
+                _Way(f"{way} in base_velocity", "base_pose", "rad" if "turn" in way else "m", column)
+                for column, way in enumerate(ways)
             ]
         self._is_base = "base_pose" in sizes
         self._grippers = [(at, spec.command.labels[at], spec.command.high[at]) for at in columns_in(spec.command, "m")]
@@ -224,7 +225,9 @@ class FirstMotion(Guard):
         seconds = max(0.0, tick.pause - (tick.age - self._age)) if tick.pause else self._period
         signals, self._age = tick.signals, tick.age
         if self._is_base:
-            speeds, changes = signals["base_velocity"][0].tolist(), self._driven(signals["base_pose"][0].tolist())
+            speeds = signals["base_velocity"][0].tolist()
+            changes = self._driven(signals["base_pose"][0].tolist())
+            changes = changes if len(speeds) == 3 else [changes[0], changes[2]]
         else:
             speeds = signals["joint_velocity"][0].tolist()
             positions = signals["joint_position"][0].tolist()
@@ -241,11 +244,12 @@ class FirstMotion(Guard):
         return None
 
     def _driven(self, pose: Numbers) -> Numbers:
-        """Distance driven forwards [m] and angle turned [rad] since the last tick, by the pose x, y, yaw."""
+        """Distance driven forwards and to the left [m] and angle turned [rad] since the last tick, by x, y, yaw."""
         before, self._pose = self._pose or pose, pose
         turned = math.remainder(pose[2] - before[2], 2 * math.pi)
-        heading = before[2] + turned / 2
-        return [(pose[0] - before[0]) * math.cos(heading) + (pose[1] - before[1]) * math.sin(heading), turned]
+        heading, dx, dy = before[2] + turned / 2, pose[0] - before[0], pose[1] - before[1]
+        cos, sin = math.cos(heading), math.sin(heading)
+        return [dx * cos + dy * sin, dy * cos - dx * sin, turned]
 
     def _gripper(self, tick: Tick) -> str | None:
         """Report a gripper that was commanded to open and is not measured open."""

@@ -162,8 +162,14 @@ class BaseSpeed(Guard):
         self.limit_value = max(self._high)
 
     def limit(self, tick: Tick) -> bool:
-        """Clip this speed; the other one is unchanged."""
-        return clip(tick, self._columns, self._low, self._high)
+        """Clip this speed, in its direction if the base drives sideways too; others are unchanged."""
+        changed = clip(tick, self._columns, self._low, self._high)
+        speed = math.hypot(*(tick.command[at] for at in self._columns))
+        if len(self._columns) == 1 or speed <= self.limit_value:
+            return changed
+        for at in self._columns:
+            tick.command[at] *= self.limit_value / speed
+        return True
 
 
 class BaseAcceleration(Guard):
@@ -356,7 +362,7 @@ def _kinematics(spec: RobotSpec, tool_position: ToolPosition | None) -> ToolPosi
 def _base_guards(spec: RobotSpec, limits: Limits) -> list[Guard]:
     drive, turn = picker(columns_in(spec.command, "m/s")), picker(columns_in(spec.command, "rad/s"))
     return [
-        MeasuredSpeed("G11", "base speed", "m/s", limits.base_speed, lambda tick: drive(tick.measured)),
+        MeasuredSpeed("G11", "base speed", "m/s", limits.base_speed, lambda tick: [math.hypot(*drive(tick.measured))]),
         MeasuredSpeed("G11", "turn speed", "rad/s", limits.turn_speed, lambda tick: turn(tick.measured)),
         BaseSpeed("base speed", "m/s", limits.base_speed, spec),
         BaseSpeed("turn speed", "rad/s", limits.turn_speed, spec),

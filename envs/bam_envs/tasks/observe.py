@@ -5,13 +5,14 @@ from collections.abc import Sequence
 import numpy as np
 from gymnasium import spaces
 
-from bam_envs.arms.description import DEFAULT_MODEL, robot_model
+from bam_envs.arms.description import robot_model
 from bam_envs.core.robot import EnvIds, Initial, RobotState
+from bam_envs.core.robot_models import DEFAULT_ARM
 from bam_envs.core.task import Array, Floats, Label, Memory, Score, draw_seeds, labelled_box, limited
 from bam_envs.tasks.pick import CubeTable
 from bam_envs.tasks.reach import START_NOISE
 
-_TABLE = CubeTable(robot_model(DEFAULT_MODEL))
+_TABLE = CubeTable(robot_model(DEFAULT_ARM))
 HOME, JOINTS = np.array(_TABLE.description.home), _TABLE.description.joint_names
 
 

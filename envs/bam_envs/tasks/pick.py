@@ -6,10 +6,11 @@ from typing import Any
 import numpy as np
 from gymnasium import spaces
 
-from bam_envs.arms.description import DEFAULT_MODEL, ArmDescription, cube_edge
+from bam_envs.arms.description import ArmDescription, cube_edge
 from bam_envs.arms.description import robot_model as model_called
 from bam_envs.core.kinematics import cube_yaw_phase
 from bam_envs.core.robot import EnvIds, Initial, RobotState
+from bam_envs.core.robot_models import DEFAULT_ARM
 from bam_envs.core.task import Array, Floats, Label, Memory, Score, draw_seeds, labelled_box, limited
 from bam_envs.tasks.tool_control import ToolControl, WorkSpace, hand_state
 
@@ -97,7 +98,7 @@ class PickTask(Memory):
     memory: Mapping[str, str] = {"rest_height": "rest_height", "held": "held"}
     moves_straight = True  # the tool, along straight lines: singularities count
 
-    def __init__(self, num_envs: int = 1, *, robot_model: Any = DEFAULT_MODEL) -> None:
+    def __init__(self, num_envs: int = 1, *, robot_model: Any = DEFAULT_ARM) -> None:
         self.num_envs, self.table = num_envs, CubeTable(model_called(robot_model))
         self.arm = self.table.arm
         self.action_labels = self.table.action_labels

@@ -5,8 +5,8 @@ from typing import Any
 
 import numpy as np
 
-from bam_envs.arms.description import DEFAULT_MODEL
 from bam_envs.core.robot import EnvIds, Initial, RobotState
+from bam_envs.core.robot_models import DEFAULT_ARM
 from bam_envs.core.task import Array, Floats, Label, Score, limited
 from bam_envs.tasks.pick import TABLE_EDGE, CubeSense, CubeTable, PickTask
 
@@ -56,7 +56,7 @@ class PickPlaceTask(PickTask):
 
     memory: Mapping[str, str] = {**PickTask.memory, "goal": "goal", "picked": "picked"}
 
-    def __init__(self, num_envs: int = 1, *, robot_model: Any = DEFAULT_MODEL) -> None:
+    def __init__(self, num_envs: int = 1, *, robot_model: Any = DEFAULT_ARM) -> None:
         super().__init__(num_envs, robot_model=robot_model)
         (x, _, _), (half_x, half_y, _) = self.table.middle, self.table.half
         self.robot_labels = (

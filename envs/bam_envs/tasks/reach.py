@@ -6,9 +6,10 @@ from typing import Any
 import numpy as np
 from gymnasium import spaces
 
-from bam_envs.arms.description import DEFAULT_MODEL, ArmDescription
+from bam_envs.arms.description import ArmDescription
 from bam_envs.arms.description import robot_model as model_called
 from bam_envs.core.robot import EnvIds, Initial, RobotState
+from bam_envs.core.robot_models import DEFAULT_ARM
 from bam_envs.core.task import Array, Floats, Label, Memory, Score, draw_seeds, labelled_box, limited
 from bam_envs.tasks.tool_control import JOINT_STEP, TOOL_STEP, WorkSpace
 
@@ -66,7 +67,7 @@ class ReachTask(Memory):
 
     memory: Mapping[str, str] = {"goal": "goal"}
 
-    def __init__(self, num_envs: int = 1, *, robot_model: Any = DEFAULT_MODEL) -> None:
+    def __init__(self, num_envs: int = 1, *, robot_model: Any = DEFAULT_ARM) -> None:
         self.num_envs, self.space = num_envs, GoalSpace(model_called(robot_model))
         self.arm = self.space.arm
         joints = self.space.description.joint_names

@@ -8,9 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from bam_envs.arms.description import DEFAULT_MODEL, ArmDescription, robot_model
+from bam_envs.arms.description import ArmDescription, robot_model
 from bam_envs.core.errors import InvalidValue, UnknownName
 from bam_envs.core.registry import ENVIRONMENTS
+from bam_envs.core.robot_models import DEFAULT_ARM
 from bam_envs.core.task import Array, Flags, Floats, Label
 from bam_envs.tasks.grasping.scripted_grasps import ScriptedGrasps
 from bam_envs.tasks.pick import CubeTable, PickTask
@@ -132,7 +133,7 @@ SCRIPTED: dict[str, tuple[type[Any], Callable[[ArmDescription], Any], Callable[[
 GRASP = "bam/grasp-xyr-v0"
 
 
-def scripted_policy(env_id: str, arm: Any = DEFAULT_MODEL) -> ScriptedPolicy | ScriptedGrasps:
+def scripted_policy(env_id: str, arm: Any = DEFAULT_ARM) -> ScriptedPolicy | ScriptedGrasps:
     """The scripted policy for `env_id` with the arm of that name; see `bam_envs.arms.description.robot_model`.
 
     Raises:

@@ -11,8 +11,9 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from bam_envs.arms.description import DEFAULT_MODEL, ArmDescription, robot_model
+from bam_envs.arms.description import ArmDescription, robot_model
 from bam_envs.core.robot import EnvIds, RobotState
+from bam_envs.core.robot_models import DEFAULT_ARM
 from bam_envs.core.task import Array, Floats, Label, Memory, limited
 
 TOOL_STEP = 0.0124
@@ -76,7 +77,7 @@ class WorkSpace:
         return tuple(Label(joint, "joint position", "rad", "/ pi", -2, 2) for joint in self.description.joint_names)
 
 
-_DEFAULT = WorkSpace(robot_model(DEFAULT_MODEL))
+_DEFAULT = WorkSpace(robot_model(DEFAULT_ARM))
 ACTION_LABELS, HAND_LABELS = _DEFAULT.action_labels, _DEFAULT.hand_labels
 """Labels of the default arm."""
 

@@ -7,11 +7,12 @@ from importlib import metadata
 import numpy as np
 import pytest
 
-from bam_envs.arms import description
-from bam_envs.arms.description import known_models, read_description, robot_model
+from bam_envs.arms.description import ArmDescription, robot_model
+from bam_envs.core import robot_models
 from bam_envs.core.errors import InvalidValue, UnknownName
+from bam_envs.core.robot_models import known_models, read_description
 
-SHIPPED = known_models()
+SHIPPED = known_models(ArmDescription)
 SO101 = SHIPPED["so101"].read_text(encoding="utf-8")
 
 
@@ -168,8 +169,8 @@ def test_a_project_comes_before_its_user_and_both_before_packages_and_the_shippe
     package.mkdir()
     (package / "__init__.py").touch()
     monkeypatch.syspath_prepend(str(tmp_path))
-    point = metadata.EntryPoint("arms", "arms_of_a_package", description.ENTRY_POINTS)
-    monkeypatch.setattr(metadata, "entry_points", lambda group: [point] if group == description.ENTRY_POINTS else [])
+    point = metadata.EntryPoint("arms", "arms_of_a_package", robot_models.ENTRY_POINTS)
+    monkeypatch.setattr(metadata, "entry_points", lambda group: [point] if group == robot_models.ENTRY_POINTS else [])
     titles = []
     for folder, title in ((None, ""), (package, "a package's"), (user, "the user's"), (project, "the project's")):
         if folder is not None:
@@ -179,7 +180,7 @@ def test_a_project_comes_before_its_user_and_both_before_packages_and_the_shippe
     assert titles == ["SO-101 (5 joints) with its jaw", "a package's", "the user's", "the project's"]
     (project / "notes.txt").touch()
     (user / "lab.toml").write_text(SO101.replace('name = "so101"', 'name = "lab"'), encoding="utf-8")
-    assert set(known_models()) == {*SHIPPED, "lab"}
+    assert set(known_models(ArmDescription)) == {*SHIPPED, "lab"}
     assert robot_model("lab").name == "lab"
 
 
@@ -189,7 +190,7 @@ def test_a_name_that_is_not_known(places):
     assert str(caught.value) == "Unknown robot model 'fr4'. Did you mean 'fr3'?"
     with pytest.raises(UnknownName) as caught:
         robot_model("zebra")
-    assert str(caught.value) == f"Unknown robot model 'zebra'. Choose from: {', '.join(sorted(SHIPPED))}."
+    assert str(caught.value) == f"Unknown robot model 'zebra'. Choose from: {', '.join(sorted(known_models()))}."
 
 
 def test_a_file_and_a_description_are_taken_as_they_are(tmp_path):

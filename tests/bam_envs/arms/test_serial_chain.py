@@ -10,9 +10,10 @@ import numpy as np
 import pytest
 
 from bam_envs.arms.capsules import Outline
-from bam_envs.arms.description import known_models, robot_model
+from bam_envs.arms.description import ArmDescription, robot_model
 from bam_envs.arms.serial_chain import HAND, Capsule, arm_of, chain_of
 from bam_envs.core.kinematics import ArmGeometry
+from bam_envs.core.robot_models import known_models
 from bam_envs.robots.physics.arm_model import scene_spec
 
 ARMS = ("fr3", "gen3", "so101", "ur10e", "ur16e", "ur3e", "ur5e", "xarm7")
@@ -42,7 +43,7 @@ def line(chain, goals, yaws, steps=150):
 
 
 def test_these_are_the_shipped_arms():
-    assert set(ARMS) == set(known_models())
+    assert set(ARMS) == set(known_models(ArmDescription))
 
 
 @pytest.mark.parametrize("name", ARMS)

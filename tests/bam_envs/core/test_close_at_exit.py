@@ -78,7 +78,7 @@ LIVE = """
 import sys
 import gymnasium as gym
 import bam_envs
-env = gym.make("bam/mir100-navigation-v0", robot=sys.argv[1], disable_env_checker=True)
+env = gym.make("bam/navigation-v0", robot=sys.argv[1], disable_env_checker=True)
 env.reset(seed=1)
 env.step(env.action_space.sample())
 print("left", flush=True)
@@ -88,7 +88,7 @@ print("left", flush=True)
 def test_a_live_robot_is_halted_too():
     """It was halted once by the reset; a bridge of others, unlike ours, says nothing to a base whose driver is gone."""
     halts = []
-    with ServedEnvironment(gym.make("bam/mir100-navigation-v0"), ServeOptions(port=0, fast=True)) as served:
+    with ServedEnvironment(gym.make("bam/navigation-v0"), ServeOptions(port=0, fast=True)) as served:
         served.bus.subscribe("/bam/halt", "std_msgs/Empty", lambda message, caller: halts.append(message))
         program = [sys.executable, "-c", LIVE, served.bus.url]
         ended = subprocess.run(program, capture_output=True, text=True, timeout=60, check=False)

@@ -17,8 +17,8 @@ def test_the_table():
         "bam/reach-v0": (100, 0.05),
         "bam/pick-v0": (100, 0.05),
         "bam/pick-place-v0": (200, 0.05),
-        "bam/mir100-navigation-v0": (500, 0.1),
-        "bam/mir100-avoidance-v0": (500, 0.1),
+        "bam/navigation-v0": (500, 0.1),
+        "bam/avoidance-v0": (500, 0.1),
         "bam/ur-reach-v0": (300, 0.1),
         "bam/ur-empty-v0": (300, 0.05),
         "bam/ur-avoidance-v0": (1000, 0.05),
@@ -165,7 +165,7 @@ def test_a_flag_that_is_none_is_an_error(making):
 
 @pytest.mark.parametrize("making", [gym.make, gym.make_vec])
 def test_options_of_reset_are_a_table(making):
-    env = making("bam/mir100-navigation-v0")
+    env = making("bam/navigation-v0")
     with pytest.raises(InvalidValue, match=r"^options= of reset must be a dict of names and values, not \[1, 2\]\.$"):
         env.reset(options=[1, 2])
     env.close()
@@ -183,9 +183,9 @@ def test_a_reset_option_where_there_is_none():
 @pytest.mark.parametrize(
     ("env_id", "steps"),
     [
-        ("bam/mir100-navigation-v0", 7),
-        ("bam/mir100-navigation-v0", 700),
-        ("bam/mir100-navigation-v0", -1),
+        ("bam/navigation-v0", 7),
+        ("bam/navigation-v0", 700),
+        ("bam/navigation-v0", -1),
         ("NoObstacleNavigationMir100Sim-v0", 7),
     ],
 )
@@ -206,9 +206,9 @@ def test_the_time_limit_can_be_changed(make, env_id, steps):
 @pytest.mark.parametrize(
     ("env_id", "parity", "steps", "ended", "flags"),
     [
-        ("bam/mir100-navigation-v0", True, None, 500, (True, True)),
-        ("bam/mir100-navigation-v0", True, 7, 7, (False, True)),
-        ("bam/mir100-navigation-v0", True, 700, 500, (True, False)),
+        ("bam/navigation-v0", True, None, 500, (True, True)),
+        ("bam/navigation-v0", True, 7, 7, (False, True)),
+        ("bam/navigation-v0", True, 700, 500, (True, False)),
         ("NoObstacleNavigationMir100Sim-v0", True, None, 500, (True, False)),
         ("NoObstacleNavigationMir100Sim-v0", False, None, 500, (False, True)),
         ("NoObstacleNavigationMir100Sim-v0", False, 700, 500, (False, True)),

@@ -19,7 +19,7 @@ from bam_envs.tasks.scripted import SCRIPTED, scripted_policy
 from bam_envs.testing.assertions import assert_same_value
 from tests.bam_envs.making import EACH, each
 
-ONE_OF_EACH = ("bam/pick-v0", "bam/mir100-avoidance-v0", "bam/ur-empty-v0")
+ONE_OF_EACH = ("bam/pick-v0", "bam/avoidance-v0", "bam/ur-empty-v0")
 """An arm with a gripper, a base, an arm alone: for what does not depend on the task."""
 
 SAME_START = "bam/ur-empty-v0"
@@ -171,8 +171,8 @@ def test_a_cube_off_the_table_terminates_without_success(make, env_id):
 
 
 ENDED = {
-    "bam/mir100-navigation-v0": ("out of boundary", [-1, 0]),
-    "bam/mir100-avoidance-v0": ("collision", [1, 1]),
+    "bam/navigation-v0": ("out of boundary", [-1, 0]),
+    "bam/avoidance-v0": ("collision", [1, 1]),
     "bam/ur-reach-v0": ("collision", [0, -1, 0, 0, 0]),
     "bam/ur-empty-v0": ("collision", [0, -1, 0, 0, 0]),
     "bam/ur-avoidance-v0": ("collision", [0, -1, 0, 0, 0]),

@@ -18,7 +18,7 @@ from bam_envs.tasks.scripted import SCRIPTED, scripted_policy
 from bam_envs.testing.assertions import assert_same_value
 from tests.bam_envs.making import EACH, QUICK, ROBOTS
 
-ONE_OF_EACH = ("bam/pick-v0", "bam/mir100-avoidance-v0", "bam/ur-empty-v0")
+ONE_OF_EACH = ("bam/pick-v0", "bam/avoidance-v0", "bam/ur-empty-v0")
 """An arm with a gripper, a base, an arm alone: for what does not depend on the task."""
 
 

@@ -15,8 +15,8 @@ from bam_envs.live.rosbridge_robot import RosbridgeRobot
 from bam_envs.remote.serve.command_lease import CommandLease
 from bam_envs.remote.serve.robot_service import RobotService
 from bam_envs.remote.serve.served_robot import ServedRobot
+from bam_envs.robots.base_description import base_model
 from bam_envs.robots.fake import FakeRobot
-from bam_envs.robots.mir100 import base_spec
 from bam_envs.robots.physics.kinematic_base import SimulatedBase
 from bam_envs.robots.profile import load_profile
 from bam_envs.robots.ur5e import JOINTS, arm_spec
@@ -132,7 +132,7 @@ def test_certificates_without_tls():
 
 def test_its_profile():
     assert live_robot("ws://robot").spec == arm_spec("ur5e", with_object=True)
-    assert live_robot("ws://robot", base_spec("any")).spec == base_spec()
+    assert live_robot("ws://robot", base_model("mir100").spec()).spec == base_model("mir100").spec()
     assert live_robot("ws://robot", profile="mir100").spec.name == "mir100"
     assert live_robot("ws://robot", profile=load_profile("mir100")).spec.name == "mir100"
     with pytest.raises(UnknownName, match="Did you mean 'ur5e'"):
@@ -171,8 +171,8 @@ def test_some_limits_of_its_guards():
 @pytest.mark.parametrize(
     ("spec", "limit", "value"),
     [
-        (base_spec(), "box_x_min", -1.0),
-        (base_spec(with_scans=False), "laser_slow", 0.5),
+        (base_model("mir100").spec(), "box_x_min", -1.0),
+        (base_model("mir100").spec(with_scans=False), "laser_slow", 0.5),
         (arm_spec("ur5e", with_object=False), "base_speed", 0.3),
         (arm_spec("ur5e", with_object=False), "singularity_slow", 15.0),  # not along straight lines
     ],

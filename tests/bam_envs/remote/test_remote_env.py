@@ -33,7 +33,7 @@ THROUGH = pytest.mark.parametrize("through", [local, tcp])
 
 
 @THROUGH
-@pytest.mark.parametrize("env_id", ["bam/reach-v0", "bam/mir100-avoidance-v0", "CartPole-v1"])
+@pytest.mark.parametrize("env_id", ["bam/reach-v0", "bam/avoidance-v0", "CartPole-v1"])
 @pytest.mark.filterwarnings("ignore:.*Not able to test alternative render modes.*")
 @pytest.mark.filterwarnings("ignore:.*Box observation space m(in|ax)imum value is (-)?infinity.*")
 def test_gymnasiums_checker_passes(make, through, env_id):

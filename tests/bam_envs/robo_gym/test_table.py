@@ -9,8 +9,8 @@ from bam_envs.aliases.robo_gym_names import ROBO_GYM
 from bam_envs.core.registry import are_same, entry_of, resolve_id
 
 STEMS = {
-    "NoObstacleNavigationMir100": "bam/mir100-navigation-v0",
-    "ObstacleAvoidanceMir100": "bam/mir100-avoidance-v0",
+    "NoObstacleNavigationMir100": "bam/navigation-v0",
+    "ObstacleAvoidanceMir100": "bam/avoidance-v0",
     "EmptyEnvironmentUR": "bam/ur-empty-v0",
     "EndEffectorPositioningUR": "bam/ur-reach-v0",
     "BasicAvoidanceUR": "bam/ur-avoidance-v0",
@@ -52,11 +52,11 @@ print(sorted(name for name in sys.modules if name.startswith("bam_envs.")))
 
 
 def test_two_names_of_one_environment_are_the_same():
-    assert are_same("bam/mir100-navigation-v0", "NoObstacleNavigationMir100Sim-v0")
+    assert are_same("bam/navigation-v0", "NoObstacleNavigationMir100Sim-v0")
     assert are_same("EndEffectorPositioningURRob-v0", "EndEffectorPositioningURSim-v0")
     assert are_same("CartPole-v1", "CartPole-v1")
     assert not are_same("CartPole-v1", "Pendulum-v1")
-    assert not are_same("bam/mir100-navigation-v0", "bam/mir100-avoidance-v0")
+    assert not are_same("bam/navigation-v0", "bam/avoidance-v0")
     assert not are_same("AvoidanceRaad2022URSim-v0", "AvoidanceRaad2022TestURSim-v0")
     assert are_same("AvoidanceRaad2022TestURRob-v0", "AvoidanceRaad2022TestURSim-v0")
     assert not are_same("EndEffectorPositioning2URSim-v0", "bam/ur-reach-v0")

@@ -271,7 +271,7 @@ def test_every_environment_can_be_behind_a_link(make, make_rows, env_id, actions
 
 def test_a_saved_environment_goes_on_with_what_is_on_its_way(make_rows, actions_of):
     options = {"link": "bad", "action_delay": [0, 3], "randomize": True}
-    rows, again = (make_rows("bam/mir100-avoidance-v0", 2, **options) for _ in range(2))
+    rows, again = (make_rows("bam/avoidance-v0", 2, **options) for _ in range(2))
     rows.reset(seed=0)
     actions = np.stack([actions_of(k, 30, 2) for k in range(2)], axis=1)
     for action in actions[:15]:

@@ -7,11 +7,12 @@ import pytest
 
 from bam_envs.arms.description import robot_model
 from bam_envs.core.errors import InvalidValue, UnknownName
+from bam_envs.robots.base_description import base_model
 from bam_envs.robots.fake import FakeRobot
-from bam_envs.robots.mir100 import base_spec
 from bam_envs.robots.profile import load_profile, profile_for, shipped_profiles
 from bam_envs.robots.ur import ur_model, ur_spec
 from bam_envs.robots.ur5e import JOINTS, arm_spec
+from tests.bam_envs.making import CART
 
 OWN = """
 name = "lift"
@@ -68,7 +69,7 @@ def refusal(path):
 
 
 def test_the_ur5e_whose_controller_interpolates():
-    assert shipped_profiles() == ["mir100", "ur5e", "ur5e_position", "ur5e_trajectory"]
+    assert shipped_profiles() == ["husky", "mir100", "ur5e", "ur5e_position", "ur5e_trajectory"]
     profile, held = load_profile("ur5e_trajectory"), load_profile("ur5e")
     assert profile.spec() == replace(held.spec(), name="ur5e_trajectory")
     assert (profile.state, profile.readiness, profile.limits) == (held.state, held.readiness, held.limits)
@@ -97,7 +98,7 @@ def test_the_ur5e_is_the_simulated_arm():
 
 def test_the_mir100():
     profile = load_profile("mir100")
-    assert profile.spec() == base_spec()
+    assert profile.spec() == base_model("mir100").spec()
     assert (profile.kind, profile.period, profile.max_age, profile.command_timeout) == ("base", 0.1, 0.5, 0.5)
     sizes = {signal.name: len(signal.labels) for signal in profile.signals}
     assert sizes == {"base_pose": 3, "base_velocity": 2, "f_scan": 501, "b_scan": 511}
@@ -148,8 +149,9 @@ def test_commands_that_it_does_not_take():
         assert str(caught.value) == (
             f"Commands are {told}, and mir100 takes linear_velocity, angular_velocity. Choose another profile."
         )
-    nothing = replace(base_spec("base"), command=profile.command.part(()))
-    other = replace(base_spec("base"), command=replace(profile.command, labels=("linear_velocity", "lift")))
+    base = replace(base_model("mir100").spec(), name="base")
+    nothing = replace(base, command=profile.command.part(()))
+    other = replace(base, command=replace(profile.command, labels=("linear_velocity", "lift")))
     for spec in (nothing, other):
         with pytest.raises(InvalidValue) as caught:
             profile_for(spec)
@@ -159,7 +161,8 @@ def test_commands_that_it_does_not_take():
 
 
 def test_no_message_is_cut_in_two():
-    spec = replace(base_spec("base"), command=base_spec().command.part(("linear_velocity",)))
+    base = base_model("mir100").spec()
+    spec = replace(base, command=base.command.part(("linear_velocity",)))
     with pytest.raises(InvalidValue) as caught:
         profile_for(spec)
     assert str(caught.value) == (
@@ -226,7 +229,7 @@ name = "lift"\n -> -> the key 'name' is missing
 period = 0.02 -> perod = 0.02 -> unknown key 'perod'. Did you mean 'period'?
 period = 0.02 -> period = nan -> period: expected a number above 0, found nan
 period = 0.02 -> period = 0.02\ndead_man = 1e9 -> command_timeout: expected a number above 0 and at most 1, found
-period = 0.02 -> -> give robot (ur5e, mir100), or [command] with max_rate, and period.
+period = 0.02 -> -> give robot (a name of bam-robots list), or [command] with max_rate, and period.
 period = 0.02 -> robot = "ur5" -> Unknown robot 'ur5'. Did you mean 'ur5e'?
 max_rate = 0.5 -> -> command needs max_rate, and takes no name.
 high = 2\n -> high = 0\n -> command: low must be below high.
@@ -281,7 +284,7 @@ def test_files(write, tmp_path):
     missing = tmp_path / "other.toml"
     (tmp_path / "folder.toml").mkdir()
     assert refusal(missing) == (
-        "There is no robot profile FILE. Give the path of a file, or one of: mir100, ur5e, ur5e_position, "
+        "There is no robot profile FILE. Give the path of a file, or one of: husky, mir100, ur5e, ur5e_position, "
         "ur5e_trajectory."
     )
     assert refusal(write("name =")).startswith("FILE is not TOML: ")
@@ -296,7 +299,7 @@ def test_files(write, tmp_path):
         load_profile(write('extends = "ur5"'))
     assert refusal(write("extends = 3")) == "FILE: extends: expected non-empty text, found 3"
     assert refusal(write('extends = "b.toml"')) == (
-        "FILE: extends must be a shipped profile (mir100, ur5e, ur5e_position, ur5e_trajectory), not 'b.toml'."
+        "FILE: extends must be a shipped profile (husky, mir100, ur5e, ur5e_position, ur5e_trajectory), not 'b.toml'."
     )
     assert refusal(tmp_path / "folder.toml") == (
         "The robot profile FILE cannot be read: [Errno 21] Is a directory: 'FILE'."
@@ -376,6 +379,36 @@ labels = ["shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_ro
 """
     profile, arm = load_profile(write(text)), robot_model("so101").spec(with_object=True)
     assert (profile.command, profile.signals) == (arm.command, arm.signals[:1])
+
+
+@pytest.mark.parametrize(("model", "namespace"), [("turtlebot4", ""), ("husky", "/sensors/lidar2d_0")])
+def test_bases_are_driven_by_stamped_twists(model, namespace):
+    spec, profile = base_model(model).spec(), profile_for(base_model(model).spec())
+    assert load_profile(model) == profile
+    assert (profile.name, profile.kind, profile.spec(), profile.body) == (model, "base", spec, spec.body)
+    odometry = "/platform/odom" if namespace else "/odom"
+    assert [source.topic for source in profile.state] == [odometry, odometry, f"{namespace}/scan"]
+    (sink,) = profile.sinks("velocity")
+    assert (sink.topic, sink.type) == ("/cmd_vel", "geometry_msgs/TwistStamped")
+    assert sink.fields == ("twist.linear.x", "twist.angular.z")
+    constants, laser = profile.state[2].constants, base_model(model).lasers[0]
+    assert (constants["angle_min"], constants["range_max"]) == (laser.angles[0], laser.range[1])
+    step = (laser.angles[1] - laser.angles[0]) / (laser.beams - 1)
+    assert constants["angle_increment"] == pytest.approx(step, abs=1e-12)
+
+
+def test_a_users_own_base(write):
+    """Its usual topics, and those of a profile with another name and namespace."""
+    profile = profile_for(base_model(CART).spec())
+    assert [source.fields for source in profile.state if source.signal == "base_velocity"] == [
+        ("twist.twist.linear.x", "twist.twist.linear.y", "twist.twist.angular.z")
+    ]
+    own = load_profile(write('extends = "husky"\nname = "ours"\n[rename]\n"/cmd_vel" = "/ours/cmd_vel"'))
+    assert (own.command, own.body) == (base_model("husky").spec().command, base_model("husky").body)
+    assert own.sinks("velocity")[0].topic == "/ours/cmd_vel"
+    assert refusal(write('extends = "husky"\nkind = "arm"')) == (
+        "FILE: kind is arm, and its commands are those of the other kind, arm or base."
+    )
 
 
 def test_a_described_arm_has_the_usual_topics_where_no_profile_is_shipped():

@@ -6,10 +6,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from bam_envs.arms.description import known_models, robot_model
+from bam_envs.arms.description import ArmDescription, robot_model
 from bam_envs.core.errors import SafetyStop
 from bam_envs.core.robot import Initial
 from bam_envs.core.robot_env import RobotEnv
+from bam_envs.core.robot_models import known_models
 from bam_envs.robots.physics.mujoco_arm import SimulatedArm
 from bam_envs.safety.arm_tubes import ChainTubes, tubes_of
 from bam_envs.safety.gate import SafeRobot
@@ -121,7 +122,7 @@ def test_its_tool_and_joints_stay_below_their_speeds(name):
     robot.close()
 
 
-@pytest.mark.parametrize("name", known_models())
+@pytest.mark.parametrize("name", known_models(ArmDescription))
 def test_the_scripted_pick_at_full_speed_is_not_stopped(name):
     arm = SimulatedArm(robot_model=name)
     robot = SafeRobot(arm, tool_position=arm.tool_position, straight=True)

@@ -7,12 +7,13 @@ import pytest
 
 from bam_envs.core.errors import InvalidValue
 from bam_envs.core.registry import ENVIRONMENTS
-from bam_envs.robots.mir100 import BODY, base_spec
+from bam_envs.robots.base_description import base_model
 from bam_envs.safety.base_guards import BaseBox, LaserZones
 from bam_envs.safety.guard import Limits, Tick
 from bam_envs.safety.guards import default_guards
+from tests.bam_envs.making import CART
 
-BASE = base_spec()
+BASE, BODY = base_model("mir100").spec(), base_model("mir100").body
 FREE = {name: np.full((1, len(scanner.bearings)), 29.0) for scanner in BODY.scanners for name in [scanner.signal]}
 
 
@@ -30,7 +31,7 @@ def scans(*points):
 
 
 def drive(command, signals, guard=None, **limits):
-    still = [[0.0] * 2 for _ in range(5)]
+    still = [[0.0] * len(command) for _ in range(5)]
     tick = Tick([*command], [*command], *still, 0.0, 0.1, signals=signals)
     altered = (guard or LaserZones(BASE, Limits(**limits), BODY)).limit(tick)
     assert altered == (tick.command != [*command])
@@ -59,6 +60,53 @@ def test_a_base_slows_down_and_stops_for_what_its_lasers_see_on_its_way(point, c
     np.testing.assert_allclose(drive(command, scans(point)), sent, atol=0.036)
 
 
+def seen_by(model, *points):
+    """A base of that description, and what its laser, which stands in its middle, sees of points in its frame."""
+    base = base_model({**CART, **model})
+    (scanner,) = base.body.scanners
+    ranges = np.full((1, len(scanner.bearings)), scanner.range[1])
+    for x, y in points:
+        ranges[0, np.argmin(np.abs(np.array(scanner.bearings) - math.atan2(y, x)))] = math.hypot(x, y)
+    return base, {"scan": ranges}
+
+
+@pytest.mark.parametrize(
+    ("point", "command", "sent"),
+    [
+        ((0.0, 0.55), (0.0, 0.3, 0.0), (0.0, 0.0, 0.0)),  # its corner is 0.3 m to its left
+        ((0.0, 0.55), (0.3, 0.0, 0.0), (0.3, 0.0, 0.0)),
+        ((0.0, 0.55), (0.0, -0.3, 0.2), (0.0, -0.3, 0.2)),
+        ((0.0, 0.68), (0.0, 0.3, 0.0), (0.0, 0.09, 0.0)),  # in the slow zone
+        ((0.5, 0.5), (0.3, 0.3, 0.0), (0.0636, 0.0636, 0.0)),
+        ((0.9, 0.0), (0.4, 0.0, 0.0), (0.3, 0.0, 0.0)),  # a collision after 1.5 s
+    ],
+)
+def test_a_base_that_drives_sideways_stops_for_what_is_there(point, command, sent):
+    base, signals = seen_by({}, point)
+    found = drive(command, signals, LaserZones(base.spec(), Limits(), base.body))
+    np.testing.assert_allclose(found, sent, atol=0.05)
+
+
+def test_a_round_base_turns_close_to_a_wall_and_a_blind_laser_stops_it():
+    base, signals = seen_by({"footprint": {"radius": 0.2}}, (0.0, 0.21), (0.22, 0.0))
+    guard = LaserZones(base.spec(), Limits(), base.body)
+    assert drive((0.0, 0.0, 0.7), signals, guard) == [0.0, 0.0, 0.7]
+    assert drive((0.2, 0.0, 0.0), signals, guard) == [0.0, 0.0, 0.0]
+    blind = {"scan": np.full_like(signals["scan"], np.nan)}
+    for way in ((0.2, 0.0, 0.0), (-0.2, 0.0, 0.0), (0.0, 0.2, 0.0), (0.0, -0.2, 0.0)):
+        assert drive(way, blind, guard) == [0.0, 0.0, 0.0], "the laser stands in the middle: no way is free"
+
+
+def test_the_speed_of_a_base_is_that_of_its_direction():
+    guards = {one.name: one for one in default_guards(base_model(CART).spec(), Limits(base_speed=0.2))}
+    assert drive((0.2, 0.2, 0.1), {}, guards["base speed"]) == pytest.approx([0.1414, 0.1414, 0.1], abs=1e-4)
+    assert drive((0.1, -0.1, 0.1), {}, guards["base speed"]) == [0.1, -0.1, 0.1]
+    command = drive(
+        (0.3, 0.3, 0.0), pose(0.99, 0.0, 0.0), BaseBox(base_model(CART).spec(), Limits(lag=0.3), (-1, -1), (1, 1))
+    )
+    assert command == pytest.approx([0.0235, 0.0235, 0.0], abs=2e-3)
+
+
 def test_distances_are_limits():
     near = scans((FRONT + 0.29, 0.0))
     assert drive((0.1, 0.0), near) == [0.0, 0.0]
@@ -75,15 +123,15 @@ def test_a_ray_without_a_distance_is_an_obstacle(ray):
 
 
 def test_a_base_whose_lasers_are_not_measured_is_not_limited_by_them():
-    guard = next(one for one in default_guards(base_spec(with_scans=False)) if one.number == "G12")
+    guard = next(one for one in default_guards(base_model("mir100").spec(with_scans=False)) if one.number == "G12")
     assert drive((0.5, 0.0), {}, guard) == [0.5, 0.0]
 
 
 def test_the_lasers_are_where_the_simulated_room_has_them():
-    robot = ENVIRONMENTS["bam/mir100-avoidance-v0"].make_robot(1, False, {})
+    robot = ENVIRONMENTS["bam/avoidance-v0"].make_robot(1, False, {})
     guard = LaserZones(robot.spec, Limits(), robot.spec.body)
     robot.connect()
-    task = ENVIRONMENTS["bam/mir100-avoidance-v0"].make_task(1, {})
+    task = ENVIRONMENTS["bam/avoidance-v0"].make_task(1, {})
     state = robot.reset(np.arange(1), task.sample_initial(np.arange(1), [np.random.default_rng(0)]))
     points = guard.points(state.signals)
     x, y, yaw = state.signals["base_pose"][0]

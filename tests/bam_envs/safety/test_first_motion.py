@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from bam_envs.core.errors import BamEnvsError, ResetNeeded, SafetyStop
 from bam_envs.core.robot import Initial, RobotState
 from bam_envs.live.command_proof import CommandProof, Controllers
-from bam_envs.robots.mir100 import base_spec
+from bam_envs.robots.base_description import base_model
 from bam_envs.robots.profile import load_profile
 from bam_envs.robots.ur5e import arm_spec
 from bam_envs.safety.first_motion import FASTEST, MOST, FirstMotion
@@ -405,7 +405,7 @@ class Base:
     needs_clearance = True
     num_robots = 1
     info = None
-    spec = base_spec()
+    spec = base_model("mir100").spec()
 
     def __init__(self, gain=2.5, pose_scale=1.0, turn_scale=1.0):
         self.gain, self.pose_scale, self.turn_scale = gain, pose_scale, turn_scale

@@ -182,7 +182,7 @@ def test_a_freeze_on_the_way_to_the_start_pose(seconds):
 
 
 def test_a_base_that_does_not_follow_is_told_to_stand_and_stopped():
-    trial = Trial("bam/mir100-navigation-v0")
+    trial = Trial("bam/navigation-v0")
     trial.reset()
     trial.driven.misbehave("ignore", 30.0, after=0.5)
     with pytest.raises(SafetyStop) as caught:

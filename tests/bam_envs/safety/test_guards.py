@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from bam_envs.core.errors import InvalidValue, UnknownName
 from bam_envs.core.robot import RobotSpec, RobotState, SignalSpec
-from bam_envs.robots.mir100 import base_spec
+from bam_envs.robots.base_description import base_model
 from bam_envs.robots.ur5e import GEOMETRY, JOINTS, arm_spec
 from bam_envs.safety import arm_guards, guards
 from bam_envs.safety.arm_guards import longest_step
@@ -19,7 +19,7 @@ from bam_envs.safety.guard import BOUNDS, ORDERED, Limits, Tick
 from bam_envs.safety.guards import default_guards
 from bam_envs.testing import ARM_HOME
 
-ARM, BASE = arm_spec("ur5e", with_object=False), base_spec(with_scans=False)
+ARM, BASE = arm_spec("ur5e", with_object=False), base_model("mir100").spec(with_scans=False)
 HOME = np.array([*ARM_HOME, 0.085])
 PERIOD = {7: ARM.period, 2: BASE.period}
 

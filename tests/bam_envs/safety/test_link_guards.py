@@ -8,8 +8,8 @@ import pytest
 from bam_envs.core.errors import InvalidValue, SafetyStop
 from bam_envs.core.kinematics import UR5E_GRIPPER
 from bam_envs.core.robot import Initial
+from bam_envs.robots.base_description import base_model
 from bam_envs.robots.fake import FakeRobot
-from bam_envs.robots.mir100 import base_spec
 from bam_envs.robots.physics.kinematic_base import SimulatedBase
 from bam_envs.robots.profile import load_profile
 from bam_envs.robots.ur5e import arm_spec
@@ -20,7 +20,7 @@ from bam_envs.safety.guard import Limits, Tick
 from bam_envs.safety.link_guards import ActionAge, ChangedCommands, LateTicks, LinkQuality, Watchdog
 from bam_envs.testing import ARM_HOME
 
-ARM, BASE = arm_spec("ur5e", with_object=False), base_spec(with_scans=False)
+ARM, BASE = arm_spec("ur5e", with_object=False), base_model("mir100").spec(with_scans=False)
 HOME = [*ARM_HOME, 0.085]
 
 

@@ -10,7 +10,7 @@ from bam_envs.core.errors import InvalidValue
 from bam_envs.core.kinematics import UR5E_GRIPPER
 from bam_envs.core.robot import Initial
 from bam_envs.core.robot_env import RobotEnv
-from bam_envs.robots.mir100 import base_spec
+from bam_envs.robots.base_description import base_model
 from bam_envs.robots.physics.kinematic_base import SimulatedBase
 from bam_envs.robots.physics.mujoco_arm import SimulatedArm
 from bam_envs.safety.gate import SafeRobot
@@ -70,7 +70,7 @@ def test_a_base_brakes_at_the_edge():
 
 
 def test_a_base_whose_place_is_not_measured_has_no_box_and_is_refused():
-    spec = replace(base_spec(with_scans=False), signals=base_spec().signals[1:2])
+    spec = replace(base_model("mir100").spec(with_scans=False), signals=base_model("mir100").spec().signals[1:2])
     with pytest.raises(
         InvalidValue, match=r"^The trial box \(G10\) of mir100 needs base_pose, which the task does not"
     ):

@@ -11,7 +11,7 @@ from bam_envs.tasks.isaac_reach import DEFAULT
 from bam_envs.tasks.pick import PickTask
 from bam_envs.tasks.scripted import SCRIPTED
 from bam_envs.testing import TaskContract
-from tests.bam_envs.making import ROBOTS, make_task
+from tests.bam_envs.making import CART, ROBOTS, make_task
 
 PARITY = {"parity": True, "rs_state_to_info": True}
 SPEEDS = {
@@ -22,6 +22,7 @@ SPEEDS = {
     "bam/isaac-reach-v0": (0.2, 30),
 }
 """Share of its fastest speed that a joint may go at, and commands a second [Hz]."""
+BASES = ("bam/navigation-v0", "bam/avoidance-v0")
 
 
 @pytest.mark.parametrize("env_id", ["bam/reach-v0", "bam/pick-v0", "bam/pick-place-v0"])
@@ -43,15 +44,16 @@ class Simulated(TaskContract):
         return ENVIRONMENTS[self.id].make_robot(num_robots, self.randomize, self.options)
 
     def first_command(self, state):
-        return state.command if "mir100" in self.id else super().first_command(state)
+        return state.command if self.id in BASES else super().first_command(state)
 
     def check_pace(self, last, command):
         if self.id in SPEEDS:
             share, rate = SPEEDS[self.id]
             model = UR_MODELS[self.options.get("ur_model", "ur10" if "isaac" in self.id else "ur5")]
             assert (np.abs(command - last) <= share * model.max_velocity / rate * (1 + 1e-9)).all()
-        elif "mir100" in self.id:
-            assert (np.abs(command) <= [0.5, 0.7]).all()
+        elif self.id in BASES:
+            most = 0.306 if self.options.get("robot_model") == "turtlebot4" else 0.5
+            assert (np.abs(command) <= [*[most] * (command.shape[1] - 1), 0.7]).all()
         else:
             super().check_pace(last, command)
 
@@ -63,8 +65,11 @@ class Simulated(TaskContract):
         ("bam/ur-avoidance-v0", {"ur_model": "ur10e", "include_polar_to_elbow": True, "fix_base": True}, False),
         ("bam/ur-track-v0", {**PARITY, "fixed_paths": True}, False),
         ("bam/isaac-reach-v0", {}, False),
-        ("bam/mir100-navigation-v0", {}, False),
-        ("bam/mir100-avoidance-v0", PARITY, False),
+        ("bam/navigation-v0", {}, False),
+        ("bam/avoidance-v0", PARITY, False),
+        ("bam/navigation-v0", {"robot_model": CART}, False),
+        ("bam/avoidance-v0", {"robot_model": "turtlebot4"}, False),
+        ("bam/avoidance-v0", {"robot_model": "husky"}, True),
         ("bam/pick-v0", {"robot_model": "so101"}, False),
         ("bam/pick-v0", {"robot_model": "fr3"}, True),
         ("bam/pick-place-v0", {"robot_model": "ur10e"}, False),
@@ -87,8 +92,8 @@ class Simulated(TaskContract):
                     {"fixed_paths": True, "include_polar_to_elbow": False, "fix_wrist_3": False},
                     False,
                 ),
-                ("bam/mir100-navigation-v0", PARITY, False),
-                ("bam/mir100-avoidance-v0", {}, False),
+                ("bam/navigation-v0", PARITY, False),
+                ("bam/avoidance-v0", {}, False),
                 ("bam/reach-v0", {"robot_model": "so101"}, True),
                 ("bam/reach-v0", {"robot_model": "ur10e"}, False),
                 ("bam/pick-v0", {"robot_model": "ur10e"}, True),
@@ -102,7 +107,7 @@ class TestSimulated(Simulated):
     @pytest.fixture(autouse=True)
     def chosen(self, env_id, options, randomize):
         self.id, self.options, self.randomize = env_id, options, randomize
-        arm = robot_model(options.get("robot_model", "ur5e"))
+        arm = robot_model("ur5e" if env_id in BASES else options.get("robot_model", "ur5e"))
         self.joints, self.tool_position = arm.num_joints, arm.arm.tool_position
 
 
@@ -140,10 +145,13 @@ def test_the_contract_finds_a_task_that_changes_a_state():
 
 VARIANTS = [(env_id, {flag: True}) for env_id, entry in ENVIRONMENTS.items() for flag in entry.variants]
 SIZES = [("bam/ur-reach-v0", {"ur_model": model}) for model in UR_MODELS]
+WHEELED = [(env_id, {"robot_model": model}) for env_id in BASES for model in ("turtlebot4", "husky", CART)]
 ARMS = [(env_id, {"robot_model": model}) for env_id in SCRIPTED for model in ("fr3", "so101", "ur10e")]
 
 
-@pytest.mark.parametrize(("env_id", "options"), [*((env_id, {}) for env_id in ROBOTS), *VARIANTS, *SIZES, *ARMS])
+@pytest.mark.parametrize(
+    ("env_id", "options"), [*((env_id, {}) for env_id in ROBOTS), *VARIANTS, *SIZES, *WHEELED, *ARMS]
+)
 @pytest.mark.filterwarnings("ignore:.*A Box observation space m(ini|axi)mum value is -?infinity")  # robo-gym's bounds
 @pytest.mark.filterwarnings("ignore:.*we recommend using a symmetric and normalized space")  # Isaac Lab's actions
 @pytest.mark.filterwarnings("ignore:.*maximum and minimum values are equal")  # an elbow that sees nothing

@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
 
-from bam_envs.arms.description import cube_edge, known_models, robot_model
+from bam_envs.arms.description import ArmDescription, cube_edge, robot_model
 from bam_envs.core.errors import InvalidValue, UnknownName
 from bam_envs.core.robot import CameraSpec
+from bam_envs.core.robot_models import known_models
 from bam_envs.robots.physics.mujoco_arm import SimulatedArm
 from bam_envs.robots.physics.rendering import RenderingUnavailable, find_backend
 from bam_envs.tasks.pick import PickTask
@@ -17,7 +18,7 @@ from bam_envs.tasks.reach import ReachTask
 from bam_envs.tasks.scripted import scripted_policy
 from bam_envs.testing.assertions import assert_same_state, assert_same_value
 
-MODELS = tuple(known_models())
+MODELS = tuple(known_models(ArmDescription))
 
 
 def can_draw():
@@ -84,9 +85,26 @@ def test_a_model_that_is_not_known_is_refused_before_anything_is_built(make):
     assert str(caught.value) == missing
 
 
-def test_tasks_that_are_for_one_arm_take_no_model(make):
-    with pytest.raises((UnknownName, InvalidValue), match="robot_model"):
-        make("bam/mir100-navigation-v0", robot_model="fr3")
+@pytest.mark.parametrize(
+    ("env_id", "model", "message"),
+    [
+        (
+            "bam/navigation-v0",
+            "fr3",
+            "robot_model: fr3 is an arm, and a wheeled base is needed: husky, mir100, turtlebot4.",
+        ),
+        (
+            "bam/pick-v0",
+            "husky",
+            f"robot_model: husky is a wheeled base, and an arm is needed: {', '.join(sorted(MODELS))}.",
+        ),
+        ("bam/ur-reach-v0", "ur5e", "Unknown argument of bam/ur-reach-v0 'robot_model'. Did you mean 'robot_name'?"),
+    ],
+)
+def test_a_robot_of_another_kind_and_a_task_for_one_robot_are_refused(make, env_id, model, message):
+    with pytest.raises((UnknownName, InvalidValue)) as caught:
+        make(env_id, robot_model=model)
+    assert str(caught.value) == message
 
 
 @pytest.mark.parametrize(

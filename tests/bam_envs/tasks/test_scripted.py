@@ -3,9 +3,10 @@
 import numpy as np
 import pytest
 
-from bam_envs.arms.description import known_models
+from bam_envs.arms.description import ArmDescription
 from bam_envs.core.errors import InvalidValue, UnknownName
 from bam_envs.core.registry import ENVIRONMENTS
+from bam_envs.core.robot_models import known_models
 from bam_envs.tasks.scripted import GRASP, SCRIPTED, scripted_policy
 from tests.bam_envs.making import solved
 
@@ -28,7 +29,7 @@ def test_actions_are_in_their_space_and_do_not_depend_on_other_rows(make_rows, e
 
 
 @pytest.mark.parametrize("env_id", IDS)
-@pytest.mark.parametrize("arm", known_models())
+@pytest.mark.parametrize("arm", known_models(ArmDescription))
 def test_they_solve_their_tasks_with_every_shipped_arm(make_rows, env_id, arm):
     assert solved(make_rows(env_id, 16, robot_model=arm), scripted_policy(env_id, arm)) == 16
 

@@ -11,7 +11,7 @@ from PIL import Image
 from bam_envs.arms.description import robot_model
 from bam_envs.core.robot import RobotState
 from bam_envs.live.camera import CameraImage
-from bam_envs.robots.mir100 import base_spec
+from bam_envs.robots.base_description import base_model
 from bam_envs.rosbridge.tokens import Tokens
 from bam_envs.safety.guard import Limits
 from bam_train.agent.agent_states import State
@@ -164,7 +164,7 @@ def test_the_picture_changes_with_joints_gripper_and_object(page, agent):
 
 
 def test_a_base_is_drawn_where_it_is_with_what_it_sees(page, agent):
-    telemetry, here, there = Telemetry(base_spec(), Limits()), base_state(), base_state(2.0)
+    telemetry, here, there = Telemetry(base_model("mir100").spec(), Limits()), base_state(), base_state(2.0)
     there.signals["base_pose"] = np.array([[3.0, -1.0, np.pi / 2]])
     first, second = drawn(page, agent, telemetry, [here, there])
     np.testing.assert_allclose(first["parts"]["base"]["pose"][:3, 3], [1.0, 2.0, 0.0], atol=1e-4)

@@ -8,12 +8,13 @@ import pytest
 from bam_envs.core.errors import InvalidValue
 from bam_envs.core.kinematics import UR10E
 from bam_envs.core.robot import RobotSpec, RobotState, SignalSpec
-from bam_envs.robots.mir100 import base_spec
+from bam_envs.robots.base_description import base_model
 from bam_envs.robots.ur5e import GEOMETRY, GRIPPER_OPEN, arm_spec
 from bam_envs.testing import ARM_HOME
 from bam_train.agent.front.jog import JOG_LIFETIME, LEASH, Jogger
+from tests.bam_envs.making import CART
 
-ARM, BASE, PERIOD = arm_spec("ur5e", with_object=False), base_spec(with_scans=False), 0.05
+ARM, BASE, PERIOD = arm_spec("ur5e", with_object=False), base_model("mir100").spec(with_scans=False), 0.05
 HOME = np.array([*ARM_HOME, 0.04])
 
 
@@ -84,6 +85,9 @@ def test_nothing_is_faster_than_a_quarter_of_a_metre_in_a_second(arm, clock):
     base = Jogger(BASE, 0.1, clock=clock)
     base.put(**twist(1, -5.0, 0, 0, 9.0))
     np.testing.assert_allclose(base.command(None), [[-0.25, 0.5]])
+    cart = Jogger(base_model(CART).spec(with_scans=False), 0.1, clock=clock)
+    cart.put(**twist(1, 3.0, 4.0, 0.0, 0.1))
+    np.testing.assert_allclose(cart.command(None), [[0.15, 0.2, 0.1]])
 
 
 def test_near_a_singularity_no_joint_is_fast(arm, clock):

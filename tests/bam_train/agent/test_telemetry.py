@@ -10,14 +10,14 @@ import pytest
 from bam_envs.arms.description import robot_model
 from bam_envs.core.kinematics import UR10E
 from bam_envs.core.robot import RobotState
-from bam_envs.robots.mir100 import base_spec
+from bam_envs.robots.base_description import base_model
 from bam_envs.robots.ur import ur_model, ur_spec
 from bam_envs.robots.ur5e import GEOMETRY, arm_spec
 from bam_envs.safety.guard import Limits
 from bam_envs.testing import ARM_HOME
 from bam_train.agent.front.telemetry import Telemetry
 
-ARM, BASE = arm_spec("ur5e", with_object=False), base_spec()
+ARM, BASE = arm_spec("ur5e", with_object=False), base_model("mir100").spec()
 SHARES = {"value", "limit", "unit", "share"}
 
 
@@ -134,7 +134,7 @@ def test_the_message_of_a_base():
 
 
 def test_a_base_without_scanners():
-    spec = base_spec(with_scans=False)
+    spec = base_model("mir100").spec(with_scans=False)
     state = base_state()
     state.signals = {name: state.signals[name] for name in ("base_pose", "base_velocity")}
     message = Telemetry(spec, Limits()).message(state, 0.0)

@@ -7,12 +7,13 @@ from types import SimpleNamespace
 
 import pytest
 
-from bam_envs.robots.mir100 import base_spec
+from bam_envs.robots.base_description import base_model
 from bam_envs.robots.ur import ur_model, ur_spec
 from bam_envs.robots.ur5e import arm_spec
 from bam_train.cli.consent import plan_lines, require_consent
 from bam_train.errors import SettingsError
 
+BASE = base_model("mir100").spec()
 GUARDS = {
     "joint speed": {"number": "G8", "limit": 3.141592653589793, "unit": "rad/s", "altered": 3, "stopped": 0},
     "finite": {"number": "G2", "limit": "", "unit": "", "altered": 0, "stopped": 0},
@@ -67,8 +68,12 @@ def test_before_a_real_robot_moves_its_limits_are_shown_and_somebody_asked(monke
             1,
             "  bam/pick-v0: 1 episode\n  each begins by going to the start pose\n",
         ),
-        (base_spec("mir100"), 1, "  bam/pick-v0: 1 episode\n  each begins where the base stands\n"),
-        (base_spec("mir100"), 0, "  bam/pick-v0: a person begins each episode\n  each begins where the base stands\n"),
+        (BASE, 1, "  bam/pick-v0: 1 episode\n  each begins where the base stands\n"),
+        (
+            BASE,
+            0,
+            "  bam/pick-v0: a person begins each episode\n  each begins where the base stands\n",
+        ),
     ],
 )
 def test_what_it_will_do_is_shown(monkeypatch, capsys, spec, episodes, expected):

@@ -15,9 +15,9 @@ def test_table(run):
     assert lines[0].split() == ["id", "observation", "action", "steps", "Hz", "what", "to", "do"]
     assert [line.split()[0] for line in lines[1 : 1 + len(ENVIRONMENTS)]] == list(ENVIRONMENTS)
     assert lines[1 + len(ENVIRONMENTS)] == ""
-    assert lines[2].endswith("pick up a cube that lies anywhere in 30 x 40 cm with any yaw")
+    assert lines[2].endswith("pick up a cube that lies anywhere in the arm's work area with any yaw")
     start = lines.index("robo-gym's ids work too, with robo-gym's options; Rob is the one with a live robot:")
-    assert lines[start + 1].split() == ["NoObstacleNavigationMir100{Sim,Rob}-v0", "bam/mir100-navigation-v0"]
+    assert lines[start + 1].split() == ["NoObstacleNavigationMir100{Sim,Rob}-v0", "bam/navigation-v0"]
     assert lines[-2].startswith("BAM's ids work too: GridWorldEnv-v0 is bam/grid-world-v0, ClassicBandit-v0 is ")
     assert lines[-1] == "Details: bam-envs ID. Training: bam-train --env ID --algo ppo; any Gymnasium id will do."
 
@@ -50,7 +50,7 @@ except SystemExit as done:
     assert last == "0 []"
     facts = {one["id"]: one for one in json.loads(printed)}
     assert list(facts) == list(ENVIRONMENTS)
-    assert facts["bam/mir100-navigation-v0"]["robo_gym"] == [
+    assert facts["bam/navigation-v0"]["robo_gym"] == [
         "NoObstacleNavigationMir100Sim-v0",
         "NoObstacleNavigationMir100Rob-v0",
     ]
@@ -63,7 +63,7 @@ def test_details_of_ours(run):
     lines = out.splitlines()
     assert status == 0
     assert lines[:2] == [
-        "bam/pick-v0: pick up a cube that lies anywhere in 30 x 40 cm with any yaw",
+        "bam/pick-v0: pick up a cube that lies anywhere in the arm's work area with any yaw",
         "100 steps an episode, 20 Hz",
     ]
     assert {"observation", "action", "state", "command"} <= set(lines)
@@ -73,12 +73,12 @@ def test_details_of_ours(run):
 
 
 def test_rays_that_differ_by_their_number_are_one_line(run):
-    out = run(main, "bam/mir100-avoidance")[1]
+    out = run(main, "bam/avoidance")[1]
     assert "  f_scan_0 to f_scan_500  0       29     m\n" in out
     assert "  b_scan_0 to b_scan_510  0       29     m\n" in out
     assert "front_7" in out
     assert len(out.splitlines()) < 50
-    assert len(json.loads(run(main, "bam/mir100-avoidance", "--json")[1])["signals"]["state"]) == 1017
+    assert len(json.loads(run(main, "bam/avoidance", "--json")[1])["signals"]["state"]) == 1017
 
 
 @pytest.mark.parametrize("env_id", ENVIRONMENTS)

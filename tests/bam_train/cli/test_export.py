@@ -183,7 +183,7 @@ def test_arguments_of_the_environment(with_config, run, refused):
 
 
 def test_arguments_by_another_name_of_the_environment(with_config, refused):
-    root = with_config(env="bam/mir100-navigation", env_config={"no_such": 1})
+    root = with_config(env="bam/navigation", env_config={"no_such": 1})
     assert refused(root, "--env", "NoObstacleNavigationMir100Sim-v0").startswith("Unknown argument of ")
 
 

@@ -246,7 +246,7 @@ def test_it_ends_after_so_many_episodes(tty, tmp_path):
 
 def test_ctrl_c_gives_the_terminal_back(tty, tmp_path):
     before = termios.tcgetattr(tty[1])
-    status, out, shown = played(tty, tmp_path, [("ready", b"w"), ("running", b"\x03")], "bam/mir100-navigation")
+    status, out, shown = played(tty, tmp_path, [("ready", b"w"), ("running", b"\x03")], "bam/navigation")
     assert (status, out) == (130, "")
     assert "\x1b[?25h\x1b[?1049lbam-play: interrupted" in shown
     assert termios.tcgetattr(tty[1]) == before

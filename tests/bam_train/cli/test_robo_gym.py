@@ -88,9 +88,9 @@ def test_arguments_that_cannot_be(run, assignment, text):
 def test_neither_fits():
     """The first error is the one that is told."""
     with pytest.raises(CheckpointMismatch) as caught:
-        export(THEIRS / BASE, env="bam/mir100-avoidance")
+        export(THEIRS / BASE, env="bam/avoidance")
     assert str(caught.value) == (
-        f"{THEIRS / BASE}: observation_space.shape[0] is 4 in the directory and 20 in bam/mir100-avoidance-v0; "
+        f"{THEIRS / BASE}: observation_space.shape[0] is 4 in the directory and 20 in bam/avoidance-v0; "
         "give the environment it was trained on with --env"
     )
 

@@ -2,7 +2,7 @@
 
 import pytest
 
-from bam_envs.arms.description import SHIPPED, known_models
+from bam_envs.core.robot_models import SHIPPED, known_models
 from bam_train.cli.arms.bam_robots import main
 
 
@@ -10,9 +10,10 @@ def test_list(run):
     status, out, err = run(main, "list")
     lines = out.splitlines()
     assert (status, err) == (0, "")
-    assert lines[0].split() == ["name", "joints", "what", "file"]
-    assert [line.split()[0] for line in lines[1:9]] == list(known_models())
-    assert "SO-101 (5 joints) with its jaw" in lines[3]
+    assert lines[0].split() == ["name", "kind", "what", "file"]
+    assert [line.split()[0] for line in lines[1:-2]] == list(known_models())
+    kinds = {line.split()[0]: " ".join(line.split()[1:4]) for line in lines[1:-2]}
+    assert (kinds["so101"], kinds["husky"]) == ("5 joints SO-101", "base Clearpath Husky")
     assert lines[-1] == "Another arm: bam-robots add NAME --urdf FILE --gripper parallel:0.08"
 
 
@@ -23,7 +24,7 @@ def test_a_file_that_cannot_be_read_does_not_hide_the_others(run, tmp_path, monk
     status, out, err = run(main, "list")
     assert (status, err) == (1, "")
     assert "cannot be read: robots/bad.toml: " in out.splitlines()[1]
-    assert [line.split()[0] for line in out.splitlines()[2:10]] == [one for one in known_models() if one != "bad"]
+    assert [line.split()[0] for line in out.splitlines()[2:-2]] == [one for one in known_models() if one != "bad"]
 
 
 @pytest.mark.parametrize(("name", "joints"), [("so101", 5), ("fr3", 7)])
@@ -38,6 +39,24 @@ def test_check(run, name, joints):
     assert {"reach", "kinematics", "tool", "gripper", "home", "outline", "work", "limits"} <= facts
     turns = "position only: this arm cannot turn its gripper" if joints == 5 else "position and turn of the gripper"
     assert f"tool {turns}" in lines
+
+
+def test_check_of_a_base(run, tmp_path):
+    path = tmp_path / "base.png"
+    status, out, err = run(main, "check", "turtlebot4", "--picture", path)
+    lines = [" ".join(line.split()) for line in out.splitlines()]
+    assert (status, err, path.read_bytes()[:4]) == (0, "", b"\x89PNG")
+    assert lines[0] == "turtlebot4: TurtleBot 4 (iRobot Create 3), differential drive, a laser all round"
+    assert lines[2:5] == [
+        "axis speed acceleration",
+        "linear_velocity 0.306 m/s 0.9 m/s^2",
+        "angular_velocity 1.9 rad/s 7.725 rad/s^2",
+    ]
+    assert lines[6:9] == [
+        "footprint circle of 0.171 m, 0.342 x 0.342 m, at most 0.171 m from its frame",
+        "drive differential",
+        "laser lidar 640 rays from -180 to 180 degrees, 0.164 to 12 m, at x -0.04, y 0 m, yaw 90 degrees",
+    ]
 
 
 def test_an_arm_that_does_not_reach_its_work_area_fails_its_check(run, tmp_path):

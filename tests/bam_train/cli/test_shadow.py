@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from bam_envs.core.robot import RobotState
-from bam_envs.robots.mir100 import base_spec
+from bam_envs.robots.base_description import base_model
 from bam_envs.robots.ur5e import arm_spec
 from bam_envs.safety.guard import Limits
 from bam_train.deploy.agreement import Agreement, Shadow
@@ -81,7 +81,7 @@ def test_a_motion_is_compared_with_what_was_asked_for_a_lag_before():
 
 
 def test_a_base_drives_and_turns():
-    spec = replace(base_spec("mir100"), lag=0.0)
+    spec = replace(base_model("mir100").spec(), lag=0.0)
     shadow, limits = Shadow(spec, Limits()), Limits()
 
     def state(velocity):

@@ -18,7 +18,7 @@ from bam_envs.core.robot import RobotState
 from bam_envs.live.arm_checks import described_checks, read_urdf
 from bam_envs.live.examination import TOOL_POSE, Inspection
 from bam_envs.live.state import Letter
-from bam_envs.robots.mir100 import base_spec
+from bam_envs.robots.base_description import base_model
 from bam_envs.robots.profile import load_profile
 from bam_envs.robots.ur import UR_MODELS
 from bam_envs.robots.ur5e import arm_spec
@@ -112,7 +112,7 @@ class Base(Watched):
     """A MiR100 that drives and turns slowly."""
 
     def __init__(self, seed=0):
-        super().__init__("mir100", base_spec(), seed)
+        super().__init__("mir100", base_model("mir100").spec(), seed)
         self.speed, self.turn = 0.3, 0.4
 
     def signals(self, t):

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from bam_envs.core.robot import Initial
+from bam_envs.robots.base_description import base_model
 from bam_envs.robots.fake import FakeRobot
-from bam_envs.robots.mir100 import base_spec
 from bam_envs.robots.physics.kinematic_base import open_floor
 from bam_envs.robots.ur5e import arm_spec
 from bam_envs.safety.gate import SafeRobot
@@ -165,7 +165,7 @@ def test_an_axis_that_goes_elsewhere_does_not_follow():
 
 
 def test_every_unit_of_a_command_has_its_distance():
-    assert {*ARM.units, *base_spec().command.units} == FAR.keys()
+    assert {*ARM.units, *base_model("mir100").spec().command.units} == FAR.keys()
 
 
 @pytest.mark.parametrize(

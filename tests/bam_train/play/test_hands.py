@@ -73,7 +73,7 @@ def test_tool_steps_are_the_speed_of_the_key_and_the_gripper_keeps_what_it_was_t
 
 
 def test_a_base_gets_speeds():
-    hand = hand_for(make_env("bam/mir100-navigation-v0"))
+    hand = hand_for(make_env("bam/navigation-v0"))
     action = hand.action(*moved({"KeyW", "KeyQ"}, 0.25, is_base=hand.is_base))
     np.testing.assert_array_equal(action, np.array([0.5, 0.4 / 0.7], np.float32))
 

@@ -217,7 +217,7 @@ def test_the_screen_shows_every_number_with_name_unit_and_limits():
     driven.env.close()
 
 
-@pytest.mark.parametrize("env_id", ["bam/reach-v0", "bam/pick-v0", "bam/pick-place-v0", "bam/mir100-navigation-v0"])
+@pytest.mark.parametrize("env_id", ["bam/reach-v0", "bam/pick-v0", "bam/pick-place-v0", "bam/navigation-v0"])
 def test_a_small_terminal_shows_every_number_and_the_key_that_starts(env_id):
     driven = Driven(env_id)
     ready = screen_lines(driven.session, env_id, 80, 24)

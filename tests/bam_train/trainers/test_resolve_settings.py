@@ -381,7 +381,7 @@ def test_a_path_that_is_none_is_no_best(saved, here, path):
 
 
 def test_a_name_of_robo_gym_is_tuned_as_the_environment():
-    ours = resolve({"env": "bam/mir100-navigation", "algo": "ppo"})
+    ours = resolve({"env": "bam/navigation", "algo": "ppo"})
     theirs = resolve({**ROBO_GYM, "env_kwargs": {"ip": "127.0.0.1"}})
     assert (theirs.env, theirs.env_kwargs) == ("NoObstacleNavigationMir100Sim-v0", {"ip": "127.0.0.1"})
     assert replace(theirs, env=ours.env, env_kwargs=ours.env_kwargs) == ours

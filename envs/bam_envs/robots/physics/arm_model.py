@@ -8,8 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from bam_envs.arms.description import SHIPPED, ArmDescription, Box, Placed, cube_edge, read_description
+from bam_envs.arms.description import ArmDescription, Box, Placed, cube_edge
 from bam_envs.arms.serial_chain import Capsule
+from bam_envs.core.robot_models import SHIPPED, read_description
 from bam_envs.robots.physics.mujoco_batch import MODELS, mujoco
 
 CUBE_DENSITY = 0.08 / 0.04**3

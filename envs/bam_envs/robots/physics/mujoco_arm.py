@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bam_envs.arms.description import DEFAULT_MODEL
 from bam_envs.arms.description import robot_model as model_called
 from bam_envs.core.errors import InvalidValue, PhysicsDiverged, ResetNeeded
 from bam_envs.core.robot import CameraSpec, EnvIds, Initial, RobotState, checked_command
+from bam_envs.core.robot_models import DEFAULT_ARM
 from bam_envs.robots.physics.shapes import marked
 
 if TYPE_CHECKING:
@@ -53,7 +53,7 @@ class SimulatedArm:
         randomize: bool = False,
         cameras: tuple[CameraSpec, ...] = (),
         looks: str = "fixed",
-        robot_model: Any = DEFAULT_MODEL,
+        robot_model: Any = DEFAULT_ARM,
     ) -> None:
         self.num_robots, self.description = num_robots, model_called(robot_model)
         self.randomize, self._looks = randomize, looks

@@ -1,4 +1,4 @@
-"""Bodies of an image that are in no MuJoCo model: boxes, capsules and spheres. The first image imports MuJoCo."""
+"""Bodies of an image that are in no MuJoCo model: boxes, capsules and the like. The first image imports MuJoCo."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -21,11 +21,11 @@ RED: Colour = (0.85, 0.30, 0.25, 1.0)
 class Shape:
     """One body of an image, in the world's frame [m]."""
 
-    kind: Literal["box", "capsule", "sphere"]
+    kind: Literal["box", "capsule", "cylinder", "sphere"]
     position: Array
     """Its middle, or the middle of a capsule's first end. Shape: (3,)."""
     size: tuple[float, ...]
-    """Edges of a box, or only the radius of a capsule or sphere."""
+    """Edges of a box, radius and half the height of an upright cylinder, or only the radius of a capsule or sphere."""
     colour: Colour = GREY
     rotation: Array | None = None
     """From a box's frame to the world's; None for upright. Shape: (3, 3)."""

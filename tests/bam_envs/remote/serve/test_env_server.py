@@ -285,7 +285,7 @@ def test_wrapped_environments_are_served():
         *((name, "bam/pick-place-v0", True) for name in ("pick-place", "PickPlace", "pick_place", "bam/pick-place")),
         *((name, "bam/pick-place-v0", False) for name in ("pick", "bam/pick-v0", "place", "bam", "-v0")),
         ("ale_py:ALE/Pong-v5", "Pong", True),
-        ("NoObstacleNavigationMir100Sim-v0", "bam/mir100-navigation-v0", True),
+        ("NoObstacleNavigationMir100Sim-v0", "bam/navigation-v0", True),
         ("mir100-navigation", "NoObstacleNavigationMir100Rob", True),
         ("NoObstacleNavigationMir100Rob", "ObstacleAvoidanceMir100Sim-v0", False),
         ("AvoidanceRaad2022TestURSim-v0", "bam/ur-track-v0", False),

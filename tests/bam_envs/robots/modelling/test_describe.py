@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from bam_envs.arms.capsules import Outline
-from bam_envs.arms.description import read_description
 from bam_envs.arms.work_area import covers
 from bam_envs.core.errors import InvalidValue, UnknownName
+from bam_envs.core.robot_models import read_description
 from bam_envs.robots.modelling.describe import as_toml, describe, write_description
 from bam_envs.robots.modelling.model_files import read_arm
 from bam_envs.tasks.scripted import scripted_policy

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from bam_envs.core.robot import Initial
-from bam_envs.robots.mir100 import BACK_RAYS, FRONT_RAYS
+from bam_envs.robo_gym.rs_state import BACK_RAYS, FRONT_RAYS
 from bam_envs.robots.physics.kinematic_arm import obstacle_arm
 from bam_envs.robots.physics.kinematic_base import SimulatedBase, lab, open_floor
 from bam_envs.robots.physics.rendering import RenderingUnavailable

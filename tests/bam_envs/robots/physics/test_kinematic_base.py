@@ -9,6 +9,7 @@ from bam_envs.core.errors import InvalidValue
 from bam_envs.core.robot import Initial
 from bam_envs.robots.physics.kinematic_base import SimulatedBase, lab, open_floor
 from bam_envs.testing import RobotContract
+from tests.bam_envs.making import CART
 
 BOXES = np.array([[-2.0, 0.0, 0.3], [0.0, 2.0, 1.0], [2.0, -1.5, 0.0]])
 
@@ -33,6 +34,16 @@ class TestLab(BaseContract):
 class TestRandomizedLab(TestLab):
     def make(self, num_robots):
         return lab(num_robots, randomize=True)
+
+
+class TestHusky(TestLab):
+    def make(self, num_robots):
+        return lab(num_robots, robot_model="husky")
+
+
+class TestOmnidirectional(TestLab):
+    def make(self, num_robots):
+        return lab(num_robots, robot_model=CART, randomize=True)
 
 
 class TestOpenFloor(BaseContract):
@@ -63,6 +74,20 @@ def test_limits():
     speeds = [base.step(np.array([[-9.0, 9.0]])).signals["base_velocity"][0] for _ in range(7)]
     forwards = [-0.2, -0.4, -0.6, -0.8, -1.0, -1.0, -1.0]
     np.testing.assert_allclose(speeds, np.transpose([forwards, [0.25, 0.5, 0.75, 1.0, 1.25, 1.5, 1.5]]), atol=1e-12)
+
+
+def test_it_drives_sideways_as_its_drive_can():
+    """Along the arc of its three speeds: a base that drives to the left and turns goes round the point to its left."""
+    base, _ = started((0.0, 0.0, 0.0), room=None, robot_model=CART)
+    assert base.spec.command.labels == ("linear_velocity", "lateral_velocity", "angular_velocity")
+    speeds = [base.step(np.array([[0.0, 0.9, 0.0]])).signals["base_velocity"][0].tolist() for _ in range(4)]
+    np.testing.assert_allclose(speeds, [[0, 0.1, 0], [0, 0.2, 0], [0, 0.3, 0], [0, 0.3, 0]], atol=1e-12)
+    np.testing.assert_allclose(base.pose, [[0.0, 0.09, 0.0]], atol=1e-12)
+    base, _ = started((0.0, 0.0, 0.0), room=None, robot_model=CART)
+    for _ in range(10):
+        state = base.step(np.array([[0.0, 0.1, 0.2]]))  # radius 0.5 m, reached at once
+    pose = [0.5 * (math.cos(0.2) - 1.0), 0.5 * math.sin(0.2), 0.2]
+    np.testing.assert_allclose(state.signals["base_pose"], [pose], atol=1e-12)
 
 
 def test_it_goes_round_a_circle():

@@ -1,16 +1,21 @@
 """What a base touches in a room, and what its lasers see."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from bam_envs.robots.mir100 import BACK_MASKED, BACK_MOUNT, BACK_RAYS, FRONT_MASKED, FRONT_MOUNT, FRONT_RAYS
+from bam_envs.robots.base_description import base_model
 from bam_envs.robots.room import LAB, NOISE, NOWHERE, LaserScanner, Room, measured, mixed, noise, touches
+from tests.bam_envs.making import CART
+
+BODY = base_model("mir100").body
+SCANNERS = BODY.scanners
 
 
-def touching(pose, room=None, boxes=()):
-    return bool(touches(np.array([pose], dtype=float), room, np.array([boxes], dtype=float).reshape(1, -1, 3))[0])
+def touching(pose, room=None, boxes=(), body=BODY):
+    return bool(touches(body, np.array([pose], dtype=float), room, np.array([boxes], dtype=float).reshape(1, -1, 3))[0])
 
 
 @pytest.mark.parametrize(
@@ -61,7 +66,34 @@ def test_corner_to_corner_is_separated_by_an_axis_of_the_box():
         assert touching((0, 0, 0), None, [(*middle, math.pi / 4)]) == (gap < 0)
 
 
-FRONT, BACK = LaserScanner(FRONT_MOUNT, FRONT_MASKED), LaserScanner(BACK_MOUNT, BACK_MASKED)
+@pytest.mark.parametrize("model", ["turtlebot4", "husky", CART])
+def test_what_touches_any_footprint_is_what_a_plain_search_finds(model):
+    """Points on a grid inside the box, and inside the footprint; poses where the two nearly touch are left out."""
+    body, rng = base_model(model).body, np.random.default_rng(1)
+    grid = np.linspace(-0.25, 0.25, 60)
+    own_x, own_y = (one.ravel() for one in np.meshgrid(grid, grid))
+    far = rng.uniform(0.0, 1.3, 200)
+    poses = np.stack([far, rng.uniform(-0.3, 0.3, 200), rng.uniform(-4, 4, 200)], axis=1)
+    box = (0.1, -0.05, 0.4)
+    found = touches(body, poses, None, np.tile(box, (200, 1, 1)))
+    for (x, y, yaw), touching in zip(poses, found, strict=True):
+        dx = box[0] + own_x * math.cos(box[2]) - own_y * math.sin(box[2]) - x
+        dy = box[1] + own_x * math.sin(box[2]) + own_y * math.cos(box[2]) - y
+        seen_x, seen_y = dx * math.cos(yaw) + dy * math.sin(yaw), dy * math.cos(yaw) - dx * math.sin(yaw)
+        inside = body.holds(seen_x, seen_y).any()
+        near = body.holds(seen_x * 0.97, seen_y * 0.97).any() | body.holds(seen_x * 1.03, seen_y * 1.03).any()
+        assert touching == inside or (near and not inside), (x, y, yaw)
+    assert 40 < found.sum() < 170
+
+
+def test_a_round_base_beside_a_wall():
+    body = base_model("turtlebot4").body
+    for way in (0.0, 1.0, 2.5):
+        assert not touching((2.823 - 0.171 - 1e-6, 0, way), LAB, body=body)
+        assert touching((2.823 - 0.171 + 1e-6, 0, way), LAB, body=body)
+
+
+FRONT, BACK = map(LaserScanner, SCANNERS)
 FORWARDS = 150  # -135 + (30 + 150) / 2 = -45 degrees in a scanner that looks to +45
 LEFTWARDS = 330  # +45 degrees there
 BACKWARDS = 170  # -135 + (10 + 170) / 2 = -45 degrees in a scanner that looks to -135
@@ -84,7 +116,7 @@ def test_walls_from_both_corners():
 
 
 def test_nothing_near_and_nothing_but_near():
-    assert (FRONT_RAYS, BACK_RAYS) == (501, 511)
+    assert [len(scanner.bearings) for scanner in SCANNERS] == [501, 511]
     assert np.isinf(cast(FRONT, (1.0, 2.0, 0.3), None)).all()
     assert (cast(FRONT, (0, 0, 0), LAB, [(0.4288, 0.2358, 0.3)]) == 0).all()  # from inside a box
     assert not touching((0, 0, 0), LAB)
@@ -100,7 +132,8 @@ def test_as_a_plain_search_finds_it():
     """Points along each ray, a millimetre apart, until one is outside the room or inside a box."""
     room, boxes = Room((-1.5, -1.2), (1.4, 1.6)), [(0.9, 1.0, 0.4), (-1.0, 0.4, 1.1), (0.3, -0.9, -0.2)]
     pose = (0.05, 0.1, 0.37)
-    for scanner, mount, masked in ((FRONT, FRONT_MOUNT, FRONT_MASKED), (BACK, BACK_MOUNT, BACK_MASKED)):
+    for scanner, seen in zip((FRONT, BACK), SCANNERS, strict=True):
+        mount, masked = seen.pose, seen.hidden
         ranges = cast(scanner, pose, room, boxes)
         x = pose[0] + mount[0] * math.cos(pose[2]) - mount[1] * math.sin(pose[2])
         y = pose[1] + mount[0] * math.sin(pose[2]) + mount[1] * math.cos(pose[2])
@@ -128,7 +161,7 @@ def test_a_row_of_many_is_the_row_alone():
 
 def test_measured_ranges_are_inside_what_a_scanner_says():
     true = np.array([[0.01, 1.0, 28.995, np.inf, np.nan]], np.float32)
-    said = measured(true, np.full((1, 5), 0.01, np.float32))
+    said = measured(true, np.full((1, 5), 0.01, np.float32), [replace(SCANNERS[0], bearings=(0.0,) * 5)])
     assert said.dtype == np.float64
     np.testing.assert_allclose(said, [[0.05, 1.01, 29.0, 29.0, 0.05]], atol=1e-6)
 

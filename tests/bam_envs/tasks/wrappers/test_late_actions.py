@@ -33,14 +33,14 @@ def test_an_action_counts_two_steps_later(make, env_id, actions_of):
 
 
 def test_the_delay_is_drawn_for_each_episode(make, make_rows):
-    rows = make_rows("bam/mir100-navigation-v0", 200, action_delay=[1, 3])
+    rows = make_rows("bam/navigation-v0", 200, action_delay=[1, 3])
     rows.reset(seed=0)
     delays = []
     for _ in range(3):
         rows.step(np.ones(rows.action_space.shape, np.float32))
         delays.append((rows.unwrapped.state.command[:, 0] == 0).mean())
     assert delays == pytest.approx([1.0, 2 / 3, 1 / 3], abs=0.1)
-    one = make("bam/mir100-navigation-v0", action_delay=[1, 3])
+    one = make("bam/navigation-v0", action_delay=[1, 3])
     for k in (0, 7):
         one.reset(seed=k)
         rows.reset(seed=0)
@@ -51,7 +51,7 @@ def test_the_delay_is_drawn_for_each_episode(make, make_rows):
 
 
 def test_nothing_of_the_episode_before_counts(make):
-    env = make("bam/mir100-navigation-v0", action_delay=1)
+    env = make("bam/navigation-v0", action_delay=1)
     for _ in range(2):
         env.reset(seed=0)
         env.step(np.ones(2, np.float32))

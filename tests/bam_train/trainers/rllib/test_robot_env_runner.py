@@ -94,7 +94,7 @@ def _collected(kind, number):
     """By their first observation: observations, actions, rewards, and how each episode ended."""
     torch.manual_seed(0)
     register()  # another test may have shut Ray down, and RLlib's registry with it
-    config = PPOConfig().environment("bam/mir100-avoidance").debugging(seed=5)
+    config = PPOConfig().environment("bam/avoidance").debugging(seed=5)
     config.rl_module(model_config={"fcnet_hiddens": [16]})
     config.env_runners(num_env_runners=0, num_envs_per_env_runner=number, env_runner_cls=kind)
     with warnings.catch_warnings():

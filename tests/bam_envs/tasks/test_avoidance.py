@@ -9,11 +9,11 @@ import bam_envs  # noqa: F401 - registers the environments
 from bam_envs.core.errors import ProtocolError
 from bam_envs.core.robot import RobotState
 from bam_envs.robo_gym.parity import BEAMS
-from bam_envs.robots.mir100 import BACK_RAYS, FRONT_RAYS
-from bam_envs.tasks.mir100_avoidance import BOXES
+from bam_envs.robo_gym.rs_state import BACK_RAYS, FRONT_RAYS
+from bam_envs.tasks.avoidance import BOXES
 from tests.bam_envs.making import make_task
 
-ENV = "bam/mir100-avoidance-v0"
+ENV = "bam/avoidance-v0"
 ROW = np.zeros(1, np.int64)
 STILL = np.zeros((1, 2), np.float32)
 
@@ -32,7 +32,7 @@ def at(x, y, yaw=0.0, *, scan=None, touching=None):
 
 
 def begun(start=(0.0, -2.5, 0.0), target=(0.0, 2.5, 0.0), **options):
-    task = make_task("bam/mir100-avoidance-v0", 1, **options)
+    task = make_task("bam/avoidance-v0", 1, **options)
     task.sample_initial(ROW, [np.random.default_rng(0)], {"start_pose": start, "target_pose": target})
     task.on_reset(ROW, at(*start))
     return task
@@ -161,7 +161,7 @@ def test_arriving_and_colliding_at_once(parity, touching, reward, status):
 
 
 def test_samples():
-    rows, task = np.arange(2000), make_task("bam/mir100-avoidance-v0", 2000)
+    rows, task = np.arange(2000), make_task("bam/avoidance-v0", 2000)
     signals = task.sample_initial(rows, [np.random.default_rng(seed) for seed in rows]).signals
     pose, boxes = signals["base_pose"], signals["obstacle_pose"]
     np.testing.assert_array_equal(boxes, task.obstacles)
@@ -182,7 +182,7 @@ def test_samples():
 
 @pytest.mark.parametrize(("y", "low", "high"), [(0.5, -3.1, -2.1), (0.0, 2.1, 3.1), (-0.5, 2.1, 3.1)])
 def test_the_target_is_across_from_where_a_live_base_stands(y, low, high):
-    task = make_task("bam/mir100-avoidance-v0")
+    task = make_task("bam/avoidance-v0")
     for seed in range(20):
         task.sample_initial(ROW, [np.random.default_rng(seed)])
         task.on_reset(ROW, at(0.0, y))

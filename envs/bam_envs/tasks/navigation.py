@@ -1,4 +1,4 @@
-"""Drive a MiR100 to a target on an open floor; `DriveTask` is the base class of the MiR100's tasks.
+"""Drive a wheeled base to a target on an open floor; `DriveTask` is the base class of the tasks of bases.
 
 Poses are x, y [m] and yaw [rad].
 """
@@ -13,10 +13,18 @@ from gymnasium import spaces
 from bam_envs.core.env_options import finite_numbers
 from bam_envs.core.errors import InvalidValue
 from bam_envs.core.robot import EnvIds, Initial, RobotState
+from bam_envs.core.robot_models import DEFAULT_BASE
 from bam_envs.core.task import Array, Flags, Floats, Label, Memory, Score, as_objects, draw_seeds, labelled_box, limited
-from bam_envs.robots.mir100 import BACK_RAYS, FRONT_RAYS, SCAN_RANGE
+from bam_envs.robots.base_description import base_model
 
-FASTEST = np.array([0.5, 0.7])  # speeds of an action of 1: forward [m/s], turning anticlockwise [rad/s]
+FASTEST = {"m/s": 0.5, "rad/s": 0.7}
+"""Speeds of an action of 1 by unit, or the maximum of a base that is slower; the guards of a live base allow them."""
+AXES = {
+    "linear_velocity": ("forward", "speed forward"),
+    "lateral_velocity": ("sideways", "speed to the left"),
+    "angular_velocity": ("turn", "speed of turning anticlockwise"),
+}
+"""The numbers of an action, by those of the command, and what they mean."""
 ARRIVED = 0.2
 """The base has arrived when it is nearer than this to its target [m]."""
 MAX_STEPS = 500
@@ -37,26 +45,32 @@ class DriveTask(Memory):
     """Drive to within `ARRIVED` of a target; the heading there does not matter.
 
     Args:
-        rs_state_to_info: Add the state of robo-gym's robot server to the info as ``rs_state``.
+        robot_model: The base: the name of a description, or its file.
+        rs_state_to_info: Add the state of robo-gym's robot server to the info as ``rs_state``; for a MiR100.
+
+    Raises:
+        InvalidValue: `robot_model` is no base, or no MiR100 where robo-gym's state is asked for.
     """
 
     reset_options = ("start_pose", "target_pose")
-    action_labels = (
-        Label("forward", "speed forward", "m/s", f"/ {FASTEST[0]:g}"),
-        Label("turn", "speed of turning anticlockwise", "rad/s", f"/ {FASTEST[1]:g}"),
-    )
-    observation_labels: tuple[Label, ...] = (
-        Label("target_distance", "target from the base", "m", f"/ {DISTANCE_SCALE:g}", 0.0, 6.0),
-        Label("target_bearing", "where the target is, seen from the base", "rad", "/ pi"),
-        Label("linear_velocity", "speed forward", "m/s", f"/ {FASTEST[0]:g}", -2.5, 2.5),
-        Label("angular_velocity", "speed of turning anticlockwise", "rad/s", f"/ {FASTEST[1]:g}", -2.5, 2.5),
-    )
     memory: Mapping[str, str] = {"target": "target", "elapsed": "elapsed", "previous": "_previous"}
     failure: str  # ``final_status`` of a failure
     draws: int  # number of random numbers that `starts` and `targets` take for each environment
 
-    def __init__(self, num_envs: int = 1, *, rs_state_to_info: bool = False) -> None:
+    def __init__(self, num_envs: int = 1, *, robot_model: Any = DEFAULT_BASE, rs_state_to_info: bool = False) -> None:
         self.num_envs, self.rs_state_to_info = num_envs, rs_state_to_info
+        self.base = base_model(robot_model)
+        if rs_state_to_info:
+            self.require_mir100("rs_state_to_info")
+        self.body, command = self.base.body, self.base.spec(with_scans=False).command
+        rows = list(zip(command.labels, command.units, command.high, strict=True))
+        self.fastest = np.array([min(FASTEST[unit], most) for _, unit, most in rows])
+        """Speeds of an action of 1 [m/s, rad/s]. Shape: (m,)."""
+        scales = [f"/ {fastest:g}" for fastest in self.fastest]
+        self.action_labels: tuple[Label, ...] = tuple(
+            Label(*AXES[name], unit, scale) for (name, unit, _), scale in zip(rows, scales, strict=True)
+        )
+        self.observation_labels: tuple[Label, ...] = self._observation_labels()
         self.action_space: spaces.Box = labelled_box(self.action_labels)
         self.observation_space: spaces.Box = labelled_box(self.observation_labels)
         self.target = np.zeros((num_envs, 3))
@@ -64,6 +78,19 @@ class DriveTask(Memory):
         self.elapsed = np.zeros(num_envs, dtype=np.int64)  # steps since the episode began
         self._previous = np.full(num_envs, np.nan)  # distance one step ago [m]
         self._draws, self._asked = np.zeros((num_envs, self.draws)), np.full((num_envs, 2, 3), np.nan)
+
+    def require_mir100(self, option: str) -> None:
+        """`InvalidValue` if an option of robo-gym is given for another base."""
+        if self.base.name != DEFAULT_BASE:
+            raise InvalidValue(f"{option} is for robo-gym's base, {DEFAULT_BASE}, and not for {self.base.name}.")
+
+    def _observation_labels(self) -> tuple[Label, ...]:
+        speeds = zip(self.base.spec(with_scans=False).command.labels, self.action_labels, strict=True)
+        return (
+            Label("target_distance", "target from the base", "m", f"/ {DISTANCE_SCALE:g}", 0.0, 6.0),
+            Label("target_bearing", "where the target is, seen from the base", "rad", "/ pi"),
+            *(Label(name, axis.meaning, axis.unit, axis.scale, -2.5, 2.5) for name, axis in speeds),
+        )
 
     def starts(self, draws: Array) -> Array:
         """Hook: start poses out of `draws` from [0, 1). Shapes: (k, draws) -> (k, 3)."""
@@ -139,9 +166,9 @@ class DriveTask(Memory):
         return half_turn(np.arctan2(self.target[:, 1] - pose[:, 1], self.target[:, 0] - pose[:, 0]) - pose[:, 2])
 
     def _columns(self, state: RobotState) -> list[Array]:
-        """The first four numbers of an observation. Shape: (n,) each."""
-        v, w = state.signals["base_velocity"].T
-        return [self.distance(state) / DISTANCE_SCALE, self.bearing(state) / math.pi, v / FASTEST[0], w / FASTEST[1]]
+        """The first numbers of an observation. Shape: (n,) each."""
+        speeds = state.signals["base_velocity"] / self.fastest
+        return [self.distance(state) / DISTANCE_SCALE, self.bearing(state) / math.pi, *speeds.T]
 
     def observe(self, state: RobotState) -> Floats:
         """See `observation_labels`. Shape: (n, k) float32."""
@@ -152,16 +179,16 @@ class DriveTask(Memory):
         return limited(observation, self.observation_space.low, self.observation_space.high)
 
     def command(self, action: Floats, state: RobotState) -> Array:
-        """Speeds forward [m/s] and of turning [rad/s]. Shape: (n, 2)."""
-        command: Array = limited(action, -1.0, 1.0).astype(np.float64) * FASTEST
+        """Speeds of the base [m/s, rad/s]. Shape: (n, m)."""
+        command: Array = limited(action, -1.0, 1.0).astype(np.float64) * self.fastest
         return command
 
     def score(self, state: RobotState, action: Floats) -> Score:
         """Reward approaching the target, less time and power; success and failure have their own rewards instead."""
         distance, failed = self.distance(state), self.failed(state)
         success = (distance < ARRIVED) & ~failed
-        forward, turn = np.abs(limited(action, -1.0, 1.0)).astype(np.float64).T
-        reward = NEARER * (self._previous - distance) - POWER[0] * forward - POWER[1] * turn - TIME
+        *driven, turn = np.abs(limited(action, -1.0, 1.0)).astype(np.float64).T
+        reward = NEARER * (self._previous - distance) - POWER[0] * sum(driven) - POWER[1] * turn - TIME
         reward = np.where(failed, FAILING, np.where(success, ARRIVING, reward))
         self.elapsed = self.elapsed + 1
         terminated = failed | success
@@ -180,13 +207,12 @@ class DriveTask(Memory):
 
     def rs_state(self, state: RobotState) -> list[list[float]]:
         """The states as robo-gym's robot server sends them, 1030 numbers each; see `bam_envs.robo_gym.rs_state`."""
-        n, obstacles = self.num_envs, self._wire_obstacles(state)
+        n, obstacles, scanners = self.num_envs, self._wire_obstacles(state), self.body.scanners
         columns = [
             self.target,
             state.signals["base_pose"],
             state.signals["base_velocity"],
-            state.signals.get("f_scan", np.full((n, FRONT_RAYS), SCAN_RANGE[1])),
-            state.signals.get("b_scan", np.full((n, BACK_RAYS), SCAN_RANGE[1])),
+            *(state.signals.get(one.signal, np.full((n, len(one.bearings)), one.range[1])) for one in scanners),
             state.truth.get("collision", np.zeros(n))[:, None],
             obstacles if obstacles.shape[1] else np.zeros((n, 9)),
         ]
@@ -201,8 +227,11 @@ class DriveTask(Memory):
         return [(np.array([self.target[0, 0], self.target[0, 1], 0.0]), (0.1, 0.7, 0.3, 0.6))]
 
 
-class Mir100NavigationTask(DriveTask):
+class NavigationTask(DriveTask):
     """Drive to within 20 cm of a target, nothing in the way.
+
+    An action of 1 is 0.5 m/s and 0.7 rad/s, or the maximum of a base that is slower; a base that can drive sideways has
+    an action for it.
 
     Start:
         The base is at rest between x and y -2 and 2 m, with any yaw; a live one where it is. The target is between x

@@ -11,7 +11,7 @@ from bam_envs.core.errors import InvalidValue
 from bam_envs.core.robot import RobotState
 from tests.bam_envs.making import make_task
 
-ENV = "bam/mir100-navigation-v0"
+ENV = "bam/navigation-v0"
 ROW = np.zeros(1, np.int64)
 
 
@@ -21,7 +21,7 @@ def at(x, y, yaw=0.0, v=0.0, w=0.0):
 
 
 def begun(start=(0.0, 0.0, 0.0), target=(3.0, 4.0, 0.0), **options):
-    task = make_task("bam/mir100-navigation-v0", 1, **options)
+    task = make_task("bam/navigation-v0", 1, **options)
     initial = task.sample_initial(ROW, [np.random.default_rng(0)], {"start_pose": start, "target_pose": target})
     np.testing.assert_array_equal(initial.signals["base_pose"], [start])
     task.on_reset(ROW, at(*start))
@@ -126,7 +126,7 @@ def test_time_limits(make, make_rows):
 
 
 def test_samples():
-    task = make_task("bam/mir100-navigation-v0", 2000)
+    task = make_task("bam/navigation-v0", 2000)
     rows = np.arange(2000)
     pose = task.sample_initial(rows, [np.random.default_rng(seed) for seed in rows]).signals["base_pose"]
     state = RobotState({"base_pose": pose}, np.zeros(2000), np.zeros((2000, 2)))
@@ -183,7 +183,7 @@ def test_none_is_no_pose(make):
 
 
 def test_a_robot_that_stays_where_it_is_is_not_started_elsewhere():
-    task = make_task("bam/mir100-navigation-v0")
+    task = make_task("bam/navigation-v0")
     task.sample_initial(ROW, [np.random.default_rng(0)], {"start_pose": [1.0, 0.0, 0.0]})
     with pytest.raises(InvalidValue) as caught:
         task.on_reset(ROW, at(0.5, 0.0))
@@ -194,7 +194,7 @@ def test_a_robot_that_stays_where_it_is_is_not_started_elsewhere():
 
 
 def test_the_state_of_robo_gyms_server(make):
-    space = make_task("bam/mir100-navigation-v0", parity=True).observation_space
+    space = make_task("bam/navigation-v0", parity=True).observation_space
     np.testing.assert_array_equal(space.low, np.float32([-np.inf, -math.pi, -1.1, -1.6]))
     np.testing.assert_array_equal(space.high, np.float32([np.inf, math.pi, 1.1, 1.6]))
     env = make(ENV, parity=True, rs_state_to_info=True)

@@ -1,23 +1,24 @@
-"""The MiR100's environments on a live robot: a simulated base behind our rosbridge server, as `bam-serve` offers it."""
+"""Bases' environments on a live robot: a simulated base behind our rosbridge server, as `bam-serve` offers it."""
 
 import math
 
+import gymnasium as gym
 import numpy as np
 import pytest
 
 from bam_envs.core.errors import InvalidValue
 from bam_envs.remote.serve.served_robot import ServedRobot
+from tests.bam_envs.making import CART
 
-NAVIGATION, AVOIDANCE = "bam/mir100-navigation-v0", "bam/mir100-avoidance-v0"
-FORWARD = np.array([1.0, 0.0], np.float32)
+NAVIGATION, AVOIDANCE = "bam/navigation-v0", "bam/avoidance-v0"
 
 
 @pytest.fixture
 def serve(serve_env):
-    """Serve an environment whose base was put somewhere: ``serve(id, pose, **options)``."""
+    """Serve an environment whose base was put somewhere: ``serve(id, pose, model, **options)``."""
 
-    def start(env_id, pose, **options):
-        served = serve_env(env_id, **options)
+    def start(env_id, pose, model="mir100", **options):
+        served = serve_env(env_id, gym.make(env_id, robot_model=model, disable_env_checker=True), **options)
         assert isinstance(served.env.unwrapped.robot, ServedRobot)
         served.env.reset(seed=3, options={"start_pose": pose})
         return served
@@ -50,17 +51,19 @@ def test_navigation_drives_to_the_target_from_where_the_base_is(serve, make, opt
         assert served.env.unwrapped.robot.state.signals["base_velocity"].any()
 
 
-def test_a_live_base_sees_what_the_simulated_one_sees_and_stops_before_it(serve, make):
+@pytest.mark.parametrize("model", ["mir100", "turtlebot4", CART])
+def test_a_live_base_sees_what_the_simulated_one_sees_and_stops_before_it(serve, make, model):
     """The same commands, here and there, until the lasers slow the live base down."""
     pose = [0.0, -2.6, math.pi / 2]
-    served = serve(AVOIDANCE, pose, fast=True)
-    there, here = live(make, served, AVOIDANCE), make(AVOIDANCE)
+    served = serve(AVOIDANCE, pose, model, fast=True)
+    there, here = live(make, served, AVOIDANCE, robot_model=model), make(AVOIDANCE, robot_model=model)
+    forward = np.eye(1, *there.action_space.shape, dtype=np.float32)[0]
     here.reset(seed=3, options={"start_pose": pose, "target_pose": [0.0, 2.5, 0.0]})
     there.reset(seed=8, options={"target_pose": [0.0, 2.5, 0.0]})
     assert there.unwrapped.state.truth == {}
     seen, zones = 0, there.unwrapped.robot.report()["laser zones"]
     for _ in range(100):
-        one, two = here.step(FORWARD), there.step(FORWARD)
+        one, two = here.step(forward), there.step(forward)
         zones = there.unwrapped.robot.report()["laser zones"]
         if zones["altered"] or one[2]:
             break
@@ -70,7 +73,7 @@ def test_a_live_base_sees_what_the_simulated_one_sees_and_stops_before_it(serve,
     np.testing.assert_array_equal(served.env.unwrapped.task.obstacles, here.unwrapped.task.obstacles)
     assert zones["number"] == "G12"
     for _ in range(60):
-        assert not there.step(FORWARD)[2]
+        assert not there.step(forward)[2]
     assert served.env.unwrapped.robot.state.truth["collision"].tolist() == [False]
     assert np.abs(served.env.unwrapped.robot.state.signals["base_velocity"]).max() < 0.01
 
