@@ -30,6 +30,7 @@ from bam_envs.ros.codec import LISTED_TYPES
 from bam_envs.ros.messages import bare_type, has_header
 from bam_envs.ros.profile_tables import (
     CameraSource,
+    Enable,
     IdentitySource,
     ImageType,
     Readiness,
@@ -46,8 +47,10 @@ Table = dict[str, Any]
 Age = Annotated[float, Meta(gt=0, le=BOUNDS["max_age"][1])]
 """Maximum age of states and commands [s]."""
 T = TypeVar("T")
-Topical = TypeVar("Topical", Source, Sink, CameraSource, Readiness)
+Typed = TypeVar("Typed", Source, Sink, CameraSource, Readiness, Enable)
 Converted = TypeVar("Converted", Source, Sink)
+_PLACES = ("topic", "action", "service")
+"""The keys of a table that say where something is."""
 _STATES = "sensor_msgs/JointState"
 _SUFFIXES = (".toml", ".yaml", ".yml")
 _SHIPPED = resources.files("bam_envs.robots") / "profiles"
@@ -82,6 +85,7 @@ class _File:
     cameras: tuple[Table, ...] = ()
     readiness: tuple[Table, ...] = ()
     identity: tuple[Table, ...] = ()
+    enable: tuple[Table, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -225,23 +229,25 @@ def _profile(where: str, table: Table) -> RobotProfile:
         raise InvalidValue(f"{where}: at least one command mode is needed, such as [[commands.position]].")
     cameras, readiness = [], []
     for row, at in _rows(f"{where}: cameras", file.cameras):
-        cameras.append(_topical(CameraSource, row, at))
+        cameras.append(_typed(CameraSource, row, at))
         check(cameras[-1].type, ImageType, f"{at}: type")
     for row, at in _rows(f"{where}: readiness", file.readiness):
-        readiness.append(entry := _topical(Readiness, row, at))
+        readiness.append(entry := _typed(Readiness, row, at))
         if bool(entry.ready) == (entry.at_least is not None):
             raise InvalidValue(f"{at}: give either ready (the values with which it can move) or at_least.")
     identity = [_identity(row, at) for row, at in _rows(f"{where}: identity", file.identity)]
+    enable = [_typed(Enable, row, at) for row, at in _rows(f"{where}: enable", file.enable)]
     sinks = [sink for mode in commands.values() for sink in mode]
-    entries: list[Source | Sink | CameraSource | Readiness] = [*state, *cameras, *readiness, *sinks]
-    _require_known(f"{where}: rename", "topic", file.rename, [entry.topic for entry in entries])
+    entries: list[Source | Sink | CameraSource | Readiness | Enable] = [*state, *cameras, *readiness, *sinks, *enable]
+    names = {getattr(entry, key, "") for entry in entries for key in _PLACES}
+    _require_known(f"{where}: rename", "topic", file.rename, names - {""})
 
-    def renamed(entry: Topical) -> Topical:
-        if entry.topic not in file.rename:
-            return entry
+    def renamed(entry: Typed) -> Typed:
+        found: dict[str, Any] = {key: file.rename.get(getattr(entry, key, "")) for key in _PLACES}
+        changed = {key: name for key, name in found.items() if name is not None}
         # A topic of another name belongs to another controller.
-        other: dict[str, Any] = {"controller": ""} if isinstance(entry, Sink) else {}
-        return replace(entry, topic=file.rename[entry.topic], **other)
+        other: dict[str, Any] = {"controller": ""} if changed and isinstance(entry, Sink) else {}
+        return replace(entry, **changed, **other)
 
     return RobotProfile(
         name=file.name,
@@ -257,6 +263,7 @@ def _profile(where: str, table: Table) -> RobotProfile:
         cameras=tuple(map(renamed, cameras)),
         readiness=tuple(map(renamed, readiness)),
         identity=tuple(identity),
+        enable=tuple(map(renamed, enable)),
         controllers=file.controllers,
         watchdog=file.watchdog,
         body=spec.body,
@@ -316,7 +323,7 @@ def _state(where: str, file: _File, spec: RobotSpec) -> list[Source]:
     sizes = {signal.name: len(signal.labels) for signal in spec.signals}
     sources: dict[str, Source] = {}
     for row, at in _rows(f"{where}: state", file.state):
-        source = _topical(Source, row, at)
+        source = _typed(Source, row, at)
         _require_known(at, "signal", [source.signal], sizes)
         if source.signal in sources:
             raise InvalidValue(f"{at}: {source.signal} has a source already.")
@@ -357,19 +364,29 @@ def _sinks(where: str, mode: str, rows: list[Table], command: SignalSpec) -> tup
     where = f"{where}: commands.{mode}"
     sinks: list[Sink] = []
     for row, at in _rows(where, rows):
-        sink = _topical(Sink, row, at)
+        sink = _typed(Sink, row, at)
+        if sum(bool(getattr(sink, key)) for key in _PLACES) != 1:
+            raise InvalidValue(f"{at}: give one of {', '.join(_PLACES)}.")
+        if not sink.topic:  # what a gripper holds, it holds without another goal
+            if sink.hold != "last" and "hold" in row:
+                raise InvalidValue(f"{at}: hold of an action or a service is last: a halt cancels it.")
+            sink = replace(sink, hold="last", tag=False)
         size = len(sink.labels)
         for key, values in (("names", sink.names), ("fields", sink.fields)):
             if values and len(values) != size:
                 raise InvalidValue(f"{at}: {key} must have {size} values, not {len(values)}.")
-        if not sink.fields and sink.type not in LISTED_TYPES:
+        if not sink.fields and not (sink.topic and sink.type in LISTED_TYPES):
             raise InvalidValue(f"{at}: {sink.type} needs fields; only {', '.join(sorted(LISTED_TYPES))} do without.")
+        if sink.constants and not sink.fields:
+            raise InvalidValue(f"{at}: constants need fields.")
         sinks.append(_converted(at, replace(sink, names=sink.names or sink.labels), size))
     labels = [label for sink in sinks for label in sink.labels]
     _require_once(where, "label", labels)
     if set(labels) != set(command.labels):
         raise InvalidValue(f"{where}: labels must be {', '.join(command.labels)}, not {', '.join(labels)}.")
-    _require_once(where, "topic", [sink.topic for sink in sinks])
+    _require_once(where, "topic", [sink.address for sink in sinks])
+    if not sinks[-1].topic:
+        raise InvalidValue(f"{where}: the last table must have a topic, because it completes a command.")
     return tuple(sinks)
 
 
@@ -382,8 +399,8 @@ def _row(kind: type[T], row: Table, where: str) -> T:
     return read_table(kind, listed, where)
 
 
-def _topical(kind: type[Topical], row: Table, where: str) -> Topical:
-    """A table with a topic and a type; the type becomes ``pkg/Type``."""
+def _typed(kind: type[Typed], row: Table, where: str) -> Typed:
+    """A table with a type, which becomes ``pkg/Type``."""
     entry = _row(kind, row, where)
     return replace(entry, type=bare_type(entry.type))
 

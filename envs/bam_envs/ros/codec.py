@@ -165,8 +165,8 @@ def encode_sink(
         content: list[float] | Array = raw
         if any("(" in path for path in sink.fields):  # an angle is written as a quaternion, and read with rounding
             content = _read_command(sink, _write_command(sink, raw, "", reach))
-        text = tag.to_text() if sign is None else sign(tag, sink.topic, _signed(content))
-    return sink.topic, sink.type, _write_command(sink, raw, text, reach, ros1=ros1)
+        text = tag.to_text() if sign is None else sign(tag, sink.address, _signed(content))
+    return sink.address, sink.type, _write_command(sink, raw, text, reach, ros1=ros1)
 
 
 def _write_command(sink: Sink, values: list[float], text: str, reach: float, *, ros1: bool = False) -> dict[str, Any]:
@@ -179,6 +179,8 @@ def _write_command(sink: Sink, values: list[float], text: str, reach: float, *, 
         if sink.type in ("geometry_msgs/Twist", "geometry_msgs/TwistStamped"):  # all six fields, commanded or not
             twist = {part: dict.fromkeys("xyz", 0.0) for part in ("linear", "angular")}
             message.update({"twist": twist} if stamped else twist)
+        for path, constant in sink.constants.items():
+            put_at(message, path, constant)
         for path, value in zip(sink.fields, values, strict=True):
             put_at(message, path, value)
         return message
@@ -212,8 +214,8 @@ class Decoded(NamedTuple):
 
 
 def decode_command(profile: RobotProfile, spec: RobotSpec, topic: str, message: object) -> Decoded:
-    """The command in a message on `topic`; `ProtocolError` if it differs from the profile."""
-    sink = profile.sinks_by_topic.get(topic)
+    """The command in a message on `topic`, a goal or a request; `ProtocolError` if it differs from the profile."""
+    sink = profile.sinks_by_address.get(topic)
     if sink is None:
         raise ProtocolError(f"{topic}: {profile.name} takes no command on this topic.")
     content = require_message(message, topic)
@@ -224,7 +226,7 @@ def decode_command(profile: RobotProfile, spec: RobotSpec, topic: str, message: 
 
 def _read_command(sink: Sink, message: Message) -> Array:
     """The raw numbers in `message`, in the order of the labels of `sink`. Shape: (k,)."""
-    where = sink.topic
+    where = sink.address
     if sink.fields:
         return np.array([number_at(message, path, where) for path in sink.fields])
     if sink.type in _ARRAYS:

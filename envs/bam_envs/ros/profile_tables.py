@@ -14,11 +14,16 @@ from bam_envs.core.robot import BaseBody, RobotSpec, SignalSpec
 from bam_envs.core.validation import Finite, NonEmpty, NonNegativeInt, Positive, RobotName, check
 
 Topic = Annotated[str, Meta(pattern=r"^(/[A-Za-z]\w*)+\Z", description="an absolute name such as /joint_states")]
-"""A topic without its namespace."""
+"""A topic, action or service without its namespace."""
 MessageType = Annotated[
     str,
-    Meta(pattern=r"^[A-Za-z]\w*/(msg/)?[A-Za-z]\w*\Z", description="a message type such as sensor_msgs/JointState"),
+    Meta(
+        pattern=r"^[A-Za-z]\w*/((msg|action|srv)/)?[A-Za-z]\w*\Z",
+        description="a message type such as sensor_msgs/JointState",
+    ),
 ]
+Answer = Finite | bool | str
+"""A value in a message that tells whether something succeeded, or whether a robot can move."""
 ImageType = Literal["sensor_msgs/CompressedImage", "sensor_msgs/Image"]
 """Message type of a camera: JPEG or PNG, or raw pixels, both over a separate CBOR connection."""
 IMAGE_TYPES = get_args(ImageType)
@@ -33,7 +38,7 @@ class Content:
 
     topic: Topic
     type: MessageType
-    """Message type, ``pkg/Type``; its stamped version (``pkg/TypeStamped``) is read too."""
+    """Type of the message, goal or request, ``pkg/Type``; a stamped message (``pkg/TypeStamped``) is read too."""
     fields: tuple[NonEmpty, ...] = ()
     """Path of each number, e.g. ``pose.position.x``; ``yaw(orientation)`` is the angle about z of a quaternion."""
     names: tuple[NonEmpty, ...] = ()
@@ -75,8 +80,19 @@ class Source(Content):
 
 @dataclass(frozen=True, kw_only=True)
 class Sink(Content):
-    """The topic for some of the numbers of a command."""
+    """Where some of the numbers of a command are sent: to a topic, or as goals of an action or requests of a service.
 
+    The last two get a number only when it changes, and wait for no answer within a period.
+    """
+
+    topic: Topic = ""
+    """The topic; or `action`, or `service`."""
+    action: Topic = ""
+    """The action; a new goal replaces the one that runs, and a halt cancels it."""
+    service: Topic = ""
+    """The service."""
+    constants: Mapping[str, Answer] = dataclasses.field(default_factory=dict)
+    """Other fields of each message, goal or request, by their paths, e.g. ``command.max_effort``."""
     labels: tuple[NonEmpty, ...]
     """Labels of its numbers in the command, in the order of the message."""
     reach: Positive | None = None
@@ -91,6 +107,11 @@ class Sink(Content):
     controller: NonEmpty = ""
     """The controller of ros2_control that takes it, which must be active; not checked if empty, or if the topic is
     renamed."""
+
+    @property
+    def address(self) -> str:
+        """The topic, action or service."""
+        return self.topic or self.action or self.service
 
     @property
     def is_timed(self) -> bool:
@@ -115,7 +136,7 @@ class Readiness:
     type: MessageType
     field: tuple[NonEmpty, ...]
     """Path of the value, e.g. ``mode``; the first of several paths that the message has."""
-    ready: tuple[Finite | bool | str, ...] = ()
+    ready: tuple[Answer, ...] = ()
     """The values with which it can move; or `at_least`."""
     at_least: Finite | None = None
     """The least number with which it can begin to move."""
@@ -139,10 +160,17 @@ class Readiness:
         enough = self.at_least is not None and not (number and value < self.at_least)
         if value is None or value in self.ready or enough:
             return None
-        text = f"{value:g}" if number else str(value).lower() if isinstance(value, bool) else str(value)
+        text = _text(value)
         remedy = self.remedies.get(text) or self.remedy
         what = self.words.get(text) or self.otherwise.replace("{}", text) or f"{self.field[0]} is {text}"
         return f"{what} ({self.topic}){remedy and f': {remedy}'}"
+
+
+def _text(value: Any) -> str:
+    """A value of a message as people write it."""
+    if isinstance(value, (int, float)) and not isinstance(value, bool):
+        return f"{value:g}"
+    return "missing" if value is None else str(value).lower() if isinstance(value, bool) else str(value)
 
 
 def _value_in(message: Any, path: str) -> Any:
@@ -150,6 +178,32 @@ def _value_in(message: Any, path: str) -> Any:
     for name in path.split("."):
         message = message.get(name) if isinstance(message, Mapping) else None
     return message
+
+
+@dataclass(frozen=True, kw_only=True)
+class Enable:
+    """A service that is called before a robot takes commands, with the operator's consent."""
+
+    service: Topic
+    type: MessageType
+    """Type of the service."""
+    does: NonEmpty
+    """What it does, for the operator, e.g. ``enables the motors``."""
+    request: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+    """The request."""
+    field: NonEmpty = "success"
+    """Path of the value in the response that tells whether it succeeded."""
+    ready: tuple[Answer, ...] = (True,)
+    """The values that mean success."""
+
+    def trouble(self, response: Any) -> str | None:
+        """Why `response` is not that of a success; None if it is."""
+        value = _value_in(response, self.field)
+        if value in self.ready:
+            return None
+        said = _value_in(response, "message")
+        expected = " or ".join(map(_text, self.ready))
+        return f"{self.field} is {_text(value)}, not {expected}{f': {said}' if said else ''}"
 
 
 @dataclass(frozen=True)
@@ -206,7 +260,8 @@ class RobotProfile:
     command: SignalSpec
     state: tuple[Source, ...]  # one source for each of `signals`, in their order
     commands: Mapping[str, tuple[Sink, ...]]
-    """Modes in which a command is sent, by name, the default first. The last sink of a mode completes a command."""
+    """Modes in which a command is sent, by name, the default first. The last sink of a mode is a topic, and completes a
+    command."""
     period: float  # time between two commands [s]
     max_age: float  # maximum age of a state [s]
     command_timeout: float  # time for which a command is valid [s]; see `command_life`
@@ -215,6 +270,7 @@ class RobotProfile:
     cameras: tuple[CameraSource, ...] = ()
     readiness: tuple[Readiness, ...] = ()  # topics that report whether it can move
     identity: tuple[IdentitySource, ...] = ()  # where it tells which robot it is; the first that answers counts
+    enable: tuple[Enable, ...] = ()  # services to be called before it takes commands, in this order
     controllers: str = ""
     """The service that lists its controllers and their states (``list_controllers``); empty: there is none."""
     watchdog: float | None = None
@@ -223,9 +279,9 @@ class RobotProfile:
     """Shape and laser scanners of a base, if they are known."""
 
     @cached_property
-    def sinks_by_topic(self) -> Mapping[str, Sink]:
-        """The sink of each topic, in the first mode that uses it."""
-        return {sink.topic: sink for sinks in reversed([*self.commands.values()]) for sink in reversed(sinks)}
+    def sinks_by_address(self) -> Mapping[str, Sink]:
+        """The sink of each topic, action and service, in the first mode that uses it."""
+        return {sink.address: sink for sinks in reversed([*self.commands.values()]) for sink in reversed(sinks)}
 
     def command_life(self, period: float) -> float:
         """Time for which a command is valid [s], for one command every `period` [s]: two periods at least."""
@@ -271,7 +327,7 @@ class RobotProfile:
             if missing := _missing(sink, labels):
                 taken, absent, alone = (", ".join(one) for one in (sink.labels, missing, labels))
                 raise InvalidValue(
-                    f"{sink.topic} takes {taken} in one message, and {absent} is not commanded. "
+                    f"{sink.address} takes {taken} in one message, and {absent} is not commanded. "
                     f"Give the profile of {self.name} a command mode with a topic for {alone} alone."
                 )
         commands = {

@@ -12,6 +12,7 @@ from bam_envs.robots.mir100 import base_spec
 from bam_envs.robots.profile import load_profile, profile_for, shipped_profiles
 from bam_envs.robots.ur import ur_model, ur_spec
 from bam_envs.robots.ur5e import JOINTS, arm_spec
+from bam_envs.ros.codec import decode_command, encode_sink
 
 OWN = """
 name = "lift"
@@ -130,7 +131,7 @@ def test_a_task_may_take_a_part_of_the_commands():
     (_, trajectory), (_, arm) = profile.commands.values()
     assert dict(narrow.commands) == {"trajectory": (trajectory,), "position": (arm,)}
     assert narrow.sinks() == (trajectory,)
-    assert list(narrow.sinks_by_topic) == [arm.topic, trajectory.topic]
+    assert list(narrow.sinks_by_address) == [arm.topic, trajectory.topic]
     assert replace(narrow, command=profile.command, commands=profile.commands) == profile
     assert profile.narrowed(profile.command.labels) is profile
     assert profile_for(wanted) == narrow
@@ -253,6 +254,13 @@ sensor_msgs/msg/JointState" -> a/B"\nframe = "map" -> state[0]: frame needs a ty
 [command] -> [rename]\n"/lift/command" = "c"\n[command] -> rename./lift/command: expected an absolute name such as
 [command] -> [[cameras]]\nname = "c"\ntopic = "/c"\ntype = "a/B"\n[command] -> cameras[0]: type: expected 'sensor_msgs/C
 [command] -> [[readiness]]\ntopic = "/c"\ntype = "a/B"\nfield = "f"\n[command] -> readiness[0]: give either ready (the
+topic = "/lift/command" -> -> commands.position[0]: give one of topic, action, service.
+topic = "/lift/command" -> topic = "/a"\nservice = "/b" -> commands.position[0]: give one of topic, action, service.
+topic = "/lift/command" -> action = "/a" -> commands.position: the last table must have a topic, because it completes
+topic = "/lift/command" -> action = "/a"\nhold = "zero" -> commands.position[0]: hold of an action or a service is last
+fields = ["data"] -> constants = { a = [1] } -> commands.position[0]: constants.a: expected a finite number or true or f
+[command] -> [[enable]]\nservice = "/on"\ntype = "a/B"\n[command] -> enable[0]: the key 'does' is missing
+[command] -> [[enable]]\nservice = "on"\ntype = "a/B"\ndoes = "c"\n[command] -> enable[0]: service: expected an absolute
 """
 """What is replaced in `OWN`, by what, and how the error begins, behind the name of the file."""
 
@@ -306,8 +314,54 @@ def test_files(write, tmp_path):
 def test_what_is_sent_on_a_topic():
     profile = load_profile("ur5e")
     (gripper, arm), (_, trajectory) = profile.commands.values()
-    assert profile.sinks_by_topic == {sink.topic: sink for sink in (gripper, arm, trajectory)}
-    assert profile.sinks_by_topic[gripper.topic] is gripper
+    assert profile.sinks_by_address == {sink.topic: sink for sink in (gripper, arm, trajectory)}
+    assert profile.sinks_by_address[gripper.topic] is gripper
+
+
+GRIPPER = """
+extends = "ur5e"
+readiness = []
+
+[[commands.action]]
+action = "/gripper/gripper_cmd"
+type = "control_msgs/action/GripperCommand"
+labels = ["gripper_width"]
+fields = ["command.position"]
+scale = -0.1
+offset = 0.085
+constants = { "command.max_effort" = 40.0 }
+
+[[commands.action]]
+topic = "/arm/joint_trajectory"
+type = "trajectory_msgs/JointTrajectory"
+labels = ["shoulder_pan_joint", "shoulder_lift_joint", "elbow_joint", "wrist_1_joint", "wrist_2_joint", "wrist_3_joint"]
+
+[[enable]]
+service = "/arm/motion_enable"
+type = "xarm_msgs/srv/SetInt16ById"
+request = { id = 8, data = 1 }
+field = "ret"
+ready = 0
+does = "enables the motors"
+"""
+
+
+def test_a_gripper_may_be_an_action_and_a_robot_may_have_to_be_enabled(write):
+    profile = load_profile(write(GRIPPER + '[rename]\n"/gripper/gripper_cmd" = "/g"\n"/arm/motion_enable" = "/on"\n'))
+    gripper, _ = profile.sinks("action")
+    assert (gripper.topic, gripper.action, gripper.address) == ("", "/g", "/g")
+    assert (gripper.type, gripper.hold, gripper.tag) == ("control_msgs/GripperCommand", "last", False)
+    assert profile.sinks_by_address["/g"] is gripper
+    command = np.append(np.zeros(6), 0.045)
+    address, _, goal = encode_sink(gripper, profile.spec(), command, None)
+    assert (address, goal) == ("/g", {"command": {"max_effort": 40.0, "position": pytest.approx(0.4)}})
+    decoded = decode_command(profile, profile.spec(), "/g", goal)
+    assert (decoded.places, decoded.values) == ([6], pytest.approx([0.045]))
+    (enable,) = profile.enable
+    assert (enable.service, enable.type, enable.request) == ("/on", "xarm_msgs/SetInt16ById", {"id": 8, "data": 1})
+    assert enable.trouble({"ret": 0, "message": ""}) is None
+    assert enable.trouble({"ret": 9, "message": "not ready"}) == "ret is 9, not 0: not ready"
+    assert enable.trouble({}) == "ret is missing, not 0"
 
 
 def test_a_frame_of_another_name(write):
