@@ -254,13 +254,16 @@ class Diagnosis:
     def _command_path(self) -> Findings:
         robot, _ = self._robot_and_profile()
         robot.connect()  # checks types and listeners of all command topics and opens the connection that halts
+        services = [f"{one.service} ({one.does})" for one in robot.enabling]
         why = robot.not_ready()
-        if why is not None:
+        if why is not None and not services:
             raise NotReady(f"{why}. Run this again when the robot takes commands")
-        found = ["the connection that halts is open; ready; nothing was sent"]
+        found = [f"the connection that halts is open; {'ready' if why is None else why}; nothing was sent"]
+        if services:  # a diagnosis enables no motors
+            found.append(f"a program that moves it calls first, once its operator agrees: {', '.join(services)}")
         if self.inspected.types is None:
             return found, ["without a rosapi node the server cannot report whether anybody listens"]
-        return ["the topics of commands have listeners", *found], []
+        return ["somebody takes the commands", *found], []
 
     def _guards(self) -> Findings:
         robot, _ = self._robot_and_profile()

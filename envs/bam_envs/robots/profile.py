@@ -371,6 +371,10 @@ def _sinks(where: str, mode: str, rows: list[Table], command: SignalSpec) -> tup
             if sink.hold != "last" and "hold" in row:
                 raise InvalidValue(f"{at}: hold of an action or a service is last: a halt cancels it.")
             sink = replace(sink, hold="last", tag=False)
+            units = dict(zip(command.labels, command.units, strict=True))
+            for label in sink.labels:
+                if units.get(label, "m") != "m":  # a motion needs a stream of commands
+                    raise InvalidValue(f"{at}: only a gripper may be an action or a service; {label} needs a topic.")
         size = len(sink.labels)
         for key, values in (("names", sink.names), ("fields", sink.fields)):
             if values and len(values) != size:

@@ -1,6 +1,7 @@
 """The tables of a robot profile: sources of its signals, sinks of its commands, cameras, ages and limits."""
 
 import dataclasses
+import math
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -340,6 +341,8 @@ class RobotProfile:
     def spec(self, wanted: RobotSpec | None = None, mode: str | None = None) -> RobotSpec:
         """The spec of this robot; with `wanted`, only the signals, command and period of that spec.
 
+        What goes to an action or a service has no `max_rate`: it gets the end of a motion, whose speed is its own.
+
         For `mode` and errors see `narrowed`; `InvalidValue` also for a signal that it does not measure, `UnknownName`
         for images of a camera that it does not have.
         """
@@ -351,7 +354,8 @@ class RobotProfile:
         is_timed = all(sink.is_timed for sink in self.sinks(mode) if joints & set(sink.labels))
         if wanted is None:
             signals = tuple(signal for signal in self.signals if not self.source(signal.name).optional)
-            return RobotSpec(self.name, signals, self.command, period, lag, self.body, is_timed=is_timed)
+            command = self._at_own_speed(self.command, mode)
+            return RobotSpec(self.name, signals, command, period, lag, self.body, is_timed=is_timed)
         for name in (name for camera in wanted.cameras for name in camera.spaces()):
             self.camera(name)
         known = {signal.name: signal for signal in self.signals}
@@ -365,8 +369,15 @@ class RobotProfile:
                 found = ", ".join(known[signal.name].labels)
                 raise InvalidValue(f"{signal.name} must be {', '.join(signal.labels)}; that of {self.name} is {found}.")
         signals = tuple(known[signal.name] for signal in wanted.signals)
-        command = self.narrowed(wanted.command.labels, mode).command
+        command = self._at_own_speed(self.narrowed(wanted.command.labels, mode).command, mode)
         return RobotSpec(self.name, signals, command, period, lag, self.body, wanted.cameras, is_timed)
+
+    def _at_own_speed(self, command: SignalSpec, mode: str | None) -> SignalSpec:
+        if command.max_rate is None:
+            return command
+        own = {label for sink in self.sinks(mode) if not sink.topic for label in sink.labels}
+        rates = zip(command.labels, command.max_rate, strict=True)
+        return dataclasses.replace(command, max_rate=tuple(math.inf if at in own else rate for at, rate in rates))
 
 
 def _missing(sink: Sink, labels: tuple[str, ...]) -> list[str]:

@@ -2,7 +2,7 @@
 
 import os
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from functools import partial
 from typing import Any
@@ -96,23 +96,29 @@ class UserRosLink(RosBus):
         if self._thread.loop is not None:
             self._ros.on(event, hook)
 
-    def _ask(
-        self, connection: Any, request: dict[str, Any], took: Callable[[Reply], None], within: float
-    ) -> Callable[[], object]:
+    def _asking(
+        self, connection: Any, request: dict[str, Any], took: Callable[[Reply], None]
+    ) -> tuple[Callable[[], None], Callable[[], object]]:
         dump_json(request)  # refuses what roslibpy would send: numbers that are not finite
+        is_goal = request["op"] == "send_action_goal"
 
         def back(result: bool, values: Any) -> None:
             if took in self._waiting:
                 self._waiting.discard(took)
-                took({"values": values if isinstance(values, str) else dict(values), "result": result})
+                reply = {"result": result, "values": values["values"] if is_goal else values}
+                reply |= {"status": values["status"].value} if is_goal else {}
+                took({name: dict(one) if isinstance(one, Mapping) else one for name, one in reply.items()})
 
         def ask() -> None:
             self._send(connection)
             self._waiting.add(took)
-            connection.send_ros_service_request(Message(request), partial(back, True), partial(back, False))
+            done, failed = partial(back, True), partial(back, False)
+            if is_goal:
+                connection.send_ros_action_goal(Message(request), done, lambda news: None, failed)
+            else:
+                connection.send_ros_service_request(Message(request), done, failed)
 
-        self._thread.do(ask, within)
-        return lambda: self._waiting.discard(took)
+        return ask, lambda: self._waiting.discard(took)
 
     # ---- the network thread
 

@@ -279,6 +279,19 @@ class SafeRobot(metaclass=Sealed):
         why: str | None = getattr(self._live, "not_ready", lambda: None)()
         return why
 
+    @property
+    def enabling(self) -> tuple[Any, ...]:
+        """The services that `enable` will call: `service` and what it `does`; empty if none is left."""
+        return tuple(getattr(self._live, "enabling", ()))
+
+    def enable(self) -> None:
+        """Call the services before which a live robot takes no commands, once its operator has agreed.
+
+        `NotReady` names the first that does not succeed.
+        """
+        if self.enabling:
+            self._live.enable()
+
     def age(self) -> float:
         """Age of the newest state of a live robot [s]; 0 for any other."""
         return 0.0 if self._live is None else float(self._live.age())
