@@ -165,13 +165,15 @@ class TopicTypes:
 
     def offered(self, name: str, sink: Sink) -> str:
         """The type of the action or service `name` on the server, that of `sink` if it is unknown; empty if absent."""
-        asks = ("action_servers", {}) if sink.action else ("service_type", {"service": name})
-        try:
-            answer = self._link.call(f"/rosapi/{asks[0]}", "", asks[1], self._timeout)
-        except RemoteError:  # no rosapi, or one of a version without it
+        what = "action" if sink.action else "service"
+        try:  # a rosapi may lack any of the services
+            if sink.action:  # many lack `action_type`
+                servers = self._link.call("/rosapi/action_servers", "", {}, self._timeout).get("action_servers")
+                if name not in (servers or ()):
+                    return ""
+            answer = self._link.call(f"/rosapi/{what}_type", "", {what: name}, self._timeout)
+        except RemoteError:
             return sink.type
-        if sink.action:
-            return sink.type if name in (answer.get("action_servers") or ()) else ""
         return str(answer.get("type") or "")
 
     def _wrong_type(self, topic: str, expected: str, kind: str) -> ProtocolError:

@@ -17,16 +17,17 @@ from numpy.typing import NDArray
 from bam_envs.core.errors import BamEnvsError, LinkLost, RemoteError
 from bam_envs.core.robot import SignalSpec
 from bam_envs.ros.profile_tables import Sink
+from bam_envs.rosbridge.bus import ABORTED, CANCELED, SUCCEEDED
 from bam_envs.rosbridge.ros_bus import Reply, RosBus, bare_reason
 
 Array = NDArray[np.float64]
+GOAL = "goal:"
+"""How the ids of all goals and calls here begin."""
 _STEP = 0.02
 """Least change of a number for which a goal is sent, as a share of its range; the ends of the range are always sent."""
 _ANSWER_WITHIN = 10.0
 """Longest time that a service may take for its answer [s]."""
-_SUCCEEDED = 4
-"""`status` of a goal in action_msgs/GoalStatus; the others that end a goal are below."""
-_ENDS = {5: "was canceled", 6: "was aborted"}
+_ENDS = {CANCELED: "was canceled", ABORTED: "was aborted"}
 
 
 class Goals:
@@ -87,7 +88,7 @@ class Goals:
         return bool((moved | ends).any())
 
     def _ask(self, sink: Sink, message: dict[str, Any]) -> None:
-        identity, name = f"goal:{secrets.token_hex(8)}", self._namespace + sink.address  # unique among all clients
+        identity, name = f"{GOAL}{secrets.token_hex(8)}", self._namespace + sink.address  # unique among all clients
         kind = sink.type.replace("/", "/action/" if sink.action else "/srv/")
         request: dict[str, Any] = {"id": identity, "args": message}
         if sink.action:
@@ -132,8 +133,8 @@ def _trouble(sink: Sink, url: str, reply: Reply) -> str:
     if sink.service:
         return f"failed{text}" if fields.get("success") is False else ""
     # A gripper that holds something has not reached its goal: control_msgs/GripperCommand says that it is stalled.
-    status = reply.get("status", _SUCCEEDED)
+    status = reply.get("status", SUCCEEDED)
     is_held = fields.get("stalled") is True or fields.get("reached_goal") is True
-    if status == _SUCCEEDED or is_held:
+    if status == SUCCEEDED or is_held:
         return ""
     return f"ended: its goal {_ENDS.get(status, f'has the status {status}')}{text}"

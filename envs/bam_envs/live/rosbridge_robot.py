@@ -33,7 +33,7 @@ from bam_envs.core.timing import Pacer
 from bam_envs.live import bringup
 from bam_envs.live.camera import LiveCamera, fitted
 from bam_envs.live.command_proof import CommandProof, needed_proof
-from bam_envs.live.goals import Goals
+from bam_envs.live.goals import GOAL, Goals
 from bam_envs.live.state import Letter, LiveState
 from bam_envs.live.take_over import TakeOver
 from bam_envs.ros.codec import (
@@ -305,7 +305,8 @@ class RosbridgeRobot:
         """Take a status of the server, or of the robot's side behind it; `step` raises the first error."""
         if self._readiness is not None and self._readiness.owns(status, self.namespace):
             return
-        if STATUS_TOPIC in str(status.get("id")) + str(status.get("msg")):  # a server may refuse the report
+        # A server may refuse the report; a goal may have ended before it was canceled.
+        if STATUS_TOPIC in str(status.get("id")) + str(status.get("msg")) or str(status.get("id")).startswith(GOAL):
             return
         if status.get("level") == "error":
             text = str(status.get("msg"))
