@@ -25,7 +25,7 @@ from bam_envs.live.command_proof import CommandProof, needed_proof
 from bam_envs.live.robot_identity import robot_identity
 from bam_envs.live.state import Letter, Mailbox, SourceAge, concerns
 from bam_envs.robots.linked import LinkProfile
-from bam_envs.ros.codec import INFO_SERVICE, RobotInfo, decode_source, read_info
+from bam_envs.ros.codec import DESCRIPTION_TOPIC, INFO_SERVICE, RobotInfo, decode_source, read_info
 from bam_envs.ros.messages import same_type
 from bam_envs.ros.profile_tables import RobotProfile, Sink, Source
 from bam_envs.rosbridge.client import RosbridgeLink
@@ -33,7 +33,7 @@ from bam_envs.rosbridge.client import RosbridgeLink
 Array = NDArray[np.float64]
 LISTEN = 0.5
 """Shortest time for which messages are collected [s]."""
-DESCRIPTION, DESCRIPTION_TYPE = "/robot_description", "std_msgs/String"
+DESCRIPTION, DESCRIPTION_TYPE = DESCRIPTION_TOPIC, "std_msgs/String"
 """The topic on which a robot publishes its URDF, latched."""
 TOOL_POSE = ("tool_position", "tool_quaternion")
 """Optional signals of an arm: the pose of its tool, as its controller measures it."""

@@ -20,7 +20,7 @@ from typing import Annotated, Any, Literal, TypeVar, get_args
 import yaml
 from msgspec import Meta
 
-from bam_envs.arms.description import known_models, robot_model
+from bam_envs.arms.description import description_folders, known_models, robot_model
 from bam_envs.core.errors import InvalidValue, UnknownName
 from bam_envs.core.robot import RobotSpec, SignalSpec
 from bam_envs.core.validation import Finite, NonEmpty, NonNegative, Positive, check, read_table, type_hints
@@ -55,6 +55,15 @@ _STATES = "sensor_msgs/JointState"
 _SUFFIXES = (".toml", ".yaml", ".yml")
 _SHIPPED = resources.files("bam_envs.robots") / "profiles"
 _AGES = {"arm": 0.1, "base": 0.5}
+_CAMERAS: tuple[Table, ...] = tuple(
+    {"name": f"{name}{depth}", "topic": f"/{name}_camera/{topic}", "type": kind, "optional": True}
+    for depth, topic, kind in (
+        ("", "color/image_raw/compressed", "sensor_msgs/CompressedImage"),
+        ("_depth", "depth/image_raw", "sensor_msgs/Image"),
+    )
+    for name in ("front", "wrist")
+)
+"""Cameras of an arm whose profile names none; each is read only for a task that looks through it."""
 _ROBOTS: dict[str, Callable[[], RobotSpec]] = {
     "ur5e": lambda: arm_spec("ur5e", with_object=True),
     "mir100": base_spec,
@@ -109,18 +118,32 @@ def load_profile(name_or_path: str | Path) -> RobotProfile:
 
 
 def profile_for(spec: RobotSpec) -> RobotProfile:
-    """The shipped profile that takes the commands of `spec`, else the first that takes more, narrowed to them.
+    """The profile of the robot of `spec`, narrowed to the commands of `spec`.
 
-    A described arm without one has the usual topics of ros2_control: `usual_profile`.
+    It is the file ``profiles/NAME.toml`` beside the descriptions of robots (`write_profile` writes it there), else the
+    shipped one of that robot, else the shipped one of Universal Robots' arms or of a MiR that takes these commands (the
+    first that takes more, if there is none). A described arm without one has the usual topics of ros2_control:
+    `usual_profile`.
     """
-    labels, shipped = spec.command.labels, [load_profile(name) for name in shipped_profiles()]
-    for profile in sorted(shipped, key=lambda one: one.command.labels != labels):
+    labels = spec.command.labels
+    if (own := own_profile(spec.name)) is not None:
+        return _profile(str(own), _table_at(own)).narrowed(labels)
+    tables = {name: _read_file(name) for name in shipped_profiles()}
+    same = [one for one in tables.values() if one[1].get("robot") == spec.name and spec.name not in _ROBOTS]
+    others = [one for one in tables.values() if one[1].get("robot") in _ROBOTS]
+    for profile in sorted((_profile(*one) for one in same or others), key=lambda one: one.command.labels != labels):
         if labels and set(labels) <= set(profile.command.labels):
             return profile.narrowed(labels)
     joints = next((one.labels for one in spec.signals if one.name == "joint_position"), ())
     if joints and labels == (*joints, "gripper_width"):
         return usual_profile(spec)
     raise InvalidValue(f"No shipped profile takes the commands of {spec.name}. Give its file: profile='my_robot.toml'.")
+
+
+def own_profile(name: str) -> Any:
+    """The file ``profiles/NAME.toml`` in the first folder of robot descriptions that has one, or None."""
+    files = (folder / "profiles" / f"{name}.toml" for folder in description_folders())
+    return next((file for file in files if file.is_file()), None)
 
 
 def usual_profile(spec: RobotSpec) -> RobotProfile:
@@ -168,31 +191,35 @@ def shipped_profiles() -> list[str]:
 
 
 def _read_file(name: str) -> tuple[str, Table]:
-    """The name of the file for errors, and its table, merged with the profile that it extends."""
+    """The name for errors of the profile `name`, or of that file, and its table, merged with what it extends."""
     path = Path(name)
     if path.suffix not in _SUFFIXES and len(path.parts) == 1:
         if name not in shipped_profiles():
             raise UnknownName("robot profile", name, shipped_profiles())
-        path = Path(f"{name}.toml")
-        text = (_SHIPPED / path.name).read_text(encoding="utf-8")
-    else:
-        try:
-            text = path.read_text(encoding="utf-8")
-        except FileNotFoundError as error:
-            choices = ", ".join(shipped_profiles())
-            raise InvalidValue(
-                f"There is no robot profile {path}. Give the path of a file, or one of: {choices}."
-            ) from error
-        except (OSError, UnicodeDecodeError) as error:
-            raise InvalidValue(f"The robot profile {path} cannot be read: {error}.") from error
-    table = _parsed(str(path), text)
+        return f"{name}.toml", _table_at(_SHIPPED / f"{name}.toml")
+    return str(path), _table_at(path)
+
+
+def _table_at(path: Any) -> Table:
+    """The table in the file `path`, merged with the profile that it extends."""
+    try:
+        text = path.read_text(encoding="utf-8")
+    except FileNotFoundError as error:
+        choices = ", ".join(shipped_profiles())
+        raise InvalidValue(
+            f"There is no robot profile {path}. Give the path of a file, or one of: {choices}."
+        ) from error
+    except (OSError, UnicodeDecodeError) as error:
+        raise InvalidValue(f"The robot profile {path} cannot be read: {error}.") from error
+    where = str(path) if isinstance(path, Path) else path.name
+    table = _parsed(where, text)
     if "extends" not in table:
-        return str(path), table
-    extends = check(table["extends"], NonEmpty, f"{path}: extends")
+        return table
+    extends = check(table["extends"], NonEmpty, f"{where}: extends")
     if Path(extends).suffix in _SUFFIXES:
         choices = ", ".join(shipped_profiles())
-        raise InvalidValue(f"{path}: extends must be a shipped profile ({choices}), not {extends!r}.")
-    return str(path), {**_read_file(extends)[1], **table}
+        raise InvalidValue(f"{where}: extends must be a shipped profile ({choices}), not {extends!r}.")
+    return {**_read_file(extends)[1], **table}
 
 
 def _parsed(where: str, text: str) -> Table:
@@ -224,6 +251,8 @@ def _profile(where: str, table: Table) -> RobotProfile:
         )
     spec = _robot(where, file)
     state = _state(where, file, spec)
+    if file.kind == "arm" and "cameras" not in table:
+        file = replace(file, cameras=_CAMERAS)
     commands = {mode: _sinks(where, mode, rows, spec.command) for mode, rows in file.commands.items()}
     if not commands:
         raise InvalidValue(f"{where}: at least one command mode is needed, such as [[commands.position]].")
@@ -252,6 +281,7 @@ def _profile(where: str, table: Table) -> RobotProfile:
     return RobotProfile(
         name=file.name,
         kind=file.kind,
+        robot=file.robot,
         signals=tuple(signal for source in state for signal in spec.signals if signal.name == source.signal),
         command=spec.command,
         state=tuple(map(renamed, state)),
@@ -335,7 +365,8 @@ def _state(where: str, file: _File, spec: RobotSpec) -> list[Source]:
     state = [sources[name] for name in sizes if name in sources]
     for place, source in enumerate(state):
         known = (*source.names, *source.ignore)
-        others = tuple(name for name in file.ignore if name not in known) if source.names else ()
+        beside = [name for one in state if one.topic == source.topic for name in (*one.names, *one.ignore)]
+        others = dict.fromkeys(name for name in (*beside, *file.ignore) if name not in known) if source.names else ()
         frame = file.frames.get(source.topic, source.frame)
         state[place] = replace(source, ignore=(*source.ignore, *others), frame=frame)
     return state

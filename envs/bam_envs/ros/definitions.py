@@ -1,9 +1,10 @@
 """The known message and service types with their fields, one per line.
 
 ``pkg/Type: type field; type field`` for a message, ``pkg/Type: request -> response`` for a service; an action has three
-messages, ``pkg/TypeGoal``, ``pkg/TypeResult`` and ``pkg/TypeFeedback``. A ``|`` separates spellings of one type, of ROS 1 and ROS 2 or of versions. A type without a package is in the package of its line;
-``time`` and ``duration`` are the built-in ones; ``any`` is any plain value; ``Type[?]`` is one or a list of them;
-``type field=1`` has a default other than zero.
+messages, ``pkg/TypeGoal``, ``pkg/TypeResult`` and ``pkg/TypeFeedback``. A ``|`` separates spellings of one type, of
+ROS 1 and ROS 2 or of versions. A type without a package is in the package of its line; ``time`` and ``duration`` are
+the built-in ones; ``any`` is any plain value; ``Type[?]`` is one or a list of them; ``type field=1`` has a default
+other than zero.
 """
 
 _NUMBERS = ("Int8", "Int16", "Int32", "Int64", "UInt8", "UInt16", "UInt32", "UInt64", "Float32", "Float64")

@@ -60,7 +60,7 @@ class Source(Content):
     field: NonEmpty = ""
     """Path of the list of its numbers, e.g. ``position``; or `fields`."""
     ignore: tuple[NonEmpty, ...] = ()
-    """Other names that messages may have."""
+    """Other names that messages may have, beside those of other sources of the topic."""
     partial: bool = False
     """Whether several publishers share the topic, so that messages without any of `names` are ignored."""
     skip: tuple[NonNegativeInt, NonNegativeInt] = (0, 0)
@@ -274,6 +274,7 @@ class RobotProfile:
     enable: tuple[Enable, ...] = ()  # services to be called before it takes commands, in this order
     controllers: str = ""
     """The service that lists its controllers and their states (``list_controllers``); empty: there is none."""
+    robot: str = ""  # the robot that it is for, if it is a described one
     watchdog: float | None = None
     """Time after which it stops by itself without a command [s]; 0: it does not; None: that is not known."""
     body: BaseBody | None = None

@@ -498,7 +498,7 @@ def test_a_silent_topic(server, robot_on):
     ("changes", "message"),
     [
         ({"name": list(JOINTS[:5]), "position": [0.0] * 5}, "wrist_3_joint missing; found: "),
-        ({"position": [None] + [0.0] * 5}, "position of shoulder_pan_joint must be a finite number, not None."),
+        ({"position": [None] + [0.0] * 5}, "position of elbow_joint must be a finite number, not None."),
         ({"header": {"stamp": {"sec": "now", "nanosec": 0}}}, "header.stamp.sec must be a finite number"),
     ],
 )

@@ -7,12 +7,14 @@ import pytest
 
 from bam_envs.arms.description import robot_model
 from bam_envs.core.errors import InvalidValue, UnknownName
+from bam_envs.core.robot import RobotState
 from bam_envs.robots.fake import FakeRobot
 from bam_envs.robots.mir100 import base_spec
 from bam_envs.robots.profile import load_profile, profile_for, shipped_profiles
 from bam_envs.robots.ur import ur_model, ur_spec
 from bam_envs.robots.ur5e import JOINTS, arm_spec
-from bam_envs.ros.codec import decode_command, encode_sink
+from bam_envs.ros.codec import decode_command, decode_source, encode_sink, encode_state
+from bam_envs.ros.messages import write_stamp
 
 OWN = """
 name = "lift"
@@ -69,7 +71,8 @@ def refusal(path):
 
 
 def test_the_ur5e_whose_controller_interpolates():
-    assert shipped_profiles() == ["mir100", "ur5e", "ur5e_position", "ur5e_trajectory"]
+    arms = ["franka_ros2", "ros2_kortex", "ros2_so_arm100", "xarm_ros2"]
+    assert shipped_profiles() == sorted([*arms, "mir100", "ur5e", "ur5e_position", "ur5e_trajectory"])
     profile, held = load_profile("ur5e_trajectory"), load_profile("ur5e")
     assert profile.spec() == replace(held.spec(), name="ur5e_trajectory")
     assert (profile.state, profile.readiness, profile.limits) == (held.state, held.readiness, held.limits)
@@ -289,8 +292,8 @@ def test_files(write, tmp_path):
     missing = tmp_path / "other.toml"
     (tmp_path / "folder.toml").mkdir()
     assert refusal(missing) == (
-        "There is no robot profile FILE. Give the path of a file, or one of: mir100, ur5e, ur5e_position, "
-        "ur5e_trajectory."
+        "There is no robot profile FILE. Give the path of a file, or one of: franka_ros2, mir100, "
+        "ros2_kortex, ros2_so_arm100, ur5e, ur5e_position, ur5e_trajectory, xarm_ros2."
     )
     assert refusal(write("name =")).startswith("FILE is not TOML: ")
     for text in ("a: [", "a: 2020-13-45", "a: !!int b", "[" * 1000):
@@ -433,12 +436,88 @@ labels = ["shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_ro
 
 
 def test_a_described_arm_has_the_usual_topics_where_no_profile_is_shipped():
-    profile = profile_for(robot_model("fr3").spec(with_object=True))
+    arm = replace(robot_model("fr3"), name="fr3b")
+    profile = profile_for(arm.spec(with_object=True))
     assert [source.topic for source in profile.state] == [
         *["/joint_states"] * 2,
         "/gripper/joint_states",
         *["/object_pose"] * 2,
     ]
-    gripper, arm = profile.commands["trajectory"]
-    assert (gripper.topic, arm.topic) == ("/gripper/commands", "/joint_trajectory_controller/joint_trajectory")
-    assert (arm.type, arm.names) == ("trajectory_msgs/JointTrajectory", robot_model("fr3").joint_names)
+    gripper, trajectory = profile.commands["trajectory"]
+    assert (gripper.topic, trajectory.topic) == ("/gripper/commands", "/joint_trajectory_controller/joint_trajectory")
+    assert (trajectory.type, trajectory.names) == ("trajectory_msgs/JointTrajectory", arm.joint_names)
+    assert [camera.name for camera in profile.cameras] == ["front", "wrist", "front_depth", "wrist_depth"]
+
+
+JTC = "joint_trajectory_controller"
+
+
+@pytest.mark.parametrize(
+    ("name", "profile", "states", "modes"),
+    [
+        (
+            "fr3",
+            "franka_ros2",
+            {"/joint_states", "/object_pose"},
+            {
+                "trajectory": ["/franka_gripper/move", "/fr3_arm_controller/joint_trajectory"],
+                "crisp": ["/franka_gripper/move", "/target_joint"],
+            },
+        ),
+        (
+            "xarm7",
+            "xarm_ros2",
+            {"/xarm/joint_states", "/object_pose"},
+            {"trajectory": ["/xarm_gripper/gripper_action", "/xarm7_traj_controller/joint_trajectory"]},
+        ),
+        (
+            "gen3",
+            "ros2_kortex",
+            {"/joint_states", "/object_pose"},
+            {
+                "trajectory": [
+                    "/robotiq_gripper_controller/gripper_cmd",
+                    "/joint_trajectory_controller/joint_trajectory",
+                ]
+            },
+        ),
+        (
+            "so101",
+            "ros2_so_arm100",
+            {"/joint_states", "/object_pose"},
+            {
+                "trajectory": [f"/{JTC}/joint_trajectory"],
+                "position": ["/forward_position_controller/commands"],
+            },
+        ),
+    ],
+)
+def test_shipped_arms_have_the_names_of_their_drivers(name, profile, states, modes):
+    arm = robot_model(name)
+    shipped = profile_for(arm.spec(with_object=True))
+    assert (shipped.name, shipped.robot, shipped) == (profile, name, load_profile(profile))
+    assert {source.topic for source in shipped.state} == states
+    assert {mode: [sink.address for sink in sinks] for mode, sinks in shipped.commands.items()} == modes
+    spec = arm.spec(with_object=True)
+    assert (shipped.command, shipped.signals) == (spec.command, spec.signals)
+    numbers = {one.name: np.linspace(one.low, one.high, 3)[1:2] + 0.01 for one in spec.signals}
+    state = RobotState(numbers, np.zeros(1), np.zeros((1, len(spec.command.labels))))
+    messages = [
+        one for _, kind, one in encode_state(shipped, state, 0, write_stamp(1.0)) if kind.endswith("JointState")
+    ]
+    for source in shipped.state[:3]:  # each finds its numbers in the messages of its driver
+        (message,) = (one for one in messages if source.names[0] in one["name"])
+        read = decode_source(source, message, len(source.names))
+        np.testing.assert_allclose(read, numbers[source.signal][0], atol=1e-12)
+    assert all(message["name"] == sorted(message["name"]) for message in messages)
+
+
+def test_a_profile_beside_the_descriptions_comes_first(write, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "robots" / "profiles").mkdir(parents=True)
+    (tmp_path / "robots" / "profiles" / "gen3.toml").write_text('extends = "ros2_kortex"\nname = "cell 4"\n')
+    spec = robot_model("gen3").spec(with_object=True)
+    assert profile_for(spec) == replace(load_profile("ros2_kortex"), name="cell 4")
+    (tmp_path / "robots" / "profiles" / "gen3.toml").write_text('extends = "kortex"\n')
+    with pytest.raises(UnknownName, match="Unknown robot profile 'kortex'"):
+        profile_for(spec)

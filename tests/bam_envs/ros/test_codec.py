@@ -78,11 +78,12 @@ def test_messages_of_an_arm():
     del state.signals["tool_position"], state.signals["tool_quaternion"], state.signals["object_position"]
     messages = {topic: message for topic, _, message in encode_state(ARM, state, 0, STAMP, "hello")}
     assert list(messages) == ["/gripper/joint_states", "/object_pose", "/joint_states"]
+    places = [JOINTS.index(name) for name in sorted(JOINTS)]
     assert messages["/joint_states"] == {
         "header": {"stamp": STAMP, "frame_id": "hello"},
-        "name": list(JOINTS),
-        "position": state.signals["joint_position"][0].tolist(),
-        "velocity": state.signals["joint_velocity"][0].tolist(),
+        "name": sorted(JOINTS),
+        "position": state.signals["joint_position"][0, places].tolist(),
+        "velocity": state.signals["joint_velocity"][0, places].tolist(),
     }
     w, x, y, z = state.signals["object_quaternion"][0].tolist()
     assert messages["/object_pose"] == {

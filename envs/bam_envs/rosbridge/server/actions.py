@@ -6,7 +6,7 @@ from typing import Any
 
 from bam_envs.core.errors import BamEnvsError, InvalidValue, ProtocolError
 from bam_envs.ros.interfaces import complete, normal_name
-from bam_envs.rosbridge.bus import ABORTED, CANCELED, Action, Goal, Message, tell
+from bam_envs.rosbridge.bus import ABORTED, Action, Goal, Message, tell
 from bam_envs.rosbridge.encoding import Id
 from bam_envs.rosbridge.server.client_session import ClientSession, Event, Send, pack
 
@@ -69,11 +69,10 @@ class Actions(dict[str, Action]):
             raise
 
     def cancel(self, session: ClientSession, name: str, number: Id) -> None:
-        """Ask this process to end a client's goal."""
-        goal = next((one for one in self._goals_of(session) if (one.action.name, one.id) == (name, number)), None)
-        if goal is None:
-            raise ProtocolError(f"No goal {number!r:.80} of {name} of this client runs.")
-        tell(goal.action.cancel, goal)
+        """Ask this process to end a client's goal, which may have ended meanwhile."""
+        for goal in self._goals_of(session):
+            if (goal.action.name, goal.id) == (name, number):
+                tell(goal.action.cancel, goal)
 
     def reject(self, session: ClientSession, number: Id, action: object, reason: str) -> None:
         """Answer a goal that does not run."""

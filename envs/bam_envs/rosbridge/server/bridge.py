@@ -70,7 +70,7 @@ class Incoming(NamedTuple):
 
 
 class Bridge:
-    """All clients, topics, services and actions of one server. `clock` is the wall clock [s], for ``/rosapi/get_time``."""
+    """Clients, topics, services and actions of one server. `clock` is the wall clock [s], for ``/rosapi/get_time``."""
 
     def __init__(
         self,
