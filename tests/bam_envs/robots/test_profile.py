@@ -307,7 +307,8 @@ def test_files(write, tmp_path):
         load_profile(write('extends = "ur5"'))
     assert refusal(write("extends = 3")) == "FILE: extends: expected non-empty text, found 3"
     assert refusal(write('extends = "b.toml"')) == (
-        "FILE: extends must be a shipped profile (mir100, ur5e, ur5e_position, ur5e_trajectory), not 'b.toml'."
+        "FILE: extends must be a shipped profile (franka_ros2, mir100, ros2_kortex, ros2_so_arm100, ur5e, "
+        "ur5e_position, ur5e_trajectory, xarm_ros2), not 'b.toml'."
     )
     assert refusal(tmp_path / "folder.toml") == (
         "The robot profile FILE cannot be read: [Errno 21] Is a directory: 'FILE'."
