@@ -229,6 +229,7 @@ def inspect_robot(
     answer = ask(link, service)
     info = None if answer is None else read_info(answer.get("message"), service)
     sinks = (tagged_sinks(narrowed, None) if info is not None else None) or narrowed.sinks()
+    sinks = tuple(form for sink in sinks for form in sink.forms)
     topical = [sink for sink in sinks if sink.topic]
     needed = {entry.topic: entry.type for entry in (*required, *topical)}
     wanted = {**needed, **{source.topic: source.type for source in extra}, DESCRIPTION: DESCRIPTION_TYPE}

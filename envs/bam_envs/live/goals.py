@@ -9,7 +9,7 @@ import threading
 import time
 from collections.abc import Callable, Mapping
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,6 +30,22 @@ _ANSWER_WITHIN = 10.0
 _ENDS = {CANCELED: "was canceled", ABORTED: "was aborted"}
 
 
+class _Running(NamedTuple):
+    """A goal, or a call of a service, without an answer."""
+
+    identity: str
+    name: str
+    """The action or service, with its namespace."""
+    since: float
+    """When it was sent [s, monotonic clock]."""
+
+
+def form_for(sink: Sink, command: Array, spec: SignalSpec) -> Sink:
+    """The form of `sink` for `command` (m,): the one that closes below half of the range of its width."""
+    at = spec.labels.index(sink.labels[0])
+    return sink.forms[-1] if command[at] < (spec.low[at] + spec.high[at]) / 2 else sink
+
+
 class Goals:
     """Sends the newest numbers to actions and services, and reports those that fail.
 
@@ -45,9 +61,11 @@ class Goals:
     ) -> None:
         self.link, self._command, self._namespace, self._report = link, command, namespace, report
         self._lock = threading.Lock()
-        self._last: dict[str, Array] = {}  # by address: the numbers that were sent, or are to be sent next
-        self._running: dict[str, tuple[str, float]] = {}  # by address: id of what has no answer yet, and when it began
-        self._next: dict[str, tuple[Sink, dict[str, Any]]] = {}  # by service: request to send after the one that runs
+        # By the labels of the numbers: what was sent, or is to be sent next; what has no answer yet; and the request to
+        # send after that.
+        self._last: dict[tuple[str, ...], Array] = {}
+        self._running: dict[tuple[str, ...], _Running] = {}
+        self._next: dict[tuple[str, ...], tuple[Sink, dict[str, Any]]] = {}
 
     def send(self, sink: Sink, values: Array, message: dict[str, Any]) -> None:
         """Send the `message` with the numbers `values` (k,) [SI], if they are news; never waits.
@@ -58,15 +76,15 @@ class Goals:
         with self._lock:
             if not self._is_news(sink, values):
                 return
-            self._last[sink.address] = values.copy()
-            identity, since = self._running.get(sink.address, ("", 0.0))
-            if sink.service and identity:
-                self._next[sink.address] = sink, message
-                if time.monotonic() - since > _ANSWER_WITHIN:
+            self._last[sink.labels] = values.copy()
+            running = self._running.get(sink.labels)
+            if sink.service and running is not None:
+                self._next[sink.labels] = sink, message
+                if time.monotonic() - running.since > _ANSWER_WITHIN:
                     self._fail(sink, f"has not answered for {_ANSWER_WITHIN:g} s")
                 return
-            if identity:
-                self._cancel(sink.address, identity)
+            if running is not None:
+                self._cancel(running)
             self._ask(sink, message)
 
     def cancel(self) -> None:
@@ -74,11 +92,11 @@ class Goals:
         with self._lock:
             running, self._running = self._running, {}
             self._last, self._next = {}, {}
-            for address, (identity, _) in running.items():
-                self._cancel(address, identity)
+            for one in running.values():
+                self._cancel(one)
 
     def _is_news(self, sink: Sink, values: Array) -> bool:
-        last = self._last.get(sink.address)
+        last = self._last.get(sink.labels)
         if last is None:
             return True
         at = [self._command.labels.index(label) for label in sink.labels]
@@ -95,26 +113,27 @@ class Goals:
             request |= {"op": "send_action_goal", "action": name, "action_type": kind, "feedback": False}
         else:
             request |= {"op": "call_service", "service": name, "type": kind, "timeout": _ANSWER_WITHIN}
-        self._running[sink.address] = identity, time.monotonic()
+        self._running[sink.labels] = _Running(identity, name, time.monotonic())
         self.link.ask_soon(request, partial(self._took, sink, identity))
 
-    def _cancel(self, address: str, identity: str) -> None:
-        self.link.send_soon({"op": "cancel_action_goal", "id": identity, "action": self._namespace + address})
+    def _cancel(self, running: "_Running") -> None:
+        self.link.send_soon({"op": "cancel_action_goal", "id": running.identity, "action": running.name})
 
     def _took(self, sink: Sink, identity: str, reply: Reply) -> None:
         with self._lock:
-            if self._running.get(sink.address, ("",))[0] != identity:  # it was replaced, or canceled
+            running = self._running.get(sink.labels)
+            if running is None or running.identity != identity:  # it was replaced, or canceled
                 return
-            del self._running[sink.address]
+            del self._running[sink.labels]
             trouble = _trouble(sink, self.link.url, reply)
             if trouble:
                 self._fail(sink, trouble)
-            elif sink.address in self._next:
-                self._ask(*self._next.pop(sink.address))
+            elif sink.labels in self._next:
+                self._ask(*self._next.pop(sink.labels))
 
     def _fail(self, sink: Sink, trouble: str) -> None:
-        last = self._last.pop(sink.address)
-        self._next.pop(sink.address, None)
+        last = self._last.pop(sink.labels)
+        self._next.pop(sink.labels, None)
         asked = ", ".join(f"{label} {value:.3g}" for label, value in zip(sink.labels, last.tolist(), strict=True))
         what = f"the {'action' if sink.action else 'service'} {self._namespace}{sink.address}"
         self._report(RemoteError(f"{self.link.url}: {what} {trouble} ({asked}). Look at the gripper and its driver."))

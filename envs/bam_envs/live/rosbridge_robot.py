@@ -33,7 +33,7 @@ from bam_envs.core.timing import Pacer
 from bam_envs.live import bringup
 from bam_envs.live.camera import LiveCamera, fitted
 from bam_envs.live.command_proof import CommandProof, needed_proof
-from bam_envs.live.goals import GOAL, Goals
+from bam_envs.live.goals import GOAL, Goals, form_for
 from bam_envs.live.state import Letter, LiveState
 from bam_envs.live.take_over import TakeOver
 from bam_envs.ros.codec import (
@@ -231,8 +231,8 @@ class RosbridgeRobot:
     def _advertise(self, control: RosBus, halting: RosbridgeLink, types: bringup.TopicTypes) -> None:
         """Advertise commands, with their types on the server."""
         if others := [sink for sink in self._sinks if not sink.topic]:
-            for sink in others:
-                types.check_offered(sink)
+            for one in (form for sink in others for form in sink.forms):
+                types.check_offered(one)
             link = control
             if not self._describes_itself:
                 link = RosbridgeLink(self._endpoint, name="goals", lost_after=_LOST_AFTER)
@@ -447,6 +447,7 @@ class RosbridgeRobot:
         ros1, sign = control.ros == "ros1", self._session.tagger.sign
         options: Any = {"sign": sign, "ros1": ros1, "reach": self.reach}
         sinks = [sink for sink in self._sinks if not (self.joints_only and sink.hold == "last")]
+        sinks = [form_for(sink, command, self.spec.command) for sink in sinks]
         messages = [(sink, encode_sink(sink, self.spec, command, tag, **options)[2]) for sink in sinks]
         with self._sending:
             if self._clock() > until:

@@ -268,7 +268,8 @@ def _profile(where: str, table: Table) -> RobotProfile:
     enable = [_typed(Enable, row, at) for row, at in _rows(f"{where}: enable", file.enable)]
     sinks = [sink for mode in commands.values() for sink in mode]
     entries: list[Source | Sink | CameraSource | Readiness | Enable] = [*state, *cameras, *readiness, *sinks, *enable]
-    names = {getattr(entry, key, "") for entry in entries for key in _PLACES}
+    every = [one for entry in entries for one in (entry.forms if isinstance(entry, Sink) else (entry,))]
+    names = {getattr(entry, key, "") for entry in every for key in _PLACES}
     _require_known(f"{where}: rename", "topic", file.rename, names - {""})
 
     def renamed(entry: Typed) -> Typed:
@@ -276,6 +277,9 @@ def _profile(where: str, table: Table) -> RobotProfile:
         changed = {key: name for key, name in found.items() if name is not None}
         # A topic of another name belongs to another controller.
         other: dict[str, Any] = {"controller": ""} if changed and isinstance(entry, Sink) else {}
+        if isinstance(entry, Sink) and entry.closing is not None:
+            closer = entry.closing.action
+            other["closing"] = replace(entry.closing, action=file.rename.get(closer, closer))
         return replace(entry, **changed, **other)
 
     return RobotProfile(
@@ -414,6 +418,10 @@ def _sinks(where: str, mode: str, rows: list[Table], command: SignalSpec) -> tup
             raise InvalidValue(f"{at}: {sink.type} needs fields; only {', '.join(sorted(LISTED_TYPES))} do without.")
         if sink.constants and not sink.fields:
             raise InvalidValue(f"{at}: constants need fields.")
+        if sink.closing is not None:
+            if not sink.action or size != 1:
+                raise InvalidValue(f"{at}: closing needs an action with one label.")
+            sink = replace(sink, closing=replace(sink.closing, type=bare_type(sink.closing.type)))
         sinks.append(_converted(at, replace(sink, names=sink.names or sink.labels), size))
     labels = [label for sink in sinks for label in sink.labels]
     _require_once(where, "label", labels)

@@ -80,6 +80,16 @@ class Source(Content):
 
 
 @dataclass(frozen=True, kw_only=True)
+class Closing:
+    """The action by which a gripper closes, if it opens by another one; its goals have the same `fields`."""
+
+    action: Topic
+    type: MessageType
+    constants: Mapping[str, Answer] = dataclasses.field(default_factory=dict)
+    """See `Sink.constants`."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class Sink(Content):
     """Where some of the numbers of a command are sent: to a topic, or as goals of an action or requests of a service.
 
@@ -94,6 +104,8 @@ class Sink(Content):
     """The service."""
     constants: Mapping[str, Answer] = dataclasses.field(default_factory=dict)
     """Other fields of each message, goal or request, by their paths, e.g. ``command.max_effort``."""
+    closing: Closing | None = None
+    """Another action for a width below half of its range."""
     labels: tuple[NonEmpty, ...]
     """Labels of its numbers in the command, in the order of the message."""
     reach: Positive | None = None
@@ -113,6 +125,13 @@ class Sink(Content):
     def address(self) -> str:
         """The topic, action or service."""
         return self.topic or self.action or self.service
+
+    @property
+    def forms(self) -> tuple["Sink", ...]:
+        """The sink, and the one with the action `closing` if it has that."""
+        if self.closing is None:
+            return (self,)
+        return self, dataclasses.replace(self, **vars(self.closing), closing=None)
 
     @property
     def is_timed(self) -> bool:
@@ -283,7 +302,8 @@ class RobotProfile:
     @cached_property
     def sinks_by_address(self) -> Mapping[str, Sink]:
         """The sink of each topic, action and service, in the first mode that uses it."""
-        return {sink.address: sink for sinks in reversed([*self.commands.values()]) for sink in reversed(sinks)}
+        modes = reversed([*self.commands.values()])
+        return {one.address: one for sinks in modes for sink in reversed(sinks) for one in reversed(sink.forms)}
 
     def command_life(self, period: float) -> float:
         """Time for which a command is valid [s], for one command every `period` [s]: two periods at least."""

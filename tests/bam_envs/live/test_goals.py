@@ -160,6 +160,24 @@ def test_a_goal_that_fails_ends_the_motion_in_one_line_and_one_that_holds_someth
     ended(step, f"{action} {why} (gripper_width 0). Look at the gripper and its driver.")
 
 
+def test_a_gripper_may_close_by_another_action(server, robot_on, connect, profile):
+    closing = '{ action = "/gripper/grasp", type = "franka_msgs/Grasp", constants = { force = 9.0 } }'
+    path = profile(way="action", type="franka_msgs/Move", field="width")
+    path.write_text(path.read_text().replace('"width"]', f'"width"]\nclosing = {closing}'), encoding="utf-8")
+    scripted = robot_on(server, path)
+    scripted.on_goal = lambda goal: None
+    step = connect(server.url, path)
+    for width in (0.085, 0.0, 0.0, 0.05):
+        step(width)
+    step.robot.close()
+    assert [topic for topic, _, _ in scripted.commands if topic.startswith("/gripper")] == [
+        *(GRIPPER, "/gripper/grasp", GRIPPER)
+    ]
+    assert [goal.values["width"] for goal in scripted.goals] == [0.085, 0.0, 0.05]
+    assert scripted.goals[1].values["force"] == 9.0
+    assert scripted.canceled == scripted.goals
+
+
 @pytest.mark.parametrize("what", ["action", "service"])
 def test_a_gripper_that_nobody_offers_is_refused(server, robot_on, profile, what):
     scripted = robot_on(server)

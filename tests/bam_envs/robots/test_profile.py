@@ -260,6 +260,7 @@ sensor_msgs/msg/JointState" -> a/B"\nframe = "map" -> state[0]: frame needs a ty
 topic = "/lift/command" -> -> commands.position[0]: give one of topic, action, service.
 topic = "/lift/command" -> topic = "/a"\nservice = "/b" -> commands.position[0]: give one of topic, action, service.
 topic = "/lift/command" -> action = "/a" -> commands.position: the last table must have a topic, because it completes
+topic = "/lift/command" -> topic = "/a"\nclosing = { action = "/b", type = "c/D" } -> commands.position[0]: closing
 topic = "/lift/command" -> action = "/a"\nhold = "zero" -> commands.position[0]: hold of an action or a service is last
 fields = ["data"] -> constants = { a = [1] } -> commands.position[0]: constants.a: expected a finite number or true or f
 [command] -> [[enable]]\nservice = "/on"\ntype = "a/B"\n[command] -> enable[0]: the key 'does' is missing
