@@ -85,7 +85,7 @@ class Diagnosis:
         """The messages of the robot and the measured link; None before the step ``"rates and ages"``."""
         self.profile: RobotProfile | None = None if self._at.profile is None else load_profile(self._at.profile)
         if self._at.profile is None and robot is not None:
-            self.profile = profile_for(robot.spec)
+            self.profile = robot.profile or profile_for(robot.spec)
         self._link = RosbridgeLink(endpoint, name="doctor")
         self._timeout = endpoint.timeout or bringup.TIMEOUT
 

@@ -270,6 +270,11 @@ class SafeRobot(metaclass=Sealed):
         return getattr(self._robot, "info", None)
 
     @property
+    def profile(self) -> Any:
+        """The profile of a live robot; None of any other."""
+        return getattr(self._live, "profile", None)
+
+    @property
     def agent_state(self) -> str:
         """The state of a live agent once its robot was handed back, such as ``"paused"``; "" if it is unknown."""
         return getattr(self._live, "agent_state", "")
