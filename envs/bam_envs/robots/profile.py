@@ -117,6 +117,11 @@ def load_profile(name_or_path: str | Path) -> RobotProfile:
     return _profile(*_read_file(str(name_or_path)))
 
 
+def read_profile(text: str, where: str) -> RobotProfile:
+    """The profile in the text of a file; `where`, which ends in the suffix of its language, begins errors."""
+    return _profile(where, _merged(_parsed(where, text), where))
+
+
 def profile_for(spec: RobotSpec) -> RobotProfile:
     """The profile of the robot of `spec`, narrowed to the commands of `spec`.
 
@@ -212,7 +217,11 @@ def _table_at(path: Any) -> Table:
     except (OSError, UnicodeDecodeError) as error:
         raise InvalidValue(f"The robot profile {path} cannot be read: {error}.") from error
     where = str(path) if isinstance(path, Path) else path.name
-    table = _parsed(where, text)
+    return _merged(_parsed(where, text), where)
+
+
+def _merged(table: Table, where: str) -> Table:
+    """`table` with the keys of the profile that it extends."""
     if "extends" not in table:
         return table
     extends = check(table["extends"], NonEmpty, f"{where}: extends")
