@@ -36,6 +36,7 @@ def connected_env(
     yes: bool = False,
     render: bool | str = False,
     named: str | None = None,
+    arm: str | None = None,
     env_kwargs: Mapping[str, Any] | None = None,
     admit: Callable[[gym.Env[Any, Any], Location, str], Sequence[str]] = lambda env, place, identity: (),
     motion: Path | None = None,
@@ -52,6 +53,7 @@ def connected_env(
         yes: Whether to skip the question before a real robot moves.
         render: Whether to show the simulation in a window; or the render mode.
         named: The environment that the user expects.
+        arm: The description here that takes the place of the checkpoint's; None: the checkpoint's.
         env_kwargs: Arguments of the environment, which override the checkpoint's.
         admit: Called before the question with the connected environment, its place, and the identity of its robot
             (`Inspection.identity`); returns lines for the operator.
@@ -64,7 +66,7 @@ def connected_env(
     """
     env_id, saved = named or "", dict[str, Any]()
     if checkpoint is not None:
-        env_id, saved = environment_of(checkpoint, named, elsewhere=isinstance(place, Remote))
+        env_id, saved = environment_of(checkpoint, named, elsewhere=isinstance(place, Remote), arm=arm)
     mode = "human" if render is True else render or None
     make = partial(make_env, env_id, {**saved, **(env_kwargs or {})}, render_mode=mode)
 

@@ -388,21 +388,27 @@ def _in_table(table: Mapping[str, Any]) -> ArmDescription:
     return arm
 
 
-def require_same_arm(table: object) -> None:
-    """Refuse a description in a checkpoint if the one of that name here is of another arm.
+def require_same_arm(table: object, name: str | None = None) -> None:
+    """Refuse a description in a checkpoint if the one here is of another arm: `name`, None for the one of its name.
 
     Raises:
+        UnknownName: There is none called `name`.
         InvalidValue: What differs, in the checkpoint and here.
     """
-    if not isinstance(table, Mapping):
+    if not isinstance(table, Mapping) and name is None:
         return
-    there = robot_model(table)
-    path = known_models().get(there.name)
-    here = there if path is None else read_description(path)
+    there: Any = robot_model(table if isinstance(table, (Mapping, str)) else DEFAULT_MODEL)
+    path: Any = known_models().get(there.name) if name is None else name
+    here = there if path is None else robot_model(name) if name is not None else read_description(path)
     if here.digest == there.digest:
         return
     rows = [f"{name}: {theirs}, here {ours}" for name, theirs, ours in there.differences(here)]
     more = f", and {len(rows) - _MOST} more" if len(rows) > _MOST else ""
+    if name is not None:
+        raise InvalidValue(
+            f"{there.name}, and {name} moves otherwise: {'; '.join(rows[:_MOST])}{more}. Give the description with "
+            "which the policy was trained, or train a policy for this one."
+        )
     raise InvalidValue(
         f"{there.name} is another arm here ({path}): {'; '.join(rows[:_MOST])}{more}. Give the description with which "
         "the policy was trained another name, or train a policy for this one."

@@ -8,6 +8,7 @@ Longer than most files: the checks of an arm, and the URDF that they read.
 
 import itertools
 import math
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 from xml.etree import ElementTree
@@ -35,9 +36,9 @@ _STILL = 0.05  # maximum motion of a joint at rest [rad]
 
 AXES, AXES_TURN = 0.005, 0.02
 """Tolerance of the axes of a described arm: distance [m] and angle [rad]."""
-TOOL_OFF, TOOL_CENTRE = 0.02, "tcp"
+TOOL_OFF, TOOL_CENTRE = 0.02, re.compile(r"(?i).*tcp.*|tool")
 """Tolerance of the tool centre point in a URDF [m], which makers put at the tips of the fingers, and tasks between the
-pads; and what is in the names of links that are one."""
+pads; and the names of links that are one."""
 Axis = tuple[Array, Array]
 
 
@@ -163,12 +164,16 @@ def described_checks(spec: RobotSpec, chain: SerialChain, margin: float, inspect
     tool centre point; its rotation is not compared.
     """
     urdf, why = _description(inspection)
-    yield from _limits(spec, margin, urdf, why)
     names = [name for name, unit in zip(spec.command.labels, spec.command.units, strict=True) if unit == "rad"]
+    state = inspection.profile.state
+    theirs = next((one.names for one in state if one.signal == "joint_position"), ())
+    names = list(theirs) if len(theirs) == len(names) else names
+    yield from _limits(spec, margin, urdf, why, (*names, *spec.command.labels[len(names) :]))
     if urdf is None:
         return
     if missing := [name for name in names if name not in urdf]:
-        yield Check(f"kinematics in {DESCRIPTION}", "the joints", f"{', '.join(missing)} not in it", fits=None)
+        found = f"another arm: {', '.join(missing)} not in it"
+        yield Check(f"kinematics in {DESCRIPTION}", ", ".join(names), found, fits=False)
         return
     expected = f"every two axes within {1000 * AXES:g} mm and {math.degrees(AXES_TURN):.0f} degree"
     there, frames = urdf.axes(names, chain.home.tolist()), chain.link_frames(chain.home[None])[0]
@@ -183,7 +188,7 @@ def described_checks(spec: RobotSpec, chain: SerialChain, margin: float, inspect
     if wrong:
         return
     base = urdf[names[0]].parent
-    frames_of_poses = [one.frame for one in inspection.profile.state if one.signal == "object_position"]
+    frames_of_poses = [one.frame for one in state if one.signal == "object_position"]
     known = [one for one in (*frames_of_poses, "base_link", base) if urdf.pose(one, base, {}) is not None]
     frame = known[0]
     yield _mount(urdf, frame, base, names, list(zip(here, there, strict=True))[:2])
@@ -222,11 +227,11 @@ def _tool_centre(urdf: Urdf, frame: str, last: str, at: Mapping[str, float], too
     for _ in range(len(fixed)):
         carried |= {joint.child for joint in fixed.values() if joint.parent in carried}
     for link in sorted(carried):
-        pose = urdf.pose(frame, link, at) if TOOL_CENTRE in link.lower() else None
+        pose = urdf.pose(frame, link, at) if TOOL_CENTRE.fullmatch(link) else None
         if pose is not None:
             gaps[link] = float(np.linalg.norm(pose[0] - tool))
     if not gaps:
-        yield Check(what, expected, f"no link is called *{TOOL_CENTRE}*", fits=None)
+        yield Check(what, expected, "no link is called tool or *tcp*", fits=None)
         return
     gap, link = min((gap, link) for link, gap in gaps.items())
     found = f"{link} is {1000 * gap:.0f} mm from it"
@@ -347,10 +352,11 @@ def _description(inspection: Inspection) -> tuple[Urdf | None, str]:
         return None, str(error)
 
 
-def _limits(spec: RobotSpec, margin: float, urdf: Urdf | None, why: str) -> Iterator[Check]:
-    """The range of each joint in the URDF includes the range that the guards allow."""
+def _limits(spec: RobotSpec, margin: float, urdf: Urdf | None, why: str, names: Sequence[str] = ()) -> Iterator[Check]:
+    """The range of each joint in the URDF includes the range that the guards allow; `names` are those of the URDF."""
     command = spec.command
-    joints = [(i, urdf[name]) for i, name in enumerate(command.labels) if urdf is not None and name in urdf]
+    rows = enumerate(names or command.labels)
+    joints = [(i, urdf[name]) for i, name in rows if urdf is not None and name in urdf]
     if not joints:
         yield Check("joint limits", "as in the profile", why or f"{DESCRIPTION} has none of the joints", fits=None)
     for i, joint in joints:

@@ -4,6 +4,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
+from bam_envs.arms.description import DEFAULT_MODEL, known_models, robot_model
 from bam_envs.core.errors import InvalidValue
 from bam_envs.core.location import NO_CREDENTIALS, LiveRobot
 from bam_envs.core.robot import RobotSpec
@@ -32,7 +33,8 @@ def live_robot(
         at: Where it is; or its address, or a connected `roslibpy.Ros`, to which `options` belong.
         spec: Signals and commands that the task needs; None: all of the profile that are not optional.
         limits: The limits of the guards; None: those of the profile.
-        tool_position: Forward kinematics of an arm other than a UR5e, (n, k) [rad] to (n, 3) [m].
+        tool_position: Forward kinematics of an arm other than a UR5e, (n, k) [rad] to (n, 3) [m]; None: those of the
+            described arm of the profile.
         straight: Whether the commands move the tool along straight lines, so that singularities count.
         command: Command mode, such as ``"trajectory"``; None: the profile's default.
         options: Fields of `LiveRobot`, such as ``guards={"joint_speed": 0.3}``.
@@ -45,6 +47,8 @@ def live_robot(
     place = at if isinstance(at, LiveRobot) else LiveRobot(at, **options)
     endpoint, ros = _server(place)
     chosen = _chosen(place.profile, spec)
+    if tool_position is None and chosen.robot != DEFAULT_MODEL and chosen.robot in known_models():
+        tool_position = robot_model(chosen.robot).arm.tool_position
     robot = RosbridgeRobot(endpoint, chosen, spec=spec, command=command, ros=ros)
     chosen_limits = limits or profile_limits(chosen)
     if place.guards != {}:

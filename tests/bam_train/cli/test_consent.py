@@ -112,7 +112,7 @@ def test_a_robot_is_enabled_once_somebody_has_agreed(monkeypatch, capsys):
     robot = RealArm()
     robot.trouble = "the motors are off"
     robot.enabling = (SimpleNamespace(service="/arm/motion_enable", does="enables the motors"),)
-    with pytest.raises(SettingsError, match="^the answer was not yes; nothing has moved$"):
+    with pytest.raises(SettingsError, match=r"^the answer was not yes; nothing has moved$"):
         consent(monkeypatch, robot, "no\n")
     assert len(robot.enabling) == 1
     capsys.readouterr()
@@ -121,7 +121,7 @@ def test_a_robot_is_enabled_once_somebody_has_agreed(monkeypatch, capsys):
     assert "\n  first /arm/motion_enable is called, which enables the motors\n" in capsys.readouterr().err
     robot.enabling, robot.enable = (SimpleNamespace(service="/a", does="b"),), lambda: None
     robot.trouble = "the motors are off"
-    with pytest.raises(SettingsError, match="^not ready: the motors are off; nothing has moved$"):
+    with pytest.raises(SettingsError, match=r"^not ready: the motors are off; nothing has moved$"):
         consent(monkeypatch, robot, yes=True)
 
 
