@@ -7,7 +7,7 @@ assumed, and a note says so.
 
 import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import MISSING, asdict, dataclass, fields
+from dataclasses import MISSING, asdict, dataclass, fields, is_dataclass
 from typing import Any
 
 from bam_envs.arms.description import ArmDescription
@@ -303,7 +303,7 @@ class GraphProfile:
         """Where the gripper's width goes."""
         known = [] if template is None else [one for one in template.sinks() if one.labels == (_WIDTH,)]
         for sink in known:
-            if self._offers(sink):
+            if all(map(self._offers, sink.forms)):
                 return _row(sink) | self._joint_unit(sink.type)
         for kind, field in _GOALS.items():
             actions = sorted(name for name, one in self.graph.actions.items() if one == kind)
@@ -367,7 +367,8 @@ def _row(entry: Source | Sink) -> Row:
     usual: Row = {one.name: one.default if one.default is not MISSING else None for one in fields(entry)}
     row: Row = {}
     for name, value in ((one.name, getattr(entry, one.name)) for one in fields(entry)):
-        plain = list(value) if isinstance(value, tuple) else dict(value) if isinstance(value, Mapping) else value
+        plain: Any = list(value) if isinstance(value, tuple) else dict(value) if isinstance(value, Mapping) else value
+        plain = asdict(value) if is_dataclass(value) and not isinstance(value, type) else plain
         if name in ("scale", "offset"):
             if set(value) != set(usual[name]):
                 row[name] = plain if len(set(plain)) > 1 else plain[0]

@@ -97,6 +97,8 @@ def test_a_gripper_of_its_makers_own_action(client):
     status, values, news = fr3.goal(FR3, MOVE, {"width": 0.06, "speed": 0.1})
     assert (status, values) == ("SUCCEEDED", {"success": True, "error": ""})
     assert 0.06 < news[0]["current_width"] <= 0.08
+    grasp = {"width": 0.0, "speed": 0.1, "force": 40.0, "epsilon": {"inner": 0.08, "outer": 0.08}}
+    assert fr3.goal("/franka_gripper/grasp", "franka_msgs/action/Grasp", grasp)[0] == "SUCCEEDED"
 
 
 def test_an_arm_takes_no_command_before_it_is_enabled(client):
