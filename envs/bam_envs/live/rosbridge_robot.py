@@ -552,6 +552,10 @@ class RosbridgeRobot:
             places = self._places(sink)
             if sink.hold == "last" or not np.isfinite(hold[places]).all():
                 hold[places] = np.nan if sent is None else sent[places]
+            elif len(places) > 1 and sent is not None:  # a jaw in the message of its arm holds what it holds
+                alone = [signal.labels[0] for signal in self.spec.signals if len(signal.labels) == 1]
+                grips = [place for place in places if self.spec.command.labels[place] in alone]
+                hold[grips] = sent[grips]
         if sent is not None and self._clock() - self._sent_at <= _CANNOT_BE_FAR:
             joints = np.array([unit == "rad" for unit in self.spec.command.units])
             if (np.abs(hold - sent)[joints] > _FAR).any():  # no guard allows such a gap: a wrong measurement

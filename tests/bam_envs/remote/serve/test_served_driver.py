@@ -10,6 +10,7 @@ import roslibpy
 from bam_envs.arms.description import robot_model
 from bam_envs.live.arm_checks import read_urdf
 from bam_envs.robots.profile import profile_for
+from bam_envs.tasks.scripted import scripted_policy
 
 GRIP, MOVE = "control_msgs/action/GripperCommand", "franka_msgs/action/Move"
 GEN3, FR3, XARM7 = "/robotiq_gripper_controller/gripper_cmd", "/franka_gripper/move", "/xarm_gripper/gripper_action"
@@ -130,3 +131,25 @@ def test_controllers_and_urdf(client, name):
     frame = arm.chain.link_frames(q[None])[0, -1]
     np.testing.assert_allclose(position, frame[:3, 3], atol=1e-12)
     np.testing.assert_allclose(rotation, frame[:3, :3], atol=1e-12)
+
+
+@pytest.mark.parametrize("name", ["fr3", "xarm7", "gen3", "so101"])
+def test_a_cube_is_picked_by_the_names_of_each_driver(serve_env, name):
+    """The gripper by its action, or by the message of the arm; a halt in between drops nothing."""
+    env = gym.make("bam/pick-v0", robot_model=name, disable_env_checker=True)
+    url, policy = serve_env(env=env, fast=True).bus.url, scripted_policy("bam/pick-v0", name)
+    live = gym.make("bam/pick-v0", robot_model=name, robot=url, disable_env_checker=True)
+    robot = live.unwrapped.robot
+    try:
+        robot.connect()
+        robot.enable()
+        observation, _ = live.reset(seed=0)
+        ended, steps = False, 0
+        while not ended:
+            observation, _, success, truncated, _ = live.step(policy.act_batch(observation[None])[0])
+            ended, steps = success or truncated, steps + 1
+            if steps == 30:
+                robot.halt()
+        assert success
+    finally:
+        live.close()
