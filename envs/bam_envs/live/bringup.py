@@ -133,8 +133,8 @@ class TopicTypes:
         actual = self.type_of(topic)
         return same_type(actual, kind) if actual else not self.answers
 
-    def check_listened(self, topic: str, sink: Sink) -> str:
-        """As `check`, for the `topic` of `sink`: it needs a subscriber, and the expected type, stamped or not."""
+    def check_listened(self, topic: str, sink: Sink) -> Sink:
+        """`sink`, whose `topic` needs a subscriber, with the type that this has: its own, or see `Sink.of_type`."""
         deadline, expected = Deadline(self._timeout), sink.type
         while not self.type_of(topic) and self.answers:
             if deadline.passed:
@@ -144,10 +144,11 @@ class TopicTypes:
                     f"this may be another robot than it describes.{namespaces_with(self._link, 'topics', sink.topic)}"
                 )
             time.sleep(_TRY_AGAIN)  # nodes of a ROS graph take a while to discover each other
-        kind = self.type_of(topic) or expected
-        if bare_type(kind) != bare_type(expected):  # reading ignores a stamp, writing does not
+        kind = bare_type(self.type_of(topic) or expected)
+        found = sink.of_type(kind)
+        if found is None:
             raise self._wrong_type(topic, expected, kind)
-        return kind
+        return found
 
     def check_offered(self, sink: Sink) -> None:
         """`ProtocolError` if it is known that nobody offers the action or the service of `sink`, or another type."""

@@ -230,7 +230,7 @@ def _commands(inspection: Inspection) -> Iterator[Check]:
         kind = None if inspection.types is None else inspection.types[sink.address]
         nobody = "nobody listens" if sink.topic else "nobody offers it: start the gripper's driver"
         found = "unknown" if kind is None else bare_type(kind) or nobody
-        fits = None if kind is None else bare_type(kind) == bare_type(sink.type)
+        fits = None if kind is None else sink.of_type(bare_type(kind)) is not None
         yield Check(f"command {sink.address}", sink.type, found, fits=fits)
     proof = inspection.proof
     if proof is not None:

@@ -238,11 +238,12 @@ class RosbridgeRobot:
                 link = RosbridgeLink(self._endpoint, name="goals", lost_after=_LOST_AFTER)
             self._goals = Goals(link, self.spec.command, self.namespace, self._refuse)
             link.connect()
+        self._sinks = tuple(
+            types.check_listened(self.namespace + one.topic, one) if one.topic else one for one in self._sinks
+        )
         for sink in (one for one in self._sinks if one.topic):
-            name = self.namespace + sink.topic
-            kind = types.check_listened(name, sink)
-            control.advertise(name, kind)
-            halting.advertise(name, kind)
+            control.advertise(self.namespace + sink.topic, sink.type)
+            halting.advertise(self.namespace + sink.topic, sink.type)
         halting.advertise(self.namespace + HALT_TOPIC, "std_msgs/Empty")
         control.advertise(self.namespace + STATUS_TOPIC, "std_msgs/String")
 

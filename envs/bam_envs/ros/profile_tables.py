@@ -28,7 +28,7 @@ Answer = Finite | bool | str
 ImageType = Literal["sensor_msgs/CompressedImage", "sensor_msgs/Image"]
 """Message type of a camera: JPEG or PNG, or raw pixels, both over a separate CBOR connection."""
 IMAGE_TYPES = get_args(ImageType)
-_TRAJECTORY = "trajectory_msgs/JointTrajectory"
+_TRAJECTORY, _TWIST = "trajectory_msgs/JointTrajectory", "geometry_msgs/Twist"
 _LAGS = {"arm": 0.1, "base": 0.3}
 """Delay of live robots behind their commands [s], of network and controller; the limit `lag` overrides it."""
 
@@ -132,6 +132,19 @@ class Sink(Content):
         if self.closing is None:
             return (self,)
         return self, dataclasses.replace(self, **vars(self.closing), closing=None)
+
+    def of_type(self, kind: str) -> "Sink | None":
+        """The sink with messages of type ``pkg/Type``: its own, or a Twist with a stamp instead of without, or without.
+
+        Drives took a Twist before ROS 2 Jazzy, and take a TwistStamped since, under the same name. None for any other.
+        """
+        if kind == self.type:
+            return self
+        if {kind, self.type} != {_TWIST, f"{_TWIST}Stamped"}:
+            return None
+        stamped = kind != _TWIST
+        fields = [f"twist.{path}" if stamped else path.removeprefix("twist.") for path in self.fields]
+        return dataclasses.replace(self, type=kind, fields=tuple(fields))
 
     @property
     def is_timed(self) -> bool:

@@ -14,6 +14,7 @@ from bam_envs.live.diagnosis import Diagnosis
 from bam_envs.live.robot_checks import robot_checks
 from bam_envs.live.rosbridge_robot import RosbridgeRobot
 from bam_envs.robots.profile import load_profile
+from bam_envs.robots.ur5e import JOINTS
 from bam_envs.ros.codec import RobotInfo
 from bam_envs.rosbridge.bus import ABORTED, SUCCEEDED
 from bam_envs.safety.gate import _clear
@@ -300,3 +301,69 @@ def test_a_diagnosis_lists_the_services_and_calls_none(server, robot_on, profile
     )
     assert lines[f"command {GRIPPER}"] == ("control_msgs/GripperCommand", "control_msgs/GripperCommand", "ok")
     assert (calls, scripted.commands) == ([], [])
+
+
+JAW = """
+extends = "ur5e"
+name = "jaw"
+readiness = []
+identity = []
+
+[[commands.all]]
+topic = "/arm/joint_trajectory"
+type = "trajectory_msgs/JointTrajectory"
+labels = [{labels}, "gripper_width"]
+"""
+
+
+def test_a_jaw_in_the_message_of_its_arm_holds_what_it_holds_at_a_halt(server, robot_on, connect, profile, tmp_path):
+    path = tmp_path / "jaw.toml"
+    path.write_text(JAW.format(labels=str([*JOINTS])[1:-1]), encoding="utf-8")
+    scripted = robot_on(server, path)
+    step = connect(server.url, path)
+    step(0.04)
+    scripted.frozen = True  # an object is between the pads
+    scripted.signals["gripper_width"][:] = 0.04
+    step(0.02)
+    count = len(scripted.commands)
+    step.robot.halt()
+    scripted.wait_for(lambda: any(topic == ARM for topic, _, _ in scripted.commands[count:]))
+    held = next(message for topic, _, message in scripted.commands[count:] if topic == ARM)
+    assert held["points"][0]["positions"][6] == 0.02
+
+
+TWIST = """
+extends = "mir100"
+name = "base"
+readiness = []
+identity = []
+
+[[commands.velocity]]
+topic = "/cmd_vel"
+type = "geometry_msgs/{}"
+labels = ["linear_velocity", "angular_velocity"]
+fields = ["{}linear.x", "{}angular.z"]
+hold = "zero"
+"""
+
+
+@pytest.mark.parametrize(("there", "here"), [("TwistStamped", "Twist"), ("Twist", "TwistStamped")])
+def test_a_drive_gets_the_twist_that_its_topic_has(server, robot_on, connect, tmp_path, there, here):
+    """The profile has the other one, which a drive would ignore."""
+    paths = {}
+    for kind in (there, here):
+        stamped = "twist." if kind.endswith("Stamped") else ""
+        paths[kind] = tmp_path / f"{kind}.toml"
+        paths[kind].write_text(TWIST.format(kind, stamped, stamped), encoding="utf-8")
+    scripted = robot_on(server, paths[there])
+    robot = RosbridgeRobot(server.url, load_profile(paths[here]))
+    try:
+        robot.connect()
+        robot.reset(ROW, START)
+        robot.step(_clear(robot, np.array([[0.25, -0.5]])))
+        scripted.wait_for(lambda: any(topic == "/cmd_vel" for topic, _, _ in scripted.commands))
+        message = next(message for topic, _, message in scripted.commands if topic == "/cmd_vel")
+        twist = message["twist"] if there == "TwistStamped" else message
+        assert (twist["linear"]["x"], twist["angular"]["z"], "header" in message) == (0.25, -0.5, there != "Twist")
+    finally:
+        robot.close()
