@@ -270,7 +270,7 @@ class GraphProfile:
             for key, usual in (("scale", 1.0), ("offset", 0.0)):
                 value = self._gripper.get(key, usual)
                 row[key] = [value if label == _WIDTH else usual for label in labels]
-        row |= {"reach_periods": 1.5} if kind == _TRAJECTORY else {}
+        row |= {"reach_periods": 2.0} if kind == _TRAJECTORY else {}
         modes = ((mode, sinks[-1]) for one in self._known for mode, sinks in one.commands.items())
         shipped = next((mode for mode, sink in modes if sink.topic == topic), "")
         return shipped or _TOPICS.get(kind, ("", "joints"))[1], row

@@ -68,6 +68,8 @@ _HALT_WAITS = 0.05
 _LEAD, _LEAD_DECAY = 0.1, 0.95
 """A step ends before its deadline by the longest time that a recent command took to compute, at most by this share of a
 period; at each tick the memory of that longest time fades by this factor."""
+_HOLD_PERIODS = 1.5
+"""Longest time in which a trajectory of a halt is to be reached [periods]."""
 _BY_HAND = "stop it by hand if it moves; a robot with a command timeout stops by itself"
 _NOTHING_SENT = ". Nothing was sent, and nothing is kept"
 _FAR, _CANNOT_BE_FAR = 0.3, 1.0
@@ -564,7 +566,9 @@ class RosbridgeRobot:
         tag = self._session.tagger.next(self._epoch, self._command_life)
         for sink in (one for one in self._sinks if one.topic):
             if np.isfinite(hold[self._places(sink)]).all() and (sink.is_timed or not unproved):
-                reach, ros1 = REST_REACH if unproved else None, halting.ros == "ros1"
+                # Along a spline it would go on before it comes back.
+                soon = min(sink.reach_at(self.spec.period), _HOLD_PERIODS * self.spec.period)
+                reach, ros1 = REST_REACH if unproved else soon, halting.ros == "ros1"
                 topic, _, message = encode_sink(sink, self.spec, hold, tag, ros1=ros1, reach=reach)
                 halting.publish(self.namespace + topic, message)
 

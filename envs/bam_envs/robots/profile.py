@@ -169,7 +169,7 @@ def usual_profile(spec: RobotSpec) -> RobotProfile:
         states.append({**pose, "signal": signal, "fields": [f"pose.{part}.{axis}" for axis in axes]})
     known = {signal.name for signal in spec.signals}
     sink: Table = {"type": "trajectory_msgs/JointTrajectory", "controller": "joint_trajectory_controller"}
-    sink |= {"topic": "/joint_trajectory_controller/joint_trajectory", "labels": list(joints), "reach_periods": 1.5}
+    sink |= {"topic": "/joint_trajectory_controller/joint_trajectory", "labels": list(joints), "reach_periods": 2.0}
     width: Table = {"topic": "/gripper/commands", "type": "std_msgs/Float64MultiArray", "labels": [gripper]}
     table: Table = {
         "name": spec.name,

@@ -169,8 +169,9 @@ def encode_sink(
 ) -> Envelope:
     """The message with the part of `command` (m,) [SI] for `sink`, with `tag`, which `sign` signs.
 
-    `reach` is the time in which a trajectory's point is to be reached [s]; None: that of the sink.
+    `reach` is the time in which a trajectory's point is to be reached [s], at any speed; None: as the sink has it.
     """
+    at_rest = reach is None and sink.is_spline(spec.period)
     reach = sink.reach_at(spec.period) if reach is None else reach
     raw, text = from_si(sink, command[_places(sink, spec)]), ""
     if tag is not None and sink.tag:
@@ -178,10 +179,12 @@ def encode_sink(
         if any("(" in path for path in sink.fields):  # an angle is written as a quaternion, and read with rounding
             content = _read_command(sink, _write_command(sink, raw, "", reach))
         text = tag.to_text() if sign is None else sign(tag, sink.address, _signed(content))
-    return sink.address, sink.type, _write_command(sink, raw, text, reach, ros1=ros1)
+    return sink.address, sink.type, _write_command(sink, raw, text, reach, ros1=ros1, at_rest=at_rest)
 
 
-def _write_command(sink: Sink, values: list[float], text: str, reach: float, *, ros1: bool = False) -> dict[str, Any]:
+def _write_command(
+    sink: Sink, values: list[float], text: str, reach: float, *, ros1: bool = False, at_rest: bool = False
+) -> dict[str, Any]:
     """The message that carries raw numbers, in the order of the sink's labels, the `text` of a tag, and `reach` [s]."""
     header = {"stamp": write_stamp(0.0, ros1=ros1), "frame_id": text}  # the stamp 0 means at once
     names = list(sink.names)
@@ -202,7 +205,8 @@ def _write_command(sink: Sink, values: list[float], text: str, reach: float, *, 
     if sink.type == _JOINTS:
         return {"header": header, "name": names, "position": values, "velocity": [], "effort": []}
     reached = write_stamp(reach, ros1=ros1)
-    point = {"positions": values, "velocities": [], "accelerations": [], "effort": [], "time_from_start": reached}
+    speeds = [0.0] * len(values) if at_rest else []
+    point = {"positions": values, "velocities": speeds, "accelerations": [], "effort": [], "time_from_start": reached}
     return {"header": header, "joint_names": names, "points": [point]}
 
 

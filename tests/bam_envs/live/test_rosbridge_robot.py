@@ -568,7 +568,7 @@ def test_ros_1(lax, robot_on, connect):
     scripted.wait_for(lambda: len(scripted.commands) == 2)
     message = scripted.commands[1][2]
     assert message["header"]["stamp"] == {"secs": 0, "nsecs": 0}
-    assert message["points"][0]["time_from_start"] == {"secs": 0, "nsecs": 75_000_000}
+    assert message["points"][0]["time_from_start"] == {"secs": 0, "nsecs": 100_000_000}
 
 
 def test_two_robots_behind_one_server(server, robot_on, connect):
