@@ -34,6 +34,7 @@ from bam_envs.live import bringup
 from bam_envs.live.camera import LiveCamera, fitted
 from bam_envs.live.command_proof import CommandProof, needed_proof
 from bam_envs.live.goals import GOAL, Goals, form_for
+from bam_envs.live.set_points import SetPoints
 from bam_envs.live.state import Letter, LiveState
 from bam_envs.live.take_over import TakeOver
 from bam_envs.ros.codec import (
@@ -46,7 +47,7 @@ from bam_envs.ros.codec import (
     read_info,
 )
 from bam_envs.ros.freshness import Tag
-from bam_envs.ros.profile_tables import Enable, RobotProfile, Sink
+from bam_envs.ros.profile_tables import SPLINE_PERIODS, Enable, RobotProfile, Sink
 from bam_envs.rosbridge.client import RosbridgeLink
 from bam_envs.rosbridge.endpoint import Endpoint
 from bam_envs.rosbridge.ros_bus import RosBus, bare_reason
@@ -118,6 +119,10 @@ class RosbridgeRobot:
         """Whether the gripper is not commanded, but the joints of the arm alone."""
         images = {name: box for camera in self.spec.cameras for name, box in camera.spaces().items()}
         self._cameras = {name: (LiveCamera(endpoint, profile.camera(name)), box) for name, box in images.items()}
+        self._points: SetPoints | None = None  # of controllers that get set points between commands
+        rates = [one.rate for one in self._sinks if one.rate]
+        self._every = 1.0 / max(rates, default=1.0)
+        self._streamed = [place for one in self._sinks if one.rate for place in self._places(one)]
         self._pacer, self._session = Pacer(self.spec.period, now=clock), bringup.DrivingSession()
         self._ended_at, self._lead = clock(), 0.0  # of the last step; how long before its deadline the next one ends
         self._command_life = profile.command_life(self.spec.period)
@@ -411,6 +416,7 @@ class RosbridgeRobot:
         if lockstep and self._sent_tag != tag:  # a halt came before it: nothing will answer
             return self.measure()
         if not lockstep:
+            self._stream(control, tag, halts)
             self._wait(self._pacer.slack - self._lead, halts)
             self._ended_at = self._clock()
         elif not self._state.await_answer(
@@ -451,6 +457,7 @@ class RosbridgeRobot:
         options: Any = {"sign": sign, "ros1": ros1, "reach": self.reach}
         sinks = [sink for sink in self._sinks if not (self.joints_only and sink.hold == "last")]
         sinks = [form_for(sink, command, self.spec.command) for sink in sinks]
+        target, command = command, self._set_point(command, halts)
         messages = [(sink, encode_sink(sink, self.spec, command, tag, **options)[2]) for sink in sinks]
         with self._sending:
             if self._clock() > until:
@@ -462,10 +469,43 @@ class RosbridgeRobot:
                     if self._goals is not None and not sink.topic:
                         self._goals.send(sink, command[self._places(sink)], message)
                 control.publish_all([(self.namespace + one.topic, message) for one, message in messages if one.topic])
-                self._sent, self._sent_at, self._sent_after = command.copy(), self._clock(), halts
+                self._sent, self._sent_at, self._sent_after = target.copy(), self._clock(), halts
                 self._sent_tag = tag
                 if self._answers:
                     self._owed[tag.sequence] = self._sent_at
+
+    def _set_point(self, command: Array, halts: int) -> Array:
+        """What is sent at once of `command` (m,): controllers with a rate get the first point of a spline to it."""
+        places, period, now = self._streamed, self.spec.period, self._clock()
+        if self._describes_itself or not places:
+            return command
+        if self._points is None or self._sent_after != halts or now - self._sent_at > SPLINE_PERIODS * period:
+            # The arm is at rest, maybe elsewhere than its last set point.
+            self._points = SetPoints(self._at_rest(self._state.read()[0])[places], now)
+        self._points.aim(command[places], now, SPLINE_PERIODS * period)
+        return self._next_point(command)
+
+    def _next_point(self, command: Array) -> Array:
+        point = command.copy()
+        if self._points is not None:
+            point[self._streamed] = self._points.at(self._clock() + self._every)[0]
+        within: Array = np.clip(point, self.spec.command.low, self.spec.command.high)
+        return within
+
+    def _stream(self, control: RosBus, tag: Tag, halts: int) -> None:
+        """Send set points between this command and the next to controllers with a rate, until one would be late."""
+        if self._points is None or self._sent is None:
+            return
+        due = self._sent_at + self._every
+        while due < self._clock() + self._pacer.slack - self._lead:
+            self._wait(due - self._clock(), halts)
+            with self._sending:
+                if self._halts != halts or self._cut.is_set():
+                    return
+                point = self._next_point(self._sent)
+                rated = [encode_sink(one, self.spec, point, tag) for one in self._sinks if one.rate]
+                control.publish_all([(self.namespace + topic, message) for topic, _, message in rated])
+            due += self._every
 
     def tell_status(self, code: int, guard: str, *, stopped: bool) -> None:
         """Publish `SafeRobot.code` and `SafeRobot.status` on `STATUS_TOPIC`: a stop at once, else after the command."""

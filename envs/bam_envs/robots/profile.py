@@ -427,6 +427,8 @@ def _sinks(where: str, mode: str, rows: list[Table], command: SignalSpec) -> tup
             raise InvalidValue(f"{at}: {sink.type} needs fields; only {', '.join(sorted(LISTED_TYPES))} do without.")
         if sink.constants and not sink.fields:
             raise InvalidValue(f"{at}: constants need fields.")
+        if sink.rate is not None and (sink.is_timed or not sink.topic or command.units[0] != "rad"):
+            raise InvalidValue(f"{at}: rate is for positions of an arm that are executed at once.")
         if sink.closing is not None:
             if not sink.action or size != 1:
                 raise InvalidValue(f"{at}: closing needs an action with one label.")

@@ -29,7 +29,7 @@ ImageType = Literal["sensor_msgs/CompressedImage", "sensor_msgs/Image"]
 """Message type of a camera: JPEG or PNG, or raw pixels, both over a separate CBOR connection."""
 IMAGE_TYPES = get_args(ImageType)
 _TRAJECTORY, _TWIST = "trajectory_msgs/JointTrajectory", "geometry_msgs/Twist"
-_SPLINE_PERIODS, _SPLINE_DELAY = 2.0, 0.75
+SPLINE_PERIODS, _SPLINE_DELAY = 2.0, 0.75
 """Periods from which on a trajectory's point is reached at rest, and the delay of such a motion as a share of its time:
 it has gone half of the way in half of the time, and begins before it has come to rest (`benchmarks jerk`)."""
 _LAGS = {"arm": 0.1, "base": 0.3}
@@ -116,6 +116,9 @@ class Sink(Content):
     reach_periods: Positive = 1.0
     """The same in periods of the task; above 1 an arm does not stop when the next command is late. From 2 on the point
     is reached at rest, to which a controller goes along a cubic spline, without jumps of the speed."""
+    rate: Positive | None = None
+    """Rate of a controller that holds its set points [Hz]: it gets some between two commands, on a spline over two
+    periods. None: it gets the commands alone."""
     hold: Literal["measured", "last", "zero"] = "measured"
     """Command of a halt: the measured position, the last command, or zeros."""
     tag: bool = True
@@ -166,10 +169,12 @@ class Sink(Content):
 
     def is_spline(self, period: float) -> bool:
         """Whether a trajectory's point is reached at rest, for a command every `period` [s]."""
-        return self.reach_at(period) >= _SPLINE_PERIODS * period
+        return self.reach_at(period) >= SPLINE_PERIODS * period
 
     def delay_at(self, period: float) -> float:
-        """Delay of an arm behind the points of its trajectories [s], without that of its drives."""
+        """Delay of the set points behind the commands [s]."""
+        if not self.is_timed:
+            return 0.0 if self.rate is None else SPLINE_PERIODS * _SPLINE_DELAY * period
         return self.reach_at(period) * (_SPLINE_DELAY if self.is_spline(period) else 1.0)
 
 
@@ -394,7 +399,7 @@ class RobotProfile:
         """
         period = self.period if wanted is None else wanted.period
         # A trajectory that takes longer than a period adds to the lag.
-        reached = (sink.delay_at(period) for sink in self.sinks(mode) if sink.type == _TRAJECTORY)
+        reached = (sink.delay_at(period) for sink in self.sinks(mode))
         lag = _LAGS[self.kind] + max(0.0, max(reached, default=0.0) - period)
         joints = {at for at, unit in zip(self.command.labels, self.command.units, strict=True) if unit == "rad"}
         is_timed = all(sink.is_timed for sink in self.sinks(mode) if joints & set(sink.labels))

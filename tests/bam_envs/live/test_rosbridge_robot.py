@@ -5,6 +5,7 @@ import threading
 import time
 from dataclasses import replace
 from functools import partial
+from importlib.resources import files
 
 import numpy as np
 import pytest
@@ -122,6 +123,33 @@ def test_commands_and_their_tags(server, robot_on, connect):
     assert sequences == [sequences[0] + n // 2 for n in range(6)]
     assert all(tag.deadline - tag.sent == pytest.approx(0.1, abs=1e-5) for tag in tags)
     assert (np.diff([state.stamp[0] for state in states]) > 0).all()
+
+
+def test_a_controller_that_holds_gets_set_points_between_commands(server, robot_on, tmp_path, connect):
+    path = tmp_path / "mine.toml"
+    row = 'hold = "measured"\nrate = 200.0\n'
+    shipped = (files("bam_envs.robots") / "profiles" / "ur5e.toml").read_text()
+    path.write_text(shipped.removesuffix('hold = "measured"\n') + row)
+    scripted = robot_on(server)
+    start = scripted.signals["joint_position"].copy()
+    robot, gate = connect(server.url, path, command="position")
+    assert robot.spec.lag == pytest.approx(0.125)  # 0.1 s, and half a period
+    command = gate.state.command.copy()
+    command[0, 0] += 0.2
+    for _ in range(4):
+        state = gate.step(command)
+    np.testing.assert_array_equal(state.command, command)
+    robot.halt()
+    scripted.wait_for(lambda: scripted.halts == 1)
+    points = np.array([message["data"] for message in scripted.on(JOINT_COMMANDS)])[:-1]  # the last one holds
+    assert len(points) > 2 * 4
+    assert len(scripted.on(GRIPPER_COMMANDS)) == 5
+    first = points[:, 0]
+    assert first.max() < command[0, 0] + 0.01  # a spline whose goal stays goes a little beyond it
+    assert 0.0 < first[0] - start[0] < 0.04
+    assert np.abs(np.diff(first)).max() < 0.1
+    assert first[-1] == pytest.approx(command[0, 0], abs=5e-3)
+    np.testing.assert_array_equal(points[:, 1:], np.tile(command[0, 1:6], (len(points), 1)))
 
 
 def test_only_a_gate_sends_commands(server, robot_on, connect):
