@@ -152,10 +152,10 @@ def write_profile(config: ProfileConfig) -> int | None:
 
     from bam_envs.arms.description import robot_model
     from bam_envs.core.location import LiveRobot
-    from bam_envs.live.live_graph import GraphProfile, profile_toml, read_graph
     from bam_envs.robots.profile import read_profile
     from bam_envs.rosbridge.client import RosbridgeLink
     from bam_envs.rosbridge.endpoint import Endpoint
+    from bam_train.cli.arms.live_graph import GraphProfile, profile_toml, read_graph
 
     arm = robot_model(config.name)
     path = config.out or Path("robots") / "profiles" / f"{arm.name}.toml"

@@ -486,13 +486,13 @@ def test_without_a_halt_link_nothing_is_sent(server, robot_on, connect):
     ("profile", "topic", "found", "expected"),
     [
         ("ur5e", "/object_pose", "std_msgs/String", "geometry_msgs/PoseStamped"),
-        ("mir100", "/cmd_vel", "geometry_msgs/TwistStamped", "geometry_msgs/Twist"),  # a bridge would drop what is not
+        ("mir100", "/cmd_vel", "geometry_msgs/Wrench", "geometry_msgs/Twist"),  # a bridge would drop what is not
     ],
 )
 def test_a_topic_of_another_type(server, profile, topic, found, expected):
     for source in load_profile(profile).state:
         server.advertise(source.topic, found if source.topic == topic else source.type)
-    server.subscribe("/cmd_vel", "geometry_msgs/msg/TwistStamped", lambda message, caller: None)
+    server.subscribe("/cmd_vel", "geometry_msgs/msg/Wrench", lambda message, caller: None)
     robot = robot_at(server.url, profile)
     assert raised(ProtocolError, robot.connect) == (
         f"{topic} is a {found} there, and {expected} was expected. "
