@@ -29,6 +29,8 @@ _GOALS = {"control_msgs/GripperCommand": "command.position", "franka_msgs/Move":
 _TOPICS = {_TRAJECTORY: ("{}/joint_trajectory", "trajectory"), _ARRAY: ("{}/commands", "position")}
 """Types of the commands of controllers: the topic of a controller, and the name of the command mode."""
 _ACTIVE = ("active", "running")
+_FASTEST = 100
+"""Greatest rate at which a controller that holds its set points gets some [Hz]: more is a burden for a bridge."""
 Row = dict[str, Any]
 
 
@@ -270,6 +272,9 @@ class GraphProfile:
             for key, usual in (("scale", 1.0), ("offset", 0.0)):
                 value = self._gripper.get(key, usual)
                 row[key] = [value if label == _WIDTH else usual for label in labels]
+        rates = [one.get("update_rate") for one in self.graph.controllers if one.get("name") == controller]
+        if kind == _ARRAY and isinstance(rate := next(iter(rates), 0), int) and rate > 0:  # it holds its set points
+            row["rate"] = float(min(rate, _FASTEST))
         row |= {"reach_periods": 2.0} if kind == _TRAJECTORY else {}
         modes = ((mode, sinks[-1]) for one in self._known for mode, sinks in one.commands.items())
         shipped = next((mode for mode, sink in modes if sink.topic == topic), "")

@@ -83,7 +83,8 @@ rosapi/ServiceType: string service -> string type
 rosapi/GetActionServers: -> string[] action_servers
 rosapi/ActionType: string action -> string type
 
-controller_manager_msgs/ControllerState: string name; string state; string type; string[] claimed_interfaces; \
+controller_manager_msgs/ControllerState: string name; string state; string type; uint16 update_rate; \
+string[] claimed_interfaces; \
 string[] required_command_interfaces; string[] required_state_interfaces
 controller_manager_msgs/ListControllers: -> ControllerState[] controller
 control_msgs/GripperCommand: float64 position; float64 max_effort

@@ -170,21 +170,24 @@ class ServedDriver:
 
     def _controllers(self) -> Iterator[dict[str, Any]]:
         """The controllers of all command modes; those of the first one are active."""
-        yield _controller("joint_state_broadcaster", "joint_state_broadcaster/JointStateBroadcaster", [], True)
+        yield _controller("joint_state_broadcaster", "joint_state_broadcaster/JointStateBroadcaster", [], active=True)
         measured = {source.signal: source.names for source in self._profile.state}
         active = self._profile.sinks()
         for sink in self._profile.sinks_by_address.values():
             if sink.controller:
                 joints = sink.names if sink.topic else measured.get(sink.labels[0], sink.names)
                 kind = _CONTROLLERS.get(sink.type, sink.type)
-                yield _controller(sink.controller, kind, [f"{name}/position" for name in joints], sink in active)
+                interfaces = [f"{name}/position" for name in joints]
+                yield _controller(sink.controller, kind, interfaces, active=sink in active, rate=sink.rate)
 
 
-def _controller(name: str, kind: str, interfaces: list[str], active: bool) -> dict[str, Any]:
-    state = "active" if active else "inactive"
-    claimed = interfaces if active else []
+def _controller(
+    name: str, kind: str, interfaces: list[str], *, active: bool, rate: float | None = None
+) -> dict[str, Any]:
+    """One row of controller_manager_msgs/ControllerState; the rate 0 is that of the controller manager."""
+    state, claimed = ("active", interfaces) if active else ("inactive", [])
     required = {"required_command_interfaces": interfaces, "claimed_interfaces": claimed}
-    return {"name": name, "state": state, "type": kind, **required}
+    return {"name": name, "state": state, "type": kind, "update_rate": round(rate or 0), **required}
 
 
 def _only(values: Mapping[str, Any], kind: str) -> dict[str, Any]:
