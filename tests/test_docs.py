@@ -204,7 +204,7 @@ def test_every_field_of_a_table_has_its_meaning(make_docs):
     [
         *sorted(PROGRAMS.keys() - {"bam-data", "bam-robots"}),
         *(f"bam-data {command}" for command in DATA_COMMANDS),
-        *("bam-robots add", "bam-robots check"),
+        *("bam-robots add", "bam-robots check", "bam-robots profile"),
     ],
 )
 def test_flags_on_the_site_are_the_flags_of_the_programs(make_docs, program, monkeypatch, capsys):

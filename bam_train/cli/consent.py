@@ -36,6 +36,7 @@ def connected_env(
     yes: bool = False,
     render: bool | str = False,
     named: str | None = None,
+    arm: str | None = None,
     env_kwargs: Mapping[str, Any] | None = None,
     admit: Callable[[gym.Env[Any, Any], Location, str], Sequence[str]] = lambda env, place, identity: (),
     motion: Path | None = None,
@@ -52,6 +53,7 @@ def connected_env(
         yes: Whether to skip the question before a real robot moves.
         render: Whether to show the simulation in a window; or the render mode.
         named: The environment that the user expects.
+        arm: The description here that takes the place of the checkpoint's; None: the checkpoint's.
         env_kwargs: Arguments of the environment, which override the checkpoint's.
         admit: Called before the question with the connected environment, its place, and the identity of its robot
             (`Inspection.identity`); returns lines for the operator.
@@ -64,7 +66,7 @@ def connected_env(
     """
     env_id, saved = named or "", dict[str, Any]()
     if checkpoint is not None:
-        env_id, saved = environment_of(checkpoint, named, elsewhere=isinstance(place, Remote))
+        env_id, saved = environment_of(checkpoint, named, elsewhere=isinstance(place, Remote), arm=arm)
     mode = "human" if render is True else render or None
     make = partial(make_env, env_id, {**saved, **(env_kwargs or {})}, render_mode=mode)
 
@@ -173,7 +175,7 @@ def plan_lines(env: Any, env_id: str, address: str, episodes: int, *, wiggle: bo
 
 
 def require_consent(env: Any, who: str, *, yes: bool, plan: Sequence[str] = ()) -> None:
-    """Ask the operator once before the real robot of `env` moves; do nothing for any other environment.
+    """Ask the operator once before the real robot of `env` moves, then enable it; any other is enabled only.
 
     Args:
         env: The environment, single or vector, with a connected robot.
@@ -184,11 +186,14 @@ def require_consent(env: Any, who: str, *, yes: bool, plan: Sequence[str] = ()) 
     Raises:
         SettingsError: The robot is not ready to move, the answer is not yes, or standard input is not a terminal.
     """
+    robot: Any = getattr(env.unwrapped, "robot", None)
+    enable = getattr(robot, "enable", lambda: None)
     if not has_real_robot(env):
+        enable()
         return
-    robot: Any = env.unwrapped.robot
     guards = guards_of(env)
-    limits = [f"{name} {guards[name]['limit']:.3g} {guards[name]['unit']}" for name in _MOTION if name in guards]
+    finite = [name for name in _MOTION if name in guards and math.isfinite(guards[name]["limit"])]
+    limits = [f"{name} {guards[name]['limit']:.3g} {guards[name]['unit']}" for name in finite]
     off = [name for name, guard in guards.items() if guard["limit"] == math.inf]
     say(f"{who} will move {robot.info.text}:")
     for line in (*plan, f"  at most {', '.join(limits)}"):
@@ -197,16 +202,28 @@ def require_consent(env: Any, who: str, *, yes: bool, plan: Sequence[str] = ()) 
     say(f"  behind {len(guards)} guards{without}; bam-deploy --print-guards shows them")
     for warning in getattr(robot, "warnings", ()):
         say(f"  warning: {warning}")
+    services = robot.enabling
+    for one in services:
+        say(f"  first {one.service} is called, which {one.does}")
+    if not services:  # else it is not ready before they are called
+        _require_ready(robot)
+    if not yes:
+        if not sys.stdin.isatty():
+            raise SettingsError(
+                "a real robot would move, and there is nobody to ask; give --yes to go on without asking"
+            )
+        question = "Is the robot clear of people, and a hand on its emergency stop? Type yes to go on: "
+        print(question, end="", file=sys.stderr, flush=True)
+        if sys.stdin.readline().strip().lower() != "yes":
+            raise SettingsError("the answer was not yes; nothing has moved")
+    if services:
+        enable()
+        _require_ready(robot)
+
+
+def _require_ready(robot: Any) -> None:
     if (why := robot.not_ready()) is not None:
         raise SettingsError(f"not ready: {why}; nothing has moved")
-    if yes:
-        return
-    if not sys.stdin.isatty():
-        raise SettingsError("a real robot would move, and there is nobody to ask; give --yes to go on without asking")
-    question = "Is the robot clear of people, and a hand on its emergency stop? Type yes to go on: "
-    print(question, end="", file=sys.stderr, flush=True)
-    if sys.stdin.readline().strip().lower() != "yes":
-        raise SettingsError("the answer was not yes; nothing has moved")
 
 
 def require_screen(*, remote: bool) -> None:

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 LIVE_ONLY = (
     *("robot", "robot_name", "transport", "rate", "fast", "render", "wiggle", "motion", "stage", "i_know", "trials"),
     *("shadow", "unusual", "record", "print_guards", "print_contract", "ca_file", "token_file", "timeout", "keys"),
-    "allow_unsigned",
+    *("allow_unsigned", "robot_model"),
 )
 """Flags that a rehearsal has no use for."""
 FIRST_SEED = 1_000_000
@@ -67,7 +67,7 @@ def deploy_checkpoint(config: DeployConfig, signals: SignalMemory) -> int:
         raise NoDetector(f"--unusual: {checkpoint.path} has no detector of unusual observations. {remedy}")
     admission = Admission(checkpoint, config.keys, config.allow_unsigned, config.trials, config.i_know)
     options: Any = {"episodes": config.episodes, "yes": config.yes, "render": config.render, "named": config.env}
-    options |= {"wiggle": config.wiggle, "motion": config.motion}
+    options |= {"wiggle": config.wiggle, "motion": config.motion, "arm": config.robot_model}
     env = connected_env(checkpoint, place, signals, who="bam-deploy", admit=admission, **options)
     try:
         seed = config.seed if config.seed is not None else FIRST_SEED
@@ -95,7 +95,7 @@ def print_guards(config: DeployConfig, checkpoint: Checkpoint, place: Location) 
     from bam_train.environments import environment_of, make_env
     from bam_train.errors import SettingsError
 
-    env_id, env_kwargs = environment_of(checkpoint, config.env)
+    env_id, env_kwargs = environment_of(checkpoint, config.env, arm=config.robot_model)
     if entry_of(env_id) is None:
         raise SettingsError(f"--print-guards: {env_id} has no robot, and so no guards")
     env = make_env(env_id, env_kwargs, place=place)
@@ -114,7 +114,8 @@ def _print_contract(config: DeployConfig, checkpoint: Checkpoint, place: LiveRob
     from bam_train.environments import environment_of, make_env
     from bam_train.errors import ContractRefused
 
-    with closing(make_env(*environment_of(checkpoint, config.env), place=place)) as env:
+    made_for = environment_of(checkpoint, config.env, arm=config.robot_model)
+    with closing(make_env(*made_for, place=place)) as env:
         contract = check_contract(checkpoint, env, place)
     tell(*([json_module.dumps(contract.to_json())] if config.json else contract.lines()))
     return ContractRefused.exit_status if contract.refused else 0
@@ -210,6 +211,8 @@ def _checked_place(config: DeployConfig) -> Location:
     """The place of the environment by the flags; invalid flags are refused before anything is loaded."""
     from bam_train.errors import SettingsError
 
+    if config.robot_model is not None and config.transport is not None:
+        raise SettingsError("--robot-model is about an arm that this computer drives, and --transport has its own")
     if config.print_guards and config.transport is not None:
         raise SettingsError("--print-guards shows the guards of a live robot, and --transport has none; leave it out")
     if config.print_contract and (config.robot is None or config.print_guards):

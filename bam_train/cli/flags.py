@@ -283,7 +283,7 @@ class DeployConfig(LocationFlags):
 
     GROUPS: ClassVar[Groups] = {
         "Episodes": ("episodes", "seed", "rate", "fast", "render"),
-        "Where": ("robot", "transport", "profile", "ca_file", "token_file", "timeout", "rehearse"),
+        "Where": ("robot", "robot_model", "transport", "profile", "ca_file", "token_file", "timeout", "rehearse"),
         "How a live robot may move": (
             *("stage", "i_know", "guard", "print_guards", "unusual", "wiggle", "motion", "shadow", "trials", "yes"),
             *("keys", "allow_unsigned"),
@@ -300,6 +300,9 @@ class DeployConfig(LocationFlags):
     that no trial of this checkpoint on this robot has had."""
     env: EnvId = None
     """Refuse the checkpoint unless it was trained on this environment; needed for some_module:Env-v0."""
+    robot_model: Name = None
+    """Description of the checkpoint's arm to use, a name of bam-robots list or a file; refused if it is of another
+    arm. By default the checkpoint's own."""
     print_guards: bool = False
     """Print the guards that a live robot would have, with their limits and what they do; connect and move nothing."""
     print_contract: bool = False
@@ -352,6 +355,9 @@ class DoctorConfig(CredentialFlags):
     """Refuse the checkpoint unless it was trained on this environment; needed for some_module:Env-v0."""
     profile: Name = None
     """Topics and limits of the robot: a shipped profile's name, or a .toml or .yaml file; by default the best fit."""
+    robot_model: Name = None
+    """Compare the robot's URDF with this arm, a name of bam-robots list or a file; by default the profile's, unless it
+    is a Universal Robots arm."""
     seconds: Annotated[Positive, tyro.conf.arg(metavar="S")] = 5.0
     """Duration of the measurement of states and link [s]."""
     measure: File = None

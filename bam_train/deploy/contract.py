@@ -101,8 +101,10 @@ def check_contract(
         LinkLost: The link dropped.
         InvalidValue: The robot is another one than `place` names.
     """
-    spec = env.unwrapped.robot.spec
-    profile = profile_for(spec) if place.profile is None else load_profile(place.profile)
+    robot = env.unwrapped.robot
+    spec, profile = robot.spec, getattr(robot, "profile", None)
+    if profile is None:
+        profile = profile_for(spec) if place.profile is None else load_profile(place.profile)
     link = RosbridgeLink(Endpoint.of(place), name="contract")
     try:
         link.connect()

@@ -33,18 +33,20 @@ T = TypeVar("T")
 
 
 def environment_of(
-    checkpoint: Checkpoint, named: str | None = None, *, elsewhere: bool = False
+    checkpoint: Checkpoint, named: str | None = None, *, elsewhere: bool = False, arm: str | None = None
 ) -> tuple[str, dict[str, Any]]:
     """The id and the keyword arguments of the environment that a checkpoint belongs to.
 
     A checkpoint alone imports no foreign module: the user must have `named` its environment, unless it is `elsewhere`.
+    With `arm`, the description of that name or file here takes the place of the checkpoint's.
 
     Raises:
         CheckpointMismatch: It was trained on another environment than `named`, or in a module that must be named.
         SettingsError: The manifest names no known environment, or arguments that it does not take.
         UnknownName: No environment is called `named`.
     """
-    env_id, env_kwargs = checkpoint.manifest.env, checkpoint.manifest.env_kwargs
+    env_id, saved = checkpoint.manifest.env, checkpoint.manifest.env_kwargs
+    env_kwargs = saved if arm is None else {**saved, "robot_model": arm}
     module = env_id.rpartition(":")[0]
     if named is not None:
         asked = resolve_id(named)
@@ -61,9 +63,10 @@ def environment_of(
             resolve_id(env_id)
         require_env_kwargs(env_id, env_kwargs)
     except (UnknownName, SettingsError) as error:
-        raise SettingsError(f"{checkpoint.path}: its manifest: {error}") from error
+        whose = "its manifest" if arm is None else f"--robot-model {arm}"
+        raise SettingsError(f"{checkpoint.path}: {whose}: {error}") from error
     try:
-        require_same_robot(env_kwargs.get("robot_model"))
+        require_same_robot(saved.get("robot_model"), arm)
     except InvalidValue as error:
         raise CheckpointMismatch(checkpoint.path, f"was trained for another robot: {error}") from error
     return env_id, dict(env_kwargs)

@@ -11,6 +11,9 @@ trajectory N    joint_trajectory_controller, one point that is reached after N p
 
 Each is measured with commands that are on time, and with each of them late by up to --late seconds. The jerk [rad/s^3]
 is that of the median episode, as now and then the arm touches the cube.
+
+The stacks are drivers with their arm: the controller of a mode of their profile, at its own rate, behind the policy of
+bam/pick (of a UR5e) or the scripted one. Physics take steps of 1 ms, and the jerk is that of positions 5 ms apart.
 """
 
 from contextlib import closing, suppress
@@ -26,8 +29,10 @@ from bam_envs.core.registry import ENVIRONMENTS
 from bam_envs.core.robot_env import RobotEnv
 from bam_envs.robots.physics.mujoco_arm import PHYSICS_STEPS, SimulatedArm
 from bam_envs.robots.profile import load_profile
+from bam_envs.ros.profile_tables import SPLINE_PERIODS
 from bam_envs.safety.gate import SafeRobot
 from bam_envs.tasks.pick import PickTask
+from bam_envs.tasks.scripted import scripted_policy
 from bam_train.cli.flags import Count
 from tests.benchmarks import harness
 
@@ -40,10 +45,14 @@ class Flags(harness.Flags):
     """Episodes of each row."""
     late: float = 0.015
     """Most that a command is late [s]."""
-    smoothing: float = 0.0
-    """Time constant with which the robot itself smooths set points, of a UR about 0.03 [s]."""
+    smoothing: float = 0.03
+    """Time constant with which the robot itself smooths set points, of a UR about 0.03 [s]; 0: stiff drives."""
     controller: tuple[str, ...] = ()
-    """These controllers alone."""
+    """These controllers and stacks alone."""
+
+
+LIVE_LAG = load_profile("ur5e_position").spec(mode="position").lag
+"""Delay of a live arm without that of its controller [s]."""
 
 
 class Controller(NamedTuple):
@@ -52,6 +61,8 @@ class Controller(NamedTuple):
     reach: float = 0.0
     measured: bool = False
     at_rest: bool = False
+    rate: float = 1e9
+    """Of its set points [Hz]."""
 
 
 CONTROLLERS = {
@@ -65,43 +76,69 @@ CONTROLLERS = {
 }
 
 
+STACKS = {
+    "ur_robot_driver": ("ur5e", "ur5e", "trajectory", 500),
+    "franka_ros2": ("fr3", "franka_ros2", "trajectory", 1000),
+    "xarm_ros2": ("xarm7", "xarm_ros2", "trajectory", 250),
+    "ros2_kortex": ("gen3", "ros2_kortex", "trajectory", 1000),
+    "ros2_so_arm100": ("so101", "ros2_so_arm100", "position", 100),
+}
+"""The arm, the profile and its mode, and the rate of the controller [Hz]."""
+GOAL = 50.0
+"""Greatest jerk of a stack, rms [rad/s^3]."""
+_SUBSTEPS = 5
+"""Physics steps of 1 ms between two positions whose jerk is measured."""
+
+
 class DrivenArm(SimulatedArm):
     """The simulated arm with a controller between commands and drives."""
 
-    def __init__(self, controller, late, smoothing):
-        super().__init__(1, with_object=True)
+    def __init__(self, controller, late, smoothing, arm="ur5e"):
+        super().__init__(1, with_object=True, robot_model=arm)
         self.controller, self.late = controller, late
         # What the guards know of a live arm with such a controller.
-        extra = max(0.0, controller.reach - 1.0) * self.spec.period
-        self.spec = replace(self.spec, lag=load_profile("ur5e").spec().lag + extra)
+        delay = controller.reach * (0.75 if controller.at_rest else 1.0)
+        self.spec = replace(self.spec, lag=LIVE_LAG + max(0.0, delay - 1.0) * self.spec.period)
         self._tick = self.spec.period / PHYSICS_STEPS
-        self._share = 1 - np.exp(-self._tick / smoothing) if smoothing else 1.0
+        self._share = 1 - np.exp(-self._tick / _SUBSTEPS / smoothing) if smoothing else 1.0
         self._rng = np.random.default_rng(0)
+
+    def connect(self):
+        """Build the physics."""
+        super().connect()
+        self.physics.model.opt.timestep = self._tick / _SUBSTEPS
 
     def reset(self, env_ids, initial):
         """Begin at rest."""
         state = super().reset(env_ids, initial)
         # Measured joints at each physics step [rad], and what was commanded by then, were it on time, moving linearly.
         self.positions, self.targets = [], []
-        self._from = self._to = self._wanted = self._smooth = self._setpoint[0, :6].copy()
-        self._velocity, self._begun, self._now = np.zeros(6), -np.inf, 0.0
+        size = self._size = self.description.num_joints
+        self._from = self._to = self._wanted = self._smooth = self._held = self._setpoint[0, :size].copy()
+        self._velocity, self._begun, self._now, self._ticked = np.zeros(size), -np.inf, 0.0, -1.0
         return state
 
     def slices(self, command, parts):
         """One period, in physics steps."""
-        travel = self._travel(command)
-        goal, arrival = self._command[0, :6], self._now + self.late * self._rng.random()
-        wanted, pending, gripper = self._wanted, True, self._setpoint[0, 6]
+        travel, size = self._travel(command), self._size
+        goal, arrival = self._command[0, :size], self._now + self.late * self._rng.random()
+        wanted, pending, gripper = self._wanted, True, self._setpoint[0, size]
         for k in range(1, PHYSICS_STEPS + 1):
-            if pending and arrival <= self._now:
-                self._take(goal)
-                pending = False
-            self._now += self._tick
-            self._smooth = self._smooth + (self._at(self._now)[0] - self._smooth) * self._share
-            setpoint = np.append(self._smooth, gripper + travel[0, 6] * k / PHYSICS_STEPS)
-            self.physics.step(setpoint[None, None])
-            self._setpoint = setpoint[None]
-            self.positions.append(self.physics.qpos[0, :6].copy())
+            rows = []
+            for substep in range(1, _SUBSTEPS + 1):
+                if pending and arrival <= self._now:
+                    self._take(goal)
+                    pending = False
+                self._now += self._tick / _SUBSTEPS
+                due = np.floor(self._now * self.controller.rate + 1e-6) / self.controller.rate
+                if due > self._ticked:
+                    self._ticked, self._held = due, self._at(due)[0]
+                self._smooth = self._smooth + (self._held - self._smooth) * self._share
+                share = (k - 1 + substep / _SUBSTEPS) / PHYSICS_STEPS
+                rows.append(np.append(self._smooth, gripper + travel[0, size] * share))
+            self.physics.step(np.array(rows)[None])
+            self._setpoint = rows[-1][None]
+            self.positions.append(self.physics.qpos[0, :size].copy())
             self.targets.append(wanted + (goal - wanted) * k / PHYSICS_STEPS)
         self._wanted = goal
         yield self._measure(self._all)
@@ -110,15 +147,15 @@ class DrivenArm(SimulatedArm):
         """A new command replaces the one that runs."""
         here, speed = self._at(self._now)
         if self.controller.measured:
-            here, speed = self.physics.qpos[0, :6].copy(), self.physics.qvel[0, :6].copy()
+            here, speed = self.physics.qpos[0, : self._size].copy(), self.physics.qvel[0, : self._size].copy()
         self._from, self._velocity, self._to, self._begun = here, speed, goal, self._now
 
     def _at(self, now):
         """Set point [rad] and its speed [rad/s]."""
         reach, way = self.controller.reach * self.spec.period, self._to - self._from
-        share = (now - self._begun) / reach if reach else 1.0
+        share = max(0.0, (now - self._begun) / reach) if reach else 1.0
         if share >= 1.0:
-            return self._to, np.zeros(6)
+            return self._to, np.zeros(self._size)
         if not self.controller.at_rest:
             return self._from + way * share, way / reach
         first = self._velocity * reach
@@ -131,7 +168,8 @@ def play(arm, policy, episodes):
     """Jerk [rad/s^3], rms and 99.9 %, in the median episode; lag [s] and share of successes."""
     limit, tick = ENVIRONMENTS["bam/pick-v0"].max_episode_steps, arm.spec.period / PHYSICS_STEPS
     rms, peaks, lags, successes = [], [], [], 0
-    with closing(TimeLimit(RobotEnv(SafeRobot(arm), PickTask(1)), limit)) as env:
+    safe, task = SafeRobot(arm, tool_position=arm.tool_position), PickTask(1, robot_model=arm.description)
+    with closing(TimeLimit(RobotEnv(safe, task), limit)) as env:
         for seed in range(episodes):
             env.unwrapped.robot.resume()
             observation, info = env.reset(seed=seed)
@@ -139,7 +177,8 @@ def play(arm, policy, episodes):
             done = False
             with suppress(SafetyStop):  # a guard finds that it does not follow
                 while not done:
-                    observation, _, terminated, truncated, info = env.step(policy.act(observation))
+                    action = policy.act_batch(np.asarray(observation)[None])[0]
+                    observation, _, terminated, truncated, info = env.step(action)
                     done = terminated or truncated
             successes += bool(info["is_success"])
             positions, targets = np.array(arm.positions), np.array(arm.targets)
@@ -152,13 +191,43 @@ def play(arm, policy, episodes):
     return np.median(rms), np.median(peaks), np.mean(lags), successes / episodes
 
 
+def _controller(profile, mode, rate, period):
+    """The controller of the arm in a mode of a profile, and the same one if it only held the commands."""
+    (sink,) = (one for one in load_profile(profile).sinks(mode) if len(one.labels) > 1)
+    if sink.is_timed:
+        is_spline = sink.is_spline(period)
+        return Controller(sink.reach_at(period) / period, at_rest=is_spline, rate=rate), Controller(rate=rate)
+    reach = 0.0 if sink.rate is None else SPLINE_PERIODS
+    return Controller(reach, at_rest=reach > 0.0, rate=min(rate, sink.rate or rate)), Controller(rate=rate)
+
+
+def measure_stacks(flags):
+    """Each driver with its arm: jerk, its ratio to that of held set points, lag and share of successes."""
+    from bam_train.policy import FrozenPolicy
+
+    for name, (arm, profile, mode, rate) in STACKS.items():
+        if flags.controller and name not in flags.controller:
+            continue
+        policy = FrozenPolicy.load(flags.checkpoint) if arm == "ur5e" else scripted_policy("bam/pick-v0", arm)
+        now, held = _controller(profile, mode, rate, ENVIRONMENTS["bam/pick-v0"].period)
+        for late in (0.0, flags.late):
+            before, after = (
+                play(DrivenArm(one, late, flags.smoothing, arm), policy, flags.times(flags.episodes))
+                for one in (held, now)
+            )
+            share, lag = after[0] / before[0], 1000 * after[2]
+            found = f"{after[0]:.0f}, {share:.2f} of {before[0]:.0f} held; {lag:.0f} ms; {after[3]:.0%}"
+            when = "late" if late else "on time"
+            yield harness.at_most(f"{name}, {arm}, {when}", after[0], GOAL, "rad/s^3", found=found)
+
+
 def measure_controllers(flags):
     """Each controller."""
     from bam_train.policy import FrozenPolicy
 
     policy = FrozenPolicy.load(flags.checkpoint)
     yield "controller                commands   jerk rms   99.9 %   lag [ms]   success"
-    for name in flags.controller or CONTROLLERS:
+    for name in [one for one in CONTROLLERS if one in flags.controller or not flags.controller]:
         for late in (0.0, flags.late):
             rms, peak, lag, success = play(
                 DrivenArm(CONTROLLERS[name], late, flags.smoothing), policy, flags.times(flags.episodes)

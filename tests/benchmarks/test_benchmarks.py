@@ -111,9 +111,10 @@ def test_environments(bench):
 
 
 def test_smoothness(bench):
-    """Trajectories are smoother than set points that are held."""
-    controllers = ("--controller", "held", "trajectory 1.5")
-    rows = bench("jerk", "--smoothing", 0.03, *controllers)
+    """Trajectories are smoother than set points that are held, also those of a driver."""
+    rows = bench("jerk", "--controller", "held", "trajectory 1.5", "ros2_kortex")
+    stack = {row[0]: row[3] for row in rows if row[0].startswith("ros2_kortex")}
+    assert stack == {"ros2_kortex, gen3, on time": "met", "ros2_kortex, gen3, late": "met"}
     found = {row[0]: row[2:] for row in rows if row[1] == "on time"}
     rms, _, lag, success = found["trajectory 1.5"]
     assert float(rms) < float(found["held"][0]) / 5

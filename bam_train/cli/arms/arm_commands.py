@@ -10,12 +10,14 @@ from bam_envs.core.errors import InvalidValue, UnknownName
 from bam_train.cli.console import tell
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
     from pathlib import Path
 
     from bam_envs.arms.description import ArmDescription
     from bam_envs.core.robot_models import Description
     from bam_envs.robots.base_description import BaseDescription
-    from bam_train.cli.arms.bam_robots import AddArmConfig, CheckArmConfig, ListArmsConfig
+    from bam_envs.ros.profile_tables import RobotProfile
+    from bam_train.cli.arms.bam_robots import AddArmConfig, CheckArmConfig, ListArmsConfig, ProfileConfig
 
 _PICTURES = (".png", ".jpg")
 _POSTURES = 2000  # in which kinematics are compared with MuJoCo's
@@ -186,6 +188,45 @@ def _draw(description: Description, path: Path) -> None:
         Image.fromarray(robot.render("rgb_array", [])).save(path)
     finally:
         robot.close()
+
+
+def write_profile(config: ProfileConfig) -> int | None:
+    """Write the profile of an arm from its live graph."""
+    from pathlib import Path
+
+    from bam_envs.arms.description import robot_model
+    from bam_envs.core.location import LiveRobot
+    from bam_envs.robots.profile import read_profile
+    from bam_envs.rosbridge.client import RosbridgeLink
+    from bam_envs.rosbridge.endpoint import Endpoint
+    from bam_train.cli.arms.live_graph import GraphProfile, profile_toml, read_graph
+
+    arm = robot_model(config.name)
+    path = config.out or Path("robots") / "profiles" / f"{arm.name}.toml"
+    if path.exists() and not config.force:
+        raise InvalidValue(f"{path} exists; give another name with --out, or --force to replace it.")
+    link = RosbridgeLink(Endpoint.of(LiveRobot(config.url, config.credentials)), name="profile")
+    try:
+        link.connect()
+        found = GraphProfile(arm, read_graph(link))
+    finally:
+        link.close()
+    text = profile_toml(found)
+    profile = read_profile(text, str(path))
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(text, encoding="utf-8")
+    tell(f"wrote {path}:", *(f"  {line}" for line in _profile_lines(profile)))
+    if found.notes:
+        tell("notes, written at its head:", *(f"  {note}" for note in found.notes))
+    return None
+
+
+def _profile_lines(profile: RobotProfile) -> Iterator[str]:
+    yield f"states: {', '.join(dict.fromkeys(source.topic for source in profile.state if not source.optional))}"
+    for mode, sinks in profile.commands.items():
+        yield f"{mode}: {', '.join(sink.address for sink in sinks)}"
+    if profile.enable:
+        yield f"enabled by: {', '.join(one.service for one in profile.enable)}"
 
 
 def list_models(config: ListArmsConfig) -> int | None:

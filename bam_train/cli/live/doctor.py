@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json as json_module
 from contextlib import ExitStack
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -23,25 +23,29 @@ if TYPE_CHECKING:
     from bam_train.cli.flags import DoctorConfig
     from bam_train.deploy.contract import Contract
 
-CONTRACT = "contract"
-"""Name of the last step, with a checkpoint."""
+CONTRACT, DESCRIPTION = "contract", "description"
+"""Name of the last step, with a checkpoint, and without."""
 
 
 def examine(config: DoctorConfig, signals: SignalMemory) -> int:
     """Run the program with its parsed flags; returns the exit status, also 1 if --measure wrote no file."""
     _require_valid(config)
+    from bam_envs.arms.description import robot_model
     from bam_envs.core.location import LiveRobot
     from bam_envs.live.diagnosis import STEPS, Diagnosis
+    from bam_envs.robots.profile import profile_for
 
     place = LiveRobot(config.url, config.credentials, config.profile)
     contracts: list[Contract] = []  # one, once it was checked
     with ExitStack() as opened:
-        robot, more = None, []
+        robot, more = None, [(DESCRIPTION, lambda inspection: _description(config, inspection, contracts))]
         if config.checkpoint is not None:
             checkpoint, env = _opened(config, place)
             opened.callback(env.close)
             robot = env.unwrapped.robot
             more = [(CONTRACT, lambda inspection: _contract(checkpoint, env, inspection, contracts))]
+        elif config.robot_model is not None and config.profile is None:
+            place = replace(place, profile=profile_for(robot_model(config.robot_model).spec(with_object=False)))
         diagnosis = Diagnosis(place, robot, seconds=config.seconds)
         opened.callback(diagnosis.close)
         steps: list[DiagnosisStep] = []
@@ -58,7 +62,7 @@ def examine(config: DoctorConfig, signals: SignalMemory) -> int:
             "address": config.url,
             "profile": None if diagnosis.profile is None else diagnosis.profile.name,
             "steps": [asdict(step) for step in steps],
-            "not_tried": names[len(steps) :],
+            "not_tried": [] if failed is None else names[len(steps) :],
             "failed": None if failed is None else failed.name,
             "contract": contracts[0].to_json() if contracts else None,
             "measured": measured,
@@ -81,13 +85,39 @@ def _opened(config: DoctorConfig, place: LiveRobot) -> tuple[Checkpoint, Any]:
 
 def _contract(checkpoint: Checkpoint, env: Any, inspection: Inspection, contracts: list[Contract]) -> Findings:
     """The last step, which fails if the checkpoint and the robot do not fit; adds the contract to `contracts`."""
-    from bam_envs.core.errors import NotReady
-    from bam_envs.core.wording import listed
     from bam_train.deploy.contract import contract_with
 
-    contracts.append(contract := contract_with(checkpoint, env, inspection))
+    return _required(contract_with(checkpoint, env, inspection), str(checkpoint.path), contracts)
+
+
+def _description(config: DoctorConfig, inspection: Inspection, contracts: list[Contract]) -> Findings | None:
+    """The last step without a checkpoint: the URDF of the robot is that of the arm of the flags, or of the profile.
+
+    None for a base, and for a Universal Robots arm that no flag names: all of them have one profile.
+    """
+    from bam_envs.arms.description import ArmDescription, robot_model
+    from bam_envs.core.robot_models import known_models
+    from bam_envs.live.arm_checks import described_checks
+    from bam_envs.live.building import profile_limits
+    from bam_train.deploy.contract import Contract
+
+    profile = inspection.profile
+    name = config.robot_model or (profile.robot if profile.robot in known_models(ArmDescription) else "")
+    if not name or (config.robot_model is None and robot_model(name).geometry):
+        return None
+    arm, margin = robot_model(name), profile_limits(profile).position_margin
+    checks = described_checks(arm.spec(with_object=False), arm.chain, margin, inspection)
+    return _required(Contract(tuple(checks), inspection), f"the description of {arm.name}", contracts)
+
+
+def _required(contract: Contract, whose: str, contracts: list[Contract]) -> Findings:
+    """What a contract found, which is added to `contracts`; `NotReady` if it is refused."""
+    from bam_envs.core.errors import NotReady
+    from bam_envs.core.wording import listed
+
+    contracts.append(contract)
     try:
-        contract.require(f"{checkpoint.path} and the robot")
+        contract.require(f"{whose} and the robot")
     except ContractRefused as error:
         raise NotReady(str(error)) from error
     unknown = [line.what for line in contract.checks if line.verdict == "unknown"]
@@ -108,6 +138,8 @@ def _require_valid(config: DoctorConfig) -> None:
     from bam_train.errors import SettingsError
     from bam_train.files.atomic_file import require_writable
 
+    if config.robot_model is not None and config.checkpoint is not None:
+        raise SettingsError("--robot-model and --checkpoint each name an arm; give one of them")
     if config.env is not None and config.checkpoint is None:
         raise SettingsError("--env says what a checkpoint was trained on; give --checkpoint too, or leave it out")
     if config.measure is None:

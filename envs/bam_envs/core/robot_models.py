@@ -208,22 +208,30 @@ def _in_table(table: Mapping[str, Any]) -> Description:
     return robot
 
 
-def require_same_robot(table: object) -> None:
-    """Refuse a description in a checkpoint if the one of that name here is of another robot.
+def require_same_robot(table: object, name: str | None = None) -> None:
+    """Refuse a description in a checkpoint if the one here is of another robot: `name`, None for the one of its name.
 
     Raises:
+        UnknownName: There is none called `name`.
         InvalidValue: What differs, in the checkpoint and here.
     """
-    if not isinstance(table, Mapping):
+    if name is not None:
+        here: Description = _found(name)
+        default = next(one for one in (DEFAULT_ARM, DEFAULT_BASE) if type(_found(one)) is type(here))
+        there = _found(table if isinstance(table, (Mapping, str)) else default)
+        found, remedy = f", and {name} moves otherwise", "Give the description with which the policy was trained"
+    elif isinstance(table, Mapping):
+        there = _in_table(table)
+        path = known_models().get(there.name)
+        here = there if path is None else read_description(path)
+        found = f" is another robot here ({path})"
+        remedy = "Give the description with which the policy was trained another name"
+    else:
         return
-    there = _in_table(table)
-    path = known_models().get(there.name)
-    here = there if path is None else read_description(path)
     if here.digest == there.digest:
         return
-    rows = [f"{name}: {theirs}, here {ours}" for name, theirs, ours in there.differences(here)]
+    rows = [f"{one}: {theirs}, here {ours}" for one, theirs, ours in there.differences(here)]
     more = f", and {len(rows) - _MOST} more" if len(rows) > _MOST else ""
     raise InvalidValue(
-        f"{there.name} is another robot here ({path}): {'; '.join(rows[:_MOST])}{more}. Give the description with "
-        "which the policy was trained another name, or train a policy for this one."
+        f"{there.name}{found}: {'; '.join(rows[:_MOST])}{more}. {remedy}, or train a policy for this one."
     )

@@ -8,6 +8,7 @@ Longer than most files: the checks of an arm, and the URDF that they read.
 
 import itertools
 import math
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 from xml.etree import ElementTree
@@ -34,7 +35,10 @@ _STILL = 0.05  # maximum motion of a joint at rest [rad]
 
 
 AXES, AXES_TURN = 0.005, 0.02
-"""Tolerance of two axes of a described arm: their distance [m] and angle [rad]."""
+"""Tolerance of the axes of a described arm: distance [m] and angle [rad]."""
+TOOL_OFF, TOOL_CENTRE = 0.02, re.compile(r"(?i).*tcp.*|tool")
+"""Tolerance of the tool centre point in a URDF [m], which makers put at the tips of the fingers, and tasks between the
+pads; and the names of links that are one."""
 Axis = tuple[Array, Array]
 
 
@@ -76,17 +80,25 @@ class Urdf(dict[str, UrdfJoint]):
     """The joints of a robot by name."""
 
     def axes(self, names: Sequence[str], positions: Sequence[float]) -> list[Axis]:
-        """A point (3,) [m] and the direction (3,) of the axes of some joints at `positions` [rad], in its root."""
-        parents, root = {joint.child: joint.parent for joint in self.values()}, self[names[0]].parent
-        for _ in range(len(self)):
-            root = parents.get(root, root)
+        """A point (3,) [m] and the direction (3,) of the axes of some joints at `positions` [rad].
+
+        They are in the link that the first of them turns in.
+        """
+        base = self[names[0]].parent
         at, found = dict(zip(names, positions, strict=True)), []
         for name in names:
-            pose = self.pose(root, self[name].child, at)
+            pose = self.pose(base, self[name].child, at)
             if pose is None:  # a joint that is not named moves on the way
                 return [(np.full(3, np.nan), np.full(3, np.nan))] * len(names)
             found.append((pose[0], pose[1] @ self[name].axis))
         return found
+
+    def root(self, link: str) -> str:
+        """The link at the root of the tree that has `link`."""
+        parents = {joint.child: joint.parent for joint in self.values()}
+        for _ in range(len(self)):
+            link = parents.get(link, link)
+        return link
 
     def pose(self, base: str, link: str, positions: Mapping[str, float]) -> tuple[Array, Array] | None:
         """Position (3,) [m] and rotation (3, 3) of `link` in `base`; None if a joint or link between them is missing.
@@ -144,15 +156,24 @@ def arm_checks(spec: RobotSpec, geometry: ArmGeometry, margin: float, inspection
 
 
 def described_checks(spec: RobotSpec, chain: SerialChain, margin: float, inspection: Inspection) -> Iterator[Check]:
-    """Lines about limits and kinematics of a described arm: its URDF has the axes of the joints where they are here.
+    """Lines about a described arm by its URDF: limits, kinematics, mount and tool.
 
     Every two axes are compared, by their angle and their distance, because frames of the same arm differ from file to
-    file. The tool is not compared.
+    file. The mount is where the first two are in the frame of the profile's poses, in ``base_link`` or in the link that
+    the first joint turns in; that frame has to be upright in the URDF. The tool is compared where a link is called a
+    tool centre point; its rotation is not compared.
     """
     urdf, why = _description(inspection)
-    yield from _limits(spec, margin, urdf, why)
     names = [name for name, unit in zip(spec.command.labels, spec.command.units, strict=True) if unit == "rad"]
-    if urdf is None or not set(names) <= set(urdf):
+    state = inspection.profile.state
+    theirs = next((one.names for one in state if one.signal == "joint_position"), ())
+    names = list(theirs) if len(theirs) == len(names) else names
+    yield from _limits(spec, margin, urdf, why, (*names, *spec.command.labels[len(names) :]))
+    if urdf is None:
+        return
+    if missing := [name for name in names if name not in urdf]:
+        found = f"another arm: {', '.join(missing)} not in it"
+        yield Check(f"kinematics in {DESCRIPTION}", ", ".join(names), found, fits=False)
         return
     expected = f"every two axes within {1000 * AXES:g} mm and {math.degrees(AXES_TURN):.0f} degree"
     there, frames = urdf.axes(names, chain.home.tolist()), chain.link_frames(chain.home[None])[0]
@@ -162,8 +183,59 @@ def described_checks(spec: RobotSpec, chain: SerialChain, margin: float, inspect
         for one, other in itertools.combinations(range(len(names)), 2)
         if not np.allclose(_between(here[one], here[other]), _between(there[one], there[other]), 0.0, [AXES, AXES_TURN])
     ]
-    found = f"another arm, mount or calibration: {', '.join(wrong[:3])} are not as in its description"
+    found = f"another arm or calibration: {', '.join(wrong[:3])} are not as in its description"
     yield Check(f"kinematics in {DESCRIPTION}", expected, found if wrong else "as described", fits=not wrong)
+    if wrong:
+        return
+    base = urdf[names[0]].parent
+    frames_of_poses = [one.frame for one in state if one.signal == "object_position"]
+    known = [one for one in (*frames_of_poses, "base_link", base) if urdf.pose(one, base, {}) is not None]
+    frame = known[0]
+    yield _mount(urdf, frame, base, names, list(zip(here, there, strict=True))[:2])
+    at = dict(zip(names, chain.home.tolist(), strict=True))
+    yield from _tool_centre(urdf, frame, names[-1], at, frames[-1][:3, 3])
+
+
+def _mount(urdf: Urdf, frame: str, base: str, names: Sequence[str], axes: Sequence[tuple[Axis, Axis]]) -> Check:
+    """`frame` is upright, and joints have their axes where they are here.
+
+    `axes` has, for each of the first joints, its axis here in `frame` and there in the link `base`.
+    """
+    what, expected, root = f"mount in {DESCRIPTION}", f"upright, and as described in {frame}", urdf.root(frame)
+    upright, placed = urdf.pose(root, frame, {}), urdf.pose(frame, base, {})
+    if upright is None or placed is None:
+        return Check(what, expected, f"{frame} is on something that moves", fits=None)
+    tilt = math.acos(min(1.0, max(-1.0, upright[1][2, 2])))
+    if tilt > AXES_TURN:
+        return Check(what, expected, f"{frame} is tilted by {math.degrees(tilt):.0f} degrees in {root}", fits=False)
+    position, rotation = placed
+    for name, ((point, along), (place, direction)) in zip(names, axes, strict=False):
+        gap, there = rotation @ place + position - point, rotation @ direction
+        off, turned = float(np.linalg.norm(np.cross(gap, along))), float(np.linalg.norm(np.cross(along, there)))
+        if off > AXES or turned > AXES_TURN or along @ there < 0.0:
+            angle = math.degrees(math.atan2(turned, along @ there))
+            found = f"another mount: the axis of {name} is {1000 * off:.0f} mm and {angle:.0f} degrees off in {frame}"
+            return Check(what, expected, found, fits=False)
+    return Check(what, expected, "as described", fits=True)
+
+
+def _tool_centre(urdf: Urdf, frame: str, last: str, at: Mapping[str, float], tool: Array) -> Iterator[Check]:
+    """A tool centre point that is fixed to the `last` joint is where `tool` (3,) is in `frame`, with joints `at`."""
+    what, expected = f"tool in {DESCRIPTION}", f"within {1000 * TOOL_OFF:g} mm of the description's"
+    fixed = {name: joint for name, joint in urdf.items() if joint.kind == "fixed"}
+    carried, gaps = {urdf[last].child}, dict[str, float]()
+    for _ in range(len(fixed)):
+        carried |= {joint.child for joint in fixed.values() if joint.parent in carried}
+    for link in sorted(carried):
+        pose = urdf.pose(frame, link, at) if TOOL_CENTRE.fullmatch(link) else None
+        if pose is not None:
+            gaps[link] = float(np.linalg.norm(pose[0] - tool))
+    if not gaps:
+        yield Check(what, expected, "no link is called tool or *tcp*", fits=None)
+        return
+    gap, link = min((gap, link) for link, gap in gaps.items())
+    found = f"{link} is {1000 * gap:.0f} mm from it"
+    yield Check(what, expected, found if gap <= TOOL_OFF else f"another tool: {found}", fits=gap <= TOOL_OFF)
 
 
 def measured_joints(inspection: Inspection, spec: RobotSpec) -> Array | None:
@@ -280,10 +352,11 @@ def _description(inspection: Inspection) -> tuple[Urdf | None, str]:
         return None, str(error)
 
 
-def _limits(spec: RobotSpec, margin: float, urdf: Urdf | None, why: str) -> Iterator[Check]:
-    """The range of each joint in the URDF includes the range that the guards allow."""
+def _limits(spec: RobotSpec, margin: float, urdf: Urdf | None, why: str, names: Sequence[str] = ()) -> Iterator[Check]:
+    """The range of each joint in the URDF includes the range that the guards allow; `names` are those of the URDF."""
     command = spec.command
-    joints = [(i, urdf[name]) for i, name in enumerate(command.labels) if urdf is not None and name in urdf]
+    rows = enumerate(names or command.labels)
+    joints = [(i, urdf[name]) for i, name in rows if urdf is not None and name in urdf]
     if not joints:
         yield Check("joint limits", "as in the profile", why or f"{DESCRIPTION} has none of the joints", fits=None)
     for i, joint in joints:
@@ -308,6 +381,11 @@ def _described_kinematics(geometry: ArmGeometry, joints: Array, urdf: Urdf) -> I
     fits = _near(beside, turned) and abs(along) <= OFF_AXIS
     found = f"{math.hypot(beside, along):.3f} m" if fits else _explained_model(geometry, q, pose)
     yield Check(f"kinematics in {DESCRIPTION}", f"flange within {OFF_AXIS:g} m", found, fits=fits)
+    if fits:
+        yield _mount(urdf, "base_link", "base_link", (), ())  # its axes were compared with the flange
+        at, tool = dict(zip(UR_JOINTS, q.tolist(), strict=True)), geometry.tool_position(q[None])[0]
+        lines = _tool_centre(urdf, "base_link", UR_JOINTS[-1], at, tool) if geometry.tool else ()
+        yield from (line for line in lines if line.fits is not None)  # the tool's pose shows it better
 
 
 def _explained_model(geometry: ArmGeometry, q: Array, pose: Pose) -> str:

@@ -12,15 +12,15 @@ from contextlib import suppress
 from functools import partial
 from typing import Any
 
-from bam_envs.core.errors import BamEnvsError, LinkLost, ProtocolError, RemoteError, StaleState
+from bam_envs.core.errors import BamEnvsError, LinkLost, NotReady, ProtocolError, RemoteError, StaleState
 from bam_envs.core.timing import Deadline
 from bam_envs.live.state import LiveState, Mailbox
 from bam_envs.ros.codec import RobotInfo, has_room
 from bam_envs.ros.freshness import Tagger, read_tag
 from bam_envs.ros.messages import bare_type, same_type, tag_text
-from bam_envs.ros.profile_tables import Readiness, RobotProfile, Sink
+from bam_envs.ros.profile_tables import Enable, Readiness, RobotProfile, Sink
 from bam_envs.rosbridge.bus import Caller, Message, namespaces_with
-from bam_envs.rosbridge.ros_bus import RosBus
+from bam_envs.rosbridge.ros_bus import RosBus, bare_reason
 from bam_envs.rosbridge.sessions import LEASE_TOPIC, LEAVE, RENEW, SESSION_SERVICE, is_forbidden, read_session
 
 TIMEOUT = 3.0
@@ -30,6 +30,8 @@ _TRIES, _TRY_AGAIN = 3, 0.1
 FIRST_WITHIN = 0.3
 """Longest wait for the latched topics that report whether the robot is ready [s]."""
 _ANSWER_WITHIN = 2.0
+_ENABLED_WITHIN = 10.0
+"""Longest wait for the answer of a service that enables a robot [s]."""
 _RIVAL_TIME = 1.0
 """How long after a command of somebody else a robot counts as driven by it [s]."""
 _RENEW_EVERY, _RENEWAL_LIFE = 0.5, 1.0
@@ -63,6 +65,26 @@ def ask(
         return ask(link, service, tries - 1, request=request)
 
 
+def enable(link: RosBus, services: Iterable[Enable], profile: RobotProfile, *, needed: bool) -> None:
+    """Call `services` in their order; `NotReady` for the first that does not succeed, or is `needed` and absent."""
+    for one in services:
+        name = link.namespace + one.service
+        try:
+            response = link.call(name, "", dict(one.request), _ENABLED_WITHIN)
+        except RemoteError as error:
+            if not needed and "does not exist" in str(error):  # a served robot has no motors to enable
+                continue
+            why, remedy = f"failed: {bare_reason(link.url, error)}", f"or change it in the profile of {profile.name}"
+        except LinkLost as error:
+            why, remedy = f"is not known to have succeeded: {bare_reason(link.url, error)}", "and try again"
+        else:
+            why, remedy = one.trouble(response) or "", "and try again"
+        if why:
+            raise NotReady(
+                f"{link.url}: {name}, which {one.does}, {why}. Look at the robot's driver, {remedy}. Nothing has moved."
+            )
+
+
 def info_by_profile(url: str, profile: RobotProfile, unknown: Iterable[str] = ()) -> RobotInfo:
     """A description of a robot at `url` that does not describe itself; `unknown` names its silent topics."""
     silent = ", ".join(name.rpartition("/")[2] for name in unknown)
@@ -86,9 +108,9 @@ def least_interval(profile: RobotProfile, period: float, topic: str, *, describe
 
 
 def tagged_sinks(profile: RobotProfile, mode: str | None) -> tuple[Sink, ...] | None:
-    """The sinks of `mode`, or of the first mode, whose messages have room for a tag; None if there are none."""
+    """The sinks of `mode`, or of the first mode, whose topics have room for a tag; None if there are none."""
     modes = profile.commands.values() if mode is None else [profile.sinks(mode)]
-    return next((sinks for sinks in modes if all(sink.tag and has_room(sink.type) for sink in sinks)), None)
+    return next((sinks for sinks in modes if all(one.tag and has_room(one.type) for one in sinks if one.topic)), None)
 
 
 class TopicTypes:
@@ -111,8 +133,8 @@ class TopicTypes:
         actual = self.type_of(topic)
         return same_type(actual, kind) if actual else not self.answers
 
-    def check_listened(self, topic: str, sink: Sink) -> str:
-        """As `check`, for the `topic` of `sink`: it needs a subscriber, and the expected type, stamped or not."""
+    def check_listened(self, topic: str, sink: Sink) -> Sink:
+        """`sink`, whose `topic` needs a subscriber, with the type that this has: its own, or see `Sink.of_type`."""
         deadline, expected = Deadline(self._timeout), sink.type
         while not self.type_of(topic) and self.answers:
             if deadline.passed:
@@ -122,10 +144,38 @@ class TopicTypes:
                     f"this may be another robot than it describes.{namespaces_with(self._link, 'topics', sink.topic)}"
                 )
             time.sleep(_TRY_AGAIN)  # nodes of a ROS graph take a while to discover each other
-        kind = self.type_of(topic) or expected
-        if bare_type(kind) != bare_type(expected):  # reading ignores a stamp, writing does not
+        kind = bare_type(self.type_of(topic) or expected)
+        found = sink.of_type(kind)
+        if found is None:
             raise self._wrong_type(topic, expected, kind)
-        return kind
+        return found
+
+    def check_offered(self, sink: Sink) -> None:
+        """`ProtocolError` if it is known that nobody offers the action or the service of `sink`, or another type."""
+        deadline, name = Deadline(self._timeout), self._link.namespace + sink.address
+        what = "action" if sink.action else "service"
+        while not (kind := self.offered(name, sink)):
+            if deadline.passed:
+                raise ProtocolError(
+                    f"Nobody offers the {what} {name} ({sink.type}), which takes {', '.join(sink.labels)}: start the "
+                    f"gripper's driver, or change `{what}` in the profile of {self._profile.name}."
+                )
+            time.sleep(_TRY_AGAIN)
+        if bare_type(kind) != sink.type:
+            raise self._wrong_type(name, sink.type, kind)
+
+    def offered(self, name: str, sink: Sink) -> str:
+        """The type of the action or service `name` on the server, that of `sink` if it is unknown; empty if absent."""
+        what = "action" if sink.action else "service"
+        try:  # a rosapi may lack any of the services
+            if sink.action:  # many lack `action_type`
+                servers = self._link.call("/rosapi/action_servers", "", {}, self._timeout).get("action_servers")
+                if name not in (servers or ()):
+                    return ""
+            answer = self._link.call(f"/rosapi/{what}_type", "", {what: name}, self._timeout)
+        except RemoteError:
+            return sink.type
+        return str(answer.get("type") or "")
 
     def _wrong_type(self, topic: str, expected: str, kind: str) -> ProtocolError:
         return ProtocolError(
@@ -190,7 +240,7 @@ class LiveReadiness:
             self._subscribed = tuple(one for one in every if self._types.may_be(link.namespace + one.topic, one.type))
             for one in self._subscribed:
                 link.subscribe(link.namespace + one.topic, one.type, self.mailbox.listener(one.topic))
-            for sink in self._sinks:
+            for sink in (one for one in self._sinks if one.topic):
                 kind = self._types.type_of(link.namespace + sink.topic) or sink.type
                 if has_room(kind):
                     link.subscribe(link.namespace + sink.topic, kind, partial(self._on_command, sink.topic))

@@ -4,9 +4,11 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
+from bam_envs.arms.description import ArmDescription, robot_model
 from bam_envs.core.errors import InvalidValue
 from bam_envs.core.location import NO_CREDENTIALS, LiveRobot
 from bam_envs.core.robot import RobotSpec
+from bam_envs.core.robot_models import DEFAULT_ARM, known_models
 from bam_envs.live.rosbridge_robot import RosbridgeRobot
 from bam_envs.live.shadow_robot import ShadowRobot
 from bam_envs.robots.profile import load_profile, profile_for
@@ -32,7 +34,8 @@ def live_robot(
         at: Where it is; or its address, or a connected `roslibpy.Ros`, to which `options` belong.
         spec: Signals and commands that the task needs; None: all of the profile that are not optional.
         limits: The limits of the guards; None: those of the profile.
-        tool_position: Forward kinematics of an arm other than a UR5e, (n, k) [rad] to (n, 3) [m].
+        tool_position: Forward kinematics of an arm other than a UR5e, (n, k) [rad] to (n, 3) [m]; None: those of the
+            described arm of the profile.
         straight: Whether the commands move the tool along straight lines, so that singularities count.
         command: Command mode, such as ``"trajectory"``; None: the profile's default.
         options: Fields of `LiveRobot`, such as ``guards={"joint_speed": 0.3}``.
@@ -45,6 +48,8 @@ def live_robot(
     place = at if isinstance(at, LiveRobot) else LiveRobot(at, **options)
     endpoint, ros = _server(place)
     chosen = _chosen(place.profile, spec)
+    if tool_position is None and chosen.robot != DEFAULT_ARM and chosen.robot in known_models(ArmDescription):
+        tool_position = robot_model(chosen.robot).arm.tool_position
     robot = RosbridgeRobot(endpoint, chosen, spec=spec, command=command, ros=ros)
     chosen_limits = limits or profile_limits(chosen)
     if place.guards != {}:

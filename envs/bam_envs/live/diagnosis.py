@@ -83,21 +83,28 @@ class Diagnosis:
         self.robot, self.seconds = robot, seconds
         self.inspection: Inspection | None = None
         """The messages of the robot and the measured link; None before the step ``"rates and ages"``."""
-        self.profile: RobotProfile | None = None if self._at.profile is None else load_profile(self._at.profile)
+        known = self._at.profile is None or isinstance(self._at.profile, RobotProfile)
+        self.profile: RobotProfile | None = self._at.profile if known else load_profile(self._at.profile)
         if self._at.profile is None and robot is not None:
-            self.profile = profile_for(robot.spec)
+            self.profile = robot.profile or profile_for(robot.spec)
         self._link = RosbridgeLink(endpoint, name="doctor")
         self._timeout = endpoint.timeout or bringup.TIMEOUT
 
-    def steps(self, *more: tuple[str, Callable[[Inspection], Findings]]) -> Iterator[DiagnosisStep]:
-        """Run the steps in order, up to the first failure; then `more` of them, which look at the inspection."""
+    def steps(self, *more: tuple[str, Callable[[Inspection], Findings | None]]) -> Iterator[DiagnosisStep]:
+        """Run the steps in order, up to the first failure; then `more` of them, which look at the inspection.
+
+        One that finds None has nothing to check, and is left out.
+        """
         own = [(name, getattr(self, f"_{name.replace(' ', '_')}")) for name in STEPS]
         for name, step in (*own, *((name, lambda step=step: step(self.inspected)) for name, step in more)):
             try:
-                found, warnings = step()
+                findings = step()
             except BamEnvsError as error:
                 yield DiagnosisStep(name, "failed", str(error))
                 return
+            if findings is None:
+                continue
+            found, warnings = findings
             yield DiagnosisStep(name, "warning" if warnings else "ok", "; ".join(found), tuple(warnings))
 
     def close(self) -> None:
@@ -165,19 +172,22 @@ class Diagnosis:
         return self.profile
 
     def _best_profile(self) -> tuple[RobotProfile, float]:
-        """The shipped profile most of whose topics are there, and 0 if none of them is."""
+        """The shipped profile most of whose topics of states are there, then of commands; 0 if none of states is."""
         answer: dict[str, Any] = {}
         with suppress(BamEnvsError):  # a server without rosapi
             answer = self._link.call("/rosapi/topics", "rosapi/Topics", {}, self._timeout)
         present, namespace = {str(topic) for topic in answer.get("topics") or ()}, self._link.namespace
 
-        def share(profile: RobotProfile) -> float:
-            topics = {source.topic for source in profile.state if not source.optional}
+        def share(topics: set[str]) -> float:
             elsewhere = sum(any(name.endswith(topic) for name in present) for topic in topics)  # in any namespace
             return (len({namespace + topic for topic in topics} & present) + elsewhere) / len(topics)
 
-        best = max((load_profile(name) for name in ("ur5e", *shipped_profiles())), key=share)
-        return best, share(best)
+        def shares(profile: RobotProfile) -> tuple[float, float]:
+            states = {source.topic for source in profile.state if not source.optional}
+            return share(states), share({sink.topic for sink in profile.sinks() if sink.topic})
+
+        best = max((load_profile(name) for name in ("ur5e", *shipped_profiles())), key=shares)
+        return best, shares(best)[0]
 
     def _another_robot(self, profile: RobotProfile) -> str:
         """A sentence for an error, if an arm is where `profile` has a base, or a base where it has an arm."""
@@ -254,13 +264,16 @@ class Diagnosis:
     def _command_path(self) -> Findings:
         robot, _ = self._robot_and_profile()
         robot.connect()  # checks types and listeners of all command topics and opens the connection that halts
+        services = [f"{one.service} ({one.does})" for one in robot.enabling]
         why = robot.not_ready()
-        if why is not None:
+        if why is not None and not services:
             raise NotReady(f"{why}. Run this again when the robot takes commands")
-        found = ["the connection that halts is open; ready; nothing was sent"]
+        found = [f"the connection that halts is open; {'ready' if why is None else why}; nothing was sent"]
+        if services:  # a diagnosis enables no motors
+            found.append(f"a program that moves it calls first, once its operator agrees: {', '.join(services)}")
         if self.inspected.types is None:
             return found, ["without a rosapi node the server cannot report whether anybody listens"]
-        return ["the topics of commands have listeners", *found], []
+        return ["somebody takes the commands", *found], []
 
     def _guards(self) -> Findings:
         robot, _ = self._robot_and_profile()

@@ -25,7 +25,7 @@ from bam_envs.live.command_proof import CommandProof, needed_proof
 from bam_envs.live.robot_identity import robot_identity
 from bam_envs.live.state import Letter, Mailbox, SourceAge, concerns
 from bam_envs.robots.linked import LinkProfile
-from bam_envs.ros.codec import INFO_SERVICE, RobotInfo, decode_source, read_info
+from bam_envs.ros.codec import DESCRIPTION_TOPIC, INFO_SERVICE, RobotInfo, decode_source, read_info
 from bam_envs.ros.messages import same_type
 from bam_envs.ros.profile_tables import RobotProfile, Sink, Source
 from bam_envs.rosbridge.client import RosbridgeLink
@@ -33,7 +33,7 @@ from bam_envs.rosbridge.client import RosbridgeLink
 Array = NDArray[np.float64]
 LISTEN = 0.5
 """Shortest time for which messages are collected [s]."""
-DESCRIPTION, DESCRIPTION_TYPE = "/robot_description", "std_msgs/String"
+DESCRIPTION, DESCRIPTION_TYPE = DESCRIPTION_TOPIC, "std_msgs/String"
 """The topic on which a robot publishes its URDF, latched."""
 TOOL_POSE = ("tool_position", "tool_quaternion")
 """Optional signals of an arm: the pose of its tool, as its controller measures it."""
@@ -89,9 +89,10 @@ class Inspection:
     sources: tuple[Source, ...]
     """Topics of the task's signals, and of the tool's pose if the profile has it."""
     sinks: tuple[Sink, ...]
-    """Topics of the task's commands."""
+    """Topics, actions and services of the task's commands."""
     types: Mapping[str, str] | None
-    """Type of each topic on the server, empty if the server does not know it; None without an answer."""
+    """Type of each topic on the server, and of each action and service of a command; empty if the server does not know
+    it; None without an answer."""
     letters: Mapping[str, Sequence[Letter]]
     """Messages of each topic, in order."""
     seconds: float
@@ -228,14 +229,20 @@ def inspect_robot(
     answer = ask(link, service)
     info = None if answer is None else read_info(answer.get("message"), service)
     sinks = (tagged_sinks(narrowed, None) if info is not None else None) or narrowed.sinks()
-    needed = {entry.topic: entry.type for entry in (*required, *sinks)}
+    sinks = tuple(form for sink in sinks for form in sink.forms)
+    topical = [sink for sink in sinks if sink.topic]
+    needed = {entry.topic: entry.type for entry in (*required, *topical)}
     wanted = {**needed, **{source.topic: source.type for source in extra}, DESCRIPTION: DESCRIPTION_TYPE}
-    types = _types(link, TopicTypes(link, profile, timeout), wanted, needed, timeout)
+    asked = TopicTypes(link, profile, timeout)
+    types = _types(link, asked, wanted, needed, timeout)
+    if types is not None:
+        offered = {sink.address: asked.offered(link.namespace + sink.address, sink) for sink in sinks if not sink.topic}
+        types = {**types, **offered}
     identity = robot_identity(endpoint, profile, info)
     proof = needed_proof(link, info, narrowed, sinks, endpoint, identity)
     inbox = Mailbox(keeps_all=True)
     are_echoed = pings and _are_echoed(link, inbox, timeout)
-    unheard, start = {sink.topic for sink in sinks}, time.monotonic()
+    unheard, start = {sink.topic for sink in topical}, time.monotonic()
     for topic, expected in wanted.items():
         kind = expected if types is None else types[topic]
         if topic in unheard or not same_type(kind or "", expected):

@@ -229,12 +229,13 @@ def driven(poses: Array, axes: int) -> Array:
 
 
 def _commands(inspection: Inspection) -> Iterator[Check]:
-    """Each topic of a command has a subscriber and the expected type."""
+    """Each topic of a command has a subscriber, each action and service somebody who offers it, of that type."""
     for sink in inspection.sinks:
-        kind = None if inspection.types is None else inspection.types[sink.topic]
-        found = "unknown" if kind is None else bare_type(kind) or "nobody listens"
-        fits = None if kind is None else bare_type(kind) == bare_type(sink.type)
-        yield Check(f"command {sink.topic}", sink.type, found, fits=fits)
+        kind = None if inspection.types is None else inspection.types[sink.address]
+        nobody = "nobody listens" if sink.topic else "nobody offers it: start the gripper's driver"
+        found = "unknown" if kind is None else bare_type(kind) or nobody
+        fits = None if kind is None else sink.of_type(bare_type(kind)) is not None
+        yield Check(f"command {sink.address}", sink.type, found, fits=fits)
     proof = inspection.proof
     if proof is not None:
         found = proof.fault or (f"proved on {proof.since}" if proof.is_known else "to be proved in the first motion")

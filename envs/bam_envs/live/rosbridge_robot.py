@@ -33,6 +33,8 @@ from bam_envs.core.timing import Pacer
 from bam_envs.live import bringup
 from bam_envs.live.camera import LiveCamera, fitted
 from bam_envs.live.command_proof import CommandProof, needed_proof
+from bam_envs.live.goals import GOAL, Goals, form_for
+from bam_envs.live.set_points import SetPoints
 from bam_envs.live.state import Letter, LiveState
 from bam_envs.live.take_over import TakeOver
 from bam_envs.ros.codec import (
@@ -45,7 +47,7 @@ from bam_envs.ros.codec import (
     read_info,
 )
 from bam_envs.ros.freshness import Tag
-from bam_envs.ros.profile_tables import RobotProfile, Sink
+from bam_envs.ros.profile_tables import SPLINE_PERIODS, Enable, RobotProfile, Sink
 from bam_envs.rosbridge.client import RosbridgeLink
 from bam_envs.rosbridge.endpoint import Endpoint
 from bam_envs.rosbridge.ros_bus import RosBus, bare_reason
@@ -67,6 +69,8 @@ _HALT_WAITS = 0.05
 _LEAD, _LEAD_DECAY = 0.1, 0.95
 """A step ends before its deadline by the longest time that a recent command took to compute, at most by this share of a
 period; at each tick the memory of that longest time fades by this factor."""
+_HOLD_PERIODS = 1.5
+"""Longest time in which a trajectory of a halt is to be reached [periods]."""
 _BY_HAND = "stop it by hand if it moves; a robot with a command timeout stops by itself"
 _NOTHING_SENT = ". Nothing was sent, and nothing is kept"
 _FAR, _CANNOT_BE_FAR = 0.3, 1.0
@@ -115,17 +119,22 @@ class RosbridgeRobot:
         """Whether the gripper is not commanded, but the joints of the arm alone."""
         images = {name: box for camera in self.spec.cameras for name, box in camera.spaces().items()}
         self._cameras = {name: (LiveCamera(endpoint, profile.camera(name)), box) for name, box in images.items()}
+        self._points: SetPoints | None = None  # of controllers that get set points between commands
+        rates = [one.rate for one in self._sinks if one.rate]
+        self._every = 1.0 / max(rates, default=1.0)
+        self._streamed = [place for one in self._sinks if one.rate for place in self._places(one)]
         self._pacer, self._session = Pacer(self.spec.period, now=clock), bringup.DrivingSession()
         self._ended_at, self._lead = clock(), 0.0  # of the last step; how long before its deadline the next one ends
         self._command_life = profile.command_life(self.spec.period)
         self._control: RosBus | None = None
         self._halting: RosbridgeLink | None = None
+        self._goals: Goals | None = None  # of a gripper that is an action or a service
         self._epoch = 0  # of the connection that was verified; another one needs a reset
         self._cut = threading.Event()
         self._sending, self._halts = threading.Lock(), 0
         self._woken = threading.Event()  # by a halt or a drop of the link, which end the wait of a step
         self._halt_failed = False  # and the failure was reported
-        self._commanded = False  # since `connect`
+        self._commanded = self._is_enabled = False  # since `connect`
         self._take_over: TakeOver | None = None  # of a robot that a live agent drives
         self.agent_state = ""
         """The state of that agent once the robot was handed back, such as ``"paused"``; "" if it is unknown."""
@@ -172,8 +181,9 @@ class RosbridgeRobot:
         except BaseException:
             for camera, _ in self._cameras.values():
                 camera.close()
-            halting.close()
-            control.close()
+            goals, self._goals = self._goals, None
+            for link in (halting, control, *([] if goals is None else [goals.link])):
+                link.close()
             raise
         close_at_exit(self)
 
@@ -227,11 +237,20 @@ class RosbridgeRobot:
 
     def _advertise(self, control: RosBus, halting: RosbridgeLink, types: bringup.TopicTypes) -> None:
         """Advertise commands, with their types on the server."""
-        for sink in self._sinks:
-            name = self.namespace + sink.topic
-            kind = types.check_listened(name, sink)
-            control.advertise(name, kind)
-            halting.advertise(name, kind)
+        if others := [sink for sink in self._sinks if not sink.topic]:
+            for one in (form for sink in others for form in sink.forms):
+                types.check_offered(one)
+            link = control
+            if not self._describes_itself:
+                link = RosbridgeLink(self._endpoint, name="goals", lost_after=_LOST_AFTER)
+            self._goals = Goals(link, self.spec.command, self.namespace, self._refuse)
+            link.connect()
+        self._sinks = tuple(
+            types.check_listened(self.namespace + one.topic, one) if one.topic else one for one in self._sinks
+        )
+        for sink in (one for one in self._sinks if one.topic):
+            control.advertise(self.namespace + sink.topic, sink.type)
+            halting.advertise(self.namespace + sink.topic, sink.type)
         halting.advertise(self.namespace + HALT_TOPIC, "std_msgs/Empty")
         control.advertise(self.namespace + STATUS_TOPIC, "std_msgs/String")
 
@@ -251,9 +270,24 @@ class RosbridgeRobot:
         self._refusals.clear()
         self._state.read()
         self._sent = None
+        if self._goals is not None:
+            self._goals.cancel()  # whatever came of those of an older connection
 
     def _needed_proof(self, control: RosBus) -> CommandProof | None:
         return needed_proof(control, self.info, self.profile, self._sinks, self._endpoint)
+
+    @property
+    def enabling(self) -> tuple[Enable, ...]:
+        """The services that `enable` will call; empty if none is left."""
+        return () if self._is_enabled or self.info.agent else self.profile.enable
+
+    def enable(self) -> None:
+        """Call the services before which the robot takes no commands, once the operator has agreed; once a connection.
+
+        `NotReady` if one is not offered or does not succeed; those after it are not called.
+        """
+        bringup.enable(self._connected(), self.enabling, self.profile, needed=not self._describes_itself)
+        self._is_enabled = True
 
     def tell_proved(self, lag: float) -> None:
         """Take that the commands of this connection are proved, with the measured `lag` of the arm [s]."""
@@ -279,7 +313,8 @@ class RosbridgeRobot:
         """Take a status of the server, or of the robot's side behind it; `step` raises the first error."""
         if self._readiness is not None and self._readiness.owns(status, self.namespace):
             return
-        if STATUS_TOPIC in str(status.get("id")) + str(status.get("msg")):  # a server may refuse the report
+        # A server may refuse the report; a goal may have ended before it was canceled.
+        if STATUS_TOPIC in str(status.get("id")) + str(status.get("msg")) or str(status.get("id")).startswith(GOAL):
             return
         if status.get("level") == "error":
             text = str(status.get("msg"))
@@ -288,16 +323,19 @@ class RosbridgeRobot:
                 refusal = NotInCommand if " in command" in text else RemoteError
                 error = SafetyStop.told(text) or refusal(f"{self.url}: {text}")
                 self._session_over |= is_over(error)
-                if not self._refusals:  # the first one is raised, however many a server sends
-                    self._refusals.append(error)
-                self._state.mailbox.wake()
+                self._refuse(error)
+
+    def _refuse(self, error: BamEnvsError) -> None:
+        if not self._refusals:  # the first one is raised, however many a server sends
+            self._refusals.append(error)
+        self._state.mailbox.wake()
 
     def reset(self, env_ids: EnvIds, initial: Initial) -> RobotState:
         """A fresh state. A real robot does not move; a simulated one is put at rest, its object at its `initial` pose.
 
         Raises:
             LinkLost: The link is down.
-            NotReady: The robot reports that it cannot move now.
+            NotReady: The robot reports that it cannot move now, or has to be enabled before.
             RemoteError: The other end refused the scene.
             SafetyStop: A guard of a live agent stopped the robot meanwhile.
             StaleState: No fresh state came.
@@ -308,6 +346,12 @@ class RosbridgeRobot:
         elif self._session_over or (self._session.is_driving and self._state.echo()[0] != self._session.tagger.session):
             self._open_session(control)  # the robot's side restarted and lost the session
         self._refusals.clear()
+        if self.enabling:
+            first = self.enabling[0]
+            raise NotReady(
+                f"{self.url}: not enabled: {first.service}, which {first.does}, has not been called. Once its operator "
+                "agrees, call robot.enable(), which calls it; the programs ask the operator."
+            )
         self._require_ready(self.not_ready())
         if self._take_over is not None:
             self._take_over.take()
@@ -372,6 +416,7 @@ class RosbridgeRobot:
         if lockstep and self._sent_tag != tag:  # a halt came before it: nothing will answer
             return self.measure()
         if not lockstep:
+            self._stream(control, tag, halts)
             self._wait(self._pacer.slack - self._lead, halts)
             self._ended_at = self._clock()
         elif not self._state.await_answer(
@@ -411,18 +456,56 @@ class RosbridgeRobot:
         ros1, sign = control.ros == "ros1", self._session.tagger.sign
         options: Any = {"sign": sign, "ros1": ros1, "reach": self.reach}
         sinks = [sink for sink in self._sinks if not (self.joints_only and sink.hold == "last")]
-        envelopes = [encode_sink(sink, self.spec, command, tag, **options) for sink in sinks]
+        sinks = [form_for(sink, command, self.spec.command) for sink in sinks]
+        target, command = command, self._set_point(command, halts)
+        messages = [(sink, encode_sink(sink, self.spec, command, tag, **options)[2]) for sink in sinks]
         with self._sending:
             if self._clock() > until:
                 _LOG.warning("%s: a command waited too long in this process, and was not sent.", self.url)
             elif self._halts == halts:
                 self._commanded = True
                 self._session.drive()
-                control.publish_all([(self.namespace + topic, message) for topic, _, message in envelopes])
-                self._sent, self._sent_at, self._sent_after = command.copy(), self._clock(), halts
+                for sink, message in messages:
+                    if self._goals is not None and not sink.topic:
+                        self._goals.send(sink, command[self._places(sink)], message)
+                control.publish_all([(self.namespace + one.topic, message) for one, message in messages if one.topic])
+                self._sent, self._sent_at, self._sent_after = target.copy(), self._clock(), halts
                 self._sent_tag = tag
                 if self._answers:
                     self._owed[tag.sequence] = self._sent_at
+
+    def _set_point(self, command: Array, halts: int) -> Array:
+        """What is sent at once of `command` (m,): controllers with a rate get the first point of a spline to it."""
+        places, period, now = self._streamed, self.spec.period, self._clock()
+        if self._describes_itself or not places:
+            return command
+        if self._points is None or self._sent_after != halts or now - self._sent_at > SPLINE_PERIODS * period:
+            # The arm is at rest, maybe elsewhere than its last set point.
+            self._points = SetPoints(self._at_rest(self._state.read()[0])[places], now)
+        self._points.aim(command[places], now, SPLINE_PERIODS * period)
+        return self._next_point(command)
+
+    def _next_point(self, command: Array) -> Array:
+        point = command.copy()
+        if self._points is not None:
+            point[self._streamed] = self._points.at(self._clock() + self._every)[0]
+        within: Array = np.clip(point, self.spec.command.low, self.spec.command.high)
+        return within
+
+    def _stream(self, control: RosBus, tag: Tag, halts: int) -> None:
+        """Send set points between this command and the next to controllers with a rate, until one would be late."""
+        if self._points is None or self._sent is None:
+            return
+        due = self._sent_at + self._every
+        while due < self._clock() + self._pacer.slack - self._lead:
+            self._wait(due - self._clock(), halts)
+            with self._sending:
+                if self._halts != halts or self._cut.is_set():
+                    return
+                point = self._next_point(self._sent)
+                rated = [encode_sink(one, self.spec, point, tag) for one in self._sinks if one.rate]
+                control.publish_all([(self.namespace + topic, message) for topic, _, message in rated])
+            due += self._every
 
     def tell_status(self, code: int, guard: str, *, stopped: bool) -> None:
         """Publish `SafeRobot.code` and `SafeRobot.status` on `STATUS_TOPIC`: a stop at once, else after the command."""
@@ -491,6 +574,8 @@ class RosbridgeRobot:
                 _LOG.warning("%s: the halt could not be sent, %s: %s.", self.url, why, _BY_HAND)
             self._halt_failed = True
         finally:
+            if self._goals is not None:
+                self._goals.cancel()
             if first:
                 self._sending.release()
 
@@ -510,14 +595,20 @@ class RosbridgeRobot:
             places = self._places(sink)
             if sink.hold == "last" or not np.isfinite(hold[places]).all():
                 hold[places] = np.nan if sent is None else sent[places]
+            elif len(places) > 1 and sent is not None:  # a jaw in the message of its arm holds what it holds
+                alone = [signal.labels[0] for signal in self.spec.signals if len(signal.labels) == 1]
+                grips = [place for place in places if self.spec.command.labels[place] in alone]
+                hold[grips] = sent[grips]
         if sent is not None and self._clock() - self._sent_at <= _CANNOT_BE_FAR:
             joints = np.array([unit == "rad" for unit in self.spec.command.units])
             if (np.abs(hold - sent)[joints] > _FAR).any():  # no guard allows such a gap: a wrong measurement
                 hold[joints] = sent[joints]
         tag = self._session.tagger.next(self._epoch, self._command_life)
-        for sink in self._sinks:
+        for sink in (one for one in self._sinks if one.topic):
             if np.isfinite(hold[self._places(sink)]).all() and (sink.is_timed or not unproved):
-                reach, ros1 = REST_REACH if unproved else None, halting.ros == "ros1"
+                # Along a spline it would go on before it comes back.
+                soon = min(sink.reach_at(self.spec.period), _HOLD_PERIODS * self.spec.period)
+                reach, ros1 = REST_REACH if unproved else soon, halting.ros == "ros1"
                 topic, _, message = encode_sink(sink, self.spec, hold, tag, ros1=ros1, reach=reach)
                 halting.publish(self.namespace + topic, message)
 
@@ -543,14 +634,14 @@ class RosbridgeRobot:
             self.agent_state = self._take_over.hand_back()
             self._take_over = None
         self._session.leave()
-        control, halting = self._control, self._halting
-        self._control = self._halting = None
-        self._commanded = False
+        control, halting, goals = self._control, self._halting, self._goals
+        self._control = self._halting = self._goals = None
+        self._commanded = self._is_enabled = False
         self._cut.set()
         self._woken.set()
         for camera, _ in self._cameras.values():
             camera.close()
-        for link in (control, halting):
+        for link in (None if goals is None else goals.link, control, halting):
             if link is not None:
                 link.close()
 
@@ -561,10 +652,10 @@ class RosbridgeRobot:
 
     def _wait_up(self) -> RosBus:
         """The connection of the commands, when both are up; `LinkLost` if they are not after `_RESET_TIMEOUT` [s]."""
-        control, halting = self._connected(), self._halting
-        control.wait_up(_RESET_TIMEOUT)
-        if halting is not None:
-            halting.wait_up(_RESET_TIMEOUT)
+        control = self._connected()
+        for link in (control, self._halting, None if self._goals is None else self._goals.link):
+            if link is not None:
+                link.wait_up(_RESET_TIMEOUT)
         return control
 
     def _require_link(self) -> None:
@@ -578,6 +669,8 @@ class RosbridgeRobot:
             raise LinkLost(f"{self.url}: the link dropped, and is back. Nothing is sent before reset().")
         if halting is None or not halting.is_up:
             raise LinkLost(f"{self.url}: the connection that halts the robot is down. Nothing is sent without it.")
+        if self._goals is not None and not self._goals.link.is_up:
+            raise LinkLost(f"{self.url}: the connection of the gripper's goals is down. Nothing is sent without it.")
 
     def not_ready(self) -> str | None:
         """Why the robot reports that it cannot move now, or None. May call its services: only at rest."""

@@ -27,6 +27,7 @@ class ShadowRobot(RosbridgeRobot):
     """
 
     needs_clearance = False
+    enabling = ()
 
     def __init__(self, *arguments: Any, limits: Limits, **options: Any) -> None:
         super().__init__(*arguments, **options)
@@ -42,6 +43,9 @@ class ShadowRobot(RosbridgeRobot):
 
     def _open_session(self, control: RosBus) -> None:
         """Do nothing: a session is for the program that drives."""
+
+    def enable(self) -> None:
+        """Do nothing: whoever drives the robot enables it."""
 
     def not_ready(self) -> str | None:
         """Return None: readiness is the concern of whoever drives the robot."""

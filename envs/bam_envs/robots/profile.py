@@ -23,7 +23,7 @@ from msgspec import Meta
 from bam_envs.arms.description import ArmDescription
 from bam_envs.core.errors import InvalidValue, UnknownName
 from bam_envs.core.robot import RobotSpec, SignalSpec
-from bam_envs.core.robot_models import Description, find_model, known_models
+from bam_envs.core.robot_models import Description, description_folders, find_model, known_models
 from bam_envs.core.validation import Finite, NonEmpty, NonNegative, Positive, check, read_table, type_hints
 from bam_envs.robots.base_description import base_model
 from bam_envs.robots.ur5e import arm_spec
@@ -31,6 +31,7 @@ from bam_envs.ros.codec import LISTED_TYPES
 from bam_envs.ros.messages import bare_type, has_header
 from bam_envs.ros.profile_tables import (
     CameraSource,
+    Enable,
     IdentitySource,
     ImageType,
     Readiness,
@@ -47,13 +48,24 @@ Table = dict[str, Any]
 Age = Annotated[float, Meta(gt=0, le=BOUNDS["max_age"][1])]
 """Maximum age of states and commands [s]."""
 T = TypeVar("T")
-Topical = TypeVar("Topical", Source, Sink, CameraSource, Readiness)
+Typed = TypeVar("Typed", Source, Sink, CameraSource, Readiness, Enable)
 Converted = TypeVar("Converted", Source, Sink)
+_PLACES = ("topic", "action", "service")
+"""The keys of a table that say where something is."""
 _STATES = "sensor_msgs/JointState"
 _SUFFIXES = (".toml", ".yaml", ".yml")
 _SHIPPED = resources.files("bam_envs.robots") / "profiles"
 _AGES = {"arm": 0.1, "base": 0.5}
 _AXES = {"linear_velocity": "linear.x", "lateral_velocity": "linear.y", "angular_velocity": "angular.z"}
+_CAMERAS: tuple[Table, ...] = tuple(
+    {"name": f"{name}{depth}", "topic": f"/{name}_camera/{topic}", "type": kind, "optional": True}
+    for depth, topic, kind in (
+        ("", "color/image_raw/compressed", "sensor_msgs/CompressedImage"),
+        ("_depth", "depth/image_raw", "sensor_msgs/Image"),
+    )
+    for name in ("front", "wrist")
+)
+"""Cameras of an arm whose profile names none; each is read only for a task that looks through it."""
 _ROBOTS: dict[str, Callable[[], RobotSpec]] = {"ur5e": lambda: arm_spec("ur5e", with_object=True)}
 
 
@@ -81,6 +93,7 @@ class _File:
     cameras: tuple[Table, ...] = ()
     readiness: tuple[Table, ...] = ()
     identity: tuple[Table, ...] = ()
+    enable: tuple[Table, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -107,21 +120,39 @@ def load_profile(name_or_path: str | Path) -> RobotProfile:
     return _profile(*_read_file(name))
 
 
-def profile_for(spec: RobotSpec) -> RobotProfile:
-    """The shipped profile for `spec`: of its name, else one that takes its commands, or more and is narrowed to them.
+def read_profile(text: str, where: str) -> RobotProfile:
+    """The profile in the text of a file; `where`, which ends in the suffix of its language, begins errors."""
+    return _profile(where, _merged(_parsed(where, text), where))
 
-    A base, or a described arm, without one has the usual topics of ROS 2: `usual_profile`.
+
+def profile_for(spec: RobotSpec) -> RobotProfile:
+    """The profile of the robot of `spec`, narrowed to the commands of `spec`.
+
+    It is the file ``profiles/NAME.toml`` beside the descriptions of robots (`write_profile` writes it there), else the
+    shipped one of that robot, else the shipped one of Universal Robots' arms that takes these commands (the first that
+    takes more, if there is none). A described robot without one has the usual topics of ROS 2: `usual_profile`.
     """
-    labels, shipped = spec.command.labels, [load_profile(name) for name in shipped_profiles()]
-    if is_base(spec) and set(labels) <= _AXES.keys() and spec.name not in shipped_profiles():
+    labels = spec.command.labels
+    if (own := own_profile(spec.name)) is not None:
+        return _profile(str(own), _table_at(own)).narrowed(labels)
+    tables = {name: _read_file(name) for name in shipped_profiles()}
+    same = [one for one in tables.values() if one[1].get("robot") == spec.name and spec.name not in _ROBOTS]
+    if is_base(spec) and set(labels) <= _AXES.keys() and not same:
         return usual_profile(spec)
-    for profile in sorted(shipped, key=lambda one: (one.name != spec.name, one.command.labels != labels)):
+    others = [one for one in tables.values() if one[1].get("robot") in _ROBOTS]
+    for profile in sorted((_profile(*one) for one in same or others), key=lambda one: one.command.labels != labels):
         if labels and set(labels) <= set(profile.command.labels):
             return profile.narrowed(labels)
     joints = next((one.labels for one in spec.signals if one.name == "joint_position"), ())
     if joints and labels == (*joints, "gripper_width"):
         return usual_profile(spec)
     raise InvalidValue(f"No shipped profile takes the commands of {spec.name}. Give its file: profile='my_robot.toml'.")
+
+
+def own_profile(name: str) -> Any:
+    """The file ``profiles/NAME.toml`` in the first folder of robot descriptions that has one, or None."""
+    files = (folder / "profiles" / f"{name}.toml" for folder in description_folders())
+    return next((file for file in files if file.is_file()), None)
 
 
 def usual_profile(spec: RobotSpec) -> RobotProfile:
@@ -146,7 +177,7 @@ def usual_profile(spec: RobotSpec) -> RobotProfile:
         states.append({**pose, "signal": signal, "fields": [f"pose.{part}.{axis}" for axis in axes]})
     known = {signal.name for signal in spec.signals}
     sink: Table = {"type": "trajectory_msgs/JointTrajectory", "controller": "joint_trajectory_controller"}
-    sink |= {"topic": "/joint_trajectory_controller/joint_trajectory", "labels": list(joints), "reach_periods": 1.5}
+    sink |= {"topic": "/joint_trajectory_controller/joint_trajectory", "labels": list(joints), "reach_periods": 2.0}
     width: Table = {"topic": "/gripper/commands", "type": "std_msgs/Float64MultiArray", "labels": [gripper]}
     table: Table = {
         "name": spec.name,
@@ -205,31 +236,39 @@ def shipped_profiles() -> list[str]:
 
 
 def _read_file(name: str) -> tuple[str, Table]:
-    """The name of the file for errors, and its table, merged with the profile that it extends."""
+    """The name for errors of the profile `name`, or of that file, and its table, merged with what it extends."""
     path = Path(name)
     if path.suffix not in _SUFFIXES and len(path.parts) == 1:
         if name not in shipped_profiles():
             raise UnknownName("robot profile", name, shipped_profiles())
-        path = Path(f"{name}.toml")
-        text = (_SHIPPED / path.name).read_text(encoding="utf-8")
-    else:
-        try:
-            text = path.read_text(encoding="utf-8")
-        except FileNotFoundError as error:
-            choices = ", ".join(shipped_profiles())
-            raise InvalidValue(
-                f"There is no robot profile {path}. Give the path of a file, or one of: {choices}."
-            ) from error
-        except (OSError, UnicodeDecodeError) as error:
-            raise InvalidValue(f"The robot profile {path} cannot be read: {error}.") from error
-    table = _parsed(str(path), text)
+        return f"{name}.toml", _table_at(_SHIPPED / f"{name}.toml")
+    return str(path), _table_at(path)
+
+
+def _table_at(path: Any) -> Table:
+    """The table in the file `path`, merged with the profile that it extends."""
+    try:
+        text = path.read_text(encoding="utf-8")
+    except FileNotFoundError as error:
+        choices = ", ".join(shipped_profiles())
+        raise InvalidValue(
+            f"There is no robot profile {path}. Give the path of a file, or one of: {choices}."
+        ) from error
+    except (OSError, UnicodeDecodeError) as error:
+        raise InvalidValue(f"The robot profile {path} cannot be read: {error}.") from error
+    where = str(path) if isinstance(path, Path) else path.name
+    return _merged(_parsed(where, text), where)
+
+
+def _merged(table: Table, where: str) -> Table:
+    """`table` with the keys of the profile that it extends."""
     if "extends" not in table:
-        return str(path), table
-    extends = check(table["extends"], NonEmpty, f"{path}: extends")
+        return table
+    extends = check(table["extends"], NonEmpty, f"{where}: extends")
     if Path(extends).suffix in _SUFFIXES:
         choices = ", ".join(shipped_profiles())
-        raise InvalidValue(f"{path}: extends must be a shipped profile ({choices}), not {extends!r}.")
-    return str(path), {**_read_file(extends)[1], **table}
+        raise InvalidValue(f"{where}: extends must be a shipped profile ({choices}), not {extends!r}.")
+    return {**_read_file(extends)[1], **table}
 
 
 def _parsed(where: str, text: str) -> Table:
@@ -263,32 +302,41 @@ def _profile(where: str, table: Table) -> RobotProfile:
     if is_base(spec) != (file.kind == "base"):
         raise InvalidValue(f"{where}: kind is {file.kind}, and its commands are those of the other kind, arm or base.")
     state = _state(where, file, spec)
+    if file.kind == "arm" and "cameras" not in table:
+        file = replace(file, cameras=_CAMERAS)
     commands = {mode: _sinks(where, mode, rows, spec.command) for mode, rows in file.commands.items()}
     if not commands:
         raise InvalidValue(f"{where}: at least one command mode is needed, such as [[commands.position]].")
     cameras, readiness = [], []
     for row, at in _rows(f"{where}: cameras", file.cameras):
-        cameras.append(_topical(CameraSource, row, at))
+        cameras.append(_typed(CameraSource, row, at))
         check(cameras[-1].type, ImageType, f"{at}: type")
     for row, at in _rows(f"{where}: readiness", file.readiness):
-        readiness.append(entry := _topical(Readiness, row, at))
+        readiness.append(entry := _typed(Readiness, row, at))
         if bool(entry.ready) == (entry.at_least is not None):
             raise InvalidValue(f"{at}: give either ready (the values with which it can move) or at_least.")
     identity = [_identity(row, at) for row, at in _rows(f"{where}: identity", file.identity)]
+    enable = [_typed(Enable, row, at) for row, at in _rows(f"{where}: enable", file.enable)]
     sinks = [sink for mode in commands.values() for sink in mode]
-    entries: list[Source | Sink | CameraSource | Readiness] = [*state, *cameras, *readiness, *sinks]
-    _require_known(f"{where}: rename", "topic", file.rename, [entry.topic for entry in entries])
+    entries: list[Source | Sink | CameraSource | Readiness | Enable] = [*state, *cameras, *readiness, *sinks, *enable]
+    every = [one for entry in entries for one in (entry.forms if isinstance(entry, Sink) else (entry,))]
+    names = {getattr(entry, key, "") for entry in every for key in _PLACES}
+    _require_known(f"{where}: rename", "topic", file.rename, names - {""})
 
-    def renamed(entry: Topical) -> Topical:
-        if entry.topic not in file.rename:
-            return entry
+    def renamed(entry: Typed) -> Typed:
+        found: dict[str, Any] = {key: file.rename.get(getattr(entry, key, "")) for key in _PLACES}
+        changed = {key: name for key, name in found.items() if name is not None}
         # A topic of another name belongs to another controller.
-        other: dict[str, Any] = {"controller": ""} if isinstance(entry, Sink) else {}
-        return replace(entry, topic=file.rename[entry.topic], **other)
+        other: dict[str, Any] = {"controller": ""} if changed and isinstance(entry, Sink) else {}
+        if isinstance(entry, Sink) and entry.closing is not None:
+            closer = entry.closing.action
+            other["closing"] = replace(entry.closing, action=file.rename.get(closer, closer))
+        return replace(entry, **changed, **other)
 
     return RobotProfile(
         name=file.name,
         kind=file.kind,
+        robot=file.robot,
         signals=tuple(signal for source in state for signal in spec.signals if signal.name == source.signal),
         command=spec.command,
         state=tuple(map(renamed, state)),
@@ -300,6 +348,7 @@ def _profile(where: str, table: Table) -> RobotProfile:
         cameras=tuple(map(renamed, cameras)),
         readiness=tuple(map(renamed, readiness)),
         identity=tuple(identity),
+        enable=tuple(map(renamed, enable)),
         controllers=file.controllers,
         watchdog=file.watchdog,
         body=spec.body,
@@ -360,7 +409,7 @@ def _state(where: str, file: _File, spec: RobotSpec) -> list[Source]:
     sizes = {signal.name: len(signal.labels) for signal in spec.signals}
     sources: dict[str, Source] = {}
     for row, at in _rows(f"{where}: state", file.state):
-        source = _topical(Source, row, at)
+        source = _typed(Source, row, at)
         _require_known(at, "signal", [source.signal], sizes)
         if source.signal in sources:
             raise InvalidValue(f"{at}: {source.signal} has a source already.")
@@ -372,7 +421,8 @@ def _state(where: str, file: _File, spec: RobotSpec) -> list[Source]:
     state = [sources[name] for name in sizes if name in sources]
     for place, source in enumerate(state):
         known = (*source.names, *source.ignore)
-        others = tuple(name for name in file.ignore if name not in known) if source.names else ()
+        beside = [name for one in state if one.topic == source.topic for name in (*one.names, *one.ignore)]
+        others = dict.fromkeys(name for name in (*beside, *file.ignore) if name not in known) if source.names else ()
         frame = file.frames.get(source.topic, source.frame)
         state[place] = replace(source, ignore=(*source.ignore, *others), frame=frame)
     return state
@@ -401,19 +451,39 @@ def _sinks(where: str, mode: str, rows: list[Table], command: SignalSpec) -> tup
     where = f"{where}: commands.{mode}"
     sinks: list[Sink] = []
     for row, at in _rows(where, rows):
-        sink = _topical(Sink, row, at)
+        sink = _typed(Sink, row, at)
+        if sum(bool(getattr(sink, key)) for key in _PLACES) != 1:
+            raise InvalidValue(f"{at}: give one of {', '.join(_PLACES)}.")
+        if not sink.topic:  # what a gripper holds, it holds without another goal
+            if sink.hold != "last" and "hold" in row:
+                raise InvalidValue(f"{at}: hold of an action or a service is last: a halt cancels it.")
+            sink = replace(sink, hold="last", tag=False)
+            units = dict(zip(command.labels, command.units, strict=True))
+            for label in sink.labels:
+                if units.get(label, "m") != "m":  # a motion needs a stream of commands
+                    raise InvalidValue(f"{at}: only a gripper may be an action or a service; {label} needs a topic.")
         size = len(sink.labels)
         for key, values in (("names", sink.names), ("fields", sink.fields)):
             if values and len(values) != size:
                 raise InvalidValue(f"{at}: {key} must have {size} values, not {len(values)}.")
-        if not sink.fields and sink.type not in LISTED_TYPES:
+        if not sink.fields and not (sink.topic and sink.type in LISTED_TYPES):
             raise InvalidValue(f"{at}: {sink.type} needs fields; only {', '.join(sorted(LISTED_TYPES))} do without.")
+        if sink.constants and not sink.fields:
+            raise InvalidValue(f"{at}: constants need fields.")
+        if sink.rate is not None and (sink.is_timed or not sink.topic or command.units[0] != "rad"):
+            raise InvalidValue(f"{at}: rate is for positions of an arm that are executed at once.")
+        if sink.closing is not None:
+            if not sink.action or size != 1:
+                raise InvalidValue(f"{at}: closing needs an action with one label.")
+            sink = replace(sink, closing=replace(sink.closing, type=bare_type(sink.closing.type)))
         sinks.append(_converted(at, replace(sink, names=sink.names or sink.labels), size))
     labels = [label for sink in sinks for label in sink.labels]
     _require_once(where, "label", labels)
     if set(labels) != set(command.labels):
         raise InvalidValue(f"{where}: labels must be {', '.join(command.labels)}, not {', '.join(labels)}.")
-    _require_once(where, "topic", [sink.topic for sink in sinks])
+    _require_once(where, "topic", [sink.address for sink in sinks])
+    if not sinks[-1].topic:
+        raise InvalidValue(f"{where}: the last table must have a topic, because it completes a command.")
     return tuple(sinks)
 
 
@@ -426,8 +496,8 @@ def _row(kind: type[T], row: Table, where: str) -> T:
     return read_table(kind, listed, where)
 
 
-def _topical(kind: type[Topical], row: Table, where: str) -> Topical:
-    """A table with a topic and a type; the type becomes ``pkg/Type``."""
+def _typed(kind: type[Typed], row: Table, where: str) -> Typed:
+    """A table with a type, which becomes ``pkg/Type``."""
     entry = _row(kind, row, where)
     return replace(entry, type=bare_type(entry.type))
 

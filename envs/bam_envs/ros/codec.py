@@ -40,6 +40,7 @@ AGENT_TOPIC = "/bam/agent"
 """Requests to the live agent of a robot: who drives, take over, hand back; see `bam_envs.live.take_over`."""
 AGENT_STEP_TOPIC = "/bam/agent/step"
 """The steps of the environment of whoever has taken over from a live agent, for a learner (std_msgs/String of JSON)."""
+DESCRIPTION_TOPIC = "/robot_description"  # the URDF of the robot (std_msgs/String), latched
 HALT_TOPIC = "/bam/halt"  # stops a served robot (std_msgs/Empty)
 STATUS_TOPIC = "/bam/status"  # what the guards did in each tick (std_msgs/String of JSON), sent by the client
 SCENE_TOPIC = "/bam/scene"
@@ -109,7 +110,8 @@ def _to_si(entry: Content, raw: Array) -> Array:
     return np.asarray(raw * entry.scale + entry.offset)
 
 
-def _from_si(entry: Content, values: Array) -> list[float]:
+def from_si(entry: Content, values: Array) -> list[float]:
+    """The numbers on the wire for `values` [SI]. Shape: (k,)."""
     return list(((values - entry.offset) / entry.scale).tolist())
 
 
@@ -122,22 +124,32 @@ def encode_state(
     ``frame_id`` of the last message, which shows that all messages have arrived.
     """
     messages: dict[tuple[str, tuple[str, ...]], Envelope] = {}
+    read = {name for source in profile.state for name in source.names}
+    lists: dict[tuple[str, tuple[str, ...]], dict[str, dict[str, float]]] = {}  # of named numbers: by field and name
     for source in profile.state:
         if source.signal not in state.signals:
             continue
-        key = (source.topic, source.names)
+        # Drivers send the numbers of several joints in one message; publishers that share a topic, in their own.
+        key = (source.topic, source.names if source.partial or not source.names else ())
         if key not in messages:
             header = {"header": {"stamp": dict(stamp), "frame_id": source.frame}} if has_header(source.type) else {}
             messages[key] = (source.topic, source.type, {**header, **source.constants})
-        message, raw = messages[key][2], _from_si(source, state.signals[source.signal][env_id])
+        message, raw = messages[key][2], from_si(source, state.signals[source.signal][env_id])
         if source.fields:
             for path, value in zip(source.fields, raw, strict=True):
                 put_at(message, path, value)
         elif source.names:
-            message["name"], message[source.field] = list(source.names), raw
+            values = lists.setdefault(key, {}).setdefault(source.field, {})
+            values.update(zip(source.names, raw, strict=True))
+            if len(raw) == 1:  # the other joints of a gripper move with the one that is read
+                values.update(dict.fromkeys((name for name in source.ignore if name not in read), raw[0]))
         else:
             first, last = source.skip
             message[source.field] = [0.0] * first + raw + [0.0] * last
+    for key, fields in lists.items():
+        names = sorted({name for values in fields.values() for name in values})  # as the broadcaster of ros2_control
+        messages[key][2]["name"] = names
+        messages[key][2].update({field: [values.get(name, 0.0) for name in names] for field, values in fields.items()})
     stamped = [one for one in messages.values() if has_header(one[1]) and not one[2]["header"]["frame_id"]]
     if not stamped:
         return list(messages.values())
@@ -157,19 +169,22 @@ def encode_sink(
 ) -> Envelope:
     """The message with the part of `command` (m,) [SI] for `sink`, with `tag`, which `sign` signs.
 
-    `reach` is the time in which a trajectory's point is to be reached [s]; None: that of the sink.
+    `reach` is the time in which a trajectory's point is to be reached [s], at any speed; None: as the sink has it.
     """
+    at_rest = reach is None and sink.is_spline(spec.period)
     reach = sink.reach_at(spec.period) if reach is None else reach
-    raw, text = _from_si(sink, command[_places(sink, spec)]), ""
+    raw, text = from_si(sink, command[_places(sink, spec)]), ""
     if tag is not None and sink.tag:
         content: list[float] | Array = raw
         if any("(" in path for path in sink.fields):  # an angle is written as a quaternion, and read with rounding
             content = _read_command(sink, _write_command(sink, raw, "", reach))
-        text = tag.to_text() if sign is None else sign(tag, sink.topic, _signed(content))
-    return sink.topic, sink.type, _write_command(sink, raw, text, reach, ros1=ros1)
+        text = tag.to_text() if sign is None else sign(tag, sink.address, _signed(content))
+    return sink.address, sink.type, _write_command(sink, raw, text, reach, ros1=ros1, at_rest=at_rest)
 
 
-def _write_command(sink: Sink, values: list[float], text: str, reach: float, *, ros1: bool = False) -> dict[str, Any]:
+def _write_command(
+    sink: Sink, values: list[float], text: str, reach: float, *, ros1: bool = False, at_rest: bool = False
+) -> dict[str, Any]:
     """The message that carries raw numbers, in the order of the sink's labels, the `text` of a tag, and `reach` [s]."""
     header = {"stamp": write_stamp(0.0, ros1=ros1), "frame_id": text}  # the stamp 0 means at once
     names = list(sink.names)
@@ -179,6 +194,8 @@ def _write_command(sink: Sink, values: list[float], text: str, reach: float, *, 
         if sink.type in ("geometry_msgs/Twist", "geometry_msgs/TwistStamped"):  # all six fields, commanded or not
             twist = {part: dict.fromkeys("xyz", 0.0) for part in ("linear", "angular")}
             message.update({"twist": twist} if stamped else twist)
+        for path, constant in sink.constants.items():
+            put_at(message, path, constant)
         for path, value in zip(sink.fields, values, strict=True):
             put_at(message, path, value)
         return message
@@ -188,7 +205,8 @@ def _write_command(sink: Sink, values: list[float], text: str, reach: float, *, 
     if sink.type == _JOINTS:
         return {"header": header, "name": names, "position": values, "velocity": [], "effort": []}
     reached = write_stamp(reach, ros1=ros1)
-    point = {"positions": values, "velocities": [], "accelerations": [], "effort": [], "time_from_start": reached}
+    speeds = [0.0] * len(values) if at_rest else []
+    point = {"positions": values, "velocities": speeds, "accelerations": [], "effort": [], "time_from_start": reached}
     return {"header": header, "joint_names": names, "points": [point]}
 
 
@@ -212,8 +230,8 @@ class Decoded(NamedTuple):
 
 
 def decode_command(profile: RobotProfile, spec: RobotSpec, topic: str, message: object) -> Decoded:
-    """The command in a message on `topic`; `ProtocolError` if it differs from the profile."""
-    sink = profile.sinks_by_topic.get(topic)
+    """The command in a message on `topic`, a goal or a request; `ProtocolError` if it differs from the profile."""
+    sink = profile.sinks_by_address.get(topic)
     if sink is None:
         raise ProtocolError(f"{topic}: {profile.name} takes no command on this topic.")
     content = require_message(message, topic)
@@ -224,7 +242,7 @@ def decode_command(profile: RobotProfile, spec: RobotSpec, topic: str, message: 
 
 def _read_command(sink: Sink, message: Message) -> Array:
     """The raw numbers in `message`, in the order of the labels of `sink`. Shape: (k,)."""
-    where = sink.topic
+    where = sink.address
     if sink.fields:
         return np.array([number_at(message, path, where) for path in sink.fields])
     if sink.type in _ARRAYS:

@@ -1,9 +1,10 @@
 """The known message and service types with their fields, one per line.
 
-``pkg/Type: type field; type field`` for a message, ``pkg/Type: request -> response`` for a service. A ``|`` separates
-spellings of one type, of ROS 1 and ROS 2 or of versions. A type without a package is in the package of its line;
-``time`` and ``duration`` are the built-in ones; ``any`` is any plain value; ``Type[?]`` is one or a list of them;
-``type field=1`` has a default other than zero.
+``pkg/Type: type field; type field`` for a message, ``pkg/Type: request -> response`` for a service; an action has three
+messages, ``pkg/TypeGoal``, ``pkg/TypeResult`` and ``pkg/TypeFeedback``. A ``|`` separates spellings of one type, of
+ROS 1 and ROS 2 or of versions. A type without a package is in the package of its line; ``time`` and ``duration`` are
+the built-in ones; ``any`` is any plain value; ``Type[?]`` is one or a list of them; ``type field=1`` has a default
+other than zero.
 """
 
 _NUMBERS = ("Int8", "Int16", "Int32", "Int64", "UInt8", "UInt16", "UInt32", "UInt64", "Float32", "Float64")
@@ -79,6 +80,26 @@ rosapi/Topics: -> string[] topics; string[] types
 rosapi/TopicType: string topic -> string type
 rosapi/Services: -> string[] services
 rosapi/ServiceType: string service -> string type
+rosapi/GetActionServers: -> string[] action_servers
+rosapi/ActionType: string action -> string type
+
+controller_manager_msgs/ControllerState: string name; string state; string type; uint16 update_rate; \
+string[] claimed_interfaces; \
+string[] required_command_interfaces; string[] required_state_interfaces
+controller_manager_msgs/ListControllers: -> ControllerState[] controller
+control_msgs/GripperCommand: float64 position; float64 max_effort
+control_msgs/GripperCommandGoal: GripperCommand command
+control_msgs/GripperCommandResult: float64 position; float64 effort; bool stalled; bool reached_goal
+control_msgs/GripperCommandFeedback: float64 position; float64 effort; bool stalled; bool reached_goal
+franka_msgs/GraspEpsilon: float64 inner; float64 outer
+franka_msgs/MoveGoal: float64 width; float64 speed
+franka_msgs/MoveResult: bool success; string error
+franka_msgs/MoveFeedback: float64 current_width
+franka_msgs/GraspGoal: float64 width; GraspEpsilon epsilon; float64 speed; float64 force
+franka_msgs/GraspResult: bool success; string error
+franka_msgs/GraspFeedback: float64 current_width
+xarm_msgs/SetInt16: int16 data -> int16 ret; string message
+xarm_msgs/SetInt16ById: int16 id; int16 data -> int16 ret; string message
 
 bam_msgs/ErrorCode: int32 value
 bam_msgs/RequestHeader: string client_id; uint8 request_type; bool force_busy; bool force_uncalibrated; \

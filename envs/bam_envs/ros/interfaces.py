@@ -29,7 +29,7 @@ _BYTES = ("uint8", "byte", "char")  # the types whose arrays are `bytes`
 _OBJECT = (dict, Mapping)  # dict first: a check for Mapping takes ten times as long
 _MISSING: Any = object()  # stands for a field that a message leaves out
 _SHORT = {"time": "builtin_interfaces/Time", "duration": "builtin_interfaces/Duration"}
-_PLAIN_NAME = re.compile(r"[A-Za-z]\w*/(?:msg/|srv/)?[A-Za-z]\w*", re.ASCII)
+_PLAIN_NAME = re.compile(r"[A-Za-z]\w*/(?:msg/|srv/|action/)?[A-Za-z]\w*", re.ASCII)
 
 Check = Callable[[Any, int], Any]
 """Takes a value and how deep it is nested, returns it in its normal form or raises _Misfit."""
@@ -61,10 +61,10 @@ class Field:
 
 
 def normal_name(kind: str) -> str:
-    """``pkg/Type`` of ``pkg/Type``, ``pkg/msg/Type`` or ``pkg/srv/Type``; `InvalidValue` for any other name."""
+    """``pkg/Type`` of that, ``pkg/msg/Type``, ``pkg/srv/Type`` or ``pkg/action/Type``; else `InvalidValue`."""
     if not isinstance(kind, str) or len(kind) > 256 or not _PLAIN_NAME.fullmatch(kind):
         raise InvalidValue(f"Type: expected a name such as 'std_msgs/String', found {brief(kind)}.")
-    return kind.replace("/msg/", "/").replace("/srv/", "/")
+    return re.sub("/(msg|srv|action)/", "/", kind)
 
 
 def request_type(kind: str) -> str:

@@ -36,8 +36,8 @@ def same_type(one: str, other: str) -> bool:
 
 
 def bare_type(kind: str) -> str:
-    """The type without ``/msg/``: ``pkg/Type``."""
-    return kind.replace("/msg/", "/")
+    """The type without ``/msg/``, ``/action/`` and ``/srv/``: ``pkg/Type``."""
+    return "/".join(part for part in kind.split("/") if part not in ("msg", "action", "srv"))
 
 
 def require_message(message: object, where: str) -> Message:
@@ -157,7 +157,7 @@ def require_frame(frame: str, message: Message, where: str) -> None:
     )
 
 
-def put_at(message: dict[str, Any], path: str, value: float) -> None:
+def put_at(message: dict[str, Any], path: str, value: Any) -> None:
     """Write `value` at `path`; at ``yaw(path)`` the quaternion of that angle about z."""
     quaternion = _quaternion(path)
     if quaternion:

@@ -1,6 +1,7 @@
 """The tables of a robot profile: sources of its signals, sinks of its commands, cameras, ages and limits."""
 
 import dataclasses
+import math
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -14,15 +15,23 @@ from bam_envs.core.robot import BaseBody, RobotSpec, SignalSpec
 from bam_envs.core.validation import Finite, NonEmpty, NonNegativeInt, Positive, RobotName, check
 
 Topic = Annotated[str, Meta(pattern=r"^(/[A-Za-z]\w*)+\Z", description="an absolute name such as /joint_states")]
-"""A topic without its namespace."""
+"""A topic, action or service without its namespace."""
 MessageType = Annotated[
     str,
-    Meta(pattern=r"^[A-Za-z]\w*/(msg/)?[A-Za-z]\w*\Z", description="a message type such as sensor_msgs/JointState"),
+    Meta(
+        pattern=r"^[A-Za-z]\w*/((msg|action|srv)/)?[A-Za-z]\w*\Z",
+        description="a message type such as sensor_msgs/JointState",
+    ),
 ]
+Answer = Finite | bool | str
+"""A value in a message that tells whether something succeeded, or whether a robot can move."""
 ImageType = Literal["sensor_msgs/CompressedImage", "sensor_msgs/Image"]
 """Message type of a camera: JPEG or PNG, or raw pixels, both over a separate CBOR connection."""
 IMAGE_TYPES = get_args(ImageType)
-_TRAJECTORY = "trajectory_msgs/JointTrajectory"
+_TRAJECTORY, _TWIST = "trajectory_msgs/JointTrajectory", "geometry_msgs/Twist"
+SPLINE_PERIODS, _SPLINE_DELAY = 2.0, 0.75
+"""Periods from which on a trajectory's point is reached at rest, and the delay of such a motion as a share of its time:
+it has gone half of the way in half of the time, and begins before it has come to rest (`benchmarks jerk`)."""
 _LAGS = {"arm": 0.1, "base": 0.3}
 """Delay of live robots behind their commands [s], of network and controller; the limit `lag` overrides it."""
 
@@ -33,7 +42,7 @@ class Content:
 
     topic: Topic
     type: MessageType
-    """Message type, ``pkg/Type``; its stamped version (``pkg/TypeStamped``) is read too."""
+    """Type of the message, goal or request, ``pkg/Type``; a stamped message (``pkg/TypeStamped``) is read too."""
     fields: tuple[NonEmpty, ...] = ()
     """Path of each number, e.g. ``pose.position.x``; ``yaw(orientation)`` is the angle about z of a quaternion."""
     names: tuple[NonEmpty, ...] = ()
@@ -54,7 +63,7 @@ class Source(Content):
     field: NonEmpty = ""
     """Path of the list of its numbers, e.g. ``position``; or `fields`."""
     ignore: tuple[NonEmpty, ...] = ()
-    """Other names that messages may have."""
+    """Other names that messages may have, beside those of other sources of the topic."""
     partial: bool = False
     """Whether several publishers share the topic, so that messages without any of `names` are ignored."""
     skip: tuple[NonNegativeInt, NonNegativeInt] = (0, 0)
@@ -74,15 +83,42 @@ class Source(Content):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Sink(Content):
-    """The topic for some of the numbers of a command."""
+class Closing:
+    """The action by which a gripper closes, if it opens by another one; its goals have the same `fields`."""
 
+    action: Topic
+    type: MessageType
+    constants: Mapping[str, Answer] = dataclasses.field(default_factory=dict)
+    """See `Sink.constants`."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Sink(Content):
+    """Where some of the numbers of a command are sent: to a topic, or as goals of an action or requests of a service.
+
+    The last two get a number only when it changes, and wait for no answer within a period.
+    """
+
+    topic: Topic = ""
+    """The topic; or `action`, or `service`."""
+    action: Topic = ""
+    """The action; a new goal replaces the one that runs, and a halt cancels it."""
+    service: Topic = ""
+    """The service."""
+    constants: Mapping[str, Answer] = dataclasses.field(default_factory=dict)
+    """Other fields of each message, goal or request, by their paths, e.g. ``command.max_effort``."""
+    closing: Closing | None = None
+    """Another action for a width below half of its range."""
     labels: tuple[NonEmpty, ...]
     """Labels of its numbers in the command, in the order of the message."""
     reach: Positive | None = None
     """Time in which a trajectory's point is to be reached [s]; None: `reach_periods`."""
     reach_periods: Positive = 1.0
-    """The same in periods of the task; above 1 an arm does not stop when the next command is late."""
+    """The same in periods of the task; above 1 an arm does not stop when the next command is late. From 2 on the point
+    is reached at rest, to which a controller goes along a cubic spline, without jumps of the speed."""
+    rate: Positive | None = None
+    """Rate of a controller that holds its set points [Hz]: it gets some between two commands, on a spline over two
+    periods. None: it gets the commands alone."""
     hold: Literal["measured", "last", "zero"] = "measured"
     """Command of a halt: the measured position, the last command, or zeros."""
     tag: bool = True
@@ -91,6 +127,31 @@ class Sink(Content):
     controller: NonEmpty = ""
     """The controller of ros2_control that takes it, which must be active; not checked if empty, or if the topic is
     renamed."""
+
+    @property
+    def address(self) -> str:
+        """The topic, action or service."""
+        return self.topic or self.action or self.service
+
+    @property
+    def forms(self) -> tuple["Sink", ...]:
+        """The sink, and the one with the action `closing` if it has that."""
+        if self.closing is None:
+            return (self,)
+        return self, dataclasses.replace(self, **vars(self.closing), closing=None)
+
+    def of_type(self, kind: str) -> "Sink | None":
+        """The sink with messages of type ``pkg/Type``: its own, or a Twist with a stamp instead of without, or without.
+
+        Drives took a Twist before ROS 2 Jazzy, and take a TwistStamped since, under the same name. None for any other.
+        """
+        if kind == self.type:
+            return self
+        if {kind, self.type} != {_TWIST, f"{_TWIST}Stamped"}:
+            return None
+        stamped = kind != _TWIST
+        fields = [f"twist.{path}" if stamped else path.removeprefix("twist.") for path in self.fields]
+        return dataclasses.replace(self, type=kind, fields=tuple(fields))
 
     @property
     def is_timed(self) -> bool:
@@ -106,6 +167,16 @@ class Sink(Content):
         """Time in which a trajectory's point is to be reached [s], for a command every `period` [s]."""
         return period * self.reach_periods if self.reach is None else self.reach
 
+    def is_spline(self, period: float) -> bool:
+        """Whether a trajectory's point is reached at rest, for a command every `period` [s]."""
+        return self.reach_at(period) >= SPLINE_PERIODS * period
+
+    def delay_at(self, period: float) -> float:
+        """Delay of the set points behind the commands [s]."""
+        if not self.is_timed:
+            return 0.0 if self.rate is None else SPLINE_PERIODS * _SPLINE_DELAY * period
+        return self.reach_at(period) * (_SPLINE_DELAY if self.is_spline(period) else 1.0)
+
 
 @dataclass(frozen=True)
 class Readiness:
@@ -115,7 +186,7 @@ class Readiness:
     type: MessageType
     field: tuple[NonEmpty, ...]
     """Path of the value, e.g. ``mode``; the first of several paths that the message has."""
-    ready: tuple[Finite | bool | str, ...] = ()
+    ready: tuple[Answer, ...] = ()
     """The values with which it can move; or `at_least`."""
     at_least: Finite | None = None
     """The least number with which it can begin to move."""
@@ -139,10 +210,17 @@ class Readiness:
         enough = self.at_least is not None and not (number and value < self.at_least)
         if value is None or value in self.ready or enough:
             return None
-        text = f"{value:g}" if number else str(value).lower() if isinstance(value, bool) else str(value)
+        text = _text(value)
         remedy = self.remedies.get(text) or self.remedy
         what = self.words.get(text) or self.otherwise.replace("{}", text) or f"{self.field[0]} is {text}"
         return f"{what} ({self.topic}){remedy and f': {remedy}'}"
+
+
+def _text(value: Any) -> str:
+    """A value of a message as people write it."""
+    if isinstance(value, (int, float)) and not isinstance(value, bool):
+        return f"{value:g}"
+    return "missing" if value is None else str(value).lower() if isinstance(value, bool) else str(value)
 
 
 def _value_in(message: Any, path: str) -> Any:
@@ -150,6 +228,32 @@ def _value_in(message: Any, path: str) -> Any:
     for name in path.split("."):
         message = message.get(name) if isinstance(message, Mapping) else None
     return message
+
+
+@dataclass(frozen=True, kw_only=True)
+class Enable:
+    """A service that is called before a robot takes commands, with the operator's consent."""
+
+    service: Topic
+    type: MessageType
+    """Type of the service."""
+    does: NonEmpty
+    """What it does, for the operator, e.g. ``enables the motors``."""
+    request: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+    """The request."""
+    field: NonEmpty = "success"
+    """Path of the value in the response that tells whether it succeeded."""
+    ready: tuple[Answer, ...] = (True,)
+    """The values that mean success."""
+
+    def trouble(self, response: Any) -> str | None:
+        """Why `response` is not that of a success; None if it is."""
+        value = _value_in(response, self.field)
+        if value in self.ready:
+            return None
+        said = _value_in(response, "message")
+        expected = " or ".join(map(_text, self.ready))
+        return f"{self.field} is {_text(value)}, not {expected}{f': {said}' if said else ''}"
 
 
 @dataclass(frozen=True)
@@ -206,7 +310,8 @@ class RobotProfile:
     command: SignalSpec
     state: tuple[Source, ...]  # one source for each of `signals`, in their order
     commands: Mapping[str, tuple[Sink, ...]]
-    """Modes in which a command is sent, by name, the default first. The last sink of a mode completes a command."""
+    """Modes in which a command is sent, by name, the default first. The last sink of a mode is a topic, and completes a
+    command."""
     period: float  # time between two commands [s]
     max_age: float  # maximum age of a state [s]
     command_timeout: float  # time for which a command is valid [s]; see `command_life`
@@ -215,17 +320,20 @@ class RobotProfile:
     cameras: tuple[CameraSource, ...] = ()
     readiness: tuple[Readiness, ...] = ()  # topics that report whether it can move
     identity: tuple[IdentitySource, ...] = ()  # where it tells which robot it is; the first that answers counts
+    enable: tuple[Enable, ...] = ()  # services to be called before it takes commands, in this order
     controllers: str = ""
     """The service that lists its controllers and their states (``list_controllers``); empty: there is none."""
+    robot: str = ""  # the robot that it is for, if it is a described one
     watchdog: float | None = None
     """Time after which it stops by itself without a command [s]; 0: it does not; None: that is not known."""
     body: BaseBody | None = None
     """Shape and laser scanners of a base, if they are known."""
 
     @cached_property
-    def sinks_by_topic(self) -> Mapping[str, Sink]:
-        """The sink of each topic, in the first mode that uses it."""
-        return {sink.topic: sink for sinks in reversed([*self.commands.values()]) for sink in reversed(sinks)}
+    def sinks_by_address(self) -> Mapping[str, Sink]:
+        """The sink of each topic, action and service, in the first mode that uses it."""
+        modes = reversed([*self.commands.values()])
+        return {one.address: one for sinks in modes for sink in reversed(sinks) for one in reversed(sink.forms)}
 
     def command_life(self, period: float) -> float:
         """Time for which a command is valid [s], for one command every `period` [s]: two periods at least."""
@@ -271,7 +379,7 @@ class RobotProfile:
             if missing := _missing(sink, labels):
                 taken, absent, alone = (", ".join(one) for one in (sink.labels, missing, labels))
                 raise InvalidValue(
-                    f"{sink.topic} takes {taken} in one message, and {absent} is not commanded. "
+                    f"{sink.address} takes {taken} in one message, and {absent} is not commanded. "
                     f"Give the profile of {self.name} a command mode with a topic for {alone} alone."
                 )
         commands = {
@@ -284,18 +392,21 @@ class RobotProfile:
     def spec(self, wanted: RobotSpec | None = None, mode: str | None = None) -> RobotSpec:
         """The spec of this robot; with `wanted`, only the signals, command and period of that spec.
 
+        What goes to an action or a service has no `max_rate`: it gets the end of a motion, whose speed is its own.
+
         For `mode` and errors see `narrowed`; `InvalidValue` also for a signal that it does not measure, `UnknownName`
         for images of a camera that it does not have.
         """
         period = self.period if wanted is None else wanted.period
         # A trajectory that takes longer than a period adds to the lag.
-        reached = (sink.reach_at(period) for sink in self.sinks(mode) if sink.type == _TRAJECTORY)
+        reached = (sink.delay_at(period) for sink in self.sinks(mode))
         lag = _LAGS[self.kind] + max(0.0, max(reached, default=0.0) - period)
         joints = {at for at, unit in zip(self.command.labels, self.command.units, strict=True) if unit == "rad"}
         is_timed = all(sink.is_timed for sink in self.sinks(mode) if joints & set(sink.labels))
         if wanted is None:
             signals = tuple(signal for signal in self.signals if not self.source(signal.name).optional)
-            return RobotSpec(self.name, signals, self.command, period, lag, self.body, is_timed=is_timed)
+            command = self._at_own_speed(self.command, mode)
+            return RobotSpec(self.name, signals, command, period, lag, self.body, is_timed=is_timed)
         for name in (name for camera in wanted.cameras for name in camera.spaces()):
             self.camera(name)
         known = {signal.name: signal for signal in self.signals}
@@ -309,8 +420,15 @@ class RobotProfile:
                 found = ", ".join(known[signal.name].labels)
                 raise InvalidValue(f"{signal.name} must be {', '.join(signal.labels)}; that of {self.name} is {found}.")
         signals = tuple(known[signal.name] for signal in wanted.signals)
-        command = self.narrowed(wanted.command.labels, mode).command
+        command = self._at_own_speed(self.narrowed(wanted.command.labels, mode).command, mode)
         return RobotSpec(self.name, signals, command, period, lag, self.body, wanted.cameras, is_timed)
+
+    def _at_own_speed(self, command: SignalSpec, mode: str | None) -> SignalSpec:
+        if command.max_rate is None:
+            return command
+        own = {label for sink in self.sinks(mode) if not sink.topic for label in sink.labels}
+        rates = zip(command.labels, command.max_rate, strict=True)
+        return dataclasses.replace(command, max_rate=tuple(math.inf if at in own else rate for at, rate in rates))
 
 
 def _missing(sink: Sink, labels: tuple[str, ...]) -> list[str]:

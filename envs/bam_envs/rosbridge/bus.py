@@ -45,6 +45,37 @@ class Caller:
 
 UNKNOWN_CALLER = Caller("")  # of a bus that does not report callers (a real ROS graph)
 
+SUCCEEDED, CANCELED, ABORTED = 4, 5, 6
+"""Ends of a goal, as action_msgs/GoalStatus numbers them."""
+
+
+class Goal(Protocol):
+    """One goal that a caller has sent to an action."""
+
+    values: Message
+    """Its content, complete."""
+    caller: Caller
+    """Its sender."""
+
+    def feedback(self, values: Message) -> None:
+        """Tell the caller how far it is. Thread-safe."""
+
+    def end(self, status: int, values: Message) -> None:
+        """End it with `SUCCEEDED`, `CANCELED` or `ABORTED`, and the result; only the first end counts. Thread-safe."""
+
+
+@dataclass(frozen=True)
+class Action:
+    """An action that this process offers. Its functions must return at once: they run in the network thread."""
+
+    name: str  # with a leading slash
+    kind: str  # normal name of its type
+    begin: Callable[[Goal], None]
+    """Begins a goal, which `Goal.end` ends; the text of a `BamEnvsError` that it raises rejects the goal."""
+    cancel: Callable[[Goal], None]
+    """Ends a goal whose caller wants that, or left."""
+
+
 Listener = Callable[[Message, Caller], None]
 """Takes a message. Must return at once: it runs in the network thread."""
 Handler = Callable[[Message, Caller], Message]
@@ -89,7 +120,7 @@ def answer(handler: Handler, request: Message, caller: Caller, name: str) -> Mes
 class Bus(Protocol):
     """Publish, subscribe, serve, from any thread.
 
-    Subclasses inherit `publish`, and `reserve` and `on_leave` without effect.
+    Subclasses inherit `publish`, and `act`, `reserve` and `on_leave` without effect.
     """
 
     def advertise(self, topic: str, kind: str, *, latch: bool = False) -> None:
@@ -112,6 +143,10 @@ class Bus(Protocol):
 
     def serve(self, service: str, kind: str, handler: Handler) -> None:
         """Answer `service` of type `kind`, even when the handler fails."""
+
+    def act(self, action: Action) -> bool:
+        """Offer an action; False if the bus has none."""
+        return False
 
     def reserve(self, topic: str, check: Callable[[Caller], None]) -> None:
         """Refuse what a caller publishes on `topic` if ``check(caller)`` raises a `BamEnvsError`, if the bus can."""

@@ -145,7 +145,7 @@ class RosbridgeLink(RosBus, Ros):  # type: ignore[misc]
             if (back := errback if failed else callback) is not None:
                 back(values if failed else ServiceResponse(values))
 
-        self._ask(self._require_up(), dict(message), took, SEND_WITHIN)
+        self._thread.do(self._asking(self._require_up(), dict(message), took)[0], SEND_WITHIN)
 
     def call_async_action(
         self,
@@ -165,7 +165,8 @@ class RosbridgeLink(RosBus, Ros):  # type: ignore[misc]
             result = {"status": GoalStatus(status or 0), "values": values}
             (errback(result) if reply.get("result") is False else resultback(Result(result)))
 
-        self._ask(self._require_up(), dict(message), took, SEND_WITHIN, lambda values: feedback(Feedback(values)))
+        request, news = dict(message), lambda values: feedback(Feedback(values))
+        self._thread.do(self._asking(self._require_up(), request, took, news)[0], SEND_WITHIN)
 
     def blocking_call_from_thread(self, callback: Callable[[Any], Any], timeout: float | None) -> Any:
         """Run a request on the network thread and wait for its result; `LinkLost` if the link is down."""
@@ -178,17 +179,16 @@ class RosbridgeLink(RosBus, Ros):  # type: ignore[misc]
     def _send(self, connection: Connection, *frames: str) -> None:
         connection.send(*frames)
 
-    def _ask(
+    def _asking(
         self,
         connection: Connection,
         request: Message,
         took: Callable[[Reply], None],
-        within: float,
         news: Callable[[Any], Any] | None = None,
-    ) -> Callable[[], object]:
+    ) -> tuple[Callable[[], None], Callable[[], object]]:
         identity, frame = str(request["id"]), dump_json(request)
-        self._thread.do(lambda: connection.ask(identity, frame, took, news), within)
-        return partial(self._thread.post, partial(connection.forget, identity))
+        ask = partial(connection.ask, identity, frame, took, news)
+        return ask, partial(self._thread.post, partial(connection.forget, identity))
 
     def _require_open(self) -> None:
         if self._closed:

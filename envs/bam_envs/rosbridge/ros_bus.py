@@ -102,10 +102,10 @@ class RosBus(Bus):
         """Write frames to `connection` now, all or none; on the network thread."""
 
     @abstractmethod
-    def _ask(
-        self, connection: Any, request: dict[str, Any], took: Callable[[Reply], None], within: float
-    ) -> Callable[[], object]:
-        """Send a request whose reply goes to `took`; returns a function that stops waiting for it."""
+    def _asking(
+        self, connection: Any, request: dict[str, Any], took: Callable[[Reply], None]
+    ) -> tuple[Callable[[], None], Callable[[], object]]:
+        """Two functions: one sends a request on the network thread, and its reply goes to `took`; one forgets it."""
 
     # ---- topics
 
@@ -129,7 +129,11 @@ class RosBus(Bus):
 
     def publish_soon(self, topic: str, message: Message) -> None:
         """Hand a report to the network thread without waiting for it; dropped if it cannot be sent at once."""
-        connection, frame = self._up, dump_json({"op": "publish", "topic": topic, "msg": message})
+        self.send_soon({"op": "publish", "topic": topic, "msg": message})
+
+    def send_soon(self, operation: Message) -> None:
+        """As `publish_soon`, for any operation of the protocol."""
+        connection, frame = self._up, dump_json(operation)
 
         def send() -> None:
             with suppress(LinkLost):
@@ -243,8 +247,9 @@ class RosBus(Bus):
         if kind:
             request["type"] = normal_name(kind)
         response: Future[Reply] = Future()
-        forget = self._ask(connection, request, response.set_result, timeout)
+        ask, forget = self._asking(connection, request, response.set_result)
         try:
+            self._thread.do(ask, timeout)
             reply = response.result(begun + timeout - time.monotonic())
         except NoResultYet as error:
             raise LinkLost(f"{self.url}: {service} did not answer in {timeout:g} s; it may still be at it.") from error
@@ -253,6 +258,21 @@ class RosBus(Bus):
         if isinstance(reply, BamEnvsError):
             raise reply
         return self._response(service, reply, time.monotonic() - begun, timeout)
+
+    def ask_soon(self, request: dict[str, Any], took: Callable[[Reply], None]) -> None:
+        """Send a goal or a call of a service without waiting, now or not at all.
+
+        Its reply, or why there is none, goes to `took` on the network thread. `LinkLost` if the link is down.
+        """
+        ask, _ = self._asking(self._require_up(), request, took)
+
+        def send() -> None:
+            try:
+                ask()
+            except BamEnvsError as error:
+                tell(took, error)
+
+        self._thread.post(send)
 
     def _response(self, service: str, reply: Mapping[str, Any], waited: float, timeout: float) -> dict[str, Any]:
         values = reply.get("values")

@@ -73,6 +73,12 @@ class Sessions:
             raise RemoteError(f"session {tag.session} {_ELSEWHERE}")
         return session.fresh
 
+    def newest(self, caller: Caller) -> str:
+        """The session that the connection of `caller` opened last; empty if none is open."""
+        with self._lock:
+            names = [name for name, session in self._sessions.items() if session.caller == caller.name]
+        return names[-1] if names else ""
+
     def left(self, caller: Caller) -> list[str]:
         """Close the sessions of `caller`, whose connection ended; returns their names."""
         with self._lock:

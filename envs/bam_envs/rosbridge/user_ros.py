@@ -2,21 +2,22 @@
 
 import os
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from functools import partial
 from typing import Any
 
-from roslibpy import Message, Ros
+from roslibpy import Message as Request
+from roslibpy import Ros
 from roslibpy.comm import select_factory
 
 from bam_envs.core.errors import InvalidValue, LinkLost, NoServer, RemoteError
 from bam_envs.core.wording import brief
-from bam_envs.rosbridge.bus import Handler, tell
+from bam_envs.rosbridge.bus import Handler, Message, tell
 from bam_envs.rosbridge.client_connection import TWISTED, send_now
 from bam_envs.rosbridge.encoding import dump_json
 from bam_envs.rosbridge.endpoint import Endpoint
-from bam_envs.rosbridge.ros_bus import Reply, RosBus, read_clock
+from bam_envs.rosbridge.ros_bus import SEND_WITHIN, Reply, RosBus, read_clock
 
 _MAX_MESSAGE = 64 * 1024 * 1024
 _ANSWER_WITHIN = 3.0
@@ -44,6 +45,7 @@ class UserRosLink(RosBus):
         super().__init__(address.url, address.namespace, "roslibpy")
         self._ros = ros
         self._waiting: set[Callable[[Reply], None]] = set()  # for replies
+        self._has_asked = False  # since the last message was published
         self._hooks: dict[str, Callable[[Any], None]] = {  # by event of roslibpy's; a topic and a service is one, too
             "ready": partial(tell, self._begin),
             "close": self._note_close,
@@ -85,6 +87,18 @@ class UserRosLink(RosBus):
             self._hook(request["topic"], partial(self._take_published, request["topic"]))
         super()._declare(request, *kind_and_listener)
 
+    def ask_soon(self, request: dict[str, Any], took: Callable[[Reply], None]) -> None:
+        """Send a goal or a call of a service without waiting; see the base class."""
+        super().ask_soon(request, took)
+        self._has_asked = True
+
+    def publish_all(self, messages: Sequence[tuple[str, Message]]) -> None:
+        """Send several messages now or not at all, behind what was asked before; see the base class."""
+        if self._has_asked:  # roslibpy writes a request in the next round of its loop
+            self._has_asked = False
+            self._thread.do(lambda: None, SEND_WITHIN)
+        super().publish_all(messages)
+
     def serve(self, service: str, kind: str, handler: Handler) -> None:
         """Answer `service` of type `kind` through the server."""
         self._hook(service, self._serve)
@@ -96,23 +110,29 @@ class UserRosLink(RosBus):
         if self._thread.loop is not None:
             self._ros.on(event, hook)
 
-    def _ask(
-        self, connection: Any, request: dict[str, Any], took: Callable[[Reply], None], within: float
-    ) -> Callable[[], object]:
+    def _asking(
+        self, connection: Any, request: dict[str, Any], took: Callable[[Reply], None]
+    ) -> tuple[Callable[[], None], Callable[[], object]]:
         dump_json(request)  # refuses what roslibpy would send: numbers that are not finite
+        is_goal = request["op"] == "send_action_goal"
 
         def back(result: bool, values: Any) -> None:
             if took in self._waiting:
                 self._waiting.discard(took)
-                took({"values": values if isinstance(values, str) else dict(values), "result": result})
+                reply = {"result": result, "values": values["values"] if is_goal else values}
+                reply |= {"status": values["status"].value} if is_goal else {}
+                took({name: dict(one) if isinstance(one, Mapping) else one for name, one in reply.items()})
 
         def ask() -> None:
             self._send(connection)
             self._waiting.add(took)
-            connection.send_ros_service_request(Message(request), partial(back, True), partial(back, False))
+            done, failed = partial(back, True), partial(back, False)
+            if is_goal:
+                connection.send_ros_action_goal(Request(request), done, lambda news: None, failed)
+            else:
+                connection.send_ros_service_request(Request(request), done, failed)
 
-        self._thread.do(ask, within)
-        return lambda: self._waiting.discard(took)
+        return ask, lambda: self._waiting.discard(took)
 
     # ---- the network thread
 

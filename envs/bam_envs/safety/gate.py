@@ -270,6 +270,11 @@ class SafeRobot(metaclass=Sealed):
         return getattr(self._robot, "info", None)
 
     @property
+    def profile(self) -> Any:
+        """The profile of a live robot; None of any other."""
+        return getattr(self._live, "profile", None)
+
+    @property
     def agent_state(self) -> str:
         """The state of a live agent once its robot was handed back, such as ``"paused"``; "" if it is unknown."""
         return getattr(self._live, "agent_state", "")
@@ -278,6 +283,19 @@ class SafeRobot(metaclass=Sealed):
         """Why a live robot reports that it cannot move now, or None. May call its services: only at rest."""
         why: str | None = getattr(self._live, "not_ready", lambda: None)()
         return why
+
+    @property
+    def enabling(self) -> tuple[Any, ...]:
+        """The services that `enable` will call: `service` and what it `does`; empty if none is left."""
+        return tuple(getattr(self._live, "enabling", ()))
+
+    def enable(self) -> None:
+        """Call the services before which a live robot takes no commands, once its operator has agreed.
+
+        `NotReady` names the first that does not succeed.
+        """
+        if self.enabling:
+            self._live.enable()
 
     def age(self) -> float:
         """Age of the newest state of a live robot [s]; 0 for any other."""

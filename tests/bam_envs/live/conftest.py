@@ -6,6 +6,7 @@ import copy
 import json
 import threading
 import time
+from functools import partial
 
 import numpy as np
 import pytest
@@ -18,7 +19,7 @@ from bam_envs.live import rosbridge_robot
 from bam_envs.robots.profile import load_profile
 from bam_envs.ros.codec import HALT_TOPIC, INFO_SERVICE, RobotInfo, decode_command, encode_state
 from bam_envs.ros.messages import write_stamp
-from bam_envs.rosbridge.bus import Caller
+from bam_envs.rosbridge.bus import CANCELED, SUCCEEDED, Action, Caller
 from bam_envs.rosbridge.server import BridgeServer
 
 DEADLINE = 10.0
@@ -135,6 +136,10 @@ class ScriptedRobot:
         self.profile = self.profile.narrowed(self.spec.command.labels)
         self.commands = []
         """(topic, caller, message), in order."""
+        self.goals, self.canceled = [], []
+        """Goals of actions, in order, and those that were to be canceled."""
+        self.on_goal = lambda goal: goal.end(SUCCEEDED, {"reached_goal": True})
+        self.respond = lambda request: {"success": True}
         self.halts, self.frozen = 0, False
         self.signals = {one.name: np.zeros(len(one.labels)) for one in self.spec.signals}
         self.mangle = lambda topic, message: message
@@ -155,8 +160,14 @@ class ScriptedRobot:
         for source in self.profile.state:
             if source.signal in self.signals:
                 self._bus.advertise(self._namespace + source.topic, source.type)
-        for topic, kind in {(sink.topic, sink.type) for way in self.profile.commands.values() for sink in way}:
-            self._bus.subscribe(self._namespace + topic, kind, self._listener(topic))
+        for sink in self.profile.sinks_by_address.values():
+            name, listener = self._namespace + sink.address, self._listener(sink.address)
+            if sink.topic:
+                self._bus.subscribe(name, sink.type, listener)
+            elif sink.action:
+                self._bus.act(Action(name, sink.type, partial(self._begin, listener), self._cancel))
+            else:
+                self._bus.serve(name, sink.type, partial(self._serve, listener))
         self._bus.subscribe(self._namespace + HALT_TOPIC, "std_msgs/Empty", self._on_halt)
         if self._info is not None:
             answer = {"success": True, "message": self._info.to_json()}
@@ -196,6 +207,21 @@ class ScriptedRobot:
                 self.publish()
 
         return listen
+
+    def _begin(self, listener, goal):
+        listener(goal.values, goal.caller)
+        self.goals.append(goal)
+        self.on_goal(goal)
+
+    def _cancel(self, goal):
+        with self._changed:
+            self.canceled.append(goal)
+            self._changed.notify_all()
+        goal.end(CANCELED, {})
+
+    def _serve(self, listener, request, caller):
+        listener(request, caller)
+        return self.respond(request)
 
     def _on_halt(self, message, caller):
         with self._changed:

@@ -5,6 +5,7 @@ import threading
 import time
 from dataclasses import replace
 from functools import partial
+from importlib.resources import files
 
 import numpy as np
 import pytest
@@ -122,6 +123,33 @@ def test_commands_and_their_tags(server, robot_on, connect):
     assert sequences == [sequences[0] + n // 2 for n in range(6)]
     assert all(tag.deadline - tag.sent == pytest.approx(0.1, abs=1e-5) for tag in tags)
     assert (np.diff([state.stamp[0] for state in states]) > 0).all()
+
+
+def test_a_controller_that_holds_gets_set_points_between_commands(server, robot_on, tmp_path, connect):
+    path = tmp_path / "mine.toml"
+    row = 'hold = "measured"\nrate = 200.0\n'
+    shipped = (files("bam_envs.robots") / "profiles" / "ur5e.toml").read_text()
+    path.write_text(shipped.removesuffix('hold = "measured"\n') + row)
+    scripted = robot_on(server)
+    start = scripted.signals["joint_position"].copy()
+    robot, gate = connect(server.url, path, command="position")
+    assert robot.spec.lag == pytest.approx(0.125)  # 0.1 s, and half a period
+    command = gate.state.command.copy()
+    command[0, 0] += 0.2
+    for _ in range(4):
+        state = gate.step(command)
+    np.testing.assert_array_equal(state.command, command)
+    robot.halt()
+    scripted.wait_for(lambda: scripted.halts == 1)
+    points = np.array([message["data"] for message in scripted.on(JOINT_COMMANDS)])[:-1]  # the last one holds
+    assert len(points) > 2 * 4
+    assert len(scripted.on(GRIPPER_COMMANDS)) == 5
+    first = points[:, 0]
+    assert first.max() < command[0, 0] + 0.01  # a spline whose goal stays goes a little beyond it
+    assert 0.0 < first[0] - start[0] < 0.04
+    assert np.abs(np.diff(first)).max() < 0.1
+    assert first[-1] == pytest.approx(command[0, 0], abs=5e-3)
+    np.testing.assert_array_equal(points[:, 1:], np.tile(command[0, 1:6], (len(points), 1)))
 
 
 def test_only_a_gate_sends_commands(server, robot_on, connect):
@@ -458,13 +486,13 @@ def test_without_a_halt_link_nothing_is_sent(server, robot_on, connect):
     ("profile", "topic", "found", "expected"),
     [
         ("ur5e", "/object_pose", "std_msgs/String", "geometry_msgs/PoseStamped"),
-        ("mir100", "/cmd_vel", "geometry_msgs/TwistStamped", "geometry_msgs/Twist"),  # a bridge would drop what is not
+        ("mir100", "/cmd_vel", "geometry_msgs/Wrench", "geometry_msgs/Twist"),  # a bridge would drop what is not
     ],
 )
 def test_a_topic_of_another_type(server, profile, topic, found, expected):
     for source in load_profile(profile).state:
         server.advertise(source.topic, found if source.topic == topic else source.type)
-    server.subscribe("/cmd_vel", "geometry_msgs/msg/TwistStamped", lambda message, caller: None)
+    server.subscribe("/cmd_vel", "geometry_msgs/msg/Wrench", lambda message, caller: None)
     robot = robot_at(server.url, profile)
     assert raised(ProtocolError, robot.connect) == (
         f"{topic} is a {found} there, and {expected} was expected. "
@@ -498,7 +526,7 @@ def test_a_silent_topic(server, robot_on):
     ("changes", "message"),
     [
         ({"name": list(JOINTS[:5]), "position": [0.0] * 5}, "wrist_3_joint missing; found: "),
-        ({"position": [None] + [0.0] * 5}, "position of shoulder_pan_joint must be a finite number, not None."),
+        ({"position": [None] + [0.0] * 5}, "position of elbow_joint must be a finite number, not None."),
         ({"header": {"stamp": {"sec": "now", "nanosec": 0}}}, "header.stamp.sec must be a finite number"),
     ],
 )
@@ -568,7 +596,7 @@ def test_ros_1(lax, robot_on, connect):
     scripted.wait_for(lambda: len(scripted.commands) == 2)
     message = scripted.commands[1][2]
     assert message["header"]["stamp"] == {"secs": 0, "nsecs": 0}
-    assert message["points"][0]["time_from_start"] == {"secs": 0, "nsecs": 75_000_000}
+    assert message["points"][0]["time_from_start"] == {"secs": 0, "nsecs": 100_000_000}
 
 
 def test_two_robots_behind_one_server(server, robot_on, connect):

@@ -7,11 +7,14 @@ import pytest
 
 from bam_envs.arms.description import robot_model
 from bam_envs.core.errors import InvalidValue, UnknownName
+from bam_envs.core.robot import RobotState
 from bam_envs.robots.base_description import base_model
 from bam_envs.robots.fake import FakeRobot
 from bam_envs.robots.profile import load_profile, profile_for, shipped_profiles
 from bam_envs.robots.ur import ur_model, ur_spec
 from bam_envs.robots.ur5e import JOINTS, arm_spec
+from bam_envs.ros.codec import decode_command, decode_source, encode_sink, encode_state
+from bam_envs.ros.messages import write_stamp
 from tests.bam_envs.making import CART
 
 OWN = """
@@ -69,7 +72,8 @@ def refusal(path):
 
 
 def test_the_ur5e_whose_controller_interpolates():
-    assert shipped_profiles() == ["husky", "mir100", "ur5e", "ur5e_position", "ur5e_trajectory"]
+    arms = ["franka_ros2", "ros2_kortex", "ros2_so_arm100", "xarm_ros2"]
+    assert shipped_profiles() == sorted([*arms, "husky", "mir100", "ur5e", "ur5e_position", "ur5e_trajectory"])
     profile, held = load_profile("ur5e_trajectory"), load_profile("ur5e")
     assert profile.spec() == replace(held.spec(), name="ur5e_trajectory")
     assert (profile.state, profile.readiness, profile.limits) == (held.state, held.readiness, held.limits)
@@ -131,7 +135,7 @@ def test_a_task_may_take_a_part_of_the_commands():
     (_, trajectory), (_, arm) = profile.commands.values()
     assert dict(narrow.commands) == {"trajectory": (trajectory,), "position": (arm,)}
     assert narrow.sinks() == (trajectory,)
-    assert list(narrow.sinks_by_topic) == [arm.topic, trajectory.topic]
+    assert list(narrow.sinks_by_address) == [arm.topic, trajectory.topic]
     assert replace(narrow, command=profile.command, commands=profile.commands) == profile
     assert profile.narrowed(profile.command.labels) is profile
     assert profile_for(wanted) == narrow
@@ -256,6 +260,14 @@ sensor_msgs/msg/JointState" -> a/B"\nframe = "map" -> state[0]: frame needs a ty
 [command] -> [rename]\n"/lift/command" = "c"\n[command] -> rename./lift/command: expected an absolute name such as
 [command] -> [[cameras]]\nname = "c"\ntopic = "/c"\ntype = "a/B"\n[command] -> cameras[0]: type: expected 'sensor_msgs/C
 [command] -> [[readiness]]\ntopic = "/c"\ntype = "a/B"\nfield = "f"\n[command] -> readiness[0]: give either ready (the
+topic = "/lift/command" -> -> commands.position[0]: give one of topic, action, service.
+topic = "/lift/command" -> topic = "/a"\nservice = "/b" -> commands.position[0]: give one of topic, action, service.
+topic = "/lift/command" -> action = "/a" -> commands.position: the last table must have a topic, because it completes
+topic = "/lift/command" -> topic = "/a"\nclosing = { action = "/b", type = "c/D" } -> commands.position[0]: closing
+topic = "/lift/command" -> action = "/a"\nhold = "zero" -> commands.position[0]: hold of an action or a service is last
+fields = ["data"] -> constants = { a = [1] } -> commands.position[0]: constants.a: expected a finite number or true or f
+[command] -> [[enable]]\nservice = "/on"\ntype = "a/B"\n[command] -> enable[0]: the key 'does' is missing
+[command] -> [[enable]]\nservice = "on"\ntype = "a/B"\ndoes = "c"\n[command] -> enable[0]: service: expected an absolute
 """
 """What is replaced in `OWN`, by what, and how the error begins, behind the name of the file."""
 
@@ -284,8 +296,8 @@ def test_files(write, tmp_path):
     missing = tmp_path / "other.toml"
     (tmp_path / "folder.toml").mkdir()
     assert refusal(missing) == (
-        "There is no robot profile FILE. Give the path of a file, or one of: husky, mir100, ur5e, ur5e_position, "
-        "ur5e_trajectory."
+        "There is no robot profile FILE. Give the path of a file, or one of: franka_ros2, husky, mir100, "
+        "ros2_kortex, ros2_so_arm100, ur5e, ur5e_position, ur5e_trajectory, xarm_ros2."
     )
     assert refusal(write("name =")).startswith("FILE is not TOML: ")
     for text in ("a: [", "a: 2020-13-45", "a: !!int b", "[" * 1000):
@@ -299,7 +311,8 @@ def test_files(write, tmp_path):
         load_profile(write('extends = "ur5"'))
     assert refusal(write("extends = 3")) == "FILE: extends: expected non-empty text, found 3"
     assert refusal(write('extends = "b.toml"')) == (
-        "FILE: extends must be a shipped profile (husky, mir100, ur5e, ur5e_position, ur5e_trajectory), not 'b.toml'."
+        "FILE: extends must be a shipped profile (franka_ros2, husky, mir100, ros2_kortex, ros2_so_arm100, ur5e, "
+        "ur5e_position, ur5e_trajectory, xarm_ros2), not 'b.toml'."
     )
     assert refusal(tmp_path / "folder.toml") == (
         "The robot profile FILE cannot be read: [Errno 21] Is a directory: 'FILE'."
@@ -309,8 +322,54 @@ def test_files(write, tmp_path):
 def test_what_is_sent_on_a_topic():
     profile = load_profile("ur5e")
     (gripper, arm), (_, trajectory) = profile.commands.values()
-    assert profile.sinks_by_topic == {sink.topic: sink for sink in (gripper, arm, trajectory)}
-    assert profile.sinks_by_topic[gripper.topic] is gripper
+    assert profile.sinks_by_address == {sink.topic: sink for sink in (gripper, arm, trajectory)}
+    assert profile.sinks_by_address[gripper.topic] is gripper
+
+
+GRIPPER = """
+extends = "ur5e"
+readiness = []
+
+[[commands.action]]
+action = "/gripper/gripper_cmd"
+type = "control_msgs/action/GripperCommand"
+labels = ["gripper_width"]
+fields = ["command.position"]
+scale = -0.1
+offset = 0.085
+constants = { "command.max_effort" = 40.0 }
+
+[[commands.action]]
+topic = "/arm/joint_trajectory"
+type = "trajectory_msgs/JointTrajectory"
+labels = ["shoulder_pan_joint", "shoulder_lift_joint", "elbow_joint", "wrist_1_joint", "wrist_2_joint", "wrist_3_joint"]
+
+[[enable]]
+service = "/arm/motion_enable"
+type = "xarm_msgs/srv/SetInt16ById"
+request = { id = 8, data = 1 }
+field = "ret"
+ready = 0
+does = "enables the motors"
+"""
+
+
+def test_a_gripper_may_be_an_action_and_a_robot_may_have_to_be_enabled(write):
+    profile = load_profile(write(GRIPPER + '[rename]\n"/gripper/gripper_cmd" = "/g"\n"/arm/motion_enable" = "/on"\n'))
+    gripper, _ = profile.sinks("action")
+    assert (gripper.topic, gripper.action, gripper.address) == ("", "/g", "/g")
+    assert (gripper.type, gripper.hold, gripper.tag) == ("control_msgs/GripperCommand", "last", False)
+    assert profile.sinks_by_address["/g"] is gripper
+    command = np.append(np.zeros(6), 0.045)
+    address, _, goal = encode_sink(gripper, profile.spec(), command, None)
+    assert (address, goal) == ("/g", {"command": {"max_effort": 40.0, "position": pytest.approx(0.4)}})
+    decoded = decode_command(profile, profile.spec(), "/g", goal)
+    assert (decoded.places, decoded.values) == ([6], pytest.approx([0.045]))
+    (enable,) = profile.enable
+    assert (enable.service, enable.type, enable.request) == ("/on", "xarm_msgs/SetInt16ById", {"id": 8, "data": 1})
+    assert enable.trouble({"ret": 0, "message": ""}) is None
+    assert enable.trouble({"ret": 9, "message": "not ready"}) == "ret is 9, not 0: not ready"
+    assert enable.trouble({}) == "ret is missing, not 0"
 
 
 def test_a_frame_of_another_name(write):
@@ -412,12 +471,88 @@ def test_a_users_own_base(write):
 
 
 def test_a_described_arm_has_the_usual_topics_where_no_profile_is_shipped():
-    profile = profile_for(robot_model("fr3").spec(with_object=True))
+    arm = replace(robot_model("fr3"), name="fr3b")
+    profile = profile_for(arm.spec(with_object=True))
     assert [source.topic for source in profile.state] == [
         *["/joint_states"] * 2,
         "/gripper/joint_states",
         *["/object_pose"] * 2,
     ]
-    gripper, arm = profile.commands["trajectory"]
-    assert (gripper.topic, arm.topic) == ("/gripper/commands", "/joint_trajectory_controller/joint_trajectory")
-    assert (arm.type, arm.names) == ("trajectory_msgs/JointTrajectory", robot_model("fr3").joint_names)
+    gripper, trajectory = profile.commands["trajectory"]
+    assert (gripper.topic, trajectory.topic) == ("/gripper/commands", "/joint_trajectory_controller/joint_trajectory")
+    assert (trajectory.type, trajectory.names) == ("trajectory_msgs/JointTrajectory", arm.joint_names)
+    assert [camera.name for camera in profile.cameras] == ["front", "wrist", "front_depth", "wrist_depth"]
+
+
+JTC = "joint_trajectory_controller"
+
+
+@pytest.mark.parametrize(
+    ("name", "profile", "states", "modes"),
+    [
+        (
+            "fr3",
+            "franka_ros2",
+            {"/joint_states", "/object_pose"},
+            {
+                "trajectory": ["/franka_gripper/move", "/fr3_arm_controller/joint_trajectory"],
+                "crisp": ["/franka_gripper/move", "/target_joint"],
+            },
+        ),
+        (
+            "xarm7",
+            "xarm_ros2",
+            {"/xarm/joint_states", "/object_pose"},
+            {"trajectory": ["/xarm_gripper/gripper_action", "/xarm7_traj_controller/joint_trajectory"]},
+        ),
+        (
+            "gen3",
+            "ros2_kortex",
+            {"/joint_states", "/object_pose"},
+            {
+                "trajectory": [
+                    "/robotiq_gripper_controller/gripper_cmd",
+                    "/joint_trajectory_controller/joint_trajectory",
+                ]
+            },
+        ),
+        (
+            "so101",
+            "ros2_so_arm100",
+            {"/joint_states", "/object_pose"},
+            {
+                "trajectory": [f"/{JTC}/joint_trajectory"],
+                "position": ["/forward_position_controller/commands"],
+            },
+        ),
+    ],
+)
+def test_shipped_arms_have_the_names_of_their_drivers(name, profile, states, modes):
+    arm = robot_model(name)
+    shipped = profile_for(arm.spec(with_object=True))
+    assert (shipped.name, shipped.robot, shipped) == (profile, name, load_profile(profile))
+    assert {source.topic for source in shipped.state} == states
+    assert {mode: [sink.address for sink in sinks] for mode, sinks in shipped.commands.items()} == modes
+    spec = arm.spec(with_object=True)
+    assert (shipped.command, shipped.signals) == (spec.command, spec.signals)
+    numbers = {one.name: np.linspace(one.low, one.high, 3)[1:2] + 0.01 for one in spec.signals}
+    state = RobotState(numbers, np.zeros(1), np.zeros((1, len(spec.command.labels))))
+    messages = [
+        one for _, kind, one in encode_state(shipped, state, 0, write_stamp(1.0)) if kind.endswith("JointState")
+    ]
+    for source in shipped.state[:3]:  # each finds its numbers in the messages of its driver
+        (message,) = (one for one in messages if source.names[0] in one["name"])
+        read = decode_source(source, message, len(source.names))
+        np.testing.assert_allclose(read, numbers[source.signal][0], atol=1e-12)
+    assert all(message["name"] == sorted(message["name"]) for message in messages)
+
+
+def test_a_profile_beside_the_descriptions_comes_first(write, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "robots" / "profiles").mkdir(parents=True)
+    (tmp_path / "robots" / "profiles" / "gen3.toml").write_text('extends = "ros2_kortex"\nname = "cell 4"\n')
+    spec = robot_model("gen3").spec(with_object=True)
+    assert profile_for(spec) == replace(load_profile("ros2_kortex"), name="cell 4")
+    (tmp_path / "robots" / "profiles" / "gen3.toml").write_text('extends = "kortex"\n')
+    with pytest.raises(UnknownName, match="Unknown robot profile 'kortex'"):
+        profile_for(spec)

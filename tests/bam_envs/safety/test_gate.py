@@ -112,8 +112,8 @@ def test_the_limits_of_a_live_robot_are_of_no_other_kind_and_their_bounds_are_fi
 @pytest.mark.parametrize(
     ("text", "error"),
     [
-        ("reach = 100.0", "ur5e may be 0 to 0.5 s behind its commands, not 100.05 s. "),
-        ("reach_periods = 50", "ur5e may be 0 to 0.5 s behind its commands, not 2.55 s. "),
+        ("reach = 100.0", "ur5e may be 0 to 0.5 s behind its commands, not 75.05 s. "),
+        ("reach_periods = 50", "ur5e may be 0 to 0.5 s behind its commands, not 1.925 s. "),
         (
             "period = 100.0",
             "The period of ur5e must be above 0 and at most 1 s, not 100 s: the robot moves for that "
@@ -125,7 +125,7 @@ def test_a_profile_cannot_make_one_command_go_anywhere(tmp_path, text, error):
     """How far a command may be from the arm, and for how long it is not missed, would be without bounds."""
     shipped = (Path(bam_envs.__file__).parent / "robots" / "profiles" / "ur5e.toml").read_text()
     profile = tmp_path / "mine.toml"
-    late = shipped.replace("reach_periods = 1.5", text)
+    late = shipped.replace("reach_periods = 2.0", text)
     profile.write_text(late if "reach" in text else f'extends = "ur5e"\n{text}\n')
     with pytest.raises(InvalidValue) as caught:
         live_robot(NOBODY, profile=profile)

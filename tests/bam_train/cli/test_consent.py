@@ -26,12 +26,17 @@ class RealArm:
     info = SimpleNamespace(simulated=False, text="ur5e at ws://10.0.0.5:9090")
 
     trouble = None
+    enabling = ()
 
     def report(self):
         return GUARDS
 
     def not_ready(self):
         return self.trouble
+
+    def enable(self):
+        """What makes it ready, if anything has to."""
+        self.trouble, self.enabling = None, ()
 
 
 def consent(monkeypatch, robot, answer=None, yes=False, plan=()):
@@ -108,9 +113,28 @@ def test_nobody_is_asked_about_a_robot_that_is_not_ready(monkeypatch):
     )
 
 
+def test_a_robot_is_enabled_once_somebody_has_agreed(monkeypatch, capsys):
+    robot = RealArm()
+    robot.trouble = "the motors are off"
+    robot.enabling = (SimpleNamespace(service="/arm/motion_enable", does="enables the motors"),)
+    with pytest.raises(SettingsError, match=r"^the answer was not yes; nothing has moved$"):
+        consent(monkeypatch, robot, "no\n")
+    assert len(robot.enabling) == 1
+    capsys.readouterr()
+    consent(monkeypatch, robot, "yes\n")
+    assert robot.enabling == ()
+    assert "\n  first /arm/motion_enable is called, which enables the motors\n" in capsys.readouterr().err
+    robot.enabling, robot.enable = (SimpleNamespace(service="/a", does="b"),), lambda: None
+    robot.trouble = "the motors are off"
+    with pytest.raises(SettingsError, match=r"^not ready: the motors are off; nothing has moved$"):
+        consent(monkeypatch, robot, yes=True)
+
+
 def test_simulated_robots_move_without_asking(monkeypatch, capsys):
     served = RealArm()
     served.info = SimpleNamespace(simulated=True, text="ur5e, simulated")
+    served.enabling = (SimpleNamespace(service="/a", does="b"),)
     consent(monkeypatch, served)
+    assert served.enabling == ()
     consent(monkeypatch, None)
     assert capsys.readouterr().err == ""

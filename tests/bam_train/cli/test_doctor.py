@@ -88,7 +88,7 @@ def test_json_of_a_failure(run, nobody):
     status, out, _ = run(doctor, nobody, "--json")
     report = json.loads(out)
     assert status == 1
-    assert (report["failed"], report["not_tried"], report["measured"]) == ("port", list(STEPS[1:]), None)
+    assert (report["failed"], report["not_tried"], report["measured"]) == ("port", [*STEPS[1:], "description"], None)
     assert report["steps"][0]["verdict"] == "failed"
 
 
@@ -117,3 +117,24 @@ def test_flags_that_are_refused(run, flags, text):
     assert (status, out) == (1, "")
     assert err.startswith(f"bam-doctor: {text}")
     assert len(err.splitlines()) == 1
+
+
+def test_the_urdf_of_a_described_arm_is_compared_with_that_of_the_profile_or_of_a_flag(run):
+    fr3 = gym.make("bam/pick-v0", robot_model="fr3", disable_env_checker=True)
+    with ServedEnvironment(fr3, ServeOptions(port=0, fast=True)) as one:
+        given = (one.bus.url, "--seconds", 0.1)
+        status, out, err = run(doctor, *given, "--json")
+        report = json.loads(out)
+        assert (status, err, report["steps"][-1]["name"]) == (0, "", "description")
+        lines = {line["what"]: (line["found"], line["verdict"]) for line in report["contract"]}
+        assert lines["mount in /robot_description"] == ("as described", "ok")
+        assert lines["tool in /robot_description"] == ("tool is 0 mm from it", "ok")
+        assert run(doctor, *given, "--robot-model", "fr3")[0] == 0
+        status, out, err = run(doctor, *given, "--robot-model", "gen3", "--profile", "franka_ros2")
+        assert status == 3
+        assert "kinematics in /robot_description" in out
+        assert err.startswith("bam-doctor: description failed: the description of gen3 and the robot do not fit: ")
+    flags = ("--robot-model", "fr3", "--checkpoint", PICK)
+    assert run(doctor, "ws://127.0.0.1:9", *flags)[2] == (
+        "bam-doctor: --robot-model and --checkpoint each name an arm; give one of them\n"
+    )

@@ -78,3 +78,17 @@ def test_an_environment_without_a_robot_has_no_guards(run, corridor_checkpoint):
     status, out, err = run(main, corridor_checkpoint(), "--print-guards")
     assert (status, out) == (1, "")
     assert err == "bam-deploy: --print-guards: test/Corridor-v0 has no robot, and so no guards\n"
+
+
+def test_the_description_of_the_arm_may_be_the_one_here_and_not_another_arms(run, tmp_path):
+    path, print_guards = CHECKPOINTS / "reach-ppo.zip", "--print-guards"
+    here = run(main, path, print_guards, "--json")
+    assert run(main, path, print_guards, "--json", "--robot-model", "ur5e") == here
+    status, out, err = run(main, path, print_guards, "--robot-model", "ur10e")
+    assert (status, out) == (1, "")
+    assert err.startswith(
+        f"bam-deploy: {path}: was trained for another robot: ur5e, and ur10e moves otherwise: home.0: "
+    )
+    assert err.endswith("Give the description with which the policy was trained, or train a policy for this one.\n")
+    _, _, err = run(main, CHECKPOINTS / "mir100-navigation-ppo.zip", print_guards, "--robot-model", "ur5e")
+    assert "--robot-model ur5e: env_kwargs: unknown setting 'robot_model' of bam/mir100-navigation-v0" in err

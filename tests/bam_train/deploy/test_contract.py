@@ -181,7 +181,8 @@ def test_the_table_of_a_correct_arm():
         *("length of object_quaternion", "joint_velocity against joint_position"),
         *("command /gripper/commands", "command /scaled_joint_trajectory_controller/joint_trajectory"),
         *(f"limits of {name}" for name in UR_JOINTS),
-        *("kinematics in /robot_description", "tool pose", "tool length", "sense of the joints"),
+        *("kinematics in /robot_description", "mount in /robot_description"),
+        *("tool pose", "tool length", "sense of the joints"),
     ]
     assert lines[0].split() == ["what", "expected", "found", "verdict"]
     assert lines[2].split() == ["rate", "of", "/joint_states", "at", "least", "16", "Hz", "100", "Hz", "ok"]
@@ -603,24 +604,86 @@ def described_urdf(arm, lengths=1.0):
             f'<origin xyz="{xyz}" rpy="{roll!r} {pitch!r} {yaw!r}"/><axis xyz="{axis}"/>'
             f'<limit lower="{row.low!r}" upper="{row.high!r}"/></joint>'
         )
+    rows.append(fixed(f"l{len(arm.joints)}", "hand_tcp", " ".join(map(repr, arm.tool.xyz))))
     return f'<robot name="arm">{"".join(rows)}</robot>'
 
 
-def described(name, urdf):
+def fixed(parent, child, xyz="0 0 0", rpy="0 0 0"):
+    """A fixed joint of a URDF."""
+    return (
+        f'<joint name="to_{child}" type="fixed"><parent link="{parent}"/><child link="{child}"/>'
+        f'<origin xyz="{xyz}" rpy="{rpy}"/></joint>'
+    )
+
+
+def on_top_of(urdf, *joints):
+    """The `urdf` with further joints."""
+    return urdf.replace("</robot>", "".join(joints) + "</robot>")
+
+
+def described(name, urdf, frame=""):
     arm = robot_model(name)
-    inspection = SimpleNamespace(letters={"/robot_description": [Letter({"data": urdf}, BEGIN, 1)]})
+    letters = {"/robot_description": [Letter({"data": urdf}, BEGIN, 1)]}
+    sources = [("object_position", ()), ("joint_position", arm.joint_names)]
+    profile = SimpleNamespace(state=[SimpleNamespace(signal=one, frame=frame, names=names) for one, names in sources])
+    inspection = SimpleNamespace(letters=letters, profile=profile)
     return list(described_checks(arm.spec(with_object=False), arm.chain, 0.02, inspection))
+
+
+def found_in(name, urdf, frame=""):
+    """What is found of the model, the mount and the tool, and the verdict."""
+    lines = described(name, urdf, frame)
+    return {line.what.split()[0]: (line.found, line.verdict) for line in lines if line.what.endswith("description")}
 
 
 @pytest.mark.parametrize("name", ["fr3", "so101", "gen3", "xarm7"])
 def test_the_urdf_of_a_described_arm_is_compared_axis_by_axis(name):
     arm = robot_model(name)
-    *limits, same = described(name, described_urdf(arm))
+    *limits, same, mount, tool = described(name, described_urdf(arm))
     assert [one.what for one in limits] == [f"limits of {joint}" for joint in arm.joint_names]
     assert (same.what, same.found, same.fits) == ("kinematics in /robot_description", "as described", True)
+    assert (mount.what, mount.found, mount.fits) == ("mount in /robot_description", "as described", True)
+    assert (tool.expected, tool.found) == ("within 20 mm of the description's", "hand_tcp is 0 mm from it")
     *_, longer = described(name, described_urdf(arm, 1.1))
     assert not longer.fits
-    assert longer.found.startswith("another arm, mount or calibration: ")
+    assert longer.found.startswith("another arm or calibration: ")
     names = arm.joint_names
     mirrored = described_urdf(arm).replace('<axis xyz="0.0 0.0 1.0"/>', '<axis xyz="0.0 0.0 -1.0"/>', 1)
     assert f"{names[0]} and " in described(name, mirrored)[-1].found
+
+
+def test_another_mount_is_refused():
+    urdf = described_urdf(robot_model("fr3"))
+    assert found_in("fr3", on_top_of(urdf, fixed("world", "l0", "1 2 0.8", "0 0 1")))["mount"] == ("as described", "ok")
+    assert found_in("fr3", on_top_of(urdf, fixed("world", "l0", "0 0 1", "3.1416 0 0")))["mount"] == (
+        "l0 is tilted by 180 degrees in world",
+        "refused",
+    )
+    above = on_top_of(urdf, fixed("base_link", "l0", "0.05 0 0.8"))
+    assert found_in("fr3", above)["mount"] == (
+        "another mount: the axis of fr3_joint1 is 50 mm and 0 degrees off in base_link",
+        "refused",
+    )
+    turned = on_top_of(urdf, fixed("table", "l0", "0 0 0", "0 0 1.5708"))
+    assert found_in("fr3", turned)["mount"] == ("as described", "ok")
+    assert found_in("fr3", turned, "table")["mount"] == (
+        "another mount: the axis of fr3_joint2 is 0 mm and 90 degrees off in table",
+        "refused",
+    )
+    rail = fixed("world", "l0").replace('type="fixed"', 'type="prismatic"')
+    assert found_in("fr3", on_top_of(urdf, rail))["mount"] == ("l0 is on something that moves", "unknown")
+    assert found_in("so101", urdf)["kinematics"] == (
+        "another arm: shoulder_pan, shoulder_lift, elbow_flex, wrist_flex, wrist_roll not in it",
+        "refused",
+    )
+
+
+def test_another_tool_is_refused():
+    arm = robot_model("xarm7")
+    urdf = described_urdf(arm)
+    flange = urdf.replace("hand_tcp", "flange")
+    assert found_in("xarm7", flange)["tool"] == ("no link is called tool or *tcp*", "unknown")
+    longer = urdf.replace(repr(arm.tool.xyz[2]), "0.25")
+    assert found_in("xarm7", longer)["tool"] == ("another tool: hand_tcp is 78 mm from it", "refused")
+    both = on_top_of(longer, fixed("l7", "grip"), fixed("grip", "tool", "0 0 0.18"))
+    assert found_in("xarm7", both)["tool"] == ("tool is 8 mm from it", "ok")

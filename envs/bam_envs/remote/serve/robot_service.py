@@ -17,10 +17,12 @@ from typing import Any
 
 import numpy as np
 
+from bam_envs.arms.description import ArmDescription
 from bam_envs.core.errors import LinkLost, NotInCommand, ProtocolError, RemoteError, RobotFault, SafetyStop
 from bam_envs.core.robot import RobotState
 from bam_envs.core.timing import Ticker
 from bam_envs.remote.serve.command_lease import CommandLease
+from bam_envs.remote.serve.served_driver import ServedDriver
 from bam_envs.remote.serve.served_robot import ServedRobot
 from bam_envs.ros.codec import (
     HALT_TOPIC,
@@ -101,6 +103,7 @@ class RobotService:
         identity: The name that tells it from other robots; or empty.
         info: Its description for clients; None: that of a simulated robot.
         paced: Whether a robot in lockstep executes no command sooner than `PACE` of a period after the one before.
+        description: The arm, for its URDF; None: there is none.
     """
 
     def __init__(
@@ -114,6 +117,7 @@ class RobotService:
         identity: str = "",
         info: RobotInfo | None = None,
         paced: bool = False,
+        description: ArmDescription | None = None,
     ) -> None:
         profile = profile.narrowed(robot.spec.command.labels)
         self._robot, self._profile, self._bus, self._lease = robot, profile, bus, lease
@@ -125,6 +129,8 @@ class RobotService:
             profile.name, True, lockstep, robot.spec.period, text, robot.command_timeout, identity=identity
         )
         """Its description for clients."""
+        if self.info.agent:  # which has enabled the robot behind it, and checks its controllers
+            self._profile = profile = replace(profile, enable=(), controllers="")
         self._at_once = lockstep or getattr(robot, "at_once", False)  # whether a command does not wait for the clock
         self._slot = CommandSlot()
         self.sessions = Sessions(lambda name: lease.holder == Caller("", session=name).client)
@@ -139,6 +145,8 @@ class RobotService:
         self._pause, self._free_at = PACE * robot.spec.period if paced else 0.0, 0.0  # between commands; until when [s]
         self._moving = threading.Lock()  # an order is begun before a halt, or not at all
         self._unsubscribe: list[Callable[[], None]] = []
+        self._driver = ServedDriver(robot.spec, profile, bus, namespace, self._take, description)
+        self._gripping = False  # whether the robot is moved by goals alone
         self._scene = StringRpcService(bus, namespace + SCENE_TOPIC, self._set_scene, self.sessions)
         self.clock = Ticker(self.tick, IDLE_PERIOD if lockstep else robot.tick_period)
         """Moves the robot and publishes."""
@@ -150,8 +158,10 @@ class RobotService:
             self._bus.advertise(self._namespace + topic, kind)
         for camera in self._cameras:
             self._bus.advertise(self._namespace + camera.topic, camera.type)
-        for topic, kind in {(sink.topic, sink.type) for mode in self._profile.commands.values() for sink in mode}:
-            self._listen(topic, kind, partial(self._on_command, topic))
+        for sink in self._profile.sinks_by_address.values():
+            if sink.topic:
+                self._listen(sink.topic, sink.type, partial(self._on_command, sink.topic))
+        self._driver.start()
         self._listen(HALT_TOPIC, "std_msgs/Empty", self._on_halt)
         self._listen(LEASE_TOPIC, "std_msgs/String", self._on_lease)
         self._bus.serve(self._namespace + SESSION_SERVICE, "std_srvs/Trigger", self.sessions.open)
@@ -177,6 +187,10 @@ class RobotService:
         return {"success": True, "message": self.info.to_json()}
 
     def _on_command(self, topic: str, message: Message, caller: Caller) -> None:
+        self._take(topic, message, caller)
+
+    def _take(self, topic: str, message: Message, caller: Caller) -> Mapping[str, float]:
+        """Take a command, which came on `topic` or as a goal or request; returns its numbers by label [SI]."""
         command = self._robot.spec.command
         places, received, tag, content = decode_command(self._profile, self._robot.spec, topic, message)
         values = dict(zip(places, received.tolist(), strict=True))
@@ -185,6 +199,7 @@ class RobotService:
             if not low - _ROUNDING <= value <= high + _ROUNDING:
                 label, unit = command.labels[place], command.units[place]
                 raise ProtocolError(f"{topic}: {label} must be {low:g} to {high:g} {unit}, not {value:g} {unit}.")
+        self._driver.require_enabled()
         if isinstance(self._robot.fault, SafetyStop):
             raise self._robot.fault
         if self._robot.fault is not None:
@@ -192,11 +207,14 @@ class RobotService:
         if tag is not None:
             self.sessions.prove(tag, topic, content, caller).require(tag, topic)
             caller = replace(caller, session=tag.session)
+        elif not self._profile.sinks_by_address[topic].topic:  # goals and requests have no room for a tag
+            caller = replace(caller, session=self.sessions.newest(caller))
         self._lease.take(caller.client, caller, shown=caller.shown)
         echo, complete = "" if tag is None else tag.echo, topic in self._completing
         self._slot.put(Order(values, complete, echo, caller.client))
         if complete and self._at_once:
             self.clock.wake()
+        return {command.labels[place]: value for place, value in values.items()}
 
     def _require_driver(self, caller: Caller) -> None:
         """Raise `NotInCommand` for any other client: what the guards did is told by the one whose guards they are."""
@@ -227,6 +245,7 @@ class RobotService:
         """Halt; returns the pending order, which is not executed."""
         with self._moving:
             order = self._slot.take()
+            self._driver.cancel()
             self._robot.halt()
             if order.complete and self.info.lockstep:
                 self._answered = order.tag
@@ -269,6 +288,7 @@ class RobotService:
                 command = self._robot.target()
                 command[0, list(order.values)] = list(order.values.values())
                 command = np.minimum(np.maximum(command, self._low), self._high)  # np.clip takes three times as long
+                self._gripping = False
                 try:
                     if lockstep:
                         self._free_at = time.monotonic() + self._pause
@@ -278,9 +298,22 @@ class RobotService:
                     self._answered = order.tag
                 except RobotFault as fault:
                     _log.warning("%s: %s", self._profile.name, fault)
-        if not lockstep:
-            self._robot.tick()
+            elif not lockstep:
+                self._follow_goals()
+            if not lockstep:
+                self._robot.tick()
+            if self._robot.state is not None:
+                self._driver.advance(self._robot.state)
         self._publish()
+
+    def _follow_goals(self) -> None:
+        """Move a gripper to the goal that runs while the arm rests: an action goes on without further commands."""
+        command, targets = self._robot.target(), self._driver.targets
+        if targets and (self._gripping or self._robot.resting):
+            for label, value in targets.items():
+                command[0, self._robot.spec.command.labels.index(label)] = value
+            self._robot.follow(command, at_once=False, count=0)
+        self._gripping = bool(targets) and (self._gripping or self._robot.resting)
 
     def _publish(self) -> None:
         state = self._robot.state

@@ -7,8 +7,10 @@ from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from typing import Any
 
+from bam_envs.arms.description import ArmDescription, robot_model
 from bam_envs.core.errors import InvalidValue, RemoteError
 from bam_envs.core.location import Credentials
+from bam_envs.core.robot_models import known_models
 from bam_envs.remote.serve.command_lease import CommandLease
 from bam_envs.remote.serve.env_server import Env, EnvServer
 from bam_envs.remote.serve.gymapi_service import GymApiService
@@ -107,7 +109,14 @@ class ServedEnvironment:
             if isinstance(bus, RosbridgeLink):
                 self._require_own_names(bus)
             self.robot_service = RobotService(
-                robot, profile, bus, self.lease, namespace=self.prefix, identity=options.name, paced=self._paced
+                robot,
+                profile,
+                bus,
+                self.lease,
+                namespace=self.prefix,
+                identity=options.name,
+                paced=self._paced,
+                description=_description_of(robot),
             )
             started.callback(self.robot_service.close)
             self.robot_service.start()
@@ -236,6 +245,14 @@ def _profile_of(env: Env) -> RobotProfile | None:
         return profile_for(robot.spec)
     except InvalidValue:  # then its environment is served without topics
         return None
+
+
+def _description_of(robot: ServedRobot) -> ArmDescription | None:
+    """The description of a simulated arm, or of the arm of its name; None if there is none."""
+    own = getattr(robot, "description", robot.spec.name)
+    if isinstance(own, str):
+        return robot_model(own) if own in known_models(ArmDescription) else None
+    return own if isinstance(own, ArmDescription) else None
 
 
 def _take_robot(env: Env, profile: RobotProfile, realtime: bool) -> ServedRobot:

@@ -8,6 +8,7 @@ import contextlib
 import logging
 import time
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 from bam_envs.core.errors import BamEnvsError, InvalidValue, ProtocolError, RemoteError
@@ -15,8 +16,9 @@ from bam_envs.core.wording import brief
 from bam_envs.ros.codec import HALT_TOPIC, INFO_SERVICE
 from bam_envs.ros.interfaces import complete, normal_name, request_type, response_type
 from bam_envs.ros.messages import write_stamp
-from bam_envs.rosbridge.bus import Caller, Handler, Listener, Message, deliver, tell
+from bam_envs.rosbridge.bus import Action, Caller, Handler, Listener, Message, deliver, tell
 from bam_envs.rosbridge.encoding import Id, decode_frame, read_id
+from bam_envs.rosbridge.server.actions import Actions, ClientGoal, Post
 from bam_envs.rosbridge.server.client_session import (
     LEVELS,
     Call,
@@ -39,15 +41,15 @@ from bam_envs.rosbridge.server.services import Services, checked, packed_respons
 from bam_envs.rosbridge.server.topics import Topic, Topics
 from bam_envs.rosbridge.sessions import FORBIDDEN
 
-_FOR_WATCHERS = frozenset({"subscribe", "unsubscribe", "set_level", "fragment", "call_service"})
+_FOR_WATCHERS = frozenset({"subscribe", "unsubscribe", "set_level", "fragment", "call_service", "send_action_goal"})
 _ON_HALT = frozenset({"advertise", "unadvertise", "publish"})  # what a watcher may do on the topic that halts, only
 _logger = logging.getLogger(__name__)
 _PROCESS = Caller("this process")
 _OPERATIONS = (
     *("advertise", "unadvertise", "publish", "subscribe", "unsubscribe", "call_service", "advertise_service"),
-    *("unadvertise_service", "service_response", "set_level", "send_action_goal"),
+    *("unadvertise_service", "service_response", "set_level", "send_action_goal", "cancel_action_goal"),
 )
-_NO_ACTIONS = "Actions are not supported by this server; use a service, or a pair of topics."
+_NO_ACTIONS = "Clients cannot offer actions to this server; offer a service, or a pair of topics."
 _NO_AUTH = "The op auth is for the first message of a web page; this client has been let in already."
 
 
@@ -68,7 +70,7 @@ class Incoming(NamedTuple):
 
 
 class Bridge:
-    """All clients, topics and services of one server. `clock` is the wall clock [s], for ``/rosapi/get_time``."""
+    """Clients, topics, services and actions of one server. `clock` is the wall clock [s], for ``/rosapi/get_time``."""
 
     def __init__(
         self,
@@ -80,16 +82,20 @@ class Bridge:
         self._events: list[Event] = []
         self.topics = Topics(self._events.append)
         self.services = Services(self._events.append)
+        self.actions = Actions(self._events.append)
         self._fragmented: set[ClientSession] = set()
         self._leave: list[Callable[[Caller], None]] = []
         self._reserved: dict[str, Callable[[Caller], None]] = {}
         self._refusals = refusals or Refusals(_logger)
+        self._post: Post = lambda work: work()  # of the goals of actions
         rosapi: dict[str, tuple[str, Handler]] = {
             "get_time": ("GetTime", lambda *_: {"time": _time_of_day(clock())}),
             "topics": ("Topics", lambda *_: {"topics": [*self.topics], "types": self.topics.kinds}),
             "topic_type": ("TopicType", lambda request, _: _type_of(self.topics, request, "topic")),
             "services": ("Services", lambda *_: {"services": [*self.services]}),
             "service_type": ("ServiceType", lambda request, _: _type_of(self.services, request, "service")),
+            "action_servers": ("GetActionServers", lambda *_: {"action_servers": [*self.actions]}),
+            "action_type": ("ActionType", lambda request, _: _type_of(self.actions, request, "action")),
         }
         for name, (kind, handler) in rosapi.items():
             path = f"/rosapi/{name}"
@@ -105,6 +111,7 @@ class Bridge:
         """Remove a client whose connection ended, with everything that it declared."""
         self._fragmented.discard(session)
         self.services.leave(session)
+        self.actions.leave(session)
         self.topics.leave(session)
         for callback in self._leave:
             tell(callback, session.caller)
@@ -227,6 +234,11 @@ class Bridge:
         """Answer `service` with `handler`, which runs for each event that is a `Call`."""
         self.services.offer(Service(canonical(service), normal_name(kind), service, handler=handler))
 
+    def act(self, action: Action, post: Post = lambda work: work()) -> None:
+        """Offer `action`; what its goals report runs by `post`, in the network thread."""
+        self.actions.offer(replace(action, name=canonical(action.name), kind=normal_name(action.kind)))
+        self._post = post
+
     def reserve(self, topic: str, check: Callable[[Caller], None]) -> None:
         """Let clients publish on `topic` only if `check` raises nothing."""
         self._reserved[canonical(topic)] = check
@@ -335,9 +347,22 @@ class Bridge:
         session.level = level
 
     def _send_action_goal(self, session: ClientSession, incoming: Incoming, now: float) -> None:
-        action, aborted = read_text(incoming.message, "action"), 6
-        result = {"op": "action_result", "action": action, "values": _NO_ACTIONS, "status": aborted, "result": False}
-        self._events.append(Send(session, pack({**result, "id": read_id(incoming.message)})))
+        message, spelling, number = incoming.message, incoming.message.get("action"), read_id(incoming.message)
+        # Even an invalid goal is answered by a result, which its caller waits for.
+        try:
+            action = self.actions.get(read_name(message, "action"))
+            if session.caller.role == "watch":
+                raise self._refused(session, f"The action {spelling}")
+            if action is None:
+                raise ProtocolError(f"Action {canonical(str(spelling))} does not exist")
+            wants, post = message.get("feedback") is True, self._post
+            goal = ClientGoal(session, number, str(spelling), action, wants, self.actions, post)
+            self.actions.send(goal, read_text(message, "action_type"), message.get("args"))
+        except BamEnvsError as error:
+            self.actions.reject(session, number, spelling, str(error))
+
+    def _cancel_action_goal(self, session: ClientSession, incoming: Incoming, now: float) -> None:
+        self.actions.cancel(session, read_name(incoming.message, "action"), read_id(incoming.message))
 
     # ---- inside
 
@@ -415,7 +440,7 @@ def _time_of_day(now: float) -> dict[str, int]:
     return {**write_stamp(now), **write_stamp(now, ros1=True)}
 
 
-def _type_of(table: Topics | Services, request: Message, field: str) -> dict[str, str]:
+def _type_of(table: Topics | Services | Actions, request: Message, field: str) -> dict[str, str]:
     entry = table.get(read_name(request, field))
     return {"type": entry.kind if entry else ""}
 

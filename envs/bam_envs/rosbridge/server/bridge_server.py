@@ -20,7 +20,7 @@ from websockets.exceptions import ConnectionClosed
 from websockets.protocol import State
 
 from bam_envs.core.errors import InvalidValue, LinkLost, ProtocolError
-from bam_envs.rosbridge.bus import Bus, Caller, Handler, Listener, Message
+from bam_envs.rosbridge.bus import Action, Bus, Caller, Handler, Listener, Message
 from bam_envs.rosbridge.endpoint import Address
 from bam_envs.rosbridge.server.admission import ClientAdmission, listening_error, tls_context
 from bam_envs.rosbridge.server.bridge import Bridge, Incoming
@@ -172,6 +172,11 @@ class BridgeServer(Bus):
     def serve(self, service: str, kind: str, handler: Handler) -> None:
         """Answer `service` of type `kind`, even when the handler fails."""
         self._do(lambda: self._bridge.serve(service, kind, handler))
+
+    def act(self, action: Action) -> bool:
+        """Offer an action, whose functions run in the network thread."""
+        self._do(lambda: self._bridge.act(action, self._post))
+        return True
 
     def reserve(self, topic: str, check: Callable[[Caller], None]) -> None:
         """Refuse what a client publishes on `topic` if `check` raises a `BamEnvsError`, in the network thread."""

@@ -20,6 +20,7 @@ from bam_envs.robots.physics.kinematic_arm import reach_arm
 from bam_envs.robots.physics.kinematic_base import SimulatedBase
 from bam_envs.robots.physics.mujoco_arm import SimulatedArm
 from bam_envs.robots.profile import load_profile
+from bam_envs.robots.ur5e import JOINTS
 from bam_envs.ros.codec import RobotInfo, read_info
 from bam_envs.ros.freshness import Tagger, read_echo
 from bam_envs.rosbridge.bus import Caller
@@ -38,6 +39,13 @@ def initial():
 
 def command(change=0.0, width=0.085):
     return np.concatenate([HOME[0] + change, [width]])
+
+
+def in_order(message):
+    return {
+        **message,
+        "position": [dict(zip(message["name"], message["position"], strict=True))[one] for one in JOINTS],
+    }
 
 
 class Service:
@@ -71,7 +79,8 @@ class Service:
         return self.bus.say(LEASE_TOPIC, {"data": f"{word} {tagger.sign(tag, LEASE_TOPIC, word.encode())}"}, caller)
 
     def joints(self, condition=lambda message: True):
-        return self.bus.wait_for("/joint_states", condition)
+        """The newest joint states that fit, their positions in the order of `JOINTS`."""
+        return in_order(self.bus.wait_for("/joint_states", lambda message: condition(in_order(message))))
 
 
 @pytest.fixture
@@ -108,6 +117,7 @@ def test_what_it_offers(serve, bus):
     assert {name: kind for name, (kind, _) in bus.services.items()} == {
         "/cell/bam/robot": "std_srvs/Trigger",
         "/cell/bam/session": "std_srvs/Trigger",
+        "/cell/controller_manager/list_controllers": "controller_manager_msgs/ListControllers",
     }
 
 

@@ -8,7 +8,7 @@ import pytest
 from PIL import Image
 
 from bam_envs.core.errors import InvalidValue, NotInCommand, RemoteError
-from bam_envs.rosbridge.bus import Caller
+from bam_envs.rosbridge.bus import ABORTED, CANCELED, SUCCEEDED, Action, Caller
 from bam_envs.rosbridge.encoding import split
 from bam_envs.rosbridge.server.bridge import Bridge
 from bam_envs.rosbridge.server.client_session import Call, Send, ServerOptions
@@ -107,7 +107,7 @@ def text(value):
 # Everything is answered, and the connection is usable afterwards: the inputs of which real servers were measured.
 
 
-SERVED = "Actions are not supported by this server; use a service, or a pair of topics."
+SERVED = "Clients cannot offer actions to this server; offer a service, or a pair of topics."
 LET_IN = "The op auth is for the first message of a web page; this client has been let in already."
 NUMBER = "std_msgs/Float64MultiArray.data[0]: expected a"
 
@@ -174,9 +174,97 @@ def test_an_operation_that_nobody_knows(peers):
     assert answer["id"] == 4
 
 
-def test_a_goal_of_an_action_is_answered_as_one(peers):
-    answer = {"op": "action_result", "action": "/a", "id": "g", "values": SERVED, "status": 6, "result": False}
-    assert peers.say(peers.client(), op="send_action_goal", action="/a", action_type="x/Y", id="g") == [answer]
+# Actions.
+
+GRIP, GRIPPER = "control_msgs/action/GripperCommand", "/gripper/gripper_cmd"
+
+
+@pytest.fixture
+def goals(peers):
+    """The goals of the action `GRIPPER` that have begun; a cancelled one ends so."""
+    begun = []
+
+    def begin(goal):
+        if goal.values["command"]["position"] < 0:
+            raise NotInCommand("Another client drives.")
+        begun.append(goal)
+
+    peers.bridge.act(Action(GRIPPER, GRIP, begin, lambda goal: goal.end(CANCELED, {"stalled": True})))
+    return begun
+
+
+def send_goal(peers, client, position=0.8, **more):
+    request = {"action": GRIPPER, "action_type": GRIP, "id": "g", "args": {"command": {"position": position}}}
+    return peers.say(client, {"op": "send_action_goal", **request, **more})
+
+
+def gripper_values(**more):
+    return {"position": 0.0, "effort": 0.0, "stalled": False, "reached_goal": False, **more}
+
+
+def result(values, status, *, fits=True, **more):
+    return {
+        "op": "action_result",
+        "action": GRIPPER,
+        "id": "g",
+        "values": values,
+        "status": status,
+        "result": fits,
+    } | more
+
+
+def test_a_goal_of_an_action_has_feedback_if_wanted_and_one_result(peers, goals):
+    client, quiet = peers.client(), peers.client("b")
+    assert send_goal(peers, client, feedback=True) == send_goal(peers, quiet) == []
+    assert [goal.values for goal in goals] == [{"command": {"position": 0.8, "max_effort": 0.0}}] * 2
+    assert [goal.caller.name for goal in goals] == ["a", "b"]
+    for goal in goals:
+        goal.feedback({"position": 0.4})
+        goal.end(SUCCEEDED, {"position": 0.8, "reached_goal": True})
+        goal.end(ABORTED, {})
+        goal.feedback({})
+    done = result(gripper_values(position=0.8, reached_goal=True), 4)
+    feedback = {"op": "action_feedback", "action": GRIPPER, "id": "g", "values": gripper_values(position=0.4)}
+    assert peers.take(client) == [feedback, done]
+    assert peers.take(quiet) == [done]
+
+
+def test_a_goal_is_cancelled_by_its_client_or_when_it_leaves(peers, goals):
+    client, other = peers.client(), peers.client("b")
+    send_goal(peers, client)
+    assert peers.say(other, op="cancel_action_goal", action=GRIPPER, id="g") == peers.take(client) == []
+    done = result(gripper_values(stalled=True), 5)
+    assert peers.say(client, op="cancel_action_goal", action=GRIPPER, id="g") == [done]
+    ended = []
+    peers.bridge.act(Action("/b", GRIP, lambda goal: None, ended.append))
+    send_goal(peers, other, action="/b")
+    peers.bridge.lost(other)
+    assert [goal.caller.name for goal in ended] == ["b"]
+
+
+@pytest.mark.parametrize(
+    ("more", "reason"),
+    [
+        ({"action": "/a"}, "Action /a does not exist"),
+        ({"action_type": "x/Y"}, f"Action {GRIPPER} is a control_msgs/GripperCommand, not a x/Y."),
+        ({"action_type": None}, "action_type: expected a text, found None."),
+        ({"args": {"speed": 1}}, "control_msgs/GripperCommandGoal: expected only the fields command, found 'speed'."),
+        ({"position": -1.0}, "Another client drives."),
+    ],
+)
+def test_a_goal_that_cannot_run_is_rejected_by_its_result(peers, goals, more, reason):
+    client = peers.client()
+    expected = result(reason, 6, fits=False, action=more.get("action", GRIPPER))
+    assert send_goal(peers, client, **more) == [expected]
+    assert goals == []
+
+
+def test_actions_are_listed(peers, goals):
+    answers = [
+        peers.say(peers.client(), op="call_service", service=f"/rosapi/{name}", args=args)[0]["values"]
+        for name, args in (("action_servers", {}), ("action_type", {"action": GRIPPER}))
+    ]
+    assert answers == [{"action_servers": [GRIPPER]}, {"type": "control_msgs/GripperCommand"}]
 
 
 def test_levels_of_status(peers):

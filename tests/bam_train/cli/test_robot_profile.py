@@ -1,0 +1,214 @@
+"""``bam-robots profile``: reads the profile of an arm from its live graph."""
+
+import contextlib
+from dataclasses import replace
+
+import gymnasium as gym
+import pytest
+
+import bam_envs  # noqa: F401 - registers the environments
+from bam_envs.core.robot_models import SHIPPED
+from bam_envs.remote.serve.serve_options import ServeOptions
+from bam_envs.remote.serve.served_environment import ServedEnvironment
+from bam_envs.robots.profile import load_profile
+from bam_envs.rosbridge.bus import Action
+from bam_envs.rosbridge.server import BridgeServer
+from bam_train.cli.arms.bam_robots import main
+from tests.bam_envs.live.conftest import LaxServer
+
+GRIP, TRAJECTORY = "control_msgs/GripperCommand", "trajectory_msgs/JointTrajectory"
+
+
+@pytest.fixture
+def served(tmp_path, monkeypatch):
+    """Serve an arm; the address. Files are written into a folder of this test."""
+    monkeypatch.chdir(tmp_path)
+    running = []
+
+    def start(name):
+        env = gym.make("bam/pick-v0", robot_model=name, disable_env_checker=True)
+        running.append(ServedEnvironment(env, ServeOptions(port=0)))
+        return running[-1].__enter__().bus.url
+
+    yield start
+    for one in running:
+        one.close()
+
+
+@pytest.mark.parametrize(
+    ("name", "shipped"),
+    [
+        ("ur5e", "ur5e"),
+        ("fr3", "franka_ros2"),
+        ("xarm7", "xarm_ros2"),
+        ("gen3", "ros2_kortex"),
+        ("so101", "ros2_so_arm100"),
+    ],
+)
+def test_the_graph_of_a_served_arm_gives_its_shipped_profile(run, served, tmp_path, name, shipped):
+    status, out, err = run(main, "profile", name, "--from", served(name))
+    assert (status, err) == (0, "")
+    assert out.splitlines()[0] == f"wrote robots/profiles/{name}.toml:"
+    expected = load_profile(shipped)
+    read = load_profile(tmp_path / "robots" / "profiles" / f"{name}.toml")
+    assert read.commands == expected.commands
+    assert read.state == expected.state
+    assert replace(read, name=expected.name) == expected
+
+
+JTC, FORWARD = (
+    "joint_trajectory_controller/JointTrajectoryController",
+    "forward_command_controller/ForwardCommandController",
+)
+JOINTS = [f"joint_{number}" for number in range(1, 8)]
+KNUCKLE = "robotiq_85_left_knuckle_joint"
+
+
+def controller(name, kind=JTC, state="active", joints=JOINTS, what="position"):
+    return {
+        "name": name,
+        "type": kind,
+        "state": state,
+        "required_command_interfaces": [f"{joint}/{what}" for joint in joints],
+    }
+
+
+@pytest.fixture
+def graph(tmp_path, monkeypatch):
+    """Offer a graph for a Gen3; the address. Its joint states are latched."""
+    monkeypatch.chdir(tmp_path)
+    servers = []
+
+    def start(controllers, *, joints=(*JOINTS, KNUCKLE), actions=(("/gripper/gripper_cmd", GRIP),), trajectories=()):
+        servers.append(server := BridgeServer(port=0).start())
+        if joints:
+            server.advertise("/joint_states", "sensor_msgs/JointState", latch=True)
+            values = [0.0] * len(joints)
+            server.publish("/joint_states", {"name": list(joints), "position": values, "velocity": values})
+        for row in controllers or ():
+            trajectory = "TrajectoryController" in row["type"]
+            name, kind = ("joint_trajectory", TRAJECTORY) if trajectory else ("commands", "std_msgs/Float64MultiArray")
+            server.subscribe(f"/{row['name']}/{name}", kind, lambda message, caller: None)
+        if controllers is not None:
+            kind = "controller_manager_msgs/ListControllers"
+            server.serve("/controller_manager/list_controllers", kind, lambda *_: {"controller": list(controllers)})
+        for name in trajectories:
+            server.subscribe(name, TRAJECTORY, lambda message, caller: None)
+        for name, kind in actions:
+            server.act(Action(name, kind, lambda goal: None, lambda goal: None))
+        return server.url
+
+    yield start
+    for one in servers:
+        one.close()
+
+
+def read(run, url, name="gen3"):
+    status, out, err = run(main, "profile", name, "--from", url)
+    assert (status, err) == (0, "")
+    return load_profile(f"robots/profiles/{name}.toml"), out
+
+
+def test_an_arm_with_a_prefix_takes_the_active_controller(run, graph):
+    """An inactive controller of the same kind is left out, and one of velocities."""
+    joints = [f"left_{name}" for name in JOINTS]
+    rows = [
+        controller("slow_controller", state="inactive", joints=joints),
+        controller("left_controller", joints=joints),
+        controller("velocities", FORWARD, "inactive", joints, "velocity"),
+        controller("positions", FORWARD, "inactive", joints[::-1]),
+    ]
+    profile, out = read(run, graph(rows, joints=("wheel", *joints, f"left_{KNUCKLE}")))
+    assert profile.source("joint_position").names == tuple(joints)
+    assert "wheel" in profile.source("joint_velocity").ignore
+    assert list(profile.commands) == ["trajectory", "position"]
+    gripper, arm = profile.sinks()
+    assert (arm.topic, arm.labels, arm.names) == ("/left_controller/joint_trajectory", tuple(JOINTS), tuple(joints))
+    assert (gripper.action, gripper.fields) == ("/gripper/gripper_cmd", ("command.position",))
+    assert (gripper.scale, gripper.offset) == ((-0.10625,), (0.085,))
+    assert profile.sinks("position")[1].names == tuple(joints[::-1])
+    assert out.splitlines()[-4:-1] == [
+        "notes, written at its head:",
+        "  slow_controller takes the same joints, and is not active: left_controller is used",
+        "  positions is not active now",
+    ]
+
+
+def test_what_nothing_tells_is_a_comment_with_a_default(run, graph, tmp_path):
+    text = (SHIPPED / "gen3.toml").read_text(encoding="utf-8")
+    (tmp_path / "robots").mkdir()
+    (tmp_path / "robots" / "lab.toml").write_text(text.replace('"gen3"', '"lab"').replace(KNUCKLE, "jaw"))
+    url = graph(None, joints=(*JOINTS, "jaw"), trajectories=("/arm_controller/joint_trajectory",))
+    profile, out = read(run, url, "lab")
+    assert [sink.address for sink in profile.sinks()] == ["/gripper/gripper_cmd", "/arm_controller/joint_trajectory"]
+    assert (profile.robot, profile.controllers, profile.source("gripper_width").scale) == ("lab", "", (1.0,))
+    written = (tmp_path / "robots" / "profiles" / "lab.toml").read_text()
+    assert "\n# scale = 1.0   # width in m = position of the joint x scale + offset\n# offset = 0.0\n" in written
+    assert '# controllers = "/controller_manager/list_controllers"   # nothing there lists them\n' in written
+    assert out.splitlines()[-3:] == [
+        "  jaw is taken for the gripper's width in m; else give its source scale and offset",
+        "  nothing lists the controllers: which joints each takes is assumed",
+        "  nobody publishes /object_pose (geometry_msgs/PoseStamped), which picking needs",
+    ]
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (
+            {"controllers": [controller("a"), controller("b", FORWARD)]},
+            "a, b are active and take the same joints. Stop all but one: "
+            "ros2 control switch_controllers --deactivate b",
+        ),
+        (
+            {"controllers": [controller("a", state="inactive"), controller("b", FORWARD, "inactive")]},
+            "none of the controllers of gen3 is active (a, b): ros2 control switch_controllers --activate a",
+        ),
+        (
+            {"controllers": [controller("a", joints=JOINTS[:6])]},
+            f"no controller there takes all joints of gen3 ({', '.join(JOINTS)}) by joint trajectories or positions. "
+            "Load one, such as joint_trajectory_controller.",
+        ),
+        (
+            {"controllers": [controller("a")], "actions": [("/x", "a/B")]},
+            "nobody offers the gripper of gen3: no action of control_msgs/GripperCommand or franka_msgs/Move, and no "
+            "topic of a gripper; there is /x. Start the gripper's driver.",
+        ),
+        (
+            {"controllers": [controller("a")], "joints": (*JOINTS[:6], KNUCKLE)},
+            f"/joint_states has no joint_7 of gen3; it has {', '.join(JOINTS[:6])}, {KNUCKLE}. Is another arm there? "
+            "Else correct the names in its description.",
+        ),
+        (
+            {"controllers": [controller("a")], "joints": JOINTS},
+            f"no joint states have {KNUCKLE}, the gripper of gen3; they have {', '.join(JOINTS)}. Start the gripper's "
+            "driver, or correct gripper.joint in the description.",
+        ),
+        (
+            {"controllers": [controller("a")], "joints": ()},
+            "no joint states came in 3 s. Is the driver of gen3 running?",
+        ),
+    ],
+)
+def test_a_graph_that_does_not_fit_is_one_line(run, graph, tmp_path, options, message):
+    url = graph(**options)
+    status, out, err = run(main, "profile", "gen3", "--from", url)
+    assert (status, out, err) == (1, "", f"bam-robots profile: {url}: {message}\n")
+    assert not (tmp_path / "robots").exists()
+
+
+def test_no_server_no_rosapi_and_a_file_that_is_there(run, graph, tmp_path):
+    with contextlib.closing(LaxServer().start()) as lax:
+        status, _, err = run(main, "profile", "gen3", "--from", lax.url)
+        assert status == 1
+        assert err == (
+            f"bam-robots profile: {lax.url}: rosapi, which tells what there is, does not run there. Start it beside "
+            "the bridge: ros2 run rosapi rosapi_node.\n"
+        )
+        url = lax.url
+    status, _, err = run(main, "profile", "gen3", "--from", url)
+    assert (status, err.count("\n"), "nothing listens there" in err) == (1, 1, True)
+    (tmp_path / "robots" / "profiles").mkdir(parents=True)
+    (tmp_path / "robots" / "profiles" / "gen3.toml").write_text("")
+    status, _, err = run(main, "profile", "gen3", "--from", url)
+    assert (status, "robots/profiles/gen3.toml exists; give another name with --out, or --force" in err) == (1, True)
