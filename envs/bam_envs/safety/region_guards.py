@@ -119,8 +119,6 @@ class Collision(ForbiddenRegion):
     def __init__(self, spec: RobotSpec, limits: Limits, tubes: Tubes) -> None:
         super().__init__(spec, limits)
         self.limit_value, self._tubes, self._table = limits.clearance, tubes, limits.table_height
-        self._at: Sequence[float] = [math.inf] * len(self._joints)  # where it was computed last
-        self._room = 0.0  # the distance to anything may shrink by this before the next computation [m]
 
     def depth(self, joints: Sequence[float]) -> float:
         """By how much the least distance is below the limit [m]."""
@@ -129,12 +127,7 @@ class Collision(ForbiddenRegion):
 
     def is_outside(self, joints: Sequence[float]) -> bool:
         """As in the base class; distances that the motion cannot have used up are not computed again."""
-        if self._tubes.change(self._at, joints) < self._room:
-            return True
-        height = self._tubes.lowest(joints) - self._table
-        near = self._tubes.nearer_than(self.limit_value, joints)
-        self._at, self._room = joints, min(height, self._tubes.least) - self.limit_value
-        return not near and height >= self.limit_value
+        return not self._tubes.nearer_than(self.limit_value, joints, self._table)
 
     def start_fault(self, start: Numbers) -> str | None:
         """Why the arm must not go to `start` (m,)."""
