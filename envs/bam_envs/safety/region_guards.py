@@ -7,6 +7,7 @@ already may stay or leave, and must not go farther in.
 
 import math
 from collections.abc import Sequence
+from operator import sub
 
 from bam_envs.core.errors import InvalidValue
 from bam_envs.core.robot import RobotSpec
@@ -46,7 +47,7 @@ class ForbiddenRegion(Guard):
     def limit(self, tick: Tick) -> bool:
         """Shorten the step of all joints."""
         last = self._pick(tick.last)
-        step = [wanted - before for wanted, before in zip(self._pick(tick.command), last, strict=True)]
+        step = list(map(sub, self._pick(tick.command), last))
         if self.is_outside(self.rest(last, step)):
             return False
         here = max(self.depth(last), _TOUCH)
