@@ -168,7 +168,9 @@ class SerialChain:
             lines.append(f"{c} = cos(q[{joint}]); {s} = sin(q[{joint}])")
             place = self.placements[joint] @ self._turns[joint]
             frame = _times(frame, self._turns[joint - 1].T @ place if joint else place, f"a{joint}_", lines)
-            turn = np.array([[c, f"-{s}", 0.0, 0.0], [s, c, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]], object)
+            turn = np.array(
+                [[c, f"-{s}", 0.0, 0.0], [s, c, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]], object
+            )
             frame = _times(frame, turn, f"b{joint}_", lines)
             frames.append([one for row in _times(frame, self._turns[joint].T, f"f{joint}_", lines)[:3] for one in row])
         last = self._turns[-1].T @ self.tool_placement
@@ -288,7 +290,7 @@ def _times(frame: list[list[float | str]], other: Array, name: str, lines: list[
                     terms.append(" * ".join(str(part) for part in factors if part != 1.0).replace("-1.0 * ", "-"))
             if number and terms:
                 terms.append(repr(number))
-            if len(terms) == 1 and terms[0].isidentifier() or not terms:
+            if (len(terms) == 1 and terms[0].isidentifier()) or not terms:
                 product[-1].append(terms[0] if terms else number)
             else:
                 lines.append(f"{name}{row}{column} = {' + '.join(terms)}")

@@ -135,7 +135,9 @@ class ToolSpeed(Guard):
         self._joints = columns_in(spec.command, "rad")
         self._pick = picker(self._joints)
         self._checked: tuple[Numbers, Numbers, float] | None = None
-        self._there: tuple[Numbers, tuple[float, float, float]] | None = None  # the last command that was found slow enough, and its tool
+        self._there: tuple[Numbers, tuple[float, float, float]] | None = (
+            None  # the last command that was found slow enough, and its tool
+        )
 
     def limit(self, tick: Tick) -> bool:
         """Shorten the step of all joints."""

@@ -45,7 +45,7 @@ class Group(NamedTuple):
     high: int
     """The first joint after it that does not."""
     pairs: Sequence[Pair]
-    around: Pair | None = None
+    around: Pair
     """A tube around all of these tubes of the one link and one around those of the other, which are computed first."""
 
     def nearest(self, segments: Mapping[int, Segment]) -> float:
@@ -84,11 +84,6 @@ class Tubes:
         segments = self.segments(q, set().union(*self._in))
         return min((group.nearest(segments) for group in self._groups), default=math.inf)
 
-    @property
-    def least(self) -> float:
-        """Lower bound on the smallest distance of two tubes at the joints of `nearer_than` [m]."""
-        return min(self._near, default=math.inf)
-
     def nearer_than(self, margin: float, q: Sequence[float], table: float = -math.inf) -> bool:
         """Whether two tubes, or the lowest point and the `table`, are nearer than `margin` [m] at the joints `q` (k,).
 
@@ -99,20 +94,17 @@ class Tubes:
         if min(self._least, self._height - table) - sum(moved) >= margin:
             return False
         turned_by, near, due = list(accumulate(moved, initial=0.0)), self._near, []
-        for place, (low, high, _, around) in enumerate(self._groups):
+        for place, (low, high, _, _) in enumerate(self._groups):
             near[place] -= turned_by[high] - turned_by[low]
             if not near[place] >= margin:
-                due.append((place, around))
+                due.append(place)
         if due:
-            segments = self.segments(q, {tube for place, around in due for tube in (around[:2] if around else self._in[place])})
-            closer = []
-            for place, around in due:
-                if around is None:
-                    near[place] = self._groups[place].nearest(segments)
-                else:
-                    near[place] = _distance(segments, around)
-                    if not near[place] >= margin + _ENOUGH:
-                        closer.append(place)
+            pairs = [self._groups[place].around for place in due]
+            segments, closer = self.segments(q, {tube for pair in pairs for tube in pair[:2]}), []
+            for place, pair in zip(due, pairs, strict=True):
+                near[place] = apart = _distance(segments, pair)
+                if not apart >= margin + _ENOUGH and len(self._groups[place].pairs) > 1:
+                    closer.append(place)
             if closer:
                 segments = self.segments(q, {tube for place in closer for tube in self._in[place]})
                 for place in closer:
@@ -120,7 +112,7 @@ class Tubes:
         self._height -= turned_by[-1]
         if not self._height - table >= margin:
             self._height = self.lowest(q)
-        self._at, self._least = list(q), self.least
+        self._at, self._least = list(q), min(near, default=math.inf)
         return min(self._least, self._height - table) < margin
 
 
@@ -134,7 +126,8 @@ class ArmTubes(Tubes):
         wrist = geometry.d5 + end
         levers = abs(geometry.a2) + abs(geometry.a3) + wrist, abs(geometry.a3) + wrist, wrist, end
         radii = self._radii
-        groups = [Group(joint, 5, [(one, other, radii[one] + radii[other])]) for one, other, joint in _PAIRS]
+        pairs = [(one, other, radii[one] + radii[other]) for one, other, _ in _PAIRS]
+        groups = [Group(joint, 5, [pair], pair) for pair, (*_, joint) in zip(pairs, _PAIRS, strict=True)]
         super().__init__(groups, [0.0, *levers, 0.0])
 
     def lowest(self, q: Sequence[float]) -> float:
@@ -187,7 +180,7 @@ class ChainTubes(Tubes):
             pairs.setdefault((kept[one].link, kept[other].link), []).append((one, other, spare))
         hulls, groups = [], []
         for (link, far), members in pairs.items():
-            around = None
+            around = members[0]
             if len(members) > 1:
                 ends = [_around([kept[tube] for tube in {*tubes}]) for tubes in list(zip(*members, strict=True))[:2]]
                 slack = max(self._radii[one] + self._radii[other] - spare for one, other, spare in members)

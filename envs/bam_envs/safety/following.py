@@ -96,11 +96,13 @@ class Following(Guard):
         """Distance of values measured `age` [s] ago from the range of the commands until then, 0 inside it (k,)."""
         self._sent.append(sent)
         off, since = [0.0] * len(sent), self._recent + int(min(age, OLD_STATE) / self._period)
-        first = self._sent[max(-since, -len(self._sent))]
-        for at, (value, oldest, newest) in enumerate(zip(measured, first, sent, strict=True)):
-            if oldest <= value <= newest or newest <= value <= oldest:
-                continue
-            commands = [command[at] for command in [*self._sent][-since:]]
+        known = [*self._sent][-since:]
+        for value, oldest, newest in zip(measured, known[0], sent, strict=True):
+            if not (oldest <= value <= newest or newest <= value <= oldest):
+                break
+        else:
+            return off
+        for at, (value, *commands) in enumerate(zip(measured, *known, strict=True)):
             low, high = min(commands), max(commands)
             off[at] = low - value if value < low else high - value if value > high else 0.0  # NaN: it is not measured
         return off

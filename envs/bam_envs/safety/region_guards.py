@@ -46,12 +46,14 @@ class ForbiddenRegion(Guard):
 
     def limit(self, tick: Tick) -> bool:
         """Shorten the step of all joints."""
-        last = self._pick(tick.last)
-        step = list(map(sub, self._pick(tick.command), last))
-        if self.is_outside(self.rest(last, step)):
+        last, wanted = self._pick(tick.last), self._pick(tick.command)
+        step = list(map(sub, wanted, last))
+        if tick.rest[0] != wanted:
+            tick.rest = wanted, self.rest(last, step)
+        if self.is_outside(tick.rest[1]):
             return False
         here = max(self.depth(last), _TOUCH)
-        if self.depth(self.rest(last, step)) <= here:  # it leaves
+        if self.depth(tick.rest[1]) <= here:  # it leaves
             return False
         least, most = 0.0, 1.0
         for _ in range(_HALVINGS):
