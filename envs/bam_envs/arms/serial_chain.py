@@ -161,7 +161,7 @@ class SerialChain:
     def _poses(self) -> Callable[[Sequence[float]], Sequence[Pose]]:
         """`poses` as straight-line code, from the base to the tool, about joints that turn about their z axes."""
         lines: list[str] = []
-        frame: list[list[float | str]] = np.eye(4).tolist()
+        frame: list[list[float | str]] = [[*row] for row in np.eye(4).tolist()]
         frames = [self.mount[:3].ravel().tolist()]
         for joint in range(self.num_joints):
             c, s = f"c{joint}", f"s{joint}"
@@ -196,7 +196,8 @@ class SerialChain:
             u, v, w = a * x + b * y + c * z, d * x + e * y + f * z, g * x + h * y + i * z
             px, py, pz = tool[3] - px, tool[7] - py, tool[11] - pz
             columns.append((v * pz - w * py, w * px - u * pz, u * py - v * px, u, v, w))
-        return np.array(columns).T
+        jacobian: Array = np.array(columns).T
+        return jacobian
 
     def flange_pose(self, q: Array) -> tuple[Array, Array]:
         """Pose of a gripper of `HAND` length that ends at the tool, as `ArmGeometry.flange_pose`. (n, 3), (n, 3, 3)."""
@@ -284,8 +285,8 @@ def _times(frame: list[list[float | str]], other: Array, name: str, lines: list[
             number, terms = 0.0, []
             for one, two in zip(left, other[:, column].tolist(), strict=True):
                 factors = [round(part, 15) if isinstance(part, float) else part for part in (one, two)]
-                if all(isinstance(part, float) for part in factors):
-                    number += factors[0] * factors[1]
+                if isinstance(one, float) and isinstance(two, float):
+                    number += one * two
                 elif 0.0 not in factors:
                     terms.append(" * ".join(str(part) for part in factors if part != 1.0).replace("-1.0 * ", "-"))
             if number and terms:

@@ -178,7 +178,7 @@ class ChainTubes(Tubes):
         for (one, other), slack in zip(outline.pairs.tolist(), outline.slack.tolist(), strict=True):
             spare = self._radii[one] + self._radii[other] - slack
             pairs.setdefault((kept[one].link, kept[other].link), []).append((one, other, spare))
-        hulls, groups = [], []
+        hulls, groups = list[Capsule](), list[Group]()
         for (link, far), members in pairs.items():
             around = members[0]
             if len(members) > 1:

@@ -18,10 +18,10 @@ SPEED, ACCELERATION, JERK = 1.5, 6.0, 60.0
 """Limits of a joint where the files name none [rad/s, rad/s^2, rad/s^3]: below those of every arm that is shipped."""
 EFFORT_PER_REACH = 60.0
 """Torque of a joint where the files name none [N m], for each metre from the joint to the tool."""
-_POSTURES, _ENOUGH = 20_000, 20
+_POSTURES, _ENOUGH = 10_000, 20
 """Postures in which the outline is compared with the links, and the least number in which a pair overlaps."""
 _GIVEN_UP = 0.1
-_REFITS, _FALSE = 8, 0.015  # times that links get more capsules, and the share of false alarms that is good enough
+_REFITS, _FALSE = 6, 0.015  # times that links get more capsules, and the share of false alarms that is good enough
 DEEP = 0.005
 """A collision deeper than this is to be found [m]."""
 _CLEARANCE = 0.005  # that the guards keep, so that they act where links touch [m]
@@ -65,6 +65,7 @@ def describe(
         tool=tool,
         gripper=Gripper(open=width, mass=round(read.gripper_mass, 3)),
         workspace=((0.3, -0.25, 0.016), (0.7, 0.25, 0.35)),
+        capsules=(),
         sources={"model": model, **({"gripper": gripper} if gripper else {})},
     )
     if read.shapes is not None:
@@ -219,7 +220,8 @@ def _slack(arm: ArmDescription, q: Array, apart: Apart, given_up: float) -> Iter
 def postures(chain: SerialChain, seed: int = 0) -> Array:
     """Random postures of an arm, each joint within a turn (n, k) [rad]."""
     low, high = np.maximum(chain.low, -np.pi), np.minimum(chain.high, np.pi)
-    return low + np.random.default_rng(seed).random((_POSTURES, len(low))) * (high - low)
+    q: Array = low + np.random.default_rng(seed).random((_POSTURES, len(low))) * (high - low)
+    return q
 
 
 def _joints(read: ReadArm) -> tuple[JointRow, ...]:
