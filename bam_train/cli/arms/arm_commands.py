@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
     from pathlib import Path
 
+    from bam_envs.arms.capsules import Outline
     from bam_envs.arms.description import ArmDescription
     from bam_envs.core.robot_models import Description
     from bam_envs.robots.base_description import BaseDescription
@@ -20,6 +21,8 @@ if TYPE_CHECKING:
     from bam_train.cli.arms.bam_robots import AddArmConfig, CheckArmConfig, ListArmsConfig, ProfileConfig
 
 _PICTURES = (".png", ".jpg")
+_STRAY = 0.05
+"""Distance from the links around it from which a capsule is no part of an arm [m]."""
 _POSTURES = 2000  # in which kinematics are compared with MuJoCo's
 
 
@@ -128,6 +131,7 @@ def _facts(arm: ArmDescription) -> list[tuple[str, str, bool]]:
     clear = float(min(outline.nearest(chain.home[None])[0], outline.lowest(chain.home[None])[0]))
     reached = covers(chain, outline, np.array(arm.workspace))
     share = float((outline.nearest(q) < 0.0).mean())
+    flaw = _outline_flaw(arm, outline)
     turns = "position and turn of the gripper" if chain.turns else "position only: this arm cannot turn its gripper"
     return [
         ("reach", f"{reach:.3f} m from the first joint", True),
@@ -137,11 +141,25 @@ def _facts(arm: ArmDescription) -> list[tuple[str, str, bool]]:
         ("home pose", f"{clear:.3f} m from itself and from the table", clear > 0.0),
         (
             "outline",
-            f"{len(arm.capsules)} capsules, {len(outline.pairs)} pairs; {share:.0%} of all postures touch",
-            True,
+            f"{len(arm.capsules)} capsules, {len(outline.pairs)} pairs; {share:.0%} of all postures touch{flaw}",
+            not flaw,
         ),
         ("work area", _area(arm) + ("" if reached else ": not all of it is reached"), reached),
     ]
+
+
+def _outline_flaw(arm: ArmDescription, outline: Outline) -> str:
+    """What is wrong with the capsules in the home pose: a gripper without any, or one far from all around it; or ""."""
+    from bam_envs.arms.capsules import segment_distances
+
+    if arm.num_joints + 1 not in outline.links:
+        return "; the gripper has no capsule, so that nothing keeps it from the arm: add its shapes"
+    start, end = np.moveaxis(outline.segments(arm.chain.home[None])[0], 1, 0)
+    gaps = segment_distances(start[:, None], end[:, None], start, end) - outline.radius[:, None] - outline.radius
+    gaps[(np.abs(np.subtract.outer(outline.links, outline.links)) > 2) | np.eye(len(gaps), dtype=bool)] = np.inf
+    stray = [place for place, gap in enumerate(gaps.min(axis=1)) if gap > _STRAY]
+    where = ", ".join(f"capsules[{place}] of link {outline.links[place]}" for place in stray)
+    return f"; {where}: more than {100 * _STRAY:g} cm from the links around it; correct or remove it" if stray else ""
 
 
 def _area(arm: ArmDescription) -> str:

@@ -14,26 +14,27 @@ _NEARLY_ALWAYS = 0.5  # share of postures
 _TRIALS = 250  # steps of the search for a thinner capsule
 
 
-def fitted_capsules(points: Array, link: int) -> list[Capsule]:
-    """One or two capsules around all `points` (n, 3) [m] on the surface of a link, in the frame of the points."""
+_Fit = tuple[Array, Array, float]
+"""Ends and radius of a capsule."""
+
+
+def fitted_capsules(points: Array, link: int, most: int = 2) -> list[Capsule]:
+    """Capsules around all `points` (n, 3) [m] on the surface of a link, in the frame of the points; `most` at most."""
     if len(points) == 0:
         return []
     outer = _outermost(points)
     rng = np.random.default_rng(0)
-    one = _thinner(outer, _capsule(outer), rng)
-    splits = []
-    for axis in np.concatenate([_principal_axes(outer), np.eye(3)]):
-        along = outer @ axis
-        for share in (0.3, 0.5, 0.7):
-            first = along < along.min() + share * (along.max() - along.min())
-            if first.any() and not first.all():
-                splits.append(_pair(outer, first))
-    splits.sort(key=lambda pair: sum(itertools.starmap(_volume, pair)))
-    best, least = [one], _GAIN * _volume(*one)
-    for pair in splits[:2]:
-        pair = _thinner_pair(outer, pair, rng)
-        if sum(itertools.starmap(_volume, pair)) < least:
-            best, least = pair, sum(itertools.starmap(_volume, pair))
+    best = [_thinner(outer, _capsule(outer), rng)]
+    while len(best) < most:
+        gaps = [_distances(outer, start, end) - radius for start, end, radius in best]
+        nearest, halves = np.argmin(gaps, axis=0), []
+        for at, one in enumerate(best):
+            pair = _halves(outer[nearest == at], one, rng)
+            halves.append((_volume(*one) - sum(itertools.starmap(_volume, pair)), at, pair))
+        gained, at, pair = max(halves, key=lambda half: half[:2])
+        if gained <= (1.0 - (_GAIN if most <= 2 else 1.0)) * _volume(*best[at]):
+            break
+        best = [*best[:at], *pair, *best[at + 1 :]]
     gaps = [_distances(points, start, end) - radius for start, end, radius in best]
     outside = max(0.0, float(np.min(gaps, axis=0).max()))  # of points that were left out
     return [
@@ -42,8 +43,18 @@ def fitted_capsules(points: Array, link: int) -> list[Capsule]:
     ]
 
 
-_Fit = tuple[Array, Array, float]
-"""Ends and radius of a capsule."""
+def _halves(points: Array, one: _Fit, rng: np.random.Generator) -> list[_Fit]:
+    """The two smallest capsules around `points` instead of `one`; that one if there are none."""
+    splits = []
+    for axis in np.concatenate([_principal_axes(points), np.eye(3)]):
+        along = points @ axis
+        for share in (0.3, 0.5, 0.7):
+            first = along < along.min() + share * (along.max() - along.min())
+            if first.any() and not first.all():
+                splits.append(_pair(points, first))
+    splits.sort(key=lambda pair: sum(itertools.starmap(_volume, pair)))
+    pairs = [_thinner_pair(points, pair, rng) for pair in splits[:2]]
+    return min(pairs, key=lambda pair: sum(itertools.starmap(_volume, pair)), default=[one])
 
 
 def _outermost(points: Array) -> Array:
@@ -136,16 +147,17 @@ class Outline:
 
     Args:
         chain: The arm, with capsules.
+        every: Keep also pairs on both sides of a wrist or an elbow that overlap nearly always.
     """
 
-    def __init__(self, chain: SerialChain) -> None:
+    def __init__(self, chain: SerialChain, *, every: bool = False) -> None:
         self.chain, capsules = chain, chain.capsules
         self.links = np.array([capsule.link for capsule in capsules], dtype=np.int64)
         self.radius = np.array([capsule.radius for capsule in capsules], dtype=np.float64)
         self._ends = np.array([(capsule.start, capsule.end) for capsule in capsules]).reshape(-1, 2, 3)
         self._mount = chain.mount
         self._slack = {(one, other): slack for one, other, slack in chain.slack}
-        self.pairs = self._pairs()
+        self.pairs = self._pairs(every)
 
     def segments(self, q: Array) -> Array:
         """Ends of the capsules' segments at the joints `q` (n, k) [rad]. Shape: (n, capsules, 2, 3)."""
@@ -184,7 +196,7 @@ class Outline:
         """How far the capsules of each of `pairs` may overlap [m]. Shape: (pairs,)."""
         return np.array([self._slack.get((int(self.links[i]), int(self.links[j])), 0.0) for i, j in self.pairs])
 
-    def _pairs(self) -> NDArray[np.int64]:
+    def _pairs(self, every: bool) -> NDArray[np.int64]:
         """Pairs of capsules on links with a joint between them that are apart in some posture, and not in all."""
         links = self.links
         rows = [
@@ -199,10 +211,12 @@ class Outline:
         rng = np.random.default_rng(0)
         low, high = self.chain.low, self.chain.high
         gaps = self.distances(low + rng.random((2000, len(low))) * (high - low))
-        # Capsules on both sides of a wrist or an elbow overlap nearly always: limits of joints keep their links apart.
+        # Capsules on both sides of a wrist or an elbow overlap nearly always: limits of joints keep their links apart,
+        # unless a slack is known, with which they overlap where the links do.
         near = np.diff(np.minimum(links[self.pairs], last), axis=1)[:, 0] == 2
+        near &= [(int(links[i]), int(links[j])) not in self._slack for i, j in rows]
         share = (gaps < 0.0).mean(axis=0)
-        kept: NDArray[np.int64] = self.pairs[(share > 0.0) & ~(near & (share > _NEARLY_ALWAYS))]
+        kept: NDArray[np.int64] = self.pairs[(share > 0.0) & ~(near & (share > _NEARLY_ALWAYS) & (not every))]
         return kept
 
 

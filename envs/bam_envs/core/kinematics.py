@@ -91,15 +91,15 @@ class ArmGeometry:
 
     def tool_point(self, q: Sequence[float]) -> tuple[float, float, float]:
         """`tool_position` of one pose (6,) [rad] in plain numbers, which take a tenth of the time; x, y, z [m]."""
-        q1, q2, q3, q4, q5, _ = q
+        cos, sin, (q1, q2, q3, q4, q5, _) = math.cos, math.sin, q
         q23 = q2 + q3
         q234 = q23 + q4
-        c1, s1, c234, s234 = math.cos(q1), math.sin(q1), math.cos(q234), math.sin(q234)
+        c1, s1, c234, s234, a2, a3, d5 = cos(q1), sin(q1), cos(q234), sin(q234), self.a2, self.a3, self.d5
         end = self.d6 + self.tool
-        across = end * math.sin(q5)
-        radial = self.a2 * math.cos(q2) + self.a3 * math.cos(q23) + self.d5 * s234 - across * c234
-        sideways = self.d4 + end * math.cos(q5)
-        height = self.d1 + self.a2 * math.sin(q2) + self.a3 * math.sin(q23) - self.d5 * c234 - across * s234
+        across = end * sin(q5)
+        radial = a2 * cos(q2) + a3 * cos(q23) + d5 * s234 - across * c234
+        sideways = self.d4 + end * cos(q5)
+        height = self.d1 + a2 * sin(q2) + a3 * sin(q23) - d5 * c234 - across * s234
         return -(radial * c1 + sideways * s1), sideways * c1 - radial * s1, height
 
     def flange_pose(self, q: Array) -> tuple[Array, Array]:

@@ -7,6 +7,8 @@ its direction.
 
 import math
 from collections.abc import Sequence
+from itertools import repeat
+from operator import le, sub
 
 from bam_envs.core.robot import RobotSpec
 from bam_envs.safety.guard import (
@@ -61,11 +63,10 @@ class PositionLimits(Guard):
 
     def limit(self, tick: Tick) -> bool:
         """Clip the goal, joint by joint."""
-        for value, low, high in zip(tick.goal, self.low, self.high, strict=True):
-            if not low <= value <= high:
-                return self._clip(tick)
-        tick.command = tick.goal.copy()
-        return False
+        if all(map(le, self.low, tick.goal)) and all(map(le, tick.goal, self.high)):
+            tick.command = tick.goal.copy()
+            return False
+        return self._clip(tick)
 
     def _clip(self, tick: Tick) -> bool:
         rows = zip(tick.goal, tick.last, self.low, self.high, strict=True)
@@ -82,11 +83,16 @@ class JointSpeed(Guard):
 
     def __init__(self, spec: RobotSpec, limits: Limits) -> None:
         self._joints, self._fastest = columns_in(spec.command, "rad"), fastest_commands(spec, limits)
-        self.limit_value = max(self._fastest)
+        self.limit_value, self._pick = max(self._fastest), picker(self._joints)
+        self._period, self._reach = 0.0, list[float]()
 
     def limit(self, tick: Tick) -> bool:
         """Shorten the step of all joints."""
-        return shorten(tick, self._joints, [fastest * tick.period for fastest in self._fastest])
+        if tick.period != self._period:
+            self._period, self._reach = tick.period, [fastest * tick.period for fastest in self._fastest]
+        if all(map(le, map(abs, map(sub, self._pick(tick.command), self._pick(tick.last))), self._reach)):
+            return False
+        return shorten(tick, self._joints, self._reach)
 
 
 class RampIn(Guard):
@@ -129,16 +135,23 @@ class ToolSpeed(Guard):
         self._joints = columns_in(spec.command, "rad")
         self._pick = picker(self._joints)
         self._checked: tuple[Numbers, Numbers, float] | None = None
+        self._there: tuple[Numbers, tuple[float, float, float]] | None = (
+            None  # the last command that was found slow enough, and its tool
+        )
 
     def limit(self, tick: Tick) -> bool:
         """Shorten the step of all joints."""
         last, wanted, reach = self._pick(tick.last), self._pick(tick.command), self.limit_value * tick.period
         if self._checked == (last, wanted, reach):  # called twice in a tick, and few commands change in between
             return False
+        known = self._there
+        start = known[1] if known is not None and known[0] == last else self._tool(last)
+        there = self._tool(wanted)
+        if math.dist(start, there) <= reach * ROUNDING:
+            self._checked, self._there = (last, wanted, reach), (wanted, there)
+            return False
         slowed = within_reach(self._tool, last, wanted, reach)
         self._checked = last, slowed, reach
-        if slowed is wanted:
-            return False
         for at, value in zip(self._joints, slowed, strict=True):
             tick.command[at] = value
         return True
@@ -161,39 +174,36 @@ class JointAcceleration(Guard):
 
     def limit(self, tick: Tick) -> bool:
         """Bring the step near to the last one."""
-        goal, command, last = tick.goal, tick.command, tick.last
-        wanted = [command[at] - last[at] for at in self._joints]
+        pick, command, last = self._pick, tick.command, self._pick(tick.last)
+        wanted, before = list(map(sub, pick(command), last)), pick(tick.last_step)
+        distances = list(map(abs, map(sub, pick(tick.goal), last)))
         change, braking = self.limit_value * tick.period**2, self.limit_value * self._period**2
         shortened, share = tick.period / self._period, 1.0
-        for at, way in zip(self._joints, wanted, strict=True):
-            if abs(way) > change or abs(way) > abs(goal[at] - last[at]) * shortened:
+        for way, distance, about in zip(wanted, distances, before, strict=True):
+            if abs(way) > change or abs(way) > distance * shortened:
                 break  # it may have to brake
-            if not -change <= way - tick.last_step[at] <= change:
+            if not -change <= way - about <= change:
                 break
         else:
             return False
-        for at, way in zip(self._joints, wanted, strict=True):
-            distance, way = abs(goal[at] - last[at]), abs(way)
+        for way, distance in zip(map(abs, wanted), distances, strict=True):
             if way <= change and way <= distance * shortened:  # it can stop after that
                 continue
             longest = distance if distance <= change else longest_step(distance, braking) * shortened
             if way > longest * ROUNDING:
                 share = min(share, longest / way)
         slowed = wanted if share == 1.0 else [way * share for way in wanted]
-        step = self._near(slowed, self._pick(tick.last_step), change * ROUNDING)
+        step = self._near(slowed, before, change * ROUNDING)
         if step is wanted or step == wanted:
             return False
-        for at, way in zip(self._joints, step, strict=True):
-            command[at] = last[at] + way
+        for at, begin, way in zip(self._joints, last, step, strict=True):
+            command[at] = begin + way
         return True
 
     @staticmethod
     def _near(wanted: Numbers, before: Numbers, change: float) -> Numbers:
         """The longest part of `wanted` within reach of the step `before`; if there is none, each joint by itself."""
-        for way, about in zip(wanted, before, strict=True):
-            if not -change <= way - about <= change:
-                break
-        else:
+        if all(map(le, map(abs, map(sub, wanted, before)), repeat(change))):
             return wanted
         least, most = 0.0, 1.0
         for way, about in zip(wanted, before, strict=True):
@@ -220,6 +230,7 @@ class JointJerk(Guard):
     def __init__(self, spec: RobotSpec, limits: Limits) -> None:
         self.limit_value, self._acceleration = limits.joint_jerk, limits.joint_acceleration
         self._joints = columns_in(spec.command, "rad")
+        self._pick = picker(self._joints)
         self._before = [0.0] * len(self._joints)  # speeds one command before the last one [rad/s]
 
     def restart(self) -> None:
@@ -229,7 +240,7 @@ class JointJerk(Guard):
     def limit(self, tick: Tick) -> bool:
         """Bring the steps of joints that speed up near to the last ones."""
         period, jerk = tick.period, self.limit_value * tick.period
-        speeds = [tick.last_step[at] / period for at in self._joints]
+        speeds = [step / period for step in self._pick(tick.last_step)]
         before, self._before, changed = self._before, speeds, False
         if jerk >= self._acceleration:  # any acceleration is reached in one step
             return False
@@ -280,10 +291,14 @@ class MeasuredJump(Guard):
     def __init__(self, spec: RobotSpec) -> None:
         self.limit_value, self._period, rates = JUMP, spec.period, max_rate(spec.command)
         self._joints = [(at, rates[at], spec.command.labels[at]) for at in columns_in(spec.command, "rad")]
+        self._pick = picker(columns_in(spec.command, "rad"))
+        self._slowest = min(rate for _, rate, _ in self._joints)
 
     def fault(self, tick: Tick) -> str | None:
         """Report the joint with the largest jump."""
         measured, before, seconds = tick.measured, tick.before, max(self._period, tick.pause) + tick.age
+        if max(map(abs, map(sub, self._pick(measured), self._pick(before)))) <= self._slowest * seconds + JUMP:
+            return None
         worst, text = 0.0, None
         for at, fastest, label in self._joints:
             turned, most = abs(measured[at] - before[at]), fastest * seconds + self.limit_value

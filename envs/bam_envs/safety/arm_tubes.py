@@ -7,8 +7,11 @@ other described arm, in ``base_link``.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
+from itertools import accumulate, combinations
+from operator import mul, sub
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,28 +22,113 @@ from bam_envs.core.kinematics import ArmGeometry, ArmOutline
 
 Array = NDArray[np.float64]
 Point = tuple[float, float, float]
-Tube = tuple[Point, Point, float]
-"""The two ends and the radius [m]."""
+Segment = tuple[Point, Point]
+"""The two ends of a tube [m]."""
+Pair = tuple[int, int, float]
+"""Two tubes, and the distance of their segments at which their links touch [m]."""
+_ENOUGH = 0.03
+"""A distance of tubes around all tubes of two links that is this much above a margin [m] needs no closer look."""
 _BASE, _SHOULDER, _UPPER, _FOREARM, _WRIST_1, _WRIST_2, _WRIST_3, _ELBOW = range(8)
 _PAIRS = (
-    *((first, other, 0) for first in (_BASE, _SHOULDER) for other in (_FOREARM, _WRIST_1, _WRIST_2, _WRIST_3)),
-    *((_UPPER, other, 1) for other in (_WRIST_1, _WRIST_2, _WRIST_3)),
-    (_FOREARM, _WRIST_3, 2),
+    *((first, other, 1) for first in (_BASE, _SHOULDER) for other in (_FOREARM, _WRIST_1, _WRIST_2, _WRIST_3)),
+    *((_UPPER, other, 2) for other in (_WRIST_1, _WRIST_2, _WRIST_3)),
+    (_FOREARM, _WRIST_3, 3),
 )
-"""Pairs of tubes that can touch and share no joint; 0, 1, 2: the joints from 2, 3, 4 on change their distance."""
+"""Pairs of tubes that can touch and share no joint, and the first joint, from 0, that changes their distance."""
 
 
-class ArmTubes:
-    """Distances of an arm's tubes; `tool` is whether the geometry's tool is mounted."""
+class Group(NamedTuple):
+    """Pairs of tubes on two links that can touch."""
+
+    low: int
+    """The first joint, from 0, that changes their distance."""
+    high: int
+    """The first joint after it that does not."""
+    pairs: Sequence[Pair]
+    around: Pair
+    """A tube around all of these tubes of the one link and one around those of the other, which are computed first."""
+
+    def nearest(self, segments: Mapping[int, Segment]) -> float:
+        """Smallest distance of a pair [m]."""
+        return min(_distance(segments, pair) for pair in self.pairs)
+
+
+class Tubes:
+    """Tubes around the links of an arm; subclasses say where they are in a posture.
+
+    Args:
+        groups: The tubes that can touch.
+        levers: How far a turn of each joint moves what is beyond it at most [m/rad]. Shape: (k,).
+    """
+
+    def __init__(self, groups: Sequence[Group], levers: Sequence[float]) -> None:
+        self._groups, self._levers = groups, levers
+        self._in = [{tube for pair in group.pairs for tube in pair[:2]} for group in groups]
+        self._at: Sequence[float] = [math.inf] * len(levers)  # the joints of these lower bounds
+        self._near, self._height, self._least = [-math.inf] * len(groups), -math.inf, -math.inf
+
+    def segments(self, q: Sequence[float], tubes: Iterable[int]) -> dict[int, Segment]:
+        """The segments of some `tubes` at the joints `q` (k,) [rad]."""
+        raise NotImplementedError
+
+    def lowest(self, q: Sequence[float]) -> float:
+        """Height of the lowest point of the links that move at the joints `q` (k,) [rad], up to the flange [m]."""
+        raise NotImplementedError
+
+    def drawn(self, q: Sequence[float]) -> list[list[float]]:
+        """The tubes in ``base_link``: two ends, x, y, z [m] each, and the radius [m]."""
+        raise NotImplementedError
+
+    def nearest(self, q: Sequence[float]) -> float:
+        """Smallest distance of two tubes at the joints `q` (k,) [rad], in m; below 0 if their links overlap."""
+        segments = self.segments(q, set().union(*self._in))
+        return min((group.nearest(segments) for group in self._groups), default=math.inf)
+
+    def nearer_than(self, margin: float, q: Sequence[float], table: float = -math.inf) -> bool:
+        """Whether two tubes, or the lowest point and the `table`, are nearer than `margin` [m] at the joints `q` (k,).
+
+        A distance is computed again only when the joints that change it have turned far enough since the last time to
+        bring it within the margin: a turn moves a tube by at most its angle times the length of the arm beyond.
+        """
+        moved = list(map(mul, self._levers, map(abs, map(sub, q, self._at))))
+        if min(self._least, self._height - table) - sum(moved) >= margin:
+            return False
+        turned_by, near, due = list(accumulate(moved, initial=0.0)), self._near, []
+        for place, (low, high, _, _) in enumerate(self._groups):
+            near[place] -= turned_by[high] - turned_by[low]
+            if not near[place] >= margin:
+                due.append(place)
+        if due:
+            pairs = [self._groups[place].around for place in due]
+            segments, closer = self.segments(q, {tube for pair in pairs for tube in pair[:2]}), []
+            for place, pair in zip(due, pairs, strict=True):
+                near[place] = apart = _distance(segments, pair)
+                if not apart >= margin + _ENOUGH and len(self._groups[place].pairs) > 1:
+                    closer.append(place)
+            if closer:
+                segments = self.segments(q, {tube for place in closer for tube in self._in[place]})
+                for place in closer:
+                    near[place] = self._groups[place].nearest(segments)
+        self._height -= turned_by[-1]
+        if not self._height - table >= margin:
+            self._height = self.lowest(q)
+        self._at, self._least = list(q), min(near, default=math.inf)
+        return min(self._least, self._height - table) < margin
+
+
+class ArmTubes(Tubes):
+    """The tubes of a Universal Robots arm; `tool` is whether the geometry's tool is mounted."""
 
     def __init__(self, geometry: ArmGeometry, outline: ArmOutline, *, tool: bool) -> None:
         self._arm, self._outline, self._tool = geometry, outline, geometry.tool if tool else 0.0
         self._radii = [outline.base, *[outline.upper_arm] * 2, outline.forearm, *[outline.wrist] * 3, outline.forearm]
         end = geometry.d6 + self._tool
         wrist = geometry.d5 + end
-        self._levers = abs(geometry.a2) + abs(geometry.a3) + wrist, abs(geometry.a3) + wrist, wrist, end
-        self._near = [0.0] * len(_PAIRS)
-        self._at: Sequence[float] = [math.inf] * 6
+        levers = abs(geometry.a2) + abs(geometry.a3) + wrist, abs(geometry.a3) + wrist, wrist, end
+        radii = self._radii
+        pairs = [(one, other, radii[one] + radii[other]) for one, other, _ in _PAIRS]
+        groups = [Group(joint, 5, [pair], pair) for pair, (*_, joint) in zip(pairs, _PAIRS, strict=True)]
+        super().__init__(groups, [0.0, *levers, 0.0])
 
     def lowest(self, q: Sequence[float]) -> float:
         """Height of the lowest point of the arm at the joints `q` (6,) [rad], up to its flange [m]."""
@@ -52,52 +140,7 @@ class ArmTubes:
         thick = max(shape.upper_arm, shape.forearm)
         return min(elbow - thick, wrist_1 - shape.forearm, min(wrist_2, flange) - shape.wrist)
 
-    def nearest(self, q: Sequence[float]) -> float:
-        """Smallest distance of two tubes at the joints `q` (6,) [rad], in m; below 0 if they overlap."""
-        tubes = self.tubes(q)
-        return min(self._distance(tubes, first, other) for first, other, _ in _PAIRS)
-
-    def change(self, here: Sequence[float], there: Sequence[float]) -> float:
-        """Upper bound on the change of `lowest` and of any distance [m] between two sets of joints (6,) [rad]."""
-        levers = self._levers
-        return (
-            levers[0] * abs(there[1] - here[1])
-            + levers[1] * abs(there[2] - here[2])
-            + levers[2] * abs(there[3] - here[3])
-            + levers[3] * abs(there[4] - here[4])
-        )
-
-    def nearer_than(self, margin: float, q: Sequence[float]) -> bool:
-        """Whether two tubes are nearer than `margin` [m] at the joints `q` (6,) [rad].
-
-        A pair is computed again only when the joints between its tubes have turned far enough since the last time to
-        bring it within the margin: a turn moves a tube by at most its angle times the length of the arm beyond.
-        """
-        moved, at, levers = [0.0] * 3, self._at, self._levers
-        beyond = levers[3] * abs(q[4] - at[4])
-        for group, joint in ((2, 3), (1, 2), (0, 1)):
-            beyond += levers[joint - 1] * abs(q[joint] - at[joint])
-            moved[group] = beyond
-        self._at = list(q)
-        tubes: list[Tube] = []
-        for place, (first, other, group) in enumerate(_PAIRS):
-            self._near[place] -= moved[group]
-            if not self._near[place] >= margin:
-                tubes = tubes or self.tubes(q)
-                self._near[place] = self._distance(tubes, first, other)
-        return self.least < margin
-
-    @property
-    def least(self) -> float:
-        """Lower bound on the smallest distance of two tubes at the joints of `nearer_than` [m]."""
-        return min(self._near)
-
-    @staticmethod
-    def _distance(tubes: list[Tube], first: int, other: int) -> float:
-        (start, end, radius), (other_start, other_end, other_radius) = tubes[first], tubes[other]
-        return math.sqrt(segment_distance2(start, end, other_start, other_end)) - radius - other_radius
-
-    def tubes(self, q: Sequence[float]) -> list[Tube]:
+    def segments(self, q: Sequence[float], tubes: Iterable[int]) -> dict[int, Segment]:
         """Base, shoulder, upper arm, forearm, wrists 1 to 3 (up to the end of the tool), elbow, at `q` (6,) [rad]."""
         arm, shape, low = self._arm, self._outline, q[1] + q[2] + q[3]
         sine, cosine, s5, reach = math.sin(low), math.cos(low), math.sin(q[4]), arm.d6 + self._tool
@@ -112,89 +155,67 @@ class ArmTubes:
         elbow, inside = (elbow_x, upper, elbow_z), (elbow_x, fore, elbow_z)
         starts = (0.0, 0.0, 0.0), shoulder, beside, inside, wrist, wrist_1, wrist_2, elbow
         ends = shoulder, beside, elbow, wrist, wrist_1, wrist_2, tool, inside
-        return list(zip(starts, ends, self._radii, strict=True))
+        return dict(enumerate(zip(starts, ends, strict=True)))
 
 
-class ChainTubes:
-    """Distances of the capsules of a described arm, with the methods of `ArmTubes`; `tool`: with its gripper."""
+class ChainTubes(Tubes):
+    """The capsules of a described arm; `tool`: with its gripper."""
 
     def __init__(self, chain: SerialChain, *, tool: bool) -> None:
         size = chain.num_joints
         kept = tuple(one for one in chain.capsules if tool or one.link <= size)
-        self._chain, self._outline = chain, Outline(replace(chain, capsules=kept))
-        outline = self._outline
-        ends = [[(*one.start, 1.0), (*one.end, 1.0)] for one in kept]
-        self._links, self._ends = outline.links, np.array(ends).transpose(0, 2, 1)
-        self._low = np.flatnonzero((self._links > 2) & (self._links <= size))
-        one, other = outline.pairs.T
-        self._beyond = np.minimum(self._links[one], size), np.minimum(self._links[other], size)
-        self._kept = (outline.radius[one] + outline.radius[other] - outline.slack).tolist()
-        self._levers = _levers(chain, kept)
-        self._near, self._at = np.full(len(outline.pairs), -math.inf), np.zeros(size)
-        self._mount = chain.mount[None]
-        self._placed: tuple[list[float], Array] = [], np.empty(0)
-
-    @property
-    def least(self) -> float:
-        """Lower bound on the smallest distance of two capsules at the joints of `nearer_than` [m]."""
-        return float(self._near.min(initial=math.inf))
+        outline = Outline(replace(chain, capsules=kept))
+        self._chain, self._radii = chain, [one.radius for one in kept]
+        self._moving = [
+            (one.link, *ends, one.radius) for one in kept if 2 < one.link <= size for ends in (one.start, one.end)
+        ]
+        pairs: dict[tuple[int, int], list[Pair]] = {}
+        for (one, other), slack in zip(outline.pairs.tolist(), outline.slack.tolist(), strict=True):
+            spare = self._radii[one] + self._radii[other] - slack
+            pairs.setdefault((kept[one].link, kept[other].link), []).append((one, other, spare))
+        hulls, groups = list[Capsule](), list[Group]()
+        for (link, far), members in pairs.items():
+            around = members[0]
+            if len(members) > 1:
+                ends = [_around([kept[tube] for tube in {*tubes}]) for tubes in list(zip(*members, strict=True))[:2]]
+                slack = max(self._radii[one] + self._radii[other] - spare for one, other, spare in members)
+                place = len(kept) + len(hulls)
+                around = place, place + 1, ends[0].radius + ends[1].radius - slack
+                hulls += ends
+            groups.append(Group(min(link, size), min(far, size), members, around))
+        self._shapes = [(one.link, *one.start, *one.end) for one in (*kept, *hulls)]
+        super().__init__(groups, _levers(chain, kept))
 
     def lowest(self, q: Sequence[float]) -> float:
         """Height of the lowest point of the links at the joints `q` (k,) [rad], from the third to the flange [m]."""
-        places = self._places(q)[self._low]
-        lows: Array = places[:, 2].min(axis=1) - self._outline.radius[self._low]
-        return float(lows.min(initial=math.inf))
+        poses, lowest = self._chain.poses(q), math.inf
+        for link, x, y, z, radius in self._moving:
+            _, _, _, _, _, _, _, _, g, h, i, height = poses[link]
+            lowest = min(lowest, g * x + h * y + i * z + height - radius)
+        return lowest
 
-    def nearest(self, q: Sequence[float]) -> float:
-        """Smallest distance of two capsules at the joints `q` (k,) [rad], in m; below 0 if their links overlap."""
-        return float(self._outline.nearest(np.array([q]))[0])
-
-    def change(self, here: Sequence[float], there: Sequence[float]) -> float:
-        """Upper bound on the change of `lowest` and of any distance [m] between two sets of joints (k,) [rad]."""
-        rows = zip(self._levers.tolist(), here, there, strict=True)
-        return float(sum(lever * abs(one - other) for lever, one, other in rows))
-
-    def nearer_than(self, margin: float, q: Sequence[float]) -> bool:
-        """Whether two capsules are nearer than `margin` [m] at the joints `q` (k,) [rad].
-
-        A pair is computed again only when the joints between its links have turned far enough since the last time to
-        bring it within the margin.
-        """
-        moved = np.zeros(len(self._levers) + 1)
-        np.cumsum(self._levers * np.abs(np.array(q) - self._at), out=moved[1:])
-        self._near -= moved[self._beyond[1]] - moved[self._beyond[0]]
-        self._at = np.array(q)
-        due = np.flatnonzero(self._near < margin)
-        if len(due):
-            places = self._places(q).transpose(0, 2, 1).tolist()
-            for pair in due.tolist():
-                one, other = self._outline.pairs[pair].tolist()
-                gap = math.sqrt(segment_distance2(*places[one], *places[other]))
-                self._near[pair] = gap - self._kept[pair]
-        return self.least < margin
-
-    def _places(self, q: Sequence[float]) -> Array:
-        """Ends of the capsules as columns [m]. Shape: (capsules, 3, 2)."""
-        if self._placed[0] != q:
-            frames = np.concatenate([self._mount, self._chain.link_frames(np.array([q]))[0]])
-            self._placed = list(q), frames[self._links, :3] @ self._ends
-        return self._placed[1]
+    def segments(self, q: Sequence[float], tubes: Iterable[int]) -> dict[int, Segment]:
+        """The segments of some of the capsules at the joints `q` (k,) [rad]."""
+        poses, found = self._chain.poses(q), dict[int, Segment]()
+        for tube in tubes:
+            link, x, y, z, u, v, w = self._shapes[tube]
+            a, b, c, px, d, e, f, py, g, h, i, pz = poses[link]
+            start = a * x + b * y + c * z + px, d * x + e * y + f * z + py, g * x + h * y + i * z + pz
+            found[tube] = start, (a * u + b * v + c * w + px, d * u + e * v + f * w + py, g * u + h * v + i * w + pz)
+        return found
 
 
-def _levers(chain: SerialChain, capsules: Sequence[Capsule]) -> Array:
+def _levers(chain: SerialChain, capsules: Sequence[Capsule]) -> list[float]:
     """How far a turn of each joint moves what is beyond it at most [m/rad]. Shape: (k,)."""
     size = chain.num_joints
     extent = [0.0] * (size + 2)
     for one in capsules:
         extent[one.link] = max(extent[one.link], math.hypot(*one.start) + one.radius, math.hypot(*one.end) + one.radius)
     steps = [math.hypot(*place[:3, 3]) for place in (*chain.placements[1:], chain.tool_placement)]
-    levers, beyond = np.zeros(size), extent[size + 1]
+    levers, beyond = [0.0] * size, extent[size + 1]
     for joint in reversed(range(size)):
         levers[joint] = beyond = max(extent[joint + 1], steps[joint] + beyond)
     return levers
-
-
-Tubes = ArmTubes | ChainTubes
 
 
 def tubes_of(arm: Arm, *, tool: bool) -> Tubes | None:
@@ -202,6 +223,20 @@ def tubes_of(arm: Arm, *, tool: bool) -> Tubes | None:
     if isinstance(arm, SerialChain):
         return ChainTubes(arm, tool=tool) if arm.capsules else None
     return ArmTubes(arm, arm.outline, tool=tool) if arm.outline is not None else None
+
+
+def _around(capsules: Sequence[Capsule]) -> Capsule:
+    """One capsule around all `capsules` of a link, about the two ends that are farthest apart."""
+    balls = [(end, one.radius) for one in capsules for end in (one.start, one.end)]
+    start, end = max(combinations((place for place, _ in balls), 2), key=lambda two: math.dist(*two))
+    apart = [math.sqrt(segment_distance2(place, place, start, end)) + radius for place, radius in balls]
+    return Capsule(link=capsules[0].link, start=start, end=end, radius=max(apart))
+
+
+def _distance(segments: Mapping[int, Segment], pair: Pair) -> float:
+    """Distance of two tubes [m]."""
+    first, other, kept = pair
+    return math.sqrt(segment_distance2(*segments[first], *segments[other])) - kept
 
 
 def segment_distance2(start: Point, end: Point, other_start: Point, other_end: Point) -> float:

@@ -8,6 +8,7 @@ simulated arm, whose controllers are softer, is also pushed that far by the obje
 
 import math
 from collections import deque
+from operator import gt
 
 from bam_envs.core.robot import RobotSpec
 from bam_envs.safety.arm_guards import fastest_commands, within_reach
@@ -54,7 +55,7 @@ class Following(Guard):
         self._recent = 2 + ticks_of(self._lag, spec)
         self._sent: deque[Numbers] = deque(maxlen=self._recent + ticks_of(OLD_STATE, spec))
         self._strikes, self._good, self._forgiven = 0, 0, ticks_of(FORGIVEN, spec)
-        self._spec, self._own_lag = spec, self._lag
+        self._spec, self._own_lag, self._period = spec, self._lag, spec.period
         self._ended: Numbers = []  # see Tick
         self._yields = False
 
@@ -94,12 +95,14 @@ class Following(Guard):
     def off(self, sent: Numbers, measured: Numbers, age: float) -> Numbers:
         """Distance of values measured `age` [s] ago from the range of the commands until then, 0 inside it (k,)."""
         self._sent.append(sent)
-        off, first = [0.0] * len(sent), -self._recent - int(min(age, OLD_STATE) / self._spec.period)
-        known = [*self._sent][first:]
-        for at, (value, oldest, newest) in enumerate(zip(measured, known[0], sent, strict=True)):
-            if oldest <= value <= newest or newest <= value <= oldest:
-                continue
-            commands = [command[at] for command in known]
+        off, since = [0.0] * len(sent), self._recent + int(min(age, OLD_STATE) / self._period)
+        known = [*self._sent][-since:]
+        for value, oldest, newest in zip(measured, known[0], sent, strict=True):
+            if not (oldest <= value <= newest or newest <= value <= oldest):
+                break
+        else:
+            return off
+        for at, (value, *commands) in enumerate(zip(measured, *known, strict=True)):
             low, high = min(commands), max(commands)
             off[at] = low - value if value < low else high - value if value > high else 0.0  # NaN: it is not measured
         return off
@@ -122,7 +125,7 @@ class JointFollowing(Following):
 
     def __init__(self, spec: RobotSpec, limits: Limits, tool_position: ToolPosition | None) -> None:
         super().__init__(spec, limits)
-        self._joints, self._period = columns_in(spec.command, "rad"), spec.period
+        self._joints = columns_in(spec.command, "rad")
         self._pick = picker(self._joints)
         self._tool = None if tool_position is None else tool_point_of(tool_position)
         self._tool_reach = limits.tool_speed * spec.period
@@ -162,9 +165,8 @@ class JointFollowing(Following):
         # The farthest that a command may be from a joint at rest.
         allowed, farthest, over = self._slow_allowed if tick.approach else self._allowed, 0.0, False
         if any(off):
-            for gap, most in zip(off, allowed, strict=True):
-                size = abs(gap)
-                farthest, over = max(farthest, size), over or size > most
+            sizes = list(map(abs, off))
+            farthest, over = max(sizes), any(map(gt, sizes, allowed))
         if not over and self._tool is not None and farthest > self._tolerance:
             explained = [value + gap for value, gap in zip(measured, off, strict=True)]
             over = math.dist(self._tool(measured), self._tool(explained)) > SHARE * self._tool_reach
@@ -202,22 +204,26 @@ class JointFollowing(Following):
             return False
         command, pick, reaches = tick.command, self._pick, self._slow_reach if tick.approach else self._reach
         wanted, last, measured = pick(command), pick(tick.last), pick(tick.measured)
-        before, self._moved = self._moved or [math.inf] * len(last), []
-        lag, places, near, farther = min(self._lag, self._known_lag), [], [], False
+        inf, change, tolerance, turned = math.inf, self._change, self._tolerance, list[float]()
+        before, self._moved = self._moved or [inf] * len(last), turned
+        lag, places, near, farther = min(self._lag, self._known_lag), list[float](), list[float](), False
         measured_before, speeds = pick(tick.before), pick(tick.velocity)
         rows = zip(wanted, last, measured, measured_before, speeds, self._fastest, reaches, before, strict=True)
         for goal, sent, here, was, speed, fastest, reach, moved_before in rows:
-            gap, moved = sent - here, abs(here - was) if was == was else math.inf  # NaN in a first tick
-            ahead = min(max(speed, -fastest), fastest) * lag
-            # The lag explains a gap in the direction of the motion; NaN: the speed is not measured.
-            place = here + ((gap if abs(gap) < abs(ahead) else ahead) if gap * ahead > 0.0 else 0.0)
+            gap, moved, place = sent - here, abs(here - was) if was == was else inf, here  # NaN in a first tick
+            if gap:
+                ahead = (speed if -fastest <= speed <= fastest else min(max(speed, -fastest), fastest)) * lag
+                # The lag explains a gap in the direction of the motion; NaN: the speed is not measured.
+                if gap * ahead > 0.0:
+                    place = here + (gap if abs(gap) < abs(ahead) else ahead)
+                farther = farther or abs(goal - place) > abs(goal - sent) + tolerance
+            low, high = place - reach, place + reach
             # A joint that has just made up for a gap, faster than it may speed up, makes a step that much shorter.
-            sudden = moved - moved_before - self._change if moved_before < math.inf else 0.0
-            step = reach - min(reach, max(sudden, 0.0))
-            low, high = max(place - reach, min(sent, place) - step), min(place + reach, max(sent, place) + step)
-            self._moved.append(moved)
+            if moved - moved_before > change:
+                step = reach - min(reach, moved - moved_before - change)
+                low, high = max(low, min(sent, place) - step), min(high, max(sent, place) + step)
+            turned.append(moved)
             near.append(low if goal < low else high if goal > high else goal)
-            farther = farther or abs(goal - place) > abs(goal - sent) + self._tolerance
             places.append(place)
         changed = near != wanted
         if farther and self._tool is not None:  # at most the tool's limit for one period from there

@@ -90,10 +90,10 @@ _CLEARED: weakref.WeakKeyDictionary[ClearedCommand, tuple[object, Array]] = weak
 
 
 def _clear(robot: object, command: Array) -> ClearedCommand:
-    """Clear a copy of `command` (1, m) for `robot`, valid until it is removed from `_CLEARED`."""
-    cleared, kept = object.__new__(ClearedCommand), command.copy()
-    kept.flags.writeable = False
-    _CLEARED[cleared] = robot, kept
+    """Clear `command` (1, m), which becomes read-only, for `robot`, valid until it is removed from `_CLEARED`."""
+    cleared = object.__new__(ClearedCommand)
+    command.flags.writeable = False
+    _CLEARED[cleared] = robot, command
     return cleared
 
 
@@ -127,6 +127,7 @@ class SafeRobot(metaclass=Sealed):
         "_code",
         "_ended",
         "_every",
+        "_facts",
         "_further",
         "_guards",
         "_halts",
@@ -138,6 +139,7 @@ class SafeRobot(metaclass=Sealed):
         "_live",
         "_observer",
         "_places",
+        "_read",
         "_report",
         "_returned_at",
         "_robot",
@@ -185,12 +187,15 @@ class SafeRobot(metaclass=Sealed):
         self._limiters = tuple(one for one in self._guards if type(one).limit is not Guard.limit)
         self._robot: Any = robot
         self._clock, self._is_base, command = clock, is_base(robot.spec), robot.spec.command
-        self._places = measured_places(robot.spec, command.units)
-        self._speeds = measured_places(robot.spec, [f"{unit}/s" for unit in command.units])
-        unmeasured = {*columns_in(command, "rad")} - {place for place, _, _ in self._places}
+        places = measured_places(robot.spec, command.units)
+        speeds = measured_places(robot.spec, [f"{unit}/s" for unit in command.units])
+        self._read = tuple(dict.fromkeys(name for _, name, _ in (*places, *speeds)))
+        self._places, self._speeds = self._columns(places), self._columns(speeds)
+        unmeasured = {*columns_in(command, "rad")} - {place for place, _, _ in places}
         if unmeasured:  # the guards need the position of the arm
             names = ", ".join(command.labels[at] for at in sorted(unmeasured))
             raise InvalidValue(f"The guards need {names} of {robot.spec.name} measured in rad; no signal has it.")
+        self._facts = {id(one): (one.title, one.code) for one in self._every}
         self._report: dict[str, dict[str, Any]] = {}
         for one in self._every:
             facts = {"number": one.number, "limit": one.limit_value, "unit": one.unit}
@@ -402,11 +407,13 @@ class SafeRobot(metaclass=Sealed):
     def _tick(self, goal: Numbers, approach: bool) -> Tick:
         pause = self._pause()
         last = self._begin_at(pause)
-        measured, speeds, period = self._measured(self._places), self._measured(self._speeds), self._spec.period
+        rows, period = self._rows(), self._spec.period
+        measured = [rows[row][column] for row, column in self._places]
+        speeds = [rows[row][column] for row, column in self._speeds]
         before = self._unmeasured if self._before is None else self._before
         self._before = measured
         time_passed = min(period, pause or period)
-        rows = zip(speeds, measured, before, strict=True)
+        known = zip(speeds, measured, before, strict=True)
         return Tick(
             goal=goal,
             command=goal.copy(),
@@ -414,7 +421,7 @@ class SafeRobot(metaclass=Sealed):
             last_step=[speed * time_passed for speed in self._speed],
             measured=measured,
             before=before,
-            velocity=[(now - old) / period if math.isnan(speed) else speed for speed, now, old in rows],
+            velocity=[speed if speed == speed else (now - old) / period for speed, now, old in known],  # NaN is not
             age=self.age(),
             period=time_passed,
             pause=pause,
@@ -448,7 +455,7 @@ class SafeRobot(metaclass=Sealed):
         if self._live is not None:
             self._state = self._fresh_state()
             self._require_in_range(self._state)  # a motion does not begin at a wrong measurement
-        measured, command = self._measured(self._places), self.spec.command
+        measured, command = self._measured(), self.spec.command
         if self._is_base:
             last = [0.0] * len(measured)
         elif self._sent is None:
@@ -465,14 +472,22 @@ class SafeRobot(metaclass=Sealed):
         self._restart()
         return last
 
-    def _measured(self, places: list[tuple[int, str, int]]) -> Numbers:
-        """The measured value of each number of the command, from `places`; NaN if not measured. Shape: (m,)."""
+    def _columns(self, places: list[tuple[int, str, int]]) -> list[tuple[int, int]]:
+        """Where in `_rows` each number of the command is measured. Shape: (m,)."""
+        known = {place: (self._read.index(name), column) for place, name, column in places}
+        return [known.get(place, (len(self._read), 0)) for place in range(len(self._unmeasured))]
+
+    def _rows(self) -> list[Numbers]:
+        """The newest values of the signals that are read, and NaN for what is not measured."""
         if self._state is None:
             raise ResetNeeded("Nothing is known of the robot yet. Call reset() first.")
-        measured, signals = self._unmeasured.copy(), self._state.signals
-        for place, name, column in places:
-            measured[place] = signals[name].item(0, column)
-        return measured
+        signals = self._state.signals
+        return [*[signals[name][0].tolist() for name in self._read], [math.nan]]
+
+    def _measured(self) -> Numbers:
+        """The measured value of each number of the command; NaN if not measured. Shape: (m,)."""
+        rows = self._rows()
+        return [rows[row][column] for row, column in self._places]
 
     def _fresh_state(self) -> RobotState:
         """The newest state, or `StaleState`: even holding an outdated position would be a motion.
@@ -523,7 +538,7 @@ class SafeRobot(metaclass=Sealed):
                 self._note(guard, "altered")
 
     def _note(self, guard: Guard, effect: str) -> None:
-        self._status, self._code = guard.title, guard.code
+        self._status, self._code = self._facts[id(guard)]
         self._report[guard.name][effect] += 1
         self._kept_out |= guard.keeps_out
 
@@ -557,8 +572,7 @@ class SafeRobot(metaclass=Sealed):
     def _send(self, tick: Tick, halts: int) -> RobotState:
         """Send the command; halt the robot if that fails."""
         command = np.array([tick.command])
-        cleared = _clear(self._robot, command)
-        handed: Any = command if self._live is None else cleared
+        handed: Any = command if self._live is None else _clear(self._robot, command)
         if self._tell is not None:
             self._tell(self._code, self._status, stopped=False)
         done, self._sent_at = False, self._clock()
@@ -566,7 +580,8 @@ class SafeRobot(metaclass=Sealed):
             self._state = self._robot.step(handed)
             done, self._returned_at = True, self._clock()
         finally:
-            _CLEARED.pop(cleared, None)
+            if self._live is not None:
+                _CLEARED.pop(handed, None)
             if not done or self._halts != halts:  # a halt of another thread may have come just before the command
                 self.halt()
         self._sent = tick.command
@@ -676,7 +691,7 @@ class SafeRobot(metaclass=Sealed):
         low, high = position_range(self.spec, self.limits)
         motion = ProofMotion(
             [self.spec.command.labels[at] for at in columns],
-            [self._measured(self._places)[at] for at in columns],
+            [self._measured()[at] for at in columns],
             [(low[at] + high[at]) / 2 for at in columns],
             self.spec.period,
             self.spec.lag if self.limits.lag is None else self.limits.lag,
@@ -692,7 +707,7 @@ class SafeRobot(metaclass=Sealed):
                 if proof is not None:
                     self._live.reach, self._live.joints_only = reach, True
                 states.append(self._advance(rest.copy(), approach=True, proving=True))
-                measured = self._measured(self._places)
+                measured = self._measured()
                 joints, reach = moves.send([measured[at] for at in columns])
         except StopIteration:
             pass
@@ -742,13 +757,13 @@ class SafeRobot(metaclass=Sealed):
 
     def _joints_off(self, start: Numbers) -> dict[str, float]:
         """The joints that are not measured at `start` (m,), with their remaining distance [rad]."""
-        measured, near = self._measured(self._places), self.limits.reset_tolerance
+        measured, near = self._measured(), self.limits.reset_tolerance
         far = {at: start[at] - measured[at] for at in columns_in(self.spec.command, "rad")}
         return {self.spec.command.labels[at]: gap for at, gap in far.items() if not abs(gap) <= near}
 
     def _is_open(self) -> bool:
         """Whether the gripper is measured open; one that is not measured (NaN) counts as open."""
-        measured, widest = self._measured(self._places), self.spec.command.high
+        measured, widest = self._measured(), self.spec.command.high
         return not any(abs(widest[at] - measured[at]) > GRIPPER_NEAR for at in columns_in(self.spec.command, "m"))
 
     def _approach(self, start: Numbers) -> None:

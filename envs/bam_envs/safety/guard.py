@@ -315,6 +315,8 @@ class Tick:
     """Whether the previous command was changed to keep the robot out of a forbidden region."""
     ended: Numbers = field(default_factory=list)
     """Command that was sent shortly before this motion began, and that the robot may still be moving to; or empty."""
+    rest: tuple[Numbers, Numbers] = ([], [])
+    """Joints of a command, and where they come to rest if the arm brakes after it; see `ForbiddenRegion`."""
     signals: Mapping[str, Array] = field(default_factory=dict)
     """The newest measured signals, with shape (1, k) each; to be read only."""
 

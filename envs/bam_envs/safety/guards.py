@@ -211,7 +211,7 @@ class MeasuredSpeed(Guard):
 
     def fault(self, tick: Tick) -> str | None:
         """Report the measured speed."""
-        now = [abs(speed) for speed in self._speeds(tick)]
+        now = list(map(abs, self._speeds(tick)))
         before, self._before = self._before, now
         fastest_before, self._fastest = self._fastest, max(now)
         if before is None or fastest_before + self._fastest <= 2 * self.limit_value:

@@ -38,7 +38,7 @@ class ActionAge(Guard):
 
 
 class Share(Guard):
-    """Base class: counts the ticks among the last 100 for which `is_counted` is true."""
+    """Base class: counts the ticks among the last 100 for which `is_counted` is true, and judges their number."""
 
     unit = "share of 100 ticks"
 
@@ -47,6 +47,10 @@ class Share(Guard):
 
     def is_counted(self, tick: Tick) -> bool:
         """Whether `tick` is counted."""
+        raise NotImplementedError
+
+    def judge(self, counted: int) -> str | None:
+        """Warn, or report why a tick is not executed, when `counted` ticks, this one included, are above 0 or were."""
         raise NotImplementedError
 
     def forgive(self) -> None:
@@ -59,14 +63,16 @@ class Share(Guard):
         """Number of counted ticks among the last 100."""
         return len(self._counted)
 
-    def count(self, tick: Tick) -> int:
-        """Number of counted ticks among the last 100, this one included."""
+    def fault(self, tick: Tick) -> str | None:
+        """Count this tick, and report what `judge` does."""
         self._tick += 1
         if self.is_counted(tick):
             self._counted.append(self._tick)
-        if self._counted and self._counted[0] <= self._tick - TICKS:
+        elif not self._counted:
+            return None
+        if self._counted[0] <= self._tick - TICKS:
             self._counted.popleft()
-        return self.counted
+        return self.judge(len(self._counted))
 
 
 class LateTicks(Share):
@@ -83,16 +89,15 @@ class LateTicks(Share):
         """Whether the command is late."""
         return tick.pause > self._period + self._by
 
-    def fault(self, tick: Tick) -> str | None:
+    def judge(self, counted: int) -> str | None:
         """Return None: this guard only warns."""
-        late = self.count(tick)
-        if late > TICKS * self.limit_value + 1e-9:
+        if counted > TICKS * self.limit_value + 1e-9:
             self.warning = (
-                f"{late} of the last {TICKS} commands were more than {1000 * self._by:.0f} ms late, and "
+                f"{counted} of the last {TICKS} commands were more than {1000 * self._by:.0f} ms late, and "
                 f"{TICKS * self.limit_value:g} may be: the robot moves unevenly, because the policy takes too long "
                 "or the computer is busy; end other programs, or use a faster policy"
             )
-        elif not late:
+        elif not counted:
             self.warning = ""
         return None
 
@@ -111,15 +116,14 @@ class LinkQuality(Share):
         """Whether a state or an answer did not come in time."""
         return not tick.age <= self._max_age or tick.waiting > self._answer
 
-    def fault(self, tick: Tick) -> str | None:
+    def judge(self, counted: int) -> str | None:
         """Report the number of good ticks once the link is back; while it is down, other guards hold the robot."""
-        bad = self.count(tick)
-        if not bad:
+        if not counted:
             self.warning = ""
             return None
-        good = f"only {TICKS - bad} of the last {TICKS} ticks had a state and an answer in time"
-        self.warning = good if bad > TICKS * (1.0 - self._warn) + 1e-9 else ""
-        if self._counted[-1] == self._tick or bad <= TICKS * (1.0 - self.limit_value) + 1e-9:
+        good = f"only {TICKS - counted} of the last {TICKS} ticks had a state and an answer in time"
+        self.warning = good if counted > TICKS * (1.0 - self._warn) + 1e-9 else ""
+        if self._counted[-1] == self._tick or counted <= TICKS * (1.0 - self.limit_value) + 1e-9:
             return None
         return (
             f"{good}, and {TICKS * self.limit_value:.0f} are needed: look at the load of this computer and of the "
@@ -140,15 +144,14 @@ class ChangedCommands(Share):
         """Whether the previous command was changed to keep the robot out of a forbidden region."""
         return tick.kept_out
 
-    def fault(self, tick: Tick) -> str | None:
+    def judge(self, counted: int) -> str | None:
         """Report the number of changed commands."""
-        changed = self.count(tick)
-        if not changed:
+        if not counted:
             self.warning = ""
             return None
-        text = f"{changed} of the last {TICKS} commands were changed to keep the robot out of a forbidden region"
-        self.warning = text if changed > TICKS * self._warn + 1e-9 else ""
-        if changed <= TICKS * self.limit_value + 1e-9:
+        text = f"{counted} of the last {TICKS} commands were changed to keep the robot out of a forbidden region"
+        self.warning = text if counted > TICKS * self._warn + 1e-9 else ""
+        if counted <= TICKS * self.limit_value + 1e-9:
             return None
         self.forgive()  # after the stop, the count begins again
         return f"{text}, and {TICKS * self.limit_value:.0f} are allowed: the report names the guards that changed them"

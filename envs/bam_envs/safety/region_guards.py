@@ -7,6 +7,7 @@ already may stay or leave, and must not go farther in.
 
 import math
 from collections.abc import Sequence
+from operator import sub
 
 from bam_envs.core.errors import InvalidValue
 from bam_envs.core.robot import RobotSpec
@@ -45,12 +46,14 @@ class ForbiddenRegion(Guard):
 
     def limit(self, tick: Tick) -> bool:
         """Shorten the step of all joints."""
-        last = self._pick(tick.last)
-        step = [wanted - before for wanted, before in zip(self._pick(tick.command), last, strict=True)]
-        if self.is_outside(self.rest(last, step)):
+        last, wanted = self._pick(tick.last), self._pick(tick.command)
+        step = list(map(sub, wanted, last))
+        if tick.rest[0] != wanted:
+            tick.rest = wanted, self.rest(last, step)
+        if self.is_outside(tick.rest[1]):
             return False
         here = max(self.depth(last), _TOUCH)
-        if self.depth(self.rest(last, step)) <= here:  # it leaves
+        if self.depth(tick.rest[1]) <= here:  # it leaves
             return False
         least, most = 0.0, 1.0
         for _ in range(_HALVINGS):
@@ -119,8 +122,6 @@ class Collision(ForbiddenRegion):
     def __init__(self, spec: RobotSpec, limits: Limits, tubes: Tubes) -> None:
         super().__init__(spec, limits)
         self.limit_value, self._tubes, self._table = limits.clearance, tubes, limits.table_height
-        self._at: Sequence[float] = [math.inf] * len(self._joints)  # where it was computed last
-        self._room = 0.0  # the distance to anything may shrink by this before the next computation [m]
 
     def depth(self, joints: Sequence[float]) -> float:
         """By how much the least distance is below the limit [m]."""
@@ -129,12 +130,7 @@ class Collision(ForbiddenRegion):
 
     def is_outside(self, joints: Sequence[float]) -> bool:
         """As in the base class; distances that the motion cannot have used up are not computed again."""
-        if self._tubes.change(self._at, joints) < self._room:
-            return True
-        height = self._tubes.lowest(joints) - self._table
-        near = self._tubes.nearer_than(self.limit_value, joints)
-        self._at, self._room = joints, min(height, self._tubes.least) - self.limit_value
-        return not near and height >= self.limit_value
+        return not self._tubes.nearer_than(self.limit_value, joints, self._table)
 
     def start_fault(self, start: Numbers) -> str | None:
         """Why the arm must not go to `start` (m,)."""

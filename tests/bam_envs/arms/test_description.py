@@ -95,9 +95,9 @@ def test_signals_are_the_arms_own():
         ("home = .-0.0016, ", "home = [", "so101: home: expected 5 numbers, one a joint, found 4."),
         ("low = -1.91986", "low = 2.0", "so101: joints: shoulder_pan: low must be below high."),
         ("link = 6", "link = 7", "so101: capsules: there is no link 7; the last is 6."),
-        (r"\[0, 2, 0.007\]", "[0, 9, 0.007]", "so101: slack: there is no link 9; the last is 6."),
-        ("link = 6", "link = -1", "capsules[8]: link: expected a whole number of at least 0, found -1"),
-        ("radius = 0.0579", 'radius = "thick"', "capsules[0]: radius: expected a number above 0, found 'thick'"),
+        (r"\[0, 2, 0.023\]", "[0, 9, 0.023]", "so101: slack: there is no link 9; the last is 6."),
+        ("link = 6", "link = -1", "capsules[11]: link: expected a whole number of at least 0, found -1"),
+        ("radius = 0.0558", 'radius = "thick"', "capsules[0]: radius: expected a number above 0, found 'thick'"),
         ("low = -1.91986", "low = nan", "joints[0]: low: expected a finite number, found nan"),
         ("axis = .0.0, 0.0, 1.0.", "axis = [0, 0, 0]", "joints[0]: shoulder_pan: axis: 0, 0, 0 is no direction."),
         (

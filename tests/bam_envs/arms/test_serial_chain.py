@@ -97,6 +97,9 @@ def test_one_pose_and_many_are_the_same(name):
     np.testing.assert_array_equal(chain.tool_position(q), chain.tool_pose(q)[0])
     one_by_one = [chain.tool_point(pose) for pose in q.tolist()]
     np.testing.assert_allclose(one_by_one, chain.tool_position(q), rtol=0, atol=1e-14)
+    poses = np.array([chain.poses(pose) for pose in q.tolist()])
+    np.testing.assert_array_equal(poses[:, 0], np.tile(chain.mount[:3].ravel(), (20, 1)))
+    np.testing.assert_allclose(poses[:, 1:].reshape(20, -1, 3, 4), chain.link_frames(q)[:, :, :3], rtol=0, atol=1e-14)
     goals, yaws = chain.tool_position(chain.home[None]) + 0.01, np.zeros(1)
     near = np.tile(chain.home, (20, 1)) + 0.01 * q
     many = chain.reach_down(np.tile(goals, (20, 1)), np.tile(yaws, 20), near)

@@ -1,16 +1,18 @@
 """Make the description of an arm from its model files, and write it with what had to be assumed."""
 
 import dataclasses
-from collections.abc import Callable, Iterator
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 
 import numpy as np
 
 from bam_envs.arms.capsules import Outline, fitted_capsules
 from bam_envs.arms.description import ArmDescription, Gripper, JointRow, Placed, Vector
+from bam_envs.arms.serial_chain import Capsule, SerialChain
 from bam_envs.arms.work_area import find_work_area
 from bam_envs.core.errors import InvalidValue
-from bam_envs.robots.modelling.model_files import Array, ReadArm, Shapes, read_arm
+from bam_envs.robots.modelling.model_files import Array, ReadArm, read_arm
 
 SPEED, ACCELERATION, JERK = 1.5, 6.0, 60.0
 """Limits of a joint where the files name none [rad/s, rad/s^2, rad/s^3]: below those of every arm that is shipped."""
@@ -18,13 +20,17 @@ EFFORT_PER_REACH = 60.0
 """Torque of a joint where the files name none [N m], for each metre from the joint to the tool."""
 _POSTURES, _ENOUGH = 10_000, 20
 """Postures in which the outline is compared with the links, and the least number in which a pair overlaps."""
-_COMPARED = 1200  # of those, most for a pair
 _GIVEN_UP = 0.1
+_REFITS, _FALSE = 6, 0.015  # times that links get more capsules, and the share of false alarms that is good enough
+DEEP = 0.005
+"""A collision deeper than this is to be found [m]."""
 _CLEARANCE = 0.005  # that the guards keep, so that they act where links touch [m]
 _TOUCH = 0.0045  # depth from which shapes touch, and what is kept of the slack [m]
 _SURE = 0.001
 _ANYWHERE = 5.6  # travel of a first joint with which an arm works in any direction [rad]
 _ASIDE = 0.02  # of the middle of all postures from the base, that tells the direction of an arm [m]
+Apart = Mapping[tuple[int, int], Array]
+"""Distances of two links in many postures [m]; see `Shapes.distances`."""
 _FARTHEST = 3.0  # an arm longer than this has its lengths in another unit [m]
 
 
@@ -50,8 +56,6 @@ def describe(
         raise InvalidValue(f"{model}: the arm is {reach:.3g} m long; are its lengths in metres?")
     joints = _joints(read)
     tool = _placed(read.tool)
-    capsules = [one for link, points in enumerate(read.points) for one in fitted_capsules(points, link)]
-    capsules += [one for points in read.grip for one in fitted_capsules(points, len(joints) + 1)]
     width = read.width
     first = ArmDescription(
         name=name,
@@ -61,30 +65,34 @@ def describe(
         tool=tool,
         gripper=Gripper(open=width, mass=round(read.gripper_mass, 3)),
         workspace=((0.3, -0.25, 0.016), (0.7, 0.25, 0.35)),
-        capsules=tuple(capsules),
+        capsules=(),
         sources={"model": model, **({"gripper": gripper} if gripper else {})},
     )
     if read.shapes is not None:
-        tell(f"comparing {len(capsules)} capsules with the shapes of the links, in {_POSTURES} postures")
-        first = dataclasses.replace(first, slack=tuple(_slack(first, read.shapes)))
-    quarters = _facing(first)
+        tell(f"comparing capsules with the shapes of the links, in {_POSTURES} postures")
+    arm, how_well = _outlined(first, read)
+    mount, quarters = first.mount, _facing(first)
     if quarters:
         turn = np.pi / 4 * quarters
-        first = dataclasses.replace(first, mount=Placed(quat=(float(np.cos(turn)), 0.0, 0.0, float(np.sin(turn)))))
+        mount = Placed(quat=(float(np.cos(turn)), 0.0, 0.0, float(np.sin(turn))))
         read.notes.append(f"the base is turned by {90 * quarters} degrees about z, so that the arm faces x (mount)")
     tell("looking for a work area before the arm")
+    arm = dataclasses.replace(arm, mount=mount)
     try:
-        found = find_work_area(first, _turned(first))
+        found = find_work_area(arm, _turned(arm))
     except InvalidValue:
         if read.shapes is None:
             raise
         # Capsules are thicker than a bent link: what the slightest of its collisions are is given up.
         read.shapes.trust_pads()
-        first = dataclasses.replace(first, slack=tuple(_slack(first, read.shapes, _GIVEN_UP)))
-        found = find_work_area(first, _turned(first))
+        arm, how_well = _outlined(first, read, _GIVEN_UP)
+        arm = dataclasses.replace(arm, mount=mount)
+        found = find_work_area(arm, _turned(arm))
         read.notes.append(
             f"collisions of the arm with itself: the slightest {_GIVEN_UP:.0%} of two links are not noticed"
         )
+    if how_well:
+        found = dataclasses.replace(found, sources={**found.sources, "outline": how_well})
     return found, read.notes
 
 
@@ -114,29 +122,106 @@ def _turned(arm: ArmDescription) -> ArmDescription:
     return dataclasses.replace(arm, tool=_placed(arm.tool.matrix() @ half), capsules=capsules)
 
 
-def _slack(description: ArmDescription, shapes: Shapes, given_up: float = 0.0) -> Iterator[tuple[int, int, float]]:
+def _outlined(arm: ArmDescription, read: ReadArm, given_up: float = 0.0) -> tuple[ArmDescription, str]:
+    """The arm with capsules around its links, and how well they find its collisions with itself.
+
+    Two links whose capsules touch too often while the links are apart get more of them.
+
+    Args:
+        arm: The description without capsules.
+        read: The points and the shapes of its links.
+        given_up: The share of the slightest collisions of two links that need not be found.
+    """
+    groups = [*enumerate(read.points), *((arm.num_joints + 1, points) for points in read.grip)]
+    fits = [{2: fitted_capsules(points, link)} for link, points in groups]
+
+    def fitted(most: Mapping[int, int]) -> ArmDescription:
+        capsules: list[Capsule] = []
+        for known, (link, points) in zip(fits, groups, strict=True):
+            if (count := most.get(link, 2)) not in known:
+                known[count] = fitted_capsules(points, link, count)
+            capsules += known[count]
+        return dataclasses.replace(arm, capsules=tuple(capsules), slack=())
+
+    best, most, kept = fitted({}), dict[int, int](), dict[int, int]()
+    q = postures(arm.chain)
+    apart = {} if read.shapes is None else read.shapes.distances(q)
+    if not apart:
+        return best, ""
+    share, missed, worst, spent = 1.0, len(q), list[tuple[int, int]](), set[tuple[int, int]]()
+    for _ in range(_REFITS):
+        trial = fitted(most)
+        trial = dataclasses.replace(trial, slack=tuple(_slack(trial, q, apart, given_up)))
+        wrong, overlooked, blamed = judged(trial, q, apart)
+        if (overlooked, wrong) < (missed, share):
+            best, share, missed, kept, worst = trial, wrong, overlooked, most, blamed
+        pair = next((pair for pair in worst if pair not in spent), None)
+        if share <= _FALSE or pair is None:
+            break
+        spent.add(pair)
+        most = {**kept, **{link: kept.get(link, 2) + 2 for link in pair}}
+    deep = sum(np.min([*apart.values()], axis=0) < -DEEP)
+    found = f"{deep - missed} of {deep} collisions of the arm with itself in {len(q)} postures are found"
+    return best, f"{found}, and {share:.1%} of the other postures count as one"
+
+
+def judged(arm: ArmDescription, q: Array, apart: Apart) -> tuple[float, int, list[tuple[int, int]]]:
+    """How the capsules of an arm compare with its links at the joints `q` (n, k) [rad].
+
+    Args:
+        arm: The arm.
+        q: Joint positions.
+        apart: Distances of its links there; see `Shapes.distances`.
+
+    Returns:
+        The share of the postures without a collision in which the guards would act, the number of collisions deeper
+        than `DEEP` in which they would not, and the links that are falsely near, most often first.
+    """
+    outline = Outline(arm.chain)
+    known = np.array([tuple(pair) in apart for pair in outline.links[outline.pairs].tolist()], dtype=bool)
+    gaps, links = outline.distances(q)[:, known], outline.links[outline.pairs[known]]
+    if not known.any():
+        gaps = np.full((len(q), 1), np.inf)
+    acts, nearest = (gaps < _CLEARANCE).any(axis=1), np.min([*apart.values()], axis=0)
+    free = nearest > _CLEARANCE
+    blamed = Counter((int(i), int(j)) for i, j in links[gaps[acts & free].argmin(axis=1)])
+    share = float((acts & free).sum() / max(1, free.sum()))
+    return share, int((~acts & (nearest < -DEEP)).sum()), [pair for pair, _ in blamed.most_common()]
+
+
+def _slack(arm: ArmDescription, q: Array, apart: Apart, given_up: float) -> Iterator[tuple[int, int, float]]:
     """For two links, how far their capsules overlap while their shapes are apart [m], if it matters.
 
-    The share `given_up` of the slightest collisions does not count.
+    Args:
+        arm: The arm, without slack.
+        q: Joint positions [rad]. Shape: (n, k).
+        apart: Distances of its links there; see `Shapes.distances`.
+        given_up: The share of the slightest collisions that does not count.
     """
-    description = dataclasses.replace(description, slack=())
-    outline, chain = Outline(description.chain), description.chain
-    rng = np.random.default_rng(0)
-    low, high = np.maximum(chain.low, -np.pi), np.minimum(chain.high, np.pi)
-    q = low + rng.random((_POSTURES, len(low))) * (high - low)
+    outline, usual = Outline(arm.chain, every=True), Outline(arm.chain)
+    guarded = {(int(i), int(j)) for i, j in usual.links[usual.pairs]}
     gaps, links = outline.distances(q), outline.links[outline.pairs]
-    for one, other in sorted({(int(i), int(j)) for i, j in links}):
+    for one, other in sorted({(int(i), int(j)) for i, j in links} & apart.keys()):
         gap = gaps[:, (links == [one, other]).all(axis=1)].min(axis=1)
-        overlapping = np.flatnonzero(gap < _CLEARANCE)
-        if len(overlapping) < _ENOUGH or not shapes.are_known(one, other):
+        if (gap < _CLEARANCE).sum() < _ENOUGH:
             continue
-        overlapping = overlapping[np.argsort(-gap[overlapping])]  # the slightest first
-        picked = overlapping[np.unique(np.linspace(0, len(overlapping) - 1, _COMPARED).astype(int))]
-        deepest = float(gap[picked].min())
-        touching = [float(gap[at]) for at in picked if shapes.distance(one, other, q[at]) < -_TOUCH] or [deepest]
-        slack = max(0.0, _CLEARANCE - touching[int(given_up * len(touching))] - _SURE)
-        if slack > 0.002:
+        touching = np.sort(gap[(gap < _CLEARANCE) & (apart[one, other] < -_TOUCH)])[::-1]  # the slightest first
+        if len(touching):
+            least = touching[int(given_up * len(touching))]
+        elif (one, other) in guarded:
+            least = gap.min()
+        else:
+            continue  # limits of joints keep these links apart
+        slack = max(0.0, _CLEARANCE - float(least) - _SURE)
+        if slack > 0.002 or (one, other) not in guarded:
             yield one, other, round(slack, 3)
+
+
+def postures(chain: SerialChain, seed: int = 0) -> Array:
+    """Random postures of an arm, each joint within a turn (n, k) [rad]."""
+    low, high = np.maximum(chain.low, -np.pi), np.minimum(chain.high, np.pi)
+    q: Array = low + np.random.default_rng(seed).random((_POSTURES, len(low))) * (high - low)
+    return q
 
 
 def _joints(read: ReadArm) -> tuple[JointRow, ...]:

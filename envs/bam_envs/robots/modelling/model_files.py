@@ -6,6 +6,7 @@ What a file does not say gets a default, and a note that says so.
 import contextlib
 import importlib
 import itertools
+import math
 import re
 import tempfile
 import xml.etree.ElementTree as ElementTree
@@ -295,6 +296,10 @@ def _attach(spec: Any, body: Any, gripper: str, folder: str) -> None:
         raise _refusal(f"MuJoCo cannot join {gripper}", error) from error
 
 
+_FAR = 0.05
+"""Distance of two links from which they count as that far apart [m]."""
+
+
 class Shapes:
     """The shapes of an arm's links, as MuJoCo compares them: meshes by their convex hulls.
 
@@ -316,21 +321,29 @@ class Shapes:
         self._geoms[-1] += self._pads
         self._pads = []
 
-    def are_known(self, one: int, other: int) -> bool:
-        """Whether both links have shapes in the model."""
-        is_assumed = bool(self._pads) and max(one, other) == len(self._geoms) - 1
-        return bool(self._geoms[one] and self._geoms[other]) and not is_assumed
+    def distances(self, q: Array) -> dict[tuple[int, int], Array]:
+        """For two links that can touch, their distance [m], at most 5 cm, negative if they overlap: (n, k) to (n,).
 
-    def distance(self, one: int, other: int, q: Array) -> float:
-        """Distance of two links at the joints `q` (k,) [rad], at most 5 cm; negative if they overlap."""
-        self._data.qpos[:] = 0.0
-        self._data.qpos[self._where] = q
-        mujoco.mj_kinematics(self._model, self._data)
-        pairs = itertools.product(self._geoms[one], self._geoms[other])
-        return min(
-            (mujoco.mj_geomDistance(self._model, self._data, first, second, 0.05, None) for first, second in pairs),
-            default=0.05,
-        )
+        Links that share a joint are left out, like the gripper and the last two; so are links without shapes.
+        """
+        geoms, last = self._geoms, len(self._where)
+        links = [(one, other) for one in range(last - 1) for other in range(one + 2, last + 2)]
+        found = {
+            pair: np.full(len(q), _FAR)
+            for pair in links
+            if geoms[pair[0]] and geoms[pair[1]] and not (self._pads and pair[1] == last + 1)
+        }
+        radii, places = self._model.geom_rbound, self._data.geom_xpos
+        for row, joints in enumerate(q):
+            self._data.qpos[:] = 0.0
+            self._data.qpos[self._where] = joints
+            mujoco.mj_kinematics(self._model, self._data)
+            for (one, other), apart in found.items():
+                for first, second in itertools.product(geoms[one], geoms[other]):
+                    if math.dist(places[first], places[second]) < radii[first] + radii[second] + _FAR:
+                        near = mujoco.mj_geomDistance(self._model, self._data, first, second, _FAR, None)
+                        apart[row] = min(apart[row], near)
+        return found
 
 
 def _is_pad(model: Any, geom: int) -> bool:
