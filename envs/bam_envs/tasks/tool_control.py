@@ -1,9 +1,9 @@
-"""From tool actions (dx, dy, dz, dyaw, grip) to joint commands, slow enough for a robot near people.
+"""From tool actions (dx, dy, dz, dyaw, grip) to commands of joints and gripper, as smooth as the guards ask for.
 
 The actions move a tool *target*, not the measured tool, which sags and lags; the target stays within `LEASH` of the
 measured tool and inside the workspace, and continues from the command that was actually sent if guards changed it.
-The tool always points straight down, and the joints follow by the inverse kinematics of the arm's description. From one
-command to the next the tool target moves at most `TOOL_STEP` and no joint more than `JOINT_STEP`.
+The tool always points straight down, and the joints follow by the inverse kinematics of the arm's description. Target
+and joints gain and lose speed together (`JointPace`), along a straight line: a joint at its limit slows down all.
 """
 
 import math
@@ -20,7 +20,8 @@ from bam_envs.safety.guard import Limits
 PERIOD = 0.05
 """Time between two commands [s]."""
 PACE = 0.96
-"""Share of a limit that commands use: the guards hold a command that is sent 2 ms early to a period of 48 ms."""
+"""Share of a limit that commands use: the guards hold a command that is sent 2 ms early to a period of 48 ms, and an
+acceleration to its square."""
 FASTEST = PACE * PERIOD * Limits().tool_speed
 """Maximum motion of the tool target in a period [m]; the tool stays below 0.25 m/s, as in a UR's recovery mode."""
 TOOL_STEP = 0.0124
@@ -104,9 +105,9 @@ class JointPace:
         usual, rows = Limits(), description.joints
         gains = [min(row.acceleration, row.jerk * PERIOD, usual.joint_acceleration) for row in rows]
         speeds = [SHARE_AT_ONCE * min(row.velocity, usual.joint_speed) for row in rows]
-        self.change_limit = PACE * PERIOD**2 * np.array(gains)
+        self.change_limit = (PACE * PERIOD) ** 2 * np.array(gains)
         """Greatest change of a step [rad]. Shape: (k,)."""
-        braking = PACE * PERIOD**2 * usual.joint_acceleration
+        braking = (PACE * PERIOD) ** 2 * usual.joint_acceleration
         self.step = np.minimum(PACE * PERIOD * np.array(speeds), braking)
         """Longest step [rad]. Shape: (k,)."""
         self.brakes = float(min(1.0, (self.change_limit / self.step).min()))

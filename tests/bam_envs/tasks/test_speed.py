@@ -71,13 +71,13 @@ def test_measured_speeds(make_rows, env_id, randomize, actions):
     assert 0.1 < joint_speed <= JOINT_SPEED * SLACK
 
 
-SLOW = [0.96 * 0.05**2 * 5.2] * 4 + [0.024] * 3
+SLOW = [0.048**2 * 5.2] * 4 + [0.02304] * 3
 """Greatest change of a step of a Gen3 [rad], whose large joints gain 5.2 rad/s^2."""
 
 
 @pytest.mark.parametrize(
     ("env_id", "options", "change"),
-    [*((one, {}, 0.024) for one in SCRIPTED), ("bam/pick-v0", {"robot_model": "gen3"}, SLOW)],
+    [*((one, {}, 0.02304) for one in SCRIPTED), ("bam/pick-v0", {"robot_model": "gen3"}, SLOW)],
 )
 def test_commands_keep_to_speed_and_acceleration_whatever_the_actions(make_rows, env_id, options, change):
     """To the limit for half a second each way, into the table and into the cube; then the guards change nothing."""
@@ -104,4 +104,4 @@ def test_commands_keep_to_speed_and_acceleration_whatever_the_actions(make_rows,
             after[:, -1] - np.maximum(before[:, -1], width), np.minimum(before[:, -1], width) - after[:, -1]
         )
         assert ahead[running].max(initial=0.0) <= 0.96 * 0.05 * robot.description.gripper.speed * (1 + 1e-9)
-    assert (fastest, changed) == (pytest.approx(0.024), pytest.approx(1.0))
+    assert (fastest, changed) == (pytest.approx(0.02304), pytest.approx(1.0))
