@@ -141,6 +141,7 @@ class ToolControl(Memory):
         "travel": "_travel",
         "turn": "_turn",
         "step": "_step",
+        "width": "_width",
     }
 
     def __init__(self, num_envs: int, space: WorkSpace = _DEFAULT) -> None:
@@ -154,13 +155,15 @@ class ToolControl(Memory):
         self.closed = np.zeros(num_envs, dtype=bool)
         """Whether the gripper was commanded to close. Shape: (n,)."""
         self._joints = np.zeros((num_envs, space.size))
+        self._width = np.zeros(num_envs)  # commanded [m]
         # Changes of target, yaw and joints by the last command.
         self._travel, self._turn, self._step = np.zeros((num_envs, 3)), np.zeros(num_envs), np.zeros_like(self._joints)
 
     def start(self, env_ids: EnvIds, joints: Array) -> None:
         """Begin at rest at the measured `joints` (k, joints) [rad] of these environments."""
         self._continue_from(env_ids, joints)
-        self._travel[env_ids], self._turn[env_ids], self._step[env_ids], self.closed[env_ids] = 0.0, 0.0, 0.0, False
+        self._travel[env_ids], self._turn[env_ids], self._step[env_ids] = 0.0, 0.0, 0.0
+        self.closed[env_ids], self._width[env_ids] = False, self.space.open
 
     def _continue_from(self, env_ids: EnvIds, joints: Array) -> None:
         """Begin at `joints` (k, joints) [rad], which were sent after the last but one command."""
@@ -175,22 +178,24 @@ class ToolControl(Memory):
             change[env_ids] = limited(value - (now - change)[env_ids], -most, most)
             now[env_ids] = value
 
-    def command(self, action: Floats, tool: Array, sent: Array, width: Array) -> Array:
+    def command(self, action: Floats, tool: Array, sent: Array, width: Array | None = None) -> Array:
         """Joint positions [rad] and gripper width [m] for an action, as `WorkSpace.action_labels` says.
 
         Args:
             action: In [-1, 1]. Shape: (n, 5), or (n, 4) without ``dyaw``.
             tool: Measured tool position [m]. Shape: (n, 3).
-            sent: Command that was actually sent last; if guards changed its joints, the target begins there.
-                Shape: (n, joints + 1).
-            width: Measured width of the gripper [m]. Shape: (n, 1).
+            sent: Joints that were actually sent last [rad]; if guards changed them, the target begins there.
+                Shape: (n, joints).
+            width: Measured width of the gripper [m], around an object more than the commanded one; that by default.
+                Shape: (n, 1).
         """
+        width = self._width[:, None] if width is None else width
         if len(action) == 1:
             return self._command_one(action, tool, sent, width)
-        changed = sent[:, :-1] != self._joints
+        changed = sent != self._joints
         if changed.any():
             held = np.flatnonzero(changed.any(axis=1))
-            self._continue_from(held, sent[held, :-1])
+            self._continue_from(held, sent[held])
         moves: Array = limited(action, -1.0, 1.0).astype(np.float64)
         travel = limited(self.target + moves[:, :3] * TOOL_STEP, tool - LEASH, tool + LEASH) - self.target
         brakes = self._pace.brakes
@@ -216,16 +221,15 @@ class ToolControl(Memory):
         self._travel = limited(self.target + self._travel, self._low, self._high) - self.target
         self.target, self.yaw = self.target + self._travel, self.yaw + self._turn
         self.closed = action[:, -1] > 0
-        fingers, last = width[:, 0], sent[:, -1]
+        fingers, last = width[:, 0], self._width
         low, high = np.minimum(fingers, last) - self._slide, np.maximum(fingers, last) + self._slide
-        opened = limited(np.where(self.closed, 0.0, self.space.open), low, high)
-        return np.concatenate([self._joints, opened[:, None]], axis=1)
+        self._width = limited(np.where(self.closed, 0.0, self.space.open), low, high)
+        return np.concatenate([self._joints, self._width[:, None]], axis=1)
 
     def _command_one(self, action: Floats, tool: Array, sent: Array, width: Array) -> Array:
         """`command` of one environment: the same arithmetic in plain numbers, which take a third of the time."""
-        *joints, last = sent[0].tolist()
-        if joints != self._joints[0].tolist():
-            self._continue_from(np.zeros(1, np.int64), sent[:, :-1])
+        if sent[0].tolist() != self._joints[0].tolist():
+            self._continue_from(np.zeros(1, np.int64), sent)
         dx, dy, dz, *turns, grip = action[0].tolist()
         here, yaw, joints = self.target[0].tolist(), self.yaw.item(), self._joints[0].tolist()
         travel, lows, highs = [], self._low.tolist(), self._high.tolist()
@@ -269,8 +273,9 @@ class ToolControl(Memory):
         self._step, self._travel, self._turn = np.array([way]), np.array([travel]), np.array([turn])
         self.target = np.array([[at + one for at, one in zip(here, travel, strict=True)]])
         self.yaw, self._joints, self.closed = np.array([yaw + turn]), np.array([joints]), np.array([grip > 0])
-        fingers, wanted = width.item(), 0.0 if grip > 0 else self.space.open
+        fingers, last, wanted = width.item(), self._width.item(), 0.0 if grip > 0 else self.space.open
         opened = _limited(wanted, min(fingers, last) - self._slide, max(fingers, last) + self._slide)
+        self._width = np.array([opened])
         return np.array([[*joints, opened]])
 
 
