@@ -6,6 +6,7 @@ import pytest
 
 from bam_envs.core.location import SIMULATED
 from bam_train.checkpoint import Checkpoint
+from bam_train.deploy.rehearsal import Rehearsal
 from bam_train.evaluation import evaluate
 from bam_train.policy import FrozenPolicy
 
@@ -50,3 +51,13 @@ def test_a_committed_checkpoint_succeeds_and_is_small(name, least):
     report = evaluate(FrozenPolicy.load(path), manifest.env, env_kwargs, episodes=episodes, seed=7_000_000)
     assert report.episodes == episodes
     assert report.success_rate >= least
+
+
+@pytest.mark.parametrize("name", ["reach-ppo", "pick-ppo", "pick-place-ppo"])
+def test_guards_change_almost_no_command_of_a_shipped_policy(name):
+    """At full speed, on a robot that is never late; the pads that press on the cube are told from a robot that lags."""
+    checkpoint = Checkpoint.open(FOLDER / f"{name}.zip")
+    rehearsal = Rehearsal(checkpoint, {"command_delay": [0.0, 0.0], "state_delay": [0.0, 0.0]})
+    policy = FrozenPolicy.from_checkpoint(checkpoint)
+    report = rehearsal.run(policy, episodes=8, seed=1_000_000, tell=pytest.fail)
+    assert sum(row["altered"] for row in report.guards.values()) <= 0.02 * sum(one.length for one in report.records)

@@ -206,7 +206,7 @@ class DeployReport:
         return [
             f"{reason}: {episodes}, {self.pacer.ticks} ticks, {rate_text(self.pacer)}{journal.marked}",
             *([f"lateness {lateness_text(self.pacer)}"] if self.pacer.period is not None else []),
-            *([guards_text(self.guards)] if self.guards else []),
+            *([guards_text(self.guards, self.pacer.ticks)] if self.guards else []),
             *([self.trials.evidence.text] if self.trials else []),
             *([self.shadow.agreement.text] if self.shadow else []),
             *([f"recorded in {self.recorder.path}"] if self.recorder is not None else []),
@@ -226,11 +226,11 @@ def lateness_text(pacer: Pacer) -> str:
     return ", ".join([*figures, f"{pacer.missed or 'no'} deadline{'s' if pacer.missed > 1 else ''} missed"])
 
 
-def guards_text(guards: Mapping[str, Mapping[str, Any]]) -> str:
-    """Counts of the guards, such as ``guards changed the command: joint speed (G8) in 3 ticks``."""
+def guards_text(guards: Mapping[str, Mapping[str, Any]], ticks: int) -> str:
+    """Counts of the guards, such as ``guards changed the command: joint speed (G8) in 3 of 60 ticks (5.0 %)``."""
     counts = {
         what: ", ".join(
-            f"{name} ({row['number']}) in {row[what]} tick{'s' if row[what] > 1 else ''}"
+            f"{name} ({row['number']}) in {row[what]} of {ticks} ticks ({100 * row[what] / max(1, ticks):.1f} %)"
             for name, row in guards.items()
             if row.get(what)
         )

@@ -114,9 +114,10 @@ class Memory:
         return {key: getattr(self, attribute).copy() for key, attribute in self.memory.items()}
 
     def load_state_dict(self, state: dict[str, Any]) -> Any:
-        """Restore the result of `state_dict`."""
+        """Restore the result of `state_dict`; arrays that an earlier version did not save stay as they are."""
         for key, attribute in self.memory.items():
-            setattr(self, attribute, np.array(state[key], dtype=getattr(self, attribute).dtype))
+            if key in state:
+                setattr(self, attribute, np.array(state[key], dtype=getattr(self, attribute).dtype))
 
     def own_memory(self) -> None:
         """Continue with copies, so that views of the arrays that a caller holds keep their numbers."""

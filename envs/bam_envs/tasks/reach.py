@@ -11,7 +11,7 @@ from bam_envs.arms.description import robot_model as model_called
 from bam_envs.core.robot import EnvIds, Initial, RobotState
 from bam_envs.core.robot_models import DEFAULT_ARM
 from bam_envs.core.task import Array, Floats, Label, Memory, Score, draw_seeds, labelled_box, limited
-from bam_envs.tasks.tool_control import JOINT_STEP, TOOL_STEP, WorkSpace
+from bam_envs.tasks.tool_control import FASTEST, JOINT_STEP, JointPace, WorkSpace
 
 START_NOISE = 0.1
 """The start differs from the home pose by at most this much in each joint [rad]."""
@@ -65,7 +65,7 @@ class ReachTask(Memory):
         `distance` of the tool from the goal [m].
     """
 
-    memory: Mapping[str, str] = {"goal": "goal"}
+    memory: Mapping[str, str] = {"goal": "goal", "sent": "_sent"}
 
     def __init__(self, num_envs: int = 1, *, robot_model: Any = DEFAULT_ARM) -> None:
         self.num_envs, self.space = num_envs, GoalSpace(model_called(robot_model))
@@ -78,6 +78,7 @@ class ReachTask(Memory):
         self.observation_space: spaces.Box = labelled_box(self.observation_labels)
         self.goal = np.zeros((num_envs, 3))
         """Goals [m]. Shape: (n, 3)."""
+        self._pace, self._sent = JointPace(self.space.description), np.zeros((num_envs, self.space.size))
 
     @staticmethod
     def labels(space: GoalSpace) -> tuple[Label, ...]:
@@ -107,7 +108,9 @@ class ReachTask(Memory):
         return Initial({"joint_position": self.space.home + START_NOISE * (2 * draws[:, :size] - 1)}, seeds)
 
     def on_reset(self, env_ids: EnvIds, state: RobotState) -> None:
-        """Do nothing: commands continue from the one that was actually sent last."""
+        """The arm is at rest; commands continue from the one that was actually sent last."""
+        self._sent = self._sent.copy()
+        self._sent[env_ids] = state.command[env_ids, :-1]
 
     def observe(self, state: RobotState) -> Floats:
         """See `observation_labels`. Shape: (n, 2 joints + 9) float32."""
@@ -128,21 +131,23 @@ class ReachTask(Memory):
         ]
 
     def command(self, action: Floats, state: RobotState) -> Array:
-        """Joints [rad] within `TOOL_STEP` and `JOINT_STEP`, and the open gripper [m]. Shape: (n, joints + 1)."""
+        """Joints [rad] within `FASTEST` and `JointPace`, and the open gripper [m]. Shape: (n, joints + 1)."""
         measured, sent = state.signals["joint_position"], state.command[:, :-1]
+        before = limited(sent - self._sent, -self._pace.step, self._pace.step)
         wanted = sent + limited(action, -1.0, 1.0).astype(np.float64) * JOINT_STEP
         wanted = limited(limited(wanted, measured - LEASH, measured + LEASH), self.space.low, self.space.high)
-        travel = wanted - sent
-        travel *= np.minimum(1.0, 0.999 * JOINT_STEP / np.maximum(np.abs(travel).max(axis=1), 1e-9))[:, None]
+        travel = self._pace.speed(wanted - sent) * (wanted - sent)
+        travel = before + self._pace.change(travel, before) * (travel - before)
         tool = self.space.arm.tool_position(sent)
         for _ in range(3):
             step = self.space.arm.tool_position(sent + travel) - tool
             length = np.sqrt(np.einsum("ij,ij->i", step, step))
-            if length.max() <= TOOL_STEP:
+            if length.max() <= FASTEST:
                 break
-            travel *= np.where(length > TOOL_STEP, 0.99 * TOOL_STEP / np.maximum(length, 1e-9), 1.0)[:, None]
+            travel *= np.where(length > FASTEST, 0.99 * FASTEST / np.maximum(length, 1e-9), 1.0)[:, None]
         sinks = (tool[:, 2] + step[:, 2] < self.space.lowest) & (step[:, 2] < 0)
         joints = sent + np.where(sinks[:, None], 0.0, travel)
+        self._sent = sent
         return np.concatenate([joints, np.full((self.num_envs, 1), self.space.open)], axis=1)
 
     def action_for(self, command: Array, state: RobotState) -> Floats:

@@ -107,9 +107,9 @@ def test_running_free():
 def test_what_the_guards_did():
     speed = {"number": "G8", "limit": 1.0, "unit": "rad/s", "altered": 3, "stopped": 0}
     finite = {"number": "G2", "limit": "", "unit": "", "altered": 0, "stopped": 0}
-    text = "guards changed the command: joint speed (G8) in 3 ticks"
-    assert guards_text({"joint speed": speed, "finite": finite}) == text
-    assert guards_text({"finite": finite}) == "no guard changed a command"
+    text = "guards changed the command: joint speed (G8) in 3 of 60 ticks (5.0 %)"
+    assert guards_text({"joint speed": speed, "finite": finite}, 60) == text
+    assert guards_text({"finite": finite}, 60) == "no guard changed a command"
 
 
 def test_the_start_is_measured_once():

@@ -14,7 +14,7 @@ from bam_envs.arms.work_area import find_work_area
 from bam_envs.core.errors import InvalidValue
 from bam_envs.robots.modelling.model_files import Array, ReadArm, read_arm
 
-SPEED, ACCELERATION, JERK = 1.5, 6.0, 60.0
+SPEED, ACCELERATION, JERK = 1.5, 6.0, 120.0
 """Limits of a joint where the files name none [rad/s, rad/s^2, rad/s^3]: below those of every arm that is shipped."""
 EFFORT_PER_REACH = 60.0
 """Torque of a joint where the files name none [N m], for each metre from the joint to the tool."""

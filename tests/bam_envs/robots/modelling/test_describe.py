@@ -101,7 +101,7 @@ FIVE = """<mujoco><compiler angle="radian"/><worldbody><body name="base">
 <body name="jaw" pos="-0.02 0 0.01"><joint name="jaw" axis="0 -1 0" range="0 1"/>
 <geom type="box" size="0.006 0.01 0.04" pos="0.014 0 0.04" mass="0.02"/></body>
 </body></body></body></body></body></body></worldbody></mujoco>"""
-NO_JERK = "all {} joints: no acceleration or jerk in the files, so 6 rad/s^2, 60 rad/s^3"
+NO_JERK = "all {} joints: no acceleration or jerk in the files, so 6 rad/s^2, 120 rad/s^3"
 
 
 @pytest.fixture(scope="module")
@@ -140,7 +140,7 @@ def test_an_urdf_with_a_gripper_of_which_only_the_width_is_known(described, fold
     assert [(row.velocity, row.effort, row.mass) for row in arm.joints] == [(2.5, 80.0, 2.0)] * 3 + [
         (2.5, 20.0, 2.0)
     ] * 3
-    assert {(row.acceleration, row.jerk) for row in arm.joints} == {(6.0, 60.0)}
+    assert {(row.acceleration, row.jerk) for row in arm.joints} == {(6.0, 120.0)}
     assert arm.tool.xyz == pytest.approx((0.0, 0.0, 0.14))
     # Half a turn about the tool's axis: the arm reaches more so, and pads do not tell.
     assert arm.tool.quat == pytest.approx((0.0, 0.0, 0.0, 1.0))
