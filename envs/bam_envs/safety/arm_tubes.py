@@ -75,10 +75,6 @@ class Tubes:
         """Height of the lowest point of the links that move at the joints `q` (k,) [rad], up to the flange [m]."""
         raise NotImplementedError
 
-    def drawn(self, q: Sequence[float]) -> list[list[float]]:
-        """The tubes in ``base_link``: two ends, x, y, z [m] each, and the radius [m]."""
-        raise NotImplementedError
-
     def nearest(self, q: Sequence[float]) -> float:
         """Smallest distance of two tubes at the joints `q` (k,) [rad], in m; below 0 if their links overlap."""
         segments = self.segments(q, set().union(*self._in))
