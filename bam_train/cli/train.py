@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from bam_train.checkpoint import Checkpoint
     from bam_train.cli.flags import TrainConfig
     from bam_train.settings import TrainSettings
+    from bam_train.trainers.run_folder import RunFolder
     from bam_train.trainers.training_run import TrainingRun
 
 _STARTED = time.monotonic()
@@ -32,7 +33,7 @@ def train(config: TrainConfig) -> int:
     from bam_train.checkpoint import Checkpoint
     from bam_train.errors import SettingsError
     from bam_train.settings import NAMES, merge, read_assignments, read_config
-    from bam_train.trainers.resolve_settings import read_preset, resolve, resolve_resumed
+    from bam_train.trainers.resolve_settings import resolve, resolve_resumed
 
     if config.resume is not None and not config.resume.expanduser().exists():
         raise SettingsError(f"--resume {config.resume}: no such file. Check the name; a run keeps runs/NAME/last.zip")
@@ -42,26 +43,46 @@ def train(config: TrainConfig) -> int:
     if "transport" in flags:
         flags["transport"] = list(addresses(flags["transport"]))
     given = merge(file, read_assignments(config.set), flags)
+    if config.seeds is not None:
+        from bam_train.cli.experiments.seeds import train_seeds
+
+        return train_seeds(config, config.seeds, given)
     if config.learner is not None:
         return _learn(config, config.learner, given, checkpoint)
     settings = resolve(given, say) if checkpoint is None else resolve_resumed(given, checkpoint, say)
     if config.print_config:
         tell(*json.dumps(settings.to_mapping(), indent=2).split("\n"))
         return 0
-    notices = []
-    if checkpoint is None and not read_preset(settings.env, settings.algo, settings.trainer):
-        besides = ", ".join(given.get("hyperparameters", {}))
-        notices.append(f"no preset: the library's defaults{f', but for {besides}' if besides else ''}")
-    return _train(config, settings, checkpoint, notices)
+    return train_run(config, settings, checkpoint, [] if checkpoint else preset_notices(settings, given))
 
 
-def _train(config: TrainConfig, settings: TrainSettings, checkpoint: Checkpoint | None, notices: list[str]) -> int:
-    """Train with complete settings, and print `notices` and the outcome; returns the exit status."""
+def preset_notices(settings: TrainSettings, given: Mapping[str, Any]) -> list[str]:
+    """A line that says so if a new run has no preset; `given` are the settings of the user."""
+    from bam_train.trainers.resolve_settings import read_preset
+
+    if read_preset(settings.env, settings.algo, settings.trainer):
+        return []
+    besides = ", ".join(given.get("hyperparameters", {}))
+    return [f"no preset: the library's defaults{f', but for {besides}' if besides else ''}"]
+
+
+def train_run(
+    config: TrainConfig,
+    settings: TrainSettings,
+    checkpoint: Checkpoint | None,
+    notices: list[str],
+    folder: RunFolder | None = None,
+) -> int:
+    """Train with complete settings, and print `notices` and the outcome; returns the exit status.
+
+    A run that continues from a checkpoint goes on in its `folder`, if that is given; otherwise a run has a new one.
+    """
     from bam_train.cli.train_display import LiveDisplay, MayClose, PlainDisplay, say_next, summarise
     from bam_train.environments import is_batched
     from bam_train.errors import LearntNothing, SettingsError
     from bam_train.settings import file_stem
     from bam_train.trainers import load_trainer
+    from bam_train.trainers.base import hardware, origin
     from bam_train.trainers.best_checkpoint import choose_output
     from bam_train.trainers.run_folder import Copies, RunFolder, require_room
     from bam_train.trainers.training_run import TrainingRun
@@ -87,7 +108,8 @@ def _train(config: TrainConfig, settings: TrainSettings, checkpoint: Checkpoint 
             settings = trainer.settings  # as the trainer completed them
             if config.record is not None:
                 trainer.record(config.record)  # type: ignore[attr-defined]
-            folder = RunFolder(runs, file_stem(settings.env, settings.algo, settings.trainer, settings.env_kwargs))
+            if folder is None:
+                folder = RunFolder(runs, file_stem(settings.env, settings.algo, settings.trainer, settings.env_kwargs))
             folder.write_config(settings.to_mapping())
             trainer.log_to(folder.tensorboard)
             display = (LiveDisplay if can_draw() else PlainDisplay)(title)
@@ -100,6 +122,9 @@ def _train(config: TrainConfig, settings: TrainSettings, checkpoint: Checkpoint 
             summarise(settings, outcome, folder, time.monotonic() - _STARTED)
             if outcome.shortfall is None:
                 run.add_detector()  # a tenth of a short run's time, so that nobody waits for the outcome
+            if outcome.reason != "stopped" and outcome.failure is None:
+                made = {"reason": outcome.reason, "steps": outcome.steps, "seconds": run.seconds, "best": outcome.best}
+                folder.write_outcome({**made, "shortfall": outcome.shortfall, "hardware": hardware(), **origin()})
         finally:
             trainer.close()
         say_next(settings, outcome)

@@ -130,7 +130,7 @@ def _steps(progress: Progress) -> str:
     return f"{count(progress.steps)}{more} steps"
 
 
-_REASONS = {
+REASONS = {
     "steps": "all steps done",
     "success": "success reached",
     "reward": "reward reached",
@@ -147,7 +147,7 @@ def summarise(settings: TrainSettings, outcome: Outcome, folder: RunFolder, seco
     except OutputError as error:
         say(f"no learning curve: {error}")
     say()
-    end = f"{_REASONS[outcome.reason]} at {count(outcome.steps)} steps, {duration(seconds)} in all"
+    end = f"{REASONS[outcome.reason]} at {count(outcome.steps)} steps, {duration(seconds)} in all"
     say(f"{settings.algo} on {settings.env}: {end}")
     if outcome.best is None and outcome.reason == "stopped":
         say("  best        none yet: stopped before the first evaluation; the checkpoint is the newest state")

@@ -1,0 +1,269 @@
+"""`bam-train --seeds`: one run a seed, one display, one summary; `main` is the process of one of them."""
+
+from __future__ import annotations
+
+import atexit
+import contextlib
+import gc
+import json
+import os
+import shutil
+import signal
+import sys
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from bam_train.checkpoint import Checkpoint
+from bam_train.cli.console import can_draw, count, duration, make_console, number, percent, rich_text, say
+from bam_train.cli.experiment import signals_ask
+from bam_train.cli.experiments.comparison import summary_lines
+from bam_train.cli.flags import TrainConfig
+from bam_train.cli.program import guarded
+from bam_train.cli.train import preset_notices, train_run
+from bam_train.cli.train_display import REASONS
+from bam_train.errors import SettingsError
+from bam_train.experiments.seed_runs import (
+    ClusterSeed,
+    SeedProcess,
+    SeedRun,
+    Started,
+    at_once,
+    group_folder,
+    read_seeds,
+    run_seeds,
+)
+from bam_train.files.atomic_file import replacing
+from bam_train.files.place import with_addresses
+from bam_train.settings import RLlibSettings, TrainSettings, read_assignments
+from bam_train.signals import at_end_of_parent
+from bam_train.trainers.base import cores
+from bam_train.trainers.best_checkpoint import choose_output
+from bam_train.trainers.resolve_settings import resolve
+from bam_train.trainers.run_folder import Copies, RunFolder, require_room
+from bam_train.trainers.training_run import rank
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+
+def train_seeds(config: TrainConfig, text: str, given: Mapping[str, Any]) -> int:
+    """Train one run a seed and print the summary; returns the exit status."""
+    seeds = read_seeds(text)
+    refused = [name for name in ("resume", "learner", "record", "transport") if getattr(config, name) is not None]
+    if config.seed is not None or "seed" in read_assignments(config.set):
+        refused.append("seed")
+    if refused:
+        raise SettingsError(f"--seeds trains new runs in simulation, one a seed; leave --{refused[0]} out")
+    runs = config.runs.expanduser()
+    if with_addresses(f"{runs}/") != f"{runs}/":
+        raise SettingsError("--seeds needs --runs on this computer, where a later call goes on; see --copy-to")
+    settings = resolve({name: value for name, value in given.items() if name != "address"}, say)
+    require_room(runs)
+    choose_output(settings, config.out, True, None)  # refuses what cannot be written
+    copies = None if config.copy_to is None else Copies(config.copy_to)
+    with group_folder(runs, settings) as (group, lock):
+        every = [_seed_run(group, seed, settings) for seed in seeds]
+        with _starter(settings, given.get("address"), lock) as (start, jobs, where):
+            title = f"{settings.algo} on {settings.env}, {len(seeds)} seeds in {group.path}, {jobs} at once{where}"
+            say(title)
+            for notice in preset_notices(settings, given):
+                say(notice)
+            show = (_LiveTable if can_draw() else _PlainLines)(every)
+            with signals_ask() as stopped:
+                with show:
+                    run_seeds(every, start, jobs, stopped, show.update)
+                done = [run for run in every if run.state == "done"]
+                if stopped() and len(done) < len(every):
+                    say(f"{len(done)} of {len(every)} seeds are done; the same command goes on with the others")
+                elif done:
+                    _summarise(config, settings, group, every, copies)
+    return _status(every)
+
+
+def _seed_run(group: RunFolder, seed: int, settings: TrainSettings) -> SeedRun:
+    folder = RunFolder(group.path, f"seed-{seed}", lambda path: True)
+    run = SeedRun(seed, folder, settings.steps)
+    run.take(folder.records())
+    if folder.outcome is not None:
+        run.end(0, "", False)
+    return run
+
+
+@contextlib.contextmanager
+def _starter(
+    settings: TrainSettings, address: str | None, lock: int | None
+) -> Iterator[tuple[Callable[[SeedRun], Started], int, str]]:
+    """What starts a run, how many run at once, and where in words."""
+
+    def values(run: SeedRun) -> dict[str, Any]:
+        return replace(settings, seed=run.number).to_mapping()
+
+    if address is None:
+        jobs, _ = at_once(settings, [cores()])
+        yield lambda run: SeedProcess(values(run), run.folder.path, lock=lock), jobs, ""
+        return
+    from bam_train.trainers.rllib import ray_cluster
+
+    joined = RLlibSettings(env=settings.env, algo="ppo", trainer="rllib", num_gpus=0, address=address)
+    with ray_cluster.cluster(joined):
+        import ray
+
+        nodes = [int(node["Resources"].get("CPU", 0)) for node in ray.nodes() if node["Alive"]]
+        jobs, cpus = at_once(settings, nodes)
+        if max(nodes, default=0) < cpus:
+            raise SettingsError(f"a run needs {cpus} CPUs on one computer, and no node of the cluster has as many")
+        yield lambda run: ClusterSeed(values(run), run.folder.path, cpus), jobs, f" on the cluster at {address}"
+
+
+def _status(every: list[SeedRun]) -> int:
+    """Say which seeds failed or learnt nothing, and why; the exit status."""
+    status = 0
+    for run in every:
+        shortfall = (run.folder.outcome or {}).get("shortfall")
+        if run.state == "failed":
+            say(f"bam-train: seed {run.number}: {run.why}")
+            status = 1
+        elif shortfall:
+            say(f"bam-train: seed {run.number}: nothing was learnt in {run.steps:,} steps: {shortfall}")
+            status = status or 3
+    return status
+
+
+# Display
+
+
+def _state(run: SeedRun) -> str:
+    why = REASONS.get(run.why, run.why) if run.state == "done" else run.why
+    return f"{run.state}: {why}" if why else run.state
+
+
+class _PlainLines:
+    """A line for each change of a seed's state and each of its evaluations."""
+
+    def __init__(self, runs: list[SeedRun]) -> None:
+        self._runs = runs
+        self._shown = {run.number: ("waiting", run.evaluations) for run in runs}
+
+    def __enter__(self) -> _PlainLines:
+        self.update()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        return
+
+    def update(self) -> None:
+        """Print what is new."""
+        for run in self._runs:
+            if self._shown[run.number] != (run.state, run.evaluations):
+                self._shown[run.number] = run.state, run.evaluations
+                cells = [text for name, text in _cells(run).items() if name != "seed" and text != "-"]
+                say(f"seed {run.number}: {', '.join(cells)}")
+
+
+class _LiveTable(_PlainLines):
+    """A table that changes in place."""
+
+    def __init__(self, runs: list[SeedRun]) -> None:
+        super().__init__(runs)
+        from rich.live import Live
+
+        self._live = Live(console=make_console(), refresh_per_second=4, transient=True)
+
+    def __enter__(self) -> _LiveTable:
+        self._live.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._live.stop()
+
+    def update(self) -> None:
+        """Draw the table."""
+        self._live.update(self._table())
+
+    def _table(self) -> Table:
+        from rich.table import Table
+
+        rows = [_cells(run) for run in self._runs]
+        table = Table(box=None, padding=(0, 2, 0, 0))
+        for name in rows[0]:
+            table.add_column(name, style=None, no_wrap=True)
+        for row in rows:
+            table.add_row(*map(rich_text, row.values()))
+        return table
+
+
+def _cells(run: SeedRun) -> dict[str, str]:
+    more = f" of {count(run.total)}" if run.state in ("training", "waiting") else ""
+    return {
+        "seed": str(run.number),
+        "state": _state(run),
+        "steps": f"{count(run.steps)}{more} steps" if run.steps else "-",
+        "success": "-" if run.success is None else f"success {percent(run.success)}",
+        "return": "-" if run.returns is None else f"return {number(run.returns)}",
+        "time left": "-" if run.left is None else f"at most {duration(run.left)} left",
+    }
+
+
+# Outcome
+
+
+def _summarise(
+    config: TrainConfig, settings: TrainSettings, group: RunFolder, every: list[SeedRun], copies: Copies | None
+) -> None:
+    """Copy the best checkpoint, and print a row a seed and the means over seeds."""
+    best = max((run for run in every if _best(run)), key=lambda run: rank(_best(run)), default=None)
+    say()
+    for line in summary_lines(group.path):
+        say(line)
+    if best is not None:
+        path = _keep(config, settings, group, best)
+        say(f"  best of all   {path} (seed {best.number})")
+        if copies is not None:
+            copies.copy(path)
+    say(f"  runs          {group.path}/: seed-{every[0].number}/ and so on, each with best.zip and log.txt")
+
+
+def _best(run: SeedRun) -> dict[str, Any]:
+    return (run.folder.outcome or {}).get("best") or {}
+
+
+def _keep(config: TrainConfig, settings: TrainSettings, group: RunFolder, best: SeedRun) -> Path:
+    """Copy the best checkpoint to where checkpoints are; over a copy of an earlier call, unless it was changed."""
+    earlier = group.outcome or {}
+    out, wanted = config.out, (best.folder.path / "best.zip").read_bytes()
+    kept = Path(str(earlier.get("checkpoint")))
+    source = group.path / f"seed-{earlier.get('seed')}" / "best.zip"
+    is_own = kept.is_file() and source.is_file() and kept.read_bytes() == source.read_bytes()
+    if is_own and out is None:
+        out = kept
+    output = choose_output(settings, out, config.force or (is_own and out == kept), None)
+    for notice in output.notices:
+        say(notice)
+    with replacing(output.path) as temporary:
+        temporary.write_bytes(wanted)
+    group.write_outcome({"checkpoint": str(output.path.resolve()), "seed": best.number})
+    return output.path
+
+
+# The process of one seed
+
+
+def main() -> None:
+    """Train in the folder of the first argument with the settings on standard input, whose end stops the run."""
+    sys.path.append(os.getcwd())
+    atexit.register(gc.freeze)
+    path, values = Path(sys.argv[1]), json.loads(sys.stdin.readline())
+    at_end_of_parent(lambda: os.kill(os.getpid(), signal.SIGTERM))
+    sys.exit(guarded(lambda: _train_in(path, TrainSettings.from_mapping(values)), "bam-train"))
+
+
+def _train_in(path: Path, settings: TrainSettings) -> int:
+    folder = RunFolder(path.parent, path.name, lambda path: True)
+    checkpoint = Checkpoint.open(folder.last) if folder.last.exists() else None
+    if checkpoint is None:
+        (path / "progress.jsonl").unlink(missing_ok=True)
+        shutil.rmtree(folder.tensorboard, ignore_errors=True)
+    config = TrainConfig(out=path / "best.zip", force=True, runs=path.parent)
+    return train_run(config, settings, checkpoint, [], folder)
