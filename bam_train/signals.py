@@ -132,10 +132,17 @@ def drop_handlers() -> None:
 # Child processes, which a signal at the terminal does not reach
 
 
-def start_child(module: str, *arguments: str, **options: Any) -> subprocess.Popen[Any]:
-    """Start ``main`` of a module with arguments, in a process that finds the same packages; `options` of Popen."""
+def start_child(call: str, *arguments: str, **options: Any) -> subprocess.Popen[Any]:
+    """Call ``module:function`` in a new process that finds the same packages.
+
+    Args:
+        call: The function.
+        arguments: Its ``sys.argv[1:]``.
+        options: Of `subprocess.Popen`.
+    """
+    module, _, name = call.partition(":")
     # Without the folder it is started in, whose files could hide ours.
-    program = f"import sys; sys.path[:] = filter(None, sys.path); import {module} as it; it.main()"
+    program = f"import sys; sys.path[:] = filter(None, sys.path); import {module} as it; it.{name}()"
     return subprocess.Popen(
         [sys.executable, "-c", program, *arguments],
         env={**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))},

@@ -79,7 +79,7 @@ class FrontLink:
         with theirs:
             theirs.set_inheritable(True)
             self._process = start_child(
-                "bam_train.agent.front.front_process",
+                "bam_train.agent.front.front_process:main",
                 str(theirs.fileno()),
                 pass_fds=[theirs.fileno()],
                 stdout=subprocess.DEVNULL,
@@ -138,7 +138,7 @@ class SimulatedBox:
     def start(self) -> None:
         """Start the process; returns when the robot can be reached. Raises SettingsError if it cannot be simulated."""
         pipes: dict[str, Any] = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
-        self._process = start_child("bam_train.agent.child_processes", self._what, **pipes)
+        self._process = start_child("bam_train.agent.child_processes:main", self._what, **pipes)
         self.url = self._process.stdout.readline().strip() if self._process.stdout else ""
         if not self.url:
             self._process.wait()

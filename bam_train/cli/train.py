@@ -2,19 +2,24 @@
 
 from __future__ import annotations
 
+import atexit
 import contextlib
+import gc
 import json
 import os
+import pkgutil
+import shutil
 import signal
 import sys
 import time
 from collections.abc import Callable, Mapping
 from functools import partial
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from bam_train.cli.console import can_draw, count, say, tell
-from bam_train.cli.program import run_program
-from bam_train.signals import before_quitting, handled
+from bam_train.cli.program import guarded, run_program
+from bam_train.signals import at_end_of_parent, before_quitting, handled
 
 if TYPE_CHECKING:
     from bam_train.checkpoint import Checkpoint
@@ -33,7 +38,7 @@ def train(config: TrainConfig) -> int:
     from bam_train.checkpoint import Checkpoint
     from bam_train.errors import SettingsError
     from bam_train.settings import NAMES, merge, read_assignments, read_config
-    from bam_train.trainers.resolve_settings import resolve, resolve_resumed
+    from bam_train.trainers.resolve_settings import preset_notices, resolve, resolve_resumed
 
     if config.resume is not None and not config.resume.expanduser().exists():
         raise SettingsError(f"--resume {config.resume}: no such file. Check the name; a run keeps runs/NAME/last.zip")
@@ -44,29 +49,17 @@ def train(config: TrainConfig) -> int:
         flags["transport"] = list(addresses(flags["transport"]))
     given = merge(file, read_assignments(config.set), flags)
     if config.seeds is not None:
-        from bam_train.cli.experiments.seeds import train_seeds
-
-        return train_seeds(config, config.seeds, given)
+        return int(pkgutil.resolve_name("bam_train.cli.experiments.seeds:train_seeds")(config, config.seeds, given))
     if config.learner is not None:
         return _learn(config, config.learner, given, checkpoint)
     settings = resolve(given, say) if checkpoint is None else resolve_resumed(given, checkpoint, say)
     if config.print_config:
         tell(*json.dumps(settings.to_mapping(), indent=2).split("\n"))
         return 0
-    return train_run(config, settings, checkpoint, [] if checkpoint else preset_notices(settings, given))
+    return _train(config, settings, checkpoint, [] if checkpoint else preset_notices(settings, given))
 
 
-def preset_notices(settings: TrainSettings, given: Mapping[str, Any]) -> list[str]:
-    """A line that says so if a new run has no preset; `given` are the settings of the user."""
-    from bam_train.trainers.resolve_settings import read_preset
-
-    if read_preset(settings.env, settings.algo, settings.trainer):
-        return []
-    besides = ", ".join(given.get("hyperparameters", {}))
-    return [f"no preset: the library's defaults{f', but for {besides}' if besides else ''}"]
-
-
-def train_run(
+def _train(
     config: TrainConfig,
     settings: TrainSettings,
     checkpoint: Checkpoint | None,
@@ -181,6 +174,33 @@ def _stop_on_signals(run: TrainingRun, came: list[int]) -> Callable[[int], None]
         write(f"{doing}; {again} quits at once\n")
 
     return stop
+
+
+def train_seed() -> None:
+    """A process of ``--seeds``: train in the folder of the first argument, which may hold a part of the run.
+
+    Its settings are the first line of standard input; the end of standard input is the end of the run.
+    """
+    sys.path.append(os.getcwd())
+    atexit.register(gc.freeze)
+    path, values = Path(sys.argv[1]), json.loads(sys.stdin.readline())
+    at_end_of_parent(lambda: os.kill(os.getpid(), signal.SIGTERM))
+
+    def run() -> int:
+        from bam_train.checkpoint import Checkpoint
+        from bam_train.cli.flags import TrainConfig
+        from bam_train.settings import TrainSettings
+        from bam_train.trainers.run_folder import RunFolder
+
+        folder = RunFolder(path.parent, path.name, lambda path: True)
+        checkpoint = Checkpoint.open(folder.last) if folder.last.exists() else None
+        if checkpoint is None:
+            (path / "progress.jsonl").unlink(missing_ok=True)
+            shutil.rmtree(folder.tensorboard, ignore_errors=True)
+        config = TrainConfig(out=path / "best.zip", force=True, runs=path.parent)
+        return _train(config, TrainSettings.from_mapping(values), checkpoint, [], folder)
+
+    sys.exit(guarded(run, "bam-train"))
 
 
 main = partial(run_program, "bam-train", "bam_train.cli.flags:TrainConfig", lambda config, _: train(config))

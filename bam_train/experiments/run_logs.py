@@ -14,7 +14,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bam_train.errors import SettingsError
+from bam_train.checkpoint import Checkpoint
+from bam_train.errors import CheckpointError, SettingsError
 from bam_train.trainers.run_folder import read_object, read_records
 
 Array = NDArray[Any]
@@ -64,6 +65,8 @@ class RunLog:
     settings: Mapping[str, Any] = field(default_factory=dict)
     outcome: Mapping[str, Any] = field(default_factory=dict)
     """Empty unless the run is done, and ours."""
+    commit: str | None = None
+    """Of the source tree that it was made with."""
 
 
 def read_runs(place: Path) -> list[RunLog]:
@@ -129,7 +132,16 @@ def _own(folder: Path, files: list[Path]) -> RunLog:
             curves[metric] = _curve(rows)
     settings = read_object(folder / "config.json") or {}
     outcome = read_object(folder / "outcome.json") or {}
-    return RunLog(folder, curves, settings.get("env"), settings.get("seed"), settings, outcome)
+    commit = outcome.get("git_commit") or _commit(folder / "last.zip")
+    return RunLog(folder, curves, settings.get("env"), settings.get("seed"), settings, outcome, commit)
+
+
+def _commit(path: Path) -> str | None:
+    """The commit of a checkpoint, for a run that is not done."""
+    try:
+        return Checkpoint.open(path, members=False).manifest.git_commit
+    except CheckpointError:
+        return None
 
 
 def _zoo(folder: Path, files: list[Path]) -> RunLog:

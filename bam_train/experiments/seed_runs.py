@@ -44,8 +44,8 @@ POLL = 0.2
 """Seconds between two looks at the runs."""
 WHERE = ("seed", "threads", "address")
 """Settings by which the runs of one folder may differ: they do not change what is learnt from a seed."""
-MODULE = "bam_train.cli.experiments.seeds"
-"""Its ``main`` trains one seed: the folder is its argument, the settings are the line on its standard input."""
+CALL = "bam_train.cli.train:train_seed"
+"""What trains one seed: the folder is its argument, the settings are the line on its standard input."""
 
 
 def read_seeds(text: str) -> list[int]:
@@ -141,7 +141,7 @@ class SeedProcess:
         with self._log.open("ab") as log:
             pipes: dict[str, Any] = {"stdin": subprocess.PIPE, "stdout": log, "stderr": log}
             self._process = start_child(
-                MODULE, str(self.folder), **pipes, pass_fds=[] if lock is None else [lock], text=True
+                CALL, str(self.folder), **pipes, pass_fds=[] if lock is None else [lock], text=True
             )
         if self._process.stdin is not None:
             with contextlib.suppress(BrokenPipeError):  # it has ended, and its status says why

@@ -71,9 +71,9 @@ def improvement(values: Array, others: Array, matched: bool) -> Interval:
     return Interval(share, *wilson_interval(share * n, n)) if n >= FEWEST else Interval(share)
 
 
-def bands(curves: Array) -> tuple[Array, Array, Array]:
+def bands(curves: Array, within: tuple[float, float] = (-np.inf, np.inf)) -> tuple[Array, Array, Array]:
     """Interquartile mean of curves, shape (n, k), and the low and high ends of its interval at each of the k points."""
-    found = [estimate(column) for column in curves.T]
+    found = [estimate(column, within) for column in curves.T]
     ends = [[one.value if end is None else end for one, end in ((f, f.low), (f, f.high))] for f in found]
     low, high = np.transpose(ends)
     return np.array([one.value for one in found]), low, high

@@ -9,7 +9,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-from bam_train.cli.console import say, tell
+from bam_train.cli.console import percent, say, tell
 from bam_train.cli.flags import File
 from bam_train.cli.program import run_program
 
@@ -55,14 +55,14 @@ def compare(config: CompareConfig) -> int:
     """Run the program with its parsed flags; returns the exit status."""
     if config.self_test:
         return _test()
-    from bam_train.cli.experiments.comparison import Comparison
+    from bam_train.cli.experiments.comparison import RunComparison
     from bam_train.errors import SettingsError
     from bam_train.files.atomic_file import require_writable
 
     if not config.folders:
         raise SettingsError("FOLDER is missing: give a folder of runs for each row, such as runs/pick-ppo")
     report = None if config.report is None else require_writable(config.report)
-    found = Comparison([folder.expanduser() for folder in config.folders], config.metric, config.level)
+    found = RunComparison([folder.expanduser() for folder in config.folders], config.metric, config.level)
     failures = [] if config.fail_if is None else found.failures(config.fail_if)
     tell(*found.text(config.format).split("\n"))
     if report is not None:
@@ -80,13 +80,11 @@ def _test() -> int:
     for seeds in TRIED:
         held = coverage(seeds)
         shares += held.values()
-        tell(f"{seeds} seeds: " + ", ".join(f"{name} {share:.1%}" for name, share in held.items()))
-    low, high = HELD
-    good = all(low <= share <= high for share in shares)
-    tell(
-        f"{sum(shares) / len(shares):.1%} of the 95 % intervals hold the truth, {min(shares):.1%} to {max(shares):.1%}"
-    )
-    return 0 if good else 1
+        tell(f"{seeds} seeds: " + ", ".join(f"{name} {percent(share)}" for name, share in held.items()))
+    low, high = min(shares), max(shares)
+    mean = percent(sum(shares) / len(shares))
+    tell(f"{mean} of the 95 % intervals hold the truth, {percent(low)} to {percent(high)}")
+    return 0 if HELD[0] <= low and high <= HELD[1] else 1
 
 
 main = partial(

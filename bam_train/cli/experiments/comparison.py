@@ -45,9 +45,10 @@ GOALS = {"success": "until_success", "return": "stop_reward"}
 ALIKE = ("seed", "threads", "address", "device")
 """Settings in which runs of one row may differ."""
 INTERVALS = ("score", "difference", "better", "steps", "seconds")
-"""Fields of `Found` that are intervals."""
+"""Fields of `RowResult` that are intervals."""
 _FORMS: dict[str, Callable[[float | None], str]] = {"success": percent, "return": number}
 _WITHIN = {"success": (0.0, 1.0), "return": (-math.inf, math.inf)}
+_POSITIVE = (0.0, math.inf)
 POINTS = 100
 """Points of a drawn curve."""
 
@@ -69,13 +70,9 @@ class Row:
         """The last value of each run. Shape: (n,)."""
         return np.array([run.curves[metric].values[-1] for run in self.runs])
 
-    def facts(self, name: str) -> list[str]:
-        """What the outcomes of the runs say under a name, such as ``hardware``."""
-        return sorted({str(run.outcome[name]) for run in self.runs if run.outcome.get(name)})
-
 
 @dataclass(frozen=True)
-class Found:
+class RowResult:
     """What a row has reached, and how it compares with the first row."""
 
     row: str
@@ -92,7 +89,7 @@ class Found:
     seconds: Interval | None
 
 
-class Comparison:
+class RunComparison:
     """Rows of runs of one environment.
 
     Args:
@@ -119,19 +116,19 @@ class Comparison:
         self.level: float | None = level if level is not None else goals.pop() if len(goals) == 1 else None
         self.found = [self._compare(row) for row in self.rows]
 
-    def _compare(self, row: Row) -> Found:
+    def _compare(self, row: Row) -> RowResult:
         values, reached, steps, seconds = row.final(self.metric), None, None, None
         if self.level is not None:
             at = [run.curves[self.metric].reaches(self.level) for run in row.runs]
-            reached, steps = sum(math.isfinite(one) for one, _ in at), estimate([one for one, _ in at])
+            reached, steps = sum(math.isfinite(one) for one, _ in at), estimate([one for one, _ in at], _POSITIVE)
             times = [time for _, time in at if time is not None]
-            seconds = estimate(times) if len(times) == len(at) else None
+            seconds = estimate(times, _POSITIVE) if len(times) == len(at) else None
         first, less, better, matched = self.rows[0], None, None, False
         if row is not first:
             ours, theirs, matched = _matched(row, first, self.metric)
             less, better = difference(ours, theirs, matched), improvement(ours, theirs, matched)
         score = estimate(values, _WITHIN[self.metric])
-        return Found(row.name, len(values), score, less, better, matched, reached, steps, seconds)
+        return RowResult(row.name, len(values), score, less, better, matched, reached, steps, seconds)
 
     @property
     def notes(self) -> list[str]:
@@ -163,7 +160,7 @@ class Comparison:
         form = _FORMS[self.metric]
         head = ["row", "seeds", f"{self.metric} (IQM)"]
         if len(self.rows) > 1:
-            head += [f"less {self.rows[0].name}", "P(better)"]
+            head += [f"difference from {self.rows[0].name}", "P(better)"]
         if self.level is not None:
             head += [f"reach {form(self.level)}", "steps to it", "time to it"]
         rows = []
@@ -245,9 +242,11 @@ class Comparison:
         lines = []
         for row, each in zip(self.rows, places, strict=True):
             done = all(run.outcome for run in row.runs)  # what a run that has ended had reached, it would keep
-            grid = np.linspace(0, (max if done else min)(float(one[-1]) for one in each), POINTS)
+            end = (max if done else min)(float(one[-1]) for one in each)
+            grid = np.linspace(min(end, max(float(one[0]) for one in each)), end, POINTS)
             values = [run.curves[self.metric].values for run in row.runs]
-            lines.append((grid, *bands(np.array([np.interp(grid, *pair) for pair in zip(each, values, strict=True)]))))
+            curves = np.array([np.interp(grid, *pair) for pair in zip(each, values, strict=True)])
+            lines.append((grid, *bands(curves, _WITHIN[self.metric])))
         return self._plot(lines, axis, f"{self.metric} (interquartile mean, 95 % interval)")
 
     def _plot(self, lines: Iterable[tuple[Any, ...]], across: str, up: str) -> bytes:
@@ -366,8 +365,13 @@ def _at(settings: Mapping[str, Any], name: str) -> str:
 def _origins(rows: Sequence[Row]) -> list[str]:
     """On what and with what the runs were made: one line of each if they agree, else one of each row."""
     lines = []
-    for title, key in (("hardware", "hardware"), ("commit", "git_commit")):
-        known = {row.name: "; ".join(row.facts(key)) or "not known" for row in rows}
+    facts: dict[str, Callable[[RunLog], str | None]] = {
+        "hardware": lambda run: run.outcome.get("hardware"),
+        "commit": lambda run: run.commit and run.commit[:12],
+    }
+    for title, fact in facts.items():
+        said = {row.name: dict.fromkeys(text for run in row.runs if (text := fact(run))) for row in rows}
+        known = {name: "; ".join(texts) or "not known" for name, texts in said.items()}
         if len({*known.values()}) == 1:
             lines.append(f"{title}: {known[rows[0].name]}")
         else:
@@ -389,7 +393,7 @@ def _signed(form: Callable[[float], str]) -> Callable[[float], str]:
     return lambda value: f"{'+' if value >= 0 else '-'}{form(abs(value))}"
 
 
-def _flat(found: Found) -> dict[str, Any]:
+def _flat(found: RowResult) -> dict[str, Any]:
     """The numbers of a row under names such as ``score_low``; None for infinity, and what is not known."""
     flat: dict[str, Any] = {}
     for name, value in vars(found).items():

@@ -1,28 +1,20 @@
-"""`bam-train --seeds`: one run a seed, one display, one summary; `main` is the process of one of them."""
+"""`bam-train --seeds`: one run a seed, one display, one summary."""
 
 from __future__ import annotations
 
-import atexit
 import contextlib
-import gc
-import json
-import os
-import shutil
-import signal
 import sys
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from bam_train.checkpoint import Checkpoint
 from bam_train.cli.console import can_draw, count, duration, make_console, number, percent, rich_text, say
 from bam_train.cli.experiment import signals_ask
 from bam_train.cli.experiments.comparison import summary_lines
 from bam_train.cli.flags import TrainConfig
-from bam_train.cli.program import guarded
-from bam_train.cli.train import preset_notices, train_run
-from bam_train.cli.train_display import REASONS
+from bam_train.cli.train_display import REASONS, MayClose, short_path
 from bam_train.errors import SettingsError
 from bam_train.experiments.seed_runs import (
     ClusterSeed,
@@ -37,10 +29,9 @@ from bam_train.experiments.seed_runs import (
 from bam_train.files.atomic_file import replacing
 from bam_train.files.place import with_addresses
 from bam_train.settings import RLlibSettings, TrainSettings, read_assignments
-from bam_train.signals import at_end_of_parent
 from bam_train.trainers.base import cores
 from bam_train.trainers.best_checkpoint import choose_output
-from bam_train.trainers.resolve_settings import resolve
+from bam_train.trainers.resolve_settings import preset_notices, resolve
 from bam_train.trainers.run_folder import Copies, RunFolder, require_room
 from bam_train.trainers.training_run import rank
 
@@ -63,23 +54,25 @@ def train_seeds(config: TrainConfig, text: str, given: Mapping[str, Any]) -> int
     require_room(runs)
     choose_output(settings, config.out, True, None)  # refuses what cannot be written
     copies = None if config.copy_to is None else Copies(config.copy_to)
-    with group_folder(runs, settings) as (group, lock):
+    with (
+        contextlib.redirect_stderr(MayClose(sys.stderr)),
+        _starter(settings, given.get("address")) as (start, jobs, where),
+        group_folder(runs, settings) as (group, lock),
+    ):
         every = [_seed_run(group, seed, settings) for seed in seeds]
-        with _starter(settings, given.get("address"), lock) as (start, jobs, where):
-            title = f"{settings.algo} on {settings.env}, {len(seeds)} seeds in {group.path}, {jobs} at once{where}"
-            say(title)
-            for notice in preset_notices(settings, given):
-                say(notice)
-            show = (_LiveTable if can_draw() else _PlainLines)(every)
-            with signals_ask() as stopped:
-                with show:
-                    run_seeds(every, start, jobs, stopped, show.update)
-                done = [run for run in every if run.state == "done"]
-                if stopped() and len(done) < len(every):
-                    say(f"{len(done)} of {len(every)} seeds are done; the same command goes on with the others")
-                elif done:
-                    _summarise(config, settings, group, every, copies)
-    return _status(every)
+        say(f"{settings.algo} on {settings.env}, {len(seeds)} seeds in {group.path}, {jobs} at once{where}")
+        for notice in preset_notices(settings, given):
+            say(notice)
+        show = (_LiveTable if can_draw() else _PlainLines)(every)
+        with signals_ask() as stopped:
+            with show:
+                run_seeds(every, partial(start, lock), jobs, stopped, show.update)
+            done = [run for run in every if run.state == "done"]
+            if stopped() and len(done) < len(every):
+                say(f"{len(done)} of {len(every)} seeds are done; the same command goes on with the others")
+            elif done:
+                _summarise(config, settings, group, every, copies)
+        return _status(every)
 
 
 def _seed_run(group: RunFolder, seed: int, settings: TrainSettings) -> SeedRun:
@@ -93,16 +86,16 @@ def _seed_run(group: RunFolder, seed: int, settings: TrainSettings) -> SeedRun:
 
 @contextlib.contextmanager
 def _starter(
-    settings: TrainSettings, address: str | None, lock: int | None
-) -> Iterator[tuple[Callable[[SeedRun], Started], int, str]]:
-    """What starts a run, how many run at once, and where in words."""
+    settings: TrainSettings, address: str | None
+) -> Iterator[tuple[Callable[[int | None, SeedRun], Started], int, str]]:
+    """What starts a run, given the lock of the folder; how many run at once; and where in words."""
 
     def values(run: SeedRun) -> dict[str, Any]:
         return replace(settings, seed=run.number).to_mapping()
 
     if address is None:
         jobs, _ = at_once(settings, [cores()])
-        yield lambda run: SeedProcess(values(run), run.folder.path, lock=lock), jobs, ""
+        yield lambda lock, run: SeedProcess(values(run), run.folder.path, lock=lock), jobs, ""
         return
     from bam_train.trainers.rllib import ray_cluster
 
@@ -114,7 +107,7 @@ def _starter(
         jobs, cpus = at_once(settings, nodes)
         if max(nodes, default=0) < cpus:
             raise SettingsError(f"a run needs {cpus} CPUs on one computer, and no node of the cluster has as many")
-        yield lambda run: ClusterSeed(values(run), run.folder.path, cpus), jobs, f" on the cluster at {address}"
+        yield lambda _, run: ClusterSeed(values(run), run.folder.path, cpus), jobs, f" on the cluster at {address}"
 
 
 def _status(every: list[SeedRun]) -> int:
@@ -219,10 +212,10 @@ def _summarise(
         say(line)
     if best is not None:
         path = _keep(config, settings, group, best)
-        say(f"  best of all   {path} (seed {best.number})")
+        say(f"  best of all   {short_path(path)} (seed {best.number})")
         if copies is not None:
             copies.copy(path)
-    say(f"  runs          {group.path}/: seed-{every[0].number}/ and so on, each with best.zip and log.txt")
+    say(f"  runs          {short_path(group.path)}/: seed-{every[0].number}/ and so on, each with best.zip and log.txt")
 
 
 def _best(run: SeedRun) -> dict[str, Any]:
@@ -245,25 +238,3 @@ def _keep(config: TrainConfig, settings: TrainSettings, group: RunFolder, best: 
         temporary.write_bytes(wanted)
     group.write_outcome({"checkpoint": str(output.path.resolve()), "seed": best.number})
     return output.path
-
-
-# The process of one seed
-
-
-def main() -> None:
-    """Train in the folder of the first argument with the settings on standard input, whose end stops the run."""
-    sys.path.append(os.getcwd())
-    atexit.register(gc.freeze)
-    path, values = Path(sys.argv[1]), json.loads(sys.stdin.readline())
-    at_end_of_parent(lambda: os.kill(os.getpid(), signal.SIGTERM))
-    sys.exit(guarded(lambda: _train_in(path, TrainSettings.from_mapping(values)), "bam-train"))
-
-
-def _train_in(path: Path, settings: TrainSettings) -> int:
-    folder = RunFolder(path.parent, path.name, lambda path: True)
-    checkpoint = Checkpoint.open(folder.last) if folder.last.exists() else None
-    if checkpoint is None:
-        (path / "progress.jsonl").unlink(missing_ok=True)
-        shutil.rmtree(folder.tensorboard, ignore_errors=True)
-    config = TrainConfig(out=path / "best.zip", force=True, runs=path.parent)
-    return train_run(config, settings, checkpoint, [], folder)
