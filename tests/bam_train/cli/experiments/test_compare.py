@@ -40,16 +40,17 @@ def rows(here):
 
 
 def test_the_table(run, rows):
+    """Of four seeds 5.1 % of the samples hold the worst one thrice: 0.925 - 1.59 (0.925 - 0.8), 0.55 - 1.59 × 0.15."""
     status, out, err = run(main, "ppo", "sac/")
     assert (status, err) == (0, "")
     assert out.splitlines() == [
         "success of the last evaluation on bam/pick-v0",
         "",
-        "row  seeds  success (IQM)             difference from ppo          P(better)            reach 90 %  "
+        "row  seeds  success (IQM)             difference from ppo           P(better)          reach 90 %  "
         "steps to it         time to it",
-        "ppo  4      92.5 % (75.6 % to 100 %)  -                            -                    3 of 4      "
+        "ppo  4      92.5 % (72.6 % to 100 %)  -                             -                  3 of 4      "
         "200 (200 to never)  20.0 s (20.0 s to never)",
-        "sac  4      55 % (35.1 % to 74.9 %)   -37.5 % (-41.5 % to -25.6 %)   0 % (0 % to 49 %)    0 of 4      "
+        "sac  4      55 % (31.1 % to 78.8 %)   -37.5 % (-41.5 % to -25.6 %)  0 % (0 % to 49 %)  0 of 4      "
         "never               never",
         "",
         f"interval: {METHOD}; of P(better) Wilson's",
