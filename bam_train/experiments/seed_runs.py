@@ -27,7 +27,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 from bam_train.errors import FolderInUse, SettingsError
 from bam_train.settings import TrainSettings, file_stem
@@ -107,19 +107,6 @@ class News(NamedTuple):
     """Its last line, once it has ended."""
 
 
-class Started(Protocol):
-    """A run that was started."""
-
-    def news(self) -> News:
-        """Does not wait."""
-
-    def stop(self) -> None:
-        """Let it save and end; the second time, quit at once."""
-
-    def kill(self) -> None:
-        """End it at once."""
-
-
 class SeedProcess:
     """The process that trains one seed.
 
@@ -168,7 +155,7 @@ class SeedProcess:
         return News(records, status, by or said.removeprefix("bam-train: "))
 
     def stop(self) -> None:
-        """Send SIGTERM."""
+        """Let it save and end; the second time, quit at once."""
         self._process.terminate()
 
     def kill(self) -> None:
@@ -230,7 +217,7 @@ class ClusterSeed:
         return news
 
     def stop(self) -> None:
-        """Send SIGTERM; a run that no computer has begun is given up."""
+        """Let it save and end; a run that no computer has begun is given up."""
         if self._is_there:
             self._actor.stop.remote()
         else:
@@ -289,7 +276,7 @@ class SeedRun:
 
 def run_seeds(
     runs: Sequence[SeedRun],
-    start: Callable[[SeedRun], Started],
+    start: Callable[[SeedRun], SeedProcess | ClusterSeed],
     jobs: int,
     stopped: Callable[[], bool],
     show: Callable[[], None],
@@ -299,7 +286,7 @@ def run_seeds(
     An exception, such as that of a second signal, kills them.
     """
     waiting, told = [run for run in runs if run.state == "waiting"], False
-    running: dict[int, tuple[SeedRun, Started]] = {}
+    running: dict[int, tuple[SeedRun, SeedProcess | ClusterSeed]] = {}
     try:
         while running or (waiting and not stopped()):
             while waiting and len(running) < jobs and not stopped():

@@ -23,17 +23,9 @@ from numpy.typing import NDArray
 
 from bam_train.cli.console import count, duration, number, percent
 from bam_train.errors import OutputError, SettingsError
+from bam_train.experiments import seed_statistics as statistics
 from bam_train.experiments.run_logs import RunLog, read_runs
-from bam_train.experiments.seed_statistics import (
-    FEWEST,
-    METHOD,
-    Interval,
-    bands,
-    difference,
-    estimate,
-    improvement,
-    profile,
-)
+from bam_train.experiments.seed_statistics import FEWEST, METHOD, Interval, estimate
 from bam_train.files.atomic_file import replacing
 from bam_train.files.log_lines import aligned
 from bam_train.settings import differences
@@ -126,7 +118,7 @@ class RunComparison:
         first, less, better, matched = self.rows[0], None, None, False
         if row is not first:
             ours, theirs, matched = _matched(row, first, self.metric)
-            less, better = difference(ours, theirs, matched), improvement(ours, theirs, matched)
+            less, better = statistics.difference(ours, theirs, matched), statistics.improvement(ours, theirs, matched)
         score = estimate(values, _WITHIN[self.metric])
         return RowResult(row.name, len(values), score, less, better, matched, reached, steps, seconds)
 
@@ -233,7 +225,7 @@ class RunComparison:
         finals = [row.final(self.metric) for row in self.rows]
         low, high = (0.0, 1.0) if self.metric == "success" else (min(map(np.min, finals)), max(map(np.max, finals)))
         levels = np.linspace(low, high, POINTS)
-        lines = [(levels, profile(values, levels), None, None) for values in finals]
+        lines = [(levels, statistics.profile(values, levels), None, None) for values in finals]
         drawn = self._plot(lines, f"{self.metric} τ", "share of runs above τ")
         return [*pictures, ("Performance profile", drawn)]
 
@@ -246,7 +238,7 @@ class RunComparison:
             grid = np.linspace(min(end, max(float(one[0]) for one in each)), end, POINTS)
             values = [run.curves[self.metric].values for run in row.runs]
             curves = np.array([np.interp(grid, *pair) for pair in zip(each, values, strict=True)])
-            lines.append((grid, *bands(curves, _WITHIN[self.metric])))
+            lines.append((grid, *statistics.bands(curves, _WITHIN[self.metric])))
         return self._plot(lines, axis, f"{self.metric} (interquartile mean, 95 % interval)")
 
     def _plot(self, lines: Iterable[tuple[Any, ...]], across: str, up: str) -> bytes:

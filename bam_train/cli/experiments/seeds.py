@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import contextlib
+import shutil
 import sys
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from bam_train.cli.console import can_draw, count, duration, make_console, number, percent, rich_text, say
 from bam_train.cli.experiment import signals_ask
@@ -20,7 +21,6 @@ from bam_train.experiments.seed_runs import (
     ClusterSeed,
     SeedProcess,
     SeedRun,
-    Started,
     at_once,
     group_folder,
     read_seeds,
@@ -32,19 +32,16 @@ from bam_train.settings import RLlibSettings, TrainSettings, read_assignments
 from bam_train.trainers.base import cores
 from bam_train.trainers.best_checkpoint import choose_output
 from bam_train.trainers.resolve_settings import preset_notices, resolve
-from bam_train.trainers.run_folder import Copies, RunFolder, require_room
+from bam_train.trainers.run_folder import Copies, RunFolder, read_object, require_room
 from bam_train.trainers.training_run import rank
-
-if TYPE_CHECKING:
-    from rich.table import Table
 
 
 def train_seeds(config: TrainConfig, text: str, given: Mapping[str, Any]) -> int:
     """Train one run a seed and print the summary; returns the exit status."""
     seeds = read_seeds(text)
-    refused = [name for name in ("resume", "learner", "record", "transport") if getattr(config, name) is not None]
-    if config.seed is not None or "seed" in read_assignments(config.set):
-        refused.append("seed")
+    refused = [name for name in ("resume", "learner", "record") if getattr(config, name) is not None]
+    refused += ["transport"] * bool(given.get("transport"))
+    refused += ["seed"] * (config.seed is not None or "seed" in read_assignments(config.set))
     if refused:
         raise SettingsError(f"--seeds trains new runs in simulation, one a seed; leave --{refused[0]} out")
     runs = config.runs.expanduser()
@@ -71,7 +68,7 @@ def train_seeds(config: TrainConfig, text: str, given: Mapping[str, Any]) -> int
             if stopped() and len(done) < len(every):
                 say(f"{len(done)} of {len(every)} seeds are done; the same command goes on with the others")
             elif done:
-                _summarise(config, settings, group, every, copies)
+                _summarise(config, settings, group, copies)
         return _status(every)
 
 
@@ -87,7 +84,7 @@ def _seed_run(group: RunFolder, seed: int, settings: TrainSettings) -> SeedRun:
 @contextlib.contextmanager
 def _starter(
     settings: TrainSettings, address: str | None
-) -> Iterator[tuple[Callable[[int | None, SeedRun], Started], int, str]]:
+) -> Iterator[tuple[Callable[[int | None, SeedRun], SeedProcess | ClusterSeed], int, str]]:
     """What starts a run, given the lock of the folder; how many run at once; and where in words."""
 
     def values(run: SeedRun) -> dict[str, Any]:
@@ -127,9 +124,22 @@ def _status(every: list[SeedRun]) -> int:
 # Display
 
 
-def _state(run: SeedRun) -> str:
+_WORDS = {"state": "{}", "steps": "{} steps", "success": "success {}", "return": "return {}", "time left": "{} left"}
+"""The cells of `_cells` in a plain line."""
+
+
+def _cells(run: SeedRun) -> dict[str, str]:
+    """What is shown of a seed; a dash for what is not known."""
     why = REASONS.get(run.why, run.why) if run.state == "done" else run.why
-    return f"{run.state}: {why}" if why else run.state
+    more = f" of {count(run.total)}" if run.state == "training" else ""
+    return {
+        "seed": str(run.number),
+        "state": f"{run.state}: {why}" if why else run.state,
+        "steps": f"{count(run.steps)}{more}" if run.steps else "-",
+        "success": percent(run.success),
+        "return": number(run.returns),
+        "time left": "-" if run.left is None else f"at most {duration(run.left)}",
+    }
 
 
 class _PlainLines:
@@ -151,8 +161,9 @@ class _PlainLines:
         for run in self._runs:
             if self._shown[run.number] != (run.state, run.evaluations):
                 self._shown[run.number] = run.state, run.evaluations
-                cells = [text for name, text in _cells(run).items() if name != "seed" and text != "-"]
-                say(f"seed {run.number}: {', '.join(cells)}")
+                cells = _cells(run)
+                known = [form.format(cells[name]) for name, form in _WORDS.items() if cells[name] != "-"]
+                say(f"seed {run.number}: {', '.join(known)}")
 
 
 class _LiveTable(_PlainLines):
@@ -173,68 +184,44 @@ class _LiveTable(_PlainLines):
 
     def update(self) -> None:
         """Draw the table."""
-        self._live.update(self._table())
-
-    def _table(self) -> Table:
         from rich.table import Table
 
-        rows = [_cells(run) for run in self._runs]
-        table = Table(box=None, padding=(0, 2, 0, 0))
-        for name in rows[0]:
-            table.add_column(name, style=None, no_wrap=True)
-        for row in rows:
-            table.add_row(*map(rich_text, row.values()))
-        return table
-
-
-def _cells(run: SeedRun) -> dict[str, str]:
-    more = f" of {count(run.total)}" if run.state in ("training", "waiting") else ""
-    return {
-        "seed": str(run.number),
-        "state": _state(run),
-        "steps": f"{count(run.steps)}{more} steps" if run.steps else "-",
-        "success": "-" if run.success is None else f"success {percent(run.success)}",
-        "return": "-" if run.returns is None else f"return {number(run.returns)}",
-        "time left": "-" if run.left is None else f"at most {duration(run.left)} left",
-    }
+        table = Table("seed", *_WORDS, box=None, padding=(0, 2, 0, 0))
+        for run in self._runs:
+            table.add_row(*map(rich_text, _cells(run).values()))
+        self._live.update(table)
 
 
 # Outcome
 
 
-def _summarise(
-    config: TrainConfig, settings: TrainSettings, group: RunFolder, every: list[SeedRun], copies: Copies | None
-) -> None:
-    """Copy the best checkpoint, and print a row a seed and the means over seeds."""
-    best = max((run for run in every if _best(run)), key=lambda run: rank(_best(run)), default=None)
+def _summarise(config: TrainConfig, settings: TrainSettings, group: RunFolder, copies: Copies | None) -> None:
+    """Print a row a seed and the means over seeds, also those of earlier calls, and copy the best checkpoint."""
     say()
     for line in summary_lines(group.path):
         say(line)
+    outcomes = {path.parent: read_object(path) or {} for path in group.path.glob("seed-*/outcome.json")}
+    scores = {folder: outcome["best"] for folder, outcome in outcomes.items() if outcome.get("best")}
+    best = max(scores, key=lambda folder: rank(scores[folder]), default=None)
     if best is not None:
         path = _keep(config, settings, group, best)
-        say(f"  best of all   {short_path(path)} (seed {best.number})")
+        say(f"  best of all   {short_path(path)} ({best.name})")
         if copies is not None:
             copies.copy(path)
-    say(f"  runs          {short_path(group.path)}/: seed-{every[0].number}/ and so on, each with best.zip and log.txt")
+    say(f"  runs          {short_path(group.path)}/: in the folder of each seed best.zip, log.txt and what a run has")
 
 
-def _best(run: SeedRun) -> dict[str, Any]:
-    return (run.folder.outcome or {}).get("best") or {}
-
-
-def _keep(config: TrainConfig, settings: TrainSettings, group: RunFolder, best: SeedRun) -> Path:
+def _keep(config: TrainConfig, settings: TrainSettings, group: RunFolder, best: Path) -> Path:
     """Copy the best checkpoint to where checkpoints are; over a copy of an earlier call, unless it was changed."""
-    earlier = group.outcome or {}
-    out, wanted = config.out, (best.folder.path / "best.zip").read_bytes()
-    kept = Path(str(earlier.get("checkpoint")))
-    source = group.path / f"seed-{earlier.get('seed')}" / "best.zip"
+    earlier, out = group.outcome or {}, config.out
+    kept, source = Path(str(earlier.get("checkpoint"))), group.path / str(earlier.get("seed")) / "best.zip"
     is_own = kept.is_file() and source.is_file() and kept.read_bytes() == source.read_bytes()
-    if is_own and out is None:
+    if is_own and (out is None or out.expanduser().resolve() == kept):
         out = kept
     output = choose_output(settings, out, config.force or (is_own and out == kept), None)
     for notice in output.notices:
         say(notice)
     with replacing(output.path) as temporary:
-        temporary.write_bytes(wanted)
-    group.write_outcome({"checkpoint": str(output.path.resolve()), "seed": best.number})
+        shutil.copyfile(best / "best.zip", temporary)
+    group.write_outcome({"checkpoint": str(output.path.resolve()), "seed": best.name})
     return output.path

@@ -98,12 +98,15 @@ def test_the_summary_and_a_second_call_that_does_what_is_missing(bam_train, monk
         "interval: 95 % bootstrap over seeds, 2,000 draws, widened for few seeds",
         "hardware: 2 cores",
         "commit: abc",
-        "  best of all   checkpoints/CartPole-v1-ppo.zip (seed 3)",
-        "  runs          runs/CartPole-v1-ppo-2/: seed-0/ and so on, each with best.zip and log.txt",
+        "  best of all   checkpoints/CartPole-v1-ppo.zip (seed-3)",
+        "  runs          runs/CartPole-v1-ppo-2/: in the folder of each seed best.zip, log.txt and what a run has",
         "bam-train: seed 1: rewards are NaN",
         "bam-train: seed 2: nothing was learnt in 1,024 steps: return 9, and the goal is 475",
     ]
     assert Path("checkpoints/CartPole-v1-ppo.zip").read_bytes() == b"checkpoint 3"
+    assert "  best of all   checkpoints/CartPole-v1-ppo.zip (seed-5)" in bam_train(seeds="5")[1]
+    assert Path("checkpoints/CartPole-v1-ppo.zip").read_bytes() == b"checkpoint 5"
+    assert [one.name for one in Path("checkpoints").iterdir()] == ["CartPole-v1-ppo.zip"]
     monkeypatch.setattr(Trained, "news", lambda self: News([], 1, "again"))
     status, lines = bam_train(seeds="1,4", out=Path("a.zip"))
     assert status == 1
