@@ -171,6 +171,7 @@ class TrainConfig(SettingsFlags, RobotModelFlag):  # type: ignore[misc]
     Examples:
       bam-train --env bam/pick --algo ppo
       bam-train --env CartPole-v1 --algo ppo --steps 50_000 --set learning_rate=lin_1e-3
+      bam-train --env bam/pick --algo ppo --seeds 0..4
       bam-train --resume runs/pick-ppo/last.zip --steps 2_000_000
       bam-train --data data/pick --algo iql
     """

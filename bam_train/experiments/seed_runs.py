@@ -74,7 +74,7 @@ def group_folder(runs: Path, settings: TrainSettings) -> Iterator[tuple[RunFolde
     Raises:
         FolderInUse: Another call trains in it, or processes of a killed one still save.
     """
-    what = {name: value for name, value in settings.to_mapping().items() if name not in WHERE}
+    what = json.loads(json.dumps({name: v for name, v in settings.to_mapping().items() if name not in WHERE}))
     stem = file_stem(settings.env, settings.algo, settings.trainer, settings.env_kwargs)
     folder = RunFolder(runs, stem, lambda path: read_object(path / "config.json") == what)
     folder.write_config(what)

@@ -56,12 +56,10 @@ class RunFolder:
         self.tensorboard = self.path / "tensorboard"
         self.curve = self.path / "learning-curve.png"
         self._progress = self.path / "progress.jsonl"
-        self._outcome = self.path / "outcome.json"
 
     def write_config(self, settings: Mapping[str, Any]) -> None:
         """Write ``config.json``."""
-        with _writing(self.path / "config.json"):
-            (self.path / "config.json").write_text(json.dumps(settings, indent=2) + "\n", encoding="utf-8")
+        self._write("config.json", settings)
 
     def add(self, record: Mapping[str, Any]) -> None:
         """Append one line to ``progress.jsonl``, and close the file."""
@@ -75,12 +73,16 @@ class RunFolder:
     @property
     def outcome(self) -> dict[str, Any] | None:
         """What `write_outcome` has written; None of a run that is not done."""
-        return read_object(self._outcome)
+        return read_object(self.path / "outcome.json")
 
     def write_outcome(self, outcome: Mapping[str, Any]) -> None:
-        """Write ``outcome.json``, whole or not at all."""
-        with _writing(self._outcome), replacing(self._outcome) as path:
-            path.write_text(json.dumps(outcome, indent=2) + "\n", encoding="utf-8")
+        """Write ``outcome.json``."""
+        self._write("outcome.json", outcome)
+
+    def _write(self, name: str, content: Mapping[str, Any]) -> None:
+        """Write a JSON file, whole or not at all."""
+        with _writing(self.path / name), replacing(self.path / name) as temporary:
+            temporary.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
 
     def write_traceback(self, error: BaseException) -> str:
         """Write where an exception came from, for whoever corrects it; says so, or nothing if it cannot be written."""

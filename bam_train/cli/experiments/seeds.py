@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import filecmp
 import shutil
 import sys
 from collections.abc import Callable, Iterator, Mapping
@@ -214,14 +215,14 @@ def _summarise(config: TrainConfig, settings: TrainSettings, group: RunFolder, c
 def _keep(config: TrainConfig, settings: TrainSettings, group: RunFolder, best: Path) -> Path:
     """Copy the best checkpoint to where checkpoints are; over a copy of an earlier call, unless it was changed."""
     earlier, out = group.outcome or {}, config.out
-    kept, source = Path(str(earlier.get("checkpoint"))), group.path / str(earlier.get("seed")) / "best.zip"
-    is_own = kept.is_file() and source.is_file() and kept.read_bytes() == source.read_bytes()
+    kept = Path(str(earlier.get("checkpoint")))
+    is_own = kept.is_file() and any(filecmp.cmp(kept, one, shallow=False) for one in group.path.glob("seed-*/best.zip"))
     if is_own and (out is None or out.expanduser().resolve() == kept):
         out = kept
     output = choose_output(settings, out, config.force or (is_own and out == kept), None)
     for notice in output.notices:
         say(notice)
+    group.write_outcome({"checkpoint": str(output.path.resolve()), "seed": best.name})
     with replacing(output.path) as temporary:
         shutil.copyfile(best / "best.zip", temporary)
-    group.write_outcome({"checkpoint": str(output.path.resolve()), "seed": best.name})
     return output.path
