@@ -13,6 +13,7 @@ import signal
 import sys
 import time
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -72,7 +73,7 @@ def _train(
     """
     from bam_train.cli.train_display import LiveDisplay, MayClose, PlainDisplay, say_next, summarise
     from bam_train.environments import is_batched
-    from bam_train.errors import LearntNothing, SettingsError
+    from bam_train.errors import LearntNothing, OutputError, SettingsError
     from bam_train.settings import file_stem
     from bam_train.trainers import load_trainer
     from bam_train.trainers.base import hardware, origin
@@ -117,7 +118,10 @@ def _train(
                 run.add_detector()  # a tenth of a short run's time, so that nobody waits for the outcome
             if outcome.reason != "stopped" and outcome.failure is None:
                 made = {"reason": outcome.reason, "steps": outcome.steps, "seconds": run.seconds, "best": outcome.best}
-                folder.write_outcome({**made, "shortfall": outcome.shortfall, "hardware": hardware(), **origin()})
+                try:
+                    folder.write_outcome({**made, "shortfall": outcome.shortfall, "hardware": hardware(), **origin()})
+                except OutputError as error:
+                    outcome = replace(outcome, failure=error)
         finally:
             trainer.close()
         say_next(settings, outcome)
