@@ -1,4 +1,4 @@
-"""Ctrl-C (SIGINT), SIGTERM and SIGHUP: the only module that installs handlers for them.
+"""Ctrl-C (SIGINT), SIGTERM and SIGHUP: the only module that installs handlers for them; processes that they spare.
 
 Python runs handlers in the main thread, between two bytecodes. So they are installed in the main thread only; in other
 threads the functions of this module do nothing.
@@ -8,12 +8,15 @@ from __future__ import annotations
 
 import contextlib
 import math
+import os
 import signal
+import subprocess
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from types import FrameType
-from typing import NoReturn
+from typing import Any, NoReturn
 
 SIGNALS = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name))
 """Signals that ask a program to end; Windows has no SIGHUP."""
@@ -124,6 +127,47 @@ def drop_handlers() -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
     signal.pthread_sigmask(signal.SIG_UNBLOCK, signal.valid_signals())
+
+
+# Child processes, which a signal at the terminal does not reach
+
+
+def start_child(call: str, *arguments: str, **options: Any) -> subprocess.Popen[Any]:
+    """Call ``module:function`` in a new process that finds the same packages.
+
+    Args:
+        call: The function.
+        arguments: Its ``sys.argv[1:]``.
+        options: Of `subprocess.Popen`.
+    """
+    module, _, name = call.partition(":")
+    # Without the folder it is started in, whose files could hide ours.
+    program = f"import sys; sys.path[:] = filter(None, sys.path); import {module} as it; it.{name}()"
+    return subprocess.Popen(
+        [sys.executable, "-c", program, *arguments],
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
+        start_new_session=True,  # Ctrl-C at the terminal is for the parent alone
+        **{"stdin": subprocess.DEVNULL, **options},
+    )
+
+
+def await_end(process: subprocess.Popen[Any]) -> None:
+    """Wait for the end of a process, which was told to end; kill it if that takes long."""
+    try:
+        process.wait(5.0)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        process.wait()
+
+
+def at_end_of_parent(call: Callable[[], object]) -> None:
+    """In a child: `call` runs in a thread when the standard input ends, because the parent closes it or has ended."""
+
+    def wait() -> None:
+        sys.stdin.read()
+        call()
+
+    threading.Thread(target=wait, daemon=True).start()
 
 
 # A process that quits at once runs no `finally`, only the functions that are registered here.

@@ -67,7 +67,7 @@ def train(args: Flags, experiment: Experiment) -> tuple[Checkpoint, Any]:
     }
     runners = max(0, args.num_cpus - 1)
     settings = resolve({**given, "seed": args.seed, "steps": experiment.stop_timesteps, "num_env_runners": runners})
-    from bam_train.trainers.rllib.ray_cluster import cores
+    from bam_train.trainers.base import cores
 
     if runners > cores():
         raise SettingsError(

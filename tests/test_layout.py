@@ -48,6 +48,7 @@ ORDER = {
             "agent",
             "trainers",
             "estimation",
+            "experiments",
             "compat",
             "play",
             "cli",

@@ -135,6 +135,7 @@ def test_console_scripts(wheel):
     lines = sorted(line for line in wheel.read(name).decode().splitlines() if " = " in line)
     assert lines == [
         "bam-agent = bam_train.cli.live.live_agent:main",
+        "bam-compare = bam_train.cli.experiments.compare:main",
         "bam-data = bam_train.cli.data.bam_data:main",
         "bam-deploy = bam_train.cli.deploy:main",
         "bam-doctor = bam_train.cli.live.doctor:main",

@@ -22,6 +22,7 @@ from bam_train.agent.agent_messages import Channel, Front, Listening, Message, R
 from bam_train.environments import make_env
 from bam_train.errors import SettingsError
 from bam_train.files.log_lines import begin_log
+from bam_train.signals import at_end_of_parent, await_end, start_child
 
 _log = logging.getLogger(__name__)
 _START = 30.0  # longest start [s]
@@ -71,14 +72,17 @@ class FrontLink:
         if channel is not None:
             channel.close()
         if self._process is not None:
-            _await_end(self._process)
+            await_end(self._process)
 
     def _spawn(self) -> None:
         ours, theirs = socket_pair()
         with theirs:
             theirs.set_inheritable(True)
-            self._process = _child(
-                "front.front_process", str(theirs.fileno()), pass_fds=[theirs.fileno()], stdout=subprocess.DEVNULL
+            self._process = start_child(
+                "bam_train.agent.front.front_process:main",
+                str(theirs.fileno()),
+                pass_fds=[theirs.fileno()],
+                stdout=subprocess.DEVNULL,
             )
         agent = replace(self._front.agent, port=self.port)  # the same one, if it is started again
         ours.send(msgspec.structs.replace(self._front, agent=agent).to_bytes())
@@ -133,7 +137,8 @@ class SimulatedBox:
 
     def start(self) -> None:
         """Start the process; returns when the robot can be reached. Raises SettingsError if it cannot be simulated."""
-        self._process = _child("child_processes", self._what, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+        pipes: dict[str, Any] = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
+        self._process = start_child("bam_train.agent.child_processes:main", self._what, **pipes)
         self.url = self._process.stdout.readline().strip() if self._process.stdout else ""
         if not self.url:
             self._process.wait()
@@ -143,7 +148,7 @@ class SimulatedBox:
         """End the process. Idempotent."""
         if self._process is not None and self._process.stdin is not None:
             self._process.stdin.close()  # which ends it, as the end of this process does
-            _await_end(self._process)
+            await_end(self._process)
             if self._process.stdout is not None:
                 self._process.stdout.close()
 
@@ -156,31 +161,5 @@ def main() -> None:
     options = ServeOptions(port=0, name=name, fast=True)
     with ServedEnvironment(make_env(env_id, env_kwargs), options, paced=True) as served:
         print(served.bus.url, flush=True)  # type: ignore[union-attr]  # noqa: T201 - read by the parent
-        threading.Thread(target=_end_with_parent, daemon=True).start()
+        at_end_of_parent(lambda: os._exit(0))
         threading.Event().wait()
-
-
-def _end_with_parent() -> None:
-    sys.stdin.read()
-    os._exit(0)
-
-
-def _child(module: str, argument: str, **options: Any) -> "subprocess.Popen[Any]":
-    """Start ``main`` of a module of this package with an argument, in a process that finds the same packages."""
-    # Without the folder it is started in, whose files could hide ours.
-    program = f"import sys; sys.path[:] = filter(None, sys.path); import bam_train.agent.{module} as it; it.main()"
-    return subprocess.Popen(
-        [sys.executable, "-c", program, argument],
-        env={**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
-        start_new_session=True,  # Ctrl-C at the terminal is for the resident alone
-        **{"stdin": subprocess.DEVNULL, **options},
-    )
-
-
-def _await_end(process: "subprocess.Popen[Any]") -> None:
-    """Wait for the end of a process, which was told to end; kill it if that takes long."""
-    try:
-        process.wait(5.0)
-    except subprocess.TimeoutExpired:
-        process.kill()
-        process.wait()

@@ -171,12 +171,13 @@ class TrainConfig(SettingsFlags, RobotModelFlag):  # type: ignore[misc]
     Examples:
       bam-train --env bam/pick --algo ppo
       bam-train --env CartPole-v1 --algo ppo --steps 50_000 --set learning_rate=lin_1e-3
+      bam-train --env bam/pick --algo ppo --seeds 0..4
       bam-train --resume runs/pick-ppo/last.zip --steps 2_000_000
       bam-train --data data/pick --algo iql
     """
 
     GROUPS: ClassVar[Groups] = {
-        "What is learnt": ("env", "robot_model", "algo", "steps", "seed", "until_success"),
+        "What is learnt": ("env", "robot_model", "algo", "steps", "seed", "seeds", "until_success"),
         "Settings": ("set", "config", "print_config"),
         "Files": ("out", "force", "runs", "resume", "start", "copy_to", "record"),
         "Evaluations": ("eval_every", "eval_episodes", "trial_threshold"),
@@ -214,6 +215,9 @@ class TrainConfig(SettingsFlags, RobotModelFlag):  # type: ignore[misc]
     """Overwrite the checkpoint at --out instead of adding a number to its name."""
     runs: Annotated[Path, tyro.conf.arg(metavar="FOLDER")] = Path("runs")
     """Folder in which the run's own folder is made; it may be s3://bucket/runs."""
+    seeds: Annotated[str | None, tyro.conf.arg(metavar="SEEDS")] = None
+    """Train one run a seed, such as 0..4 or 0,3,7: as many at once as there are cores, or on the Ray cluster at
+    --address. The same command again trains what is missing."""
     record: DataSetName = None
     """Add the episodes of training to this data set; of --trainer sb3 with an environment of bam_envs."""
     learner: Url = None

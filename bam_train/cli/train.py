@@ -2,24 +2,31 @@
 
 from __future__ import annotations
 
+import atexit
 import contextlib
+import gc
 import json
 import os
+import pkgutil
+import shutil
 import signal
 import sys
 import time
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from functools import partial
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from bam_train.cli.console import can_draw, count, say, tell
-from bam_train.cli.program import run_program
-from bam_train.signals import before_quitting, handled
+from bam_train.cli.program import guarded, run_program
+from bam_train.signals import at_end_of_parent, before_quitting, handled
 
 if TYPE_CHECKING:
     from bam_train.checkpoint import Checkpoint
     from bam_train.cli.flags import TrainConfig
     from bam_train.settings import TrainSettings
+    from bam_train.trainers.run_folder import RunFolder
     from bam_train.trainers.training_run import TrainingRun
 
 _STARTED = time.monotonic()
@@ -32,7 +39,7 @@ def train(config: TrainConfig) -> int:
     from bam_train.checkpoint import Checkpoint
     from bam_train.errors import SettingsError
     from bam_train.settings import NAMES, merge, read_assignments, read_config
-    from bam_train.trainers.resolve_settings import read_preset, resolve, resolve_resumed
+    from bam_train.trainers.resolve_settings import preset_notices, resolve, resolve_resumed
 
     if config.resume is not None and not config.resume.expanduser().exists():
         raise SettingsError(f"--resume {config.resume}: no such file. Check the name; a run keeps runs/NAME/last.zip")
@@ -42,26 +49,34 @@ def train(config: TrainConfig) -> int:
     if "transport" in flags:
         flags["transport"] = list(addresses(flags["transport"]))
     given = merge(file, read_assignments(config.set), flags)
+    if config.seeds is not None:
+        return int(pkgutil.resolve_name("bam_train.cli.experiments.seeds:train_seeds")(config, config.seeds, given))
     if config.learner is not None:
         return _learn(config, config.learner, given, checkpoint)
     settings = resolve(given, say) if checkpoint is None else resolve_resumed(given, checkpoint, say)
     if config.print_config:
         tell(*json.dumps(settings.to_mapping(), indent=2).split("\n"))
         return 0
-    notices = []
-    if checkpoint is None and not read_preset(settings.env, settings.algo, settings.trainer):
-        besides = ", ".join(given.get("hyperparameters", {}))
-        notices.append(f"no preset: the library's defaults{f', but for {besides}' if besides else ''}")
-    return _train(config, settings, checkpoint, notices)
+    return _train(config, settings, checkpoint, [] if checkpoint else preset_notices(settings, given))
 
 
-def _train(config: TrainConfig, settings: TrainSettings, checkpoint: Checkpoint | None, notices: list[str]) -> int:
-    """Train with complete settings, and print `notices` and the outcome; returns the exit status."""
+def _train(
+    config: TrainConfig,
+    settings: TrainSettings,
+    checkpoint: Checkpoint | None,
+    notices: list[str],
+    folder: RunFolder | None = None,
+) -> int:
+    """Train with complete settings, and print `notices` and the outcome; returns the exit status.
+
+    A run that continues from a checkpoint goes on in its `folder`, if that is given; otherwise a run has a new one.
+    """
     from bam_train.cli.train_display import LiveDisplay, MayClose, PlainDisplay, say_next, summarise
     from bam_train.environments import is_batched
-    from bam_train.errors import LearntNothing, SettingsError
+    from bam_train.errors import LearntNothing, OutputError, SettingsError
     from bam_train.settings import file_stem
     from bam_train.trainers import load_trainer
+    from bam_train.trainers.base import hardware, origin
     from bam_train.trainers.best_checkpoint import choose_output
     from bam_train.trainers.run_folder import Copies, RunFolder, require_room
     from bam_train.trainers.training_run import TrainingRun
@@ -87,7 +102,8 @@ def _train(config: TrainConfig, settings: TrainSettings, checkpoint: Checkpoint 
             settings = trainer.settings  # as the trainer completed them
             if config.record is not None:
                 trainer.record(config.record)  # type: ignore[attr-defined]
-            folder = RunFolder(runs, file_stem(settings.env, settings.algo, settings.trainer, settings.env_kwargs))
+            if folder is None:
+                folder = RunFolder(runs, file_stem(settings.env, settings.algo, settings.trainer, settings.env_kwargs))
             folder.write_config(settings.to_mapping())
             trainer.log_to(folder.tensorboard)
             display = (LiveDisplay if can_draw() else PlainDisplay)(title)
@@ -100,6 +116,12 @@ def _train(config: TrainConfig, settings: TrainSettings, checkpoint: Checkpoint 
             summarise(settings, outcome, folder, time.monotonic() - _STARTED)
             if outcome.shortfall is None:
                 run.add_detector()  # a tenth of a short run's time, so that nobody waits for the outcome
+            if outcome.reason != "stopped" and outcome.failure is None:
+                made = {"reason": outcome.reason, "steps": outcome.steps, "seconds": run.seconds, "best": outcome.best}
+                try:
+                    folder.write_outcome({**made, "shortfall": outcome.shortfall, "hardware": hardware(), **origin()})
+                except OutputError as error:
+                    outcome = replace(outcome, failure=error)
         finally:
             trainer.close()
         say_next(settings, outcome)
@@ -156,6 +178,33 @@ def _stop_on_signals(run: TrainingRun, came: list[int]) -> Callable[[int], None]
         write(f"{doing}; {again} quits at once\n")
 
     return stop
+
+
+def train_seed() -> None:
+    """A process of ``--seeds``: train in the folder of the first argument, which may hold a part of the run.
+
+    Its settings are the first line of standard input; the end of standard input is the end of the run.
+    """
+    sys.path.append(os.getcwd())
+    atexit.register(gc.freeze)
+    path, values = Path(sys.argv[1]), json.loads(sys.stdin.readline())
+    at_end_of_parent(lambda: os.kill(os.getpid(), signal.SIGTERM))
+
+    def run() -> int:
+        from bam_train.checkpoint import Checkpoint
+        from bam_train.cli.flags import TrainConfig
+        from bam_train.settings import TrainSettings
+        from bam_train.trainers.run_folder import RunFolder
+
+        folder = RunFolder(path.parent, path.name, lambda path: True)
+        checkpoint = Checkpoint.open(folder.last) if folder.last.exists() else None
+        if checkpoint is None:
+            (path / "progress.jsonl").unlink(missing_ok=True)
+            shutil.rmtree(folder.tensorboard, ignore_errors=True)
+        config = TrainConfig(out=path / "best.zip", force=True, runs=path.parent)
+        return _train(config, TrainSettings.from_mapping(values), checkpoint, [], folder)
+
+    sys.exit(guarded(run, "bam-train"))
 
 
 main = partial(run_program, "bam-train", "bam_train.cli.flags:TrainConfig", lambda config, _: train(config))

@@ -130,7 +130,7 @@ def _steps(progress: Progress) -> str:
     return f"{count(progress.steps)}{more} steps"
 
 
-_REASONS = {
+REASONS = {
     "steps": "all steps done",
     "success": "success reached",
     "reward": "reward reached",
@@ -147,18 +147,18 @@ def summarise(settings: TrainSettings, outcome: Outcome, folder: RunFolder, seco
     except OutputError as error:
         say(f"no learning curve: {error}")
     say()
-    end = f"{_REASONS[outcome.reason]} at {count(outcome.steps)} steps, {duration(seconds)} in all"
+    end = f"{REASONS[outcome.reason]} at {count(outcome.steps)} steps, {duration(seconds)} in all"
     say(f"{settings.algo} on {settings.env}: {end}")
     if outcome.best is None and outcome.reason == "stopped":
         say("  best        none yet: stopped before the first evaluation; the checkpoint is the newest state")
     if outcome.checkpoint is not None and outcome.checkpoint.exists():
         if outcome.best is not None:
             say(f"  best        {_score_text(outcome.best)}")
-        say(f"  checkpoint  {_short(outcome.checkpoint)}")
+        say(f"  checkpoint  {short_path(outcome.checkpoint)}")
     if outcome.last is not None:
         older = "" if outcome.last_steps == outcome.steps else f" (after {count(outcome.last_steps)} steps)"
-        say(f"  last state  {_short(outcome.last)}{older}")
-    say(f"  run         {_short(folder.path)}/: learning-curve.png, progress.jsonl, config.json, tensorboard/")
+        say(f"  last state  {short_path(outcome.last)}{older}")
+    say(f"  run         {short_path(folder.path)}/: learning-curve.png, progress.jsonl, config.json, tensorboard/")
 
 
 def _score_text(best: Scores) -> str:
@@ -178,17 +178,17 @@ def say_next(settings: TrainSettings, outcome: Outcome) -> None:
     usable = outcome.checkpoint or outcome.last
     named = f" --env {shlex.quote(settings.env)}" if must_be_named(settings.env) else ""
     if usable is not None:
-        commands.append(f"bam-eval {_short(usable)}{named}")
+        commands.append(f"bam-eval {short_path(usable)}{named}")
         if is_batched(settings.env) and outcome.shortfall is None:
-            commands.append(f"bam-deploy {_short(usable)}{named}")
+            commands.append(f"bam-deploy {short_path(usable)}{named}")
     if outcome.reason == "stopped" and outcome.last is not None:
-        commands.append(f"bam-train --resume {_short(outcome.last)}{named}")
+        commands.append(f"bam-train --resume {short_path(outcome.last)}{named}")
     if outcome.checkpoint is not None and outcome.checkpoint.exists():
         say(f"  size        {outcome.checkpoint.stat().st_size / 1000:,.0f} kB")
     for line in ["next:", *(f"  {command}" for command in commands)] if commands else []:
         say(line)
 
 
-def _short(path: Path) -> str:
+def short_path(path: Path) -> str:
     """The shortest form of the path for a shell in this folder."""
     return shlex.quote(with_addresses(str(path.resolve())).removeprefix(f"{Path.cwd()}{os.sep}"))

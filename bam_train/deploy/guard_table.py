@@ -8,6 +8,7 @@ from bam_envs.core.errors import BamEnvsError
 from bam_envs.core.robot import RobotSpec
 from bam_envs.safety.guard import BOUNDS, Limits, is_base, limits_of
 from bam_train.errors import SettingsError
+from bam_train.files.log_lines import aligned
 
 OUTSIDE_THE_GATE = (
     "G1   contract, signature  compared and verified before a live robot moves (exit status 3 or 1)",
@@ -52,13 +53,7 @@ def guard_lines(guards: Sequence[Mapping[str, Any]], limits: Mapping[str, float 
     for name, (least, most, unit) in BOUNDS.items():
         value = limits[name]
         settings.append([name, "-" if value is None else f"{value:g}", f"{least:g}", f"{most:g}", unit])
-    return [*_aligned(rows), "", "outside the gate", *OUTSIDE_THE_GATE, "", *_aligned(settings)]
-
-
-def _aligned(rows: Sequence[Sequence[str]]) -> list[str]:
-    """Each row as one line, in aligned columns."""
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    return ["  ".join(text.ljust(width) for text, width in zip(row, widths, strict=True)).rstrip() for row in rows]
+    return [*aligned(rows), "", "outside the gate", *OUTSIDE_THE_GATE, "", *aligned(settings)]
 
 
 def read_guards(texts: Iterable[str]) -> dict[str, float]:

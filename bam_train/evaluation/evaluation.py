@@ -58,7 +58,7 @@ class EvaluationReport:
         return {name: value for name, value in found.items() if name != "starts" or value is not None}
 
 
-def wilson_interval(successes: int, episodes: int) -> tuple[float, float]:
+def wilson_interval(successes: float, episodes: int) -> tuple[float, float]:
     """Wilson's score interval at 95 % for a proportion; valid also for no success and for all.
 
     Centre (p + z²/2n) / (1 + z²/n), half width z sqrt(p(1-p)/n + z²/4n²) / (1 + z²/n).

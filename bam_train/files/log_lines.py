@@ -1,7 +1,7 @@
 """Lines that programs print: without characters that a terminal executes, and with the time in a log."""
 
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 from bam_train.files.place import with_addresses
@@ -15,6 +15,12 @@ def shown(text: str) -> str:
     """
     text = with_addresses(text)
     return text if text.isprintable() else "".join(one if one.isprintable() else repr(one)[1:-1] for one in text)
+
+
+def aligned(rows: Sequence[Sequence[str]]) -> list[str]:
+    """Each row as one line, in aligned columns."""
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    return ["  ".join(text.ljust(width) for text, width in zip(row, widths, strict=True)).rstrip() for row in rows]
 
 
 class ShownFormatter(logging.Formatter):

@@ -3,7 +3,9 @@
 import contextlib
 import datetime
 import functools
+import os
 import platform
+import re
 import subprocess
 from collections.abc import Callable, Collection, Mapping
 from contextlib import AbstractContextManager
@@ -150,6 +152,23 @@ def origin() -> dict[str, Any]:
     versions, commit = _software()
     created = datetime.datetime.now(datetime.timezone.utc).isoformat(timespec="seconds")
     return {"versions": dict(versions), "git_commit": commit, "created": created}
+
+
+def cores() -> int:
+    """CPUs that this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+@functools.cache
+def hardware() -> str:
+    """The computer in words: the cores that this process may use, and what they are."""
+    name = platform.processor() or platform.machine()
+    with contextlib.suppress(OSError):
+        if match := re.search(r"model name\s*: (.+)", Path("/proc/cpuinfo").read_text(encoding="utf-8")):
+            name = match[1]
+    return f"{cores()} cores, {' '.join(name.split())}"
 
 
 @functools.cache

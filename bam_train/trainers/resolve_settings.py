@@ -62,6 +62,14 @@ def read_preset(env: str, algo: str, trainer: str = "sb3") -> dict[str, Any]:
     return parse_config(path.name, path.read_text(encoding="utf-8")) if path.is_file() else {}
 
 
+def preset_notices(settings: TrainSettings, given: Mapping[str, Any]) -> list[str]:
+    """A line that says so if a new run has no preset; `given` are the settings of the user."""
+    if read_preset(settings.env, settings.algo, settings.trainer):
+        return []
+    besides = ", ".join(given.get("hyperparameters", {}))
+    return [f"no preset: the library's defaults{f', but for {besides}' if besides else ''}"]
+
+
 def resolve(given: Mapping[str, Any], tell: Tell = lambda text: None) -> TrainSettings:
     """Complete settings of a new run: the trainer's defaults, overridden by the preset, overridden by `given`.
 

@@ -4,6 +4,7 @@
 
     config.json         all settings; `--config` reads it
     progress.jsonl      a JSON object per line: training statistics ("kind": "training") or an evaluation ("evaluation")
+    outcome.json        of a run that is done: why it ended, its best evaluation, computer, versions and commit
     tensorboard/        event files
     last.zip            the newest checkpoint; `--resume` continues from it
     learning-curve.png  return and success over steps
@@ -19,12 +20,12 @@ import shutil
 import tempfile
 import threading
 import traceback
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from bam_train.errors import OutputError
-from bam_train.files.atomic_file import remove_orphans
+from bam_train.files.atomic_file import remove_orphans, replacing
 from bam_train.files.place import Place
 
 LEAST_FREE = 20_000_000
@@ -34,11 +35,11 @@ LEAST_FREE = 20_000_000
 class RunFolder:
     """The folder ``root/name`` of one run, or ``root/name-2``, ``-3``, … while the name is taken.
 
-    The folder is new; temporary files of killed runs with the same name are removed. The constructor and every method
-    raise OutputError if they cannot write.
+    The folder is new, unless `is_own` says of one that is there that the run goes on in it; temporary files of killed
+    runs with the same name are removed. The constructor and every method raise OutputError if they cannot write.
     """
 
-    def __init__(self, root: Path, name: str) -> None:
+    def __init__(self, root: Path, name: str, is_own: Callable[[Path], bool] = lambda path: False) -> None:
         with _writing(root):
             root.mkdir(parents=True, exist_ok=True)
             for number in itertools.count(1):
@@ -49,6 +50,8 @@ class RunFolder:
                 except FileExistsError:
                     for checkpoint in ("last.zip", "best.zip"):
                         remove_orphans(self.path / checkpoint)
+                    if is_own(self.path):
+                        break
         self.last = self.path / "last.zip"
         self.tensorboard = self.path / "tensorboard"
         self.curve = self.path / "learning-curve.png"
@@ -56,8 +59,7 @@ class RunFolder:
 
     def write_config(self, settings: Mapping[str, Any]) -> None:
         """Write ``config.json``."""
-        with _writing(self.path / "config.json"):
-            (self.path / "config.json").write_text(json.dumps(settings, indent=2) + "\n", encoding="utf-8")
+        self._write("config.json", settings)
 
     def add(self, record: Mapping[str, Any]) -> None:
         """Append one line to ``progress.jsonl``, and close the file."""
@@ -65,12 +67,22 @@ class RunFolder:
             file.write(json.dumps(record, allow_nan=False) + "\n")
 
     def records(self) -> list[dict[str, Any]]:
-        """All records so far, without lines that a full disk cut off."""
-        records = []
-        for line in self._progress.read_text(encoding="utf-8").splitlines() if self._progress.exists() else ():
-            with contextlib.suppress(ValueError):
-                records.append(json.loads(line))
-        return records
+        """All records so far; see `read_records`."""
+        return read_records(self._progress)
+
+    @property
+    def outcome(self) -> dict[str, Any] | None:
+        """What `write_outcome` has written; None of a run that is not done."""
+        return read_object(self.path / "outcome.json")
+
+    def write_outcome(self, outcome: Mapping[str, Any]) -> None:
+        """Write ``outcome.json``."""
+        self._write("outcome.json", outcome)
+
+    def _write(self, name: str, content: Mapping[str, Any]) -> None:
+        """Write a JSON file, whole or not at all."""
+        with _writing(self.path / name), replacing(self.path / name) as temporary:
+            temporary.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
 
     def write_traceback(self, error: BaseException) -> str:
         """Write where an exception came from, for whoever corrects it; says so, or nothing if it cannot be written."""
@@ -85,6 +97,27 @@ class RunFolder:
         """Remove temporary files of an interrupted save."""
         for path in self.path.glob(".*.tmp"):
             path.unlink(missing_ok=True)
+
+
+def read_records(path: Path) -> list[dict[str, Any]]:
+    """The records of a ``progress.jsonl``, without lines that were cut off, and steps that a resumed run repeated."""
+    records: list[dict[str, Any]] = []
+    for line in path.read_text(encoding="utf-8").splitlines() if path.exists() else ():
+        with contextlib.suppress(ValueError):
+            record = json.loads(line)
+            if records and record["steps"] < records[-1]["steps"]:
+                records = [one for one in records if one["steps"] < record["steps"]]
+            records.append(record)
+    return records
+
+
+def read_object(path: Path) -> dict[str, Any] | None:
+    """The JSON object in a file; None if there is none."""
+    try:
+        found = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return None
+    return found if isinstance(found, dict) else None
 
 
 @contextlib.contextmanager

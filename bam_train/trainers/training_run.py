@@ -67,7 +67,7 @@ Scores = dict[str, Any]
 """A manifest's ``scores``: an evaluation as JSON, and the ``steps`` trained when it was made."""
 
 
-def _rank(scores: Scores) -> tuple[float, float]:
+def rank(scores: Scores) -> tuple[float, float]:
     """Sort key of evaluations, larger is better: success first, then return; unknown values rank last.
 
     Success counts as the low end of its interval: 1 of 5 is less than 4 of 20.
@@ -121,6 +121,8 @@ class TrainingRun:
         self._clock, self._copies = clock, copies
         self._start = self._recorded = self._saved = clock()
         self._first_step = trainer.steps
+        before = [one["seconds"] for one in folder.records() if one["steps"] <= trainer.steps]
+        self._seconds_before = max(before, default=0.0)  # in a folder in which the run goes on
         self._save_pause = FIRST_SAVE
         self._learning_from: tuple[int, float] | None = None  # steps and time when the trainer had first learnt
         self._stop, self._reached = False, ""
@@ -140,6 +142,11 @@ class TrainingRun:
     def last(self) -> Path | None:
         """The newest checkpoint on the disk from which the run can be resumed."""
         return next((path for path in (self.folder.last, self._kept) if path is not None and path.exists()), None)
+
+    @property
+    def seconds(self) -> float:
+        """Time that the run has taken so far [s]."""
+        return round(self._seconds_before + self._clock() - self._start, 3)
 
     def run(self) -> Outcome:
         """Train to the end; raises TrainingFailed, whose message names the last good checkpoint."""
@@ -286,7 +293,7 @@ class TrainingRun:
             self.watcher.note(f"{self.settings.env} reports no is_success, so --until-success has no effect")
         self._scores = {**report.to_json(), "steps": steps}
         chosen = self.best is not None and self.trainer.evaluations == "choose"
-        better = not chosen or _rank(self._scores) > _rank(self.best or {})
+        better = not chosen or rank(self._scores) > rank(self.best or {})
         self._add("evaluation", steps, self._scores)
         numbers = {"eval/return_mean": report.return_mean, "eval/success_rate": report.success_rate}
         self.trainer.log({name: value for name, value in numbers.items() if value is not None})
@@ -297,8 +304,7 @@ class TrainingRun:
     def _add(self, kind: str, steps: int, figures: Scores) -> None:
         """Add a record; a failure does not end training."""
         try:
-            seconds = round(self._clock() - self._start, 3)
-            self.folder.add({"kind": kind, "steps": steps, "seconds": seconds, **figures})
+            self.folder.add({"kind": kind, "steps": steps, "seconds": self.seconds, **figures})
         except OutputError as error:
             if "progress" not in self._failures:
                 self.watcher.note(f"{error}. Training goes on, and some records are missing")

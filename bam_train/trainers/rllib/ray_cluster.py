@@ -30,6 +30,7 @@ import ray.rllib  # sets up its loggers
 from bam_train.errors import SettingsError, TrainingFailed
 from bam_train.settings import RLlibSettings
 from bam_train.signals import at_quit, interrupt, waiting
+from bam_train.trainers.base import cores
 
 psutil: Any = importlib.import_module("psutil")  # Ray brings its own copy
 
@@ -340,13 +341,6 @@ def learners(settings: RLlibSettings) -> tuple[int, int]:
         name = VARIABLE if settings.num_gpus is None else "num_gpus"
         raise SettingsError(f"{name}: {number} learners use 0 or {number} GPUs, one each, found {wanted}")
     return number, int(wanted > 0)
-
-
-def cores() -> int:
-    """CPUs that this process may use."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
 
 
 def require_resources(settings: RLlibSettings) -> None:

@@ -56,6 +56,7 @@ def test_a_whole_run(bam_train, here):
         "config.json",
         "last.zip",
         "learning-curve.png",
+        "outcome.json",
         "progress.jsonl",
         "tensorboard",
     ]

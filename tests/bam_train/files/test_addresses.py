@@ -75,7 +75,7 @@ def test_training_in_a_bucket_and_going_on_from_there(bucket, run, corridor, tmp
     assert status == 0, err
     assert f"{bucket}/out/c.zip" in out + err
     (first,) = names(f"{bucket}/runs")
-    files = {"config.json", "last.zip", "learning-curve.png", "progress.jsonl", "tensorboard"}
+    files = {"config.json", "last.zip", "learning-curve.png", "outcome.json", "progress.jsonl", "tensorboard"}
     assert set(names(f"{bucket}/runs/{first}")) == files
     status, out, err = run(train.main, "--resume", f"{bucket}/runs/{first}/last.zip", "--steps", 96, *into)
     assert status == 0, err

@@ -20,7 +20,8 @@ import ray
 from bam_train.errors import SettingsError, TrainingFailed
 from bam_train.settings import RLlibSettings
 from bam_train.signals import Terminated
-from bam_train.trainers.rllib.ray_cluster import cluster, cores, reach
+from bam_train.trainers.base import cores
+from bam_train.trainers.rllib.ray_cluster import cluster, reach
 
 pytestmark = pytest.mark.slow
 

@@ -1,0 +1,1 @@
+"""Programs of experiments: several seeds of a run, and the comparison of runs."""
