@@ -340,7 +340,7 @@ ARMS = [
     (
         sending(JOINT_TOPIC, put("position", lambda values: [None, *values[1:]])),
         f"topic {JOINT_TOPIC}",
-        "position of shoulder_pan_joint must be a finite number, not None",
+        "position of elbow_joint must be a finite number, not None",
     ),
     (
         typed("/scaled_joint_trajectory_controller/joint_trajectory", ""),
@@ -365,7 +365,7 @@ BASES = [
     (altered(base_velocity=mirrored(0)), "base_velocity against base_pose", "-0.3 measured, 0.3 from base_pose"),
     (altered(base_velocity=mirrored(1)), "base_velocity against base_pose", "-0.4 measured, 0.4 from base_pose"),
     (altered(base_velocity=lambda x: 1000 * x), "base_velocity", "linear_velocity at 300"),
-    (typed("/cmd_vel", "geometry_msgs/TwistStamped"), "command /cmd_vel", "geometry_msgs/TwistStamped"),
+    (typed("/cmd_vel", "geometry_msgs/Wrench"), "command /cmd_vel", "geometry_msgs/Wrench"),
 ]
 
 
