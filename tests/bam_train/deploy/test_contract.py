@@ -335,7 +335,7 @@ ARMS = [
     (
         sending(JOINT_TOPIC, put("name", lambda names: [*names[:5], "tool_joint"])),
         f"topic {JOINT_TOPIC}",
-        f"wrist_3_joint missing; found: {LIST.replace('wrist_3', 'tool')}",
+        f"wrist_3_joint missing; found: {', '.join([*sorted(UR_JOINTS)[:5], 'tool_joint'])}",
     ),
     (
         sending(JOINT_TOPIC, put("position", lambda values: [None, *values[1:]])),
