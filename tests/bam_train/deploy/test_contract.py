@@ -292,7 +292,6 @@ def of_kind(name):
 
 
 JOINT_TOPIC, SCAN = "/joint_states", "/f_scan"
-LIST = "shoulder_pan_joint, shoulder_lift_joint, elbow_joint, wrist_1_joint, wrist_2_joint, wrist_3_joint"
 ARMS = [
     (altered(joint_position=swapped(1, 2)), "tool pose", "shoulder_lift_joint and elbow_joint are swapped"),
     (altered(joint_position=swapped(3, 4)), "tool pose", "wrist_1_joint and wrist_2_joint are swapped"),
