@@ -9,7 +9,7 @@ import gymnasium as gym
 
 from bam_envs.core.location import LiveRobot, Location, config_folder
 from bam_envs.core.robot_env import robot_of
-from bam_envs.live.robot_identity import is_one_robot
+from bam_envs.live.command_proof import is_one_robot
 from bam_envs.rosbridge.endpoint import Endpoint
 from bam_envs.safety.guard import TRIAL_SPEED
 from bam_train.checkpoint import Checkpoint

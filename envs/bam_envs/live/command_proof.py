@@ -1,4 +1,4 @@
-"""What shows that the commands of a live arm reach the joints that are meant, before anything moves.
+"""Which robot is at an address, and what shows that commands of an arm reach the joints that are meant.
 
 A message either names its joints, or depends on the order in which a controller lists them, which the robot's side is
 asked for. Sign, offset and unit show in a small motion only (`SafeRobot.prove`), which is safe where a message says in
@@ -11,19 +11,23 @@ import hashlib
 import json
 import logging
 import os
+import queue
 import tempfile
 import time
 from collections.abc import Mapping, Sequence
+from contextlib import closing, suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from bam_envs.core.errors import BamEnvsError, LinkLost, NotReady
+from bam_envs.core.errors import BamEnvsError, InvalidValue, LinkLost, NotReady, RemoteError
 from bam_envs.core.location import config_folder
-from bam_envs.live.robot_identity import is_one_robot, robot_identity
+from bam_envs.live import bringup
 from bam_envs.ros.codec import RobotInfo
 from bam_envs.ros.profile_tables import RobotProfile, Sink
-from bam_envs.rosbridge.endpoint import Endpoint
+from bam_envs.rosbridge.bus import Message
+from bam_envs.rosbridge.client import RosbridgeLink
+from bam_envs.rosbridge.endpoint import Endpoint, is_loopback
 from bam_envs.rosbridge.ros_bus import RosBus
 
 _LOG = logging.getLogger(__name__)
@@ -264,3 +268,62 @@ def _write(file: Path, row: Mapping[str, Any]) -> None:
     with os.fdopen(descriptor, "w", encoding="utf-8") as stream:
         json.dump(row, stream)
     os.replace(name, file)
+
+
+# ---- which robot it is: its serial number or name, as it tells it, or else as its operator does
+
+NAME_WITHIN = 1.5
+"""Longest wait for the topic on which a robot repeats its name [s]."""
+
+
+def robot_identity(endpoint: Endpoint, profile: RobotProfile, info: RobotInfo | None) -> str:
+    """The serial number or name of the robot at `endpoint`; empty if neither is known.
+
+    A robot without a description that tells it is asked as its profile says, over a connection of its own: with a ROS 2
+    bridge, a service that does not answer holds up everything else on its connection.
+
+    Raises:
+        InvalidValue: It tells another one than `Endpoint.robot_name`.
+        NoServer: There is no usable server.
+    """
+    told = "" if info is None else info.identity
+    if not told and profile.identity and not (info is not None and info.simulated):
+        link = RosbridgeLink(endpoint, name="identity")
+        with closing(link):
+            link.connect()
+            told = _asked(link, profile)
+    if told and endpoint.robot_name not in ("", told):
+        raise InvalidValue(
+            f"The robot at {endpoint.url} says that it is {told}, not {endpoint.robot_name}: correct the name, or the "
+            "address. Nothing has moved."
+        )
+    return told or endpoint.robot_name
+
+
+def is_one_robot(endpoint: Endpoint, identity: str) -> bool:
+    """Whether `identity`, or the address if it is empty, belongs to one robot: every tunnel ends on this computer."""
+    return bool(identity) or not is_loopback(endpoint.address.host)
+
+
+def _asked(link: RosbridgeLink, profile: RobotProfile) -> str:
+    """What the first source of `profile` that has an answer tells; empty if none has."""
+    types = bringup.TopicTypes(link, profile, bringup.TIMEOUT)
+    for source in profile.identity:
+        message: Any = None
+        if source.topic and types.may_be(link.namespace + source.topic, source.type):
+            message = _first(link, link.namespace + source.topic, source.type)
+        elif source.service:
+            with suppress(LinkLost, RemoteError):
+                message = bringup.ask(link, link.namespace + source.service, request=source.request)
+        if found := source.identity(message):
+            return found
+    return ""
+
+
+def _first(link: RosbridgeLink, topic: str, kind: str) -> Message | None:
+    """The first message on `topic` within `NAME_WITHIN`; None if there is none."""
+    came: queue.SimpleQueue[Message] = queue.SimpleQueue()
+    link.subscribe(topic, kind, lambda message, caller: came.put(message))
+    with suppress(queue.Empty):
+        return came.get(timeout=NAME_WITHIN)
+    return None

@@ -21,8 +21,7 @@ from bam_envs.core.errors import InvalidValue, LinkLost, ProtocolError
 from bam_envs.core.robot import RobotSpec
 from bam_envs.core.timing import BUSY, Deadline, Pacer, is_disturbed
 from bam_envs.live.bringup import TIMEOUT, TopicTypes, ask, least_interval, tagged_sinks
-from bam_envs.live.command_proof import CommandProof, needed_proof
-from bam_envs.live.robot_identity import robot_identity
+from bam_envs.live.command_proof import CommandProof, needed_proof, robot_identity
 from bam_envs.live.state import Letter, Mailbox, SourceAge, concerns
 from bam_envs.robots.linked import LinkProfile
 from bam_envs.ros.codec import DESCRIPTION_TOPIC, INFO_SERVICE, RobotInfo, decode_source, read_info

@@ -34,9 +34,9 @@ from bam_envs.live import bringup
 from bam_envs.live.camera import LiveCamera, fitted
 from bam_envs.live.command_proof import CommandProof, needed_proof
 from bam_envs.live.goals import GOAL, Goals, form_for
-from bam_envs.live.set_points import SetPoints
 from bam_envs.live.state import Letter, LiveState
 from bam_envs.live.take_over import TakeOver
+from bam_envs.robots.splines import SetPoints
 from bam_envs.ros.codec import (
     HALT_TOPIC,
     INFO_SERVICE,

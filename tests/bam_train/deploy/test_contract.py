@@ -292,7 +292,6 @@ def of_kind(name):
 
 
 JOINT_TOPIC, SCAN = "/joint_states", "/f_scan"
-LIST = "shoulder_pan_joint, shoulder_lift_joint, elbow_joint, wrist_1_joint, wrist_2_joint, wrist_3_joint"
 ARMS = [
     (altered(joint_position=swapped(1, 2)), "tool pose", "shoulder_lift_joint and elbow_joint are swapped"),
     (altered(joint_position=swapped(3, 4)), "tool pose", "wrist_1_joint and wrist_2_joint are swapped"),
@@ -335,12 +334,12 @@ ARMS = [
     (
         sending(JOINT_TOPIC, put("name", lambda names: [*names[:5], "tool_joint"])),
         f"topic {JOINT_TOPIC}",
-        f"wrist_3_joint missing; found: {LIST.replace('wrist_3', 'tool')}",
+        f"wrist_3_joint missing; found: {', '.join([*sorted(UR_JOINTS)[:5], 'tool_joint'])}",
     ),
     (
         sending(JOINT_TOPIC, put("position", lambda values: [None, *values[1:]])),
         f"topic {JOINT_TOPIC}",
-        "position of shoulder_pan_joint must be a finite number, not None",
+        "position of elbow_joint must be a finite number, not None",
     ),
     (
         typed("/scaled_joint_trajectory_controller/joint_trajectory", ""),
@@ -365,7 +364,7 @@ BASES = [
     (altered(base_velocity=mirrored(0)), "base_velocity against base_pose", "-0.3 measured, 0.3 from base_pose"),
     (altered(base_velocity=mirrored(1)), "base_velocity against base_pose", "-0.4 measured, 0.4 from base_pose"),
     (altered(base_velocity=lambda x: 1000 * x), "base_velocity", "linear_velocity at 300"),
-    (typed("/cmd_vel", "geometry_msgs/TwistStamped"), "command /cmd_vel", "geometry_msgs/TwistStamped"),
+    (typed("/cmd_vel", "geometry_msgs/Wrench"), "command /cmd_vel", "geometry_msgs/Wrench"),
 ]
 
 

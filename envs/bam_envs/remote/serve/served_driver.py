@@ -3,6 +3,7 @@
 That is a gripper as an action or a service, services that enable the arm, the list of controllers, and the URDF.
 """
 
+import logging
 import math
 from collections.abc import Callable, Iterator, Mapping
 from functools import partial
@@ -20,6 +21,8 @@ from bam_envs.ros.interfaces import response_type, variants
 from bam_envs.ros.messages import number_at
 from bam_envs.ros.profile_tables import Enable, RobotProfile, Sink
 from bam_envs.rosbridge.bus import ABORTED, CANCELED, SUCCEEDED, Action, Bus, Caller, Goal, Message
+
+_log = logging.getLogger(__name__)
 
 Array = NDArray[np.float64]
 Take = Callable[[str, Message, Caller], Mapping[str, float]]
@@ -104,7 +107,8 @@ class ServedDriver:
         for sink in self._profile.sinks_by_address.values():
             name = self._namespace + sink.address
             if sink.action:
-                self._bus.act(Action(name, sink.type, partial(self._begin, sink), self._cancel))
+                if not self._bus.act(Action(name, sink.type, partial(self._begin, sink), self._cancel)):
+                    _log.warning("%s (%s) is not offered: only bam-serve's own server has actions", name, sink.type)
             elif sink.service:
                 self._bus.serve(name, sink.type, partial(self._request, sink))
         for one in self._profile.enable:
