@@ -37,7 +37,7 @@ _PAIRS = (
 """Pairs of tubes that can touch and share no joint, and the first joint, from 0, that changes their distance."""
 
 
-class Group(NamedTuple):
+class LinkPair(NamedTuple):
     """Pairs of tubes on two links that can touch."""
 
     low: int
@@ -61,7 +61,7 @@ class Tubes:
         levers: How far a turn of each joint moves what is beyond it at most [m/rad]. Shape: (k,).
     """
 
-    def __init__(self, groups: Sequence[Group], levers: Sequence[float]) -> None:
+    def __init__(self, groups: Sequence[LinkPair], levers: Sequence[float]) -> None:
         self._groups, self._levers = groups, levers
         self._in = [{tube for pair in group.pairs for tube in pair[:2]} for group in groups]
         self._at: Sequence[float] = [math.inf] * len(levers)  # the joints of these lower bounds
@@ -123,7 +123,7 @@ class ArmTubes(Tubes):
         levers = abs(geometry.a2) + abs(geometry.a3) + wrist, abs(geometry.a3) + wrist, wrist, end
         radii = self._radii
         pairs = [(one, other, radii[one] + radii[other]) for one, other, _ in _PAIRS]
-        groups = [Group(joint, 5, [pair], pair) for pair, (*_, joint) in zip(pairs, _PAIRS, strict=True)]
+        groups = [LinkPair(joint, 5, [pair], pair) for pair, (*_, joint) in zip(pairs, _PAIRS, strict=True)]
         super().__init__(groups, [0.0, *levers, 0.0])
 
     def lowest(self, q: Sequence[float]) -> float:
@@ -169,7 +169,7 @@ class ChainTubes(Tubes):
         for (one, other), slack in zip(outline.pairs.tolist(), outline.slack.tolist(), strict=True):
             spare = self._radii[one] + self._radii[other] - slack
             pairs.setdefault((kept[one].link, kept[other].link), []).append((one, other, spare))
-        hulls, groups = list[Capsule](), list[Group]()
+        hulls, groups = list[Capsule](), list[LinkPair]()
         for (link, far), members in pairs.items():
             around = members[0]
             if len(members) > 1:
@@ -178,7 +178,7 @@ class ChainTubes(Tubes):
                 place = len(kept) + len(hulls)
                 around = place, place + 1, ends[0].radius + ends[1].radius - slack
                 hulls += ends
-            groups.append(Group(min(link, size), min(far, size), members, around))
+            groups.append(LinkPair(min(link, size), min(far, size), members, around))
         self._shapes = [(one.link, *one.start, *one.end) for one in (*kept, *hulls)]
         super().__init__(groups, _levers(chain, kept))
 
