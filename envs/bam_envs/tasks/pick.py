@@ -174,7 +174,7 @@ class PickTask(Memory):
 
     def command(self, action: Floats, state: RobotState) -> Array:
         """Joint positions [rad] and gripper width [m]. Shape: (n, joints + 1)."""
-        width = state.signals["gripper_width"]
+        width, self.control.width = state.signals["gripper_width"], state.command[:, -1]
         return self.control.command(action, self.sense(state).tool, state.command[:, :-1], width)
 
     def grasped(self, sense: CubeSense) -> Any:

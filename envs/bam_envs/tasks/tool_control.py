@@ -142,7 +142,7 @@ class ToolControl(Memory):
         "travel": "_travel",
         "turn": "_turn",
         "step": "_step",
-        "width": "_width",
+        "width": "width",
     }
 
     def __init__(self, num_envs: int, space: WorkSpace = _DEFAULT) -> None:
@@ -155,8 +155,9 @@ class ToolControl(Memory):
         """Commanded yaw [rad]. Shape: (n,)."""
         self.closed = np.zeros(num_envs, dtype=bool)
         """Whether the gripper was commanded to close. Shape: (n,)."""
+        self.width = np.zeros(num_envs)
+        """Width of the gripper that was sent last [m]; a task whose guards may change it sets it. Shape: (n,)."""
         self._joints = np.zeros((num_envs, space.size))
-        self._width = np.zeros(num_envs)  # commanded [m]
         # Changes of target, yaw and joints by the last command.
         self._travel, self._turn, self._step = np.zeros((num_envs, 3)), np.zeros(num_envs), np.zeros_like(self._joints)
 
@@ -164,7 +165,7 @@ class ToolControl(Memory):
         """Begin at rest at the measured `joints` (k, joints) [rad] of these environments."""
         self._continue_from(env_ids, joints)
         self._travel[env_ids], self._turn[env_ids], self._step[env_ids] = 0.0, 0.0, 0.0
-        self.closed[env_ids], self._width[env_ids] = False, self.space.open
+        self.closed[env_ids], self.width[env_ids] = False, self.space.open
 
     def _continue_from(self, env_ids: EnvIds, joints: Array) -> None:
         """Begin at `joints` (k, joints) [rad], which were sent after the last but one command."""
@@ -190,7 +191,7 @@ class ToolControl(Memory):
             width: Measured width of the gripper [m], around an object more than the commanded one; that by default.
                 Shape: (n, 1).
         """
-        width = self._width[:, None] if width is None else width
+        width = self.width[:, None] if width is None else width
         if len(action) == 1:
             return self._command_one(action, tool, sent, width)
         changed = sent != self._joints
@@ -222,10 +223,10 @@ class ToolControl(Memory):
         self._travel = limited(self.target + self._travel, self._low, self._high) - self.target
         self.target, self.yaw = self.target + self._travel, self.yaw + self._turn
         self.closed = action[:, -1] > 0
-        fingers, last = width[:, 0], self._width
+        fingers, last = width[:, 0], self.width
         low, high = np.minimum(fingers, last) - self._slide, np.maximum(fingers, last) + self._slide
-        self._width = limited(np.where(self.closed, 0.0, self.space.open), low, high)
-        return np.concatenate([self._joints, self._width[:, None]], axis=1)
+        self.width = limited(np.where(self.closed, 0.0, self.space.open), low, high)
+        return np.concatenate([self._joints, self.width[:, None]], axis=1)
 
     def _command_one(self, action: Floats, tool: Array, sent: Array, width: Array) -> Array:
         """`command` of one environment: the same arithmetic in plain numbers, which take a third of the time."""
@@ -274,9 +275,9 @@ class ToolControl(Memory):
         self._step, self._travel, self._turn = np.array([way]), np.array([travel]), np.array([turn])
         self.target = np.array([[at + one for at, one in zip(here, travel, strict=True)]])
         self.yaw, self._joints, self.closed = np.array([yaw + turn]), np.array([joints]), np.array([grip > 0])
-        fingers, last, wanted = width.item(), self._width.item(), 0.0 if grip > 0 else self.space.open
+        fingers, last, wanted = width.item(), self.width.item(), 0.0 if grip > 0 else self.space.open
         opened = _limited(wanted, min(fingers, last) - self._slide, max(fingers, last) + self._slide)
-        self._width = np.array([opened])
+        self.width = np.array([opened])
         return np.array([[*joints, opened]])
 
 
