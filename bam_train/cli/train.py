@@ -49,7 +49,7 @@ def train(config: TrainConfig) -> int:
     if "transport" in flags:
         flags["transport"] = list(addresses(flags["transport"]))
     given = merge(file, read_assignments(config.set), flags)
-    if config.seeds is not None:
+    if config.seeds is not None and not config.print_config:
         return int(pkgutil.resolve_name("bam_train.cli.experiments.seeds:train_seeds")(config, config.seeds, given))
     if config.learner is not None:
         return _learn(config, config.learner, given, checkpoint)
