@@ -172,3 +172,19 @@ def test_the_state_of_a_robot_is_saved_and_restored(model, cameras):
     assert_same_value(second.state_dict(), first.state_dict())
     first.close()
     second.close()
+
+
+@pytest.mark.parametrize(
+    ("env_id", "added"), [("bam/pick-v0", ("travel", "turn", "step", "width")), ("bam/reach-v0", ("sent",))]
+)
+def test_a_state_of_before_without_the_last_changes_of_commands_opens(make, env_id, added):
+    one, other = make(env_id), make(env_id)
+    one.reset(seed=0)
+    other.reset(seed=1)
+    saved = one.unwrapped.state_dict()
+    memory = saved["task"]["control"] if "control" in saved["task"] else saved["task"]
+    for key in added:
+        del memory[key]
+    other.unwrapped.load_state_dict(saved)
+    np.testing.assert_array_equal(other.unwrapped.state.command, one.unwrapped.state.command)
+    other.step(other.action_space.sample())
