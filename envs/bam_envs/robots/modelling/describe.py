@@ -75,7 +75,9 @@ def describe(
     if quarters:
         turn = np.pi / 4 * quarters
         mount = Placed(quat=(float(np.cos(turn)), 0.0, 0.0, float(np.sin(turn))))
-        read.notes.append(f"the base is turned by {90 * quarters} degrees about z, so that the arm faces x (mount)")
+        read.notes.append(
+            f"the base is turned by {90 * quarters} degrees about z, to face x (mount), as poses of a live robot have to be"
+        )
     tell("looking for a work area before the arm")
     arm = dataclasses.replace(arm, mount=mount)
     try:
@@ -237,7 +239,6 @@ def _joints(read: ReadArm) -> tuple[JointRow, ...]:
             read.notes.append(f"{name}: no torque in the files, so {effort:g} N m")
         if velocity is None:
             velocity = SPEED
-            read.notes.append(f"{name}: no speed in the files, so {velocity:g} rad/s")
         axis = tuple(round(float(one), 9) + 0.0 for one in read.axes[at])
         rows.append(
             JointRow(
@@ -254,6 +255,10 @@ def _joints(read: ReadArm) -> tuple[JointRow, ...]:
                 mass=round(read.mass[at], 3),
             )
         )
+    slow = [name for name, velocity in zip(read.names, read.velocity, strict=True) if velocity is None]
+    if slow:
+        which = f"all {size} joints" if len(slow) == size else ", ".join(slow)
+        read.notes.append(f"{which}: no speed in the files, so {SPEED:g} rad/s")
     read.notes.append(
         f"all {size} joints: no acceleration or jerk in the files, so {ACCELERATION:g} rad/s^2, {JERK:g} rad/s^3"
     )
