@@ -76,7 +76,7 @@ def describe(
         turn = np.pi / 4 * quarters
         mount = Placed(quat=(float(np.cos(turn)), 0.0, 0.0, float(np.sin(turn))))
         read.notes.append(
-            f"the base is turned by {90 * quarters} degrees about z, to face x (mount), as poses of a live robot have to be"
+            f"the base is turned by {90 * quarters} degrees about z, to face x (mount), as poses of a live robot are"
         )
     tell("looking for a work area before the arm")
     arm = dataclasses.replace(arm, mount=mount)

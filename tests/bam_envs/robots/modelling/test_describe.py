@@ -479,7 +479,7 @@ def test_an_arm_that_faces_another_way_is_turned_to_face_x(folder, tmp_path):
     text = FIVE.replace('name="base"', 'name="base" quat="1 0 0 -1"')
     (tmp_path / "five.xml").write_text(text, encoding="utf-8")
     arm, notes = describe("five", str(tmp_path / "five.xml"), None, "b5")
-    turned = "the base is turned by 90 degrees about z, to face x (mount), as poses of a live robot have to be"
+    turned = "the base is turned by 90 degrees about z, to face x (mount), as poses of a live robot are"
     assert notes[-1] == turned
     straight, _ = describe("five", str(folder / "five.xml"), None, "b5")
     assert (arm.workspace, arm.joint_names) == (straight.workspace, straight.joint_names)
