@@ -45,7 +45,9 @@ def fitted_capsules(points: Array, link: int, most: int = 2) -> list[Capsule]:
 
 def _halves(points: Array, one: _Fit, rng: np.random.Generator) -> list[_Fit]:
     """The two smallest capsules around `points` instead of `one`; that one if there are none."""
-    splits = []
+    splits: list[list[_Fit]] = []
+    if len(points) < 2:
+        return [one]
     for axis in np.concatenate([_principal_axes(points), np.eye(3)]):
         along = points @ axis
         for share in (0.3, 0.5, 0.7):

@@ -55,8 +55,8 @@ def test_the_scene_of_an_arm_is_its_description():
     assert scene["placements"] == chain.placements.reshape(7, 16).tolist()
     assert (scene["mount"], scene["axes"]) == (np.eye(4).ravel().tolist(), chain.axes.tolist())
     assert scene["tool"] == chain.tool_placement.ravel().tolist()
-    assert [one[0] for one in scene["capsules"]] == [0, 1, 2, 3, 4, 5, 6, 7]
-    assert scene["capsules"][0] == [0, -0.00391, -0.00054, 0.05154, -0.06326, 0.00168, 0.03796, 0.1078]
+    links = [one for one in arm.capsules if one.link < 8]  # the gripper is drawn as in simulation
+    assert scene["capsules"] == [[one.link, *one.start, *one.end, one.radius] for one in links]
     assert (scene["gripper"]["width"], scene["cube"]) == (0.08, 0.04)
     palm, finger, pad = scene["gripper"]["boxes"]
     size = 0.08 / 0.085  # of a Robotiq 2F-85

@@ -82,19 +82,14 @@ def test_the_rate_and_its_deadlines_are_reported(corridor_checkpoint, run, flags
 
 
 def test_a_simulated_arm_that_the_cube_pushes_is_not_stopped(run):
-    """In most episodes with this seed the closing gripper presses on the cube, which turns a wrist by 0.02 rad."""
-    held = 0
-    for _ in range(6):
-        with ServedEnvironment(
-            gym.make("bam/pick-v0", disable_env_checker=True), ServeOptions(port=0, fast=True)
-        ) as served:
-            flags = ("--robot", served.bus.url, "--seed", 1_000_053, "--episodes", 1, "--no-record", "--json")
-            status, out, err = run(main, CHECKPOINTS / "pick-ppo.zip", *flags)
-        assert (status, json.loads(out)["successes"]) == (0, 1), err
-        held = json.loads(out)["guards"]["following"]["held"]
-        if held:
-            break
-    assert held > 0
+    """In about one episode of forty the closing gripper presses on the cube, which turns a wrist by 0.02 rad."""
+    with ServedEnvironment(
+        gym.make("bam/pick-v0", disable_env_checker=True), ServeOptions(port=0, fast=True)
+    ) as served:
+        flags = ("--robot", served.bus.url, "--seed", 1_000_053, "--episodes", 30, "--no-record", "--json")
+        status, out, err = run(main, CHECKPOINTS / "pick-ppo.zip", *flags)
+    report = json.loads(out)
+    assert (status, report["successes"], report["guards"]["following"]["stopped"]) == (0, 30, 0), err
 
 
 def test_a_recording_that_cannot_be_made_is_one_line_and_nothing_moves(corridor_checkpoint, corridor, run, monkeypatch):

@@ -110,6 +110,7 @@ def test_a_real_robot_does_not_move_unasked(monkeypatch, capsys):
     monkeypatch.setattr("bam_train.cli.consent.required_contract", lambda *arguments: Contract(()))  # it would listen
     robot, closed = made.unwrapped.robot, []
     robot.info, robot.not_ready = SimpleNamespace(simulated=False, text="a real robot"), lambda: None
+    robot.enabling = ()
     monkeypatch.setattr(robot, "close", lambda: closed.append(True))
     opening = open_env(Checkpoint.open(PICK), "ws://10.0.0.5:9090", who="try", episodes=3)
     with pytest.raises(SettingsError, match="give --yes to go on without asking"), opening:
