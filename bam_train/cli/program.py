@@ -334,7 +334,7 @@ def is_hidden(hint: Any) -> bool:
 
 def _flag(name: str, hint: Any) -> str:
     """The flag of a field: its name, or the one in its hint."""
-    given = [one.name for one in get_args(hint)[1:] if getattr(one, "metavar", None) and one.name]
+    given: list[str] = [one.name for one in get_args(hint)[1:] if getattr(one, "metavar", None) and one.name]
     return "--" + (given or [name])[-1].replace("_", "-")
 
 
