@@ -120,12 +120,14 @@ def test_what_an_environment_has_in_common_with_one_above_it_is_not_said_again(m
     for name in make_docs.SECTIONS:
         assert f"**{name}.** " in first
     assert "**Start.** As in `bam/grasp-xyr-v0`." in second
-    assert "**Options** of `gym.make`, besides `objects`, `grasps`, `size` as above:" in second
+    assert "**Options** of `gym.make`, besides `objects`, `grasps`, `size` as above:\n\n- `bins=" in second
+    third = make_docs.environment("bam/grasp-6d-v0", told)
+    assert "**Options** of `gym.make`: `objects`, `grasps`, `size` as above.\n" in third
 
 
 def test_every_number_of_an_environment_is_named_on_the_site(make_docs):
     page = make_docs.build(make_docs.environment("bam/pick-v0"))
-    assert "**Observation**: float32, shape (18,). **Action**: float32, shape (5,); `bam-envs bam/pick-v0`" in page
+    assert "**Observation**: float32, shape (18,). **Action**: float32, shape (5,).\n" in page
     names, action = page.partition("```text\n")[2].split("\n\naction\n")
     assert "  tool_z          -2   2     (z - 0.183) / 0.167  m     tool, above the table\n" in names
     assert re.search(r"^  grip +-1 +1 +1 +1 +close the gripper when positive, open it otherwise\n```", action, re.M)

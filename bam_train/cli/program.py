@@ -215,7 +215,7 @@ def usage_error(box: str, config: type[Any]) -> str:
     Examples: ``unknown option --enb, did you mean --env?``, ``--steps: expected a whole number, found 'x'.``
     """
     from bam_envs.core.validation import expected, type_hints
-    from bam_envs.core.wording import as_flag, closest
+    from bam_envs.core.wording import closest
 
     text = " ".join(re.sub(r"[─│╭╮╰╯]+|-{4,}|(?<!\S)[|+](?!\S)", " ", box).split())  # drawn in ASCII where it must be
     text = re.split(r" For full helptext| Argument helptext", text)[0]
@@ -223,7 +223,7 @@ def usage_error(box: str, config: type[Any]) -> str:
     if match := re.search(r"Unrecognized options: ([^\s,]+)", text):
         if not match[1].startswith("-"):
             return f"unexpected argument {match[1]}."
-        flags = [as_flag(name) for name, hint in hints.items() if not (is_positional(hint) or is_hidden(hint))]
+        flags = [_flag(name, hint) for name, hint in hints.items() if not (is_positional(hint) or is_hidden(hint))]
         flags, instead = [*flags, "--help"], getattr(config, "INSTEAD", {})
         name = match[1].partition("=")[0].replace("_", "-")
         if name in instead:
@@ -300,7 +300,7 @@ def help_text(config: type[Any], prog: str, description: str) -> str:
             value: dict[str, Any] = {"action": "store_true"}
             if hints[name] is not bool:
                 value = {"metavar": _metavar(hints[name])}
-            group.add_argument("--" + name.replace("_", "-"), help=text, **value)
+            group.add_argument(_flag(name, hints[name]), help=text, **value)
     group.add_argument("-h", "--help", action="store_true", help="Show this text.")
     return parser.format_help()
 
@@ -330,6 +330,12 @@ def is_hidden(hint: Any) -> bool:
     import tyro
 
     return tyro.conf.Suppress in get_args(hint)
+
+
+def _flag(name: str, hint: Any) -> str:
+    """The flag of a field: its name, or the one in its hint."""
+    given: list[str] = [one.name for one in get_args(hint)[1:] if getattr(one, "metavar", None) and one.name]
+    return "--" + (given or [name])[-1].replace("_", "-")
 
 
 def _metavar(hint: Any) -> str:

@@ -131,17 +131,16 @@ def environment(env_id: str, told: dict[str, str] | None = None) -> str:
     if options := arguments(entry):
         rows = {item(*option): option[0] for option in options}
         names = [f"`{name}`" for row, name in rows.items() if told.setdefault(row, env_id) != env_id]
-        shared = f", besides {', '.join(names)} as above" if names else ""
-        parts.append(
-            "\n".join([f"**Options** of `gym.make`{shared}:\n", *(row for row in rows if told[row] == env_id)])
-        )
+        own = "\n".join(row for row in rows if told[row] == env_id)
+        shared = f"{', besides' if own else ':'} {', '.join(names)} as above" if names else ""
+        parts.append(f"**Options** of `gym.make`{shared}" + (f":\n\n{own}" if own else "."))
     if entry.cameras:
         both = " and ".join(f"`{name}`" for name in entry.cameras)
         shown = f"of {both}, or of those in" if entry.shows else f"with `camera=` of {both};"
         parts.append(f"**Images**: {shown}{' `camera=`;' * bool(entry.shows)} see [images](index.md#images).")
     kinds = [(kind, getattr(task(1), f"{kind}_space")) for kind in ("observation", "action")]
     shapes = [f"**{kind.capitalize()}**: {_shape(space) if robot else space_text(space)}" for kind, space in kinds]
-    parts += [f"{'. '.join(shapes)}; `bam-envs {env_id}` names the numbers.", f"<!-- site: numbers {env_id} -->"]
+    parts += [f"{'. '.join(shapes)}.", f"<!-- site: numbers {env_id} -->"]
     return "\n\n".join(parts)
 
 

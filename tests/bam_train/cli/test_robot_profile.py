@@ -197,6 +197,13 @@ def test_a_graph_that_does_not_fit_is_one_line(run, graph, tmp_path, options, me
     assert not (tmp_path / "robots").exists()
 
 
+def test_the_address_is_called_as_the_help_says(run):
+    assert "  --from URL         Address of the robot behind rosbridge.\n" in run(main, "profile", "--help")[1]
+    status, _, err = run(main, "profile", "gen3", "--form", "ws://127.0.0.1:9")
+    remedy = "Run bam-robots profile --help\n"
+    assert (status, err) == (2, f"bam-robots profile: unknown option --form, did you mean --from? {remedy}")
+
+
 def test_no_server_no_rosapi_and_a_file_that_is_there(run, graph, tmp_path):
     with contextlib.closing(LaxServer().start()) as lax:
         status, _, err = run(main, "profile", "gen3", "--from", lax.url)
