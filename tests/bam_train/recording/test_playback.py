@@ -32,6 +32,9 @@ from bam_train.recording.recording import Event, Recording
 
 CHECKPOINTS = Path(__file__).parents[3] / "checkpoints"
 PICK = CHECKPOINTS / "pick-ppo.zip"
+STEPS, RETURNS = (44, 47), ("41.16", "42.10")
+"""Of two episodes of the shipped policy."""
+TICKS = sum(STEPS) + len(STEPS)
 
 
 def call(main, *arguments):
@@ -81,8 +84,8 @@ def small_chunks(pick):
 def test_the_numbers_are_there_again(pick):
     recording = Recording.open(pick)
     assert recording.complete
-    assert recording.ticks == 70
-    assert recording.episodes() == [range(36), range(36, 70)]
+    assert recording.ticks == TICKS
+    assert recording.episodes() == [range(STEPS[0] + 1), range(STEPS[0] + 1, TICKS)]
     assert recording.metadata["env"] == "bam/pick-v0"
     assert recording.metadata["checkpoint_sha256"] == Checkpoint.open(PICK).digest
     assert [event.text for event in recording.events] == [
@@ -93,12 +96,12 @@ def test_the_numbers_are_there_again(pick):
     env = make_env("bam/pick-v0")
     observation, _ = env.reset(seed=1_000_000)
     states, [action] = recording.states(env.unwrapped.robot.spec), recording.arrays("action").values()
-    for k in range(36):
+    for k in range(STEPS[0] + 1):
         [observed] = recording.arrays("observation").values()
         np.testing.assert_array_equal(observed[k], observation)
         for name, values in env.unwrapped.last_state.signals.items():
             np.testing.assert_array_equal(states[k].signals[name], values)
-        if k < 35:
+        if k < STEPS[0]:
             observation, *_ = env.step(action[k])
     env.close()
 
@@ -128,7 +131,7 @@ def test_another_policy_is_compared(pick):
     played = play(recording, env, Still())
     env.close()
     [action] = recording.arrays("action").values()
-    assert (played.ticks, played.observations, played.actions) == (70, 70, 0)
+    assert (played.ticks, played.observations, played.actions) == (TICKS, TICKS, 0)
     assert played.worst == np.abs(action).max()
 
 
@@ -142,13 +145,18 @@ def test_of_a_recording_of_several_policies_a_checkpoint_is_compared_with_its_ow
     events = [Event(times[at] - 1, 2, text) for at, text in zip((20, 50), texts, strict=True)]
     with_swaps.write_bytes(rewritten(pick, events))
 
-    assert Recording.open(with_swaps).policies() == [own[:12]] * 20 + [other[:12]] * 30 + [own[:12]] * 20
+    assert Recording.open(with_swaps).policies() == [own[:12]] * 20 + [other[:12]] * 30 + [own[:12]] * (TICKS - 50)
     assert call(replay, with_swaps) == 0
     said = capsys.readouterr().out.splitlines()
-    assert "played: the same observation in 40 of 40 ticks, the same action in 40" in said
-    assert said[said.index("played: the same observation in 40 of 40 ticks, the same action in 40") + 1] == (
-        f"not compared: the ticks in which another policy acted: {other[:12]} in 30"
+    assert (
+        f"played: the same observation in {TICKS - 30} of {TICKS - 30} ticks, the same action in {TICKS - 30}" in said
     )
+    assert said[
+        said.index(
+            f"played: the same observation in {TICKS - 30} of {TICKS - 30} ticks, the same action in {TICKS - 30}"
+        )
+        + 1
+    ] == (f"not compared: the ticks in which another policy acted: {other[:12]} in 30")
     third = tmp_path / "third.zip"
     third.write_bytes(PICK.read_bytes())
     third = Checkpoint.open(forge(third, seed=8))
@@ -166,27 +174,27 @@ def test_summary_for_people_and_programs(pick, capsys):
     assert call(replay, pick) == 0
     lines = capsys.readouterr().out.splitlines()
     assert lines[0] == f"{pick}: pick-ppo.zip ({Checkpoint.open(PICK).digest[:12]}) on bam/pick-v0"
-    assert lines[1].startswith("70 ticks in ")
+    assert lines[1].startswith(f"{TICKS} ticks in ")
     assert lines[1].endswith(" s, complete")
     assert lines[2:5] == [
-        "episode 1 (seed 1000000): success after 35 steps, return 38.48",
-        "episode 2 (seed 1000001): success after 33 steps, return 39.01",
+        f"episode 1 (seed 1000000): success after {STEPS[0]} steps, return {RETURNS[0]}",
+        f"episode 2 (seed 1000001): success after {STEPS[1]} steps, return {RETURNS[1]}",
         "no guard acted",
     ]
     assert [line.partition(":")[0] for line in lines[5:10]] == ["step", "wait", "late", "policy", "record"]
     assert lines[-2].endswith(" s: episodes done")
-    assert lines[-1] == "played: the same observation in 70 of 70 ticks, the same action in 70"
+    assert lines[-1] == f"played: the same observation in {TICKS} of {TICKS} ticks, the same action in {TICKS}"
     assert call(replay, pick, "--json") == 0
     report = json.loads(capsys.readouterr().out)
     assert report["played"] == {
-        "ticks": 70,
-        "observations": 70,
-        "actions": 70,
+        "ticks": TICKS,
+        "observations": TICKS,
+        "actions": TICKS,
         "worst": 0.0,
         "others": {},
         "same": True,
     }
-    assert [row["length"] for row in report["per_episode"]] == [35, 33]
+    assert [row["length"] for row in report["per_episode"]] == [*STEPS]
     assert report["complete"] is True
 
 
@@ -243,14 +251,14 @@ def test_a_recording_cut_anywhere_is_readable(small_chunks, tmp_path, capsys):
         ticks.append(recording.ticks)
         assert len(recording.states(make_spec())) == recording.ticks if recording.ticks else True
     assert ticks == sorted(ticks)
-    assert ticks[-1] == 70
+    assert ticks[-1] == TICKS
     path.write_bytes(data[: len(data) // 2])
     assert call(replay, path) == 0
     lines = capsys.readouterr().out.splitlines()
     assert lines[1].endswith(" s, its end is missing: it was cut off or damaged")
     assert [line for line in lines if " (seed 100000" in line][-1].split(": ")[1].startswith("cut off after ")
     played = Recording.open(path).ticks
-    assert 20 < played < 70
+    assert 20 < played < TICKS
     assert lines[-1] == f"played: the same observation in {played} of {played} ticks, the same action in {played}"
 
 
@@ -263,7 +271,7 @@ def test_a_damaged_recording_is_read_up_to_the_damage(small_chunks, tmp_path):
     for place in rng.integers(0, len(data), 60):
         path.write_bytes(data[:place] + bytes([data[place] ^ 0xFF]) + data[place + 1 :])
         try:
-            assert 0 <= Recording.open(path).ticks <= 70
+            assert 0 <= Recording.open(path).ticks <= TICKS
         except BadRecording as error:
             assert str(error).startswith(f"{path}: ")  # noqa: PT017 - either is right
 
