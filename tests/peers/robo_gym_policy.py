@@ -36,7 +36,7 @@ class BaseServer(services.RobotServerServicer):
     """A robot server of a simulated MiR100."""
 
     def __init__(self):
-        self.robot, self.task = open_floor(1), make_task("bam/mir100-navigation-v0", 1, parity=True)
+        self.robot, self.task = open_floor(1), make_task("bam/navigation-v0", 1, parity=True)
         self.robot.connect()
 
     def SetState(self, request, context):  # noqa: N802 - the service's names

@@ -193,6 +193,7 @@ def _draw(description: Description, path: Path) -> None:
 
     if path.suffix.lower() not in _PICTURES:
         raise InvalidValue(f"--picture {path}: expected a name that ends in {' or '.join(_PICTURES)}.")
+    path.parent.mkdir(parents=True, exist_ok=True)
     robot: SimulatedArm | SimulatedBase
     start: dict[str, Any] = {"obstacle_pose": np.array([[[1.5, 0.5, 0.3], [-0.5, -1.5, 1.0]]])}
     if isinstance(description, ArmDescription):

@@ -27,6 +27,7 @@ SITES = ("attachment_site", "right_hand", "tool0", "flange", "ee_link", "link_tc
 _FEWEST_JOINTS, _MOST_JOINTS = 4, 8
 _MESHES = (".stl", ".obj", ".msh")
 _PAD, _BOX = "bam_pad", mujoco.mjtGeom.mjGEOM_BOX
+_PARALLEL, _ACROSS = 0.99, 0.3  # cosine of the angle of axes that count as one, and of those across
 _FLUSH = 0.02  # shapes of the end that stand out less do not move the gripper [m]
 _END = "_end"  # ends the name of the body at the end of an arm
 CONTINUOUS = 2 * np.pi
@@ -366,12 +367,13 @@ class _Reader:
         self._where, self._limits, self._parallel = where, limits, parallel
         self._notes = notes
         self._compile(spec, end)
-        self._way, self._begin = 1.0, 0.0  # of the gripper along the z axis of the end, and where it begins [m]
+        self._out, self._begin = np.eye(3), 0.0  # axes of the gripper in the end's, and where it begins along z [m]
         if parallel is not None:
-            self._way, self._begin = self._outwards()
+            self._out, self._begin = self._outwards()
             for at, (low, high) in enumerate(_pads(parallel)):
-                pos = (0.5 * (low + high) + [0.0, 0.0, self._begin]) * [1.0, 1.0, self._way]
-                spec.body(end).add_geom(name=f"{_PAD}{at}", type=_BOX, pos=pos, size=0.5 * (high - low), mass=0.0)
+                pos = self._out @ (0.5 * (low + high) + [0.0, 0.0, self._begin])
+                half = np.abs(self._out) @ (0.5 * (high - low))
+                spec.body(end).add_geom(name=f"{_PAD}{at}", type=_BOX, pos=pos, size=half, mass=0.0)
             self._compile(spec, end)
         self._pivot: Array | None = None
 
@@ -383,24 +385,34 @@ class _Reader:
         self._data = mujoco.MjData(self._model)
         self._end = self._model.body(end).id
 
-    def _outwards(self) -> tuple[float, float]:
-        """1 if the z axis of the end points away from the joint before the last, else -1; how far its shapes go [m]."""
+    def _outwards(self) -> tuple[Array, float]:
+        """Axes of the gripper in those of the end, and how far the shapes of the end stand out along its z [m].
+
+        The gripper points along z of the end; if that is across the arm, along x or y about which the last joint turns.
+        """
         model, data = self._model, self._data
         mujoco.mj_kinematics(model, data)
         joints, name = self._chain(), model.body(self._end).name.removesuffix(_END)
-        way, z = data.xpos[self._end] - data.xanchor[joints[-2]], data.xmat[self._end].reshape(3, 3)[:, 2]
-        sign = 1.0 if way @ z > -0.5 * np.linalg.norm(way) else -1.0
-        if sign < 0.0:
-            self._notes.append(f"the gripper points along -z of {name}, away from the arm")
+        way, axes = data.xpos[self._end] - data.xanchor[joints[-2]], data.xmat[self._end].reshape(3, 3)
+        away, turns = way @ axes / max(float(np.linalg.norm(way)), 1e-9), np.abs(data.xaxis[joints[-1]] @ axes)
+        axis = int(turns.argmax())
+        if abs(away[2]) > _ACROSS or turns[axis] < _PARALLEL or abs(away[axis]) < 0.5:
+            axis = 2
+        sign = 1.0 if away[axis] > -0.5 else -1.0
+        if (axis, sign) != (2, 1.0):
+            self._notes.append(f"the gripper points along {'-' * (sign < 0)}{'xyz'[axis]} of {name}, away from the arm")
+        out = np.eye(3)[:, [(axis + 1) % 3, (axis + 2) % 3, axis]]
+        out[:, 1:] *= sign
+        z = axes @ out[:, 2]
         below = np.zeros(model.nbody, bool)
         for body in range(self._end, model.nbody):
             below[body] = body == self._end or (below[model.body_parentid[body]] and not model.body_jntnum[body])
         points = self._points(below, np.eye(4)) - data.xpos[self._end]
-        begin = float((sign * points @ z).max(initial=0.0))
+        begin = float((points @ z).max(initial=0.0))
         if begin < _FLUSH:
-            return sign, 0.0
+            return out, 0.0
         self._notes.append(f"the gripper is fixed {begin:.3f} m from {name}, where its shapes end")
-        return sign, begin
+        return out, begin
 
     def read(self) -> ReadArm:
         model, data = self._model, self._data
@@ -537,7 +549,7 @@ class _Reader:
         bodies = owner == link
         flange = np.eye(4)
         flange[:3, :3], flange[:3, 3] = data.xmat[self._end].reshape(3, 3), data.xpos[self._end]
-        flange[:3, 1:3] *= self._way
+        flange[:3, :3] = flange[:3, :3] @ self._out
         grip: list[Array]
         if self._parallel is not None:
             length = _length(self._parallel)

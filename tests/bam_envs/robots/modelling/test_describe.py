@@ -475,6 +475,16 @@ def test_a_gripper_begins_where_the_shapes_of_the_end_do_and_points_away_from_th
     np.testing.assert_allclose(read.tool[:3, 2], [0.0, 0.0, 1.0], atol=1e-6)
 
 
+def test_a_gripper_points_along_another_axis_of_the_end_where_z_is_across_the_arm(tmp_path):
+    across = f'name="flange" type="fixed"><origin rpy="0 {np.pi / 2} 0"/>'
+    (tmp_path / "lab.urdf").write_text(six_joints().replace('name="flange" type="fixed">', across), encoding="utf-8")
+    read = read_arm(str(tmp_path / "lab.urdf"), GRIPPER, None)
+    assert read.notes[0] == "the gripper points along -x of tool0, away from the arm"
+    np.testing.assert_allclose(read.tool[:3, 3], [0.0, 0.0, 0.14], atol=1e-6)
+    np.testing.assert_allclose(read.tool[:3, 2], [0.0, 0.0, 1.0], atol=1e-6)
+    assert np.linalg.det(read.tool[:3, :3]) == pytest.approx(1.0)
+
+
 def test_an_arm_that_faces_another_way_is_turned_to_face_x(folder, tmp_path):
     text = FIVE.replace('name="base"', 'name="base" quat="1 0 0 -1"')
     (tmp_path / "five.xml").write_text(text, encoding="utf-8")
