@@ -18,7 +18,7 @@ from bam_envs.core.location import LiveRobot
 from bam_envs.live import bringup
 from bam_envs.live.building import live_robot, require_robot_address
 from bam_envs.live.examination import PING_TOPIC, Array, Inspection, Reading, inspect_robot
-from bam_envs.robots.profile import load_profile, profile_for, shipped_profiles
+from bam_envs.robots.profile import load_profile, own_profile, profile_for, shipped_profiles
 from bam_envs.ros.codec import INFO_SERVICE, read_info
 from bam_envs.ros.profile_tables import RobotProfile
 from bam_envs.rosbridge.bus import namespaces_with
@@ -140,6 +140,8 @@ class Diagnosis:
         if answer is not None:
             info = read_info(answer.get("message"), service)
             found.append(f"the robot describes itself: {info.text or info.name}")
+            if self.profile is None and own_profile(info.name) is not None:
+                self.profile = load_profile(info.name)
         return found, []
 
     # ---- states

@@ -109,12 +109,14 @@ class _Signal:
 
 
 def load_profile(name_or_path: str | Path) -> RobotProfile:
-    """The shipped profile of that name, or the one in a TOML or YAML file, checked.
+    """The profile of that name beside the descriptions of robots, the shipped one, or the one in a file, checked.
 
     A described robot without a profile has the usual topics: `usual_profile`. `UnknownName` carries the closest match
     to a name, `InvalidValue` names the error in a file.
     """
     name = str(name_or_path)
+    if len(Path(name).parts) == 1 and (own := own_profile(name)) is not None:
+        return _profile(str(own), _table_at(own))
     if name not in shipped_profiles() and name in known_models():
         return usual_profile(_named_robot("robot profile", name))
     return _profile(*_read_file(name))

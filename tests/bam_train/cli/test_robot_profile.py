@@ -106,7 +106,9 @@ def graph(tmp_path, monkeypatch):
 def read(run, url, name="gen3"):
     status, out, err = run(main, "profile", name, "--from", url)
     assert (status, err) == (0, "")
-    return load_profile(f"robots/profiles/{name}.toml"), out
+    profile = load_profile(f"robots/profiles/{name}.toml")
+    assert load_profile(name) == profile
+    return profile, out
 
 
 def test_an_arm_with_a_prefix_takes_the_active_controller(run, graph):
