@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -149,11 +150,14 @@ def _facts(arm: ArmDescription) -> list[tuple[str, str, bool]]:
 
 
 def _outline_flaw(arm: ArmDescription, outline: Outline) -> str:
-    """What is wrong with the capsules in the home pose: a gripper without any, or one far from all around it; or ""."""
-    from bam_envs.arms.capsules import segment_distances
+    """What is wrong with the capsules: a gripper without any, collisions that are not found, a stray one; or ""."""
+    from bam_envs.arms.capsules import WHOLE, segment_distances
 
     if arm.num_joints + 1 not in outline.links:
         return "; the gripper has no capsule, so that nothing keeps it from the arm: add its shapes"
+    seen = re.match(r"(\d+) of (\d+) collisions", arm.sources.get("outline", ""))
+    if seen and int(seen[1]) < WHOLE * int(seen[2]):
+        return f"; only {seen[0]} of the arm with itself are found: add capsules where its links meet"
     start, end = np.moveaxis(outline.segments(arm.chain.home[None])[0], 1, 0)
     gaps = segment_distances(start[:, None], end[:, None], start, end) - outline.radius[:, None] - outline.radius
     gaps[(np.abs(np.subtract.outer(outline.links, outline.links)) > 2) | np.eye(len(gaps), dtype=bool)] = np.inf

@@ -16,6 +16,8 @@ _TRIALS = 250  # steps of the search for a thinner capsule
 
 _Fit = tuple[Array, Array, float]
 """Ends and radius of a capsule."""
+WHOLE = 0.9
+"""Least share of an arm's collisions with itself that its outline has to find."""
 
 
 def fitted_capsules(points: Array, link: int, most: int = 2) -> list[Capsule]:

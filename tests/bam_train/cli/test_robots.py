@@ -1,5 +1,7 @@
 """``bam-robots``: the list of arms, the table of one, and what `add` refuses."""
 
+import re
+
 import pytest
 
 from bam_envs.core.robot_models import SHIPPED, known_models
@@ -66,6 +68,15 @@ def test_an_arm_that_does_not_reach_its_work_area_fails_its_check(run, tmp_path)
     status, out, _ = run(main, "check", path)
     assert status == 1
     assert "z 0.016 to 0.06 m: not all of it is reached" in out
+
+
+def test_an_outline_that_misses_collisions_fails_its_check(run, tmp_path):
+    path, text = tmp_path / "lab.toml", (SHIPPED / "so101.toml").read_text(encoding="utf-8")
+    for seen, status in ((89, 1), (90, 0)):
+        found = f'outline = "{seen} of 100 collisions of the arm with itself in 10000 postures are found"'
+        path.write_text(re.sub("(?m)^outline = .*$", found, text), encoding="utf-8")
+        code, out, _ = run(main, "check", path)
+        assert (code, f"only {seen} of 100 collisions of the arm with itself are found" in out) == (status, status == 1)
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from bam_envs.arms.capsules import Outline, fitted_capsules
+from bam_envs.arms.capsules import WHOLE, Outline, fitted_capsules
 from bam_envs.arms.description import ArmDescription, Gripper, JointRow, Placed, Vector
 from bam_envs.arms.serial_chain import Capsule, SerialChain
 from bam_envs.arms.work_area import find_work_area
@@ -94,6 +94,9 @@ def describe(
             f"collisions of the arm with itself: the slightest {_GIVEN_UP:.0%} of two links are not noticed"
         )
     if how_well:
+        seen, every = (int(word) for word in how_well.split()[:3:2])
+        if seen < WHOLE * every:
+            read.notes.append(f"{every - seen} of {every} collisions of the arm with itself are not seen by the guards")
         found = dataclasses.replace(found, sources={**found.sources, "outline": how_well})
     return found, read.notes
 
