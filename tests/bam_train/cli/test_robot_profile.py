@@ -2,6 +2,7 @@
 
 import contextlib
 from dataclasses import replace
+from pathlib import Path
 
 import gymnasium as gym
 import pytest
@@ -25,8 +26,8 @@ def served(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     running = []
 
-    def start(name):
-        env = gym.make("bam/pick-v0", robot_model=name, disable_env_checker=True)
+    def start(name, env_id="bam/pick-v0"):
+        env = gym.make(env_id, robot_model=name, disable_env_checker=True)
         running.append(ServedEnvironment(env, ServeOptions(port=0)))
         return running[-1].__enter__().bus.url
 
@@ -54,6 +55,54 @@ def test_the_graph_of_a_served_arm_gives_its_shipped_profile(run, served, tmp_pa
     assert read.commands == expected.commands
     assert read.state == expected.state
     assert replace(read, name=expected.name) == expected
+
+
+@pytest.mark.parametrize("name", ["mir100", "husky", "turtlebot4"])
+def test_the_graph_of_a_served_base_gives_its_profile(run, served, tmp_path, name):
+    expected = load_profile(name)
+    status, out, err = run(main, "profile", name, "--from", served(name, "bam/avoidance-v0"))
+    assert (status, err) == (0, "")
+    assert replace(load_profile(tmp_path / "robots" / "profiles" / f"{name}.toml"), robot=expected.robot) == expected
+    assumed = ["  its drive is taken to stop 0.5 s after the last command (watchdog)"] * (name == "turtlebot4")
+    assert [line for line in out.splitlines() if "watchdog" in line] == assumed
+
+
+def lab(name, of, *replaced):
+    """Describe `of` with other numbers as `name`."""
+    text = (SHIPPED / f"{of}.toml").read_text(encoding="utf-8").replace(f'name = "{of}"', f'name = "{name}"', 1)
+    for old, new in replaced:
+        assert old in text
+        text = text.replace(old, new)
+    Path("robots").mkdir(exist_ok=True)
+    Path("robots", f"{name}.toml").write_text(text, encoding="utf-8")
+
+
+def test_a_robot_of_another_name_is_refused(run, served, tmp_path):
+    url = served("gen3")
+    lab("lab", "gen3")
+    refused = run(main, "profile", "lab", "--from", url)
+    assert refused == (
+        1,
+        "",
+        f"bam-robots profile: {url}: the robot there calls itself gen3, and lab was named. Give bam-robots profile "
+        f"gen3 --from {url}, or --force if it is lab.\n",
+    )
+    assert not (tmp_path / "robots" / "profiles").exists()
+    assert run(main, "profile", "lab", "--from", url, "--force")[0] == 0
+
+
+def test_an_arm_of_another_urdf_is_refused(run, served, tmp_path):
+    usual = (KNUCKLE, "gripper_width")
+    lab("lab", "gen3", ("-0.21038", "-0.24038"), usual)
+    url = served("lab")
+    lab("lab", "gen3", usual)
+    status, out, err = run(main, "profile", "lab", "--from", url)
+    assert (status, out) == (1, "")
+    assert err == (
+        f"bam-robots profile: {url}: kinematics in /robot_description: another arm or calibration: joint_1 and "
+        "joint_4, joint_1 and joint_5, joint_1 and joint_6 are not as in its description, lab. Name the arm that is "
+        "there, or give --force.\n"
+    )
 
 
 JTC, FORWARD = (

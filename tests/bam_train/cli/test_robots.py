@@ -84,7 +84,8 @@ def test_an_outline_that_misses_collisions_fails_its_check(run, tmp_path):
     [
         (
             ("check", "fr4"),
-            "Unknown robot model 'fr4'. Did you mean 'fr3'? Another arm is described first: bam-robots add fr4 ...",
+            "Unknown robot model 'fr4'. Did you mean 'fr3'? "
+            "Another arm is described first: bam-robots add NAME --urdf FILE",
         ),
         (("add", "lab"), "Give one model of the arm: --mjcf FILE or --urdf FILE."),
         (("add", "lab", "--mjcf", "a.xml", "--urdf", "b.urdf"), "--mjcf FILE or --urdf FILE."),
@@ -94,6 +95,14 @@ def test_an_outline_that_misses_collisions_fails_its_check(run, tmp_path):
             "There is no model file a.urdf. Give an MJCF or URDF file, or menagerie:NAME.",
         ),
         (("add", "so101", "--urdf", "a.urdf"), "exists; give another name, or --force to replace it."),
+        (
+            ("add", "lab", "--urdf", "a.urdf", "--gripper", "paralel:0.08"),
+            "paralel:0.08: there is no paralel:, only menagerie:NAME and parallel:WIDTH. Did you mean parallel:0.08?",
+        ),
+        (
+            ("add", "lab", "--mjcf", "menagrie:x"),
+            "there is no menagrie:, only menagerie:NAME. Did you mean menagerie:x?",
+        ),
         (("add", "../lab", "--urdf", "a.urdf"), "NAME: expected at most 64 letters, digits and . _ -, found '../lab'"),
         (("add", "fr3", "--urdf", "a.urdf"), "which this one would hide; give another name, or --force."),
         (("check", "so101", "--picture", "arm.pdf"), "arm.pdf: expected a name that ends in .png or .jpg."),

@@ -201,7 +201,7 @@ def _only(values: Mapping[str, Any], kind: str) -> dict[str, Any]:
 
 
 def urdf_of(arm: ArmDescription) -> str:
-    """The URDF of a described arm: its joints with limits, from ``base_link`` on, and the frame ``tool``."""
+    """The URDF of a described arm: its joints with limits, from ``base_link`` on, the frame ``tool``, and a finger."""
     robot, parent = ElementTree.Element("robot", name=arm.name), "base_link"
     ElementTree.SubElement(robot, "link", name=parent)
     placements = [*arm.chain.placements, arm.chain.tool_placement]
@@ -219,6 +219,12 @@ def urdf_of(arm: ArmDescription) -> str:
             limits = {"lower": row.low, "upper": row.high, "velocity": row.velocity, "effort": row.effort}
             ElementTree.SubElement(joint, "limit", {key: repr(value) for key, value in limits.items()})
         parent = child
+    ElementTree.SubElement(robot, "link", name="finger")
+    finger = ElementTree.SubElement(robot, "joint", name="finger_joint", type="prismatic")
+    ElementTree.SubElement(finger, "parent", link=parent)
+    ElementTree.SubElement(finger, "child", link="finger")
+    ElementTree.SubElement(finger, "axis", xyz="1 0 0")  # along which the pads close
+    ElementTree.SubElement(finger, "limit", lower="0", upper=repr(arm.gripper.open / 2), velocity="1", effort="1")
     return ElementTree.tostring(robot, encoding="unicode")
 
 

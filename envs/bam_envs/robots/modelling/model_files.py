@@ -12,6 +12,7 @@ import tempfile
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
+from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bam_envs.core.errors import InvalidValue, MissingExtra, UnknownName
+from bam_envs.core.wording import closest
 from bam_envs.robots.physics.mujoco_batch import mujoco
 
 Array = NDArray[np.float64]
@@ -99,6 +101,7 @@ def _length(width: float) -> float:
 def _parallel(gripper: str | None) -> float | None:
     """The width [m] of ``parallel:0.08``."""
     if gripper is None or not gripper.startswith("parallel:"):
+        _require_scheme(gripper or "", "parallel:WIDTH")
         return None
     with contextlib.suppress(ValueError):
         if 0.005 <= (width := float(gripper.partition(":")[2])) <= 0.3:
@@ -106,16 +109,27 @@ def _parallel(gripper: str | None) -> float | None:
     raise InvalidValue(f"--gripper {gripper}: give the width of the open gripper in metres, from 0.005 to 0.3.")
 
 
+def _require_scheme(name: str, *more: str) -> None:
+    """Refuse a name with a misspelt word before its colon; `more` are forms that it may have beside menagerie:NAME."""
+    word, colon, rest = name.partition(":")
+    known = {form.partition(":")[0]: form for form in ("menagerie:NAME", *more)}
+    if colon and word not in known and not Path(name).exists() and (meant := closest(word, known)):
+        raise InvalidValue(
+            f"{name}: there is no {word}:, only {' and '.join(known.values())}. Did you mean {meant}:{rest}?"
+        )
+
+
 def _spec(name: str, folder: str) -> tuple[Any, dict[str, tuple[float | None, float | None]]]:
     """The model in a file as MuJoCo reads it, and the velocities and efforts in an URDF, by joint."""
     if name.startswith("menagerie:"):
         return _menagerie(name.partition(":")[2]), {}
+    _require_scheme(name)
     path = Path(name)
     if not path.is_file():
         raise InvalidValue(f"There is no model file {name}. Give an MJCF or URDF file, or menagerie:NAME.")
     limits: dict[str, tuple[float | None, float | None]] = {}
     try:
-        if _is_urdf(path):
+        if is_urdf(path):
             text, limits = _urdf(path, folder)
             spec = mujoco.MjSpec.from_string(text)
         else:
@@ -129,8 +143,10 @@ def _spec(name: str, folder: str) -> tuple[Any, dict[str, tuple[float | None, fl
     return spec, limits
 
 
-def _is_urdf(path: Path) -> bool:
-    return path.suffix in (".urdf", ".xacro") or (path.is_file() and b"<robot" in path.read_bytes()[:4000])
+def is_urdf(path: Path) -> bool:
+    """Whether a model file is a URDF or xacro file, by its first element, or by its name if it has none."""
+    root = re.search(rb"<(robot|mujoco)\b", path.read_bytes()[:4000]) if path.is_file() else None
+    return path.suffix == ".xacro" or (path.suffix == ".urdf" if root is None else root[1] == b"robot")
 
 
 def _menagerie(name: str) -> Any:
@@ -142,7 +158,11 @@ def _menagerie(name: str) -> Any:
         return menagerie.get(name).spec()
     except Exception as error:  # its errors, and those of the network, are many
         if "Unknown robot" in str(error):
-            raise InvalidValue(f"menagerie:{name}: {_line(error)}") from error
+            known = menagerie.names()
+            meant = min([one for one in known if name in one], key=len, default=name)
+            listing = f"mujoco-menagerie names lists all {len(known)}."
+            examples = get_close_matches(name, known, cutoff=0.0)
+            raise UnknownName("robot of menagerie", name, known, examples, meant=meant, remedy=listing) from error
         raise InvalidValue(
             f"menagerie:{name} cannot be fetched: {_line(error)}. Set the variable MENAGERIE_ROOT to a folder with the "
             "models, or try again with a network."
@@ -250,7 +270,7 @@ def _named_body(spec: Any, site: str | None, model: str, gripper: str | None) ->
     sites = {one.name: one for one in spec.sites if one.name}
     names = [site] if site else [name for name in SITES if name in sites or name in bodies]
     named = [one for one in (*sites, *bodies) if one != "world"]
-    flag, kind = ("--tip", "link") if _is_urdf(Path(model)) else ("--site", "site or body")
+    flag, kind = ("--tip", "link") if is_urdf(Path(model)) else ("--site", "site or body")
     if not names and (end := _last_body(spec, gripper)) is not None:
         return end, [f"the end of the arm is {end.name}, as {flag} was not given and none of the usual names is there"]
     if not names:
@@ -468,7 +488,7 @@ class _Reader:
             joints += [int(first)] if count else []
             body = int(model.body_parentid[body])
         if not _FEWEST_JOINTS <= len(joints) <= _MOST_JOINTS:
-            name, flag = model.body(self._end).name, "--tip" if _is_urdf(Path(self._where)) else "--site"
+            name, flag = model.body(self._end).name, "--tip" if is_urdf(Path(self._where)) else "--site"
             raise InvalidValue(
                 f"{self._where}: {len(joints)} joints lead to {name.removesuffix(_END)!r}; an arm has 4 to 8. If "
                 f"that is not its end, give {flag}."

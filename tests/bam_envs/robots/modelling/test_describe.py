@@ -270,6 +270,7 @@ REFUSED = (
     "MuJoCo cannot read {}: Schema violation: unrecognized attribute: 'foo' Element 'option', line 1. Remedy: the "
     "file is for another version of MuJoCo: take it out."
 )
+NEAR = "Choose from: unitree_z1, unitree_h1, unitree_g1."
 MODEL = "Give an MJCF or URDF file, or menagerie:NAME."
 NEEDS_LIMITS = "{}: its joints have no position limits: add them to the file."
 
@@ -530,8 +531,12 @@ def test_a_speed_of_nothing_is_not_taken(tmp_path, speed, effort):
     assert read.effort == [effort, 80, 80, 20, 20, 20]
 
 
-def test_a_name_that_the_menagerie_does_not_have():
-    pytest.importorskip("mujoco_menagerie")
-    with pytest.raises(InvalidValue) as caught:
-        describe("lab", "menagerie:frnka_fr3", GRIPPER, None)
-    assert str(caught.value) == "menagerie:frnka_fr3: Unknown robot 'frnka_fr3'. Did you mean 'franka_fr3'?"
+@pytest.mark.parametrize(
+    ("name", "meant"), [(one, "Did you mean 'franka_fr3'?") for one in ("fr3", "frnka_fr3")] + [("nothere", NEAR)]
+)
+def test_a_name_that_the_menagerie_does_not_have(name, meant):
+    menagerie = pytest.importorskip("mujoco_menagerie")
+    with pytest.raises(UnknownName) as caught:
+        describe("lab", f"menagerie:{name}", GRIPPER, None)
+    listing = f"mujoco-menagerie names lists all {len(menagerie.names())}."
+    assert str(caught.value) == f"Unknown robot of menagerie {name!r}. {meant} {listing}"
