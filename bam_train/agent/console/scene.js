@@ -137,12 +137,14 @@ export class Scene {
     for (const [part, side, x] of this.fingers) part.position.x = side * (x + width / 2);
   }
 
-  base({ base: [x, y, yaw], outline: [front, back, side], scan }) {
+  base({ base: [x, y, yaw], outline, scan }) {
     if (!this.body) {
       this.body = new three.Group();
       this.body.name = "base";
-      this.box(this.body, [(front + back) / 2, side, 0.16], LINKS[0], [(front - back) / 2, 0, 0.19]);
-      this.box(this.body, [0.06, 0.7 * side, 0.01], LINKS[1], [front - 0.1, 0, 0.35]); // where its front is
+      const front = Math.max(...outline.map(([u]) => u)), shape = new three.Shape(outline.map(([u, v]) => new three.Vector2(u, v)));
+      const side = Math.max(0.02, ...outline.map(([u, v]) => (u > 0.6 * front ? Math.abs(v) : 0)));
+      this.solid(this.body, new three.ExtrudeGeometry(shape, { depth: 0.32, bevelEnabled: false }), LINKS[0], [0, 0, 0.03]);
+      this.box(this.body, [0.12 * front, 0.5 * side, 0.01], LINKS[1], [0.7 * front, 0, 0.35]); // where its front is
       this.scan = this.line("act", three.Points);
       this.scene.add(this.body);
       this.ground([Math.round(x), Math.round(y), 0], 5, 1);

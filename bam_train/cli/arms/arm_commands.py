@@ -256,11 +256,12 @@ def write_profile(config: ProfileConfig) -> int | None:
 
 def _require_named(robot: Description, graph: LiveGraph) -> None:
     """`InvalidValue` if the robot of `graph` calls itself by the name of another one than `robot`."""
+    from bam_envs.arms.description import ArmDescription
     from bam_envs.core.robot_models import DEFAULT_ARM
     from bam_envs.robots.profile import load_profile, shipped_profiles
 
     told = load_profile(graph.name).robot if graph.name in shipped_profiles() else graph.name
-    same = told == DEFAULT_ARM and getattr(robot, "geometry", "")  # all Universal Robots arms have one profile
+    same = told == DEFAULT_ARM and isinstance(robot, ArmDescription) and robot.geometry  # UR arms share a profile
     if told and told != robot.name and not same:
         raise InvalidValue(
             f"{graph.url}: the robot there calls itself {told}, and {robot.name} was named. Give bam-robots profile "

@@ -26,7 +26,11 @@ _STATES, _TRAJECTORY, _ARRAY = "sensor_msgs/JointState", "trajectory_msgs/JointT
 _LISTEN = 1.0
 """Time for which joint states are collected after the first [s]: several publishers may share a topic."""
 _WIDTH = "gripper_width"
-_GOALS = {"control_msgs/GripperCommand": "command.position", "franka_msgs/Move": "width"}
+_GOALS = {
+    "control_msgs/GripperCommand": "command.position",
+    "control_msgs/ParallelGripperCommand": "command.position[0]",  # since ROS 2 Jazzy
+    "franka_msgs/Move": "width",
+}
 """Actions that move a gripper, and where the number is in their goals; the first that is offered is used."""
 _TOPICS = {_TRAJECTORY: ("{}/joint_trajectory", "trajectory"), _ARRAY: ("{}/commands", "position")}
 """Types of the commands of controllers: the topic of a controller, and the name of the command mode."""
@@ -328,6 +332,8 @@ class GraphProfile:
             actions = sorted(name for name, one in self.graph.actions.items() if one == kind)
             if actions:
                 row = {"action": actions[0], "type": kind, "labels": [_WIDTH], "fields": [field]}
+                if kind == "control_msgs/ParallelGripperCommand":
+                    row["constants"] = {"command.name[0]": self._gripper["names"][0]}
                 row |= self._joint_unit(kind)
                 self.notes += [f"{other} is offered too, and not used" for other in actions[1:]]
                 return row
@@ -336,13 +342,13 @@ class GraphProfile:
             offered = ", ".join([*self.graph.actions]) or "no action at all"
             raise InvalidValue(
                 f"{self.graph.url}: nobody offers the gripper of {self.arm.name}: no action of "
-                f"{' or '.join(_GOALS)}, and no topic of a gripper; there is {offered}. Start the gripper's driver."
+                f"{', '.join(_GOALS)}, and no topic of a gripper; there is {offered}. Start the gripper's driver."
             )
         return {"topic": topics[0], "type": _ARRAY, "labels": [_WIDTH], "hold": "last"}
 
     def _joint_unit(self, kind: str) -> Row:
         """Scale and offset of a goal of type `kind`, if its number is the position of the gripper's joint."""
-        keys = ("scale", "offset") if kind == "control_msgs/GripperCommand" else ()
+        keys = ("scale", "offset") if kind.startswith("control_msgs/") else ()
         return {key: self._gripper[key] for key in keys if key in self._gripper}
 
     def _offers(self, sink: Sink) -> bool:

@@ -203,6 +203,14 @@ def test_what_nothing_tells_is_a_comment_with_a_default(run, graph, tmp_path):
     ]
 
 
+def test_a_gripper_whose_action_has_the_message_of_a_joint(run, graph):
+    parallel = "control_msgs/ParallelGripperCommand"
+    url = graph([controller("left_controller")], actions=[("/gripper/gripper_cmd", parallel)])
+    gripper, _ = read(run, url)[0].sinks()
+    assert (gripper.type, gripper.fields) == (parallel, ("command.position[0]",))
+    assert (gripper.constants, gripper.scale) == ({"command.name[0]": KNUCKLE}, (-0.10625,))
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [
@@ -222,8 +230,9 @@ def test_what_nothing_tells_is_a_comment_with_a_default(run, graph, tmp_path):
         ),
         (
             {"controllers": [controller("a")], "actions": [("/x", "a/B")]},
-            "nobody offers the gripper of gen3: no action of control_msgs/GripperCommand or franka_msgs/Move, and no "
-            "topic of a gripper; there is /x. Start the gripper's driver.",
+            "nobody offers the gripper of gen3: no action of control_msgs/GripperCommand, "
+            "control_msgs/ParallelGripperCommand, franka_msgs/Move, and no topic of a gripper; there is /x. Start the "
+            "gripper's driver.",
         ),
         (
             {"controllers": [controller("a")], "joints": (*JOINTS[:6], KNUCKLE)},

@@ -37,8 +37,11 @@ _CONTROLLERS = {
     "std_msgs/Float64MultiArray": "position_controllers/JointGroupPositionController",
     "sensor_msgs/JointState": "crisp_controllers/JointImpedanceController",
     "control_msgs/GripperCommand": "position_controllers/GripperActionController",
+    "control_msgs/ParallelGripperCommand": "parallel_gripper_action_controller/GripperActionController",
 }
 """The controller of ros2_control that takes commands of a type."""
+_HOLDING = ("control_msgs/GripperCommand", "control_msgs/ParallelGripperCommand")
+"""Actions that succeed where the gripper holds something."""
 
 
 class _Grip:
@@ -54,7 +57,7 @@ class _Grip:
         if not abs(at - self._at) <= _STILL or now < self._since:
             self._since, self._at = now, at
         reached, stalled = abs(at - self.width) <= _REACHED, now - self._since >= _STALLED
-        values, holds = self._values(at, reached, stalled), stalled and self.sink.type == "control_msgs/GripperCommand"
+        values, holds = self._values(at, reached, stalled), stalled and self.sink.type in _HOLDING
         if "epsilon" in self.goal.values:  # of franka_msgs/Grasp
             low, high = (number_at(self.goal.values, f"epsilon.{end}", "") for end in ("inner", "outer"))
             holds = stalled and self.width - low <= at <= self.width + high
@@ -72,7 +75,9 @@ class _Grip:
 
     def _values(self, width: float, reached: bool = False, stalled: bool = False) -> dict[str, Any]:
         (position,) = from_si(self.sink, np.array([width]))
-        return {"position": position, "current_width": width, "stalled": stalled, "reached_goal": reached}
+        state = {"position": [position]}  # of ParallelGripperCommand
+        found = {"position": position, "state": state, "current_width": width}
+        return {**found, "stalled": stalled, "reached_goal": reached}
 
 
 class ServedDriver:
