@@ -49,7 +49,7 @@ def add(config: AddArmConfig) -> int | None:
         )
     model = config.mjcf or config.urdf or ""
     if is_urdf(Path(model)) != (config.mjcf is None) and Path(model).is_file():
-        tell("{0} is {1}, and is read as {1}".format(model, "MJCF" if config.mjcf is None else "a URDF"))
+        tell(f"{model} is {'MJCF' if config.mjcf is None else 'a URDF'}, and is read as such")
     arm, notes = describe(config.name, model, config.gripper, config.site or config.tip, tell=tell)
     write_description(arm, notes, path)
     tell(f"wrote {path}: {arm.num_joints} joints, gripper {1000 * arm.gripper.open:.0f} mm, {_area(arm)}")

@@ -70,6 +70,24 @@ def test_an_arm_that_does_not_reach_its_work_area_fails_its_check(run, tmp_path)
     assert "z 0.016 to 0.06 m: not all of it is reached" in out
 
 
+NOTHING = "there is no body in it. Is it a part of another file? Then give that one."
+
+
+@pytest.mark.parametrize(
+    ("flag", "text", "said"),
+    [
+        ("--mjcf", "<robot/>", "arm.urdf is a URDF, and is read as such"),
+        ("--urdf", "<mujoco><worldbody/></mujoco>", "arm.urdf is MJCF, and is read as such"),
+    ],
+)
+def test_a_model_under_the_flag_of_the_other_kind_is_read_as_what_it_is(run, tmp_path, monkeypatch, flag, text, said):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "arm.urdf").write_text(text)
+    status, out, err = run(main, "add", "lab", flag, "arm.urdf", "--gripper", "parallel:0.08")
+    assert (status, out.splitlines()[0]) == (1, said)
+    assert err == f"bam-robots add: arm.urdf: {NOTHING}\n"
+
+
 def test_an_outline_that_misses_collisions_fails_its_check(run, tmp_path):
     path, text = tmp_path / "lab.toml", (SHIPPED / "so101.toml").read_text(encoding="utf-8")
     for seen, status in ((89, 1), (90, 0)):

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bam_envs.core.errors import InvalidValue, MissingExtra, UnknownName
-from bam_envs.core.wording import closest
+from bam_envs.core.wording import closest, did_you_mean
 from bam_envs.robots.physics.mujoco_batch import mujoco
 
 Array = NDArray[np.float64]
@@ -36,12 +36,15 @@ CONTINUOUS = 2 * np.pi
 """Limit of a joint that turns without end [rad]."""
 WIDEST = 0.10
 """Widest gripper that is simulated [m]."""
+_FETCH = "fetch the mesh again; a repository with Git LFS holds a pointer in its place"
 _REMEDIES = {
     "repeated name": "give each of them a name of its own",
     "unrecognized": "the file is for another version of MuJoCo: take it out",
     "no decoder": "MuJoCo reads STL, OBJ and MSH: convert the mesh, or give the link a shape",
     "bad format": "write a number there",
-    "is empty": "fetch the mesh again; a repository with Git LFS holds a pointer in its place",
+    "is empty": _FETCH,
+    "invalid header": _FETCH,
+    "Error opening": "put that file where it is looked for, beside this one",
 }
 """What to do about a file that MuJoCo refuses, by words in its text."""
 _SETTLING = 2.0  # time for a linkage to come to rest [s]
@@ -183,7 +186,10 @@ def _line(error: BaseException) -> str:
 
 def _urdf(path: Path, folder: str) -> tuple[str, dict[str, tuple[float | None, float | None]]]:
     """The text of an URDF with the files of its meshes found, and velocity and effort of its joints."""
-    root = ElementTree.fromstring(_expanded(path) if path.suffix == ".xacro" else path.read_text(encoding="utf-8"))
+    root = _parsed(_expanded(path) if path.suffix == ".xacro" else path.read_text(encoding="utf-8"))
+    if path.suffix != ".xacro" and any("xacro}" in one.tag for one in root.iter()):
+        root = _parsed(_expanded(path))
+    _check_names(path, root)
     for link in root.iter("link"):
         drawn = link.findall("visual")
         for visual in drawn:
@@ -208,6 +214,33 @@ def _urdf(path: Path, folder: str) -> tuple[str, dict[str, tuple[float | None, f
             speed, effort = (value if 0.0 < value < np.inf else None for value in given)
             limits[name] = speed, effort
     return ElementTree.tostring(root, encoding="unicode"), limits
+
+
+def _parsed(text: str) -> ElementTree.Element:
+    """The XML in `text`; prefixes that are not declared, such as ``drake:``, are part of a name, as in ROS."""
+    try:
+        return ElementTree.fromstring(text)
+    except ElementTree.ParseError as error:
+        if "unbound prefix" not in str(error):
+            raise
+    known = {"xmlns", *re.findall(r"xmlns:(\w+)", text)}
+    return ElementTree.fromstring(
+        re.sub(r"(?<=[\s</])(\w+):(?=\w)", lambda found: found[0] if found[1] in known else f"{found[1]}_", text)
+    )
+
+
+def _check_names(path: Path, root: ElementTree.Element) -> None:
+    """Refuse names that come twice, and those of links and joints that are not there, which MuJoCo does not tell."""
+    names = {kind: [one.get("name", "") for one in root.findall(kind)] for kind in ("link", "joint")}
+    for kind, found in names.items():
+        if twice := [name for name in found if found.count(name) > 1 or not name]:
+            raise InvalidValue(f"{path}: two {kind}s are called {twice[0]!r}: give each of them a name of its own.")
+    for joint in root.findall("joint"):
+        for part, key, kind in (("parent", "link", "link"), ("child", "link", "link"), ("mimic", "joint", "joint")):
+            name = joint.find(part).get(key, "") if joint.find(part) is not None else None  # type: ignore[union-attr]
+            if name is not None and name not in names[kind]:
+                hint = did_you_mean(name, names[kind])
+                raise InvalidValue(f"{path}: {joint.get('name')}: its {part} {name!r} is no {kind} of the file. {hint}")
 
 
 def _number(path: Path, joint: str, limit: ElementTree.Element, key: str) -> float:
@@ -273,6 +306,8 @@ def _named_body(spec: Any, site: str | None, model: str, gripper: str | None) ->
     flag, kind = ("--tip", "link") if is_urdf(Path(model)) else ("--site", "site or body")
     if not names and (end := _last_body(spec, gripper)) is not None:
         return end, [f"the end of the arm is {end.name}, as {flag} was not given and none of the usual names is there"]
+    if not named:
+        raise InvalidValue(f"{model}: there is no body in it. Is it a part of another file? Then give that one.")
     if not names:
         raise InvalidValue(f"{model}: give the end of the arm with {flag}, a {kind}: {_few(named)}.")
     name = names[0]
@@ -484,6 +519,11 @@ class _Reader:
                 name = model.body(body).name
                 raise InvalidValue(
                     f"{self._where}: {name!r} has another joint than one revolute joint; only such arms are served."
+                )
+            if count and not model.joint(first).name:
+                raise InvalidValue(
+                    f"{self._where}: the joint of {model.body(body).name!r} has no name; give it that of the robot's "
+                    "messages."
                 )
             joints += [int(first)] if count else []
             body = int(model.body_parentid[body])

@@ -402,6 +402,43 @@ def scaled(text, factor):
             "{}: the joint 'w1' follows another; each joint needs a drive.",
         ),
         (
+            six_joints().replace('effort="20"/>', 'effort="20"/><mimic joint="pam"/>', 1),
+            GRIPPER,
+            None,
+            "{}: w1: its mimic 'pam' is no joint of the file. Did you mean 'pan'?",
+        ),
+        (
+            six_joints().replace('name="elbow"', 'name="pan"', 1),
+            GRIPPER,
+            None,
+            "{}: two joints are called 'pan': give each of them a name of its own.",
+        ),
+        (
+            six_joints().replace('<parent link="upper"', '<parent link="uper"', 1),
+            GRIPPER,
+            None,
+            "{}: elbow: its parent 'uper' is no link of the file. Did you mean 'upper'?",
+        ),
+        (
+            re.sub(r'<joint name="j1"', "<joint", seven_joints(), count=1),
+            GRIPPER,
+            None,
+            "{}: the joint of 'link1' has no name; give it that of the robot's messages.",
+        ),
+        (
+            "<mujoco><worldbody/></mujoco>",
+            GRIPPER,
+            None,
+            "{}: there is no body in it. Is it a part of another file? Then give that one.",
+        ),
+        (
+            seven_joints().replace("<worldbody>", '<include file="no.xml"/><worldbody>'),
+            GRIPPER,
+            None,
+            "MuJoCo cannot read {}: Error opening file 'no.xml' Element 'include', line 1. Remedy: put that file where "
+            "it is looked for, beside this one.",
+        ),
+        (
             seven_joints().replace(
                 "</worldbody>", '<body name="other"><joint name="o"/><geom size="0.1"/></body></worldbody>'
             ),
@@ -529,6 +566,20 @@ def test_a_speed_of_nothing_is_not_taken(tmp_path, speed, effort):
     read = read_arm(str(path), GRIPPER, None)
     assert read.velocity == [None, *[2.5] * 5]
     assert read.effort == [effort, 80, 80, 20, 20, 20]
+
+
+def test_a_urdf_with_prefixes_that_are_not_declared_and_with_xacro(tmp_path):
+    """As ROS reads them; a file with elements of xacro is expanded, whatever it is called."""
+    path, text = tmp_path / "lab.urdf", six_joints()
+    path.write_text(text, encoding="utf-8")
+    plain = read_arm(str(path), GRIPPER, None)
+    path.write_text(text.replace("<limit ", '<limit drake:acceleration="2.5" '), encoding="utf-8")
+    assert read_arm(str(path), GRIPPER, None).velocity == plain.velocity == [2.5] * 6
+    pytest.importorskip("xacrodoc")
+    space = '<robot xmlns:xacro="http://www.ros.org/wiki/xacro"'
+    text = text.replace("<robot", f"{space}", 1).replace('velocity="2.5"', 'velocity="${speed}"')
+    path.write_text(text.replace("<link", '<xacro:property name="speed" value="2.0"/><link', 1), encoding="utf-8")
+    assert read_arm(str(path), GRIPPER, None).velocity == [2.0] * 6
 
 
 @pytest.mark.parametrize(
