@@ -331,7 +331,7 @@ class GraphProfile:
         for kind, field in _GOALS.items():
             actions = sorted(name for name, one in self.graph.actions.items() if one == kind)
             if actions:
-                row = {"action": actions[0], "type": kind, "labels": [_WIDTH], "fields": [field]}
+                row: Row = {"action": actions[0], "type": kind, "labels": [_WIDTH], "fields": [field]}
                 if kind == "control_msgs/ParallelGripperCommand":
                     row["constants"] = {"command.name[0]": self._gripper["names"][0]}
                 row |= self._joint_unit(kind)
