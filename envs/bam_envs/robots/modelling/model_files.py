@@ -678,9 +678,15 @@ class _Reader:
                 data.qpos[held] = 0.0
                 yield data.qpos.copy()
             return
-        for ends in _combinations(model.jnt_range[joints]):
+        kind = int(mujoco.mjtEq.mjEQ_JOINT)
+        followers = {int(model.eq_obj1id[row]): row for row in range(model.neq) if int(model.eq_type[row]) == kind}
+        leaders = [joint for joint in joints if joint not in followers]
+        for ends in _combinations(model.jnt_range[leaders]):
             state = np.zeros(model.nq)
-            state[model.jnt_qposadr[joints]] = ends
+            state[model.jnt_qposadr[leaders]] = ends
+            for joint, row in followers.items():
+                lead = state[model.jnt_qposadr[model.eq_obj2id[row]]]
+                state[model.jnt_qposadr[joint]] = np.polyval(model.eq_data[row, 4::-1], lead)
             yield state
 
     def _tips(self, moved: Any, bodies: Any, flange: Array, state: Array) -> "_Tips":

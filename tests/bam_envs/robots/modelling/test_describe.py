@@ -568,6 +568,23 @@ def test_a_speed_of_nothing_is_not_taken(tmp_path, speed, effort):
     assert read.effort == [effort, 80, 80, 20, 20, 20]
 
 
+def test_a_finger_that_follows_another_in_a_urdf(tmp_path):
+    """Half as far: the gripper opens to 4 + 2 cm, between pads that touch when it is closed."""
+    pad = '<geometry><box size="0.02 0.01 0.1"/></geometry>'
+    link = f'<link name="{{}}"><collision><origin xyz="0 {{}} 0.05"/>{pad}</collision></link>'
+    joint = (
+        '<joint name="{0}_slide" type="prismatic"><parent link="palm"/><child link="{0}"/><axis xyz="0 {1} 0"/>'
+        '<limit lower="0" upper="0.04" velocity="1" effort="1"/>{2}</joint>'
+    )
+    fingers = link.format("left", 0.005) + link.format("right", -0.005) + joint.format("left", 1, "")
+    follows = '<mimic joint="left_slide" multiplier="0.5"/>'
+    (tmp_path / "lab.urdf").write_text(six_joints(), encoding="utf-8")
+    text = f'<robot name="hand"><link name="palm"/>{fingers}{joint.format("right", -1, follows)}</robot>'
+    (tmp_path / "hand.urdf").write_text(text, encoding="utf-8")
+    read = read_arm(str(tmp_path / "lab.urdf"), str(tmp_path / "hand.urdf"), None)
+    assert read.width == pytest.approx(0.06)
+
+
 def test_a_urdf_with_prefixes_that_are_not_declared_and_with_xacro(tmp_path):
     """As ROS reads them; a file with elements of xacro is expanded, whatever it is called."""
     path, text = tmp_path / "lab.urdf", six_joints()
