@@ -35,6 +35,7 @@ _GOALS = {
 _TOPICS = {_TRAJECTORY: ("{}/joint_trajectory", "trajectory"), _ARRAY: ("{}/commands", "position")}
 """Types of the commands of controllers: the topic of a controller, and the name of the command mode."""
 _ACTIVE = ("active", "running")
+_ROS1_GOAL = "ActionGoal"
 _FASTEST = 100
 """Greatest rate at which a controller that holds its set points gets some [Hz]: more is a burden for a bridge."""
 Row = dict[str, Any]
@@ -88,6 +89,8 @@ def read_graph(link: RosbridgeLink) -> LiveGraph:
         name: bare_type(str(_ask(link, "action_type", action=link.namespace + name).get("type") or ""))
         for name in ours(_ask(link, "action_servers").get("action_servers") or ())
     }
+    goals = {name: kind for name, kind in topics.items() if kind.endswith(_ROS1_GOAL)}  # of actionlib, in ROS 1
+    actions |= {name.removesuffix("/goal"): kind.removesuffix(_ROS1_GOAL) for name, kind in goals.items()}
     manager = next((name for name in sorted(services) if name.endswith("/list_controllers")), "")
     rows: Any = link.call(link.namespace + manager, "", {}, TIMEOUT).get("controller") if manager else ()
     controllers = tuple(row for row in rows or () if isinstance(row, Mapping))
