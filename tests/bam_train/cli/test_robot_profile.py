@@ -128,7 +128,7 @@ def graph(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     servers = []
 
-    def start(controllers, *, joints=(*JOINTS, KNUCKLE), actions=(("/gripper/gripper_cmd", GRIP),), trajectories=()):
+    def start(controllers, *, joints=(*JOINTS, KNUCKLE), actions=(("/gripper/gripper_cmd", GRIP),), topics=()):
         servers.append(server := BridgeServer(port=0).start())
         if joints:
             server.advertise("/joint_states", "sensor_msgs/JointState", latch=True)
@@ -141,8 +141,8 @@ def graph(tmp_path, monkeypatch):
         if controllers is not None:
             kind = "controller_manager_msgs/ListControllers"
             server.serve("/controller_manager/list_controllers", kind, lambda *_: {"controller": list(controllers)})
-        for name in trajectories:
-            server.subscribe(name, TRAJECTORY, lambda message, caller: None)
+        for name, kind in topics:
+            server.subscribe(name, kind, lambda message, caller: None)
         for name, kind in actions:
             server.act(Action(name, kind, lambda goal: None, lambda goal: None))
         return server.url
@@ -189,7 +189,7 @@ def test_what_nothing_tells_is_a_comment_with_a_default(run, graph, tmp_path):
     text = (SHIPPED / "gen3.toml").read_text(encoding="utf-8")
     (tmp_path / "robots").mkdir()
     (tmp_path / "robots" / "lab.toml").write_text(text.replace('"gen3"', '"lab"').replace(KNUCKLE, "jaw"))
-    url = graph(None, joints=(*JOINTS, "jaw"), trajectories=("/arm_controller/joint_trajectory",))
+    url = graph(None, joints=(*JOINTS, "jaw"), topics=[("/arm_controller/joint_trajectory", TRAJECTORY)])
     profile, out = read(run, url, "lab")
     assert [sink.address for sink in profile.sinks()] == ["/gripper/gripper_cmd", "/arm_controller/joint_trajectory"]
     assert (profile.robot, profile.controllers, profile.source("gripper_width").scale) == ("lab", "", (1.0,))
@@ -209,6 +209,12 @@ def test_a_gripper_whose_action_has_the_message_of_a_joint(run, graph):
     gripper, _ = read(run, url)[0].sinks()
     assert (gripper.type, gripper.fields) == (parallel, ("command.position[0]",))
     assert (gripper.constants, gripper.scale) == ({"command.name[0]": KNUCKLE}, (-0.10625,))
+
+
+def test_an_action_of_ros_1_is_found_by_the_topic_of_its_goals(run, graph):
+    goals = [("/gripper/gripper_cmd/goal", f"{GRIP}ActionGoal")]
+    gripper, _ = read(run, graph([controller("left_controller")], actions=(), topics=goals))[0].sinks()
+    assert (gripper.action, gripper.type, gripper.scale) == ("/gripper/gripper_cmd", GRIP, (-0.10625,))
 
 
 @pytest.mark.parametrize(
