@@ -124,7 +124,7 @@ function draw() {
   const now = performance.now();
   try {
     noPicture();
-    picture?.draw(telemetry);
+    picture?.draw({ ...telemetry, goals: status.goals ?? [] });
     if (now - written < WRITE) return;
     written = now;
     plots.draw();
