@@ -545,7 +545,4 @@ def test_a_pause_while_the_robot_is_away_holds_and_is_written_down(bench):
         running.ask("resume")
         running.state(State.RUNNING)
     noted = [(what, text) for what, text, who, _, _ in running.events if who == "anna"]
-    assert noted == [
-        ("pause", "paused by anna: hand in the cell"),
-        ("state", "paused -> running: resumed by anna"),
-    ]
+    assert noted == [("pause", "paused by anna: hand in the cell"), ("state", "paused -> running: resumed by anna")]

@@ -10,6 +10,7 @@ from bam_train.agent.transitions import MOST, TransitionCollector, TransitionLog
 from bam_train.deploy.deployment import Deployment
 from bam_train.deploy.journal import Journal
 from bam_train.errors import FormatError
+from tests.raising import raising
 
 
 def three():
@@ -58,10 +59,7 @@ def test_pictures_keep_their_shape():
         ({"policy": None}, "transitions: policy: expected 3 values of type str, found None"),
         ({"action": [1.0]}, "transitions: action: expected an array of 3 rows, found [1.0]"),
         ({"reward": {"shape": [3], "data": "?"}}, "transitions: reward: expected base64, found '?'"),
-        (
-            {"reward": {"shape": [3], "data": "AAAA"}},
-            "transitions: reward: expected 12 bytes for shape [3], found 3",
-        ),
+        ({"reward": {"shape": [3], "data": "AAAA"}}, "transitions: reward: expected 12 bytes for shape [3], found 3"),
         (
             {"reward": {"shape": [3, 1], "data": "AAAAAAAAAAAAAAAA"}},
             "transitions: reward: expected shape (3,), found (3, 1)",
@@ -74,9 +72,8 @@ def test_pictures_keep_their_shape():
     ],
 )
 def test_a_bad_message_is_refused(change, message):
-    with pytest.raises(FormatError) as error:
+    with raising(FormatError, message):
         decode(encode(three()) | change)
-    assert str(error.value) == message
 
 
 def test_a_full_log_keeps_the_newest_and_counts_the_others():

@@ -17,6 +17,7 @@ import pytest
 from bam_train.agent.versions import KEPT, Versions, load_policy
 from bam_train.checkpoint import Checkpoint
 from bam_train.errors import AlteredCheckpoint, CheckpointError, FolderInUse, OutputError, SettingsError, UnknownVersion
+from tests.raising import raising
 
 _PROGRAM = """
 import sys
@@ -91,18 +92,16 @@ def test_a_version_is_a_copy_that_is_found_by_name_and_digest(versions, some):
 
 
 def test_an_unknown_version_is_one_line_with_those_there_are(versions, some):
-    with pytest.raises(UnknownVersion) as caught:
+    with raising(UnknownVersion, "'champion': no such version. Push one first"):
         versions.find("champion")
-    assert str(caught.value) == "'champion': no such version. Push one first"
     one, other = some(2)
     for checkpoint in (one, other):
         versions.add(checkpoint)
     versions.point({"champion": one.digest})
     known = f"Choose from: {other.digest[:12]}, champion = {one.digest[:12]}"
     for text in ("previous", "", one.digest[:5], "f" * 64, f"{one.digest}0"):
-        with pytest.raises(UnknownVersion) as caught:
+        with raising(UnknownVersion, f"{text!r}: no such version. {known}"):
             versions.find(text)
-        assert str(caught.value) == f"{text!r}: no such version. {known}"
     with pytest.raises(UnknownVersion):
         versions.point({"previous": "ffffff"})
     assert versions.names == {"champion": one.digest}
@@ -113,9 +112,8 @@ def test_several_versions_with_one_beginning_are_not_guessed(versions, some):
     digest = versions.add(one).digest
     twin = digest[:20] + ("0" if digest[20] != "0" else "1") * 44
     (versions.folder / f"{twin}.zip").write_bytes(b"")
-    with pytest.raises(UnknownVersion) as caught:
+    with raising(UnknownVersion, f"{digest[:20]!r}: 2 versions begin with it. Choose from: ", begins=True):
         versions.find(digest[:20])
-    assert str(caught.value).startswith(f"{digest[:20]!r}: 2 versions begin with it. Choose from: ")
     assert versions.find(digest[:21]).digest == digest
 
 
@@ -158,9 +156,8 @@ def test_a_clock_that_was_set_back_does_not_make_a_new_version_the_oldest(versio
 def test_a_file_that_was_changed_after_it_was_verified_is_not_kept(versions, some, forge):
     (one,) = some(1)
     forge(one.path, seed=99)
-    with pytest.raises(AlteredCheckpoint) as caught:
+    with raising(AlteredCheckpoint, f"{one.path}: was changed while it was read. Push it again"):
         versions.add(one)
-    assert str(caught.value) == f"{one.path}: was changed while it was read. Push it again"
     assert files(versions) == []
 
 
@@ -176,9 +173,8 @@ def test_damaged_names_are_one_line(versions, text):
 
 def test_an_agent_that_is_started_again_goes_on_with_its_champion(versions, some):
     one, pushed, other = some(3)
-    with pytest.raises(SettingsError) as caught:
+    with raising(SettingsError, f"{versions.folder} has no version yet; give a checkpoint with --policy"):
         versions.first(None)
-    assert str(caught.value) == f"{versions.folder} has no version yet; give a checkpoint with --policy"
     assert versions.first(one.path).digest == one.digest
     assert versions.names == {"champion": one.digest, "given": one.digest}
     versions.add(pushed)
@@ -213,9 +209,8 @@ def test_a_full_disk_is_one_line_and_nothing_is_lost(versions, some):
     why = f"{versions.folder}: versions cannot be kept there: File too large. Make room, or give another --folder"
     with full_disk(40):
         for change in (lambda: versions.add(other), lambda: versions.point({"previous": one.digest})):
-            with pytest.raises(OutputError) as caught:
+            with raising(OutputError, why):
                 change()
-            assert str(caught.value) == why
     assert files(versions) == before
     assert versions.names == {"champion": one.digest}
     assert load_policy(versions.find("champion")).act(np.ones(1, np.float32)) == 1
@@ -311,9 +306,8 @@ def test_a_version_that_was_changed_is_not_loaded(versions, some, forge):
     one, other = some(2)
     version = versions.add(one)
     version.path.write_bytes(versions.add(other).path.read_bytes())
-    with pytest.raises(CheckpointError) as caught:
+    with raising(CheckpointError, f"{version.path}: is another checkpoint than its name says. Push it again"):
         load_policy(version)
-    assert str(caught.value) == f"{version.path}: is another checkpoint than its name says. Push it again"
     version.path.write_bytes(b"PK")
     with pytest.raises(CheckpointError, match="not a whole zip file"):
         load_policy(version)

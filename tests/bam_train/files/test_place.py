@@ -15,6 +15,7 @@ from bam_train.errors import NoSuchPlace, PlaceError
 from bam_train.files import place as module
 from bam_train.files.place import Place, local_path
 from tests.object_store import Proxy, answering, bucket_fixture, environment  # noqa: F401
+from tests.raising import raising
 
 
 @pytest.fixture(params=["path", "file", "s3", "memory"])
@@ -72,9 +73,8 @@ def test_what_is_missing(folder):
     ],
 )
 def test_addresses_that_are_none(text, message):
-    with pytest.raises(PlaceError) as caught:
+    with raising(PlaceError, message):
         Place(text)
-    assert str(caught.value) == message
 
 
 def test_addresses():

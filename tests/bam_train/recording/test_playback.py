@@ -306,10 +306,7 @@ def test_a_recording_is_drawn(small_chunks, tmp_path, capsys, monkeypatch):
     ticks = Recording.open(cut).ticks
     assert 3 < ticks < 15
     assert call(replay, cut, "--plot", plot, "--video", video) == 0
-    assert capsys.readouterr().err.splitlines() == [
-        f"bam-replay: {plot}: drawn",
-        f"bam-replay: {video}: {ticks} ticks",
-    ]
+    assert capsys.readouterr().err.splitlines() == [f"bam-replay: {plot}: drawn", f"bam-replay: {video}: {ticks} ticks"]
     quantities = ["joint_position [rad]", "joint_velocity [rad/s]", "gripper_width [m]", "object_position [m]"]
     others = ["object_quaternion", "command [rad, m]", "action", "status", "latency [ms]"]
     assert titles == quantities + others

@@ -25,6 +25,7 @@ from bam_train.recording.recorder_process import RecordingFile, drain
 from bam_train.recording.recording import Recording
 from bam_train.recording.ring import LAYOUT as LAYOUT_RECORD
 from bam_train.recording.ring import TICK, TIMES, Ring, make_shared_file
+from tests.raising import raising
 
 LAYOUT = {"/state": ["arm.pan", "arm.lift"], "/action": ["dx"], "/status": ["code", "guard"]}
 
@@ -261,9 +262,8 @@ def test_a_tick_that_was_not_declared_ends_the_recording(started):
 def test_a_file_that_is_there_is_kept(started, tmp_path):
     path = tmp_path / "a.mcap"
     path.write_text("mine")
-    with pytest.raises(OutputError) as caught:
+    with raising(OutputError, f"{path}: a recording is there already. Choose another file"):
         started()
-    assert str(caught.value) == f"{path}: a recording is there already. Choose another file"
     assert path.read_text() == "mine"
     with pytest.raises(OutputError, match=r": a folder is there already\. Choose another file$"):
         started(".")

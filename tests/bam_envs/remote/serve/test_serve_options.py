@@ -2,6 +2,7 @@ import pytest
 
 from bam_envs.core.errors import InvalidValue
 from bam_envs.remote.serve.serve_options import ServeOptions
+from tests.raising import raising
 
 
 def test_the_defaults_are_possible():
@@ -43,9 +44,8 @@ def test_a_token_of_the_tcp_port_beside_a_ros_2_node():
     ],
 )
 def test_what_cannot_be(options, text):
-    with pytest.raises(InvalidValue) as error:
+    with raising(InvalidValue, text):
         ServeOptions(**options).require_sane()
-    assert str(error.value) == text
 
 
 CLEAR = "The token is sent unencrypted to {}, and so is everything else: give --cert, or trust that network."
@@ -88,9 +88,8 @@ def test_what_stands_open_is_said(options, text):
     ],
 )
 def test_no_network_without_a_token_by_oversight(options, place):
-    with pytest.raises(InvalidValue) as error:
+    with raising(InvalidValue, REFUSED.format(place)):
         ServeOptions(**options).require_sane()
-    assert str(error.value) == REFUSED.format(place)
 
 
 @pytest.mark.parametrize(("name", "prefix"), [("", ""), ("/", ""), ("a", "/a"), ("/a/b_1/", "/a/b_1")])

@@ -18,6 +18,7 @@ from bam_envs.rosbridge.endpoint import Endpoint
 from bam_envs.rosbridge.server import BridgeServer
 from bam_envs.testing.transports import assert_same_value
 from tests.bam_envs.making import EACH, encode_command
+from tests.raising import raising
 
 UR5E = load_profile("ur5e")
 ARM = arm_spec("ur5e", with_object=True)
@@ -210,12 +211,12 @@ def test_a_robot_that_is_there_already_is_not_doubled(serve_env):
     with BridgeServer(port=0) as theirs:
         serve_env(fast=True, via=theirs.url)
         env = gym.make("bam/pick-v0", disable_env_checker=True)
-        with pytest.raises(InvalidValue) as caught:
-            serve_env(env=env, fast=True, via=theirs.url)
-        assert str(caught.value) == (
+        with raising(
+            InvalidValue,
             f"{theirs.url}: /bam/robot answers there already, so another robot has these names. "
-            "Give this one names of its own: --namespace NAME."
-        )
+            "Give this one names of its own: --namespace NAME.",
+        ):
+            serve_env(env=env, fast=True, via=theirs.url)
         serve_env(fast=True, via=theirs.url, namespace="cell_2")
         with pytest.raises(InvalidValue, match="/cell_2/bam/robot answers there already"):
             serve_env(fast=True, via=theirs.url, namespace="cell_2")
