@@ -117,10 +117,7 @@ def test_stamps_of_ros_1_and_unknown_fields_are_let_through():
         ({"seed": "1"}, "seed: expected an integer (int64), found '1'"),
         ({"header": {"force_priority": 1}}, "header.force_priority: expected true or false, found 1"),
         ({"action": {}}, "action: expected a list, found {"),
-        (
-            {"header": {"request_type": 9}},
-            "header.request_type must be one of 0 NONE, 1 STEP, 2 RESET, 3 CLOSE, not 9.",
-        ),
+        ({"header": {"request_type": 9}}, "request_type must be one of 0 NONE, 1 STEP, 2 RESET, 3 CLOSE, not 9."),
         (
             {"action": [{"continuous_action": [0.0, "x"]}]},
             "action[0].continuous_action[1]: expected a number, found 'x'",
@@ -212,15 +209,9 @@ def test_failures_of_other_racks(code, text, expected):
 @pytest.mark.parametrize(
     ("message", "text"),
     [
-        *(
-            (one, "bam_msgs/GymAPIResponse")
-            for one in (None, {"feedback": None}, {"feedback": [None]}, {"feedback": 3})
-        ),
+        *((one, "bam_msgs") for one in (None, {"feedback": None}, {"feedback": [None]}, {"feedback": 3})),
         (answer({"observation": [0.0, "a"]}), "feedback[0].observation[1]: expected a number, found 'a'."),
-        *(
-            (answer({one: None}), f"feedback[0].{one}: expected ")
-            for one in ("reward", "terminated", "info", "executed")
-        ),
+        *((answer({one: None}), f"feedback[0].{one}: ") for one in ("reward", "terminated", "info", "executed")),
     ],
 )
 def test_what_is_no_response_is_refused(message, text):

@@ -131,6 +131,8 @@ def rows(number):
 def test_some_rows_can_be_reset():
     transports = [FakeTransport(), FakeTransport(rows(2)), FakeTransport()]
     envs = RemoteVectorEnv(transports)
+    with raising(ResetNeeded, "No episode is running. Call reset() first, without a reset_mask."):
+        envs.reset(options={"reset_mask": [True, False, True, True]})
     first, _ = envs.reset(seed=1)
     mask = np.array([False, True, False, True])
     again, infos = envs.reset(options={"reset_mask": mask})
@@ -142,13 +144,6 @@ def test_some_rows_can_be_reset():
     for bad in ([True], [[True] * 4]):
         with raising(InvalidValue, f"reset_mask must have shape (4,), not {np.shape(bad)}."):
             envs.reset(options={"reset_mask": np.array(bad)})
-    envs.close()
-
-
-def test_a_mask_needs_episodes_of_the_other_rows():
-    envs = RemoteVectorEnv([FakeTransport(), FakeTransport()])
-    with raising(ResetNeeded, "No episode is running. Call reset() first, without a reset_mask."):
-        envs.reset(options={"reset_mask": [True, False]})
     envs.close()
 
 
@@ -187,14 +182,11 @@ def test_a_fault_of_one_rack_goes_through_when_all_have_answered():
     envs.close()
 
 
-def test_the_number_of_rows_must_be_right():
+def test_racks_must_be_alike_and_as_many_as_said():
     with raising(InvalidValue, "num_envs must be 3, as many as there are, not 4."):
         RemoteVectorEnv([FakeTransport(rows(2)), FakeTransport()], 4).reset()
     with raising(InvalidValue, "There must be at least one transport."):
         RemoteVectorEnv([])
-
-
-def test_racks_must_be_alike():
     other = FakeTransport(FakeEnv(action_space=spaces.Discrete(2)))
     envs = RemoteVectorEnv([FakeTransport(), other])
     with raising(
@@ -213,9 +205,6 @@ def test_actions_of_another_shape_are_refused(shape):
     with raising(InvalidValue, f"The actions must have shape (2, 2), not {shape}."):
         envs.step(np.zeros(shape))
     envs.close()
-
-
-def test_discrete_actions():
     transports = [FakeTransport(FakeEnv(action_space=spaces.Discrete(3))) for _ in range(2)]
     envs = RemoteVectorEnv(transports)
     envs.reset()
@@ -263,7 +252,7 @@ ROWS = [
 ]
 
 
-def test_joining_makes_columns_with_masks():
+def test_joining_makes_columns_with_masks_and_splitting_gives_the_rows_back():
     infos = join_infos(ROWS)
     assert infos["x"].tolist() == [0.5, 1.5, 2.5]
     assert infos["_x"].tolist() == [True, True, True]
@@ -275,26 +264,16 @@ def test_joining_makes_columns_with_masks():
     assert (infos["arr"].dtype, infos["arr"].tolist()) == (np.int8, [[1, 2], [0, 0], [3, 4]])
     assert (infos["text"].dtype, infos["text"].tolist()) == (object, [None, "b", None])
     assert infos["_text"].tolist() == [False, True, False]
-
-
-def test_splitting_gives_the_rows_back():
-    back = split_infos(join_infos(ROWS), 3)
-    for row, given in zip(back, ROWS, strict=True):
+    for row, given in zip(split_infos(infos, 3), ROWS, strict=True):
         assert row.keys() == given.keys()
         assert all(np.array_equal(row[key], given[key]) for key in given)
-
-
-def test_values_of_several_kinds_keep_them():
-    column = join_infos([{"x": 1}, {"x": 0.5}, {"x": [1]}])["x"]
-    assert column.tolist() == [1, 0.5, [1]]
-    assert column.dtype == object
+    column = join_infos([{"x": 1}, {"x": 0.5}, {"x": [1]}])["x"]  # of several kinds
+    assert (column.dtype, column.tolist()) == (object, [1, 0.5, [1]])
 
 
 def test_what_has_no_mask_or_no_rows_is_for_every_row():
-    assert split_infos({"x": np.arange(2), "name": "rack", "sizes": [1, 2, 3], "_hidden": 1}, 2) == [
-        {"x": 0, "name": "rack", "sizes": [1, 2, 3], "_hidden": 1},
-        {"x": 1, "name": "rack", "sizes": [1, 2, 3], "_hidden": 1},
-    ]
+    every = {"name": "rack", "sizes": [1, 2, 3], "_hidden": 1}
+    assert split_infos({"x": np.arange(2), **every}, 2) == [{"x": 0, **every}, {"x": 1, **every}]
 
 
 def test_last_observations_are_none_where_an_episode_goes_on_and_no_array_holds_them():

@@ -140,10 +140,6 @@ def test_other_seeds_of_its_arms_are_refused(arms, seed):
     ):
         envs.reset(seed=seed)
     assert there.requests == []
-
-
-def test_the_arms_of_a_rack_begin_together(arms):
-    envs, there = arms
     envs.reset()
     with raising(InvalidValue, "The 2 environments of Pick begin together; reset_mask must hold all of them or none."):
         envs.reset(options={"reset_mask": np.array([True, False])})
@@ -161,23 +157,13 @@ def test_what_a_rack_does_not_understand_is_not_sent(rack, open_to):
     assert there.requests == []
 
 
-def test_a_rack_without_that_environment(rack, open_to):
-    rack()
-    transport = open_to(**{**PICKING, "env_id": "FoldShirt"})
-    transport.connect()
+def test_a_rack_without_that_environment_with_more_arms_or_without_spaces(rack, open_to):
+    there = rack()
     with pytest.raises(RemoteError, match=r"^Unknown environment: FoldShirt$"):
-        transport.reset()
-
-
-def test_a_rack_with_more_arms_than_said(rack, open_to):
-    rack(arms=2)
-    transport = open_to(**PICKING)
+        open_to(**{**PICKING, "env_id": "FoldShirt"}).reset()
+    there.arms = 2
     with pytest.raises(ProtocolError, match="The response must have 1 feedback, one for each environment, not 2"):
-        transport.reset()
-
-
-def test_a_rack_whose_spaces_are_not_given(rack, open_to):
-    rack()
+        open_to(**PICKING).reset()
     with pytest.raises(NoServer) as error:
         open_to(env_id="Pick").connect()
     assert str(error.value).endswith(

@@ -29,38 +29,34 @@ def test_addresses(given, url):
     assert agent_url(given) == url
 
 
-def test_a_request(hub, new_agent):
-    agent = new_agent()
+def test_requests_progress_and_patience(hub, new_agent):
+    agent, told = new_agent(), []
     assert (agent.role, agent.agent) == ("administer", __version__)
     assert agent.ask("status") == {"state": "paused", "active": None, "owner": None}
     agent.ask("resume", why="lunch is over")
     assert [(op, arguments) for op, arguments, _ in hub.asked] == [("status", {}), ("resume", {"why": "lunch is over"})]
     assert {person.who for _, _, person in hub.asked} == {"anna@laptop"}
-
-
-def test_progress_and_patience(hub, new_agent):
-    agent, told = new_agent(), []
     with raising(LinkLost, f"{agent.url}: no answer to pause within 0.2 s."):
         agent.ask("pause", within=0.2, progress=told.append)
     assert told == ["waits for the tick"]
     assert agent.ask("status")
 
 
+RESUME = "resume needs a token of the role drive; the token shown has the role watch."
+
+
 @pytest.mark.parametrize(
-    ("op", "text", "kind", "status"),
-    [("take", "bob@lab is in command", "NotInCommand", 3), ("versions", "'a mistake'", "KeyError", 1)],
+    ("token", "op", "text", "kind", "status"),
+    [
+        ("a", "take", "bob@lab is in command", "NotInCommand", 3),
+        ("a", "versions", "'a mistake'", "KeyError", 1),
+        ("w", "resume", RESUME, "RoleTooLow", 3),
+    ],
 )
-def test_refusals_carry_their_kind(new_agent, op, text, kind, status):
+def test_refusals_carry_their_kind(new_agent, token, op, text, kind, status):
     with pytest.raises(AgentRefused) as error:
-        new_agent().ask(op)
+        new_agent(token).ask(op)
     assert (str(error.value), error.value.kind, error.value.exit_status) == (text, kind, status)
-
-
-def test_a_role_that_is_too_low_is_a_refusal(new_agent):
-    with pytest.raises(AgentRefused) as error:
-        new_agent("w").ask("resume")
-    text = "resume needs a token of the role drive; the token shown has the role watch."
-    assert (str(error.value), error.value.exit_status) == (text, 3)
 
 
 def test_push(hub, new_agent, tmp_path):
@@ -141,12 +137,6 @@ def refused(url, **options):
     return str(error.value)
 
 
-def test_nothing_listens():
-    with BridgeServer(port=0) as server:
-        url = server.url
-    assert refused(url) == f"{url}: refused: nothing listens there. Does bam-agent run there, with this port?"
-
-
 def test_a_wrong_token(server, tmp_path):
     (tmp_path / "token").touch(0o600)
     (tmp_path / "token").write_text("x")
@@ -161,9 +151,13 @@ NO_AGENT = (
 )
 
 
-def test_a_rosbridge_server_is_no_agent():
+def test_a_rosbridge_server_is_no_agent_and_where_nothing_listens_is_none():
     with BridgeServer(port=0) as server:
         assert refused(server.url) == f"{server.url}: {NO_AGENT}"
+    text = "refused: nothing listens there. Does bam-agent run there, with this port?"
+    assert refused(server.url) == f"{server.url}: {text}"
+    with raising(InvalidValue, "Address 'robot:9095' has the scheme 'robot'.", begins=True):
+        AgentClient("robot:9095")
 
 
 @pytest.mark.parametrize("first", ['{"hello": 1}', "[]", "SSH-2.0", '{"event": "status"}'])
@@ -192,8 +186,3 @@ def test_tls(new_server, tmp_path, certificates):
     assert "the certificate is not trusted" in refused(server.url, token_file=tmp_path / "token")
     plain = server.url.replace("wss:", "ws:")
     assert refused(plain, token_file=tmp_path / "token").endswith("If it has TLS, use wss://.")
-
-
-def test_an_address_that_is_none():
-    with raising(InvalidValue, "Address 'robot:9095' has the scheme 'robot'.", begins=True):
-        AgentClient("robot:9095")

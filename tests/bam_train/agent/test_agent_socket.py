@@ -23,22 +23,18 @@ def messages(caplog):
     return [record.getMessage() for record in caplog.records]
 
 
-def test_the_greeting_and_a_request(hub, new_raw):
+def test_the_greeting_a_request_and_who_it_is_from(hub, new_raw):
     raw = new_raw("d")
     assert raw.hello == {"event": "hello", "protocol": 1, "agent": __version__, "role": "drive"}
+    raw.ask("status", name="")
     answer = raw.ask("status", name="anna@laptop")
-    assert answer == {"id": 1, "ok": True, "result": {"state": "paused", "active": None, "owner": None}}
-    (op, arguments, person), address = hub.asked[0], "{}:{}".format(*raw.socket.local_address[:2])
-    assert (op, arguments) == ("status", {})
+    assert answer == {"id": 2, "ok": True, "result": {"state": "paused", "active": None, "owner": None}}
+    (op, arguments, person), address = hub.asked[1], "{}:{}".format(*raw.socket.local_address[:2])
+    assert (op, arguments, hub.asked[0][2].who) == ("status", {}, address)
     assert person == Person(person.name, address, role="drive", who="anna@laptop")
-
-
-def test_without_a_name_a_person_is_the_address(hub, new_raw):
-    new_raw().ask("status", name="")
-    person = hub.asked[0][2]
-    assert person.who == person.address
-    new_raw().ask("status", name="anna\x1b[31m\n")
-    assert hub.asked[1][2].who == "anna?[31m?"
+    raw.ask("status", name="anna\x1b[31m\n")
+    raw.close()
+    hub.wait_for(lambda: [person.who for person in hub.gone] == ["anna?[31m?"])
 
 
 def test_texts_of_others_have_no_control_characters(hub, new_raw):
@@ -132,7 +128,7 @@ def test_what_is_no_request_is_one_line_and_the_socket_stays(new_raw, caplog, da
     assert [line.partition(" was refused: ")[2] for line in messages(caplog)] == [error]
 
 
-def test_a_request_is_heard_once(hub, new_raw):
+def test_a_request_is_heard_once(hub, new_raw, caplog):
     raw = new_raw()
     frame = json.dumps({"id": 5, "op": "resume"})
     raw.socket.send(frame)
@@ -141,6 +137,7 @@ def test_a_request_is_heard_once(hub, new_raw):
     error = "The id 5 is not above 5: ids grow."
     assert raw.receive() == {"id": 5, "ok": False, "error": error, "kind": "BadRequest"}
     assert len(hub.asked) == 1
+    assert messages(caplog)[0].endswith(f" was refused: {error}")
 
 
 ARGUMENTS = {
@@ -280,13 +277,6 @@ def test_one_learner_at_a_time(hub, new_raw, until):
     assert second.ask("transitions", on=True)["ok"]
 
 
-def test_the_hub_learns_who_left(hub, new_raw):
-    raw = new_raw("d")
-    raw.ask("status", name="anna")
-    raw.close()
-    hub.wait_for(lambda: [person.who for person in hub.gone] == ["anna"])
-
-
 def test_a_flood_of_messages_ends_its_socket_only(hub, new_raw, caplog):
     raw, other = new_raw("d"), new_raw("w")
     began = time.monotonic()
@@ -373,7 +363,7 @@ def test_a_size_that_is_too_large_is_refused_before_anything_is_sent(hub, new_ra
     assert messages(caplog)[0].endswith(f" was refused: push: {error}")
 
 
-def test_a_disk_without_room(hub, new_server, new_raw, monkeypatch):
+def test_a_disk_without_room_and_a_folder_that_cannot_be_written(hub, new_server, new_raw, monkeypatch):
     server = new_server()
     monkeypatch.setattr("shutil.disk_usage", lambda path: SimpleNamespace(free=1_000_000))
     answer = announce(new_raw(on=server), bytes(1_000))
@@ -381,15 +371,12 @@ def test_a_disk_without_room(hub, new_server, new_raw, monkeypatch):
         "The disk of the robot's computer has 1.0 MB free, and the upload of 0.0 MB needs 134.2 MB. "
         f"Make room in {hub.incoming}."
     )
-
-
-def test_a_folder_that_cannot_be_written(hub, new_raw):
+    monkeypatch.undo()
+    hub.incoming.rmdir()
     hub.incoming.write_text("a file")
-    answer = announce(new_raw(), b"1234")
-    assert (answer["kind"], answer["error"]) == (
-        "OutputError",
-        f"The upload cannot be written to {hub.incoming}: File exists.",
-    )
+    answer = announce(new_raw(on=server), b"1234")
+    assert answer["error"] == f"The upload cannot be written to {hub.incoming}: File exists."
+    assert answer["kind"] == "OutputError"
 
 
 def test_few_uploads_at_once(hub, new_raw):

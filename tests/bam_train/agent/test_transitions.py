@@ -40,14 +40,6 @@ def test_a_message_carries_every_bit():
     assert sent.ends.tolist() == [False, False, True]
 
 
-def test_pictures_keep_their_shape():
-    log = TransitionLog()
-    log.add(np.ones((2, 3)), np.zeros(1), 0.0, np.zeros((2, 3)), False, True, False, False, 0, 0, "ab")
-    decoded = decode(encode(log.take()))
-    assert decoded.observation.shape == (1, 2, 3)
-    assert len(decoded) == 1
-
-
 @pytest.mark.parametrize(
     ("change", "message"),
     [
@@ -74,15 +66,6 @@ def test_pictures_keep_their_shape():
 def test_a_bad_message_is_refused(change, message):
     with raising(FormatError, message):
         decode(encode(three()) | change)
-
-
-def test_a_full_log_keeps_the_newest_and_counts_the_others():
-    log = TransitionLog(most=2)
-    for step in range(5):
-        log.add(np.zeros(1), np.zeros(1), step, np.zeros(1), False, False, False, False, 0, step, "")
-    assert log.lost == 3
-    assert log.take().step.tolist() == [3, 4]
-    assert log.take() is None
 
 
 class Counting(gym.Env):

@@ -1,5 +1,6 @@
 import threading
 import time
+from unittest import mock
 
 import numpy as np
 import pytest
@@ -35,17 +36,11 @@ class Without:
         return getattr(self._robot, name)
 
 
-class Hands:
-    def __init__(self):
-        self.now = 0.0
-
-    def __call__(self):
-        return self.now
-
-
 @pytest.fixture
 def hands():
-    return Hands()
+    """A clock that is set by hand."""
+    clock = mock.Mock(side_effect=lambda: clock.now, now=0.0)
+    return clock
 
 
 @pytest.fixture
@@ -185,6 +180,12 @@ def test_a_command_one_part_early_loses_none(serve, hands):
 
 
 def test_halt_stops_at_once_and_again_changes_nothing(serve, hands):
+    served = serve(FakeRobot(1), realtime=True)  # which says no set point, and rests where it was measured
+    served.follow(command(3.0))
+    ticks(served, hands, PARTS)
+    served.halt()
+    measured = np.concatenate([served.state.signals[name] for name in ("joint_position", "gripper_width")], axis=1)
+    np.testing.assert_array_equal(served.target(), measured)
     served = serve(SimulatedArm(1), realtime=True)
     served.follow(command(0.5))
     ticks(served, hands, 3)
@@ -211,15 +212,6 @@ def test_a_base_rests_at_zero_speed(serve, hands):
     hands.now += 0.11
     served.tick()
     np.testing.assert_array_equal(served.target(), np.zeros((1, 7)))
-
-
-def test_a_robot_that_says_no_set_point_rests_where_it_was_measured(serve, hands):
-    served = serve(FakeRobot(1), realtime=True)
-    served.follow(command(3.0))
-    ticks(served, hands, PARTS)
-    served.halt()
-    measured = np.concatenate([served.state.signals[name] for name in ("joint_position", "gripper_width")], axis=1)
-    np.testing.assert_array_equal(served.target(), measured)
 
 
 def test_a_step_in_real_time_waits_for_the_clock(serve):
@@ -259,28 +251,23 @@ class Failing(FakeRobot):
         yield self.step(command)
 
 
-@pytest.mark.parametrize("realtime", [False, True])
-def test_a_fault_stays_until_a_reset(serve, realtime):
-    served = serve(Failing(1), realtime=realtime)
-    if realtime:
+@pytest.mark.parametrize("mode", ["fast", "followed", "stepped"])
+def test_a_fault_reaches_the_step_that_waits_and_stays_until_a_reset(serve, mode):
+    served = serve(Failing(1), time.monotonic, realtime=mode != "fast")
+    clock = Ticker(served.tick, 0.001)
+    if mode == "followed":
         served.follow(command())
         served.tick()
         served.tick()
     else:
+        if mode == "stepped":
+            clock.start()
         with pytest.raises(PhysicsDiverged, match="not finite"):
             served.step(command())
+        clock.stop()
     assert str(served.fault) == "The simulated state of environments [0] is not finite. Reset them."
     served.reset(ROWS, initial())
     assert served.fault is None
-
-
-def test_a_fault_reaches_the_step_that_waits(serve):
-    served = serve(Failing(1), time.monotonic, realtime=True)
-    clock = Ticker(served.tick, 0.001)
-    clock.start()
-    with pytest.raises(PhysicsDiverged, match="not finite"):
-        served.step(command())
-    clock.stop()
 
 
 def test_wrong_commands_are_refused(serve):
@@ -298,19 +285,11 @@ def test_the_scene_changes_and_the_arm_stays(serve):
     served.place_object(np.array([[0.4, -0.1, 0.0]]), np.zeros(1, dtype=np.int64))
     np.testing.assert_allclose(served.state.signals["object_position"][0, :2], [0.4, -0.1])
     np.testing.assert_array_equal(served.state.signals["joint_position"], joints)
-
-
-def test_a_robot_without_a_scene_says_so(serve):
+    assert sorted(served.state_dict()) == ["command", "physics", "setpoint"]
+    assert not any(hasattr(served, name) for name in ("no_such_thing", "_no_such_thing"))
     served = serve(Without(FakeRobot(1), "place_object"))
     with pytest.raises(RemoteError, match=r"fake has no object that could be placed\."):
         served.place_object(np.zeros((1, 3)), np.zeros(1, dtype=np.int64))
-
-
-def test_what_else_the_robot_can_is_there(serve):
-    served = serve(SimulatedArm(1))
-    assert sorted(served.state_dict()) == ["command", "physics", "setpoint"]
-    assert not hasattr(served, "no_such_thing")
-    assert not hasattr(served, "_no_such_thing")
 
 
 def test_time_stands_still_before_the_first_reset_and_after_the_end(hands):
