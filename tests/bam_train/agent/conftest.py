@@ -17,7 +17,7 @@ from bam_envs.rosbridge.tokens import Tokens
 from bam_train.agent.front.agent_socket import AgentSocket
 from bam_train.agent.remote.agent_client import AgentClient
 from bam_train.agent.remote.agent_protocol import PATH, encode_message
-from bam_train.errors import CandidateRefused
+from bam_train.errors import RequestRefused
 from tests.tls_certificates import certificates
 
 __all__ = ["certificates"]  # fixtures from elsewhere
@@ -44,7 +44,7 @@ class FakeHub:
         if content is not None:
             progress("the checker reads it")
             if content.startswith(b"bad"):
-                raise CandidateRefused("the policy says NaN")
+                raise RequestRefused("the policy says NaN", "CandidateRefused")
             return {"digest": content[:4].hex(), "stage": "trial", "state": "on trial", "names": [], "lines": []}
         if op == "take":
             raise NotInCommand("bob@lab is in command")

@@ -10,7 +10,7 @@ from bam_envs import __version__
 from bam_envs.core.errors import InvalidValue, LinkLost, NoServer
 from bam_envs.rosbridge.server import BridgeServer
 from bam_train.agent.remote.agent_client import AgentClient, agent_url
-from bam_train.errors import AgentRefused, NotACheckpoint
+from bam_train.errors import NotACheckpoint, RequestRefused
 from tests.raising import raising
 
 
@@ -54,7 +54,7 @@ RESUME = "resume needs a token of the role drive; the token shown has the role w
     ],
 )
 def test_refusals_carry_their_kind(new_agent, token, op, text, kind, status):
-    with pytest.raises(AgentRefused) as error:
+    with pytest.raises(RequestRefused) as error:
         new_agent(token).ask(op)
     assert (str(error.value), error.value.kind, error.value.exit_status) == (text, kind, status)
 
@@ -73,7 +73,7 @@ def test_push(hub, new_agent, tmp_path):
         "better",
     )
     path.write_bytes(b"bad")
-    with pytest.raises(AgentRefused) as error:
+    with pytest.raises(RequestRefused) as error:
         new_agent().push(path)
     assert (str(error.value), error.value.exit_status) == ("the policy says NaN", 3)
 
@@ -82,7 +82,7 @@ def test_a_push_that_is_refused_before_it_is_sent(new_agent, new_server, tmp_pat
     path = tmp_path / "large.zip"
     path.write_bytes(bytes(2_000_000))
     small = new_server(most_upload=1_000_000)
-    with raising(AgentRefused, "The upload has 2.0 MB, and 1.0 MB is the most that this agent takes."):
+    with raising(RequestRefused, "The upload has 2.0 MB, and 1.0 MB is the most that this agent takes."):
         new_agent(url=small.url).push(path)
     with pytest.raises(NotACheckpoint) as missing:
         new_agent().push(tmp_path / "none.zip")
@@ -116,7 +116,7 @@ def test_many_threads_ask_at_once(hub, new_agent):
         for _ in range(5):
             try:
                 agent.ask("status")
-            except AgentRefused as error:
+            except RequestRefused as error:
                 failed.append(str(error))
             time.sleep(0.02)
 

@@ -16,7 +16,7 @@ import pytest
 
 from bam_train.agent.versions import KEPT, Versions, load_policy
 from bam_train.checkpoint import Checkpoint
-from bam_train.errors import AlteredCheckpoint, CheckpointError, FolderInUse, OutputError, SettingsError, UnknownVersion
+from bam_train.errors import AlteredCheckpoint, CheckpointError, OutputError, RequestRefused, SettingsError
 from tests.raising import raising
 
 _PROGRAM = """
@@ -95,7 +95,7 @@ def test_a_version_is_a_copy_that_is_found_by_name_and_digest(versions, some):
 
 
 def test_an_unknown_version_is_one_line_with_those_there_are(versions, some):
-    with raising(UnknownVersion, "'champion': no such version. Push one first"):
+    with raising(RequestRefused, "'champion': no such version. Push one first"):
         versions.find("champion")
     one, other = some(2)
     for checkpoint in (one, other):
@@ -103,14 +103,14 @@ def test_an_unknown_version_is_one_line_with_those_there_are(versions, some):
     versions.point({"champion": one.digest})
     known = f"Choose from: {other.digest[:12]}, champion = {one.digest[:12]}"
     for text in ("previous", "", one.digest[:5], "f" * 64, f"{one.digest}0"):
-        with raising(UnknownVersion, f"{text!r}: no such version. {known}"):
+        with raising(RequestRefused, f"{text!r}: no such version. {known}"):
             versions.find(text)
-    with pytest.raises(UnknownVersion):
+    with pytest.raises(RequestRefused):
         versions.point({"previous": "ffffff"})
     assert versions.names == {"champion": one.digest}
     twin = one.digest[:20] + ("0" if one.digest[20] != "0" else "1") * 44
     (versions.folder / f"{twin}.zip").write_bytes(b"")
-    with raising(UnknownVersion, f"{one.digest[:20]!r}: 2 versions begin with it. Choose from: ", begins=True):
+    with raising(RequestRefused, f"{one.digest[:20]!r}: 2 versions begin with it. Choose from: ", begins=True):
         versions.find(one.digest[:20])
     assert versions.find(one.digest[:21]).digest == one.digest
 
@@ -119,10 +119,10 @@ def test_an_unknown_version_is_one_line_with_those_there_are(versions, some):
 def test_no_text_leads_out_of_the_folder(versions, some, text, corridor_checkpoint):
     versions.add(some(1)[0])
     corridor_checkpoint("secret.zip")
-    with pytest.raises(UnknownVersion):
+    with pytest.raises(RequestRefused):
         versions.find(text)
     (versions.folder / "names.json").write_text(json.dumps({"champion": text}))
-    with pytest.raises(UnknownVersion):
+    with pytest.raises(RequestRefused):
         versions.find("champion")
 
 
@@ -226,7 +226,7 @@ def test_the_folder_survives_a_kill_at_any_moment(versions, some):
 
 def test_a_second_agent_is_refused_until_the_first_ends(versions):
     with versions.held():
-        with pytest.raises(FolderInUse) as caught, Versions(versions.folder).held():
+        with pytest.raises(OutputError) as caught, Versions(versions.folder).held():
             pass
         other = f"another bam-agent (process {os.getpid()})"
         assert str(caught.value) == f"{versions.folder}: {other} uses it. End that one, or give another --folder"
@@ -241,7 +241,7 @@ def test_the_lock_of_a_killed_agent_is_free(versions):
     )
     with subprocess.Popen([sys.executable, "-c", program, str(versions.folder)], stdout=subprocess.PIPE) as process:
         process.stdout.readline()
-        with pytest.raises(FolderInUse, match=rf"\(process {process.pid}\)"), versions.held():
+        with pytest.raises(OutputError, match=rf"\(process {process.pid}\)"), versions.held():
             pass
         process.kill()
     with versions.held():

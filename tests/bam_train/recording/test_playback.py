@@ -23,7 +23,7 @@ from bam_train.deploy.deployment import Deployment
 from bam_train.deploy.flight import deployment_facts, flight_recorder
 from bam_train.deploy.journal import Journal
 from bam_train.environments import make_env
-from bam_train.errors import BadRecording
+from bam_train.errors import FormatError
 from bam_train.policy import FrozenPolicy
 from bam_train.recording.drawing import frames
 from bam_train.recording.playback import play, replay_env
@@ -236,7 +236,7 @@ def test_a_recording_cut_anywhere_is_readable(small_chunks, tmp_path, capsys):
         path.write_bytes(data[:size])
         try:
             recording = Recording.open(path)
-        except BadRecording as error:
+        except FormatError as error:
             assert "not a recording of bam-deploy" in str(error)  # noqa: PT017 - its beginning is missing
             assert size < 2000
             continue
@@ -265,7 +265,7 @@ def test_a_damaged_recording_is_read_up_to_the_damage(small_chunks, tmp_path):
         path.write_bytes(data[:place] + bytes([data[place] ^ 0xFF]) + data[place + 1 :])
         try:
             assert 0 <= Recording.open(path).ticks <= TICKS
-        except BadRecording as error:
+        except FormatError as error:
             assert str(error).startswith(f"{path}: ")  # noqa: PT017 - either is right
 
 
@@ -294,7 +294,7 @@ def test_somebody_elses_mcap_file_is_refused(tmp_path, topic, content):
         writer.start()
         writer.add_message(writer.register_channel(topic, "json", 0), 1, content, 1)
         writer.finish()
-    with pytest.raises(BadRecording, match=r"not a recording of bam-deploy"):
+    with pytest.raises(FormatError, match=r"not a recording of bam-deploy"):
         Recording.open(path)
 
 
@@ -355,7 +355,7 @@ def test_a_seed_that_is_no_number_is_refused(pick):
     recording.metadata["seed"] = "soon"
     text = r"its metadata says seed 'soon', which is no number\. Get the file again$"
     for read in (facts_of, lambda damaged: play(damaged, replay_env(damaged, Checkpoint.open(PICK)), None)):
-        with pytest.raises(BadRecording, match=text):
+        with pytest.raises(FormatError, match=text):
             read(recording)
 
 
