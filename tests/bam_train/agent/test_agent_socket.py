@@ -68,53 +68,30 @@ def test_errors_are_one_line_with_their_kind(hub, new_raw, caplog):
     assert raw.ask("status")["ok"]
 
 
+JOG, DEEP = b'{"op": "jog", "seq": 1, "twist": ', "maximum recursion depth exceeded while deserializing an object."
+NO_REQUESTS = [
+    (b"{", None, "Input data was truncated."),
+    (b"\xff\xfe", None, "JSON is malformed: invalid character (byte 0)."),
+    *((data, None, "Expected `object`, got `array`.") for data in (b"[]", b"[" * 60_000)),
+    (b'{"op": "status", "id": 1, "x": ' + b"[" * 50_000, None, DEEP),
+    (b'{"op": 3, "id": 1}', None, "Expected `str`, got `int` - at `$.op`."),
+    (b'{"op": "pause"}', None, "Object missing required field `id`."),
+    (b'{"op": "pause", "id": 1, "force": 1}', 1, "Object contains unknown field `force`."),
+    (b'{"op": "pause", "id": 1, "why": 5}', 1, "Expected `str`, got `int` - at `$.why`."),
+    (JOG + b"[NaN, 0, 0, 0]}", None, "JSON is malformed: invalid character (byte 34)."),
+    (JOG + b"[0, 0, 0]}", None, "Expected `array` of length >= 4 - at `$.twist`."),
+    (JOG + b"[1e999, 0, 0, 0]}", None, "Number out of range - at `$.twist[0]`."),
+    (b'{"op": "jog", "seq": "1", "twist": [0, 0, 0, 0]}', None, "Expected `int`, got `str` - at `$.seq`."),
+    (JOG + b'[0, 0, 0, 0], "gripper": 2}', None, "Invalid enum value 2 - at `$.gripper`."),
+    (JOG + b'[0, 0, 0, 0], "sent": "now"}', None, "Expected `float | null`, got `str` - at `$.sent`."),
+]
+
+
 @pytest.mark.parametrize(
     ("data", "number", "error"),
     [
-        (b"{", None, "This is no request: Input data was truncated."),
-        (b"\xff\xfe", None, "This is no request: JSON is malformed: invalid character (byte 0)."),
-        (b"[" * 60_000, None, "This is no request: Expected `object`, got `array`."),
-        (
-            b'{"op": "status", "id": 1, "x": ' + b"[" * 50_000,
-            None,
-            "This is no request: maximum recursion depth exceeded while deserializing an object.",
-        ),
-        (b"[]", None, "This is no request: Expected `object`, got `array`."),
+        *((data, number, f"This is no request: {why}") for data, number, why in NO_REQUESTS),
         (b'{"op": "stats", "id": 1}', 1, "Unknown op 'stats'. Did you mean 'status'?"),
-        (b'{"op": 3, "id": 1}', None, "This is no request: Expected `str`, got `int` - at `$.op`."),
-        (b'{"op": "pause"}', None, "This is no request: Object missing required field `id`."),
-        (b'{"op": "pause", "id": 1, "force": 1}', 1, "This is no request: Object contains unknown field `force`."),
-        (b'{"op": "pause", "id": 1, "why": 5}', 1, "This is no request: Expected `str`, got `int` - at `$.why`."),
-        (
-            b'{"op": "jog", "seq": 1, "twist": [NaN, 0, 0, 0]}',
-            None,
-            "This is no request: JSON is malformed: invalid character (byte 34).",
-        ),
-        (
-            b'{"op": "jog", "seq": 1, "twist": [0, 0, 0]}',
-            None,
-            "This is no request: Expected `array` of length >= 4 - at `$.twist`.",
-        ),
-        (
-            b'{"op": "jog", "seq": 1, "twist": [1e999, 0, 0, 0]}',
-            None,
-            "This is no request: Number out of range - at `$.twist[0]`.",
-        ),
-        (
-            b'{"op": "jog", "seq": "1", "twist": [0, 0, 0, 0]}',
-            None,
-            "This is no request: Expected `int`, got `str` - at `$.seq`.",
-        ),
-        (
-            b'{"op": "jog", "seq": 1, "twist": [0, 0, 0, 0], "gripper": 2}',
-            None,
-            "This is no request: Invalid enum value 2 - at `$.gripper`.",
-        ),
-        (
-            b'{"op": "jog", "seq": 1, "twist": [0, 0, 0, 0], "sent": "now"}',
-            None,
-            "This is no request: Expected `float | null`, got `str` - at `$.sent`.",
-        ),
         (b" " * 65_537, None, "A request has at most 65536 bytes; this one has 65537."),
     ],
 )

@@ -1,15 +1,12 @@
 """A rosbridge server that does not carry everything: what is missing is said, and what helps."""
 
-import asyncio
-import contextlib
 import json
 import threading
 import time
 
 import gymnasium as gym
 import pytest
-from websockets.asyncio.server import serve
-from websockets.exceptions import ConnectionClosed
+from websockets.sync.server import serve
 
 import bam_envs  # noqa: F401 - registers the environments
 from bam_envs.core.errors import RemoteError
@@ -31,26 +28,19 @@ class Bridge:
     def __init__(self, missing, *, tells, rosapi):
         self._missing, self._tells, self._rosapi = missing, tells, rosapi
         self._topics, self._services = [], []
-        self._started, self._thread = threading.Event(), threading.Thread(target=lambda: asyncio.run(self._run()))
+        self._server = serve(self._talk, "127.0.0.1", 0, compression=None)
+        self.url = "ws://{}:{}".format(*self._server.socket.getsockname())
+        self._thread = threading.Thread(target=self._server.serve_forever)
         self._thread.start()
-        assert self._started.wait(10.0)
 
     def close(self):
-        self._loop.call_soon_threadsafe(self._stop.set)
+        self._server.shutdown()
         self._thread.join(10.0)
 
-    async def _run(self):
-        self._loop, self._stop = asyncio.get_running_loop(), asyncio.Event()
-        async with serve(self._talk, "127.0.0.1", 0, compression=None) as server:
-            self.url = f"ws://127.0.0.1:{server.sockets[0].getsockname()[1]}"
-            self._started.set()
-            await self._stop.wait()
-
-    async def _talk(self, connection):
-        with contextlib.suppress(ConnectionClosed):
-            async for frame in connection:
-                for answer in self._answers(json.loads(frame)):
-                    await connection.send(json.dumps(answer))
+    def _talk(self, connection):
+        for frame in connection:
+            for answer in self._answers(json.loads(frame)):
+                connection.send(json.dumps(answer))
 
     def _answers(self, message):
         if message["op"] == "call_service":
