@@ -120,18 +120,11 @@ def test_what_it_offers(serve, bus):
         "/cell/bam/session": "std_srvs/Trigger",
         "/cell/controller_manager/list_controllers": "controller_manager_msgs/ListControllers",
     }
-
-
-def test_an_arm_without_gripper_offers_no_topics_of_one(serve, bus):
-    service = serve(reach_arm(1, ur_model="ur5e"))
-    assert set(bus.advertised) == {"/joint_states", "/bam/scene/reply"}
-    assert set(bus.listeners) == {
-        ARM,
-        "/scaled_joint_trajectory_controller/joint_trajectory",
-        "/bam/halt",
-        "/bam/lease",
-        "/bam/scene/request",
-    }
+    advertised, listeners = set(bus.advertised), set(bus.listeners)
+    service = serve(reach_arm(1, ur_model="ur5e"))  # without a gripper, and its topics
+    assert set(bus.advertised) - advertised == {"/joint_states", "/bam/scene/reply"}
+    trajectory = "/scaled_joint_trajectory_controller/joint_trajectory"
+    assert set(bus.listeners) - listeners == {ARM, trajectory, "/bam/halt", "/bam/lease", "/bam/scene/request"}
     assert bus.say(ARM, {"data": (HOME[0] + 0.01).tolist()}, "a") is None
     state = service.joints(lambda message: message["position"] != HOME[0].tolist())
     np.testing.assert_allclose(state["position"], HOME[0] + 0.01)
@@ -207,8 +200,12 @@ def test_bad_commands_are_refused_and_the_robot_does_not_move(serve, bus):
     assert service.lease.holder is None
 
 
-def test_old_commands_are_refused(serve):
+def test_old_commands_and_those_of_a_session_that_nobody_opened_are_refused(serve, tagger):
     service = serve()
+    assert service.send(command(0.5), tagger) == (
+        f"RemoteError: session {tagger.session} is not open here: reset(), which opens one at /bam/session; "
+        "both sides must be of one version of bam-train"
+    )
     tagger = service.session()
     first, second = tagger.next(1, 0.1), tagger.next(1, 0.1)
     assert service.send(command(0.01), tagger, tag=second) is None
@@ -262,14 +259,6 @@ def test_nothing_that_a_watcher_can_send_is_executed(serve, bus, driver):
     assert service.send(command(0.02), tagger, driver) is None
 
 
-def test_a_session_that_nobody_opened_is_told_the_remedy(serve, tagger):
-    service = serve()
-    assert service.send(command(0.5), tagger) == (
-        f"RemoteError: session {tagger.session} is not open here: reset(), which opens one at /bam/session; "
-        "both sides must be of one version of bam-train"
-    )
-
-
 def test_who_drives_keeps_command_by_signs_of_life_and_leaves_by_a_word(serve, bus):
     now = [0.0]
     service = serve(lease=CommandLease(2.0, lambda: now[0]))
@@ -312,6 +301,10 @@ def test_a_session_ends_with_the_connection_that_opened_it(serve, bus):
     bus.leave("control")
     assert service.lease.holder is None
     assert "is not open here" in service.send(command(0.02), tagger, "again")
+    tagger = service.session("old")  # whose connection may end late: who comes back leaves over the new one
+    assert service.send(command(0.01), tagger, "old") is None
+    assert service.say("leave", tagger, "new") is None
+    assert service.send(command(0.02), service.session("new"), "new") is None
 
 
 def test_a_step_that_outlives_its_client_ends_at_rest(serve, bus):
@@ -339,15 +332,6 @@ def test_a_step_that_outlives_its_client_ends_at_rest(serve, bus):
     gym_api.close()  # waits for who leaves
     assert service.robot.resting
     gym_api.env.close()
-
-
-def test_who_comes_back_leaves_over_the_new_connection(serve):
-    """The end of the old one may come late."""
-    service = serve()
-    tagger = service.session("old")
-    assert service.send(command(0.01), tagger, "old") is None
-    assert service.say("leave", tagger, "new") is None
-    assert service.send(command(0.02), service.session("new"), "new") is None
 
 
 def test_what_a_client_sent_does_not_go_on_under_the_next_one(serve, bus):

@@ -121,6 +121,16 @@ def test_a_robot_whose_clock_stood_still_catches_up_slowly(serve, hands, burst, 
     np.testing.assert_allclose(served.state.signals["joint_position"], HOME + 39 * step * pan, atol=0.005)
 
 
+def test_wrong_commands_are_refused_and_a_clock_that_stands_still_is_an_error(serve):
+    served = serve(FakeRobot(1), realtime=True, patience=0.01)
+    with pytest.raises(InvalidValue, match=r"must have shape \(1, 7\), not \(1, 6\)"):
+        served.step(np.zeros((1, 6)))
+    with pytest.raises(InvalidValue, match="finite"):
+        served.step(np.full((1, 7), np.nan))
+    with pytest.raises(RemoteError, match=r"The clock of .* has stood still for 0.01 s\."):
+        served.step(command())
+
+
 def test_a_robot_without_parts_is_stepped_a_period_at_a_time(serve, hands):
     robot = FakeRobot(1)
     served = serve(Without(robot, "slices"), realtime=True)
@@ -197,21 +207,18 @@ def test_halt_stops_at_once_and_again_changes_nothing(serve, hands):
     np.testing.assert_array_equal(served.target(), rest)
 
 
-def test_a_closed_gripper_keeps_holding_after_the_command_timeout(serve, hands):
+def test_after_the_command_timeout_a_closed_gripper_keeps_holding_and_a_base_rests_at_zero_speed(serve, hands):
     served = serve(SimulatedArm(1), realtime=True)
     for _ in range(10):
         served.follow(command(0.0, 0.0))
         ticks(served, hands, PARTS)
     ticks(served, hands, 50)
     assert served.target()[0, 6] < 0.01
-
-
-def test_a_base_rests_at_zero_speed(serve, hands):
-    served = serve(FakeRobot(1), realtime=True, zero_rests=True)
-    served.follow(command(0.1))
+    base = serve(FakeRobot(1), realtime=True, zero_rests=True)
+    base.follow(command(0.1))
     hands.now += 0.11
-    served.tick()
-    np.testing.assert_array_equal(served.target(), np.zeros((1, 7)))
+    base.tick()
+    np.testing.assert_array_equal(base.target(), np.zeros((1, 7)))
 
 
 def test_a_step_in_real_time_waits_for_the_clock(serve):
@@ -235,12 +242,6 @@ def test_a_halt_ends_a_step_that_is_waited_for_in_time(serve):
         served.tick()
     thread.join(10)
     assert states == [served.state]
-
-
-def test_a_clock_that_stands_still_is_an_error(serve):
-    served = serve(SimulatedArm(1), realtime=True, patience=0.01)
-    with pytest.raises(RemoteError, match=r"The clock of ur5e has stood still for 0.01 s\."):
-        served.step(command())
 
 
 class Failing(FakeRobot):
@@ -268,14 +269,6 @@ def test_a_fault_reaches_the_step_that_waits_and_stays_until_a_reset(serve, mode
     assert str(served.fault) == "The simulated state of environments [0] is not finite. Reset them."
     served.reset(ROWS, initial())
     assert served.fault is None
-
-
-def test_wrong_commands_are_refused(serve):
-    served = serve(FakeRobot(1), realtime=True)
-    with pytest.raises(InvalidValue, match=r"must have shape \(1, 7\), not \(1, 6\)"):
-        served.step(np.zeros((1, 6)))
-    with pytest.raises(InvalidValue, match="finite"):
-        served.step(np.full((1, 7), np.nan))
 
 
 def test_the_scene_changes_and_the_arm_stays(serve):
