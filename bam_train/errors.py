@@ -22,13 +22,14 @@
     │   ├── TimeNotWritten         a time at which the variable is not written, or that has left the window
     │   ├── WiringError            an agent reads what no agent writes
     │   └── RemoteAgentError       an agent in another process failed, or its process ended
+    ├── FolderInUse                a folder that another process uses, such as the versions of another live agent
     ├── RequestRefused             a request that a live agent refuses; carries the kind of its reason
     ├── ContractRefused            a robot that does not fit the checkpoint; nothing has moved
     ├── EnvironmentFailed          an environment gave NaN or infinity
     ├── TrainingFailed             training cannot continue (a NaN loss); the last good checkpoint is kept
     │   └── ProcessesLost          processes that training needs have ended; earlier checkpoints are good
     ├── LearntNothing              a run whose steps are all done, and whose policy is nowhere near the run's goal
-    └── OutputError                no space, no permission, a file that is in the way, or a folder that others use
+    └── OutputError                no space, no permission, or a file that is in the way
         └── PlaceError             a place, such as one in a bucket, that cannot be reached, read or written
             └── NoSuchPlace        nothing is there
 
@@ -150,6 +151,10 @@ class RemoteAgentError(LoopError):
         super().__init__(message)
 
 
+class FolderInUse(BamTrainError):  # noqa: N818
+    """A folder that another process uses, such as the versions of another live agent."""
+
+
 class RequestRefused(BamTrainError):  # noqa: N818 - reads as what happened
     """A live agent refuses what it was asked, or fails; `kind` says why.
 
@@ -200,7 +205,7 @@ class LearntNothing(BamTrainError):  # noqa: N818
 
 
 class OutputError(BamTrainError, OSError):
-    """A file cannot be written: no space, no permission, something in the way, or a folder that others use."""
+    """A file cannot be written: no space, no permission, or something in the way."""
 
 
 class PlaceError(OutputError):

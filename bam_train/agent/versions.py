@@ -19,7 +19,7 @@ from typing import IO, Any
 
 from bam_train.checkpoint import MANIFEST, POLICY, Checkpoint
 from bam_train.checkpoint.detector import Detector
-from bam_train.errors import AlteredCheckpoint, CheckpointError, OutputError, RequestRefused, SettingsError
+from bam_train.errors import AlteredCheckpoint, CheckpointError, FolderInUse, OutputError, RequestRefused, SettingsError
 from bam_train.files.atomic_file import remove_orphans, replacing
 from bam_train.policy import FrozenPolicy
 
@@ -75,7 +75,7 @@ class Versions:
         """Within the ``with`` block, no other agent uses the folder; what a killed one left half written is removed.
 
         Raises:
-            OutputError: Another agent uses it.
+            FolderInUse: Another agent uses it.
         """
         with self._writing():
             file = _open_lock(self.folder / _HOLDER)
@@ -85,7 +85,7 @@ class Versions:
                     fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except BlockingIOError as error:
                 other = f"another bam-agent (process {file.read(20).decode('ascii', 'replace').strip()})"
-                raise OutputError(f"{self.folder}: {other} uses it. End that one, or give another --folder") from error
+                raise FolderInUse(f"{self.folder}: {other} uses it. End that one, or give another --folder") from error
             file.truncate(0)
             file.write(f"{os.getpid()}\n".encode())
             file.flush()

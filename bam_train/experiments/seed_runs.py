@@ -29,7 +29,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from bam_train.errors import OutputError, SettingsError
+from bam_train.errors import FolderInUse, SettingsError
 from bam_train.settings import TrainSettings, file_stem
 from bam_train.signals import await_end, start_child
 from bam_train.trainers.run_folder import RunFolder, read_object
@@ -72,7 +72,7 @@ def group_folder(runs: Path, settings: TrainSettings) -> Iterator[tuple[RunFolde
     """The folder of the runs with these settings, which no other call uses within the ``with`` block, and its lock.
 
     Raises:
-        OutputError: Another call trains in it, or processes of a killed one still save.
+        FolderInUse: Another call trains in it, or processes of a killed one still save.
     """
     what = json.loads(json.dumps({name: v for name, v in settings.to_mapping().items() if name not in WHERE}))
     stem = file_stem(settings.env, settings.algo, settings.trainer, settings.env_kwargs)
@@ -87,7 +87,7 @@ def group_folder(runs: Path, settings: TrainSettings) -> Iterator[tuple[RunFolde
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError as error:
             text = "another bam-train trains its seeds, or its runs are being saved. Wait for its end"
-            raise OutputError(f"{folder.path}: {text}") from error
+            raise FolderInUse(f"{folder.path}: {text}") from error
         yield folder, lock
     finally:
         os.close(lock)

@@ -16,7 +16,7 @@ import pytest
 
 from bam_train.agent.versions import KEPT, Versions, load_policy
 from bam_train.checkpoint import Checkpoint
-from bam_train.errors import AlteredCheckpoint, CheckpointError, OutputError, RequestRefused, SettingsError
+from bam_train.errors import AlteredCheckpoint, CheckpointError, FolderInUse, OutputError, RequestRefused, SettingsError
 from tests.raising import raising
 
 _PROGRAM = """
@@ -226,7 +226,7 @@ def test_the_folder_survives_a_kill_at_any_moment(versions, some):
 
 def test_a_second_agent_is_refused_until_the_first_ends(versions):
     with versions.held():
-        with pytest.raises(OutputError) as caught, Versions(versions.folder).held():
+        with pytest.raises(FolderInUse) as caught, Versions(versions.folder).held():
             pass
         other = f"another bam-agent (process {os.getpid()})"
         assert str(caught.value) == f"{versions.folder}: {other} uses it. End that one, or give another --folder"
@@ -241,7 +241,7 @@ def test_the_lock_of_a_killed_agent_is_free(versions):
     )
     with subprocess.Popen([sys.executable, "-c", program, str(versions.folder)], stdout=subprocess.PIPE) as process:
         process.stdout.readline()
-        with pytest.raises(OutputError, match=rf"\(process {process.pid}\)"), versions.held():
+        with pytest.raises(FolderInUse, match=rf"\(process {process.pid}\)"), versions.held():
             pass
         process.kill()
     with versions.held():
