@@ -36,12 +36,7 @@ class Telemetry:
     """
 
     def __init__(
-        self,
-        spec: RobotSpec,
-        limits: Limits,
-        *,
-        geometry: Arm | None = None,
-        workspace: Array | None = None,
+        self, spec: RobotSpec, limits: Limits, *, geometry: Arm | None = None, workspace: Array | None = None
     ) -> None:
         self._spec, self._signals = spec, [one for one in spec.signals if len(one.labels) <= _MOST]
         self._units = {one.name: dict(zip(one.labels, one.units, strict=True)) for one in self._signals}
