@@ -43,7 +43,6 @@ from bam_train.data.recorded_episode import (
     Transitions,
     Values,
     digest_of,
-    leaves_of,
     nested,
 )
 from bam_train.environments import first_difference, short_json
@@ -64,8 +63,7 @@ class DataSet:
         self.features = {name: one for name, one in head["features"].items() if name not in DEFAULTS}
         """Columns of the steps, as LeRobot describes them."""
         self.total_frames = int(head["total_frames"])
-        self._observation = leaves_of(info.observation_space, "observation")
-        self._action = leaves_of(info.action_space, "action")
+        self._observation, self._action = info.observation_leaves, info.action_leaves
         self._rows = self._read_rows(int(head["total_episodes"]))
 
     @property
@@ -89,12 +87,12 @@ class DataSet:
         if not isinstance(own.get("format"), int) or own["format"] > FORMAT:
             raise BadDataSet(f"{place}: has format {own.get('format')}; this bam-train reads up to {FORMAT}. Update it")
         if sealed(own)["digest"] != own.get("digest", sealed(own)["digest"]):  # older ones have none
-            raise BadDataSet(f"{place}: {BAM} is not as it was written; run bam-data check {place}")
+            raise files.damaged(f"{BAM} is not as it was written")
         try:
             data = cls(files, DataSetInfo.from_json(own), head, own["columns"])
             data._require_true(head)
         except (KeyError, TypeError, ValueError, BamEnvsError) as error:
-            raise BadDataSet(f"{place}: {BAM} or {INFO} is damaged: {error!r}; run bam-data check {place}") from error
+            raise files.damaged(f"{BAM} or {INFO} is damaged: {error!r}") from error
         return data
 
     def _require_true(self, head: Mapping[str, Any]) -> None:
@@ -108,8 +106,7 @@ class DataSet:
             true = {key: truth[name][key] for key in one} if isinstance(one, dict) else truth[name]
             if found := first_difference(one, true, name):
                 what, wrong, right = found
-                text = f"{INFO}: {what} is {short_json(wrong)}, expected {short_json(right)}"
-                raise BadDataSet(f"{self.place}: {text}; run bam-data check {self.place}")
+                raise self._files.damaged(f"{INFO}: {what} is {short_json(wrong)}, expected {short_json(right)}")
 
     def _read_rows(self, count: int) -> list[dict[str, Any]]:
         rows: list[dict[str, Any]] = []
@@ -121,11 +118,11 @@ class DataSet:
             if {*LIGHT} - {*table.column_names} or any(
                 row_digest(row) != row.get(ROW, row_digest(row)) for row in found
             ):
-                raise BadDataSet(f"{self.place}: {name} is not as it was written; run bam-data check {self.place}")
+                raise self._files.damaged(f"{name} is not as it was written")
             rows += found
             number += 1
         if [row["episode_index"] for row in rows] != list(range(len(rows))):
-            raise BadDataSet(f"{self.place}: its episodes are not numbered from 0 on; run bam-data check {self.place}")
+            raise self._files.damaged("its episodes are not numbered from 0 on")
         self.next_file = number
         return rows[:count]
 
@@ -173,7 +170,7 @@ class DataSet:
                 not copy or copy.others[STATS] == sha256(content)
             ):
                 return stats
-        raise BadDataSet(f"{self.place}: {STATS} is not that of its steps; run bam-data check {self.place}")
+        raise self._files.damaged(f"{STATS} is not that of its steps")
 
     def _index(self, index: int) -> int:
         if not -len(self) <= index < len(self):
@@ -228,7 +225,7 @@ class DataSet:
             raise
         except UNREADABLE as error:
             why = str(error).partition("\n")[0]
-            raise BadDataSet(f"{self.place}: {name} is damaged: {why}; run bam-data check {self.place}") from error
+            raise self._files.damaged(f"{name} is damaged: {why}") from error
 
     def _of_table(self, name: str, table: Any, last: Any, first: int, indices: list[int]) -> Iterator[Episode]:
         start = 0
@@ -244,9 +241,7 @@ class DataSet:
                     raise ValueError(f"it has no column {min(missing)}")
                 yield self.read(self._rows[index], steps, last.slice(index - first, 1))
             except UNREADABLE as error:
-                raise BadDataSet(
-                    f"{self.place}: {name}: episode {index} is damaged: {error}; run bam-data check {self.place}"
-                ) from error
+                raise self._files.damaged(f"{name}: episode {index} is damaged: {error}") from error
 
     def read(self, row: Mapping[str, Any], steps: Any, final: Any) -> Episode:
         """An episode of its rows in the files: that of the episodes, those of its steps, and its last observation.

@@ -38,7 +38,7 @@ from bam_train.data.layout import (
     sealed,
     tasks_table,
 )
-from bam_train.data.recorded_episode import Array, DataSetInfo, Episode, digest_of, leaves_of
+from bam_train.data.recorded_episode import Array, DataSetInfo, Episode, digest_of
 from bam_train.data.statistics import add_stats
 
 _TAIL = struct.Struct("<I4s")  # how a Parquet file ends: length of its footer, magic
@@ -68,9 +68,8 @@ class Columns:
     @classmethod
     def read(cls, episode: Episode, info: DataSetInfo) -> Columns:
         """An episode as a reader gives it."""
-        observation, action = leaves_of(info.observation_space, "observation"), leaves_of(info.action_space, "action")
-        observed = {leaf.column: leaf.of(episode.observations) for leaf in observation}
-        return cls.of(episode, observed, {leaf.column: leaf.of(episode.actions) for leaf in action})
+        observed = {leaf.column: leaf.of(episode.observations) for leaf in info.observation_leaves}
+        return cls.of(episode, observed, {leaf.column: leaf.of(episode.actions) for leaf in info.action_leaves})
 
 
 @dataclass
@@ -89,7 +88,7 @@ class Head:
 
     @property
     def _images(self) -> set[str]:
-        return {leaf.column for leaf in leaves_of(self.info.observation_space, "observation") if leaf.is_image}
+        return {leaf.column for leaf in self.info.observation_leaves if leaf.is_image}
 
     def task(self, episode: Episode) -> int:
         """Index of the episode's task, which is added if it is new."""
@@ -206,14 +205,12 @@ class Head:
 
     def features(self) -> dict[str, dict[str, Any]]:
         """The columns as LeRobot describes them."""
-        spaces = {"observation": self.info.observation_space, "action": self.info.action_space}
         found = {}
-        for kind, space in spaces.items():
-            for leaf in leaves_of(space, kind):
-                found[leaf.column] = self._feature(leaf.column, str(leaf.dtype), leaf.shape)
-                if leaf.is_image:
-                    names = ["height", "width", "channels"]
-                    found[leaf.column] = {"dtype": "image", "shape": list(leaf.shape), "names": names}
+        for leaf in self.info.observation_leaves + self.info.action_leaves:
+            found[leaf.column] = self._feature(leaf.column, str(leaf.dtype), leaf.shape)
+            if leaf.is_image:
+                names = ["height", "width", "channels"]
+                found[leaf.column] = {"dtype": "image", "shape": list(leaf.shape), "names": names}
         found |= {name: self._feature(name, "float64" if name == NEXT[0] else "bool", ()) for name in NEXT}
         texts = {"str": "string"}
         found |= {

@@ -28,7 +28,7 @@ from bam_train.data.layout import (
     file_name,
     row_digest,
 )
-from bam_train.data.recorded_episode import Episode, leaves_of
+from bam_train.data.recorded_episode import Episode
 
 _ENDS = ("bam/terminated", "bam/truncated", "bam/success")
 
@@ -160,8 +160,7 @@ def _episode(
 
     None if they do not belong together, or observations, actions or rewards are damaged.
     """
-    spaces = ((data.info.observation_space, "observation"), (data.info.action_space, "action"))
-    observed, acted = ([leaf.column for leaf in leaves_of(*one)] for one in spaces)
+    observed, acted = ([leaf.column for leaf in one] for one in (data.info.observation_leaves, data.info.action_leaves))
     if not {*observed, *acted, NEXT[0]} <= {*steps.column_names} or not len(steps):
         return None
     known, lost = dict(row), []

@@ -347,13 +347,6 @@ def test_certificates_that_are_none(certificates, tmp_path, threads):
     assert threads() == set()
 
 
-def test_there_is_room_for_so_many(new_server, new_client):
-    url = new_server(options=ServerOptions(max_clients=2)).url
-    for client in (new_client(url), new_client(url)):
-        client.sync()
-    assert refused(url) == (503, "There are 2 clients, and no room for more.\n")
-
-
 def test_websockets_that_say_nothing_keep_nobody_out(new_server, new_client, caplog):
     server = new_server(options=ServerOptions(max_clients=4))
     first, *others = [new_client(server.url) for _ in range(4)]
