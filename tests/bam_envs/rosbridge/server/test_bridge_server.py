@@ -24,11 +24,9 @@ class Client:
     """A plain WebSocket."""
 
     def __init__(self, url, **options):
-        self._stack = contextlib.ExitStack()
-        self.socket = self._stack.enter_context(connect(url, max_size=None, compression=None, **options))
-
-    def close(self):
-        self._stack.close()
+        stack = contextlib.ExitStack()
+        self.socket = stack.enter_context(connect(url, max_size=None, compression=None, **options))
+        self.close = stack.close
 
     def send(self, **message):
         self.socket.send(json.dumps(message))
@@ -49,16 +47,8 @@ class Client:
 
 
 @pytest.fixture
-def new_server():
-    made = []
-
-    def make(**options):
-        made.append(BridgeServer(port=0, **options).start())
-        return made[-1]
-
-    yield make
-    for server in made:
-        server.close()
+def new_server(stack):
+    return lambda **options: stack.enter_context(BridgeServer(port=0, **options))
 
 
 @pytest.fixture
@@ -67,16 +57,13 @@ def server(new_server):
 
 
 @pytest.fixture
-def new_client(server):
-    made = []
-
+def new_client(server, stack):
     def make(url=None, **options):
-        made.append(Client(url or server.url, **options))
-        return made[-1]
+        client = Client(url or server.url, **options)
+        stack.callback(client.close)
+        return client
 
-    yield make
-    for client in made:
-        client.close()
+    return make
 
 
 @pytest.fixture

@@ -38,17 +38,12 @@ SITE = Site({"/": Page("text/html; charset=utf-8", b"<p>hello")}, {"/echo": echo
 
 
 @pytest.fixture
-def new_server():
-    made = []
-
+def new_server(stack):
     def make(tokens=None, site=SITE, **options):
         tokens = tokens or Tokens(otherwise="administer")
-        made.append(BridgeServer(port=0, tokens=tokens, site=site, **options).start())
-        return made[-1]
+        return stack.enter_context(BridgeServer(port=0, tokens=tokens, site=site, **options))
 
-    yield make
-    for server in made:
-        server.close()
+    return make
 
 
 def get(server, path, **headers):
