@@ -106,23 +106,3 @@ def test_a_stored_value_that_is_changed_in_place_shows_until_all_are_read(ws):
     assert ws["plain"].tolist() == changed
     ws.set("plain", 0, ws.get("plain", 0))
     assert ws["plain"].tolist() == [[0.0, 0.0], [3.0, 12.0], [2.0, 20.0]]
-
-
-@pytest.mark.parametrize(
-    "write",
-    [
-        lambda ws: ws.set("plain", 1, torch.tensor([5.0, 5.0])),
-        lambda ws: ws.set("plain", -1, torch.tensor([5.0, 5.0])),
-        lambda ws: ws.set_full("plain", torch.tensor([[5.0, 5.0]])),
-        lambda ws: ws.copy_time(2, 0, 1),
-        lambda ws: ws.copy_n_last_steps(1),
-        lambda ws: (ws.clear("plain"), ws.set("plain", 0, torch.tensor([5.0, 5.0]))),
-    ],
-)
-def test_every_kind_of_write_shows(ws, write):
-    before = ws["plain"]
-    write(ws)
-    after = ws["plain"].tolist()
-    assert after == [ws.get("plain", t).tolist() for t in range(len(after))]
-    assert after != VALUES
-    assert before.tolist() == VALUES

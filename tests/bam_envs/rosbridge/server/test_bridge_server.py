@@ -1,15 +1,12 @@
-import asyncio
 import base64
 import contextlib
 import json
 import socket
-import ssl
 import struct
 import threading
 import time
 
 import pytest
-from websockets.asyncio.client import connect as async_connect
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
 
@@ -301,21 +298,6 @@ def test_guessing_tokens_is_slow_and_keeps_no_other_address_out(new_server, new_
     except OSError:
         pytest.skip("this system has one loopback address")
     new_client(server.url, sock=elsewhere, **bearer("secret")).sync()
-
-
-def test_tls(new_server, certificates):
-    cert, _ = certificates("127.0.0.1")
-    url = new_server(cert=cert, key=cert.replace("cert.pem", "key.pem")).url
-    assert url.startswith("wss://127.0.0.1:")
-    tls = ssl.create_default_context(cafile=cert)
-
-    async def sync():
-        # Not the client of `websockets.sync`: its two threads use one TLS object, which is not safe.
-        async with async_connect(url, ssl=tls) as client:
-            await client.send('{"op": "call_service", "service": "/rosapi/get_time"}')
-            return json.loads(await client.recv())["result"]
-
-    assert asyncio.run(sync())
 
 
 def test_certificates_that_are_none(certificates, tmp_path, threads):

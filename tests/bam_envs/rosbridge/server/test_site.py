@@ -286,6 +286,7 @@ def test_over_tls_the_origin_is_https(new_server, certificates):
     cert, _ = certificates("127.0.0.1")
     server = new_server(ROLES, cert=cert, key=cert.replace("cert.pem", "key.pem"))
     own, tls = f"127.0.0.1:{server.port}", ssl.create_default_context(cafile=cert)
+    assert server.url == f"wss://{own}"
 
     async def first_message(origin):
         # Not the client of `websockets.sync`: its two threads use one TLS object, which is not safe.
