@@ -264,11 +264,10 @@ class _Recorder:
         **options: Any,
     ) -> None:
         super().__init__(env)  # type: ignore[call-arg] # of the wrapper
-        mode = env.metadata.get("autoreset_mode")
-        if isinstance(env, VectorEnv) and mode is not AutoresetMode.SAME_STEP:
+        if isinstance(env, VectorEnv) and env.metadata.get("autoreset_mode") is not AutoresetMode.SAME_STEP:
             raise BadDataSet(
                 f"{place}: environments side by side are recorded in autoreset mode SAME_STEP, which keeps the last "
-                f"observation; found {mode}"
+                f"observation; found {env.metadata.get('autoreset_mode')}"
             )
         info = info or info_of(env, env_id, env_kwargs, period)
         self.writer = DataSetWriter(place, info, **options)
