@@ -17,15 +17,7 @@ from bam_train.data import layout
 from bam_train.data.arrow_columns import from_arrow
 from bam_train.data.file_pair import Copy, Head, sha256
 from bam_train.data.layout import Files, file_name, row_digest, sealed
-from bam_train.data.recorded_episode import (
-    Array,
-    DataSetInfo,
-    Episode,
-    Transitions,
-    Values,
-    digest_of,
-    nested,
-)
+from bam_train.data.recorded_episode import Array, DataSetInfo, Episode, Transitions, Values, digest_of, nested
 from bam_train.environments import first_difference, short_json
 from bam_train.errors import BadDataSet, PlaceError
 from bam_train.files.place import Place

@@ -33,10 +33,7 @@ _NOT_RECORDED = WHERE | {"env_id", "id", "render_mode", "num_envs", "vectorizati
 
 
 def info_of(
-    env: AnyEnv,
-    env_id: str | None = None,
-    env_kwargs: Mapping[str, Any] | None = None,
-    period: float | None = None,
+    env: AnyEnv, env_id: str | None = None, env_kwargs: Mapping[str, Any] | None = None, period: float | None = None
 ) -> DataSetInfo:
     """What all episodes of `env` have in common.
 

@@ -39,11 +39,7 @@ def require_picture_path(path: Path) -> Path:
 
 
 def plot(
-    data: DataSet,
-    path: Path,
-    kinds: Sequence[str] = (),
-    against: DataSet | None = None,
-    episodes: Sequence[int] = (),
+    data: DataSet, path: Path, kinds: Sequence[str] = (), against: DataSet | None = None, episodes: Sequence[int] = ()
 ) -> list[str]:
     """Draw `data` into an image file; returns the kinds that were drawn.
 

@@ -65,10 +65,7 @@ def test_a_film_of_recorded_pictures(tmp_path, run):
     with pytest.raises(SettingsError, match="has no 'kamera'"):
         next(frames(data, 0, "kamera"))
     status, _, err = run(main, "show", tmp_path / "a", "--episode", "3", "--out", tmp_path / "e.gif")
-    assert (status, err) == (
-        1,
-        f"bam-data show: --episode: {tmp_path}/a has 3 episodes, and there is no 3\n",
-    )
+    assert (status, err) == (1, f"bam-data show: --episode: {tmp_path}/a has 3 episodes, and there is no 3\n")
 
 
 def test_a_film_of_actions_that_are_played_again(tmp_path):
