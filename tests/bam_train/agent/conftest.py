@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import json
 import threading
-import time
 
 import pytest
 from websockets.exceptions import ConnectionClosed
@@ -169,17 +168,6 @@ def new_agent(server, tmp_path):
             return stack.enter_context(AgentClient(url or server.url, token_file=path, name="anna@laptop", **more))
 
         yield make
-
-
-@pytest.fixture
-def until():
-    def wait(condition, timeout=DEADLINE):
-        end = time.monotonic() + timeout
-        while not condition():
-            assert time.monotonic() < end, condition
-            time.sleep(0.005)
-
-    return wait
 
 
 @contextlib.contextmanager

@@ -30,18 +30,6 @@ def test_without_auto_reset_the_last_frame_is_repeated(toys):
     assert agent.include_last_state
 
 
-def test_auto_reset_with_the_last_state(toys):
-    agent = ParallelGymAgent(lambda: Autoreset(toys.Counting(length=2)), 1)
-    ws = toys.run(agent, 8)
-    assert toys.column(ws, "env/env_obs") == [[1, 0], [1, 1], [1, 2], [2, 0], [2, 1], [2, 2], [3, 0], [3, 1]]
-    assert toys.column(ws, "env/reward") == [0, 11, 12, 0, 21, 22, 0, 31]
-    assert toys.column(ws, "env/cumulated_reward") == [0, 11, 23, 0, 21, 43, 0, 31]
-    assert toys.column(ws, "env/timestep") == [0, 1, 2, 0, 1, 2, 0, 1]
-    assert toys.column(ws, "env/done") == [False, False, True, False, False, True, False, False]
-    assert agent.envs[0].unwrapped.actions == [1, 2, 4, 5, 7]
-    assert ws["env/cumulated_reward"][ws["env/done"]].tolist() == [23, 43]
-
-
 def test_reward_at_t(toys):
     ws = toys.run(ParallelGymAgent(toys.Counting, 1, reward_at_t=True), 4)
     assert toys.column(ws, "env/reward") == [11, 12, 13, 0]

@@ -26,15 +26,6 @@ def test_gae_in_numbers():
     assert gae(reward, next_critic, bootstrap, critic, 0.5, 0.5).tolist() == [1 - 0.25 * 18, -18, -7]
 
 
-def test_lambda_0_and_1(steps):
-    reward, next_critic, bootstrap, critic = steps
-    delta = reward + GAMMA * next_critic * bootstrap - critic
-    assert torch.equal(gae(*steps, GAMMA, 0.0), delta)
-    alive = torch.ones(3, dtype=torch.bool)
-    advantage = gae(torch.ones(3), torch.zeros(3), alive, torch.zeros(3), 0.5, 1.0)
-    assert advantage.tolist() == [1.75, 1.5, 1.0]
-
-
 def test_gae_keeps_the_dtype_and_takes_flags_as_numbers(steps):
     reward, next_critic, bootstrap, critic = (value.double() for value in steps)
     found = gae(reward, next_critic, bootstrap, critic, GAMMA, LAMBDA)
@@ -56,32 +47,10 @@ def test_gae_refuses_what_would_broadcast():
         gae(*values, GAMMA, LAMBDA)
 
 
-def test_temporal_difference_in_numbers():
-    critic = torch.tensor([[10.0, 1.0], [20.0, 2.0], [30.0, 3.0]], requires_grad=True)
-    reward = torch.tensor([[9.0, 9.0], [1.0, 2.0], [3.0, 4.0]])
-    bootstrap = torch.tensor([[True, False], [False, True]])
-    td = temporal_difference(critic, reward, bootstrap, 0.5)
-    assert td.tolist() == [[1 + 10 - 10, 2 - 1], [3 - 20, 4 + 1.5 - 2], [0, 0]]
-    td.sum().backward()
-    assert critic.grad.tolist() == [[-1, -1], [-1, -1], [0, 0]]
-
-
 def test_temporal_difference_wants_one_flag_for_each_transition():
     message = r"^temporal_difference: expected must_bootstrap \(1, 1\), found \(2, 1\)\.$"
     with pytest.raises(LoopError, match=message):
         temporal_difference(torch.zeros(2, 1), torch.zeros(2, 1), torch.zeros(2, 1), 0.5)
-
-
-def test_double_q_learning_in_numbers():
-    q = torch.tensor([[[1.0, 2.0]], [[4.0, 3.0]]], requires_grad=True)
-    q_target = torch.tensor([[[50.0, 60.0]], [[70.0, 80.0]]])
-    action, reward = torch.tensor([[1], [0]]), torch.tensor([[9.0], [5.0]])
-    td = doubleqlearning_temporal_difference(q, action, q_target, reward, torch.tensor([[True]]), 0.5)
-    assert td.tolist() == [[5 + 35 - 2], [0]]
-    td.sum().backward()
-    assert q.grad.tolist() == [[[0, -1]], [[0, 0]]]
-    ended = doubleqlearning_temporal_difference(q, action, q_target, reward, torch.tensor([[False]]), 0.5)
-    assert ended.tolist() == [[5 - 2], [0]]
 
 
 def test_double_q_learning_names_what_does_not_fit():

@@ -9,9 +9,6 @@ pytest.importorskip("torch")
 
 from bam_envs.robots.physics.rendering import RenderingUnavailable, find_backend
 from bam_train.checkpoint import Checkpoint
-from bam_train.cli.flags import TrainConfig
-from bam_train.cli.program import guarded
-from bam_train.cli.train import train
 from bam_train.evaluation import evaluate
 from bam_train.policy import FrozenPolicy
 from bam_train.trainers.learning.dagger import DaggerTrainer
@@ -19,23 +16,6 @@ from bam_train.trainers.resolve_settings import resolve
 
 PICK_PPO = Path(__file__).parents[4] / "checkpoints" / "pick-ppo.zip"
 TINY = ("width=16", "channels=2", "batch_size=16", "env_kwargs.image_size=16", "env_kwargs.action_delay=1")
-
-
-@pytest.fixture(autouse=True)
-def here(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-
-
-@pytest.fixture
-def bam_train(capsys):
-    """Runs the program in this process; its status, and standard error."""
-
-    def run(**flags):
-        flags |= {name: Path(flags[name]) for name in ("out", "resume") if name in flags}
-        status = guarded(lambda: train(TrainConfig(**flags)), "bam-train")
-        return status, capsys.readouterr().err
-
-    return run
 
 
 def test_a_scripted_teacher_is_imitated(bam_train):

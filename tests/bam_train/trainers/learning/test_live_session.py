@@ -203,10 +203,7 @@ def test_the_second_learner_is_refused(hub, tmp_path):
     ("given", "message"),
     [
         ({}, "env: expected a name, found nothing. Give --env NAME, that of the agent's checkpoint"),
-        (
-            {"env": ENV, "algo": "ppo"},
-            "--learner: the algorithm of a learner is rlpd; leave --algo and --trainer out",
-        ),
+        ({"env": ENV, "algo": "ppo"}, "--learner: the algorithm of a learner is rlpd; leave --algo and --trainer out"),
         (
             {"env": ENV, "transport": ["tcp://a:1"]},
             "--learner and --transport exclude each other: it learns from the agent's robot; give one",

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 from importlib.util import find_spec
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,9 +13,6 @@ pytest.importorskip("torch")
 pytest.importorskip("pyarrow")
 
 from bam_train.checkpoint import Checkpoint
-from bam_train.cli.flags import TrainConfig
-from bam_train.cli.program import guarded
-from bam_train.cli.train import train
 from bam_train.data import DataSet, DataSetInfo, DataSetWriter, Episode
 from bam_train.policy import FrozenPolicy
 from bam_train.trainers.resolve_settings import resolve
@@ -24,26 +20,6 @@ from bam_train.trainers.resolve_settings import resolve
 SEEN = spaces.Box(-1, 1, (2,), np.float32)
 ACTED = spaces.Box(np.float32([-1, 0]), np.float32([1, 10]))
 TINY = ("width=16", "batch_size=32")
-
-
-@pytest.fixture(autouse=True)
-def here(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    return tmp_path
-
-
-@pytest.fixture
-def bam_train(capsys):
-    """Runs the program in this process; its status, and standard error."""
-
-    def run(**flags):
-        flags |= {name: Path(flags[name]) for name in ("out", "resume") if name in flags}
-        status = guarded(lambda: train(TrainConfig(**flags)), "bam-train")
-        out, err = capsys.readouterr()
-        assert out == ""
-        return status, err
-
-    return run
 
 
 def record(place, *, action_space=ACTED, env="elsewhere/Point-v0", episodes=8, steps=20, bad=0.0):
