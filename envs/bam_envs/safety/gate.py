@@ -311,13 +311,14 @@ class SafeRobot(metaclass=Sealed):
         return _copied(self._fresh_state())
 
     def guards(self) -> list[dict[str, Any]]:
-        """The guards in their order: number, name, limit, unit, name of the setting in `Limits`, and what it does."""
+        """The guards in order: number, name, limit, those of joints, unit, setting in `Limits`, and what it does."""
         every = dict.fromkeys(self._every)  # the tool's speed is limited twice
         return [
             {
                 "number": one.number,
                 "name": one.name,
                 "limit": one.limit_value if math.isfinite(one.limit_value) else None,
+                "each": [*one.each],
                 "unit": one.unit,
                 "setting": one.setting,
                 "does": inspect.cleandoc(type(one).__doc__ or "").partition("\n\n")[0].replace("\n", " "),

@@ -359,6 +359,27 @@ def test_at_its_speed_limit_a_joint_goes_on_until_it_must_brake():
     np.testing.assert_allclose(steps[5:38], 0.0125)
 
 
+def test_a_joint_speeds_up_within_its_own_limit_and_brakes_for_its_goal():
+    gentle = replace(ARM, command=replace(ARM.command, max_acceleration=(2.0, *(20.0,) * 5, math.inf)))
+    guard = arm_guards.JointAcceleration(gentle, Limits())
+    assert (guard.each, guard.limit_value) == ([2.0, *(10.0,) * 5], 10.0)
+    np.testing.assert_allclose(ticks_of(guard, joints(0.05), 6), [0.005, 0.01, 0.015, 0.02, 0, 0], atol=1e-10)
+    ended = arm_tick(joints(0.0), step=(0.02,))  # its last command is its goal: it must not pass it
+    assert not guard.limit(ended)
+    back = arm_tick(joints(-0.03), step=(0.02,))
+    assert guard.limit(back)
+    np.testing.assert_allclose(back.command - HOME, joints(0.0), atol=1e-9)
+
+
+def test_a_joint_has_its_own_jerk():
+    own = replace(ARM, command=replace(ARM.command, max_jerk=(40.0, *(5000.0,) * 5, math.inf)))
+    guard = arm_guards.JointJerk(own, Limits())
+    assert (guard.each, guard.limit_value) == ([40.0, *(500.0,) * 5], 500.0)
+    tick = arm_tick(joints(0.025, 0.025))
+    assert guard.limit(tick)
+    np.testing.assert_allclose(tick.command - HOME, joints(0.005, 0.025), atol=1e-9)
+
+
 @given(st.floats(0, 100), st.floats(1e-4, 10))
 def test_the_longest_step_is_followed_by_others_that_stop_at_the_end(distance, change):
     step, left, count = longest_step(distance, change), distance, 0
