@@ -302,6 +302,8 @@ class Tick:
     """Duration of the command [s]: the time since the last one was sent, at most one period of the robot."""
     pause: float = 0.0
     """Time since the last command was sent [s]; 0 for the first one, and where time passes only with commands."""
+    elapsed: float = 0.0
+    """Time from the state before to this one [s]; one period where time passes only with commands."""
     waiting: float = 0.0
     """Time since the oldest unanswered command was sent [s]; 0 if there is none, or the robot never answers."""
     approach: bool = False
