@@ -47,8 +47,9 @@ class SignalSpec:
     def part(self, labels: tuple[str, ...]) -> SignalSpec:
         """The numbers called `labels`, in that order; the signal must have all of them."""
         places = [self.labels.index(label) for label in labels]
-        rows: dict[str, Any] = {key: value for key, value in vars(self).items() if isinstance(value, tuple)}
-        return replace(self, **{key: tuple(value[one] for one in places) for key, value in rows.items()})
+        rows = ((key, value) for key, value in vars(self).items() if isinstance(value, tuple))
+        picked: dict[str, Any] = {key: tuple(value[one] for one in places) for key, value in rows}
+        return replace(self, **picked)
 
 
 @dataclass(frozen=True)

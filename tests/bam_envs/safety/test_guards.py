@@ -15,6 +15,7 @@ from bam_envs.robots.base_description import base_model
 from bam_envs.robots.ur5e import GEOMETRY, JOINTS, arm_spec
 from bam_envs.safety import arm_guards, guards
 from bam_envs.safety.arm_guards import longest_step
+from bam_envs.safety.following import JointFollowing
 from bam_envs.safety.guard import BOUNDS, ORDERED, Limits, Tick
 from bam_envs.safety.guards import default_guards
 from bam_envs.testing import ARM_HOME
@@ -464,6 +465,29 @@ def test_base_acceleration(last, command, sent):
 def measured(position=0.0, velocity=0.0):
     signals = {"joint_position": np.full((1, 6), position), "joint_velocity": np.full((1, 6), velocity)}
     return RobotState({**signals, "gripper_width": np.full((1, 1), -0.001)}, np.zeros(1), HOME[None])
+
+
+@pytest.mark.parametrize(
+    ("is_simulated", "ticks", "cause"),
+    [
+        (False, 3, "look for a protective stop, a paused program"),
+        (True, 8, "it presses on something, such as the object"),
+    ],
+)
+def test_a_slow_arm_that_is_held_fast_is_stopped_and_a_simulated_one_not_while_it_is_relieved(
+    is_simulated, ticks, cause
+):
+    guard = JointFollowing(ARM, Limits().on_trial(base=False), GEOMETRY.tool_position)
+    guard.connected(0.0, yields=is_simulated)
+    sent, faults = HOME + joints(0, 0.03), []
+    while guard.patience > 1 or not faults:
+        tick = tick_from(sent, measured=HOME, before=HOME, velocity=np.zeros(7))
+        reason = guard.fault(tick)
+        if reason is not None and (guard.patience == 1 or not faults):
+            assert cause in reason
+        faults.append(reason is not None)
+        sent = np.array(guard.hold(tick)) if faults[-1] else sent + joints(0, 0.01)
+    assert len(faults) == ticks
 
 
 def test_measured_limits():
