@@ -99,7 +99,7 @@ def test_a_simulated_arm_that_is_held_fast_is_stopped(run):
     with ServedEnvironment(env, ServeOptions(port=0, fast=True)) as served:
         flags = ("--robot", served.bus.url, "--episodes", 1, "--no-record", "--json")
         status, out, err = run(main, CHECKPOINTS / "pick-ppo.zip", *flags)
-    assert (status, json.loads(out)["guards"]["following"]["stopped"]) == (5, 1), err
+    assert (status, json.loads(out)["guards"]["following"]["stopped"]) == (3, 1), err
     assert "it presses on something, such as the object or the table" in err
     assert "protective stop" not in err
 
