@@ -691,6 +691,7 @@ class Resident:
             "loop_ms": round(self._loop_ms, 3),
             "recording": None if session is None or session.recorder is None else str(session.recorder.path),
             "marks": [] if session is None else list(session.marks),
+            "goals": [] if session is None else session.goals(),
             "unusual": None if journal is None else journal.unusual,
             "warnings": self._warnings(),
             "guards": {} if session is None else session.robot.report(),

@@ -124,13 +124,22 @@ def test_the_message_of_a_base():
     assert set(message["state"]) == {"base_pose", "base_velocity"}
     assert message["tool"] is None
     assert message["base"] == [1.0, 2.0, 0.5]
-    assert message["outline"] == pytest.approx([0.4876, 0.4124, 0.29])
+    assert message["outline"] == [[0.4876, -0.29], [0.4876, 0.29], [-0.4124, 0.29], [-0.4124, -0.29]]
     assert 100 < len(message["scan"]) <= 180
     assert all(len(point) == 2 for point in message["scan"])
     assert message["near"]["base speed"] == {"value": 0.25, "limit": 0.5, "unit": "m/s", "share": 0.5}
     assert message["near"]["turn speed"]["share"] == 0.0
     assert message["near"]["laser zones"]["share"] == 0.0
     assert Telemetry(BASE, Limits()).message(base_state(0.4), 0.0)["near"]["laser zones"]["share"] > 0.9
+
+
+def test_a_round_base_is_drawn_round():
+    spec = base_model("turtlebot4").spec(with_scans=False)
+    state = base_state()
+    state.signals = {name: state.signals[name] for name in ("base_pose", "base_velocity")}
+    edge = np.array(Telemetry(spec, Limits()).message(state, 0.0)["outline"])
+    assert edge.shape == (32, 2)
+    np.testing.assert_allclose(np.hypot(*edge.T), 0.171, atol=1e-5)
 
 
 def test_a_base_without_scanners():
