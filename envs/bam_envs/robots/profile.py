@@ -24,7 +24,7 @@ from bam_envs.arms.description import ArmDescription
 from bam_envs.core.errors import InvalidValue, UnknownName
 from bam_envs.core.robot import RobotSpec, SignalSpec
 from bam_envs.core.robot_models import Description, description_folders, find_model, known_models
-from bam_envs.core.validation import Finite, NonEmpty, NonNegative, Positive, check, read_table, type_hints
+from bam_envs.core.validation import AboveZero, Finite, NonEmpty, NonNegative, Positive, check, read_table, type_hints
 from bam_envs.robots.base_description import base_model
 from bam_envs.robots.ur5e import arm_spec
 from bam_envs.ros.codec import LISTED_TYPES
@@ -106,6 +106,8 @@ class _Signal:
     high: tuple[Finite, ...]
     name: NonEmpty = "command"
     max_rate: tuple[Finite, ...] = ()
+    max_acceleration: tuple[AboveZero, ...] = ()
+    max_jerk: tuple[AboveZero, ...] = ()
 
 
 def load_profile(name_or_path: str | Path) -> RobotProfile:
@@ -425,8 +427,9 @@ def _signal(row: Table, where: str) -> SignalSpec:
     units, low, high = (_each(where, key, getattr(signal, key), size) for key in ("units", "low", "high"))
     if not all(least < most for least, most in zip(low, high, strict=True)):
         raise InvalidValue(f"{where}: low must be below high.")
-    rate = _each(where, "max_rate", signal.max_rate, size) if signal.max_rate else None
-    return SignalSpec(signal.name, signal.labels, units, low, high, rate)
+    given = {key: getattr(signal, key) for key in ("max_rate", "max_acceleration", "max_jerk")}
+    limits = {key: _each(where, key, values, size) for key, values in given.items() if values}
+    return SignalSpec(signal.name, signal.labels, units, low, high, **limits)
 
 
 def _state(where: str, file: _File, spec: RobotSpec) -> list[Source]:

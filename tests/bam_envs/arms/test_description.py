@@ -1,5 +1,6 @@
 """Descriptions of arms: what a file must say, where it is looked for, and what makes two of them differ."""
 
+import math
 import re
 from dataclasses import replace
 from importlib import metadata
@@ -11,6 +12,7 @@ from bam_envs.arms.description import ArmDescription, robot_model
 from bam_envs.core import robot_models
 from bam_envs.core.errors import InvalidValue, UnknownName
 from bam_envs.core.robot_models import known_models, read_description
+from bam_envs.robots.profile import load_profile
 
 SHIPPED = known_models(ArmDescription)
 SO101 = SHIPPED["so101"].read_text(encoding="utf-8")
@@ -73,6 +75,11 @@ def test_signals_are_the_arms_own():
     assert spec.command.low == (-1.91986, -1.74533, -1.69, -1.65806, -2.74385, 0.0)
     assert spec.command.high == (1.91986, 1.74533, 1.69, 1.65806, 2.84121, 0.05)
     assert spec.command.max_rate == (*(4.7,) * 5, 0.1)
+    assert (spec.command.max_acceleration, spec.command.max_jerk) == (
+        (*(20.0,) * 5, math.inf),
+        (*(200.0,) * 5, math.inf),
+    )
+    assert load_profile("so101").spec().command == spec.command
     measured = ["joint_position", "joint_velocity", "gripper_width"]
     assert [one.name for one in spec.signals] == [*measured, "object_position", "object_quaternion"]
     assert [one.name for one in arm.spec(with_object=False).signals] == measured

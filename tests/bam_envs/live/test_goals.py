@@ -88,6 +88,7 @@ def connect():
         def step(width):
             command = robot.measure().command
             command[0, 6] = width
+            robot.await_due()
             return robot.step(_clear(robot, command))
 
         step.robot = robot
@@ -395,6 +396,7 @@ def test_a_drive_gets_the_twist_that_its_topic_has(server, robot_on, connect, tm
     try:
         robot.connect()
         robot.reset(ROW, START)
+        robot.await_due()
         robot.step(_clear(robot, np.array([[0.25, -0.5]])))
         scripted.wait_for(lambda: any(topic == "/cmd_vel" for topic, _, _ in scripted.commands))
         message = next(message for topic, _, message in scripted.commands if topic == "/cmd_vel")

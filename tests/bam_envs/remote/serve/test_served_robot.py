@@ -94,31 +94,50 @@ def test_in_real_time_a_command_takes_a_period_of_ticks(serve, arm, hands):
     np.testing.assert_allclose(served.state.stamp, [0.05])
 
 
-@pytest.mark.parametrize("burst", [1, 2])  # the commands of the lost time come in one tick, or in two
-@pytest.mark.parametrize("held", [0, 3])  # periods in which the last of them comes again
-def test_a_robot_whose_clock_stood_still_catches_up_slowly(serve, hands, burst, held):
-    served, step, speeds, pan = serve(SimulatedArm(1), realtime=True), 0.02, [], np.eye(6)[:1]
+@pytest.fixture
+def stream(serve, hands):
+    """Sends the pan joint of a simulated arm steps of 0.02 rad, and notes its highest speed after each tick."""
+    served = serve(SimulatedArm(1), realtime=True)
     served.command_timeout = 0.5
 
-    def period(change, parts=PARTS, count=1):
-        served.follow(command(change * pan), count=count)
+    def period(step, parts=PARTS, count=1):
+        served.follow(command(0.02 * step * np.eye(6)[:1]), count=count)
         for _ in range(parts):
             ticks(served, hands, 1)
-            speeds.append(np.abs(served.state.signals["joint_velocity"]).max())
+            period.speeds.append(np.abs(served.state.signals["joint_velocity"]).max())
 
-    for i in range(1, 9):
-        period(i * step)
-    usual, speeds[:] = max(speeds), []
+    period.served, period.hands, period.speeds = served, hands, []
+    for step in range(1, 9):
+        period(step)
+    period.usual = max(period.speeds)
+    return period
+
+
+def arrives(stream, last):
+    """Whether the arm is never much faster than its commands, and comes to the `last` one."""
+    ticks(stream.served, stream.hands, 4 * PARTS)
+    there = HOME + 0.02 * last * np.eye(6)[0]
+    np.testing.assert_allclose(stream.served.state.signals["joint_position"], there, atol=0.005)
+    return max(stream.speeds) < 1.3 * stream.usual
+
+
+@pytest.mark.parametrize("burst", [1, 2])  # the commands of the lost time come in one tick, or in two
+@pytest.mark.parametrize("held", [0, 3])  # periods in which the last of them comes again
+def test_a_robot_whose_clock_stood_still_catches_up_slowly(stream, hands, burst, held):
     hands.now += 3 * 0.05  # commands 9, 10 and 11 come meanwhile
     if burst == 2:
-        period(9 * step, parts=1)
-    period(11 * step, count=4 - burst)
-    for i in [*[11] * held, *range(12, 40)]:
-        period(i * step)
-    assert max(speeds) < 1.3 * usual
-    np.testing.assert_allclose(served.target(), command(39 * step * pan))
-    ticks(served, hands, 4 * PARTS)
-    np.testing.assert_allclose(served.state.signals["joint_position"], HOME + 39 * step * pan, atol=0.005)
+        stream(9, parts=1)
+    stream(11, count=4 - burst)
+    for step in [*[11] * held, *range(12, 40)]:
+        stream(step)
+    assert arrives(stream, 39)
+
+
+@pytest.mark.parametrize("late", [2, 4])
+def test_a_command_soon_after_a_late_one_does_not_make_the_robot_fast(stream, late):
+    for step in range(9, 40):
+        stream(step, parts=PARTS + late * (step % 5 == 0) - late * (step % 5 == 1))
+    assert arrives(stream, 39)
 
 
 def test_wrong_commands_are_refused_and_a_clock_that_stands_still_is_an_error(serve):
