@@ -117,7 +117,7 @@ def test_the_summary_and_a_second_call_that_does_what_is_missing(bam_train, monk
 
 def test_two_calls_do_not_train_the_same_seeds(here):
     settings = TrainSettings(env="CartPole-v1", algo="ppo")
-    text = "runs/CartPole-v1-ppo: another bam-train trains its seeds, or its runs are being saved. Wait for its end"
+    text = "runs/CartPole-v1-ppo: another program trains its seeds, or its runs are being saved. Wait for its end"
     again = group_folder(Path("runs"), settings)
     with group_folder(Path("runs"), settings), pytest.raises(FolderInUse) as error:
         again.__enter__()
