@@ -39,6 +39,8 @@ try:
 except ImportError:  # Windows: nothing keeps two calls from the same folder
     fcntl = None  # type: ignore[assignment]
 
+LOCKS = fcntl is not None
+"""Whether a folder can be locked."""
 MOST_SEEDS = 1000
 POLL = 0.2
 """Seconds between two looks at the runs."""
