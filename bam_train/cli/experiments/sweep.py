@@ -45,9 +45,9 @@ class SweepConfig(SettingsFlags, RobotModelFlag):  # type: ignore[misc]
     SET: ClassVar[str] = "env_kwargs.robot_model"
 
     file: Annotated[tyro.conf.Positional[Path | None], tyro.conf.arg(metavar="[FILE]")] = None
-    """Settings as of bam-train --config, .toml or .json, with ranges and choices as text; also trials, seeds, minutes."""
+    """Settings as of bam-train --config, .toml or .json, with ranges and choices as text; trials, seeds, minutes."""
     set: Assignments = ()
-    """A setting to search, or a fixed one, any number of times: gamma=0.9..0.99, policy_kwargs.net_arch=[64,64],[256]."""
+    """A setting to search, or a fixed one, any number of times: gamma=0.9..0.99, policy_kwargs.net_arch=[64],[256]."""
     trials: Annotated[Count | None, tyro.conf.arg(metavar="N")] = None
     """Trials in all, also after --resume (default 20)."""
     seeds: Annotated[Count | None, tyro.conf.arg(metavar="N")] = None

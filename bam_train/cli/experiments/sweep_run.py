@@ -178,11 +178,8 @@ _WORDS = {
 
 def _order(trial: FrozenTrial) -> tuple[int, float, int]:
     """Done trials first, the best of them at the top."""
-    return (
-        [*_WORDS].index(trial.state),
-        -(trial.value or 0.0) if trial.state == TrialState.COMPLETE else 0.0,
-        trial.number,
-    )
+    score = (trial.value or 0.0) if trial.state == TrialState.COMPLETE else 0.0
+    return [*_WORDS].index(trial.state), -score, trial.number
 
 
 def _base_name(base: TrainSettings) -> str:
@@ -197,9 +194,7 @@ def _confirm(folder: SweepFolder, best: FrozenTrial, number: int, address: str |
     base, name = folder.space.base, _base_name(folder.space.base)
     rows = {name: base, f"trial-{best.number}": folder.space.settings(best.params)}
     if len({json.dumps(one.to_mapping(), sort_keys=True) for one in rows.values()}) == 1:
-        raise SettingsError(
-            f"trial {best.number}, the best one, has the settings of the {name}: more trials may find others"
-        )
+        raise SettingsError(f"trial {best.number}, the best one, has the settings of the {name}: try more --trials")
     place = RunFolder(folder.path, "confirm", lambda path: True).path
     with (
         _runs(folder, address, f"trial {best.number} and the {name} on {number} new seeds") as (start, jobs, stopped),
