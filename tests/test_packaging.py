@@ -149,6 +149,7 @@ def test_console_scripts(wheel):
         "bam-robots = bam_train.cli.arms.bam_robots:main",
         "bam-serve = bam_train.cli.serve:main",
         "bam-sign = bam_train.cli.sign:main",
+        "bam-sweep = bam_train.cli.experiments.sweep:main",
         "bam-train = bam_train.cli.train:main",
     ]
 

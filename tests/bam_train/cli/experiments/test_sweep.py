@@ -7,6 +7,7 @@ import json
 import os
 import shutil
 import signal
+import subprocess
 import sys
 import time
 from pathlib import Path
@@ -100,11 +101,18 @@ def trained(monkeypatch):
         (("seed=1,2",), "seed: a search trains new runs in simulation, with seeds of its own; leave it out"),
     ],
 )
-def test_what_is_refused_leaves_nothing_and_needs_no_torch(run, here, monkeypatch, words, line):
-    monkeypatch.setitem(sys.modules, "torch", None)
+def test_what_is_refused_leaves_nothing(run, here, words, line):
     flags = [part for word in words for part in ("--set", word)]
     assert run(main, *BASE, *flags) == (1, "", f"bam-sweep: {line}\n")
     assert list(here.iterdir()) == []
+
+
+def test_a_setting_that_does_not_exist_costs_no_import_of_torch():
+    code = "import atexit, sys; atexit.register(lambda: print('torch' in sys.modules))"
+    code += f"; from bam_train.cli.experiments.sweep import main; main({[*BASE, '--set', 'lr=1..2']})"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout) == (1, "False\n")
+    assert done.stderr == "bam-sweep: Unknown ppo hyperparameter 'lr'. Did you mean 'learning_rate'?\n"
 
 
 def test_refused_before_anything_is_searched(run, monkeypatch):
@@ -147,7 +155,7 @@ def test_a_search_from_a_file_and_what_a_second_call_does(run, trained):
             assert (outcome["state"], outcome["score"]) == ("pruned", size / 2)
     pruned = [number for number, state in states.items() if state == TrialState.PRUNED]
     done = [number for number, state in states.items() if state == TrialState.COMPLETE]
-    assert pruned and min(pruned) > sorted(done)[3]
+    assert min(pruned) > sorted(done)[3]
     before = sorted(sizes[number] / 2 for number in done if number < pruned[0])
     middle = (before[(len(before) - 1) // 2] + before[len(before) // 2]) / 2
     why = f"{sizes[pruned[0]] / 2:.4g} is below {middle:.4g}, the median of {len(before)} trials (seed 0 at 500 steps)"
@@ -231,16 +239,14 @@ def test_a_full_disk_loses_no_trial(run, trained, monkeypatch):
             raise OSError(errno.ENOSPC, "No space left on device")
         append(self, logs)
 
-    monkeypatch.setattr(JournalFileBackend, "append_logs", fails)
-    status, _, err = run(main, *SEARCHED, "--trials", "6", "--seeds", "1")
+    with monkeypatch.context() as full:
+        full.setattr(JournalFileBackend, "append_logs", fails)
+        status, _, err = run(main, *SEARCHED, "--trials", "6", "--seeds", "1")
     line = (
         f"bam-sweep: {FOLDER}/journal.log: cannot be written: No space left on device. Choose another place with --runs"
     )
     assert (status, err.splitlines()[-1]) == (1, line)
-    monkeypatch.undo()
-    monkeypatch.setattr(seeds, "SeedProcess", Trained)
-    begun = len(trained)
-    assert begun >= 2
+    assert len(trained) == 4
     assert run(main, *SEARCHED, "--trials", "6", "--seeds", "1")[0] == 0
     assert len(trained) == 6
 
@@ -268,7 +274,7 @@ def interrupt_at(number, trained, news, process):
 
 
 def test_when_the_time_is_over(run, trained):
-    status, out, err = run(main, *SEARCHED, "--minutes", "1e-9")
+    status, _, err = run(main, *SEARCHED, "--minutes", "1e-9")
     assert status == 1
     assert err.splitlines()[-2:] == [
         "1e-09 minutes are over: 0 of 20 trials have ended; the same command goes on with the others",
