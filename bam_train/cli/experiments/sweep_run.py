@@ -24,8 +24,8 @@ from bam_train.experiments.run_logs import read_runs
 from bam_train.experiments.search_space import walk
 from bam_train.experiments.seed_runs import SeedRun, locked, run_seeds
 from bam_train.experiments.seed_statistics import FEWEST
-from bam_train.experiments.sweep import Sweep, chosen, shown
 from bam_train.experiments.sweep_folder import SweepFolder
+from bam_train.experiments.trial_search import Sweep, chosen, shown
 from bam_train.files.atomic_file import replacing, require_writable
 from bam_train.files.log_lines import aligned
 from bam_train.settings import (
@@ -39,7 +39,7 @@ from bam_train.settings import (
     toml_text,
 )
 from bam_train.trainers.resolve_settings import preset_notices, read_preset, resolve
-from bam_train.trainers.run_folder import RunFolder, require_room
+from bam_train.trainers.run_folder import RunFolder
 
 TRIALS = 20
 """Trials of a search, unless it is said."""
@@ -58,12 +58,11 @@ def sweep(config: SweepConfig) -> int:
     given = merge(file, read_assignments(config.set), flags)
     trials, seeds, minutes = (_number(given.pop(name, None), name) for name in OWN)
     address = given.pop("address", None)
-    for name in ("seed", "transport", "resume"):
+    for name in ("seed", "transport"):
         if given.get(name):
             raise SettingsError(f"{name}: a search trains new runs in simulation, with seeds of its own; leave it out")
     begun = config.resume is not None
     place = (config.resume or config.runs).expanduser()
-    require_room(place)
     if config.save_preset is not None and config.save_preset.suffix not in (".toml", ".json"):
         raise SettingsError(f"--save-preset: expected a .toml or .json file, found {config.save_preset}")
     folder = SweepFolder(place, given, seeds, begun)
