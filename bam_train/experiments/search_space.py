@@ -14,7 +14,7 @@ from typing import Any
 
 from bam_envs.core.wording import brief
 from bam_train.errors import SettingsError
-from bam_train.settings import TABLES, TrainSettings, merge
+from bam_train.settings import TABLES, TrainSettings, merge, parse_assignment
 from bam_train.trainers.resolve_settings import resolve
 
 _NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
@@ -152,15 +152,8 @@ def _read(name: str, text: Any) -> Dimension | None:
     try:
         choices = json.loads(f"[{text}]")
     except ValueError:  # words
-        choices = [_word(part.strip()) for part in text.split(",")]
+        choices = [parse_assignment(f"{name}={part}", "")[1] for part in text.split(",")]
     written = tuple(json.dumps(one) for one in choices)
     if "" in choices or len({*written}) < max(2, len(written)):
         raise SettingsError(f"{shown}={text}: expected different choices such as 256,512, found {brief(text)}")
     return Dimension(name, choices=written)
-
-
-def _word(text: str) -> Any:
-    try:
-        return json.loads(text)
-    except ValueError:
-        return text

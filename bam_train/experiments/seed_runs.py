@@ -261,6 +261,8 @@ class SeedRun:
     settings: TrainSettings
     """With the seed."""
     folder: RunFolder
+    lock: int | None = None
+    """Descriptor of the lock of the folder, which its process gets."""
     of: str = ""
     """Whose seed it is, where there are several: `` of trial 3``."""
     state: str = "waiting"
@@ -281,9 +283,9 @@ class SeedRun:
     """Whether it was told so."""
 
     @classmethod
-    def there(cls, folder: Path, settings: TrainSettings, seed: int, of: str = "") -> SeedRun:
+    def there(cls, folder: Path, settings: TrainSettings, seed: int, lock: int | None, of: str = "") -> SeedRun:
         """The run of a seed in the folder of several, as far as it has come."""
-        run = cls(replace(settings, seed=seed), RunFolder(folder, f"seed-{seed}", lambda path: True), of)
+        run = cls(replace(settings, seed=seed), RunFolder(folder, f"seed-{seed}", lambda path: True), lock, of)
         run.take(run.folder.records())
         if run.folder.outcome is not None:
             run.end(0, "")

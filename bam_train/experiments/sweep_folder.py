@@ -186,7 +186,7 @@ class SweepFolder:
     def begin(self, taken: SweepTrial) -> None:
         """Look up the runs of a trial; raises SettingsError if the trainer refuses its values together."""
         settings, of = self.space.settings(taken.trial.params), f" of trial {taken.number}"
-        taken.runs = [SeedRun.there(taken.folder.path, settings, seed, of) for seed in range(self.seeds)]
+        taken.runs = [SeedRun.there(taken.folder.path, settings, seed, taken.lock, of) for seed in range(self.seeds)]
 
     def tell(self, taken: SweepTrial, state: TrialState, outcome: Mapping[str, Any]) -> None:
         """Write how a trial has ended: first in its folder, then in the journal."""

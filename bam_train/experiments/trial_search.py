@@ -43,8 +43,6 @@ class Sweep:
         self.open: dict[int, SweepTrial] = {}
         self.runs: list[SeedRun] = []
         """Runs that train here."""
-        self.locks: dict[str, int | None] = {}
-        """Descriptor of the lock of each of them, by its name."""
         self._failed: list[str] = []
         self._fine = 0
         self._curves: dict[tuple[int, int], Curve | None] = {}
@@ -63,7 +61,6 @@ class Sweep:
                 for run in taken.runs:
                     if run.state == "waiting":
                         self.runs.append(run)
-                        self.locks[run.name] = taken.lock
                         return run
             require_room(self.folder.path)
             new = self.folder.take(self._trials, self.open)

@@ -7,7 +7,6 @@ import filecmp
 import shutil
 import sys
 from collections.abc import Callable, Iterator, Mapping
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -59,12 +58,12 @@ def train_seeds(config: TrainConfig, text: str, given: Mapping[str, Any]) -> int
         starter(settings, given.get("address")) as (start, jobs, where),
         group_folder(runs, settings) as (group, lock),
     ):
-        every = [SeedRun.there(group.path, settings, seed) for seed in seeds]
+        every = [SeedRun.there(group.path, settings, seed, lock) for seed in seeds]
         say(f"{settings.algo} on {settings.env}, {len(seeds)} seeds in {group.path}, {jobs} at once{where}")
         for notice in preset_notices(settings, given):
             say(notice)
         with signals_ask() as stopped:
-            run_all(every, partial(start, lock), jobs, stopped)
+            run_all(every, start, jobs, stopped)
             done = [run for run in every if run.state == "done"]
             if stopped() and len(done) < len(every):
                 say(f"{len(done)} of {len(every)} seeds are done; the same command goes on with the others")
@@ -81,14 +80,12 @@ def run_all(every: list[SeedRun], start: Start, jobs: int, stopped: Callable[[],
 
 
 @contextlib.contextmanager
-def starter(
-    settings: TrainSettings, address: str | None
-) -> Iterator[tuple[Callable[[int | None, SeedRun], SeedProcess | ClusterSeed], int, str]]:
-    """What starts a run, given the lock of its folder; how many run at once; and where in words."""
+def starter(settings: TrainSettings, address: str | None) -> Iterator[tuple[Start, int, str]]:
+    """What starts a run; how many run at once; and where in words."""
     needed = needs(settings)
     if address is None:
         jobs = max(1, cores() // needed["CPU"])
-        yield lambda lock, run: SeedProcess(run.settings.to_mapping(), run.folder.path, lock=lock), jobs, ""
+        yield lambda run: SeedProcess(run.settings.to_mapping(), run.folder.path, lock=run.lock), jobs, ""
         return
     from bam_train.trainers.rllib import ray_cluster
 
@@ -101,7 +98,7 @@ def starter(
             wanted = " and ".join(f"{number} {name}s" for name, number in needed.items() if number)
             raise SettingsError(f"a run needs {wanted} on one computer, and no node of the cluster has as many")
         yield (
-            lambda _, run: ClusterSeed(run.settings.to_mapping(), run.folder.path, *needed.values()),
+            lambda run: ClusterSeed(run.settings.to_mapping(), run.folder.path, *needed.values()),
             jobs,
             f" on the cluster at {address}",
         )

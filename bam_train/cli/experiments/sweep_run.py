@@ -7,7 +7,6 @@ import json
 import sys
 import time
 from collections.abc import Iterator
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -107,7 +106,7 @@ def _search(folder: SweepFolder, trials: int, minutes: float | None, address: st
                     table.update()
 
             over = lambda: stopped() or time.monotonic() > end  # noqa: E731
-            run_seeds(search.following, lambda run: start(search.locks[run.name], run), jobs, over, show)
+            run_seeds(search.following, start, jobs, over, show)
         ended = len(folder.trials()) - len(folder.trials(TrialState.RUNNING))
         if stopped() or ended < trials:
             why = "" if stopped() or minutes is None else f"{minutes:g} minutes are over: "
@@ -158,7 +157,8 @@ def _status(folder: SweepFolder) -> list[str]:
         rows.append([one.title, percent(shares.get(one.name)), shown(best.params[one.name]), shown(plain)])
     lines += [*aligned(rows), ""]
     table = [["trial", "state", "score", *(one.title for one in folder.space.dimensions), "why"]]
-    for trial in sorted(folder.trials(), key=_order):
+    order = [*_WORDS]
+    for trial in sorted(folder.trials(), key=lambda one: (order.index(one.state), -(one.value or 0.0), one.number)):
         outcome = folder.outcome(trial.number)
         score = outcome.get("score")
         values = [shown(trial.params.get(one.name)) for one in folder.space.dimensions]
@@ -173,12 +173,6 @@ _WORDS = {
     TrialState.FAIL: "failed",
     TrialState.RUNNING: "begun",
 }
-
-
-def _order(trial: FrozenTrial) -> tuple[int, float, int]:
-    """Done trials first, the best of them at the top."""
-    score = (trial.value or 0.0) if trial.state == TrialState.COMPLETE else 0.0
-    return [*_WORDS].index(trial.state), -score, trial.number
 
 
 def _base_name(base: TrainSettings) -> str:
@@ -200,11 +194,11 @@ def _confirm(folder: SweepFolder, best: FrozenTrial, number: int, address: str |
         locked(place) as lock,
     ):
         every = [
-            SeedRun.there(RunFolder(place, row, lambda path: True).path, settings, seed, f" of {row}")
+            SeedRun.there(RunFolder(place, row, lambda path: True).path, settings, seed, lock, f" of {row}")
             for seed in range(NEW_SEEDS, NEW_SEEDS + number)
             for row, settings in rows.items()
         ]
-        run_all(every, partial(start, lock), jobs, stopped)
+        run_all(every, start, jobs, stopped)
         missing = [run for run in every if run.state != "done"]
         if stopped():
             say(f"{len(every) - len(missing)} of {len(every)} runs are done; the same command goes on with the others")
@@ -243,25 +237,10 @@ def _save(folder: SweepFolder, best: FrozenTrial, path: Path) -> None:
     notes.append(_confirmed(folder, best)[1])
     text = json.dumps(table, indent=2) + "\n"
     if path.suffix == ".toml":
-        text = "".join(f"# {note}\n" for note in notes) + _toml(table)
+        lines = [f"{name} = {toml_text(value)}" for name, value in walk(table) if value is not None]
+        text = "\n".join([*(f"# {note}" for note in notes), *lines, ""])
         if resolve(parse_config(path.name, text)) != settings:
-            raise SettingsError(f"{path}: a setting is null, which TOML cannot hold; give a .json file")
+            raise SettingsError(f"{path}: a setting does not fit into TOML, which has no null; give a .json file")
     with replacing(path) as temporary:
         temporary.write_text(text, encoding="utf-8")
     tell(f"{short_path(path)}: {notes[0]}", notes[1], f"bam-train --config {path} trains with it")
-
-
-def _toml(table: dict[str, Any]) -> str:
-    """A file of settings, without those that are None."""
-    known = {name: _without_none(value) for name, value in table.items() if value is not None}
-    last = {name: value for name, value in known.items() if isinstance(value, dict)}
-    lines = [f"{name} = {toml_text(value)}" for name, value in known.items() if name not in last]
-    for name, entries in last.items():
-        lines += ["", f"[{name}]", *(f"{json.dumps(key)} = {toml_text(value)}" for key, value in entries.items())]
-    return "\n".join(lines) + "\n"
-
-
-def _without_none(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {name: _without_none(one) for name, one in value.items() if one is not None}
-    return value
