@@ -38,8 +38,13 @@ SEEDS = 3
 """Runs of a trial, unless it is said."""
 FEWEST = 5
 """Trials that are done below which importance is not computed."""
-BEGUN = (TrialState.RUNNING, TrialState.COMPLETE, TrialState.PRUNED, TrialState.FAIL)
-"""States of all trials but those that wait."""
+STATES = {
+    TrialState.COMPLETE: "done",
+    TrialState.PRUNED: "pruned",
+    TrialState.FAIL: "failed",
+    TrialState.RUNNING: "begun",
+}
+"""States of all trials but those that wait, in words."""
 
 
 class _JournalLock(JournalFileOpenLock):
@@ -109,8 +114,13 @@ class SweepFolder:
             self.folder = RunFolder(place.parent, place.name, lambda path: True)
         else:
             stem = f"{file_stem(base.env, base.algo, base.trainer, base.env_kwargs)}-sweep"
-            self.folder = RunFolder(place, stem, lambda path: read_object(path / "config.json") == what)
-            self.folder.write_config(what)
+            try:
+                place.mkdir(parents=True, exist_ok=True)
+            except OSError as error:
+                raise unwritable(place, error, "--runs") from error
+            with locked(place, wait=True):  # of two calls that begin at the same time, one makes the folder
+                self.folder = RunFolder(place, stem, lambda path: read_object(path / "config.json") == what)
+                self.folder.write_config(what)
         self.path = self.folder.path
         self.study = self._open(hashlib.sha256(json.dumps(what, sort_keys=True).encode()).hexdigest()[:16])
 
@@ -152,7 +162,7 @@ class SweepFolder:
 
     def trials(self, *states: TrialState) -> list[FrozenTrial]:
         """The trials in these states, or all that were begun."""
-        return self.study.get_trials(deepcopy=False, states=states or BEGUN)
+        return self.study.get_trials(deepcopy=False, states=states or tuple(STATES))
 
     @property
     def best(self) -> FrozenTrial | None:
@@ -177,6 +187,9 @@ class SweepFolder:
     def _taken(self, trial: Trial) -> SweepTrial:
         folder, held = RunFolder(self.path, f"trial-{trial.number}", lambda path: True), contextlib.ExitStack()
         lock = held.enter_context(locked(folder.path))
+        if trial.number not in [one.number for one in self.trials(TrialState.RUNNING)]:
+            held.close()
+            raise FolderInUse(f"{folder.path}: the trial has ended meanwhile")
         # The same number and history give the same values, also after a break.
         self.study.sampler = optuna.samplers.TPESampler(seed=trial.number)
         for dimension in self.space.dimensions:
@@ -190,7 +203,7 @@ class SweepFolder:
 
     def tell(self, taken: SweepTrial, state: TrialState, outcome: Mapping[str, Any]) -> None:
         """Write how a trial has ended: first in its folder, then in the journal."""
-        taken.folder.write_outcome({"state": state.name.lower(), **outcome})
+        taken.folder.write_outcome({"state": STATES[state], **outcome})
         with self.writing():
             if state == TrialState.PRUNED:
                 taken.trial.report(outcome["score"], sum(run.steps for run in taken.runs))

@@ -18,7 +18,7 @@ from bam_train.errors import SettingsError, TrainingFailed
 from bam_train.experiments.run_logs import Curve, counts, curves_of, score
 from bam_train.experiments.seed_runs import SeedRun
 from bam_train.experiments.seed_statistics import interquartile_mean
-from bam_train.experiments.sweep_folder import SweepFolder, SweepTrial
+from bam_train.experiments.sweep_folder import STATES, SweepFolder, SweepTrial
 from bam_train.trainers.run_folder import read_records, require_room
 
 WARM = 1 / 3
@@ -105,9 +105,9 @@ class Sweep:
         self.open.pop(taken.number, None)
         for run in taken.runs:
             run.is_wanted = False
-        said = {TrialState.COMPLETE: "done", TrialState.PRUNED: "pruned", TrialState.FAIL: "failed"}[state]
-        words = [f"score {outcome['score']:.4g}"] if state == TrialState.COMPLETE else [outcome["why"]]
-        self._tell(f"trial {taken.number} {said}: {', '.join([*words, *chosen(self.folder, taken.trial.params)])}")
+        words = f"score {outcome['score']:.4g}" if state == TrialState.COMPLETE else outcome["why"]
+        values = ", ".join(chosen(self.folder, taken.trial.params))
+        self._tell(f"trial {taken.number} {STATES[state]}: {words}, {values}")
         if state == TrialState.FAIL:
             self._failed.append(outcome["why"])
         self._fine += state != TrialState.FAIL
@@ -116,7 +116,8 @@ class Sweep:
 
     def _behind(self, taken: SweepTrial) -> dict[str, Any] | None:
         """Score and reason if a trial is to be pruned."""
-        ours = {run.settings.seed: curve for run in taken.runs if (curve := self._own(run)) is not None}
+        base = self.folder.space.base.to_mapping()
+        ours = {run.settings.seed: curve for run in taken.runs if (curve := counts(curves_of(run.evaluations), base))}
         places = {seed: float(curve.steps[-1]) for seed, curve in ours.items()}
         least = WARM * taken.runs[0].settings.steps
         if max(places.values(), default=0.0) < least or self._judged.get(taken.number) == places:
@@ -130,24 +131,17 @@ class Sweep:
         where = ", ".join(f"seed {seed} at {steps:,.0f} steps" for seed, steps in places.items())
         return {"score": mean, "why": f"{mean:.4g} is below {median:.4g}, the median of {len(theirs)} trials ({where})"}
 
-    def _own(self, run: SeedRun) -> Curve | None:
-        return counts(curves_of(run.evaluations), run.settings.to_mapping())
-
     def _mean(self, number: int, places: Mapping[int, float]) -> float:
         """Mean over seeds of what a trial that is done had at these steps; NaN if one had no evaluation then."""
-        values = []
-        for seed, steps in places.items():
-            curve = self._curve_of(number, seed)
-            values.append(math.nan if curve is None else curve.at(steps))
-        return float(np.mean(values))
+        curves = {seed: self._curve_of(number, seed) for seed in places}
+        return float(np.mean([math.nan if one is None else one.at(places[seed]) for seed, one in curves.items()]))
 
     def _curve_of(self, number: int, seed: int) -> Curve | None:
         """The curve of a run of a trial that is done, perhaps of another process."""
         if (number, seed) not in self._curves:
             path = self.folder.path / f"trial-{number}" / f"seed-{seed}" / "progress.jsonl"
             evaluations = [one for one in read_records(path) if one["kind"] == "evaluation"]
-            settings = self.folder.space.base.to_mapping()
-            self._curves[number, seed] = counts(curves_of(evaluations), settings)
+            self._curves[number, seed] = counts(curves_of(evaluations), self.folder.space.base.to_mapping())
         return self._curves[number, seed]
 
 

@@ -12,18 +12,20 @@ from typing import Any
 
 from optuna.trial import FrozenTrial, TrialState
 
+from bam_envs.core.validation import check
 from bam_train.cli.console import can_draw, percent, say, tell
 from bam_train.cli.experiment import signals_ask
 from bam_train.cli.experiments.comparison import RunComparison
 from bam_train.cli.experiments.seeds import LiveTable, run_all, starter
 from bam_train.cli.experiments.sweep import SweepConfig
+from bam_train.cli.flags import Count, Positive
 from bam_train.cli.train_display import MayClose, short_path
 from bam_train.errors import SettingsError, TrainingFailed
 from bam_train.experiments.run_logs import read_runs
 from bam_train.experiments.search_space import walk
 from bam_train.experiments.seed_runs import SeedRun, locked, run_seeds
 from bam_train.experiments.seed_statistics import FEWEST
-from bam_train.experiments.sweep_folder import SweepFolder
+from bam_train.experiments.sweep_folder import STATES, SweepFolder
 from bam_train.experiments.trial_search import Sweep, chosen, shown
 from bam_train.files.atomic_file import replacing, require_writable
 from bam_train.files.log_lines import aligned
@@ -44,7 +46,7 @@ TRIALS = 20
 """Trials of a search, unless it is said."""
 NEW_SEEDS = 10_000
 """First seed of a comparison with the preset: far from those of the search, so that other episodes evaluate it too."""
-OWN = ("trials", "seeds", "minutes")
+OWN: dict[str, Any] = {"trials": Count | None, "seeds": Count | None, "minutes": Positive | None}
 """Entries of a file that are no settings of `bam-train`."""
 NOT_BETTER = 3
 """Exit status if the best trial is not shown to be better than the preset."""
@@ -55,7 +57,7 @@ def sweep(config: SweepConfig) -> int:
     file = {} if config.file is None else read_config(config.file, (*OWN, "num_envs"))
     flags = {name: value for name in (*NAMES, *OWN) if (value := getattr(config, name)) is not None}
     given = merge(file, read_assignments(config.set), flags)
-    trials, seeds, minutes = (_number(given.pop(name, None), name) for name in OWN)
+    trials, seeds, minutes = (check(given.pop(name, None), kind, name, SettingsError) for name, kind in OWN.items())
     address = given.pop("address", None)
     for name in ("seed", "transport"):
         if given.get(name):
@@ -77,14 +79,6 @@ def sweep(config: SweepConfig) -> int:
     if config.save_preset is not None:
         _save(folder, best, require_writable(config.save_preset))
     return status
-
-
-def _number(value: Any, name: str) -> Any:
-    """A value of `OWN` that may come from a file."""
-    is_number = isinstance(value, (int, float)) and not isinstance(value, bool) and value > 0
-    if value is None or (is_number and (name == "minutes" or isinstance(value, int))):
-        return value
-    raise SettingsError(f"{name}: expected a {'' if name == 'minutes' else 'whole '}number above 0, found {value!r}")
 
 
 # The search
@@ -142,8 +136,8 @@ def _runs(folder: SweepFolder, address: str | None, what: str) -> Iterator[Any]:
 def _status(folder: SweepFolder) -> list[str]:
     """The best trial, the importance of each setting, and all trials, as lines."""
     base, best = folder.space.base, folder.best
-    counts = {state: len(folder.trials(state)) for state in _WORDS}
-    said = ", ".join(f"{number} {_WORDS[state]}" for state, number in counts.items() if number)
+    counts = {state: len(folder.trials(state)) for state in STATES}
+    said = ", ".join(f"{number} {STATES[state]}" for state, number in counts.items() if number)
     lines = [f"{base.algo} on {base.env}, {folder.seeds} seeds a trial, in {folder.path}: {said or 'no trial'}"]
     if best is None:
         return [*lines, "no trial is done yet"]
@@ -157,22 +151,14 @@ def _status(folder: SweepFolder) -> list[str]:
         rows.append([one.title, percent(shares.get(one.name)), shown(best.params[one.name]), shown(plain)])
     lines += [*aligned(rows), ""]
     table = [["trial", "state", "score", *(one.title for one in folder.space.dimensions), "why"]]
-    order = [*_WORDS]
+    order = [*STATES]
     for trial in sorted(folder.trials(), key=lambda one: (order.index(one.state), -(one.value or 0.0), one.number)):
         outcome = folder.outcome(trial.number)
         score = outcome.get("score")
         values = [shown(trial.params.get(one.name)) for one in folder.space.dimensions]
-        row = [str(trial.number), _WORDS[trial.state], "-" if score is None else f"{score:.4g}", *values]
+        row = [str(trial.number), STATES[trial.state], "-" if score is None else f"{score:.4g}", *values]
         table.append([*row, outcome.get("why", "")])
     return [*lines, *aligned(table)]
-
-
-_WORDS = {
-    TrialState.COMPLETE: "done",
-    TrialState.PRUNED: "pruned",
-    TrialState.FAIL: "failed",
-    TrialState.RUNNING: "begun",
-}
 
 
 def _base_name(base: TrainSettings) -> str:

@@ -121,7 +121,7 @@ def test_refused_before_anything_is_searched(run, monkeypatch):
     line = "bam-sweep: nowhere: no sweep is there. Check the name after --resume, such as runs/pick-ppo-sweep\n"
     assert run(main, "--resume", "nowhere", "--status") == (1, "", line)
     Path("sweep.toml").write_text("trials = 'many'\n")
-    line = "bam-sweep: trials: expected a whole number above 0, found 'many'\n"
+    line = "bam-sweep: trials: expected a whole number of at least 1, found 'many'\n"
     assert run(main, "sweep.toml", *SEARCHED) == (1, "", line)
     for name in ("bam_train.cli.experiments.sweep_run", "bam_train.experiments.sweep_folder"):
         monkeypatch.delitem(sys.modules, name, raising=False)
@@ -212,6 +212,17 @@ def test_each_trial_is_taken_once_and_goes_on_when_it_was_left():
     second.held.close()
     left = one.take(2, {})
     assert (left.number, left.trial.params) == (1, values)
+
+
+def test_a_trial_that_ends_while_another_process_looks_is_not_taken(monkeypatch):
+    asked = {"env": "CartPole-v1", "algo": "ppo", "hyperparameters": {"gamma": "0.9..0.99"}}
+    one, other = (SweepFolder(Path("runs"), asked, 1) for _ in range(2))
+    taken, trials = one.take(1, {}), other.trials
+    seen = [trials(TrialState.RUNNING)]
+    one.tell(taken, TrialState.COMPLETE, {"score": 1.0})
+    monkeypatch.setattr(other, "trials", lambda *states: seen.pop() if seen else trials(*states))
+    assert other.take(1, {}) is None
+    assert [one.state for one in other.trials()] == [TrialState.COMPLETE]
 
 
 def test_a_journal_that_is_cut_off_loses_what_was_cut(run, trained):
@@ -333,4 +344,4 @@ def test_killed_in_mid_search_nothing_is_lost(start_forked, here):
     assert [one.state for one in folder.trials()] == [TrialState.COMPLETE] * 2
     assert folder.trials()[1].params == params
     assert (FOLDER / "trial-0" / "outcome.json").read_bytes() == outcome
-    assert json.loads((FOLDER / "trial-1" / "outcome.json").read_text())["state"] == "complete"
+    assert json.loads((FOLDER / "trial-1" / "outcome.json").read_text())["state"] == "done"
