@@ -29,11 +29,11 @@ from bam_train.settings import read_config
 from bam_train.trainers.resolve_settings import resolve
 from bam_train.trainers.run_folder import RunFolder
 
-pytestmark = pytest.mark.usefixtures("here")
+pytestmark = pytest.mark.usefixtures("here", "corridor")
 
-BASE = ("--env", "CartPole-v1", "--algo", "ppo", "--steps", "1000", "--set", "n_epochs=1")
+BASE = ("--env", "test/Corridor-v0", "--algo", "ppo", "--steps", "1000", "--set", "n_epochs=1")
 SEARCHED = (*BASE, "--set", "n_steps=64,128,256,512", "--set", "gamma=0.9..0.99")
-FOLDER = Path("runs/CartPole-v1-ppo-sweep")
+FOLDER = Path("runs/test-Corridor-v0-ppo-sweep")
 
 
 class Trained:
@@ -109,7 +109,8 @@ def test_what_is_refused_leaves_nothing(run, here, words, line):
 
 def test_a_setting_that_does_not_exist_costs_no_import_of_torch():
     code = "import atexit, sys; atexit.register(lambda: print('torch' in sys.modules))"
-    code += f"; from bam_train.cli.experiments.sweep import main; main({[*BASE, '--set', 'lr=1..2']})"
+    words = ["--env", "CartPole-v1", "--algo", "ppo", "--set", "lr=1..2"]
+    code += f"; from bam_train.cli.experiments.sweep import main; main({words})"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert (done.returncode, done.stdout) == (1, "False\n")
     assert done.stderr == "bam-sweep: Unknown ppo hyperparameter 'lr'. Did you mean 'learning_rate'?\n"
@@ -134,13 +135,13 @@ def test_refused_before_anything_is_searched(run, monkeypatch):
 
 def test_a_search_from_a_file_and_what_a_second_call_does(run, trained):
     Path("sweep.toml").write_text(
-        'env = "CartPole-v1"\nalgo = "ppo"\nsteps = 1000\ntrials = 12\nseeds = 2\n'
+        'env = "test/Corridor-v0"\nalgo = "ppo"\nsteps = 1000\ntrials = 12\nseeds = 2\n'
         '[hyperparameters]\nn_steps = "64,128,256,512"\ngamma = "0.9..0.99"\n'
     )
     status, out, err = run(main, "sweep.toml")
     assert status == 0
     lines = err.splitlines()
-    assert lines[0] == "ppo on CartPole-v1: 12 trials of 2 seeds in runs/CartPole-v1-ppo-sweep, 1 runs at once"
+    assert lines[0] == f"ppo on test/Corridor-v0: 12 trials of 2 seeds in {FOLDER}, 1 runs at once"
     folder = SweepFolder(FOLDER, {}, None, begun=True)
     sizes = {one.number: int(one.params["hyperparameters.n_steps"]) for one in folder.trials()}
     assert {64, 128, 256, 512} == {*sizes.values()}
@@ -179,7 +180,7 @@ def test_a_search_from_a_file_and_what_a_second_call_does(run, trained):
 def test_another_search_is_refused_or_has_another_folder(run, trained):
     assert run(main, *SEARCHED, "--trials", "1", "--seeds", "1")[0] == 0
     for flags, text in (
-        (("--env", "Acrobot-v1"), "env 'CartPole-v1', not 'Acrobot-v1'"),
+        (("--env", "Acrobot-v1"), "env 'test/Corridor-v0', not 'Acrobot-v1'"),
         (("--algo", "a2c"), "algo 'ppo', not 'a2c'"),
         (("--set", "gamma=0.8..0.9"), "hyperparameters.gamma '0.9..0.99', not '0.8..0.9'"),
         (("--seeds", "3"), "seeds 1, not 3"),
@@ -201,7 +202,7 @@ def test_if_all_crash_it_stops(run, trained):
 
 
 def test_each_trial_is_taken_once_and_goes_on_when_it_was_left():
-    asked = {"env": "CartPole-v1", "algo": "ppo", "hyperparameters": {"gamma": "0.9..0.99"}}
+    asked = {"env": "test/Corridor-v0", "algo": "ppo", "hyperparameters": {"gamma": "0.9..0.99"}}
     one, other = (SweepFolder(Path("runs"), asked, 1) for _ in range(2))
     assert one.path == other.path
     first, second = one.take(2, {}), other.take(2, {})
@@ -215,7 +216,7 @@ def test_each_trial_is_taken_once_and_goes_on_when_it_was_left():
 
 
 def test_a_trial_that_ends_while_another_process_looks_is_not_taken(monkeypatch):
-    asked = {"env": "CartPole-v1", "algo": "ppo", "hyperparameters": {"gamma": "0.9..0.99"}}
+    asked = {"env": "test/Corridor-v0", "algo": "ppo", "hyperparameters": {"gamma": "0.9..0.99"}}
     one, other = (SweepFolder(Path("runs"), asked, 1) for _ in range(2))
     taken, trials = one.take(1, {}), other.trials
     seen = [trials(TrialState.RUNNING)]
@@ -321,6 +322,7 @@ def test_the_best_is_confirmed_on_new_seeds_and_becomes_a_preset(run, trained):
 
 
 def test_killed_in_mid_search_nothing_is_lost(start_forked, here):
+    place = Path("runs/CartPole-v1-ppo-sweep")
     words = ("--env", "CartPole-v1", "--algo", "ppo", "--steps", "1024", "--eval-every", "256", "--eval-episodes", "1")
     quick = ("--set", "n_epochs=1", "--set", "n_steps=64,128", "--set", "policy_kwargs.net_arch=[8]")
     rest = ("--threads", "1000", "--trials", "2", "--seeds", "1")
@@ -334,14 +336,14 @@ def test_killed_in_mid_search_nothing_is_lost(start_forked, here):
         os.kill(process, signal.SIGKILL)
     psutil.wait_procs(children, timeout=20)
     program.close()
-    folder = SweepFolder(FOLDER, {}, None, begun=True)
+    folder = SweepFolder(place, {}, None, begun=True)
     assert [one.state for one in folder.trials()] == [TrialState.COMPLETE, TrialState.RUNNING]
-    params, outcome = folder.trials()[1].params, (FOLDER / "trial-0" / "outcome.json").read_bytes()
+    params, outcome = folder.trials()[1].params, (place / "trial-0" / "outcome.json").read_bytes()
     program = start_forked((), here, *words, *quick, *rest, program="bam_train.cli.experiments.sweep")
     status, said = program.end()
     assert status == 0, said
     assert "trial 0" not in said
     assert [one.state for one in folder.trials()] == [TrialState.COMPLETE] * 2
     assert folder.trials()[1].params == params
-    assert (FOLDER / "trial-0" / "outcome.json").read_bytes() == outcome
-    assert json.loads((FOLDER / "trial-1" / "outcome.json").read_text())["state"] == "done"
+    assert (place / "trial-0" / "outcome.json").read_bytes() == outcome
+    assert json.loads((place / "trial-1" / "outcome.json").read_text())["state"] == "done"
