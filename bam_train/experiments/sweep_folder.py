@@ -16,7 +16,7 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -26,11 +26,11 @@ from optuna.storages import JournalStorage
 from optuna.storages.journal import JournalFileBackend, JournalFileOpenLock
 from optuna.trial import FrozenTrial, Trial, TrialState
 
-from bam_train.errors import FolderInUse, OutputError, SettingsError
+from bam_train.errors import FolderInUse, SettingsError
 from bam_train.experiments.search_space import SearchSpace
 from bam_train.experiments.seed_runs import LOCKS, SeedRun, locked, what_is_learnt
 from bam_train.settings import differences, file_stem
-from bam_train.trainers.run_folder import RunFolder, read_object, unwritable
+from bam_train.trainers.run_folder import RunFolder, read_object, writing
 
 optuna.logging.set_verbosity(optuna.logging.ERROR)
 
@@ -78,11 +78,6 @@ class SweepTrial:
     held: contextlib.ExitStack
     """Has the lock."""
 
-    @property
-    def number(self) -> int:
-        """Its number."""
-        return self.trial.number
-
 
 class SweepFolder:
     """A search that was begun, or is begun now.
@@ -114,14 +109,12 @@ class SweepFolder:
             self.folder = RunFolder(place.parent, place.name, lambda path: True)
         else:
             stem = f"{file_stem(base.env, base.algo, base.trainer, base.env_kwargs)}-sweep"
-            try:
+            with writing(place):
                 place.mkdir(parents=True, exist_ok=True)
-            except OSError as error:
-                raise unwritable(place, error, "--runs") from error
             with locked(place, wait=True):  # of two calls that begin at the same time, one makes the folder
                 self.folder = RunFolder(place, stem, lambda path: read_object(path / "config.json") == what)
                 self.folder.write_config(what)
-        self.path = self.folder.path
+        self.path, self.journal = self.folder.path, self.folder.path / "journal.log"
         self.study = self._open(hashlib.sha256(json.dumps(what, sort_keys=True).encode()).hexdigest()[:16])
 
     @staticmethod
@@ -132,8 +125,8 @@ class SweepFolder:
 
     def _open(self, name: str) -> optuna.Study:
         """The study in the journal; a new one begins with the values of the preset."""
-        path = self.path / "journal.log"
-        with self.writing(), locked(self.path, wait=True):
+        path = self.journal
+        with writing(self.journal), locked(self.path, wait=True):
             path.touch()
             lock = _JournalLock(path) if LOCKS else JournalFileOpenLock(str(path))
             try:
@@ -150,16 +143,6 @@ class SweepFolder:
                 study.enqueue_trial(values)
         return study
 
-    @contextlib.contextmanager
-    def writing(self) -> Iterator[None]:
-        """Map failures to write the journal to `OutputError`."""
-        try:
-            yield
-        except OSError as error:
-            if isinstance(error, OutputError):
-                raise
-            raise unwritable(self.path / "journal.log", error, "--runs") from error
-
     def trials(self, *states: TrialState) -> list[FrozenTrial]:
         """The trials in these states, or all that were begun."""
         return self.study.get_trials(deepcopy=False, states=states or tuple(STATES))
@@ -175,7 +158,7 @@ class SweepFolder:
 
     def take(self, most: int, own: Mapping[int, SweepTrial]) -> SweepTrial | None:
         """A trial that no process runs: one that was begun and left, or a new one while there are fewer than `most`."""
-        with self.writing(), locked(self.path, wait=True):
+        with writing(self.journal), locked(self.path, wait=True):
             for left in self.trials(TrialState.RUNNING):
                 with contextlib.suppress(FolderInUse):
                     if left.number not in own:
@@ -198,13 +181,13 @@ class SweepFolder:
 
     def begin(self, taken: SweepTrial) -> None:
         """Look up the runs of a trial; raises SettingsError if the trainer refuses its values together."""
-        settings, of = self.space.settings(taken.trial.params), f" of trial {taken.number}"
+        settings, of = self.space.settings(taken.trial.params), f" of trial {taken.trial.number}"
         taken.runs = [SeedRun.there(taken.folder.path, settings, seed, taken.lock, of) for seed in range(self.seeds)]
 
     def tell(self, taken: SweepTrial, state: TrialState, outcome: Mapping[str, Any]) -> None:
         """Write how a trial has ended: first in its folder, then in the journal."""
         taken.folder.write_outcome({"state": STATES[state], **outcome})
-        with self.writing():
+        with writing(self.journal):
             if state == TrialState.PRUNED:
                 taken.trial.report(outcome["score"], sum(run.steps for run in taken.runs))
             value = outcome["score"] if state == TrialState.COMPLETE else None

@@ -71,7 +71,7 @@ class Sweep:
             except SettingsError as error:  # values that do not go together
                 self._end(new, TrialState.FAIL, why=str(error))
             else:
-                self.open[new.number] = new
+                self.open[new.trial.number] = new
 
     def look(self) -> None:
         """End the trials of which a run has failed, all runs are done, or which are behind."""
@@ -102,12 +102,12 @@ class Sweep:
 
     def _end(self, taken: SweepTrial, state: TrialState, **outcome: Any) -> None:
         self.folder.tell(taken, state, outcome)
-        self.open.pop(taken.number, None)
+        self.open.pop(taken.trial.number, None)
         for run in taken.runs:
             run.is_wanted = False
         words = f"score {outcome['score']:.4g}" if state == TrialState.COMPLETE else outcome["why"]
         values = ", ".join(chosen(self.folder, taken.trial.params))
-        self._tell(f"trial {taken.number} {STATES[state]}: {words}, {values}")
+        self._tell(f"trial {taken.trial.number} {STATES[state]}: {words}, {values}")
         if state == TrialState.FAIL:
             self._failed.append(outcome["why"])
         self._fine += state != TrialState.FAIL
@@ -120,9 +120,9 @@ class Sweep:
         ours = {run.settings.seed: curve for run in taken.runs if (curve := counts(curves_of(run.evaluations), base))}
         places = {seed: float(curve.steps[-1]) for seed, curve in ours.items()}
         least = WARM * taken.runs[0].settings.steps
-        if max(places.values(), default=0.0) < least or self._judged.get(taken.number) == places:
+        if max(places.values(), default=0.0) < least or self._judged.get(taken.trial.number) == places:
             return None
-        self._judged[taken.number] = places
+        self._judged[taken.trial.number] = places
         means = [self._mean(one.number, places) for one in self.folder.trials(TrialState.COMPLETE)]
         theirs = [mean for mean in means if not math.isnan(mean)]
         mean = float(np.mean([curve.values[-1] for curve in ours.values()]))

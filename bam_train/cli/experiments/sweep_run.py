@@ -16,7 +16,7 @@ from bam_envs.core.validation import check
 from bam_train.cli.console import can_draw, percent, say, tell
 from bam_train.cli.experiment import signals_ask
 from bam_train.cli.experiments.comparison import RunComparison
-from bam_train.cli.experiments.seeds import LiveTable, run_all, starter
+from bam_train.cli.experiments.seeds import LiveTable, PlainLines, run_all, starter
 from bam_train.cli.experiments.sweep import SweepConfig
 from bam_train.cli.flags import Count, Positive
 from bam_train.cli.train_display import MayClose, short_path
@@ -40,7 +40,7 @@ from bam_train.settings import (
     toml_text,
 )
 from bam_train.trainers.resolve_settings import preset_notices, read_preset, resolve
-from bam_train.trainers.run_folder import RunFolder
+from bam_train.trainers.run_folder import RunFolder, writing
 
 TRIALS = 20
 """Trials of a search, unless it is said."""
@@ -86,18 +86,17 @@ def sweep(config: SweepConfig) -> int:
 
 def _search(folder: SweepFolder, trials: int, minutes: float | None, address: str | None) -> int:
     """Train trials until there are enough, the time is over, or a signal comes; print the status."""
-    with folder.writing():
+    with writing(folder.journal):
         folder.study.set_user_attr("trials", trials)
     end = float("inf") if minutes is None else time.monotonic() + 60 * minutes
     search = Sweep(folder, trials, say)
     with _runs(folder, address, f"{trials} trials of {folder.seeds} seeds") as (start, jobs, stopped):
-        display = LiveTable(search.runs) if can_draw() else contextlib.nullcontext()
+        display = LiveTable(search.runs) if can_draw() else PlainLines([])
         with contextlib.closing(search), display as table:
 
             def show() -> None:
                 search.look()
-                if table is not None:
-                    table.update()
+                table.update()
 
             over = lambda: stopped() or time.monotonic() > end  # noqa: E731
             run_seeds(search.following, start, jobs, over, show)

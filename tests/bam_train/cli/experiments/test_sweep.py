@@ -206,13 +206,13 @@ def test_each_trial_is_taken_once_and_goes_on_when_it_was_left():
     one, other = (SweepFolder(Path("runs"), asked, 1) for _ in range(2))
     assert one.path == other.path
     first, second = one.take(2, {}), other.take(2, {})
-    assert (first.number, second.number) == (0, 1)
+    assert (first.trial.number, second.trial.number) == (0, 1)
     assert first.trial.params == {"hyperparameters.gamma": 0.99}  # of the preset
     assert one.take(2, {}) is other.take(2, {}) is None
     values = second.trial.params
     second.held.close()
     left = one.take(2, {})
-    assert (left.number, left.trial.params) == (1, values)
+    assert (left.trial.number, left.trial.params) == (1, values)
 
 
 def test_a_trial_that_ends_while_another_process_looks_is_not_taken(monkeypatch):
