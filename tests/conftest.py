@@ -51,6 +51,7 @@ KINDS = {
         "bam_train/trainers/sb3",
         "bam_train/cli/test_train.py",
         "bam_train/cli/experiments/test_seeds.py",
+        "bam_train/cli/experiments/test_sweep.py",
         "bam_train/files/test_addresses.py",
         "bam_train/cli/test_elsewhere.py",
     ),

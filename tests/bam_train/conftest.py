@@ -15,6 +15,9 @@ import pytest
 
 from bam_envs.core.spaces import space_to_json
 from bam_train.checkpoint import GOLDEN, MANIFEST, POLICY, safetensors_file, write_checkpoint
+from bam_train.cli.flags import TrainConfig
+from bam_train.cli.program import guarded
+from bam_train.cli.train import train
 from tests.one_ray import no_ray_fixture, one_ray_fixture, shared_ray_fixture  # noqa: F401
 
 
@@ -26,6 +29,26 @@ def run(capsys):
         with pytest.raises(SystemExit) as done:
             main([str(argument) for argument in arguments])
         return done.value.code or 0, *capsys.readouterr()
+
+    return run
+
+
+@pytest.fixture(name="here")
+def here_fixture(tmp_path, monkeypatch):
+    """An empty folder, in which the test runs."""
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+@pytest.fixture(name="bam_train")
+def bam_train_fixture(capsys, request):
+    """Runs `bam-train` here with ``BASE`` of the test's module and more flags; its status, output and error."""
+
+    def run(**flags):
+        flags = {**getattr(request.module, "BASE", {}), **flags}
+        flags |= {name: Path(flags[name]) for name in ("out", "resume") if flags.get(name) is not None}
+        status = guarded(lambda: train(TrainConfig(**flags)), "bam-train")
+        return status, *capsys.readouterr()
 
     return run
 

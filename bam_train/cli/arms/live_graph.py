@@ -5,7 +5,6 @@ the unit of a gripper's joint or the request of a service, is that of a shipped 
 assumed, and a note says so.
 """
 
-import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import MISSING, asdict, dataclass, fields, is_dataclass
 from typing import Any
@@ -21,6 +20,7 @@ from bam_envs.ros.codec import INFO_SERVICE, read_info
 from bam_envs.ros.messages import bare_type
 from bam_envs.ros.profile_tables import RobotProfile, Sink, Source
 from bam_envs.rosbridge.client import RosbridgeLink
+from bam_train.settings import toml_text
 
 _STATES, _TRAJECTORY, _ARRAY = "sensor_msgs/JointState", "trajectory_msgs/JointTrajectory", "std_msgs/Float64MultiArray"
 _LISTEN = 1.0
@@ -409,22 +409,14 @@ def profile_toml(profile: Any) -> str:
     """The text of the profile's file, its notes as comments at the head."""
     table, lines = profile.table, [f"# {profile.robot.title}, as {profile.graph.url} offers it."]
     lines += [f"# {note}." for note in profile.notes]
-    lines += ["", *(f"{key} = {_toml(value)}" for key, value in table.items() if isinstance(value, (str, float)))]
+    lines += ["", *(f"{key} = {toml_text(value)}" for key, value in table.items() if isinstance(value, (str, float)))]
     if table["kind"] == "arm" and not profile.graph.manager:
         lines.append('# controllers = "/controller_manager/list_controllers"   # nothing there lists them')
     tables = [("state", row) for row in table["state"]]
     tables += [(f"commands.{mode}", row) for mode, rows in table["commands"].items() for row in rows]
     tables += [("enable", row) for row in table.get("enable", ())]
     for name, row in tables:
-        lines += ["", f"[[{name}]]", *(f"{key} = {_toml(value)}" for key, value in row.items())]
+        lines += ["", f"[[{name}]]", *(f"{key} = {toml_text(value)}" for key, value in row.items())]
         if row.get("signal") == _WIDTH and not profile.is_known:
             lines += ["# scale = 1.0   # width in m = position of the joint x scale + offset", "# offset = 0.0"]
     return "\n".join(lines) + "\n"
-
-
-def _toml(value: Any) -> str:
-    if isinstance(value, Mapping):
-        return "{ " + ", ".join(f"{json.dumps(key)} = {_toml(one)}" for key, one in value.items()) + " }"
-    if isinstance(value, (list, tuple)):
-        return "[" + ", ".join(map(_toml, value)) + "]"
-    return json.dumps(value)

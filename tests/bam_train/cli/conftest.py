@@ -23,9 +23,9 @@ LONGEST = 300.0
 
 
 class Program:
-    """`bam-train` in a process group of its own, as a shell starts it, with its standard error a pipe."""
+    """A program in a process group of its own, as a shell starts it, with its standard error a pipe."""
 
-    def __init__(self, context, folder, arguments):
+    def __init__(self, context, folder, arguments, module):
         reader, writer = context.Pipe(duplex=False)
         code = f"""
 import os, sys
@@ -33,7 +33,7 @@ os.setsid()
 os.chdir({str(folder)!r})
 os.dup2(writer.fileno(), 2)
 sys.stderr = open(2, "w", buffering=1, closefd=False)
-from bam_train.cli.train import main
+from {module} import main
 main({list(arguments)!r})
 """
         self.process = context.Process(target=exec, args=(code, {"writer": writer}))
@@ -75,9 +75,9 @@ def start_forked():
     """``start_forked(modules, folder, *arguments)`` starts a `Program`, forked from a process with these modules."""
     context, programs = multiprocessing.get_context("forkserver"), []
 
-    def start(modules, folder, *arguments):
+    def start(modules, folder, *arguments, program="bam_train.cli.train"):
         context.set_forkserver_preload(["pytest", "torch._dynamo", "bam_train.cli.train", *modules])
-        programs.append(Program(context, folder, arguments))
+        programs.append(Program(context, folder, arguments, program))
         return programs[-1]
 
     yield start
