@@ -28,6 +28,7 @@ _CLEARANCE = 0.005  # that the guards keep, so that they act where links touch [
 _TOUCH = 0.0045  # depth from which shapes touch, and what is kept of the slack [m]
 _SURE = 0.001
 _RARE = 0.003  # share of postures in which two links count as touching falsely, that needs no slack
+_MANY = 300  # postures in which two links touch, that show how far apart their capsules can be; else slack is less
 _ANYWHERE = 5.6  # travel of a first joint with which an arm works in any direction [rad]
 _ASIDE = 0.02  # of the middle of all postures from the base, that tells the direction of an arm [m]
 Apart = Mapping[tuple[int, int], Array]
@@ -208,11 +209,12 @@ def _slack(arm: ArmDescription, q: Array, apart: Apart, given_up: float) -> Iter
     for one, other in sorted({(int(i), int(j)) for i, j in links} & apart.keys()):
         gap = gaps[:, (links == [one, other]).all(axis=1)].min(axis=1)
         acts, known = gap < _CLEARANCE, (one, other) in guarded
-        touching = np.sort(gap[acts & (apart[one, other] < -_TOUCH)])[::-1]  # the slightest first
+        few = (apart[one, other] < -_TOUCH).sum() < _MANY
+        touching = np.sort(gap[acts & (apart[one, other] < (0.0 if few else -_TOUCH))])[::-1]  # the slightest first
         if not len(touching) and not known:
             continue  # limits of joints keep these links apart
         slack = 0.0
-        if (acts & (apart[one, other] > _CLEARANCE)).mean() > _RARE:
+        if (acts & (apart[one, other] > _CLEARANCE)).mean() > _RARE * (1 + few):
             least = touching[int(given_up * len(touching))] if len(touching) else gap.min()
             slack = max(0.0, _CLEARANCE - float(least) - _SURE)
         if slack > 0.002 or not known:
