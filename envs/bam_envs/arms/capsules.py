@@ -12,7 +12,7 @@ _DIRECTIONS = 500
 _GAIN = 0.8  # two capsules instead of one must have less than this share of its volume
 _NEARLY_ALWAYS = 0.5  # share of postures
 _TRIALS = 250  # steps of the search for a thinner capsule
-_NEAR = 0.02  # distance below which capsules of two links with a slack are compared, some of which touch later [m]
+_NEAR = 0.02  # distance of capsules of two links with a slack that touch in other postures than those looked at [m]
 
 
 _Fit = tuple[Array, Array, float]
@@ -220,10 +220,13 @@ class Outline:
         gaps = self.distances(low + rng.random((2000, len(low))) * (high - low))
         # Capsules on both sides of a wrist or an elbow overlap nearly always: limits of joints keep their links apart,
         # unless a slack is known, with which they overlap where the links do.
-        known = np.array([(int(links[i]), int(links[j])) in self._slack for i, j in rows])
+        ends = [(int(links[i]), int(links[j])) for i, j in rows]
+        known = np.array([pair in self._slack for pair in ends])
         near = (np.diff(np.minimum(links[self.pairs], last), axis=1)[:, 0] == 2) & ~known
-        share = (gaps < np.where(known, _NEAR, 0.0)).mean(axis=0)
-        kept: NDArray[np.int64] = self.pairs[(share > 0.0) & ~(near & (share > _NEARLY_ALWAYS) & (not every))]
+        share, least = (gaps < 0.0).mean(axis=0), gaps.min(axis=0)
+        touching = {pair for pair, gap in zip(ends, least, strict=True) if gap < 0.0}
+        seldom = known & [pair not in touching for pair in ends] & (least < _NEAR)
+        kept: NDArray[np.int64] = self.pairs[seldom | (share > 0.0) & ~(near & (share > _NEARLY_ALWAYS) & (not every))]
         return kept
 
 
