@@ -33,7 +33,7 @@ ARMS = {
 }
 """Files of the same arm and its gripper, and where the arm ends."""
 HULLS = {"ur5e": ((0, 2), (2, 6), (3, 6))}
-"""Links whose hulls overlap where their drawn meshes do not: base and upper arm are 17 mm apart, wrist 3 9 to 26 mm."""
+"""Links whose hulls overlap where their drawn meshes do not: base and upper arm are 17 mm apart, wrist 3 4 to 26 mm."""
 
 
 @dataclass(frozen=True, kw_only=True)
