@@ -235,7 +235,12 @@ class FrozenPolicy:
 
     def answer(self, seen: Mapping[str, np.ndarray]) -> np.ndarray:
         """The graph's own answers to its inputs, (n, ...) each: actions (n, ...), or chunks (n, size, ...)."""
-        return self._act({part.name: part.checked(seen[part.name], (len(seen[part.name]),)) for part in self._taken})
+        inputs = {part.name: part.checked(seen[part.name], (len(seen[part.name]),)) for part in self._taken}
+        first = self._taken[0].name
+        if self._session.inputs[first].shape[0] != 1:
+            return self._act(inputs)
+        rows = range(len(inputs[first]))  # a graph that was traced for one observation
+        return np.concatenate([self._act({name: value[i : i + 1] for name, value in inputs.items()}) for i in rows])
 
     def plan(self, fade: np.ndarray | None = None) -> Plan:
         """A new plan of the actions of one environment; for `fade`, see `Plan`."""
