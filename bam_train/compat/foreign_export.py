@@ -13,6 +13,7 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
+from bam_envs.core.robot_models import portable_model
 from bam_envs.core.spaces import space_to_json
 from bam_train.checkpoint import GOLDEN, POLICY, Checkpoint, safetensors_file, write_checkpoint
 from bam_train.compat.foreign_graph import as_ours, as_theirs, mapped_graph, with_known_sizes
@@ -77,7 +78,7 @@ def export_foreign(
             text = f"{first.what}: expected {first.expected}, found {first.found}{more}"
             raise ContractRefused(first.what, f"{policy.place} does not fit {env_id}: {text}; nothing was written")
         observation, action = env.observation_space, env.action_space
-        signals = getattr(env.unwrapped, "describe", dict)()
+        signals: dict[str, Any] = getattr(env.unwrapped, "describe", dict)()
     if not isinstance(action, spaces.Box):
         raise PolicyError(f"{policy.place}: {env_id} takes {action}, and policies of others give numbers")
     taken, given = _meanings(policy, observation, signals), meaning(policy.output, *_numbers(signals, "action"))
@@ -91,7 +92,7 @@ def export_foreign(
         raise PolicyError(f"{policy.place}: {text}, expected at most {TOLERANCE}: this network cannot be exported")
     fields = {
         "env": env_id,
-        "env_kwargs": dict(env_kwargs),
+        "env_kwargs": _portable(env_kwargs),
         "observation_space": jsons[0],
         "action_space": jsons[1],
         "signals": signals,
@@ -106,6 +107,12 @@ def export_foreign(
         **origin(),
     }
     return ForeignExport({POLICY: graph, GOLDEN: safetensors_file.dump(golden)}, fields, worst)
+
+
+def _portable(env_kwargs: Mapping[str, Any]) -> dict[str, Any]:
+    """The arguments with the whole description of a robot in place of its name."""
+    robot = env_kwargs.get("robot_model")
+    return {**env_kwargs, **({} if robot is None else {"robot_model": portable_model(robot)})}
 
 
 def _numbers(signals: Mapping[str, Any], of: str) -> tuple[list[Mapping[str, Any]], dict[str, tuple[float, float]]]:

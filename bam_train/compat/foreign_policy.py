@@ -91,6 +91,10 @@ class ForeignPolicy:
     steps: int = 0
     source: Mapping[str, Any] = field(default_factory=dict)
     """Where it comes from, for the manifest."""
+    env: str | None = None
+    """The environment that it was trained on, if it is one of ours."""
+    env_kwargs: Mapping[str, Any] = field(default_factory=dict)
+    """Arguments of that."""
 
 
 @dataclass(frozen=True)
@@ -140,7 +144,7 @@ def _si(name: str, units: Units, limits: tuple[float, float]) -> tuple[float, fl
 
 def fit_rows(policy: ForeignPolicy, env: gym.Env[Any, Any], period: float | None) -> Iterator[Check]:
     """The lines of a contract between the policy and an environment: rate, images, and each number of each vector."""
-    signals = getattr(env.unwrapped, "describe", lambda: {"observation": [], "action": []})()
+    signals: Mapping[str, Any] = getattr(env.unwrapped, "describe", lambda: {"observation": [], "action": []})()
     if policy.period is not None and period is not None:
         same = math.isclose(policy.period, period, rel_tol=1e-3)
         yield Check("period", f"{policy.period:g} s", f"{period:g} s", fits=same)

@@ -18,6 +18,7 @@ from torch import nn
 from bam_train.checkpoint import safetensors_file
 from bam_train.checkpoint.manifest import Chunk
 from bam_train.compat.foreign_policy import Affine, ForeignPolicy, Port, Units
+from bam_train.data import DataSet
 from bam_train.errors import AlteredCheckpoint, CheckpointMismatch, FormatError, NotACheckpoint, SettingsError
 from bam_train.trainers.frozen_network import Layer, trace
 
@@ -57,8 +58,8 @@ def lerobot_policy(folder: Path, *, data: Path | None = None, units: Units | Non
     steps = {name: _steps(folder, f"policy_{name}.json") for name in ("preprocessor", "postprocessor")}
     renamed = {old: new for step in steps["preprocessor"] for old, new in step["config"].get("rename_map", {}).items()}
     info, root = _data_set(folder, data)
-    is_ours = (root / "meta/bam.json").is_file()
-    if units is None and not is_ours:
+    ours = DataSet.open(root).info if (root / "meta/bam.json").is_file() else None
+    if units is None and ours is None:
         text = (
             "its joints may be measured in degrees, or from -100 to 100. Say which: --units degrees, or --units range"
         )
@@ -72,7 +73,7 @@ def lerobot_policy(folder: Path, *, data: Path | None = None, units: Units | Non
         if len(shape) == 3:
             channels = np.ones(shape[0])
             return Port(feature, part, shape, norm.after(Affine(channels / 255, 0 * channels)))
-        names = () if is_ours else _names(folder, info, there)
+        names = () if ours is not None else _names(folder, info, there)
         return Port(feature, part, shape, norm, names, units or "si")
 
     inputs = [port(name, shape, norms["preprocessor"](name, shape)) for name, shape in network.features.items()]
@@ -94,6 +95,8 @@ def lerobot_policy(folder: Path, *, data: Path | None = None, units: Units | Non
         f"LeRobot {version}",
         network.answer,
         source=source,
+        env=ours.env if ours is not None else None,
+        env_kwargs=ours.env_kwargs if ours is not None else {},
     )
 
 
