@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 SPARE = 1.5
 """A chunk is asked for so many times its longest duration before it is due."""
-NICE = 10
+NICE = 5
 """How much the thread gives way to the loop, where the system knows threads (Linux)."""
 
 
