@@ -2,14 +2,20 @@ from __future__ import annotations
 
 import queue
 import threading
+from types import SimpleNamespace
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 import pytest
+from gymnasium import spaces
 from onnx import helper
 
+from bam_envs.core.timing import Pacer
 from bam_train.checkpoint import safetensors_file, write_checkpoint
 from bam_train.checkpoint.manifest import Chunk
+from bam_train.deploy.deployment import Deployment
+from bam_train.deploy.journal import Ending, Journal
 from bam_train.errors import CheckpointError, PolicyError
 from bam_train.policy import FrozenPolicy
 from bam_train.policy.background import Background
@@ -228,3 +234,30 @@ def test_a_failure_of_the_thread_ends_the_step(slow):
     beside._asked.thread.join()
     with pytest.raises(PolicyError, match=r"^the graph failed$"):
         acts(beside, 3)
+
+
+class Line(gym.Env):
+    """Shows the seed of its episode in every step, and keeps the actions."""
+
+    observation_space = action_space = spaces.Box(-np.inf, np.inf, (1,), np.float32)
+
+    def __init__(self):
+        self.acts, self.seen = [], np.zeros(1, np.float32)
+
+    def reset(self, *, seed=None, options=None):
+        self.acts.append([])
+        self.seen = np.full(1, seed, np.float32)
+        return self.seen, {}
+
+    def step(self, action):
+        self.acts[-1].append(round(float(action[0]), 4))
+        return self.seen, 0.0, False, len(self.acts[-1]) == 4, {}
+
+
+def test_a_deployment_begins_every_episode_with_a_chunk_of_its_own():
+    env, journal = Line(), Journal(2)
+    policy = chunked(Chunk(size=50, steps=50))
+    deployment = Deployment(env, policy, Pacer(1e-3), journal)
+    watcher = SimpleNamespace(ticked=lambda *_: None, ended=lambda _: None)
+    assert deployment.run(watcher, seed=7) == Ending("episodes done", 0)
+    assert env.acts == [[7.0, 7.1, 7.2, 7.3], [8.0, 8.1, 8.2, 8.3]]
