@@ -155,7 +155,7 @@ _ENTRIES = (
     ),
     EnvEntry(
         "bam/joints-v0",
-        "move the joints of an arm to positions: for policies that were trained elsewhere",
+        "follow positions of an arm's joints, for policies of others",
         "bam_envs.tasks.joints:JointsTask",
         "bam_envs.robots.physics.mujoco_arm:arm_scene",
         max_episode_steps=600,

@@ -25,8 +25,8 @@ class JointsTask(ReachTask):
         Each joint is within 0.1 rad of the home pose.
 
     Action:
-        Positions of the joints [rad] and width of the gripper [m]. The arm follows as fast as `JointPace` and 0.24 m/s
-        of the tool allow, no lower than its work area.
+        Positions of the joints [rad] and width of the gripper [m], followed with at most 0.24 m/s of the tool, no lower
+        than the work area.
 
     Reward:
         0.
