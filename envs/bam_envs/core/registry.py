@@ -156,7 +156,7 @@ _ENTRIES = (
     EnvEntry(
         "bam/joints-v0",
         "follow positions of an arm's joints, for policies of others",
-        "bam_envs.tasks.joints:JointsTask",
+        "bam_envs.tasks.reach:JointsTask",
         "bam_envs.robots.physics.mujoco_arm:arm_scene",
         max_episode_steps=600,
         robot_options=("robot_model",),
