@@ -25,7 +25,7 @@ from bam_train.data.layout import INFO, Files
 from bam_train.data.record_dataset import info_of
 from bam_train.data.recorded_episode import Array, DataSetInfo, Episode, digest_of, leaves_of, nested
 from bam_train.environments import make_env, must_be_named, require_env_kwargs
-from bam_train.errors import BadDataSet, BadRecording
+from bam_train.errors import BadDataSet, FormatError
 from bam_train.files.place import Place, local_path
 from bam_train.recording.recording import DIGEST, Recording
 
@@ -51,18 +51,18 @@ def info_of_recording(recording: Recording, env: str | None = None) -> DataSetIn
         env: Its environment where a module must be imported for it, ``some_module:Env-v0``.
 
     Raises:
-        BadRecording: It does not say its environment, or that is another one.
+        FormatError: It does not say its environment, or that is another one.
     """
     named = recording.metadata.get("env", "")
     if not named or (env is not None and env.rpartition(":")[2] != named.rpartition(":")[2]):
-        raise BadRecording(f"{recording.path}: is of {named or 'no named environment'}, not of {env}; give that one")
+        raise FormatError(f"{recording.path}: is of {named or 'no named environment'}, not of {env}; give that one")
     if must_be_named(named) and env is None:
-        raise BadRecording(f"{recording.path}: is of {named}, whose module is imported only if you add --env {named}")
+        raise FormatError(f"{recording.path}: is of {named}, whose module is imported only if you add --env {named}")
     kwargs = json.loads(recording.metadata.get("env_kwargs", "{}"))
     try:
         require_no_place(kwargs)
     except ValueError as error:
-        raise BadRecording(f"{recording.path}: {error}. Ask whoever made it") from error
+        raise FormatError(f"{recording.path}: {error}. Ask whoever made it") from error
     period = json.loads(recording.metadata.get("period_s", "null"))
     with closing(make_env(env or named, kwargs)) as made:
         return info_of(made, env or named, kwargs, period)

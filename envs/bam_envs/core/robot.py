@@ -107,6 +107,14 @@ class BaseBody:
         return max(math.hypot(x, y) for x, y in self.corners) + self.radius
 
     @cached_property
+    def edge(self) -> tuple[tuple[float, float], ...]:
+        """Corners to draw it with: of a circle those of a polygon with 32 of them, anticlockwise [m]."""
+        if not self.radius:
+            return self.corners
+        ((x, y),), turns = self.corners, (math.tau * at / 32 for at in range(32))
+        return tuple((x + self.radius * math.cos(turn), y + self.radius * math.sin(turn)) for turn in turns)
+
+    @cached_property
     def sides(self) -> tuple[tuple[float, float, float], ...]:
         """Outward unit vector x, y of each side of the polygon, and how far the side is from the frame [m]."""
         pairs = zip(self.corners, (*self.corners[1:], self.corners[0]), strict=True)

@@ -245,6 +245,7 @@ class RosbridgeRobot:
                 link = RosbridgeLink(self._endpoint, name="goals", lost_after=_LOST_AFTER)
             self._goals = Goals(link, self.spec.command, self.namespace, self._refuse)
             link.connect()
+            self._goals.prepare(others)
         self._sinks = tuple(
             types.check_listened(self.namespace + one.topic, one) if one.topic else one for one in self._sinks
         )

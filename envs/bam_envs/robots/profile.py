@@ -122,6 +122,29 @@ def load_profile(name_or_path: str | Path) -> RobotProfile:
     return _profile(*_read_file(name))
 
 
+def fitting_profile(name_or_path: str | Path, spec: RobotSpec) -> RobotProfile:
+    """As `load_profile`, for the robot of `spec`; `InvalidValue` for that of another robot, with those that fit."""
+    profile, ours = load_profile(name_or_path), _moved(spec)
+    if (profile.kind == "base") == is_base(spec) and set(ours) <= set(_moved(profile)):
+        return profile
+    tables = [name for name in (*shipped_profiles(), spec.name) if name in shipped_profiles() or own_profile(name)]
+    found = {name: load_profile(name) for name in tables}
+    fits = [
+        name for name, one in found.items() if ours == _moved(one) and (one.kind == "arm" or one.robot == spec.name)
+    ]
+    remedy = f"Leave it out for the usual topics, or write one: bam-robots profile {spec.name} --from URL."
+    remedy = f"Profiles that fit: {', '.join(fits)}." if fits else remedy
+    raise InvalidValue(
+        f"The profile {name_or_path} is that of another robot: it has {', '.join(_moved(profile))}, and "
+        f"{spec.name} has {', '.join(ours)}. {remedy}"
+    )
+
+
+def _moved(robot: RobotSpec | RobotProfile) -> tuple[str, ...]:
+    """The joints of an arm, or the axes of a base."""
+    return tuple(at for at, unit in zip(robot.command.labels, robot.command.units, strict=True) if unit != "m")
+
+
 def read_profile(text: str, where: str) -> RobotProfile:
     """The profile in the text of a file; `where`, which ends in the suffix of its language, begins errors."""
     return _profile(where, _merged(_parsed(where, text), where))

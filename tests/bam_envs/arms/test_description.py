@@ -184,13 +184,17 @@ def test_a_project_comes_before_its_user_and_both_before_packages_and_the_shippe
     assert robot_model("lab").name == "lab"
 
 
+ANOTHER = "Another arm is described first: bam-robots add NAME --urdf FILE."
+
+
 def test_a_name_that_is_not_known(places):
     with pytest.raises(UnknownName) as caught:
         robot_model("fr4")
-    assert str(caught.value) == "Unknown robot model 'fr4'. Did you mean 'fr3'?"
+    assert str(caught.value) == f"Unknown robot model 'fr4'. Did you mean 'fr3'? {ANOTHER}"
     with pytest.raises(UnknownName) as caught:
         robot_model("zebra")
-    assert str(caught.value) == f"Unknown robot model 'zebra'. Choose from: {', '.join(sorted(known_models()))}."
+    choices = ", ".join(sorted(known_models(ArmDescription)))
+    assert str(caught.value) == f"Unknown robot model 'zebra'. Choose from: {choices}. {ANOTHER}"
 
 
 def test_a_file_and_a_description_are_taken_as_they_are(tmp_path):

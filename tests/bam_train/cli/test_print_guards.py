@@ -91,4 +91,4 @@ def test_the_description_of_the_arm_may_be_the_one_here_and_not_another_arms(run
     )
     assert err.endswith("Give the description with which the policy was trained, or train a policy for this one.\n")
     _, _, err = run(main, CHECKPOINTS / "mir100-navigation-ppo.zip", print_guards, "--robot-model", "ur5e")
-    assert "--robot-model ur5e: env_kwargs: robot_model: ur5e is an arm, and a wheeled base is needed: husky, " in err
+    assert "--robot-model ur5e: robot_model: ur5e is an arm, and a wheeled base is needed: husky, " in err

@@ -4,7 +4,7 @@ import threading
 
 import pytest
 
-from bam_train.errors import AgentInUse, LoopError
+from bam_train.errors import LoopError
 from bam_train.loop import Agent, Workspace
 
 IN_USE = "{} is running already, in another thread or around this call; give each its own: agent.clone()."
@@ -137,7 +137,7 @@ def test_an_agent_that_calls_itself(kind):
             self.set(("y", t), kind([float(t)]))
 
     ws, agent = Workspace(), Nested()
-    with pytest.raises(AgentInUse) as error:
+    with pytest.raises(LoopError) as error:
         agent(ws, t=0)
     assert str(error.value) == IN_USE.format("Nested")
     assert agent.workspace is None
@@ -160,7 +160,7 @@ def test_two_threads_in_one_agent(kind):
     thread.start()
     assert inside.wait(30)
     try:
-        with pytest.raises(AgentInUse) as error:
+        with pytest.raises(LoopError) as error:
             agent(other, t=0, wait=False)
     finally:
         go_on.set()

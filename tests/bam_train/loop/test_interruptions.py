@@ -7,7 +7,7 @@ from contextlib import suppress
 import numpy as np
 import pytest
 
-from bam_train.errors import AgentInUse
+from bam_train.errors import LoopError
 from bam_train.loop import Agent, Agents, TemporalAgent, Workspace
 
 
@@ -71,7 +71,7 @@ def test_a_loop_that_runs_in_another_thread_is_left_alone():
     try:
         assert inside.wait(10)
         other = Workspace()
-        with pytest.raises(AgentInUse, match=r"^TemporalAgent is running already, in another thread"):
+        with pytest.raises(LoopError, match=r"^TemporalAgent is running already, in another thread"):
             loop(other, n_steps=1)
         assert list(other.keys()) == []
         assert env.closes == 0

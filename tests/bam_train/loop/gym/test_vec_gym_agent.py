@@ -11,7 +11,7 @@ from gymnasium import spaces
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
 from gymnasium.wrappers import Autoreset, TimeLimit
 
-from bam_train.errors import LoopError, SettingsError, ValueMismatch
+from bam_train.errors import LoopError, SettingsError
 from bam_train.loop import Agent, Agents, ParallelGymAgent, TemporalAgent, VecGymAgent, Workspace
 from tests.bam_envs.making import ROBOTS
 
@@ -307,5 +307,5 @@ def test_actions_that_do_not_fit(toys):
         ws.clear()
         agent(ws, t=0)
         ws.set("action", 0, action)
-        with pytest.raises(ValueMismatch, match=f"^{re.escape(text)}$"):
+        with pytest.raises(LoopError, match=f"^{re.escape(text)}$"):
             agent(ws, t=1)

@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from bam_train.errors import ValueMismatch, WorkspaceError
+from bam_train.errors import LoopError
 from bam_train.loop.workspace.returns import (
     cumulated_reward,
     doubleqlearning_temporal_difference,
@@ -52,7 +52,7 @@ def test_gae_of_no_rows():
 
 def test_gae_refuses_what_would_broadcast():
     values = torch.zeros(3), torch.zeros(3), torch.zeros(3), torch.zeros(3, 1)
-    with pytest.raises(ValueMismatch, match=r"^gae: expected critic \(3,\), found \(3, 1\)\.$"):
+    with pytest.raises(LoopError, match=r"^gae: expected critic \(3,\), found \(3, 1\)\.$"):
         gae(*values, GAMMA, LAMBDA)
 
 
@@ -68,7 +68,7 @@ def test_temporal_difference_in_numbers():
 
 def test_temporal_difference_wants_one_flag_for_each_transition():
     message = r"^temporal_difference: expected must_bootstrap \(1, 1\), found \(2, 1\)\.$"
-    with pytest.raises(ValueMismatch, match=message):
+    with pytest.raises(LoopError, match=message):
         temporal_difference(torch.zeros(2, 1), torch.zeros(2, 1), torch.zeros(2, 1), 0.5)
 
 
@@ -87,7 +87,7 @@ def test_double_q_learning_in_numbers():
 def test_double_q_learning_names_what_does_not_fit():
     q = torch.zeros(2, 1, 3)
     message = r"^doubleqlearning_temporal_difference: expected action \(2, 1\), found \(2,\)\.$"
-    with pytest.raises(ValueMismatch, match=message):
+    with pytest.raises(LoopError, match=message):
         doubleqlearning_temporal_difference(q, torch.zeros(2), q, torch.zeros(2, 1), torch.zeros(1, 1), 0.5)
 
 
@@ -100,5 +100,5 @@ def test_cumulated_reward_ends_with_the_first_done():
 
 def test_cumulated_reward_of_what_has_not_ended():
     message = r"^cumulated_reward: expected a done in every column, found none in \[1\]; run until all are done\.$"
-    with pytest.raises(WorkspaceError, match=message):
+    with pytest.raises(LoopError, match=message):
         cumulated_reward(torch.zeros(2, 2), torch.tensor([[False, False], [True, False]]))
