@@ -68,6 +68,13 @@ def test_numbers_do_not_depend_on_how_many_run_side_by_side(corridor, num_envs):
     )
 
 
+@pytest.mark.parametrize(("episodes", "most", "played"), [(12, 1, 4), (12, 5, 6), (12, 12, 12), (32, 1, 8)])
+def test_more_failures_than_wanted_end_it_after_a_wave_and_a_quarter_of_the_episodes(corridor, episodes, most, played):
+    slow = {"slow": True}  # nobody succeeds
+    report = evaluate(Always(), corridor, slow, episodes=episodes, num_envs=2, most_failures=most)
+    assert (report.episodes, report.successes) == (played, 0)
+
+
 def test_time_limit_and_no_success_where_the_environment_has_none(corridor):
     report = evaluate(Always(), corridor, {"slow": True}, episodes=2, seed=0)
     assert (report.length_mean, report.return_mean, report.success_rate) == (10.0, -2.5, 0.0)
