@@ -393,7 +393,7 @@ def evaluate_for_goal(
 
     def play(first: int, count: int) -> EvaluationReport:
         seed = EVALUATION_SEED + settings.seed + first
-        given = {"episodes": count, "seed": seed, "env": envs, "most_failures": most}
+        given: dict[str, Any] = {"episodes": count, "seed": seed, "env": envs, "most_failures": most}
         return evaluate(policy, settings.env, settings.env_kwargs, **given)
 
     if most < LOOK <= episodes / 8 and (look := play(0, LOOK)).successes == 0:

@@ -57,6 +57,8 @@ class SimulatedArm:
     ) -> None:
         self.num_robots, self.description = num_robots, model_called(robot_model)
         self.randomize, self._looks = randomize, looks
+        self.coarse = False
+        """Whether `connect` builds coarse physics, to train on; see `coarse_physics`."""
         self.spec = replace(self.description.spec(with_object=with_object), lag=LAG, cameras=cameras)
         self._joints, self._open = self.description.num_joints, self.description.gripper.open
         command = self.spec.command
@@ -76,11 +78,16 @@ class SimulatedArm:
         if self._physics is not None:
             return
         from bam_envs.robots.physics.arm_model import scene_spec
+        from bam_envs.robots.physics.coarse_physics import CoarsePhysics
         from bam_envs.robots.physics.domain_randomization import Imperfection
         from bam_envs.robots.physics.mujoco_batch import Physics
 
         scene = partial(scene_spec, self.description, with_object=self._with_object)
-        self._physics = Physics(scene().compile(), self.num_robots, varied=self.randomize)
+        if self.coarse:
+            given: dict[str, Any] = {"with_object": self._with_object, "varied": self.randomize}
+            self._physics = CoarsePhysics(self.description, self.num_robots, **given)
+        else:
+            self._physics = Physics(scene().compile(), self.num_robots, varied=self.randomize)
         self._imperfection = Imperfection(self._physics) if self.randomize else None
         if self.spec.cameras:
             from bam_envs.robots.physics.cameras import Cameras
