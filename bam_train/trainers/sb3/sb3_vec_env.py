@@ -30,12 +30,12 @@ def make_training_env(
     Their physics is `coarse` if that is asked for, unless they are elsewhere; raises SettingsError if it cannot be.
     """
     if is_batched(env_id) or isinstance(place, Remote):
-        envs = make_vector_env(env_id, env_kwargs, num_envs, place)
-        robot: Any = getattr(envs.unwrapped, "robot", None)
+        batch = make_vector_env(env_id, env_kwargs, num_envs, place)
+        robot: Any = getattr(batch.unwrapped, "robot", None)
         if hasattr(robot, "coarse"):
             robot.coarse, coarse = coarse, False
         if not coarse or isinstance(place, Remote):
-            return BatchVecEnv(envs, env_id)
+            return BatchVecEnv(batch, env_id)
     if coarse:
         raise SettingsError(f"coarse_physics: {env_id} has no arm that MuJoCo simulates; leave it out")
     envs = (FiniteEnv(make_env(env_id, env_kwargs), env_id, index) for index in range(num_envs))

@@ -177,6 +177,11 @@ class SimulatedArm:
             raise InvalidValue(f"A period has {PHYSICS_STEPS} physics steps; it cannot be divided into {parts!r}.")
         return self._slices(self._travel(checked_command(command, self._command.shape)), parts)
 
+    def rest(self, resting: NDArray[np.bool_]) -> None:
+        """Leave the arms of a mask (n,) as they are in the next steps; see `RobotVectorEnv.rest`."""
+        if self._physics is not None:
+            self._physics.resting = resting
+
     def _travel(self, command: Array) -> Array:
         """Change of the set points in this period, if `command` is sent now. Shape: (n, joints + 1)."""
         reach, last = self._max_rate * self.spec.period, self._joints

@@ -45,6 +45,8 @@ class Physics:
         mujoco.mj_getState(self.model, self._scratch, state, FULL)
         self.state: Array = np.tile(state, (num_envs, 1))
         """Time, joint positions, joint velocities. Shape: (n, 1 + nq + nv)."""
+        self.resting = np.zeros(num_envs, dtype=bool)
+        """Environments that `step` leaves as they are. Shape: (n,)."""
 
     def _start(self) -> None:
         """Create the threads and their working memory, which belong to this process."""
@@ -81,7 +83,12 @@ class Physics:
 
     def step(self, control: Array) -> None:
         """Advance all environments; `control` are the actuators' set points for each physics step (n, steps, nu)."""
-        self.state = self.advanced(self.state, control, self._models)
+        if not self.resting.any():
+            self.state = self.advanced(self.state, control, self._models)
+            return
+        rows, after = np.flatnonzero(~self.resting), self.state.copy()
+        after[rows] = self.advanced(after[rows], control[rows], [self._models[row] for row in rows])
+        self.state = after
 
     def advanced(self, state: Array, control: Array, models: list[Any]) -> Array:
         """What follows the rows of `state` (k, nstate), of one model or k, under `control` (k, steps, nu)."""
