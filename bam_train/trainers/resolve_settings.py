@@ -131,8 +131,20 @@ def require_start(settings: TrainSettings, path: str) -> Checkpoint:
     return checkpoint
 
 
+def _best_algorithm(name: str) -> str | None:
+    """The first in `ALGORITHMS`, of a trainer that needs no other flag, with a preset for an environment, or None."""
+    runs = [(algo, table) for table in ("sb3", "bandit") for algo in ALGORITHMS[table]]
+    return next((algo for algo, table in runs if read_preset(name, algo, table)), None)
+
+
 def _implied(given: Mapping[str, Any]) -> dict[str, Any]:
-    """The trainer of an algorithm that no other one has; or the trainer, environment and arguments of a data set."""
+    """The trainer of an algorithm that no other one has; or the trainer, environment and arguments of a data set.
+
+    Without an algorithm, that of the environment's first preset.
+    """
+    if "env" in given and not {"algo", "data", "trainer"} & given.keys():
+        algo = _best_algorithm(_resolve_env(given["env"], elsewhere="transport" in given))
+        return {**_implied({**given, "algo": algo}), "algo": algo}
     trainers = [trainer for trainer in ("imitation", "bandit") if given.get("algo") in ALGORITHMS[trainer]]
     if trainers or given.get("data") is None:
         return {"trainer": trainers[0]} if trainers else {}

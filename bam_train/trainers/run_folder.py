@@ -105,7 +105,8 @@ def read_records(path: Path) -> list[dict[str, Any]]:
     for line in path.read_text(encoding="utf-8").splitlines() if path.exists() else ():
         with contextlib.suppress(ValueError):
             record = json.loads(line)
-            if records and record["steps"] < records[-1]["steps"]:
+            newest = [(one["steps"], one["kind"]) for one in records[-2:]]
+            if newest and (record["steps"] < newest[-1][0] or (record["steps"], record["kind"]) in newest):
                 records = [one for one in records if one["steps"] < record["steps"]]
             records.append(record)
     return records

@@ -23,6 +23,8 @@ def lists(curve):
 def test_our_own_runs_without_what_a_resumed_one_repeated(tmp_path):
     rows = [
         ("training", 64, 1.0, 1.0, 0.0),
+        ("evaluation", 64, 1.1, 9.0, 0.5),  # killed before its checkpoint
+        ("training", 64, 1.2, 1.0, 0.0),
         ("evaluation", 64, 1.5, 2.0, 0.25),
         ("evaluation", 128, 2.5, 3.0, 0.5),
         ("training", 100, 3.0, 1.0, 0.0),

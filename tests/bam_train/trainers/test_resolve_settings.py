@@ -33,7 +33,27 @@ def test_later_layers_win():
     assert (settings.steps, settings.num_envs) == (preset["steps"], 2)
     assert (found["gamma"], found["vf_coef"]) == (tuned["gamma"], 0.5)
     assert found["policy_kwargs"] == {**tuned.get("policy_kwargs", {}), "ortho_init": False}
-    assert resolve({"env": "Acrobot-v1", "algo": "dqn"}).hyperparameters["learning_rate"] == 1e-4
+    assert resolve({"env": "MountainCar-v0", "algo": "dqn"}).hyperparameters["learning_rate"] == 1e-4
+
+
+@pytest.mark.parametrize(
+    ("env", "trainer", "algo"),
+    [
+        ("bam/pick", "sb3", "ppo"),
+        ("CartPole-v1", "sb3", "ppo"),
+        ("Pendulum-v1", "sb3", "ppo"),
+        ("bam/grasp-xyr", "bandit", "grasp-q"),
+    ],
+)
+def test_without_an_algorithm_the_first_preset_of_the_environment_says_which(env, trainer, algo):
+    settings = resolve({"env": env})
+    assert (settings.trainer, settings.algo) == (trainer, algo)
+    assert settings == resolve({"env": env, "algo": algo})
+
+
+def test_no_preset_and_no_algorithm():
+    with pytest.raises(SettingsError, match=r"^algo: expected a name, found nothing\. Give --algo NAME$"):
+        resolve({"env": "MountainCar-v0"})
 
 
 def test_there_are_as_many_environments_as_the_servers_have():
@@ -115,7 +135,7 @@ def test_the_table_of_trainers():
 @pytest.mark.parametrize("name", sorted(path.name for path in PRESETS.iterdir() if path.name != "__pycache__"))
 def test_every_preset_is_complete_and_of_an_environment_that_is_here(name):
     runs = [(trainer, algo) for trainer, table in ALGORITHMS.items() for algo in table]
-    here = [*ENVIRONMENTS, "CartPole-v1"]
+    here = [*ENVIRONMENTS, "CartPole-v1", "Pendulum-v1"]
     found = [(env, *run) for env in here for run in runs if f"{file_stem(env, run[1], run[0])}.toml" == name]
     assert len(found) == 1
     env, trainer, algo = found[0]
@@ -125,7 +145,7 @@ def test_every_preset_is_complete_and_of_an_environment_that_is_here(name):
         resolve(
             {"env": env, "algo": algo, "trainer": trainer, "teacher": "scripted" if trainer == "imitation" else None}
         )
-    assert read_preset("CartPole-v1", "ppo") == {}
+    assert read_preset("CartPole-v1", "a2c") == {}
 
 
 @pytest.fixture
@@ -205,7 +225,7 @@ def test_settings_that_no_run_has_are_refused(saved, fields, tmp_path, name, val
 
 
 def test_what_is_said_again_is_no_difference(saved):
-    same = {"gamma": 0.99, "policy_kwargs": {}}
+    same = {"gamma": 0.98, "policy_kwargs": {}}
     again = {"env": "CartPole-v1", "algo": "ppo", "seed": 3, "normalize": True, "hyperparameters": same}
     assert resolve_resumed(again, saved.checkpoint) == saved.settings
 
@@ -222,9 +242,9 @@ def test_when_to_stop_and_how_to_measure_may_change(saved):
         ({"env": "MountainCar-v0"}, "env", "CartPole-v1", "MountainCar-v0"),
         ({"algo": "a2c"}, "algo", "ppo", "a2c"),
         ({"seed": 4}, "seed", 3, 4),
-        ({"num_envs": 2}, "num_envs", 1, 2),
-        ({"normalize": False}, "normalize", {"gamma": 0.99}, False),
-        ({"hyperparameters": {"gamma": 0.9}}, "hyperparameters.gamma", 0.99, 0.9),
+        ({"num_envs": 2}, "num_envs", 8, 2),
+        ({"normalize": False}, "normalize", {"gamma": 0.98}, False),
+        ({"hyperparameters": {"gamma": 0.9}}, "hyperparameters.gamma", 0.98, 0.9),
         ({"hyperparameters": {"target_kl": 0.9}}, "hyperparameters.target_kl", None, 0.9),
         (
             {"hyperparameters": {"policy_kwargs": {"net_arch": [4]}}},

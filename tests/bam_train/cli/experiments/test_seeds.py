@@ -20,8 +20,8 @@ from bam_train.experiments.seed_runs import News, group_folder
 from bam_train.settings import TrainSettings
 from bam_train.trainers.run_folder import RunFolder, read_records
 
-BASE = {"env": "CartPole-v1", "algo": "ppo", "steps": 1024, "set": ("n_steps=64", "n_epochs=1")}
-SHORT = ("--env", "CartPole-v1", "--algo", "ppo", "--eval-every", "512", "--eval-episodes", "2")
+BASE = {"env": "CartPole-v1", "algo": "ppo", "steps": 1024, "num_envs": 1, "set": ("n_steps=64", "n_epochs=1")}
+SHORT = ("--env", "CartPole-v1", "--algo", "ppo", "--num-envs", "1", "--eval-every", "512", "--eval-episodes", "2")
 QUICK = ("--set", "n_steps=64", "--set", "n_epochs=1", "--set", "policy_kwargs.net_arch=[8]")
 
 
@@ -87,7 +87,7 @@ def test_the_summary_and_a_second_call_that_does_what_is_missing(bam_train, monk
     Path("runs/CartPole-v1-ppo/config.json").write_text('{"seed": 0}')
     status, lines = bam_train(seeds="0..3")
     assert status == 1
-    assert lines[2:4] == ["seed 0: done: all steps done, 1024 steps, return 100", "seed 1: failed: rewards are NaN"]
+    assert lines[1:3] == ["seed 0: done: all steps done, 1024 steps, return 100", "seed 1: failed: rewards are NaN"]
     start = lines.index("seed  steps  time   success  return")
     assert lines[start:] == [
         "seed  steps  time   success  return",
@@ -110,7 +110,7 @@ def test_the_summary_and_a_second_call_that_does_what_is_missing(bam_train, monk
     monkeypatch.setattr(Trained, "news", lambda self: News([], 1, "again"))
     status, lines = bam_train(seeds="1,4", out=Path("a.zip"))
     assert status == 1
-    assert lines[2:4] == ["seed 1: failed: again", "seed 4: failed: again"]
+    assert lines[1:3] == ["seed 1: failed: again", "seed 4: failed: again"]
     assert Path("runs/CartPole-v1-ppo/config.json").read_text() == '{"seed": 0}'
     assert sorted(one.name for one in Path("runs").iterdir()) == ["CartPole-v1-ppo", "CartPole-v1-ppo-2"]
 
