@@ -6,33 +6,24 @@
     ├── CheckpointError            a checkpoint that cannot be used; carries its path
     │   ├── NotACheckpoint         no such file, not a zip, truncated, or without bam/manifest.json
     │   ├── AlteredCheckpoint      a member differs from the manifest, is missing or is extra
-    │   ├── NewerFormat            written by a newer bam-train
-    │   ├── CheckpointMismatch     made for another environment, algorithm or setting
+    │   ├── CheckpointMismatch     made for another environment, algorithm or setting, or by a newer bam-train
     │   └── UntrustedCheckpoint    not signed, or not by a key that this computer trusts
     ├── BadTrials                  a record of trials that was edited, or cannot be read or written
     ├── TrialsNeeded               full speed before trials have shown that the policy succeeds
     ├── BadKey                     a key for signing or verifying that cannot be used
-    ├── BadRecording               a file that is no recording, or does not fit what it is played with
     ├── BadDataSet                 a folder that is no data set, a damaged one, or episodes that do not belong into it
-    ├── FormatError                bytes that do not follow their file format (safetensors, ONNX)
+    ├── FormatError                a file or bytes that do not follow their format (safetensors, ONNX, a recording)
     ├── PolicyError                a frozen policy that cannot run, or an observation that does not fit it
     ├── NoDetector                 episodes of which no detector of unusual observations can be made, or none is there
     ├── SettingsError              a setting or option that does not exist or does not fit
     │   └── NoTerminal             a program that reads keys has neither a terminal nor a window
-    ├── LoopError                  the interaction loop
+    ├── LoopError                  the interaction loop, such as a value of another shape or dtype than before
     │   ├── UnknownVariable        a variable that no agent wrote
     │   ├── TimeNotWritten         a time at which the variable is not written, or that has left the window
-    │   ├── ValueMismatch          another shape, dtype, device or kind of array than before
-    │   ├── WorkspaceError         anything else that a workspace refuses, such as variables of different lengths
     │   ├── WiringError            an agent reads what no agent writes
-    │   ├── RemoteAgentError       an agent in another process failed, or its process ended
-    │   └── AgentInUse             an agent is called by two threads at once
-    ├── UnknownVersion             a version that a live agent does not have
-    ├── FolderInUse                a folder of versions that another live agent uses
-    ├── CandidateRefused           a checkpoint that a live agent does not take
-    ├── RequestRefused             a request that a live agent refuses
-    │   └── RoleTooLow             one that needs a token of a higher role
-    ├── AgentRefused               a live agent elsewhere refuses a request; carries the kind of its error
+    │   └── RemoteAgentError       an agent in another process failed, or its process ended
+    ├── FolderInUse                a folder that another process uses, such as the versions of another live agent
+    ├── RequestRefused             a request that a live agent refuses; carries the kind of its reason
     ├── ContractRefused            a robot that does not fit the checkpoint; nothing has moved
     ├── EnvironmentFailed          an environment gave NaN or infinity
     ├── TrainingFailed             training cannot continue (a NaN loss); the last good checkpoint is kept
@@ -76,12 +67,8 @@ class AlteredCheckpoint(CheckpointError):  # noqa: N818
         super().__init__(path, message)
 
 
-class NewerFormat(CheckpointError):  # noqa: N818
-    """The checkpoint was written by a newer bam-train."""
-
-
 class CheckpointMismatch(CheckpointError):  # noqa: N818
-    """The checkpoint belongs to another environment, algorithm or setting."""
+    """The checkpoint belongs to another environment, algorithm or setting, or to a newer bam-train."""
 
 
 class UntrustedCheckpoint(CheckpointError):  # noqa: N818
@@ -104,16 +91,12 @@ class BadKey(BamTrainError):  # noqa: N818
     """A key for signing or verifying that cannot be used; the text names its file."""
 
 
-class BadRecording(BamTrainError, ValueError):  # noqa: N818
-    """A file that is no recording of a deployment, or one that does not fit what it is played with."""
-
-
 class BadDataSet(BamTrainError, ValueError):  # noqa: N818
     """A folder that is no data set, a damaged one, or episodes that do not belong into it; the text names the place."""
 
 
 class FormatError(BamTrainError, ValueError):
-    """Bytes that do not follow their file format; the message names the place."""
+    """A file or bytes that do not follow their format, or do not fit what they are used with; names the place."""
 
 
 class PolicyError(BamTrainError, ValueError):
@@ -134,8 +117,8 @@ class NoTerminal(SettingsError):  # noqa: N818
     exit_status = 2
 
 
-class LoopError(BamTrainError):
-    """An error of the interaction loop."""
+class LoopError(BamTrainError, ValueError):
+    """The interaction loop or a workspace refuses an operation, or a value that does not fit its variable."""
 
 
 class UnknownVariable(LoopError, LookupError):  # noqa: N818 - reads as what happened
@@ -156,14 +139,6 @@ class TimeNotWritten(LoopError, LookupError):  # noqa: N818
     """A time at which a variable is not written, or that has left the window."""
 
 
-class ValueMismatch(LoopError, ValueError):  # noqa: N818
-    """Another shape, dtype, device or kind of array than the variable has."""
-
-
-class WorkspaceError(LoopError, ValueError):
-    """An operation that a workspace refuses for any other reason."""
-
-
 class WiringError(LoopError):
     """An agent reads what no agent writes."""
 
@@ -176,40 +151,26 @@ class RemoteAgentError(LoopError):
         super().__init__(message)
 
 
-class AgentInUse(LoopError):  # noqa: N818
-    """An agent is called by two threads at once."""
-
-
-class UnknownVersion(BamTrainError, LookupError):  # noqa: N818
-    """A name or digest of which a live agent has no version, or several."""
-
-
 class FolderInUse(BamTrainError):  # noqa: N818
-    """A folder of versions that another live agent uses."""
-
-
-class CandidateRefused(BamTrainError):  # noqa: N818
-    """A checkpoint that a live agent does not take; the policy before it drives on."""
-
-    exit_status = 3
+    """A folder that another process uses, such as the versions of another live agent."""
 
 
 class RequestRefused(BamTrainError):  # noqa: N818 - reads as what happened
-    """A live agent refuses what it was asked."""
+    """A live agent refuses what it was asked, or fails; `kind` says why.
 
-    exit_status = 3
+    Kinds of its own are CandidateRefused (a checkpoint that it does not take), UnknownVersion (a name or digest of
+    which it has no version, or several) and RoleTooLow (a token of a higher role is needed); others are names of
+    exceptions.
+    """
 
-
-class RoleTooLow(RequestRefused):
-    """A request that needs a token of a higher role."""
-
-
-class AgentRefused(BamTrainError):  # noqa: N818
-    """A live agent elsewhere refuses a request, or failed; `kind` is the name of its exception there."""
-
-    def __init__(self, kind: str, message: str, exit_status: int = 1) -> None:
+    def __init__(self, message: str, kind: str = "RequestRefused", exit_status: int = 3) -> None:
         self.kind, self.exit_status = kind, exit_status
         super().__init__(message)
+
+
+def kind_of(error: BaseException) -> str:
+    """What kind of error it is, for other programs."""
+    return error.kind if isinstance(error, RequestRefused) else type(error).__name__
 
 
 class ContractRefused(BamTrainError):  # noqa: N818

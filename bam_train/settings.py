@@ -11,7 +11,7 @@ import json
 import math
 import re
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -277,8 +277,8 @@ def merge(*layers: Mapping[str, Any]) -> dict[str, Any]:
     return merged
 
 
-def read_config(path: str | Path) -> dict[str, Any]:
-    """Read a ``.toml`` or ``.json`` file of settings, such as ``--print-config`` writes."""
+def read_config(path: str | Path, also: Collection[str] = ()) -> dict[str, Any]:
+    """Read a ``.toml`` or ``.json`` file of settings, such as ``--print-config`` writes; `also` are not checked."""
     path = Path(path).expanduser()
     if path.suffix not in (".toml", ".json"):
         raise SettingsError(f"{path}: expected a .toml or .json file, found {path.suffix or 'no suffix'}")
@@ -291,11 +291,11 @@ def read_config(path: str | Path) -> dict[str, Any]:
         raise SettingsError(f"{path}: cannot be read: {error.strerror or error}") from error
     except UnicodeDecodeError as error:
         raise SettingsError(f"{path}: is not text ({error.reason} at byte {error.start}). Save it as UTF-8") from error
-    return parse_config(str(path), text)
+    return parse_config(str(path), text, also)
 
 
-def parse_config(name: str, text: str) -> dict[str, Any]:
-    """Read settings from the text of a file called `name`, whose suffix gives the format."""
+def parse_config(name: str, text: str, also: Collection[str] = ()) -> dict[str, Any]:
+    """Read settings from the text of a file called `name`, whose suffix gives the format; see `read_config`."""
     try:
         values = json.loads(text) if name.endswith(".json") else tomllib.loads(text)
     except (ValueError, RecursionError) as error:
@@ -303,9 +303,19 @@ def parse_config(name: str, text: str) -> dict[str, Any]:
         raise SettingsError(f"{name}: is not whole {kind}: {error}. Correct that, or see --print-config") from error
     if not isinstance(values, dict):
         raise SettingsError(f"{name}: expected a table of settings, found a {type(values).__name__}")
-    check_names(values, name)
-    check_values({setting: value for setting, value in values.items() if value is not None}, f"{name}: ")
+    checked = {setting: value for setting, value in values.items() if setting not in also}
+    check_names(checked, name)
+    check_values({setting: value for setting, value in checked.items() if value is not None}, f"{name}: ")
     return values  # a flag may replace None
+
+
+def toml_text(value: Any) -> str:
+    """A JSON value without None as a TOML file has it; a table on one line."""
+    if isinstance(value, Mapping):
+        return "{ " + ", ".join(f"{json.dumps(key)} = {toml_text(one)}" for key, one in value.items()) + " }"
+    if isinstance(value, (list, tuple)):
+        return "[" + ", ".join(map(toml_text, value)) + "]"
+    return json.dumps(value)
 
 
 def differences(wanted: Mapping[str, Any], found: Mapping[str, Any], prefix: str = "") -> list[tuple[str, Any, Any]]:

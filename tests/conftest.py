@@ -5,9 +5,11 @@ with what the file sets up once; so do all of Ray, whose processes fill a machin
 share their servers. The longest come first, so that the workers end at about the same time.
 """
 
+import contextlib
 import os
 import signal
 import sys
+import time
 from typing import Any
 
 import pytest
@@ -49,6 +51,7 @@ KINDS = {
         "bam_train/trainers/sb3",
         "bam_train/cli/test_train.py",
         "bam_train/cli/experiments/test_seeds.py",
+        "bam_train/cli/experiments/test_sweep.py",
         "bam_train/files/test_addresses.py",
         "bam_train/cli/test_elsewhere.py",
     ),
@@ -107,3 +110,23 @@ def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
     told = {str(report.longrepr[2]) for report in terminalreporter.stats.get("skipped", ())}
     for reason in sorted(one.partition("no peers: ")[2] for one in told if "no peers: " in one):
         terminalreporter.write_line(f"tests/peers did not run: {reason}")
+
+
+@pytest.fixture
+def until():
+    """Wait for something that tells nobody when it happens, such as the end of a thread."""
+
+    def wait(condition, timeout=10.0):
+        end = time.monotonic() + timeout
+        while not condition():
+            assert time.monotonic() < end, condition
+            time.sleep(0.005)
+
+    return wait
+
+
+@pytest.fixture
+def stack():
+    """Closes what a test has made, the newest first."""
+    with contextlib.ExitStack() as stack:
+        yield stack

@@ -149,6 +149,7 @@ def test_console_scripts(wheel):
         "bam-robots = bam_train.cli.arms.bam_robots:main",
         "bam-serve = bam_train.cli.serve:main",
         "bam-sign = bam_train.cli.sign:main",
+        "bam-sweep = bam_train.cli.experiments.sweep:main",
         "bam-train = bam_train.cli.train:main",
     ]
 
@@ -185,6 +186,7 @@ def test_extras(metadata):
         "rllib",
         "robots",
         "sim",
+        "sweep",
         "train",
         "video",
     ]
@@ -201,8 +203,8 @@ def test_rllib_brings_ray_and_what_training_needs(metadata):
     assert not [one for one in base_requirements(metadata) if one.startswith(("ray", "torch"))]
 
 
-OF_RLLIB = ("ray", "pydantic", "pyarrow", "tensorboardx", "dm-tree", "lz4", "ormsgpack", "scipy", "pandas")
-"""Ray, and what its extra rllib asks for."""
+PINNED = ("ray", "pydantic", "pyarrow", "tensorboardx", "dm-tree", "lz4", "ormsgpack", "scipy", "pandas", "optuna")
+"""Ray, what its extra rllib asks for, and Optuna."""
 
 
 def normal(name):
@@ -210,10 +212,10 @@ def normal(name):
 
 
 def test_what_the_extras_bring_is_pinned_as_installed():
-    """Every package that the extra rllib brings, and what those bring, is in constraints.txt."""
+    """Every package that the extras rllib and sweep bring, and what those bring, is in constraints.txt."""
     lines = (ROOT / "constraints.txt").read_text().splitlines()
     pins = {normal(one): one.partition("==")[2].partition(";")[0] for one in lines if "==" in one}
-    wanted, seen = [*OF_RLLIB], set()
+    wanted, seen = [*PINNED], set()
     while wanted:
         name = wanted.pop()
         if name in seen or name == "setuptools":

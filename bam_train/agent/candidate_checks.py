@@ -35,7 +35,7 @@ from bam_train.errors import (
     CheckpointError,
     CheckpointMismatch,
     PolicyError,
-    UnknownVersion,
+    RequestRefused,
     UntrustedCheckpoint,
 )
 from bam_train.policy import FrozenPolicy
@@ -164,7 +164,7 @@ def _require_finite(path: Path, action: Any, what: str) -> None:
 def _keep(checkpoint: Checkpoint, folder: Path, *, signed: bool) -> None:
     """Put the checkpoint into the folder; an unsigned one does not replace its copy there, which may be signed."""
     versions = Versions(folder)
-    with contextlib.suppress(UnknownVersion, CheckpointError):
+    with contextlib.suppress(RequestRefused, CheckpointError):
         if not signed and Checkpoint.open(versions.find(checkpoint.digest).path).digest == checkpoint.digest:
             return
     versions.add(checkpoint)

@@ -34,7 +34,7 @@ from bam_train.agent.versions import Versions
 from bam_train.checkpoint import Checkpoint
 from bam_train.deploy.deployment import Stopped, StopSwitch, fault_text
 from bam_train.deploy.journal import EpisodeRecord
-from bam_train.errors import BadTrials, BamTrainError, ContractRefused, PolicyError, RequestRefused
+from bam_train.errors import BadTrials, BamTrainError, ContractRefused, PolicyError, RequestRefused, kind_of
 
 if TYPE_CHECKING:
     from bam_train.agent.audit import Audit
@@ -247,7 +247,7 @@ class Resident:
                 result = do()
                 answer = Answer(number, result=result or {})
             except (BamTrainError, BamEnvsError) as error:
-                answer = Answer(number, error=_advised(error), kind=type(error).__name__)
+                answer = Answer(number, error=_advised(error), kind=kind_of(error))
             if number:
                 self.send(answer)
 
@@ -691,6 +691,7 @@ class Resident:
             "loop_ms": round(self._loop_ms, 3),
             "recording": None if session is None or session.recorder is None else str(session.recorder.path),
             "marks": [] if session is None else list(session.marks),
+            "goals": [] if session is None else session.goals(),
             "unusual": None if journal is None else journal.unusual,
             "warnings": self._warnings(),
             "guards": {} if session is None else session.robot.report(),

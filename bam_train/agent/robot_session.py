@@ -130,6 +130,11 @@ class RobotSession:
         """The task."""
         return self._env.unwrapped.task
 
+    def goals(self) -> list[list[float]]:
+        """Where the task of the episode goes: x, y, z of each goal [m]."""
+        begun = self.deployment.journal.begun
+        return [place.tolist() for place, _ in self.task.marks()] if begun else []
+
     @property
     def is_up(self) -> bool:
         """Whether the robot's states still come, as far as its newest one shows."""

@@ -29,7 +29,7 @@ from bam_train.checkpoint import Checkpoint
 from bam_train.deploy.checkpoint_admission import trials_of
 from bam_train.deploy.journal import EpisodeRecord
 from bam_train.deploy.trials import Evidence, Trials
-from bam_train.errors import BadTrials, BamTrainError, CandidateRefused, RequestRefused, TrialsNeeded
+from bam_train.errors import BadTrials, BamTrainError, RequestRefused, TrialsNeeded, kind_of
 
 _log = logging.getLogger(__name__)
 _EPISODE_TIMEOUT = 3600.0  # longest wait for the end of an episode [s]
@@ -169,7 +169,7 @@ class Succession:
         except (BamTrainError, BamEnvsError) as error:
             text = " ".join(str(error).split())
             resident.post(lambda: resident.note("refused", text, ask.who, ask.address))
-            resident.send(Answer(ask.number, error=text, kind=type(error).__name__))
+            resident.send(Answer(ask.number, error=text, kind=kind_of(error)))
 
     def _push(self, ask: Ask) -> dict[str, Any]:
         path = Path(ask.arguments["path"])
@@ -188,7 +188,7 @@ class Succession:
         """Check a file in another process, which puts it into the folder.
 
         Raises:
-            CandidateRefused: It is refused.
+            RequestRefused: It is refused.
             RequestRefused: There is no robot to check it for.
         """
         resident, session = self._resident, self._resident.session
@@ -209,7 +209,7 @@ class Succession:
             )
         )
         if not verdict.ok:
-            raise CandidateRefused(verdict.reason)
+            raise RequestRefused(verdict.reason, "CandidateRefused")
         return verdict
 
     def _choose(self, version: Version, ask: Ask) -> dict[str, Any]:

@@ -19,7 +19,7 @@ from typing import IO, Any
 
 from bam_train.checkpoint import MANIFEST, POLICY, Checkpoint
 from bam_train.checkpoint.detector import Detector
-from bam_train.errors import AlteredCheckpoint, CheckpointError, FolderInUse, OutputError, SettingsError, UnknownVersion
+from bam_train.errors import AlteredCheckpoint, CheckpointError, FolderInUse, OutputError, RequestRefused, SettingsError
 from bam_train.files.atomic_file import remove_orphans, replacing
 from bam_train.policy import FrozenPolicy
 
@@ -165,7 +165,7 @@ class Versions:
         """The version with this name, digest, or beginning of a digest of at least 6 digits.
 
         Raises:
-            UnknownVersion: There is none, or there are several.
+            RequestRefused: There is none, or there are several.
         """
         every, wanted = self.all(), self._names().get(text, text)
         found = [one for one in every if one.digest.startswith(wanted) and len(wanted) >= _SHORTEST]
@@ -173,7 +173,9 @@ class Versions:
             return found[0]
         what = f"{len(found)} versions begin with it" if found else "no such version"
         known = ", ".join(" = ".join([*one.names, one.digest[:12]]) for one in every)
-        raise UnknownVersion(f"{text[:80]!r}: {what}. {f'Choose from: {known}' if known else 'Push one first'}")
+        raise RequestRefused(
+            f"{text[:80]!r}: {what}. {f'Choose from: {known}' if known else 'Push one first'}", "UnknownVersion"
+        )
 
     def named(self, name: str) -> Version | None:
         """The version with this name; None if no version has it."""
@@ -188,7 +190,7 @@ class Versions:
         """Move names to digests, all in one step; None removes a name.
 
         Raises:
-            UnknownVersion: There is no such version.
+            RequestRefused: There is no such version.
             OutputError: The disk is full, or the folder cannot be written; no name has moved.
         """
         with self._changing():

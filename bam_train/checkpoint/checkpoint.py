@@ -71,7 +71,7 @@ class Checkpoint:
         Raises:
             PlaceError: An address that it cannot be fetched from.
             NotACheckpoint: No such file, not a zip, truncated, too large, or no manifest in it.
-            NewerFormat: Written by a newer bam-train.
+            CheckpointMismatch: Written by a newer bam-train.
             AlteredCheckpoint: A member was changed, is missing, was added or is too large.
         """
         path = local_path(path)

@@ -13,7 +13,7 @@ from typing import Annotated, Any, Literal
 import msgspec
 from msgspec import Meta, Struct
 
-from bam_train.errors import AlteredCheckpoint, CheckpointError, NewerFormat
+from bam_train.errors import AlteredCheckpoint, CheckpointError, CheckpointMismatch
 
 FORMAT = 1
 MANIFEST = "bam/manifest.json"
@@ -143,7 +143,7 @@ def parse_manifest(path: Path, data: bytes) -> Manifest:
     """Read the manifest of the checkpoint at `path`; fields that this version does not know are ignored.
 
     Raises:
-        NewerFormat: Written by a newer bam-train.
+        CheckpointMismatch: Written by a newer bam-train.
         AlteredCheckpoint: A field is missing, of the wrong type or not allowed in a file.
     """
     try:
@@ -192,7 +192,7 @@ def _parse(path: Path, data: bytes) -> Manifest:
     found = msgspec.json.decode(data, type=_Head).format
     if type(found) is int and found > FORMAT:
         text = f"has format {found}; this bam-train reads up to {FORMAT}. Run: pip install --upgrade bam-train"
-        raise NewerFormat(path, text)
+        raise CheckpointMismatch(path, text)
     manifest = msgspec.json.decode(data, type=Manifest)
     contents = msgspec.json.decode(data, type=_Contents)
     if not re.fullmatch(r"([\w.]+:)?[^:]+", manifest.env):

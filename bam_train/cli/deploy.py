@@ -132,7 +132,11 @@ def _rehearse(config: DeployConfig, link: str) -> int:
 
     for name in LIVE_ONLY:
         if getattr(config, name):
-            raise SettingsError(f"--rehearse simulates the robot, its link and its time; leave out {as_flag(name)}")
+            trial = f". To practise a trial, start bam-serve, and give --robot {ANY_ROBOT} --stage trial"
+            raise SettingsError(
+                f"--rehearse simulates the robot, its link and its time; leave out {as_flag(name)}"
+                f"{trial if name == 'stage' else ''}"
+            )
     checkpoint = Checkpoint.open(config.checkpoint)
     policy = FrozenPolicy.from_checkpoint(checkpoint)
     limits: Any = {"profile": config.profile, "guards": read_guards(config.guard)}

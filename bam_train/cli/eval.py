@@ -154,6 +154,7 @@ def _add_detector(subject: _Subject, path: Path) -> None:
 
 def _own(config: EvalConfig, path: Path) -> _Subject:
     """Open a checkpoint of bam-train, without unpickling and without torch."""
+    from bam_envs.core.robot_models import DEFAULT_ARM, Description, find_model
     from bam_train.checkpoint import Checkpoint
     from bam_train.environments import environment_of, held_out, require_env_kwargs
     from bam_train.errors import CheckpointMismatch
@@ -166,6 +167,12 @@ def _own(config: EvalConfig, path: Path) -> _Subject:
     if config.algo not in (None, manifest.algorithm):
         raise CheckpointMismatch(path, f"was trained by {manifest.algorithm}, not by {config.algo}; leave --algo out")
     require_env_kwargs(env_id, asked)
+    if "robot_model" in asked:
+        robots = [find_model(one.get("robot_model", DEFAULT_ARM), Description) for one in (env_kwargs, asked)]
+        theirs, ours = (getattr(one, "joint_names", None) for one in robots)  # of a base: None
+        if None not in (theirs, ours) and ours != theirs:
+            why = f"was trained for {robots[0].name}, and {robots[1].name} has other joints: train a policy for that"
+            raise CheckpointMismatch(path, why)
     policy = FrozenPolicy.from_checkpoint(checkpoint)
     used = held_out(env_id, env_kwargs, asked)
     return _Subject(policy, env_id, used, manifest.algorithm, manifest.steps, asked, checkpoint)

@@ -43,6 +43,7 @@ EXTRAS = {
     "onnx": "train",
     "tensorboard": "train",
     "matplotlib": "train",
+    "optuna": "sweep",
     "mujoco": "sim",
     "PIL": "video",
     "imageio": "video",

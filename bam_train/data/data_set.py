@@ -13,39 +13,11 @@ import numpy as np
 
 from bam_envs.core.errors import BamEnvsError
 from bam_envs.core.spaces import indexed, mapped
+from bam_train.data import layout
 from bam_train.data.arrow_columns import from_arrow
 from bam_train.data.file_pair import Copy, Head, sha256
-from bam_train.data.layout import (
-    BAM,
-    CHUNK,
-    COPIES,
-    DATA,
-    DEFAULTS,
-    EPISODES,
-    EXTRA,
-    FINAL,
-    FORMAT,
-    INFO,
-    LIGHT,
-    NEXT,
-    ROW,
-    STATS,
-    UNREADABLE,
-    Files,
-    file_name,
-    row_digest,
-    sealed,
-)
-from bam_train.data.recorded_episode import (
-    Array,
-    DataSetInfo,
-    Episode,
-    Transitions,
-    Values,
-    digest_of,
-    leaves_of,
-    nested,
-)
+from bam_train.data.layout import Files, file_name, row_digest, sealed
+from bam_train.data.recorded_episode import Array, DataSetInfo, Episode, Transitions, Values, digest_of, nested
 from bam_train.environments import first_difference, short_json
 from bam_train.errors import BadDataSet, PlaceError
 from bam_train.files.place import Place
@@ -61,11 +33,10 @@ class DataSet:
         self._files, self.info = files, info
         self.extra: dict[str, dict[str, Any]] = dict(columns)
         """Dtype and shape of each further column."""
-        self.features = {name: one for name, one in head["features"].items() if name not in DEFAULTS}
+        self.features = {name: one for name, one in head["features"].items() if name not in layout.DEFAULTS}
         """Columns of the steps, as LeRobot describes them."""
         self.total_frames = int(head["total_frames"])
-        self._observation = leaves_of(info.observation_space, "observation")
-        self._action = leaves_of(info.action_space, "action")
+        self._observation, self._action = info.observation_leaves, info.action_leaves
         self._rows = self._read_rows(int(head["total_episodes"]))
 
     @property
@@ -82,19 +53,21 @@ class DataSet:
         """
         files = Files(place)
         files.require()
-        head = files.read_json(INFO)
-        if not files.exists(BAM) and not files.numbers(COPIES):
-            raise BadDataSet(f"{place}: has no {BAM}, so its environment is unknown; bam-train did not write it")
-        own = files.read_json(BAM)
-        if not isinstance(own.get("format"), int) or own["format"] > FORMAT:
-            raise BadDataSet(f"{place}: has format {own.get('format')}; this bam-train reads up to {FORMAT}. Update it")
+        head = files.read_json(layout.INFO)
+        if not files.exists(layout.BAM) and not files.numbers(layout.COPIES):
+            raise BadDataSet(f"{place}: has no {layout.BAM}, so its environment is unknown; bam-train did not write it")
+        own = files.read_json(layout.BAM)
+        if not isinstance(own.get("format"), int) or own["format"] > layout.FORMAT:
+            raise BadDataSet(
+                f"{place}: has format {own.get('format')}; this bam-train reads up to {layout.FORMAT}. Update it"
+            )
         if sealed(own)["digest"] != own.get("digest", sealed(own)["digest"]):  # older ones have none
-            raise BadDataSet(f"{place}: {BAM} is not as it was written; run bam-data check {place}")
+            raise files.damaged(f"{layout.BAM} is not as it was written")
         try:
             data = cls(files, DataSetInfo.from_json(own), head, own["columns"])
             data._require_true(head)
         except (KeyError, TypeError, ValueError, BamEnvsError) as error:
-            raise BadDataSet(f"{place}: {BAM} or {INFO} is damaged: {error!r}; run bam-data check {place}") from error
+            raise files.damaged(f"{layout.BAM} or {layout.INFO} is damaged: {error!r}") from error
         return data
 
     def _require_true(self, head: Mapping[str, Any]) -> None:
@@ -108,24 +81,23 @@ class DataSet:
             true = {key: truth[name][key] for key in one} if isinstance(one, dict) else truth[name]
             if found := first_difference(one, true, name):
                 what, wrong, right = found
-                text = f"{INFO}: {what} is {short_json(wrong)}, expected {short_json(right)}"
-                raise BadDataSet(f"{self.place}: {text}; run bam-data check {self.place}")
+                raise self._files.damaged(f"{layout.INFO}: {what} is {short_json(wrong)}, expected {short_json(right)}")
 
     def _read_rows(self, count: int) -> list[dict[str, Any]]:
         rows: list[dict[str, Any]] = []
         number = 0
         while len(rows) < count:
-            name = file_name(EPISODES, number)
-            table = self._files.open_parquet(name, (*LIGHT, EXTRA, ROW))
+            name = file_name(layout.EPISODES, number)
+            table = self._files.open_parquet(name, (*layout.LIGHT, layout.EXTRA, layout.ROW))
             found = table.to_pylist()
-            if {*LIGHT} - {*table.column_names} or any(
-                row_digest(row) != row.get(ROW, row_digest(row)) for row in found
+            if {*layout.LIGHT} - {*table.column_names} or any(
+                row_digest(row) != row.get(layout.ROW, row_digest(row)) for row in found
             ):
-                raise BadDataSet(f"{self.place}: {name} is not as it was written; run bam-data check {self.place}")
+                raise self._files.damaged(f"{name} is not as it was written")
             rows += found
             number += 1
         if [row["episode_index"] for row in rows] != list(range(len(rows))):
-            raise BadDataSet(f"{self.place}: its episodes are not numbered from 0 on; run bam-data check {self.place}")
+            raise self._files.damaged("its episodes are not numbered from 0 on")
         self.next_file = number
         return rows[:count]
 
@@ -165,15 +137,15 @@ class DataSet:
         """
         if not self.next_file:
             return {}
-        copy = Copy.from_bytes(self._files.content(file_name(COPIES, self.next_file - 1)))
-        with contextlib.suppress(*UNREADABLE):
-            content = self._files.content(STATS) or b""
+        copy = Copy.from_bytes(self._files.content(file_name(layout.COPIES, self.next_file - 1)))
+        with contextlib.suppress(*layout.UNREADABLE):
+            content = self._files.content(layout.STATS) or b""
             stats: dict[str, Any] = json.loads(content)
             if stats["next.reward"]["count"] == [self.total_frames] and (
-                not copy or copy.others[STATS] == sha256(content)
+                not copy or copy.others[layout.STATS] == sha256(content)
             ):
                 return stats
-        raise BadDataSet(f"{self.place}: {STATS} is not that of its steps; run bam-data check {self.place}")
+        raise self._files.damaged(f"{layout.STATS} is not that of its steps")
 
     def _index(self, index: int) -> int:
         if not -len(self) <= index < len(self):
@@ -205,14 +177,15 @@ class DataSet:
 
     def _file_of(self, index: int) -> int:
         row = self._rows[index]
-        return int(row["data/chunk_index"]) * CHUNK + int(row["data/file_index"])
+        return int(row["data/chunk_index"]) * layout.CHUNK + int(row["data/file_index"])
 
     def _of_file(self, number: int, indices: Sequence[int]) -> Iterator[Episode]:
-        name = file_name(DATA, number)
+        name = file_name(layout.DATA, number)
         try:
             data = self._files.open_parquet(name)
             last = self._files.open_parquet(
-                file_name(EPISODES, number), ["episode_index", *(FINAL + leaf.column for leaf in self._observation)]
+                file_name(layout.EPISODES, number),
+                ["episode_index", *(layout.FINAL + leaf.column for leaf in self._observation)],
             )
             first = last["episode_index"][0].as_py()
             batch: list[int] = []
@@ -226,9 +199,9 @@ class DataSet:
                     batch, size = [], 0
         except PlaceError:
             raise
-        except UNREADABLE as error:
+        except layout.UNREADABLE as error:
             why = str(error).partition("\n")[0]
-            raise BadDataSet(f"{self.place}: {name} is damaged: {why}; run bam-data check {self.place}") from error
+            raise self._files.damaged(f"{name} is damaged: {why}") from error
 
     def _of_table(self, name: str, table: Any, last: Any, first: int, indices: list[int]) -> Iterator[Episode]:
         start = 0
@@ -240,13 +213,11 @@ class DataSet:
                 numbers = np.unique(steps["episode_index"].to_numpy()).tolist()
                 if len(steps) != length or numbers != [index]:
                     raise ValueError(f"its place has {len(steps)} steps of episodes {numbers}")
-                if missing := {*DEFAULTS, *NEXT} - {*steps.column_names}:
+                if missing := {*layout.DEFAULTS, *layout.NEXT} - {*steps.column_names}:
                     raise ValueError(f"it has no column {min(missing)}")
                 yield self.read(self._rows[index], steps, last.slice(index - first, 1))
-            except UNREADABLE as error:
-                raise BadDataSet(
-                    f"{self.place}: {name}: episode {index} is damaged: {error}; run bam-data check {self.place}"
-                ) from error
+            except layout.UNREADABLE as error:
+                raise self._files.damaged(f"{name}: episode {index} is damaged: {error}") from error
 
     def read(self, row: Mapping[str, Any], steps: Any, final: Any) -> Episode:
         """An episode of its rows in the files: that of the episodes, those of its steps, and its last observation.
@@ -259,15 +230,15 @@ class DataSet:
         """
         arrays = {}
         for leaf in self._observation:
-            parts = (steps[leaf.column], final[FINAL + leaf.column])
+            parts = (steps[leaf.column], final[layout.FINAL + leaf.column])
             arrays[leaf.column] = np.concatenate([from_arrow(one, leaf.shape, leaf.dtype) for one in parts])
         arrays |= {leaf.column: from_arrow(steps[leaf.column], leaf.shape, leaf.dtype) for leaf in self._action}
         rewards = from_arrow(steps["next.reward"], (), np.dtype(np.float64))
         end = (row["bam/terminated"], row["bam/truncated"], row["bam/success"])
         digest = digest_of({**arrays, "reward": rewards}, *end)
-        columns = self._columns(row, steps, [*arrays, *NEXT, *DEFAULTS])
+        columns = self._columns(row, steps, [*arrays, *layout.NEXT, *layout.DEFAULTS])
         own = {name: columns[name] for name in json.loads(row["bam/columns"])}
-        pairs = ((digest, row["bam/digest"]), (row.get(EXTRA) and digest_of(own), row.get(EXTRA)))
+        pairs = ((digest, row["bam/digest"]), (row.get(layout.EXTRA) and digest_of(own), row.get(layout.EXTRA)))
         if any(found != written for found, written in pairs if written is not None):
             raise ValueError("its numbers are not those that were written")
         return Episode(

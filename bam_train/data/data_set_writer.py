@@ -14,7 +14,7 @@ from bam_train.data.data_set import DataSet
 from bam_train.data.file_pair import Columns, Head, kind_of
 from bam_train.data.layout import BAM, COPIES, DATA, DEFAULTS, EPISODES, INFO, Files, WriterLock, file_name
 from bam_train.data.mending import mend
-from bam_train.data.recorded_episode import Array, DataSetInfo, Episode, Leaf, digest_of, leaves_of
+from bam_train.data.recorded_episode import Array, DataSetInfo, Episode, Leaf, digest_of
 from bam_train.environments import first_difference, short_json
 from bam_train.errors import BadDataSet
 from bam_train.files.place import Place
@@ -48,8 +48,7 @@ class DataSetWriter:
         if self._files.root.suffix == ".mcap":
             raise BadDataSet(f"{place}: is named as a recording, and a data set is a folder; leave .mcap out")
         self._flush_episodes, self._flush_bytes = flush_episodes, flush_bytes
-        self._observation = leaves_of(info.observation_space, "observation")
-        self._action = leaves_of(info.action_space, "action")
+        self._observation, self._action = info.observation_leaves, info.action_leaves
         self._waiting: list[Columns] = []
         self._bytes = 0
         self._lock = WriterLock(self._files)
@@ -63,7 +62,7 @@ class DataSetWriter:
         files, kinds = self._files, (DATA, EPISODES, COPIES)
         if not files.exists(INFO):
             if any(files.numbers(kind) for kind in kinds):
-                raise BadDataSet(f"{files.text}: {INFO} is missing; run bam-data check {files.text}")
+                raise files.damaged(f"{INFO} is missing")
             self._head = Head(self.info, {})
             files.write_json(BAM, self._head.own())
             self._head.write(files)
@@ -76,7 +75,7 @@ class DataSetWriter:
             stats = None
         if stats is None or any(files.exists(file_name(kind, old.next_file)) for kind in kinds):
             if lost := mend(files).lost:  # else a writer was killed
-                raise BadDataSet(f"{files.text}: is damaged: {lost[0]}; run bam-data check {files.text}")
+                raise files.damaged(f"is damaged: {lost[0]}")
             old = DataSet.open(files.text)
             stats = old.stats()
         counts = (len(old), old.total_frames, old.next_file)

@@ -14,31 +14,10 @@ from typing import Any
 
 import numpy as np
 
+from bam_train.data import layout
 from bam_train.data.arrow_columns import Arrow, to_arrow
-from bam_train.data.layout import (
-    CHUNK,
-    COPIES,
-    DATA,
-    DEFAULTS,
-    EPISODES,
-    EXTRA,
-    FINAL,
-    FORMAT,
-    INFO,
-    NEXT,
-    ROW,
-    STATS,
-    TASKS,
-    VERSION,
-    Files,
-    file_name,
-    json_bytes,
-    parquet_bytes,
-    row_digest,
-    sealed,
-    tasks_table,
-)
-from bam_train.data.recorded_episode import Array, DataSetInfo, Episode, digest_of, leaves_of
+from bam_train.data.layout import Files, file_name, json_bytes, parquet_bytes, row_digest, sealed, tasks_table
+from bam_train.data.recorded_episode import Array, DataSetInfo, Episode, digest_of
 from bam_train.data.statistics import add_stats
 
 _TAIL = struct.Struct("<I4s")  # how a Parquet file ends: length of its footer, magic
@@ -62,15 +41,14 @@ class Columns:
         last = np.arange(len(episode)) == len(episode) - 1
         ends = [last, last & episode.terminated, last & episode.truncated, last & bool(episode.success)]
         steps = {name: values[:-1] for name, values in observed.items()} | dict(acted)
-        steps |= dict(zip(NEXT, [episode.rewards, *ends], strict=True)) | episode.columns
+        steps |= dict(zip(layout.NEXT, [episode.rewards, *ends], strict=True)) | episode.columns
         return cls(episode, steps, {name: values[-1:] for name, values in observed.items()})
 
     @classmethod
     def read(cls, episode: Episode, info: DataSetInfo) -> Columns:
         """An episode as a reader gives it."""
-        observation, action = leaves_of(info.observation_space, "observation"), leaves_of(info.action_space, "action")
-        observed = {leaf.column: leaf.of(episode.observations) for leaf in observation}
-        return cls.of(episode, observed, {leaf.column: leaf.of(episode.actions) for leaf in action})
+        observed = {leaf.column: leaf.of(episode.observations) for leaf in info.observation_leaves}
+        return cls.of(episode, observed, {leaf.column: leaf.of(episode.actions) for leaf in info.action_leaves})
 
 
 @dataclass
@@ -89,7 +67,7 @@ class Head:
 
     @property
     def _images(self) -> set[str]:
-        return {leaf.column for leaf in leaves_of(self.info.observation_space, "observation") if leaf.is_image}
+        return {leaf.column for leaf in self.info.observation_leaves if leaf.is_image}
 
     def task(self, episode: Episode) -> int:
         """Index of the episode's task, which is added if it is new."""
@@ -122,9 +100,9 @@ class Head:
         self.add_stats(episodes)
         data = parquet_bytes(pa.concat_tables(tables, promote_options="default"), [len(table) for table in tables])
         heads = parquet_bytes(_table(rows, images))
-        files.write(file_name(COPIES, self.file), self.copy(data, heads).to_bytes())
-        files.write(file_name(DATA, self.file), data)
-        files.write(file_name(EPISODES, self.file), heads)
+        files.write(file_name(layout.COPIES, self.file), self.copy(data, heads).to_bytes())
+        files.write(file_name(layout.DATA, self.file), data)
+        files.write(file_name(layout.EPISODES, self.file), heads)
         self.file += 1
 
     def places(self, episode: Episode) -> dict[str, Arrow]:
@@ -143,7 +121,7 @@ class Head:
 
     def numbers(self, episode: Episode) -> dict[str, Any]:
         """What of the row of the next episode follows from the episodes before."""
-        places = {"chunk_index": self.file // CHUNK, "file_index": self.file % CHUNK}
+        places = {"chunk_index": self.file // layout.CHUNK, "file_index": self.file % layout.CHUNK}
         return {
             "episode_index": self.episodes,
             "tasks": [self.tasks[self.task(episode)]],
@@ -166,21 +144,21 @@ class Head:
             "bam/facts": json.dumps(episode.facts),
             "bam/columns": json.dumps(list(episode.columns)),
         }
-        row[EXTRA] = digest_of(episode.columns)
-        return row | {ROW: row_digest(row)} | {FINAL + name: values for name, values in one.final.items()}
+        row[layout.EXTRA] = digest_of(episode.columns)
+        return row | {layout.ROW: row_digest(row)} | {layout.FINAL + name: values for name, values in one.final.items()}
 
     def own(self) -> dict[str, Any]:
         """The content of bam.json."""
-        return sealed({"format": FORMAT, **self.info.to_json(), "columns": self.extra})
+        return sealed({"format": layout.FORMAT, **self.info.to_json(), "columns": self.extra})
 
     def write(self, files: Files) -> None:
         """Replace tasks.parquet, stats.json and then info.json: from now on, readers see the episodes so far."""
         for name, content in self._others().items() if self.episodes else ():
             files.write(name, content)
-        files.write_json(INFO, self.content())
+        files.write_json(layout.INFO, self.content())
 
     def _others(self) -> dict[str, bytes]:
-        return {STATS: json_bytes(self.stats), TASKS: parquet_bytes(tasks_table(self.tasks))}
+        return {layout.STATS: json_bytes(self.stats), layout.TASKS: parquet_bytes(tasks_table(self.tasks))}
 
     def copy(self, data: bytes, episodes: bytes) -> Copy:
         """The copy of a data file and its episodes file, the last that are counted."""
@@ -189,38 +167,38 @@ class Head:
     def content(self) -> dict[str, Any]:
         """The content of info.json."""
         return {
-            "codebase_version": VERSION,
+            "codebase_version": layout.VERSION,
             "robot_type": self.info.robot or None,
             "total_episodes": self.episodes,
             "total_frames": self.frames,
             "total_tasks": len(self.tasks),
-            "chunks_size": CHUNK,
+            "chunks_size": layout.CHUNK,
             "data_files_size_in_mb": 100,
             "video_files_size_in_mb": 200,
             "fps": self.info.fps,
             "splits": {"train": f"0:{self.episodes}"},
-            "data_path": DATA,
+            "data_path": layout.DATA,
             "video_path": None,
             "features": self.features(),
         }
 
     def features(self) -> dict[str, dict[str, Any]]:
         """The columns as LeRobot describes them."""
-        spaces = {"observation": self.info.observation_space, "action": self.info.action_space}
         found = {}
-        for kind, space in spaces.items():
-            for leaf in leaves_of(space, kind):
-                found[leaf.column] = self._feature(leaf.column, str(leaf.dtype), leaf.shape)
-                if leaf.is_image:
-                    names = ["height", "width", "channels"]
-                    found[leaf.column] = {"dtype": "image", "shape": list(leaf.shape), "names": names}
-        found |= {name: self._feature(name, "float64" if name == NEXT[0] else "bool", ()) for name in NEXT}
+        for leaf in self.info.observation_leaves + self.info.action_leaves:
+            found[leaf.column] = self._feature(leaf.column, str(leaf.dtype), leaf.shape)
+            if leaf.is_image:
+                names = ["height", "width", "channels"]
+                found[leaf.column] = {"dtype": "image", "shape": list(leaf.shape), "names": names}
+        found |= {
+            name: self._feature(name, "float64" if name == layout.NEXT[0] else "bool", ()) for name in layout.NEXT
+        }
         texts = {"str": "string"}
         found |= {
             name: self._feature(name, texts.get(one["dtype"], one["dtype"]), one["shape"])
             for name, one in self.extra.items()
         }
-        return found | {name: self._feature(name, dtype, ()) for name, dtype in DEFAULTS.items()}
+        return found | {name: self._feature(name, dtype, ()) for name, dtype in layout.DEFAULTS.items()}
 
     def _feature(self, name: str, dtype: str, shape: Sequence[int]) -> dict[str, Any]:
         kind = {"observation.state": "observation", "raw_action": "action", "raw_command": "command"}.get(name, name)
@@ -306,8 +284,8 @@ def _table(rows: list[dict[str, Any]], images: set[str]) -> Arrow:
     columns: dict[str, Any] = {}
     for name in rows[0]:
         values = [row[name] for row in rows]
-        if name.startswith(FINAL):
-            columns[name] = to_arrow(np.concatenate(values), is_image=name.removeprefix(FINAL) in images)
+        if name.startswith(layout.FINAL):
+            columns[name] = to_arrow(np.concatenate(values), is_image=name.removeprefix(layout.FINAL) in images)
         else:
             columns[name] = pa.array(values, pa.bool_() if name == "bam/success" else None)
     return pa.table(columns)

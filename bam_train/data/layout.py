@@ -92,6 +92,10 @@ class Files:
         if not any(self.exists(name) for name in (BAM, "meta/episodes", "data", "copies")):
             raise BadDataSet(f"{self.text}: is no data set: it has no {INFO}; {remedy}")
 
+    def damaged(self, what: str) -> BadDataSet:
+        """The error for `what` is not whole."""
+        return BadDataSet(f"{self.text}: {what}; run bam-data check {self.text}")
+
     def content(self, name: str) -> bytes | None:
         """The bytes of a file; None if there is none."""
         try:
@@ -104,13 +108,13 @@ class Files:
         try:
             value = json.loads((self.root / name).read_bytes())
         except NoSuchPlace as error:
-            raise BadDataSet(f"{self.text}: {name} is missing; run bam-data check {self.text}") from error
+            raise self.damaged(f"{name} is missing") from error
         except PlaceError:
             raise
         except (OSError, ValueError) as error:
-            raise BadDataSet(f"{self.text}: {name} cannot be read: {error}; run bam-data check {self.text}") from error
+            raise self.damaged(f"{name} cannot be read: {error}") from error
         if not isinstance(value, dict):
-            raise BadDataSet(f"{self.text}: {name} is no JSON object; run bam-data check {self.text}")
+            raise self.damaged(f"{name} is no JSON object")
         return value
 
     def write(self, name: str, content: bytes) -> None:
@@ -159,14 +163,12 @@ class Files:
             file = pq.ParquetFile(place.local or place.open_input(), **options)
             return file if columns is None else file.read(columns=list(columns))
         except FileNotFoundError as error:
-            raise BadDataSet(f"{self.text}: {name} is missing; run bam-data check {self.text}") from error
+            raise self.damaged(f"{name} is missing") from error
         except PlaceError:
             raise
         except UNREADABLE as error:
             why = str(error).partition("\n")[0]
-            raise BadDataSet(
-                f"{self.text}: {name} is damaged or no Parquet file: {why}; run bam-data check {self.text}"
-            ) from error
+            raise self.damaged(f"{name} is damaged or no Parquet file: {why}") from error
 
 
 class WriterLock:

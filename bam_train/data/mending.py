@@ -17,25 +17,11 @@ import numpy as np
 
 from bam_envs.core.errors import BamEnvsError
 from bam_envs.core.spaces import leaves_by_path
+from bam_train.data import layout
 from bam_train.data.arrow_columns import to_arrow
 from bam_train.data.data_set import DataSet
 from bam_train.data.file_pair import Columns, Copy, Head, sha256
-from bam_train.data.layout import (
-    BAM,
-    COPIES,
-    DATA,
-    EPISODES,
-    INFO,
-    MENDING,
-    NEXT,
-    STATS,
-    TASKS,
-    UNREADABLE,
-    Files,
-    file_name,
-    sealed,
-    tasks_table,
-)
+from bam_train.data.layout import Files, file_name, sealed, tasks_table
 from bam_train.data.recorded_episode import DataSetInfo, Episode
 from bam_train.data.salvage import Pair, read_pair
 from bam_train.environments import first_difference, short_json
@@ -74,14 +60,16 @@ class _Reader:
 
     def __init__(self, files: Files) -> None:
         self.files = files
-        self.numbers = sorted({number for kind in (DATA, EPISODES, COPIES) for number in files.numbers(kind)})
-        self.is_cut_off = files.exists(MENDING)
+        self.numbers = sorted(
+            {number for kind in (layout.DATA, layout.EPISODES, layout.COPIES) for number in files.numbers(kind)}
+        )
+        self.is_cut_off = files.exists(layout.MENDING)
         """Whether a mending was cut off, which has left some episodes twice."""
         own, self.problems = self._bam_json()
         try:
             self.info, self.extra = DataSetInfo.from_json(own), dict(own["columns"])
         except (KeyError, TypeError, ValueError, BamEnvsError) as error:
-            raise _hopeless(files, f"{BAM} is damaged: {error!r}") from error
+            raise _hopeless(files, f"{layout.BAM} is damaged: {error!r}") from error
         self.is_sealed = "digest" in own
         self.data = DataSet(files, self.info, {"features": {}, "total_frames": 0, "total_episodes": 0}, self.extra)
 
@@ -89,13 +77,13 @@ class _Reader:
         """The content of bam.json, and what is wrong with the file."""
         own: dict[str, Any] = {}
         try:
-            own = self.files.read_json(BAM)
+            own = self.files.read_json(layout.BAM)
             if own.get("digest") == sealed(own)["digest"]:
                 return own, []
-            why = f"{BAM} is not as it was written"
+            why = f"{layout.BAM} is not as it was written"
         except BadDataSet as error:
             why = str(error).partition("; run bam-data")[0].removeprefix(f"{self.files.text}: ")
-        for number in reversed(self.files.numbers(COPIES)):
+        for number in reversed(self.files.numbers(layout.COPIES)):
             if copy := self.copy(number):
                 return json.loads(copy.bam), [why]
         if not own or "digest" in own:
@@ -104,7 +92,7 @@ class _Reader:
 
     def copy(self, number: int) -> Copy | None:
         """The copy of this number; None without one that is whole."""
-        return Copy.from_bytes(self.files.content(file_name(COPIES, number)))
+        return Copy.from_bytes(self.files.content(file_name(layout.COPIES, number)))
 
     def pairs(self) -> Iterator[Pair]:
         """What the files say, number by number."""
@@ -112,7 +100,7 @@ class _Reader:
         for number in self.numbers:
             pair = read_pair(self.files, self.data, number)
             if self.is_cut_off and pair.episodes and pair.same in seen:
-                pair = Pair(number, damaged=[f"{file_name(DATA, number)} is twice there"])
+                pair = Pair(number, damaged=[f"{file_name(layout.DATA, number)} is twice there"])
             seen.add(pair.same)
             yield pair
 
@@ -142,14 +130,14 @@ def _look(reader: _Reader) -> tuple[Found, set[int]]:
     known, whole = {*head.features()}, set[Any]()
     lost: list[tuple[str, dict[str, Any], str]] = []
     for pair in reader.pairs():
-        name, before = file_name(DATA, pair.number), len(found.problems)
+        name, before = file_name(layout.DATA, pair.number), len(found.problems)
         if pair.number > head.file and not reader.is_cut_off:
-            found.problems.append(f"{file_name(DATA, head.file)} is missing")
+            found.problems.append(f"{file_name(layout.DATA, head.file)} is missing")
             first = next(
                 (row for row in [*pair.rows, *(row for row, _ in pair.lost)] if "dataset_from_index" in row), {}
             )
             gone = range(head.episodes, first.get("episode_index", head.episodes))
-            lost += [(file_name(DATA, head.file), {"episode_index": index}, "") for index in gone]
+            lost += [(file_name(layout.DATA, head.file), {"episode_index": index}, "") for index in gone]
             head.episodes, head.frames = max(gone.start, gone.stop), first.get("dataset_from_index", head.frames)
         head.file = pair.number
         if pair.lost and not pair.is_complete and counted is not None and head.episodes >= counted:
@@ -166,13 +154,13 @@ def _look(reader: _Reader) -> tuple[Found, set[int]]:
         for row, one in zip(pair.rows, columns, strict=True):
             found.notes += _odd(row["episode_index"], one.episode)
             new = [column for column in one.episode.columns if column not in known]
-            found.notes += [f"column {column} is not described in {BAM}; it is kept" for column in new]
+            found.notes += [f"column {column} is not described in {layout.BAM}; it is kept" for column in new]
             known |= {*new}
             whole.add((row["bam/digest"], row["bam/facts"]))
             found.episodes, found.frames = found.episodes + 1, found.frames + len(one.episode)
         if counted is not None and columns and head.episodes > counted and len(found.problems) == before:
             found.problems.append(
-                f"{file_name(EPISODES, pair.number)}: its {len(columns)} episodes are not counted yet"
+                f"{file_name(layout.EPISODES, pair.number)}: its {len(columns)} episodes are not counted yet"
             )
     if counted is not None and counted > head.episodes and not reader.is_cut_off:
         lost += [("no file", {"episode_index": index}, "") for index in range(head.episodes, counted)]
@@ -190,7 +178,7 @@ def _said(files: Files, reader: _Reader) -> dict[str, Any]:
         BadDataSet: It says something else than a bam.json of an older bam-train, which has no digest.
     """
     try:
-        said = files.read_json(INFO)
+        said = files.read_json(layout.INFO)
     except BadDataSet:
         return {}
     own = Head(reader.info, reader.extra).content()
@@ -200,7 +188,7 @@ def _said(files: Files, reader: _Reader) -> dict[str, Any]:
     for name, (one, other) in pairs.items() if not reader.is_sealed else ():
         if found := first_difference(one, other, name):
             what, ours, theirs = found
-            text = f"{what} is {short_json(ours)} in {BAM} and {short_json(theirs)} in {INFO}"
+            text = f"{what} is {short_json(ours)} in {layout.BAM} and {short_json(theirs)} in {layout.INFO}"
             raise BadDataSet(f"{files.text}: {text}: one of them is damaged. Get both files from a copy")
     return said
 
@@ -218,7 +206,7 @@ def _problems(pair: Pair, columns: list[Columns], head: Head) -> Iterator[str]:
     import pyarrow as pa
 
     yield from pair.damaged
-    name, described = file_name(DATA, pair.number), {*head.features()}
+    name, described = file_name(layout.DATA, pair.number), {*head.features()}
     is_foreign = any(column not in described for one in columns for column in one.episode.columns)
     if pair.copy is not None and not (pair.is_as_written or pair.lost or pair.damaged or is_foreign):
         yield f"{name} is not as it was written"
@@ -227,7 +215,7 @@ def _problems(pair: Pair, columns: list[Columns], head: Head) -> Iterator[str]:
         right = head.numbers(one.episode)
         is_right = all(row.get(key) == value for key, value in right.items())
         if is_right and not pair.is_as_written:
-            derived = {key: to_arrow(one.steps[key]) for key in NEXT[1:]}
+            derived = {key: to_arrow(one.steps[key]) for key in layout.NEXT[1:]}
             is_right = places.equals(pa.table(head.places(one.episode) | derived))
         misplaced += [] if is_right else [(name, row, "place")]
         head.count(one.episode)
@@ -241,7 +229,7 @@ def _problems(pair: Pair, columns: list[Columns], head: Head) -> Iterator[str]:
 def _differences(files: Files, head: Head, said: dict[str, Any], last: Copy | None) -> Iterator[str]:
     """What info.json, tasks.parquet and stats.json say that is not true."""
     if not said:
-        yield f"{INFO} is missing or damaged"
+        yield f"{layout.INFO} is missing or damaged"
     right = head.content()
     for key, value in right.items() if said else ():
         there = value if key == "splits" and _counts(said) else said.get(key)
@@ -249,10 +237,10 @@ def _differences(files: Files, head: Head, said: dict[str, Any], last: Copy | No
             there = {name: there.get(name) for name in value}
         if found := first_difference(there, value, key):
             what, wrong, true = found
-            yield f"{INFO}: {what} is {short_json(wrong)}, expected {short_json(true)}"
+            yield f"{layout.INFO}: {what} is {short_json(wrong)}, expected {short_json(true)}"
     if not head.file:
         return
-    for name, is_right in ((TASKS, _has_tasks), (STATS, _has_stats)):
+    for name, is_right in ((layout.TASKS, _has_tasks), (layout.STATS, _has_stats)):
         content = files.content(name) or b""
         if not (is_right(content, head) if last is None else sha256(content) == last.others[name]):
             yield f"{name} is not that of the episodes"
@@ -261,14 +249,14 @@ def _differences(files: Files, head: Head, said: dict[str, Any], last: Copy | No
 def _has_tasks(content: bytes, head: Head) -> bool:
     import pyarrow.parquet as pq
 
-    with contextlib.suppress(*UNREADABLE):
+    with contextlib.suppress(*layout.UNREADABLE):
         return bool(pq.read_table(io.BytesIO(content)).equals(tasks_table(head.tasks), check_metadata=True))
     return False
 
 
 def _has_stats(content: bytes, head: Head) -> bool:
     """Whether statistics without a digest are right; quantiles depend on how the steps came together."""
-    with contextlib.suppress(*UNREADABLE, AttributeError):
+    with contextlib.suppress(*layout.UNREADABLE, AttributeError):
         found, right = json.loads(content), head.stats
         return found.keys() == right.keys() and all(
             np.allclose(found[name][key], one[key], rtol=1e-6, equal_nan=True)
@@ -320,11 +308,11 @@ def mend(files: Files, *, accept_loss: bool = False) -> Found:
     if (found.is_whole and found.has_copies) or (found.lost and not accept_loss):
         return found
     head, is_hidden = Head(reader.info, reader.extra), False
-    files.write(MENDING, b"")
+    files.write(layout.MENDING, b"")
     for pair in reader.pairs():
         for name, content in pair.exact.items():
             files.write(name, content)
-        copy_line = file_name(COPIES, pair.number)
+        copy_line = file_name(layout.COPIES, pair.number)
         pair.damaged = [] if pair.is_as_written else [one for one in pair.damaged if not one.startswith(copy_line)]
         columns, ahead = [Columns.read(one, reader.info) for one in pair.episodes], replace(head, tasks=[*head.tasks])
         if pair.number == head.file and columns and not pair.lost and not [*_problems(pair, columns, ahead)]:
@@ -337,24 +325,24 @@ def mend(files: Files, *, accept_loss: bool = False) -> Found:
             is_hidden = True
             head.write(files)  # readers see the whole files alone until the rest is in place
         if pair.lost or not pair.is_as_written:
-            for kind in (DATA, EPISODES):
+            for kind in (layout.DATA, layout.EPISODES):
                 found.set_aside += files.copy_aside(file_name(kind, pair.number), ASIDE)
         if columns and pair.number not in left_over:
             head.write_pair(files, columns)
-    for number, kind in itertools.product(reversed(reader.numbers), (DATA, EPISODES, COPIES)):
+    for number, kind in itertools.product(reversed(reader.numbers), (layout.DATA, layout.EPISODES, layout.COPIES)):
         if number >= head.file:
             files.delete(file_name(kind, number))
-    files.write_json(BAM, head.own())
-    for name in (TASKS, STATS) if not head.episodes else ():
+    files.write_json(layout.BAM, head.own())
+    for name in (layout.TASKS, layout.STATS) if not head.episodes else ():
         files.delete(name)
     head.write(files)
     if head.file:
         _write_copy(files, head)  # with the digest of these statistics
-    files.delete(MENDING)
+    files.delete(layout.MENDING)
     return found
 
 
 def _write_copy(files: Files, head: Head) -> None:
     """Write the copy of the last file that `head` counts."""
-    data, episodes = (files.content(file_name(kind, head.file - 1)) for kind in (DATA, EPISODES))
-    files.write(file_name(COPIES, head.file - 1), head.copy(data or b"", episodes or b"").to_bytes())
+    data, episodes = (files.content(file_name(kind, head.file - 1)) for kind in (layout.DATA, layout.EPISODES))
+    files.write(file_name(layout.COPIES, head.file - 1), head.copy(data or b"", episodes or b"").to_bytes())

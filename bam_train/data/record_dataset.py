@@ -19,7 +19,7 @@ from bam_envs.core.spaces import leaves_by_path, mapped
 from bam_envs.remote.wire.values import plain_info, tree_to_json
 from bam_train.checkpoint.manifest import WHERE
 from bam_train.data.data_set_writer import DataSetWriter
-from bam_train.data.recorded_episode import Array, DataSetInfo, Episode, Leaf, leaves_of, nested
+from bam_train.data.recorded_episode import Array, DataSetInfo, Episode, Leaf, nested
 from bam_train.environments import AnyEnv, control_period
 from bam_train.errors import BadDataSet, SettingsError
 from bam_train.files.place import Place
@@ -33,10 +33,7 @@ _NOT_RECORDED = WHERE | {"env_id", "id", "render_mode", "num_envs", "vectorizati
 
 
 def info_of(
-    env: AnyEnv,
-    env_id: str | None = None,
-    env_kwargs: Mapping[str, Any] | None = None,
-    period: float | None = None,
+    env: AnyEnv, env_id: str | None = None, env_kwargs: Mapping[str, Any] | None = None, period: float | None = None
 ) -> DataSetInfo:
     """What all episodes of `env` have in common.
 
@@ -103,8 +100,7 @@ class Tracks:
         self, env: AnyEnv, info: DataSetInfo, num_envs: int, facts: Mapping[str, Any], keep: Keep | None
     ) -> None:
         self.info, self._n, self.facts, self._keep = info, num_envs, dict(facts), keep
-        self._observation = leaves_of(info.observation_space, "observation")
-        self._action = leaves_of(info.action_space, "action")
+        self._observation, self._action = info.observation_leaves, info.action_leaves
         self._start = np.full(num_envs, -1)
         """Number of the step with which each episode began; -1 for one that is not recorded. Shape: (n,)."""
         self._begun: list[dict[str, Any]] = [{} for _ in range(num_envs)]
@@ -248,7 +244,40 @@ def _numbers_or_texts(array: Array) -> Array:
     return texts
 
 
-class RecordDataset(gym.Wrapper[Any, Any, Any, Any]):
+class _Recorder:
+    """What both wrappers have."""
+
+    def __init__(
+        self,
+        env: AnyEnv,
+        place: str | Path | Place,
+        info: DataSetInfo | None = None,
+        facts: Mapping[str, Any] | None = None,
+        keep: Keep | None = None,
+        *,
+        env_id: str | None = None,
+        env_kwargs: Mapping[str, Any] | None = None,
+        period: float | None = None,
+        **options: Any,
+    ) -> None:
+        super().__init__(env)  # type: ignore[call-arg] # of the wrapper
+        if isinstance(env, VectorEnv) and env.metadata.get("autoreset_mode") is not AutoresetMode.SAME_STEP:
+            raise BadDataSet(
+                f"{place}: environments side by side are recorded in autoreset mode SAME_STEP, which keeps the last "
+                f"observation; found {env.metadata.get('autoreset_mode')}"
+            )
+        info = info or info_of(env, env_id, env_kwargs, period)
+        self.writer = DataSetWriter(place, info, **options)
+        self._tracks = Tracks(env, info, env.num_envs if isinstance(env, VectorEnv) else 1, facts or {}, keep)
+        self.extra: dict[str, Array] = {}
+        """Further columns (n, ...) of the next step, such as ``raw_action`` and ``intervention``."""
+
+    def _add(self, episodes: Iterable[Episode]) -> None:
+        for episode in episodes:
+            self.writer.add(episode)
+
+
+class RecordDataset(_Recorder, gym.Wrapper[Any, Any, Any, Any]):
     """Records every whole episode of `env`, one environment or several side by side (`gymnasium.vector.VectorEnv`).
 
     ::
@@ -275,30 +304,6 @@ class RecordDataset(gym.Wrapper[Any, Any, Any, Any]):
     def __new__(cls, env: AnyEnv, *arguments: Any, **options: Any) -> Any:
         """Several environments need a vector wrapper."""
         return RecordVectorDataset(env, *arguments, **options) if isinstance(env, VectorEnv) else super().__new__(cls)
-
-    def __init__(
-        self,
-        env: gym.Env[Any, Any],
-        place: str | Path | Place,
-        info: DataSetInfo | None = None,
-        facts: Mapping[str, Any] | None = None,
-        keep: Keep | None = None,
-        *,
-        env_id: str | None = None,
-        env_kwargs: Mapping[str, Any] | None = None,
-        period: float | None = None,
-        **options: Any,
-    ) -> None:
-        super().__init__(env)
-        info = info or info_of(env, env_id, env_kwargs, period)
-        self.writer = DataSetWriter(place, info, **options)
-        self._tracks = Tracks(env, info, 1, facts or {}, keep)
-        self.extra: dict[str, Array] = {}
-        """Further columns (1, ...) of the next step, such as ``intervention``."""
-
-    def _add(self, episodes: Iterable[Episode]) -> None:
-        for episode in episodes:
-            self.writer.add(episode)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Begin an episode."""
@@ -336,33 +341,8 @@ class RecordDataset(gym.Wrapper[Any, Any, Any, Any]):
             super().close()  # type: ignore[no-untyped-call]
 
 
-class RecordVectorDataset(VectorWrapper):
+class RecordVectorDataset(_Recorder, VectorWrapper):
     """`RecordDataset` of several environments."""
-
-    def __init__(
-        self,
-        env: VectorEnv[Any, Any, Any],
-        place: str | Path | Place,
-        info: DataSetInfo | None = None,
-        facts: Mapping[str, Any] | None = None,
-        keep: Keep | None = None,
-        *,
-        env_id: str | None = None,
-        env_kwargs: Mapping[str, Any] | None = None,
-        period: float | None = None,
-        **options: Any,
-    ) -> None:
-        super().__init__(env)
-        if env.metadata.get("autoreset_mode") is not AutoresetMode.SAME_STEP:
-            raise BadDataSet(
-                f"{place}: environments side by side are recorded in autoreset mode SAME_STEP, which keeps the last "
-                f"observation; found {env.metadata.get('autoreset_mode')}"
-            )
-        info = info or info_of(env, env_id, env_kwargs, period)
-        self.writer = DataSetWriter(place, info, **options)
-        self._tracks = Tracks(env, info, env.num_envs, facts or {}, keep)
-        self.extra: dict[str, Array] = {}
-        """Further columns (n, ...) of the next step, such as ``raw_action``."""
 
     def __getattr__(self, name: str) -> Any:
         """Any other attribute is the environments'."""
@@ -372,10 +352,6 @@ class RecordVectorDataset(VectorWrapper):
 
     def __del__(self) -> None:
         """Nothing: the environments, which others may use too, close themselves."""
-
-    def _add(self, episodes: Iterable[Episode]) -> None:
-        for episode in episodes:
-            self.writer.add(episode)
 
     def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Begin an episode in every environment, or in those of ``options["reset_mask"]``."""

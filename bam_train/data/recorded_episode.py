@@ -42,6 +42,16 @@ class DataSetInfo:
         """Steps per second as LeRobot has them: a whole number from 1 on."""
         return max(1, round(1 / self.period))
 
+    @property
+    def observation_leaves(self) -> list[Leaf]:
+        """The arrays of an observation; BadDataSet as `leaves_of`."""
+        return leaves_of(self.observation_space, "observation")
+
+    @property
+    def action_leaves(self) -> list[Leaf]:
+        """The arrays of an action; BadDataSet as `leaves_of`."""
+        return leaves_of(self.action_space, "action")
+
     def to_json(self) -> dict[str, Any]:
         """Plain values for `from_json`."""
         spaces = {name: space_to_json(getattr(self, name)) for name in ("observation_space", "action_space")}

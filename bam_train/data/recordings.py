@@ -23,9 +23,9 @@ from bam_train.data.data_set import DataSet
 from bam_train.data.data_set_writer import DataSetWriter
 from bam_train.data.layout import INFO, Files
 from bam_train.data.record_dataset import info_of
-from bam_train.data.recorded_episode import Array, DataSetInfo, Episode, digest_of, leaves_of, nested
+from bam_train.data.recorded_episode import Array, DataSetInfo, Episode, digest_of, nested
 from bam_train.environments import make_env, must_be_named, require_env_kwargs
-from bam_train.errors import BadDataSet, BadRecording
+from bam_train.errors import BadDataSet, FormatError
 from bam_train.files.place import Place, local_path
 from bam_train.recording.recording import DIGEST, Recording
 
@@ -51,18 +51,18 @@ def info_of_recording(recording: Recording, env: str | None = None) -> DataSetIn
         env: Its environment where a module must be imported for it, ``some_module:Env-v0``.
 
     Raises:
-        BadRecording: It does not say its environment, or that is another one.
+        FormatError: It does not say its environment, or that is another one.
     """
     named = recording.metadata.get("env", "")
     if not named or (env is not None and env.rpartition(":")[2] != named.rpartition(":")[2]):
-        raise BadRecording(f"{recording.path}: is of {named or 'no named environment'}, not of {env}; give that one")
+        raise FormatError(f"{recording.path}: is of {named or 'no named environment'}, not of {env}; give that one")
     if must_be_named(named) and env is None:
-        raise BadRecording(f"{recording.path}: is of {named}, whose module is imported only if you add --env {named}")
+        raise FormatError(f"{recording.path}: is of {named}, whose module is imported only if you add --env {named}")
     kwargs = json.loads(recording.metadata.get("env_kwargs", "{}"))
     try:
         require_no_place(kwargs)
     except ValueError as error:
-        raise BadRecording(f"{recording.path}: {error}. Ask whoever made it") from error
+        raise FormatError(f"{recording.path}: {error}. Ask whoever made it") from error
     period = json.loads(recording.metadata.get("period_s", "null"))
     with closing(make_env(env or named, kwargs)) as made:
         return info_of(made, env or named, kwargs, period)
@@ -149,7 +149,7 @@ def episodes_of(recording: Recording, info: DataSetInfo) -> Iterator[tuple[Episo
     if not recording.ticks:
         return
     observed, [actions] = recording.arrays("observation"), recording.arrays("action").values()
-    leaves = leaves_of(info.observation_space, "observation")
+    leaves = info.observation_leaves
     pictures = _pictures(recording, [("/".join(map(str, one.path)), one.shape) for one in leaves if one.is_image])
     table, seed, acted = recording.tables["/episode"], recording.seed, recording.policies()
     own = recording.metadata.get("checkpoint_sha256", "")
@@ -193,13 +193,8 @@ def episodes_of(recording: Recording, info: DataSetInfo) -> Iterator[tuple[Episo
 
 def _in_rows(episode: Episode, info: DataSetInfo) -> str:
     """Digest of what Parquet rows keep of an episode."""
-    parts = (
-        ("observation", info.observation_space, episode.observations),
-        ("action", info.action_space, episode.actions),
-    )
-    arrays = {
-        leaf.column: np.asarray(leaf.of(values)) for name, space, values in parts for leaf in leaves_of(space, name)
-    }
+    parts = ((info.observation_leaves, episode.observations), (info.action_leaves, episode.actions))
+    arrays = {leaf.column: np.asarray(leaf.of(values)) for leaves, values in parts for leaf in leaves}
     return digest_of(
         {**arrays, "reward": episode.rewards.astype(np.float32)}, bool(episode.terminated), bool(episode.truncated)
     )
@@ -215,7 +210,7 @@ def episodes_of_rows(source: Path, info: DataSetInfo) -> list[tuple[Episode, str
         BadDataSet: There are no rows, a column or a value is missing, not finite or of another shape or kind than the
             environment's, or the rows of an episode do not follow each other.
     """
-    [observed], [acted] = leaves_of(info.observation_space, "observation"), leaves_of(info.action_space, "action")
+    [observed], [acted] = info.observation_leaves, info.action_leaves
     kinds: dict[str, tuple[tuple[int, ...], Any]] = dict.fromkeys(("obs", "new_obs"), (observed.shape, observed.dtype))
     kinds |= {"actions": (acted.shape, acted.dtype), "rewards": ((), np.float64)}
     kinds |= dict.fromkeys(("terminateds", "truncateds"), ((), np.bool_))

@@ -10,25 +10,12 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
+from bam_train.data import layout
 from bam_train.data.arrow_columns import Arrow
 from bam_train.data.data_set import DataSet
 from bam_train.data.file_pair import MAGIC, Copy, sha256
-from bam_train.data.layout import (
-    COPIES,
-    DATA,
-    DEFAULTS,
-    EPISODES,
-    EXTRA,
-    FINAL,
-    LIGHT,
-    NEXT,
-    ROW,
-    UNREADABLE,
-    Files,
-    file_name,
-    row_digest,
-)
-from bam_train.data.recorded_episode import Episode, leaves_of
+from bam_train.data.layout import Files, file_name, row_digest
+from bam_train.data.recorded_episode import Episode
 
 _ENDS = ("bam/terminated", "bam/truncated", "bam/success")
 
@@ -63,7 +50,7 @@ class Pair:
 
 def read_pair(files: Files, data: DataSet, number: int) -> Pair:
     """What the files of this number say; `data` knows the columns."""
-    names = [file_name(kind, number) for kind in (DATA, EPISODES, COPIES)]
+    names = [file_name(kind, number) for kind in (layout.DATA, layout.EPISODES, layout.COPIES)]
     steps, heads, zipped = map(files.content, names)
     copy, contents = Copy.from_bytes(zipped), [(steps, heads)]
     if copy is not None:
@@ -100,7 +87,7 @@ class _Table:
             groups = range(self._file.metadata.num_row_groups)
             self._names = list(self._file.schema_arrow.names)
             self.lengths = [self._file.metadata.row_group(group).num_rows for group in groups]
-        except UNREADABLE:
+        except layout.UNREADABLE:
             self.is_whole = False
 
     def read(self, group: int) -> Arrow:
@@ -109,13 +96,13 @@ class _Table:
 
         try:
             return self._file.read_row_group(group)
-        except UNREADABLE:
+        except layout.UNREADABLE:
             self.is_whole = False
         found: dict[str, Arrow] = {}
         for name in self._names:
             try:
                 column = self._file.read_row_group(group, columns=[name]).column(name)
-            except UNREADABLE:
+            except layout.UNREADABLE:
                 continue
             found |= {name: column} if len(column) == self.lengths[group] else {}
         return pa.table(found)
@@ -128,7 +115,7 @@ def _read(data: DataSet, number: int, steps: bytes | None, heads: bytes | None) 
     rows: list[dict[str, Any]] = [{} for _ in groups]
     if head.lengths:
         last = head.read(0)
-        light = [name for name in last.column_names if not name.startswith(FINAL)]
+        light = [name for name in last.column_names if not name.startswith(layout.FINAL)]
         rows = last.select(light).to_pylist() or [{} for _ in range(head.lengths[0])]
     used: set[int] = set()
     for place, row in enumerate(rows):
@@ -140,7 +127,7 @@ def _read(data: DataSet, number: int, steps: bytes | None, heads: bytes | None) 
                 episode, whole_row, lost = found
                 pair.episodes.append(episode)
                 pair.rows.append(whole_row)
-                derived = [name for name in (*DEFAULTS, *NEXT[1:]) if name in groups[group].column_names]
+                derived = [name for name in (*layout.DEFAULTS, *layout.NEXT[1:]) if name in groups[group].column_names]
                 pair.places.append(groups[group].select(derived))
                 pair.lost += [(whole_row, lost)] if lost else []
                 break
@@ -148,7 +135,7 @@ def _read(data: DataSet, number: int, steps: bytes | None, heads: bytes | None) 
             pair.lost.append((row, ""))
     if not rows and (steps or heads):
         pair.lost.append(({}, ""))
-    names = (file_name(DATA, number), file_name(EPISODES, number))
+    names = (file_name(layout.DATA, number), file_name(layout.EPISODES, number))
     pair.damaged = [f"{name} is damaged" for name, one in zip(names, (table, head), strict=True) if not one.is_whole]
     return pair
 
@@ -160,12 +147,13 @@ def _episode(
 
     None if they do not belong together, or observations, actions or rewards are damaged.
     """
-    spaces = ((data.info.observation_space, "observation"), (data.info.action_space, "action"))
-    observed, acted = ([leaf.column for leaf in leaves_of(*one)] for one in spaces)
-    if not {*observed, *acted, NEXT[0]} <= {*steps.column_names} or not len(steps):
+    observed, acted = ([leaf.column for leaf in one] for one in (data.info.observation_leaves, data.info.action_leaves))
+    if not {*observed, *acted, layout.NEXT[0]} <= {*steps.column_names} or not len(steps):
         return None
     known, lost = dict(row), []
-    if {*LIGHT} <= row.keys() and row_digest(row) != row.get(ROW, row_digest(row)):  # one of its values is wrong
+    if {*layout.LIGHT} <= row.keys() and row_digest(row) != row.get(
+        layout.ROW, row_digest(row)
+    ):  # one of its values is wrong
         known = {name: row[name] for name in ("episode_index", "bam/digest", *_ENDS)}
     here = [name for name in data.extra if name in steps.column_names and not steps[name].null_count]
     own = json.loads(known.get("bam/columns", json.dumps(here)))
@@ -176,12 +164,12 @@ def _episode(
         lost.append("facts")
     if gone:
         lost.append(f"column {', '.join(gone)}")
-    digests = {"bam/digest": known.get("bam/digest"), EXTRA: None if gone else known.get(EXTRA)}
-    if last is None or not {FINAL + name for name in observed} <= {*last.column_names}:
+    digests = {"bam/digest": known.get("bam/digest"), layout.EXTRA: None if gone else known.get(layout.EXTRA)}
+    if last is None or not {layout.FINAL + name for name in observed} <= {*last.column_names}:
         # Learners take no value after a terminated episode; any other one ends before its last step.
         lost.append("last observation" if ends[0][0] else "last step")
         facts, digests["bam/digest"] = {**facts, "lost": lost[-1]}, None
-        last = steps.slice(len(steps) - 1).select(observed).rename_columns([FINAL + name for name in observed])
+        last = steps.slice(len(steps) - 1).select(observed).rename_columns([layout.FINAL + name for name in observed])
         if not ends[0][0]:
             steps, ends = steps.slice(0, len(steps) - 1), [[False], [True], ends[2][:1]]
     number = steps["episode_index"][0].as_py() if "episode_index" in steps.column_names and len(steps) else None
@@ -190,13 +178,13 @@ def _episode(
             return None
         ends = [one[:1] for one in ends]
     kept = [name for name in own if name not in gone]
-    tries = [(kept, digests[EXTRA], "")] + ([([], None, "further columns")] if digests[EXTRA] else [])
+    tries = [(kept, digests[layout.EXTRA], "")] + ([([], None, "further columns")] if digests[layout.EXTRA] else [])
     for (names, extra, missing), end in itertools.product(tries, itertools.product(*ends)):
-        full = {"episode_index": number, **known, **digests, EXTRA: extra, **dict(zip(_ENDS, end, strict=True))}
+        full = {"episode_index": number, **known, **digests, layout.EXTRA: extra, **dict(zip(_ENDS, end, strict=True))}
         full |= {"bam/facts": json.dumps(facts), "bam/columns": json.dumps(names)}
         try:
             found = data.read(full, steps.drop_columns([one for one in here if one not in names]), last)
-        except UNREADABLE:
+        except layout.UNREADABLE:
             continue
         return found, full | {"bam/digest": found.digest}, " and ".join([*lost, *([missing] if missing else [])])
     return None
@@ -204,7 +192,7 @@ def _episode(
 
 def _ends(row: Mapping[str, Any], steps: Arrow) -> list[list[bool | None]]:
     """Values of `_ENDS`, the likeliest first; one alone where the row says it."""
-    said = {name: bool(steps[name][-1].as_py()) for name in NEXT if name in steps.column_names}
+    said = {name: bool(steps[name][-1].as_py()) for name in layout.NEXT if name in steps.column_names}
     measured = steps["info.is_success"][-1].as_py() if "info.is_success" in steps.column_names else None
     success = True if said.get("next.success") else None if measured is None or math.isnan(measured) else False
     guesses: list[list[bool | None]] = [[said.get("next.terminated", False), True, False]]

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from bam_envs.core.timing import Pacer, TickTimes
 from bam_train.deploy.journal import EpisodeRecord, Journal
-from bam_train.errors import ValueMismatch
+from bam_train.errors import LoopError
 from bam_train.finite_envs import require_finite_action
 
 OBSERVATION = "env_obs"
@@ -173,14 +173,14 @@ def named_arrays(observation: Any, space: gym.Space[Any], name: str = OBSERVATIO
     """The arrays (1, ...) of an observation by name, copied, with the dtypes of `space`.
 
     Raises:
-        ValueMismatch: A part is neither an array nor a number.
+        LoopError: A part is neither an array nor a number.
     """
     if isinstance(observation, Mapping):
         parts = [named_arrays(value, space[key], f"{name}/{key}") for key, value in observation.items()]  # type: ignore[index]
         return {path: array for part in parts for path, array in part.items()}
     array = np.asarray(None if isinstance(observation, (tuple, str)) else observation)
     if array.dtype.kind not in "fiub":
-        raise ValueMismatch(
+        raise LoopError(
             f"{name!r}: expected an array, a number or a dict of them, found a {type(observation).__name__}; "
             "wrap the environment, for example in gymnasium.wrappers.FlattenObservation."
         )

@@ -45,7 +45,9 @@ def guard_lines(guards: Sequence[Mapping[str, Any]], limits: Mapping[str, float 
     """
     rows = [["guard", "", "limit", "set by", "what it does"]]
     for guard in guards:
-        limit = "off" if guard["limit"] is None else f"{guard['limit']:.3g} {guard['unit']}"
+        lowest, highest = (f"{end(guard['each'] or [guard['limit'] or 0.0]):.3g}" for end in (min, max))
+        limit = f"{highest if lowest == highest else f'{lowest} to {highest}'} {guard['unit']}"
+        limit = "off" if guard["limit"] is None else limit
         names = guard["setting"].split(", ")
         by = names[0] if len(names) == 1 else f"{names[0].partition('_')[0]}_*"
         rows.append([guard["number"], guard["name"], limit, by or "-", guard["does"]])

@@ -66,7 +66,7 @@ def recorded_motion(path: Path, spec: RobotSpec, address: str, identity: str = "
     robot, of a simulation, or of a shadow, which sends nothing, is refused.
 
     Raises:
-        BadRecording: There is no such recording, or it is of another robot.
+        FormatError: There is no such recording, or it is of another robot.
     """
     recording = Recording.open(path)
     metadata = recording.metadata

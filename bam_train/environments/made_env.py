@@ -114,12 +114,15 @@ def require_env_kwargs(env: str, given: Mapping[str, Any]) -> None:
         entry.read_cameras(given)
         if given.get("link") is not None:
             link_profile(given["link"])
-        if "robot_model" in given:
-            find_model(given["robot_model"], type(find_model(options["robot_model"], Description)))
         if given.get("action_delay") is not None:
             read_delay(given["action_delay"])
     except (InvalidValue, UnknownName) as error:
         raise SettingsError(f"env_kwargs: {error}") from error
+    if "robot_model" in given:
+        try:
+            find_model(given["robot_model"], type(find_model(options["robot_model"], Description)))
+        except (InvalidValue, UnknownName) as error:
+            raise SettingsError(str(error)) from error
 
 
 def is_batched(env_id: str) -> bool:

@@ -36,11 +36,7 @@ from bam_train.estimation.estimates import Estimate
 from bam_train.estimation.fitted_q import fit_q
 from bam_train.estimation.paired_test import Pairs, Verdict, verdict_of
 from bam_train.estimation.steps import read_steps
-from bam_train.evaluation import (
-    default_num_envs,
-    waves,
-    wilson_interval,
-)
+from bam_train.evaluation import default_num_envs, waves, wilson_interval
 from bam_train.finite_envs import FiniteVectorEnv
 from bam_train.policy import FrozenPolicy
 from bam_train.rollout import PlayedEpisode

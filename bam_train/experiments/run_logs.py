@@ -6,7 +6,7 @@ import csv
 import json
 import re
 import zipfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -44,6 +44,11 @@ class Curve:
     seconds: Array | None = None
     """Time since the start of the run [s]. Shape: (k,)."""
 
+    def at(self, steps: float) -> float:
+        """The newest value at these steps; NaN before the first one."""
+        place = int(np.searchsorted(self.steps, steps, side="right"))
+        return float(self.values[place - 1]) if place else np.nan
+
     def reaches(self, level: float) -> tuple[float, float | None]:
         """Steps and seconds at which the metric is at `level` first; infinity if it never is."""
         places = np.flatnonzero(self.values >= level)
@@ -59,7 +64,7 @@ class RunLog:
 
     place: Path
     curves: Mapping[str, Curve]
-    """``success`` and ``return``, as far as they are known, of evaluations if there were any."""
+    """``success`` and ``return``, as far as they are known, of evaluations if there were any; `score` of a done run."""
     env: str | None = None
     seed: int | None = None
     settings: Mapping[str, Any] = field(default_factory=dict)
@@ -124,16 +129,42 @@ def _curve(rows: list[tuple[Any, Any, Any]]) -> Curve:
 
 
 def _own(folder: Path, files: list[Path]) -> RunLog:
-    evaluations = [record for record in read_records(files[0]) if record["kind"] == "evaluation"]
+    curves = curves_of([record for record in read_records(files[0]) if record["kind"] == "evaluation"])
+    settings = read_object(folder / "config.json") or {}
+    outcome = read_object(folder / "outcome.json") or {}
+    if (scored := score(curves, settings, outcome)) is not None:
+        curves["score"] = scored
+    commit = outcome.get("git_commit") or _commit(folder / "last.zip")
+    return RunLog(folder, curves, settings.get("env"), settings.get("seed"), settings, outcome, commit)
+
+
+def curves_of(evaluations: Sequence[Mapping[str, Any]]) -> dict[str, Curve]:
+    """The curves of a run of ours, of the records of its evaluations."""
     curves = {}
     for metric, name in (("success", "success_rate"), ("return", "return_mean")):
         rows = [(one["steps"], one["seconds"], one[name]) for one in evaluations if one.get(name) is not None]
         if rows:
             curves[metric] = _curve(rows)
-    settings = read_object(folder / "config.json") or {}
-    outcome = read_object(folder / "outcome.json") or {}
-    commit = outcome.get("git_commit") or _commit(folder / "last.zip")
-    return RunLog(folder, curves, settings.get("env"), settings.get("seed"), settings, outcome, commit)
+    return curves
+
+
+def counts(curves: Mapping[str, Curve], settings: Mapping[str, Any]) -> Curve | None:
+    """The curve by which a run is chosen: the return if that is its goal, else success if it is known."""
+    by_return = settings.get("stop_reward") is not None and settings.get("until_success") is None
+    return curves.get("return" if by_return or "success" not in curves else "success")
+
+
+def score(curves: Mapping[str, Curve], settings: Mapping[str, Any], outcome: Mapping[str, Any]) -> Curve | None:
+    """The curve that `counts`, whose last value is higher if the run has ended at its goal.
+
+    All runs that do are about as good, so the share of the steps that they saved, times the goal, is added.
+    """
+    curve = counts(curves, settings)
+    if curve is None or not outcome:
+        return None
+    goal = settings.get({"success": "until_success", "reward": "stop_reward"}.get(str(outcome.get("reason")), ""))
+    saved = 0.0 if goal is None else abs(goal) * (1 - min(1.0, outcome["steps"] / settings["steps"]))
+    return Curve(curve.steps, np.append(curve.values[:-1], curve.values[-1] + saved), curve.seconds)
 
 
 def _commit(path: Path) -> str | None:

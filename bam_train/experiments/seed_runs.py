@@ -24,8 +24,8 @@ import tempfile
 import time
 import zipfile
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -39,6 +39,8 @@ try:
 except ImportError:  # Windows: nothing keeps two calls from the same folder
     fcntl = None  # type: ignore[assignment]
 
+LOCKS = fcntl is not None
+"""Whether a folder can be locked."""
 MOST_SEEDS = 1000
 POLL = 0.2
 """Seconds between two looks at the runs."""
@@ -74,21 +76,40 @@ def group_folder(runs: Path, settings: TrainSettings) -> Iterator[tuple[RunFolde
     Raises:
         FolderInUse: Another call trains in it, or processes of a killed one still save.
     """
-    what = json.loads(json.dumps({name: v for name, v in settings.to_mapping().items() if name not in WHERE}))
+    what = what_is_learnt(settings)
     stem = file_stem(settings.env, settings.algo, settings.trainer, settings.env_kwargs)
     folder = RunFolder(runs, stem, lambda path: read_object(path / "config.json") == what)
     folder.write_config(what)
+    with locked(folder.path) as lock:
+        yield folder, lock
+
+
+def what_is_learnt(settings: TrainSettings) -> dict[str, Any]:
+    """The settings as JSON has them, without `WHERE`."""
+    what: dict[str, Any] = json.loads(json.dumps(settings.to_mapping()))
+    return {name: value for name, value in what.items() if name not in WHERE}
+
+
+@contextlib.contextmanager
+def locked(folder: Path, wait: bool = False) -> Iterator[int | None]:
+    """Within the ``with`` block no other call has the lock of the folder; yields its descriptor.
+
+    Children that get the descriptor hold the lock as long as one of them lives.
+
+    Raises:
+        FolderInUse: Another process has it, unless `wait`.
+    """
     if fcntl is None:
-        yield folder, None
+        yield None
         return
-    lock = os.open(folder.path, os.O_RDONLY)  # of children too: it is held as long as one of them lives
+    lock = os.open(folder, os.O_RDONLY)
     try:
         try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            fcntl.flock(lock, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
         except BlockingIOError as error:
-            text = "another bam-train trains its seeds, or its runs are being saved. Wait for its end"
-            raise FolderInUse(f"{folder.path}: {text}") from error
-        yield folder, lock
+            text = "another program trains its seeds, or its runs are being saved. Wait for its end"
+            raise FolderInUse(f"{folder}: {text}") from error
+        yield lock
     finally:
         os.close(lock)
 
@@ -186,16 +207,16 @@ def unpack(content: bytes, folder: Path) -> None:
 
 
 class ClusterSeed:
-    """A `SeedProcess` on a node of the Ray cluster that this process has joined, for which it asks for `cpus`.
+    """A `SeedProcess` on a node of the Ray cluster that this process has joined, for which it asks for CPUs and GPUs.
 
     The run's folder goes there when it is begun and comes back when it has ended; if the node dies, it does not.
     """
 
-    def __init__(self, settings: dict[str, Any], folder: Path, cpus: int) -> None:
+    def __init__(self, settings: dict[str, Any], folder: Path, cpus: int, gpus: int = 0) -> None:
         import ray
 
         self._folder = folder
-        self._actor = ray.remote(num_cpus=cpus)(SeedProcess).remote(settings, None, pack(folder))
+        self._actor = ray.remote(num_cpus=cpus, num_gpus=gpus)(SeedProcess).remote(settings, None, pack(folder))
         self._asked, self._is_there = self._actor.news.remote(), False
 
     def news(self) -> News:
@@ -237,10 +258,13 @@ class ClusterSeed:
 class SeedRun:
     """One seed, as it is displayed."""
 
-    number: int
+    settings: TrainSettings
+    """With the seed."""
     folder: RunFolder
-    total: int
-    """Steps of a whole run."""
+    lock: int | None = None
+    """Descriptor of the lock of the folder, which its process gets."""
+    of: str = ""
+    """Whose seed it is, where there are several: `` of trial 3``."""
     state: str = "waiting"
     """``waiting``, ``training``, ``stopped``, ``failed`` or ``done``."""
     steps: int = 0
@@ -251,68 +275,90 @@ class SeedRun:
     """Longest time that it may still take [s]."""
     why: str = ""
     """Why it has ended."""
-    evaluations: int = 0
+    evaluations: list[dict[str, Any]] = field(default_factory=list)
+    """Their records."""
+    is_wanted: bool = True
+    """If it is not, it is told to save and end."""
+    told: bool = False
+    """Whether it was told so."""
+
+    @classmethod
+    def there(cls, folder: Path, settings: TrainSettings, seed: int, lock: int | None, of: str = "") -> SeedRun:
+        """The run of a seed in the folder of several, as far as it has come."""
+        run = cls(replace(settings, seed=seed), RunFolder(folder, f"seed-{seed}", lambda path: True), lock, of)
+        run.take(run.folder.records())
+        if run.folder.outcome is not None:
+            run.end(0, "")
+        return run
+
+    @property
+    def name(self) -> str:
+        """Its seed, and whose it is."""
+        return f"{self.settings.seed}{self.of}"
 
     def take(self, records: Sequence[dict[str, Any]]) -> None:
         """Take over what the records say."""
         for record in records:
-            is_evaluation = record["kind"] == "evaluation"
             self.steps = record["steps"]
-            self.evaluations += is_evaluation
-            if is_evaluation or not self.evaluations:
+            if record["kind"] == "evaluation":
+                self.evaluations = [*(one for one in self.evaluations if one["steps"] < self.steps), record]
+            if record["kind"] == "evaluation" or not self.evaluations:
                 self.success, self.returns = record.get("success_rate"), record.get("return_mean")
             if speed := record.get("steps_per_second"):
-                self.left = max(0.0, (self.total - self.steps) / speed)
+                self.left = max(0.0, (self.settings.steps - self.steps) / speed)
 
-    def end(self, status: int, said: str, stopped: bool) -> None:
+    def end(self, status: int, said: str) -> None:
         """Take over how its process has ended."""
         outcome = self.folder.outcome
         if outcome is not None:
             self.state, self.why = "done", outcome["reason"]
         else:
-            self.state, self.why = ("stopped", "") if stopped and status in (130, 143) else ("failed", said)
+            self.state, self.why = ("stopped", "") if self.told and status in (130, 143) else ("failed", said)
         self.left = None
 
 
 def run_seeds(
-    runs: Sequence[SeedRun],
+    following: Callable[[], SeedRun | None],
     start: Callable[[SeedRun], SeedProcess | ClusterSeed],
     jobs: int,
     stopped: Callable[[], bool],
     show: Callable[[], None],
 ) -> None:
-    """Train the runs that wait, `jobs` at once; once `stopped` is true, those that train save and end.
+    """Train runs, `jobs` at once, until there is no `following` one; once `stopped`, those that train save and end.
 
     An exception, such as that of a second signal, kills them.
     """
-    waiting, told = [run for run in runs if run.state == "waiting"], False
-    running: dict[int, tuple[SeedRun, SeedProcess | ClusterSeed]] = {}
+    running: list[tuple[SeedRun, SeedProcess | ClusterSeed]] = []
     try:
-        while running or (waiting and not stopped()):
-            while waiting and len(running) < jobs and not stopped():
-                run = waiting.pop(0)
-                running[run.number] = run, start(run)
+        while True:
+            while len(running) < jobs and not stopped() and (run := following()) is not None:
+                running.append((run, start(run)))
                 run.state = "training"
-            if stopped() and not told:
-                told = True
-                for _, process in running.values():
+            if not running:
+                return
+            for run, process in list(running):
+                if not run.told and (stopped() or not run.is_wanted):
+                    run.told = True
                     process.stop()
-            for run, process in list(running.values()):
                 news = process.news()
                 run.take(news.records)
                 if news.status is not None:
-                    del running[run.number]
-                    run.end(news.status, news.said, told)
+                    running.remove((run, process))
+                    run.end(news.status, news.said)
             show()
             if running:
                 time.sleep(POLL)
     finally:
-        for _, process in running.values():
+        for _, process in running:
             process.kill()
 
 
-def at_once(settings: TrainSettings, nodes: Sequence[int]) -> tuple[int, int]:
-    """How many runs fit side by side on computers with so many CPUs each, at least one; and the CPUs of one run."""
+def needs(settings: TrainSettings) -> dict[str, int]:
+    """The resources of a run, as Ray names them."""
     runners = getattr(settings, "num_env_runners", 0) + getattr(settings, "num_learners", 0)
-    cpus = settings.threads + runners
-    return max(1, sum(there // cpus for there in nodes)), cpus
+    return {"CPU": settings.threads + runners, "GPU": int(settings.device.startswith("cuda"))}
+
+
+def at_once(needed: Mapping[str, int], nodes: Sequence[Mapping[str, float]]) -> int:
+    """How many runs fit side by side on computers with these resources."""
+    return sum(int(min(node.get(name, 0) // number for name, number in needed.items() if number)) for node in nodes)

@@ -331,9 +331,9 @@ def local_path(text: str | Path) -> Path:
     if place.local is not None:
         return place.local
     with place._errors("read"):
-        version = place._call("ukey")
-    found = (one.path for one in _COPIES if (one.place, one.version) == (place, version))
-    return next(found, None) or _Copy(place, version=version).path
+        info = place._call("info")
+    found = (one.path for one in _COPIES if (one.place, one.info) == (place, info))
+    return next(found, None) or _Copy(place, info=info).path
 
 
 @contextlib.contextmanager
@@ -377,19 +377,22 @@ class _Copy:
     whether it may be written is known before any work is done.
     """
 
-    def __init__(self, place: Place, written: str = "", version: str = "") -> None:
-        self.place, self.version = place, version
+    def __init__(self, place: Place, written: str = "", info: dict[str, Any] | None = None) -> None:
+        self.place, self.info = place, info
         self.above = place if written == "runs" else place.parent
         self.folder = Path(tempfile.mkdtemp(prefix="bam-")).resolve()
         self.path = self.folder if written == "runs" else self.folder / place.name
         _ADDRESSES[f"{self.folder}/"] = f"{str(self.above).rstrip('/')}/"
         atexit.register(self._remove)
         try:
-            if written:
+            if info is None:
                 self._take_names()
             else:
                 with place._errors("read"):
-                    place._call("get", str(self.path), recursive=place.is_dir())
+                    if info["type"] == "directory":
+                        place._call("get", str(self.path), recursive=True)
+                    else:  # of a file, `get` would ask for its kind and for files below it too
+                        place._call("get_file", str(self.path))
         except BaseException:
             self._remove()
             raise

@@ -24,7 +24,7 @@ class Hand:
 
     waits = False
     """Whether time passes with presses only."""
-    is_base = False
+    is_base = sideways = False
     memory: Any = None
     """What it goes on from, such as whether the gripper is closed."""
 
@@ -41,7 +41,7 @@ class Hand:
 
     def lines(self) -> list[str]:
         """The keys, for the screen."""
-        return move_lines(is_base=self.is_base)
+        return move_lines(is_base=self.is_base, sideways=self.sideways)
 
 
 def hand_for(env: gym.Env[Any, Any], *, is_live: bool = False) -> Hand:
@@ -70,7 +70,7 @@ class MotionHand(Hand):
     """Steps of a tool, or speeds of a base, as the numbers of the action are called."""
 
     def __init__(self, labels: Sequence[Mapping[str, Any]], period: float) -> None:
-        self.is_base = any(label["name"] == "forward" for label in labels)
+        self.is_base, self.sideways = (any(one["name"] == name for one in labels) for name in ("forward", "sideways"))
         self._axes = [AXES.get(label["name"], -1) for label in labels]  # -1 is the gripper
         times = [1.0 if label["unit"].endswith("/s") else period for label in labels]
         self._factors = [time / _scale(label) for time, label in zip(times, labels, strict=True)]

@@ -207,9 +207,10 @@ class Session:
         self._step(lambda: self.suggestion if by_policy else self._persons(keys, holds=holds), driver)
 
     def _persons(self, keys: set[str], *, holds: bool) -> Any:
+        kind: Any = {"is_base": self.hand.is_base, "sideways": self.hand.sideways}
         if self.pad is None or holds:
-            return self.hand.action(*moved(keys, self.speed, is_base=self.hand.is_base))
-        return self.hand.action(*stick_moved(*self.pad, self.speed, is_base=self.hand.is_base))
+            return self.hand.action(*moved(keys, self.speed, **kind))
+        return self.hand.action(*stick_moved(*self.pad, self.speed, **kind))
 
     def _step(self, choose: Callable[[], Any], driver: str) -> None:
         if self._saves:

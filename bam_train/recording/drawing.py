@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from bam_envs.core.errors import MissingExtra, ProtocolError
 from bam_envs.ros.images import decode_image
-from bam_train.errors import BadRecording, OutputError
+from bam_train.errors import FormatError, OutputError
 from bam_train.files.atomic_file import replacing
 from bam_train.recording.recording import Recording
 
@@ -30,7 +30,7 @@ def plot(recording: Recording, path: Path) -> None:
     """Draw states, commands, actions, status and latencies over time into an image file.
 
     Raises:
-        BadRecording: The recording has no tick.
+        FormatError: The recording has no tick.
         MissingExtra: matplotlib is not installed.
         OutputError: The file cannot be written.
     """
@@ -40,7 +40,7 @@ def plot(recording: Recording, path: Path) -> None:
         raise MissingExtra("matplotlib", "notebook", "--plot") from error
     plots = _plots(recording)
     if not recording.ticks:
-        raise BadRecording(f"{recording.path}: no whole tick is in it; there is nothing to draw")
+        raise FormatError(f"{recording.path}: no whole tick is in it; there is nothing to draw")
     figure = Figure(figsize=(10, 0.8 + 1.7 * len(plots)), layout="constrained")
     axes = figure.subplots(len(plots), 1, sharex=True, squeeze=False)[:, 0]
     for panel, (name, draw) in zip(axes, plots, strict=True):
@@ -117,7 +117,7 @@ def frames(recording: Recording, topic: str | None = None) -> Iterator[NDArray[n
     """The recorded pictures of a topic, by default the first with pictures. Shape: (height, width, 3), RGB.
 
     Raises:
-        BadRecording: A picture cannot be decoded.
+        FormatError: A picture cannot be decoded.
     """
     for name, _, message in recording.pictures(topic):
         topic = topic or name
@@ -125,7 +125,7 @@ def frames(recording: Recording, topic: str | None = None) -> Iterator[NDArray[n
             try:
                 yield _colours(_pixels(message))
             except (ProtocolError, KeyError, ValueError, binascii.Error) as error:
-                raise BadRecording(f"{recording.path}: a picture of {name} cannot be decoded: {error}") from error
+                raise FormatError(f"{recording.path}: a picture of {name} cannot be decoded: {error}") from error
 
 
 def _pixels(message: dict[str, Any]) -> NDArray[np.uint8]:

@@ -14,7 +14,7 @@ from bam_envs.core.robot_env import RobotEnv
 from bam_envs.robots.replay_robot import ReplayRobot
 from bam_train.checkpoint import Checkpoint
 from bam_train.environments import environment_of, make_env
-from bam_train.errors import BadRecording, CheckpointMismatch
+from bam_train.errors import CheckpointMismatch, FormatError
 from bam_train.recording.recording import DIGEST, Recording
 
 ROBOT_OPTIONS = ("randomize", "link", "guards", "trial")
@@ -88,7 +88,7 @@ def replay_env(
         render_mode: ``"rgb_array"`` draws the simulated robot in the recorded states.
 
     Raises:
-        BadRecording: No robot was recorded, or another robot.
+        FormatError: No robot was recorded, or another robot.
         CheckpointError: The checkpoint belongs to another environment, or its environment must be named.
     """
     require_same_env(recording, checkpoint)
@@ -100,11 +100,11 @@ def replay_env(
     env = make_env(env_id, kwargs, render_mode=render_mode)
     inner = env.unwrapped
     if not isinstance(inner, RobotEnv):
-        raise BadRecording(f"{recording.path}: {env_id} has no robot, whose states could be played")
+        raise FormatError(f"{recording.path}: {env_id} has no robot, whose states could be played")
     states, simulated = recording.states(inner.robot.spec), inner.robot
     episodes = [[states[k] for k in ticks] for ticks in recording.episodes()]
     if not episodes:
-        raise BadRecording(f"{recording.path}: no whole tick is in it; there is nothing to play")
+        raise FormatError(f"{recording.path}: no whole tick is in it; there is nothing to play")
     inner.robot = ReplayRobot(simulated.spec, episodes, simulated if render_mode else None)
     return env
 
@@ -144,7 +144,7 @@ def play(
             except RobotFault:
                 break
             if (terminated or truncated) and k + 1 != ticks[-1]:
-                raise BadRecording(
+                raise FormatError(
                     f"{recording.path}: episode {number + 1} ends after {k + 1 - ticks[0]} steps, and was recorded "
                     f"with {ticks[-1] - ticks[0]}; play it with the versions in its metadata"
                 )

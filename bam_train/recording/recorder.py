@@ -30,7 +30,6 @@ import logging
 import os
 import struct
 import subprocess
-import sys
 import time
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
@@ -41,13 +40,12 @@ from numpy.typing import NDArray
 
 from bam_train.errors import OutputError
 from bam_train.recording.ring import EVENT, IMAGE, LAYOUT, PIXELS, TICK, TIMES, Ring, make_shared_file
+from bam_train.signals import start_child
 
 INFO, WARNING, ERROR = 2, 3, 4
 """Levels of events, as of foxglove.Log."""
 _LOG = logging.getLogger(__name__)
-_PROGRAM = (  # without the folder it is started in, whose files could hide ours
-    "import sys; sys.path[:] = filter(None, sys.path); import bam_train.recording.recorder_process as it; it.main()"
-)
+_PROGRAM = "bam_train.recording.recorder_process:main"
 _RING = 16 * 2**20
 _START, _END = 20.0, 10.0  # maximum time for the start and the end of the process [s]
 _CHECK = 64
@@ -111,16 +109,9 @@ class Recorder:
         self._ring = ring = Ring(descriptor)
         head = {"paths": [str(path) for path in self._paths], "metadata": self.metadata, "guards": self.guards}
         ring.write(json.dumps(head).encode())
-        program = [sys.executable, "-c", _PROGRAM, str(descriptor), str(os.getpid())]
+        options = {"pass_fds": [descriptor], "stdout": subprocess.DEVNULL}
         try:
-            self._process = subprocess.Popen(
-                program,
-                pass_fds=[descriptor],
-                stdin=subprocess.DEVNULL,
-                stdout=subprocess.DEVNULL,
-                env={**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
-                start_new_session=True,  # Ctrl-C at the terminal is for the deployment alone
-            )
+            self._process = start_child(_PROGRAM, str(descriptor), str(os.getpid()), **options)
         finally:
             os.close(descriptor)
         started = time.monotonic()

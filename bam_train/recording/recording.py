@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from zstandard import ZstdError
 
 from bam_envs.core.robot import RobotSpec, RobotState
-from bam_train.errors import BadRecording
+from bam_train.errors import FormatError
 
 Array = NDArray[np.float64]
 TICKS = ("/state", "/truth", "/command", "/observation", "/action", "/status", "/latency", "/episode")
@@ -88,25 +88,25 @@ class Recording:
         """Read a recording up to its end, or to the place where it is cut off or damaged; without its pictures.
 
         Raises:
-            BadRecording: There is no such file, or it is not a recording of `bam-deploy`.
+            FormatError: There is no such file, or it is not a recording of `bam-deploy`.
         """
         recording = cls(Path(path).expanduser())
         rows: _Rows = {topic: [] for topic in TICKS}
         try:
             for record in recording._records():
                 recording._take(rows, record)
-        except BadRecording:
+        except FormatError:
             raise
         except _FOREIGN:
             pass  # what was read so far is the recording
         if not all(rows[topic] for topic in _ALWAYS):
             rows.clear()  # not one whole tick
         if not recording.metadata and not rows:
-            raise BadRecording(f"{path}: not a recording of bam-deploy. Give a .mcap file that it wrote")
+            raise FormatError(f"{path}: not a recording of bam-deploy. Give a .mcap file that it wrote")
         try:
             recording._fill({topic: messages for topic, messages in rows.items() if messages})
         except (TypeError, ValueError, AttributeError) as error:
-            raise BadRecording(f"{path}: its numbers cannot be read: {error}. Get the file again") from error
+            raise FormatError(f"{path}: its numbers cannot be read: {error}. Get the file again") from error
         return recording
 
     def pictures(self, topic: str | None = None) -> Iterator[tuple[str, int, dict[str, Any]]]:
@@ -130,7 +130,7 @@ class Recording:
                         yield (topics[part.channel_id], part) if isinstance(part, Message) else part
         except OSError as error:
             why = error.strerror or error
-            raise BadRecording(f"{self.path}: cannot be read: {why}. Give a .mcap file of bam-deploy") from error
+            raise FormatError(f"{self.path}: cannot be read: {why}. Give a .mcap file of bam-deploy") from error
         except _DAMAGE:
             return  # what was read so far is the recording
 
@@ -169,10 +169,10 @@ class Recording:
 
     @property
     def seed(self) -> int:
-        """Seed of the first episode. Raises BadRecording if the metadata has something else."""
+        """Seed of the first episode. Raises FormatError if the metadata has something else."""
         text = self.metadata.get("seed", "0")
         if not text.isdecimal():
-            raise BadRecording(f"{self.path}: its metadata says seed {text!r}, which is no number. Get the file again")
+            raise FormatError(f"{self.path}: its metadata says seed {text!r}, which is no number. Get the file again")
         return int(text)
 
     def policies(self) -> list[str]:
@@ -198,13 +198,13 @@ class Recording:
         try:
             return {} if table is None else _split(table.numbers[:, 1:], self.kinds.get(kind, {}))
         except (TypeError, ValueError) as error:
-            raise BadRecording(f"{self.path}: its arrays cannot be read: {error}. Get the file again") from error
+            raise FormatError(f"{self.path}: its arrays cannot be read: {error}. Get the file again") from error
 
     def states(self, spec: RobotSpec) -> list[RobotState]:
         """The state at each tick, of a robot with this spec.
 
         Raises:
-            BadRecording: The recording lacks a signal of the spec.
+            FormatError: The recording lacks a signal of the spec.
         """
         state, command, known = self._table("/state"), self._table("/command"), self.arrays("truth")
         try:
@@ -214,7 +214,7 @@ class Recording:
             }
             commands = np.stack([command.column(label) for label in spec.command.labels], axis=1)
         except ValueError as error:
-            raise BadRecording(f"{self.path}: another robot than {spec.name} was recorded: {error}") from error
+            raise FormatError(f"{self.path}: another robot than {spec.name} was recorded: {error}") from error
         stamps = state.column("stamp")
         return [
             RobotState(
@@ -228,7 +228,7 @@ class Recording:
 
     def _table(self, topic: str) -> Table:
         if topic not in self.tables:
-            raise BadRecording(f"{self.path}: no robot was recorded: there is no {topic} in it")
+            raise FormatError(f"{self.path}: no robot was recorded: there is no {topic} in it")
         return self.tables[topic]
 
 

@@ -40,7 +40,7 @@ class RunFolder:
     """
 
     def __init__(self, root: Path, name: str, is_own: Callable[[Path], bool] = lambda path: False) -> None:
-        with _writing(root):
+        with writing(root):
             root.mkdir(parents=True, exist_ok=True)
             for number in itertools.count(1):
                 self.path = root / (name if number == 1 else f"{name}-{number}")
@@ -63,7 +63,7 @@ class RunFolder:
 
     def add(self, record: Mapping[str, Any]) -> None:
         """Append one line to ``progress.jsonl``, and close the file."""
-        with _writing(self._progress), self._progress.open("a", encoding="utf-8") as file:
+        with writing(self._progress), self._progress.open("a", encoding="utf-8") as file:
             file.write(json.dumps(record, allow_nan=False) + "\n")
 
     def records(self) -> list[dict[str, Any]]:
@@ -81,7 +81,7 @@ class RunFolder:
 
     def _write(self, name: str, content: Mapping[str, Any]) -> None:
         """Write a JSON file, whole or not at all."""
-        with _writing(self.path / name), replacing(self.path / name) as temporary:
+        with writing(self.path / name), replacing(self.path / name) as temporary:
             temporary.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
 
     def write_traceback(self, error: BaseException) -> str:
@@ -122,7 +122,7 @@ def read_object(path: Path) -> dict[str, Any] | None:
 
 
 @contextlib.contextmanager
-def _writing(path: Path) -> Iterator[None]:
+def writing(path: Path) -> Iterator[None]:
     """Map failures to write `path` to `OutputError`."""
     try:
         yield

@@ -121,12 +121,12 @@ class TrainingRun:
         self._clock, self._copies = clock, copies
         self._start = self._recorded = self._saved = clock()
         self._first_step = trainer.steps
-        before = [one["seconds"] for one in folder.records() if one["steps"] <= trainer.steps]
-        self._seconds_before = max(before, default=0.0)  # in a folder in which the run goes on
+        before = [one for one in folder.records() if one["steps"] <= trainer.steps]
+        self._seconds_before = max((one["seconds"] for one in before), default=0.0)  # in a folder of the run
         self._save_pause = FIRST_SAVE
         self._learning_from: tuple[int, float] | None = None  # steps and time when the trainer had first learnt
         self._stop, self._reached = False, ""
-        self._evaluated_at = trainer.steps if best else 0
+        self._evaluated_at = trainer.steps if best or any(one["kind"] == "evaluation" for one in before) else 0
         self._scores: Scores = {}  # the newest evaluation
         self._kept: Path | None = out if best else None
         self._last_steps = 0
@@ -152,7 +152,7 @@ class TrainingRun:
         """Train to the end; raises TrainingFailed, whose message names the last good checkpoint."""
         try:
             self.trainer.train(self.settings.steps, self._between)
-            if not self._stop and self._evaluated_at < self.trainer.steps:
+            if not self._stop and (self._evaluated_at < self.trainer.steps or self._kept is None):
                 self._evaluate()
         except (ProcessesLost, RobotFault) as error:  # the state after the last update is good
             self._save_last()

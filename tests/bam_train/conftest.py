@@ -15,7 +15,42 @@ import pytest
 
 from bam_envs.core.spaces import space_to_json
 from bam_train.checkpoint import GOLDEN, MANIFEST, POLICY, safetensors_file, write_checkpoint
+from bam_train.cli.flags import TrainConfig
+from bam_train.cli.program import guarded
+from bam_train.cli.train import train
 from tests.one_ray import no_ray_fixture, one_ray_fixture, shared_ray_fixture  # noqa: F401
+
+
+@pytest.fixture
+def run(capsys):
+    """Runs a program in this process: ``run(main, arguments...)`` gives its exit status, standard output and error."""
+
+    def run(main, *arguments):
+        with pytest.raises(SystemExit) as done:
+            main([str(argument) for argument in arguments])
+        return done.value.code or 0, *capsys.readouterr()
+
+    return run
+
+
+@pytest.fixture(name="here")
+def here_fixture(tmp_path, monkeypatch):
+    """An empty folder, in which the test runs."""
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+@pytest.fixture(name="bam_train")
+def bam_train_fixture(capsys, request):
+    """Runs `bam-train` here with ``BASE`` of the test's module and more flags; its status, output and error."""
+
+    def run(**flags):
+        flags = {**getattr(request.module, "BASE", {}), **flags}
+        flags |= {name: Path(flags[name]) for name in ("out", "resume") if flags.get(name) is not None}
+        status = guarded(lambda: train(TrainConfig(**flags)), "bam-train")
+        return status, *capsys.readouterr()
+
+    return run
 
 
 class Corridor(gym.Env):
@@ -137,7 +172,7 @@ def corridor_checkpoint(corridor, tmp_path, manifest_fields):
         manifest = manifest_fields(Corridor.observation_space, Corridor.action_space, env=corridor) | fields
         numbers = manifest["observation_space"]["shape"][0]
         golden = {"observation": np.ones((2, numbers), np.float32), "action": np.array([1, 1])}
-        members = {POLICY: always_right(numbers), GOLDEN: safetensors_file.dump(golden)}
+        members = {POLICY: chooser(np.zeros((numbers, 2)), [0, 1]), GOLDEN: safetensors_file.dump(golden)}
         return write_checkpoint(tmp_path / name, manifest, members).path
 
     return make
@@ -160,8 +195,8 @@ def forge(path, members=None, **fields):
     return path
 
 
-def always_right(numbers: int) -> bytes:
-    """ONNX: the larger of two scores that do not depend on the observation."""
+def chooser(weight, bias) -> bytes:
+    """ONNX: the larger of the scores observation @ weight + bias. Shapes: (numbers, choices), (choices,)."""
     from onnx import TensorProto, helper, numpy_helper
 
     nodes = [
@@ -171,11 +206,11 @@ def always_right(numbers: int) -> bytes:
     graph = helper.make_graph(
         nodes,
         "policy",
-        [helper.make_tensor_value_info("observation", TensorProto.FLOAT, ["n", numbers])],
+        [helper.make_tensor_value_info("observation", TensorProto.FLOAT, ["n", len(weight)])],
         [helper.make_tensor_value_info("action", TensorProto.INT64, ["n"])],
         [
-            numpy_helper.from_array(np.zeros((numbers, 2), np.float32), "weight"),
-            numpy_helper.from_array(np.array([0, 1], np.float32), "bias"),
+            numpy_helper.from_array(np.array(weight, np.float32), "weight"),
+            numpy_helper.from_array(np.array(bias, np.float32), "bias"),
         ],
     )
     return helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8).SerializeToString()

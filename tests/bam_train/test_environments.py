@@ -244,14 +244,14 @@ THOSE = "Leave it out; these take one: bam/reach, bam/pick, bam/pick-place, bam/
         (
             "bam/navigation-v0",
             "fr3",
-            "env_kwargs: robot_model: fr3 is an arm, and a wheeled base is needed: husky",
+            "robot_model: fr3 is an arm, and a wheeled base is needed: husky",
         ),
         (
             "bam/mir100-navigation-v0",
             "fr3",
-            "env_kwargs: robot_model: fr3 is an arm, and a wheeled base is needed: husky",
+            "robot_model: fr3 is an arm, and a wheeled base is needed: husky",
         ),
-        ("bam/pick-v0", "husky", "env_kwargs: robot_model: husky is a wheeled base, and an arm is needed: fr3, gen3"),
+        ("bam/pick-v0", "husky", "robot_model: husky is a wheeled base, and an arm is needed: fr3, gen3"),
         ("bam/grid-world-v0", "fr3", f"--robot-model: bam/grid-world-v0 takes none. {THOSE}"),
         (
             "bam/ur-reach-v0",

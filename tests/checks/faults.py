@@ -29,9 +29,9 @@ from zstandard import ZstdError
 
 from bam_envs.core.errors import InvalidValue
 from bam_envs.core.wording import did_you_mean
-from bam_envs.testing.robot_cell import CellLog, Network, RobotCell, StateFault
 from bam_train.checkpoint import Checkpoint
 from tests.benchmarks.harness import CHECKPOINTS, ROOT
+from tests.checks.robot_cell import CellLog, Network, RobotCell, StateFault
 
 CHECKPOINT = CHECKPOINTS / "reach-ppo.zip"
 FAST, AT_REST = 0.1, 0.02

@@ -5,9 +5,9 @@ import sys
 
 import pytest
 
-from bam_envs.testing.robot_cell import RobotCell, StateFault
 from tests.benchmarks import harness
 from tests.checks import faults
+from tests.checks.robot_cell import RobotCell, StateFault
 
 
 @pytest.fixture(scope="module")

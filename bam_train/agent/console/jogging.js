@@ -3,7 +3,7 @@
 
 const PERIOD = 50; // between two twists [ms]
 const FROZEN = 250; // a gap between two looks from which on everything counts as released [ms]
-// The keys, for bam-play too; moves: name: [keys, vx, vy, vz, wz, gripper, whether a base has it]; speeds in m/s, rad/s.
+// The keys, for bam-play too; moves: name: [keys, vx, vy, vz, wz, gripper, whether a base has it, or "sideways"]; m/s, rad/s.
 export const KEYS = await (await fetch("keys.json")).json();
 const { moves: MOVES, turn: TURN } = KEYS;
 const { dead: DEAD, enable: ENABLE, stop: STOP, close: CLOSE, open: OPEN } = KEYS.gamepad;
@@ -15,7 +15,7 @@ export class Jogging {
     Object.assign(this, { send, changed, stop });
     this.held = new Map(); // how it is held (a key, a pointer) -> name of the move
     this.active = false;
-    this.isBase = false;
+    this.isBase = this.sideways = false;
     this.speed = KEYS.speed;
     this.seq = 0;
     this.moved = false;
@@ -46,10 +46,11 @@ export class Jogging {
     return button;
   }
 
-  start(isBase) {
-    this.active = true;
-    this.isBase = isBase;
-    for (const pad of this.pads.children) pad.hidden = isBase && !MOVES[pad.dataset.move][6];
+  // Of a base, and whether it drives sideways; else of an arm.
+  start(isBase, sideways) {
+    Object.assign(this, { active: true, isBase, sideways });
+    const has = sideways ? [true, "sideways"] : [true];
+    for (const pad of this.pads.children) pad.hidden = isBase && !has.includes(MOVES[pad.dataset.move][6]);
   }
 
   end() {
@@ -121,10 +122,10 @@ export class Jogging {
     }
   }
 
-  sendTwist(twist, gripper) {
+  sendTwist([x, y, z, turn], gripper) {
+    const twist = this.isBase ? [x, this.sideways ? y : 0, 0] : [x, y, z];
     const length = Math.sqrt(twist[0] * twist[0] + twist[1] * twist[1] + twist[2] * twist[2]); // as Python's, bit for bit
     const share = length > this.speed ? this.speed / length : 1;
-    const limited = this.isBase ? [twist[0], 0, 0, twist[3]] : [...twist.slice(0, 3).map((v) => v * share), twist[3]];
-    this.send({ op: "jog", seq: this.seq++, sent: performance.now() / 1000, twist: limited, gripper });
+    this.send({ op: "jog", seq: this.seq++, sent: performance.now() / 1000, twist: [...twist.map((v) => v * share), turn], gripper });
   }
 }

@@ -124,7 +124,7 @@ function draw() {
   const now = performance.now();
   try {
     noPicture();
-    picture?.draw(telemetry);
+    picture?.draw({ ...telemetry, goals: status.goals ?? [] });
     if (now - written < WRITE) return;
     written = now;
     plots.draw();
@@ -204,7 +204,7 @@ byId("take").onclick = async () => {
   const result = await order("take", { force });
   if (result === undefined) return;
   owner = result.owner ?? "";
-  jogging.start(Boolean(telemetry?.base));
+  jogging.start(Boolean(telemetry?.base), "lateral_velocity" in (telemetry?.state?.base_velocity ?? {}));
   byId("jog").hidden = false;
   showStatus(status, true);
   enable();

@@ -105,7 +105,7 @@ export function showTelemetry({ tool, base, state }) {
   const at = (values, unit) => values.map((value) => value.toFixed(3)).join(", ") + ` ${unit}`;
   const width = state.gripper_width?.gripper_width, gripper = width == null ? "" : `; gripper open by ${(1000 * width).toFixed(0)} mm`;
   say("tool", tool ? `Tool at x, y, z: ${at(tool, "m")}${gripper}` : base ? `Base at x, y: ${at(base.slice(0, 2), "m")}, yaw ${base[2].toFixed(2)} rad` : "");
-  say("legend", `${base ? "Blue: its front, and what its scanners see" : "Line: the tool's way; dashed: its workspace; red, green, blue: x, y, z"}. Drag to turn, scroll or pinch to zoom.`);
+  say("legend", `${base ? "Blue: its front, and what its scanners see; green: where it goes" : "Line: the tool's way; dashed: its workspace; red, green, blue: x, y, z"}. Drag to turn, scroll or pinch to zoom.`);
 }
 
 export function showVersions(versions, status) {

@@ -3,7 +3,7 @@
 
 import * as three from "./three.module.min.js";
 
-const LINKS = [0xe3e6ea, 0x4b7fb8], GRIPPER = 0x2b2f36, PAD = 0x5a606a, OBJECT = 0xd9532f;
+const LINKS = [0xe3e6ea, 0x4b7fb8], GRIPPER = 0x2b2f36, PAD = 0x5a606a, OBJECT = 0xd9532f, GOAL = 0x1ab34d;
 const FIELD = 30; // height of the view [degrees]
 const Y = new three.Vector3(0, 1, 0); // axis of a capsule of three.js
 
@@ -30,7 +30,7 @@ export class Scene {
   // Draw another robot, from what the agent told of it, in the colours of the page.
   show(told, colours) {
     this.scene?.traverse((one) => { one.geometry?.dispose(); one.material?.dispose?.(); });
-    Object.assign(this, { colours, robot: told, joints: [], fingers: [], size: 0, body: null, scene: new three.Scene() });
+    Object.assign(this, { colours, robot: told, joints: [], fingers: [], goals: [], size: 0, body: null, scene: new three.Scene() });
     this.sun = new three.DirectionalLight(0xffffff, 2);
     this.scene.add(new three.HemisphereLight(0xffffff, 0x9a948c, 1.6), this.sun, this.sun.target);
     this.sun.castShadow = true;
@@ -137,12 +137,14 @@ export class Scene {
     for (const [part, side, x] of this.fingers) part.position.x = side * (x + width / 2);
   }
 
-  base({ base: [x, y, yaw], outline: [front, back, side], scan }) {
+  base({ base: [x, y, yaw], outline, scan }) {
     if (!this.body) {
       this.body = new three.Group();
       this.body.name = "base";
-      this.box(this.body, [(front + back) / 2, side, 0.16], LINKS[0], [(front - back) / 2, 0, 0.19]);
-      this.box(this.body, [0.06, 0.7 * side, 0.01], LINKS[1], [front - 0.1, 0, 0.35]); // where its front is
+      const front = Math.max(...outline.map(([u]) => u)), shape = new three.Shape(outline.map(([u, v]) => new three.Vector2(u, v)));
+      const side = Math.max(0.02, ...outline.map(([u, v]) => (u > 0.6 * front ? Math.abs(v) : 0)));
+      this.solid(this.body, new three.ExtrudeGeometry(shape, { depth: 0.32, bevelEnabled: false }), LINKS[0], [0, 0, 0.03]);
+      this.box(this.body, [0.12 * front, 0.5 * side, 0.01], LINKS[1], [0.7 * front, 0, 0.35]); // where its front is
       this.scan = this.line("act", three.Points);
       this.scene.add(this.body);
       this.ground([Math.round(x), Math.round(y), 0], 5, 1);
@@ -161,8 +163,13 @@ export class Scene {
   }
 
   // Draw a message of telemetry, and the way that the tool has gone.
-  draw({ state, object, ...more }, way) {
+  draw({ state, object, goals = [], ...more }, way) {
     if (more.base) this.base(more);
+    while (this.goals.length < goals.length) {
+      this.goals.push(this.solid(this.scene, new three.SphereGeometry(more.base ? 0.1 : 0.015), GOAL));
+      this.goals.at(-1).name = `goal ${this.goals.length}`;
+    }
+    this.goals.forEach((one, at) => { one.visible = known(goals[at]); if (one.visible) one.position.set(...goals[at]); });
     const turns = (this.robot.joints ?? []).map(([signal, label]) => state[signal]?.[label] ?? null);
     if (this.joints.length && known(turns)) {
       this.joints.forEach(([link, axis], at) => link.quaternion.setFromAxisAngle(axis, turns[at]));

@@ -30,7 +30,7 @@ from bam_envs.rosbridge.server.server_connection import BridgeConnection
 from bam_envs.rosbridge.threads import Workers
 from bam_train.agent.front.hub import AgentHub, Person
 from bam_train.agent.remote import agent_protocol as protocol
-from bam_train.errors import BamTrainError, OutputError, RequestRefused, RoleTooLow
+from bam_train.errors import BamTrainError, OutputError, RequestRefused, kind_of
 
 _log = logging.getLogger(__name__)
 _THREADS = 64
@@ -146,17 +146,21 @@ class _Client:
             self._refuse(error.number, error)
         except (BamTrainError, BamEnvsError) as error:
             # A lease says how long it lasts: of twists, many a second, the log gets equal lines.
-            self._note(f"{op}: {type(error).__name__ if op == 'jog' else error}")
+            self._note(f"{op}: {kind_of(error) if op == 'jog' else error}")
             self._refuse(number, error)
 
     def _require_role(self, request: protocol.Request) -> None:
         op, role = request.__struct_config__.tag, self._person.role
         if not protocol.may(role, type(request)):
-            raise RoleTooLow(f"{op} needs a token of the role {request.role}; the token shown has the role {role}.")
+            raise RequestRefused(
+                f"{op} needs a token of the role {request.role}; the token shown has the role {role}.", "RoleTooLow"
+            )
         if self._person.full and not isinstance(request, (protocol.Stop, protocol.Status)):
             raise RequestRefused(f"{self._person.full} This connection can stop the robot, and look at its status.")
         if isinstance(request, protocol.Take) and request.force and not self._person.operator:
-            raise RoleTooLow("Taking command by force needs a token of the role administer (bam-agent --token-file).")
+            raise RequestRefused(
+                "Taking command by force needs a token of the role administer (bam-agent --token-file).", "RoleTooLow"
+            )
 
     async def _do(self, request: protocol.Request) -> None:
         match request:
@@ -279,7 +283,7 @@ class _Client:
         if not isinstance(error, (BamTrainError, BamEnvsError)):
             _log.error("the agent failed", exc_info=error)
         text = " ".join((str(error) or type(error).__name__).split())
-        self._send({"id": number, "ok": False, "error": text, "kind": type(error).__name__})
+        self._send({"id": number, "ok": False, "error": text, "kind": kind_of(error)})
 
     def _send(self, message: Mapping[str, Any]) -> None:
         self._send_packet(Packet((protocol.encode_message(message),), text=True), 0)

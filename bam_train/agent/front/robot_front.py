@@ -41,13 +41,13 @@ from bam_train.agent.front.remote_robot import RemoteRobot
 from bam_train.agent.remote.agent_protocol import encode_message, printable
 from bam_train.agent.transitions import EVENT, TransitionLog, encode
 from bam_train.environments import make_env
-from bam_train.errors import BamTrainError, CandidateRefused, RequestRefused, TrialsNeeded, UnknownVersion
+from bam_train.errors import BamTrainError, RequestRefused
 
 _log = logging.getLogger(__name__)
 Listener = Callable[[bytes], None]
 _LEASE_POLL_PERIOD = 0.1  # time between two looks at the lease [s]
 _HALT_LATE = 1.0  # longest time for which a halt comes after the end of its sender's lease [s]
-_REFUSALS = {one.__name__: one for one in (NotInCommand, CandidateRefused, TrialsNeeded, UnknownVersion)}
+_KINDS = ("CandidateRefused", "TrialsNeeded", "UnknownVersion")  # of refusals that a client is told
 _ANSWER_TIMEOUT = 10.0  # longest wait for an answer of the resident, unless it needs longer [s]
 
 
@@ -175,7 +175,9 @@ class FrontProcess:
         if answer.result is None:
             if answer.kind == SafetyStop.__name__ and (stop := SafetyStop.told(answer.error)) is not None:
                 raise stop
-            raise _REFUSALS.get(answer.kind, RequestRefused)(answer.error)
+            if answer.kind == NotInCommand.__name__:
+                raise NotInCommand(answer.error)
+            raise RequestRefused(answer.error, answer.kind if answer.kind in _KINDS else "RequestRefused")
         return answer.result
 
     def _ask_now(self, op: str, arguments: dict[str, Any]) -> dict[str, Any]:

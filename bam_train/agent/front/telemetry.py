@@ -36,12 +36,7 @@ class Telemetry:
     """
 
     def __init__(
-        self,
-        spec: RobotSpec,
-        limits: Limits,
-        *,
-        geometry: Arm | None = None,
-        workspace: Array | None = None,
+        self, spec: RobotSpec, limits: Limits, *, geometry: Arm | None = None, workspace: Array | None = None
     ) -> None:
         self._spec, self._signals = spec, [one for one in spec.signals if len(one.labels) <= _MOST]
         self._units = {one.name: dict(zip(one.labels, one.units, strict=True)) for one in self._signals}
@@ -70,8 +65,8 @@ class Telemetry:
             ``event``; ``t``; ``state`` and ``units``: a mapping by label for each signal; ``command``: number by label;
             ``tool``: x, y, z [m], of an arm; ``near``: by the name of a guard, ``value``, ``limit``, ``unit`` and
             ``share`` (0: far from it, 1: it acts); and to draw, ``object`` (pose of the tracked object: x, y, z [m] and
-            a quaternion x, y, z, w); or ``base`` (x, y [m], yaw [rad]), ``outline`` (front, back, side [m]) and
-            ``scan`` (points x, y in the base's frame [m]). What is not known, or not finite, is None or left out.
+            a quaternion x, y, z, w); or ``base`` (x, y [m], yaw [rad]), ``outline`` (corners x, y) and ``scan`` (points
+            x, y in the base's frame [m]). What is not known, or not finite, is None or left out.
         """
         near = {"state age": _below(age, self._most_age, "s")} | self._body.near(state)
         return {
@@ -180,8 +175,8 @@ class _Base:
             return {}
         points = self._points(state)
         few = points[:, :: max(1, -(-points.shape[1] // _POINTS))].T
-        outline = [self._body.front, self._body.back, self._body.side]
-        return {"base": _plain(state.signals["base_pose"][0]), "outline": outline, "scan": [_plain(one) for one in few]}
+        pose, outline = _plain(state.signals["base_pose"][0]), [_plain(one) for one in self._body.edge]
+        return {"base": pose, "outline": outline, "scan": [_plain(one) for one in few]}
 
     def near(self, state: RobotState) -> dict[str, Row | None]:
         limits = {"m/s": ("base speed", self._limits.base_speed), "rad/s": ("turn speed", self._limits.turn_speed)}

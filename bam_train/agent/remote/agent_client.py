@@ -34,7 +34,7 @@ from bam_envs.rosbridge.dialing import AGENT_PORT, http_refusal, no_connection, 
 from bam_envs.rosbridge.endpoint import Endpoint
 from bam_envs.rosbridge.threads import LoopThread
 from bam_train.agent.remote.agent_protocol import CHUNK, PATH, PROTOCOL, Stage, When
-from bam_train.errors import AgentRefused, NotACheckpoint
+from bam_train.errors import NotACheckpoint, RequestRefused
 
 PORT = AGENT_PORT
 """Default port of an agent."""
@@ -132,7 +132,7 @@ class AgentClient:
             arguments: Those of the op.
 
         Raises:
-            AgentRefused: The agent refuses, or failed.
+            RequestRefused: The agent refuses, or failed.
             LinkLost: The connection ended, or no answer came in time.
         """
         return self._run(self._ask(op, arguments, progress or (lambda text: None), within or self.timeout))
@@ -155,7 +155,7 @@ class AgentClient:
 
         Raises:
             NotACheckpoint: The file cannot be read.
-            AgentRefused: The agent refuses the candidate, or the trial failed.
+            RequestRefused: The agent refuses the candidate, or the trial failed.
             LinkLost: The connection ended.
         """
         try:
@@ -339,7 +339,7 @@ class AgentClient:
             answer.set_result(message["result"])
         else:
             kind = str(message["kind"])
-            answer.set_exception(AgentRefused(kind, str(message["error"]), REFUSED if kind in _REFUSALS else 1))
+            answer.set_exception(RequestRefused(str(message["error"]), kind, REFUSED if kind in _REFUSALS else 1))
 
 
 _NO_AGENT = (

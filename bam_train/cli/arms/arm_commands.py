@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import re
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from bam_envs.core.errors import InvalidValue, UnknownName
+from bam_envs.core.errors import InvalidValue
 from bam_train.cli.console import tell
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
-    from pathlib import Path
 
     from bam_envs.arms.capsules import Outline
     from bam_envs.arms.description import ArmDescription
@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from bam_envs.robots.base_description import BaseDescription
     from bam_envs.ros.profile_tables import RobotProfile
     from bam_train.cli.arms.bam_robots import AddArmConfig, CheckArmConfig, ListArmsConfig, ProfileConfig
+    from bam_train.cli.arms.live_graph import LiveGraph
 
 _PICTURES = (".png", ".jpg")
 _STRAY = 0.05
@@ -32,6 +33,7 @@ def add(config: AddArmConfig) -> int | None:
     from bam_envs.core.robot_models import ModelName, known_models
     from bam_envs.core.validation import check as check_value
     from bam_envs.robots.modelling.describe import describe, write_description
+    from bam_envs.robots.modelling.model_files import is_urdf
 
     if (config.mjcf is None) == (config.urdf is None):
         raise InvalidValue("Give one model of the arm: --mjcf FILE or --urdf FILE.")
@@ -46,6 +48,8 @@ def add(config: AddArmConfig) -> int | None:
             f"{config.name} is a robot already, which this one would hide; give another name, or --force."
         )
     model = config.mjcf or config.urdf or ""
+    if is_urdf(Path(model)) != (config.mjcf is None) and Path(model).is_file():
+        tell(f"{model} is {'MJCF' if config.mjcf is None else 'a URDF'}, and is read as such")
     arm, notes = describe(config.name, model, config.gripper, config.site or config.tip, tell=tell)
     write_description(arm, notes, path)
     tell(f"wrote {path}: {arm.num_joints} joints, gripper {1000 * arm.gripper.open:.0f} mm, {_area(arm)}")
@@ -66,10 +70,7 @@ def check(config: CheckArmConfig) -> int | None:
     from bam_envs.robots.base_description import base_model
     from bam_train.cli.envs import aligned
 
-    try:
-        robot = find_model(config.name, Description)
-    except UnknownName as error:
-        raise InvalidValue(f"{error} Another arm is described first: bam-robots add {config.name} ...") from error
+    robot = find_model(config.name, Description)
     tell(f"{robot.name}: {robot.title}", "")
     if isinstance(robot, ArmDescription):
         table, facts = _joints(robot), _facts(robot)
@@ -214,34 +215,75 @@ def _draw(description: Description, path: Path) -> None:
 
 
 def write_profile(config: ProfileConfig) -> int | None:
-    """Write the profile of an arm from its live graph."""
-    from pathlib import Path
-
-    from bam_envs.arms.description import robot_model
+    """Write the profile of a robot from its live graph."""
+    from bam_envs.arms.description import ArmDescription
     from bam_envs.core.location import LiveRobot
+    from bam_envs.core.robot_models import Description, find_model
+    from bam_envs.robots.base_description import base_model
     from bam_envs.robots.profile import read_profile
     from bam_envs.rosbridge.client import RosbridgeLink
     from bam_envs.rosbridge.endpoint import Endpoint
+    from bam_train.cli.arms.base_graph import BaseGraphProfile
     from bam_train.cli.arms.live_graph import GraphProfile, profile_toml, read_graph
 
-    arm = robot_model(config.name)
-    path = config.out or Path("robots") / "profiles" / f"{arm.name}.toml"
+    robot = find_model(config.name, Description)
+    path = config.out or Path("robots") / "profiles" / f"{robot.name}.toml"
     if path.exists() and not config.force:
         raise InvalidValue(f"{path} exists; give another name with --out, or --force to replace it.")
     link = RosbridgeLink(Endpoint.of(LiveRobot(config.url, config.credentials)), name="profile")
     try:
         link.connect()
-        found = GraphProfile(arm, read_graph(link))
+        graph = read_graph(link)
     finally:
         link.close()
-    text = profile_toml(found)
-    profile = read_profile(text, str(path))
+    if not config.force:
+        _require_named(robot, graph)
+    found: GraphProfile | BaseGraphProfile
+    if isinstance(robot, ArmDescription):
+        found = GraphProfile(robot, graph)
+    else:
+        found = BaseGraphProfile(base_model(robot), graph)
+    profile = read_profile(profile_toml(found), str(path))
+    if isinstance(robot, ArmDescription):
+        found.notes += _against_urdf(robot, graph, profile, forced=config.force)
     path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(text, encoding="utf-8")
+    path.write_text(profile_toml(found), encoding="utf-8")
     tell(f"wrote {path}:", *(f"  {line}" for line in _profile_lines(profile)))
     if found.notes:
         tell("notes, written at its head:", *(f"  {note}" for note in found.notes))
     return None
+
+
+def _require_named(robot: Description, graph: LiveGraph) -> None:
+    """`InvalidValue` if the robot of `graph` calls itself by the name of another one than `robot`."""
+    from bam_envs.arms.description import ArmDescription
+    from bam_envs.core.robot_models import DEFAULT_ARM
+    from bam_envs.robots.profile import load_profile, shipped_profiles
+
+    told = load_profile(graph.name).robot if graph.name in shipped_profiles() else graph.name
+    same = told == DEFAULT_ARM and isinstance(robot, ArmDescription) and robot.geometry  # UR arms share a profile
+    if told and told != robot.name and not same:
+        raise InvalidValue(
+            f"{graph.url}: the robot there calls itself {told}, and {robot.name} was named. Give bam-robots profile "
+            f"{told} --from {graph.url}, or --force if it is {robot.name}."
+        )
+
+
+def _against_urdf(arm: ArmDescription, graph: LiveGraph, profile: RobotProfile, *, forced: bool) -> Iterator[str]:
+    """What differs between an arm and the URDF of `graph`; `InvalidValue` if that is another arm, unless `forced`."""
+    from bam_envs.live.arm_checks import described_checks
+    from bam_envs.live.building import profile_limits
+    from bam_envs.live.examination import DESCRIPTION, Inspection
+
+    seen = Inspection(profile, None, (), (), None, {DESCRIPTION: graph.urdf}, 0.0)
+    margin = profile_limits(profile).position_margin
+    for line in described_checks(arm.spec(with_object=False), arm.chain, margin, seen):
+        if line.fits is False and line.what.startswith("kinematics") and not forced:
+            raise InvalidValue(
+                f"{graph.url}: {line.what}: {line.found}, {arm.name}. Name the arm that is there, or give --force."
+            )
+        if line.fits is False:
+            yield f"{line.what}: expected {line.expected}, found {line.found}"
 
 
 def _profile_lines(profile: RobotProfile) -> Iterator[str]:

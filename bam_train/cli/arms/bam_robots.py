@@ -72,30 +72,30 @@ class ListArmsConfig:
 
 @dataclass(frozen=True)
 class ProfileConfig(CredentialFlags):
-    """Write the live profile of an arm from its robot's graph: topics, joints, controllers, gripper and services.
+    """Write the live profile of a robot from its graph: topics, joints, controllers, gripper and services.
 
     It asks rosapi and the controller manager behind rosbridge, and moves nothing. The file is found by the name of the
-    arm; comments at its head say what was assumed.
+    robot; comments at its head say what was assumed.
 
     Examples:
       bam-robots profile lab --from ws://10.0.0.5:9090
     """
 
     name: ModelName
-    """Name of the arm, or the file of its description."""
+    """Name of the robot, or the file of its description."""
     url: Annotated[str, tyro.conf.arg(name="from", metavar="URL")]
     """Address of the robot behind rosbridge."""
     out: File = None
     """The file (default robots/profiles/NAME.toml)."""
     force: bool = False
-    """Replace a file of that name."""
+    """Replace a file of that name, and take a robot that calls itself otherwise."""
 
 
 _FLAGS, _HERE = "bam_train.cli.arms.bam_robots", "bam_train.cli.arms.arm_commands"
 COMMANDS = {
     "add": Command("describe an arm and its gripper from model files", f"{_FLAGS}:AddArmConfig", f"{_HERE}:add"),
     "check": Command("limits, shape, reach and sensors of a robot", f"{_FLAGS}:CheckArmConfig", f"{_HERE}:check"),
-    "profile": Command("topics of an arm, from its live robot", f"{_FLAGS}:ProfileConfig", f"{_HERE}:write_profile"),
+    "profile": Command("topics of a robot, from its live graph", f"{_FLAGS}:ProfileConfig", f"{_HERE}:write_profile"),
     "list": Command("the robots that are known here", f"{_FLAGS}:ListArmsConfig", f"{_HERE}:list_models"),
 }
 main = partial(run_commands, "bam-robots", "Describe robots once, for simulation, guards and live robots.", COMMANDS)

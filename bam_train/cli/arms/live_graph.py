@@ -1,11 +1,10 @@
-"""The profile of a described arm as its live graph has it: topics, joints, controllers, gripper, services.
+"""A live graph, and the profile of a described arm as it has it: topics, joints, controllers, gripper, services.
 
 rosapi tells what there is, and the controller manager which controllers take which joints. What neither tells, such as
 the unit of a gripper's joint or the request of a service, is that of a shipped profile with the same names; else it is
 assumed, and a note says so.
 """
 
-import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import MISSING, asdict, dataclass, fields, is_dataclass
 from typing import Any
@@ -13,22 +12,30 @@ from typing import Any
 from bam_envs.arms.description import ArmDescription
 from bam_envs.core.errors import InvalidValue, LinkLost, RemoteError
 from bam_envs.core.wording import listed
-from bam_envs.live.bringup import TIMEOUT
-from bam_envs.live.state import Mailbox
+from bam_envs.live.bringup import TIMEOUT, ask
+from bam_envs.live.examination import DESCRIPTION
+from bam_envs.live.state import Letter, Mailbox
 from bam_envs.robots.profile import load_profile, shipped_profiles
+from bam_envs.ros.codec import INFO_SERVICE, read_info
 from bam_envs.ros.messages import bare_type
 from bam_envs.ros.profile_tables import RobotProfile, Sink, Source
 from bam_envs.rosbridge.client import RosbridgeLink
+from bam_train.settings import toml_text
 
 _STATES, _TRAJECTORY, _ARRAY = "sensor_msgs/JointState", "trajectory_msgs/JointTrajectory", "std_msgs/Float64MultiArray"
 _LISTEN = 1.0
 """Time for which joint states are collected after the first [s]: several publishers may share a topic."""
 _WIDTH = "gripper_width"
-_GOALS = {"control_msgs/GripperCommand": "command.position", "franka_msgs/Move": "width"}
+_GOALS = {
+    "control_msgs/GripperCommand": "command.position",
+    "control_msgs/ParallelGripperCommand": "command.position[0]",  # since ROS 2 Jazzy
+    "franka_msgs/Move": "width",
+}
 """Actions that move a gripper, and where the number is in their goals; the first that is offered is used."""
 _TOPICS = {_TRAJECTORY: ("{}/joint_trajectory", "trajectory"), _ARRAY: ("{}/commands", "position")}
 """Types of the commands of controllers: the topic of a controller, and the name of the command mode."""
 _ACTIVE = ("active", "running")
+_ROS1_GOAL = "ActionGoal"
 _FASTEST = 100
 """Greatest rate at which a controller that holds its set points gets some [Hz]: more is a burden for a bridge."""
 Row = dict[str, Any]
@@ -50,6 +57,10 @@ class LiveGraph:
     """Its answer."""
     joints: Mapping[str, tuple[tuple[str, ...], ...]]
     """Names in the joint states of each topic, once for each publisher."""
+    name: str = ""
+    """What the robot calls itself, or its profile; empty: it does not tell."""
+    urdf: tuple[Letter, ...] = ()
+    """Its URDF, as it came."""
 
 
 def read_graph(link: RosbridgeLink) -> LiveGraph:
@@ -78,11 +89,15 @@ def read_graph(link: RosbridgeLink) -> LiveGraph:
         name: bare_type(str(_ask(link, "action_type", action=link.namespace + name).get("type") or ""))
         for name in ours(_ask(link, "action_servers").get("action_servers") or ())
     }
+    goals = {name: kind for name, kind in topics.items() if kind.endswith(_ROS1_GOAL)}  # of actionlib, in ROS 1
+    actions |= {name.removesuffix("/goal"): kind.removesuffix(_ROS1_GOAL) for name, kind in goals.items()}
     manager = next((name for name in sorted(services) if name.endswith("/list_controllers")), "")
     rows: Any = link.call(link.namespace + manager, "", {}, TIMEOUT).get("controller") if manager else ()
     controllers = tuple(row for row in rows or () if isinstance(row, Mapping))
-    names = [name for name, kind in topics.items() if kind == _STATES]
-    return LiveGraph(link.url, topics, services, actions, manager, controllers, _joints(link, names))
+    info = ask(link, link.namespace + INFO_SERVICE)
+    name = "" if info is None else read_info(info.get("message"), INFO_SERVICE).name
+    joints, urdf = _heard(link, topics)
+    return LiveGraph(link.url, topics, services, actions, manager, controllers, joints, name, urdf)
 
 
 def _ask(link: RosbridgeLink, service: str, **request: str) -> Mapping[str, Any]:
@@ -93,17 +108,23 @@ def _ask(link: RosbridgeLink, service: str, **request: str) -> Mapping[str, Any]
         return {}
 
 
-def _joints(link: RosbridgeLink, topics: Sequence[str]) -> dict[str, tuple[tuple[str, ...], ...]]:
+def _heard(
+    link: RosbridgeLink, topics: Mapping[str, str]
+) -> tuple[dict[str, tuple[tuple[str, ...], ...]], tuple[Letter, ...]]:
+    """The names in the joint states of each topic, and the URDF."""
     inbox = Mailbox(keeps_all=True)
-    ends = [link.subscribe(link.namespace + name, _STATES, inbox.listener(name)) for name in topics]
-    inbox.wait_for(lambda slots: bool(slots) or not link.is_up, TIMEOUT)
+    read = {name: kind for name, kind in topics.items() if kind == _STATES or name == DESCRIPTION}
+    ends = [link.subscribe(link.namespace + name, kind, inbox.listener(name)) for name, kind in read.items()]
+    inbox.wait_for(lambda slots: bool(slots.keys() - {DESCRIPTION}) or not link.is_up, TIMEOUT if read else 0.0)
     inbox.wait_for(lambda slots: not link.is_up, _LISTEN)
     for end in ends:
         end()
     if not link.is_up:
         raise LinkLost(f"{link.url}: the link dropped while its joint states were read.")
-    heard = {name: [letter.message.get("name") or () for letter in inbox.letters[name]] for name in inbox.newest()}
-    return {name: tuple(dict.fromkeys(tuple(map(str, one)) for one in names)) for name, names in heard.items()}
+    states = [name for name in inbox.newest() if name != DESCRIPTION]
+    heard = {name: [letter.message.get("name") or () for letter in inbox.letters[name]] for name in states}
+    joints = {name: tuple(dict.fromkeys(tuple(map(str, one)) for one in names)) for name, names in heard.items()}
+    return joints, tuple(inbox.letters[DESCRIPTION])
 
 
 class GraphProfile:
@@ -114,7 +135,7 @@ class GraphProfile:
     """
 
     def __init__(self, arm: ArmDescription, graph: LiveGraph) -> None:
-        self.arm, self.graph = arm, graph
+        self.robot, self.arm, self.graph = arm, arm, graph
         self.notes: list[str] = []
         """What was assumed, or left out."""
         shipped = [load_profile(name) for name in shipped_profiles()]
@@ -142,7 +163,7 @@ class GraphProfile:
         if self._base is not None:  # what a graph need not show: whether the robot is ready, and which one it is
             self.table = {"extends": self._base.name, **self.table}
             optional = [source for source in self._base.state if source.optional]
-            self.table["state"] += [_row(source) for source in optional]
+            self.table["state"] += [entry_row(source) for source in optional]
 
     # ---- states
 
@@ -257,9 +278,9 @@ class GraphProfile:
                 self.notes.append(f"{other} takes the same joints, and is not active: {controller} is used")
             if not is_active:
                 self.notes.append(f"{controller} is not active now")
-            yield self._arm_row(controller, kind, topic, joints, template)
+            yield self._armentry_row(controller, kind, topic, joints, template)
 
-    def _arm_row(
+    def _armentry_row(
         self, controller: str, kind: str, topic: str, joints: list[str], template: RobotProfile | None
     ) -> tuple[str, Row]:
         """Mode and row of one controller."""
@@ -309,11 +330,13 @@ class GraphProfile:
         known = [] if template is None else [one for one in template.sinks() if one.labels == (_WIDTH,)]
         for sink in known:
             if all(map(self._offers, sink.forms)):
-                return _row(sink) | self._joint_unit(sink.type)
+                return entry_row(sink) | self._joint_unit(sink.type)
         for kind, field in _GOALS.items():
             actions = sorted(name for name, one in self.graph.actions.items() if one == kind)
             if actions:
-                row = {"action": actions[0], "type": kind, "labels": [_WIDTH], "fields": [field]}
+                row: Row = {"action": actions[0], "type": kind, "labels": [_WIDTH], "fields": [field]}
+                if kind == "control_msgs/ParallelGripperCommand":
+                    row["constants"] = {"command.name[0]": self._gripper["names"][0]}
                 row |= self._joint_unit(kind)
                 self.notes += [f"{other} is offered too, and not used" for other in actions[1:]]
                 return row
@@ -322,13 +345,13 @@ class GraphProfile:
             offered = ", ".join([*self.graph.actions]) or "no action at all"
             raise InvalidValue(
                 f"{self.graph.url}: nobody offers the gripper of {self.arm.name}: no action of "
-                f"{' or '.join(_GOALS)}, and no topic of a gripper; there is {offered}. Start the gripper's driver."
+                f"{', '.join(_GOALS)}, and no topic of a gripper; there is {offered}. Start the gripper's driver."
             )
         return {"topic": topics[0], "type": _ARRAY, "labels": [_WIDTH], "hold": "last"}
 
     def _joint_unit(self, kind: str) -> Row:
         """Scale and offset of a goal of type `kind`, if its number is the position of the gripper's joint."""
-        keys = ("scale", "offset") if kind == "control_msgs/GripperCommand" else ()
+        keys = ("scale", "offset") if kind.startswith("control_msgs/") else ()
         return {key: self._gripper[key] for key in keys if key in self._gripper}
 
     def _offers(self, sink: Sink) -> bool:
@@ -367,7 +390,7 @@ def _affixed(joint: str, names: Mapping[str, str], sets: Iterable[Sequence[str]]
     return next((one for one in (joint, f"{before}{joint}{behind}") if one in heard), "")
 
 
-def _row(entry: Source | Sink) -> Row:
+def entry_row(entry: Source | Sink) -> Row:
     """A table of a profile that gives `entry`."""
     usual: Row = {one.name: one.default if one.default is not MISSING else None for one in fields(entry)}
     row: Row = {}
@@ -382,26 +405,18 @@ def _row(entry: Source | Sink) -> Row:
     return {key: value for key, value in row.items() if key not in ("tag", "ignore")}
 
 
-def profile_toml(profile: GraphProfile) -> str:
+def profile_toml(profile: Any) -> str:
     """The text of the profile's file, its notes as comments at the head."""
-    table, lines = profile.table, [f"# {profile.arm.title}, as {profile.graph.url} offers it."]
+    table, lines = profile.table, [f"# {profile.robot.title}, as {profile.graph.url} offers it."]
     lines += [f"# {note}." for note in profile.notes]
-    lines += ["", *(f"{key} = {_toml(value)}" for key, value in table.items() if isinstance(value, (str, float)))]
-    if not profile.graph.manager:
+    lines += ["", *(f"{key} = {toml_text(value)}" for key, value in table.items() if isinstance(value, (str, float)))]
+    if table["kind"] == "arm" and not profile.graph.manager:
         lines.append('# controllers = "/controller_manager/list_controllers"   # nothing there lists them')
     tables = [("state", row) for row in table["state"]]
     tables += [(f"commands.{mode}", row) for mode, rows in table["commands"].items() for row in rows]
-    tables += [("enable", row) for row in table["enable"]]
+    tables += [("enable", row) for row in table.get("enable", ())]
     for name, row in tables:
-        lines += ["", f"[[{name}]]", *(f"{key} = {_toml(value)}" for key, value in row.items())]
+        lines += ["", f"[[{name}]]", *(f"{key} = {toml_text(value)}" for key, value in row.items())]
         if row.get("signal") == _WIDTH and not profile.is_known:
             lines += ["# scale = 1.0   # width in m = position of the joint x scale + offset", "# offset = 0.0"]
     return "\n".join(lines) + "\n"
-
-
-def _toml(value: Any) -> str:
-    if isinstance(value, Mapping):
-        return "{ " + ", ".join(f"{json.dumps(key)} = {_toml(one)}" for key, one in value.items()) + " }"
-    if isinstance(value, (list, tuple)):
-        return "[" + ", ".join(map(_toml, value)) + "]"
-    return json.dumps(value)

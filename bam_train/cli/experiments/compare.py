@@ -36,8 +36,11 @@ class CompareConfig:
 
     folders: Annotated[tyro.conf.Positional[tuple[Path, ...]], tyro.conf.arg(metavar="FOLDER...")] = ()
     """A folder for each row, such as runs/pick-ppo of bam-train --seeds."""
-    metric: Annotated[Literal["success", "return"] | None, tyro.conf.arg(metavar="success|return")] = None
-    """What is compared (default: success, if all runs know it, else return)."""
+    metric: Annotated[Literal["success", "return", "score"] | None, tyro.conf.arg(metavar="success|return|score")] = (
+        None
+    )
+    """What is compared (default: success, if all runs know it, else return). The score, of runs of bam-train that are
+    done, is higher the earlier a run has ended at its goal."""
     level: Annotated[float | None, tyro.conf.arg(metavar="X")] = None
     """Value of the metric to which steps and time are counted, such as 0.95 (default: the goal of the runs)."""
     format: Annotated[Literal["text", "md", "csv", "json"], tyro.conf.arg(metavar="text|md|csv|json")] = "text"

@@ -31,15 +31,16 @@ from bam_train.files.log_lines import aligned
 from bam_train.settings import differences
 
 Array = NDArray[Any]
-Metric = Literal["success", "return"]
+Metric = Literal["success", "return", "score"]
 GOALS = {"success": "until_success", "return": "stop_reward"}
 """Metric to the setting that is its level, unless another one is given."""
 ALIKE = ("seed", "threads", "address", "device")
 """Settings in which runs of one row may differ."""
 INTERVALS = ("score", "difference", "better", "steps", "seconds")
 """Fields of `RowResult` that are intervals."""
-_FORMS: dict[str, Callable[[float | None], str]] = {"success": percent, "return": number}
-_WITHIN = {"success": (0.0, 1.0), "return": (-math.inf, math.inf)}
+_FORMS: dict[str, Callable[[float | None], str]] = {"success": percent, "return": number, "score": number}
+_WITHIN = {"success": (0.0, 1.0)}
+_ANY = (-math.inf, math.inf)
 _POSITIVE = (0.0, math.inf)
 POINTS = 100
 """Points of a drawn curve."""
@@ -104,7 +105,7 @@ class RunComparison:
         if lacking := next((run for run in runs if self.metric not in run.curves), None):
             has = " and ".join(lacking.curves) or "no evaluation"
             raise SettingsError(f"{lacking.place}: {self.metric} is not in its log; there is {has}")
-        goals = {run.settings.get(GOALS[self.metric]) for run in runs}
+        goals = {run.settings.get(GOALS.get(self.metric, "")) for run in runs}
         self.level: float | None = level if level is not None else goals.pop() if len(goals) == 1 else None
         self.found = [self._compare(row) for row in self.rows]
 
@@ -119,7 +120,7 @@ class RunComparison:
         if row is not first:
             ours, theirs, matched = _matched(row, first, self.metric)
             less, better = statistics.difference(ours, theirs, matched), statistics.improvement(ours, theirs, matched)
-        score = estimate(values, _WITHIN[self.metric])
+        score = estimate(values, _WITHIN.get(self.metric, _ANY))
         return RowResult(row.name, len(values), score, less, better, matched, reached, steps, seconds)
 
     @property
@@ -238,7 +239,7 @@ class RunComparison:
             grid = np.linspace(min(end, max(float(one[0]) for one in each)), end, POINTS)
             values = [run.curves[self.metric].values for run in row.runs]
             curves = np.array([np.interp(grid, *pair) for pair in zip(each, values, strict=True)])
-            lines.append((grid, *statistics.bands(curves, _WITHIN[self.metric])))
+            lines.append((grid, *statistics.bands(curves, _WITHIN.get(self.metric, _ANY))))
         return self._plot(lines, axis, f"{self.metric} (interquartile mean, 95 % interval)")
 
     def _plot(self, lines: Iterable[tuple[Any, ...]], across: str, up: str) -> bytes:
@@ -296,14 +297,14 @@ def summary_lines(group: Path) -> list[str]:
     row = Row(group.name, read_runs(group))
     table = [["seed", "steps", "time", "success", "return"]]
     for run in row.runs:
-        shown = [_FORMS[metric](_last(run, metric)) for metric in _FORMS]
+        shown = [_FORMS[metric](_last(run, metric)) for metric in GOALS]
         steps, seconds = (run.outcome.get(name) for name in ("steps", "seconds"))
         table.append([str(run.seed), "-" if steps is None else count(steps), duration(seconds), *shown])
     lines = aligned(table)
-    for metric, form in _FORMS.items():
+    for metric in GOALS:
         known = [value for run in row.runs if (value := _last(run, metric)) is not None]
         if known:
-            score = _shown(estimate(known, _WITHIN[metric]), form)
+            score = _shown(estimate(known, _WITHIN.get(metric, _ANY)), _FORMS[metric])
             lines.append(f"{metric} of {len(known)} seeds: interquartile mean {score}")
     few = f"warning: fewer than {FEWEST} seeds: no interval, and no conclusion"
     return [*lines, few if len(row.runs) < FEWEST else f"interval: {METHOD}", *_origins([row])]

@@ -7,8 +7,6 @@ import filecmp
 import shutil
 import sys
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +22,7 @@ from bam_train.experiments.seed_runs import (
     SeedRun,
     at_once,
     group_folder,
+    needs,
     read_seeds,
     run_seeds,
 )
@@ -35,6 +34,8 @@ from bam_train.trainers.best_checkpoint import choose_output
 from bam_train.trainers.resolve_settings import preset_notices, resolve
 from bam_train.trainers.run_folder import Copies, RunFolder, read_object, require_room
 from bam_train.trainers.training_run import rank
+
+Start = Callable[[SeedRun], SeedProcess | ClusterSeed]
 
 
 def train_seeds(config: TrainConfig, text: str, given: Mapping[str, Any]) -> int:
@@ -54,17 +55,15 @@ def train_seeds(config: TrainConfig, text: str, given: Mapping[str, Any]) -> int
     copies = None if config.copy_to is None else Copies(config.copy_to)
     with (
         contextlib.redirect_stderr(MayClose(sys.stderr)),
-        _starter(settings, given.get("address")) as (start, jobs, where),
+        starter(settings, given.get("address")) as (start, jobs, where),
         group_folder(runs, settings) as (group, lock),
     ):
-        every = [_seed_run(group, seed, settings) for seed in seeds]
+        every = [SeedRun.there(group.path, settings, seed, lock) for seed in seeds]
         say(f"{settings.algo} on {settings.env}, {len(seeds)} seeds in {group.path}, {jobs} at once{where}")
         for notice in preset_notices(settings, given):
             say(notice)
-        show = (_LiveTable if can_draw() else _PlainLines)(every)
         with signals_ask() as stopped:
-            with show:
-                run_seeds(every, partial(start, lock), jobs, stopped, show.update)
+            run_all(every, start, jobs, stopped)
             done = [run for run in every if run.state == "done"]
             if stopped() and len(done) < len(every):
                 say(f"{len(done)} of {len(every)} seeds are done; the same command goes on with the others")
@@ -73,27 +72,20 @@ def train_seeds(config: TrainConfig, text: str, given: Mapping[str, Any]) -> int
         return _status(every)
 
 
-def _seed_run(group: RunFolder, seed: int, settings: TrainSettings) -> SeedRun:
-    folder = RunFolder(group.path, f"seed-{seed}", lambda path: True)
-    run = SeedRun(seed, folder, settings.steps)
-    run.take(folder.records())
-    if folder.outcome is not None:
-        run.end(0, "", False)
-    return run
+def run_all(every: list[SeedRun], start: Start, jobs: int, stopped: Callable[[], bool]) -> None:
+    """Train the runs that wait, and show all of them."""
+    waiting = (run for run in every if run.state == "waiting")
+    with (LiveTable if can_draw() else PlainLines)(every) as show:
+        run_seeds(lambda: next(waiting, None), start, jobs, stopped, show.update)
 
 
 @contextlib.contextmanager
-def _starter(
-    settings: TrainSettings, address: str | None
-) -> Iterator[tuple[Callable[[int | None, SeedRun], SeedProcess | ClusterSeed], int, str]]:
-    """What starts a run, given the lock of the folder; how many run at once; and where in words."""
-
-    def values(run: SeedRun) -> dict[str, Any]:
-        return replace(settings, seed=run.number).to_mapping()
-
+def starter(settings: TrainSettings, address: str | None) -> Iterator[tuple[Start, int, str]]:
+    """What starts a run; how many run at once; and where in words."""
+    needed = needs(settings)
     if address is None:
-        jobs, _ = at_once(settings, [cores()])
-        yield lambda lock, run: SeedProcess(values(run), run.folder.path, lock=lock), jobs, ""
+        jobs = max(1, cores() // needed["CPU"])
+        yield lambda run: SeedProcess(run.settings.to_mapping(), run.folder.path, lock=run.lock), jobs, ""
         return
     from bam_train.trainers.rllib import ray_cluster
 
@@ -101,11 +93,15 @@ def _starter(
     with ray_cluster.cluster(joined):
         import ray
 
-        nodes = [int(node["Resources"].get("CPU", 0)) for node in ray.nodes() if node["Alive"]]
-        jobs, cpus = at_once(settings, nodes)
-        if max(nodes, default=0) < cpus:
-            raise SettingsError(f"a run needs {cpus} CPUs on one computer, and no node of the cluster has as many")
-        yield lambda _, run: ClusterSeed(values(run), run.folder.path, cpus), jobs, f" on the cluster at {address}"
+        jobs = at_once(needed, [node["Resources"] for node in ray.nodes() if node["Alive"]])
+        if not jobs:
+            wanted = " and ".join(f"{number} {name}s" for name, number in needed.items() if number)
+            raise SettingsError(f"a run needs {wanted} on one computer, and no node of the cluster has as many")
+        yield (
+            lambda run: ClusterSeed(run.settings.to_mapping(), run.folder.path, *needed.values()),
+            jobs,
+            f" on the cluster at {address}",
+        )
 
 
 def _status(every: list[SeedRun]) -> int:
@@ -114,10 +110,10 @@ def _status(every: list[SeedRun]) -> int:
     for run in every:
         shortfall = (run.folder.outcome or {}).get("shortfall")
         if run.state == "failed":
-            say(f"bam-train: seed {run.number}: {run.why}")
+            say(f"bam-train: seed {run.name}: {run.why}")
             status = 1
         elif shortfall:
-            say(f"bam-train: seed {run.number}: nothing was learnt in {run.steps:,} steps: {shortfall}")
+            say(f"bam-train: seed {run.name}: nothing was learnt in {run.steps:,} steps: {shortfall}")
             status = status or 3
     return status
 
@@ -132,9 +128,9 @@ _WORDS = {"state": "{}", "steps": "{} steps", "success": "success {}", "return":
 def _cells(run: SeedRun) -> dict[str, str]:
     """What is shown of a seed; a dash for what is not known."""
     why = REASONS.get(run.why, run.why) if run.state == "done" else run.why
-    more = f" of {count(run.total)}" if run.state == "training" else ""
+    more = f" of {count(run.settings.steps)}" if run.state == "training" else ""
     return {
-        "seed": str(run.number),
+        "seed": run.name,
         "state": f"{run.state}: {why}" if why else run.state,
         "steps": f"{count(run.steps)}{more}" if run.steps else "-",
         "success": percent(run.success),
@@ -143,14 +139,14 @@ def _cells(run: SeedRun) -> dict[str, str]:
     }
 
 
-class _PlainLines:
+class PlainLines:
     """A line for each change of a seed's state and each of its evaluations."""
 
     def __init__(self, runs: list[SeedRun]) -> None:
         self._runs = runs
-        self._shown = {run.number: ("waiting", run.evaluations) for run in runs}
+        self._shown = {run.name: ("waiting", run.evaluations) for run in runs}
 
-    def __enter__(self) -> _PlainLines:
+    def __enter__(self) -> PlainLines:
         self.update()
         return self
 
@@ -160,14 +156,14 @@ class _PlainLines:
     def update(self) -> None:
         """Print what is new."""
         for run in self._runs:
-            if self._shown[run.number] != (run.state, run.evaluations):
-                self._shown[run.number] = run.state, run.evaluations
+            if self._shown[run.name] != (run.state, run.evaluations):
+                self._shown[run.name] = run.state, run.evaluations
                 cells = _cells(run)
                 known = [form.format(cells[name]) for name, form in _WORDS.items() if cells[name] != "-"]
-                say(f"seed {run.number}: {', '.join(known)}")
+                say(f"seed {run.name}: {', '.join(known)}")
 
 
-class _LiveTable(_PlainLines):
+class LiveTable(PlainLines):
     """A table that changes in place."""
 
     def __init__(self, runs: list[SeedRun]) -> None:
@@ -176,7 +172,7 @@ class _LiveTable(_PlainLines):
 
         self._live = Live(console=make_console(), refresh_per_second=4, transient=True)
 
-    def __enter__(self) -> _LiveTable:
+    def __enter__(self) -> LiveTable:
         self._live.start()
         return self
 

@@ -63,7 +63,7 @@ def with_agent(
     from bam_envs.core.errors import BamEnvsError
     from bam_train.agent.remote.agent_client import AgentClient
     from bam_train.checkpoint import Checkpoint
-    from bam_train.errors import AgentRefused, BamTrainError
+    from bam_train.errors import BamTrainError, kind_of
 
     nothing = {"state": None, "active": None, "owner": None}
     try:
@@ -73,8 +73,7 @@ def with_agent(
             result = {**nothing, **do(agent)}
     except (BamTrainError, BamEnvsError) as error:
         if config.json:
-            kind = error.kind if isinstance(error, AgentRefused) else type(error).__name__
-            tell(json_module.dumps({**nothing, "error": str(error), "kind": kind}))
+            tell(json_module.dumps({**nothing, "error": str(error), "kind": kind_of(error)}))
         raise
     if config.json:
         tell(json_module.dumps(result))

@@ -33,7 +33,7 @@ def examine(config: DoctorConfig, signals: SignalMemory) -> int:
     from bam_envs.arms.description import robot_model
     from bam_envs.core.location import LiveRobot
     from bam_envs.live.diagnosis import STEPS, Diagnosis
-    from bam_envs.robots.profile import profile_for
+    from bam_envs.robots.profile import fitting_profile, profile_for
 
     place = LiveRobot(config.url, config.credentials, config.profile)
     contracts: list[Contract] = []  # one, once it was checked
@@ -44,8 +44,9 @@ def examine(config: DoctorConfig, signals: SignalMemory) -> int:
             opened.callback(env.close)
             robot = env.unwrapped.robot
             more = [(CONTRACT, lambda inspection: _contract(checkpoint, env, inspection, contracts))]
-        elif config.robot_model is not None and config.profile is None:
-            place = replace(place, profile=profile_for(robot_model(config.robot_model).spec(with_object=False)))
+        elif config.robot_model is not None:
+            spec, named = robot_model(config.robot_model).spec(with_object=False), config.profile
+            place = replace(place, profile=profile_for(spec) if named is None else fitting_profile(named, spec))
         diagnosis = Diagnosis(place, robot, seconds=config.seconds)
         opened.callback(diagnosis.close)
         steps: list[DiagnosisStep] = []

@@ -75,7 +75,7 @@ def _arguments(config: PushConfig) -> tuple[Path | None, str]:
 def _pass_gate(agent: AgentClient, candidate: Path, champion: Path) -> None:
     """Refuse a candidate that `bam-gate` finds neither better nor not worse than the agent's champion."""
     from bam_train.checkpoint import Checkpoint
-    from bam_train.errors import CandidateRefused
+    from bam_train.errors import RequestRefused
 
     digest = Checkpoint.open(champion).digest
     found = (agent.ask("status").get("names") or {}).get("champion") or "none"
@@ -83,7 +83,7 @@ def _pass_gate(agent: AgentClient, candidate: Path, champion: Path) -> None:
         text = (
             f"has the digest {digest[:SHORT]}, and the agent's champion {found[:SHORT]}; give that one's file to --gate"
         )
-        raise CandidateRefused(f"{champion}: {text}")
+        raise RequestRefused(f"{champion}: {text}", "CandidateRefused")
     command = [sys.executable, "-c", _GATE, str(candidate), str(champion)]
     gate = subprocess.run(command, stdout=subprocess.PIPE, text=True)  # which says on standard error what went wrong
     lines = gate.stdout.splitlines()
@@ -91,7 +91,7 @@ def _pass_gate(agent: AgentClient, candidate: Path, champion: Path) -> None:
         _progress(line)
     if gate.returncode not in _PASSED:
         found = f"finds it {lines[0].partition(':')[0]} against {champion}" if lines else "gave no verdict"
-        raise CandidateRefused(f"{candidate}: bam-gate {found}, so it was not pushed")
+        raise RequestRefused(f"{candidate}: bam-gate {found}, so it was not pushed", "CandidateRefused")
 
 
 def _misused(text: str) -> SystemExit:

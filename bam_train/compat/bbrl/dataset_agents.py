@@ -13,7 +13,7 @@ import numpy as np
 import torch
 
 from bam_envs.core.validation import NonNegativeInt, check
-from bam_train.errors import WorkspaceError
+from bam_train.errors import LoopError
 from bam_train.loop.agents.agent import Agent
 
 if TYPE_CHECKING:
@@ -40,15 +40,11 @@ class _DatasetAgent(Agent):
         if isinstance(batch, Mapping):
             missing = [name for name in names if name not in batch]
             if missing:
-                raise WorkspaceError(
-                    f"The dataset has no {missing[0]!r}; its items have {', '.join(map(repr, batch))}."
-                )
+                raise LoopError(f"The dataset has no {missing[0]!r}; its items have {', '.join(map(repr, batch))}.")
             return [batch[name] for name in names]
         values = [batch] if isinstance(batch, (torch.Tensor, np.ndarray)) else list(batch)
         if len(values) < len(names):
-            raise WorkspaceError(
-                f"output_names: expected as many as the dataset has values ({len(values)}), found {names}."
-            )
+            raise LoopError(f"output_names: expected as many as the dataset has values ({len(values)}), found {names}.")
         return values[: len(names)]
 
 
@@ -108,14 +104,14 @@ class ShuffledDatasetAgent(_DatasetAgent):
 
     def seed(self, seed: int | None = None) -> Self:
         """Draw from the agent's own generator from now on, instead of torch's; None seeds it at random."""
-        self._rng = np.random.default_rng(check(seed, NonNegativeInt | None, "seed", WorkspaceError))
+        self._rng = np.random.default_rng(check(seed, NonNegativeInt | None, "seed", LoopError))
         return self
 
     def forward(self, **kwargs: Any) -> None:
         """Write a batch at time 0."""
         size, count = len(self.dataset), self.batch_size
         if not size:
-            raise WorkspaceError("The dataset is empty: there is nothing to draw from.")
+            raise LoopError("The dataset is empty: there is nothing to draw from.")
         drawn = torch.randint(size, (count,)) if self._rng is None else self._rng.integers(size, size=count)
         items = [self._values(self.dataset[int(k)]) for k in drawn]
         self._write([torch.stack([torch.as_tensor(value) for value in column]) for column in zip(*items, strict=True)])

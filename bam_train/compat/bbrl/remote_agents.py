@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, Any
 
 from bam_train.compat.bbrl.shared_workspace import SharedWorkspace, shared_workspace
 from bam_train.compat.bbrl.worker import Worker, close_all, wait_for
-from bam_train.errors import LoopError, WorkspaceError
+from bam_train.errors import LoopError
 from bam_train.loop.agents import Agents
 from bam_train.loop.agents.agent import Agent, agent_name
 from bam_train.loop.workspace import Workspace
@@ -101,11 +101,11 @@ class RemoteAgent(_ProcessAgent):
         """Run the agent with these keywords, and wait for its end.
 
         Raises:
-            WorkspaceError: The workspace is not shared.
+            LoopError: The workspace is not shared.
             RemoteAgentError: The agent failed, or its process ended.
         """
         if not self.workspace.is_shared:
-            raise WorkspaceError(
+            raise LoopError(
                 f"{agent_name(self)} needs a shared workspace; NRemoteAgent.create makes one, or "
                 f"bam_train.compat.bbrl.shared_workspace.shared_workspace(workspace)."
             )
@@ -155,10 +155,10 @@ class NRemoteAgent(Agents):
             extra_kwargs: Keywords of the first run, such as ``t=0, n_steps=10``.
 
         Raises:
-            WorkspaceError: The agent writes no variable, or variables of different batch sizes; or `num_processes` < 0.
+            LoopError: The agent writes no variable, or variables of different batch sizes; or `num_processes` < 0.
         """
         if num_processes < 0:
-            raise WorkspaceError(f"num_processes: expected at least 0, found {num_processes}.")
+            raise LoopError(f"num_processes: expected at least 0, found {num_processes}.")
         workspace, trial = Workspace(), copy.deepcopy(agent)
         try:
             trial.seed(0)
@@ -182,7 +182,7 @@ class NRemoteAgent(Agents):
         """Run all copies in parallel, each on its columns of the workspace, and wait for their end.
 
         Raises:
-            WorkspaceError: The workspace is not shared, or has another batch size than all copies together.
+            LoopError: The workspace is not shared, or has another batch size than all copies together.
             RemoteAgentError: A copy failed, or its process ended; all are closed.
         """
         parts = self._columns()
@@ -206,11 +206,11 @@ class NRemoteAgent(Agents):
         """Each copy's part of the workspace; cached for the last workspace."""
         workspace = self.workspace
         if not isinstance(workspace, SharedWorkspace):
-            raise WorkspaceError(f"{agent_name(self)} needs the shared workspace that NRemoteAgent.create made for it.")
+            raise LoopError(f"{agent_name(self)} needs the shared workspace that NRemoteAgent.create made for it.")
         if self._split[0] is not workspace:
             width = self.batch_dims[-1][1]
             if workspace.batch_size() != width:
-                raise WorkspaceError(f"Expected a shared workspace of {width} columns, found {workspace.batch_size()}.")
+                raise LoopError(f"Expected a shared workspace of {width} columns, found {workspace.batch_size()}.")
             self._split = (workspace, [workspace.columns(*columns) for columns in self.batch_dims])
         return self._split[1]
 

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from bam_train.errors import WorkspaceError
+from bam_train.errors import LoopError
 from bam_train.loop.workspace import Workspace
 from bam_train.loop.workspace.tensor_variable import TensorVariable
 from bam_train.loop.workspace.variables import Variable
@@ -55,7 +55,7 @@ class _SharedVariable(Variable):
 
     def _require_length(self, t: int) -> None:
         if t >= len(self.memory):
-            raise WorkspaceError(
+            raise LoopError(
                 f"{self.name!r} at t={t}: a shared workspace has a fixed length, and this one has {len(self.memory)} "
                 f"times; make it as long as the run: NRemoteAgent.create(..., time_size=...), {t + 1} at least."
             )
@@ -83,15 +83,15 @@ class SharedWorkspace(Workspace):
         return SharedWorkspace({name: type(v)(name, v.memory[:, begin:end]) for name, v in variables.items()})
 
     def remove_variable(self, name: str) -> None:
-        """Raise WorkspaceError: other processes use the variable."""
-        raise WorkspaceError(f"{name!r} cannot be removed from a shared workspace.")
+        """Raise LoopError: other processes use the variable."""
+        raise LoopError(f"{name!r} cannot be removed from a shared workspace.")
 
     def clear(self, name: str | None = None) -> None:
-        """Raise WorkspaceError: other processes use the workspace."""
-        raise WorkspaceError("A shared workspace cannot be cleared: its variables and its length are fixed.")
+        """Raise LoopError: other processes use the workspace."""
+        raise LoopError("A shared workspace cannot be cleared: its variables and its length are fixed.")
 
     def _new(self, name: str, value: Any, where: str) -> Any:
-        raise WorkspaceError(
+        raise LoopError(
             f"{name!r} cannot be added to a shared workspace, which has {', '.join(map(repr, self.variables))}."
         )
 
@@ -107,16 +107,16 @@ def shared_workspace(workspace: Workspace, n_repeat: int = 1, time_size: int | N
     """
     for what, number in (("n_repeat", n_repeat), ("time_size", 1 if time_size is None else time_size)):
         if number < 1:
-            raise WorkspaceError(f"{what}: expected at least 1, found {number}.")
+            raise LoopError(f"{what}: expected at least 1, found {number}.")
     if not workspace.variables:
-        raise WorkspaceError("The workspace is empty: there is nothing to share; run the agent on it first.")
+        raise LoopError("The workspace is empty: there is nothing to share; run the agent on it first.")
     variables = {}
     for name, one in workspace.variables.items():
         value = one.full()
         try:
             tensor = torch.cat([torch.as_tensor(value).detach()] * n_repeat, dim=1)
         except TypeError as error:
-            raise WorkspaceError(f"{name!r} cannot be shared: {error}") from error
+            raise LoopError(f"{name!r} cannot be shared: {error}") from error
         if time_size is not None:
             tensor = tensor.new_zeros((time_size, *tensor.shape[1:]))
         kind = _SharedVariable if isinstance(value, np.ndarray) else _SharedTensorVariable

@@ -12,7 +12,7 @@ import numpy as np
 
 from bam_envs.core.errors import MissingExtra
 from bam_train.data.data_set import DataSet
-from bam_train.data.recorded_episode import Array, DataSetInfo, Episode, leaves_of
+from bam_train.data.recorded_episode import Array, DataSetInfo, Episode
 from bam_train.errors import SettingsError
 
 
@@ -61,7 +61,7 @@ def as_d3rlpy(info: DataSetInfo, episode: Episode) -> Any:
     d3rlpy = import_d3rlpy()
     more = 0 if episode.terminated else 1
     steps = len(episode)
-    observed = [_observed(leaf.of(episode.observations))[: steps + more] for leaf in leaves_of(*_observation(info))]
+    observed = [_observed(leaf.of(episode.observations))[: steps + more] for leaf in info.observation_leaves]
     actions = _columns(episode.actions, steps)
     rewards = episode.rewards.astype(np.float32).reshape(steps, 1)
     if more:
@@ -72,10 +72,6 @@ def as_d3rlpy(info: DataSetInfo, episode: Episode) -> Any:
         rewards,
         terminated=bool(episode.terminated),
     )
-
-
-def _observation(info: DataSetInfo) -> tuple[gym.Space[Any], str]:
-    return info.observation_space, "observation"
 
 
 def _observed(values: Array) -> Array:

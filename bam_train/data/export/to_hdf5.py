@@ -10,7 +10,6 @@ import numpy as np
 
 from bam_envs.core.errors import MissingExtra
 from bam_train.data.data_set import DataSet
-from bam_train.data.recorded_episode import leaves_of
 
 
 def write(data: DataSet, indices: Sequence[int], path: Path) -> str:
@@ -19,17 +18,15 @@ def write(data: DataSet, indices: Sequence[int], path: Path) -> str:
         import h5py
     except ImportError as error:
         raise MissingExtra("h5py", "data", "export --to hdf5") from error
-    observation = leaves_of(data.info.observation_space, "observation")
-    action = leaves_of(data.info.action_space, "action")
     with h5py.File(path, "w") as file:
         root = file.create_group("data")
         for number, episode in enumerate(data.episodes(indices)):
             demo = root.create_group(f"demo_{number}")
             last = np.arange(len(episode)) == len(episode) - 1
-            for leaf in observation:
+            for leaf in data.info.observation_leaves:
                 values, name = leaf.of(episode.observations), leaf.column.removeprefix("observation.")
                 demo[f"obs/{name}"], demo[f"next_obs/{name}"] = values[:-1], values[1:]
-            for leaf in action:
+            for leaf in data.info.action_leaves:
                 demo[leaf.column.replace("action", "actions", 1)] = leaf.of(episode.actions)
             demo["rewards"], demo["dones"] = episode.rewards, last.astype(np.int64)
             demo["terminated"], demo["truncated"] = last & episode.terminated, last & episode.truncated

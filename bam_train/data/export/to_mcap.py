@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from bam_train.data.data_set import DataSet
-from bam_train.data.recorded_episode import Array, DataSetInfo, Episode, leaves_of
+from bam_train.data.recorded_episode import Array, DataSetInfo, Episode
 from bam_train.recording.recorder_process import RecordingFile
 from bam_train.recording.ring import EVENT, LAYOUT, PIXELS, TICK, TIMES
 
@@ -67,10 +67,10 @@ def _add(
     file: RecordingFile, info: DataSetInfo, number: int, episode: Episode, times: Array, guards: list[str]
 ) -> None:
     steps = len(episode)
-    observation, action = leaves_of(info.observation_space, "observation"), leaves_of(info.action_space, "action")
+    observation = info.observation_leaves
     pictures = {leaf.column: leaf.of(episode.observations) for leaf in observation if leaf.is_image}
     observed = {_name(leaf): leaf.of(episode.observations) for leaf in observation if not leaf.is_image}
-    acted = {_name(leaf): leaf.of(episode.actions) for leaf in action}
+    acted = {_name(leaf): leaf.of(episode.actions) for leaf in info.action_leaves}
     unknown = np.nan if all(values.dtype.kind == "f" for values in acted.values()) else 0
     tables = {"/observation": _flat(observed, steps + 1), "/action": _later(_flat(acted, steps), 0, 1, unknown)}
     if "command" in episode.columns:

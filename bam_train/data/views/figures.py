@@ -12,7 +12,7 @@ import numpy as np
 from bam_envs.core.errors import MissingExtra
 from bam_train.data.data_set import DataSet
 from bam_train.data.data_set_writer import require_same
-from bam_train.data.recorded_episode import Array, Episode, leaves_of
+from bam_train.data.recorded_episode import Array, Episode
 from bam_train.errors import OutputError, SettingsError
 from bam_train.files.atomic_file import replacing
 
@@ -39,11 +39,7 @@ def require_picture_path(path: Path) -> Path:
 
 
 def plot(
-    data: DataSet,
-    path: Path,
-    kinds: Sequence[str] = (),
-    against: DataSet | None = None,
-    episodes: Sequence[int] = (),
+    data: DataSet, path: Path, kinds: Sequence[str] = (), against: DataSet | None = None, episodes: Sequence[int] = ()
 ) -> list[str]:
     """Draw `data` into an image file; returns the kinds that were drawn.
 
@@ -126,8 +122,8 @@ def _labels(data: DataSet, kind: str, size: int) -> list[str]:
 def _named(data: DataSet, episodes: Sequence[Episode]) -> dict[str, Array]:
     """Each number of observations and actions that is no picture, by name. Shape: (steps,)."""
     found: dict[str, Array] = {}
-    for kind, space in (("observation", data.info.observation_space), ("action", data.info.action_space)):
-        leaves = [leaf for leaf in leaves_of(space, kind) if not leaf.is_image]
+    for kind, every in (("observation", data.info.observation_leaves), ("action", data.info.action_leaves)):
+        leaves = [leaf for leaf in every if not leaf.is_image]
         parts = []
         for one in episodes:
             values = one.observations if kind == "observation" else one.actions

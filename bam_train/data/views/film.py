@@ -9,7 +9,7 @@ import numpy as np
 from bam_envs.core.spaces import leaves_by_path, part_at
 from bam_envs.core.wording import did_you_mean
 from bam_train.data.data_set import DataSet
-from bam_train.data.recorded_episode import Episode, Leaf, leaves_of
+from bam_train.data.recorded_episode import Episode, Leaf
 from bam_train.environments import make_env, must_be_named
 from bam_train.errors import SettingsError
 from bam_train.files.video import Frame, picture
@@ -38,7 +38,7 @@ def frames(data: DataSet, index: int, camera: str | None = None) -> Iterator[Fra
 
 
 def _cameras(data: DataSet) -> list[Leaf]:
-    return [leaf for leaf in leaves_of(data.info.observation_space, "observation") if leaf.is_image]
+    return [leaf for leaf in data.info.observation_leaves if leaf.is_image]
 
 
 def _played(data: DataSet, index: int, episode: Episode) -> Iterator[Frame]:

@@ -17,7 +17,7 @@ from contextlib import ExitStack
 from functools import cache
 from typing import TYPE_CHECKING, Any
 
-from bam_train.errors import AgentInUse, LoopError
+from bam_train.errors import LoopError
 from bam_train.loop.workspace import Workspace
 
 if TYPE_CHECKING:
@@ -69,7 +69,7 @@ class Agent(_Base):  # type: ignore[misc]
         """Run `forward` with these keywords on `workspace`.
 
         Raises:
-            AgentInUse: It is running already: agents are not shared by threads, and do not call themselves.
+            LoopError: It is running already: agents are not shared by threads, and do not call themselves.
             LoopError: `workspace` is None.
         """
         if workspace is None:
@@ -79,7 +79,7 @@ class Agent(_Base):  # type: ignore[misc]
         attributes = self.__dict__
         try:
             if attributes.setdefault("_call", kwargs) is not kwargs:
-                raise AgentInUse(
+                raise LoopError(
                     f"{agent_name(self)} is running already, in another thread or around this call; "
                     f"give each its own: agent.clone()."
                 )

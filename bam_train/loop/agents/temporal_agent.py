@@ -58,7 +58,7 @@ class TemporalAgent(Agent):
             kwargs: Passed to every agent.
 
         Raises:
-            AgentInUse: It is running already: loops are not shared by threads.
+            LoopError: It is running already: loops are not shared by threads.
             LoopError: Neither `n_steps` nor `stop_variable`, or no workspace.
             WiringError: An agent reads a variable that no agent writes, or no agent writes the stop variable.
             UnknownVariable: No agent has written the stop variable at the first time.

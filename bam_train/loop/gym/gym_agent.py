@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from gymnasium import Space, spaces
 
-from bam_train.errors import LoopError, SettingsError, ValueMismatch
+from bam_train.errors import LoopError, SettingsError
 from bam_train.loop.agents import SeedableAgent
 from bam_train.loop.agents.agent import agent_name, import_torch
 from bam_train.loop.gym.gym_spaces import Array, Arrays, InfoRecorder, Kind, names
@@ -148,7 +148,7 @@ class GymAgent(SeedableAgent):
         """The variables of n environments at one time: new arrays (n, ...) by name, without the output prefix."""
         reward = np.array(rewards, dtype=self._floats)
         if reward.ndim != 1:
-            raise ValueMismatch(f"'reward': expected one number from each environment, found {rewards[0]!r}.")
+            raise LoopError(f"'reward': expected one number from each environment, found {rewards[0]!r}.")
         numbers = {
             "terminated": terminated,
             "truncated": truncated,

@@ -13,7 +13,7 @@ import numpy as np
 from gymnasium import Space, spaces
 from numpy.typing import NDArray
 
-from bam_train.errors import ValueMismatch
+from bam_train.errors import LoopError
 from bam_train.loop.workspace.variables import kind_name, mismatch, to_array
 
 Array = NDArray[Any]
@@ -53,7 +53,7 @@ def kinds(parts: Mapping[str, Any], space: Space[Any] | None, for_torch: bool) -
     """Dtypes and shapes of the variables of an observation.
 
     Args:
-        parts: `flat` of the observation of one environment: arrays or numbers; anything else raises `ValueMismatch`.
+        parts: `flat` of the observation of one environment: arrays or numbers; anything else raises `LoopError`.
         space: Determines the dtypes unless `for_torch`; None for those of the observation.
         for_torch: Whether all floats become float32 and all integers int64.
     """
@@ -61,7 +61,7 @@ def kinds(parts: Mapping[str, Any], space: Space[Any] | None, for_torch: bool) -
     for name, value in parts.items():
         dtype = None if isinstance(value, (tuple, str)) else np.asarray(value).dtype
         if dtype is None or dtype.kind not in "fiub":
-            raise ValueMismatch(
+            raise LoopError(
                 f"{name!r}: expected an array, a number or a dict of them, found a {kind_name(value)}; "
                 "wrap the environment, for example in gymnasium.wrappers.FlattenObservation."
             )
@@ -75,7 +75,7 @@ def kinds(parts: Mapping[str, Any], space: Space[Any] | None, for_torch: bool) -
 
 
 def pack(kinds: Mapping[str, Kind], observations: Sequence[Any]) -> Arrays:
-    """New arrays (n, ...) by variable from the observations of n environments; raises ValueMismatch if they differ."""
+    """New arrays (n, ...) by variable from the observations of n environments; raises LoopError if they differ."""
     rows, packed = [flat(observation) for observation in observations], {}
     for name, (dtype, shape) in kinds.items():
         values = [pick(row, name) for row in rows]
@@ -85,7 +85,7 @@ def pack(kinds: Mapping[str, Kind], observations: Sequence[Any]) -> Arrays:
             array = np.empty(0)
         if array.shape != (len(rows), *shape):
             k, other = next((k, s) for k, s in enumerate(map(np.shape, values)) if s != shape)
-            raise ValueMismatch(f"{name!r}: expected shape {shape}, found {other} from environment {k}.")
+            raise LoopError(f"{name!r}: expected shape {shape}, found {other} from environment {k}.")
         packed[name] = array
     return packed
 
@@ -93,7 +93,7 @@ def pack(kinds: Mapping[str, Kind], observations: Sequence[Any]) -> Arrays:
 def pick(parts: Mapping[str, Any], name: str) -> Any:
     """The part of an observation for one variable."""
     if name not in parts:
-        raise ValueMismatch(f"{name!r}: the environment gave an observation without it.")
+        raise LoopError(f"{name!r}: the environment gave an observation without it.")
     return parts[name]
 
 
@@ -133,7 +133,7 @@ class InfoRecorder:
             first = value[0] if np.ndim(index) else value
             array = np.asarray(first)
             if array.dtype.kind not in self._dtypes:  # at every time: NumPy converts None to NaN and "2" to 2
-                raise ValueMismatch(f"info {key!r}: expected a number or an array of them, found a {kind_name(first)}.")
+                raise LoopError(f"info {key!r}: expected a number or an array of them, found a {kind_name(first)}.")
             self._known.setdefault(key, (self._dtypes[array.dtype.kind], array.shape))
         if key not in self._known:
             return
@@ -142,7 +142,7 @@ class InfoRecorder:
         found[f"info/_{key}"] = mask
         for index, value in given:
             if np.shape(value)[np.ndim(index) :] != shape:
-                raise ValueMismatch(f"info {key!r}: expected shape {shape}, found {np.shape(value)[np.ndim(index) :]}.")
+                raise LoopError(f"info {key!r}: expected shape {shape}, found {np.shape(value)[np.ndim(index) :]}.")
             values[index] = value
 
 
@@ -158,7 +158,7 @@ def each_action(workspace: Any, t: int, name: str, space: Space[Any], num_envs: 
         workspace: The workspace; raises `UnknownVariable` or `TimeNotWritten` if no action was written.
         t: The time.
         name: The variable; for dict actions, the prefix of the variables' names.
-        space: Action space of one environment; an action that does not fit raises `ValueMismatch`.
+        space: Action space of one environment; an action that does not fit raises `LoopError`.
         num_envs: The number of environments.
     """
     if isinstance(space, spaces.Dict):
@@ -191,13 +191,11 @@ def _read(workspace: Any, t: int, name: str, space: Space[Any], num_envs: int) -
     if array.shape != shape:
         raise mismatch(name, f"t={t}", "shape", shape, array.shape)
     if array.dtype.kind == "f" and isinstance(space, _WHOLE):
-        raise ValueMismatch(f"{name!r} at t={t}: {space} takes whole numbers, found {array.dtype}.")
+        raise LoopError(f"{name!r} at t={t}: {space} takes whole numbers, found {array.dtype}.")
     if isinstance(space, spaces.Discrete):
         first, last = int(space.start), int(space.start + space.n - 1)
         plain = array.tolist()  # faster than NumPy for few environments
         if min(plain) < first or max(plain) > last:
             k, found = next((k, number) for k, number in enumerate(plain) if not first <= number <= last)
-            raise ValueMismatch(
-                f"{name!r} at t={t}: {space} takes {first} to {last}, found {found} for environment {k}."
-            )
+            raise LoopError(f"{name!r} at t={t}: {space} takes {first} to {last}, found {found} for environment {k}.")
     return array

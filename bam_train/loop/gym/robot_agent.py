@@ -55,11 +55,7 @@ class RobotAgent(Agent):
     """
 
     def __init__(
-        self,
-        env: gym.Env[Any, Any],
-        input_string: str = "action",
-        output_string: str = "env/",
-        name: str | None = None,
+        self, env: gym.Env[Any, Any], input_string: str = "action", output_string: str = "env/", name: str | None = None
     ) -> None:
         super().__init__(name=name)
         self.env, self.input, self.output = env, input_string, output_string

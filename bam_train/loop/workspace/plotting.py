@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 
 from bam_envs.core.errors import MissingExtra
-from bam_train.errors import WorkspaceError
+from bam_train.errors import LoopError
 from bam_train.loop.workspace.variables import to_array
 
 if TYPE_CHECKING:
@@ -49,7 +49,7 @@ def plot(workspace: Recorded, *names: str, batch: int | Sequence[int] | None = N
         batch: The batch column or columns to draw; None draws all.
 
     Raises:
-        WorkspaceError: There is nothing to draw, a variable holds images, or it lacks one of the batch columns.
+        LoopError: There is nothing to draw, a variable holds images, or it lacks one of the batch columns.
         MissingExtra: matplotlib is not installed.
     """
     try:
@@ -66,7 +66,7 @@ def plot(workspace: Recorded, *names: str, batch: int | Sequence[int] | None = N
         for column in columns:
             if not 0 <= column < array.shape[1]:
                 last = array.shape[1] - 1
-                raise WorkspaceError(f"{name!r} has no batch column {column}; it has columns 0 to {last}.")
+                raise LoopError(f"{name!r} has no batch column {column}; it has columns 0 to {last}.")
         _draw(axes, times, name, array, columns)
     rows[-1].set_xlabel("t")
     return figure
@@ -105,14 +105,12 @@ def _arrays(workspace: Recorded, names: tuple[str, ...], purpose: str) -> dict[s
     images = [name for name, array in arrays.items() if array.ndim > 2 + MAX_VALUE_AXES]
     if names and images:
         shape = arrays[images[0]].shape[2:]
-        raise WorkspaceError(
+        raise LoopError(
             f"{images[0]!r}: expected numbers, vectors or matrices, found images of shape {shape}; "
             f"leave it out of {purpose}."
         )
     if len(images) == len(arrays):
-        raise WorkspaceError(
-            f"{purpose} has nothing to show: the workspace {'has only images' if images else 'is empty'}."
-        )
+        raise LoopError(f"{purpose} has nothing to show: the workspace {'has only images' if images else 'is empty'}.")
     return {name: array for name, array in arrays.items() if name not in images}
 
 

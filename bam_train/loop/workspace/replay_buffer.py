@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import torch
 
-from bam_train.errors import UnknownVariable, ValueMismatch, WorkspaceError
+from bam_train.errors import LoopError, UnknownVariable
 from bam_train.loop.workspace import Workspace
 
 
@@ -29,7 +29,7 @@ class ReplayBuffer:
     def __init__(self, max_size: int, device: torch.device | str = torch.device("cpu")) -> None:  # noqa: B008 - a value
         self.max_size = int(max_size)
         if self.max_size < 1:
-            raise WorkspaceError(f"max_size: expected at least 1, found {max_size}.")
+            raise LoopError(f"max_size: expected at least 1, found {max_size}.")
         self.device = torch.device(device)
         self.variables: dict[str, torch.Tensor] = {}
         self.position = 0
@@ -42,16 +42,16 @@ class ReplayBuffer:
 
         Raises:
             UnknownVariable: A variable that the buffer has is missing.
-            ValueMismatch: Another T, shape or dtype than the first `put`.
-            WorkspaceError: A variable that the buffer does not have, columns that differ in number, or no variable.
+            LoopError: Another T, shape or dtype than the first `put`.
+            LoopError: A variable that the buffer does not have, columns that differ in number, or no variable.
         """
         if not workspace.variables:
-            raise WorkspaceError("The workspace is empty: there is nothing to put into the replay buffer.")
+            raise LoopError("The workspace is empty: there is nothing to put into the replay buffer.")
         items: dict[str, torch.Tensor] = {}
         for name in workspace:  # N x T x ...
             value = torch.as_tensor(workspace.get_full(name)).detach().to(self.device)
             if value.ndim < 2:
-                raise ValueMismatch(
+                raise LoopError(
                     f"{name!r} in the replay buffer: expected T x N x ..., found shape {tuple(value.shape)}."
                 )
             items[name] = value.transpose(0, 1)
@@ -81,7 +81,7 @@ class ReplayBuffer:
         """
         size = self.size()
         if not size:
-            raise WorkspaceError("The replay buffer is empty: put transitions into it before drawing from it.")
+            raise LoopError("The replay buffer is empty: put transitions into it before drawing from it.")
         chosen = torch.randint(low=0, high=size, size=(batch_size,), device=self.device)
         workspace = Workspace()
         for name, value in self.variables.items():
@@ -101,7 +101,7 @@ class ReplayBuffer:
         for name, value in items.items():
             if name not in self.variables:
                 has = ", ".join(map(repr, sorted(self.variables)))
-                raise WorkspaceError(f"{name!r} is not in the replay buffer, which has {has} since the first put.")
+                raise LoopError(f"{name!r} is not in the replay buffer, which has {has} since the first put.")
             kept = self.variables[name]
             for what, expected, found in (
                 ("time size", kept.shape[1], value.shape[1]),
@@ -109,4 +109,4 @@ class ReplayBuffer:
                 ("dtype", kept.dtype, value.dtype),
             ):
                 if expected != found:
-                    raise ValueMismatch(f"{name!r} in the replay buffer: expected {what} {expected}, found {found}.")
+                    raise LoopError(f"{name!r} in the replay buffer: expected {what} {expected}, found {found}.")

@@ -3,13 +3,13 @@
 T is time, B the batch. ``reward[t + 1]`` and ``critic[t + 1]`` follow from ``action[t]``: a workspace holds at t the
 reward of the action before it.
 
-Differences from BBRL's `bbrl.utils.functional`: shapes that differ raise `ValueMismatch`, where BBRL's broadcasts (N
+Differences from BBRL's `bbrl.utils.functional`: shapes that differ raise `LoopError`, where BBRL's broadcasts (N
 and N x 1 give N x N); `gae` takes log2(T) operations on whole tensors instead of T on single times, and keeps float64.
 """
 
 import torch
 
-from bam_train.errors import ValueMismatch, WorkspaceError
+from bam_train.errors import LoopError
 
 
 def gae(
@@ -129,13 +129,13 @@ def cumulated_reward(reward: torch.Tensor, done: torch.Tensor) -> float:
         done: T x B, True (or 1) at the last step of an episode.
 
     Raises:
-        WorkspaceError: An episode does not end.
+        LoopError: An episode does not end.
     """
     _require_shapes("cumulated_reward", reward.shape, done=done)
     ended = done.detach().bool()
     unfinished = (~ended.any(0)).nonzero().flatten().tolist()
     if unfinished:
-        raise WorkspaceError(
+        raise LoopError(
             f"cumulated_reward: expected a done in every column, found none in {unfinished[:5]}; "
             f"run until all are done."
         )
@@ -163,4 +163,4 @@ def _require_shapes(function: str, expected: torch.Size, **tensors: torch.Tensor
     """Refuse tensors of another shape, which would broadcast silently."""
     for name, tensor in tensors.items():
         if tensor.shape != expected:
-            raise ValueMismatch(f"{function}: expected {name} {tuple(expected)}, found {tuple(tensor.shape)}.")
+            raise LoopError(f"{function}: expected {name} {tuple(expected)}, found {tuple(tensor.shape)}.")

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from bam_train.errors import TimeNotWritten, ValueMismatch, WorkspaceError
+from bam_train.errors import LoopError, TimeNotWritten
 
 
 class Variable:
@@ -50,9 +50,9 @@ class Variable:
         return self.first + len(self._whole if self._values is None else self._values)
 
     def batch_size(self) -> int:
-        """B; raises WorkspaceError without a batch axis, as `set_full` accepts shape (T,) too."""
+        """B; raises LoopError without a batch axis, as `set_full` accepts shape (T,) too."""
         if not self.shape:
-            raise WorkspaceError(f"{self.name!r} has no batch axis; write it as T x B x ....")
+            raise LoopError(f"{self.name!r} has no batch axis; write it as T x B x ....")
         return int(self.shape[0])
 
     # -- one time --------------------------------------------------------------------------------------------------
@@ -160,7 +160,7 @@ class Variable:
     def on_device(array: Any, device: Any) -> Any:
         """The array on `device`; the same object if it is there already."""
         if str(device).partition(":")[0] != "cpu":
-            raise WorkspaceError(f"A NumPy array cannot be moved to {device}; only tensors can.")
+            raise LoopError(f"A NumPy array cannot be moved to {device}; only tensors can.")
         return array
 
     # -- inside ----------------------------------------------------------------------------------------------------
@@ -192,7 +192,7 @@ class Variable:
         self.shape, self.dtype = shape, value.dtype
 
     def _check(self, value: Any, where: str) -> None:
-        """Take the shape and dtype of the first value; raise ValueMismatch if another value differs."""
+        """Take the shape and dtype of the first value; raise LoopError if another value differs."""
         if not isinstance(value, self.ARRAY):
             raise kind_mismatch(self.name, where, self.KIND, value)
         if self.shape is None:
@@ -205,11 +205,11 @@ class Variable:
                 raise mismatch(self.name, where, what, expected, found)
 
     def _check_full(self, value: Any) -> None:
-        """Raise ValueMismatch unless the value is an array with a time axis."""
+        """Raise LoopError unless the value is an array with a time axis."""
         if not isinstance(value, self.ARRAY):
             raise kind_mismatch(self.name, "all times", self.KIND, value)
         if value.ndim == 0:  # type: ignore[attr-defined]
-            raise ValueMismatch(
+            raise LoopError(
                 f"{self.name!r} at all times: expected time and batch first (T x B x ...), found a single number."
             )
 
@@ -231,25 +231,23 @@ def kind_name(value: Any) -> str:
     return kind.__name__ if kind.__module__ == "builtins" else f"{kind.__module__}.{kind.__name__}"
 
 
-def mismatch(name: str, where: str, what: str, expected: Any, found: Any) -> ValueMismatch:
+def mismatch(name: str, where: str, what: str, expected: Any, found: Any) -> LoopError:
     """The error for a value that differs from earlier ones."""
     shown = [str(tuple(part)) if isinstance(part, tuple) else str(part) for part in (expected, found)]
-    return ValueMismatch(f"{name!r} at {where}: expected {what} {shown[0]}, found {shown[1]}.")
+    return LoopError(f"{name!r} at {where}: expected {what} {shown[0]}, found {shown[1]}.")
 
 
-def no_batch(name: str, where: str) -> ValueMismatch:
+def no_batch(name: str, where: str) -> LoopError:
     """The error for a value without axes."""
-    return ValueMismatch(
+    return LoopError(
         f"{name!r} at {where}: expected a batch axis first (B x ...), found a single number; give it shape (1,)."
     )
 
 
-def kind_mismatch(name: str, where: str, expected: str, found: Any) -> ValueMismatch:
+def kind_mismatch(name: str, where: str, expected: str, found: Any) -> LoopError:
     """The error for a value that is not an array of the expected kind."""
     kind = kind_name(found)
-    return ValueMismatch(
-        f"{name!r} at {where}: expected {expected}, found {'an' if kind[0] in 'aeiou' else 'a'} {kind}."
-    )
+    return LoopError(f"{name!r} at {where}: expected {expected}, found {'an' if kind[0] in 'aeiou' else 'a'} {kind}.")
 
 
 def to_array(value: Any) -> np.ndarray:

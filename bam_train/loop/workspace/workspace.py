@@ -25,7 +25,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from bam_train.errors import TimeNotWritten, UnknownVariable, WorkspaceError
+from bam_train.errors import LoopError, TimeNotWritten, UnknownVariable
 from bam_train.loop.workspace.variables import Variable, kind_mismatch, no_batch
 
 if TYPE_CHECKING:
@@ -60,9 +60,9 @@ class Workspace:
         self, workspace: Workspace | None = None, *, window: int | None = None, sink: Sink | None = None
     ) -> None:
         if window is not None and window < 2:
-            raise WorkspaceError(f"window: expected at least 2 times (the last and the one before), found {window}.")
+            raise LoopError(f"window: expected at least 2 times (the last and the one before), found {window}.")
         if sink is not None and not callable(sink):
-            raise WorkspaceError(f"sink: expected sink(first_time, values), found {type(sink).__name__}.")
+            raise LoopError(f"sink: expected sink(first_time, values), found {type(sink).__name__}.")
         self.variables: dict[str, Variable] = {}
         self.first_time = 0
         self.window, self._sink = window, sink
@@ -78,7 +78,7 @@ class Workspace:
         The first write makes the variable. Missing earlier times become zeros. Times may be written in any order.
 
         Raises:
-            ValueMismatch: Another shape, dtype, device or kind of array than the variable has.
+            LoopError: Another shape, dtype, device or kind of array than the variable has.
             TimeNotWritten: t has left the window, or is negative beyond the first.
         """
         variable = self.variables.get(name)
@@ -117,11 +117,11 @@ class Workspace:
         In a variable that was written time by time, it overwrites times 0 to T - 1 and leaves later ones.
 
         Raises:
-            ValueMismatch: Not an array, or it differs from the times already written.
-            WorkspaceError: Earlier times have left the window.
+            LoopError: Not an array, or it differs from the times already written.
+            LoopError: Earlier times have left the window.
         """
         if self.first_time:
-            raise WorkspaceError(
+            raise LoopError(
                 f"{name!r}: all times cannot be written, those before {self.first_time} have left the window."
             )
         variable = self.variables.get(name) or self._new(name, value, "all times")
@@ -170,11 +170,11 @@ class Workspace:
     # -- sizes -----------------------------------------------------------------------------------------------------
 
     def time_size(self) -> int | None:
-        """One after the last time written; None if empty. Raises `WorkspaceError` if the variables differ."""
+        """One after the last time written; None if empty. Raises `LoopError` if the variables differ."""
         return _common("time", {name: one.time_size() for name, one in self.variables.items()})
 
     def batch_size(self) -> int | None:
-        """B; None if empty. Raises `WorkspaceError` if the variables differ."""
+        """B; None if empty. Raises `LoopError` if the variables differ."""
         return _common("batch", {name: one.batch_size() for name, one in self.variables.items()})
 
     def __str__(self) -> str:
@@ -197,7 +197,7 @@ class Workspace:
         if size is None:
             return
         if not 0 <= n <= size:
-            raise WorkspaceError(f"copy_n_last_steps: expected at most {size} steps, found {n}.")
+            raise LoopError(f"copy_n_last_steps: expected at most {size} steps, found {n}.")
         self.copy_time(size - n, 0, n, var_names)
 
     def subtime(self, from_t: int, to_t: int) -> Workspace:
@@ -223,7 +223,7 @@ class Workspace:
         """A new workspace of n batch columns, drawn uniformly with replacement."""
         size = self.batch_size()
         if not size:
-            raise WorkspaceError(f"select_batch_n: {n} columns are wanted, and there are none.")
+            raise LoopError(f"select_batch_n: {n} columns are wanted, and there are none.")
         torch = self._torch()
         return self.select_batch(torch.randint(size, (n,)) if torch else np.random.randint(size, size=n))
 
@@ -250,7 +250,7 @@ class Workspace:
         """
         times = self.time_size() or 0
         if n_timesteps > times or n_times < 1:
-            raise WorkspaceError(
+            raise LoopError(
                 f"sample_subworkspace: expected one or more windows of at most {times} times, "
                 f"found {n_times} of {n_timesteps}."
             )
@@ -270,13 +270,11 @@ class Workspace:
     def cat_batch(workspaces: Sequence[Workspace]) -> Workspace:
         """A new workspace of several, side by side over the batch; all must have one length."""
         if not workspaces:
-            raise WorkspaceError("cat_batch: expected one workspace or more, found none.")
+            raise LoopError("cat_batch: expected one workspace or more, found none.")
         times = workspaces[0].time_size()
         for other in workspaces[1:]:
             if other.time_size() != times:
-                raise WorkspaceError(
-                    f"cat_batch: expected workspaces of {times} times, found one of {other.time_size()}."
-                )
+                raise LoopError(f"cat_batch: expected workspaces of {times} times, found one of {other.time_size()}.")
         variables = workspaces[0].variables.items()
         return _of(
             {name: one.library.concatenate([ws.get_full(name) for ws in workspaces], 1) for name, one in variables}
@@ -297,7 +295,7 @@ class Workspace:
             done = self.variables[filter_key]
             for name, one in self.variables.items():
                 if one.time_size() != done.time_size():
-                    raise WorkspaceError(
+                    raise LoopError(
                         f"{name!r} has {one.time_size()} times and {filter_key!r} has {done.time_size()}; "
                         f"get_transitions needs all to be alike."
                     )
@@ -374,7 +372,7 @@ class Workspace:
     def _require_times(self, name: str, begin: int, end: int) -> None:
         """Refuse a range of times that is empty, negative, or has left the window."""
         if not 0 <= begin < end:
-            raise WorkspaceError(f"{name!r}: expected times with 0 <= from < to, found from {begin} to {end}.")
+            raise LoopError(f"{name!r}: expected times with 0 <= from < to, found from {begin} to {end}.")
         if begin < self.first_time:
             raise TimeNotWritten(f"{name!r} has lost t={begin}: times before {self.first_time} have left the window.")
 
@@ -415,11 +413,9 @@ def _common(what: str, sizes: Mapping[str, int]) -> int | None:
     (first, common), *others = sizes.items() or [("", None)]
     for name, size in others:
         if size != common:
-            raise WorkspaceError(
-                f"The variables have different {what} sizes: {first!r} has {common}, {name!r} has {size}."
-            )
+            raise LoopError(f"The variables have different {what} sizes: {first!r} has {common}, {name!r} has {size}.")
     return common
 
 
-def _no_time(name: str, t: Any) -> WorkspaceError:
-    return WorkspaceError(f"{name!r}: expected a whole number as time, found {t!r}.")
+def _no_time(name: str, t: Any) -> LoopError:
+    return LoopError(f"{name!r}: expected a whole number as time, found {t!r}.")

@@ -23,7 +23,7 @@ from bam_train.agent.remote.agent_client import AgentClient
 from bam_train.agent.transitions import decode
 from bam_train.checkpoint import Checkpoint
 from bam_train.environments import require_env_kwargs
-from bam_train.errors import AgentRefused, BamTrainError, OutputError, SettingsError, TrainingFailed
+from bam_train.errors import BamTrainError, OutputError, RequestRefused, SettingsError, TrainingFailed
 from bam_train.settings import SB3Settings, file_stem, merge
 from bam_train.trainers.best_checkpoint import choose_output
 from bam_train.trainers.learning.live_learner import ALGORITHM, TRAINER, LiveLearner
@@ -84,7 +84,7 @@ class LiveSession:
         """Learn until the steps are done (True), or the user wants to end (False); saves in both cases.
 
         Raises:
-            AgentRefused: Another learner is there, or the token does not administer.
+            RequestRefused: Another learner is there, or the token does not administer.
             TrainingFailed: A loss is not finite, or the agent runs another environment.
         """
         try:
@@ -117,7 +117,7 @@ class LiveSession:
         try:
             client.connect().listen("transitions", self._events.put)
             status = client.ask("status")
-        except AgentRefused:
+        except RequestRefused:
             client.close()
             if self._learned_at is None or time.monotonic() - self._learned_at > _GHOST:
                 raise

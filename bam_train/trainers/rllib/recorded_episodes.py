@@ -50,11 +50,7 @@ def add_data(config: Any, settings: RLlibSettings, observation_space: Space[Any]
     if config.is_online:  # CQL, a subclass of SAC, makes an environment without stepping it
         config.environment(register_foreign(settings.env), disable_env_checking=True)
         config.env_runners(num_env_runners=0)
-    config.offline_data(
-        input_=[settings.data],
-        offline_data_class=RecordedData,
-        dataset_num_iters_per_learner=updates,
-    )
+    config.offline_data(input_=[settings.data], offline_data_class=RecordedData, dataset_num_iters_per_learner=updates)
     return config
 
 

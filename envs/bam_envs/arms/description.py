@@ -1,6 +1,7 @@
 """The description of an arm: joints, limits, tool, gripper, outline and work area, as plain data in a TOML file."""
 
 import dataclasses
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
@@ -239,6 +240,8 @@ class ArmDescription(Description):
             (*low, 0.0),
             (*high, width),
             (*speed, self.gripper.speed),
+            (*(row.acceleration for row in self.joints), math.inf),
+            (*(row.jerk for row in self.joints), math.inf),
         )
         return RobotSpec(self.name, tuple(signals), command, period=0.05)
 

@@ -50,6 +50,7 @@ class UnknownName(BamEnvsError, ValueError):  # noqa: N818 - named for the cause
         examples: Names to suggest if none is similar; every choice by default.
         similar: Least similarity of a suggested choice, from 0 to 1.
         meant: The name in the spelling of the table, to find the most similar choice; by default `name`.
+        remedy: A sentence that follows: how else to go on.
     """
 
     def __init__(
@@ -60,11 +61,12 @@ class UnknownName(BamEnvsError, ValueError):  # noqa: N818 - named for the cause
         examples: Iterable[str] | None = None,
         similar: float = 0.65,
         meant: str | None = None,
+        remedy: str = "",
     ) -> None:
         self.kind, self.name, self.choices = kind, name, sorted(choices)
         self.closest = closest(meant or name, self.choices, similar)
         hint = did_you_mean(meant or name, self.choices, similar, examples)
-        super().__init__(f"Unknown {kind} {name!r}. {hint}")
+        super().__init__(f"Unknown {kind} {name!r}. {hint}{remedy and f' {remedy}'}")
 
 
 class InvalidValue(BamEnvsError, ValueError):  # noqa: N818

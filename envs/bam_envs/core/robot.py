@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, Protocol, runtime_checkable
 
@@ -39,13 +39,17 @@ class SignalSpec:
     """Highest value of each number."""
     max_rate: tuple[float, ...] | None = None
     """Fastest change of each number [unit/s]; None for a measured signal."""
+    max_acceleration: tuple[float, ...] | None = None
+    """Greatest acceleration of each number of an arm's command [unit/s^2]; None if it is not known."""
+    max_jerk: tuple[float, ...] | None = None
+    """Greatest jerk of each number of an arm's command [unit/s^3]; None if it is not known."""
 
     def part(self, labels: tuple[str, ...]) -> SignalSpec:
         """The numbers called `labels`, in that order; the signal must have all of them."""
         places = [self.labels.index(label) for label in labels]
-        low, high = tuple(self.low[one] for one in places), tuple(self.high[one] for one in places)
-        rate = None if self.max_rate is None else tuple(self.max_rate[one] for one in places)
-        return SignalSpec(self.name, labels, tuple(self.units[one] for one in places), low, high, rate)
+        rows = ((key, value) for key, value in vars(self).items() if isinstance(value, tuple))
+        picked: dict[str, Any] = {key: tuple(value[one] for one in places) for key, value in rows}
+        return replace(self, **picked)
 
 
 @dataclass(frozen=True)
@@ -105,6 +109,14 @@ class BaseBody:
     def size(self) -> float:
         """Distance of its farthest point from its frame [m]."""
         return max(math.hypot(x, y) for x, y in self.corners) + self.radius
+
+    @cached_property
+    def edge(self) -> tuple[tuple[float, float], ...]:
+        """Corners to draw it with: of a circle those of a polygon with 32 of them, anticlockwise [m]."""
+        if not self.radius:
+            return self.corners
+        ((x, y),), turns = self.corners, (math.tau * at / 32 for at in range(32))
+        return tuple((x + self.radius * math.cos(turn), y + self.radius * math.sin(turn)) for turn in turns)
 
     @cached_property
     def sides(self) -> tuple[tuple[float, float, float], ...]:

@@ -50,6 +50,8 @@ class Description:
     """The tables in it."""
     MOVING: ClassVar[tuple[str, ...]]
     """Keys that decide how the robot moves."""
+    ANOTHER: ClassVar[str] = "Another arm is described first: bam-robots add NAME --urdf FILE."
+    """How a robot of this kind that is not known is described."""
 
     name: ModelName
     title: NonEmpty
@@ -168,14 +170,14 @@ def find_model(name: "str | Mapping[str, Any] | Description", kind: type[D]) -> 
         UnknownName: There is none; with the closest match.
         InvalidValue: Its file or table does not fit, or the robot is of another `kind`.
     """
-    found = _found(name)
+    found = _found(name, kind)
     if not isinstance(found, kind):
         choices = ", ".join(sorted(known_models(kind)))
         raise InvalidValue(f"robot_model: {found.name} is {found.WHAT}, and {kind.WHAT} is needed: {choices}.")
     return found
 
 
-def _found(name: "str | Mapping[str, Any] | Description") -> Description:
+def _found(name: "str | Mapping[str, Any] | Description", kind: type[Description] = Description) -> Description:
     if isinstance(name, Description):
         return name
     if isinstance(name, Mapping):
@@ -186,7 +188,7 @@ def _found(name: "str | Mapping[str, Any] | Description") -> Description:
         return read_description(path)
     known = known_models()
     if name not in known:
-        raise UnknownName("robot model", name, known)
+        raise UnknownName("robot model", name, known_models(kind), remedy=kind.ANOTHER)
     return read_description(known[name])
 
 

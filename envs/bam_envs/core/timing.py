@@ -17,6 +17,8 @@ KEPT = 65536
 """Ticks whose lateness is kept, to limit the memory: 55 minutes at 20 Hz."""
 SLOW = 0.1
 """Share of the period from which on the CPU time of an action counts: a tenth."""
+CLOSEST = 0.96
+"""Least time from one command to the next, as a share of the period."""
 RECENT = 20
 """Number of the last ticks that show whether the computer is busy."""
 BUSY = 0.05
@@ -57,16 +59,18 @@ class Lateness:
 
 
 class Pacer:
-    """Deadlines one period apart, so that lateness does not add up, with statistics of the lateness.
+    """Deadlines one period apart, with statistics of the lateness.
 
-    A late tick starts at once, and later deadlines do not move. A tick that is late by more than half a period begins
-    a new grid: the deadlines that passed are counted as missed and are not caught up. Two deadlines are therefore never
-    less than half a period apart.
+    A late tick starts at once, and the next deadline is a period after the last one, or the share `closest` of a period
+    after this tick if that is later: what moves a robot must not come soon after a late tick. The deadlines that passed
+    before a tick that is late by more than half a period are counted as missed, and none is caught up.
 
     Args:
         period: Time between two ticks [s]; None runs as fast as possible, without deadlines.
         now: The clock [s]; monotonic.
         sleep: Waits for a time [s]; if it returns True, the tick starts now.
+        closest: Least time from a tick to the next deadline, as a share of the period; 0.5 for a clock, whose lateness
+            must not add up.
     """
 
     def __init__(
@@ -75,8 +79,9 @@ class Pacer:
         *,
         now: Callable[[], float] = time.monotonic,
         sleep: Callable[[float], bool | None] = time.sleep,
+        closest: float = CLOSEST,
     ) -> None:
-        self.period, self._now, self._sleep = period, now, sleep
+        self.period, self._now, self._sleep, self._closest = period, now, sleep, closest
         self.ticks = 0
         """Ticks started, over all episodes."""
         self.missed = 0
@@ -118,7 +123,8 @@ class Pacer:
         # Rounding must not make a tick that is late by exactly half a period begin a new grid.
         missed = math.ceil(late / self.period - 0.5 - 1e-9)
         self.missed += missed
-        self._due = (now if missed or due - now > self.period / 2 else due) + self.period
+        begins = missed or due - now > self.period / 2
+        self._due = now + self.period if begins else max(due + self.period, now + self._closest * self.period)
         self._latest = max(self._latest, late)
         if len(self._late) < KEPT:
             self._late.append(late)
@@ -235,7 +241,7 @@ class Ticker:
         self._wake.set()
 
     def _run(self) -> None:
-        pacer = Pacer(self.period)
+        pacer = Pacer(self.period, closest=0.5)
         pacer.start()
         while True:
             self._wake.wait(max(0.0, pacer.slack))

@@ -32,6 +32,7 @@ _MOST = sys.float_info.max
 
 Finite = Annotated[float, Meta(ge=-_MOST, le=_MOST, description="a finite number")]
 Positive = Annotated[float, Meta(gt=0, le=_MOST)]
+AboveZero = Annotated[float, Meta(gt=0, description="a number above 0")]  # infinity, too
 NonNegative = Annotated[float, Meta(ge=0, le=_MOST)]
 Fraction = Annotated[float, Meta(ge=0, le=1)]
 PositiveInt = Annotated[int, Meta(ge=1)]

@@ -41,7 +41,7 @@ def as_flag(field: str) -> str:
 
 
 def closest(name: object, known: Iterable[str], cutoff: float = 0.65) -> str | None:
-    """The most similar of the `known` names, ignoring case; None if none is similar.
+    """The most similar of the `known` names, ignoring case, or one with these initials; None if none is similar.
 
     Args:
         name: The misspelt name.
@@ -49,7 +49,9 @@ def closest(name: object, known: Iterable[str], cutoff: float = 0.65) -> str | N
         cutoff: Least similarity of a match, from 0 to 1.
     """
     names = sorted(known)
-    same = [one for one in names if one.lower() == str(name).lower()]
+    initials = {"".join(part[:1] for part in one.split("_")): one for one in names if "_" in one}
+    lower = str(name).lower()
+    same = [one for one in names if one.lower() == lower] or [initials[one] for one in initials if one == lower]
     matches = same or difflib.get_close_matches(str(name), names, n=1, cutoff=cutoff)
     return matches[0] if matches else None
 

@@ -9,7 +9,7 @@ Longer than most files: the checks of an arm, and the URDF that they read.
 import itertools
 import math
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Container, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 from xml.etree import ElementTree
 
@@ -39,6 +39,8 @@ AXES, AXES_TURN = 0.005, 0.02
 TOOL_OFF, TOOL_CENTRE = 0.02, re.compile(r"(?i).*tcp.*|tool")
 """Tolerance of the tool centre point in a URDF [m], which makers put at the tips of the fingers, and tasks between the
 pads; and the names of links that are one."""
+TOOL_TURN = 0.26
+"""Tolerance of the directions in which a gripper points and closes [rad]."""
 Axis = tuple[Array, Array]
 
 
@@ -161,7 +163,8 @@ def described_checks(spec: RobotSpec, chain: SerialChain, margin: float, inspect
     Every two axes are compared, by their angle and their distance, because frames of the same arm differ from file to
     file. The mount is where the first two are in the frame of the profile's poses, in ``base_link`` or in the link that
     the first joint turns in; that frame has to be upright in the URDF. The tool is compared where a link is called a
-    tool centre point; its rotation is not compared.
+    tool centre point, with the axis along which it points; and the axis along which the gripper closes is compared with
+    the first joints that move behind the last one of the arm.
     """
     urdf, why = _description(inspection)
     names = [name for name, unit in zip(spec.command.labels, spec.command.units, strict=True) if unit == "rad"]
@@ -193,7 +196,7 @@ def described_checks(spec: RobotSpec, chain: SerialChain, margin: float, inspect
     frame = known[0]
     yield _mount(urdf, frame, base, names, list(zip(here, there, strict=True))[:2])
     at = dict(zip(names, chain.home.tolist(), strict=True))
-    yield from _tool_centre(urdf, frame, names[-1], at, frames[-1][:3, 3])
+    yield from _tool_centre(urdf, frame, names[-1], at, frames[-1])
 
 
 def _mount(urdf: Urdf, frame: str, base: str, names: Sequence[str], axes: Sequence[tuple[Axis, Axis]]) -> Check:
@@ -220,22 +223,47 @@ def _mount(urdf: Urdf, frame: str, base: str, names: Sequence[str], axes: Sequen
 
 
 def _tool_centre(urdf: Urdf, frame: str, last: str, at: Mapping[str, float], tool: Array) -> Iterator[Check]:
-    """A tool centre point that is fixed to the `last` joint is where `tool` (3,) is in `frame`, with joints `at`."""
+    """A tool centre point that is fixed to the `last` joint is where `tool` (4, 4) is in `frame`, with joints `at`.
+
+    It points as `tool` does, and a gripper on that joint closes along the x axis of `tool`.
+    """
     what, expected = f"tool in {DESCRIPTION}", f"within {1000 * TOOL_OFF:g} mm of the description's"
     fixed = {name: joint for name, joint in urdf.items() if joint.kind == "fixed"}
-    carried, gaps = {urdf[last].child}, dict[str, float]()
+    carried, gaps = {urdf[last].child}, list[tuple[float, float, str]]()
     for _ in range(len(fixed)):
         carried |= {joint.child for joint in fixed.values() if joint.parent in carried}
     for link in sorted(carried):
         pose = urdf.pose(frame, link, at) if TOOL_CENTRE.fullmatch(link) else None
         if pose is not None:
-            gaps[link] = float(np.linalg.norm(pose[0] - tool))
-    if not gaps:
+            gaps.append((float(np.linalg.norm(pose[0] - tool[:3, 3])), _turn(pose[1][:, 2], tool[:3, 2]), link))
+    if gaps:
+        gap, turn, link = min(gaps)
+        found, fits = f"{link} is {1000 * gap:.0f} mm from it", gap <= TOOL_OFF and turn <= TOOL_TURN
+        found += f", and points {math.degrees(turn):.0f} degrees elsewhere" if turn > TOOL_TURN else ""
+        yield Check(what, expected, found if fits else f"another tool: {found}", fits=fits)
+    else:
         yield Check(what, expected, "no link is called tool or *tcp*", fits=None)
-        return
-    gap, link = min((gap, link) for link, gap in gaps.items())
-    found = f"{link} is {1000 * gap:.0f} mm from it"
-    yield Check(what, expected, found if gap <= TOOL_OFF else f"another tool: {found}", fits=gap <= TOOL_OFF)
+    turns = [min(turn, math.pi - turn) for turn in _closing(urdf, frame, carried, at, tool)]
+    if turns:
+        found, fits = f"{math.degrees(min(turns)):.0f} degrees off", min(turns) <= TOOL_TURN
+        found += "" if fits else ": the gripper is turned on the flange; turn it, or tool.quat of the description"
+        yield Check(f"fingers in {DESCRIPTION}", "close along x of the description's tool", found, fits=fits)
+
+
+def _closing(urdf: Urdf, frame: str, carried: Container[str], at: Mapping[str, float], tool: Array) -> Iterator[float]:
+    """Angle of x of `tool` to the way in which each finger on the links `carried` moves [rad]."""
+    for joint in urdf.values():
+        pose = urdf.pose(frame, joint.parent, at) if joint.kind != "fixed" and joint.parent in carried else None
+        if pose is not None:
+            axis = pose[1] @ joint.origin[:3, :3] @ joint.axis
+            way = axis if joint.kind == "prismatic" else np.cross(axis, tool[:3, 2])
+            if np.linalg.norm(np.cross(way, tool[:3, 2])) > 0.5:  # else the gripper turns, or grows
+                yield _turn(way, tool[:3, 0])
+
+
+def _turn(one: Array, other: Array) -> float:
+    """Angle of two vectors [rad]."""
+    return math.atan2(float(np.linalg.norm(np.cross(one, other))), float(one @ other))
 
 
 def measured_joints(inspection: Inspection, spec: RobotSpec) -> Array | None:
@@ -383,7 +411,12 @@ def _described_kinematics(geometry: ArmGeometry, joints: Array, urdf: Urdf) -> I
     yield Check(f"kinematics in {DESCRIPTION}", f"flange within {OFF_AXIS:g} m", found, fits=fits)
     if fits:
         yield _mount(urdf, "base_link", "base_link", (), ())  # its axes were compared with the flange
-        at, tool = dict(zip(UR_JOINTS, q.tolist(), strict=True)), geometry.tool_position(q[None])[0]
+        at, tool, (position, axes) = (
+            dict(zip(UR_JOINTS, q.tolist(), strict=True)),
+            np.eye(4),
+            geometry.tool_pose(q[None]),
+        )
+        tool[:3, :3], tool[:3, 3] = axes[0], position[0]
         lines = _tool_centre(urdf, "base_link", UR_JOINTS[-1], at, tool) if geometry.tool else ()
         yield from (line for line in lines if line.fits is not None)  # the tool's pose shows it better
 

@@ -11,7 +11,7 @@ from bam_envs.core.robot import RobotSpec
 from bam_envs.core.robot_models import DEFAULT_ARM, known_models
 from bam_envs.live.rosbridge_robot import RosbridgeRobot
 from bam_envs.live.shadow_robot import ShadowRobot
-from bam_envs.robots.profile import load_profile, profile_for
+from bam_envs.robots.profile import fitting_profile, load_profile, profile_for
 from bam_envs.ros.profile_tables import RobotProfile
 from bam_envs.rosbridge.endpoint import Endpoint
 from bam_envs.safety.gate import SafeRobot
@@ -84,7 +84,10 @@ def _chosen(profile: RobotProfile | str | Path | None, spec: RobotSpec | None) -
     """The profile that is named, or the one for `spec`."""
     if profile is None and spec is not None:
         return profile_for(spec)
-    return profile if isinstance(profile, RobotProfile) else load_profile("ur5e" if profile is None else profile)
+    if isinstance(profile, RobotProfile):
+        return profile
+    name = "ur5e" if profile is None else profile
+    return load_profile(name) if spec is None else fitting_profile(name, spec)
 
 
 def profile_limits(profile: RobotProfile) -> Limits:

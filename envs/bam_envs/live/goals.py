@@ -1,13 +1,14 @@
 """Parts of a command that go to actions and services, such as a gripper's: sent when they change, awaited by nobody.
 
 A robot that describes itself gets them over the connection of its commands, in their order. Any other gets them over a
-connection of their own, because a bridge may read nothing else of a connection while a goal runs.
+connection of their own, because a bridge may read nothing else of a connection while a goal runs. A bridge of ROS 1 has
+no goals: they go over the topics of actionlib.
 """
 
 import secrets
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -16,8 +17,9 @@ from numpy.typing import NDArray
 
 from bam_envs.core.errors import BamEnvsError, LinkLost, RemoteError
 from bam_envs.core.robot import SignalSpec
+from bam_envs.ros.messages import write_stamp
 from bam_envs.ros.profile_tables import Sink
-from bam_envs.rosbridge.bus import ABORTED, CANCELED, SUCCEEDED
+from bam_envs.rosbridge.bus import ABORTED, CANCELED, SUCCEEDED, Caller, Message
 from bam_envs.rosbridge.ros_bus import Reply, RosBus, bare_reason
 
 Array = NDArray[np.float64]
@@ -27,6 +29,8 @@ _STEP = 0.02
 """Least change of a number for which a goal is sent, as a share of its range; the ends of the range are always sent."""
 _ANSWER_WITHIN = 10.0
 """Longest time that a service may take for its answer [s]."""
+_STATUSES = {2: CANCELED, 3: SUCCEEDED, 4: ABORTED, 5: ABORTED, 8: CANCELED}
+"""The ends of a goal in actionlib_msgs/GoalStatus: preempted, succeeded, aborted, rejected, recalled."""
 _ENDS = {CANCELED: "was canceled", ABORTED: "was aborted"}
 
 
@@ -66,6 +70,29 @@ class Goals:
         self._last: dict[tuple[str, ...], Array] = {}
         self._running: dict[tuple[str, ...], _Running] = {}
         self._next: dict[tuple[str, ...], tuple[Sink, dict[str, Any]]] = {}
+
+    def prepare(self, sinks: Iterable[Sink]) -> None:
+        """Declare the topics of actionlib for the actions of `sinks`, if the bridge is one of ROS 1."""
+        if not self._is_ros1:
+            return
+        for sink in (form for one in sinks for form in one.forms if form.action):
+            name = self._namespace + sink.action
+            self.link.advertise(f"{name}/goal", f"{sink.type}ActionGoal")
+            self.link.advertise(f"{name}/cancel", "actionlib_msgs/GoalID")
+            self.link.subscribe(f"{name}/result", f"{sink.type}ActionResult", partial(self._ended, sink))
+
+    @property
+    def _is_ros1(self) -> bool:
+        return self.link.ros == "ros1"
+
+    def _ended(self, sink: Sink, message: Message, caller: Caller) -> None:
+        """The result of a goal of actionlib, perhaps of somebody else's."""
+        status: Any = message.get("status")
+        status = status if isinstance(status, Mapping) else {}
+        identity: Any = status.get("goal_id")
+        if isinstance(identity, Mapping) and isinstance(identity.get("id"), str):
+            end = _STATUSES.get(status.get("status", 0), status.get("status"))
+            self._took(sink, identity["id"], {"status": end, "values": message.get("result")})
 
     def send(self, sink: Sink, values: Array, message: dict[str, Any]) -> None:
         """Send the `message` with the numbers `values` (k,) [SI], if they are news; never waits.
@@ -114,9 +141,15 @@ class Goals:
         else:
             request |= {"op": "call_service", "service": name, "type": kind, "timeout": _ANSWER_WITHIN}
         self._running[sink.labels] = _Running(identity, name, time.monotonic())
+        if sink.action and self._is_ros1:
+            self.link.publish(f"{name}/goal", {"goal_id": _goal_id(identity), "goal": message})
+            return
         self.link.ask_soon(request, partial(self._took, sink, identity))
 
     def _cancel(self, running: "_Running") -> None:
+        if self._is_ros1:
+            self.link.publish_soon(f"{running.name}/cancel", _goal_id(running.identity))
+            return
         self.link.send_soon({"op": "cancel_action_goal", "id": running.identity, "action": running.name})
 
     def _took(self, sink: Sink, identity: str, reply: Reply) -> None:
@@ -137,6 +170,11 @@ class Goals:
         asked = ", ".join(f"{label} {value:.3g}" for label, value in zip(sink.labels, last.tolist(), strict=True))
         what = f"the {'action' if sink.action else 'service'} {self._namespace}{sink.address}"
         self._report(RemoteError(f"{self.link.url}: {what} {trouble} ({asked}). Look at the gripper and its driver."))
+
+
+def _goal_id(identity: str) -> dict[str, Any]:
+    """An actionlib_msgs/GoalID; the stamp 0 means that nothing but the id tells which goal it is."""
+    return {"stamp": write_stamp(0.0, ros1=True), "id": identity}
 
 
 def _trouble(sink: Sink, url: str, reply: Reply) -> str:

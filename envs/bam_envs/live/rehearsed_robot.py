@@ -11,7 +11,7 @@ from bam_envs.core.errors import InvalidValue, ResetNeeded
 from bam_envs.core.robot import EnvIds, Initial, RobotSpec, RobotState
 from bam_envs.live.building import profile_limits, require_effect
 from bam_envs.robots.linked import Array, LinkedRobot
-from bam_envs.robots.profile import load_profile, profile_for
+from bam_envs.robots.profile import fitting_profile, profile_for
 from bam_envs.ros.codec import RobotInfo
 from bam_envs.safety.gate import ClearedCommand, SafeRobot
 from bam_envs.safety.guard import is_base, measured_places
@@ -102,7 +102,7 @@ def rehearsed_robot(
             changes no guard.
     """
     labels = robot.spec.command.labels
-    chosen = profile_for(robot.spec) if profile is None else load_profile(profile).narrowed(labels)
+    chosen = profile_for(robot.spec) if profile is None else fitting_profile(profile, robot.spec).narrowed(labels)
     tool = getattr(robot.robot, "tool_position", None)  # forward kinematics of an arm that is no UR5e
     limits = profile_limits(chosen).changed({} if guards is None else guards)
     if trial:

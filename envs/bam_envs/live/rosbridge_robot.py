@@ -132,6 +132,7 @@ class RosbridgeRobot:
         self._epoch = 0  # of the connection that was verified; another one needs a reset
         self._cut = threading.Event()
         self._sending, self._halts = threading.Lock(), 0
+        self._due_after = 0  # halts that there were when the next command began to be due
         self._woken = threading.Event()  # by a halt or a drop of the link, which end the wait of a step
         self._halt_failed = False  # and the failure was reported
         self._commanded = self._is_enabled = False  # since `connect`
@@ -245,6 +246,7 @@ class RosbridgeRobot:
                 link = RosbridgeLink(self._endpoint, name="goals", lost_after=_LOST_AFTER)
             self._goals = Goals(link, self.spec.command, self.namespace, self._refuse)
             link.connect()
+            self._goals.prepare(others)
         self._sinks = tuple(
             types.check_listened(self.namespace + one.topic, one) if one.topic else one for one in self._sinks
         )
@@ -397,7 +399,7 @@ class RosbridgeRobot:
             StaleState: The robot did not answer in time.
             ProtocolError: The state differs from the profile.
         """
-        control, halts = self._connected(), self._halts
+        control, halts = self._connected(), self._due_after
         if not isinstance(command, ClearedCommand):
             raise InvalidValue("Commands reach a live robot only through SafeRobot. Build it with live_robot(...).")
         values = command.for_robot(self)[0]
@@ -405,10 +407,8 @@ class RosbridgeRobot:
         self._require_accepted()
         lockstep = self.info.lockstep  # no time passes between commands: a late one is valid until the wait times out
         life = self._answer_timeout if lockstep else self._command_life
-        if not lockstep:
-            self._await_deadline(halts)
-            if self._halts != halts:
-                return self.measure()
+        if self._halts != halts:
+            return self.measure()
         tag, until = self._session.tagger.next(self._epoch, life), self._clock() + life
         self._pacer.tick()
         self._send(control, values, tag, halts, until)
@@ -431,15 +431,20 @@ class RosbridgeRobot:
         self._require_accepted()
         return self.measure()
 
-    def _await_deadline(self, halts: int) -> None:
-        """Wait until the command is due; the next period ends earlier by the time that its computation took."""
+    def await_due(self) -> None:
+        """Wait until the next command is due; a halt from here on ends the wait, and `step` then sends nothing.
+
+        The next period ends earlier by the time that the computation of the command took.
+        """
+        halts = self._due_after = self._halts
+        if self.info.lockstep:
+            return
         worked, period = self._clock() - self._ended_at, self.spec.period
         if worked < period:  # a longer pause is not spent on one command
             self._lead = min(max(worked, _LEAD_DECAY * self._lead), _LEAD * period)
         if self._sent_after != halts:  # the robot is at rest, and whoever takes over need not wait for so long
             self._pacer.hasten()
         self._wait(self._pacer.slack, halts)
-        self._require_link()
 
     def _wait(self, seconds: float, halts: int) -> None:
         """Wait, at most until the link drops, or until there were more than `halts` halts."""

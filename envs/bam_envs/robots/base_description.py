@@ -164,6 +164,7 @@ class BaseDescription(Description):
     WHAT: ClassVar[str] = "a wheeled base"
     PARTS: ClassVar[Mapping[str, type[Any]]] = {"footprint": Footprint, "drive": DriveRow, "lasers": LaserRow}
     MOVING: ClassVar[tuple[str, ...]] = ("footprint", "drive", "lasers")
+    ANOTHER: ClassVar[str] = "Another base is described in a file robots/NAME.toml, such as turtlebot4.toml."
 
     footprint: Footprint
     drive: DriveRow

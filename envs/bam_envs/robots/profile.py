@@ -24,7 +24,7 @@ from bam_envs.arms.description import ArmDescription
 from bam_envs.core.errors import InvalidValue, UnknownName
 from bam_envs.core.robot import RobotSpec, SignalSpec
 from bam_envs.core.robot_models import Description, description_folders, find_model, known_models
-from bam_envs.core.validation import Finite, NonEmpty, NonNegative, Positive, check, read_table, type_hints
+from bam_envs.core.validation import AboveZero, Finite, NonEmpty, NonNegative, Positive, check, read_table, type_hints
 from bam_envs.robots.base_description import base_model
 from bam_envs.robots.ur5e import arm_spec
 from bam_envs.ros.codec import LISTED_TYPES
@@ -106,6 +106,8 @@ class _Signal:
     high: tuple[Finite, ...]
     name: NonEmpty = "command"
     max_rate: tuple[Finite, ...] = ()
+    max_acceleration: tuple[AboveZero, ...] = ()
+    max_jerk: tuple[AboveZero, ...] = ()
 
 
 def load_profile(name_or_path: str | Path) -> RobotProfile:
@@ -120,6 +122,29 @@ def load_profile(name_or_path: str | Path) -> RobotProfile:
     if name not in shipped_profiles() and name in known_models():
         return usual_profile(_named_robot("robot profile", name))
     return _profile(*_read_file(name))
+
+
+def fitting_profile(name_or_path: str | Path, spec: RobotSpec) -> RobotProfile:
+    """As `load_profile`, for the robot of `spec`; `InvalidValue` for that of another robot, with those that fit."""
+    profile, ours = load_profile(name_or_path), _moved(spec)
+    if (profile.kind == "base") == is_base(spec) and set(ours) <= set(_moved(profile)):
+        return profile
+    tables = [name for name in (*shipped_profiles(), spec.name) if name in shipped_profiles() or own_profile(name)]
+    found = {name: load_profile(name) for name in tables}
+    fits = [
+        name for name, one in found.items() if ours == _moved(one) and (one.kind == "arm" or one.robot == spec.name)
+    ]
+    remedy = f"Leave it out for the usual topics, or write one: bam-robots profile {spec.name} --from URL."
+    remedy = f"Profiles that fit: {', '.join(fits)}." if fits else remedy
+    raise InvalidValue(
+        f"The profile {name_or_path} is that of another robot: it has {', '.join(_moved(profile))}, and "
+        f"{spec.name} has {', '.join(ours)}. {remedy}"
+    )
+
+
+def _moved(robot: RobotSpec | RobotProfile) -> tuple[str, ...]:
+    """The joints of an arm, or the axes of a base."""
+    return tuple(at for at, unit in zip(robot.command.labels, robot.command.units, strict=True) if unit != "m")
 
 
 def read_profile(text: str, where: str) -> RobotProfile:
@@ -402,8 +427,9 @@ def _signal(row: Table, where: str) -> SignalSpec:
     units, low, high = (_each(where, key, getattr(signal, key), size) for key in ("units", "low", "high"))
     if not all(least < most for least, most in zip(low, high, strict=True)):
         raise InvalidValue(f"{where}: low must be below high.")
-    rate = _each(where, "max_rate", signal.max_rate, size) if signal.max_rate else None
-    return SignalSpec(signal.name, signal.labels, units, low, high, rate)
+    given = {key: getattr(signal, key) for key in ("max_rate", "max_acceleration", "max_jerk")}
+    limits = {key: _each(where, key, values, size) for key, values in given.items() if values}
+    return SignalSpec(signal.name, signal.labels, units, low, high, **limits)
 
 
 def _state(where: str, file: _File, spec: RobotSpec) -> list[Source]:

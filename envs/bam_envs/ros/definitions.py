@@ -91,6 +91,9 @@ control_msgs/GripperCommand: float64 position; float64 max_effort
 control_msgs/GripperCommandGoal: GripperCommand command
 control_msgs/GripperCommandResult: float64 position; float64 effort; bool stalled; bool reached_goal
 control_msgs/GripperCommandFeedback: float64 position; float64 effort; bool stalled; bool reached_goal
+control_msgs/ParallelGripperCommandGoal: sensor_msgs/JointState command
+control_msgs/ParallelGripperCommandResult: sensor_msgs/JointState state; bool stalled; bool reached_goal
+control_msgs/ParallelGripperCommandFeedback: sensor_msgs/JointState state
 franka_msgs/GraspEpsilon: float64 inner; float64 outer
 franka_msgs/MoveGoal: float64 width; float64 speed
 franka_msgs/MoveResult: bool success; string error

@@ -47,18 +47,30 @@ def require_message(message: object, where: str) -> Message:
     return message
 
 
+_FIRST = "[0]"
+"""Ends a step of a path that is a list, of which the first is meant."""
+
+
 def value_at(message: Message, path: str, where: str) -> Any:
-    """The value at `path`, e.g. ``pose.position.x``; in a stamped message, `path` is that of the unstamped type."""
+    """The value at `path`, e.g. ``pose.position.x`` or ``command.position[0]``, the first of a list.
+
+    In a stamped message, `path` is that of the unstamped type.
+    """
     steps = path.split(".")
     value: Any = message
     if steps[0] not in message and len(message) == 2 and "header" in message:  # a PoseStamped: a header and a Pose
         body = next(part for name, part in message.items() if name != "header")
         value = body if isinstance(body, _OBJECT) else message
-    for name in steps:
+    for step in steps:
+        name = step.removesuffix(_FIRST)
         if not isinstance(value, _OBJECT) or name not in value:
             found = ", ".join(map(str, value)) if isinstance(value, _OBJECT) else brief(value)
             raise ProtocolError(f"{where}: the field {path} is missing; found: {found}.")
         value = value[name]
+        if name != step:
+            if not isinstance(value, (list, tuple)) or not value:
+                raise ProtocolError(f"{where}: {name} must be a list with a value, not {brief(value)}.")
+            value = value[0]
     return value
 
 
@@ -167,7 +179,7 @@ def put_at(message: dict[str, Any], path: str, value: Any) -> None:
     *above, name = path.split(".")
     for step in above:
         message = message.setdefault(step, {})
-    message[name] = value
+    message[name.removesuffix(_FIRST)] = [value] if name.endswith(_FIRST) else value
 
 
 def read_stamp(message: Message, where: str) -> float | None:

@@ -44,7 +44,8 @@ class Content:
     type: MessageType
     """Type of the message, goal or request, ``pkg/Type``; a stamped message (``pkg/TypeStamped``) is read too."""
     fields: tuple[NonEmpty, ...] = ()
-    """Path of each number, e.g. ``pose.position.x``; ``yaw(orientation)`` is the angle about z of a quaternion."""
+    """Path of each number, e.g. ``pose.position.x``; ``command.position[0]`` is the first of a list, and
+    ``yaw(orientation)`` the angle about z of a quaternion."""
     names: tuple[NonEmpty, ...] = ()
     """The robot's names of the numbers, in the order of the labels; messages may have another order. Empty: the numbers
     of a source have no names, those of a sink have the names of its labels."""

@@ -7,7 +7,6 @@ its direction.
 
 import math
 from collections.abc import Sequence
-from itertools import repeat
 from operator import le, sub
 
 from bam_envs.core.robot import RobotSpec
@@ -49,6 +48,11 @@ def fastest_commands(spec: RobotSpec, limits: Limits, unlimited: float = math.in
     return [share * speed for speed in fastest_joints(spec, limits, unlimited)]
 
 
+def joint_limits(spec: RobotSpec, of_each: Sequence[float] | None, limit: float) -> Numbers:
+    """The lower one of `limit` and the robot's own limit `of_each` number of a command, for each joint (k,)."""
+    return [limit if of_each is None else min(limit, of_each[at]) for at in columns_in(spec.command, "rad")]
+
+
 class PositionLimits(Guard):
     """Joints keep a margin from the ends of their travel, the gripper stays in its range.
 
@@ -82,14 +86,14 @@ class JointSpeed(Guard):
     number, name, unit, setting = "G8", "joint speed", "rad/s", "joint_speed"
 
     def __init__(self, spec: RobotSpec, limits: Limits) -> None:
-        self._joints, self._fastest = columns_in(spec.command, "rad"), fastest_commands(spec, limits)
-        self.limit_value, self._pick = max(self._fastest), picker(self._joints)
+        self._joints, self.each = columns_in(spec.command, "rad"), fastest_commands(spec, limits)
+        self.limit_value, self._pick = max(self.each), picker(self._joints)
         self._period, self._reach = 0.0, list[float]()
 
     def limit(self, tick: Tick) -> bool:
         """Shorten the step of all joints."""
         if tick.period != self._period:
-            self._period, self._reach = tick.period, [fastest * tick.period for fastest in self._fastest]
+            self._period, self._reach = tick.period, [fastest * tick.period for fastest in self.each]
         if all(map(le, map(abs, map(sub, self._pick(tick.command), self._pick(tick.last))), self._reach)):
             return False
         return shorten(tick, self._joints, self._reach)
@@ -160,15 +164,18 @@ class ToolSpeed(Guard):
 class JointAcceleration(Guard):
     """Joints gain and lose speed gradually, and begin to brake early enough to stop at their goal.
 
-    A joint therefore never passes the goal of a command, unless a later command calls it back sooner than it can brake;
-    then it passes the later goal only. If a change of direction is too sharp for all joints to turn together, each
-    joint goes as far towards it as it may.
+    A joint gains speed within its own limit, the lower one of `joint_acceleration` and the description, and brakes
+    within `joint_acceleration`: it never passes the goal of a command, unless a later command calls it back sooner than
+    it can brake; then it passes the later goal only. If a change of direction is too sharp for all joints to turn
+    together, each joint goes as far towards it as it may.
     """
 
     number, name, unit, setting = "G9", "joint acceleration", "rad/s^2", "joint_acceleration"
 
     def __init__(self, spec: RobotSpec, limits: Limits) -> None:
-        self.limit_value = limits.joint_acceleration
+        self._brakes = limits.joint_acceleration
+        self.each = joint_limits(spec, spec.command.max_acceleration, self._brakes)
+        self.limit_value = max(self.each)
         self._joints = columns_in(spec.command, "rad")
         self._pick, self._period = picker(self._joints), spec.period
 
@@ -176,13 +183,13 @@ class JointAcceleration(Guard):
         """Bring the step near to the last one."""
         pick, command, last = self._pick, tick.command, self._pick(tick.last)
         wanted, before = list(map(sub, pick(command), last)), pick(tick.last_step)
-        distances = list(map(abs, map(sub, pick(tick.goal), last)))
-        change, braking = self.limit_value * tick.period**2, self.limit_value * self._period**2
+        distances, squared = list(map(abs, map(sub, pick(tick.goal), last))), tick.period**2
+        change, braking = self._brakes * squared, self._brakes * self._period**2
         shortened, share = tick.period / self._period, 1.0
-        for way, distance, about in zip(wanted, distances, before, strict=True):
-            if abs(way) > change or abs(way) > distance * shortened:
+        for way, distance, about, most in zip(wanted, distances, before, self.each, strict=True):
+            if abs(way) > most * squared or abs(way) > distance * shortened:
                 break  # it may have to brake
-            if not -change <= way - about <= change:
+            if not -most * squared <= way - about <= most * squared:
                 break
         else:
             return False
@@ -193,21 +200,27 @@ class JointAcceleration(Guard):
             if way > longest * ROUNDING:
                 share = min(share, longest / way)
         slowed = wanted if share == 1.0 else [way * share for way in wanted]
-        step = self._near(slowed, before, change * ROUNDING)
+        step = self._near(slowed, before, change, squared)
         if step is wanted or step == wanted:
             return False
         for at, begin, way in zip(self._joints, last, step, strict=True):
             command[at] = begin + way
         return True
 
-    @staticmethod
-    def _near(wanted: Numbers, before: Numbers, change: float) -> Numbers:
-        """The longest part of `wanted` within reach of the step `before`; if there is none, each joint by itself."""
-        if all(map(le, map(abs, map(sub, wanted, before)), repeat(change))):
+    def _near(self, wanted: Numbers, before: Numbers, change: float, squared: float) -> Numbers:
+        """The longest part of `wanted` within reach of the step `before`; if there is none, each joint by itself.
+
+        Within reach is a joint that gains at most its own limit, or loses at most `change` on the way to rest.
+        """
+        lows, highs = list[float](), list[float]()
+        for about, most in zip(before, self.each, strict=True):
+            gain = most * squared
+            lows.append(about - ROUNDING * max(gain, min(change, about)))
+            highs.append(about + ROUNDING * max(gain, min(change, -about)))
+        if all(map(le, lows, wanted)) and all(map(le, wanted, highs)):
             return wanted
         least, most = 0.0, 1.0
-        for way, about in zip(wanted, before, strict=True):
-            low, high = about - change, about + change
+        for way, low, high in zip(wanted, lows, highs, strict=True):
             if low <= way <= high:
                 if low > 0.0 or high < 0.0:  # a shorter part may be outside
                     least = max(least, (low if low > 0.0 else high) / way)
@@ -218,37 +231,40 @@ class JointAcceleration(Guard):
                 least, most = max(least, min(ends)), min(most, max(ends))
         if least <= most:
             return [way * most for way in wanted]
-        rows = zip(wanted, before, strict=True)
-        return [min(max(way, about - change), about + change) for way, about in rows]
+        rows = zip(wanted, lows, highs, strict=True)
+        return [min(max(way, low), high) for way, low, high in rows]
 
 
 class JointJerk(Guard):
-    """Joints that speed up do so gradually: their acceleration grows slowly. Braking is never held back."""
+    """Joints that speed up do so gradually: their acceleration grows slowly. Braking is never held back.
+
+    A joint has the lower one of `joint_jerk` and the description.
+    """
 
     number, name, unit, setting = "G9", "joint jerk", "rad/s^3", "joint_jerk"
 
     def __init__(self, spec: RobotSpec, limits: Limits) -> None:
-        self.limit_value, self._acceleration = limits.joint_jerk, limits.joint_acceleration
-        self._joints = columns_in(spec.command, "rad")
-        self._pick = picker(self._joints)
-        self._before = [0.0] * len(self._joints)  # speeds one command before the last one [rad/s]
+        self.each = joint_limits(spec, spec.command.max_jerk, limits.joint_jerk)
+        self.limit_value = max(self.each)
+        gains = joint_limits(spec, spec.command.max_acceleration, limits.joint_acceleration)
+        rows = zip(columns_in(spec.command, "rad"), self.each, gains, strict=True)
+        # The other joints reach any acceleration in one step.
+        self._jerks = [(at, jerk) for at, jerk, gain in rows if jerk * spec.period < gain]
+        self._before = [0.0] * len(spec.command.labels)  # speeds one command before the last one [unit/s]
 
     def restart(self) -> None:
         """The robot is at rest."""
-        self._before = [0.0] * len(self._joints)
+        self._before = [0.0] * len(self._before)
 
     def limit(self, tick: Tick) -> bool:
         """Bring the steps of joints that speed up near to the last ones."""
-        period, jerk = tick.period, self.limit_value * tick.period
-        speeds = [step / period for step in self._pick(tick.last_step)]
-        before, self._before, changed = self._before, speeds, False
-        if jerk >= self._acceleration:  # any acceleration is reached in one step
-            return False
-        for at, speed, earlier in zip(self._joints, speeds, before, strict=True):
-            last, step = tick.last[at], tick.command[at] - tick.last[at]
+        period, before, changed = tick.period, self._before, False
+        self._before = [step / period for step in tick.last_step]
+        for at, jerk in self._jerks:
+            last, step, speed = tick.last[at], tick.command[at] - tick.last[at], self._before[at]
             way = math.copysign(1.0, step)
-            gained = max(0.0, way * (speed - earlier) / period) if way * speed > 0.0 else 0.0
-            most = max(0.0, way * speed) * period + (gained + jerk) * period**2
+            gained = max(0.0, way * (speed - before[at]) / period) if way * speed > 0.0 else 0.0
+            most = max(0.0, way * speed) * period + (gained + jerk * period) * period**2
             if way * step > most * ROUNDING:
                 tick.command[at], changed = last + way * most, True
         return changed

@@ -202,7 +202,7 @@ class FirstMotion(Guard):
         self._grippers = [(at, spec.command.labels[at], spec.command.high[at]) for at in columns_in(spec.command, "m")]
         self._opening, self._longest = 0, ticks_of(OPENS_WITHIN, spec)
         self._pose: Numbers | None = None
-        self._age, self._gaps = 0.0, 0  # of the state before [s]; states that came after a gap
+        self._gaps = 0  # states that came after a gap
 
     @property
     def opens(self) -> bool:
@@ -221,9 +221,7 @@ class FirstMotion(Guard):
             return reason
         if not self._ways:
             return None
-        # From state to state, as a speed is one of its state; without a pause, time passes with commands alone.
-        seconds = max(0.0, tick.pause - (tick.age - self._age)) if tick.pause else self._period
-        signals, self._age = tick.signals, tick.age
+        seconds, signals = tick.elapsed, tick.signals  # from state to state, as a speed is one of its state
         if self._is_base:
             speeds = signals["base_velocity"][0].tolist()
             changes = self._driven(signals["base_pose"][0].tolist())

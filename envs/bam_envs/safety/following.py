@@ -3,7 +3,8 @@
 A joint follows if it is behind its commands by no more than its lag at its measured speed. The rest of the gap is the
 distance that it would jump when released: at most its limit for one period, so that a released joint never moves faster
 than that. A joint that moves away from its commands stops a real robot at once: what moves is not what was commanded. A
-simulated arm, whose controllers are softer, is also pushed that far by the objects that it touches.
+simulated arm, whose controllers are softer, is also pushed that far by the objects that it touches: while it is held
+and its gap shrinks, that counts once.
 """
 
 import math
@@ -41,6 +42,11 @@ OLD_STATE = 0.1
 LIKELY = (
     "look for a protective stop, a paused program, an inactive controller, a low speed slider, or something in its way"
 )
+PRESSES = (
+    "it presses on something, such as the object or the table, as the policy asks, and a real arm is stopped sooner: "
+    "train the policy further, with randomize=true"
+)
+"""The same of a simulated robot, which has no such states."""
 
 
 class Following(Guard):
@@ -70,6 +76,11 @@ class Following(Guard):
         self._lag = self._own_lag + delay
         self._recent = 2 + ticks_of(self._lag, self._spec)
         self._sent = deque(maxlen=self._recent + ticks_of(OLD_STATE, self._spec))
+
+    @property
+    def likely(self) -> str:
+        """Likely causes of a gap, for messages."""
+        return PRESSES if self._yields and self._spec.command.units[0] == "rad" else LIKELY
 
     def resumed(self) -> None:
         """Forget the commands: the robot is at rest where a person found it."""
@@ -107,14 +118,14 @@ class Following(Guard):
             off[at] = low - value if value < low else high - value if value > high else 0.0  # NaN: it is not measured
         return off
 
-    def is_struck(self, over: bool, *, at_once: bool = False) -> bool:
-        """Count a tick whose gap is `over` the limit; after `STRIKES` of them, or `at_once`, the robot is stopped."""
+    def is_struck(self, over: bool, *, most: int = STRIKES) -> bool:
+        """Count a tick whose gap is `over` the limit; at the number `most` of them the robot is stopped."""
         if not over:
             self._good += 1
             self._strikes = 0 if self._good >= self._forgiven else self._strikes
             return False
         self._strikes, self._good = self._strikes + 1, 0
-        self.patience = 1 if at_once or self._strikes >= STRIKES else math.inf
+        self.patience = 1 if self._strikes >= most else math.inf
         return True
 
 
@@ -142,6 +153,7 @@ class JointFollowing(Following):
         self._known_lag = math.inf  # as measured
         self._stuck, self._stuck_ticks, self._place = 0, ticks_of(STUCK_TIME, spec), list[float]()
         self._moved: Numbers = []  # in the period before [rad]
+        self._gap = 0.0  # the greatest one when the arm did not follow the last time [rad]
         self._change = limits.joint_acceleration * spec.period**2
 
     def measured(self, lag: float) -> None:
@@ -159,7 +171,7 @@ class JointFollowing(Following):
         sent, measured = self._pick(tick.last), self._pick(tick.measured)
         if self._stuck > self._stuck_ticks:
             self._stuck, self.patience = 0, 1
-            return f"no joint has moved for {STUCK_TIME:g} s, and the arm was commanded to move: {LIKELY}"
+            return f"no joint has moved for {STUCK_TIME:g} s, and the arm was commanded to move: {self.likely}"
         self.begin(tick)
         off = self.off(sent, measured, tick.age)
         # The farthest that a command may be from a joint at rest.
@@ -176,7 +188,13 @@ class JointFollowing(Following):
         at = max(range(len(off)), key=lambda column: abs(off[column]) / allowed[column])
         moved = measured[at] - self._pick(tick.before)[at]  # NaN in a first tick
         away = moved * off[at] < 0.0 and abs(moved) > allowed[at] / 2 and not self._yields
-        self.is_struck(over, at_once=away)
+        # Its command goes to the measured joints no faster than the tool may, which takes a slow arm some ticks.
+        retreats = self._yields and self._strikes > 0 == self._good and farthest < self._gap
+        self._gap = farthest
+        if retreats:
+            self.patience = math.inf
+        else:
+            self.is_struck(over, most=1 if away else STRIKES)
         if away:
             return (
                 f"{self._labels[at]} moved {moved:+.3f} rad within a period, away from its commands: what moves is not "
@@ -185,7 +203,7 @@ class JointFollowing(Following):
         return (
             f"{self._labels[at]} does not follow its commands: it is {measured[at] - sent[at]:+.3f} rad from the last "
             f"one, and beyond a lag of {self._lag:g} s it may be {allowed[at]:.3f} rad, and the tool "
-            f"{SHARE * self._tool_reach:.3f} m: {LIKELY}"
+            f"{SHARE * self._tool_reach:.3f} m: {self.likely}"
         )
 
     def pick_from(self, command: Numbers) -> Numbers:
@@ -303,7 +321,7 @@ class BaseFollowing(Following):
         return (
             f"the base does not follow its commands: it goes at {measured[at]:.3f} {self.unit}, and was sent "
             f"{sent[at]:.3f} {self.unit}; beyond a lag of {self._lag:g} s it may be off by {self._allowed[at]:.3f} "
-            f"{self.unit}: {LIKELY}"
+            f"{self.unit}: {self.likely}"
         )
 
     def pick_from(self, command: Numbers) -> Numbers:

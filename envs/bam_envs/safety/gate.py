@@ -103,7 +103,8 @@ class SafeRobot(metaclass=Sealed):
 
     A live robot (one whose ``needs_clearance`` is true) receives a `ClearedCommand`, any other a plain array. It has
     ``measure()``, the newest state; ``age()``, the age of that state [s]; and, if it answers commands, ``waiting()``,
-    the time since the oldest unanswered command [s]. Its ``reset`` only measures.
+    the time since the oldest unanswered command [s]; and, if it is paced, ``await_due()``, which waits for the time of
+    the next command, so that the guards judge it by the time at which it is sent. Its ``reset`` only measures.
 
     Args:
         robot: One robot, simulated or live.
@@ -137,6 +138,7 @@ class SafeRobot(metaclass=Sealed):
         "_limiters",
         "_limits",
         "_live",
+        "_measured_at",
         "_observer",
         "_places",
         "_read",
@@ -204,6 +206,7 @@ class SafeRobot(metaclass=Sealed):
         self._bad, self._halts, self._status, self._code = 0, 0, "", 0
         self._sent_at: float | None = None
         self._returned_at, self._kept_out = 0.0, False
+        self._measured_at = 0.0, 0.0  # times of the last two states
         self._forget()
         if self._live is not None:  # two gates would each allow a whole step
             other = _GUARDED.get(robot)
@@ -311,13 +314,14 @@ class SafeRobot(metaclass=Sealed):
         return _copied(self._fresh_state())
 
     def guards(self) -> list[dict[str, Any]]:
-        """The guards in their order: number, name, limit, unit, name of the setting in `Limits`, and what it does."""
+        """The guards in order: number, name, limit, those of joints, unit, setting in `Limits`, and what it does."""
         every = dict.fromkeys(self._every)  # the tool's speed is limited twice
         return [
             {
                 "number": one.number,
                 "name": one.name,
                 "limit": one.limit_value if math.isfinite(one.limit_value) else None,
+                "each": [*one.each],
                 "unit": one.unit,
                 "setting": one.setting,
                 "does": inspect.cleandoc(type(one).__doc__ or "").partition("\n\n")[0].replace("\n", " "),
@@ -389,9 +393,10 @@ class SafeRobot(metaclass=Sealed):
 
     def _advance(self, goal: Numbers, *, approach: bool = False, proving: bool = False) -> RobotState:
         """One tick towards `goal` (m,)."""
-        halts = self._halts
+        halts, came = self._halts, self._clock()
         try:
-            tick = self._tick(goal, approach)
+            getattr(self._live, "await_due", _nothing)()
+            tick = self._tick(goal, approach, came)
             tick.proving = proving
             fault = self._fault(tick)
             if fault is None:
@@ -404,7 +409,7 @@ class SafeRobot(metaclass=Sealed):
                 self.halt()
             raise
 
-    def _tick(self, goal: Numbers, approach: bool) -> Tick:
+    def _tick(self, goal: Numbers, approach: bool, came: float) -> Tick:
         pause = self._pause()
         last = self._begin_at(pause)
         rows, period = self._rows(), self._spec.period
@@ -413,6 +418,7 @@ class SafeRobot(metaclass=Sealed):
         before = self._unmeasured if self._before is None else self._before
         self._before = measured
         time_passed = min(period, pause or period)
+        elapsed = max(0.0, self._measured_at[1] - self._measured_at[0]) if pause else period
         known = zip(speeds, measured, before, strict=True)
         return Tick(
             goal=goal,
@@ -421,13 +427,14 @@ class SafeRobot(metaclass=Sealed):
             last_step=[speed * time_passed for speed in self._speed],
             measured=measured,
             before=before,
-            velocity=[speed if speed == speed else (now - old) / period for speed, now, old in known],  # NaN is not
+            velocity=[speed if speed == speed else (now - old) / max(period, elapsed) for speed, now, old in known],
             age=self.age(),
             period=time_passed,
             pause=pause,
+            elapsed=elapsed,
             waiting=getattr(self._live, "waiting", float)(),
             approach=approach,
-            action_age=self._clock() - self._returned_at if pause else 0.0,
+            action_age=came - self._returned_at if pause else 0.0,
             kept_out=self._kept_out,
             ended=self._ended,
             signals=self._state.signals if self._state is not None else {},
@@ -579,6 +586,7 @@ class SafeRobot(metaclass=Sealed):
         try:
             self._state = self._robot.step(handed)
             done, self._returned_at = True, self._clock()
+            self._measured_at = self._measured_at[1], self._returned_at - self.age()
         finally:
             if self._live is not None:
                 _CLEARED.pop(handed, None)
@@ -809,6 +817,10 @@ class SafeRobot(metaclass=Sealed):
 
 
 _GUARDED: weakref.WeakKeyDictionary[Any, weakref.ref[SafeRobot]] = weakref.WeakKeyDictionary()
+
+
+def _nothing() -> None:
+    """Do nothing."""
 
 
 def _copied(state: RobotState) -> RobotState:

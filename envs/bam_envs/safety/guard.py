@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from bam_envs.arms.serial_chain import arm_of
 from bam_envs.core.errors import InvalidValue, UnknownName
 from bam_envs.core.robot import RobotSpec, SignalSpec
-from bam_envs.core.validation import check
+from bam_envs.core.validation import AboveZero, check
 from bam_envs.core.wording import brief
 
 Array = NDArray[np.float64]
@@ -40,14 +40,13 @@ TRIAL_SPEED = 0.25
 """Share of the speed limits of a robot on trial."""
 TRIAL_BOX = {"arm": 0.35, "base": 3.0}
 """Maximum distance of a robot on trial from its start, along each axis [m]."""
-_ABOVE_ZERO = Annotated[float, Meta(gt=0, description="a number above 0")]
 _ANY = Annotated[float, Meta(ge=-sys.float_info.max, le=sys.float_info.max, description="a finite number")]
 _FINITE = Annotated[float, Meta(gt=0, le=sys.float_info.max, description="a finite number above 0")]
 
 
 def _limit(default: float | None, least: float, most: float, unit: str, *, finite: bool = False) -> Any:
     """A limit, with its minimum and maximum for a live robot; `finite` if it cannot be disabled."""
-    kind: Any = _FINITE if finite else _ABOVE_ZERO
+    kind: Any = _FINITE if finite else AboveZero
     return field(default=default, metadata={"bounds": (least, most, unit), "type": kind if default else kind | None})
 
 
@@ -303,6 +302,8 @@ class Tick:
     """Duration of the command [s]: the time since the last one was sent, at most one period of the robot."""
     pause: float = 0.0
     """Time since the last command was sent [s]; 0 for the first one, and where time passes only with commands."""
+    elapsed: float = 0.0
+    """Time from the state before to this one [s]; one period where time passes only with commands."""
     waiting: float = 0.0
     """Time since the oldest unanswered command was sent [s]; 0 if there is none, or the robot never answers."""
     approach: bool = False
@@ -346,6 +347,8 @@ class Guard(metaclass=Sealed):
     """The limit, in `unit`."""
     patience: float = 1
     """Number of faults in a row that stop the robot; fewer hold it."""
+    each: Sequence[float] = ()
+    """The limit of each joint, where they may differ; `limit_value` is the greatest."""
     setting: str = ""
     """Name of the limit in `Limits` that sets `limit_value`; empty for a fixed one."""
     keeps_out: bool = False

@@ -194,7 +194,10 @@ class BaseAcceleration(Guard):
 
 
 class MeasuredSpeed(Guard):
-    """The measured speed, averaged over two ticks, is at most 1.3 times its limit; above that the robot is held."""
+    """A robot measured at more than 1.3 times the limit of this speed, as the mean of two ticks, is held.
+
+    Controllers overshoot commands slightly, so that the limit itself is too little.
+    """
 
     patience = MEASURED_PATIENCE
 
@@ -295,7 +298,7 @@ def _arm_guards(spec: RobotSpec, limits: Limits, tool_position: ToolPosition | N
     pick = picker(joints)
     measured: list[Guard] = [arm.MeasuredJump(spec)]
     if math.isfinite(limits.joint_speed):
-        limit = limits.joint_speed
+        limit = max(arm.fastest_joints(spec, limits))
         measured.append(MeasuredSpeed("G8", "joint speed", "rad/s", limit, lambda tick: pick(tick.velocity)))
     tool: list[Guard] = []
     if position is not None:

@@ -15,12 +15,13 @@ from bam_envs.arms.description import ArmDescription, robot_model
 from bam_envs.core.robot import EnvIds, RobotState
 from bam_envs.core.robot_models import DEFAULT_ARM
 from bam_envs.core.task import Array, Floats, Label, Memory, limited
+from bam_envs.core.timing import CLOSEST
 from bam_envs.safety.arm_guards import SHARE_AT_ONCE
 from bam_envs.safety.guard import Limits
 
 PERIOD = 0.05
 """Time between two commands [s]."""
-PACE = 0.96
+PACE = CLOSEST
 """Share of a limit that commands use: the guards hold a command that is sent 2 ms early to a period of 48 ms, and an
 acceleration to its square."""
 FASTEST = PACE * PERIOD * Limits().tool_speed

@@ -1,5 +1,6 @@
 """Descriptions of arms: what a file must say, where it is looked for, and what makes two of them differ."""
 
+import math
 import re
 from dataclasses import replace
 from importlib import metadata
@@ -11,6 +12,7 @@ from bam_envs.arms.description import ArmDescription, robot_model
 from bam_envs.core import robot_models
 from bam_envs.core.errors import InvalidValue, UnknownName
 from bam_envs.core.robot_models import known_models, read_description
+from bam_envs.robots.profile import load_profile
 
 SHIPPED = known_models(ArmDescription)
 SO101 = SHIPPED["so101"].read_text(encoding="utf-8")
@@ -73,6 +75,11 @@ def test_signals_are_the_arms_own():
     assert spec.command.low == (-1.91986, -1.74533, -1.69, -1.65806, -2.74385, 0.0)
     assert spec.command.high == (1.91986, 1.74533, 1.69, 1.65806, 2.84121, 0.05)
     assert spec.command.max_rate == (*(4.7,) * 5, 0.1)
+    assert (spec.command.max_acceleration, spec.command.max_jerk) == (
+        (*(20.0,) * 5, math.inf),
+        (*(200.0,) * 5, math.inf),
+    )
+    assert load_profile("so101").spec().command == spec.command
     measured = ["joint_position", "joint_velocity", "gripper_width"]
     assert [one.name for one in spec.signals] == [*measured, "object_position", "object_quaternion"]
     assert [one.name for one in arm.spec(with_object=False).signals] == measured
@@ -184,13 +191,17 @@ def test_a_project_comes_before_its_user_and_both_before_packages_and_the_shippe
     assert robot_model("lab").name == "lab"
 
 
+ANOTHER = "Another arm is described first: bam-robots add NAME --urdf FILE."
+
+
 def test_a_name_that_is_not_known(places):
     with pytest.raises(UnknownName) as caught:
         robot_model("fr4")
-    assert str(caught.value) == "Unknown robot model 'fr4'. Did you mean 'fr3'?"
+    assert str(caught.value) == f"Unknown robot model 'fr4'. Did you mean 'fr3'? {ANOTHER}"
     with pytest.raises(UnknownName) as caught:
         robot_model("zebra")
-    assert str(caught.value) == f"Unknown robot model 'zebra'. Choose from: {', '.join(sorted(known_models()))}."
+    choices = ", ".join(sorted(known_models(ArmDescription)))
+    assert str(caught.value) == f"Unknown robot model 'zebra'. Choose from: {choices}. {ANOTHER}"
 
 
 def test_a_file_and_a_description_are_taken_as_they_are(tmp_path):

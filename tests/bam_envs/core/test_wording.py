@@ -25,6 +25,7 @@ def test_the_closest_match_does_not_mind_upper_case() -> None:
     assert closest("PPO", ["a2c", "ppo"]) == "ppo"
     assert closest("pik", ["pick", "reach"]) == "pick"
     assert closest("x", ["pick"]) is None
+    assert closest("lr", ["gamma", "learning_rate"]) == "learning_rate"
 
 
 @pytest.mark.parametrize(

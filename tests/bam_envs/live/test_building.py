@@ -139,7 +139,7 @@ def test_its_profile():
         live_robot("ws://robot", profile="ur5")
     with pytest.raises(InvalidValue, match=r"^The robot profile \. cannot be read: "):
         live_robot("ws://robot", profile="")  # of a variable that was never set: not the default instead
-    with pytest.raises(InvalidValue, match=r"^joint_position is needed, and mir100 measures only "):
+    with pytest.raises(InvalidValue, match=r"^The profile mir100 is that of another robot: it has linear_"):
         live_robot("ws://robot", arm_spec("ur5e", with_object=False), profile="mir100")
 
 

@@ -1,6 +1,8 @@
 """Grippers that are actions or services, and robots that have to be enabled before they take commands."""
 
+import re
 import threading
+import time
 
 import numpy as np
 import pytest
@@ -86,6 +88,7 @@ def connect():
         def step(width):
             command = robot.measure().command
             command[0, 6] = width
+            robot.await_due()
             return robot.step(_clear(robot, command))
 
         step.robot = robot
@@ -159,6 +162,39 @@ def test_a_goal_that_fails_ends_the_motion_in_one_line_and_one_that_holds_someth
     scripted.on_goal = reject
     why = "refused its goal: The gripper is not calibrated"
     ended(step, f"{action} {why} (gripper_width 0). Look at the gripper and its driver.")
+
+
+def test_goals_go_over_the_topics_of_actionlib_in_ros_1(lax, robot_on, connect, profile):
+    server, goals, canceled = lax("ros1"), [], []
+
+    def act(action):
+        server.subscribe(f"{action.name}/goal", "", lambda message, caller: goals.append(message))
+        server.subscribe(f"{action.name}/cancel", "", lambda message, caller: canceled.append(message["id"]))
+
+    def end(identity, status):
+        found = {"goal_id": {"id": identity}, "status": status}
+        server.publish(f"{GRIPPER}/result", {"status": found, "result": {"stalled": False, "reached_goal": False}})
+
+    server.act = act
+    scripted = robot_on(server, profile())
+    scripted.stamp = lambda: dict(zip(("secs", "nsecs"), divmod(time.time_ns(), 10**9), strict=True))
+    step = connect(server.url, profile())
+    step(0.0)
+    step(0.05)
+    server.wait_for(lambda frames: len(goals) == 2 and canceled)
+    assert [goal["goal"] for goal in goals] == [{"command": {"position": 0.0}}, {"command": {"position": 0.05}}]
+    first, second = (goal["goal_id"]["id"] for goal in goals)
+    assert canceled == [first]
+    declared = {one["topic"]: one["type"] for _, one in server.frames if one["op"] == "advertise"}
+    assert declared[f"{GRIPPER}/goal"] == "control_msgs/GripperCommandActionGoal"
+    assert declared[f"{GRIPPER}/cancel"] == "actionlib_msgs/GoalID"
+    end("somebody else's", 4)
+    end(first, 2)
+    step(0.05)
+    end(second, 4)
+    text = f"{server.url}: the action {GRIPPER} ended: its goal was aborted (gripper_width 0.05). Look at the gripper"
+    with pytest.raises(RemoteError, match=f"^{re.escape(text)}"):
+        [step(0.05) for _ in range(50)]
 
 
 def test_a_gripper_may_close_by_another_action(server, robot_on, connect, profile):
@@ -360,6 +396,7 @@ def test_a_drive_gets_the_twist_that_its_topic_has(server, robot_on, connect, tm
     try:
         robot.connect()
         robot.reset(ROW, START)
+        robot.await_due()
         robot.step(_clear(robot, np.array([[0.25, -0.5]])))
         scripted.wait_for(lambda: any(topic == "/cmd_vel" for topic, _, _ in scripted.commands))
         message = next(message for topic, _, message in scripted.commands if topic == "/cmd_vel")

@@ -23,6 +23,10 @@ def box(*shape):
     return spaces.Box(-np.inf, np.inf, shape, np.float32)
 
 
+def plain(arrays):
+    return {name: array.tolist() for name, array in arrays.items()}
+
+
 def decoded(space, message):
     return ActionCodec(space).decode(complete("bam_msgs/GymAction", message))
 
@@ -46,40 +50,21 @@ def test_a_continuous_action():
 
 
 def test_a_pick_as_racks_know_it():
-    message = ActionCodec(spaces.Dict({"pick": POSE}), action_type=2).encode(
-        {
-            "pick": {
-                "position": [0.1, 0.2, 0.3],
-                "orientation": [0.0, 1.0, 0.0, 0.0],
-                "gripper_width": np.float32([0.08]),
-            }
-        }
-    )
+    space, pose = spaces.Dict({"pick": POSE}), {"position": [0.1, 0.2, 0.3], "orientation": [0.0, 1.0, 0.0, 0.0]}
+    message = ActionCodec(space, action_type=2).encode({"pick": {**pose, "gripper_width": np.float32([0.08])}})
+    orientation = {"x": 0.0, "y": 1.0, "z": 0.0, "w": 0.0}
     assert message == {
         "action_type": 2,
         "pose_names": ["pick"],
-        "pose_action": [
-            {
-                "pose": {
-                    "position": {"x": 0.1, "y": 0.2, "z": 0.3},
-                    "orientation": {"x": 0.0, "y": 1.0, "z": 0.0, "w": 0.0},
-                }
-            }
-        ],
+        "pose_action": [{"pose": {"position": {"x": 0.1, "y": 0.2, "z": 0.3}, "orientation": orientation}}],
         "pose_param": [{**WAYPOINT, "gripper_width": float(np.float32(0.08))}],
     }
-    back = decoded(spaces.Dict({"pick": POSE}), message)["pick"]
-    assert back["position"].tolist() == [0.1, 0.2, 0.3]
-    assert back["orientation"].tolist() == [0.0, 1.0, 0.0, 0.0]
-    assert back["gripper_width"] == np.float32([0.08])
+    assert plain(decoded(space, message)["pick"]) == {**pose, "gripper_width": [float(np.float32(0.08))]}
 
 
 def test_a_pose_of_a_client_without_parameters():
-    message = {"pose_action": [{"pose": {"position": {"x": 1}}}]}
-    back = decoded(POSE, message)
-    assert back["position"].tolist() == [1, 0, 0]
-    assert back["orientation"].tolist() == [0, 0, 0, 1]
-    assert back["gripper_width"] == np.float32([0])
+    back = decoded(POSE, {"pose_action": [{"pose": {"position": {"x": 1}}}]})
+    assert plain(back) == {"position": [1, 0, 0], "orientation": [0, 0, 0, 1], "gripper_width": [0]}
 
 
 def test_parts_go_by_their_names():
@@ -121,26 +106,18 @@ def test_what_the_lists_cannot_say_is_exact_in_the_prefix(space, action):
         assert back == action
 
 
+ONE, TWO = spaces.Dict(a=box()), spaces.Dict(a=box(), b=box())
+NAMES, VALUE = "The names of continuous_action must be", "one for each value, not"
+
+
 @pytest.mark.parametrize(
     ("space", "message", "text"),
     [
         (box(2), {"continuous_action": [1]}, "continuous_action must have 2 values (action[0], action[1]), not 1."),
         (box(2), {}, "continuous_action must have 2 values (action[0], action[1]), not 0."),
-        (
-            spaces.Dict(a=box(), b=box()),
-            {"continuous_names": ["a"], "continuous_action": [1]},
-            "The names of continuous_action must be a, b, one for each value, not a for 1 values.",
-        ),
-        (
-            spaces.Dict(a=box()),
-            {"continuous_names": ["a", "z"], "continuous_action": [1, 2]},
-            "The names of continuous_action must be a, one for each value, not a, z for 2 values.",
-        ),
-        (
-            spaces.Dict(a=box()),
-            {"continuous_names": ["a"], "continuous_action": [1, 2]},
-            "The names of continuous_action must be a, one for each value, not a for 2 values.",
-        ),
+        (TWO, {"continuous_names": ["a"], "continuous_action": [1]}, f"{NAMES} a, b, one for each value, not a for 1 "),
+        (ONE, {"continuous_names": ["a", "z"], "continuous_action": [1, 2]}, f"{NAMES} a, {VALUE} a, z for 2 values."),
+        (ONE, {"continuous_names": ["a"], "continuous_action": [1, 2]}, f"{NAMES} a, {VALUE} a for 2 values."),
         (box(1), {"continuous_action": [1e300]}, "action[0] must be a number that float32 can hold, not 1e+300."),
         (spaces.Discrete(3), {"continuous_action": [1.0]}, "continuous_action must have 0 values (none), not 1."),
         (POSE, {}, "pose_action must have 1 values (action), not 0."),

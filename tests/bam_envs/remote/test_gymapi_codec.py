@@ -20,6 +20,7 @@ from bam_envs.remote.wire.gymapi_messages import (
 from bam_envs.remote.wire.transport import EnvSpecMessage
 from bam_envs.ros.interfaces import complete
 from bam_envs.testing.transports import assert_same_value
+from tests.raising import raising
 
 STAMP = {"sec": 1, "nanosec": 2}
 
@@ -129,6 +130,5 @@ def test_what_a_rack_does_not_know_is_no_fault_where_nobody_asks():
     ],
 )
 def test_what_the_space_asks_for_must_be_known(numbers, x, text):
-    with pytest.raises(ProtocolError) as caught:
+    with raising(ProtocolError, text):
         seen(numbers, x)
-    assert str(caught.value) == text

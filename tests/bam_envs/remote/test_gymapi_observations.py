@@ -73,19 +73,15 @@ def test_two_images_where_there_is_room_for_one_and_where_there_is_a_list(versio
         np.testing.assert_array_equal(back[name], value)
 
 
-def test_jpeg_when_asked():
+def test_depth_is_exact_and_an_image_is_a_jpeg_when_asked():
+    depth = np.full(DEPTH.shape, 1.23456, np.float32)
+    fields, _, back = there_and_back(spaces.Dict(depth=DEPTH), {"depth": depth})
+    assert "depth_img" not in fields
+    np.testing.assert_array_equal(back["depth"], depth)
     value = np.full(CAMERA.shape, 90, np.uint8)
     fields, _, back = there_and_back(CAMERA, value, image_format="jpeg")
     assert [one["format"] for one in fields["color_img"]] == ["jpeg"]
     np.testing.assert_allclose(back, value, atol=2)
-
-
-def test_depth_is_exact():
-    space = spaces.Dict(depth=DEPTH)
-    value = {"depth": np.full(DEPTH.shape, 1.23456, np.float32)}
-    fields, _, back = there_and_back(space, value)
-    assert "depth_img" not in fields
-    np.testing.assert_array_equal(back["depth"], value["depth"])
 
 
 @pytest.mark.parametrize(
@@ -105,6 +101,10 @@ def test_what_the_fields_cannot_say_is_exact(space, value):
         assert (back.dtype, back.tobytes()) == (value.dtype, value.tobytes())
     else:
         assert back == value
+
+
+def black(*shape):
+    return images.color_message(np.zeros((*shape, 3), np.uint8))
 
 
 def read(space, **message):
@@ -144,33 +144,13 @@ def test_images_of_a_list_go_by_frame_id_or_order():
 @pytest.mark.parametrize(
     ("space", "message", "text"),
     [
-        (
-            box(3),
-            {"observation": [1, 2]},
-            "observation must have 3 values (observation[0], observation[1], observation[2])",
-        ),
+        (box(3), {"observation": [1, 2]}, "observation must have 3 values (observation[0], observation[1], obs"),
         (CAMERA, {}, "color_img must hold observation, and is empty."),
-        (
-            CAMERA,
-            {"color_img": images.color_message(np.zeros((8, 8, 3), np.uint8))},
-            "color_img must hold an image of shape (16, 12, 3) for observation, not (8, 8, 3).",
-        ),
-        (
-            spaces.Dict(a=CAMERA, b=CAMERA),
-            {"color_img": [images.color_message(np.zeros((16, 12, 3), np.uint8))]},
-            "color_img must hold 2 images, not 1.",
-        ),
+        (CAMERA, {"color_img": black(8, 8)}, "hold an image of shape (16, 12, 3) for observation, not (8, 8, 3)."),
+        (spaces.Dict(a=CAMERA, b=CAMERA), {"color_img": [black(16, 12)]}, "color_img must hold 2 images, not 1."),
         (CAMERA, {"color_img": {"data": base64.b64encode(b"oops").decode()}}, "An image must be a PNG or JPEG file"),
-        (
-            spaces.Dict(name=spaces.Text(5)),
-            {},
-            "The feedback does not hold name: only a server of bam-train can send that.",
-        ),
-        (
-            spaces.Discrete(3),
-            {"observation": [7]},
-            "The observation does not fit its space: observation must be a whole",
-        ),
+        (spaces.Dict(name=spaces.Text(5)), {}, "does not hold name: only a server of bam-train can send that."),
+        (spaces.Discrete(3), {"observation": [7]}, "The observation does not fit its space: observation must be a "),
         (spaces.Discrete(3), {"observation": [0.5]}, "observation must be a number that int64 can hold, not 0.5."),
         (spaces.Box(0, 9, (1,), np.uint8), {"observation": [300]}, "must be a number that uint8 can hold, not 300."),
     ],
@@ -181,16 +161,10 @@ def test_what_does_not_fit_is_named(space, message, text):
     assert text in str(error.value)
 
 
-def test_an_exact_part_that_does_not_fit():
+def test_only_observations_of_the_space_are_sent():
     with pytest.raises(ProtocolError, match="The observation does not fit its space: observation must be"):
         ObservationCodec(spaces.Text(5)).decode(complete("bam_msgs/GymFeedback", {}), {"observation": 3})
-
-
-def test_only_observations_of_the_space_are_sent():
-    with pytest.raises(InvalidValue, match=r"^observation\[1\] is NaN"):
-        ObservationCodec(box(2)).encode(np.array([0, np.nan], np.float32))
-
-
-def test_another_image_format():
     with pytest.raises(InvalidValue, match=r"^The image format must be png or jpeg, not 'gif'\.$"):
         ObservationCodec(CAMERA, image_format="gif")
+    with pytest.raises(InvalidValue, match=r"^observation\[1\] is NaN"):
+        ObservationCodec(box(2)).encode(np.array([0, np.nan], np.float32))

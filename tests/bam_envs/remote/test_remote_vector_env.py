@@ -17,6 +17,7 @@ from bam_envs.remote.serve.tcp_server import TcpServer
 from bam_envs.remote.tcp_transport import TcpTransport
 from bam_envs.testing.transports import assert_same_value
 from tests.bam_envs.remote.fakes import FakeEnv, FakeTransport
+from tests.raising import raising
 
 PATIENCE = 10.0
 
@@ -118,9 +119,8 @@ def test_seeds_go_on_over_the_racks():
     assert [one.calls[-1][1] for one in transports] == [1, [None, 3], 4]
     envs.reset(options={"easy": True})
     assert [one.calls[-1][1:] for one in transports] == [(None, {"easy": True})] * 3
-    with pytest.raises(InvalidValue) as caught:
+    with raising(InvalidValue, "seed must be one number or 4 of them, not 2."):
         envs.reset(seed=[1, 2])
-    assert str(caught.value) == "seed must be one number or 4 of them, not 2."
     envs.close()
 
 
@@ -131,6 +131,8 @@ def rows(number):
 def test_some_rows_can_be_reset():
     transports = [FakeTransport(), FakeTransport(rows(2)), FakeTransport()]
     envs = RemoteVectorEnv(transports)
+    with raising(ResetNeeded, "No episode is running. Call reset() first, without a reset_mask."):
+        envs.reset(options={"reset_mask": [True, False, True, True]})
     first, _ = envs.reset(seed=1)
     mask = np.array([False, True, False, True])
     again, infos = envs.reset(options={"reset_mask": mask})
@@ -140,17 +142,8 @@ def test_some_rows_can_be_reset():
     assert transports[2].calls[-1] == ("reset", None, None)
     assert infos["_options"].tolist() == mask.tolist()
     for bad in ([True], [[True] * 4]):
-        with pytest.raises(InvalidValue) as caught:
+        with raising(InvalidValue, f"reset_mask must have shape (4,), not {np.shape(bad)}."):
             envs.reset(options={"reset_mask": np.array(bad)})
-        assert str(caught.value) == f"reset_mask must have shape (4,), not {np.shape(bad)}."
-    envs.close()
-
-
-def test_a_mask_needs_episodes_of_the_other_rows():
-    envs = RemoteVectorEnv([FakeTransport(), FakeTransport()])
-    with pytest.raises(ResetNeeded) as caught:
-        envs.reset(options={"reset_mask": [True, False]})
-    assert str(caught.value) == "No episode is running. Call reset() first, without a reset_mask."
     envs.close()
 
 
@@ -179,36 +172,29 @@ def test_a_fault_of_one_rack_goes_through_when_all_have_answered():
     envs = RemoteVectorEnv(transports)
     envs.reset(seed=0)
     transports[0].faults.append(LinkLost("the cable is out"))
-    with pytest.raises(LinkLost) as caught:
+    with raising(LinkLost, "the cable is out"):
         envs.step(np.zeros((2, 2)))
-    assert str(caught.value) == "the cable is out"
     assert transports[1].calls[-1][0] == "step"
-    with pytest.raises(ResetNeeded) as needed:
+    with raising(ResetNeeded, "No episode is running. Call reset() first."):
         envs.step(np.zeros((2, 2)))
-    assert str(needed.value) == "No episode is running. Call reset() first."
     envs.reset()
     envs.step(np.zeros((2, 2)))
     envs.close()
 
 
-def test_the_number_of_rows_must_be_right():
-    with pytest.raises(InvalidValue) as caught:
+def test_racks_must_be_alike_and_as_many_as_said():
+    with raising(InvalidValue, "num_envs must be 3, as many as there are, not 4."):
         RemoteVectorEnv([FakeTransport(rows(2)), FakeTransport()], 4).reset()
-    assert str(caught.value) == "num_envs must be 3, as many as there are, not 4."
-    with pytest.raises(InvalidValue) as caught:
+    with raising(InvalidValue, "There must be at least one transport."):
         RemoteVectorEnv([])
-    assert str(caught.value) == "There must be at least one transport."
-
-
-def test_racks_must_be_alike():
     other = FakeTransport(FakeEnv(action_space=spaces.Discrete(2)))
     envs = RemoteVectorEnv([FakeTransport(), other])
-    with pytest.raises(InvalidValue) as caught:
-        envs.reset()
-    assert str(caught.value) == (
+    with raising(
+        InvalidValue,
         "The action_space of transport 2 is Discrete(2), and that of the first Box(-1.0, 1.0, (2,), float32); "
-        "environments of one batch must be alike."
-    )
+        "environments of one batch must be alike.",
+    ):
+        envs.reset()
     envs.close()
 
 
@@ -216,21 +202,16 @@ def test_racks_must_be_alike():
 def test_actions_of_another_shape_are_refused(shape):
     envs = RemoteVectorEnv([FakeTransport(), FakeTransport()])
     envs.reset()
-    with pytest.raises(InvalidValue) as caught:
+    with raising(InvalidValue, f"The actions must have shape (2, 2), not {shape}."):
         envs.step(np.zeros(shape))
-    assert str(caught.value) == f"The actions must have shape (2, 2), not {shape}."
     envs.close()
-
-
-def test_discrete_actions():
     transports = [FakeTransport(FakeEnv(action_space=spaces.Discrete(3))) for _ in range(2)]
     envs = RemoteVectorEnv(transports)
     envs.reset()
     envs.step(np.array([2, 0]))
     assert [one.calls[-1] for one in transports] == [("step", 2), ("step", 0)]
-    with pytest.raises(InvalidValue) as caught:
+    with raising(InvalidValue, "There must be one action for each of 2 environments, not 3."):
         envs.step(np.array([2, 0, 1]))
-    assert str(caught.value) == "There must be one action for each of 2 environments, not 3."
     envs.close()
 
 
@@ -271,7 +252,7 @@ ROWS = [
 ]
 
 
-def test_joining_makes_columns_with_masks():
+def test_joining_makes_columns_with_masks_and_splitting_gives_the_rows_back():
     infos = join_infos(ROWS)
     assert infos["x"].tolist() == [0.5, 1.5, 2.5]
     assert infos["_x"].tolist() == [True, True, True]
@@ -283,26 +264,16 @@ def test_joining_makes_columns_with_masks():
     assert (infos["arr"].dtype, infos["arr"].tolist()) == (np.int8, [[1, 2], [0, 0], [3, 4]])
     assert (infos["text"].dtype, infos["text"].tolist()) == (object, [None, "b", None])
     assert infos["_text"].tolist() == [False, True, False]
-
-
-def test_splitting_gives_the_rows_back():
-    back = split_infos(join_infos(ROWS), 3)
-    for row, given in zip(back, ROWS, strict=True):
+    for row, given in zip(split_infos(infos, 3), ROWS, strict=True):
         assert row.keys() == given.keys()
         assert all(np.array_equal(row[key], given[key]) for key in given)
-
-
-def test_values_of_several_kinds_keep_them():
-    column = join_infos([{"x": 1}, {"x": 0.5}, {"x": [1]}])["x"]
-    assert column.tolist() == [1, 0.5, [1]]
-    assert column.dtype == object
+    column = join_infos([{"x": 1}, {"x": 0.5}, {"x": [1]}])["x"]  # of several kinds
+    assert (column.dtype, column.tolist()) == (object, [1, 0.5, [1]])
 
 
 def test_what_has_no_mask_or_no_rows_is_for_every_row():
-    assert split_infos({"x": np.arange(2), "name": "rack", "sizes": [1, 2, 3], "_hidden": 1}, 2) == [
-        {"x": 0, "name": "rack", "sizes": [1, 2, 3], "_hidden": 1},
-        {"x": 1, "name": "rack", "sizes": [1, 2, 3], "_hidden": 1},
-    ]
+    every = {"name": "rack", "sizes": [1, 2, 3], "_hidden": 1}
+    assert split_infos({"x": np.arange(2), **every}, 2) == [{"x": 0, **every}, {"x": 1, **every}]
 
 
 def test_last_observations_are_none_where_an_episode_goes_on_and_no_array_holds_them():

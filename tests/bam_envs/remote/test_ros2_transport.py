@@ -12,6 +12,7 @@ from bam_envs.remote.ros2_transport import RclpyTransport
 from bam_envs.remote.serve.env_server import EnvServer
 from bam_envs.remote.serve.gymapi_service import GymApiService
 from bam_envs.remote.wire.ros2_node import RclpyBus
+from tests.raising import raising
 
 RISE = np.array([0.0, 0.0, 0.5, 0.0, 0.0], dtype=np.float32)
 
@@ -54,12 +55,12 @@ def test_the_environment_is_the_one_in_process_bit_for_bit(space, ros_domain, ch
 def test_nobody_there(ros_domain):
     remote = RclpyTransport("ros2://nowhere", connect_timeout=0.2, domain=ros_domain)
     for _ in range(2):
-        with pytest.raises(NoServer) as error:
-            remote.connect()
-        assert str(error.value) == (
+        with raising(
+            NoServer,
             "ros2://nowhere: no node offers /nowhere/gym_env/request after 0.2 s. Have both ends the same "
-            "ROS_DOMAIN_ID? Start one: bam-serve --rclpy --namespace nowhere"
-        )
+            "ROS_DOMAIN_ID? Start one: bam-serve --rclpy --namespace nowhere",
+        ):
+            remote.connect()
     remote.close()
 
 
@@ -80,6 +81,5 @@ def test_nobody_there_for_the_service(ros_domain):
     ],
 )
 def test_what_cannot_be(url, options, text):
-    with pytest.raises(InvalidValue) as error:
+    with raising(InvalidValue, text):
         RclpyTransport(url, **options)
-    assert str(error.value) == text

@@ -7,6 +7,7 @@ from gymnasium import spaces
 from bam_envs.core.errors import InvalidValue, NoServer, ProtocolError, RemoteError
 from bam_envs.remote.remote_vector_env import RemoteVectorEnv
 from bam_envs.ros.images import encode_image
+from tests.raising import raising
 
 CAMERA = spaces.Box(0, 255, (8, 12, 3), np.uint8)
 SEEN = spaces.Dict(camera=CAMERA, state=spaces.Box(-10, 10, (2,), np.float64))
@@ -133,20 +134,15 @@ def test_the_arms_of_a_rack_have_one_seed(arms, seed, sent):
 @pytest.mark.parametrize("seed", [[5, 5], [5, None], [None, 6]])
 def test_other_seeds_of_its_arms_are_refused(arms, seed):
     envs, there = arms
-    with pytest.raises(InvalidValue) as caught:
+    with raising(
+        InvalidValue,
+        f"The 2 environments of Pick begin together, from one seed s that stands for s, s + 1, …; not from {seed}.",
+    ):
         envs.reset(seed=seed)
-    assert str(caught.value) == (
-        f"The 2 environments of Pick begin together, from one seed s that stands for s, s + 1, …; not from {seed}."
-    )
     assert there.requests == []
-
-
-def test_the_arms_of_a_rack_begin_together(arms):
-    envs, there = arms
     envs.reset()
-    with pytest.raises(InvalidValue) as caught:
+    with raising(InvalidValue, "The 2 environments of Pick begin together; reset_mask must hold all of them or none."):
         envs.reset(options={"reset_mask": np.array([True, False])})
-    assert str(caught.value) == "The 2 environments of Pick begin together; reset_mask must hold all of them or none."
     assert len(there.requests) == 1
 
 
@@ -161,23 +157,13 @@ def test_what_a_rack_does_not_understand_is_not_sent(rack, open_to):
     assert there.requests == []
 
 
-def test_a_rack_without_that_environment(rack, open_to):
-    rack()
-    transport = open_to(**{**PICKING, "env_id": "FoldShirt"})
-    transport.connect()
+def test_a_rack_without_that_environment_with_more_arms_or_without_spaces(rack, open_to):
+    there = rack()
     with pytest.raises(RemoteError, match=r"^Unknown environment: FoldShirt$"):
-        transport.reset()
-
-
-def test_a_rack_with_more_arms_than_said(rack, open_to):
-    rack(arms=2)
-    transport = open_to(**PICKING)
+        open_to(**{**PICKING, "env_id": "FoldShirt"}).reset()
+    there.arms = 2
     with pytest.raises(ProtocolError, match="The response must have 1 feedback, one for each environment, not 2"):
-        transport.reset()
-
-
-def test_a_rack_whose_spaces_are_not_given(rack, open_to):
-    rack()
+        open_to(**PICKING).reset()
     with pytest.raises(NoServer) as error:
         open_to(env_id="Pick").connect()
     assert str(error.value).endswith(

@@ -17,6 +17,7 @@ from bam_envs.rosbridge.client import RosbridgeLink
 from bam_envs.rosbridge.server import BridgeServer
 from bam_envs.testing import TransportContract
 from bam_envs.testing.transports import MirrorEnv
+from tests.raising import raising
 
 CAMERA = spaces.Box(0, 255, (8, 12, 3), np.uint8)
 
@@ -203,9 +204,8 @@ def test_closed_is_closed(served, open_to):
     ],
 )
 def test_options_that_are_not_possible(options, text):
-    with pytest.raises(InvalidValue) as error:
+    with raising(InvalidValue, text):
         RosbridgeTransport("ws://127.0.0.1:9090", **options)
-    assert str(error.value) == text
 
 
 @pytest.mark.parametrize("channel", ["service", "topics"])

@@ -20,9 +20,11 @@ from bam_envs.remote.wire.transport import spec_to_json
 from bam_envs.ros.freshness import read_tag
 from bam_envs.testing.transports import MirrorEnv
 from tests.bam_envs.remote.fakes import FakeEnv
+from tests.raising import raising
 
 PATIENCE = 10.0
 ACTION = np.zeros(2, np.float32)
+UNUSABLE = "no usable bam-serve TCP server"
 
 
 @pytest.fixture
@@ -137,34 +139,27 @@ def test_a_name_that_nobody_has():
 
 def test_somebody_listens_and_says_nothing():
     with socket.create_server(("127.0.0.1", 0)) as silent:
-        url = f"tcp://127.0.0.1:{silent.getsockname()[1]}"
-        begun = time.monotonic()
-        assert refused(url, connect_timeout=0.05).startswith(
-            "no usable bam-serve TCP server: timed out. If it is rosbridge, use ws://. "
-        )
+        url, begun = f"tcp://127.0.0.1:{silent.getsockname()[1]}", time.monotonic()
+        assert refused(url, connect_timeout=0.05).startswith(f"{UNUSABLE}: timed out. If it is rosbridge, use ws://. ")
         assert time.monotonic() - begun < 3
 
 
-def test_somebody_who_hangs_up():
-    with answering(hang_up) as (url, _):
-        assert refused(url) == (
-            "no usable bam-serve TCP server: the other end closed the connection. If it is rosbridge, use ws://. "
-            "Start one: bam-serve --env bam/pick --tcp PORT, at a free port."
-        )
+NO_DESCRIPTION = "Expected the description of an environment, found "
 
 
-def test_a_server_of_http():
-    with answering(saying(b"HTTP/1.1 400 Bad Request\r\n\r\n")) as (url, _):
-        text = "no usable bam-serve TCP server: it says b'HTTP/1.1'. If it is rosbridge, use ws://. "
-        assert refused(url).startswith(text)
-
-
-@pytest.mark.parametrize("content", [{}, 3, {"env_id": "x"}])
-def test_a_description_that_is_none(content):
-    with answering(telling("ok", content)) as (url, _):
-        assert refused(url).startswith(
-            "no usable bam-serve TCP server: Expected the description of an environment, found "
-        )
+@pytest.mark.parametrize(
+    ("answer", "text"),
+    [
+        (hang_up, "the other end closed the connection. If it is rosbridge, use ws://. Start one: bam-serve --env "),
+        (saying(b"HTTP/1.1 400 Bad Request\r\n\r\n"), "it says b'HTTP/1.1'. If it is rosbridge, use ws://. "),
+        *((telling("ok", content), NO_DESCRIPTION) for content in ({}, 3, {"env_id": "x"})),
+    ],
+)
+def test_somebody_else_listens(answer, text):
+    with answering(answer) as (url, _):
+        said = refused(url)
+    assert said.startswith(f"{UNUSABLE}: {text}")
+    assert said.endswith(" Start one: bam-serve --env bam/pick --tcp PORT, at a free port.")
 
 
 def test_requests_carry_session_epoch_sequence_and_deadline():
@@ -187,9 +182,8 @@ def test_a_lost_link_stays_down_until_a_reset_and_nothing_is_sent_again(env):
         "the other end closed the connection.",
         "the link is down, and nothing was sent. Call reset() to connect again.",
     ):
-        with TcpServer(EnvServer(env), port=server.port), pytest.raises(LinkLost) as caught:
+        with TcpServer(EnvServer(env), port=server.port), raising(LinkLost, f"{server.url}: {reason}"):
             transport.step(ACTION)
-        assert str(caught.value) == f"{server.url}: {reason}"
     assert env.seen == []
     with TcpServer(EnvServer(env), port=server.port):
         transport.reset()
@@ -222,9 +216,8 @@ def test_no_answer_in_time_is_a_lost_link_and_the_server_does_not_act_later(serv
 def test_a_server_that_answers_something_else(answer, text):
     with answering(welcome, telling("ok", [answer, {}])) as (url, _):
         transport = TcpTransport(url)
-        with pytest.raises(ProtocolError) as caught:
+        with raising(ProtocolError, f"{url}: {text}"):
             transport.reset()
-        assert str(caught.value) == f"{url}: {text}"
         transport.close()
 
 
@@ -232,9 +225,8 @@ def test_an_answer_to_another_request_drops_the_link():
     wrong = lambda sock, frames, tree: frames.send(encode([99, "ok", None]), time.monotonic() + PATIENCE)  # noqa: E731
     with answering(welcome, wrong) as (url, _):
         transport = TcpTransport(url)
-        with pytest.raises(ProtocolError) as caught:
+        with raising(ProtocolError, f"{url}: Expected the answer to request 2, found [99, 'ok', None]."):
             transport.reset()
-        assert str(caught.value) == f"{url}: Expected the answer to request 2, found [99, 'ok', None]."
         with pytest.raises(LinkLost):
             transport.step(ACTION)
         transport.close()
@@ -247,9 +239,8 @@ def test_another_environment_after_a_reconnect_is_refused(env):
     with TcpServer(EnvServer(FakeEnv()), port=server.port):
         with pytest.raises(LinkLost):
             transport.reset()
-        with pytest.raises(ProtocolError) as caught:
+        with raising(ProtocolError, f"{server.url}: it serves another environment than before: FakeEnv."):
             transport.reset()
-        assert str(caught.value) == f"{server.url}: it serves another environment than before: FakeEnv."
         transport.close()
 
 
@@ -281,9 +272,8 @@ def test_closing_while_it_connects_leaves_no_link():
     with answering(close_first) as (url, _):
         transport = TcpTransport(url)
         for _ in range(2):
-            with pytest.raises(LinkLost) as caught:
+            with raising(LinkLost, f"{url}: this transport is closed; make a new one."):
                 transport.connect()
-            assert str(caught.value) == f"{url}: this transport is closed; make a new one."
 
 
 def test_options_reach_the_environment(server, env):

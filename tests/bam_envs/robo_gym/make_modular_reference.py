@@ -17,10 +17,7 @@ import numpy as np
 import bam_envs  # noqa: F401 - registers the ids
 
 PATH = Path(__file__).with_name("modular_reference.npz")
-CLASSES = {
-    "IsaacReachUR": "robo_gym.envs.ur.ur_isaac_reach",
-    "EndEffectorPositioning2UR": "robo_gym.envs.ur.ur_ee_pos",
-}
+CLASSES = {"IsaacReachUR": "robo_gym.envs.ur.ur_isaac_reach", "EndEffectorPositioning2UR": "robo_gym.envs.ur.ur_ee_pos"}
 HOLD = "hold"
 """Instead of an action: the one whose joint targets are where the arm is."""
 RUNS = {

@@ -87,10 +87,7 @@ def test_an_object_and_its_quaternion():
         ([0.0] * 1029, "The wire state of a MiR100 has 1030 numbers in a row; this has shape (1029,)."),
         (["far"], "The wire state of a MiR100 must be 1030 numbers: could not convert string to float: 'far'."),
         ([], "The wire state of a MiR100 has 1030 numbers in a row; this has shape (0,)."),
-        (
-            [0.0] * 8 + [float("inf")] + [0.0] * 1021,
-            "Number 8 of the wire state of a MiR100 must be finite, not inf.",
-        ),
+        ([0.0] * 8 + [float("inf")] + [0.0] * 1021, "Number 8 of the wire state of a MiR100 must be finite, not inf."),
     ],
 )
 def test_wrong_bases(wire, text):

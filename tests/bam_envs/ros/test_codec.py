@@ -13,13 +13,7 @@ from bam_envs.core.errors import ProtocolError
 from bam_envs.core.robot import RobotState
 from bam_envs.robots.profile import load_profile
 from bam_envs.robots.ur5e import JOINTS
-from bam_envs.ros.codec import (
-    RobotInfo,
-    decode_command,
-    decode_source,
-    encode_state,
-    read_info,
-)
+from bam_envs.ros.codec import RobotInfo, decode_command, decode_source, encode_state, read_info
 from bam_envs.ros.freshness import Tag, Tagger, read_tag, signature
 from bam_envs.ros.interfaces import complete
 from tests.bam_envs.making import encode_command
@@ -153,11 +147,7 @@ def test_joint_states_that_are_refused(changes, text):
             "object_position",
             "/object_pose: the field pose.position.y is missing; found: x, z.",
         ),
-        (
-            {"pose": {"position": 3}},
-            "object_position",
-            "/object_pose: the field pose.position.x is missing; found: 3.",
-        ),
+        ({"pose": {"position": 3}}, "object_position", "/object_pose: the field pose.position.x is missing; found: 3."),
     ],
 )
 def test_other_messages(message, signal, text):
@@ -254,10 +244,7 @@ def test_commands_of_an_arm():
     assert gripper == (
         "/gripper/commands",
         "std_msgs/Float64MultiArray",
-        {
-            "layout": {"dim": [{"label": TAG.to_text(), "size": 1, "stride": 1}], "data_offset": 0},
-            "data": [6.0],
-        },
+        {"layout": {"dim": [{"label": TAG.to_text(), "size": 1, "stride": 1}], "data_offset": 0}, "data": [6.0]},
     )
     assert joints[0] == "/forward_position_controller/commands"
     assert joints[2]["data"] == [0.0, 1.0, 2.0, 3.0, 4.0, 5.0]

@@ -5,14 +5,7 @@ import pytest
 
 from bam_envs.core.errors import InvalidValue
 from bam_envs.ros.definitions import DEFINITIONS
-from bam_envs.ros.interfaces import (
-    complete,
-    normal_name,
-    request_type,
-    require_plain,
-    response_type,
-    variants,
-)
+from bam_envs.ros.interfaces import complete, normal_name, request_type, require_plain, response_type, variants
 
 STAMP = {"sec": 0, "nanosec": 0}
 HEADER = {"stamp": STAMP, "frame_id": ""}
@@ -49,10 +42,7 @@ def test_other_names_are_refused(name):
 def test_what_is_left_out_is_filled_in():
     assert complete("geometry_msgs/msg/PoseStamped", {"pose": {"position": {"x": 1}}}) == {
         "header": HEADER,
-        "pose": {
-            "position": {"x": 1.0, "y": 0.0, "z": 0.0},
-            "orientation": {"x": 0.0, "y": 0.0, "z": 0.0, "w": 1.0},
-        },
+        "pose": {"position": {"x": 1.0, "y": 0.0, "z": 0.0}, "orientation": {"x": 0.0, "y": 0.0, "z": 0.0, "w": 1.0}},
     }
     assert complete("sensor_msgs/CameraInfo", {})["k"] == [0.0] * 9
     assert complete("sensor_msgs/CompressedImage", {}) == {"header": HEADER, "format": "", "data": b""}

@@ -5,7 +5,6 @@ import contextlib
 import json
 import socket
 import threading
-import time
 from http import HTTPStatus
 
 import pytest
@@ -176,17 +175,15 @@ def heard():
 
 
 @pytest.fixture
-def new_scripted():
+def new_scripted(stack):
     """Make `ScriptedServer`s; they are stopped at the end."""
-    made = []
 
     def make(**options):
-        made.append(ScriptedServer(**options).start())
-        return made[-1]
+        server = ScriptedServer(**options).start()
+        stack.callback(server.stop)
+        return server
 
-    yield make
-    for server in made:
-        server.stop()
+    return make
 
 
 @pytest.fixture
@@ -196,25 +193,22 @@ def scripted(new_scripted):
 
 
 @pytest.fixture
-def new_link():
+def new_link(stack):
     """Make a connected `RosbridgeLink`; closed at the end. Options are of the link, or of its endpoint."""
     from bam_envs.rosbridge.client import RosbridgeLink
     from bam_envs.rosbridge.endpoint import Endpoint
-
-    made = []
 
     def make(server, connect=True, **options):
         url = server if isinstance(server, str) else server.url
         names = ("credentials", "token", "connect_timeout")
         endpoint = Endpoint(url, **{name: options.pop(name) for name in names if name in options})
-        made.append(RosbridgeLink(endpoint, **options))
+        link = RosbridgeLink(endpoint, **options)
+        stack.callback(link.close)
         if connect:
-            made[-1].connect()
-        return made[-1]
+            link.connect()
+        return link
 
-    yield make
-    for link in made:
-        link.close()
+    return make
 
 
 @pytest.fixture
@@ -228,16 +222,3 @@ def free_port():
     """A port at which nothing listens."""
     with socket.create_server(("127.0.0.1", 0)) as taken:
         return taken.getsockname()[1]
-
-
-@pytest.fixture
-def until():
-    """Wait for something that tells nobody when it happens, such as the end of a thread."""
-
-    def wait(condition, timeout=DEADLINE):
-        end = time.monotonic() + timeout
-        while not condition():
-            assert time.monotonic() < end, condition
-            time.sleep(0.005)
-
-    return wait

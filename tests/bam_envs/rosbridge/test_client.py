@@ -1,5 +1,6 @@
 """`RosbridgeLink` on a server that behaves."""
 
+import re
 import threading
 import time
 
@@ -189,20 +190,12 @@ def test_an_error_status_with_the_id_of_a_call_ends_it(scripted, link):
         link.call("/add", "a/B", {}, 5.0)
 
 
-def test_a_call_that_nobody_answers_ends_in_time(scripted, link):
-    scripted.responses["/slow"] = lambda args: None
-    with pytest.raises(LinkLost) as raised:
-        link.call("/slow", "std_srvs/Trigger", {}, 0.05)
-    assert str(raised.value) == f"{link.url}: /slow did not answer in 0.05 s; it may still be at it."
-    assert link.is_up
-
-
 def test_a_server_that_gives_a_call_up_is_no_refusal(scripted, link):
     """The service may still be at it; a bridge that was told no other time does so after 5 s."""
     scripted.responses["/slow"] = lambda args: "Timeout exceeded while waiting for service response"
     with pytest.raises(LinkLost) as caught:
         link.call("/slow", "std_srvs/Trigger", {}, 30.0)
-    assert str(caught.value) == (
+    assert re.sub(r"after \d\.\d s", "after 0.0 s", str(caught.value)) == (
         f"{scripted.url}: the server gave up /slow after 0.0 s, and 30 s were asked for; it may still be at it. Start "
         "the bridge with default_call_service_timeout:=30.0, or use a pair of topics instead of the service "
         '(channel="topics").'

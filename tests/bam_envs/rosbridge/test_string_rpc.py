@@ -44,9 +44,8 @@ class LocalBus:
 
 
 @pytest.fixture
-def pair():
+def pair(stack):
     """A client, its bus and what the handler was asked, for a handler."""
-    made = []
 
     def make(handler, lose=()):
         asked, bus = [], LocalBus(lose)
@@ -55,12 +54,12 @@ def pair():
             asked.append(payload)
             return handler(payload)
 
-        made.extend([StringRpcService(bus, "/bam/scene", record).start(), StringRpc(bus, "/bam/scene")])
-        return made[-1], bus, asked
+        service, rpc = StringRpcService(bus, "/bam/scene", record).start(), StringRpc(bus, "/bam/scene")
+        stack.callback(service.close)
+        stack.callback(rpc.close)
+        return rpc, bus, asked
 
-    yield make
-    for one in made:
-        one.close()
+    return make
 
 
 @pytest.fixture

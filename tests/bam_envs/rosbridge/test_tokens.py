@@ -139,10 +139,10 @@ def tries(guesses, addresses):
 def test_few_guesses_a_second_from_one_address():
     now = [0.0]
     guesses = Guesses(lambda: now[0])
-    for _ in range(10):
-        assert tries(guesses, ["10.0.0.1"] * 1000) == 4
+    for _ in range(3):
+        assert tries(guesses, ["10.0.0.1"] * 100) == 4
         now[0] += 1.0
-    assert tries(guesses, [f"2001:db8::{k:x}" for k in range(1000)]) == 4  # one network
+    assert tries(guesses, [f"2001:db8::{k:x}" for k in range(100)]) == 4  # one network
 
 
 def test_few_guesses_a_second_from_all_and_no_address_is_kept_out_by_others():
@@ -150,9 +150,9 @@ def test_few_guesses_a_second_from_all_and_no_address_is_kept_out_by_others():
     guesses = Guesses(lambda: now[0])
     attackers = [f"10.0.{k}.1" for k in range(200)]
     assert tries(guesses, attackers) == 200  # each once: nobody knows yet who they are
-    for _ in range(10):
+    for _ in range(3):
         now[0] += 1.0
-        assert tries(guesses, attackers * 10) <= 35
+        assert tries(guesses, attackers * 3) <= 35
         assert guesses.may_try("10.1.0.1")
     now[0] += 100.0
     assert guesses.may_try("10.0.0.1")

@@ -380,12 +380,12 @@ def test_states_that_stay_away_are_no_speed_that_is_wrong(scale, stops, frozen):
     size, still, age = len(spec.command.labels), 0, 0.0
     for at in range(200):
         still = frozen if at % 12 == 2 else max(0, still - 1)
-        age = age + period if still else 0.0
+        elapsed, age = (0.0, age + period) if still else (period + age, 0.0)
         joints = joints if still else joints + 0.5 * period
         numbers = [*joints, *[0.085] * (size - 6)]
         signals = {"joint_position": joints[None], "joint_velocity": np.full((1, 6), 0.5 * scale)}
         row = dict.fromkeys(("goal", "command", "last", "measured", "before"), numbers)
-        tick = Tick(**row, last_step=[0.0] * size, velocity=[0.5] * size, age=age, period=period, pause=period)
+        tick = Tick(**row, last_step=[0.0] * size, velocity=[0.5] * size, age=age, period=period, elapsed=elapsed)
         faults.append(guard.fault(replace(tick, signals=signals)))
     assert any(faults) is stops
 

@@ -15,6 +15,7 @@ from bam_envs.robots.base_description import base_model
 from bam_envs.robots.ur5e import GEOMETRY, JOINTS, arm_spec
 from bam_envs.safety import arm_guards, guards
 from bam_envs.safety.arm_guards import longest_step
+from bam_envs.safety.following import JointFollowing
 from bam_envs.safety.guard import BOUNDS, ORDERED, Limits, Tick
 from bam_envs.safety.guards import default_guards
 from bam_envs.testing import ARM_HOME
@@ -359,6 +360,27 @@ def test_at_its_speed_limit_a_joint_goes_on_until_it_must_brake():
     np.testing.assert_allclose(steps[5:38], 0.0125)
 
 
+def test_a_joint_speeds_up_within_its_own_limit_and_brakes_for_its_goal():
+    gentle = replace(ARM, command=replace(ARM.command, max_acceleration=(2.0, *(20.0,) * 5, math.inf)))
+    guard = arm_guards.JointAcceleration(gentle, Limits())
+    assert (guard.each, guard.limit_value) == ([2.0, *(10.0,) * 5], 10.0)
+    np.testing.assert_allclose(ticks_of(guard, joints(0.05), 6), [0.005, 0.01, 0.015, 0.02, 0, 0], atol=1e-10)
+    ended = arm_tick(joints(0.0), step=(0.02,))  # its last command is its goal: it must not pass it
+    assert not guard.limit(ended)
+    back = arm_tick(joints(-0.03), step=(0.02,))
+    assert guard.limit(back)
+    np.testing.assert_allclose(back.command - HOME, joints(0.0), atol=1e-9)
+
+
+def test_a_joint_has_its_own_jerk():
+    own = replace(ARM, command=replace(ARM.command, max_jerk=(40.0, *(5000.0,) * 5, math.inf)))
+    guard = arm_guards.JointJerk(own, Limits())
+    assert (guard.each, guard.limit_value) == ([40.0, *(500.0,) * 5], 500.0)
+    tick = arm_tick(joints(0.025, 0.025))
+    assert guard.limit(tick)
+    np.testing.assert_allclose(tick.command - HOME, joints(0.005, 0.025), atol=1e-9)
+
+
 @given(st.floats(0, 100), st.floats(1e-4, 10))
 def test_the_longest_step_is_followed_by_others_that_stop_at_the_end(distance, change):
     step, left, count = longest_step(distance, change), distance, 0
@@ -443,6 +465,29 @@ def test_base_acceleration(last, command, sent):
 def measured(position=0.0, velocity=0.0):
     signals = {"joint_position": np.full((1, 6), position), "joint_velocity": np.full((1, 6), velocity)}
     return RobotState({**signals, "gripper_width": np.full((1, 1), -0.001)}, np.zeros(1), HOME[None])
+
+
+@pytest.mark.parametrize(
+    ("is_simulated", "ticks", "cause"),
+    [
+        (False, 3, "look for a protective stop, a paused program"),
+        (True, 8, "it presses on something, such as the object"),
+    ],
+)
+def test_a_slow_arm_that_is_held_fast_is_stopped_and_a_simulated_one_not_while_it_is_relieved(
+    is_simulated, ticks, cause
+):
+    guard = JointFollowing(ARM, Limits().on_trial(base=False), GEOMETRY.tool_position)
+    guard.connected(0.0, yields=is_simulated)
+    sent, faults = HOME + joints(0, 0.03), []
+    while guard.patience > 1 or not faults:
+        tick = tick_from(sent, measured=HOME, before=HOME, velocity=np.zeros(7))
+        reason = guard.fault(tick)
+        if reason is not None and (guard.patience == 1 or not faults):
+            assert cause in reason
+        faults.append(reason is not None)
+        sent = np.array(guard.hold(tick)) if faults[-1] else sent + joints(0, 0.01)
+    assert len(faults) == ticks
 
 
 def test_measured_limits():

@@ -99,6 +99,35 @@ def live(joints=ARM_HOME, **options):
     return arm, robot, robot.reset(np.arange(1), start_at(joints))
 
 
+class EarlyArm(LiveArm):
+    """An arm whose steps end 10 ms before the next command is due."""
+
+    due = 0.0
+
+    def await_due(self):
+        self.now = max(self.now, self.due)
+
+    def step(self, command):
+        self.due = self.now + self.spec.period
+        state = super().step(command)
+        self.now = self.due - 0.01
+        return state
+
+
+def test_a_command_is_judged_by_the_time_at_which_it_is_sent():
+    arm = EarlyArm()
+    robot = SafeRobot(arm, clock=arm.clock)
+    robot.connect()
+    arm.place(ARM_HOME)
+    state = robot.reset(np.arange(1), start_at())
+    for _ in range(4):
+        asked = state.command.copy()
+        asked[0, 5] += 0.025  # as much as the limit of acceleration allows in a whole period
+        state = robot.step(asked)
+        np.testing.assert_array_equal(state.command, asked)
+        assert (robot.code, robot.is_held) == (0, False)
+
+
 class LaggingArm(LiveArm):
     """An arm that is one command behind, also after a halt."""
 

@@ -78,7 +78,7 @@ def test_an_episode_begins_with_the_tool_down_in_its_area(model):
 def test_a_model_that_is_not_known_is_refused_before_anything_is_built(make):
     with pytest.raises(UnknownName) as caught:
         make("bam/pick-v0", robot_model="fr4")
-    assert str(caught.value) == "Unknown robot model 'fr4'. Did you mean 'fr3'?"
+    assert str(caught.value) == f"Unknown robot model 'fr4'. Did you mean 'fr3'? {ArmDescription.ANOTHER}"
     with pytest.raises(InvalidValue) as caught:
         make("bam/pick-v0", robot_model="lab.toml")
     missing = "The robot description lab.toml cannot be read: [Errno 2] No such file or directory: 'lab.toml'."

@@ -37,7 +37,7 @@ def test_they_solve_their_tasks_with_every_shipped_arm(make_rows, env_id, arm):
 def test_no_policy_for_an_arm_that_is_not_known():
     with pytest.raises(UnknownName) as caught:
         scripted_policy("bam/pick-v0", "fr4")
-    assert str(caught.value) == "Unknown robot model 'fr4'. Did you mean 'fr3'?"
+    assert str(caught.value) == f"Unknown robot model 'fr4'. Did you mean 'fr3'? {ArmDescription.ANOTHER}"
 
 
 def test_no_policy_for_other_environments():

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-import asyncio
 import contextlib
 import json
 import threading
-import time
 
 import pytest
+from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
+from websockets.sync.server import serve
 
 from bam_envs.core.errors import NotInCommand
 from bam_envs.rosbridge.server import BridgeServer, Page, Site
@@ -17,7 +17,7 @@ from bam_envs.rosbridge.tokens import Tokens
 from bam_train.agent.front.agent_socket import AgentSocket
 from bam_train.agent.remote.agent_client import AgentClient
 from bam_train.agent.remote.agent_protocol import PATH, encode_message
-from bam_train.errors import CandidateRefused
+from bam_train.errors import RequestRefused
 from tests.tls_certificates import certificates
 
 __all__ = ["certificates"]  # fixtures from elsewhere
@@ -44,7 +44,7 @@ class FakeHub:
         if content is not None:
             progress("the checker reads it")
             if content.startswith(b"bad"):
-                raise CandidateRefused("the policy says NaN")
+                raise RequestRefused("the policy says NaN", "CandidateRefused")
             return {"digest": content[:4].hex(), "stage": "trial", "state": "on trial", "names": [], "lines": []}
         if op == "take":
             raise NotInCommand("bob@lab is in command")
@@ -170,48 +170,23 @@ def new_agent(server, tmp_path):
         yield make
 
 
-@pytest.fixture
-def until():
-    def wait(condition, timeout=DEADLINE):
-        end = time.monotonic() + timeout
-        while not condition():
-            assert time.monotonic() < end, condition
-            time.sleep(0.005)
-
-    return wait
-
-
+@contextlib.contextmanager
 def serve_once(first):
-    """A WebSocket server that greets with one message; gives its URL, for ``with``."""
+    """A WebSocket server that greets with one message, within the ``with`` block; its URL."""
 
-    @contextlib.contextmanager
-    def served():
-        from websockets.asyncio.server import serve
+    def handle(connection):
+        connection.send(first)
+        with contextlib.suppress(ConnectionClosed):
+            connection.recv()
 
-        box, ready = {}, threading.Event()
-
-        async def main():
-            box["loop"], box["stop"] = asyncio.get_running_loop(), asyncio.Event()
-
-            async def handle(connection):
-                await connection.send(first)
-                await connection.wait_closed()
-
-            async with serve(handle, "127.0.0.1", 0, close_timeout=0.5) as server:
-                box["port"] = server.sockets[0].getsockname()[1]
-                ready.set()
-                await box["stop"].wait()
-
-        thread = threading.Thread(target=lambda: asyncio.run(main()))
+    with serve(handle, "127.0.0.1", 0) as server:
+        thread = threading.Thread(target=server.serve_forever)
         thread.start()
-        assert ready.wait(DEADLINE)
         try:
-            yield f"ws://127.0.0.1:{box['port']}"
+            yield f"ws://127.0.0.1:{server.socket.getsockname()[1]}"
         finally:
-            box["loop"].call_soon_threadsafe(box["stop"].set)
+            server.shutdown()
             thread.join(DEADLINE)
-
-    return served()
 
 
 @pytest.fixture

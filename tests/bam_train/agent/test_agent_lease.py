@@ -1,6 +1,7 @@
 """The lease on the robot of a live agent: when it ends by itself."""
 
 import math
+from unittest import mock
 
 import pytest
 
@@ -9,16 +10,9 @@ from bam_envs.rosbridge.bus import Caller
 from bam_train.agent.front.agent_lease import CUT_LINK_TIMEOUT, SILENT_LINK_TIMEOUT, AgentLease
 
 
-class Clock:
-    now = 100.0
-
-    def __call__(self):
-        return self.now
-
-
 @pytest.fixture
 def lease():
-    clock = Clock()
+    clock = mock.Mock(side_effect=lambda: clock.now, now=100.0)
     lease = AgentLease(30.0, clock)
     lease.clock, lease.heard = clock, 0.0
     lease.grant("a", Caller("client1", "10.0.0.7:1", silence=lambda: lease.heard), shown="anna")

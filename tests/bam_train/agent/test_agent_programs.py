@@ -151,14 +151,8 @@ def test_push(hub, server, run):
     arguments = dict(hub.asked[0][1])
     assert not Path(arguments.pop("path")).exists()
     del arguments["sha256"]
-    assert arguments == {
-        "size": PICK.stat().st_size,
-        "stage": "trial",
-        "when": "tick",
-        "wait": False,
-        "file": "pick-ppo.zip",
-        "why": "better",
-    }
+    told = {"stage": "trial", "when": "tick", "wait": False, "file": "pick-ppo.zip", "why": "better"}
+    assert arguments == {"size": PICK.stat().st_size, **told}
     status, out, _ = run(push.main, PICK, server.url, "--json")
     assert (status, json.loads(out)["active"]) == (0, DIGEST)
 

@@ -23,22 +23,18 @@ def messages(caplog):
     return [record.getMessage() for record in caplog.records]
 
 
-def test_the_greeting_and_a_request(hub, new_raw):
+def test_the_greeting_a_request_and_who_it_is_from(hub, new_raw):
     raw = new_raw("d")
     assert raw.hello == {"event": "hello", "protocol": 1, "agent": __version__, "role": "drive"}
+    raw.ask("status", name="")
     answer = raw.ask("status", name="anna@laptop")
-    assert answer == {"id": 1, "ok": True, "result": {"state": "paused", "active": None, "owner": None}}
-    (op, arguments, person), address = hub.asked[0], "{}:{}".format(*raw.socket.local_address[:2])
-    assert (op, arguments) == ("status", {})
+    assert answer == {"id": 2, "ok": True, "result": {"state": "paused", "active": None, "owner": None}}
+    (op, arguments, person), address = hub.asked[1], "{}:{}".format(*raw.socket.local_address[:2])
+    assert (op, arguments, hub.asked[0][2].who) == ("status", {}, address)
     assert person == Person(person.name, address, role="drive", who="anna@laptop")
-
-
-def test_without_a_name_a_person_is_the_address(hub, new_raw):
-    new_raw().ask("status", name="")
-    person = hub.asked[0][2]
-    assert person.who == person.address
-    new_raw().ask("status", name="anna\x1b[31m\n")
-    assert hub.asked[1][2].who == "anna?[31m?"
+    raw.ask("status", name="anna\x1b[31m\n")
+    raw.close()
+    hub.wait_for(lambda: [person.who for person in hub.gone] == ["anna?[31m?"])
 
 
 def test_texts_of_others_have_no_control_characters(hub, new_raw):
@@ -72,61 +68,30 @@ def test_errors_are_one_line_with_their_kind(hub, new_raw, caplog):
     assert raw.ask("status")["ok"]
 
 
+JOG, DEEP = b'{"op": "jog", "seq": 1, "twist": ', "maximum recursion depth exceeded while deserializing an object."
+NO_REQUESTS = [
+    (b"{", None, "Input data was truncated."),
+    (b"\xff\xfe", None, "JSON is malformed: invalid character (byte 0)."),
+    *((data, None, "Expected `object`, got `array`.") for data in (b"[]", b"[" * 60_000)),
+    (b'{"op": "status", "id": 1, "x": ' + b"[" * 50_000, None, DEEP),
+    (b'{"op": 3, "id": 1}', None, "Expected `str`, got `int` - at `$.op`."),
+    (b'{"op": "pause"}', None, "Object missing required field `id`."),
+    (b'{"op": "pause", "id": 1, "force": 1}', 1, "Object contains unknown field `force`."),
+    (b'{"op": "pause", "id": 1, "why": 5}', 1, "Expected `str`, got `int` - at `$.why`."),
+    (JOG + b"[NaN, 0, 0, 0]}", None, "JSON is malformed: invalid character (byte 34)."),
+    (JOG + b"[0, 0, 0]}", None, "Expected `array` of length >= 4 - at `$.twist`."),
+    (JOG + b"[1e999, 0, 0, 0]}", None, "Number out of range - at `$.twist[0]`."),
+    (b'{"op": "jog", "seq": "1", "twist": [0, 0, 0, 0]}', None, "Expected `int`, got `str` - at `$.seq`."),
+    (JOG + b'[0, 0, 0, 0], "gripper": 2}', None, "Invalid enum value 2 - at `$.gripper`."),
+    (JOG + b'[0, 0, 0, 0], "sent": "now"}', None, "Expected `float | null`, got `str` - at `$.sent`."),
+]
+
+
 @pytest.mark.parametrize(
     ("data", "number", "error"),
     [
-        (b"{", None, "This is no request: Input data was truncated."),
-        (b"\xff\xfe", None, "This is no request: JSON is malformed: invalid character (byte 0)."),
-        (b"[" * 60_000, None, "This is no request: Expected `object`, got `array`."),
-        (
-            b'{"op": "status", "id": 1, "x": ' + b"[" * 50_000,
-            None,
-            "This is no request: maximum recursion depth exceeded while deserializing an object.",
-        ),
-        (b"[]", None, "This is no request: Expected `object`, got `array`."),
+        *((data, number, f"This is no request: {why}") for data, number, why in NO_REQUESTS),
         (b'{"op": "stats", "id": 1}', 1, "Unknown op 'stats'. Did you mean 'status'?"),
-        (b'{"op": 3, "id": 1}', None, "This is no request: Expected `str`, got `int` - at `$.op`."),
-        (b'{"op": "pause"}', None, "This is no request: Object missing required field `id`."),
-        (
-            b'{"op": "pause", "id": 1, "force": 1}',
-            1,
-            "This is no request: Object contains unknown field `force`.",
-        ),
-        (
-            b'{"op": "pause", "id": 1, "why": 5}',
-            1,
-            "This is no request: Expected `str`, got `int` - at `$.why`.",
-        ),
-        (
-            b'{"op": "jog", "seq": 1, "twist": [NaN, 0, 0, 0]}',
-            None,
-            "This is no request: JSON is malformed: invalid character (byte 34).",
-        ),
-        (
-            b'{"op": "jog", "seq": 1, "twist": [0, 0, 0]}',
-            None,
-            "This is no request: Expected `array` of length >= 4 - at `$.twist`.",
-        ),
-        (
-            b'{"op": "jog", "seq": 1, "twist": [1e999, 0, 0, 0]}',
-            None,
-            "This is no request: Number out of range - at `$.twist[0]`.",
-        ),
-        (
-            b'{"op": "jog", "seq": "1", "twist": [0, 0, 0, 0]}',
-            None,
-            "This is no request: Expected `int`, got `str` - at `$.seq`.",
-        ),
-        (
-            b'{"op": "jog", "seq": 1, "twist": [0, 0, 0, 0], "gripper": 2}',
-            None,
-            "This is no request: Invalid enum value 2 - at `$.gripper`.",
-        ),
-        (
-            b'{"op": "jog", "seq": 1, "twist": [0, 0, 0, 0], "sent": "now"}',
-            None,
-            "This is no request: Expected `float | null`, got `str` - at `$.sent`.",
-        ),
         (b" " * 65_537, None, "A request has at most 65536 bytes; this one has 65537."),
     ],
 )
@@ -140,7 +105,7 @@ def test_what_is_no_request_is_one_line_and_the_socket_stays(new_raw, caplog, da
     assert [line.partition(" was refused: ")[2] for line in messages(caplog)] == [error]
 
 
-def test_a_request_is_heard_once(hub, new_raw):
+def test_a_request_is_heard_once(hub, new_raw, caplog):
     raw = new_raw()
     frame = json.dumps({"id": 5, "op": "resume"})
     raw.socket.send(frame)
@@ -149,6 +114,7 @@ def test_a_request_is_heard_once(hub, new_raw):
     error = "The id 5 is not above 5: ids grow."
     assert raw.receive() == {"id": 5, "ok": False, "error": error, "kind": "BadRequest"}
     assert len(hub.asked) == 1
+    assert messages(caplog)[0].endswith(f" was refused: {error}")
 
 
 ARGUMENTS = {
@@ -288,13 +254,6 @@ def test_one_learner_at_a_time(hub, new_raw, until):
     assert second.ask("transitions", on=True)["ok"]
 
 
-def test_the_hub_learns_who_left(hub, new_raw):
-    raw = new_raw("d")
-    raw.ask("status", name="anna")
-    raw.close()
-    hub.wait_for(lambda: [person.who for person in hub.gone] == ["anna"])
-
-
 def test_a_flood_of_messages_ends_its_socket_only(hub, new_raw, caplog):
     raw, other = new_raw("d"), new_raw("w")
     began = time.monotonic()
@@ -381,7 +340,7 @@ def test_a_size_that_is_too_large_is_refused_before_anything_is_sent(hub, new_ra
     assert messages(caplog)[0].endswith(f" was refused: push: {error}")
 
 
-def test_a_disk_without_room(hub, new_server, new_raw, monkeypatch):
+def test_a_disk_without_room_and_a_folder_that_cannot_be_written(hub, new_server, new_raw, monkeypatch):
     server = new_server()
     monkeypatch.setattr("shutil.disk_usage", lambda path: SimpleNamespace(free=1_000_000))
     answer = announce(new_raw(on=server), bytes(1_000))
@@ -389,15 +348,12 @@ def test_a_disk_without_room(hub, new_server, new_raw, monkeypatch):
         "The disk of the robot's computer has 1.0 MB free, and the upload of 0.0 MB needs 134.2 MB. "
         f"Make room in {hub.incoming}."
     )
-
-
-def test_a_folder_that_cannot_be_written(hub, new_raw):
+    monkeypatch.undo()
+    hub.incoming.rmdir()
     hub.incoming.write_text("a file")
-    answer = announce(new_raw(), b"1234")
-    assert (answer["kind"], answer["error"]) == (
-        "OutputError",
-        f"The upload cannot be written to {hub.incoming}: File exists.",
-    )
+    answer = announce(new_raw(on=server), b"1234")
+    assert answer["error"] == f"The upload cannot be written to {hub.incoming}: File exists."
+    assert answer["kind"] == "OutputError"
 
 
 def test_few_uploads_at_once(hub, new_raw):

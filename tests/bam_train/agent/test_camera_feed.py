@@ -117,8 +117,9 @@ def test_a_page_that_takes_long_to_draw_gets_fewer_pictures(took, pause):
 
 
 def test_nonsense_of_a_page_has_no_effect(look):
+    deep, number = "[" * 60_000, '{"op": "next", "camera": 7}'
     with look(wrist=Camera()) as client:
-        for nonsense in ("", "[]", "{}", '{"op": "next", "camera": "x"}', '{"op": "next", "camera": 7}', b"\x00\xff"):
+        for nonsense in ("", "[]", "{}", deep, f"{number[:-2]}{deep}", number, f'{number[:-2]}"x"}}', b"\x00\xff"):
             client.send(nonsense)
         client.recv(DEADLINE)
         assert pictures(client)[0] == 0

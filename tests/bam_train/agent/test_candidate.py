@@ -25,8 +25,14 @@ from bam_train.environments import interface_of, make_env
 
 SEEN = np.random.default_rng(0).normal(size=(20, 4)).astype(np.float32)
 WEIGHT = np.linspace(-0.2, 0.2, 16, dtype=np.float32).reshape(4, 4)
-SIGNALS = {"state": [{"name": "force", "unit": "N"}]}
 CHECKPOINTS = Path(__file__).parents[3] / "checkpoints"
+
+
+def one_signal(name, unit):
+    return {"state": [{"name": name, "unit": unit}]}
+
+
+SIGNALS = one_signal("force", "N")
 
 
 def linear(*weights):
@@ -102,12 +108,6 @@ def test_a_shipped_checkpoint_fits_its_environment_with_a_live_robot(asked):
 # The eight kinds of bad candidates
 
 
-def test_weights_that_are_nan(asked, candidate):
-    weight = np.full_like(WEIGHT, np.nan)
-    what = "its action for the observation in row 0 of bam/golden.safetensors is [NaN, NaN, NaN, NaN]"
-    assert refused(asked(candidate([weight], golden=SEEN @ WEIGHT))) == f"a.zip: {what}. Train it again"
-
-
 def test_actions_that_are_infinite_for_observations_that_were_not_recorded(asked, candidate):
     """Observations above 4 give infinity; none that was recorded is."""
     weight, golden = np.diag(np.full(4, 8.6e37, np.float32)), np.clip(SEEN, -1, 1)
@@ -115,6 +115,20 @@ def test_actions_that_are_infinite_for_observations_that_were_not_recorded(asked
     assert reason.startswith("a.zip: its action for a random observation is [")
     assert "Infinit" in reason
     assert reason.endswith(". Train it again")
+
+
+def test_what_is_no_candidate_is_named(asked, candidate, forge):
+    what = "its action for the observation in row 0 of bam/golden.safetensors is [NaN, NaN, NaN, NaN]"
+    path = candidate([np.full_like(WEIGHT, np.nan)], golden=SEEN @ WEIGHT)
+    assert refused(asked(path)) == f"a.zip: {what}. Train it again"
+    for env in ("bam/reach-v0", "os:Env-v0"):
+        why = f"was trained on {env}, and the agent runs test/Env-v0. Push a checkpoint for that"
+        assert refused(asked(candidate(env=env))) == f"a.zip: {why}"
+    why = "has format 2; this bam-train reads up to 1. Run: pip install --upgrade bam-train"
+    assert refused(asked(forge(candidate(), format=2))) == f"a.zip: {why}"
+    path.write_bytes(path.read_bytes()[:-100])
+    why = "not a whole zip file: truncated, altered or something else. Copy it again from its source, or train again"
+    assert refused(asked(path)) == f"a.zip: {why}"
 
 
 @pytest.mark.parametrize(
@@ -126,14 +140,8 @@ def test_actions_that_are_infinite_for_observations_that_were_not_recorded(asked
             "observation_space.high is 6.0 in the checkpoint and 5.0",
         ),
         ({"period": 0.02}, "period [s] is 0.02 in the checkpoint and 0.05"),
-        (
-            {"signals": {"state": [{"name": "force", "unit": "kN"}]}},
-            'signals.state[0].unit is "kN" in the checkpoint and "N"',
-        ),
-        (
-            {"signals": {"state": [{"name": "torque", "unit": "N"}]}},
-            'signals.state[0].name is "torque" in the checkpoint and "force"',
-        ),
+        ({"signals": one_signal("force", "kN")}, 'signals.state[0].unit is "kN" in the checkpoint and "N"'),
+        ({"signals": one_signal("torque", "N")}, 'signals.state[0].name is "torque" in the checkpoint and "force"'),
         ({"env_kwargs": {"goal": 2}}, "env_kwargs.goal is 2 in the checkpoint and null"),
     ],
 )
@@ -224,25 +232,6 @@ def test_too_slow(asked, candidate):
     assert float(start.split()[-1]) > 0.5
 
 
-def test_truncated(asked, candidate):
-    path = candidate()
-    path.write_bytes(path.read_bytes()[:-100])
-    why = "not a whole zip file: truncated, altered or something else. Copy it again from its source, or train again"
-    assert refused(asked(path)) == f"a.zip: {why}"
-
-
-def test_another_environment(asked, candidate):
-    why = "was trained on bam/reach-v0, and the agent runs test/Env-v0. Push a checkpoint for that"
-    assert refused(asked(candidate(env="bam/reach-v0"))) == f"a.zip: {why}"
-    why = "was trained on os:Env-v0, and the agent runs test/Env-v0. Push a checkpoint for that"
-    assert refused(asked(candidate(env="os:Env-v0"))) == f"a.zip: {why}"
-
-
-def test_a_newer_format(asked, candidate, forge):
-    why = "has format 2; this bam-train reads up to 1. Run: pip install --upgrade bam-train"
-    assert refused(asked(forge(candidate(), format=2))) == f"a.zip: {why}"
-
-
 # The process
 
 
@@ -252,6 +241,9 @@ def test_a_refusal_comes_from_the_other_process_with_what_is_known(asked, candid
     why = "period [s] is 0.02 in the checkpoint and 0.05 in test/Env-v0 as the agent runs it"
     assert verdict.reason == f"a.zip: {why}. Push a checkpoint that was trained for that"
     assert (verdict.ok, verdict.digest, verdict.env) == (False, Checkpoint.open(path).digest, "test/Env-v0")
+    verdict = check_candidate(asked(path, interface={}))
+    why = "the check of this candidate ended with status 1: KeyError: 'observation_space'"
+    assert (verdict.ok, verdict.reason) == (False, f"a.zip: {why}")
 
 
 @pytest.fixture
@@ -279,12 +271,6 @@ def test_a_killed_check_is_a_refusal(asked, endless):
     os.kill(*new, signal.SIGKILL)
     thread.join()
     assert [verdict.reason for verdict in verdicts] == ["a.zip: the check of this candidate was ended by signal 9"]
-
-
-def test_a_check_that_fails_is_a_refusal_with_the_last_line_of_its_error(asked, candidate):
-    verdict = check_candidate(asked(candidate(), interface={}))
-    why = "the check of this candidate ended with status 1: KeyError: 'observation_space'"
-    assert (verdict.ok, verdict.reason) == (False, f"a.zip: {why}")
 
 
 def test_a_full_disk_is_a_refusal(asked, candidate):

@@ -108,10 +108,10 @@ def test_a_robot_whose_shape_is_not_known_has_its_numbers(page, agent):
     assert not page.element("picture").is_displayed()
 
 
-def drawn(page, agent, telemetry, states):
+def drawn(page, agent, telemetry, states, goals=()):
     """What the page's picture has of each state: parts (pose and solids by name), differing pixels."""
     page.open(agent.url).shows("tool", "Tool at x, y, z:")
-    messages = [telemetry.message(state, 0.0) for state in states]
+    messages = [{**telemetry.message(state, 0.0), "goals": list(goals)} for state in states]
     found = page.browser.execute_async_script(DRAWINGS, telemetry.scene, messages)
     for one in found:
         for part in one["parts"].values():
@@ -166,7 +166,8 @@ def test_the_picture_changes_with_joints_gripper_and_object(page, agent):
 def test_a_base_is_drawn_where_it_is_with_what_it_sees(page, agent):
     telemetry, here, there = Telemetry(base_model("mir100").spec(), Limits()), base_state(), base_state(2.0)
     there.signals["base_pose"] = np.array([[3.0, -1.0, np.pi / 2]])
-    first, second = drawn(page, agent, telemetry, [here, there])
+    first, second = drawn(page, agent, telemetry, [here, there], [[4.0, 1.0, 0.0]])
+    np.testing.assert_allclose(second["parts"]["goal 1"]["pose"][:3, 3], [4.0, 1.0, 0.0])
     np.testing.assert_allclose(first["parts"]["base"]["pose"][:3, 3], [1.0, 2.0, 0.0], atol=1e-4)
     np.testing.assert_allclose(second["parts"]["base"]["pose"][:2, [0, 3]], [[0.0, 3.0], [1.0, -1.0]], atol=1e-4)
     assert second["differing"] > 100

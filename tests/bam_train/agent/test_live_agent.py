@@ -20,7 +20,7 @@ from bam_envs.core.errors import NotInCommand, RobotFault
 from bam_train.agent.remote.agent_client import AgentClient
 from bam_train.checkpoint import GOLDEN, POLICY, Checkpoint, safetensors_file
 from bam_train.cli.deploy import main as deploy
-from bam_train.errors import AgentRefused
+from bam_train.errors import RequestRefused
 from bam_train.policy import FrozenPolicy
 from bam_train.recording.recording import Recording
 
@@ -240,10 +240,10 @@ def test_a_push_acts_between_two_ticks_and_is_rolled_back(running, tmp_path, for
 
 def test_a_refused_candidate_changes_nothing(running):
     champion = running.state()["active"]
-    with pytest.raises(AgentRefused, match="was trained on bam/reach-v0, and the agent runs bam/pick-v0") as refused:
+    with pytest.raises(RequestRefused, match="was trained on bam/reach-v0, and the agent runs bam/pick-v0") as refused:
         running.agent.push(PICK.with_name("reach-ppo.zip"))
     assert refused.value.kind == "CandidateRefused"
-    with pytest.raises(AgentRefused, match="no such version") as refused:
+    with pytest.raises(RequestRefused, match="no such version") as refused:
         running.agent.ask("use", version="elsewhere")
     assert (refused.value.kind, running.state()["active"]) == ("UnknownVersion", champion)
 

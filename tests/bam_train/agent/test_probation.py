@@ -23,22 +23,17 @@ def test_enough_trials_promote():
         assert probation.ended(True, trials=Evidence(trials, trials, 0.9)) is None
     text = "33 of 33 trials succeeded, which shows more than 90 % (error probability at most 5 %)"
     assert probation.ended(True, trials=Evidence(33, 33, 0.9)) == Judgement("promote", text)
-
-
-def test_successes_in_service_say_nothing():
-    probation = Probation()
-    assert {probation.ended(True) for _ in range(1000)} == {None}
-
-
-def test_the_second_stop_by_a_guard_rolls_back():
-    probation = Probation()
-    assert probation.ended(None, stopped_by="joint speed (G7)") is None
-    assert probation.ended(None) is None
-    reason = "guards stopped it 2 times in the last 3 episodes, the last was tool speed (G8)"
-    assert probation.ended(None, stopped_by="tool speed (G8)") == Judgement("roll back", reason)
+    for judged in (None, "roll back"):  # which precedes a promotion
+        trials = Evidence(100, 100, 0.9) if judged else None
+        end = probation.ended(True, stopped_by="tool speed (G8)", trials=trials)
+        assert (end and end.decision) == judged
 
 
 def test_stops_are_counted_among_the_last_episodes():
+    probation = Probation()
+    assert [probation.ended(None, stopped_by="joint speed (G7)"), probation.ended(None)] == [None, None]
+    reason = "guards stopped it 2 times in the last 3 episodes, the last was tool speed (G8)"
+    assert probation.ended(None, stopped_by="tool speed (G8)") == Judgement("roll back", reason)
     probation = Probation(guard_stops=3, window=10)
     ends = [probation.ended(None, stopped_by="tilt (G9)" if k % 5 == 0 else "") for k in range(100)]
     assert set(ends) == {None}
@@ -47,14 +42,11 @@ def test_stops_are_counted_among_the_last_episodes():
     assert probation.ended(None, stopped_by="tilt (G9)") == Judgement("roll back", reason)
 
 
-def test_late_ticks_of_the_policy_roll_back():
+def test_late_ticks_roll_back_few_do_not_and_old_ones_are_forgotten():
     probation = Probation()
     assert probation.ended(True, slow=50, ticks=99) is None  # too few to tell
     reason = "its actions took so long that 57 of 300 ticks were late, and at most 5 % may be"
     assert probation.ended(True, slow=7, ticks=201) == Judgement("roll back", reason)
-
-
-def test_few_late_ticks_do_not_and_old_ones_are_forgotten():
     probation = Probation()
     assert {probation.ended(True, slow=5, ticks=100) for _ in range(30)} == {None}
     assert probation.ended(True, slow=6, ticks=100).decision == "roll back"
@@ -74,13 +66,6 @@ def test_failures_roll_back_with_the_counts():
     assert [probation.ended(False) for _ in range(2)] == [None, None]
     reason = "0 of 3 episodes succeeded, which shows less than 90 % (error probability at most 5 %)"
     assert probation.ended(False) == Judgement("roll back", reason)
-
-
-def test_a_roll_back_precedes_a_promotion():
-    probation = Probation()
-    probation.ended(True, stopped_by="tool speed (G8)")
-    judged = probation.ended(True, stopped_by="tool speed (G8)", trials=Evidence(100, 100, 0.9))
-    assert judged.decision == "roll back"
 
 
 def test_earlier_successes_do_not_protect_a_policy_that_became_worse():
@@ -114,6 +99,10 @@ def test_the_evidence_is_a_martingale_at_the_bound_and_falls_above_it(bound):
 
 def test_a_policy_is_seldom_rolled_back_wrongly_and_a_bad_one_soon():
     """400 policies of each kind, 300 episodes."""
+    failing = Shortfall(0.9)
+    for _ in range(10_000):
+        failing.add(False)
+    assert (bool(np.isfinite(failing.value)), failing.is_enough) == (True, True)
 
     def rolled_back(*rates):
         found = [until_judged(np.repeat(rates, 300 // len(rates)), seed) for seed in range(400)]
@@ -126,14 +115,6 @@ def test_a_policy_is_seldom_rolled_back_wrongly_and_a_bad_one_soon():
     broken = [episode - 150 for episode in rolled_back(0.97, 0.5)]
     assert len(broken) >= 396
     assert np.median(broken) <= 25
-
-
-def test_numbers_stay_finite():
-    shortfall = Shortfall(0.9)
-    for _ in range(10_000):
-        shortfall.add(False)
-    assert np.isfinite(shortfall.value)
-    assert shortfall.is_enough
 
 
 @pytest.mark.parametrize(

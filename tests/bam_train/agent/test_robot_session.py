@@ -81,6 +81,13 @@ def test_after_a_full_disk_the_next_episode_is_recorded_once_there_is_room(sessi
     assert len(Recording.open(session.recorder.path).arrays("action")[""]) == 6
 
 
+def test_the_goal_of_the_episode_is_told_once_there_is_one(session):
+    session = session(no_record=True)
+    assert session.goals() == []
+    play(session)
+    assert session.goals() == [session.task.goal[0].tolist()]
+
+
 def test_where_no_recording_can_begin_one_does_once_there_is_room(session, tmp_path, until, caplog, monkeypatch):
     """It is said once, although each attempt is for a file of another name."""
     names = (Path(f"recordings/{number}-reach.mcap") for number in range(10**6))

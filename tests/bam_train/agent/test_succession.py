@@ -77,10 +77,6 @@ def better(tmp_path, forge):
     return forge(path, seed=7)
 
 
-def names(agent):
-    return {name: digest[:6] for name, digest in agent.succession.names.items()}
-
-
 def test_a_pushed_candidate_acts_and_is_promoted_by_its_trials(agent, better):
     old, new = agent.succession.active.digest, Checkpoint.open(better).digest
     answer = agent.ask("push", path=str(better), file="better.zip")
@@ -108,15 +104,27 @@ def test_a_pushed_candidate_acts_and_is_promoted_by_its_trials(agent, better):
     assert agent.notes[-1] == ("promoted", f"{new[:12]} is the champion: {text}")
 
 
-def test_a_candidate_that_fails_is_rolled_back(agent, better):
+SLOW = {"success": True, "length": 300, "end": "terminated", "slow": 57}
+
+
+@pytest.mark.parametrize(
+    ("episodes", "why"),
+    [
+        (
+            [{"success": False, "end": "truncated"}] * 3,
+            "0 of 3 episodes succeeded, which shows less than 90 % (error probability at most 5 %)",
+        ),
+        ([SLOW], "its actions took so long that 57 of 300 ticks were late, and at most 5 % may be"),
+    ],
+)
+def test_a_candidate_that_fails_or_is_too_slow_for_this_computer_is_rolled_back(agent, better, episodes, why):
     old = agent.succession.active.digest
     agent.ask("push", path=str(better))
     choice = agent.succession.choice
-    for seed in range(3):
-        agent.succession.ended(EpisodeRecord(seed, success=False, end="truncated"))
+    for seed, episode in enumerate(episodes):
+        agent.succession.ended(EpisodeRecord(seed, **episode))
     assert agent.succession.active.digest == old
     assert agent.succession.names == {"champion": old, "given": old}
-    why = "0 of 3 episodes succeeded, which shows less than 90 % (error probability at most 5 %)"
     assert choice.result == f"rolled back: {why}"
 
 
@@ -160,25 +168,19 @@ def test_an_episode_that_the_computer_cut_short_does_not_count(agent, better):
     assert trials.evidence.trials == 2
 
 
-def test_a_candidate_that_is_too_slow_for_this_computer_is_rolled_back(agent, better):
-    old = agent.succession.active.digest
-    agent.ask("push", path=str(better))
-    choice = agent.succession.choice
-    agent.succession.ended(EpisodeRecord(0, success=True, length=300, end="terminated", slow=57))
-    assert agent.succession.active.digest == old
-    why = "its actions took so long that 57 of 300 ticks were late, and at most 5 % may be"
-    assert choice.result == f"rolled back: {why}"
-
-
 def test_a_refused_candidate_changes_nothing(agent, better):
-    before = names(agent)
+    before = dict(agent.succession.names)
     better.write_bytes(better.read_bytes()[:-100])
     answer = agent.ask("push", path=str(better), file="better.zip")
     why = "not a whole zip file: truncated, altered or something else. Copy it again from its source, or train again"
     assert (answer.kind, answer.error) == ("CandidateRefused", f"better.zip: {why}")
     assert agent.notes == [("refused", f"better.zip: {why}")]
     assert not better.exists()
-    assert names(agent) == before
+    assert agent.succession.names == before
+    agent.session = None
+    answer = agent.ask("push", path=str(better))
+    why = "the agent waits for the robot, and checks no candidate without it; push it later"
+    assert (answer.kind, answer.error) == ("RequestRefused", why)
 
 
 def test_a_version_of_another_environment_does_not_act(tmp_path, agent):
@@ -194,10 +196,3 @@ def test_a_version_of_another_environment_does_not_act(tmp_path, agent):
     why = f"{pick[:12]} was trained on bam/pick-v0, and the agent runs bam/reach-v0"
     assert str(caught.value) == f"There is no version to roll back to: {why}."
     assert other.succession.active.digest == reach
-
-
-def test_without_the_robot_no_candidate_is_checked(agent, better):
-    agent.session = None
-    answer = agent.ask("push", path=str(better))
-    why = "the agent waits for the robot, and checks no candidate without it; push it later"
-    assert (answer.kind, answer.error) == ("RequestRefused", why)

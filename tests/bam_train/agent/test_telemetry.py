@@ -44,6 +44,11 @@ def test_the_message_of_an_arm():
     assert message["command"]["gripper_width"] == 0.08
     np.testing.assert_allclose(message["tool"], GEOMETRY.tool_position(np.array([ARM_HOME]))[0], atol=1e-5)
     assert message["near"]["state age"] == {"value": 0.02, "limit": 0.1, "unit": "s", "share": 0.2}
+    state = arm_state()
+    state.signals |= {"object_position": np.array([[0.5, 0.1, 0.02]])}
+    state.signals |= {"object_quaternion": np.array([[math.cos(0.2), 0.0, 0.0, math.sin(0.2)]])}
+    message = Telemetry(arm_spec("ur5e", with_object=True), Limits()).message(state, 0.0)
+    assert message["object"] == [0.5, 0.1, 0.02, 0.0, 0.0, 0.19867, 0.98007]
 
 
 def test_the_scene_of_an_arm_is_its_description():
@@ -65,21 +70,9 @@ def test_the_scene_of_an_arm_is_its_description():
     np.testing.assert_allclose(pad, [0.004, 0, -0.002 * size, 0.004, 0.011 * size, 0.014 * size])
     assert (scene["box"], scene["table"]) == ([0.3, -0.25, 0.016, 0.6, 0.25, 0.35], -0.1)
     json.dumps(scene, allow_nan=False)
-
-
-def test_the_scene_of_an_arm_without_a_gripper_and_of_a_base():
-    scene = Telemetry(ur_spec(ur_model("ur5e"), 0.05, False), Limits()).scene
-    assert scene["gripper"] is None
-    assert scene["box"] == [-2.0, -2.0, None, 2.0, 2.0, 2.0]
+    bare = Telemetry(ur_spec(ur_model("ur5e"), 0.05, False), Limits()).scene
+    assert (bare["gripper"], bare["box"]) == (None, [-2.0, -2.0, None, 2.0, 2.0, 2.0])
     assert Telemetry(BASE, Limits()).scene == {}
-
-
-def test_the_object_is_where_it_is_measured():
-    state = arm_state()
-    state.signals |= {"object_position": np.array([[0.5, 0.1, 0.02]])}
-    state.signals |= {"object_quaternion": np.array([[math.cos(0.2), 0.0, 0.0, math.sin(0.2)]])}
-    message = Telemetry(arm_spec("ur5e", with_object=True), Limits()).message(state, 0.0)
-    assert message["object"] == [0.5, 0.1, 0.02, 0.0, 0.0, 0.19867, 0.98007]
 
 
 def test_the_speed_of_the_tool_is_that_of_its_joints():
@@ -124,7 +117,7 @@ def test_the_message_of_a_base():
     assert set(message["state"]) == {"base_pose", "base_velocity"}
     assert message["tool"] is None
     assert message["base"] == [1.0, 2.0, 0.5]
-    assert message["outline"] == pytest.approx([0.4876, 0.4124, 0.29])
+    assert message["outline"] == [[0.4876, -0.29], [0.4876, 0.29], [-0.4124, 0.29], [-0.4124, -0.29]]
     assert 100 < len(message["scan"]) <= 180
     assert all(len(point) == 2 for point in message["scan"])
     assert message["near"]["base speed"] == {"value": 0.25, "limit": 0.5, "unit": "m/s", "share": 0.5}
@@ -133,13 +126,15 @@ def test_the_message_of_a_base():
     assert Telemetry(BASE, Limits()).message(base_state(0.4), 0.0)["near"]["laser zones"]["share"] > 0.9
 
 
-def test_a_base_without_scanners():
-    spec = base_model("mir100").spec(with_scans=False)
+def test_bases_without_scanners_a_round_one_is_drawn_round():
+    spec = base_model("turtlebot4").spec(with_scans=False)
     state = base_state()
     state.signals = {name: state.signals[name] for name in ("base_pose", "base_velocity")}
-    message = Telemetry(spec, Limits()).message(state, 0.0)
-    assert message["scan"] == []
-    assert "laser zones" not in message["near"]
+    edge = np.array(Telemetry(spec, Limits()).message(state, 0.0)["outline"])
+    assert edge.shape == (32, 2)
+    np.testing.assert_allclose(np.hypot(*edge.T), 0.171, atol=1e-5)
+    message = Telemetry(base_model("mir100").spec(with_scans=False), Limits()).message(state, 0.0)
+    assert (message["scan"], "laser zones" in message["near"]) == ([], False)
 
 
 def test_what_is_not_finite_is_not_sent():

@@ -10,6 +10,7 @@ from bam_train.agent.transitions import MOST, TransitionCollector, TransitionLog
 from bam_train.deploy.deployment import Deployment
 from bam_train.deploy.journal import Journal
 from bam_train.errors import FormatError
+from tests.raising import raising
 
 
 def three():
@@ -37,14 +38,16 @@ def test_a_message_carries_every_bit():
     assert sent.policy == ["ab", "", "ab"]
     assert sent.intervention.tolist() == [False, True, False]
     assert sent.ends.tolist() == [False, False, True]
+    log = TransitionLog(most=2)
+    for step in range(5):
+        log.add(np.ones((2, 3)), np.zeros(1), step, np.zeros((2, 3)), False, True, False, False, 0, step, "ab")
+    assert log.lost == 3
+    decoded = decode(encode(log.take()))  # of pictures, the newest
+    assert (len(decoded), decoded.observation.shape, decoded.step.tolist()) == (2, (2, 2, 3), [3, 4])
+    assert log.take() is None
 
 
-def test_pictures_keep_their_shape():
-    log = TransitionLog()
-    log.add(np.ones((2, 3)), np.zeros(1), 0.0, np.zeros((2, 3)), False, True, False, False, 0, 0, "ab")
-    decoded = decode(encode(log.take()))
-    assert decoded.observation.shape == (1, 2, 3)
-    assert len(decoded) == 1
+COLUMN = {"shape": [3, 1], "data": "AAAAAAAAAAAAAAAA"}
 
 
 @pytest.mark.parametrize(
@@ -58,34 +61,15 @@ def test_pictures_keep_their_shape():
         ({"policy": None}, "transitions: policy: expected 3 values of type str, found None"),
         ({"action": [1.0]}, "transitions: action: expected an array of 3 rows, found [1.0]"),
         ({"reward": {"shape": [3], "data": "?"}}, "transitions: reward: expected base64, found '?'"),
-        (
-            {"reward": {"shape": [3], "data": "AAAA"}},
-            "transitions: reward: expected 12 bytes for shape [3], found 3",
-        ),
-        (
-            {"reward": {"shape": [3, 1], "data": "AAAAAAAAAAAAAAAA"}},
-            "transitions: reward: expected shape (3,), found (3, 1)",
-        ),
+        ({"reward": {"shape": [3], "data": "AAAA"}}, "transitions: reward: expected 12 bytes for shape [3], found 3"),
+        ({"reward": COLUMN}, "transitions: reward: expected shape (3,), found (3, 1)"),
         ({"reward": {"shape": [3], "data": "AADAfwAAAAAAAAAA"}}, "transitions: reward: expected finite numbers"),
-        (
-            {"next_observation": {"shape": [3, 1], "data": "AAAAAAAAAAAAAAAA"}},
-            "transitions: next_observation: expected shape (3, 4), found (3, 1)",
-        ),
+        ({"next_observation": COLUMN}, "transitions: next_observation: expected shape (3, 4), found (3, 1)"),
     ],
 )
 def test_a_bad_message_is_refused(change, message):
-    with pytest.raises(FormatError) as error:
+    with raising(FormatError, message):
         decode(encode(three()) | change)
-    assert str(error.value) == message
-
-
-def test_a_full_log_keeps_the_newest_and_counts_the_others():
-    log = TransitionLog(most=2)
-    for step in range(5):
-        log.add(np.zeros(1), np.zeros(1), step, np.zeros(1), False, False, False, False, 0, step, "")
-    assert log.lost == 3
-    assert log.take().step.tolist() == [3, 4]
-    assert log.take() is None
 
 
 class Counting(gym.Env):

@@ -23,7 +23,6 @@ from bam_train.errors import (
     AlteredCheckpoint,
     CheckpointError,
     CheckpointMismatch,
-    NewerFormat,
     NotACheckpoint,
     OutputError,
 )
@@ -215,7 +214,7 @@ def overlap(path: Path) -> None:
         ),
         (
             lambda path: rewrite(path, {"data": b"changed"}, format=2, env=...),
-            NewerFormat,
+            CheckpointMismatch,
             r"has format 2; this bam-train reads up to 1\. Run: pip install --upgrade bam-train",
         ),
         (

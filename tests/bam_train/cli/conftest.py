@@ -11,18 +11,6 @@ from bam_envs.core.spaces import space_to_json
 
 
 @pytest.fixture
-def run(capsys):
-    """Runs a program in this process: ``run(main, arguments...)`` gives its exit status, standard output and error."""
-
-    def run(main, *arguments):
-        with pytest.raises(SystemExit) as done:
-            main([str(argument) for argument in arguments])
-        return done.value.code or 0, *capsys.readouterr()
-
-    return run
-
-
-@pytest.fixture
 def cartpole_checkpoint(corridor_checkpoint):
     """A checkpoint for CartPole-v1 that always pushes to the right."""
     env = gym.make("CartPole-v1")
@@ -35,9 +23,9 @@ LONGEST = 300.0
 
 
 class Program:
-    """`bam-train` in a process group of its own, as a shell starts it, with its standard error a pipe."""
+    """A program in a process group of its own, as a shell starts it, with its standard error a pipe."""
 
-    def __init__(self, context, folder, arguments):
+    def __init__(self, context, folder, arguments, module):
         reader, writer = context.Pipe(duplex=False)
         code = f"""
 import os, sys
@@ -45,7 +33,7 @@ os.setsid()
 os.chdir({str(folder)!r})
 os.dup2(writer.fileno(), 2)
 sys.stderr = open(2, "w", buffering=1, closefd=False)
-from bam_train.cli.train import main
+from {module} import main
 main({list(arguments)!r})
 """
         self.process = context.Process(target=exec, args=(code, {"writer": writer}))
@@ -87,9 +75,9 @@ def start_forked():
     """``start_forked(modules, folder, *arguments)`` starts a `Program`, forked from a process with these modules."""
     context, programs = multiprocessing.get_context("forkserver"), []
 
-    def start(modules, folder, *arguments):
+    def start(modules, folder, *arguments, program="bam_train.cli.train"):
         context.set_forkserver_preload(["pytest", "torch._dynamo", "bam_train.cli.train", *modules])
-        programs.append(Program(context, folder, arguments))
+        programs.append(Program(context, folder, arguments, program))
         return programs[-1]
 
     yield start

@@ -92,6 +92,18 @@ def test_a_simulated_arm_grasps_without_a_stop(run):
     assert (status, report["successes"], report["guards"]["following"]["stopped"]) == (0, 1, 0), err
 
 
+def test_a_simulated_arm_that_is_held_fast_is_stopped(run):
+    env = gym.make("bam/pick-v0", disable_env_checker=True)
+    env.reset()
+    env.unwrapped.robot.physics.model_of(0).dof_damping[:6] = 1e5
+    with ServedEnvironment(env, ServeOptions(port=0, fast=True)) as served:
+        flags = ("--robot", served.bus.url, "--episodes", 1, "--no-record", "--json")
+        status, out, err = run(main, CHECKPOINTS / "pick-ppo.zip", *flags)
+    assert (status, json.loads(out)["guards"]["following"]["stopped"]) == (3, 1), err
+    assert "it presses on something, such as the object or the table" in err
+    assert "protective stop" not in err
+
+
 def test_a_recording_that_cannot_be_made_is_one_line_and_nothing_moves(corridor_checkpoint, corridor, run, monkeypatch):
     moved, path = [], corridor_checkpoint()
     monkeypatch.setattr(corridor_class(corridor), "reset", lambda *_, **__: moved.append(True))

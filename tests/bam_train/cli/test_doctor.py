@@ -7,6 +7,7 @@ from pathlib import Path
 import gymnasium as gym
 import pytest
 
+from bam_envs.core.robot_models import SHIPPED
 from bam_envs.live.diagnosis import STEPS
 from bam_envs.remote.serve.serve_options import ServeOptions
 from bam_envs.remote.serve.served_environment import ServedEnvironment
@@ -119,7 +120,7 @@ def test_flags_that_are_refused(run, flags, text):
     assert len(err.splitlines()) == 1
 
 
-def test_the_urdf_of_a_described_arm_is_compared_with_that_of_the_profile_or_of_a_flag(run):
+def test_the_urdf_of_a_described_arm_is_compared_with_that_of_the_profile_or_of_a_flag(run, tmp_path):
     fr3 = gym.make("bam/pick-v0", robot_model="fr3", disable_env_checker=True)
     with ServedEnvironment(fr3, ServeOptions(port=0, fast=True)) as one:
         given = (one.bus.url, "--seconds", 0.1)
@@ -130,10 +131,19 @@ def test_the_urdf_of_a_described_arm_is_compared_with_that_of_the_profile_or_of_
         assert lines["mount in /robot_description"] == ("as described", "ok")
         assert lines["tool in /robot_description"] == ("tool is 0 mm from it", "ok")
         assert run(doctor, *given, "--robot-model", "fr3")[0] == 0
-        status, out, err = run(doctor, *given, "--robot-model", "gen3", "--profile", "franka_ros2")
+        longer = tmp_path / "fr3.toml"
+        longer.write_text((SHIPPED / "fr3.toml").read_text(encoding="utf-8").replace("-0.316", "-0.346"))
+        status, out, err = run(doctor, *given, "--robot-model", longer, "--profile", "franka_ros2")
         assert status == 3
         assert "kinematics in /robot_description" in out
-        assert err.startswith("bam-doctor: description failed: the description of gen3 and the robot do not fit: ")
+        assert err.startswith("bam-doctor: description failed: the description of fr3 and the robot do not fit: ")
+        status, _, err = run(doctor, *given, "--robot-model", "gen3", "--profile", "franka_ros2")
+        assert (status, err) == (
+            1,
+            "bam-doctor: The profile franka_ros2 is that of another robot: it has fr3_joint1, fr3_joint2, fr3_joint3, "
+            "fr3_joint4, fr3_joint5, fr3_joint6, fr3_joint7, and gen3 has joint_1, joint_2, joint_3, joint_4, joint_5, "
+            "joint_6, joint_7. Profiles that fit: ros2_kortex.\n",
+        )
     flags = ("--robot-model", "fr3", "--checkpoint", PICK)
     assert run(doctor, "ws://127.0.0.1:9", *flags)[2] == (
         "bam-doctor: --robot-model and --checkpoint each name an arm; give one of them\n"

@@ -124,6 +124,12 @@ def test_another_environment_or_algorithm(corridor_checkpoint, run, flags, text)
     assert refused(run, path, *flags) == text.format(path)
 
 
+def test_another_robot(run):
+    path = ROOT / "checkpoints" / "pick-ppo.zip"
+    text = "was trained for ur5e, and gen3 has other joints: train a policy for that"
+    assert run(main, path, "--set", "robot_model=gen3") == (1, "", f"bam-eval: {path}: {text}\n")
+
+
 def test_other_spaces(corridor_checkpoint, run):
     path = corridor_checkpoint(action_space={"type": "Discrete", "n": 3, "start": 0, "dtype": "int64"})
     assert refused(run, path) == (

@@ -5,8 +5,11 @@ from pathlib import Path
 
 import pytest
 
+from bam_envs.arms.description import robot_model
+from bam_envs.live.building import live_robot
 from bam_envs.safety.guard import BOUNDS
 from bam_train.cli.deploy import main
+from bam_train.deploy.guard_table import guard_lines
 
 CHECKPOINTS = Path(__file__).parents[3] / "checkpoints"
 
@@ -36,6 +39,19 @@ def test_every_guard_has_a_number_a_name_a_limit_and_says_what_it_does(run, name
 def test_a_guard_without_scans_is_off_and_a_box_without_a_bottom_is_not(run, name, guard, limit):
     table = json.loads(run(main, CHECKPOINTS / name, "--print-guards", "--json")[1])
     assert [one["limit"] for one in table["guards"] if one["name"] == guard] == [limit]
+
+
+def test_a_guard_shows_the_limits_of_the_joints_where_they_differ():
+    given = {"profile": "gen3", "tool_position": robot_model("gen3").arm.tool_position}
+    guards = live_robot("ws://127.0.0.1:9090", guards={"joint_acceleration": 8.0}, **given).guards()
+    lines = [" ".join(line.split()) for line in guard_lines(guards, dict.fromkeys(BOUNDS))]
+    assert any(line.startswith("G9 joint acceleration 5.2 to 8 rad/s^2 joint_acceleration") for line in lines)
+    each = {guard["name"]: guard["each"] for guard in guards if guard["each"]}
+    assert each == {
+        "joint speed": [1.0] * 7,
+        "joint acceleration": [5.2] * 4 + [8.0] * 3,
+        "joint jerk": [500.0] * 7,
+    }
 
 
 def test_a_guard_that_is_changed_is_shown_so(run):
@@ -91,4 +107,4 @@ def test_the_description_of_the_arm_may_be_the_one_here_and_not_another_arms(run
     )
     assert err.endswith("Give the description with which the policy was trained, or train a policy for this one.\n")
     _, _, err = run(main, CHECKPOINTS / "mir100-navigation-ppo.zip", print_guards, "--robot-model", "ur5e")
-    assert "--robot-model ur5e: env_kwargs: robot_model: ur5e is an arm, and a wheeled base is needed: husky, " in err
+    assert "--robot-model ur5e: robot_model: ur5e is an arm, and a wheeled base is needed: husky, " in err

@@ -2,6 +2,7 @@
 
 import contextlib
 from dataclasses import replace
+from pathlib import Path
 
 import gymnasium as gym
 import pytest
@@ -25,8 +26,8 @@ def served(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     running = []
 
-    def start(name):
-        env = gym.make("bam/pick-v0", robot_model=name, disable_env_checker=True)
+    def start(name, env_id="bam/pick-v0"):
+        env = gym.make(env_id, robot_model=name, disable_env_checker=True)
         running.append(ServedEnvironment(env, ServeOptions(port=0)))
         return running[-1].__enter__().bus.url
 
@@ -56,6 +57,54 @@ def test_the_graph_of_a_served_arm_gives_its_shipped_profile(run, served, tmp_pa
     assert replace(read, name=expected.name) == expected
 
 
+@pytest.mark.parametrize("name", ["mir100", "husky", "turtlebot4"])
+def test_the_graph_of_a_served_base_gives_its_profile(run, served, tmp_path, name):
+    expected = load_profile(name)
+    status, out, err = run(main, "profile", name, "--from", served(name, "bam/avoidance-v0"))
+    assert (status, err) == (0, "")
+    assert replace(load_profile(tmp_path / "robots" / "profiles" / f"{name}.toml"), robot=expected.robot) == expected
+    assumed = ["  its drive is taken to stop 0.5 s after the last command (watchdog)"] * (name == "turtlebot4")
+    assert [line for line in out.splitlines() if "watchdog" in line] == assumed
+
+
+def lab(name, of, *replaced):
+    """Describe `of` with other numbers as `name`."""
+    text = (SHIPPED / f"{of}.toml").read_text(encoding="utf-8").replace(f'name = "{of}"', f'name = "{name}"', 1)
+    for old, new in replaced:
+        assert old in text
+        text = text.replace(old, new)
+    Path("robots").mkdir(exist_ok=True)
+    Path("robots", f"{name}.toml").write_text(text, encoding="utf-8")
+
+
+def test_a_robot_of_another_name_is_refused(run, served, tmp_path):
+    url = served("gen3")
+    lab("lab", "gen3")
+    refused = run(main, "profile", "lab", "--from", url)
+    assert refused == (
+        1,
+        "",
+        f"bam-robots profile: {url}: the robot there calls itself gen3, and lab was named. Give bam-robots profile "
+        f"gen3 --from {url}, or --force if it is lab.\n",
+    )
+    assert not (tmp_path / "robots" / "profiles").exists()
+    assert run(main, "profile", "lab", "--from", url, "--force")[0] == 0
+
+
+def test_an_arm_of_another_urdf_is_refused(run, served, tmp_path):
+    usual = (KNUCKLE, "gripper_width")
+    lab("lab", "gen3", ("-0.21038", "-0.24038"), usual)
+    url = served("lab")
+    lab("lab", "gen3", usual)
+    status, out, err = run(main, "profile", "lab", "--from", url)
+    assert (status, out) == (1, "")
+    assert err == (
+        f"bam-robots profile: {url}: kinematics in /robot_description: another arm or calibration: joint_1 and "
+        "joint_4, joint_1 and joint_5, joint_1 and joint_6 are not as in its description, lab. Name the arm that is "
+        "there, or give --force.\n"
+    )
+
+
 JTC, FORWARD = (
     "joint_trajectory_controller/JointTrajectoryController",
     "forward_command_controller/ForwardCommandController",
@@ -79,7 +128,7 @@ def graph(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     servers = []
 
-    def start(controllers, *, joints=(*JOINTS, KNUCKLE), actions=(("/gripper/gripper_cmd", GRIP),), trajectories=()):
+    def start(controllers, *, joints=(*JOINTS, KNUCKLE), actions=(("/gripper/gripper_cmd", GRIP),), topics=()):
         servers.append(server := BridgeServer(port=0).start())
         if joints:
             server.advertise("/joint_states", "sensor_msgs/JointState", latch=True)
@@ -92,8 +141,8 @@ def graph(tmp_path, monkeypatch):
         if controllers is not None:
             kind = "controller_manager_msgs/ListControllers"
             server.serve("/controller_manager/list_controllers", kind, lambda *_: {"controller": list(controllers)})
-        for name in trajectories:
-            server.subscribe(name, TRAJECTORY, lambda message, caller: None)
+        for name, kind in topics:
+            server.subscribe(name, kind, lambda message, caller: None)
         for name, kind in actions:
             server.act(Action(name, kind, lambda goal: None, lambda goal: None))
         return server.url
@@ -140,7 +189,7 @@ def test_what_nothing_tells_is_a_comment_with_a_default(run, graph, tmp_path):
     text = (SHIPPED / "gen3.toml").read_text(encoding="utf-8")
     (tmp_path / "robots").mkdir()
     (tmp_path / "robots" / "lab.toml").write_text(text.replace('"gen3"', '"lab"').replace(KNUCKLE, "jaw"))
-    url = graph(None, joints=(*JOINTS, "jaw"), trajectories=("/arm_controller/joint_trajectory",))
+    url = graph(None, joints=(*JOINTS, "jaw"), topics=[("/arm_controller/joint_trajectory", TRAJECTORY)])
     profile, out = read(run, url, "lab")
     assert [sink.address for sink in profile.sinks()] == ["/gripper/gripper_cmd", "/arm_controller/joint_trajectory"]
     assert (profile.robot, profile.controllers, profile.source("gripper_width").scale) == ("lab", "", (1.0,))
@@ -152,6 +201,20 @@ def test_what_nothing_tells_is_a_comment_with_a_default(run, graph, tmp_path):
         "  nothing lists the controllers: which joints each takes is assumed",
         "  nobody publishes /object_pose (geometry_msgs/PoseStamped), which picking needs",
     ]
+
+
+def test_a_gripper_whose_action_has_the_message_of_a_joint(run, graph):
+    parallel = "control_msgs/ParallelGripperCommand"
+    url = graph([controller("left_controller")], actions=[("/gripper/gripper_cmd", parallel)])
+    gripper, _ = read(run, url)[0].sinks()
+    assert (gripper.type, gripper.fields) == (parallel, ("command.position[0]",))
+    assert (gripper.constants, gripper.scale) == ({"command.name[0]": KNUCKLE}, (-0.10625,))
+
+
+def test_an_action_of_ros_1_is_found_by_the_topic_of_its_goals(run, graph):
+    goals = [("/gripper/gripper_cmd/goal", f"{GRIP}ActionGoal")]
+    gripper, _ = read(run, graph([controller("left_controller")], actions=(), topics=goals))[0].sinks()
+    assert (gripper.action, gripper.type, gripper.scale) == ("/gripper/gripper_cmd", GRIP, (-0.10625,))
 
 
 @pytest.mark.parametrize(
@@ -173,8 +236,9 @@ def test_what_nothing_tells_is_a_comment_with_a_default(run, graph, tmp_path):
         ),
         (
             {"controllers": [controller("a")], "actions": [("/x", "a/B")]},
-            "nobody offers the gripper of gen3: no action of control_msgs/GripperCommand or franka_msgs/Move, and no "
-            "topic of a gripper; there is /x. Start the gripper's driver.",
+            "nobody offers the gripper of gen3: no action of control_msgs/GripperCommand, "
+            "control_msgs/ParallelGripperCommand, franka_msgs/Move, and no topic of a gripper; there is /x. Start the "
+            "gripper's driver.",
         ),
         (
             {"controllers": [controller("a")], "joints": (*JOINTS[:6], KNUCKLE)},

@@ -70,6 +70,24 @@ def test_an_arm_that_does_not_reach_its_work_area_fails_its_check(run, tmp_path)
     assert "z 0.016 to 0.06 m: not all of it is reached" in out
 
 
+NOTHING = "there is no body in it. Is it a part of another file? Then give that one."
+
+
+@pytest.mark.parametrize(
+    ("flag", "text", "said"),
+    [
+        ("--mjcf", "<robot/>", "arm.urdf is a URDF, and is read as such"),
+        ("--urdf", "<mujoco><worldbody/></mujoco>", "arm.urdf is MJCF, and is read as such"),
+    ],
+)
+def test_a_model_under_the_flag_of_the_other_kind_is_read_as_what_it_is(run, tmp_path, monkeypatch, flag, text, said):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "arm.urdf").write_text(text)
+    status, out, err = run(main, "add", "lab", flag, "arm.urdf", "--gripper", "parallel:0.08")
+    assert (status, out.splitlines()[0]) == (1, said)
+    assert err == f"bam-robots add: arm.urdf: {NOTHING}\n"
+
+
 def test_an_outline_that_misses_collisions_fails_its_check(run, tmp_path):
     path, text = tmp_path / "lab.toml", (SHIPPED / "so101.toml").read_text(encoding="utf-8")
     for seen, status in ((89, 1), (90, 0)):
@@ -84,7 +102,8 @@ def test_an_outline_that_misses_collisions_fails_its_check(run, tmp_path):
     [
         (
             ("check", "fr4"),
-            "Unknown robot model 'fr4'. Did you mean 'fr3'? Another arm is described first: bam-robots add fr4 ...",
+            "Unknown robot model 'fr4'. Did you mean 'fr3'? "
+            "Another arm is described first: bam-robots add NAME --urdf FILE",
         ),
         (("add", "lab"), "Give one model of the arm: --mjcf FILE or --urdf FILE."),
         (("add", "lab", "--mjcf", "a.xml", "--urdf", "b.urdf"), "--mjcf FILE or --urdf FILE."),
@@ -94,6 +113,14 @@ def test_an_outline_that_misses_collisions_fails_its_check(run, tmp_path):
             "There is no model file a.urdf. Give an MJCF or URDF file, or menagerie:NAME.",
         ),
         (("add", "so101", "--urdf", "a.urdf"), "exists; give another name, or --force to replace it."),
+        (
+            ("add", "lab", "--urdf", "a.urdf", "--gripper", "paralel:0.08"),
+            "paralel:0.08: there is no paralel:, only menagerie:NAME and parallel:WIDTH. Did you mean parallel:0.08?",
+        ),
+        (
+            ("add", "lab", "--mjcf", "menagrie:x"),
+            "there is no menagrie:, only menagerie:NAME. Did you mean menagerie:x?",
+        ),
         (("add", "../lab", "--urdf", "a.urdf"), "NAME: expected at most 64 letters, digits and . _ -, found '../lab'"),
         (("add", "fr3", "--urdf", "a.urdf"), "which this one would hide; give another name, or --force."),
         (("check", "so101", "--picture", "arm.pdf"), "arm.pdf: expected a name that ends in .png or .jpg."),

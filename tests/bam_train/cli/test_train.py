@@ -24,22 +24,7 @@ SHORT = ("num_envs=1", "n_steps=32", "batch_size=32", "n_epochs=2", "policy_kwar
 BASE = {"env": "CartPole-v1", "algo": "ppo", "steps": 128, "eval_every": 64, "eval_episodes": 2, "set": SHORT}
 
 
-@pytest.fixture(autouse=True)
-def here(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    return tmp_path
-
-
-@pytest.fixture
-def bam_train(capsys):
-    """Runs the program in this process; its status, standard output and standard error."""
-
-    def run(**flags):
-        status = guarded(lambda: train(TrainConfig(**{**BASE, **flags})), "bam-train")
-        out, err = capsys.readouterr()
-        return status, out, err
-
-    return run
+pytestmark = pytest.mark.usefixtures("here")
 
 
 def test_a_whole_run(bam_train, here):

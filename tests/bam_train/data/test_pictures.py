@@ -11,13 +11,6 @@ from bam_train.errors import SettingsError
 from tests.bam_train.data.export.test_export import record
 
 
-def run(capsys, *arguments):
-    with pytest.raises(SystemExit) as caught:
-        main(list(map(str, arguments)))
-    out, err = capsys.readouterr()
-    return caught.value.code, out, err
-
-
 def reach(place, seed=3):
     env = RecordDataset(gym.make("bam/reach-v0"), place)
     env.action_space.seed(seed)
@@ -32,44 +25,47 @@ def reach(place, seed=3):
 
 
 @pytest.mark.parametrize("kind", ["box", "nested", "discrete"])
-def test_plot_draws_what_there_is(kind, tmp_path, capsys):
+def test_plot_draws_what_there_is(kind, tmp_path, run):
     pytest.importorskip("matplotlib")
     image = pytest.importorskip("PIL.Image")
     record(tmp_path / "a", kind, 3)
     record(tmp_path / "b", kind, 4)
     given = ("plot", tmp_path / "a", "--out", tmp_path / "new" / "a.png")
     drawn = f"{tmp_path}/new/a.png: episodes, numbers, success\n"
-    assert run(capsys, *given, "--against", tmp_path / "b") == (0, drawn, "")
+    assert run(main, *given, "--against", tmp_path / "b") == (0, drawn, "")
     with image.open(tmp_path / "new" / "a.png") as picture:
         assert picture.size[0] == 1200
+
+
+def test_what_cannot_be_drawn(tmp_path, run):
+    pytest.importorskip("matplotlib")
+    record(tmp_path / "a", "box", 3)
     reach(tmp_path / "c")
-    status, _, err = run(capsys, *given, "--against", tmp_path / "c")
+    given = ("plot", tmp_path / "a", "--out", tmp_path / "a.png")
+    status, _, err = run(main, *given, "--against", tmp_path / "c")
     other = f'{tmp_path}/c: env is "bam/reach-v0" there, and "bam/pick-v0" of {tmp_path}/a'
     assert (status, err) == (1, f"bam-data plot: {other}; compare data sets of one environment\n")
-    status, _, err = run(capsys, *given[:-1], tmp_path / "a.bmp")
+    status, _, err = run(main, *given[:-1], tmp_path / "a.bmp")
     expected = f"{tmp_path}/a.bmp: expected a picture that ends in .png, .svg, .pdf, found '.bmp'"
     assert (status, err) == (1, f"bam-data plot: {expected}\n")
-    status, _, err = run(capsys, *given, "--kind", "table")
+    status, _, err = run(main, *given, "--kind", "table")
     assert (status, err.partition(": --kind")[2]) == (
         1,
         f" table: {tmp_path}/a: its observations have no object_x and object_y; leave it out\n",
     )
 
 
-def test_a_film_of_recorded_pictures(tmp_path, capsys):
+def test_a_film_of_recorded_pictures(tmp_path, run):
     pytest.importorskip("PIL")
     data = record(tmp_path / "a", "nested", 3)
     found = list(frames(data, 1, "camera"))
     np.testing.assert_array_equal(found, data[1].observations["camera"])
-    status, out, _ = run(capsys, "show", tmp_path / "a", "--episode", "-2", "--out", tmp_path / "new" / "e.gif")
+    status, out, _ = run(main, "show", tmp_path / "a", "--episode", "-2", "--out", tmp_path / "new" / "e.gif")
     assert (status, out.partition(", return")[0]) == (0, f"{tmp_path}/new/e.gif: episode 1, 5 pictures")
     with pytest.raises(SettingsError, match="has no 'kamera'"):
         next(frames(data, 0, "kamera"))
-    status, _, err = run(capsys, "show", tmp_path / "a", "--episode", "3", "--out", tmp_path / "e.gif")
-    assert (status, err) == (
-        1,
-        f"bam-data show: --episode: {tmp_path}/a has 3 episodes, and there is no 3\n",
-    )
+    status, _, err = run(main, "show", tmp_path / "a", "--episode", "3", "--out", tmp_path / "e.gif")
+    assert (status, err) == (1, f"bam-data show: --episode: {tmp_path}/a has 3 episodes, and there is no 3\n")
 
 
 def test_a_film_of_actions_that_are_played_again(tmp_path):

@@ -5,32 +5,24 @@ import subprocess
 import sys
 from urllib.parse import urlsplit
 
-import gymnasium as gym
 import numpy as np
 import pytest
 
 from bam_train.cli.data.bam_data import main
-from bam_train.data import DataSet, DataSetInfo, DataSetWriter, Episode
+from bam_train.data import DataSet, DataSetWriter
 from bam_train.data.layout import LOCK, Files
 from bam_train.data.mending import look, mend
 from bam_train.errors import BadDataSet, PlaceError
 from bam_train.files.place import Place
+from tests.bam_train.data import episode_samples as samples
+from tests.bam_train.data.episode_samples import episode, info_of
 from tests.object_store import Proxy, answering, bucket_fixture, environment  # noqa: F401
 
-BOX = gym.spaces.Box(-1.0, 1.0, (3,), np.float32)
-INFO = DataSetInfo("bam/reach-v0", {}, BOX, BOX, 0.05, "", {})
-
-
-def episode(number, steps=20):
-    numbers = np.random.default_rng(number).uniform(-1, 1, (2 * steps + 1, 3)).astype(np.float32)
-    rewards = np.arange(steps, dtype=np.float64)
-    return Episode(numbers[: steps + 1], numbers[steps + 1 :], rewards, True, False, True, {}, {"seed": number}, "")
+INFO = info_of()
 
 
 def write(place, numbers, **options):
-    with DataSetWriter(place, INFO, **options) as writer:
-        for number in numbers:
-            writer.add(episode(number))
+    samples.write(place, INFO, [episode(INFO, 20, number) for number in numbers], **options)
 
 
 def test_a_bucket_has_what_a_disk_has(bucket, tmp_path):
@@ -91,7 +83,7 @@ import os
 from tests.bam_train.data.test_places_of_data import *
 writer = DataSetWriter({place!r}, INFO, flush_episodes=2)
 for number in range(5):
-    writer.add(episode(number))
+    writer.add(episode(INFO, 20, number))
 os._exit(9)
 """
     assert subprocess.run([sys.executable, "-c", code], timeout=60).returncode == 9

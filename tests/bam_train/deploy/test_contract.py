@@ -592,19 +592,23 @@ def described_urdf(arm, lengths=1.0):
     """A described arm as a URDF, its lengths changed by a factor."""
     rows = []
     for number, row in enumerate(arm.joints):
-        matrix, axis = row.matrix(), " ".join(map(repr, row.axis))
-        pitch = -math.asin(max(-1.0, min(1.0, matrix[2, 0])))
-        roll, yaw = math.atan2(matrix[2, 1], matrix[2, 2]), math.atan2(matrix[1, 0], matrix[0, 0])
-        if abs(matrix[2, 0]) > 1 - 1e-9:  # roll and yaw turn about the same axis
-            roll, yaw = math.atan2(-matrix[2, 0] * matrix[0, 1], -matrix[2, 0] * matrix[0, 2]), 0.0
-        xyz = " ".join(repr(lengths * one) for one in row.xyz)
+        axis, xyz = " ".join(map(repr, row.axis)), " ".join(repr(lengths * one) for one in row.xyz)
         rows.append(
             f'<joint name="{row.name}" type="revolute"><parent link="l{number}"/><child link="l{number + 1}"/>'
-            f'<origin xyz="{xyz}" rpy="{roll!r} {pitch!r} {yaw!r}"/><axis xyz="{axis}"/>'
+            f'<origin xyz="{xyz}" rpy="{rpy(row.matrix())}"/><axis xyz="{axis}"/>'
             f'<limit lower="{row.low!r}" upper="{row.high!r}"/></joint>'
         )
-    rows.append(fixed(f"l{len(arm.joints)}", "hand_tcp", " ".join(map(repr, arm.tool.xyz))))
+    rows.append(fixed(f"l{len(arm.joints)}", "hand_tcp", " ".join(map(repr, arm.tool.xyz)), rpy(arm.tool.matrix())))
     return f'<robot name="arm">{"".join(rows)}</robot>'
+
+
+def rpy(matrix):
+    """Roll, pitch and yaw of a pose."""
+    pitch = -math.asin(max(-1.0, min(1.0, matrix[2, 0])))
+    roll, yaw = math.atan2(matrix[2, 1], matrix[2, 2]), math.atan2(matrix[1, 0], matrix[0, 0])
+    if abs(matrix[2, 0]) > 1 - 1e-9:  # roll and yaw turn about the same axis
+        roll, yaw = math.atan2(-matrix[2, 0] * matrix[0, 1], -matrix[2, 0] * matrix[0, 2]), 0.0
+    return f"{roll!r} {pitch!r} {yaw!r}"
 
 
 def fixed(parent, child, xyz="0 0 0", rpy="0 0 0"):
@@ -686,3 +690,28 @@ def test_another_tool_is_refused():
     assert found_in("xarm7", longer)["tool"] == ("another tool: hand_tcp is 78 mm from it", "refused")
     both = on_top_of(longer, fixed("l7", "grip"), fixed("grip", "tool", "0 0 0.18"))
     assert found_in("xarm7", both)["tool"] == ("tool is 8 mm from it", "ok")
+
+
+@pytest.mark.parametrize("name", ["fr3", "so101", "gen3", "xarm7", "ur5e"])
+def test_a_gripper_that_is_turned_is_refused(name):
+    """By 90 degrees about its axis, which its fingers show, and over to a side, which its frame shows."""
+    urdf = described_urdf(robot_model(name))
+
+    def fingers(turn):
+        place = f'<origin rpy="0 0 {turn}"/>'
+        slide = f'<joint name="f" type="prismatic"><parent link="hand_tcp"/><child link="f"/>{place}</joint>'
+        knuckle = f'<joint name="f" type="revolute"><parent link="hand_tcp"/><child link="f"/>{place}</joint>'
+        knuckle = knuckle.replace("</joint>", '<axis xyz="0 1 0"/></joint>')
+        return [found_in(name, on_top_of(urdf, one))["fingers"] for one in (slide, knuckle)]
+
+    assert fingers(0.0) == fingers(math.pi) == [("0 degrees off", "ok")] * 2
+    assert fingers(0.2) == [("11 degrees off", "ok")] * 2
+    remedy = "the gripper is turned on the flange; turn it, or tool.quat of the description"
+    assert fingers(math.pi / 2) == [(f"90 degrees off: {remedy}", "refused")] * 2
+    own = rpy(robot_model(name).tool.matrix())
+    aside = rpy(robot_model(name).tool.matrix() @ np.array([[1, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]]))
+    assert found_in(name, urdf)["tool"] == ("hand_tcp is 0 mm from it", "ok")
+    assert found_in(name, aside.join(urdf.rsplit(own, 1)))["tool"] == (
+        "another tool: hand_tcp is 0 mm from it, and points 90 degrees elsewhere",
+        "refused",
+    )

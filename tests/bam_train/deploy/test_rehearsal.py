@@ -113,14 +113,20 @@ def test_the_report_for_people():
             "--rehearse simulates the robot, its link and its time; leave out --print-guards",
         ),
         (
+            ("wifi", "--stage", "trial"),
+            "--rehearse simulates the robot, its link and its time; leave out --stage. To practise a trial, start "
+            "bam-serve, and give --robot ws://127.0.0.1:9090 --stage trial",
+        ),
+        (
             ("wifi", "--motion", "a.mcap"),
             "--rehearse simulates the robot, its link and its time; leave out --motion",
         ),
         (("wifi", "--profile", "ur6e"), "Unknown robot profile 'ur6e'. Did you mean 'ur5e'?"),
         (
             ("wifi", "--profile", "ur5e"),
-            "Commands are linear_velocity, angular_velocity, and ur5e takes shoulder_pan_joint, shoulder_lift_joint, "
-            "elbow_joint, wrist_1_joint, wrist_2_joint, wrist_3_joint, gripper_width. Choose another profile.",
+            "The profile ur5e is that of another robot: it has shoulder_pan_joint, shoulder_lift_joint, elbow_joint, "
+            "wrist_1_joint, wrist_2_joint, wrist_3_joint, and mir100 has linear_velocity, angular_velocity. Profiles "
+            "that fit: mir100.",
         ),
     ],
 )

@@ -14,18 +14,6 @@ def quick(monkeypatch):
     monkeypatch.setitem(fit_q.__kwdefaults__, "updates", 150)
 
 
-@pytest.fixture
-def run(capsys):
-    """Runs a program in this process: ``run(main, arguments...)`` gives its exit status, standard output and error."""
-
-    def run(main, *arguments):
-        with pytest.raises(SystemExit) as done:
-            main([str(argument) for argument in arguments])
-        return done.value.code or 0, *capsys.readouterr()
-
-    return run
-
-
 def episode(rng, right):
     """One of at most 10 steps, in which each step goes right with the probability `right`."""
     cells, actions, chances = [int(rng.integers(1, 4))], [], []

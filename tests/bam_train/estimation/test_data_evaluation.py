@@ -46,7 +46,7 @@ def test_the_table_says_what_is_estimated(corridor_checkpoint, make_data, run):
     assert status == 0
     assert lines[0].endswith(f"(ppo, 2,048 steps) on {place}: 120 episodes, {DataSet.open(place).total_frames} steps")
     assert [line.split()[0] for line in lines[1:9]] == [
-        *("recorded", "agreement", "FQE", "IPS", "SNIPS", "DR", "note", "by"),
+        *("recorded", "agreement", "FQE", "IPS", "SNIPS", "DR", "note", "by")
     ]
     note = "  note      how likely the recorded actions were is estimated from the data, for IPS, SNIPS and DR"
     assert lines[7] == note
@@ -136,11 +136,7 @@ def test_data_of_another_environment(corridor_checkpoint, make_data, run):
     path, other = corridor_checkpoint(), make_data("other", 20, env="CartPole-v1")
     remedy = f"That is the environment of {other}; give data of its own one"
     text = f"was trained on test/Corridor-v0, not on CartPole-v1. {remedy}"
-    assert run(main, path, "--data", other) == (
-        1,
-        "",
-        f"bam-eval: {path}: {text}\n",
-    )
+    assert run(main, path, "--data", other) == (1, "", f"bam-eval: {path}: {text}\n")
     place = make_data("wide", 20, cells=9.0)
     error = run(main, path, "--data", place)[2]
     assert error.startswith(f"bam-eval: {path}: observation_space.high is ")

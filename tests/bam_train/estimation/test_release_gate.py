@@ -4,37 +4,19 @@ import json
 
 import numpy as np
 import pytest
-from onnx import TensorProto, helper, numpy_helper
 
-from bam_train.checkpoint import GOLDEN, POLICY, safetensors_file
-from bam_train.checkpoint.checkpoint import write_checkpoint
+from bam_train.checkpoint import GOLDEN, POLICY, Checkpoint, safetensors_file, write_checkpoint
 from bam_train.cli.data import run_gate as gate
+from tests.bam_train.conftest import chooser
 
 
 @pytest.fixture
 def left(corridor_checkpoint, tmp_path):
     """A checkpoint that goes right from the third cell on, and left in the others."""
-    from bam_train.checkpoint import Checkpoint
-
     manifest = vars(Checkpoint.open(corridor_checkpoint()).manifest).copy()
     del manifest["format"], manifest["sha256"]
-    nodes = [
-        helper.make_node("Gemm", ["observation", "weight", "bias"], ["scores"]),
-        helper.make_node("ArgMax", ["scores"], ["action"], axis=1, keepdims=0),
-    ]
-    graph = helper.make_graph(
-        nodes,
-        "policy",
-        [helper.make_tensor_value_info("observation", TensorProto.FLOAT, ["n", 1])],
-        [helper.make_tensor_value_info("action", TensorProto.INT64, ["n"])],
-        [
-            numpy_helper.from_array(np.array([[0, 1]], np.float32), "weight"),
-            numpy_helper.from_array(np.array([2.5, 0], np.float32), "bias"),
-        ],
-    )
-    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8)
     golden = {"observation": np.array([[1.0], [3.0]], np.float32), "action": np.array([0, 1])}
-    members = {POLICY: model.SerializeToString(), GOLDEN: safetensors_file.dump(golden)}
+    members = {POLICY: chooser([[0, 1]], [2.5, 0]), GOLDEN: safetensors_file.dump(golden)}
     return write_checkpoint(tmp_path / "left.zip", manifest, members).path
 
 

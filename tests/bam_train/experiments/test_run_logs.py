@@ -49,6 +49,23 @@ def test_our_own_runs_without_what_a_resumed_one_repeated(tmp_path):
         read_runs(tmp_path / "pick-ppo")
 
 
+def test_the_score_of_a_run_is_higher_the_earlier_it_has_ended_at_its_goal(tmp_path):
+    """Of 400 steps: 0.5 without a goal; 0.96 + 0.9 (1 - 100 / 400) = 1.635; -150 + 200 (1 - 300 / 400) = -100."""
+    for name, goal, outcome, value in (
+        ("success_rate", {}, {"reason": "steps", "steps": 400}, 0.5),
+        ("success_rate", {"until_success": 0.9}, {"reason": "success", "steps": 100}, 0.96),
+        ("return_mean", {"stop_reward": -200.0}, {"reason": "reward", "steps": 300}, -150.0),
+    ):
+        other = "return_mean" if name == "success_rate" else "success_rate"
+        row = {"kind": "evaluation", "steps": 100, "seconds": 1.0, name: value, other: 0.1}
+        write(tmp_path / "progress.jsonl", json.dumps(row) + "\n")
+        write(tmp_path / "config.json", json.dumps({"env": "a", "seed": 0, "steps": 400, **goal}))
+        write(tmp_path / "outcome.json", json.dumps(outcome))
+        (run,) = read_runs(tmp_path)
+        wanted = {0.5: 0.5, 0.96: 1.635, -150.0: -100.0}[value]
+        assert run.curves["score"].values.tolist() == pytest.approx([wanted])
+
+
 def test_rl_zoo3(tmp_path):
     for number, seed in ((1, 17), (2, 18)):
         folder = tmp_path / "ppo" / f"Pendulum-v1_{number}"

@@ -89,32 +89,24 @@ def test_training_in_a_bucket_and_going_on_from_there(bucket, run, corridor, tmp
     assert (status, err) == (1, f"bam-train: {bucket}/c.zip: no such file or folder. Check the name\n")
 
 
+OURS = "takes a path on this computer\n"
+VIDEO = "s3://none-such/a.gif"
+
+
 @pytest.mark.parametrize(
     ("main", "flags", "message"),
     [
-        (
-            train.main,
-            ["--env", "bam/reach", "--algo", "ppo", "--out", "{bucket}/x"],
-            "bam-train: {bucket}/x: expected a file name that ",
-        ),
-        (eval.main, ["{bucket}/none.zip"], "bam-eval: {bucket}/none.zip: no such file or folder. Check the name"),
-        (replay.main, ["s3://none-such/a.mcap"], "bam-replay: s3://none-such/a.mcap: there is no bucket none-such. "),
-        (
-            sign.main,
-            ["verify", str(SHIPPED), "--keys", "{bucket}/keys"],
-            "bam-sign: {bucket}/keys: --keys takes a path on this computer\n",
-        ),
-        (
-            eval.main,
-            [str(SHIPPED), "--video", "s3://none-such/a.gif"],
-            "bam-eval: s3://none-such/a.gif: --video takes a path on this computer\n",
-        ),
+        (train.main, "--env bam/reach --algo ppo --out {bucket}/x", "train: {bucket}/x: expected a file name that "),
+        (eval.main, "{bucket}/none.zip", "eval: {bucket}/none.zip: no such file or folder. Check the name"),
+        (replay.main, "s3://none-such/a.mcap", "replay: s3://none-such/a.mcap: there is no bucket none-such. "),
+        (sign.main, f"verify {SHIPPED} --keys {{bucket}}/keys", f"sign: {{bucket}}/keys: --keys {OURS}"),
+        (eval.main, f"{SHIPPED} --video {VIDEO}", f"eval: {VIDEO}: --video {OURS}"),
     ],
 )
 def test_what_is_wrong_is_one_line(main, flags, message, bucket, run):
-    status, out, err = run(main, *(flag.format(bucket=bucket) for flag in flags))
+    status, out, err = run(main, *flags.format(bucket=bucket).split())
     assert (status, out) == (1, "")
-    assert err.startswith(message.format(bucket=bucket))
+    assert err.startswith(f"bam-{message.format(bucket=bucket)}")
     assert err.count("\n") == 1
 
 

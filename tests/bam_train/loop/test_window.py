@@ -2,7 +2,7 @@
 
 import pytest
 
-from bam_train.errors import TimeNotWritten, WorkspaceError
+from bam_train.errors import LoopError, TimeNotWritten
 from bam_train.loop import Agent, TemporalAgent, Workspace
 
 
@@ -95,7 +95,7 @@ def test_reading_and_writing_what_has_left_the_window(kind):
         lambda: ws.copy_n_last_steps(1),
         lambda: ws.copy_time(0, 199, 1),
     ):
-        with pytest.raises((TimeNotWritten, WorkspaceError), match=r"left the window|first"):
+        with pytest.raises((TimeNotWritten, LoopError), match=r"left the window|first"):
             use()
     assert ws.get_time_truncated("x", first, first + 2).flatten().tolist() == [first, first + 1]
     assert ws.subtime(198, 200)["x"].flatten().tolist() == [198, 199]
@@ -145,12 +145,12 @@ def test_windows_of_columns_are_counted_from_time_zero(kind):
         ws.set("x", t, kind([t, -t], "int64"))
     piece = ws.select_subtime(kind([198, 197], "int64"), 2)
     kind.check(piece["x"], [[198, -197], [199, -198]], "int64")
-    with pytest.raises((TimeNotWritten, WorkspaceError), match="window"):
+    with pytest.raises((TimeNotWritten, LoopError), match="window"):
         ws.select_subtime(kind([0, 0], "int64"), 2)
 
 
 @pytest.mark.parametrize("window", [1, 0, -3])
 def test_a_window_holds_the_last_time_and_the_one_before(window):
-    with pytest.raises(WorkspaceError) as error:
+    with pytest.raises(LoopError) as error:
         Workspace(window=window)
     assert str(error.value) == f"window: expected at least 2 times (the last and the one before), found {window}."

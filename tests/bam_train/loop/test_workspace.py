@@ -45,15 +45,6 @@ def test_changing_what_was_read_does_not_change_single_times(kind):
     kind.check(ws.get("x", 0), [0.0, 1.0])
 
 
-@pytest.mark.parametrize(("dtype", "zero", "one"), [("float32", 0.0, 1.0), ("int64", 0, 1), ("bool", False, True)])
-def test_missing_earlier_times_are_zeros(kind, dtype, zero, one):
-    ws = Workspace()
-    ws.set("x", 2, kind([[one, one]], dtype))
-    kind.check(ws["x"], [[[zero, zero]], [[zero, zero]], [[one, one]]], dtype)
-    ws.set("x", 4, kind([[one, zero]], dtype))
-    kind.check(ws["x"][2:], [[[one, one]], [[zero, zero]], [[one, zero]]], dtype)
-
-
 def test_sizes(kind):
     ws = Workspace()
     assert ws.time_size() is None
@@ -90,21 +81,6 @@ def test_a_copy_shares_nothing(kind):
     kind.check(copy["x"], [[0.0, 1.0], [6.0, 6.0]])
     kind.check(copy["y"], [[1.0], [2.0], [3.0]])
     kind.check(ws["x"], [[5.0, 5.0], [10.0, 11.0]])
-
-
-def test_as_text(kind):
-    ws = counted(kind, "env/obs", "action")
-    text = "Workspace:\n\tenv/obs: time_size = 3, batch_size = 2\n\taction: time_size = 3, batch_size = 2"
-    assert str(ws) == text
-    assert str(Workspace()) == "Workspace:"
-
-
-def test_variables_of_different_lengths_can_be_read(kind):
-    ws = counted(kind, "x")
-    ws.set("advantage", 0, kind([1.0, 2.0]))
-    kind.check(ws["advantage"], [[1.0, 2.0]])
-    assert str(ws).splitlines()[-1] == "\tadvantage: time_size = 1, batch_size = 2"
-    kind.check(ws.select_batch(kind([1], "int64"))["advantage"], [[2.0]])
 
 
 @pytest.mark.parametrize("again", [copy.deepcopy, lambda ws: pickle.loads(pickle.dumps(ws))])

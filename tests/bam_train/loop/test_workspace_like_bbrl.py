@@ -137,7 +137,7 @@ def gradient(weight, tensors):
 
 
 @pytest.mark.parametrize("kind", ["torch", "numpy"])
-@settings(max_examples=150, deadline=None, derandomize=True)
+@settings(max_examples=80, deadline=None, derandomize=True)
 @given(st.sampled_from([[], FILLED]), operations)
 def test_any_sequence_of_operations(kind, filled, sequence):
     weights = [torch.tensor(2.0, requires_grad=True) for _ in range(2)]
@@ -168,7 +168,7 @@ def test_any_sequence_of_operations(kind, filled, sequence):
             assert gradient(weights[0], read.values()) == gradient(weights[1], bbrl_read.values())
 
 
-@settings(max_examples=100, deadline=None, derandomize=True)
+@settings(max_examples=50, deadline=None, derandomize=True)
 @given(st.integers(1, 7), st.integers(1, 4), st.booleans(), st.booleans(), st.integers(0, 2**32 - 1))
 def test_transitions(length, columns, no_final_state, compact, seed):
     generator = torch.Generator().manual_seed(seed)

@@ -70,14 +70,6 @@ def test_values_are_copied_in():
     assert ws["y"].tolist() == [[1.0], [2.0]]
 
 
-def test_a_buffer_of_the_caller_may_be_used_again_at_every_step():
-    ws, value = Workspace(), np.zeros(2)
-    for t in range(50):
-        value[:] = t
-        ws.set("x", t, value)
-    assert ws["x"].tolist() == [[float(t)] * 2 for t in range(50)]
-
-
 def test_tensors_and_arrays_in_one_workspace():
     torch = pytest.importorskip("torch")
     ws = Workspace()

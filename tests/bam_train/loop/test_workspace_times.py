@@ -106,14 +106,6 @@ def test_another_flag_of_any_number(episodes, kind, dtype, ends):
     kind.check(pairs["x"], [[0, 10, 11, 20, 21], [10, 20, 21, 30, 31]], "int64")
 
 
-@pytest.mark.parametrize("no_final_state", [False, True])
-def test_one_time_gives_no_transition(episodes, kind, no_final_state):
-    pairs = episodes.subtime(0, 1).get_transitions(no_final_state=no_final_state)
-    assert tuple(pairs["x"].shape) == (2, 0)
-    assert tuple(pairs["v"].shape) == (2, 0, 2)
-    assert (pairs.time_size(), pairs.batch_size()) == (2, 0)
-
-
 def test_agents_run_on_transitions(episodes, kind):
     class Twice(Agent):
         def forward(self, t, **kwargs):

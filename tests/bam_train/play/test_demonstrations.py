@@ -51,5 +51,5 @@ def test_twenty_episodes_of_key_presses_teach_a_policy(tmp_path, monkeypatch):
     with pytest.raises(SystemExit) as done:
         train.main(["--data", "demos", "--algo", "bc", "--set", "eval_episodes=1", "--out", "reach.zip"])
     assert done.value.code == 0
-    result = evaluate(FrozenPolicy.load("reach.zip"), "bam/reach-v0", {}, episodes=300)
-    assert result.successes >= 270  # 280 were measured
+    result = evaluate(FrozenPolicy.load("reach.zip"), "bam/reach-v0", {}, episodes=100)
+    assert result.successes >= 90

@@ -13,7 +13,7 @@ from bam_envs.tasks.tool_control import TOOL_STEP
 from bam_train.environments import make_env
 from bam_train.errors import SettingsError
 from bam_train.play.hands import hand_for
-from bam_train.play.key_map import bounded, moved, next_speed, stick_moved, table
+from bam_train.play.key_map import bounded, move_lines, moved, next_speed, stick_moved, table
 
 STILL = (0.0, 0.0, 0.0, 0.0)
 JOINTS = [name for name in ENVIRONMENTS if name in ("bam/reach-v0", "bam/isaac-reach-v0") or name.startswith("bam/ur-")]
@@ -47,6 +47,11 @@ def test_keys_add_up_and_no_sum_is_faster(keys, twist, grip):
 
 def test_a_base_goes_forward_and_turns():
     assert moved({"KeyS", "KeyA", "KeyR", "KeyE"}, 0.25, is_base=True) == ((-0.25, 0.0, 0.0, -0.4), 0)
+    aside = {"is_base": True, "sideways": True}
+    assert moved({"KeyD", "KeyR", "KeyE"}, 0.25, **aside) == ((0.0, -0.25, 0.0, -0.4), 0)
+    assert stick_moved([-1.0, 0.0, 0.0, -1.0], [False] * 8, 0.1, **aside) == ((0.0, 0.1, 0.0, 0.0), 0)
+    names = [{line[8:] for line in move_lines(is_base=True, sideways=one)} for one in (False, True)]
+    assert names[1] - names[0] == {"left", "right"}
     assert [next_speed(speed) for speed in table()["speeds"]] == [0.1, 0.25, 0.05]
     assert bounded((3.0, 4.0, 0.0, 1.0), 0.25, is_base=False) == (0.25 / 5 * 3, 0.25 / 5 * 4, 0.0, 1.0)
 

@@ -46,10 +46,20 @@ class Driven:
 
 
 @pytest.fixture
-def driven():
-    driven = Driven()
-    yield driven
-    driven.env.close()
+def drive(stack):
+    """Begin a session, whose environment is closed at the end."""
+
+    def begin(*arguments, **options):
+        driven = Driven(*arguments, **options)
+        stack.callback(driven.env.close)
+        return driven
+
+    return begin
+
+
+@pytest.fixture
+def driven(drive):
+    return drive()
 
 
 def test_a_key_of_a_terminal_is_held_for_a_fifth_of_a_second_after_each_repetition():
@@ -86,8 +96,8 @@ def test_pause_single_steps_and_slow_motion(driven):
 
 
 @pytest.mark.parametrize("env", ["bam/pick-v0", "bam/reach-v0"])
-def test_an_undone_second_comes_again_bit_for_bit(env):
-    driven = Driven(env)
+def test_an_undone_second_comes_again_bit_for_bit(env, drive):
+    driven = drive(env)
     session = driven.tick(30, "KeyW")
     seen = session.observation
     assert driven.tap("Backspace").note == "20 steps undone"
@@ -99,11 +109,10 @@ def test_an_undone_second_comes_again_bit_for_bit(env):
     driven.tap("Backspace")
     driven.tap("Backspace")
     assert driven.tap("Backspace").note == "undo: this is the start"
-    driven.env.close()
 
 
-def test_person_and_policy_hand_over_without_a_jump():
-    driven = Driven(policy=Still())
+def test_person_and_policy_hand_over_without_a_jump(drive):
+    driven = drive(policy=Still())
     session = driven.tick(2, "KeyW")
     assert session.suggestion.tolist() == [0, 0, 0, 0, 1]
     driven.tap("KeyP")
@@ -111,7 +120,6 @@ def test_person_and_policy_hand_over_without_a_jump():
     driven.tap("KeyP")
     assert driven.tick().action.tolist() == [0, 0, 0, 0, 1]  # the gripper stays closed
     assert driven.tick(1, "KeyW").action[0] > 0
-    driven.env.close()
 
 
 def test_without_a_policy_nobody_is_handed_the_robot(driven):
@@ -129,26 +137,24 @@ def test_starts_come_again_or_are_the_next(driven):
     assert driven.tap("KeyX").done
 
 
-def test_the_end_is_said_and_nothing_moves_after_it():
-    driven = Driven(env=make_env("bam/pick-v0", {"max_episode_steps": 4}))
+def test_the_end_is_said_and_nothing_moves_after_it(drive):
+    driven = drive(env=make_env("bam/pick-v0", {"max_episode_steps": 4}))
     session = driven.tick(9, "KeyW")
     assert (session.steps, session.episodes, session.successes) == (4, 1, 0)
     assert session.note == "the episode has ended: N begins the next one, Z the same one again"
     driven.tap("Backspace")
     assert (session.steps, session.episodes, session.status) == (0, 0, "paused")
-    driven.env.close()
 
 
-def test_other_numbers_begin_with_the_first_key_too():
-    driven = Driven("Pendulum-v1")
+def test_other_numbers_begin_with_the_first_key_too(drive):
+    driven = drive("Pendulum-v1")
     driven.tap("Equal")
     assert driven.tick(2).action == np.array([0.2], np.float32)
     assert driven.tap("Backspace").note == "undo: this environment cannot go back; its state cannot be saved"
-    driven.env.close()
 
 
-def test_every_press_is_a_step_where_actions_are_choices():
-    driven = Driven("bam/grid-world-v0", seed=2)
+def test_every_press_is_a_step_where_actions_are_choices(drive):
+    driven = drive("bam/grid-world-v0", seed=2)
     session = driven.session
     assert driven.tick(5).steps == 0
     x, y = session.observation["agent"].tolist()
@@ -160,7 +166,6 @@ def test_every_press_is_a_step_where_actions_are_choices():
         (x, y), (to_x, to_y) = session.observation["agent"], session.observation["target"]
         driven.tap("ArrowRight" if x < to_x else "ArrowLeft" if x > to_x else "ArrowUp" if y < to_y else "ArrowDown")
     assert (session.successes, session.steps, session.seed) == (1, 0, 3)  # the next episode has begun
-    driven.env.close()
 
 
 def test_demonstrations_are_whole_and_without_what_was_undone(tmp_path):
@@ -188,19 +193,18 @@ def test_demonstrations_are_whole_and_without_what_was_undone(tmp_path):
     assert episode.facts["seed"] == 0
 
 
-def test_a_live_robot_holds_while_it_is_paused_and_its_time_cannot_be_stopped():
-    driven = Driven(is_live=True)
+def test_a_live_robot_holds_while_it_is_paused_and_its_time_cannot_be_stopped(drive):
+    driven = drive(is_live=True)
     session = driven.tick(2, "KeyW")
     driven.tap("Space")
     assert driven.tick(2, "KeyW").action.tolist() == [0, 0, 0, 0, -1]
     assert (session.steps, session.status) == (4, "paused")
     for key, name in (("KeyM", "slow motion"), ("Period", "one step"), ("Backspace", "undo the last second")):
         assert driven.tap(key).note == f"{name}: not with a live robot, whose time cannot be stopped"
-    driven.env.close()
 
 
-def test_the_screen_shows_every_number_with_name_unit_and_limits():
-    driven = Driven(policy=Still())
+def test_the_screen_shows_every_number_with_name_unit_and_limits(drive):
+    driven = drive(policy=Still())
     session = driven.tick(3, "KeyW")
     lines = screen_lines(session, "bam/pick-v0", 120, 60)
     assert lines[0].startswith("bam/pick-v0  seed 0  step 3 (0.15 s)  reward +0.0")
@@ -214,12 +218,11 @@ def test_the_screen_shows_every_number_with_name_unit_and_limits():
     assert screen_lines(session, "", 40, 5)[-1].endswith(" more lines on a higher screen")
     driven.tap("Slash")
     assert "W ↑     forward" in screen_lines(session, "", 120, 60)
-    driven.env.close()
 
 
 @pytest.mark.parametrize("env_id", ["bam/reach-v0", "bam/pick-v0", "bam/pick-place-v0", "bam/navigation-v0"])
-def test_a_small_terminal_shows_every_number_and_the_key_that_starts(env_id):
-    driven = Driven(env_id)
+def test_a_small_terminal_shows_every_number_and_the_key_that_starts(env_id, drive):
+    driven = drive(env_id)
     ready = screen_lines(driven.session, env_id, 80, 24)
     assert any(line.endswith("W or another key starts time; ? shows the keys") for line in ready)
     lines = screen_lines(driven.tick(3, "KeyW"), env_id, 80, 24)
@@ -228,14 +231,12 @@ def test_a_small_terminal_shows_every_number_and_the_key_that_starts(env_id):
     for row in (*described["action"], *described["observation"]):
         assert row["name"][:24] in shown
     assert max(map(len, [*ready, *lines])) <= 80
-    driven.env.close()
 
 
-def test_a_picture_is_shown_by_its_size():
-    driven = Driven("bam/digits-v0")
+def test_a_picture_is_shown_by_its_size(drive):
+    driven = drive("bam/digits-v0")
     lines = screen_lines(driven.session, "bam/digits-v0")
     assert [line.split() for line in lines][-1][:4] == ["picture", "8", "x", "8"]
-    driven.env.close()
 
 
 def test_a_plot_goes_from_the_lowest_value_to_the_highest():
@@ -245,17 +246,16 @@ def test_a_plot_goes_from_the_lowest_value_to_the_highest():
     assert sparkline([]) == ""
 
 
-def test_a_new_episode_begins_with_an_open_gripper():
-    driven = Driven(is_live=True)
+def test_a_new_episode_begins_with_an_open_gripper(drive):
+    driven = drive(is_live=True)
     assert driven.tick(2, "KeyC").action[-1] == 1
     driven.tap("KeyN")
     driven.now += 1.0
     assert driven.tick().action.tolist() == [0, 0, 0, 0, -1]
-    driven.env.close()
 
 
-def test_a_live_robot_pauses_however_soon_after_it_went_on():
-    driven = Driven(is_live=True)
+def test_a_live_robot_pauses_however_soon_after_it_went_on(drive):
+    driven = drive(is_live=True)
     for status in ("paused", "running"):
         assert driven.tap("Space").status == status
     driven.session.press("Space", driven.now + 0.1)
@@ -264,4 +264,3 @@ def test_a_live_robot_pauses_however_soon_after_it_went_on():
     driven.session.pause()
     driven.session.pause()
     assert driven.session.status == "paused"
-    driven.env.close()

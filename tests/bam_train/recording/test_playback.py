@@ -23,7 +23,7 @@ from bam_train.deploy.deployment import Deployment
 from bam_train.deploy.flight import deployment_facts, flight_recorder
 from bam_train.deploy.journal import Journal
 from bam_train.environments import make_env
-from bam_train.errors import BadRecording
+from bam_train.errors import FormatError
 from bam_train.policy import FrozenPolicy
 from bam_train.recording.drawing import frames
 from bam_train.recording.playback import play, replay_env
@@ -35,6 +35,16 @@ PICK = CHECKPOINTS / "pick-ppo.zip"
 STEPS, RETURNS = (44, 47), ("41.16", "42.10")
 """Of two episodes of the shipped policy."""
 TICKS = sum(STEPS) + len(STEPS)
+
+
+class Still:
+    """A policy without motion."""
+
+    def reset(self):
+        pass
+
+    def act(self, observation):
+        return np.zeros(5, np.float32)
 
 
 def call(main, *arguments):
@@ -119,13 +129,6 @@ def test_the_same_policy_acts_the_same_bit_for_bit(name, tmp_path):
 
 
 def test_another_policy_is_compared(pick):
-    class Still:
-        def reset(self):
-            pass
-
-        def act(self, observation):
-            return np.zeros(5, np.float32)
-
     recording, checkpoint = Recording.open(pick), Checkpoint.open(PICK)
     env = replay_env(recording, checkpoint)
     played = play(recording, env, Still())
@@ -179,14 +182,8 @@ def test_summary_for_people_and_programs(pick, capsys):
     assert lines[-1] == f"played: the same observation in {TICKS} of {TICKS} ticks, the same action in {TICKS}"
     assert call(replay, pick, "--json") == 0
     report = json.loads(capsys.readouterr().out)
-    assert report["played"] == {
-        "ticks": TICKS,
-        "observations": TICKS,
-        "actions": TICKS,
-        "worst": 0.0,
-        "others": {},
-        "same": True,
-    }
+    counts = dict.fromkeys(("ticks", "observations", "actions"), TICKS)
+    assert report["played"] == {**counts, "worst": 0.0, "others": {}, "same": True}
     assert [row["length"] for row in report["per_episode"]] == [*STEPS]
     assert report["complete"] is True
 
@@ -236,7 +233,7 @@ def test_a_recording_cut_anywhere_is_readable(small_chunks, tmp_path, capsys):
         path.write_bytes(data[:size])
         try:
             recording = Recording.open(path)
-        except BadRecording as error:
+        except FormatError as error:
             assert "not a recording of bam-deploy" in str(error)  # noqa: PT017 - its beginning is missing
             assert size < 2000
             continue
@@ -265,7 +262,7 @@ def test_a_damaged_recording_is_read_up_to_the_damage(small_chunks, tmp_path):
         path.write_bytes(data[:place] + bytes([data[place] ^ 0xFF]) + data[place + 1 :])
         try:
             assert 0 <= Recording.open(path).ticks <= TICKS
-        except BadRecording as error:
+        except FormatError as error:
             assert str(error).startswith(f"{path}: ")  # noqa: PT017 - either is right
 
 
@@ -294,7 +291,7 @@ def test_somebody_elses_mcap_file_is_refused(tmp_path, topic, content):
         writer.start()
         writer.add_message(writer.register_channel(topic, "json", 0), 1, content, 1)
         writer.finish()
-    with pytest.raises(BadRecording, match=r"not a recording of bam-deploy"):
+    with pytest.raises(FormatError, match=r"not a recording of bam-deploy"):
         Recording.open(path)
 
 
@@ -306,10 +303,7 @@ def test_a_recording_is_drawn(small_chunks, tmp_path, capsys, monkeypatch):
     ticks = Recording.open(cut).ticks
     assert 3 < ticks < 15
     assert call(replay, cut, "--plot", plot, "--video", video) == 0
-    assert capsys.readouterr().err.splitlines() == [
-        f"bam-replay: {plot}: drawn",
-        f"bam-replay: {video}: {ticks} ticks",
-    ]
+    assert capsys.readouterr().err.splitlines() == [f"bam-replay: {plot}: drawn", f"bam-replay: {video}: {ticks} ticks"]
     quantities = ["joint_position [rad]", "joint_velocity [rad/s]", "gripper_width [m]", "object_position [m]"]
     others = ["object_quaternion", "command [rad, m]", "action", "status", "latency [ms]"]
     assert titles == quantities + others
@@ -358,18 +352,11 @@ def test_a_seed_that_is_no_number_is_refused(pick):
     recording.metadata["seed"] = "soon"
     text = r"its metadata says seed 'soon', which is no number\. Get the file again$"
     for read in (facts_of, lambda damaged: play(damaged, replay_env(damaged, Checkpoint.open(PICK)), None)):
-        with pytest.raises(BadRecording, match=text):
+        with pytest.raises(FormatError, match=text):
             read(recording)
 
 
 def test_an_episode_longer_than_the_environments_is_played_to_its_end(tmp_path):
-    class Still:
-        def reset(self):
-            pass
-
-        def act(self, observation):
-            return np.zeros(5, np.float32)
-
     path, checkpoint = tmp_path / "slow.mcap", Checkpoint.open(PICK)
     env = make_env("bam/pick-v0", {"max_episode_steps": 120})  # as on trial, where a robot is slow
     recorder = flight_recorder(path, env, {**deployment_facts(checkpoint, env), "seed": 0})

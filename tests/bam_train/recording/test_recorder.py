@@ -25,6 +25,7 @@ from bam_train.recording.recorder_process import RecordingFile, drain
 from bam_train.recording.recording import Recording
 from bam_train.recording.ring import LAYOUT as LAYOUT_RECORD
 from bam_train.recording.ring import TICK, TIMES, Ring, make_shared_file
+from tests.raising import raising
 
 LAYOUT = {"/state": ["arm.pan", "arm.lift"], "/action": ["dx"], "/status": ["code", "guard"]}
 
@@ -107,9 +108,6 @@ import sys, time
 import numpy as np
 from pathlib import Path
 from bam_train.recording.recorder import Recorder
-from bam_train.recording.recorder_process import RecordingFile, drain
-from bam_train.recording.ring import LAYOUT as LAYOUT_RECORD
-from bam_train.recording.ring import TICK, TIMES, Ring, make_shared_file
 recorder = Recorder(Path(sys.argv[1]))
 recorder.start()
 recorder.declare({"/state": [f"k{i}" for i in range(20)]})
@@ -199,12 +197,7 @@ def test_a_full_disk_ends_the_recording_only(started, caplog):
     recorder = started()
     resource.prlimit(recorder.pid, resource.RLIMIT_FSIZE, (20_000, 20_000))
     rng = np.random.default_rng(0)
-
-    def failed():
-        recorder.tick([rng.random(2), rng.random(1)], [0, 0])
-        return recorder.fault
-
-    until(failed)
+    until(lambda: recorder.tick([rng.random(2), rng.random(1)], [0, 0]) or recorder.fault)
     text = f"{recorder.path}: cannot be written: File too large; nothing is recorded from now on"
     assert (recorder.fault, recorder.close()) == (text, text)
     assert [one.getMessage() for one in caplog.records if one.levelno == logging.WARNING] == [text]
@@ -229,41 +222,26 @@ def test_a_slow_disk_ends_the_recording_and_delays_no_tick(started):
     assert len(messages(recorder.path.read_bytes())["/state"]) == ticks - 1
 
 
-def test_a_recorder_that_was_killed_is_noticed(started):
-    recorder = started()
+def test_a_recorder_that_was_killed_is_noticed_and_a_tick_that_was_not_declared(started):
+    recorder, late, wrong = started(), started("b.mcap"), started("c.mcap")
     os.kill(recorder.pid, signal.SIGKILL)
-
-    def noticed():
-        recorder.tick([np.zeros(2), np.zeros(1)], [0, 0])
-        return recorder.fault
-
-    until(noticed)
-    text = f"{recorder.path}: the recorder's process ended with status -9; nothing is recorded from now on"
-    assert recorder.close() == text
-
-
-def test_a_recorder_that_was_killed_at_the_end_is_noticed(started):
-    recorder = started()
-    os.kill(recorder.pid, signal.SIGSTOP)
-    killer = threading.Timer(0.3, os.kill, (recorder.pid, signal.SIGKILL))
+    until(lambda: recorder.tick([np.zeros(2), np.zeros(1)], [0, 0]) or recorder.fault)
+    text = "the recorder's process ended with status -9"
+    assert recorder.close() == f"{recorder.path}: {text}; nothing is recorded from now on"
+    os.kill(late.pid, signal.SIGSTOP)
+    killer = threading.Timer(0.3, os.kill, (late.pid, signal.SIGKILL))
     killer.start()
-    text = f"{recorder.path}: the recorder's process ended with status -9; the end of the recording is missing"
-    assert (recorder.close(), recorder.close()) == (text, text)
+    assert {late.close(), late.close()} == {f"{late.path}: {text}; the end of the recording is missing"}
     killer.join()
-
-
-def test_a_tick_that_was_not_declared_ends_the_recording(started):
-    recorder = started()
-    recorder.tick([np.zeros(3), np.zeros(1)], [0, 0])
-    assert recorder.close() == f"{recorder.path}: a tick has 6 numbers, and 5 were declared"
+    wrong.tick([np.zeros(3), np.zeros(1)], [0, 0])
+    assert wrong.close() == f"{wrong.path}: a tick has 6 numbers, and 5 were declared"
 
 
 def test_a_file_that_is_there_is_kept(started, tmp_path):
     path = tmp_path / "a.mcap"
     path.write_text("mine")
-    with pytest.raises(OutputError) as caught:
+    with raising(OutputError, f"{path}: a recording is there already. Choose another file"):
         started()
-    assert str(caught.value) == f"{path}: a recording is there already. Choose another file"
     assert path.read_text() == "mine"
     with pytest.raises(OutputError, match=r": a folder is there already\. Choose another file$"):
         started(".")
@@ -302,16 +280,9 @@ def test_files_of_the_folder_it_is_started_in_hide_nothing(started, tmp_path, mo
     assert started().close() == ""
 
 
-def test_a_folder_that_cannot_be_made_is_named(started, tmp_path):
+@pytest.mark.parametrize(("name", "why"), [("a", "File exists"), ("a" * 250 + "/a", "Not a directory")])
+def test_a_folder_that_cannot_be_made_is_named(started, tmp_path, name, why):
     (tmp_path / "flight").write_text("a file")
-    with pytest.raises(OutputError) as caught:
-        started("flight/a.mcap")
-    path = tmp_path / "flight" / "a.mcap"
-    assert str(caught.value) == f"{path}: cannot be written: File exists. Choose another file"
-
-
-def test_a_long_path_leaves_room_for_the_reason(started, tmp_path):
-    (tmp_path / "flight").write_text("a file")
-    with pytest.raises(OutputError) as caught:
-        started("flight/" + "a" * 250 + "/a.mcap")
-    assert str(caught.value).endswith("/a.mcap: cannot be written: Not a directory. Choose another file")
+    path = tmp_path / "flight" / f"{name}.mcap"
+    with raising(OutputError, f"{path}: cannot be written: {why}. Choose another file"):
+        started(path)

@@ -88,7 +88,7 @@ class Watcher:
 def start(tmp_path, monkeypatch):
     """Makes a run whose evaluations are looked up by step; asks for seeds are in ``start.seeds``."""
 
-    def start(results, best=None, copies=None, begin=0, save_takes=0.0, **extra):
+    def start(results, best=None, copies=None, begin=0, save_takes=0.0, records=(), **extra):
         given = {"env": "test/Count-v0", "algo": "ppo", "steps": 100, "eval_every": 30, "eval_episodes": 10, "seed": 7}
         trainer, watcher = Counter(TrainSettings.from_mapping({**given, **extra}), begin, save_takes), Watcher()
         start.seeds = []
@@ -102,6 +102,8 @@ def start(tmp_path, monkeypatch):
 
         monkeypatch.setattr(run_module, "evaluate", evaluate)
         folder = RunFolder(tmp_path / "runs", "count-ppo")
+        for record in records:
+            folder.add(record)
         run = TrainingRun(trainer, folder, tmp_path / "out.zip", watcher, best, lambda: trainer.now, copies)
         return run, trainer, watcher
 
@@ -177,6 +179,16 @@ def test_a_resumed_run_keeps_a_better_best(start):
     run.out.write_text("20")
     outcome = run.run()
     assert (outcome.best["steps"], outcome.checkpoint.read_text()) == (20, "20")
+
+
+def test_a_run_that_goes_on_without_its_best_evaluates_when_it_would_have(start):
+    """It was killed between an evaluation's record and the note of its checkpoint."""
+    evaluated = {"kind": "evaluation", "steps": 30, "seconds": 3.0, "success_rate": 0.8, "return_mean": 3.0}
+    run, _, watcher = start({60: report(0.5), 90: report(0.7), 100: report(0.6)}, begin=40, records=[evaluated])
+    assert run.run().best["steps"] == 90
+    assert [row[0] for row in watcher.evaluations] == [60, 90, 100]
+    run, _, watcher = start({100: report(0.6)}, begin=100, records=[{**evaluated, "steps": 90}])
+    assert run.run().best["steps"] == 100
 
 
 def test_success_must_be_confirmed_by_fresh_episodes(start):

@@ -37,8 +37,11 @@ _CONTROLLERS = {
     "std_msgs/Float64MultiArray": "position_controllers/JointGroupPositionController",
     "sensor_msgs/JointState": "crisp_controllers/JointImpedanceController",
     "control_msgs/GripperCommand": "position_controllers/GripperActionController",
+    "control_msgs/ParallelGripperCommand": "parallel_gripper_action_controller/GripperActionController",
 }
 """The controller of ros2_control that takes commands of a type."""
+_HOLDING = ("control_msgs/GripperCommand", "control_msgs/ParallelGripperCommand")
+"""Actions that succeed where the gripper holds something."""
 
 
 class _Grip:
@@ -54,7 +57,7 @@ class _Grip:
         if not abs(at - self._at) <= _STILL or now < self._since:
             self._since, self._at = now, at
         reached, stalled = abs(at - self.width) <= _REACHED, now - self._since >= _STALLED
-        values, holds = self._values(at, reached, stalled), stalled and self.sink.type == "control_msgs/GripperCommand"
+        values, holds = self._values(at, reached, stalled), stalled and self.sink.type in _HOLDING
         if "epsilon" in self.goal.values:  # of franka_msgs/Grasp
             low, high = (number_at(self.goal.values, f"epsilon.{end}", "") for end in ("inner", "outer"))
             holds = stalled and self.width - low <= at <= self.width + high
@@ -72,7 +75,9 @@ class _Grip:
 
     def _values(self, width: float, reached: bool = False, stalled: bool = False) -> dict[str, Any]:
         (position,) = from_si(self.sink, np.array([width]))
-        return {"position": position, "current_width": width, "stalled": stalled, "reached_goal": reached}
+        state = {"position": [position]}  # of ParallelGripperCommand
+        found = {"position": position, "state": state, "current_width": width}
+        return {**found, "stalled": stalled, "reached_goal": reached}
 
 
 class ServedDriver:
@@ -201,7 +206,7 @@ def _only(values: Mapping[str, Any], kind: str) -> dict[str, Any]:
 
 
 def urdf_of(arm: ArmDescription) -> str:
-    """The URDF of a described arm: its joints with limits, from ``base_link`` on, and the frame ``tool``."""
+    """The URDF of a described arm: its joints with limits, from ``base_link`` on, the frame ``tool``, and a finger."""
     robot, parent = ElementTree.Element("robot", name=arm.name), "base_link"
     ElementTree.SubElement(robot, "link", name=parent)
     placements = [*arm.chain.placements, arm.chain.tool_placement]
@@ -219,6 +224,12 @@ def urdf_of(arm: ArmDescription) -> str:
             limits = {"lower": row.low, "upper": row.high, "velocity": row.velocity, "effort": row.effort}
             ElementTree.SubElement(joint, "limit", {key: repr(value) for key, value in limits.items()})
         parent = child
+    ElementTree.SubElement(robot, "link", name="finger")
+    finger = ElementTree.SubElement(robot, "joint", name="finger_joint", type="prismatic")
+    ElementTree.SubElement(finger, "parent", link=parent)
+    ElementTree.SubElement(finger, "child", link="finger")
+    ElementTree.SubElement(finger, "axis", xyz="1 0 0")  # along which the pads close
+    ElementTree.SubElement(finger, "limit", lower="0", upper=repr(arm.gripper.open / 2), velocity="1", effort="1")
     return ElementTree.tostring(robot, encoding="unicode")
 
 

@@ -70,7 +70,7 @@ class ServedRobot:
         self._midway = False  # whether the last period was not executed to its end
         self._orders = self._begun = self._done = 0  # commands given, begun, executed over a whole period
         self._ticked = self._followed = math.inf  # when the last tick was, and the last command came
-        self._lost, self._lost_until = 0.0, -math.inf  # time for which the clock stood still, and until when it counts
+        self._lost, self._lost_until = 0.0, -math.inf  # time that `follow` may catch up, and until when it counts
         self._behind = 0.0  # time by which the robot is behind its commands
 
     def __getattr__(self, name: str) -> Any:
@@ -125,12 +125,16 @@ class ServedRobot:
 
         With `at_once` it does not wait for the end of the current period. It is the last of `count` commands that came
         since the last tick. After the clock has stood still, as on a busy computer, the commands of that time come all
-        at once: a real robot, whose clock does not stop, has executed them one after the other.
+        at once: a real robot, whose clock does not stop, has executed them one after the other. A command that came
+        late is followed sooner by the next one: the robot has the rest of its way to go, too.
         """
         with self._changed:
             now, period = self._pass_time(), self.spec.period
             if count:
-                early = count - 1 + (0.0 <= now - self._followed < period / 2)
+                since = period if self.resting else now - self._followed
+                if since > period:
+                    self._lose(since - period, now)
+                early = count - 1 + max(0.0, 1.0 - since / period)
                 caught = min(early * period, self._lost) if now <= self._lost_until else 0.0
                 self._lost, self._behind, self._followed = self._lost - caught, self._behind + caught, now
                 if self._behind and not early:
@@ -177,9 +181,14 @@ class ServedRobot:
         now = self._now()
         lost = now - self._ticked - self.tick_period
         if lost > self.tick_period:
-            self._lost, self._lost_until = min(lost, LONGEST_LOST), now + self.spec.period
+            self._lose(lost, now)
         self._ticked = now
         return now
+
+    def _lose(self, seconds: float, now: float) -> None:
+        """Note a time for which the clock stood still, or for which a command was late."""
+        before = self._lost if now <= self._lost_until else 0.0
+        self._lost, self._lost_until = min(max(seconds, before), LONGEST_LOST), now + LONGEST_LOST
 
     def _time_to(self, command: Array) -> float:
         """Time to a `command` (n, m) at the speed of the commands [s]; infinite if it is the command before again."""

@@ -12,6 +12,7 @@ import tempfile
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
+from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bam_envs.core.errors import InvalidValue, MissingExtra, UnknownName
+from bam_envs.core.wording import closest, did_you_mean
 from bam_envs.robots.physics.mujoco_batch import mujoco
 
 Array = NDArray[np.float64]
@@ -34,12 +36,15 @@ CONTINUOUS = 2 * np.pi
 """Limit of a joint that turns without end [rad]."""
 WIDEST = 0.10
 """Widest gripper that is simulated [m]."""
+_FETCH = "fetch the mesh again; a repository with Git LFS holds a pointer in its place"
 _REMEDIES = {
     "repeated name": "give each of them a name of its own",
     "unrecognized": "the file is for another version of MuJoCo: take it out",
     "no decoder": "MuJoCo reads STL, OBJ and MSH: convert the mesh, or give the link a shape",
     "bad format": "write a number there",
-    "is empty": "fetch the mesh again; a repository with Git LFS holds a pointer in its place",
+    "is empty": _FETCH,
+    "invalid header": _FETCH,
+    "Error opening": "put that file where it is looked for, beside this one",
 }
 """What to do about a file that MuJoCo refuses, by words in its text."""
 _SETTLING = 2.0  # time for a linkage to come to rest [s]
@@ -99,6 +104,7 @@ def _length(width: float) -> float:
 def _parallel(gripper: str | None) -> float | None:
     """The width [m] of ``parallel:0.08``."""
     if gripper is None or not gripper.startswith("parallel:"):
+        _require_scheme(gripper or "", "parallel:WIDTH")
         return None
     with contextlib.suppress(ValueError):
         if 0.005 <= (width := float(gripper.partition(":")[2])) <= 0.3:
@@ -106,16 +112,27 @@ def _parallel(gripper: str | None) -> float | None:
     raise InvalidValue(f"--gripper {gripper}: give the width of the open gripper in metres, from 0.005 to 0.3.")
 
 
+def _require_scheme(name: str, *more: str) -> None:
+    """Refuse a name with a misspelt word before its colon; `more` are forms that it may have beside menagerie:NAME."""
+    word, colon, rest = name.partition(":")
+    known = {form.partition(":")[0]: form for form in ("menagerie:NAME", *more)}
+    if colon and word not in known and not Path(name).exists() and (meant := closest(word, known)):
+        raise InvalidValue(
+            f"{name}: there is no {word}:, only {' and '.join(known.values())}. Did you mean {meant}:{rest}?"
+        )
+
+
 def _spec(name: str, folder: str) -> tuple[Any, dict[str, tuple[float | None, float | None]]]:
     """The model in a file as MuJoCo reads it, and the velocities and efforts in an URDF, by joint."""
     if name.startswith("menagerie:"):
         return _menagerie(name.partition(":")[2]), {}
+    _require_scheme(name)
     path = Path(name)
     if not path.is_file():
         raise InvalidValue(f"There is no model file {name}. Give an MJCF or URDF file, or menagerie:NAME.")
     limits: dict[str, tuple[float | None, float | None]] = {}
     try:
-        if _is_urdf(path):
+        if is_urdf(path):
             text, limits = _urdf(path, folder)
             spec = mujoco.MjSpec.from_string(text)
         else:
@@ -129,8 +146,10 @@ def _spec(name: str, folder: str) -> tuple[Any, dict[str, tuple[float | None, fl
     return spec, limits
 
 
-def _is_urdf(path: Path) -> bool:
-    return path.suffix in (".urdf", ".xacro") or (path.is_file() and b"<robot" in path.read_bytes()[:4000])
+def is_urdf(path: Path) -> bool:
+    """Whether a model file is a URDF or xacro file, by its first element, or by its name if it has none."""
+    root = re.search(rb"<(robot|mujoco)\b", path.read_bytes()[:4000]) if path.is_file() else None
+    return path.suffix == ".xacro" or (path.suffix == ".urdf" if root is None else root[1] == b"robot")
 
 
 def _menagerie(name: str) -> Any:
@@ -142,7 +161,11 @@ def _menagerie(name: str) -> Any:
         return menagerie.get(name).spec()
     except Exception as error:  # its errors, and those of the network, are many
         if "Unknown robot" in str(error):
-            raise InvalidValue(f"menagerie:{name}: {_line(error)}") from error
+            known = menagerie.names()
+            meant = min([one for one in known if name in one], key=len, default=name)
+            listing = f"mujoco-menagerie names lists all {len(known)}."
+            examples = get_close_matches(name, known, cutoff=0.0)
+            raise UnknownName("robot of menagerie", name, known, examples, meant=meant, remedy=listing) from error
         raise InvalidValue(
             f"menagerie:{name} cannot be fetched: {_line(error)}. Set the variable MENAGERIE_ROOT to a folder with the "
             "models, or try again with a network."
@@ -163,7 +186,10 @@ def _line(error: BaseException) -> str:
 
 def _urdf(path: Path, folder: str) -> tuple[str, dict[str, tuple[float | None, float | None]]]:
     """The text of an URDF with the files of its meshes found, and velocity and effort of its joints."""
-    root = ElementTree.fromstring(_expanded(path) if path.suffix == ".xacro" else path.read_text(encoding="utf-8"))
+    root = _parsed(_expanded(path) if path.suffix == ".xacro" else path.read_text(encoding="utf-8"))
+    if path.suffix != ".xacro" and any("xacro}" in one.tag for one in root.iter()):
+        root = _parsed(_expanded(path))
+    _check_names(path, root)
     for link in root.iter("link"):
         drawn = link.findall("visual")
         for visual in drawn:
@@ -188,6 +214,33 @@ def _urdf(path: Path, folder: str) -> tuple[str, dict[str, tuple[float | None, f
             speed, effort = (value if 0.0 < value < np.inf else None for value in given)
             limits[name] = speed, effort
     return ElementTree.tostring(root, encoding="unicode"), limits
+
+
+def _parsed(text: str) -> ElementTree.Element:
+    """The XML in `text`; prefixes that are not declared, such as ``drake:``, are part of a name, as in ROS."""
+    try:
+        return ElementTree.fromstring(text)
+    except ElementTree.ParseError as error:
+        if "unbound prefix" not in str(error):
+            raise
+    known = {"xmlns", *re.findall(r"xmlns:(\w+)", text)}
+    return ElementTree.fromstring(
+        re.sub(r"(?<=[\s</])(\w+):(?=\w)", lambda found: found[0] if found[1] in known else f"{found[1]}_", text)
+    )
+
+
+def _check_names(path: Path, root: ElementTree.Element) -> None:
+    """Refuse names that come twice, and those of links and joints that are not there, which MuJoCo does not tell."""
+    names = {kind: [one.get("name", "") for one in root.findall(kind)] for kind in ("link", "joint")}
+    for kind, found in names.items():
+        if twice := [name for name in found if found.count(name) > 1 or not name]:
+            raise InvalidValue(f"{path}: two {kind}s are called {twice[0]!r}: give each of them a name of its own.")
+    for joint in root.findall("joint"):
+        for part, key, kind in (("parent", "link", "link"), ("child", "link", "link"), ("mimic", "joint", "joint")):
+            name = joint.find(part).get(key, "") if joint.find(part) is not None else None  # type: ignore[union-attr]
+            if name is not None and name not in names[kind]:
+                hint = did_you_mean(name, names[kind])
+                raise InvalidValue(f"{path}: {joint.get('name')}: its {part} {name!r} is no {kind} of the file. {hint}")
 
 
 def _number(path: Path, joint: str, limit: ElementTree.Element, key: str) -> float:
@@ -250,9 +303,11 @@ def _named_body(spec: Any, site: str | None, model: str, gripper: str | None) ->
     sites = {one.name: one for one in spec.sites if one.name}
     names = [site] if site else [name for name in SITES if name in sites or name in bodies]
     named = [one for one in (*sites, *bodies) if one != "world"]
-    flag, kind = ("--tip", "link") if _is_urdf(Path(model)) else ("--site", "site or body")
+    flag, kind = ("--tip", "link") if is_urdf(Path(model)) else ("--site", "site or body")
     if not names and (end := _last_body(spec, gripper)) is not None:
         return end, [f"the end of the arm is {end.name}, as {flag} was not given and none of the usual names is there"]
+    if not named:
+        raise InvalidValue(f"{model}: there is no body in it. Is it a part of another file? Then give that one.")
     if not names:
         raise InvalidValue(f"{model}: give the end of the arm with {flag}, a {kind}: {_few(named)}.")
     name = names[0]
@@ -465,10 +520,15 @@ class _Reader:
                 raise InvalidValue(
                     f"{self._where}: {name!r} has another joint than one revolute joint; only such arms are served."
                 )
+            if count and not model.joint(first).name:
+                raise InvalidValue(
+                    f"{self._where}: the joint of {model.body(body).name!r} has no name; give it that of the robot's "
+                    "messages."
+                )
             joints += [int(first)] if count else []
             body = int(model.body_parentid[body])
         if not _FEWEST_JOINTS <= len(joints) <= _MOST_JOINTS:
-            name, flag = model.body(self._end).name, "--tip" if _is_urdf(Path(self._where)) else "--site"
+            name, flag = model.body(self._end).name, "--tip" if is_urdf(Path(self._where)) else "--site"
             raise InvalidValue(
                 f"{self._where}: {len(joints)} joints lead to {name.removesuffix(_END)!r}; an arm has 4 to 8. If "
                 f"that is not its end, give {flag}."
@@ -618,9 +678,15 @@ class _Reader:
                 data.qpos[held] = 0.0
                 yield data.qpos.copy()
             return
-        for ends in _combinations(model.jnt_range[joints]):
+        kind = int(mujoco.mjtEq.mjEQ_JOINT)
+        followers = {int(model.eq_obj1id[row]): row for row in range(model.neq) if int(model.eq_type[row]) == kind}
+        leaders = [joint for joint in joints if joint not in followers]
+        for ends in _combinations(model.jnt_range[leaders]):
             state = np.zeros(model.nq)
-            state[model.jnt_qposadr[joints]] = ends
+            state[model.jnt_qposadr[leaders]] = ends
+            for joint, row in followers.items():
+                lead = state[model.jnt_qposadr[model.eq_obj2id[row]]]
+                state[model.jnt_qposadr[joint]] = np.polyval(model.eq_data[row, 4::-1], lead)
             yield state
 
     def _tips(self, moved: Any, bodies: Any, flange: Array, state: Array) -> "_Tips":

@@ -78,12 +78,7 @@ class BridgeConnection(ServerConnection):
     """A connection with an `Outbox` that counts its unread data; one of `sockets`, the open ones of the server."""
 
     def __init__(
-        self,
-        *args: Any,
-        sockets: set["BridgeConnection"],
-        limits: ServerOptions,
-        refusals: Refusals,
-        **options: Any,
+        self, *args: Any, sockets: set["BridgeConnection"], limits: ServerOptions, refusals: Refusals, **options: Any
     ) -> None:
         super().__init__(*args, **options)
         self._sockets, self._most_unfinished, self._refusals = sockets, limits.unfinished, refusals

@@ -15,6 +15,7 @@ from bam_envs.remote.serve.env_server import EnvServer, LocalTransport, describe
 from bam_envs.rosbridge.bus import Caller
 from bam_envs.testing.transports import MirrorEnv
 from tests.bam_envs.remote.fakes import FakeEnv
+from tests.raising import raising
 
 NO_EPISODE = "No episode is running: it ended, or never began. Call reset() first."
 
@@ -55,28 +56,24 @@ def test_the_wrong_number_of_actions_is_refused(make_rows):
     )
 
 
-def test_the_others_are_told_who_is_in_command():
+def test_the_others_are_told_who_is_in_command_and_need_a_reset_after_a_change():
     env, server = mirror()
     server.reset("ann")
+    text = "ann is in command, not bob; it passes on when ann leaves or is silent for 2 s."
     for act in (lambda: server.reset("bob"), lambda: server.step("bob", np.zeros(2))):
-        assert raised(NotInCommand, act) == (
-            "ann is in command, not bob; it passes on when ann leaves or is silent for 2 s."
-        )
-    assert (len(env.given), env.seen) == (1, [])
-    server.leave("ann")
-    server.reset("bob")
-
-
-def test_after_a_change_of_command_a_reset_is_needed():
-    _, server = mirror()
-    server.reset("ann")
+        assert raised(NotInCommand, act) == text
     assert raised(NotInCommand, lambda: server.reset("bob", take=True)) == (
-        "ann is in command, not bob; it passes on when ann leaves or is silent for 2 s. Taking it by force needs the "
-        "operator's token: start bam-serve with --operator-token-file, and show that one."
+        f"{text} Taking it by force needs the operator's token: start bam-serve with --operator-token-file, and show "
+        "that one."
     )
+    assert (len(env.given), env.seen) == (1, [])
+    assert raised(InvalidValue, lambda: server.step("ann", [0, np.nan])) == "action[1] is NaN; only numbers are sent."
+    assert env.seen == []
+    server.step("ann", [0, 1])  # the episode goes on
     server.reset("bob", take=True, caller=Caller("x", operator=True))
     server.leave("bob")
     assert raised(ResetNeeded, lambda: server.step("ann", np.zeros(2))) == NO_EPISODE
+    server.reset("ann")
 
 
 def test_a_lease_can_be_shared():
@@ -131,14 +128,6 @@ def test_values_have_the_dtypes_of_their_spaces():
     assert [type(one) for one in (reward, terminated, truncated)] == [float, bool, bool]
     assert info == {"a": [1, 2], "3": [4]}
     assert info["a"][1].dtype == np.int8
-
-
-def test_a_bad_action_moves_nothing_and_the_episode_goes_on():
-    env, server = mirror()
-    server.reset("ann")
-    assert raised(InvalidValue, lambda: server.step("ann", [0, np.nan])) == "action[1] is NaN; only numbers are sent."
-    assert env.seen == []
-    server.step("ann", [0, 1])
 
 
 def test_a_turn_that_comes_too_late_does_nothing():
@@ -207,36 +196,23 @@ class Halting(FakeEnv):
         self.closes += 1
 
 
-def test_the_robot_halts_when_its_client_leaves():
+@pytest.mark.parametrize("ends_first", [False, True])
+def test_the_robot_halts_when_its_client_leaves_and_it_closes_once(ends_first):
     env = Halting()
     server = EnvServer(env)
+    for client in ("bob", "ann", "ann"):
+        server.reset("ann")
+        server.leave(client)
+    assert (env.halts, env.closes) == (2, 0)
     server.reset("ann")
-    server.leave("bob")
-    assert env.halts == 0
-    server.leave("ann")
-    server.leave("ann")
-    assert env.halts == 1
-
-
-def test_closing_halts_and_closes_once():
-    env = Halting()
-    server = EnvServer(env)
-    server.reset("ann")
+    if ends_first:
+        server.end()
+        assert raised(RemoteError, lambda: server.step("ann", 0)) == "The environment is closed."
+        assert (env.halts, env.closes) == (2, 0)
     server.close()
     server.close()
-    assert (env.halts, env.closes) == (1, 1)
+    assert (env.halts, env.closes) == (3, 1)
     assert raised(RemoteError, lambda: server.reset("ann")) == "The environment is closed."
-
-
-def test_at_its_end_it_refuses_and_halts_nothing_yet():
-    env = Halting()
-    server = EnvServer(env)
-    server.reset("ann")
-    server.end()
-    assert raised(RemoteError, lambda: server.step("ann", 0)) == "The environment is closed."
-    assert (env.halts, env.closes) == (0, 0)
-    server.close()
-    assert (env.halts, env.closes) == (1, 1)
 
 
 def test_in_real_time_steps_last_a_period():
@@ -299,31 +275,17 @@ def test_names_of_one_environment(name, other, same):
         server.require_name(name)
 
 
-def test_another_one_says_less():
+def test_what_is_said_of_an_environment_and_what_cannot_be_served(make):
     spec = describe_env(FakeEnv())
     assert (spec.env_id, spec.period, spec.max_episode_steps, spec.signals) == ("FakeEnv", None, None, {})
     assert describe_env(FakeEnv(), "mine").env_id == "mine"
-
-
-def test_the_frame_rate_is_a_period(make):
     assert describe_env(make("CartPole-v1")).period == 0.02
-
-
-def test_rows_that_begin_anew_in_the_next_step_are_refused():
-    envs = SyncVectorEnv([FakeEnv] * 2)
-    with pytest.raises(InvalidValue) as caught:
-        describe_env(envs)
-    assert str(caught.value) == (
+    assert raised(UnknownName, lambda: describe_env(FakeEnv(spaces.Graph(spaces.Box(0, 1, (2,)), None))))
+    assert raised(InvalidValue, lambda: describe_env(SyncVectorEnv([FakeEnv] * 2))) == (
         "The environments of a served vector environment must be reset in the same step, not AutoresetMode.NEXT_STEP; "
         'make it with vector_kwargs={"autoreset_mode": AutoresetMode.SAME_STEP}.'
     )
     describe_env(SyncVectorEnv([FakeEnv] * 2, autoreset_mode=AutoresetMode.SAME_STEP))
-
-
-def test_spaces_that_cannot_be_sent_are_refused_at_once():
-    with pytest.raises(UnknownName) as caught:
-        describe_env(FakeEnv(spaces.Graph(spaces.Box(0, 1, (2,)), None)))
-    assert caught.value.name == "Graph"
 
 
 class Closing(FakeEnv):
@@ -333,27 +295,18 @@ class Closing(FakeEnv):
         self.closes += 1
 
 
-def test_an_environment_of_its_own_is_closed_with_it():
-    env = Closing()
-    transport = LocalTransport(env)
+def test_an_environment_of_its_own_is_closed_with_it_and_a_shared_server_goes_on():
+    own, env = Closing(), Closing()
+    transport, server = LocalTransport(own), EnvServer(env)
     transport.close()
     transport.close()
-    assert env.closes == 1
-
-
-def test_a_shared_server_goes_on():
-    env = Closing()
-    server = EnvServer(env)
+    assert own.closes == 1
     one, two = LocalTransport(server, "ann"), LocalTransport(server, "bob")
     one.reset()
-    with pytest.raises(NotInCommand) as caught:
+    with raising(NotInCommand, "ann is in command, not bob", begins=True):
         two.reset()
-    assert str(caught.value).startswith("ann is in command, not bob")
     one.close()
     assert env.closes == 0
     two.reset()
-    with pytest.raises(LinkLost) as lost:
-        one.reset()
-    assert str(lost.value) == "This transport is closed; make a new one."
-    with pytest.raises(LinkLost):
-        one.connect()
+    for act in (one.reset, one.connect):
+        assert raised(LinkLost, act) == "This transport is closed; make a new one."

@@ -2,38 +2,32 @@ import pytest
 
 from bam_envs.core.errors import InvalidValue
 from bam_envs.remote.serve.serve_options import ServeOptions
+from tests.raising import raising
 
 
 def test_the_defaults_are_possible():
     ServeOptions().require_sane()
+    ServeOptions(rclpy=True, token_file="t", tcp=0).require_sane()  # the token is for the TCP port
 
 
-def test_a_token_of_the_tcp_port_beside_a_ros_2_node():
-    ServeOptions(rclpy=True, token_file="t", tcp=0).require_sane()
+EXCLUDE, ONLY = "exclude each other; give one of the two.", "means something only where"
+CLIENTS = "clients connect to this program."
+TCP, NO_TOKEN = "and --cert does not change that", "ROS 2 has no token. Leave it out."
 
 
 @pytest.mark.parametrize(
     ("options", "text"),
     [
-        ({"realtime": True, "fast": True}, "--realtime and --fast exclude each other; give one of the two."),
-        ({"via": "ws://a", "rclpy": True}, "--via and --rclpy exclude each other; give one of the two."),
-        ({"via": "ws://a", "cert": "c"}, "--via and --cert exclude each other; give one of the two."),
-        ({"rclpy": True, "cert": "c"}, "--rclpy and --cert exclude each other; give one of the two."),
-        (
-            {"cert": "c", "tcp": 0},
-            "--tcp carries everything in the clear, and --cert does not change that; leave one of the two out.",
-        ),
+        ({"realtime": True, "fast": True}, f"--realtime and --fast {EXCLUDE}"),
+        ({"via": "ws://a", "rclpy": True}, f"--via and --rclpy {EXCLUDE}"),
+        ({"via": "ws://a", "cert": "c"}, f"--via and --cert {EXCLUDE}"),
+        ({"rclpy": True, "cert": "c"}, f"--rclpy and --cert {EXCLUDE}"),
+        ({"cert": "c", "tcp": 0}, f"--tcp carries everything in the clear, {TCP}; leave one of the two out."),
         ({"key": "k"}, "--key means something only with --cert."),
         ({"ca_file": "k"}, "--ca-file means something only with --via."),
-        (
-            {"rclpy": True, "token_file": "t"},
-            "--token-file protects nothing with --rclpy: ROS 2 has no token. Leave it out.",
-        ),
-        ({"no_token": True, "token_file": "t"}, "--no-token and --token-file exclude each other; give one of the two."),
-        (
-            {"via": "ws://a", "operator_token_file": "t"},
-            "--operator-token-file means something only where clients connect to this program.",
-        ),
+        ({"rclpy": True, "token_file": "t"}, f"--token-file protects nothing with --rclpy: {NO_TOKEN}"),
+        ({"no_token": True, "token_file": "t"}, f"--no-token and --token-file {EXCLUDE}"),
+        ({"via": "ws://a", "operator_token_file": "t"}, f"--operator-token-file {ONLY} {CLIENTS}"),
         ({"lease": 0.0}, "--lease: expected a number above 0, found 0.0"),
         ({"lease": float("nan")}, "--lease: expected a number above 0, found nan"),
         ({"port": -1}, "--port: expected a whole number from 0 to 65535, found -1"),
@@ -43,9 +37,8 @@ def test_a_token_of_the_tcp_port_beside_a_ros_2_node():
     ],
 )
 def test_what_cannot_be(options, text):
-    with pytest.raises(InvalidValue) as error:
+    with raising(InvalidValue, text):
         ServeOptions(**options).require_sane()
-    assert str(error.value) == text
 
 
 CLEAR = "The token is sent unencrypted to {}, and so is everything else: give --cert, or trust that network."
@@ -88,9 +81,8 @@ def test_what_stands_open_is_said(options, text):
     ],
 )
 def test_no_network_without_a_token_by_oversight(options, place):
-    with pytest.raises(InvalidValue) as error:
+    with raising(InvalidValue, REFUSED.format(place)):
         ServeOptions(**options).require_sane()
-    assert str(error.value) == REFUSED.format(place)
 
 
 @pytest.mark.parametrize(("name", "prefix"), [("", ""), ("/", ""), ("a", "/a"), ("/a/b_1/", "/a/b_1")])

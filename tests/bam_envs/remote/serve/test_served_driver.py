@@ -1,6 +1,7 @@
 """What drivers offer beside topics, asked for by roslibpy: gripper actions, enable services, controllers, the URDF."""
 
 import threading
+from importlib import resources
 
 import gymnasium as gym
 import numpy as np
@@ -8,12 +9,15 @@ import pytest
 import roslibpy
 
 from bam_envs.arms.description import robot_model
+from bam_envs.core.robot_models import SHIPPED
 from bam_envs.live.arm_checks import read_urdf
 from bam_envs.robots.profile import profile_for
 from bam_envs.tasks.scripted import scripted_policy
 
 GRIP, MOVE = "control_msgs/action/GripperCommand", "franka_msgs/action/Move"
 GEN3, FR3, XARM7 = "/robotiq_gripper_controller/gripper_cmd", "/franka_gripper/move", "/xarm_gripper/gripper_action"
+PARALLEL, FIELD, NAME = "control_msgs/ParallelGr", "command.position[0]", "command.name[0]"
+KNUCKLE = "robotiq_85_left_knuckle_joint"
 LONG = 20.0
 
 
@@ -93,6 +97,29 @@ def test_a_gripper_goes_to_the_goal_of_its_action_without_further_commands(clien
     assert gen3.goal(GEN3, GRIP, closed(1.0))[:2] == ("ABORTED", refused)
 
 
+@pytest.fixture
+def lab(tmp_path, monkeypatch):
+    """Describe a Gen3 whose gripper has an action with the message of a joint (ParallelGripperCommand)."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "robots" / "profiles").mkdir(parents=True)
+    text = (SHIPPED / "gen3.toml").read_text(encoding="utf-8")
+    (tmp_path / "robots" / "lab.toml").write_text(text.replace('"gen3"', '"lab"', 1))
+    text = (resources.files("bam_envs.robots") / "profiles" / "ros2_kortex.toml").read_text(encoding="utf-8")
+    text = text.replace('"ros2_kortex"', '"lab"').replace('"gen3"', '"lab"').replace("control_msgs/Gr", PARALLEL)
+    text = text.replace("command.position", FIELD).replace('"command.max_effort" = 100.0', f'"{NAME}" = "{KNUCKLE}"')
+    (tmp_path / "robots" / "profiles" / "lab.toml").write_text(text)
+
+
+def test_a_gripper_whose_action_has_the_message_of_a_joint(client, lab):
+    """As since ROS 2 Jazzy."""
+    arm = client("lab")
+    status, values, news = arm.goal(
+        GEN3, "control_msgs/action/ParallelGripperCommand", {"command": {"position": [0.4]}}
+    )
+    assert (status, values["reached_goal"], set(news[0])) == ("SUCCEEDED", True, {"state"})
+    assert values["state"]["position"] == pytest.approx([0.4], abs=0.011)
+
+
 def test_a_gripper_of_its_makers_own_action(client):
     fr3 = client("fr3")
     status, values, news = fr3.goal(FR3, MOVE, {"width": 0.06, "speed": 0.1})
@@ -133,8 +160,8 @@ def test_controllers_and_urdf(client, name):
     np.testing.assert_allclose(rotation, frame[:3, :3], atol=1e-12)
 
 
-@pytest.mark.parametrize("name", ["fr3", "xarm7", "gen3", "so101"])
-def test_a_cube_is_picked_by_the_names_of_each_driver(serve_env, name):
+@pytest.mark.parametrize("name", ["fr3", "xarm7", "gen3", "so101", "lab"])
+def test_a_cube_is_picked_by_the_names_of_each_driver(serve_env, lab, name):
     """The gripper by its action, or by the message of the arm; a halt in between drops nothing."""
     env = gym.make("bam/pick-v0", robot_model=name, disable_env_checker=True)
     url, policy = serve_env(env=env, fast=True).bus.url, scripted_policy("bam/pick-v0", name)

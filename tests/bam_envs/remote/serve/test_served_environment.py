@@ -18,6 +18,7 @@ from bam_envs.rosbridge.endpoint import Endpoint
 from bam_envs.rosbridge.server import BridgeServer
 from bam_envs.testing.transports import assert_same_value
 from tests.bam_envs.making import EACH, encode_command
+from tests.raising import raising
 
 UR5E = load_profile("ur5e")
 ARM = arm_spec("ur5e", with_object=True)
@@ -72,17 +73,17 @@ def wait_for(condition, bus, timeout=10.0):
 
 def test_an_environment_with_its_robot(serve_env):
     served = serve_env(tcp=0)
-    rosbridge, tcp = served.endpoints
-    assert rosbridge == f"bam/pick-v0 on {served.bus.url}, real time: /gym_env/gym_api_request and a ur5e's topics"
-    assert tcp == f"bam/pick-v0 on {served.tcp.url}, the environment alone"
-    served.require_running()
-
-
-def test_fast_in_a_namespace(serve_env):
-    served = serve_env(fast=True, namespace="bam_001")
+    offered = "bam/pick-v0 on {}, {}: {}/gym_env/gym_api_request and a ur5e's topics{}"
     assert served.endpoints == [
-        f"bam/pick-v0 on {served.bus.url}, fast: /bam_001/gym_env/gym_api_request and a ur5e's topics under /bam_001"
+        offered.format(served.bus.url, "real time", "", ""),
+        f"bam/pick-v0 on {served.tcp.url}, the environment alone",
     ]
+    served.require_running()
+    served.robot_service.clock.stop()
+    with pytest.raises(RemoteError, match=r"The clock of the robot stands still\."):
+        served.require_running()
+    served = serve_env(fast=True, namespace="bam_001")
+    assert served.endpoints == [offered.format(served.bus.url, "fast", "/bam_001", " under /bam_001")]
 
 
 def test_an_environment_without_a_robot_has_no_topics(serve_env, transport):
@@ -210,12 +211,12 @@ def test_a_robot_that_is_there_already_is_not_doubled(serve_env):
     with BridgeServer(port=0) as theirs:
         serve_env(fast=True, via=theirs.url)
         env = gym.make("bam/pick-v0", disable_env_checker=True)
-        with pytest.raises(InvalidValue) as caught:
-            serve_env(env=env, fast=True, via=theirs.url)
-        assert str(caught.value) == (
+        with raising(
+            InvalidValue,
             f"{theirs.url}: /bam/robot answers there already, so another robot has these names. "
-            "Give this one names of its own: --namespace NAME."
-        )
+            "Give this one names of its own: --namespace NAME.",
+        ):
+            serve_env(env=env, fast=True, via=theirs.url)
         serve_env(fast=True, via=theirs.url, namespace="cell_2")
         with pytest.raises(InvalidValue, match="/cell_2/bam/robot answers there already"):
             serve_env(fast=True, via=theirs.url, namespace="cell_2")
@@ -226,14 +227,11 @@ def test_what_stands_open_is_told(serve_env, monkeypatch):
     assert serve_env("CartPole-v1").lines == ["it stands open"]
 
 
-def test_nobody_at_the_address_of_the_other_server(serve_env):
+def test_what_was_started_ends_if_the_rest_cannot_start(serve_env):
     env = Timeless()
     with pytest.raises(NoServer, match=r"^ws://127\.0\.0\.1:1: refused"):
         serve_env(env=env, via="ws://127.0.0.1:1")
     assert env.closed > 0
-
-
-def test_what_was_started_ends_if_the_rest_cannot_start(serve_env):
     env = Timeless()
     with BridgeServer(port=0) as theirs:
         with pytest.raises(InvalidValue, match=f"Port {theirs.port} on 127.0.0.1 is in use"):
@@ -252,10 +250,3 @@ def test_a_token(serve_env, link, transport, tmp_path):
         link(served.bus.url)
     link(served.bus.url, token="secret")
     transport(TcpTransport, served.tcp.url, token="secret")
-
-
-def test_a_clock_that_ended_is_noticed(serve_env):
-    served = serve_env()
-    served.robot_service.clock.stop()
-    with pytest.raises(RemoteError, match=r"The clock of the robot stands still\."):
-        served.require_running()

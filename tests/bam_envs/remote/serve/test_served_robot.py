@@ -1,5 +1,6 @@
 import threading
 import time
+from unittest import mock
 
 import numpy as np
 import pytest
@@ -35,17 +36,11 @@ class Without:
         return getattr(self._robot, name)
 
 
-class Hands:
-    def __init__(self):
-        self.now = 0.0
-
-    def __call__(self):
-        return self.now
-
-
 @pytest.fixture
 def hands():
-    return Hands()
+    """A clock that is set by hand."""
+    clock = mock.Mock(side_effect=lambda: clock.now, now=0.0)
+    return clock
 
 
 @pytest.fixture
@@ -99,31 +94,60 @@ def test_in_real_time_a_command_takes_a_period_of_ticks(serve, arm, hands):
     np.testing.assert_allclose(served.state.stamp, [0.05])
 
 
-@pytest.mark.parametrize("burst", [1, 2])  # the commands of the lost time come in one tick, or in two
-@pytest.mark.parametrize("held", [0, 3])  # periods in which the last of them comes again
-def test_a_robot_whose_clock_stood_still_catches_up_slowly(serve, hands, burst, held):
-    served, step, speeds, pan = serve(SimulatedArm(1), realtime=True), 0.02, [], np.eye(6)[:1]
+@pytest.fixture
+def stream(serve, hands):
+    """Sends the pan joint of a simulated arm steps of 0.02 rad, and notes its highest speed after each tick."""
+    served = serve(SimulatedArm(1), realtime=True)
     served.command_timeout = 0.5
 
-    def period(change, parts=PARTS, count=1):
-        served.follow(command(change * pan), count=count)
+    def period(step, parts=PARTS, count=1):
+        served.follow(command(0.02 * step * np.eye(6)[:1]), count=count)
         for _ in range(parts):
             ticks(served, hands, 1)
-            speeds.append(np.abs(served.state.signals["joint_velocity"]).max())
+            period.speeds.append(np.abs(served.state.signals["joint_velocity"]).max())
 
-    for i in range(1, 9):
-        period(i * step)
-    usual, speeds[:] = max(speeds), []
+    period.served, period.hands, period.speeds = served, hands, []
+    for step in range(1, 9):
+        period(step)
+    period.usual = max(period.speeds)
+    return period
+
+
+def arrives(stream, last):
+    """Whether the arm is never much faster than its commands, and comes to the `last` one."""
+    ticks(stream.served, stream.hands, 4 * PARTS)
+    there = HOME + 0.02 * last * np.eye(6)[0]
+    np.testing.assert_allclose(stream.served.state.signals["joint_position"], there, atol=0.005)
+    return max(stream.speeds) < 1.3 * stream.usual
+
+
+@pytest.mark.parametrize("burst", [1, 2])  # the commands of the lost time come in one tick, or in two
+@pytest.mark.parametrize("held", [0, 3])  # periods in which the last of them comes again
+def test_a_robot_whose_clock_stood_still_catches_up_slowly(stream, hands, burst, held):
     hands.now += 3 * 0.05  # commands 9, 10 and 11 come meanwhile
     if burst == 2:
-        period(9 * step, parts=1)
-    period(11 * step, count=4 - burst)
-    for i in [*[11] * held, *range(12, 40)]:
-        period(i * step)
-    assert max(speeds) < 1.3 * usual
-    np.testing.assert_allclose(served.target(), command(39 * step * pan))
-    ticks(served, hands, 4 * PARTS)
-    np.testing.assert_allclose(served.state.signals["joint_position"], HOME + 39 * step * pan, atol=0.005)
+        stream(9, parts=1)
+    stream(11, count=4 - burst)
+    for step in [*[11] * held, *range(12, 40)]:
+        stream(step)
+    assert arrives(stream, 39)
+
+
+@pytest.mark.parametrize("late", [2, 4])
+def test_a_command_soon_after_a_late_one_does_not_make_the_robot_fast(stream, late):
+    for step in range(9, 40):
+        stream(step, parts=PARTS + late * (step % 5 == 0) - late * (step % 5 == 1))
+    assert arrives(stream, 39)
+
+
+def test_wrong_commands_are_refused_and_a_clock_that_stands_still_is_an_error(serve):
+    served = serve(FakeRobot(1), realtime=True, patience=0.01)
+    with pytest.raises(InvalidValue, match=r"must have shape \(1, 7\), not \(1, 6\)"):
+        served.step(np.zeros((1, 6)))
+    with pytest.raises(InvalidValue, match="finite"):
+        served.step(np.full((1, 7), np.nan))
+    with pytest.raises(RemoteError, match=r"The clock of .* has stood still for 0.01 s\."):
+        served.step(command())
 
 
 def test_a_robot_without_parts_is_stepped_a_period_at_a_time(serve, hands):
@@ -185,6 +209,12 @@ def test_a_command_one_part_early_loses_none(serve, hands):
 
 
 def test_halt_stops_at_once_and_again_changes_nothing(serve, hands):
+    served = serve(FakeRobot(1), realtime=True)  # which says no set point, and rests where it was measured
+    served.follow(command(3.0))
+    ticks(served, hands, PARTS)
+    served.halt()
+    measured = np.concatenate([served.state.signals[name] for name in ("joint_position", "gripper_width")], axis=1)
+    np.testing.assert_array_equal(served.target(), measured)
     served = serve(SimulatedArm(1), realtime=True)
     served.follow(command(0.5))
     ticks(served, hands, 3)
@@ -196,30 +226,18 @@ def test_halt_stops_at_once_and_again_changes_nothing(serve, hands):
     np.testing.assert_array_equal(served.target(), rest)
 
 
-def test_a_closed_gripper_keeps_holding_after_the_command_timeout(serve, hands):
+def test_after_the_command_timeout_a_closed_gripper_keeps_holding_and_a_base_rests_at_zero_speed(serve, hands):
     served = serve(SimulatedArm(1), realtime=True)
     for _ in range(10):
         served.follow(command(0.0, 0.0))
         ticks(served, hands, PARTS)
     ticks(served, hands, 50)
     assert served.target()[0, 6] < 0.01
-
-
-def test_a_base_rests_at_zero_speed(serve, hands):
-    served = serve(FakeRobot(1), realtime=True, zero_rests=True)
-    served.follow(command(0.1))
+    base = serve(FakeRobot(1), realtime=True, zero_rests=True)
+    base.follow(command(0.1))
     hands.now += 0.11
-    served.tick()
-    np.testing.assert_array_equal(served.target(), np.zeros((1, 7)))
-
-
-def test_a_robot_that_says_no_set_point_rests_where_it_was_measured(serve, hands):
-    served = serve(FakeRobot(1), realtime=True)
-    served.follow(command(3.0))
-    ticks(served, hands, PARTS)
-    served.halt()
-    measured = np.concatenate([served.state.signals[name] for name in ("joint_position", "gripper_width")], axis=1)
-    np.testing.assert_array_equal(served.target(), measured)
+    base.tick()
+    np.testing.assert_array_equal(base.target(), np.zeros((1, 7)))
 
 
 def test_a_step_in_real_time_waits_for_the_clock(serve):
@@ -245,12 +263,6 @@ def test_a_halt_ends_a_step_that_is_waited_for_in_time(serve):
     assert states == [served.state]
 
 
-def test_a_clock_that_stands_still_is_an_error(serve):
-    served = serve(SimulatedArm(1), realtime=True, patience=0.01)
-    with pytest.raises(RemoteError, match=r"The clock of ur5e has stood still for 0.01 s\."):
-        served.step(command())
-
-
 class Failing(FakeRobot):
     def step(self, command):
         raise PhysicsDiverged("The simulated state of environments [0] is not finite. Reset them.")
@@ -259,36 +271,23 @@ class Failing(FakeRobot):
         yield self.step(command)
 
 
-@pytest.mark.parametrize("realtime", [False, True])
-def test_a_fault_stays_until_a_reset(serve, realtime):
-    served = serve(Failing(1), realtime=realtime)
-    if realtime:
+@pytest.mark.parametrize("mode", ["fast", "followed", "stepped"])
+def test_a_fault_reaches_the_step_that_waits_and_stays_until_a_reset(serve, mode):
+    served = serve(Failing(1), time.monotonic, realtime=mode != "fast")
+    clock = Ticker(served.tick, 0.001)
+    if mode == "followed":
         served.follow(command())
         served.tick()
         served.tick()
     else:
+        if mode == "stepped":
+            clock.start()
         with pytest.raises(PhysicsDiverged, match="not finite"):
             served.step(command())
+        clock.stop()
     assert str(served.fault) == "The simulated state of environments [0] is not finite. Reset them."
     served.reset(ROWS, initial())
     assert served.fault is None
-
-
-def test_a_fault_reaches_the_step_that_waits(serve):
-    served = serve(Failing(1), time.monotonic, realtime=True)
-    clock = Ticker(served.tick, 0.001)
-    clock.start()
-    with pytest.raises(PhysicsDiverged, match="not finite"):
-        served.step(command())
-    clock.stop()
-
-
-def test_wrong_commands_are_refused(serve):
-    served = serve(FakeRobot(1), realtime=True)
-    with pytest.raises(InvalidValue, match=r"must have shape \(1, 7\), not \(1, 6\)"):
-        served.step(np.zeros((1, 6)))
-    with pytest.raises(InvalidValue, match="finite"):
-        served.step(np.full((1, 7), np.nan))
 
 
 def test_the_scene_changes_and_the_arm_stays(serve):
@@ -298,19 +297,11 @@ def test_the_scene_changes_and_the_arm_stays(serve):
     served.place_object(np.array([[0.4, -0.1, 0.0]]), np.zeros(1, dtype=np.int64))
     np.testing.assert_allclose(served.state.signals["object_position"][0, :2], [0.4, -0.1])
     np.testing.assert_array_equal(served.state.signals["joint_position"], joints)
-
-
-def test_a_robot_without_a_scene_says_so(serve):
+    assert sorted(served.state_dict()) == ["command", "physics", "setpoint"]
+    assert not any(hasattr(served, name) for name in ("no_such_thing", "_no_such_thing"))
     served = serve(Without(FakeRobot(1), "place_object"))
     with pytest.raises(RemoteError, match=r"fake has no object that could be placed\."):
         served.place_object(np.zeros((1, 3)), np.zeros(1, dtype=np.int64))
-
-
-def test_what_else_the_robot_can_is_there(serve):
-    served = serve(SimulatedArm(1))
-    assert sorted(served.state_dict()) == ["command", "physics", "setpoint"]
-    assert not hasattr(served, "no_such_thing")
-    assert not hasattr(served, "_no_such_thing")
 
 
 def test_time_stands_still_before_the_first_reset_and_after_the_end(hands):

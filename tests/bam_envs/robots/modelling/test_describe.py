@@ -270,6 +270,7 @@ REFUSED = (
     "MuJoCo cannot read {}: Schema violation: unrecognized attribute: 'foo' Element 'option', line 1. Remedy: the "
     "file is for another version of MuJoCo: take it out."
 )
+NEAR = "Choose from: unitree_z1, unitree_h1, unitree_g1."
 MODEL = "Give an MJCF or URDF file, or menagerie:NAME."
 NEEDS_LIMITS = "{}: its joints have no position limits: add them to the file."
 
@@ -401,6 +402,43 @@ def scaled(text, factor):
             "{}: the joint 'w1' follows another; each joint needs a drive.",
         ),
         (
+            six_joints().replace('effort="20"/>', 'effort="20"/><mimic joint="pam"/>', 1),
+            GRIPPER,
+            None,
+            "{}: w1: its mimic 'pam' is no joint of the file. Did you mean 'pan'?",
+        ),
+        (
+            six_joints().replace('name="elbow"', 'name="pan"', 1),
+            GRIPPER,
+            None,
+            "{}: two joints are called 'pan': give each of them a name of its own.",
+        ),
+        (
+            six_joints().replace('<parent link="upper"', '<parent link="uper"', 1),
+            GRIPPER,
+            None,
+            "{}: elbow: its parent 'uper' is no link of the file. Did you mean 'upper'?",
+        ),
+        (
+            re.sub(r'<joint name="j1"', "<joint", seven_joints(), count=1),
+            GRIPPER,
+            None,
+            "{}: the joint of 'link1' has no name; give it that of the robot's messages.",
+        ),
+        (
+            "<mujoco><worldbody/></mujoco>",
+            GRIPPER,
+            None,
+            "{}: there is no body in it. Is it a part of another file? Then give that one.",
+        ),
+        (
+            seven_joints().replace("<worldbody>", '<include file="no.xml"/><worldbody>'),
+            GRIPPER,
+            None,
+            "MuJoCo cannot read {}: Error opening file 'no.xml' Element 'include', line 1. Remedy: put that file where "
+            "it is looked for, beside this one.",
+        ),
+        (
             seven_joints().replace(
                 "</worldbody>", '<body name="other"><joint name="o"/><geom size="0.1"/></body></worldbody>'
             ),
@@ -530,8 +568,43 @@ def test_a_speed_of_nothing_is_not_taken(tmp_path, speed, effort):
     assert read.effort == [effort, 80, 80, 20, 20, 20]
 
 
-def test_a_name_that_the_menagerie_does_not_have():
-    pytest.importorskip("mujoco_menagerie")
-    with pytest.raises(InvalidValue) as caught:
-        describe("lab", "menagerie:frnka_fr3", GRIPPER, None)
-    assert str(caught.value) == "menagerie:frnka_fr3: Unknown robot 'frnka_fr3'. Did you mean 'franka_fr3'?"
+def test_a_finger_that_follows_another_in_a_urdf(tmp_path):
+    """Half as far: the gripper opens to 4 + 2 cm, between pads that touch when it is closed."""
+    pad = '<geometry><box size="0.02 0.01 0.1"/></geometry>'
+    link = f'<link name="{{}}"><collision><origin xyz="0 {{}} 0.05"/>{pad}</collision></link>'
+    joint = (
+        '<joint name="{0}_slide" type="prismatic"><parent link="palm"/><child link="{0}"/><axis xyz="0 {1} 0"/>'
+        '<limit lower="0" upper="0.04" velocity="1" effort="1"/>{2}</joint>'
+    )
+    fingers = link.format("left", 0.005) + link.format("right", -0.005) + joint.format("left", 1, "")
+    follows = '<mimic joint="left_slide" multiplier="0.5"/>'
+    (tmp_path / "lab.urdf").write_text(six_joints(), encoding="utf-8")
+    text = f'<robot name="hand"><link name="palm"/>{fingers}{joint.format("right", -1, follows)}</robot>'
+    (tmp_path / "hand.urdf").write_text(text, encoding="utf-8")
+    read = read_arm(str(tmp_path / "lab.urdf"), str(tmp_path / "hand.urdf"), None)
+    assert read.width == pytest.approx(0.06)
+
+
+def test_a_urdf_with_prefixes_that_are_not_declared_and_with_xacro(tmp_path):
+    """As ROS reads them; a file with elements of xacro is expanded, whatever it is called."""
+    path, text = tmp_path / "lab.urdf", six_joints()
+    path.write_text(text, encoding="utf-8")
+    plain = read_arm(str(path), GRIPPER, None)
+    path.write_text(text.replace("<limit ", '<limit drake:acceleration="2.5" '), encoding="utf-8")
+    assert read_arm(str(path), GRIPPER, None).velocity == plain.velocity == [2.5] * 6
+    pytest.importorskip("xacrodoc")
+    space = '<robot xmlns:xacro="http://www.ros.org/wiki/xacro"'
+    text = text.replace("<robot", f"{space}", 1).replace('velocity="2.5"', 'velocity="${speed}"')
+    path.write_text(text.replace("<link", '<xacro:property name="speed" value="2.0"/><link', 1), encoding="utf-8")
+    assert read_arm(str(path), GRIPPER, None).velocity == [2.0] * 6
+
+
+@pytest.mark.parametrize(
+    ("name", "meant"), [(one, "Did you mean 'franka_fr3'?") for one in ("fr3", "frnka_fr3")] + [("nothere", NEAR)]
+)
+def test_a_name_that_the_menagerie_does_not_have(name, meant):
+    menagerie = pytest.importorskip("mujoco_menagerie")
+    with pytest.raises(UnknownName) as caught:
+        describe("lab", f"menagerie:{name}", GRIPPER, None)
+    listing = f"mujoco-menagerie names lists all {len(menagerie.names())}."
+    assert str(caught.value) == f"Unknown robot of menagerie {name!r}. {meant} {listing}"

@@ -12,6 +12,7 @@ from bam_envs.rosbridge.bus import ABORTED, CANCELED, SUCCEEDED, Action, Caller
 from bam_envs.rosbridge.encoding import split
 from bam_envs.rosbridge.server.bridge import Bridge
 from bam_envs.rosbridge.server.client_session import Call, Send, ServerOptions
+from tests.bam_envs.rosbridge.server.test_fuzz import receive
 
 JOINTS, FLOATS, TEXT, TRIGGER, SET_BOOL = (
     "sensor_msgs/JointState",
@@ -20,13 +21,6 @@ JOINTS, FLOATS, TEXT, TRIGGER, SET_BOOL = (
     "std_srvs/Trigger",
     "std_srvs/SetBool",
 )
-
-
-def receive(bridge, session, frame, now):
-    """Do what a frame of a client says, as a server does."""
-    text = bridge.take(session, bridge.read(frame), now)
-    if text is not None:
-        bridge.take(session, bridge.read(text, joined=True), now)
 
 
 class Peers:
@@ -168,12 +162,6 @@ def test_what_does_not_work_is_said_at_once(peers, title, fields, told):
     assert peers.take(client) == response({"success": False, "message": ""}, True, id=1)
 
 
-def test_an_operation_that_nobody_knows(peers):
-    (answer,) = peers.say(peers.client(), op="dance", id=4)
-    assert answer["msg"].startswith("dance: Unknown op 'dance'; expected one of advertise, ")
-    assert answer["id"] == 4
-
-
 # Actions.
 
 GRIP, GRIPPER = "control_msgs/action/GripperCommand", "/gripper/gripper_cmd"
@@ -267,11 +255,12 @@ def test_actions_are_listed(peers, goals):
     assert answers == [{"action_servers": [GRIPPER]}, {"type": "control_msgs/GripperCommand"}]
 
 
-def test_levels_of_status(peers):
+def test_an_operation_that_nobody_knows_and_levels_of_status(peers):
     client = peers.client()
     assert peers.say(client, {"op": "set_level", "level": "none"}, {"op": "dance"}) == []
-    (answer,) = peers.say(client, {"op": "set_level", "level": "info"}, {"op": "dance"})
-    assert answer["op"] == "status"
+    (answer,) = peers.say(client, {"op": "set_level", "level": "info"}, {"op": "dance", "id": 4})
+    assert answer["msg"].startswith("dance: Unknown op 'dance'; expected one of advertise, ")
+    assert (answer["op"], answer["id"]) == ("status", 4)
 
 
 # Topics.
@@ -302,27 +291,19 @@ def test_a_client_gets_each_message_once(peers):
     assert peers.bridge.topics.get("/t") is None
 
 
-def test_a_throttled_client_gets_the_newest_when_it_is_time(peers):
+@pytest.mark.parametrize(("queue", "kept"), [({}, "d"), ({"queue_length": 2}, "cd")])
+def test_a_throttled_client_gets_the_newest_in_order_when_it_is_time(peers, queue, kept):
     client = peers.client()
-    peers.say(client, op="subscribe", topic="/t", type=TEXT, throttle_rate=33.3)
-    assert peers.say(client, *[{"op": "publish", "topic": "/t", "msg": text(one)} for one in "abc"]) == [
-        published("/t", text("a"))
-    ]
-    assert peers.bridge.next_deadline == pytest.approx(100.0333)
-    peers.wait(0.0332)
-    assert peers.take(client) == []
-    peers.wait(0.0002)
-    assert peers.take(client) == [published("/t", text("c"))]
-    assert peers.bridge.next_deadline == math.inf
-
-
-def test_a_throttled_queue_keeps_the_last_ones_in_order(peers):
-    client = peers.client()
-    peers.say(client, op="subscribe", topic="/t", type=TEXT, throttle_rate=100, queue_length=2)
-    peers.say(client, *[{"op": "publish", "topic": "/t", "msg": text(one)} for one in "abcd"])
-    for one in "cd":
-        peers.wait(0.1)
+    peers.say(client, op="subscribe", topic="/t", type=TEXT, throttle_rate=33.3, **queue)
+    first = peers.say(client, *[{"op": "publish", "topic": "/t", "msg": text(one)} for one in "abcd"])
+    assert first == [published("/t", text("a"))]
+    for one in kept:
+        assert peers.bridge.next_deadline == pytest.approx(peers.now + 0.0333, abs=5e-4)
+        peers.wait(0.0331)
+        assert peers.take(client) == []
+        peers.wait(0.0003)
         assert peers.take(client) == [published("/t", text(one))]
+    assert peers.bridge.next_deadline == math.inf
 
 
 def test_a_topic_of_the_rate_that_is_asked_for_loses_nothing(peers):
@@ -492,24 +473,15 @@ def test_a_handler_that_fails_or_answers_wrongly_is_an_answer(caplog, handler, t
     assert peers.call(peers.client()) == response(told, False)
 
 
-def test_a_client_offers_a_service(peers):
-    robot, client = peers.client("robot"), peers.client("c")
+@pytest.mark.parametrize("is_own", [False, True])
+def test_a_client_offers_a_service(peers, is_own):
+    robot = peers.client("robot")
+    client = robot if is_own else peers.client("c")
     peers.say(robot, op="advertise_service", service="s", type="std_srvs/srv/SetBool")
-    peers.say(client, op="call_service", service="/s", args={"data": True}, id=9)
-    (call,) = peers.take(robot)
+    (call,) = peers.say(client, op="call_service", service="/s", args={"data": True}, id=9) + peers.take(robot)
     assert call == {"op": "call_service", "service": "s", "args": {"data": True}, "id": call["id"]}
-    assert (
-        peers.say(robot, op="service_response", id=call["id"], service="s", values={"success": True}, result=True) == []
-    )
-    assert peers.take(client) == response({"success": True, "message": ""}, True, id=9)
-
-
-def test_a_client_calls_its_own_service(peers):
-    robot = peers.client()
-    peers.say(robot, op="advertise_service", service="/s", type=TRIGGER)
-    (call,) = peers.say(robot, op="call_service", service="/s", id="me")
-    answer = peers.say(robot, op="service_response", id=call["id"], service="/s", values={"success": True}, result=True)
-    assert answer == response({"success": True, "message": ""}, True, id="me")
+    said = peers.say(robot, op="service_response", id=call["id"], service="s", values={"success": True}, result=True)
+    assert said + peers.take(client) == response({"success": True, "message": ""}, True, id=9)
 
 
 @pytest.mark.parametrize(
@@ -540,6 +512,8 @@ def test_a_silent_service_is_answered_for(peers):
     peers.say(client, op="call_service", service="/s", timeout=0.5)
     peers.say(client, op="call_service", service="/s")
     late = peers.take(robot)[0]
+    (told,) = peers.say(client, op="service_response", id=late["id"], service="/s", values={}, result=True)
+    assert told["op"] == "status"  # only the one who was asked may answer
     assert peers.bridge.next_deadline == 100.5
     peers.wait(0.5)
     assert peers.take(client) == response("Timeout exceeded: service /s did not answer in 0.5 s.", False)
@@ -559,15 +533,6 @@ def test_a_service_of_a_client_that_came_back_takes_the_place_of_the_old_one(pee
     assert len(peers.take(new)) == 1
     peers.bridge.lost(old)
     assert peers.bridge.services.get("/s").provider is new
-
-
-def test_only_the_one_who_was_asked_may_answer(peers):
-    robot, client = peers.client("robot"), peers.client("c")
-    peers.say(robot, op="advertise_service", service="/s", type=TRIGGER)
-    peers.say(client, op="call_service", service="/s")
-    (call,) = peers.take(robot)
-    (told,) = peers.say(client, op="service_response", id=call["id"], service="/s", values={}, result=True)
-    assert told["op"] == "status"
 
 
 def test_an_answer_for_someone_who_left_is_dropped(peers):

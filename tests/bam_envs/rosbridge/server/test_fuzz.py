@@ -164,9 +164,9 @@ class Fuzzed:
 @pytest.mark.parametrize("seed", range(3))
 def test_nonsense_is_survived_and_forgotten(seed):
     fuzzed = Fuzzed(seed)
-    fuzzed.run(10_000)
-    assert fuzzed.robot.heard > 50
-    assert fuzzed.frames > 10_000
+    fuzzed.run(4_000)
+    assert fuzzed.robot.heard > 20
+    assert fuzzed.frames > 4_000
     fuzzed.leave()
     assert list(fuzzed.bridge.topics) == ["/command"]
     assert [name for name in fuzzed.bridge.services if not name.startswith("/rosapi/")] == ["/trigger"]

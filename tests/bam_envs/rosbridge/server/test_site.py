@@ -38,17 +38,12 @@ SITE = Site({"/": Page("text/html; charset=utf-8", b"<p>hello")}, {"/echo": echo
 
 
 @pytest.fixture
-def new_server():
-    made = []
-
+def new_server(stack):
     def make(tokens=None, site=SITE, **options):
         tokens = tokens or Tokens(otherwise="administer")
-        made.append(BridgeServer(port=0, tokens=tokens, site=site, **options).start())
-        return made[-1]
+        return stack.enter_context(BridgeServer(port=0, tokens=tokens, site=site, **options))
 
-    yield make
-    for server in made:
-        server.close()
+    return make
 
 
 def get(server, path, **headers):
@@ -291,6 +286,7 @@ def test_over_tls_the_origin_is_https(new_server, certificates):
     cert, _ = certificates("127.0.0.1")
     server = new_server(ROLES, cert=cert, key=cert.replace("cert.pem", "key.pem"))
     own, tls = f"127.0.0.1:{server.port}", ssl.create_default_context(cafile=cert)
+    assert server.url == f"wss://{own}"
 
     async def first_message(origin):
         # Not the client of `websockets.sync`: its two threads use one TLS object, which is not safe.

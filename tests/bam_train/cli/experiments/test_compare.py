@@ -10,11 +10,7 @@ import pytest
 from bam_train.cli.experiments.compare import main
 from bam_train.experiments.seed_statistics import METHOD
 
-
-@pytest.fixture(autouse=True)
-def here(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    return tmp_path
+pytestmark = pytest.mark.usefixtures("here")
 
 
 def write_row(folder, finals, env="bam/pick-v0", first=0, **settings):

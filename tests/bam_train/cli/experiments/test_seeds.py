@@ -12,9 +12,6 @@ import pytest
 
 from bam_train.checkpoint import Checkpoint
 from bam_train.cli.experiments import seeds
-from bam_train.cli.flags import TrainConfig
-from bam_train.cli.program import guarded
-from bam_train.cli.train import train
 from bam_train.errors import FolderInUse
 from bam_train.experiments.seed_runs import News, group_folder
 from bam_train.settings import TrainSettings
@@ -25,21 +22,7 @@ SHORT = ("--env", "CartPole-v1", "--algo", "ppo", "--num-envs", "1", "--eval-eve
 QUICK = ("--set", "n_steps=64", "--set", "n_epochs=1", "--set", "policy_kwargs.net_arch=[8]")
 
 
-@pytest.fixture(autouse=True)
-def here(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    return tmp_path
-
-
-@pytest.fixture
-def bam_train(capsys):
-    """Runs the program in this process; its status and the lines of its standard error."""
-
-    def run(**flags):
-        status = guarded(lambda: train(TrainConfig(**{**BASE, **flags})), "bam-train")
-        return status, capsys.readouterr().err.splitlines()
-
-    return run
+pytestmark = pytest.mark.usefixtures("here")
 
 
 @pytest.mark.parametrize(
@@ -58,7 +41,7 @@ def bam_train(capsys):
     ],
 )
 def test_what_is_refused_leaves_nothing(bam_train, here, flags, line):
-    assert bam_train(**{"seeds": "0..4", **flags}) == (1, [f"bam-train: {line}"])
+    assert bam_train(**{"seeds": "0..4", **flags}) == (1, "", f"bam-train: {line}\n")
     assert list(here.iterdir()) == []
 
 
@@ -85,7 +68,8 @@ def test_the_summary_and_a_second_call_that_does_what_is_missing(bam_train, monk
     monkeypatch.setattr(seeds, "SeedProcess", Trained)
     Path("runs/CartPole-v1-ppo").mkdir(parents=True)
     Path("runs/CartPole-v1-ppo/config.json").write_text('{"seed": 0}')
-    status, lines = bam_train(seeds="0..3")
+    status, _, err = bam_train(seeds="0..3")
+    lines = err.splitlines()
     assert status == 1
     assert lines[1:3] == ["seed 0: done: all steps done, 1024 steps, return 100", "seed 1: failed: rewards are NaN"]
     start = lines.index("seed  steps  time   success  return")
@@ -104,20 +88,20 @@ def test_the_summary_and_a_second_call_that_does_what_is_missing(bam_train, monk
         "bam-train: seed 2: nothing was learnt in 1,024 steps: return 9, and the goal is 475",
     ]
     assert Path("checkpoints/CartPole-v1-ppo.zip").read_bytes() == b"checkpoint 3"
-    assert "  best of all   checkpoints/CartPole-v1-ppo.zip (seed-5)" in bam_train(seeds="5")[1]
+    assert "  best of all   checkpoints/CartPole-v1-ppo.zip (seed-5)" in bam_train(seeds="5")[2].splitlines()
     assert Path("checkpoints/CartPole-v1-ppo.zip").read_bytes() == b"checkpoint 5"
     assert [one.name for one in Path("checkpoints").iterdir()] == ["CartPole-v1-ppo.zip"]
     monkeypatch.setattr(Trained, "news", lambda self: News([], 1, "again"))
-    status, lines = bam_train(seeds="1,4", out=Path("a.zip"))
+    status, _, err = bam_train(seeds="1,4", out=Path("a.zip"))
     assert status == 1
-    assert lines[1:3] == ["seed 1: failed: again", "seed 4: failed: again"]
+    assert err.splitlines()[1:3] == ["seed 1: failed: again", "seed 4: failed: again"]
     assert Path("runs/CartPole-v1-ppo/config.json").read_text() == '{"seed": 0}'
     assert sorted(one.name for one in Path("runs").iterdir()) == ["CartPole-v1-ppo", "CartPole-v1-ppo-2"]
 
 
 def test_two_calls_do_not_train_the_same_seeds(here):
     settings = TrainSettings(env="CartPole-v1", algo="ppo")
-    text = "runs/CartPole-v1-ppo: another bam-train trains its seeds, or its runs are being saved. Wait for its end"
+    text = "runs/CartPole-v1-ppo: another program trains its seeds, or its runs are being saved. Wait for its end"
     again = group_folder(Path("runs"), settings)
     with group_folder(Path("runs"), settings), pytest.raises(FolderInUse) as error:
         again.__enter__()

@@ -3,7 +3,7 @@ import torch
 from torch.utils.data import DataLoader, TensorDataset
 
 from bam_train.compat.bbrl.dataset_agents import DataLoaderAgent, ShuffledDatasetAgent
-from bam_train.errors import WorkspaceError
+from bam_train.errors import LoopError
 from bam_train.loop import Workspace
 
 DATA = TensorDataset(torch.arange(10.0).reshape(5, 2), torch.arange(5))
@@ -61,7 +61,7 @@ def test_a_batch_is_one_tensor():
     ],
 )
 def test_too_few_values(batch, message):
-    with pytest.raises(WorkspaceError) as caught:
+    with pytest.raises(LoopError) as caught:
         run(DataLoaderAgent([batch]))
     assert str(caught.value) == message
 
@@ -89,11 +89,11 @@ def test_unseeded_it_draws_from_torchs_global_generator():
 
 
 def test_an_empty_dataset():
-    with pytest.raises(WorkspaceError, match=r"^The dataset is empty: there is nothing to draw from"):
+    with pytest.raises(LoopError, match=r"^The dataset is empty: there is nothing to draw from"):
         run(ShuffledDatasetAgent([], 2))
 
 
 @pytest.mark.parametrize("seed", [-1, "a", 1.5])
 def test_seeds_are_natural_numbers(seed):
-    with pytest.raises(WorkspaceError, match=r"^seed: expected a whole number of at least 0.*, found"):
+    with pytest.raises(LoopError, match=r"^seed: expected a whole number of at least 0.*, found"):
         ShuffledDatasetAgent(DATA, 2).seed(seed)

@@ -17,7 +17,7 @@ from remote_test_agents import Trouble, Walker
 
 from bam_train.compat.bbrl.remote_agents import NRemoteAgent, RemoteAgent
 from bam_train.compat.bbrl.shared_workspace import shared_workspace
-from bam_train.errors import LoopError, RemoteAgentError, WorkspaceError
+from bam_train.errors import LoopError, RemoteAgentError
 from bam_train.loop import Agent, Agents, ParallelGymAgent, SeedableAgent, TemporalAgent, Workspace, make_env
 
 pytestmark = [
@@ -193,9 +193,9 @@ def test_an_agent_that_is_seeded_already():
 
 
 def test_create_refuses_what_it_cannot_share():
-    with pytest.raises(WorkspaceError, match=r"^The workspace is empty: there is nothing to share"):
+    with pytest.raises(LoopError, match=r"^The workspace is empty: there is nothing to share"):
         NRemoteAgent.create(Agents(), 1)
-    with pytest.raises(WorkspaceError, match=r"^num_processes: expected at least 0, found -1\.$"):
+    with pytest.raises(LoopError, match=r"^num_processes: expected at least 0, found -1\.$"):
         NRemoteAgent.create(Walker(), -1, t=0)
 
 
@@ -203,15 +203,11 @@ def test_workspaces_that_do_not_fit(created, started):
     remote, _ = created(Walker(), t=0)
     narrow = Workspace()
     Walker()(narrow, t=0)
-    with pytest.raises(
-        WorkspaceError, match=r"^NRemoteAgent needs the shared workspace that NRemoteAgent\.create made"
-    ):
+    with pytest.raises(LoopError, match=r"^NRemoteAgent needs the shared workspace that NRemoteAgent\.create made"):
         remote(narrow, t=0)
-    with pytest.raises(WorkspaceError, match=r"^Expected a shared workspace of 4 columns, found 2\.$"):
+    with pytest.raises(LoopError, match=r"^Expected a shared workspace of 4 columns, found 2\.$"):
         remote(shared_workspace(narrow), t=0)
-    with pytest.raises(
-        WorkspaceError, match=r"^RemoteAgent 'far' needs a shared workspace; NRemoteAgent\.create makes"
-    ):
+    with pytest.raises(LoopError, match=r"^RemoteAgent 'far' needs a shared workspace; NRemoteAgent\.create makes"):
         started(name="far")[0](narrow, t=0)
     assert multiprocessing.active_children() == []
 

@@ -3,7 +3,7 @@ import pytest
 import torch
 
 from bam_train.compat.bbrl.shared_workspace import SharedWorkspace, shared_workspace
-from bam_train.errors import TimeNotWritten, UnknownVariable, ValueMismatch, WorkspaceError
+from bam_train.errors import LoopError, TimeNotWritten, UnknownVariable
 from bam_train.loop import Workspace
 
 KINDS = {"tensor": torch.tensor, "numpy": np.array}
@@ -98,35 +98,35 @@ def test_what_is_made_from_it_is_an_ordinary_workspace(array):
     [
         (
             lambda shared, x: shared.set("y", 0, x),
-            WorkspaceError,
+            LoopError,
             "'y' cannot be added to a shared workspace, which has 'x', 'done'.",
         ),
         (
             lambda shared, x: shared.set_full("y", x),
-            WorkspaceError,
+            LoopError,
             "'y' cannot be added to a shared workspace, which has 'x', 'done'.",
         ),
         (
             lambda shared, x: shared.set("x", 3, x),
-            WorkspaceError,
+            LoopError,
             "'x' at t=3: a shared workspace has a fixed length, and this one has 3 times; make it as long as the run: "
             "NRemoteAgent.create(..., time_size=...), 4 at least.",
         ),
         (lambda shared, x: shared.set("x", -4, x), TimeNotWritten, "'x' is not written at t=-4; it has times 0 to 2."),
         (
             lambda shared, x: shared.set_full("x", shared["x"][[0, 0, 0, 0]]),
-            WorkspaceError,
+            LoopError,
             "'x' at t=3: a shared workspace has a fixed length, and this one has 3 times; make it as long as the run: "
             "NRemoteAgent.create(..., time_size=...), 4 at least.",
         ),
-        (lambda shared, x: shared.set("x", 0, x[:1]), ValueMismatch, "'x' at t=0: expected shape (2,), found (1,)."),
+        (lambda shared, x: shared.set("x", 0, x[:1]), LoopError, "'x' at t=0: expected shape (2,), found (1,)."),
         (
             lambda shared, x: shared.set_full("x", shared["x"][:, :1]),
-            ValueMismatch,
+            LoopError,
             "'x' at all times: expected shape (2,), found (1,).",
         ),
-        (lambda shared, x: shared.clear(), WorkspaceError, "A shared workspace cannot be cleared"),
-        (lambda shared, x: shared.remove_variable("x"), WorkspaceError, "'x' cannot be removed from a shared"),
+        (lambda shared, x: shared.clear(), LoopError, "A shared workspace cannot be cleared"),
+        (lambda shared, x: shared.remove_variable("x"), LoopError, "'x' cannot be removed from a shared"),
         (lambda shared, x: shared.get("y", 0), UnknownVariable, "'y' is not in the workspace."),
     ],
 )
@@ -141,9 +141,9 @@ def test_what_is_fixed(array, change, error, message):
 
 def test_other_dtypes_are_refused():
     shared = shared_workspace(written(torch.tensor))
-    with pytest.raises(ValueMismatch, match=r"^'x' at t=0: expected dtype torch.float32, found torch.int64\.$"):
+    with pytest.raises(LoopError, match=r"^'x' at t=0: expected dtype torch.float32, found torch.int64\.$"):
         shared.set("x", 0, torch.tensor([1, 2]))
-    with pytest.raises(ValueMismatch, match=r"^'x' at all times: expected dtype torch.float32, found torch.int64\.$"):
+    with pytest.raises(LoopError, match=r"^'x' at all times: expected dtype torch.float32, found torch.int64\.$"):
         shared.set_full("x", torch.zeros(3, 2, dtype=torch.int64))
 
 
@@ -157,6 +157,6 @@ def test_other_dtypes_are_refused():
     ],
 )
 def test_what_cannot_be_shared(workspace, kwargs, message):
-    with pytest.raises(WorkspaceError) as caught:
+    with pytest.raises(LoopError) as caught:
         shared_workspace(workspace, **kwargs)
     assert str(caught.value).startswith(message)

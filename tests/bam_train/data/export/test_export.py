@@ -7,12 +7,12 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from bam_envs.core.spaces import mapped
 from bam_envs.testing.assertions import assert_same_value
 from bam_train.data import DataSet, DataSetInfo, DataSetWriter, Episode
 from bam_train.data.export import export
 from bam_train.errors import OutputError, SettingsError
 from bam_train.recording.recording import Recording
+from tests.bam_train.data.episode_samples import samples
 
 pytest.importorskip("pyarrow")
 BOX, CAMERA = gym.spaces.Box(-9, 9, (3,), np.float32), gym.spaces.Box(0, 255, (4, 5, 3), np.uint8)
@@ -22,10 +22,6 @@ SPACES = {
     "picture": (CAMERA, gym.spaces.Box(-1, 1, (2,), np.float32)),
     "nested": (gym.spaces.Dict({"camera": CAMERA, "arm": BOX}), gym.spaces.Box(-1, 1, (2,), np.float32)),
 }
-
-
-def drawn(space, count):
-    return mapped(lambda part: np.stack([np.asarray(part.sample(), part.dtype) for _ in range(count)]), space)
 
 
 def record(place, kind="box", count=6, **columns):
@@ -40,8 +36,8 @@ def record(place, kind="box", count=6, **columns):
             steps = 3 + number
             writer.add(
                 Episode(
-                    drawn(observation, steps + 1),
-                    drawn(action, steps),
+                    samples(observation, steps + 1),
+                    samples(action, steps),
                     rng.normal(size=steps),
                     number % 2 == 0,
                     number % 2 == 1,

@@ -14,7 +14,7 @@ from bam_train.loop import ParallelGymAgent, VecGymAgent, Workspace, make_env
 bbrl_gymnasium = pytest.importorskip("bbrl.agents.gymnasium")
 bbrl_workspace = pytest.importorskip("bbrl.workspace")
 
-STEPS = 150
+STEPS = 70  # at least two ends of each environment with a time limit of 20 or 30
 # Warnings of BBRL, and of Gymnasium's checker about the small environments.
 pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("ignore")]
 
@@ -45,15 +45,15 @@ def discrete(n, choices):
     return act
 
 
-def compare(make, n, act, runs=2, seed=None, **kwargs):
+def compare(make, n, act, runs=2, seed=None, steps=STEPS, **kwargs):
     """Both agents over several runs; `make` makes one environment."""
     agents = bbrl_gymnasium.ParallelGymAgent(make, n, **kwargs), ParallelGymAgent(make, n, **kwargs)
     if seed is not None:
         for agent in agents:
             agent.seed(seed)
     for _ in range(runs):
-        theirs = play(agents[0], bbrl_workspace.Workspace(), act)
-        ours = play(agents[1], Workspace(), act)
+        theirs = play(agents[0], bbrl_workspace.Workspace(), act, steps)
+        ours = play(agents[1], Workspace(), act, steps)
         assert_same(ours, theirs)
     return ours
 
@@ -137,7 +137,7 @@ def test_nested_dicts_images_and_kinds_of_rewards(reward, wrap):
             "action/stop": torch.randint(2, (3,), generator=generator),
         }
 
-    compare(lambda: wrap(Nested(reward)), 3, act)
+    compare(lambda: wrap(Nested(reward)), 3, act, steps=40)  # an episode has at most 7
 
 
 def test_going_on_in_one_workspace():

@@ -8,7 +8,7 @@ import pytest
 import torch
 from gymnasium import spaces
 
-from bam_train.errors import LoopError, UnknownVariable, ValueMismatch
+from bam_train.errors import LoopError, UnknownVariable
 from bam_train.loop import ParallelGymAgent, Workspace
 
 BOX = spaces.Box(-1, 1, (2,), np.float32)
@@ -21,7 +21,7 @@ def agent_of(toys, observation, space, n=2, **kwargs):
 
 
 def refused(text):
-    return pytest.raises(ValueMismatch, match=f"^{re.escape(text)}$")
+    return pytest.raises(LoopError, match=f"^{re.escape(text)}$")
 
 
 @pytest.mark.parametrize(

@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from bam_train.errors import UnknownVariable, ValueMismatch, WorkspaceError
+from bam_train.errors import LoopError, UnknownVariable
 from bam_train.loop import Workspace
 from bam_train.loop.workspace.replay_buffer import ReplayBuffer
 
@@ -84,36 +84,36 @@ def state(buffer):
     [
         (
             full(x=torch.zeros(3, 1), done=torch.zeros(3, 1) > 0),
-            ValueMismatch,
+            LoopError,
             "'x' in the replay buffer: expected time size 2, found 3.",
         ),
         (
             full(x=torch.zeros(2, 1), done=torch.zeros(2, 1, 1) > 0),
-            ValueMismatch,
+            LoopError,
             "'done' in the replay buffer: expected shape (), found (1,).",
         ),
         (
             full(x=torch.zeros(2, 1), done=torch.zeros(2, 1)),
-            ValueMismatch,
+            LoopError,
             "'done' in the replay buffer: expected dtype torch.bool, found torch.float32.",
         ),
         (full(x=torch.zeros(2, 1)), UnknownVariable, "'done' is not in the workspace. It has 'x'."),
         (
             full(x=torch.zeros(2, 1), done=torch.zeros(2, 1) > 0, new=torch.zeros(2, 1)),
-            WorkspaceError,
+            LoopError,
             "'new' is not in the replay buffer, which has 'done', 'x' since the first put.",
         ),
         (
             full(x=torch.zeros(2, 1), done=torch.zeros(2, 2) > 0),
-            WorkspaceError,
+            LoopError,
             "The variables have different batch sizes: 'x' has 1, 'done' has 2.",
         ),
         (
             full(x=torch.zeros(2), done=torch.zeros(2, 2) > 0),
-            ValueMismatch,
+            LoopError,
             "'x' in the replay buffer: expected T x N x ..., found shape (2,).",
         ),
-        (Workspace(), WorkspaceError, "The workspace is empty: there is nothing to put into the replay buffer."),
+        (Workspace(), LoopError, "The workspace is empty: there is nothing to put into the replay buffer."),
     ],
 )
 def test_a_put_that_does_not_fit_changes_nothing(workspace, error, message):
@@ -128,18 +128,16 @@ def test_a_put_that_does_not_fit_changes_nothing(workspace, error, message):
 
 def test_a_first_put_that_does_not_fit_changes_nothing():
     buffer = ReplayBuffer(3)
-    with pytest.raises(WorkspaceError):
+    with pytest.raises(LoopError):
         buffer.put(full(x=torch.zeros(2, 1), y=torch.zeros(2, 2)))
     assert buffer.variables == {}
 
 
 def test_an_empty_buffer_says_so():
-    with pytest.raises(
-        WorkspaceError, match=r"^The replay buffer is empty: put transitions into it before drawing from"
-    ):
+    with pytest.raises(LoopError, match=r"^The replay buffer is empty: put transitions into it before drawing from"):
         ReplayBuffer(3).get_shuffled(1)
 
 
 def test_a_buffer_has_room_for_a_row():
-    with pytest.raises(WorkspaceError, match=r"^max_size: expected at least 1, found 0\.$"):
+    with pytest.raises(LoopError, match=r"^max_size: expected at least 1, found 0\.$"):
         ReplayBuffer(0)

@@ -9,9 +9,6 @@ pytest.importorskip("torch")
 
 from bam_envs.robots.physics.rendering import RenderingUnavailable, find_backend
 from bam_train.checkpoint import Checkpoint
-from bam_train.cli.flags import TrainConfig
-from bam_train.cli.program import guarded
-from bam_train.cli.train import train
 from bam_train.evaluation import evaluate
 from bam_train.policy import FrozenPolicy
 from bam_train.trainers.learning.dagger import DaggerTrainer
@@ -21,26 +18,12 @@ PICK_PPO = Path(__file__).parents[4] / "checkpoints" / "pick-ppo.zip"
 TINY = ("width=16", "channels=2", "batch_size=16", "env_kwargs.image_size=16", "env_kwargs.action_delay=1")
 
 
-@pytest.fixture(autouse=True)
-def here(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-
-
-@pytest.fixture
-def bam_train(capsys):
-    """Runs the program in this process; its status, and standard error."""
-
-    def run(**flags):
-        flags |= {name: Path(flags[name]) for name in ("out", "resume") if name in flags}
-        status = guarded(lambda: train(TrainConfig(**flags)), "bam-train")
-        return status, capsys.readouterr().err
-
-    return run
+pytestmark = pytest.mark.usefixtures("here")
 
 
 def test_a_scripted_teacher_is_imitated(bam_train):
     options = ("width=64", "passes=8", "learning_rate=3e-3")
-    status, _ = bam_train(
+    status, *_ = bam_train(
         env="bam/reach", algo="dagger", teacher="scripted", steps=2048, num_envs=64, eval_episodes=20, set=options
     )
     assert status == 0
@@ -61,7 +44,7 @@ def test_a_teacher_that_sees_the_state_teaches_one_that_sees_images(bam_train):
     assert len(made.manifest.signals["observation"]) == 16 + 2
     policy = FrozenPolicy.from_checkpoint(made)  # its actions are those of the trainer
     assert evaluate(policy, "bam/pick-v0", made.manifest.env_kwargs, episodes=2).episodes == 2
-    status, err = bam_train(resume=made.path, steps=128, out="more.zip")
+    status, _, err = bam_train(resume=made.path, steps=128, out="more.zip")
     assert status == 0
     assert "the steps that were learnt from are not saved" in err
     assert Checkpoint.open("more.zip").manifest.steps == 128
@@ -104,6 +87,6 @@ def test_whole_numbers_are_learnt_as_choices(monkeypatch):
     ],
 )
 def test_teachers_that_cannot_teach_are_refused(bam_train, flags, text):
-    status, err = bam_train(env="bam/pick", set=("env_kwargs.camera=null", "env_kwargs.looks=fixed"), **flags)
+    status, _, err = bam_train(env="bam/pick", set=("env_kwargs.camera=null", "env_kwargs.looks=fixed"), **flags)
     assert status != 0
     assert text in err

@@ -101,7 +101,9 @@ def test_weights_that_are_not_finite_are_neither_pushed_nor_saved(settings, tmp_
     assert not (tmp_path / "broken.zip").exists()
 
 
-def test_the_first_policy_is_a_copy(settings):
+def test_the_first_policy_is_a_copy(settings, monkeypatch):
+    for name, fewer in (("_STEPS", 50), ("_FITS", 600)):
+        monkeypatch.setattr(f"bam_train.trainers.learning.live_learner.{name}", fewer)
     learner = LiveLearner.create(settings())
 
     class Difference:

@@ -13,7 +13,7 @@ from bam_train.agent.front.agent_socket import AgentSocket
 from bam_train.agent.remote.agent_protocol import PATH, encode_message
 from bam_train.agent.transitions import encode
 from bam_train.checkpoint import Checkpoint
-from bam_train.errors import AgentRefused, SettingsError
+from bam_train.errors import RequestRefused, SettingsError
 from bam_train.policy import FrozenPolicy
 from bam_train.trainers.learning.live_session import learn, live_settings
 
@@ -193,7 +193,7 @@ def test_the_second_learner_is_refused(hub, tmp_path):
         until(lambda: hub.listeners)
         second = Learning(server.url, tmp_path / "second")
         second.join(DEADLINE)
-        assert isinstance(second.error, AgentRefused)
+        assert isinstance(second.error, RequestRefused)
         assert str(second.error).endswith("learns from this robot already, and there is one learner at a time.")
         assert second.error.exit_status == 3
         assert first.end() is False
@@ -203,10 +203,7 @@ def test_the_second_learner_is_refused(hub, tmp_path):
     ("given", "message"),
     [
         ({}, "env: expected a name, found nothing. Give --env NAME, that of the agent's checkpoint"),
-        (
-            {"env": ENV, "algo": "ppo"},
-            "--learner: the algorithm of a learner is rlpd; leave --algo and --trainer out",
-        ),
+        ({"env": ENV, "algo": "ppo"}, "--learner: the algorithm of a learner is rlpd; leave --algo and --trainer out"),
         (
             {"env": ENV, "transport": ["tcp://a:1"]},
             "--learner and --transport exclude each other: it learns from the agent's robot; give one",

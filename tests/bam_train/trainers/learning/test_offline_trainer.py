@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 from importlib.util import find_spec
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,9 +13,6 @@ pytest.importorskip("torch")
 pytest.importorskip("pyarrow")
 
 from bam_train.checkpoint import Checkpoint
-from bam_train.cli.flags import TrainConfig
-from bam_train.cli.program import guarded
-from bam_train.cli.train import train
 from bam_train.data import DataSet, DataSetInfo, DataSetWriter, Episode
 from bam_train.policy import FrozenPolicy
 from bam_train.trainers.resolve_settings import resolve
@@ -26,24 +22,7 @@ ACTED = spaces.Box(np.float32([-1, 0]), np.float32([1, 10]))
 TINY = ("width=16", "batch_size=32")
 
 
-@pytest.fixture(autouse=True)
-def here(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    return tmp_path
-
-
-@pytest.fixture
-def bam_train(capsys):
-    """Runs the program in this process; its status, and standard error."""
-
-    def run(**flags):
-        flags |= {name: Path(flags[name]) for name in ("out", "resume") if name in flags}
-        status = guarded(lambda: train(TrainConfig(**flags)), "bam-train")
-        out, err = capsys.readouterr()
-        assert out == ""
-        return status, err
-
-    return run
+pytestmark = pytest.mark.usefixtures("here")
 
 
 def record(place, *, action_space=ACTED, env="elsewhere/Point-v0", episodes=8, steps=20, bad=0.0):
@@ -79,7 +58,7 @@ def test_a_run_without_a_preset_has_so_many_updates():
 
 def test_cloning_needs_no_environment(bam_train):
     data = record("points")
-    status, err = bam_train(data="points", algo="bc", steps=600, set=(*TINY, "learning_rate=1e-2"))
+    status, _, err = bam_train(data="points", algo="bc", steps=600, set=(*TINY, "learning_rate=1e-2"))
     assert status == 0
     assert "elsewhere/Point-v0 is not here: no evaluation in simulation" in err
     policy = FrozenPolicy.load("checkpoints/elsewhere-Point-v0-offline-bc.zip")
@@ -100,7 +79,7 @@ def test_resumed_is_the_same_as_unbroken(bam_train, algo):
     broken = OfflineTrainer.create(settings)
     broken.train(200, lambda progress: progress.steps < 150)
     broken.save("broken.zip", {}, {})
-    status, _ = bam_train(resume="broken.zip", out="again.zip")
+    status, *_ = bam_train(resume="broken.zip", out="again.zip")
     assert status == 0
     first, second = (Checkpoint.open(name) for name in ("whole.zip", "again.zip"))
     assert first.read("bam/golden.safetensors") == second.read("bam/golden.safetensors")
@@ -109,7 +88,7 @@ def test_resumed_is_the_same_as_unbroken(bam_train, algo):
 def test_implicit_q_learning_finds_the_better_actions_of_bad_data(bam_train):
     record("choices", action_space=spaces.Discrete(3, start=5), bad=0.8, episodes=30)
     flags = ("critic_width=32", "width=32", "advantage_scale=3", "gamma=0.5", "learning_rate=1e-2")
-    status, _ = bam_train(data="choices", algo="iql", steps=800, set=flags, out="iql.zip")
+    status, *_ = bam_train(data="choices", algo="iql", steps=800, set=flags, out="iql.zip")
     assert status == 0
     seen = np.random.default_rng(1).uniform(-1, 1, (200, 2)).astype(np.float32)
     seen = seen[np.abs(seen[:, 0]) > 0.2]
@@ -119,7 +98,7 @@ def test_implicit_q_learning_finds_the_better_actions_of_bad_data(bam_train):
 @pytest.mark.skipif(find_spec("d3rlpy") is None, reason="needs d3rlpy")
 def test_an_algorithm_of_d3rlpy_gives_the_same_kind_of_checkpoint(bam_train):
     record("points")
-    status, err = bam_train(data="points", algo="td3bc", steps=60, set=("batch_size=16",), out="a.zip")
+    status, _, err = bam_train(data="points", algo="td3bc", steps=60, set=("batch_size=16",), out="a.zip")
     assert status == 0
     assert "Gym" not in err
     checkpoint = Checkpoint.open("a.zip")
@@ -129,7 +108,7 @@ def test_an_algorithm_of_d3rlpy_gives_the_same_kind_of_checkpoint(bam_train):
     assert Checkpoint.open("b.zip").manifest.steps == 80
     assert (
         "Unknown td3bc hyperparameter 'alfa'. Did you mean 'alpha'?"
-        in bam_train(data="points", algo="td3bc", set=("alfa=1",))[1]
+        in bam_train(data="points", algo="td3bc", set=("alfa=1",))[2]
     )
 
 
@@ -140,13 +119,13 @@ def test_offline_to_online(bam_train):
     small = ("width=16", "critic_width=16", "batch_size=32")
     flags = {"data": "reach", "algo": "iql", "steps": 40, "eval_episodes": 2, "set": small, "out": "a.zip"}
     assert bam_train(**flags)[0] == 0
-    status, err = bam_train(resume="a.zip", env="bam/reach", steps=200, eval_every=80, out="b.zip")
+    status, _, err = bam_train(resume="a.zip", env="bam/reach", steps=200, eval_every=80, out="b.zip")
     assert (status, "the best so far" in err) == (0, True)
     going = Checkpoint.open("runs/reach-offline-iql-2/last.zip").manifest
     assert (going.steps, going.settings["hyperparameters"]["online_from"]) == (200, 40)
     assert bam_train(resume="runs/reach-offline-iql-2/last.zip", steps=240)[0] == 0
     bam_train(**{**flags, "algo": "bc", "out": "bc.zip", "set": ("width=16",)})
-    err = bam_train(resume="bc.zip", env="bam/reach", steps=100)[1]
+    err = bam_train(resume="bc.zip", env="bam/reach", steps=100)[2]
     text = "was trained by bc, from which no run goes online: leave --env out, or train with --algo iql first"
     assert err == f"bam-train: bc.zip: {text}\n"
 
@@ -163,7 +142,7 @@ def test_offline_to_online(bam_train):
 )
 def test_what_cannot_be_is_one_line(bam_train, flags, text):
     record("points")
-    status, err = bam_train(**{"data": "points", "algo": "bc", **flags})
+    status, _, err = bam_train(**{"data": "points", "algo": "bc", **flags})
     lines = [line for line in err.splitlines() if not line.endswith("is loaded, which takes a few seconds")]
     assert (status, len(lines)) == (1, 1)
     assert text in err
@@ -174,4 +153,4 @@ def test_the_same_episodes_are_needed_to_go_on(bam_train):
     assert bam_train(data="points", algo="bc", steps=20, set=TINY, out="a.zip")[0] == 0
     record("others", steps=7)
     text = r"a.zip: was trained on an episode \(\w{12}\) that others does not have; give the data set it was trained on"
-    assert re.search(text, bam_train(resume="a.zip", data="others", steps=40)[1])
+    assert re.search(text, bam_train(resume="a.zip", data="others", steps=40)[2])

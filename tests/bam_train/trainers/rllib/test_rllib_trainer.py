@@ -98,10 +98,7 @@ def _require_equal(one, other):
 
 @pytest.mark.parametrize(
     ("name", "hyper"),
-    [
-        ("ppo", {"train_batch_size_per_learner": 100, "num_epochs": 1}),
-        ("dqn", {"epsilon": [[0, 1.0], [10000, 0.05]]}),
-    ],
+    [("ppo", {"train_batch_size_per_learner": 100, "num_epochs": 1}), ("dqn", {"epsilon": [[0, 1.0], [10000, 0.05]]})],
 )
 def test_training_goes_on_from_a_directory_of_rllib(name, hyper, rllib_directories, tmp_path):
     """Of its present API: settings, weights, filter and counters are the directory's."""

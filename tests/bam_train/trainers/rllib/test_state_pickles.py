@@ -144,10 +144,7 @@ def test_packed_arrays():
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        (
-            packed(np.array([Call(os.system, "exit 7")], object)),
-            "a packed array cannot be read: Object arrays",
-        ),
+        (packed(np.array([Call(os.system, "exit 7")], object)), "a packed array cannot be read: Object arrays"),
         ("!", "a packed array cannot be read: "),
         (base64.b64encode(b"not zlib").decode(), "a packed array cannot be read: "),
         (packed(np.zeros(100))[:40], "a packed array cannot be read: "),
