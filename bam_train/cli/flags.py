@@ -43,6 +43,7 @@ _METAVARS = {
     "address": "auto|HOST:PORT",
     "data": "PLACE",
     "start": "CHECKPOINT",
+    "coarse_physics": "True|False",
     "teacher": "PLACE|scripted",
     "transport": "URL,...",
     "ca_file": "FILE",
@@ -178,7 +179,7 @@ class TrainConfig(SettingsFlags, RobotModelFlag):  # type: ignore[misc]
 
     GROUPS: ClassVar[Groups] = {
         "What is learnt": ("env", "robot_model", "algo", "steps", "seed", "seeds", "until_success"),
-        "Settings": ("set", "config", "print_config"),
+        "Settings": ("set", "config", "print_config", "coarse_physics"),
         "Files": ("out", "force", "runs", "resume", "start", "copy_to", "record"),
         "Evaluations": ("eval_every", "eval_episodes", "trial_threshold"),
         "From a data set, a teacher or a robot": ("data", "teacher", "learner", "push_every"),
