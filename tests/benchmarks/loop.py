@@ -1,8 +1,9 @@
 """How fast the interaction loop runs, against BBRL 1.0.1 (``pip install bbrl==1.0.1``) in the same process.
 
 Figures are CPU time with one torch thread: medians over rounds in which the contenders take turns. A ratio is the
-median of the rounds' ratios. Without bbrl our own figures are printed alone. The memory of a deployment's loop is in
-``python -m tests.benchmarks deploy``.
+median of the rounds' ratios. "At most" is the ratio of the policy and the environments alone, which no loop passes: it
+falls on a busy machine, which slows PyTorch and Gymnasium too. Without bbrl our own figures are printed alone. The
+memory of a deployment's loop is in ``python -m tests.benchmarks deploy``.
 """
 
 import gc
@@ -13,6 +14,7 @@ from statistics import median
 from types import SimpleNamespace
 
 import gymnasium as gym
+import numpy as np
 
 from tests.benchmarks.harness import Row, at_least, at_most, in_turns, ratio, timed
 
@@ -37,11 +39,13 @@ def libraries():
 
 
 def compared(what, times, goal, show):
-    """The row of "ours" against "bbrl", if it is there, both shown by `show`."""
+    """The row of "ours" against "bbrl", if it is there, both shown by `show`; "alone" tells how much can be reached."""
     if "bbrl" not in times:
         return Row(what, show(median(times["ours"])), "pip install bbrl==1.0.1")
     found = ratio(times["bbrl"], times["ours"])
     text = f"{found:.2f} x, {show(median(times['ours']))}, bbrl {show(median(times['bbrl']))}"
+    if "alone" in times:
+        text += f", at most {ratio(times['bbrl'], times['alone']):.2f} x"
     return at_least(what, found, goal, "x", text)
 
 
@@ -103,20 +107,27 @@ def read_all(workspace):
     return [workspace[name] for name in list(workspace.variables)]
 
 
+def policy():
+    """A network of 64 x 64, and the function that samples actions (B,) from it for observations (B, 4)."""
+    import torch
+
+    torch.manual_seed(0)
+    first, second, last = (torch.nn.Linear(*size) for size in ((4, 64), (64, 64), (64, 2)))
+    model = torch.nn.Sequential(first, torch.nn.ReLU(), second, torch.nn.ReLU(), last)
+    return model, lambda observations: torch.multinomial(torch.softmax(model(observations), -1), 1).squeeze(-1)
+
+
 def cartpole(library, n, make_env_agent):
-    """Runs an environment agent and a policy of 64 x 64 that samples, for so many steps; the workspace."""
+    """Runs an environment agent and a policy, for so many steps; the workspace."""
     import torch
 
     class Policy(library.Agent):
         def __init__(self):
             super().__init__()
-            torch.manual_seed(0)
-            first, second, last = (torch.nn.Linear(*size) for size in ((4, 64), (64, 64), (64, 2)))
-            self.model = torch.nn.Sequential(first, torch.nn.ReLU(), second, torch.nn.ReLU(), last)
+            self.model, self.sample = policy()
 
         def forward(self, t, **kwargs):
-            probabilities = torch.softmax(self.model(self.get(("env/env_obs", t))), -1)
-            self.set(("action", t), torch.multinomial(probabilities, 1).squeeze(-1))
+            self.set(("action", t), self.sample(self.get(("env/env_obs", t))))
 
     agent = library.TemporalAgent(library.Agents(make_env_agent(), Policy()))
 
@@ -136,12 +147,38 @@ def single_envs(library, n):
     return cartpole(library, n, lambda: library.ParallelGymAgent(make, n))
 
 
+def alone(reset, step):
+    """Runs the policy and the environments, with nothing between them and nothing kept: the least a loop can take."""
+    import torch
+
+    _, sample = policy()
+
+    def run(steps):
+        observations = reset()
+        with torch.no_grad():
+            for _ in range(steps):
+                observations = step(sample(torch.from_numpy(observations)))
+
+    return run
+
+
+def single_alone(library, n):
+    """`alone` on the environments of `single_envs`."""
+    envs = [library.make_env("CartPole-v1", autoreset=True) for _ in range(n)]
+
+    def step(actions):
+        return np.array([env.step(action)[0] for env, action in zip(envs, actions.tolist(), strict=True)])
+
+    return alone(lambda: np.array([env.reset(seed=k)[0] for k, env in enumerate(envs)]), step)
+
+
 def measure_cartpole(flags):
     """CartPole-v1, auto-reset; the 8 variables of both must be alike bit for bit."""
     found = libraries()
     for n, (steps, goal) in CARTPOLES.items():
         runs = {name: single_envs(library, n) for name, library in found.items()}
         alike = "bbrl" in runs and same(runs["ours"](400), runs["bbrl"](400))
+        runs["alone"] = single_alone(found["ours"], n)
         times = in_turns({name: partial(run, steps) for name, run in runs.items()}, flags.times(9))
         yield compared(f"CartPole-v1, {n} environment{'s' * (n > 1)}, steps", times, goal, rate(n * steps))
         if "bbrl" in runs:
@@ -160,7 +197,11 @@ def measure_vector(flags):
     """The same policy on Gymnasium's own vectorised CartPole, against BBRL's 64 environments."""
     found, n, steps = libraries(), 64, CARTPOLES[64][0]
     envs = partial(gym.make_vec, "CartPole-v1", num_envs=n, vectorization_mode="vector_entry_point")
-    runs = {"ours": cartpole(found["ours"], n, lambda: found["ours"].VecGymAgent(envs))}
+    bare = envs()
+    runs = {
+        "ours": cartpole(found["ours"], n, lambda: found["ours"].VecGymAgent(envs)),
+        "alone": alone(lambda: bare.reset(seed=0)[0], lambda actions: bare.step(actions.numpy())[0]),
+    }
     if "bbrl" in found:
         runs["bbrl"] = single_envs(found["bbrl"], n)
     times = in_turns({name: partial(run, steps) for name, run in runs.items()}, flags.times(9))

@@ -97,9 +97,8 @@ class TemporalAgent(Agent):
         advance: Callable[[int], None] | None,
         kwargs: dict[str, Any],
     ) -> None:
-        calls = [
-            (agent, agent.__call__) for agent in _unfolded(self.agent, (Agents,))
-        ]  # a bound method is faster than agent(...)
+        # A bound method is faster than agent(...).
+        calls = [(agent, agent.__call__) for agent in _unfolded(self.agent, (Agents,))]
         end = None if n_steps is None else t + n_steps
         while True:
             for agent, call in calls:

@@ -193,9 +193,11 @@ def _read(workspace: Any, t: int, name: str, space: Space[Any], num_envs: int) -
     if array.dtype.kind == "f" and isinstance(space, _WHOLE):
         raise LoopError(f"{name!r} at t={t}: {space} takes whole numbers, found {array.dtype}.")
     if isinstance(space, spaces.Discrete):
-        first, last = int(space.start), int(space.start + space.n - 1)
-        plain = array.tolist()  # faster than NumPy for few environments
-        if min(plain) < first or max(plain) > last:
+        first = int(space.start)
+        last = first + int(space.n) - 1
+        plain = array.tolist()  # faster than NumPy for few environments; the set is, for many
+        different = set(plain)
+        if min(different) < first or max(different) > last:
             k, found = next((k, number) for k, number in enumerate(plain) if not first <= number <= last)
             raise LoopError(f"{name!r} at t={t}: {space} takes {first} to {last}, found {found} for environment {k}.")
     return array

@@ -147,7 +147,7 @@ class ParallelGymAgent(GymAgent):
         results = [step(action) for step, action in zip(self._steps, actions, strict=True)]
         observations, rewards, terminated, truncated, infos = zip(*results, strict=True)
         self._cumulated[:] = map(add, self._cumulated, rewards)
-        np.add(self._timestep, self._advance, out=self._timestep)
+        self._timestep[:] = self._timestep + self._advance  # for one environment quicker than np.add(..., out=...)
         ended = [k for k in range(self.num_envs) if terminated[k] or truncated[k]]
         if ended and self._is_autoreset and not self.include_last_state:
             firsts = {k: self._steps[k](None)[0] for k in ended}
