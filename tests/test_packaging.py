@@ -181,14 +181,17 @@ def test_extras(metadata):
         "data",
         "dev",
         "docs",
+        "mlflow",
         "notebook",
         "offline",
         "rllib",
         "robots",
         "sim",
         "sweep",
+        "trackio",
         "train",
         "video",
+        "wandb",
     ]
 
 
@@ -204,7 +207,8 @@ def test_rllib_brings_ray_and_what_training_needs(metadata):
 
 
 PINNED = ("ray", "pydantic", "pyarrow", "tensorboardx", "dm-tree", "lz4", "ormsgpack", "scipy", "pandas", "optuna")
-"""Ray, what its extra rllib asks for, and Optuna."""
+PINNED += ("mlflow-skinny", "trackio")
+"""Ray, what its extra rllib asks for, Optuna, and trackers."""
 
 
 def normal(name):
@@ -212,7 +216,7 @@ def normal(name):
 
 
 def test_what_the_extras_bring_is_pinned_as_installed():
-    """Every package that the extras rllib and sweep bring, and what those bring, is in constraints.txt."""
+    """Every package that the extras rllib, sweep, mlflow and trackio bring, and what those bring, is in constraints.txt."""
     lines = (ROOT / "constraints.txt").read_text().splitlines()
     pins = {normal(one): one.partition("==")[2].partition(";")[0] for one in lines if "==" in one}
     wanted, seen = [*PINNED], set()
