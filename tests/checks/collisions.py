@@ -32,6 +32,8 @@ ARMS = {
     "so101": ("so_arm_description/urdf/so101.urdf", None, "gripper_link"),
 }
 """Files of the same arm and its gripper, and where the arm ends."""
+HULLS = {"ur5e": ((0, 2), (2, 6), (3, 6))}
+"""Links whose hulls overlap where their drawn meshes do not: base and upper arm are 17 mm apart, wrist 3 4 to 26 mm."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -55,11 +57,12 @@ def measure_collisions(flags):
         read, arm = read_arm(str(folder / model), gripper, site), robot_model(name)
         same = gripper is None or not gripper.startswith("parallel:")
         q = postures(arm.chain, seed=7)[: flags.times(POSTURES)]
-        found = read.shapes.distances(q).items()
-        apart = np.min([gaps for (_, link), gaps in found if same or link <= arm.num_joints], axis=0)
+        found = {pair: gaps for pair, gaps in read.shapes.distances(q).items() if same or pair[1] <= arm.num_joints}
+        apart = np.min([*found.values()], axis=0)
+        sure = np.min([gaps for pair, gaps in found.items() if pair not in HULLS.get(name, ())], axis=0)
         tubes, clearance = tubes_of(arm.arm, tool=same), Limits().clearance
         acts = np.array([tubes.nearest(joints) for joints in q.tolist()]) < clearance
-        deep, free = apart < -DEEP, apart > clearance
+        deep, free = sure < -DEEP, apart > clearance
         alarms = 100.0 * (acts & free).sum() / free.sum()
         yield at_most(f"{name}: missed of {deep.sum()} collisions", int((deep & ~acts).sum()), 0)
         yield at_most(f"{name}: false alarms in {free.sum()} postures", alarms, MOST, "%")

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from bam_envs.core.errors import InvalidValue
-from bam_train.cli.console import tell
+from bam_train.cli.console import say, tell
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -50,7 +50,7 @@ def add(config: AddArmConfig) -> int | None:
     model = config.mjcf or config.urdf or ""
     if is_urdf(Path(model)) != (config.mjcf is None) and Path(model).is_file():
         tell(f"{model} is {'MJCF' if config.mjcf is None else 'a URDF'}, and is read as such")
-    arm, notes = describe(config.name, model, config.gripper, config.site or config.tip, tell=tell)
+    arm, notes = describe(config.name, model, config.gripper, config.site or config.tip, tell=say)
     write_description(arm, notes, path)
     tell(f"wrote {path}: {arm.num_joints} joints, gripper {1000 * arm.gripper.open:.0f} mm, {_area(arm)}")
     if notes:
@@ -152,13 +152,17 @@ def _facts(arm: ArmDescription) -> list[tuple[str, str, bool]]:
 
 def _outline_flaw(arm: ArmDescription, outline: Outline) -> str:
     """What is wrong with the capsules: a gripper without any, collisions that are not found, a stray one; or ""."""
-    from bam_envs.arms.capsules import WHOLE, segment_distances
+    from bam_envs.arms.capsules import MOST_FALSE, WHOLE, segment_distances
 
     if arm.num_joints + 1 not in outline.links:
         return "; the gripper has no capsule, so that nothing keeps it from the arm: add its shapes"
-    seen = re.match(r"(\d+) of (\d+) collisions", arm.sources.get("outline", ""))
+    seen = re.match(r"(\d+) of (\d+) collisions(?:.* ([\d.]+)% of the other)?", arm.sources.get("outline", ""))
     if seen and int(seen[1]) < WHOLE * int(seen[2]):
-        return f"; only {seen[0]} of the arm with itself are found: add capsules where its links meet"
+        return (
+            f"; only {seen[1]} of {seen[2]} collisions of the arm with itself are found: add capsules where links meet"
+        )
+    if seen and float(seen[3] or 0.0) > MOST_FALSE:
+        return f"; {seen[3]}% of the postures without a collision count as one: put two thin capsules for a thick one"
     start, end = np.moveaxis(outline.segments(arm.chain.home[None])[0], 1, 0)
     gaps = segment_distances(start[:, None], end[:, None], start, end) - outline.radius[:, None] - outline.radius
     gaps[(np.abs(np.subtract.outer(outline.links, outline.links)) > 2) | np.eye(len(gaps), dtype=bool)] = np.inf

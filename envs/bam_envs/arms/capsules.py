@@ -12,12 +12,15 @@ _DIRECTIONS = 500
 _GAIN = 0.8  # two capsules instead of one must have less than this share of its volume
 _NEARLY_ALWAYS = 0.5  # share of postures
 _TRIALS = 250  # steps of the search for a thinner capsule
+_NEAR = 0.02  # distance of capsules of two links with a slack that touch in other postures than those looked at [m]
 
 
 _Fit = tuple[Array, Array, float]
 """Ends and radius of a capsule."""
 WHOLE = 0.9
 """Least share of an arm's collisions with itself that its outline has to find."""
+MOST_FALSE = 2.0
+"""Most postures without a collision that may count as one [%]; more of them make the work area small."""
 
 
 def fitted_capsules(points: Array, link: int, most: int = 2) -> list[Capsule]:
@@ -217,10 +220,13 @@ class Outline:
         gaps = self.distances(low + rng.random((2000, len(low))) * (high - low))
         # Capsules on both sides of a wrist or an elbow overlap nearly always: limits of joints keep their links apart,
         # unless a slack is known, with which they overlap where the links do.
-        near = np.diff(np.minimum(links[self.pairs], last), axis=1)[:, 0] == 2
-        near &= [(int(links[i]), int(links[j])) not in self._slack for i, j in rows]
-        share = (gaps < 0.0).mean(axis=0)
-        kept: NDArray[np.int64] = self.pairs[(share > 0.0) & ~(near & (share > _NEARLY_ALWAYS) & (not every))]
+        ends = [(int(links[i]), int(links[j])) for i, j in rows]
+        known = np.array([pair in self._slack for pair in ends])
+        near = (np.diff(np.minimum(links[self.pairs], last), axis=1)[:, 0] == 2) & ~known
+        share, least = (gaps < 0.0).mean(axis=0), gaps.min(axis=0)
+        touching = {pair for pair, gap in zip(ends, least, strict=True) if gap < 0.0}
+        seldom = known & [pair not in touching for pair in ends] & (least < _NEAR)
+        kept: NDArray[np.int64] = self.pairs[seldom | (share > 0.0) & ~(near & (share > _NEARLY_ALWAYS) & (not every))]
         return kept
 
 

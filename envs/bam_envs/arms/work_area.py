@@ -2,7 +2,7 @@
 
 import dataclasses
 import itertools
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import numpy as np
@@ -29,11 +29,11 @@ _TRIES = 240  # start poses of the search for a home pose
 _STEPS = 12  # from the middle of the area to a point of it
 
 
-def find_work_area(*arms: ArmDescription) -> ArmDescription:
+def find_work_area(*arms: ArmDescription, tell: Callable[[str], None] = lambda _: None) -> ArmDescription:
     """The first of `arms` that has the largest work area straight before it, with that area and its home pose.
 
     They are one arm in several forms, such as with its gripper turned by half a turn. The home pose is the one farthest
-    from all limits.
+    from all limits. `tell` takes a line before each size.
 
     Raises:
         InvalidValue: It reaches no such area with its tool pointing down.
@@ -43,8 +43,14 @@ def find_work_area(*arms: ArmDescription) -> ArmDescription:
             f"{arms[0].name}: nowhere on the table before it does the tool point down in an area of "
             f"{0.4 * _SCALES[-1]:.2f} m. Look at the tool (--site, --gripper) and at the limits of the joints."
         )
-    searches = (_areas(arm, scale) for scale, arm in itertools.product(_SCALES, arms))
-    return next(areas[-1] for search in searches if (areas := list(search)))
+
+    def areas(scale: float, arm: ArmDescription) -> list[ArmDescription]:
+        if arm is arms[0]:
+            width, length = 100 * scale * np.diff(BOX[:, :2], axis=0)[0]
+            tell(f"looking for a work area of {width:.0f} x {length:.0f} cm before the arm")
+        return list(_areas(arm, scale))
+
+    return next(found[-1] for scale, arm in itertools.product(_SCALES, arms) if (found := areas(scale, arm)))
 
 
 def _areas(arm: ArmDescription, scale: float) -> Iterator[ArmDescription]:

@@ -2,8 +2,8 @@
 
 Points of `ArmTubes`, for Universal Robots arms, are in the arm's vertical plane (radial, sideways, height), which turns
 with joint 1: neither that joint nor the last one changes a distance. The tubes and pairs are those of the simulation
-(`ArmContacts`); the last tube reaches to the end of the tool where there is one. `ChainTubes` are the capsules of any
-other described arm, in ``base_link``.
+(`ArmContacts`), with the ends of the wrists; the last tube reaches to the end of the tool where there is one.
+`ChainTubes` are the capsules of any other described arm, in ``base_link``.
 """
 
 import math
@@ -28,6 +28,9 @@ Pair = tuple[int, int, float]
 """Two tubes, and the distance of their segments at which their links touch [m]."""
 _ENOUGH = 0.03
 """A distance of tubes around all tubes of two links that is this much above a margin [m] needs no closer look."""
+_CAP = 0.03
+"""How far tubes of wrists 2 and 3 begin before the axis of the joint between: flat housings of UR3 to UR10 end 4.8 to
+5.7 cm before it [m]."""
 _BASE, _SHOULDER, _UPPER, _FOREARM, _WRIST_1, _WRIST_2, _WRIST_3, _ELBOW = range(8)
 _PAIRS = (
     *((first, other, 1) for first in (_BASE, _SHOULDER) for other in (_FOREARM, _WRIST_1, _WRIST_2, _WRIST_3)),
@@ -139,17 +142,20 @@ class ArmTubes(Tubes):
     def segments(self, q: Sequence[float], tubes: Iterable[int]) -> dict[int, Segment]:
         """Base, shoulder, upper arm, forearm, wrists 1 to 3 (up to the end of the tool), elbow, at `q` (6,) [rad]."""
         arm, shape, low = self._arm, self._outline, q[1] + q[2] + q[3]
-        sine, cosine, s5, reach = math.sin(low), math.cos(low), math.sin(q[4]), arm.d6 + self._tool
+        sine, cosine, reach = math.sin(low), math.cos(low), arm.d6 + self._tool
+        s5, c5 = math.sin(q[4]), math.cos(q[4])
         upper, fore, d1 = shape.upper_arm_offset, shape.forearm_offset, arm.d1
         elbow_x, elbow_z = arm.a2 * math.cos(q[1]), d1 + arm.a2 * math.sin(q[1])
         x, z = elbow_x + arm.a3 * math.cos(q[1] + q[2]), elbow_z + arm.a3 * math.sin(q[1] + q[2])
         wrist, wrist_1 = (x, fore, z), (x, arm.d4, z)
         x, z = x + arm.d5 * sine, z - arm.d5 * cosine
         wrist_2 = x, arm.d4, z
-        tool = x - reach * s5 * cosine, arm.d4 + reach * math.cos(q[4]), z - reach * s5 * sine
+        tool = x - reach * s5 * cosine, arm.d4 + reach * c5, z - reach * s5 * sine
+        cap_1 = wrist_1[0] - _CAP * sine, wrist_1[1], wrist_1[2] + _CAP * cosine
+        cap_2 = wrist_2[0] + _CAP * s5 * cosine, arm.d4 - _CAP * c5, wrist_2[2] + _CAP * s5 * sine
         shoulder, beside = (0.0, 0.0, d1), (0.0, upper, d1)
         elbow, inside = (elbow_x, upper, elbow_z), (elbow_x, fore, elbow_z)
-        starts = (0.0, 0.0, 0.0), shoulder, beside, inside, wrist, wrist_1, wrist_2, elbow
+        starts = (0.0, 0.0, 0.0), shoulder, beside, inside, wrist, cap_1, cap_2, elbow
         ends = shoulder, beside, elbow, wrist, wrist_1, wrist_2, tool, inside
         return dict(enumerate(zip(starts, ends, strict=True)))
 

@@ -8,6 +8,7 @@ from importlib import metadata
 import numpy as np
 import pytest
 
+from bam_envs.arms.capsules import Outline
 from bam_envs.arms.description import ArmDescription, robot_model
 from bam_envs.core import robot_models
 from bam_envs.core.errors import InvalidValue, UnknownName
@@ -229,6 +230,13 @@ def test_what_changes_how_an_arm_moves_changes_its_digest(read):
     found = {name: (here, there) for name, here, there in arm.differences(fewer)}
     assert found["home.4"] == (0.0488, None)
     assert found["joints.4.name"] == ("wrist_roll", None)
+
+
+@pytest.mark.parametrize("name", ["fr3", "gen3", "so101", "xarm7"])
+def test_two_links_with_a_slack_are_compared_however_seldom_they_touch(name):
+    outline = Outline(robot_model(name).chain)
+    compared = set(map(tuple, outline.links[outline.pairs].tolist()))
+    assert {(one, other) for one, other, _ in robot_model(name).slack} <= compared
 
 
 def test_another_tool_mount_or_limit_is_another_arm():

@@ -97,6 +97,19 @@ def test_an_outline_that_misses_collisions_fails_its_check(run, tmp_path):
         assert (code, f"only {seen} of 100 collisions of the arm with itself are found" in out) == (status, status == 1)
 
 
+def test_an_outline_with_many_false_alarms_fails_its_check(run, tmp_path):
+    path, text = tmp_path / "lab.toml", (SHIPPED / "so101.toml").read_text(encoding="utf-8")
+    for share, status in (("2.1", 1), ("2.0", 0)):
+        found = "100 of 100 collisions of the arm with itself in 10000 postures are found, and "
+        outline = f'outline = "{found}{share}% of the other postures count as one"'
+        path.write_text(re.sub("(?m)^outline = .*$", outline, text), encoding="utf-8")
+        code, out, _ = run(main, "check", path)
+        told = (
+            f"touch; {share}% of the postures without a collision count as one: put two thin capsules for a thick one"
+        )
+        assert (code, told in out) == (status, status == 1)
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [

@@ -18,8 +18,8 @@ SPEED, ACCELERATION, JERK = 1.5, 6.0, 120.0
 """Limits of a joint where the files name none [rad/s, rad/s^2, rad/s^3]: below those of every arm that is shipped."""
 EFFORT_PER_REACH = 60.0
 """Torque of a joint where the files name none [N m], for each metre from the joint to the tool."""
-_POSTURES, _ENOUGH = 10_000, 20
-"""Postures in which the outline is compared with the links, and the least number in which a pair overlaps."""
+_POSTURES = 10_000
+"""Postures in which the outline is compared with the links."""
 _GIVEN_UP = 0.1
 _REFITS, _FALSE = 6, 0.015  # times that links get more capsules, and the share of false alarms that is good enough
 DEEP = 0.005
@@ -27,6 +27,8 @@ DEEP = 0.005
 _CLEARANCE = 0.005  # that the guards keep, so that they act where links touch [m]
 _TOUCH = 0.0045  # depth from which shapes touch, and what is kept of the slack [m]
 _SURE = 0.001
+_RARE = 0.003  # share of postures in which two links count as touching falsely, that needs no slack
+_MANY = 300  # postures in which two links touch, that show how far apart their capsules can be; else slack is less
 _ANYWHERE = 5.6  # travel of a first joint with which an arm works in any direction [rad]
 _ASIDE = 0.02  # of the middle of all postures from the base, that tells the direction of an arm [m]
 Apart = Mapping[tuple[int, int], Array]
@@ -49,7 +51,6 @@ def describe(
     Raises:
         InvalidValue: The files hold no arm that could work; one line that says why.
     """
-    tell(f"reading {model}")
     read = read_arm(model, gripper, site)
     reach = float(np.linalg.norm(read.placements[:, :3, 3], axis=1).sum())
     if not 0.15 < reach < _FARTHEST:
@@ -78,10 +79,9 @@ def describe(
         read.notes.append(
             f"the base is turned by {90 * quarters} degrees about z, to face x (mount), as poses of a live robot are"
         )
-    tell("looking for a work area before the arm")
     arm = dataclasses.replace(arm, mount=mount)
     try:
-        found = find_work_area(arm, _turned(arm))
+        found = find_work_area(arm, _turned(arm), tell=tell)
     except InvalidValue:
         if read.shapes is None:
             raise
@@ -89,7 +89,7 @@ def describe(
         read.shapes.trust_pads()
         arm, how_well = _outlined(first, read, _GIVEN_UP)
         arm = dataclasses.replace(arm, mount=mount)
-        found = find_work_area(arm, _turned(arm))
+        found = find_work_area(arm, _turned(arm), tell=tell)
         read.notes.append(
             f"collisions of the arm with itself: the slightest {_GIVEN_UP:.0%} of two links are not noticed"
         )
@@ -208,17 +208,16 @@ def _slack(arm: ArmDescription, q: Array, apart: Apart, given_up: float) -> Iter
     gaps, links = outline.distances(q), outline.links[outline.pairs]
     for one, other in sorted({(int(i), int(j)) for i, j in links} & apart.keys()):
         gap = gaps[:, (links == [one, other]).all(axis=1)].min(axis=1)
-        if (gap < _CLEARANCE).sum() < _ENOUGH:
-            continue
-        touching = np.sort(gap[(gap < _CLEARANCE) & (apart[one, other] < -_TOUCH)])[::-1]  # the slightest first
-        if len(touching):
-            least = touching[int(given_up * len(touching))]
-        elif (one, other) in guarded:
-            least = gap.min()
-        else:
+        acts, known = gap < _CLEARANCE, (one, other) in guarded
+        few = (apart[one, other] < -_TOUCH).sum() < _MANY
+        touching = np.sort(gap[acts & (apart[one, other] < (0.0 if few else -_TOUCH))])[::-1]  # the slightest first
+        if not len(touching) and not known:
             continue  # limits of joints keep these links apart
-        slack = max(0.0, _CLEARANCE - float(least) - _SURE)
-        if slack > 0.002 or (one, other) not in guarded:
+        slack = 0.0
+        if (acts & (apart[one, other] > _CLEARANCE)).mean() > _RARE * (1 + few):
+            least = touching[int(given_up * len(touching))] if len(touching) else gap.min()
+            slack = max(0.0, _CLEARANCE - float(least) - _SURE)
+        if slack > 0.002 or not known:
             yield one, other, round(slack, 3)
 
 

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from bam_envs.core.errors import InvalidValue, MissingExtra, UnknownName
 from bam_envs.core.wording import closest, did_you_mean
+from bam_envs.robots.modelling.mesh_parts import model_in_parts
 from bam_envs.robots.physics.mujoco_batch import mujoco
 
 Array = NDArray[np.float64]
@@ -357,7 +358,7 @@ _FAR = 0.05
 
 
 class Shapes:
-    """The shapes of an arm's links, as MuJoCo compares them: meshes by their convex hulls.
+    """The shapes of an arm's links, as MuJoCo compares them: meshes by the convex hulls of their parts.
 
     Args:
         model: The compiled model.
@@ -420,7 +421,7 @@ class _Reader:
         self, spec: Any, end: str, parallel: float | None, where: str, limits: dict[str, Any], notes: list[str]
     ) -> None:
         self._where, self._limits, self._parallel = where, limits, parallel
-        self._notes = notes
+        self._notes, self._spec = notes, spec
         self._compile(spec, end)
         self._out, self._begin = np.eye(3), 0.0  # axes of the gripper in the end's, and where it begins along z [m]
         if parallel is not None:
@@ -504,7 +505,10 @@ class _Reader:
             notes=self._notes,
         )
         self._grip(arm, owner, frames[-1])
-        arm.shapes = Shapes(model, data, joints, owner, [at for at in range(model.ngeom) if _is_pad(model, at)])
+        solid = [geom for link in range(len(joints) + 2) for geom in _solid(model, owner == link)]
+        parts = model_in_parts(self._spec, model, solid)
+        pads = [geom for geom in range(parts.ngeom) if _is_pad(parts, geom)]
+        arm.shapes = Shapes(parts, mujoco.MjData(parts), joints, owner, pads)
         return arm
 
     def _chain(self) -> list[int]:

@@ -488,6 +488,34 @@ def test_a_mesh_that_mujoco_does_not_read_is_converted(tmp_path):
         read_arm(str(tmp_path / "lab.urdf"), GRIPPER, None)
 
 
+def bent_link(path):
+    """An OBJ file of a plate of 20 x 4 x 4 cm with a leg of 5 x 4 x 8 cm under each end."""
+    points, faces = [], []
+    leg = 0.025, 0.02, 0.04
+    for x, z, half in ((0.0, 0.0, (0.1, 0.02, 0.02)), (-0.075, -0.06, leg), (0.075, -0.06, leg)):
+        corners = [[x + i * half[0], j * half[1], z + k * half[2]] for i in (-1, 1) for j in (-1, 1) for k in (-1, 1)]
+        sides = ((0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3))
+        faces += [[1 + len(points) + corner for corner in side] for side in sides]
+        points += corners
+    lines = [f"v {x} {y} {z}" for x, y, z in points] + [f"f {' '.join(map(str, face))}" for face in faces]
+    path.write_text("\n".join(lines), encoding="utf-8")
+
+
+def test_a_bent_link_is_compared_in_parts_and_not_by_the_hull_of_the_whole(tmp_path):
+    """A ball between its legs, inside the hull of the whole; each of two parts has one leg."""
+    bent_link(tmp_path / "bent.obj")
+    ball, arm = '<geom size="0.02" pos="0 0 -0.06"/>', '<body><joint range="-1 1"/>{}<geom size="0.001" pos="0 0 1"/>'
+    mesh = '<asset><mesh name="bent" file="bent.obj"/></asset>'
+    text = (
+        f'<mujoco>{mesh}<worldbody><body name="base"><geom type="mesh" mesh="bent"/>{arm.format("")}{arm.format("")}'
+        f'{arm.format(ball)}{arm.format("")}<site name="tool0" pos="0 0 0.1"/>{"</body>" * 5}</worldbody></mujoco>'
+    )
+    (tmp_path / "lab.xml").write_text(text, encoding="utf-8")
+    apart = read_arm(str(tmp_path / "lab.xml"), GRIPPER, None).shapes.distances(np.zeros((1, 4)))
+    # From the line between (-0.05, -0.1), the foot of a leg, and (0, -0.02), the end of its part.
+    assert apart[0, 3] == pytest.approx(0.002 / np.hypot(0.05, 0.08) - 0.02, abs=1e-5)
+
+
 def test_a_link_without_a_collision_shape_is_what_is_drawn_of_it(tmp_path):
     text = six_joints()
     (tmp_path / "lab.urdf").write_text(text.replace("collision>", "visual>", 2), encoding="utf-8")
