@@ -212,7 +212,7 @@ TRACKERS = ("mlflow-skinny", "trackio")
 
 
 def normal(name):
-    return re.split(r"[\[<>=; ]", name)[0].lower().replace("_", "-")
+    return re.split(r"[\[<>=~!(; ]", name)[0].lower().replace("_", "-")
 
 
 def test_what_the_extras_bring_is_pinned_as_installed():
