@@ -11,7 +11,7 @@ import json
 import math
 import re
 import sys
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -328,6 +328,15 @@ def differences(wanted: Mapping[str, Any], found: Mapping[str, Any], prefix: str
         elif value != other or isinstance(value, bool) != isinstance(other, bool):
             differing.append((prefix + name, value, other))
     return differing
+
+
+def walk(table: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """Each entry of a table and of the tables in it, by its name with dots."""
+    for name, value in table.items():
+        if isinstance(value, Mapping) and value:
+            yield from walk(value, f"{prefix}{name}.")
+        else:
+            yield f"{prefix}{name}", value
 
 
 def file_stem(env: str, algo: str, trainer: str = "sb3", env_kwargs: Mapping[str, Any] | None = None) -> str:

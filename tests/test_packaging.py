@@ -181,14 +181,17 @@ def test_extras(metadata):
         "data",
         "dev",
         "docs",
+        "mlflow",
         "notebook",
         "offline",
         "rllib",
         "robots",
         "sim",
         "sweep",
+        "trackio",
         "train",
         "video",
+        "wandb",
     ]
 
 
@@ -205,17 +208,18 @@ def test_rllib_brings_ray_and_what_training_needs(metadata):
 
 PINNED = ("ray", "pydantic", "pyarrow", "tensorboardx", "dm-tree", "lz4", "ormsgpack", "scipy", "pandas", "optuna")
 """Ray, what its extra rllib asks for, and Optuna."""
+TRACKERS = ("mlflow-skinny", "trackio")
 
 
 def normal(name):
-    return re.split(r"[\[<>=; ]", name)[0].lower().replace("_", "-")
+    return re.split(r"[\[<>=~!(; ]", name)[0].lower().replace("_", "-")
 
 
 def test_what_the_extras_bring_is_pinned_as_installed():
-    """Every package that the extras rllib and sweep bring, and what those bring, is in constraints.txt."""
+    """Every package that extras bring, and what those bring, is in constraints.txt."""
     lines = (ROOT / "constraints.txt").read_text().splitlines()
     pins = {normal(one): one.partition("==")[2].partition(";")[0] for one in lines if "==" in one}
-    wanted, seen = [*PINNED], set()
+    wanted, seen = [*PINNED, *TRACKERS], set()
     while wanted:
         name = wanted.pop()
         if name in seen or name == "setuptools":

@@ -29,6 +29,7 @@ Name = Annotated[str | None, tyro.conf.arg(metavar="NAME")]
 EnvId = Annotated[str | None, tyro.conf.arg(metavar="ID")]
 Unusual = Annotated[Literal["warn", "hold", "stop"] | None, tyro.conf.arg(metavar="warn|hold|stop")]
 Url = Annotated[str | None, tyro.conf.arg(metavar="URL")]
+Trackers = Annotated[str | None, tyro.conf.arg(metavar="NAME,...")]
 Groups = dict[str, tuple[str, ...]]
 """Title of a group of flags in the help to its fields; fields without a group come last."""
 
@@ -180,7 +181,7 @@ class TrainConfig(SettingsFlags, RobotModelFlag):  # type: ignore[misc]
     GROUPS: ClassVar[Groups] = {
         "What is learnt": ("env", "robot_model", "algo", "steps", "seed", "seeds", "until_success"),
         "Settings": ("set", "config", "print_config", "coarse_physics"),
-        "Files": ("out", "force", "runs", "resume", "start", "copy_to", "record"),
+        "Files": ("out", "force", "runs", "resume", "start", "copy_to", "record", "track"),
         "Evaluations": ("eval_every", "eval_episodes", "trial_threshold"),
         "From a data set, a teacher or a robot": ("data", "teacher", "learner", "push_every"),
         "Where it is computed": (
@@ -221,6 +222,8 @@ class TrainConfig(SettingsFlags, RobotModelFlag):  # type: ignore[misc]
     --address. The same command again trains what is missing."""
     record: DataSetName = None
     """Add the episodes of training to this data set; of --trainer sb3 with an environment of bam_envs."""
+    track: Trackers = None
+    """Show the run in wandb, mlflow or trackio too, or in several: wandb,mlflow. Each has an extra of its name."""
     learner: Url = None
     """Learn from the robot of the live agent at this address, such as ws://robot:9095, while it runs (algorithm rlpd);
     candidates are pushed to it. --token-file and --ca-file are those of the agent."""

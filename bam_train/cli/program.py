@@ -50,6 +50,10 @@ EXTRAS = {
     "mujoco_menagerie": "robots",
     "trimesh": "robots",
     "xacrodoc": "robots",
+    "wandb": "wandb",
+    "mlflow": "mlflow",
+    "sqlalchemy": "mlflow",
+    "trackio": "trackio",
 }
 """Optional package to the extra of bam-train that brings it."""
 

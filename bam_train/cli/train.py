@@ -52,6 +52,8 @@ def train(config: TrainConfig) -> int:
     if config.seeds is not None and not config.print_config:
         return int(pkgutil.resolve_name("bam_train.cli.experiments.seeds:train_seeds")(config, config.seeds, given))
     if config.learner is not None:
+        if config.track is not None:
+            raise SettingsError("--track shows runs in simulation or from data; leave it out with --learner")
         return _learn(config, config.learner, given, checkpoint)
     settings = resolve(given, say) if checkpoint is None else resolve_resumed(given, checkpoint, say)
     if config.print_config:
@@ -66,10 +68,12 @@ def _train(
     checkpoint: Checkpoint | None,
     notices: list[str],
     folder: RunFolder | None = None,
+    tracked_as: str = "",
 ) -> int:
     """Train with complete settings, and print `notices` and the outcome; returns the exit status.
 
     A run that continues from a checkpoint goes on in its `folder`, if that is given; otherwise a run has a new one.
+    Trackers call it `tracked_as`, by default as its folder.
     """
     from bam_train.cli.train_display import LiveDisplay, MayClose, PlainDisplay, say_next, summarise
     from bam_train.environments import is_batched
@@ -79,6 +83,7 @@ def _train(
     from bam_train.trainers.base import hardware, origin
     from bam_train.trainers.best_checkpoint import choose_output
     from bam_train.trainers.run_folder import Copies, RunFolder, require_room
+    from bam_train.trainers.trackers import Trackers, read_trackers
     from bam_train.trainers.training_run import TrainingRun
 
     arm = settings.env_kwargs.get("robot_model")
@@ -87,6 +92,8 @@ def _train(
     if checkpoint is not None:
         title += f", going on from {checkpoint.path} at {count(checkpoint.manifest.steps)} steps"
     require_room(runs)
+    if config.track is not None:
+        read_trackers(config.track)
     if config.record is not None:
         if settings.trainer != "sb3":
             raise SettingsError(f"--record is for --trainer sb3, found {settings.trainer}; use bam-data collect")
@@ -97,6 +104,7 @@ def _train(
     copies = None if config.copy_to is None else Copies(config.copy_to)
     trainer = kind.create(settings) if checkpoint is None else kind.load(checkpoint, settings)
     came: list[int] = []
+    trackers: Trackers | None = None
     with contextlib.redirect_stderr(MayClose(sys.stderr)), contextlib.ExitStack() as handlers:
         try:
             settings = trainer.settings  # as the trainer completed them
@@ -104,9 +112,12 @@ def _train(
                 trainer.record(config.record)  # type: ignore[attr-defined]
             if folder is None:
                 folder = RunFolder(runs, file_stem(settings.env, settings.algo, settings.trainer, settings.env_kwargs))
+            display = (LiveDisplay if can_draw() else PlainDisplay)(title)
+            if config.track is not None:
+                trackers = Trackers(config.track, tracked_as or folder.path.name, folder, settings, display.note)
+                notices = [*notices, *trackers.notices]
             folder.write_config(settings.to_mapping())
             trainer.log_to(folder.tensorboard)
-            display = (LiveDisplay if can_draw() else PlainDisplay)(title)
             run = TrainingRun(trainer, folder, output.path, display, output.best, copies=copies)
             handlers.enter_context(handled(_stop_on_signals(run, came)))
             with display:
@@ -122,7 +133,11 @@ def _train(
                     folder.write_outcome({**made, "shortfall": outcome.shortfall, "hardware": hardware(), **origin()})
                 except OutputError as error:
                     outcome = replace(outcome, failure=error)
+            if trackers is not None:
+                trackers.finish([outcome.checkpoint, folder.curve], whole=True)
         finally:
+            if trackers is not None:
+                trackers.finish([], whole=False)
             trainer.close()
         say_next(settings, outcome)
         if came:
@@ -183,7 +198,8 @@ def _stop_on_signals(run: TrainingRun, came: list[int]) -> Callable[[int], None]
 def train_seed() -> None:
     """A process of ``--seeds``: train in the folder of the first argument, which may hold a part of the run.
 
-    Its settings are the first line of standard input; the end of standard input is the end of the run.
+    The first line of standard input has its settings, and ``track`` and ``tracked_as`` if it is tracked; the end of
+    standard input is the end of the run.
     """
     sys.path.append(os.getcwd())
     atexit.register(gc.freeze)
@@ -199,10 +215,12 @@ def train_seed() -> None:
         folder = RunFolder(path.parent, path.name, lambda path: True)
         checkpoint = Checkpoint.open(folder.last) if folder.last.exists() else None
         if checkpoint is None:
-            (path / "progress.jsonl").unlink(missing_ok=True)
+            for name in ("progress.jsonl", "tracked.json"):
+                (path / name).unlink(missing_ok=True)
             shutil.rmtree(folder.tensorboard, ignore_errors=True)
-        config = TrainConfig(out=path / "best.zip", force=True, runs=path.parent)
-        return _train(config, TrainSettings.from_mapping(values), checkpoint, [], folder)
+        track, tracked_as = values.pop("track", None), values.pop("tracked_as", "")
+        config = TrainConfig(out=path / "best.zip", force=True, runs=path.parent, track=track)
+        return _train(config, TrainSettings.from_mapping(values), checkpoint, [], folder, tracked_as)
 
     sys.exit(guarded(run, "bam-train"))
 

@@ -8,13 +8,13 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
 from bam_envs.core.wording import brief
 from bam_train.errors import SettingsError
-from bam_train.settings import TABLES, TrainSettings, merge, parse_assignment
+from bam_train.settings import TABLES, TrainSettings, merge, parse_assignment, walk
 from bam_train.trainers.resolve_settings import resolve
 
 _NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
@@ -113,15 +113,6 @@ class SearchSpace:
         except SettingsError:
             return Dimension(one.name, one.low, one.high, one.log, whole=True)
         return one
-
-
-def walk(table: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """Each entry of a table and of the tables in it, by its name with dots."""
-    for name, value in table.items():
-        if isinstance(value, Mapping) and value:
-            yield from walk(value, f"{prefix}{name}.")
-        else:
-            yield f"{prefix}{name}", value
 
 
 def _nested(name: str, value: Any) -> dict[str, Any]:

@@ -29,18 +29,12 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from bam_train.errors import FolderInUse, SettingsError
+from bam_train.errors import SettingsError
+from bam_train.files.locked_folder import locked
 from bam_train.settings import TrainSettings, file_stem
 from bam_train.signals import await_end, start_child
 from bam_train.trainers.run_folder import RunFolder, read_object
 
-try:
-    import fcntl
-except ImportError:  # Windows: nothing keeps two calls from the same folder
-    fcntl = None  # type: ignore[assignment]
-
-LOCKS = fcntl is not None
-"""Whether a folder can be locked."""
 MOST_SEEDS = 1000
 POLL = 0.2
 """Seconds between two looks at the runs."""
@@ -88,30 +82,6 @@ def what_is_learnt(settings: TrainSettings) -> dict[str, Any]:
     """The settings as JSON has them, without `WHERE`."""
     what: dict[str, Any] = json.loads(json.dumps(settings.to_mapping()))
     return {name: value for name, value in what.items() if name not in WHERE}
-
-
-@contextlib.contextmanager
-def locked(folder: Path, wait: bool = False) -> Iterator[int | None]:
-    """Within the ``with`` block no other call has the lock of the folder; yields its descriptor.
-
-    Children that get the descriptor hold the lock as long as one of them lives.
-
-    Raises:
-        FolderInUse: Another process has it, unless `wait`.
-    """
-    if fcntl is None:
-        yield None
-        return
-    lock = os.open(folder, os.O_RDONLY)
-    try:
-        try:
-            fcntl.flock(lock, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
-        except BlockingIOError as error:
-            text = "another program trains its seeds, or its runs are being saved. Wait for its end"
-            raise FolderInUse(f"{folder}: {text}") from error
-        yield lock
-    finally:
-        os.close(lock)
 
 
 # Processes

@@ -28,7 +28,8 @@ from optuna.trial import FrozenTrial, Trial, TrialState
 
 from bam_train.errors import FolderInUse, SettingsError
 from bam_train.experiments.search_space import SearchSpace
-from bam_train.experiments.seed_runs import LOCKS, SeedRun, locked, what_is_learnt
+from bam_train.experiments.seed_runs import SeedRun, what_is_learnt
+from bam_train.files.locked_folder import LOCKS, locked
 from bam_train.settings import differences, file_stem
 from bam_train.trainers.run_folder import RunFolder, read_object, writing
 

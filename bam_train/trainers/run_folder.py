@@ -7,6 +7,7 @@
     outcome.json        of a run that is done: why it ended, its best evaluation, computer, versions and commit
     tensorboard/        event files
     last.zip            the newest checkpoint; `--resume` continues from it
+    tracked.json        ids of the run in the trackers of `--track`
     learning-curve.png  return and success over steps
     traceback.txt       where the code of the environment failed, if it did
 
@@ -28,6 +29,7 @@ from bam_train.errors import OutputError
 from bam_train.files.atomic_file import remove_orphans, replacing
 from bam_train.files.place import Place
 
+TRACKED = "tracked.json"
 LEAST_FREE = 20_000_000
 """Minimum free bytes of the disk before training."""
 
@@ -55,6 +57,7 @@ class RunFolder:
         self.last = self.path / "last.zip"
         self.tensorboard = self.path / "tensorboard"
         self.curve = self.path / "learning-curve.png"
+        self.followers: list[Callable[[Mapping[str, Any]], None]] = []  # get each record too
         self._progress = self.path / "progress.jsonl"
 
     def write_config(self, settings: Mapping[str, Any]) -> None:
@@ -63,6 +66,8 @@ class RunFolder:
 
     def add(self, record: Mapping[str, Any]) -> None:
         """Append one line to ``progress.jsonl``, and close the file."""
+        for follow in self.followers:
+            follow(record)
         with writing(self._progress), self._progress.open("a", encoding="utf-8") as file:
             file.write(json.dumps(record, allow_nan=False) + "\n")
 

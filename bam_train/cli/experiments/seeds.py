@@ -33,6 +33,7 @@ from bam_train.trainers.base import cores
 from bam_train.trainers.best_checkpoint import choose_output
 from bam_train.trainers.resolve_settings import preset_notices, resolve
 from bam_train.trainers.run_folder import Copies, RunFolder, read_object, require_room
+from bam_train.trainers.trackers import read_trackers
 from bam_train.trainers.training_run import rank
 
 Start = Callable[[SeedRun], SeedProcess | ClusterSeed]
@@ -55,7 +56,7 @@ def train_seeds(config: TrainConfig, text: str, given: Mapping[str, Any]) -> int
     copies = None if config.copy_to is None else Copies(config.copy_to)
     with (
         contextlib.redirect_stderr(MayClose(sys.stderr)),
-        starter(settings, given.get("address")) as (start, jobs, where),
+        starter(settings, given.get("address"), runs, config.track) as (start, jobs, where),
         group_folder(runs, settings) as (group, lock),
     ):
         every = [SeedRun.there(group.path, settings, seed, lock) for seed in seeds]
@@ -80,12 +81,21 @@ def run_all(every: list[SeedRun], start: Start, jobs: int, stopped: Callable[[],
 
 
 @contextlib.contextmanager
-def starter(settings: TrainSettings, address: str | None) -> Iterator[tuple[Start, int, str]]:
-    """What starts a run; how many run at once; and where in words."""
+def starter(
+    settings: TrainSettings, address: str | None, runs: Path, track: str | None
+) -> Iterator[tuple[Start, int, str]]:
+    """What starts a run, which trackers call by its place in `runs`; how many run at once; and where in words."""
     needed = needs(settings)
+    if track is not None:
+        read_trackers(track)
+
+    def asked(run: SeedRun) -> dict[str, Any]:
+        tracked_as = run.folder.path.relative_to(runs).as_posix()
+        return run.settings.to_mapping() | ({} if track is None else {"track": track, "tracked_as": tracked_as})
+
     if address is None:
         jobs = max(1, cores() // needed["CPU"])
-        yield lambda run: SeedProcess(run.settings.to_mapping(), run.folder.path, lock=run.lock), jobs, ""
+        yield lambda run: SeedProcess(asked(run), run.folder.path, lock=run.lock), jobs, ""
         return
     from bam_train.trainers.rllib import ray_cluster
 
@@ -98,7 +108,7 @@ def starter(settings: TrainSettings, address: str | None) -> Iterator[tuple[Star
             wanted = " and ".join(f"{number} {name}s" for name, number in needed.items() if number)
             raise SettingsError(f"a run needs {wanted} on one computer, and no node of the cluster has as many")
         yield (
-            lambda run: ClusterSeed(run.settings.to_mapping(), run.folder.path, *needed.values()),
+            lambda run: ClusterSeed(asked(run), run.folder.path, *needed.values()),
             jobs,
             f" on the cluster at {address}",
         )

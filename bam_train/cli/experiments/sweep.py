@@ -11,7 +11,17 @@ from typing import Annotated, Any, ClassVar
 import tyro
 from msgspec import Meta
 
-from bam_train.cli.flags import Assignments, Count, File, Folder, Groups, Positive, RobotModelFlag, SettingsFlags
+from bam_train.cli.flags import (
+    Assignments,
+    Count,
+    File,
+    Folder,
+    Groups,
+    Positive,
+    RobotModelFlag,
+    SettingsFlags,
+    Trackers,
+)
 from bam_train.cli.program import run_program
 
 _Hidden = Annotated[None, tyro.conf.Suppress]
@@ -34,7 +44,7 @@ class SweepConfig(SettingsFlags, RobotModelFlag):  # type: ignore[misc]
 
     GROUPS: ClassVar[Groups] = {
         "What is searched": ("env", "robot_model", "algo", "set", "steps", "until_success", "stop_reward"),
-        "How long": ("trials", "seeds", "minutes", "resume", "runs"),
+        "How long": ("trials", "seeds", "minutes", "resume", "runs", "track"),
         "What comes out": ("status", "confirm", "save_preset"),
         "Evaluations": ("eval_every", "eval_episodes", "trial_threshold"),
         "From a data set or a teacher": ("data", "teacher", "start"),
@@ -58,6 +68,8 @@ class SweepConfig(SettingsFlags, RobotModelFlag):  # type: ignore[misc]
     """Folder of a search that was begun, to go on with its settings, or for --status, --confirm and --save-preset."""
     runs: Annotated[Path, tyro.conf.arg(metavar="FOLDER")] = Path("runs")
     """Folder in which the folder of the search is made."""
+    track: Trackers = None
+    """Show each run in wandb, mlflow or trackio too, in the group of the search."""
     status: bool = False
     """Search nothing: print the best trial, how much each setting matters, and what was pruned and why."""
     confirm: Annotated[Annotated[int, Meta(ge=3, le=1000)] | None, tyro.conf.arg(metavar="N")] = None

@@ -22,12 +22,12 @@ from bam_train.cli.flags import Count, Positive
 from bam_train.cli.train_display import MayClose, short_path
 from bam_train.errors import SettingsError, TrainingFailed
 from bam_train.experiments.run_logs import read_runs
-from bam_train.experiments.search_space import walk
-from bam_train.experiments.seed_runs import SeedRun, locked, run_seeds
+from bam_train.experiments.seed_runs import SeedRun, run_seeds
 from bam_train.experiments.seed_statistics import FEWEST
 from bam_train.experiments.sweep_folder import STATES, SweepFolder
 from bam_train.experiments.trial_search import Sweep, chosen, shown
 from bam_train.files.atomic_file import replacing, require_writable
+from bam_train.files.locked_folder import locked
 from bam_train.files.log_lines import aligned
 from bam_train.settings import (
     NAMES,
@@ -38,6 +38,7 @@ from bam_train.settings import (
     read_assignments,
     read_config,
     toml_text,
+    walk,
 )
 from bam_train.trainers.resolve_settings import preset_notices, read_preset, resolve
 from bam_train.trainers.run_folder import RunFolder, writing
@@ -71,11 +72,11 @@ def sweep(config: SweepConfig) -> int:
         tell(*_status(folder))
         return 0
     if config.confirm is None and config.save_preset is None:
-        return _search(folder, trials or folder.study.user_attrs.get("trials", TRIALS), minutes, address)
+        return _search(folder, trials or folder.study.user_attrs.get("trials", TRIALS), minutes, address, config.track)
     best = folder.best
     if best is None:
         raise SettingsError(f"{folder.path}: no trial is done yet; bam-sweep --resume {folder.path} goes on")
-    status = 0 if config.confirm is None else _confirm(folder, best, config.confirm, address)
+    status = 0 if config.confirm is None else _confirm(folder, best, config.confirm, address, config.track)
     if config.save_preset is not None:
         _save(folder, best, require_writable(config.save_preset))
     return status
@@ -84,13 +85,13 @@ def sweep(config: SweepConfig) -> int:
 # The search
 
 
-def _search(folder: SweepFolder, trials: int, minutes: float | None, address: str | None) -> int:
+def _search(folder: SweepFolder, trials: int, minutes: float | None, address: str | None, track: str | None) -> int:
     """Train trials until there are enough, the time is over, or a signal comes; print the status."""
     with writing(folder.journal):
         folder.study.set_user_attr("trials", trials)
     end = float("inf") if minutes is None else time.monotonic() + 60 * minutes
     search = Sweep(folder, trials, say)
-    with _runs(folder, address, f"{trials} trials of {folder.seeds} seeds") as (start, jobs, stopped):
+    with _runs(folder, address, track, f"{trials} trials of {folder.seeds} seeds") as (start, jobs, stopped):
         display = LiveTable(search.runs) if can_draw() else PlainLines([])
         with contextlib.closing(search), display as table:
 
@@ -115,12 +116,12 @@ def _search(folder: SweepFolder, trials: int, minutes: float | None, address: st
 
 
 @contextlib.contextmanager
-def _runs(folder: SweepFolder, address: str | None, what: str) -> Iterator[Any]:
+def _runs(folder: SweepFolder, address: str | None, track: str | None, what: str) -> Iterator[Any]:
     """What starts runs, how many at once, and whether a signal has come; says what is done."""
     base = folder.space.base
     with (
         contextlib.redirect_stderr(MayClose(sys.stderr)),
-        starter(base, address) as (start, jobs, where),
+        starter(base, address, folder.path.parent, track) as (start, jobs, where),
         signals_ask() as stopped,
     ):
         say(f"{base.algo} on {base.env}: {what} in {folder.path}, {jobs} runs at once{where}")
@@ -167,15 +168,16 @@ def _base_name(base: TrainSettings) -> str:
 # The comparison with the preset
 
 
-def _confirm(folder: SweepFolder, best: FrozenTrial, number: int, address: str | None) -> int:
+def _confirm(folder: SweepFolder, best: FrozenTrial, number: int, address: str | None, track: str | None) -> int:
     """Train the best trial and the preset on new seeds, and compare them; returns the exit status."""
     base, name = folder.space.base, _base_name(folder.space.base)
     rows = {name: base, f"trial-{best.number}": folder.space.settings(best.params)}
     if len({json.dumps(one.to_mapping(), sort_keys=True) for one in rows.values()}) == 1:
         raise SettingsError(f"trial {best.number}, the best one, has the settings of the {name}: try more --trials")
     place = RunFolder(folder.path, "confirm", lambda path: True).path
+    what = f"trial {best.number} and the {name} on {number} new seeds"
     with (
-        _runs(folder, address, f"trial {best.number} and the {name} on {number} new seeds") as (start, jobs, stopped),
+        _runs(folder, address, track, what) as (start, jobs, stopped),
         locked(place) as lock,
     ):
         every = [
