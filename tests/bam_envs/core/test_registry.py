@@ -15,6 +15,7 @@ from bam_envs.make_env import make_env, make_vector_env
 def test_the_table():
     assert {key: (entry.max_episode_steps, entry.period) for key, entry in ENVIRONMENTS.items()} == {
         "bam/reach-v0": (100, 0.05),
+        "bam/joints-v0": (600, 0.05),
         "bam/pick-v0": (100, 0.05),
         "bam/pick-place-v0": (200, 0.05),
         "bam/navigation-v0": (500, 0.1),

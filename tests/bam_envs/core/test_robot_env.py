@@ -202,8 +202,9 @@ def test_failure_terminates(make, env_id):
 @pytest.mark.parametrize("env_id", EACH)
 def test_no_step_without_an_episode(env_id):
     env = make_env(env_id)
-    policy = scripted_policy(env_id) if env_id in SCRIPTED else Kept(ENDED[env_id][1])
     action = np.zeros(env.action_space.shape, np.float32)
+    kept = ENDED[env_id][1] if env_id in ENDED else action
+    policy = scripted_policy(env_id) if env_id in SCRIPTED else Kept(kept)
     for prepare in (lambda: None, lambda: finished(env, policy, seed=0), env.close):
         prepare()
         with pytest.raises(ResetNeeded) as caught:
