@@ -21,7 +21,7 @@ EFFORT_PER_REACH = 60.0
 _POSTURES = 10_000
 """Postures in which the outline is compared with the links."""
 _GIVEN_UP = 0.1
-_REFITS, _FALSE = 6, 0.015  # times that links get more capsules, and the share of false alarms that is good enough
+_REFITS, _FALSE = 32, 0.015  # times that links get other capsules, and the share of false alarms that is good enough
 DEEP = 0.005
 """A collision deeper than this is to be found [m]."""
 _CLEARANCE = 0.005  # that the guards keep, so that they act where links touch [m]
@@ -130,7 +130,7 @@ def _turned(arm: ArmDescription) -> ArmDescription:
 def _outlined(arm: ArmDescription, read: ReadArm, given_up: float = 0.0) -> tuple[ArmDescription, str]:
     """The arm with capsules around its links, and how well they find its collisions with itself.
 
-    Two links whose capsules touch too often while the links are apart get more of them.
+    Two links whose capsules touch too often while the links are apart get more of them, then thinner ones.
 
     Args:
         arm: The description without capsules.
@@ -138,33 +138,38 @@ def _outlined(arm: ArmDescription, read: ReadArm, given_up: float = 0.0) -> tupl
         given_up: The share of the slightest collisions of two links that need not be found.
     """
     groups = [*enumerate(read.points), *((arm.num_joints + 1, points) for points in read.grip)]
-    fits = [{2: fitted_capsules(points, link)} for link, points in groups]
+    fits = [{(2, 2): fitted_capsules(points, link)} for link, points in groups]
 
-    def fitted(most: Mapping[int, int]) -> ArmDescription:
+    def fitted(forms: Mapping[int, tuple[int, int]]) -> ArmDescription:
         capsules: list[Capsule] = []
         for known, (link, points) in zip(fits, groups, strict=True):
-            if (count := most.get(link, 2)) not in known:
-                known[count] = fitted_capsules(points, link, count)
-            capsules += known[count]
+            if (form := forms.get(link, (2, 2))) not in known:
+                known[form] = fitted_capsules(points, link, *form)
+            capsules += known[form]
         return dataclasses.replace(arm, capsules=tuple(capsules), slack=())
 
-    best, most, kept = fitted({}), dict[int, int](), dict[int, int]()
+    best, forms, kept = fitted({}), dict[int, tuple[int, int]](), dict[int, tuple[int, int]]()
     q = postures(arm.chain)
     apart = {} if read.shapes is None else read.shapes.distances(q)
     if not apart:
         return best, ""
     share, missed, worst, spent = 1.0, len(q), list[tuple[int, int]](), set[tuple[int, int]]()
-    for _ in range(_REFITS):
-        trial = fitted(most)
-        trial = dataclasses.replace(trial, slack=tuple(_slack(trial, q, apart, given_up)))
-        wrong, overlooked, blamed = judged(trial, q, apart)
-        if (overlooked, wrong) < (missed, share):
-            best, share, missed, kept, worst = trial, wrong, overlooked, most, blamed
-        pair = next((pair for pair in worst if pair not in spent), None)
-        if share <= _FALSE or pair is None:
+    tried = set[tuple[Capsule, ...]]()
+    while len(tried) < _REFITS:
+        trial = fitted(forms)
+        if trial.capsules not in tried:
+            tried.add(trial.capsules)
+            trial = dataclasses.replace(trial, slack=tuple(_slack(trial, q, apart, given_up)))
+            wrong, overlooked, blamed = judged(trial, q, apart)
+            if (overlooked, wrong) < (missed, share):
+                best, share, missed, kept, worst, spent = trial, wrong, overlooked, forms, blamed, set()
+        ways = ((link, more) for pair in worst for more in (0, 2) for link in pair)
+        way = next((way for way in ways if way not in spent), None)
+        if share <= _FALSE or way is None:
             break
-        spent.add(pair)
-        most = {**kept, **{link: kept.get(link, 2) + 2 for link in pair}}
+        spent.add(way)
+        (link, more), (count, power) = way, kept.get(way[0], (2, 2))
+        forms = {**kept, link: (count + more, power if more else power + 1)}
     deep = sum(np.min([*apart.values()], axis=0) < -DEEP)
     found = f"{deep - missed} of {deep} collisions of the arm with itself in {len(q)} postures are found"
     return best, f"{found}, and {share:.1%} of the other postures count as one"
