@@ -26,7 +26,7 @@ MOST_FALSE = 2.0
 def fitted_capsules(points: Array, link: int, most: int = 2, power: int = 2) -> list[Capsule]:
     """Capsules around all `points` (n, 3) [m] on the surface of a link, in the frame of the points; `most` at most.
 
-    Of their sizes, volumes with the radius to the given `power`, the least is taken: power 3 gives thinner, longer ones.
+    The least of their volumes is taken, with the radius to the given `power`: 3 gives thinner, longer ones.
     """
     if len(points) == 0:
         return []

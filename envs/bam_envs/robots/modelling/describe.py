@@ -12,7 +12,7 @@ from bam_envs.arms.description import ArmDescription, Gripper, JointRow, Placed,
 from bam_envs.arms.serial_chain import Capsule, SerialChain
 from bam_envs.arms.work_area import find_work_area
 from bam_envs.core.errors import InvalidValue
-from bam_envs.robots.modelling.model_files import Array, ReadArm, read_arm
+from bam_envs.robots.modelling.model_files import Array, ReadArm, Shapes, read_arm
 
 SPEED, ACCELERATION, JERK = 1.5, 6.0, 120.0
 """Limits of a joint where the files name none [rad/s, rad/s^2, rad/s^3]: below those of every arm that is shipped."""
@@ -28,7 +28,8 @@ _CLEARANCE = 0.005  # that the guards keep, so that they act where links touch [
 _TOUCH = 0.0045  # depth from which shapes touch, and what is kept of the slack [m]
 _SURE = 0.001
 _RARE = 0.003  # share of postures in which two links count as touching falsely, that needs no slack
-_MANY = 300  # postures in which two links touch, that show how far apart their capsules can be; else slack is less
+_MANY = 150  # postures in which two links touch, that show how far apart their capsules can be; else slack is less
+_ROUNDS, _WORST, _AROUND, _STRAY = 4, 20, 10, 0.1  # of a search: postures kept in each, others about each, within [rad]
 _ANYWHERE = 5.6  # travel of a first joint with which an arm works in any direction [rad]
 _ASIDE = 0.02  # of the middle of all postures from the base, that tells the direction of an arm [m]
 Apart = Mapping[tuple[int, int], Array]
@@ -170,6 +171,9 @@ def _outlined(arm: ArmDescription, read: ReadArm, given_up: float = 0.0) -> tupl
         spent.add(way)
         (link, more), (count, power) = way, kept.get(way[0], (2, 2))
         forms = {**kept, link: (count + more, power if more else power + 1)}
+    if not given_up and read.shapes is not None:
+        best = dataclasses.replace(best, slack=tuple(_sure_slack(best, q, apart, read.shapes)))
+        share, missed, _ = judged(best, q, apart)
     deep = sum(np.min([*apart.values()], axis=0) < -DEEP)
     found = f"{deep - missed} of {deep} collisions of the arm with itself in {len(q)} postures are found"
     return best, f"{found}, and {share:.1%} of the other postures count as one"
@@ -224,6 +228,24 @@ def _slack(arm: ArmDescription, q: Array, apart: Apart, given_up: float) -> Iter
             slack = max(0.0, _CLEARANCE - float(least) - _SURE)
         if slack > 0.002 or not known:
             yield one, other, round(slack, 3)
+
+
+def _sure_slack(arm: ArmDescription, q: Array, apart: Apart, shapes: Shapes) -> Iterator[tuple[int, int, float]]:
+    """The slack of an arm, less where two links collide in postures about those in which it is the least sufficient."""
+    outline, rng, chain = Outline(arm.chain), np.random.default_rng(0), arm.chain
+    links = outline.links[outline.pairs]
+    for one, other, slack in arm.slack:
+        mine, known = (links == [one, other]).all(axis=1), q[apart[one, other] < -DEEP]
+        if mine.any() and len(known):
+            gap = outline.distances(known)[:, mine].min(axis=1)
+            for _ in range(_ROUNDS):
+                near = np.repeat(known[np.argsort(-gap)[:_WORST]], _AROUND, axis=0)
+                near = np.clip(near + _STRAY * rng.standard_normal(near.shape), chain.low, chain.high)
+                near = near[shapes.distances(near, [(one, other)])[one, other] < -DEEP]
+                known = np.concatenate([known, near])
+                gap = np.concatenate([gap, outline.distances(near)[:, mine].min(axis=1)])
+            slack = round(min(slack, max(0.0, slack + _CLEARANCE - float(gap.max()) - _SURE)), 4)
+        yield one, other, slack
 
 
 def postures(chain: SerialChain, seed: int = 0) -> Array:
