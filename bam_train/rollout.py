@@ -94,16 +94,22 @@ def rollout(
     Raises:
         PolicyError: An action is not finite.
     """
-    begun = envs.num_envs
+    begun, rest = envs.num_envs, getattr(envs.unwrapped, "rest", None)
     kept = [keep(number) for number in range(begun)]
-    for step in islice(play(envs, policy, seed=seed, parts=parts), limit):
-        for episode in step.ended:
-            if kept[episode.env_id]:
-                yield episode
-            kept[episode.env_id] = keep(begun)
-            begun += 1
-        if not any(kept):
-            return
+    try:
+        for step in islice(play(envs, policy, seed=seed, parts=parts), limit):
+            for episode in step.ended:
+                if kept[episode.env_id]:
+                    yield episode
+                kept[episode.env_id] = keep(begun)
+                begun += 1
+            if not any(kept):
+                return
+            if step.ended and rest is not None:
+                rest(~np.array(kept))
+    finally:
+        if rest is not None:
+            rest(np.zeros(envs.num_envs, dtype=bool))
 
 
 def play(

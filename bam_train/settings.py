@@ -127,6 +127,8 @@ class SB3Settings(TrainSettings):
 
     start: str | None = None
     """Checkpoint whose weights a new run of sb3 begins with: to harden a policy with env_kwargs.randomize, say."""
+    coarse_physics: bool = False
+    """Train on physics of an arm in longer steps, in half the time (sb3); evaluations are on the usual one."""
 
 
 @dataclass(frozen=True)
@@ -178,7 +180,7 @@ NAMES = tuple(AllSettings.__dataclass_fields__)
 """Names of all top-level settings."""
 _NO_USE = {
     **dict.fromkeys(NAMES, "the {trainer} trainer has no use for it; leave it out, or add --trainer rllib"),
-    "start": "the {trainer} trainer has no use for it; leave it out",
+    **dict.fromkeys(("start", "coarse_physics"), "the {trainer} trainer has no use for it; leave it out"),
     "data": "{algo} of {trainer} learns in the environment; leave --data or --trainer out",
     "teacher": "{algo} has none; leave it out, or give --algo dagger",
 }

@@ -130,7 +130,8 @@ def _actions(checkpoint: Checkpoint, period: float | None) -> tuple[float, str]:
     CPU time, because this process gives way to others; of one thread, which is all that a policy uses.
     """
     path, manifest, golden = checkpoint.path, checkpoint.manifest, checkpoint.arrays(GOLDEN)
-    policy = FrozenPolicy.from_graph(checkpoint.read(POLICY), manifest.observation_space, manifest.action_space)
+    spaces, chunk = (manifest.observation_space, manifest.action_space), manifest.chunk
+    policy = FrozenPolicy.from_graph(checkpoint.read(POLICY), *spaces, chunk=chunk)
     try:
         rows = policy.require_rows(golden)
     except PolicyError as error:
@@ -138,21 +139,23 @@ def _actions(checkpoint: Checkpoint, period: float | None) -> tuple[float, str]:
     times: list[float] = []
     while len(times) < ACTIONS and sum(times) < _MOST_TIME:
         row = len(times) % rows
-        observation, begun = policy.recorded(golden, row), time.thread_time()
-        action = policy.act(observation)
+        begun = time.thread_time()
+        action = policy.reply(golden, row)
         times.append(time.thread_time() - begun)
         _require_finite(path, action, f"the observation in row {row} of {GOLDEN}")
     taken = sorted(times)[math.ceil(0.99 * len(times)) - 1]
-    if period is not None and taken > SHARE * period:
-        most = f"at most {1e3 * SHARE * period:g} ms, half of the period of {period:g} s"
-        raise PolicyError(f"an action takes {1e3 * taken:.3g} ms of CPU time, expected {most}. Train a smaller policy")
+    steps, what = (1, "an action") if chunk is None else (1 if chunk.ensemble is not None else chunk.steps, "a chunk")
+    if period is not None and taken > SHARE * period * steps:
+        unit = "the period" if steps == 1 else f"{steps} periods"
+        most = f"at most {1e3 * SHARE * period * steps:g} ms, half of {unit} of {period:g} s"
+        raise PolicyError(f"{what} takes {1e3 * taken:.3g} ms of CPU time, expected {most}. Train a smaller policy")
     policy.require_golden(checkpoint)
     space = space_from_json(manifest.observation_space)
     space.seed(0)
     policy.reset()
     for _ in range(SAMPLES):
         _require_finite(path, policy.act(space.sample()), "a random observation")
-    return 1e3 * taken, f"{rows} golden actions are the trainer's; an action takes {1e3 * taken:.3g} ms of CPU time"
+    return 1e3 * taken, f"{rows} golden actions are the trainer's; {what} takes {1e3 * taken:.3g} ms of CPU time"
 
 
 def _require_finite(path: Path, action: Any, what: str) -> None:

@@ -356,8 +356,10 @@ class Resident:
         self._stage = self.options.stage
 
     def _slows(self, choice: Choice) -> bool:
-        """Whether the robot gets closer limits first, for which the episode ends."""
+        """Whether the episode ends first: the robot gets closer limits, or the policy computes its first chunk."""
         session = self.session
+        if getattr(choice.policy, "chunk", None) is not None:
+            return True
         return session is not None and session.is_real and choice.stage == "trial" and session.stage != "trial"
 
     def _activate(self) -> None:

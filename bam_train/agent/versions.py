@@ -246,7 +246,8 @@ def load_policy(version: Version) -> FrozenPolicy:
     if checkpoint.digest != version.digest:
         raise CheckpointError(version.path, "is another checkpoint than its name says. Push it again")
     manifest = checkpoint.manifest
-    policy = FrozenPolicy.from_graph(checkpoint.read(POLICY), manifest.observation_space, manifest.action_space)
+    graph, spaces = checkpoint.read(POLICY), (manifest.observation_space, manifest.action_space)
+    policy = FrozenPolicy.from_graph(graph, *spaces, chunk=manifest.chunk)
     policy.detector = Detector.of(checkpoint)
     return policy
 

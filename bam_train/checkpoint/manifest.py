@@ -33,6 +33,21 @@ _Digest = Annotated[str, Meta(pattern="^[0-9a-f]{64}$")]
 
 
 @dataclass(frozen=True)
+class Chunk:
+    """How a policy answers that gives several actions at once, a chunk, one for each of the next steps."""
+
+    size: Annotated[int, Meta(ge=1, le=1000)]
+    """Actions of a chunk; none is sent more than so many steps after its observation."""
+    steps: Annotated[int, Meta(ge=1, le=1000)]
+    """Steps after which the next chunk is due; at most `size`."""
+    history: Annotated[int, Meta(ge=1, le=16)] = 1
+    """Number of the last observations that it sees, the newest last."""
+    ensemble: float | None = None
+    """The actions of all chunks for a step are averaged, the i-th oldest with the weight exp(-ensemble i), and a chunk
+    is due in every step (temporal ensembling: Zhao et al. 2023); None: the newest chunk counts."""
+
+
+@dataclass(frozen=True)
 class Manifest:
     """`bam/manifest.json`."""
 
@@ -73,6 +88,8 @@ class Manifest:
     data: dict[str, Any] = field(default_factory=dict)
     """What it learnt from a data set: the ``digest`` of the set, those of its training ``episodes``, and the number of
     their ``steps``; {} if it learnt from none."""
+    chunk: Chunk | None = None
+    """If the policy gives several actions at once."""
 
 
 _Number = Annotated[int, Meta(ge=-(2**63), le=2**63 - 1)]
@@ -197,6 +214,8 @@ def _parse(path: Path, data: bytes) -> Manifest:
     contents = msgspec.json.decode(data, type=_Contents)
     if not re.fullmatch(r"([\w.]+:)?[^:]+", manifest.env):
         raise ValueError(f"env {manifest.env!r} is no environment id, such as bam/pick-v0 or module:Env-v0")
+    if manifest.chunk is not None and manifest.chunk.steps > manifest.chunk.size:
+        raise ValueError(f"chunk.steps is {manifest.chunk.steps}, expected at most its size, {manifest.chunk.size}")
     for name in ("observation_space", "action_space"):
         _require_reasonable(name, getattr(contents, name))
     return manifest

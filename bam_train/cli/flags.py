@@ -43,6 +43,7 @@ _METAVARS = {
     "address": "auto|HOST:PORT",
     "data": "PLACE",
     "start": "CHECKPOINT",
+    "coarse_physics": "True|False",
     "teacher": "PLACE|scripted",
     "transport": "URL,...",
     "ca_file": "FILE",
@@ -178,7 +179,7 @@ class TrainConfig(SettingsFlags, RobotModelFlag):  # type: ignore[misc]
 
     GROUPS: ClassVar[Groups] = {
         "What is learnt": ("env", "robot_model", "algo", "steps", "seed", "seeds", "until_success"),
-        "Settings": ("set", "config", "print_config"),
+        "Settings": ("set", "config", "print_config", "coarse_physics"),
         "Files": ("out", "force", "runs", "resume", "start", "copy_to", "record"),
         "Evaluations": ("eval_every", "eval_episodes", "trial_threshold"),
         "From a data set, a teacher or a robot": ("data", "teacher", "learner", "push_every"),
@@ -392,27 +393,38 @@ class ReplayConfig(JsonFlag):
 
 
 @dataclass(frozen=True)
-class ExportConfig:
-    """Turn a checkpoint directory of RLlib into a checkpoint.zip that can be evaluated and deployed.
+class ExportConfig(RobotModelFlag):
+    """Turn a policy of LeRobot, RLlib, stable-baselines3 or an ONNX file into a checkpoint.zip.
 
     Examples:
+      bam-export lerobot:train/act/checkpoints/last/pretrained_model --units degrees --robot-model so101 --out act.zip
+      bam-export act.toml --set camera=front --set image_size=640x480
+      bam-export sb3:model.zip --env CartPole-v1 --algo ppo --trust-pickle
       bam-export ray_results/run/checkpoint_000010 --trust-pickle
     """
 
-    directory: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="DIR")]
-    """What algo.save_to_path or algo.save wrote, or the folder of a policy in it; of the current API or the old one."""
+    source: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="SOURCE")]
+    """LeRobot's folder pretrained_model, a TOML file that describes an ONNX file, a zip of stable-baselines3, or a
+    directory of RLlib: of algo.save_to_path or algo.save, or the folder of a policy in it. A word says which, if the
+    name does not: lerobot:, onnx:, sb3: or rllib:."""
     env: EnvId = None
-    """Environment it was trained on; by default what the directory says."""
+    """Environment: by default what RLlib's directory says, or bam/joints for LeRobot and ONNX."""
     out: File = None
-    """Where the checkpoint goes (default checkpoints/<env>-rllib-<algo>.zip); missing folders are made."""
+    """Where the checkpoint goes (default checkpoints/<env>-<trainer>-<algo>.zip); missing folders are made."""
+    units: Annotated[Literal["degrees", "range", "si"] | None, tyro.conf.arg(metavar="degrees|range|si")] = None
+    """What LeRobot's joints are in: degrees, -100 to 100 of their range (range), or radians and metres (si)."""
+    data: Folder = None
+    """LeRobot's data set, which names the numbers; by default where the policy was trained."""
+    statistics: File = None
+    """File of a VecNormalize, for a zip of stable-baselines3."""
     algo: Name = None
-    """Algorithm that trained it; by default what the directory says."""
+    """Algorithm that trained it; by default what RLlib's directory says."""
     policy: Name = None
-    """Which policy, where the directory has several."""
+    """Which policy, where RLlib's directory has several."""
     set: Assignments = ()
-    """An argument of the environment, any number of times: parity=true. It wins over the directory's."""
+    """An argument of the environment, any number of times: camera=front. It wins over the directory's."""
     trust_pickle: bool = False
-    """Let RLlib read a directory of its present API, which runs whatever code is in it."""
+    """Let RLlib or stable-baselines3 read it, which runs whatever code is in it."""
     force: bool = False
     """Overwrite the checkpoint at --out instead of adding a number to its name."""
 

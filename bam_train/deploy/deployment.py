@@ -26,6 +26,7 @@ from bam_train.deploy.flight import FlightLog
 from bam_train.deploy.journal import Ending, EpisodeRecord, Journal
 from bam_train.deploy.trials import Trials
 from bam_train.errors import BamTrainError
+from bam_train.policy.background import Background
 from bam_train.recording.recorder import ERROR, INFO, Recorder
 from bam_train.signals import handled, interrupt
 
@@ -78,7 +79,8 @@ class Deployment:
 
     Args:
         env: The environment, already checked to fit the policy.
-        policy: Has ``reset()`` and ``act(observation)``.
+        policy: Has ``reset()`` and ``act(observation)``; if it has chunks and the loop has deadlines, it runs in a
+            `Background`.
         pacer: The deadlines.
         journal: Updated at every tick.
         observers: Called with each `EpisodeStep` once the policy has decided, so they must be fast.
@@ -117,7 +119,7 @@ class Deployment:
         self.switch = switch or StopSwitch(self._halt)
         """Handler of SIGINT and SIGTERM."""
         self._loop = EpisodeLoop(
-            env, policy, pacer, journal, raise_again=self.switch.raise_again, between_ticks=between_ticks
+            env, self._beside(policy), pacer, journal, raise_again=self.switch.raise_again, between_ticks=between_ticks
         )
         self._flush: Callable[[], None] = lambda: None
         self._closing = self._closed = False
@@ -153,8 +155,21 @@ class Deployment:
 
     def swap(self, policy: Any) -> None:
         """Let another policy act from the next action on; called between two ticks."""
+        self._loop.policy.reset()  # nothing that it has planned is sent
         policy.reset()
-        self._loop.policy = policy
+        self._loop.policy = self._beside(policy)
+
+    def _beside(self, policy: Any) -> Any:
+        """The policy itself, or in a thread beside the loop."""
+        if getattr(policy, "chunk", None) is None or self.pacer.period is None:
+            return policy
+        task, robot = getattr(self.env.unwrapped, "task", None), robot_of(self.env)
+        return Background(
+            policy,
+            self.pacer.period,
+            fade=getattr(task, "action_step", None),
+            is_held=lambda: bool(getattr(robot, "is_held", False)),
+        )
 
     def episode(self, watcher: Watcher, *, seed: int) -> EpisodeRecord:
         """Run one episode; afterwards the robot is halted, and stays connected. After an exception it is closed.
@@ -168,6 +183,9 @@ class Deployment:
             with contextlib.suppress(Exception):  # the fault itself is what the operator must see
                 self._close()
             raise
+        finally:
+            if isinstance(self._loop.policy, Background):
+                self._loop.policy.reset()  # nothing that it has planned is sent
         self._halt()  # the sink and the next reset may be slow
         if self.trials is not None and record.end != "stopped":
             self.trials.end(record.success is True, record.end)

@@ -124,6 +124,8 @@ class EpisodeLoop:
         step = EpisodeStep(0, seed, named_arrays(observation, self._env.observation_space), begun, perf_counter())
         self._journal.begin(seed)
         self.policy.reset()
+        if (prepare := getattr(self.policy, "prepare", None)) is not None:
+            prepare(_observation(step))  # the first of its chunks, while nothing moves
         return step
 
     def _wait(self, step: EpisodeStep) -> None:
@@ -137,9 +139,7 @@ class EpisodeLoop:
 
     def _decide(self, step: EpisodeStep) -> None:
         begun, computed = perf_counter(), thread_time()
-        arrays = {name.removeprefix(f"{OBSERVATION}/"): array[0].copy() for name, array in step.arrays.items()}
-        observation = arrays[OBSERVATION] if OBSERVATION in step.arrays else arrays
-        action = np.asarray(self.policy.act(observation))
+        action = np.asarray(self.policy.act(_observation(step)))
         step.acted, step.computed = self._took = perf_counter() - begun, thread_time() - computed
         if not step.is_last:
             require_finite_action(action, step.number, f"the episode with seed {step.seed}")
@@ -167,6 +167,12 @@ class EpisodeLoop:
         watcher.ticked(record, step.action, self._pacer)
         if step.is_last:
             watcher.ended(record)
+
+
+def _observation(step: EpisodeStep) -> Any:
+    """What the policy gets: an array, or a mapping for a Dict."""
+    arrays = {name.removeprefix(f"{OBSERVATION}/"): array[0].copy() for name, array in step.arrays.items()}
+    return arrays[OBSERVATION] if OBSERVATION in step.arrays else arrays
 
 
 def named_arrays(observation: Any, space: gym.Space[Any], name: str = OBSERVATION) -> dict[str, NDArray[Any]]:

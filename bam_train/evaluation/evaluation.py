@@ -106,6 +106,7 @@ def evaluate(
     seed: int = FIRST_SEED,
     num_envs: int | None = None,
     env: VectorEnv[Any, Any, Any] | None = None,
+    most_failures: float = math.inf,
     on_progress: Callable[[int, int], None] | None = None,
 ) -> EvaluationReport:
     """Run `episodes` seeded episodes of the environment `env_id` under `policy` and summarise them.
@@ -118,6 +119,7 @@ def evaluate(
         seed: Seed of the first episode; episode k gets ``seed + k``.
         num_envs: Number of environments stepped together; by default that of `default_num_envs`.
         env: A vector environment of `make_vector_env`, used instead of a new one; it is left open.
+        most_failures: With more episodes that fail it ends after the wave in progress, but not before a quarter of all.
         on_progress: Called after every wave with the number of episodes done and the number of all episodes.
 
     Raises:
@@ -138,6 +140,8 @@ def evaluate(
             done += wave
             if on_progress is not None:
                 on_progress(len(done), min(episodes, starts or episodes))
+            if len(done) >= episodes / 4 and sum(e.success is False for e in done) > most_failures:
+                break
     return summarise(env_id, done, seed, starts)
 
 

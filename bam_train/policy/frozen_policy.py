@@ -6,7 +6,7 @@ Longer than most files: a policy and the arrays that it takes are one subject.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,7 +14,9 @@ import numpy as np
 
 from bam_train.checkpoint import GOLDEN, POLICY, Checkpoint
 from bam_train.checkpoint.detector import Detector
+from bam_train.checkpoint.manifest import Chunk
 from bam_train.errors import FormatError, PolicyError
+from bam_train.policy.chunks import Plan
 
 if TYPE_CHECKING:
     from bam_train.policy.onnx_session import OnnxSession
@@ -103,29 +105,39 @@ class FrozenPolicy:
         action_space: JSON form, as in the manifest.
         recurrent: Whether the action depends on the observations since `reset`.
         detector: The detector of unusual observations in its checkpoint; None if there is none.
+        chunk: How it gives several actions at once; None if it gives one. `act` computes a chunk when it is due, and
+            takes the action of the step out of it; `bam_train.policy.background` computes it beside the steps.
     """
 
     detector: Detector | None = None
 
     def __init__(
-        self, session: OnnxSession, observation_space: Mapping[str, Any], action_space: Mapping[str, Any]
+        self,
+        session: OnnxSession,
+        observation_space: Mapping[str, Any],
+        action_space: Mapping[str, Any],
+        chunk: Chunk | None = None,
     ) -> None:
         self.observation_space, self.action_space = dict(observation_space), dict(action_space)
         self._arrays, self._action = observation_arrays(observation_space), array_spec("action", action_space)
         self._is_dict = observation_space.get("type") == "Dict"
         self._session = session
         states = {name: tensor for name, tensor in session.inputs.items() if name.startswith("state.")}
-        _require_fit(session, self._arrays, states)
+        self.chunk, self._plans = chunk, list[Plan]()
+        past = () if chunk is None or chunk.history == 1 else (chunk.history,)
+        self._taken = [replace(part, shape=(*past, *part.shape)) for part in self._arrays]
+        _require_fit(session, self._taken, states)
         self._zero_state = {name: np.zeros([n or 1 for n in spec.shape], spec.dtype) for name, spec in states.items()}
         self._state: dict[str, np.ndarray] | None = None
         self._outputs = ["action", *(f"next_{name}" for name in states)]
         self.recurrent = bool(states)
-        shape = self._act({part.name: np.zeros((2, *part.shape), part.dtype) for part in self._arrays}).shape
-        self._state = None
-        if shape != (2, *self._action.shape):
-            raise PolicyError(f"action: expected shape {self._action.shape}, the graph gives {shape[1:]}")
+        n = 2 if chunk is None else 1  # a chunk may take half a second
+        shape = self._act({part.name: np.zeros((n, *part.shape), part.dtype) for part in self._taken}).shape
+        self._state, answer = None, self._answer_shape
+        if shape != (n, *answer) or (chunk is not None and (states or self._action.kind != "Box")):
+            raise PolicyError(f"action: expected shape {answer}, the graph gives {shape[1:]}")
         # An observation that is one array, as for most policies, is copied into an array that is allocated once.
-        plain = not (self.recurrent or self._is_dict) and self._arrays[0].kind == "Box"
+        plain = chunk is None and not (self.recurrent or self._is_dict) and self._arrays[0].kind == "Box"
         self._shape, self._dtype = self._arrays[0].shape, self._arrays[0].dtype
         self._buffer = np.zeros((1, *self._shape), self._dtype) if plain else None
         self._inputs: dict[str, Any] = {"observation": self._buffer}
@@ -144,19 +156,26 @@ class FrozenPolicy:
     def from_checkpoint(cls, checkpoint: Checkpoint) -> FrozenPolicy:
         """Load the policy of an open checkpoint."""
         manifest = checkpoint.manifest
-        policy = cls.from_graph(checkpoint.read(POLICY), manifest.observation_space, manifest.action_space)
+        graph, spaces = checkpoint.read(POLICY), (manifest.observation_space, manifest.action_space)
+        policy = cls.from_graph(graph, *spaces, chunk=manifest.chunk)
         policy.require_golden(checkpoint)
         policy.detector = Detector.of(checkpoint)
         return policy
 
     @classmethod
     def from_graph(
-        cls, onnx: bytes, observation_space: Mapping[str, Any], action_space: Mapping[str, Any]
+        cls,
+        onnx: bytes,
+        observation_space: Mapping[str, Any],
+        action_space: Mapping[str, Any],
+        *,
+        chunk: Chunk | None = None,
     ) -> FrozenPolicy:
         """Make a policy of an ONNX file; the spaces are in JSON form.
 
         Inputs are ``observation`` or ``observation.<key>``, and ``state.<name>``; outputs ``action`` and
-        ``next_state.<name>``; the first axis of each is the batch.
+        ``next_state.<name>``; the first axis of each is the batch. With a `chunk`, the second axis of the action counts
+        its steps, and that of the inputs the observations of its history, if it is longer than 1.
 
         Raises:
             PolicyError: Not ONNX, or its inputs and outputs do not fit the spaces.
@@ -168,12 +187,15 @@ class FrozenPolicy:
             require_policy(onnx)
         except FormatError as error:
             raise PolicyError(f"the policy cannot be read: {error}") from error
-        return cls(OnnxSession(onnx), observation_space, action_space)
+        return cls(OnnxSession(onnx), observation_space, action_space, chunk)
 
     def reset(self, env_ids: Any = None) -> None:
         """Reset the recurrent state of `env_ids` (indices or a mask), or of all environments, as an episode starts."""
         if env_ids is None:
-            self._state = None
+            self._state, self._plans = None, []
+        elif self._plans:
+            for i in np.arange(len(self._plans))[env_ids]:
+                self._plans[i] = self.plan()
         elif self._state is not None:
             try:
                 for state in self._state.values():
@@ -190,7 +212,8 @@ class FrozenPolicy:
         """
         buffer = self._buffer
         if buffer is None:
-            return self._act({name: value[None] for name, value in self._checked(observation, ()).items()})[0]
+            inputs = {name: value[None] for name, value in self._checked(observation, ()).items()}
+            return (self._act if self.chunk is None else self._planned)(inputs)[0]
         is_array = type(observation) is np.ndarray
         if not (is_array and observation.dtype is self._dtype and observation.shape == self._shape):
             observation = self._arrays[0].checked(observation, ())
@@ -200,14 +223,52 @@ class FrozenPolicy:
     def act_batch(self, observations: Any) -> np.ndarray:
         """Return a new array of actions, (n, ...), for the observations of n environments, (n, ...) each.
 
-        A recurrent policy keeps a state for each environment: give the same environments until `reset`.
+        A policy that is recurrent or has chunks keeps a state for each environment: give the same ones until `reset`.
         """
         first = observations
         if self._is_dict and isinstance(observations, Mapping) and observations:
             first = next(iter(observations.values()))
         if np.ndim(first) == 0 or len(first) == 0:
             raise PolicyError(f"observations: expected one or more, found shape {np.shape(first)}")
-        return self._act(self._checked(observations, (len(first),)))
+        inputs = self._checked(observations, (len(first),))
+        return self._act(inputs) if self.chunk is None else self._planned(inputs)
+
+    def answer(self, seen: Mapping[str, np.ndarray]) -> np.ndarray:
+        """The graph's own answers to its inputs, (n, ...) each: actions (n, ...), or chunks (n, size, ...)."""
+        inputs = {part.name: part.checked(seen[part.name], (len(seen[part.name]),)) for part in self._taken}
+        first = self._taken[0].name
+        if self._session.inputs[first].shape[0] != 1:
+            return self._act(inputs)
+        rows = range(len(inputs[first]))  # a graph that was traced for one observation
+        return np.concatenate([self._act({name: value[i : i + 1] for name, value in inputs.items()}) for i in rows])
+
+    def plan(self, fade: np.ndarray | None = None) -> Plan:
+        """A new plan of the actions of one environment; for `fade`, see `Plan`."""
+        return Plan(self.chunk, self._action.shape, fade)
+
+    def checked(self, observation: Any) -> dict[str, np.ndarray]:
+        """One observation as arrays by the names of the graph's inputs, without a batch axis, copied."""
+        return {name: np.array(value) for name, value in self._checked(observation, ()).items()}
+
+    @property
+    def _answer_shape(self) -> tuple[int, ...]:
+        return self._action.shape if self.chunk is None else (self.chunk.size, *self._action.shape)
+
+    def _planned(self, inputs: dict[str, np.ndarray]) -> np.ndarray:
+        """The actions of the environments by their plans; those that are due get a new chunk first."""
+        n = len(next(iter(inputs.values())))
+        self._plans = self._plans or [self.plan() for _ in range(n)]
+        if len(self._plans) != n:
+            raise PolicyError(f"observations: expected {len(self._plans)}, found {n}; call reset() before changing it")
+        for i, plan in enumerate(self._plans):
+            plan.see({name: value[i].copy() for name, value in inputs.items()})
+        due = [plan for plan in self._plans if plan.is_due()]
+        if due:
+            seen = [plan.seen() for plan in due]
+            chunks = self.answer({name: np.stack([one[name] for one in seen]) for name in inputs})
+            for plan, chunk in zip(due, chunks, strict=True):
+                plan.add(plan.step, chunk)
+        return np.stack([plan.take() for plan in self._plans])
 
     def _checked(self, observation: Any, batch: tuple[int, ...]) -> dict[str, np.ndarray]:
         if not self._is_dict:
@@ -220,7 +281,7 @@ class FrozenPolicy:
 
     def _act(self, inputs: dict[str, np.ndarray]) -> np.ndarray:
         """Run the graph on checked inputs, (n, ...) each, and keep the state."""
-        inputs = {part.name: inputs[part.name].astype(part.dtype, copy=False) for part in self._arrays}
+        inputs = {part.name: inputs[part.name].astype(part.dtype, copy=False) for part in self._taken}
         if not self.recurrent:
             return _int64(self._session.run(inputs, self._outputs)[0])
         n = len(inputs[self._arrays[0].name])
@@ -253,11 +314,12 @@ class FrozenPolicy:
         """
         self.require_rows(golden)
         action, expected = self._action, golden["action"].astype(np.float64)
-        single = len(expected) if self.recurrent else min(_SINGLE, len(expected))
+        one_by_one = self.recurrent or self.chunk is not None
+        single = len(expected) if one_by_one else min(_SINGLE, len(expected))
         self.reset()
-        found = np.array([self.act(self.recorded(golden, k)) for k in range(single)])
+        found = np.array([self.reply(golden, k) for k in range(single)])
         self.reset()
-        if not self.recurrent:
+        if not one_by_one:
             found = np.concatenate([found, self.act_batch(self.recorded(golden, slice(None)))[single:]])
         unit = np.ones(())  # or half the range of a Box if that is more: float32 rounds relative to it
         if action.kind == "Box" and action.low is not None and action.high is not None:
@@ -278,9 +340,15 @@ class FrozenPolicy:
         found = golden["action"].shape
         if found[0] > MOST_GOLDEN:
             raise PolicyError(f"expected at most {MOST_GOLDEN} rows, found {found[0]}")
-        if found[1:] != self._action.shape:
-            raise PolicyError(f"action: expected shape {self._action.shape}, found {found[1:]}")
+        if found[1:] != self._answer_shape:
+            raise PolicyError(f"action: expected shape {self._answer_shape}, found {found[1:]}")
         return len(golden["action"])
+
+    def reply(self, golden: Mapping[str, np.ndarray], row: int) -> Any:
+        """The action, or the chunk, for a row of recorded arrays."""
+        if self.chunk is None:
+            return self.act(self.recorded(golden, row))
+        return self.answer({part.name: golden[part.name][row][None] for part in self._arrays})[0]
 
     def recorded(self, golden: Mapping[str, np.ndarray], rows: Any) -> Any:
         """The observations in these rows of recorded arrays, as `act` or `act_batch` takes them."""

@@ -15,14 +15,15 @@ from google.protobuf.message import DecodeError
 
 from bam_train.errors import FormatError
 
-MOST_NODES = 1000
-"""Maximum number of operations of a graph; exported policies have up to about a hundred."""
+MOST_NODES = 10_000
+"""Maximum number of operations of a graph; most policies have up to about a hundred, and LeRobot's ACT has some for
+each 32 x 32 pixels of an image: 3,000 for 640 x 480."""
 MOST_STRUCTURE = 2**20
 """Maximum bytes of a file besides weights, with 16 more for each field: protobuf takes many times as much memory."""
 
 OPERATIONS = frozenset(
-    """Abs Add ArgMax AveragePool BatchNormalization Cast Celu Clip Concat Constant ConstantOfShape Conv Cos Div Elu
-    Equal Erf Exp Flatten Gather Gemm GlobalAveragePool Greater HardSigmoid HardSwish Identity LayerNormalization
+    """Abs Add ArgMax AveragePool BatchNormalization Cast Celu Clip Concat Constant ConstantOfShape Conv Cos CumSum Div
+    Elu Equal Erf Exp Flatten Gather Gemm GlobalAveragePool Greater HardSigmoid HardSwish Identity LayerNormalization
     LeakyRelu Less Log LogSoftmax MatMul Max MaxPool Min Mish Mul Neg Or Pad Pow ReduceMean ReduceSum Relu Reshape Selu
     Sigmoid Sin Slice Softmax Softplus Softsign Split Sqrt Squeeze Sub Tanh Transpose Unsqueeze Where""".split()  # noqa: SIM905 - a list of literals has one a line
 )

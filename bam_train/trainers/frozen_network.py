@@ -174,22 +174,9 @@ class FrozenNetwork(Layer):
 
     def onnx_file(self) -> bytes:
         """Trace the policy into an ONNX file."""
-        file, names = io.BytesIO(), [_input_name(key) for key in self.leaves] + [f"state.{name}" for name in self.state]
+        names = [_input_name(key) for key in self.leaves] + [f"state.{name}" for name in self.state]
         outputs = ["action", *(f"next_state.{name}" for name in self.state)]
-        with torch.no_grad(), warnings.catch_warnings():
-            for text, category in _HARMLESS_WARNINGS.items():
-                warnings.filterwarnings("ignore", text, category)
-            torch.onnx.export(
-                self,
-                (*self.example(), *self.state.values()),
-                file,
-                dynamo=False,
-                opset_version=17,
-                input_names=names,
-                output_names=outputs,
-                dynamic_axes={name: {0: "n"} for name in [*names, *outputs]},
-            )
-        return file.getvalue()
+        return trace(self, (*self.example(), *self.state.values()), names, outputs)
 
     def draw(self, n: int, rng: np.random.Generator) -> dict[str, Array]:
         """Draw n observations by key, (n, ...) each."""
@@ -225,6 +212,32 @@ class FrozenNetwork(Layer):
                 action, *state = outputs if isinstance(outputs, tuple) else (outputs,)
                 actions.append(action.numpy())
         return self.onnx_file(), pack(observations, np.concatenate(actions))
+
+
+def trace(
+    module: nn.Module,
+    example: tuple[torch.Tensor, ...],
+    names: list[str],
+    outputs: list[str],
+    *,
+    any_number: bool = True,
+) -> bytes:
+    """The ONNX file of a module, for `any_number` of observations at once, or for as many as the example has."""
+    file = io.BytesIO()
+    with torch.no_grad(), warnings.catch_warnings():
+        for text, category in _HARMLESS_WARNINGS.items():
+            warnings.filterwarnings("ignore", text, category)
+        torch.onnx.export(
+            module,
+            example,
+            file,
+            dynamo=False,
+            opset_version=17,
+            input_names=names,
+            output_names=outputs,
+            dynamic_axes={name: {0: "n"} for name in [*names, *outputs]} if any_number else None,
+        )
+    return file.getvalue()
 
 
 _KINDS_TEXT = "Box, Discrete, MultiDiscrete or MultiBinary"

@@ -373,6 +373,8 @@ class TrainingRun:
 
 EVALUATION_SEED = 2_000_000
 """First seed of evaluations, far from the small seeds of training and from bam-eval's."""
+LOOK = 16
+"""Episodes that show whether a policy succeeds at all."""
 
 
 def evaluate_for_goal(
@@ -380,20 +382,22 @@ def evaluate_for_goal(
 ) -> tuple[EvaluationReport, str]:
     """Evaluate a policy; returns the report (the worse of two), and which goal of the run was reached, "" for none.
 
-    First a quarter of the episodes is played; then all, if the quarter leaves the goal possible; then, if it was
-    reached, as many other episodes, which must reach it too. The last evaluation of a run always plays all. Episode k
-    has the seed EVALUATION_SEED + seed + k; `envs` are left open.
+    First `LOOK` episodes are played, if all are many more; then all, if any of those succeeded; then, if the goal was
+    reached, as many other episodes, which must reach it too. Failures that rule `until_success` out end an evaluation,
+    but not the last one of a run, which plays all. Episode k has the seed EVALUATION_SEED + seed + k; `envs` are left
+    open.
     """
+    episodes, wanted, most = settings.eval_episodes, settings.until_success, math.inf
+    if wanted is not None and settings.stop_reward is None and not last:
+        most = (1 - wanted) * episodes + 1e-9
 
     def play(first: int, count: int) -> EvaluationReport:
         seed = EVALUATION_SEED + settings.seed + first
-        return evaluate(policy, settings.env, settings.env_kwargs, episodes=count, seed=seed, env=envs)
+        given: dict[str, Any] = {"episodes": count, "seed": seed, "env": envs, "most_failures": most}
+        return evaluate(policy, settings.env, settings.env_kwargs, **given)
 
-    episodes, wanted = settings.eval_episodes, settings.until_success
-    if wanted is not None and settings.stop_reward is None and not last:
-        look = play(0, math.ceil(episodes / 4))
-        if look.successes is not None and look.episodes - look.successes > (1 - wanted) * episodes + 1e-9:
-            return look, ""
+    if most < LOOK <= episodes / 8 and (look := play(0, LOOK)).successes == 0:
+        return look, ""
     report = play(0, episodes)
     if not _reached(report, settings):
         return report, ""

@@ -44,7 +44,7 @@ OPTIONAL = ("Action",)
 
 
 ENVIRONMENT_PAGES = {
-    "arm": ("bam/reach-v0", "bam/pick-v0", "bam/pick-place-v0", "bam/obs-v0"),
+    "arm": ("bam/reach-v0", "bam/pick-v0", "bam/pick-place-v0", "bam/joints-v0", "bam/obs-v0"),
     "bases": ("bam/navigation-v0", "bam/avoidance-v0"),
     "ur": ("bam/ur-reach-v0", "bam/ur-empty-v0", "bam/ur-avoidance-v0", "bam/ur-track-v0", "bam/isaac-reach-v0"),
     "grasps": ("bam/grasp-xyr-v0", "bam/grasp-xyrw-v0", "bam/grasp-6d-v0", "bam/grasp-xy-v0"),

@@ -5,6 +5,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
+from bam_envs.tasks.scripted import scripted_policy
 from bam_train.environments import make_vector_env
 from bam_train.errors import PolicyError, SettingsError
 from bam_train.evaluation import (
@@ -68,6 +69,13 @@ def test_numbers_do_not_depend_on_how_many_run_side_by_side(corridor, num_envs):
     )
 
 
+@pytest.mark.parametrize(("episodes", "most", "played"), [(12, 1, 4), (12, 5, 6), (12, 12, 12), (32, 1, 8)])
+def test_more_failures_than_wanted_end_it_after_a_wave_and_a_quarter_of_the_episodes(corridor, episodes, most, played):
+    slow = {"slow": True}  # nobody succeeds
+    report = evaluate(Always(), corridor, slow, episodes=episodes, num_envs=2, most_failures=most)
+    assert (report.episodes, report.successes) == (played, 0)
+
+
 def test_time_limit_and_no_success_where_the_environment_has_none(corridor):
     report = evaluate(Always(), corridor, {"slow": True}, episodes=2, seed=0)
     assert (report.length_mean, report.return_mean, report.success_rate) == (10.0, -2.5, 0.0)
@@ -85,6 +93,20 @@ def test_recurrent_state_is_forgotten_at_the_start_of_every_episode(corridor, st
     assert [[episode.length for episode in wave] for wave in played] == [[1, 2], [1, 2]]
     assert policy.forgotten == [None, [0], None, [0]]
     assert len(policy.batches) == 4
+
+
+def test_arms_whose_episode_has_ended_rest_until_the_next_wave():
+    envs = make_vector_env("bam/pick-v0", None, 4)
+    envs.reset()
+    inner, policy = envs.unwrapped, scripted_policy("bam/pick-v0")
+    resting, step = [], inner.robot.step
+    inner.robot.step = lambda command: (resting.append(int(inner.robot.physics.resting.sum())), step(command))[1]
+    together = evaluate(policy, "bam/pick-v0", episodes=4, env=envs)
+    assert resting == sorted(resting)
+    assert (resting[0], resting[-1]) == (0, 3)
+    assert not inner.robot.physics.resting.any()
+    envs.close()
+    assert evaluate(policy, "bam/pick-v0", episodes=4, num_envs=1) == together
 
 
 def test_a_given_environment_is_used_again_and_left_open(corridor):

@@ -173,6 +173,11 @@ def test_policy(bench):
     assert [row[0] for row in rows[1:4]] == ["FrozenPolicy.act", "onnxruntime", "SB3 predict"]
 
 
+def test_training(bench):
+    [row] = bench("train", "--only", "update")
+    assert row[0] == "an update by stable-baselines3, of one with NumPy"
+
+
 def test_data(bench):
     rows = bench("data", "--only", "places")
     assert [row[0].split(",")[-1] for row in rows[:2]] == [" 5000 steps"] * 2

@@ -1,4 +1,7 @@
-"""LeRobot 0.4.4 and Hugging Face datasets open a data set as it was recorded, and as it was exported."""
+"""LeRobot 0.4.4 and Hugging Face datasets open a data set as it was recorded, and as it was exported.
+
+A policy of LeRobot, exported by `bam-export`, acts as in LeRobot.
+"""
 
 import json
 import os
@@ -17,6 +20,7 @@ from tests.peers.conftest import PEERS
 
 FOLDER = PEERS / "lerobot"
 READER = Path(__file__).parent / "lerobot_reader.py"
+POLICY = Path(__file__).parent / "lerobot_policy.py"
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -26,20 +30,31 @@ def lerobot(peers):
         (pytest.fail if os.environ.get("CI") == "true" else pytest.skip)("no peers: run tests/peers/install_peers")
 
 
-def read(root, tmp_path):
+def lerobot_python(tmp_path, *arguments):
+    """The last line that a script printed which imports LeRobot."""
     env = {name: value for name, value in os.environ.items() if not name.startswith(("PYTEST", "PYTHON"))}
     env |= {"PYTHONPATH": str(FOLDER), "HF_HUB_OFFLINE": "1", "HF_HOME": str(tmp_path / "hf"), "OMP_NUM_THREADS": "1"}
     done = subprocess.run(
-        [sys.executable, READER, root, "0.05", tmp_path / "cache"],
+        [sys.executable, *arguments],
         env=env,
         capture_output=True,
         text=True,
         check=False,
-        timeout=300,
+        timeout=600,
         cwd=tmp_path,
     )
     assert done.returncode == 0, done.stdout + done.stderr
     return json.loads(done.stdout.splitlines()[-1])
+
+
+def read(root, tmp_path):
+    return lerobot_python(tmp_path, READER, root, "0.05", tmp_path / "cache")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("ensemble", ["null", "0.1"])
+def test_an_exported_policy_acts_as_in_lerobot(tmp_path, ensemble):
+    assert lerobot_python(tmp_path, POLICY, tmp_path, ensemble) <= 1e-5
 
 
 @pytest.mark.slow

@@ -5,16 +5,20 @@ import textwrap
 import zipfile
 import zlib
 from collections.abc import Mapping
+from importlib import metadata
 from pathlib import Path
 from typing import Any
 
+from bam_envs.core.errors import UnknownName
 from bam_envs.core.spaces import space_to_json
+from bam_train.checkpoint import GOLDEN, POLICY
 from bam_train.checkpoint.manifest import MANIFEST
 from bam_train.checkpoint.zip_members import open_zip
-from bam_train.environments import make_env
+from bam_train.environments import control_period, make_env
 from bam_train.errors import CheckpointMismatch, NotACheckpoint
 from bam_train.policy import FrozenPolicy
 from bam_train.trainers.algorithms import SB3_ALGORITHMS
+from bam_train.trainers.base import origin
 from bam_train.trainers.zero_based_spaces import from_zero
 
 # Exceptions of SB3's load for a file of another algorithm or another version, then those for a damaged one.
@@ -45,18 +49,79 @@ def load_trusted(
     Raises:
         CheckpointMismatch: The file is of another algorithm, or for another environment.
     """
-    from bam_train.trainers.sb3.sb3_freezing import freeze
-
-    algorithm = SB3_ALGORITHMS[algo].load()
     env = make_env(env_id, env_kwargs)
+    model, members = _frozen(path, algo, env_id, env, None)
+    policy = FrozenPolicy.from_graph(
+        members[POLICY], space_to_json(env.observation_space), space_to_json(env.action_space)
+    )
+    env.close()  # type: ignore[no-untyped-call]
+    return policy, int(model.num_timesteps)
+
+
+def export_trusted(
+    path: Path, algo: str, env_id: str, env_kwargs: Mapping[str, Any], statistics: Path | None
+) -> tuple[dict[str, Any], dict[str, bytes]]:
+    """As `load_trusted`, for a checkpoint: fields of its manifest, and its members.
+
+    Args:
+        path: The zip.
+        algo: Its algorithm.
+        env_id: Its environment.
+        env_kwargs: Arguments of the environment.
+        statistics: File of a VecNormalize, which is unpickled too.
+
+    Raises:
+        CheckpointMismatch: A file is of another algorithm, or for another environment.
+        UnknownName: There is no such algorithm.
+    """
+    if algo not in SB3_ALGORITHMS:
+        raise UnknownName("algorithm", algo, SB3_ALGORITHMS)
+    if not is_plain_sb3(path):
+        with open_zip(path):
+            raise NotACheckpoint(path, "is not a zip of stable-baselines3, or already a checkpoint of bam-train")
+    env = make_env(env_id, env_kwargs)
+    describe = getattr(env.unwrapped, "describe", dict)
+    model, members = _frozen(path, algo, env_id, env, statistics)
+    fields = {
+        "env": env_id,
+        "env_kwargs": dict(env_kwargs),
+        "observation_space": space_to_json(env.observation_space),
+        "action_space": space_to_json(env.action_space),
+        "signals": describe(),
+        "period": control_period(env),
+        "algorithm": algo,
+        "trainer": "sb3",
+        "settings": {
+            "exported": {
+                "file": str(path.absolute()),
+                "golden": f"stable-baselines3 {metadata.version('stable-baselines3')}",
+            }
+        },
+        "steps": int(model.num_timesteps),
+        "seed": int(model.seed or 0),
+        "scores": {},
+        **origin(),
+    }
+    env.close()  # type: ignore[no-untyped-call]
+    return fields, members
+
+
+def _frozen(path: Path, algo: str, env_id: str, env: Any, statistics: Path | None) -> tuple[Any, dict[str, bytes]]:
+    """The model of a trusted zip, its graph and golden actions."""
+    from bam_train.trainers.sb3.sb3_freezing import FrozenModel, golden
+
+    algorithm, normaliser = SB3_ALGORITHMS[algo].load(), None
     try:
         model = algorithm.load(path, env=from_zero(env), device="cpu")
-        graph = freeze(model, None, env.observation_space, env.action_space)
-    except (*_MISFIT, *_DAMAGE) as error:
+        if statistics is not None:
+            from stable_baselines3.common.vec_env import VecNormalize
+
+            normaliser = VecNormalize.load(str(statistics), model.get_env())
+        space = env.observation_space, env.action_space
+        graph = FrozenModel(model, normaliser, *space).onnx_file()
+        return model, {POLICY: graph, GOLDEN: golden(model, normaliser, *space)}
+    except (*_MISFIT, *_DAMAGE, OSError) as error:
         why = textwrap.shorten(str(error) or type(error).__name__, 160, placeholder=" ...")
         why = why if why.endswith("...") else f"{why.rstrip('.')}."
         text = f"{algorithm.__name__}.load cannot use it with {env_id}: {why} Check --algo and --env"
         raise CheckpointMismatch(path, text) from error
-    policy = FrozenPolicy.from_graph(graph, space_to_json(env.observation_space), space_to_json(env.action_space))
-    env.close()  # type: ignore[no-untyped-call]
-    return policy, int(model.num_timesteps)

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import torch
 from gymnasium import spaces
+from stable_baselines3 import PPO
 from stable_baselines3.common import noise, torch_layers, utils
 from stable_baselines3.common.preprocessing import is_image_space, is_image_space_channels_first
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize, VecTransposeImage
@@ -17,6 +18,7 @@ from bam_train.errors import SettingsError
 from bam_train.settings import TrainSettings
 from bam_train.trainers.algorithms import SB3_ALGORITHMS
 from bam_train.trainers.library_arguments import linear_start
+from bam_train.trainers.sb3.numpy_ppo import NumpyPPO
 from bam_train.trainers.sb3_hyperparameters import CLASSES, check_pictures
 
 _MODULES = {"activation_fn": torch.nn, "optimizer_class": torch.optim, "features_extractor_class": torch_layers}
@@ -59,6 +61,7 @@ def make_model(settings: TrainSettings, venv: VecEnv) -> tuple[Any, list[str]]:
             env = _normalised(venv, settings.normalize) if settings.normalize else venv
             arguments = build(settings.hyperparameters, venv.action_space)
             kind, policy = SB3_ALGORITHMS[settings.algo].load(), arguments.pop("policy")
+            kind = NumpyPPO if kind is PPO else kind
             device = _device(settings.device, policy)
             model = kind(policy, env, seed=settings.seed, device=device, verbose=0, **arguments)
         except SettingsError:

@@ -81,7 +81,8 @@ class SB3Trainer:
     @classmethod
     def _made(cls, settings: SB3Settings) -> SB3Trainer:
         torch.set_num_threads(settings.threads)
-        venv = make_training_env(settings.env, settings.env_kwargs, settings.num_envs, settings.place)
+        given = settings.env, settings.env_kwargs, settings.num_envs, settings.place
+        venv = make_training_env(*given, coarse=settings.coarse_physics)
         model, notices = make_model(settings, venv)
         model.set_logger(Logger(None, []))
         trainer = cls(settings, model, venv)

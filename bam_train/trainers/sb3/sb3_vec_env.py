@@ -22,10 +22,22 @@ Observations = Any
 """An array (n, …), or a mapping of them."""
 
 
-def make_training_env(env_id: str, env_kwargs: Mapping[str, Any], num_envs: int, place: Location = HERE) -> VecEnv:
-    """Make `num_envs` environments to train on; those of `bam_envs` can save and restore their state."""
+def make_training_env(
+    env_id: str, env_kwargs: Mapping[str, Any], num_envs: int, place: Location = HERE, *, coarse: bool = False
+) -> VecEnv:
+    """Make `num_envs` environments to train on; those of `bam_envs` can save and restore their state.
+
+    Their physics is `coarse` if that is asked for, unless they are elsewhere; raises SettingsError if it cannot be.
+    """
     if is_batched(env_id) or isinstance(place, Remote):
-        return BatchVecEnv(make_vector_env(env_id, env_kwargs, num_envs, place), env_id)
+        batch = make_vector_env(env_id, env_kwargs, num_envs, place)
+        robot: Any = getattr(batch.unwrapped, "robot", None)
+        if hasattr(robot, "coarse"):
+            robot.coarse, coarse = coarse, False
+        if not coarse or isinstance(place, Remote):
+            return BatchVecEnv(batch, env_id)
+    if coarse:
+        raise SettingsError(f"coarse_physics: {env_id} has no arm that MuJoCo simulates; leave it out")
     envs = (FiniteEnv(make_env(env_id, env_kwargs), env_id, index) for index in range(num_envs))
     return DummyVecEnv([functools.partial(Monitor, from_zero(env)) for env in envs])
 

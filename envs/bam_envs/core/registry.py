@@ -154,6 +154,15 @@ _ENTRIES = (
         cameras=_CAMERAS,
     ),
     EnvEntry(
+        "bam/joints-v0",
+        "follow positions of an arm's joints, for policies of others",
+        "bam_envs.tasks.reach:JointsTask",
+        "bam_envs.robots.physics.mujoco_arm:arm_scene",
+        max_episode_steps=600,
+        robot_options=("robot_model",),
+        cameras=_CAMERAS,
+    ),
+    EnvEntry(
         "bam/navigation-v0",
         "drive a wheeled base to within 20 cm of a place, nothing in the way",
         "bam_envs.tasks.navigation:NavigationTask",

@@ -328,6 +328,12 @@ class RobotVectorEnv(_RobotAndTask, gym.vector.VectorEnv[Any, Any, NDArray[Any]]
             observation = self._next_episodes(ended, observation, infos)
         return observation, score.reward, score.terminated, truncated, infos
 
+    def rest(self, resting: NDArray[np.bool_]) -> None:
+        """Leave robots of a mask (n,) as they are in the next steps, which nobody looks at, if that saves physics."""
+        robot: Any = self.robot
+        if hasattr(robot, "rest"):
+            robot.rest(resting)
+
     def _next_episodes(self, ended: NDArray[np.bool_], observation: Any, infos: dict[str, Any]) -> Any:
         """Save the last observation and info of ended episodes in `infos`, and begin the next episodes."""
         values = {key: value for key, value in infos.items() if not key.startswith("_")}

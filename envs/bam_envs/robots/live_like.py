@@ -130,6 +130,11 @@ class LiveLike:
         draws: Array = (mixed(self._seeds + mixed(keys)) >> np.uint64(11)).astype(np.float64) / 2**53
         return draws
 
+    def rest(self, resting: NDArray[np.bool_]) -> None:
+        """See `RobotVectorEnv.rest`."""
+        if hasattr(self.robot, "rest"):
+            self.robot.rest(resting)
+
     def halt(self) -> None:
         """Stop moving."""
         self.robot.halt()

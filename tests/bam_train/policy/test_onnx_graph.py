@@ -102,7 +102,7 @@ GROWING = [
             ),
             "operation Pad: the size of its result depends on the observation",
         ),
-        (of(*[node("Tanh", ["observation"], ["action"])] * (MOST_NODES + 1)), "it has 1001 operations, expected at mo"),
+        (of(*[node("Tanh", ["observation"], ["action"])] * (MOST_NODES + 1)), "it has 10001 operations, expected at m"),
         (ONCE * 2, "onnxruntime .* cannot run the policy"),  # protobuf merges the two
         (changed(lambda made: made.functions.append(FUNCTION)), "it holds functions or training, expected a graph"),
         (changed(lambda made: made.training_info.add()), "it holds functions or training, expected a graph alone"),

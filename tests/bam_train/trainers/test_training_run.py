@@ -93,9 +93,10 @@ def start(tmp_path, monkeypatch):
         trainer, watcher = Counter(TrainSettings.from_mapping({**given, **extra}), begin, save_takes), Watcher()
         start.seeds = []
 
-        def evaluate(policy, env_id, env_kwargs, *, episodes, seed, env):
+        def evaluate(policy, env_id, env_kwargs, *, episodes, seed, env, most_failures):
             assert env is trainer.rows
             start.seeds.append((policy.steps, seed, episodes))
+            start.most_failures = most_failures
             found = results[policy.steps]
             return found.pop(0) if isinstance(found, list) else found
 
@@ -191,27 +192,29 @@ def test_a_run_that_goes_on_without_its_best_evaluates_when_it_would_have(start)
 
 
 def test_success_must_be_confirmed_by_fresh_episodes(start):
-    look, all_of_them = report(1.0, episodes=3), report(1.0)
-    lucky, lasting = [look, all_of_them, report(0.8)], [look, all_of_them, report(0.9)]
+    lucky, lasting = [report(1.0), report(0.8)], [report(1.0), report(0.9)]
     run, _, watcher = start({30: [report(0.0, episodes=3)], 60: lucky, 90: lasting}, until_success=0.9)
     outcome = run.run()
-    quarter, whole, fresh = (2_000_007, 3), (2_000_007, 10), (2_000_017, 10)
-    assert start.seeds == [(30, *quarter)] + [(step, *asked) for step in (60, 90) for asked in (quarter, whole, fresh)]
+    whole, fresh = (2_000_007, 10), (2_000_017, 10)
+    assert start.seeds == [(30, *whole)] + [(step, *asked) for step in (60, 90) for asked in (whole, fresh)]
     assert [row[:2] for row in watcher.evaluations] == [(30, 0.0), (60, 0.8), (90, 0.9)]
     assert (outcome.reason, outcome.steps, outcome.best["steps"]) == ("success", 90, 90)
 
 
-def test_a_quarter_with_few_failures_is_followed_by_the_rest_and_the_last_evaluation_is_whole(start):
-    few, many = report(2 / 3, episodes=3), report(0.0, episodes=3)
-    run, _, watcher = start({30: [few, report(0.7)], 60: [many], 90: [many], 100: report(0.1)}, until_success=0.9)
+def test_without_a_success_among_sixteen_episodes_no_more_are_played_and_the_last_evaluation_is_whole(start):
+    none, some = report(0.0, episodes=16), report(1 / 16, episodes=16)
+    results = {30: [none], 60: [some, report(0.1)], 90: [some, report(1.0), report(0.9)], 100: report(0.0)}
+    run, _, watcher = start(results, until_success=0.95, eval_episodes=128)
+    failures = []
+    watcher.evaluated = lambda *_: failures.append(start.most_failures)
     run.run()
-    assert [row[1] for row in watcher.evaluations] == [0.7, 0.0, 0.0, 0.1]
-    assert [asked[2] for asked in start.seeds] == [3, 10, 3, 3, 10]
+    assert [asked[2] for asked in start.seeds] == [16, 16, 128, 16, 128, 128, 128]
+    assert failures == pytest.approx([6.4, 6.4, 6.4, float("inf")])
 
 
 @pytest.mark.parametrize(("share", "steps"), [(0.95, [10, 20, 30]), (0.9, [40, 80, 100])])
 def test_training_that_succeeds_is_evaluated_early(start, share, steps):
-    results = dict.fromkeys(range(10, 101, 10), report(0.9)) | {30: [report(1.0), report(1.0), report(1.0)]}
+    results = dict.fromkeys(range(10, 101, 10), report(0.9)) | {30: [report(1.0), report(1.0)]}
     run, trainer, watcher = start(results, until_success=0.95, eval_every=40)
     trainer.statistics = replace(STATISTICS, success_rate=share)
     run.run()

@@ -57,6 +57,8 @@ class SimulatedArm:
     ) -> None:
         self.num_robots, self.description = num_robots, model_called(robot_model)
         self.randomize, self._looks = randomize, looks
+        self.coarse = False
+        """Whether `connect` builds coarse physics, to train on; see `coarse_physics`."""
         self.spec = replace(self.description.spec(with_object=with_object), lag=LAG, cameras=cameras)
         self._joints, self._open = self.description.num_joints, self.description.gripper.open
         command = self.spec.command
@@ -76,11 +78,16 @@ class SimulatedArm:
         if self._physics is not None:
             return
         from bam_envs.robots.physics.arm_model import scene_spec
+        from bam_envs.robots.physics.coarse_physics import CoarsePhysics
         from bam_envs.robots.physics.domain_randomization import Imperfection
         from bam_envs.robots.physics.mujoco_batch import Physics
 
         scene = partial(scene_spec, self.description, with_object=self._with_object)
-        self._physics = Physics(scene().compile(), self.num_robots, varied=self.randomize)
+        if self.coarse:
+            given: dict[str, Any] = {"with_object": self._with_object, "varied": self.randomize}
+            self._physics = CoarsePhysics(self.description, self.num_robots, **given)
+        else:
+            self._physics = Physics(scene().compile(), self.num_robots, varied=self.randomize)
         self._imperfection = Imperfection(self._physics) if self.randomize else None
         if self.spec.cameras:
             from bam_envs.robots.physics.cameras import Cameras
@@ -169,6 +176,11 @@ class SimulatedArm:
         if parts not in range(1, PHYSICS_STEPS + 1) or PHYSICS_STEPS % parts:
             raise InvalidValue(f"A period has {PHYSICS_STEPS} physics steps; it cannot be divided into {parts!r}.")
         return self._slices(self._travel(checked_command(command, self._command.shape)), parts)
+
+    def rest(self, resting: NDArray[np.bool_]) -> None:
+        """Leave the arms of a mask (n,) as they are in the next steps; see `RobotVectorEnv.rest`."""
+        if self._physics is not None:
+            self._physics.resting = resting
 
     def _travel(self, command: Array) -> Array:
         """Change of the set points in this period, if `command` is sent now. Shape: (n, joints + 1)."""

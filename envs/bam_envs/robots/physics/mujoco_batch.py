@@ -40,12 +40,13 @@ class Physics:
         self._models = [copy.copy(self.model) if varied else self.model for _ in range(num_envs)]
         cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
         self._threads = min(cores, num_envs)
-        self._chunk = max(1, num_envs // (4 * self._threads))
         self._start()
         state = np.empty(mujoco.mj_stateSize(self.model, FULL))
         mujoco.mj_getState(self.model, self._scratch, state, FULL)
         self.state: Array = np.tile(state, (num_envs, 1))
         """Time, joint positions, joint velocities. Shape: (n, 1 + nq + nv)."""
+        self.resting = np.zeros(num_envs, dtype=bool)
+        """Environments that `step` leaves as they are. Shape: (n,)."""
 
     def _start(self) -> None:
         """Create the threads and their working memory, which belong to this process."""
@@ -82,15 +83,25 @@ class Physics:
 
     def step(self, control: Array) -> None:
         """Advance all environments; `control` are the actuators' set points for each physics step (n, steps, nu)."""
-        steps = control.shape[1]
-        states = np.empty((self.num_envs, steps, self.state.shape[1]))
-        options = {"nstep": steps, "state": states, "skip_checks": True, "chunk_size": self._chunk}
-        self._rollout.rollout(self._models, self._data, self.state, control, **options)
-        after = states[:, -1].copy()
-        # MuJoCo resets a diverged state to its default, so that its time is wrong, or NaN.
-        diverged = ~(np.abs(after[:, 0] - (self.time + steps * self.model.opt.timestep)) < 1e-6)
-        after[diverged] = np.nan
+        if not self.resting.any():
+            self.state = self.advanced(self.state, control, self._models)
+            return
+        rows, after = np.flatnonzero(~self.resting), self.state.copy()
+        after[rows] = self.advanced(after[rows], control[rows], [self._models[row] for row in rows])
         self.state = after
+
+    def advanced(self, state: Array, control: Array, models: list[Any]) -> Array:
+        """What follows the rows of `state` (k, nstate), of one model or k, under `control` (k, steps, nu)."""
+        count, steps = control.shape[:2]
+        states = np.empty((count, steps, state.shape[1]))
+        chunk = max(1, count // (4 * self._threads))
+        options = {"nstep": steps, "state": states, "skip_checks": True, "chunk_size": chunk}
+        self._rollout.rollout(models if len(models) == count else models * count, self._data, state, control, **options)
+        after: Array = states[:, -1].copy()
+        # MuJoCo resets a diverged state to its default, so that its time is wrong, or NaN.
+        diverged = ~(np.abs(after[:, 0] - (state[:, 0] + steps * self.model.opt.timestep)) < 1e-6)
+        after[diverged] = np.nan
+        return after
 
     def data_of(self, env: int) -> Any:
         """An `MjData` with the state of `env` and all derived quantities; overwritten by the next call."""

@@ -57,6 +57,18 @@ def test_rows_do_not_know_of_each_other():
         physics.close()
 
 
+def test_environments_at_rest_stay_as_they_are_and_the_others_do_not_know():
+    all_of_them, some = started(3), started(3)
+    some.resting = np.array([False, True, False])
+    before = some.state.copy()
+    for physics in (all_of_them, some):
+        physics.step(control(3))
+    np.testing.assert_array_equal(some.state[1], before[1])
+    np.testing.assert_array_equal(some.state[[0, 2]], all_of_them.state[[0, 2]])
+    for physics in (all_of_them, some):
+        physics.close()
+
+
 @pytest.mark.parametrize("bad", [np.nan, 1e11])
 def test_a_row_that_diverges_is_noticed(bad, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)  # MuJoCo writes its log there

@@ -48,6 +48,28 @@ def test_a_checkpoint_says_where_it_comes_from_and_holds_the_policy(walk, tmp_pa
         assert np.abs(policy.act_batch(observations) - wanted).max() <= 1e-5
 
 
+def test_training_on_coarse_physics_is_noted_resumed_and_evaluated_on_the_usual_one(tmp_path):
+    given = {"num_envs": 4, "coarse_physics": True, "hyperparameters": FIRST}
+    trainer = SB3Trainer.create(completed("bam/reach-v0", **given))
+    assert trainer.venv.batch.unwrapped.robot.coarse
+    trainer.train(96, lambda progress: True)
+    trainer.save(tmp_path / "a.zip", {}, {"best": None})
+    trainer.train(256, lambda progress: True)
+    again = SB3Trainer.load(Checkpoint.open(tmp_path / "a.zip"))
+    again.train(256, lambda progress: True)
+    assert again.venv.batch.unwrapped.robot.physics.model.opt.timestep == pytest.approx(0.01)
+    np.testing.assert_array_equal(again.model._last_obs, trainer.model._last_obs)
+    with trainer.evaluation_envs() as envs:
+        assert envs is None  # `evaluate` makes its own
+
+
+@pytest.mark.parametrize("env", ["CartPole-v1", "bam/ur-reach-v0"])
+def test_no_coarse_physics_without_an_arm_that_mujoco_simulates(env):
+    with pytest.raises(SettingsError) as caught:
+        SB3Trainer.create(completed(env, coarse_physics=True, hyperparameters=FIRST))
+    assert str(caught.value) == f"coarse_physics: {env} has no arm that MuJoCo simulates; leave it out"
+
+
 @pytest.mark.parametrize("normalize", [False, True])
 def test_a_new_run_begins_with_the_weights_of_another(walk, tmp_path, normalize):
     path = tmp_path / "plain.zip"
@@ -167,8 +189,8 @@ def test_one_seed_one_result_and_another_seed_another(walk):
 @pytest.mark.parametrize(
     ("algo", "hyperparameters", "message"),
     [
-        ("ppo", {**FIRST, "learning_rate": 1e30}, "NaN or infinite"),
-        ("ppo", {**FIRST, "learning_rate": 1e12}, "NaN or infinite"),
+        ("ppo", {**FIRST, "learning_rate": 1e30}, "NaN or infinite|is nan"),
+        ("ppo", {**FIRST, "learning_rate": 1e12}, "NaN or infinite|is nan|is -?inf"),
         ("a2c", {"learning_rate": 1e30}, "NaN or infinite|is nan|is -?inf"),
         ("sac", {"learning_rate": 1e30, "learning_starts": 10}, "_loss is (nan|inf)"),
     ],

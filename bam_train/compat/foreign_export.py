@@ -1,0 +1,173 @@
+"""Export a policy of others as a checkpoint.zip: compared with an environment, joined to it, and checked."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+
+from bam_envs.core.robot_models import portable_model
+from bam_envs.core.spaces import space_to_json
+from bam_train.checkpoint import GOLDEN, POLICY, Checkpoint, safetensors_file, write_checkpoint
+from bam_train.compat.foreign_graph import as_ours, as_theirs, mapped_graph, with_known_sizes
+from bam_train.compat.foreign_policy import ForeignPolicy, Meaning, fit_rows, meaning, part_key, part_of
+from bam_train.deploy.contract import Contract
+from bam_train.environments import control_period, make_env
+from bam_train.errors import ContractRefused, PolicyError
+from bam_train.policy import FrozenPolicy
+from bam_train.policy.frozen_policy import TOLERANCE
+from bam_train.policy.onnx_session import OnnxSession
+from bam_train.trainers.base import origin
+
+Array = NDArray[Any]
+EXPORTED = "exported"
+"""Setting of the manifest with the source of an exported checkpoint; runs have no setting of this name."""
+_ROWS, _BUDGET = 64, 200_000  # golden observations: at most so many, and about so many bytes, but 4
+
+
+@dataclass(frozen=True)
+class ForeignExport:
+    """A policy of others that fits an environment."""
+
+    members: Mapping[str, bytes]
+    fields: Mapping[str, Any]
+    """Of the manifest."""
+    difference: float
+    """The largest difference from its own actions."""
+
+    def write(self, path: Path) -> Checkpoint:
+        """Write the checkpoint.zip; raises OutputError if it cannot be written there."""
+        return write_checkpoint(path, self.fields, self.members)
+
+
+def export_foreign(
+    policy: ForeignPolicy,
+    env_id: str,
+    env_kwargs: Mapping[str, Any],
+    *,
+    tell: Callable[[str], None] = lambda text: None,
+) -> ForeignExport:
+    """Join a policy of others to an environment.
+
+    Args:
+        policy: The policy.
+        env_id: Versioned id of the environment that it will run in.
+        env_kwargs: Its arguments.
+        tell: Called with the lines of the contract where the two do not fit.
+
+    Raises:
+        ContractRefused: A joint is missing, or named twice; the rate or an image differs.
+        PolicyError: Its graph cannot be used, or does not act as its own library does.
+    """
+    policy = with_known_sizes(policy)
+    with contextlib.closing(make_env(env_id, env_kwargs)) as env:
+        period = control_period(env)
+        contract = Contract(tuple(fit_rows(policy, env, period)))
+        if contract.refused:
+            for line in contract.lines():
+                tell(line)
+            first = contract.refused[0]
+            more = f" (and {len(contract.refused) - 1} more)" if len(contract.refused) > 1 else ""
+            text = f"{first.what}: expected {first.expected}, found {first.found}{more}"
+            raise ContractRefused(first.what, f"{policy.place} does not fit {env_id}: {text}; nothing was written")
+        observation, action = env.observation_space, env.action_space
+        signals: dict[str, Any] = getattr(env.unwrapped, "describe", dict)()
+    if not isinstance(action, spaces.Box):
+        raise PolicyError(f"{policy.place}: {env_id} takes {action}, and policies of others give numbers")
+    taken, given = _meanings(policy, observation, signals), meaning(policy.output, *_numbers(signals, "action"))
+    graph = mapped_graph(policy, [taken[port.name] for port in policy.inputs], (action, given))
+    jsons = space_to_json(observation), space_to_json(action)
+    frozen = FrozenPolicy.from_graph(graph, *jsons, chunk=policy.chunk)
+    golden = _golden(policy, taken, given, action.shape)
+    worst, row = frozen.worst_difference(golden)
+    if not worst <= TOLERANCE:  # NaN too
+        text = f"its graph differs by {worst:.3g} in row {row} from the actions of {policy.by}"
+        raise PolicyError(f"{policy.place}: {text}, expected at most {TOLERANCE}: this network cannot be exported")
+    fields = {
+        "env": env_id,
+        "env_kwargs": _portable(env_kwargs),
+        "observation_space": jsons[0],
+        "action_space": jsons[1],
+        "signals": signals,
+        "period": period,
+        "algorithm": policy.algorithm,
+        "trainer": policy.trainer,
+        "settings": {EXPORTED: {**policy.source, "golden": policy.by}},
+        "steps": policy.steps,
+        "seed": 0,
+        "scores": {},
+        "chunk": asdict(policy.chunk),
+        **origin(),
+    }
+    return ForeignExport({POLICY: graph, GOLDEN: safetensors_file.dump(golden)}, fields, worst)
+
+
+def _portable(env_kwargs: Mapping[str, Any]) -> dict[str, Any]:
+    """The arguments with the whole description of a robot in place of its name."""
+    robot = env_kwargs.get("robot_model")
+    return {**env_kwargs, **({} if robot is None else {"robot_model": portable_model(robot)})}
+
+
+def _numbers(signals: Mapping[str, Any], of: str) -> tuple[list[Mapping[str, Any]], dict[str, tuple[float, float]]]:
+    """The labels of an observation or action, and the ranges of the robot's joints and gripper [rad, m]."""
+    ranges = {one["name"]: (float(one["low"]), float(one["high"])) for one in signals.get("command", [])}
+    return list(signals.get(of, [])), ranges
+
+
+def _meanings(
+    policy: ForeignPolicy, space: spaces.Space[Any], signals: Mapping[str, Any]
+) -> dict[str, tuple[str, Any, Meaning]]:
+    """Name of ours, space and meaning of every input, by its name."""
+    found: dict[str, tuple[str, Any, Meaning]] = {}
+    is_dict = isinstance(space, spaces.Dict)
+    labels, ranges = _numbers(signals, "observation")
+    for port in policy.inputs:
+        name = f"observation.{part_key(space, port)}" if is_dict else "observation"
+        part: Any = part_of(space, port)
+        count = math.prod(part.shape)
+        known = labels[:count] if port.names else [{"name": str(i)} for i in range(count)]
+        found[port.name] = name, part, meaning(port, known, ranges)
+    missing = set(space.spaces if isinstance(space, spaces.Dict) else ()) - {
+        name.removeprefix("observation.") for name, _, _ in found.values()
+    }
+    if missing:
+        names = ", ".join(sorted(missing))
+        raise PolicyError(f"{policy.place}: it does not look at {names} of the observation. Leave that out of it")
+    return found
+
+
+def _golden(
+    policy: ForeignPolicy, taken: Mapping[str, tuple[str, Any, Meaning]], given: Meaning, shape: tuple[int, ...]
+) -> dict[str, Array]:
+    """Observations about as those that it was trained on, and its own chunks for them."""
+    rng, past = np.random.default_rng(0), (policy.chunk.history,) if policy.chunk.history > 1 else ()
+    size = sum(math.prod(part.shape) * part.dtype.itemsize for _, part, _ in taken.values()) * policy.chunk.history
+    rows, arrays = max(4, min(_ROWS, _BUDGET // size)), {}
+    for port in policy.inputs:
+        name, part, means = taken[port.name]
+        if port.is_image:
+            arrays[name] = rng.integers(0, 256, (rows, *past, *part.shape), dtype=np.uint8)
+            continue
+        drawn = np.zeros((rows, *past, *part.shape))
+        drawn[..., means.order] = means.si(port.norm.inverse(rng.normal(size=(rows, *past, len(means.order)))))
+        arrays[name] = np.clip(drawn, part.low, part.high).astype(part.dtype)
+    answer = policy.answer or _graph(policy)
+    chunks = []
+    for k in range(rows):
+        one = {name: (arrays[ours][k : k + 1], means) for name, (ours, _, means) in taken.items()}
+        chunk = as_ours(policy, np.asarray(answer(as_theirs(policy, one))), given, shape)
+        chunks.append(chunk)
+    return {**arrays, "action": np.stack(chunks)}
+
+
+def _graph(policy: ForeignPolicy) -> Callable[[Mapping[str, Array]], Array]:
+    """The network itself, as its file is."""
+    session = OnnxSession(policy.network)
+    return lambda inputs: session.run(inputs, [policy.output.name])[0]

@@ -1,0 +1,215 @@
+"""Policies of others: what the numbers of their inputs and outputs mean, as an environment has them.
+
+Each number of theirs is one of ours, in another order and unit: ``ours = scale * theirs + offset``; and a network may
+take and give it normalised, which is of the same kind. Both are composed, and become a few nodes around the network.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+import gymnasium as gym
+import numpy as np
+from numpy.typing import NDArray
+
+from bam_envs.core.wording import did_you_mean
+from bam_envs.live.robot_checks import Check
+from bam_train.checkpoint.manifest import Chunk
+
+Array = NDArray[Any]
+Units = Literal["si", "degrees", "range"]
+PERCENT = 100.0
+"""What LeRobot's robots call the end of a joint's range, and the open gripper."""
+_GRIPPER = ("gripper", "gripper_width")
+
+
+@dataclass(frozen=True)
+class Affine:
+    """``scale * x + offset``, number by number, or for each channel of an image."""
+
+    scale: Array
+    offset: Array
+
+    def __call__(self, x: Array) -> Array:
+        """Apply it in float64."""
+        result: Array = self.scale * np.asarray(x, np.float64) + self.offset
+        return result
+
+    def after(self, other: Affine) -> Affine:
+        """First `other`, then this."""
+        return Affine(self.scale * other.scale, self.scale * other.offset + self.offset)
+
+    @property
+    def inverse(self) -> Affine:
+        """The way back."""
+        return Affine(1 / self.scale, -self.offset / self.scale)
+
+
+@dataclass(frozen=True)
+class Port:
+    """An input or the output of a network."""
+
+    name: str
+    """As the graph calls it."""
+    part: str
+    """The camera, or the vector of the observation: its key, or "" where the observation is one array."""
+    size: tuple[int, ...]
+    """Its shape in one step, without batch and chunk: (k,), or (channels, height, width) of an image."""
+    norm: Affine
+    """From their numbers to those that the network takes; of an output, from those that it gives to theirs."""
+    names: tuple[str, ...] = ()
+    """What each number is, such as shoulder_pan.pos; () for the environment's own numbers in its order."""
+    units: Units = "si"
+
+    @property
+    def is_image(self) -> bool:
+        """Whether it is an image, with its channels first."""
+        return len(self.size) == 3
+
+
+@dataclass(frozen=True)
+class ForeignPolicy:
+    """A network as an ONNX graph, and what it takes and gives."""
+
+    place: str
+    """Where it was found, for messages."""
+    network: bytes
+    inputs: tuple[Port, ...]
+    output: Port
+    chunk: Chunk
+    algorithm: str
+    trainer: str
+    period: float | None = None
+    """Time between two actions [s]; None if unknown."""
+    by: str = "onnxruntime"
+    """What computes `answer`."""
+    answer: Callable[[Mapping[str, Array]], Array] | None = None
+    """The chunk for one observation, arrays (1, ...) by names of inputs, by its own library; None: by the graph."""
+    steps: int = 0
+    source: Mapping[str, Any] = field(default_factory=dict)
+    """Where it comes from, for the manifest."""
+    env: str | None = None
+    """The environment that it was trained on, if it is one of ours."""
+    env_kwargs: Mapping[str, Any] = field(default_factory=dict)
+    """Arguments of that."""
+
+
+@dataclass(frozen=True)
+class Meaning:
+    """The numbers of a port as those of an environment."""
+
+    order: NDArray[np.int64]
+    """Which of ours each of theirs is."""
+    si: Affine
+    """From theirs to ours."""
+
+
+def meaning(port: Port, labels: Sequence[Mapping[str, Any]], ranges: Mapping[str, tuple[float, float]]) -> Meaning:
+    """What the numbers of a vector are; its names were checked by `number_checks`.
+
+    Args:
+        port: The input, or the output.
+        labels: ``name`` of each number that the environment has.
+        ranges: Range of each joint [rad] and of the gripper [m], by name.
+    """
+    ours = [str(label["name"]) for label in labels]
+    if not port.names:
+        return Meaning(np.arange(len(ours)), Affine(np.ones(len(ours)), np.zeros(len(ours))))
+    names = [plain_name(name) for name in port.names]
+    pairs = [_si(name, port.units, ranges.get(name, (-math.inf, math.inf))) for name in names]
+    scale, offset = np.array(pairs).T
+    return Meaning(np.array([ours.index(name) for name in names]), Affine(scale, offset))
+
+
+def plain_name(name: str) -> str:
+    """The name of a joint without LeRobot's ``.pos``; the gripper is the width between its pads."""
+    name = name.removesuffix(".pos")
+    return "gripper_width" if name in _GRIPPER else name
+
+
+def _si(name: str, units: Units, limits: tuple[float, float]) -> tuple[float, float]:
+    """Scale and offset from a number of theirs to SI units."""
+    low, high = limits
+    if units == "si":
+        return 1.0, 0.0
+    if name in _GRIPPER:  # 0 is closed, and 100 open
+        return (high - low) / PERCENT, low
+    if units == "degrees":
+        return math.pi / 180, 0.0
+    return (high - low) / (2 * PERCENT), (low + high) / 2  # -100 to 100
+
+
+def fit_rows(policy: ForeignPolicy, env: gym.Env[Any, Any], period: float | None) -> Iterator[Check]:
+    """The lines of a contract between the policy and an environment: rate, images, and each number of each vector."""
+    signals: Mapping[str, Any] = getattr(env.unwrapped, "describe", lambda: {"observation": [], "action": []})()
+    if policy.period is not None and period is not None:
+        same = math.isclose(policy.period, period, rel_tol=1e-3)
+        yield Check("period", f"{policy.period:g} s", f"{period:g} s", fits=same)
+    box: Any = env.action_space
+    yield from _vector_rows("action", policy.output, signals["action"], math.prod(box.shape or ()), whole=True)
+    for port in policy.inputs:
+        space: Any = part_of(env.observation_space, port)
+        what = f"input {port.name}"
+        if space is None:
+            parts = (
+                ", ".join(env.observation_space) if isinstance(env.observation_space, gym.spaces.Dict) else "one array"
+            )
+            yield Check(what, port.part or "a vector", f"the observation has {parts}", fits=False)
+        elif port.is_image:
+            channels, height, width = port.size
+            found = (
+                f"{space.shape[1]} x {space.shape[0]}, {space.shape[2]} channels"
+                if len(space.shape) == 3
+                else "numbers"
+            )
+            wanted = f"{width} x {height}, {channels} channels"
+            yield Check(f"image {port.part}", wanted, found, fits=wanted == found and space.dtype == np.uint8)
+        else:
+            images = {key for key, leaf in _parts(env.observation_space).items() if len(leaf.shape or ()) == 3}
+            labels = [one for one in signals["observation"] if one["name"] not in images]
+            yield from _vector_rows(what, port, labels, math.prod(space.shape or ()), whole=False)
+
+
+def _vector_rows(
+    what: str, port: Port, labels: Sequence[Mapping[str, Any]], count: int, *, whole: bool
+) -> Iterator[Check]:
+    """With `whole`, each of the environment's numbers has to be among the policy's, and all of these once."""
+    if not port.names:
+        yield Check(what, f"{math.prod(port.size)} numbers", f"{count} numbers", fits=(count,) == port.size)
+        return
+    if (len(port.names),) != port.size:
+        yield Check(what, f"{port.size[0]} numbers", f"{len(port.names)} names", fits=False)
+        return
+    ours, theirs = [str(label["name"]) for label in labels], [plain_name(name) for name in port.names]
+    for name, theirs_name in zip(theirs, port.names, strict=True):
+        if name not in ours:
+            yield Check(
+                f"{what}: {theirs_name}", "a joint of the robot", f"none. {did_you_mean(name, ours)}", fits=False
+            )
+    for name in ours:
+        found = theirs.count(name)
+        if whole or found:
+            yield Check(
+                f"{what}: {name}", "once", {0: "missing", 1: "once"}.get(found, f"{found} times"), fits=found == 1
+            )
+
+
+def _parts(space: gym.Space[Any]) -> dict[str, gym.Space[Any]]:
+    return dict(space.spaces) if isinstance(space, gym.spaces.Dict) else {"": space}
+
+
+def part_of(space: gym.Space[Any], port: Port) -> gym.Space[Any] | None:
+    """The space of the array that a port takes; a vector without a key is the only vector."""
+    parts = _parts(space)
+    return parts.get(part_key(space, port))
+
+
+def part_key(space: gym.Space[Any], port: Port) -> str:
+    """The key of the array that a port takes; "" where the observation is one array."""
+    vectors = [key for key, leaf in _parts(space).items() if len(leaf.shape or ()) == 1]
+    if port.is_image or port.part in _parts(space) or len(vectors) != 1:
+        return port.part
+    return vectors[0] if port.part in ("", "state") else port.part

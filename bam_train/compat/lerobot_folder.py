@@ -1,0 +1,222 @@
+"""Policies that LeRobot trained: the folder ``pretrained_model`` of ACT, with the statistics of its processors.
+
+LeRobot itself makes the network and computes the actions to compare with; it is not needed where the policy runs.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import nn
+
+from bam_train.checkpoint import safetensors_file
+from bam_train.checkpoint.manifest import Chunk
+from bam_train.compat.foreign_policy import Affine, ForeignPolicy, Port, Units
+from bam_train.data import DataSet
+from bam_train.errors import AlteredCheckpoint, CheckpointMismatch, FormatError, NotACheckpoint, SettingsError
+from bam_train.trainers.frozen_network import Layer, trace
+
+Array = NDArray[Any]
+LARGE = ("smolvla", "pi0", "pi05", "pi0_fast", "groot", "xvla", "wall_x")
+"""Policies that take seconds for a chunk on a CPU."""
+_ACTION, _STATE, _IMAGES = "action", "observation.state", "observation.images."
+_STEPS = {
+    *("rename_observations_processor", "to_batch_processor", "device_processor", "normalizer_processor"),
+    "unnormalizer_processor",
+}
+"""Steps of processors that are known; each of the others may change the numbers."""
+_ENDS = {"MIN_MAX": ("min", "max"), "QUANTILES": ("q01", "q99"), "QUANTILE10": ("q10", "q90")}
+
+
+def lerobot_policy(folder: Path, *, data: Path | None = None, units: Units | None = None) -> ForeignPolicy:
+    """The policy in a folder ``pretrained_model``.
+
+    Args:
+        folder: The folder.
+        data: The data set that it learnt from, which has the names of the numbers; by default where it was.
+        units: What joints are measured in: degrees, or -100 to 100 of their range; a gripper is 0 to 100 in both.
+
+    Raises:
+        NotACheckpoint: The folder is missing, or has no policy of LeRobot in it.
+        CheckpointMismatch: It is of a kind that cannot be exported, or its data set is not known.
+        SettingsError: LeRobot is not installed, or the units are needed.
+    """
+    folder = folder.expanduser()
+    config = _json(folder, "config.json")
+    kind = str(config.get("type"))
+    if kind in LARGE:
+        text = f"{kind} takes seconds for a chunk on a robot's computer: run it on a policy server with a GPU"
+        raise CheckpointMismatch(folder, f"{text}; bam-export takes act")
+    if kind != "act":
+        raise CheckpointMismatch(folder, f"is a policy of the kind {kind}; bam-export takes act")
+    steps = {name: _steps(folder, f"policy_{name}.json") for name in ("preprocessor", "postprocessor")}
+    renamed = {old: new for step in steps["preprocessor"] for old, new in step["config"].get("rename_map", {}).items()}
+    info, root = _data_set(folder, data)
+    ours = DataSet.open(root).info if (root / "meta/bam.json").is_file() else None
+    if units is None and ours is None:
+        text = (
+            "its joints may be measured in degrees, or from -100 to 100. Say which: --units degrees, or --units range"
+        )
+        raise SettingsError(f"{folder}: {text}")
+    network = _Act(folder)
+    norms = {name: _norms(folder, found) for name, found in steps.items()}
+
+    def port(feature: str, shape: tuple[int, ...], norm: Affine) -> Port:
+        there = next((old for old, new in renamed.items() if new == feature), feature)
+        part = there.removeprefix(_IMAGES).removeprefix("observation.")
+        if len(shape) == 3:
+            channels = np.ones(shape[0])
+            return Port(feature, part, shape, norm.after(Affine(channels / 255, 0 * channels)))
+        names = () if ours is not None else _names(folder, info, there)
+        return Port(feature, part, shape, norm, names, units or "si")
+
+    inputs = [port(name, shape, norms["preprocessor"](name, shape)) for name, shape in network.features.items()]
+    output = port(_ACTION, network.shape, norms["postprocessor"](_ACTION, network.shape))
+    example = tuple(torch.zeros(1, *shape) for shape in network.features.values())
+    graph = trace(network, example, [*network.features], [_ACTION], any_number=False)
+    chunk = Chunk(config["chunk_size"], config["n_action_steps"], 1, config["temporal_ensemble_coeff"])
+    version = network.version
+    source = {"directory": str(folder.absolute()), "lerobot": version, "data": str(root.absolute())}
+    return ForeignPolicy(
+        str(folder),
+        graph,
+        tuple(inputs),
+        output,
+        chunk,
+        kind,
+        "lerobot",
+        1.0 / float(info["fps"]),
+        f"LeRobot {version}",
+        network.answer,
+        source=source,
+        env=ours.env if ours is not None else None,
+        env_kwargs=ours.env_kwargs if ours is not None else {},
+    )
+
+
+class _Act(Layer):
+    """LeRobot's ACT, from normalised features to a chunk of normalised actions."""
+
+    def __init__(self, folder: Path) -> None:
+        super().__init__()
+        try:
+            from importlib.metadata import version
+
+            from lerobot.policies.act.modeling_act import ACTPolicy  # type: ignore[import-not-found]
+        except ImportError as error:
+            text = f"{folder}: LeRobot makes the network, and {error.name or 'lerobot'} is not installed"
+            raise SettingsError(f'{text}. Run: pip install "lerobot"') from error
+        policy = ACTPolicy.from_pretrained(folder)
+        config, self.version = policy.config, version("lerobot")
+        self.model: nn.Module = policy.model.cpu()
+        self.images = list(config.image_features)
+        features = {**config.image_features}
+        features |= {_STATE: config.robot_state_feature} if config.robot_state_feature else {}
+        features |= {"observation.environment_state": config.env_state_feature} if config.env_state_feature else {}
+        self.features = {name: tuple(one.shape) for name, one in features.items()}
+        self.shape = tuple(config.action_feature.shape)
+        self.eval()
+
+    def forward(self, *features: torch.Tensor) -> torch.Tensor:
+        """The chunk, (1, size, k)."""
+        batch: dict[str, Any] = dict(zip(self.features, features, strict=True))
+        batch["observation.images"] = [batch[name] for name in self.images]
+        chunk: torch.Tensor = self.model(batch)[0]
+        return chunk
+
+    def answer(self, inputs: Mapping[str, Array]) -> Array:
+        """The chunk for arrays (1, ...) by feature."""
+        with torch.no_grad():
+            return np.asarray(self(*(torch.as_tensor(inputs[name]) for name in self.features)).numpy())
+
+
+def _norms(folder: Path, steps: list[dict[str, Any]]) -> Any:
+    """A function of a feature and its shape: how a processor normalises it; of an action, how that is undone."""
+    found = [step for step in steps if step["registry_name"].endswith("normalizer_processor")]
+
+    def norm(feature: str, shape: tuple[int, ...]) -> Affine:
+        result = Affine(np.ones(shape[0]), np.zeros(shape[0]))
+        for step in found:
+            config, arrays = step["config"], _statistics(folder, step["state_file"])
+            mode = config["norm_map"].get(config["features"].get(feature, {}).get("type"), "IDENTITY")
+            stats = {key.rpartition(".")[2]: value for key, value in arrays.items() if key.startswith(f"{feature}.")}
+            if mode == "IDENTITY" or not stats:
+                continue
+            if mode != "MEAN_STD" and mode not in _ENDS:
+                raise CheckpointMismatch(folder, f"normalises {feature} by {mode}, which is not known here")
+            numbers = {key: np.ravel(value).astype(np.float64) for key, value in stats.items()}
+            back, eps = feature == _ACTION, float(config["eps"])
+            if mode == "MEAN_STD":
+                mean, std = numbers["mean"], numbers["std"]
+                result = Affine(std, mean) if back else Affine(1 / (std + eps), -mean / (std + eps))
+            else:
+                low, high = (numbers[key] for key in _ENDS[mode])
+                span = np.where(high == low, eps, high - low)
+                to_data = Affine(span / 2, span / 2 + low)
+                result = to_data if back else to_data.inverse
+        return result
+
+    return norm
+
+
+def _statistics(folder: Path, name: str) -> dict[str, Array]:
+    try:
+        return safetensors_file.parse((folder / name).read_bytes())
+    except (OSError, FormatError) as error:
+        raise AlteredCheckpoint(folder, name, f"{name} cannot be read: {error}") from error
+
+
+def _steps(folder: Path, name: str) -> list[dict[str, Any]]:
+    """The steps of a processor; each of them must be known."""
+    steps: list[dict[str, Any]] = _json(folder, name)["steps"]
+    for step in steps:
+        if step.get("registry_name") not in _STEPS:
+            found = step.get("registry_name") or step.get("class")
+            raise CheckpointMismatch(folder, f"{name} has the step {found}, which is not known here")
+    return steps
+
+
+def _data_set(folder: Path, given: Path | None) -> tuple[dict[str, Any], Path]:
+    """LeRobot's description of the data set that the policy learnt from, and where it is."""
+    place = given
+    if place is None:
+        at = (_json(folder, "train_config.json").get("dataset") or {}).get("root") if _has(folder) else None
+        place = None if at is None else Path(at)
+    if place is None or not (place / "meta/info.json").is_file():
+        where = f"{place} is no data set of LeRobot" if place is not None else "its data set is not known"
+        raise CheckpointMismatch(folder, f"does not say which joint each number is, and {where}. Give it with --data")
+    return _json(place, "meta/info.json"), place
+
+
+def _has(folder: Path) -> bool:
+    return (folder / "train_config.json").is_file()
+
+
+def _names(folder: Path, info: Mapping[str, Any], feature: str) -> tuple[str, ...]:
+    """The names of the numbers of a feature in its data set."""
+    names = info["features"].get(feature, {}).get("names")
+    names = next(iter(names.values())) if isinstance(names, dict) else names  # {"motors": [...]} in older ones
+    if not names:
+        raise CheckpointMismatch(
+            folder, f"the data set has no names for the numbers of {feature}: which joints are they?"
+        )
+    return tuple(map(str, names))
+
+
+def _json(folder: Path, name: str) -> dict[str, Any]:
+    try:
+        content = json.loads((folder / name).read_bytes())
+    except FileNotFoundError as error:
+        text = f"has no {name}: no folder pretrained_model of LeRobot. Give .../checkpoints/last/pretrained_model"
+        raise NotACheckpoint(folder, text) from error
+    except (OSError, ValueError, RecursionError) as error:
+        raise AlteredCheckpoint(folder, name, f"{name} cannot be read: {error}") from error
+    if not isinstance(content, dict):
+        raise AlteredCheckpoint(folder, name, f"{name} holds a {type(content).__name__}, expected an object")
+    return content

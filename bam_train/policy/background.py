@@ -1,0 +1,143 @@
+"""A policy with chunks that computes them in a thread beside the steps of a robot, so that no step waits for it."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import os
+import threading
+import time
+from collections import deque
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bam_envs.core.close_at_exit import close_at_exit
+from bam_train.policy.chunks import Plan
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping
+
+    from bam_train.policy.frozen_policy import FrozenPolicy
+
+SPARE = 1.5
+"""A chunk is asked for so many times its longest duration before it is due."""
+NICE = 5
+"""How much the thread gives way to the loop, where the system knows threads (Linux)."""
+
+
+class Background:
+    """Takes the place of its policy in a loop with deadlines.
+
+    What waits is a plan of actions, which only `act` hands out, one for each step: after `reset` there is none.
+
+    Args:
+        policy: The policy.
+        period: Time between two steps [s].
+        fade: See `Plan`; None: a change-over fades in `bam_train.policy.chunks.FADE` steps.
+        is_held: Whether a guard held the robot in the last step, so that its action was not executed.
+    """
+
+    def __init__(
+        self,
+        policy: FrozenPolicy,
+        period: float,
+        *,
+        fade: NDArray[Any] | None = None,
+        is_held: Callable[[], bool] = lambda: False,
+    ) -> None:
+        self.policy, self._period, self._is_held = policy, period, is_held
+        self._fade = np.asarray(np.inf) if fade is None else fade
+        self._plan = policy.plan(self._fade)
+        self._asked: _Request | None = None
+        self._requests: list[_Request] = []
+        self._took: deque[float] = deque(maxlen=8)
+        close_at_exit(self)
+
+    def __getattr__(self, name: str) -> Any:
+        """Any other attribute is the policy's: its spaces, its detector."""
+        if name == "policy" or name.startswith("__"):
+            raise AttributeError(name)
+        return getattr(self.policy, name)
+
+    def reset(self) -> None:
+        """Drop what waits, and a chunk that is on its way, as an episode starts or ends."""
+        self._plan, self._asked = self.policy.plan(self._fade), None
+
+    def prepare(self, observation: Any) -> None:
+        """Compute the first chunk, for the first observation of an episode."""
+        self._plan.see(self.policy.checked(observation))
+        self._ask()
+        self._receive(wait=True)
+
+    def act(self, observation: Any) -> Any:
+        """The action of this step; only the first one of a plan that was not prepared waits for its chunk.
+
+        Raises:
+            PolicyError: No chunk has an action for this step, or the last one cannot be used.
+        """
+        plan = self._plan
+        if plan.tick and self._is_held():
+            plan.repeat()
+        plan.see(self.policy.checked(observation))
+        self._receive()
+        lead = math.ceil(SPARE * max(self._took, default=0.0) / self._period) + 1
+        if self._asked is None and plan.is_due(lead):
+            self._ask()
+        if not (plan.tick or plan.has_action):
+            self._receive(wait=True)
+        return plan.take()
+
+    def close(self) -> None:
+        """Drop what waits; returns when no thread of it runs, since onnxruntime must not run while Python ends."""
+        self.reset()
+        for request in self._requests:
+            request.thread.join()
+
+    def _ask(self) -> None:
+        self._requests = [one for one in self._requests if one.thread.is_alive()]
+        self._asked = _Request(self.policy, self._plan.seen(), self._plan.step, self._plan.tick)
+        self._requests.append(self._asked)
+
+    def _receive(self, *, wait: bool = False) -> None:
+        """Take the chunk that was asked for, if it has come."""
+        asked = self._asked
+        if asked is None:
+            return
+        if wait:
+            asked.thread.join()
+        if asked.ended:
+            self._asked = None
+            self._took.append(asked.took)
+            asked.give(self._plan)
+
+
+class _Request:
+    """The computation of one chunk in a thread."""
+
+    def __init__(self, policy: FrozenPolicy, seen: Mapping[str, NDArray[Any]], step: int, tick: int) -> None:
+        self._policy, self._seen, self._step, self._tick = policy, seen, step, tick
+        self._chunk: NDArray[Any] | None = None
+        self._error: Exception | None = None
+        self.ended, self.took = False, 0.0
+        self.thread = threading.Thread(target=self._run, name="bam-chunk", daemon=True)
+        self.thread.start()
+
+    def _run(self) -> None:
+        begun = time.perf_counter()
+        with contextlib.suppress(AttributeError, OSError):  # elsewhere a thread has no priority of its own
+            os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), os.getpriority(os.PRIO_PROCESS, 0) + NICE)
+        try:
+            self._chunk = self._policy.answer({name: value[None] for name, value in self._seen.items()})[0]
+        except Exception as error:  # it is the loop that must end
+            self._error = error
+        self.took = time.perf_counter() - begun
+        self.ended = True
+
+    def give(self, plan: Plan) -> None:
+        """Give the chunk to the plan; raises what the computation did."""
+        if self._error is not None:
+            raise self._error
+        if self._chunk is not None:
+            plan.add(self._step, self._chunk, self._tick)

@@ -1,0 +1,35 @@
+"""bam/joints: positions of joints are followed as fast as the arm may move, and no lower than its work area."""
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+import bam_envs  # noqa: F401 - registers
+
+
+@pytest.fixture
+def env():
+    env = gym.make("bam/joints-v0", robot_model="so101")
+    yield env.unwrapped
+    env.close()
+
+
+def test_positions_are_reached_within_the_steps_that_are_followed(env):
+    seen, _ = env.reset(seed=0)
+    goal = seen + np.array([0.4, 0.1, -0.1, 0.1, 0.2, -0.03], np.float32)
+    sent = [env.state.command[0].copy()]
+    for _ in range(60):
+        seen, reward, terminated, *_ = env.step(goal)
+        sent.append(env.state.command[0].copy())
+        assert (reward, terminated) == (0.0, False)
+    np.testing.assert_allclose(seen, goal, atol=1e-3)
+    assert (np.abs(np.diff(sent, axis=0)) <= env.task.action_step * (1 + 1e-9)).all()
+
+
+def test_the_tool_stays_above_the_lower_end_of_the_work_area(env):
+    env.reset(seed=0)
+    down = env.action_space.high.copy()  # every joint as far as it goes
+    for _ in range(200):
+        env.step(down)
+    tool = env.task.arm.tool_position(env.state.command[:, :-1])
+    assert tool[0, 2] >= env.task.space.box[0, 2] - 1e-6

@@ -1,0 +1,194 @@
+"""bam-export of an ONNX file that a TOML file describes, of a zip of stable-baselines3, and what it refuses."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+from gymnasium.spaces import flatdim
+from onnx import helper
+
+from bam_train.checkpoint import Checkpoint
+from bam_train.checkpoint.manifest import Chunk
+from bam_train.cli.export import main
+from bam_train.environments import make_env
+from bam_train.policy import FrozenPolicy
+from tests.bam_train.cli.conftest import run  # noqa: F401 - a fixture
+from tests.bam_train.policy.test_frozen_policy import onnx_of
+
+node = helper.make_node
+JOINTS = ["shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll"]
+NAMES = [*(f"{one}.pos" for one in reversed(JOINTS)), "gripper.pos"]
+MEAN, STD = [1.0, -2.0, 3.0, -4.0, 5.0, 60.0], [2.0, 3.0, 4.0, 5.0, 6.0, 10.0]
+SEEN = np.array([0.5, -0.4, 0.3, -0.2, 0.1, 0.02], np.float32)
+
+
+def network(pixels: bool) -> bytes:
+    """Chunks of two: what it sees, and that plus 1; an image adds its mean, which is 0 for a black one."""
+    nodes = [
+        node("Identity", ["state"], ["seen"]),
+        node("Add", ["seen", "one"], ["more"]),
+        node("Concat", ["seen", "more"], ["row"], axis=1),
+        node("Reshape", ["row", "shape"], ["actions"]),
+    ]
+    inputs = {"state": ("float32", [6])}
+    if pixels:
+        nodes[0] = node("Add", ["state", "bright"], ["seen"])
+        nodes = [
+            node("ReduceMean", ["image"], ["mean"], axes=[1, 2, 3]),
+            node("Reshape", ["mean", "column"], ["bright"]),
+            *nodes,
+        ]
+        inputs["image"] = ("float32", [3, 48, 64])
+    constants = {"one": np.float32(1), "shape": np.array([-1, 2, 6]), "column": np.array([-1, 1])}
+    return onnx_of(nodes, inputs, {"actions": ("float32", [2, 6])}, **constants)
+
+
+@pytest.fixture
+def described(tmp_path):
+    """Writes the files of a policy; changed texts as given."""
+
+    def write(*changes: tuple[str, str], units: str = "degrees", pixels: bool = False):
+        (tmp_path / "act.onnx").write_bytes(network(pixels))
+        vector = f'names = {json.dumps(NAMES)}\nunits = "{units}"\nmean = {MEAN}\nstd = {STD}\n'
+        image = '[[inputs]]\nname = "image"\npart = "front"\nsize = [3, 48, 64]\n' if pixels else ""
+        text = 'network = "act.onnx"\nrate = 20.0\nalgorithm = "act"\nchunk = { size = 2, steps = 2 }\n'
+        text += f'[[inputs]]\nname = "state"\n{vector}{image}[output]\nname = "actions"\n{vector}'
+        for old, new in changes:
+            assert old in text
+            text = text.replace(old, new, 1)
+        (tmp_path / "act.toml").write_text(text)
+        return tmp_path / "act.toml"
+
+    return write
+
+
+@pytest.mark.parametrize("units", ["degrees", "range"])
+def test_order_and_units_become_those_of_the_robot(described, run, tmp_path, units):  # noqa: F811
+    out = tmp_path / "act.zip"
+    status, said, err = run(main, described(units=units), "--robot-model", "so101", "--out", out)
+    assert (status, err) == (0, "")
+    assert said.splitlines()[0] == (
+        f"{out}: act on bam/joints-v0, 2 actions at once, 2 of them executed, out of {tmp_path / 'act.toml'}"
+    )
+    manifest = Checkpoint.open(out).manifest
+    assert (manifest.chunk, manifest.period, manifest.trainer) == (Chunk(2, 2), 0.05, "onnx")
+    assert [one["name"] for one in manifest.signals["action"]] == [*JOINTS, "gripper_width"]
+    policy, env = FrozenPolicy.load(out), make_env("bam/joints-v0", {"robot_model": "so101"})
+    assert flatdim(env.observation_space) == 6
+    span = env.action_space.high - env.action_space.low
+    more = np.array([*reversed(STD[:5]), STD[5]])
+    wide = np.array([*([np.pi / 180] * 5 if units == "degrees" else span[:5] / 200), span[5] / 100])
+    np.testing.assert_allclose(policy.act(SEEN), SEEN, atol=1e-6)
+    np.testing.assert_allclose(policy.act(np.zeros(6, np.float32)), SEEN + more * wide, atol=1e-6)
+    env.close()
+
+
+def test_an_image_has_its_channels_first(described, run, tmp_path):  # noqa: F811
+    out = tmp_path / "act.zip"
+    cameras = ["--set", "camera=front", "--set", "image_size=64x48"]
+    assert run(main, described(pixels=True), "--robot-model", "so101", *cameras, "--out", out)[0] == 0
+    black = {"front": np.zeros((48, 64, 3), np.uint8), "robot": SEEN}
+    np.testing.assert_allclose(FrozenPolicy.load(out).act(black), SEEN, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("changes", "flags", "row"),
+    [
+        ([("elbow_flex.pos", "wrist_flex.pos")], [], "input state: wrist_flex once 2 times refused"),
+        (
+            [
+                (
+                    '"actions"\nnames = ["wrist_roll.pos", "wrist_flex',
+                    '"actions"\nnames = ["wrist_roll.pos", "wrist_roll',
+                )
+            ],
+            [],
+            "action: wrist_flex once missing refused",
+        ),
+        (
+            [('"actions"\nnames = ["wrist_roll.pos", ', '"actions"\nsize = [6]\nnames = [')],
+            [],
+            "action 6 numbers 5 names refused",
+        ),
+        (
+            [('"actions"\nnames = ["wrist_roll.pos"', '"actions"\nnames = ["wrist_rol.pos"')],
+            [],
+            "action: wrist_rol.pos a joint of the robot none. Did you mean 'wrist_roll'? refused",
+        ),
+        ([("rate = 20.0", "rate = 30.0")], [], "period 0.0333333 s 0.05 s refused"),
+        ([], ["--set", "image_size=32"], "image front 64 x 48, 3 channels 32 x 32, 3 channels refused"),
+    ],
+)
+def test_what_does_not_fit_is_a_row_and_refused(described, run, tmp_path, changes, flags, row):  # noqa: F811
+    pixels = bool(flags)
+    size = ["--set", "camera=front", *flags] if pixels else []
+    path = described(*changes, pixels=pixels)
+    status, said, err = run(main, path, "--robot-model", "so101", *size, "--out", tmp_path / "act.zip")
+    assert (status, said) == (3, "")
+    *table, last = [" ".join(line.split()) for line in err.splitlines()]
+    assert row in table
+    assert last.startswith(f"bam-export: {path} does not fit bam/joints-v0: ")
+    assert last.endswith("; nothing was written")
+    assert not (tmp_path / "act.zip").exists()
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (('units = "degrees"\n', ""), 'state: units: expected "degrees", "range" or "si"'),
+        (("std = [2.0, ", "std = ["), "state: std: expected 6 numbers, found 5"),
+        (('name = "state"', 'nmae = "state"'), "Object contains unknown field `nmae` - at `$.inputs[0]`"),
+        (("chunk = { size = 2", "chunk = { size = 0"), "Expected `int` >= 1 - at `$.chunk.size`"),
+    ],
+)
+def test_a_description_that_says_too_little_is_one_line(described, run, change, message):  # noqa: F811
+    path = described(change)
+    assert run(main, path) == (1, "", f"bam-export: {path}: does not describe a policy: {message}\n")
+
+
+def test_a_graph_with_other_inputs_is_refused(described, run):  # noqa: F811
+    path = described(('name = "state"', 'name = "obs"'))
+    status, _, err = run(main, path, "--robot-model", "so101")
+    assert (status, err) == (1, f"bam-export: {path}: the graph's inputs are ['state'], and ['obs'] are described\n")
+
+
+@pytest.mark.parametrize(
+    ("config", "message"),
+    [
+        ({"type": "smolvla"}, "smolvla takes seconds for a chunk on a robot's computer: run it on a policy server "
+         "with a GPU; bam-export takes act"),
+        ({"type": "tdmpc"}, "is a policy of the kind tdmpc; bam-export takes act"),
+        (None, "has no config.json: no folder pretrained_model of LeRobot. Give .../checkpoints/last/pretrained_model"),
+    ],
+)  # fmt: skip
+def test_a_folder_of_lerobot_that_cannot_be_exported(run, tmp_path, config, message):  # noqa: F811
+    pytest.importorskip("torch")
+    if config is not None:
+        (tmp_path / "config.json").write_text(json.dumps(config))
+    assert run(main, f"lerobot:{tmp_path}") == (1, "", f"bam-export: {tmp_path}: {message}\n")
+
+
+def test_a_zip_of_stable_baselines3(run, tmp_path, capsys):  # noqa: F811
+    sb3 = pytest.importorskip("stable_baselines3")
+    model, path, out = sb3.PPO("MlpPolicy", "CartPole-v1", seed=0), tmp_path / "model.zip", tmp_path / "ppo.zip"
+    model.save(path)
+    capsys.readouterr()  # what importing it says
+    status, said, err = run(main, path, "--env", "CartPole-v1", "--algo", "ppo", "--trust-pickle", "--out", out)
+    warning = f"bam-export: warning: reading {path} runs whatever code is in it (--trust-pickle)\n"
+    assert (status, err) == (0, warning)
+    assert said.splitlines()[0] == f"{out}: ppo on CartPole-v1, 0 steps, out of {path}"
+    policy, seen = FrozenPolicy.load(out), np.array([0.1, -0.2, 0.05, 0.3], np.float32)
+    assert policy.act(seen) == model.predict(seen, deterministic=True)[0]
+    status, _, err = run(main, path, "--env", "CartPole-v1", "--algo", "ppo")
+    assert (status, err) == (
+        1,
+        f"bam-export: {path}: stable-baselines3 reads it, and runs whatever code is in it. If you trust its maker, "
+        "give --trust-pickle, and say what it is: --env ID --algo NAME\n",
+    )
+    assert run(main, path, "--units", "degrees") == (
+        1,
+        "",
+        f"bam-export: --units is for lerobot, and {path} is read as sb3; leave it out\n",
+    )
