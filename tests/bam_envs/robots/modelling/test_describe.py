@@ -504,11 +504,13 @@ def bent_link(path):
 def test_a_bent_link_is_compared_in_parts_and_not_by_the_hull_of_the_whole(tmp_path):
     """A ball between its legs, inside the hull of the whole; each of two parts has one leg."""
     bent_link(tmp_path / "bent.obj")
-    ball, arm = '<geom size="0.02" pos="0 0 -0.06"/>', '<body><joint name="{}" range="-1 1"/>{}<geom size="0.001" pos="0 0 1"/>'
+    link = '<body><joint name="{}" range="-1 1"/>{}<geom size="0.001" pos="0 0 1"/>'
+    balls = {"c": '<geom size="0.02" pos="0 0 -0.06"/>'}
     mesh = '<asset><mesh name="bent" file="bent.obj"/></asset>'
     text = (
-        f'<mujoco>{mesh}<worldbody><body name="base"><geom type="mesh" mesh="bent"/>{arm.format("a", "")}{arm.format("b", "")}'
-        f'{arm.format("c", ball)}{arm.format("d", "")}<site name="tool0" pos="0 0 0.1"/>{"</body>" * 5}</worldbody></mujoco>'
+        f'<mujoco>{mesh}<worldbody><body name="base"><geom type="mesh" mesh="bent"/>'
+        f"{''.join(link.format(name, balls.get(name, '')) for name in 'abcd')}"
+        f'<site name="tool0" pos="0 0 0.1"/>{"</body>" * 5}</worldbody></mujoco>'
     )
     (tmp_path / "lab.xml").write_text(text, encoding="utf-8")
     shapes = read_arm(str(tmp_path / "lab.xml"), GRIPPER, None).shapes
