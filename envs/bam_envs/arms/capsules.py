@@ -23,21 +23,24 @@ MOST_FALSE = 2.0
 """Most postures without a collision that may count as one [%]; more of them make the work area small."""
 
 
-def fitted_capsules(points: Array, link: int, most: int = 2) -> list[Capsule]:
-    """Capsules around all `points` (n, 3) [m] on the surface of a link, in the frame of the points; `most` at most."""
+def fitted_capsules(points: Array, link: int, most: int = 2, power: int = 2) -> list[Capsule]:
+    """Capsules around all `points` (n, 3) [m] on the surface of a link, in the frame of the points; `most` at most.
+
+    The least of their volumes is taken, with the radius to the given `power`: 3 gives thinner, longer ones.
+    """
     if len(points) == 0:
         return []
     outer = _outermost(points)
     rng = np.random.default_rng(0)
-    best = [_thinner(outer, _capsule(outer), rng)]
+    best = [_thinner(outer, _capsule(outer, power), rng, power)]
     while len(best) < most:
         gaps = [_distances(outer, start, end) - radius for start, end, radius in best]
         nearest, halves = np.argmin(gaps, axis=0), []
         for at, one in enumerate(best):
-            pair = _halves(outer[nearest == at], one, rng)
-            halves.append((_volume(*one) - sum(itertools.starmap(_volume, pair)), at, pair))
+            pair = _halves(outer[nearest == at], one, rng, power)
+            halves.append((_size([one], power) - _size(pair, power), at, pair))
         gained, at, pair = max(halves, key=lambda half: half[:2])
-        if gained <= (1.0 - (_GAIN if most <= 2 else 1.0)) * _volume(*best[at]):
+        if gained <= (1.0 - (_GAIN if most <= 2 else 1.0)) * _size([best[at]], power):
             break
         best = [*best[:at], *pair, *best[at + 1 :]]
     gaps = [_distances(points, start, end) - radius for start, end, radius in best]
@@ -48,7 +51,7 @@ def fitted_capsules(points: Array, link: int, most: int = 2) -> list[Capsule]:
     ]
 
 
-def _halves(points: Array, one: _Fit, rng: np.random.Generator) -> list[_Fit]:
+def _halves(points: Array, one: _Fit, rng: np.random.Generator, power: int) -> list[_Fit]:
     """The two smallest capsules around `points` instead of `one`; that one if there are none."""
     splits: list[list[_Fit]] = []
     if len(points) < 2:
@@ -58,10 +61,10 @@ def _halves(points: Array, one: _Fit, rng: np.random.Generator) -> list[_Fit]:
         for share in (0.3, 0.5, 0.7):
             first = along < along.min() + share * (along.max() - along.min())
             if first.any() and not first.all():
-                splits.append(_pair(points, first))
-    splits.sort(key=lambda pair: sum(itertools.starmap(_volume, pair)))
-    pairs = [_thinner_pair(points, pair, rng) for pair in splits[:2]]
-    return min(pairs, key=lambda pair: sum(itertools.starmap(_volume, pair)), default=[one])
+                splits.append([_capsule(points[first], power), _capsule(points[~first], power)])
+    splits.sort(key=lambda pair: _size(pair, power))
+    pairs = [_thinner_pair(points, pair, rng, power) for pair in splits[:2]]
+    return min(pairs, key=lambda pair: _size(pair, power), default=[one])
 
 
 def _outermost(points: Array) -> Array:
@@ -75,7 +78,7 @@ def _outermost(points: Array) -> Array:
     return outermost
 
 
-def _capsule(points: Array) -> _Fit:
+def _capsule(points: Array, power: int) -> _Fit:
     """The thinnest capsule about a principal axis of the points."""
     options = []
     for axis in _principal_axes(points):
@@ -87,7 +90,7 @@ def _capsule(points: Array) -> _Fit:
         if low > high:
             low = high = 0.5 * (low + high)
         options.append(_around(points, middle + low * axis, middle + high * axis))
-    return min(options, key=lambda one: _volume(*one))
+    return min(options, key=lambda one: _size([one], power))
 
 
 def _around(points: Array, start: Array, end: Array) -> _Fit:
@@ -95,31 +98,27 @@ def _around(points: Array, start: Array, end: Array) -> _Fit:
     return start, end, float(_distances(points, start, end).max()) + 1e-6
 
 
-def _thinner(points: Array, fit: _Fit, rng: np.random.Generator) -> _Fit:
+def _thinner(points: Array, fit: _Fit, rng: np.random.Generator, power: int) -> _Fit:
     """The smallest capsule that a random search about `fit` finds."""
     step = 0.3 * fit[2]
     for _ in range(_TRIALS):
         move = step * rng.standard_normal((2, 3))
         trial = _around(points, fit[0] + move[0], fit[1] + move[1])
-        if _volume(*trial) < _volume(*fit):
+        if _size([trial], power) < _size([fit], power):
             fit = trial
         else:
             step *= 0.985
     return fit
 
 
-def _pair(points: Array, first: NDArray[np.bool_]) -> list[_Fit]:
-    return [_capsule(points[first]), _capsule(points[~first])]
-
-
-def _thinner_pair(points: Array, pair: list[_Fit], rng: np.random.Generator) -> list[_Fit]:
+def _thinner_pair(points: Array, pair: list[_Fit], rng: np.random.Generator, power: int) -> list[_Fit]:
     """Two capsules about the points that are nearer to them, three times over."""
     for _ in range(3):
         gaps = [_distances(points, start, end) - radius for start, end, radius in pair]
         first = gaps[0] < gaps[1]
         if not first.any() or first.all():
             break
-        pair = [_thinner(points[mine], fit, rng) for mine, fit in zip((first, ~first), pair, strict=True)]
+        pair = [_thinner(points[mine], fit, rng, power) for mine, fit in zip((first, ~first), pair, strict=True)]
     return pair
 
 
@@ -140,8 +139,9 @@ def _principal_axes(points: Array) -> Array:
     return axes
 
 
-def _volume(start: Array, end: Array, radius: float) -> float:
-    return float(np.pi * radius**2 * (np.linalg.norm(end - start) + 4 / 3 * radius))
+def _size(fits: list[_Fit], power: int) -> float:
+    """Sum of the volumes of capsules, with the radius to a `power` that is 2 for the volume itself."""
+    return sum(float(np.pi * r**power * (np.linalg.norm(end - start) + 4 / 3 * r)) for start, end, r in fits)
 
 
 def _rounded(point: Array) -> tuple[float, float, float]:

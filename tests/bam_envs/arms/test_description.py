@@ -8,7 +8,7 @@ from importlib import metadata
 import numpy as np
 import pytest
 
-from bam_envs.arms.capsules import Outline
+from bam_envs.arms.capsules import Outline, fitted_capsules
 from bam_envs.arms.description import ArmDescription, robot_model
 from bam_envs.core import robot_models
 from bam_envs.core.errors import InvalidValue, UnknownName
@@ -252,3 +252,13 @@ def test_another_tool_mount_or_limit_is_another_arm():
         )
     }
     assert len(digests) == 5
+
+
+def test_a_higher_power_of_the_radius_gives_a_thinner_capsule_around_the_same_points():
+    """A box of 10 x 8 x 6 cm: the least volume is the ball through its corners."""
+    box = np.stack(np.meshgrid(*(np.linspace(-half, half, 9) for half in (0.05, 0.04, 0.03))), axis=-1).reshape(-1, 3)
+    (thick,), (thin,) = (fitted_capsules(box, 2, 1, power) for power in (2, 3))
+    assert (thick.radius, thin.radius) == (0.0708, 0.0561)
+    start, end = np.array(thin.start), np.array(thin.end)
+    share = np.clip((box - start) @ (end - start) / ((end - start) @ (end - start)), 0.0, 1.0)
+    assert np.linalg.norm(box - start - share[:, None] * (end - start), axis=1).max() <= thin.radius

@@ -12,7 +12,7 @@ from bam_envs.arms.description import ArmDescription, Gripper, JointRow, Placed,
 from bam_envs.arms.serial_chain import Capsule, SerialChain
 from bam_envs.arms.work_area import find_work_area
 from bam_envs.core.errors import InvalidValue
-from bam_envs.robots.modelling.model_files import Array, ReadArm, read_arm
+from bam_envs.robots.modelling.model_files import Array, ReadArm, Shapes, read_arm
 
 SPEED, ACCELERATION, JERK = 1.5, 6.0, 120.0
 """Limits of a joint where the files name none [rad/s, rad/s^2, rad/s^3]: below those of every arm that is shipped."""
@@ -21,14 +21,15 @@ EFFORT_PER_REACH = 60.0
 _POSTURES = 10_000
 """Postures in which the outline is compared with the links."""
 _GIVEN_UP = 0.1
-_REFITS, _FALSE = 6, 0.015  # times that links get more capsules, and the share of false alarms that is good enough
+_REFITS, _FALSE = 32, 0.015  # times that links get other capsules, and the share of false alarms that is good enough
 DEEP = 0.005
 """A collision deeper than this is to be found [m]."""
 _CLEARANCE = 0.005  # that the guards keep, so that they act where links touch [m]
 _TOUCH = 0.0045  # depth from which shapes touch, and what is kept of the slack [m]
 _SURE = 0.001
 _RARE = 0.003  # share of postures in which two links count as touching falsely, that needs no slack
-_MANY = 300  # postures in which two links touch, that show how far apart their capsules can be; else slack is less
+_MANY = 150  # postures in which two links touch, that show how far apart their capsules can be; else slack is less
+_ROUNDS, _WORST, _AROUND, _STRAY = 4, 20, 10, 0.1  # of a search: postures kept in each, others about each, within [rad]
 _ANYWHERE = 5.6  # travel of a first joint with which an arm works in any direction [rad]
 _ASIDE = 0.02  # of the middle of all postures from the base, that tells the direction of an arm [m]
 Apart = Mapping[tuple[int, int], Array]
@@ -130,7 +131,7 @@ def _turned(arm: ArmDescription) -> ArmDescription:
 def _outlined(arm: ArmDescription, read: ReadArm, given_up: float = 0.0) -> tuple[ArmDescription, str]:
     """The arm with capsules around its links, and how well they find its collisions with itself.
 
-    Two links whose capsules touch too often while the links are apart get more of them.
+    Two links whose capsules touch too often while the links are apart get more of them, then thinner ones.
 
     Args:
         arm: The description without capsules.
@@ -138,33 +139,41 @@ def _outlined(arm: ArmDescription, read: ReadArm, given_up: float = 0.0) -> tupl
         given_up: The share of the slightest collisions of two links that need not be found.
     """
     groups = [*enumerate(read.points), *((arm.num_joints + 1, points) for points in read.grip)]
-    fits = [{2: fitted_capsules(points, link)} for link, points in groups]
+    fits = [{(2, 2): fitted_capsules(points, link)} for link, points in groups]
 
-    def fitted(most: Mapping[int, int]) -> ArmDescription:
+    def fitted(forms: Mapping[int, tuple[int, int]]) -> ArmDescription:
         capsules: list[Capsule] = []
         for known, (link, points) in zip(fits, groups, strict=True):
-            if (count := most.get(link, 2)) not in known:
-                known[count] = fitted_capsules(points, link, count)
-            capsules += known[count]
+            if (form := forms.get(link, (2, 2))) not in known:
+                known[form] = fitted_capsules(points, link, *form)
+            capsules += known[form]
         return dataclasses.replace(arm, capsules=tuple(capsules), slack=())
 
-    best, most, kept = fitted({}), dict[int, int](), dict[int, int]()
+    best, forms, kept = fitted({}), dict[int, tuple[int, int]](), dict[int, tuple[int, int]]()
     q = postures(arm.chain)
     apart = {} if read.shapes is None else read.shapes.distances(q)
     if not apart:
         return best, ""
     share, missed, worst, spent = 1.0, len(q), list[tuple[int, int]](), set[tuple[int, int]]()
-    for _ in range(_REFITS):
-        trial = fitted(most)
-        trial = dataclasses.replace(trial, slack=tuple(_slack(trial, q, apart, given_up)))
-        wrong, overlooked, blamed = judged(trial, q, apart)
-        if (overlooked, wrong) < (missed, share):
-            best, share, missed, kept, worst = trial, wrong, overlooked, most, blamed
-        pair = next((pair for pair in worst if pair not in spent), None)
-        if share <= _FALSE or pair is None:
+    tried = set[tuple[Capsule, ...]]()
+    while len(tried) < _REFITS:
+        trial = fitted(forms)
+        if trial.capsules not in tried:
+            tried.add(trial.capsules)
+            trial = dataclasses.replace(trial, slack=tuple(_slack(trial, q, apart, given_up)))
+            wrong, overlooked, blamed = judged(trial, q, apart)
+            if (overlooked, wrong) < (missed, share):
+                best, share, missed, kept, worst, spent = trial, wrong, overlooked, forms, blamed, set()
+        ways = ((link, more) for pair in worst for more in (0, 2) for link in pair)
+        way = next((way for way in ways if way not in spent), None)
+        if share <= _FALSE or way is None:
             break
-        spent.add(pair)
-        most = {**kept, **{link: kept.get(link, 2) + 2 for link in pair}}
+        spent.add(way)
+        (link, more), (count, power) = way, kept.get(way[0], (2, 2))
+        forms = {**kept, link: (count + more, power if more else power + 1)}
+    if not given_up and read.shapes is not None:
+        best = dataclasses.replace(best, slack=tuple(_sure_slack(best, q, apart, read.shapes)))
+        share, missed, _ = judged(best, q, apart)
     deep = sum(np.min([*apart.values()], axis=0) < -DEEP)
     found = f"{deep - missed} of {deep} collisions of the arm with itself in {len(q)} postures are found"
     return best, f"{found}, and {share:.1%} of the other postures count as one"
@@ -219,6 +228,24 @@ def _slack(arm: ArmDescription, q: Array, apart: Apart, given_up: float) -> Iter
             slack = max(0.0, _CLEARANCE - float(least) - _SURE)
         if slack > 0.002 or not known:
             yield one, other, round(slack, 3)
+
+
+def _sure_slack(arm: ArmDescription, q: Array, apart: Apart, shapes: Shapes) -> Iterator[tuple[int, int, float]]:
+    """The slack of an arm, less where two links collide in postures about those in which it is the least sufficient."""
+    outline, rng, chain = Outline(arm.chain), np.random.default_rng(0), arm.chain
+    links = outline.links[outline.pairs]
+    for one, other, slack in arm.slack:
+        mine, known = (links == [one, other]).all(axis=1), q[apart[one, other] < -DEEP]
+        if mine.any() and len(known):
+            gap = outline.distances(known)[:, mine].min(axis=1)
+            for _ in range(_ROUNDS):
+                near = np.repeat(known[np.argsort(-gap)[:_WORST]], _AROUND, axis=0)
+                near = np.clip(near + _STRAY * rng.standard_normal(near.shape), chain.low, chain.high)
+                near = near[shapes.distances(near, [(one, other)])[one, other] < -DEEP]
+                known = np.concatenate([known, near])
+                gap = np.concatenate([gap, outline.distances(near)[:, mine].min(axis=1)])
+            slack = round(min(slack, max(0.0, slack + _CLEARANCE - float(gap.max()) - _SURE)), 4)
+        yield one, other, slack
 
 
 def postures(chain: SerialChain, seed: int = 0) -> Array:

@@ -378,13 +378,15 @@ class Shapes:
         self._geoms[-1] += self._pads
         self._pads = []
 
-    def distances(self, q: Array) -> dict[tuple[int, int], Array]:
+    def distances(self, q: Array, only: list[tuple[int, int]] | None = None) -> dict[tuple[int, int], Array]:
         """For two links that can touch, their distance [m], at most 5 cm, negative if they overlap: (n, k) to (n,).
+
+        `only` are the links to compare, all by default.
 
         Links that share a joint are left out, like the gripper and the last two; so are links without shapes.
         """
         geoms, last = self._geoms, len(self._where)
-        links = [(one, other) for one in range(last - 1) for other in range(one + 2, last + 2)]
+        links = only or [(one, other) for one in range(last - 1) for other in range(one + 2, last + 2)]
         found = {
             pair: np.full(len(q), _FAR)
             for pair in links

@@ -504,16 +504,20 @@ def bent_link(path):
 def test_a_bent_link_is_compared_in_parts_and_not_by_the_hull_of_the_whole(tmp_path):
     """A ball between its legs, inside the hull of the whole; each of two parts has one leg."""
     bent_link(tmp_path / "bent.obj")
-    ball, arm = '<geom size="0.02" pos="0 0 -0.06"/>', '<body><joint range="-1 1"/>{}<geom size="0.001" pos="0 0 1"/>'
+    link = '<body><joint name="{}" range="-1 1"/>{}<geom size="0.001" pos="0 0 1"/>'
+    balls = {"c": '<geom size="0.02" pos="0 0 -0.06"/>'}
     mesh = '<asset><mesh name="bent" file="bent.obj"/></asset>'
     text = (
-        f'<mujoco>{mesh}<worldbody><body name="base"><geom type="mesh" mesh="bent"/>{arm.format("")}{arm.format("")}'
-        f'{arm.format(ball)}{arm.format("")}<site name="tool0" pos="0 0 0.1"/>{"</body>" * 5}</worldbody></mujoco>'
+        f'<mujoco>{mesh}<worldbody><body name="base"><geom type="mesh" mesh="bent"/>'
+        f"{''.join(link.format(name, balls.get(name, '')) for name in 'abcd')}"
+        f'<site name="tool0" pos="0 0 0.1"/>{"</body>" * 5}</worldbody></mujoco>'
     )
     (tmp_path / "lab.xml").write_text(text, encoding="utf-8")
-    apart = read_arm(str(tmp_path / "lab.xml"), GRIPPER, None).shapes.distances(np.zeros((1, 4)))
+    shapes = read_arm(str(tmp_path / "lab.xml"), GRIPPER, None).shapes
+    apart = shapes.distances(np.zeros((1, 4)))
     # From the line between (-0.05, -0.1), the foot of a leg, and (0, -0.02), the end of its part.
     assert apart[0, 3] == pytest.approx(0.002 / np.hypot(0.05, 0.08) - 0.02, abs=1e-5)
+    assert shapes.distances(np.zeros((1, 4)), [(0, 3)]) == {(0, 3): apart[0, 3]}
 
 
 def test_a_link_without_a_collision_shape_is_what_is_drawn_of_it(tmp_path):
