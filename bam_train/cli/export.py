@@ -44,7 +44,7 @@ def _kind(source: str) -> tuple[str, Path]:
     path = Path(source)
     if (path.expanduser() / "model.safetensors").is_file():
         return "lerobot", path
-    return {".toml": "onnx", ".zip": "sb3"}.get(path.suffix, "rllib"), path
+    return {".toml": "onnx", ".onnx": "onnx", ".zip": "sb3"}.get(path.suffix, "rllib"), path
 
 
 def _export_network(config: ExportConfig, kind: str, path: Path) -> None:

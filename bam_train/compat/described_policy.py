@@ -33,6 +33,7 @@ import msgspec
 import numpy as np
 from msgspec import Meta, Struct
 
+from bam_envs.core.wording import did_you_mean
 from bam_train.checkpoint.manifest import Chunk
 from bam_train.compat.foreign_policy import Affine, ForeignPolicy, Port, Units
 from bam_train.errors import NotACheckpoint
@@ -75,7 +76,20 @@ class _Described(Struct, forbid_unknown_fields=True):
     output: _Port
     rate: _Positive
     chunk: Chunk = Chunk(1, 1)
-    algorithm: str = "unknown"
+    algorithm: str = "policy"
+
+
+def _read(text: str) -> _Described:
+    """The content of a TOML file; raises ValueError or msgspec.MsgspecError."""
+    table = tomllib.loads(text)
+    chunk = table.get("chunk")
+    for name in chunk if isinstance(chunk, dict) else ():
+        if name not in Chunk.__dataclass_fields__:
+            raise ValueError(f"chunk: there is no {name!r}. {did_you_mean(name, Chunk.__dataclass_fields__)}")
+    described = msgspec.convert(table, type=_Described)
+    if described.chunk.steps > described.chunk.size:
+        raise ValueError(f"chunk: steps is {described.chunk.steps}, expected at most its size, {described.chunk.size}")
+    return described
 
 
 def described_policy(path: Path) -> ForeignPolicy:
@@ -86,14 +100,16 @@ def described_policy(path: Path) -> ForeignPolicy:
     """
     path = path.expanduser()
     try:
-        described = msgspec.convert(tomllib.loads(path.read_text()), type=_Described)
+        if path.suffix == ".onnx":
+            raise ValueError("it is the network alone. Give a TOML file that says what its inputs and outputs mean")
+        described = _read(path.read_text())
         network = path.parent / described.network
         inputs = tuple(one.port(is_output=False) for one in described.inputs)
         output = described.output.port(is_output=True)
         graph = network.read_bytes()
     except OSError as error:
-        why = error.strerror or error
-        raise NotACheckpoint(path, f"{error.filename} cannot be read: {why}. Check network and the name") from error
+        which = "it" if error.filename == str(path) else f"its network, {error.filename},"
+        raise NotACheckpoint(path, f"{which} cannot be read: {error.strerror or error}. Check the name") from error
     except (ValueError, msgspec.MsgspecError) as error:  # ValueError: also of TOML
         raise NotACheckpoint(path, f"does not describe a policy: {error}") from error
     source: dict[str, Any] = {"description": str(path.absolute()), "network": str(network.absolute())}

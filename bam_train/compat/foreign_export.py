@@ -84,7 +84,11 @@ def export_foreign(
     taken, given = _meanings(policy, observation, signals), meaning(policy.output, *_numbers(signals, "action"))
     graph = mapped_graph(policy, [taken[port.name] for port in policy.inputs], (action, given))
     jsons = space_to_json(observation), space_to_json(action)
-    frozen = FrozenPolicy.from_graph(graph, *jsons, chunk=policy.chunk)
+    try:
+        frozen = FrozenPolicy.from_graph(graph, *jsons, chunk=policy.chunk)
+    except PolicyError as error:
+        text = "its network is not as it is described; check chunk, and names and size of inputs and output"
+        raise PolicyError(f"{policy.place}: {text}: {error}") from error
     golden = _golden(policy, taken, given, action.shape)
     worst, row = frozen.worst_difference(golden)
     if not worst <= TOLERANCE:  # NaN too

@@ -14,7 +14,6 @@ from bam_train.checkpoint.manifest import Chunk
 from bam_train.cli.export import main
 from bam_train.environments import make_env
 from bam_train.policy import FrozenPolicy
-from tests.bam_train.cli.conftest import run  # noqa: F401 - a fixture
 from tests.bam_train.policy.test_frozen_policy import onnx_of
 
 node = helper.make_node
@@ -65,7 +64,7 @@ def described(tmp_path):
 
 
 @pytest.mark.parametrize("units", ["degrees", "range"])
-def test_order_and_units_become_those_of_the_robot(described, run, tmp_path, units):  # noqa: F811
+def test_order_and_units_become_those_of_the_robot(described, run, tmp_path, units):
     out = tmp_path / "act.zip"
     status, said, err = run(main, described(units=units), "--robot-model", "so101", "--out", out)
     assert (status, err) == (0, "")
@@ -85,7 +84,7 @@ def test_order_and_units_become_those_of_the_robot(described, run, tmp_path, uni
     env.close()
 
 
-def test_an_image_has_its_channels_first(described, run, tmp_path):  # noqa: F811
+def test_an_image_has_its_channels_first(described, run, tmp_path):
     out = tmp_path / "act.zip"
     cameras = ["--set", "camera=front", "--set", "image_size=64x48"]
     assert run(main, described(pixels=True), "--robot-model", "so101", *cameras, "--out", out)[0] == 0
@@ -121,7 +120,7 @@ def test_an_image_has_its_channels_first(described, run, tmp_path):  # noqa: F81
         ([], ["--set", "image_size=32"], "image front 64 x 48, 3 channels 32 x 32, 3 channels refused"),
     ],
 )
-def test_what_does_not_fit_is_a_row_and_refused(described, run, tmp_path, changes, flags, row):  # noqa: F811
+def test_what_does_not_fit_is_a_row_and_refused(described, run, tmp_path, changes, flags, row):
     pixels = bool(flags)
     size = ["--set", "camera=front", *flags] if pixels else []
     path = described(*changes, pixels=pixels)
@@ -141,14 +140,37 @@ def test_what_does_not_fit_is_a_row_and_refused(described, run, tmp_path, change
         (("std = [2.0, ", "std = ["), "state: std: expected 6 numbers, found 5"),
         (('name = "state"', 'nmae = "state"'), "Object contains unknown field `nmae` - at `$.inputs[0]`"),
         (("chunk = { size = 2", "chunk = { size = 0"), "Expected `int` >= 1 - at `$.chunk.size`"),
+        (("chunk = { size", "chunk = { sise"), "chunk: there is no 'sise'. Did you mean 'size'?"),
+        (("chunk = { size = 2", "chunk = { size = 1"), "chunk: steps is 2, expected at most its size, 1"),
     ],
 )
-def test_a_description_that_says_too_little_is_one_line(described, run, change, message):  # noqa: F811
+def test_a_description_that_says_too_little_is_one_line(described, run, change, message):
     path = described(change)
     assert run(main, path) == (1, "", f"bam-export: {path}: does not describe a policy: {message}\n")
 
 
-def test_a_graph_with_other_inputs_is_refused(described, run):  # noqa: F811
+def test_a_network_without_its_description(run, tmp_path):
+    path = tmp_path / "act.onnx"
+    path.write_bytes(b"\x93")
+    text = "it is the network alone. Give a TOML file that says what its inputs and outputs mean"
+    for source in (path, f"onnx:{path}"):
+        assert run(main, source) == (1, "", f"bam-export: {path}: does not describe a policy: {text}\n")
+    status, _, err = run(main, path.with_suffix(".toml"))
+    assert (status, err) == (
+        1,
+        f"bam-export: {path.with_suffix('.toml')}: it cannot be read: No such file or directory. Check the name\n",
+    )
+
+
+def test_a_network_with_other_chunks_than_described(described, run):
+    path = described(("chunk = { size = 2", "chunk = { size = 3"))
+    status, _, err = run(main, path, "--robot-model", "so101")
+    text = "its network is not as it is described; check chunk, and names and size of inputs and output: "
+    assert status == 1
+    assert err.startswith(f"bam-export: {path}: {text}")
+
+
+def test_a_graph_with_other_inputs_is_refused(described, run):
     path = described(('name = "state"', 'name = "obs"'))
     status, _, err = run(main, path, "--robot-model", "so101")
     assert (status, err) == (1, f"bam-export: {path}: the graph's inputs are ['state'], and ['obs'] are described\n")
@@ -163,14 +185,14 @@ def test_a_graph_with_other_inputs_is_refused(described, run):  # noqa: F811
         (None, "has no config.json: no folder pretrained_model of LeRobot. Give .../checkpoints/last/pretrained_model"),
     ],
 )  # fmt: skip
-def test_a_folder_of_lerobot_that_cannot_be_exported(run, tmp_path, config, message):  # noqa: F811
+def test_a_folder_of_lerobot_that_cannot_be_exported(run, tmp_path, config, message):
     pytest.importorskip("torch")
     if config is not None:
         (tmp_path / "config.json").write_text(json.dumps(config))
     assert run(main, f"lerobot:{tmp_path}") == (1, "", f"bam-export: {tmp_path}: {message}\n")
 
 
-def test_a_zip_of_stable_baselines3(run, tmp_path, capsys):  # noqa: F811
+def test_a_zip_of_stable_baselines3(run, tmp_path, capsys):
     sb3 = pytest.importorskip("stable_baselines3")
     model, path, out = sb3.PPO("MlpPolicy", "CartPole-v1", seed=0), tmp_path / "model.zip", tmp_path / "ppo.zip"
     model.save(path)
