@@ -235,7 +235,7 @@ def test_a_manifest_that_does_not_fit_an_environment_of_ours(corridor_checkpoint
     assert str(caught.value).startswith(f"{path}: its manifest: {message}")
 
 
-THOSE = "Leave it out; these take one: bam/reach, bam/pick, bam/pick-place, bam/navigation, bam/avoidance"
+THOSE = "Leave it out; these take one: bam/reach, bam/pick, bam/pick-place, bam/joints, bam/navigation, bam/avoidance"
 
 
 @pytest.mark.parametrize(

@@ -56,6 +56,9 @@ class Session:
             record_command=lambda: None,
         )
 
+    def goals(self):
+        return []
+
     def _episode(self, watcher, seed):
         record = self.deployment.journal.begin(seed)
         if self.deployment.trials is not None:

@@ -1,13 +1,8 @@
-from pathlib import Path
-
 import gymnasium as gym
 import numpy as np
 import pytest
 
 from bam_train.agent.transitions import TransitionLog
-from bam_train.cli.flags import TrainConfig
-from bam_train.cli.program import guarded
-from bam_train.cli.train import train
 from bam_train.settings import SB3Settings
 
 ENV = "LiveLine-v0"
@@ -45,20 +40,7 @@ def line():
 @pytest.fixture(autouse=True)
 def here(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-
-
-@pytest.fixture
-def bam_train(capsys):
-    """Runs the program in this process; its status, and standard error."""
-
-    def run(**flags):
-        flags |= {name: Path(flags[name]) for name in ("out", "resume") if name in flags}
-        status = guarded(lambda: train(TrainConfig(**flags)), "bam-train")
-        out, err = capsys.readouterr()
-        assert out == ""
-        return status, err
-
-    return run
+    return tmp_path
 
 
 @pytest.fixture
