@@ -47,7 +47,7 @@ def test_no_robot_is_faster_than_its_task_lets_it_be(make_rows, env_id, randomiz
             action = rng.uniform(-2, 2, envs.action_space.shape).clip(-1, 1).astype(np.float32)
         envs.step(action)
         seen = max(seen, (np.abs(envs.unwrapped.state.signals[signal]) / fastest).max())
-    assert 0.45 < seen <= slack
+    assert (0.49 if env_id == "bam/joints-v0" else 0.5) < seen <= slack
 
 
 @pytest.mark.parametrize("env_id", each(SCRIPTED))

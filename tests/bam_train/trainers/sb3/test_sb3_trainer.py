@@ -189,8 +189,8 @@ def test_one_seed_one_result_and_another_seed_another(walk):
 @pytest.mark.parametrize(
     ("algo", "hyperparameters", "message"),
     [
-        ("ppo", {**FIRST, "learning_rate": 1e30}, "NaN or infinite|is nan"),
-        ("ppo", {**FIRST, "learning_rate": 1e12}, "NaN or infinite|is nan|is -?inf"),
+        ("ppo", {**FIRST, "learning_rate": 1e30}, "^train/entropy_loss is nan at step 64;"),
+        ("ppo", {**FIRST, "learning_rate": 1e12}, "^train/entropy_loss is nan at step 64;"),
         ("a2c", {"learning_rate": 1e30}, "NaN or infinite|is nan|is -?inf"),
         ("sac", {"learning_rate": 1e30, "learning_starts": 10}, "_loss is (nan|inf)"),
     ],
