@@ -141,10 +141,10 @@ def test_a_controller_that_holds_gets_set_points_between_commands(server, robot_
         state = gate.step(command)
     np.testing.assert_array_equal(state.command, command)
     robot.halt()
-    scripted.wait_for(lambda: scripted.halts == 1)
+    # Holds follow the halt: the gripper's after its four commands, then the arm's.
+    scripted.wait_for(lambda: len(scripted.on(GRIPPER_COMMANDS)) == 5 and scripted.commands[-1][0] == JOINT_COMMANDS)
     points = np.array([message["data"] for message in scripted.on(JOINT_COMMANDS)])[:-1]  # the last one holds
     assert len(points) > 2 * 4
-    assert len(scripted.on(GRIPPER_COMMANDS)) == 5
     first = points[:, 0]
     assert first.max() < command[0, 0] + 0.01  # a spline whose goal stays goes a little beyond it
     assert 0.0 < first[0] - start[0] < 0.04
