@@ -42,7 +42,7 @@ LOG = CHECKPOINTS / "commands.md"
 SCRIPTS = ("ppo_pick", "td3_mir", "training_inference_mir", "training_inference_ur")
 ELSEWHERE = ("--resume", "--start", "--learner", "--print-config", "--transport", "--address", "--data")
 """Flags of commands that go on from something, train nothing, or need other files or computers."""
-SAME = ("--seed", "--out", "--runs", "--copy-to", "--force")
+SAME = ("--seed", "--seeds", "--track", "--out", "--runs", "--copy-to", "--force")
 """Flags that do not change what is learnt."""
 LEAST = 0.9
 THRESHOLDS = {"Pendulum-v1": -200.0}
