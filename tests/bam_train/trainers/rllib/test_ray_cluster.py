@@ -204,12 +204,13 @@ def test_a_cluster_is_joined_and_left_as_it_was(monkeypatch):
     with subprocess.Popen([sys.executable, "-c", CLUSTER], **pipes) as process:
         try:
             address = process.stdout.readline().strip()
+            assert address, process.stderr.read()  # Ray gives a raylet 30 s to start
             processes = psutil.Process(process.pid).children(recursive=True)
-            joining = subprocess.Popen([sys.executable, "-c", JOIN, address], **pipes)
-            monkeypatch.setenv("RAY_AUTH_TOKEN", "f" * 64)
-            with pytest.raises(TrainingFailed) as caught:
-                reach(address)
-            out, err = joining.communicate(timeout=120)
+            with subprocess.Popen([sys.executable, "-c", JOIN, address], **pipes) as joining:
+                monkeypatch.setenv("RAY_AUTH_TOKEN", "f" * 64)
+                with pytest.raises(TrainingFailed) as caught:
+                    reach(address)
+                out, err = joining.communicate(timeout=120)
             assert all(process.is_running() for process in processes if "IDLE" not in process.name())
         finally:
             process.communicate("\n", timeout=60)
