@@ -22,7 +22,9 @@ HYPERPARAMETERS: dict[str, Any] = {
     **dict.fromkeys(("target_worker_clipping", "v_max", "v_min"), float),
     **dict.fromkeys(("vtrace_clip_pg_rho_threshold", "vtrace_clip_rho_threshold"), float | None),
     **dict.fromkeys(("train_batch_size_per_learner", "num_epochs", "num_atoms", "n_quantiles", "n_step"), PositiveInt),
-    **dict.fromkeys(("n_critics", "num_actions", "broadcast_interval", "simple_queue_size"), PositiveInt),
+    **dict.fromkeys(
+        ("n_critics", "num_actions", "broadcast_interval", "noise_steps", "simple_queue_size"), PositiveInt
+    ),
     **dict.fromkeys(("circular_buffer_num_batches", "circular_buffer_iterations_per_batch"), PositiveInt),
     **dict.fromkeys(("num_steps_sampled_before_learning_starts", "target_network_update_freq"), NonNegativeInt),
     "top_quantiles_to_drop_per_net": NonNegativeInt,
@@ -43,6 +45,7 @@ OURS: dict[str, Any] = {
     "model_config": {},
     "rollout_fragment_length": "auto",
     "log_std_init": None,
+    "noise_steps": 1,
     "action_init_scale": 1.0,
 }
 """Hyperparameters that ``training()`` does not take, with their defaults where RLlib has none."""

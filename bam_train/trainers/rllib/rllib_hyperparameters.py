@@ -2,8 +2,9 @@
 
 Additional ones are ``model_config`` (RLlib's `DefaultModelConfig`; initialisers by their name in ``torch.nn.init``),
 ``rollout_fragment_length``, the steps of each environment before a runner delivers its samples, ``log_std_init`` of a
-free standard deviation (``model_config.free_log_std``), and ``action_init_scale``, which multiplies the weights of the
-last layer: with 0.01 the first actions are about 0. A schedule is a list: ``lr=[[0, 3e-4], [1000000, 0.0]]``.
+free standard deviation (``model_config.free_log_std``), ``noise_steps``, the steps that share the noise of such
+actions (as with ``use_sde`` of stable-baselines3), and ``action_init_scale``, which multiplies the weights of the last
+layer: with 0.01 the first actions are about 0. A schedule is a list: ``lr=[[0, 3e-4], [1000000, 0.0]]``.
 """
 
 import contextlib
@@ -78,6 +79,8 @@ def complete(algorithm: Algorithm, given: Mapping[str, Any], *, is_continuous: b
     values["model_config"] = _complete_model(config, {**free, **given.get("model_config", {})})
     if values["log_std_init"] is not None and not values["model_config"]["free_log_std"]:
         raise SettingsError("log_std_init: only a free standard deviation has one; add model_config.free_log_std=true")
+    if values["noise_steps"] > 1 and not (is_continuous and values["model_config"]["free_log_std"]):
+        raise SettingsError("noise_steps: only numbers with a free standard deviation keep their noise; leave it out")
     return values
 
 
@@ -156,8 +159,11 @@ def make_config(settings: RLlibSettings, observation_space: Space[Any], action_s
     config.environment(name, env_config=dict(settings.env_kwargs), disable_env_checking=True)
     recurrent = values["model_config"]["use_lstm"]
     batched = is_batched(settings.env) and isinstance(observation_space, spaces.Box) and not recurrent
+    if not batched and values.get("noise_steps", 1) > 1:
+        raise SettingsError(f"noise_steps: the noise is kept in vector environments of bam_envs, found {settings.env}")
     if not batched:
         config.callbacks(NotesEnds)
+    config.noise_steps = values.get("noise_steps", 1)  # RobotEnvRunner's; older checkpoints have none
     config.env_runners(
         env_runner_cls=RobotEnvRunner if batched else ReportingEnvRunner,
         num_env_runners=settings.num_env_runners,

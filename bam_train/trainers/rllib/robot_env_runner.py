@@ -239,6 +239,7 @@ class RobotEnvRunner(FaultReporting, SingleAgentEnvRunner):  # type: ignore[misc
     def __init__(self, *, config: Any, **kwargs: Any) -> None:
         super().__init__(config=config, **kwargs)
         self._observation: Array = np.empty(0)
+        self._noise: torch.Tensor | None = None  # of the actions, in standard deviations
         """The module's next observations, (n, ...)."""
         self._running = [_Running() for _ in range(self.num_envs)]
         pieces = list(self._env_to_module.connectors)
@@ -416,7 +417,7 @@ class RobotEnvRunner(FaultReporting, SingleAgentEnvRunner):  # type: ignore[misc
                 module = self.module
                 kind = module.get_exploration_action_dist_cls if explore else module.get_inference_action_dist_cls
                 distribution = kind().from_logits(outputs[Columns.ACTION_DIST_INPUTS])
-                drawn = (distribution if explore else distribution.to_deterministic()).sample()
+                drawn = self._explored(distribution, step) if explore else distribution.to_deterministic().sample()
                 outputs[Columns.ACTIONS] = drawn
                 if explore:
                     outputs[Columns.ACTION_LOGP] = distribution.logp(drawn)
@@ -427,6 +428,17 @@ class RobotEnvRunner(FaultReporting, SingleAgentEnvRunner):  # type: ignore[misc
         elif self.config.clip_actions:
             actions = clip_action(actions, space)
         return columns, np.asarray(actions, space.dtype)
+
+    def _explored(self, distribution: Any, step: int) -> torch.Tensor:
+        """Actions drawn from the distribution, with the same noise for ``noise_steps`` steps; see `OURS`."""
+        drawn: torch.Tensor = distribution.sample()
+        kept = getattr(self.config, "noise_steps", 1)
+        if kept == 1:
+            return drawn
+        mean, std = distribution._dist.mean, distribution._dist.stddev
+        if self._noise is None or step % kept == 0:
+            self._noise = (drawn - mean) / std
+        return mean + std * self._noise
 
 
 @contextlib.contextmanager

@@ -43,6 +43,7 @@ WRONG = [
     ("ppo", "lr", [[0, 1e-3], [9, -1]], "lr: expected a number of at least 0, found -1"),
     ("ppo", "gamma", None, "gamma: expected a number from 0 to 1, found None"),
     ("ppo", "num_epochs", None, "num_epochs: expected a whole number of at least 1, found None"),
+    ("ppo", "noise_steps", 0, "noise_steps: expected a whole number of at least 1, found 0"),
     ("ppo", "model_config", 5, "model_config: expected a table of named values, found 5"),
     ("ppo", "model_config", {"fcnet_hiddens": []}, "model_config.fcnet_hiddens: expected one"),
     ("ppo", "model_config", {"fcnet_hiddens": [8, -3]}, "model_config.fcnet_hiddens: expected one"),
@@ -152,6 +153,18 @@ def test_cloning_has_defaults_with_which_it_learns(algo):
     values = hyperparameters.complete(RLLIB_ALGORITHMS[algo], given, is_continuous=True)
     assert (values["lr"], values["model_config"]["free_log_std"]) == (1e-4, False)
     assert not hyperparameters.complete(RLLIB_ALGORITHMS[algo], {})["model_config"]["free_log_std"]
+
+
+def test_noise_is_kept_for_numbers_with_a_free_standard_deviation():
+    given = {"noise_steps": 5, "model_config": {"free_log_std": True}}
+    algorithm = RLLIB_ALGORITHMS["ppo"]
+    assert hyperparameters.complete(algorithm, given, is_continuous=True)["noise_steps"] == 5
+    for wrong, continuous in ((given, False), ({"noise_steps": 5}, True)):
+        with pytest.raises(SettingsError) as caught:
+            hyperparameters.complete(algorithm, wrong, is_continuous=continuous)
+        assert str(caught.value) == (
+            "noise_steps: only numbers with a free standard deviation keep their noise; leave it out"
+        )
 
 
 def test_the_preset_belongs_to_its_trainer():

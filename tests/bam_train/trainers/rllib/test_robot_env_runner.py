@@ -124,3 +124,28 @@ def test_whole_episodes_come_in_one_piece():
     assert len(episodes) == 3
     assert all(episode.is_done and episode.t_started == 0 and len(episode) <= 40 for episode in episodes)
     assert max(map(len, episodes)) > 32  # joined from two rollouts
+
+
+def test_noise_of_actions_is_kept_for_some_steps():
+    """Each action is as likely as one drawn by itself."""
+    torch.manual_seed(0)
+    config = PPOConfig().environment("bam/reach").debugging(seed=5).rl_module(model_config={"free_log_std": True})
+    config.env_runners(num_env_runners=0, num_envs_per_env_runner=2, env_runner_cls=RobotEnvRunner)
+    config.noise_steps = 5
+    runner = RobotEnvRunner(config=config.copy(), worker_index=0, spaces={})
+    pieces = runner.sample(num_timesteps=20, explore=True)
+    runner.stop()
+    noises = []
+    for piece in pieces:
+        outputs, actions = piece.extra_model_outputs, piece.get_actions()
+        mean, log_std = np.split(np.asarray(outputs["action_dist_inputs"]), 2, axis=-1)
+        noises.append((actions - mean) / np.exp(log_std))
+        likely = torch.distributions.Normal(torch.tensor(mean), torch.tensor(log_std).exp()).log_prob(
+            torch.tensor(actions)
+        )
+        np.testing.assert_allclose(outputs["action_logp"], likely.sum(-1), rtol=1e-4)
+    for noise in noises:
+        assert noise.shape[0] == 10
+        np.testing.assert_allclose(noise[:5], np.tile(noise[0], (5, 1)), atol=1e-4)
+        np.testing.assert_allclose(noise[5:], np.tile(noise[5], (5, 1)), atol=1e-4)
+        assert (noise[0] != noise[5]).all()
