@@ -178,7 +178,7 @@ def _run(
         facts: Any = {"guards": guards_of(env), "trials": deployment.trials, "recorder": deployment.recorder}
         facts |= {"shadow": admission.shadow, "identity": admission.identity}
         report = DeployReport(checkpoint, seed, ending, journal, pacer, where, **facts)
-        for warning in report.warnings():
+        for warning in (one for one in report.warnings() if not watcher.has_written(one)):
             say(f"bam-deploy: warning: {warning}")
         tell(*([json_module.dumps(report.to_json(), allow_nan=False)] if config.json else report.lines()))
         say_agent_rests(env, "bam-deploy", config.robot)

@@ -36,6 +36,10 @@ class PlainDeployment:
             self._write(f"warning: {title}: {text}")
         self._warned = len(self._journal.warnings)
 
+    def has_written(self, warning: str) -> bool:
+        """Whether a warning of the report was written while the robot moved."""
+        return warning.partition(": ")[0] in [*self._journal.warnings][: self._warned]
+
     def ended(self, record: EpisodeRecord) -> None:
         """Write such as ``episode 2/5 (seed 8): success after 47 steps, return 12.31``."""
         how = {True: "success", False: "no success", None: record.end}[record.success]

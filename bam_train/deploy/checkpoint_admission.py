@@ -1,5 +1,6 @@
 """What comes before a robot moves: it is brought up, and the checkpoint is admitted: its signature, its trials."""
 
+import shlex
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -53,7 +54,7 @@ def bring_up(
     """
     env = make(place=place)
     try:
-        found = examine(env, place)
+        found = examine(env, _with_stand_in(place, env))
         _connect(env, raise_again)
         if isinstance(place, LiveRobot) and place.stage is None and has_real_robot(env):
             env.close()
@@ -64,6 +65,15 @@ def bring_up(
         env.close()
         raise
     return env, place, found
+
+
+def _with_stand_in(place: Location, env: Any) -> Location:
+    """The place of a live robot with the command that serves a simulated one for the environment `env`."""
+    if not isinstance(place, LiveRobot) or env.spec is None:
+        return place
+    model = env.spec.kwargs.get("robot_model")
+    arm = [] if model is None else ["--robot-model", str(model)]
+    return replace(place, stand_in=shlex.join(["bam-serve", "--env", env.spec.id.rpartition("-v")[0], *arm]))
 
 
 def _connect(env: Any, raise_again: Callable[[], None]) -> None:

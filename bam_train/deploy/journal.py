@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from bam_envs.core.timing import Lateness, Pacer
+from bam_envs.safety.link_guards import LateTicks
 from bam_envs.safety.unusual import UnusualObservations
 from bam_train.checkpoint import Checkpoint
 from bam_train.deploy.agreement import Shadow
@@ -38,6 +39,7 @@ class EpisodeRecord:
 
 
 UNUSUAL = UnusualObservations().title
+LATE = f"{LateTicks.name} ({LateTicks.number})"
 KEPT = 1000
 """Maximum number of records kept; older episodes are only counted, so that memory is bounded."""
 
@@ -189,7 +191,7 @@ class DeployReport:
         faults = [f"{title}: {text}" for title, text in self.journal.warnings.items()]
         if self.recorder is not None and self.recorder.fault:
             faults.append(f"recording: {self.recorder.fault}")
-        if period is None or missed <= MISSED_SHARE * planned:
+        if period is None or missed <= MISSED_SHARE * planned or LATE in self.journal.warnings:
             return faults
         return [
             *faults,

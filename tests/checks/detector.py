@@ -23,7 +23,7 @@ import tyro
 
 from bam_envs.core.errors import SafetyStop
 from bam_envs.core.location import SIMULATED
-from bam_envs.core.registry import ENVIRONMENTS
+from bam_envs.core.registry import entry_of
 from bam_envs.core.robot import EnvIds, RobotState
 from bam_envs.core.robot_env import RobotVectorEnv
 from bam_envs.core.task import Array, Floats, Score
@@ -204,7 +204,8 @@ def simulated(
 def behind_guards(checkpoint: Checkpoint, policy: FrozenPolicy, ticks: int, seed: int, *, trial: bool) -> list[Rollout]:
     """Whole episodes behind a live robot's guards; one that a guard stops has failed."""
     env_id, saved = environment_of(checkpoint)
-    limit = saved.get("max_episode_steps") or ENVIRONMENTS[env_id].max_episode_steps
+    entry: Any = entry_of(env_id)
+    limit = saved.get("max_episode_steps") or entry.max_episode_steps
     pace = TRIAL_SPEED if trial else 1.0
     kwargs = {**saved, **SIMULATED, "link": asdict(AT_ONCE), "max_episode_steps": round(limit / pace)}
     done, count = list[Rollout](), 0

@@ -72,6 +72,8 @@ class LiveRobot:
     and nothing is sent; None: at its limits, and on trial where `bring_up` finds that it is real."""
     robot_name: str = ""
     """Name of the robot, where it does not tell its serial number or a name; a robot that tells another is refused."""
+    stand_in: str = "bam-serve --env bam/pick"
+    """The command that serves a simulated robot in its place, for the message that no server is there."""
 
     @property
     def text(self) -> str:

@@ -355,7 +355,7 @@ async def open_connection(endpoint: Endpoint, timeout: float, max_message: int, 
     # Its timers are coarser than the times here. `decode_server_frame` checks UTF-8.
     factory.setProtocolOptions(openHandshakeTimeout=0, utf8validateIncoming=False, maxMessagePayloadSize=max_message)
     # TCP first, to tell apart a closed port, one behind a firewall and a silent one.
-    plain = await open_port(address, timeout)
+    plain = await open_port(address, timeout, stand_in=endpoint.stand_in)
     name = None if context is None else address.host
     try:
         dialing = loop.create_connection(factory, sock=plain, ssl=context, server_hostname=name)

@@ -5,6 +5,7 @@ import socket
 import ssl
 
 from bam_envs.core.errors import NoServer
+from bam_envs.core.location import LiveRobot
 from bam_envs.rosbridge.endpoint import Address
 
 _HOST_MISMATCH = (62, 64)  # X509_V_ERR_HOSTNAME_MISMATCH, X509_V_ERR_IP_ADDRESS_MISMATCH
@@ -14,8 +15,11 @@ AGENT_PORT = 9095
 _LAUNCH = "ros2 launch rosbridge_server rosbridge_websocket_launch.xml"
 
 
-async def open_port(address: Address, timeout: float) -> socket.socket:
-    """A TCP connection to a server; `NoServer` gives the reason why there is none within `timeout` [s]."""
+async def open_port(address: Address, timeout: float, *, stand_in: str = LiveRobot.stand_in) -> socket.socket:
+    """A TCP connection to a server; `NoServer` gives the reason why there is none within `timeout` [s].
+
+    `stand_in`: see `no_connection`.
+    """
     opening = asyncio.get_running_loop().create_task(_open_tcp(address))
     try:
         await asyncio.wait((opening,), timeout=timeout)
@@ -24,7 +28,7 @@ async def open_port(address: Address, timeout: float) -> socket.socket:
             raise asyncio.TimeoutError
         return opening.result()
     except (OSError, asyncio.TimeoutError) as error:
-        raise NoServer(address.url, no_connection(address, error, timeout)) from error
+        raise NoServer(address.url, no_connection(address, error, timeout, stand_in=stand_in)) from error
     finally:
         opening.cancel()
 
@@ -45,8 +49,18 @@ async def _open_tcp(address: Address) -> socket.socket:
     raise OSError("the name has no address")
 
 
-def no_connection(address: Address, error: OSError | asyncio.TimeoutError, timeout: float, start: str = "") -> str:
-    """The reason why no TCP or TLS connection was made within `timeout` [s]; `start` is how to start a server."""
+def no_connection(
+    address: Address,
+    error: OSError | asyncio.TimeoutError,
+    timeout: float,
+    start: str = "",
+    *,
+    stand_in: str = LiveRobot.stand_in,
+) -> str:
+    """The reason why no TCP or TLS connection was made within `timeout` [s].
+
+    `start` says how to start a server; or `stand_in` is the command that serves a simulated robot, without a port.
+    """
     if isinstance(error, ssl.SSLCertVerificationError):
         reason = error.verify_message.rstrip(".")
         if error.verify_code in _HOST_MISMATCH:
@@ -60,7 +74,7 @@ def no_connection(address: Address, error: OSError | asyncio.TimeoutError, timeo
     if isinstance(error, socket.gaierror):
         return f"the name {address.host!r} is not known: {error.strerror}. Try the IP address."
     if isinstance(error, ConnectionRefusedError):
-        here = f"Start one with `bam-serve --env bam/pick --port {address.port}` or `{_LAUNCH}`."
+        here = f"Start one with `{stand_in} --port {address.port}` or `{_LAUNCH}`."
         if address.port == AGENT_PORT:
             start = start or f"{AGENT_PORT} is the port of bam-agent: does it run there? {here}"
         return f"refused: nothing listens there. Is the port open? {start or here}"

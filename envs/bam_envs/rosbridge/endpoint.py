@@ -60,6 +60,8 @@ class Endpoint:
     """Longest time to wait for an answer [s]; None: the default of the caller."""
     robot_name: str = ""
     """Name of the robot there, as its operator knows it; empty if the robot tells it, or none is known."""
+    stand_in: str = LiveRobot.stand_in
+    """See `LiveRobot`."""
 
     def __post_init__(self) -> None:
         if self.token is None and self.credentials.token_file is not None:
@@ -83,7 +85,7 @@ class Endpoint:
     @classmethod
     def of(cls, robot: LiveRobot) -> "Endpoint":
         """The server of a live robot with an address."""
-        return cls(robot.url, robot.credentials, robot_name=robot.robot_name)
+        return cls(robot.url, robot.credentials, robot_name=robot.robot_name, stand_in=robot.stand_in)
 
     @cached_property
     def address(self) -> Address:

@@ -47,6 +47,18 @@ def test_plain_display_writes_a_line_an_episode(success, end, length, line):
     assert lines == [f"episode 1/5 (seed 8): {line}"]
 
 
+def test_a_warning_is_written_once():
+    journal, lines = Journal(1), []
+    display, record = PlainDeployment(journal, lines.append), journal.begin(0)
+    journal.warn(["late ticks (G15): 6 of the last 100 commands were late"])
+    display.ticked(record, 1, Pacer(None))
+    journal.warn(["late ticks (G15): 7 of the last 100 commands were late"])
+    display.ticked(record, 1, Pacer(None))
+    assert lines == ["warning: late ticks (G15): 6 of the last 100 commands were late"]
+    assert display.has_written("late ticks (G15): 7 of the last 100 commands were late")
+    assert not display.has_written("link quality (G16): only 93 of the last 100 ticks")
+
+
 def test_redraws_are_rare_and_only_when_there_is_time(corridor):
     times = iter([0.0, 0.05, 0.1, 0.3, 0.31, 0.4])
     panel, journal = Panel(), Journal(1)

@@ -129,6 +129,16 @@ def test_a_policy_drives_a_robot_over_its_topics(serve, run, tmp_path, monkeypat
     assert (status, played["same"], played["ticks"]) == (0, True, report["ticks"] + 1)
 
 
+def test_a_server_that_is_not_there_is_named_by_what_the_checkpoint_needs(run, nobody):
+    status, _, err = run(deploy, PICK.with_name("ur-reach-ppo.zip"), "--robot", f"ws://{nobody}")
+    port = nobody.partition(":")[2]
+    assert (status, err) == (
+        1,
+        f"bam-deploy: ws://{nobody}: refused: nothing listens there. Is the port open? Start one with `bam-serve "
+        f"--env bam/ur-reach --port {port}` or `ros2 launch rosbridge_server rosbridge_websocket_launch.xml`.\n",
+    )
+
+
 def test_the_cameras_of_a_profile_are_recorded(serve, run, tmp_path):
     served = serve(gym.make("bam/pick-v0", disable_env_checker=True), fast=True)
     picture = np.arange(48, dtype=np.uint8).reshape(4, 4, 3)

@@ -63,6 +63,13 @@ def test_everything_is_in_the_report(corridor_checkpoint):
     assert values["per_episode"][2] == {"seed": 2, "length": 1, "return": 1.5, "success": False, "end": "stopped"}
 
 
+def test_late_ticks_are_one_warning(corridor_checkpoint):
+    late, warned = "late ticks (G15): 6 of the last 100 commands were late", journal()
+    warned.warn([late])
+    report = DeployReport(Checkpoint.open(corridor_checkpoint()), 0, Ending("x", 0), warned, driven_pacer(0.05))
+    assert report.warnings() == [late]
+
+
 def test_a_limit_that_is_off_is_null(corridor_checkpoint):
     guards = {"state age": {"number": "G3", "limit": math.inf, "unit": "s", "altered": 0, "stopped": 0}}
     report = DeployReport(
