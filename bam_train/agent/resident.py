@@ -33,6 +33,7 @@ from bam_train.agent.transitions import TransitionCollector, TransitionLog, enco
 from bam_train.agent.versions import Versions
 from bam_train.checkpoint import Checkpoint
 from bam_train.deploy.deployment import Stopped, StopSwitch, fault_text
+from bam_train.deploy.episode import EpisodeStep
 from bam_train.deploy.journal import EpisodeRecord
 from bam_train.errors import BadTrials, BamTrainError, ContractRefused, PolicyError, RequestRefused, kind_of
 
@@ -262,10 +263,11 @@ class Resident:
 
     def between_ticks(self) -> bool:
         """Called by the loop between a deadline and the policy: whether the episode ends here."""
-        deployment = self._connected.deployment
-        self._loop_ms += 0.05 * (1e3 * deployment.latency - self._loop_ms)
         self._was_cut_short = self._hurry.is_set()
         return self._settled()
+
+    def _look(self, step: EpisodeStep) -> None:
+        self._loop_ms += 0.05 * (1e3 * step.latency - self._loop_ms)
 
     def _settled(self) -> bool:
         """Execute what waits, and swap the policy if that is asked for now; whether the episode ends here."""
@@ -467,9 +469,10 @@ class Resident:
                 self._stage,
                 between_ticks=self.between_ticks,
                 observers=[
+                    self._look,
                     TransitionCollector(
                         self.transitions, lambda: self.succession.active.digest, lambda: self._was_cut_short
-                    )
+                    ),
                 ],
                 switch=self.switch,
                 admit=self._admit,

@@ -212,11 +212,6 @@ class Deployment:
         """Of the last ticks."""
         return self._loop.times
 
-    @property
-    def latency(self) -> float:
-        """Time from a deadline to the step that followed it, in the last tick [s]."""
-        return self._loop.latency
-
     def sent(self, tick: Tick, state: RobotState) -> None:
         """Take a command that a `SafeRobot` has sent, for the recording: `SafeRobot.observe` has one observer only."""
         self._flight.sent(tick, state)

@@ -9,7 +9,7 @@ what they let through. Nothing else in this loop reaches the robot.
 """
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from time import perf_counter, thread_time
 from typing import Any, Protocol
 
@@ -17,10 +17,12 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
+from bam_envs.core.robot_env import robot_of
 from bam_envs.core.timing import Pacer, TickTimes
 from bam_train.deploy.journal import EpisodeRecord, Journal
 from bam_train.errors import LoopError
 from bam_train.finite_envs import require_finite_action
+from bam_train.policy.background import Background
 
 OBSERVATION = "env_obs"
 """Name of an observation that is one array; the arrays of a Dict are ``env_obs/<key>``."""
@@ -40,6 +42,8 @@ class EpisodeStep:
     """When the action before was sent."""
     stepped: float
     """When the observation had come."""
+    latency: float = 0.0
+    """Time from the deadline of the action before until it was sent [s]."""
     reward: float = 0.0
     terminated: bool = False
     truncated: bool = False
@@ -52,9 +56,34 @@ class EpisodeStep:
     action: Any = None
     """The policy's decision, an array or a number; that of the last step is not sent."""
     acted: float = 0.0
-    """Duration of the decision [s]."""
+    """Duration of the decision [s]; before it, of the one before."""
     computed: float = 0.0
-    """CPU time of the decision [s]."""
+    """CPU time of the decision [s]; before it, of the one before."""
+
+    @property
+    def observation(self) -> Any:
+        """A copy as the policy gets it: an array, or a mapping for a Dict."""
+        arrays = {name.removeprefix(f"{OBSERVATION}/"): array[0].copy() for name, array in self.arrays.items()}
+        return arrays[OBSERVATION] if OBSERVATION in self.arrays else arrays
+
+    def followed_by(
+        self, begun: float, result: tuple[Any, Any, Any, Any, Mapping[str, Any]], space: gym.Space[Any]
+    ) -> "EpisodeStep":
+        """The next step: the `result` of ``env.step``, which began at `begun`; `space` is that of the observations."""
+        stepped, (observation, reward, terminated, truncated, info) = perf_counter(), result
+        success = info.get("is_success")
+        return replace(
+            self,
+            number=self.number + 1,
+            arrays=named_arrays(observation, space),
+            begun=begun,
+            latency=begun - self.waited,
+            stepped=stepped,
+            reward=float(reward),
+            terminated=bool(terminated),
+            truncated=bool(truncated),
+            success=None if success is None else bool(success),
+        )
 
     @property
     def is_last(self) -> bool:
@@ -80,9 +109,6 @@ class Watcher(Protocol):
 class EpisodeLoop:
     """Runs episodes of `policy`, which may be exchanged between two ticks; see `Deployment` for the arguments."""
 
-    latency = 0.0
-    """Time from a deadline to the step that followed it, in the last tick [s]."""
-
     def __init__(
         self,
         env: gym.Env[Any, Any],
@@ -95,12 +121,10 @@ class EpisodeLoop:
     ) -> None:
         self._env, self.policy, self._pacer, self._journal = env, policy, pacer, journal
         self._raise_again, self._between_ticks = raise_again, between_ticks
-        self._robot: Any = getattr(env.unwrapped, "robot", None)
         self.observers: list[Callable[[EpisodeStep], None]] = []
         """Called with each step once the policy has decided, in this order; they must be fast."""
         self.times = TickTimes(pacer.period)
         """Of the last ticks."""
-        self._took = (0.0, 0.0)
 
     def run(self, watcher: Watcher, *, seed: int, begins: Callable[[int], None] = lambda seed: None) -> EpisodeRecord:
         """Run one episode; `begins` is called with the seed before the first action."""
@@ -124,8 +148,8 @@ class EpisodeLoop:
         step = EpisodeStep(0, seed, named_arrays(observation, self._env.observation_space), begun, perf_counter())
         self._journal.begin(seed)
         self.policy.reset()
-        if (prepare := getattr(self.policy, "prepare", None)) is not None:
-            prepare(_observation(step))  # the first of its chunks, while nothing moves
+        if isinstance(self.policy, Background):
+            self.policy.prepare(step.observation)  # the first of its chunks, while nothing moves
         return step
 
     def _wait(self, step: EpisodeStep) -> None:
@@ -134,13 +158,14 @@ class EpisodeLoop:
             missed = self._pacer.missed
             step.late = self._pacer.wait()
             if step.number:
-                self._journal.records[-1].slow += self.times.add(step.late, self._pacer.missed - missed, *self._took)
+                before = self._pacer.missed - missed, step.acted, step.computed
+                self._journal.records[-1].slow += self.times.add(step.late, *before)
         step.waited = perf_counter()
 
     def _decide(self, step: EpisodeStep) -> None:
         begun, computed = perf_counter(), thread_time()
-        action = np.asarray(self.policy.act(_observation(step)))
-        step.acted, step.computed = self._took = perf_counter() - begun, thread_time() - computed
+        action = np.asarray(self.policy.act(step.observation))
+        step.acted, step.computed = perf_counter() - begun, thread_time() - computed
         if not step.is_last:
             require_finite_action(action, step.number, f"the episode with seed {step.seed}")
         step.action = action[()]  # a number, if it is one
@@ -152,27 +177,15 @@ class EpisodeLoop:
     def _send(self, step: EpisodeStep) -> EpisodeStep:
         """Let the environment take the action: its task makes a command, and the guards stand before the robot."""
         self._raise_again()  # after a signal whose exception was lost, nothing more is sent
-        begun = perf_counter()
-        self.latency = begun - step.waited
-        observation, reward, terminated, truncated, info = self._env.step(step.action.copy())
-        stepped, success = perf_counter(), info.get("is_success")
-        arrays = named_arrays(observation, self._env.observation_space)
-        result = (float(reward), bool(terminated), bool(truncated), None if success is None else bool(success))
-        return EpisodeStep(step.number + 1, step.seed, arrays, begun, stepped, *result, action=step.action)
+        return step.followed_by(perf_counter(), self._env.step(step.action.copy()), self._env.observation_space)
 
     def _write_down(self, step: EpisodeStep, watcher: Watcher) -> None:
         """Into the journal, and before the operator's eyes."""
-        self._journal.warn(getattr(self._robot, "warnings", ()))
+        self._journal.warn(getattr(robot_of(self._env), "warnings", ()))
         record = self._journal.step(step.reward, step.success, step.end)
         watcher.ticked(record, step.action, self._pacer)
         if step.is_last:
             watcher.ended(record)
-
-
-def _observation(step: EpisodeStep) -> Any:
-    """What the policy gets: an array, or a mapping for a Dict."""
-    arrays = {name.removeprefix(f"{OBSERVATION}/"): array[0].copy() for name, array in step.arrays.items()}
-    return arrays[OBSERVATION] if OBSERVATION in step.arrays else arrays
 
 
 def named_arrays(observation: Any, space: gym.Space[Any], name: str = OBSERVATION) -> dict[str, NDArray[Any]]:
