@@ -30,12 +30,12 @@ from bam_train.checkpoint.signature import trusted_folder, verify
 from bam_train.deploy.checkpoint_admission import UNSIGNED
 from bam_train.environments import first_difference, interface_pairs, short_json
 from bam_train.errors import (
-    BadKey,
     BamTrainError,
     CheckpointError,
     CheckpointMismatch,
     PolicyError,
     RequestRefused,
+    SettingsError,
     UntrustedCheckpoint,
 )
 from bam_train.policy import FrozenPolicy
@@ -87,7 +87,7 @@ def _signer(checkpoint: Checkpoint, request: CandidateRequest) -> tuple[str, str
     """Who signed the checkpoint, and a line about it."""
     try:
         found = verify(checkpoint, (request.keys or trusted_folder()).expanduser())
-    except (UntrustedCheckpoint, BadKey) as error:
+    except (UntrustedCheckpoint, SettingsError) as error:
         allowed = request.allow_unsigned and isinstance(error, UntrustedCheckpoint)
         if not (request.simulated or allowed):
             raise

@@ -35,7 +35,7 @@ from bam_train.checkpoint import Checkpoint
 from bam_train.deploy.deployment import Stopped, StopSwitch, fault_text
 from bam_train.deploy.episode import EpisodeStep
 from bam_train.deploy.journal import EpisodeRecord
-from bam_train.errors import BadTrials, BamTrainError, ContractRefused, PolicyError, RequestRefused, kind_of
+from bam_train.errors import BamTrainError, ContractRefused, FormatError, PolicyError, RequestRefused, kind_of
 
 if TYPE_CHECKING:
     from bam_train.agent.audit import Audit
@@ -374,7 +374,7 @@ class Resident:
         if self.session is not None:
             deployment = self.session.deployment
             if deployment.trials is not None:
-                with contextlib.suppress(BadTrials):  # then the episode counts for the version that began it
+                with contextlib.suppress(FormatError):  # then the episode counts for the version that began it
                     deployment.trials.end(False, f"another version acts: {choice.why}", void=True)
             deployment.trials = self.succession.trials()  # an episode on its way to its start is one of this version
             deployment.swap(choice.policy)

@@ -29,7 +29,7 @@ from bam_train.checkpoint import Checkpoint
 from bam_train.deploy.checkpoint_admission import trials_of
 from bam_train.deploy.journal import EpisodeRecord
 from bam_train.deploy.trials import Evidence, Trials
-from bam_train.errors import BadTrials, BamTrainError, RequestRefused, TrialsNeeded, kind_of
+from bam_train.errors import BamTrainError, FormatError, RequestRefused, SettingsError, kind_of
 
 _log = logging.getLogger(__name__)
 _EPISODE_TIMEOUT = 3600.0  # longest wait for the end of an episode [s]
@@ -264,8 +264,9 @@ class Succession:
         trials = trials_of(checkpoint, record, identity, address, simulated=not is_real)
         if stage == "full" and is_real and not (resident.options.i_know or trials.evidence.is_enough):
             evidence = trials.evidence.text
-            raise TrialsNeeded(
-                f"--stage full: {digest[:12]} on {identity or address}: {evidence}. Push it as a trial first"
+            raise SettingsError(
+                f"--stage full: {digest[:12]} on {identity or address}: {evidence}. Push it as a trial first",
+                kind="TrialsNeeded",
             )
         at_once = ask.arguments.get("when", "episode") == "tick"
         why = f"{ask.op} by {ask.who}"
@@ -340,7 +341,7 @@ class Succession:
             try:
                 evidence = choice.trials.evidence
                 choice.progress = _progress(evidence)
-            except BadTrials as error:
+            except FormatError as error:
                 _log.warning("%s", error)
         judged = self.probation.ended(record.success, trials=evidence, slow=record.slow, ticks=record.length)
         self._judged(judged)
@@ -376,7 +377,7 @@ class Succession:
         try:
             trials.end(False, why, void=True)
             choice.progress = _progress(trials.evidence)
-        except BadTrials as error:  # then it counts
+        except FormatError as error:  # then it counts
             _log.warning("%s", error)
 
     def policy_failed(self, text: str) -> bool:

@@ -19,7 +19,7 @@ from typing import IO, Any
 
 from bam_train.checkpoint import MANIFEST, POLICY, Checkpoint
 from bam_train.checkpoint.detector import Detector
-from bam_train.errors import AlteredCheckpoint, CheckpointError, FolderInUse, OutputError, RequestRefused, SettingsError
+from bam_train.errors import CheckpointError, OutputError, RequestRefused, SettingsError
 from bam_train.files.atomic_file import remove_orphans, replacing
 from bam_train.policy import FrozenPolicy
 
@@ -75,7 +75,7 @@ class Versions:
         """Within the ``with`` block, no other agent uses the folder; what a killed one left half written is removed.
 
         Raises:
-            FolderInUse: Another agent uses it.
+            OutputError: Another agent uses it.
         """
         with self._writing():
             file = _open_lock(self.folder / _HOLDER)
@@ -85,7 +85,9 @@ class Versions:
                     fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except BlockingIOError as error:
                 other = f"another bam-agent (process {file.read(20).decode('ascii', 'replace').strip()})"
-                raise FolderInUse(f"{self.folder}: {other} uses it. End that one, or give another --folder") from error
+                raise OutputError(
+                    f"{self.folder}: {other} uses it. End that one, or give another --folder", kind="FolderInUse"
+                ) from error
             file.truncate(0)
             file.write(f"{os.getpid()}\n".encode())
             file.flush()
@@ -98,7 +100,7 @@ class Versions:
 
         Raises:
             OutputError: The disk is full, or the folder cannot be written; nothing has changed.
-            AlteredCheckpoint: The file was changed after it was verified.
+            CheckpointError: The file was changed after it was verified.
         """
         self._copy(checkpoint)
         with self._changing():
@@ -256,7 +258,7 @@ def _require_same(copy: Path, checkpoint: Checkpoint) -> None:
     with contextlib.suppress(CheckpointError):
         if Checkpoint.open(copy).digest == checkpoint.digest:
             return
-    raise AlteredCheckpoint(checkpoint.path, MANIFEST, "was changed while it was read. Push it again")
+    raise CheckpointError(checkpoint.path, "was changed while it was read. Push it again", member=MANIFEST)
 
 
 def _open_lock(path: Path) -> IO[bytes]:

@@ -42,7 +42,7 @@ from bam_train.checkpoint.zip_members import (
     open_zip,
     require_same_members,
 )
-from bam_train.errors import AlteredCheckpoint, CheckpointError, CheckpointMismatch, FormatError, OutputError
+from bam_train.errors import CheckpointError, CheckpointMismatch, FormatError, OutputError
 from bam_train.files.atomic_file import replacing
 from bam_train.files.place import local_path
 
@@ -70,9 +70,9 @@ class Checkpoint:
 
         Raises:
             PlaceError: An address that it cannot be fetched from.
-            NotACheckpoint: No such file, not a zip, truncated, too large, or no manifest in it.
+            CheckpointError: No such file, not a zip, truncated, too large, or no manifest in it.
             CheckpointMismatch: Written by a newer bam-train.
-            AlteredCheckpoint: A member was changed, is missing, was added or is too large.
+            CheckpointError: A member was changed, is missing, was added or is too large.
         """
         path = local_path(path)
         with open_zip(path) as archive:
@@ -93,7 +93,7 @@ class Checkpoint:
         """Return a member's bytes, verified again: the file may have been replaced since it was opened."""
         if not self.has(member):
             found = ", ".join(sorted(self.manifest.sha256)) or "nothing"
-            raise AlteredCheckpoint(self.path, member, f"has no {member}; it holds {found}. {AGAIN}")
+            raise CheckpointError(self.path, f"has no {member}; it holds {found}. {AGAIN}", member=member)
         with open_zip(self.path) as archive:
             infos = list_members(self.path, archive)
             require_same_members(self.path, set(infos), set(self.manifest.sha256))
@@ -110,7 +110,7 @@ class Checkpoint:
         try:
             return safetensors_file.parse(self.read(member))
         except FormatError as error:
-            raise AlteredCheckpoint(self.path, member, f"{member} cannot be read: {error}") from error
+            raise CheckpointError(self.path, f"{member} cannot be read: {error}", member=member) from error
 
     def state(self, name: str, to_tensor: Callable[[np.ndarray], Any] | None = None) -> Any:
         """Return the state that `safetensors_file.pack` wrote as ``name.json`` and ``name.safetensors``."""
@@ -118,23 +118,23 @@ class Checkpoint:
         try:
             return safetensors_file.unpack(skeleton, arrays, to_tensor)
         except FormatError as error:
-            raise AlteredCheckpoint(self.path, name, str(error)) from error
+            raise CheckpointError(self.path, str(error), member=name) from error
 
     def json(self, member: str) -> Any:
         """Return a JSON member's value."""
         try:
             return json.loads(self.read(member))
         except (ValueError, RecursionError) as error:
-            raise AlteredCheckpoint(self.path, member, f"{member} is not JSON: {error}") from error
+            raise CheckpointError(self.path, f"{member} is not JSON: {error}", member=member) from error
 
     @contextlib.contextmanager
     def fitting(self, member: str) -> Iterator[None]:
-        """Turn exceptions of restoring a member's state into `AlteredCheckpoint`."""
+        """Turn exceptions of restoring a member's state into `CheckpointError`."""
         try:
             yield
         except _MISFITS as error:
             text = f"{member} does not fit these settings: {' '.join(str(error).split()):.200}"
-            raise AlteredCheckpoint(self.path, member, text) from error
+            raise CheckpointError(self.path, text, member=member) from error
 
     def requires_env(self, env_id: str, remedy: str = "") -> None:
         """Raise CheckpointMismatch unless `env_id` is the environment of the checkpoint, also by robo-gym's name.

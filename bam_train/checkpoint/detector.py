@@ -29,7 +29,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bam_train.checkpoint import safetensors_file
-from bam_train.errors import AlteredCheckpoint, NoDetector
+from bam_train.errors import CheckpointError, SettingsError
 
 if TYPE_CHECKING:
     from bam_train.checkpoint import Checkpoint
@@ -179,7 +179,7 @@ class Detector:
 
     @classmethod
     def of(cls, checkpoint: Checkpoint) -> Detector | None:
-        """The detector of a checkpoint; None if it has none. Raises AlteredCheckpoint if it is not one."""
+        """The detector of a checkpoint; None if it has none. Raises CheckpointError if it is not one."""
         if not checkpoint.has(DETECTOR):
             return None
         arrays = checkpoint.arrays(DETECTOR)
@@ -191,7 +191,7 @@ class Detector:
             if numbers != expected:
                 raise ValueError(f"expected {expected} numbers in observation and action, found {numbers}")
         except (TypeError, ValueError, KeyError) as error:
-            raise AlteredCheckpoint(checkpoint.path, DETECTOR, f"{DETECTOR}: {error}. Make it again") from error
+            raise CheckpointError(checkpoint.path, f"{DETECTOR}: {error}. Make it again", member=DETECTOR) from error
         return cls(model)
 
     def to_bytes(self) -> bytes:
@@ -345,19 +345,19 @@ def make_detector(*kinds: Iterable[Rollout], limit: float | None = None, seed: i
         seed: Of the random features.
 
     Raises:
-        NoDetector: The observations are not up to 64 numbers, or there are too few episodes of the first kind.
+        SettingsError: The observations are not up to 64 numbers, or there are too few episodes of the first kind.
     """
     every = [[one for one in kind if len(one.actions)] for kind in kinds]
     used = [[one for one in kind if one.success] or kind for kind in every]
     ticks = sum(len(one.actions) for one in used[0])
     if ticks < LEAST_TICKS or len(used[0]) < LEAST_EPISODES:
         expected = f"at least {LEAST_EPISODES} successful episodes of {LEAST_TICKS} steps in all"
-        raise NoDetector(f"a detector needs {expected}, found {len(used[0])} of {ticks}")
+        raise SettingsError(f"a detector needs {expected}, found {len(used[0])} of {ticks}")
     if max(len(one.actions) for one in used[0]) < 2:
-        raise NoDetector("a detector compares a step with the next one, and these episodes have one step")
+        raise SettingsError("a detector compares a step with the next one, and these episodes have one step")
     sizes = [max(1, math.prod(part.shape[1:])) for part in used[0][0][:2]]
     if max(sizes) > MOST_NUMBERS:
-        raise NoDetector(f"a detector takes at most {MOST_NUMBERS} numbers, found {sizes[0]} in an observation")
+        raise SettingsError(f"a detector takes at most {MOST_NUMBERS} numbers, found {sizes[0]} in an observation")
     used = [kind for kind in used if len(kind) >= LEAST_EPISODES]
     kept = [kind[2::5] + kind[3::5] + kind[4::5] for kind in used]
     model = _learnt([one for kind in used for one in kind[0::5] + kind[1::5]], sizes[0], np.random.default_rng(seed))

@@ -13,7 +13,7 @@ from typing import Annotated, Any, Literal
 import msgspec
 from msgspec import Meta, Struct
 
-from bam_train.errors import AlteredCheckpoint, CheckpointError, CheckpointMismatch
+from bam_train.errors import CheckpointError, CheckpointMismatch
 
 FORMAT = 1
 MANIFEST = "bam/manifest.json"
@@ -161,17 +161,17 @@ def parse_manifest(path: Path, data: bytes) -> Manifest:
 
     Raises:
         CheckpointMismatch: Written by a newer bam-train.
-        AlteredCheckpoint: A field is missing, of the wrong type or not allowed in a file.
+        CheckpointError: A field is missing, of the wrong type or not allowed in a file.
     """
     try:
         manifest = _parse(path, data)
     except (msgspec.MsgspecError, RecursionError, ValueError) as error:
-        raise AlteredCheckpoint(path, MANIFEST, f"{MANIFEST}: {error}. {AGAIN}") from error
+        raise CheckpointError(path, f"{MANIFEST}: {error}. {AGAIN}", member=MANIFEST) from error
     try:
         require_no_place(manifest.env_kwargs)
     except ValueError as error:  # another copy would be the same
         remedy = "Ask whoever made it, or train again"
-        raise AlteredCheckpoint(path, MANIFEST, f"{MANIFEST}: {error}. {remedy}") from error
+        raise CheckpointError(path, f"{MANIFEST}: {error}. {remedy}", member=MANIFEST) from error
     return manifest
 
 

@@ -27,7 +27,7 @@ from bam_train.checkpoint.checkpoint import Checkpoint
 from bam_train.checkpoint.manifest import AGAIN, MANIFEST
 from bam_train.checkpoint.ownership import who_else
 from bam_train.checkpoint.zip_members import RESUME, SIGNATURE, chunks, list_members, open_zip
-from bam_train.errors import AlteredCheckpoint, BadKey, OutputError, UntrustedCheckpoint
+from bam_train.errors import CheckpointError, OutputError, SettingsError, UntrustedCheckpoint
 from bam_train.files.atomic_file import replacing
 
 _NAME = r"[A-Za-z0-9][A-Za-z0-9_.@-]{0,63}"
@@ -84,7 +84,7 @@ def make_key(path: Path, name: str) -> PublicKey:
     """Make a key: the private one at `path`, which only this user can read, and the public one at `public_path`.
 
     Raises:
-        BadKey: `name` is not a valid name, or `path` is that of a public key.
+        SettingsError: `name` is not a valid name, or `path` is that of a public key.
         OutputError: One of the files exists, or cannot be written.
     """
     from cryptography.hazmat.primitives import serialization
@@ -93,7 +93,9 @@ def make_key(path: Path, name: str) -> PublicKey:
     if path.is_dir():
         raise OutputError(f"{path}: a folder. Name the private key in it, such as {path / 'alice.key'}")
     if path.suffix == ".pub":
-        raise BadKey(f"{path}: that is a name for a public key. Give the private one: {path.with_suffix('.key')}")
+        raise SettingsError(
+            f"{path}: that is a name for a public key. Give the private one: {path.with_suffix('.key')}"
+        )
     _require_name(name)
     key = Ed25519PrivateKey.generate()
     public = PublicKey(name, _base64(key.public_key().public_bytes_raw()))
@@ -110,7 +112,7 @@ def make_key(path: Path, name: str) -> PublicKey:
 def _require_name(name: str) -> None:
     if re.fullmatch(_NAME, name) is None:
         text = "expected 1 to 64 letters, digits, '.', '_', '@' and '-', beginning with a letter or digit"
-        raise BadKey(f"the signer's name {name!r}: {text}. Give another with --name")
+        raise SettingsError(f"the signer's name {name!r}: {text}. Give another with --name")
 
 
 def _write_new(path: Path, data: bytes, mode: int) -> None:
@@ -134,48 +136,57 @@ def read_private_key(path: Path) -> tuple[Any, PublicKey]:
     """The private key at `path`, and its public key.
 
     Raises:
-        BadKey: The file cannot be read, others can read it, or it is not an Ed25519 key.
+        SettingsError: The file cannot be read, others can read it, or it is not an Ed25519 key.
     """
     from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
     from cryptography.hazmat.primitives.serialization import load_pem_private_key
 
     if path.suffix == ".pub":
-        raise BadKey(f"{path}: a public key signs nothing. Give the private one, which bam-sign keygen made with it")
+        raise SettingsError(
+            f"{path}: a public key signs nothing. Give the private one, which bam-sign keygen made with it"
+        )
     try:
         with path.open("rb") as file:
-            mode = stat.S_IMODE(os.fstat(file.fileno()).st_mode)
-            if mode & 0o077 and os.name == "posix":
-                raise BadKey(f"{path}: others can read this private key (mode {mode:04o}). Run: chmod 600 {path}")
-            key = load_pem_private_key(file.read(_MAX_KEY_SIZE), None)
+            mode, pem = stat.S_IMODE(os.fstat(file.fileno()).st_mode), file.read(_MAX_KEY_SIZE)
     except OSError as error:
         remedy = "Make one with bam-sign keygen, or give another with --key"
-        raise BadKey(f"{path}: the private key cannot be read: {error.strerror or error}. {remedy}") from error
+        raise SettingsError(f"{path}: the private key cannot be read: {error.strerror or error}. {remedy}") from error
+    if mode & 0o077 and os.name == "posix":
+        raise SettingsError(f"{path}: others can read this private key (mode {mode:04o}). Run: chmod 600 {path}")
+    try:
+        key = load_pem_private_key(pem, None)
     except (ValueError, TypeError) as error:
-        raise BadKey(f"{path}: not a private key without a password. Make one with bam-sign keygen") from error
+        raise SettingsError(f"{path}: not a private key without a password. Make one with bam-sign keygen") from error
     if not isinstance(key, Ed25519PrivateKey):
-        raise BadKey(f"{path}: expected an Ed25519 key, found {type(key).__name__}. Make one with bam-sign keygen")
-    text, public = _base64(key.public_key().public_bytes_raw()), public_path(path)
+        raise SettingsError(
+            f"{path}: expected an Ed25519 key, found {type(key).__name__}. Make one with bam-sign keygen"
+        )
+    own, public = _base64(key.public_key().public_bytes_raw()), public_path(path)
     name = read_public_key(public).name if public.exists() else path.stem
     _require_name(name)
-    return key, PublicKey(name, text)
+    return key, PublicKey(name, own)
 
 
 def read_public_key(path: Path) -> PublicKey:
     """The key in a ``.pub`` file.
 
     Raises:
-        BadKey: The file cannot be read, or is not a public key.
+        SettingsError: The file cannot be read, or is not a public key.
     """
     try:
         with path.open("rb") as file:
             text = file.read(_MAX_KEY_SIZE).decode("ascii", "replace")
     except OSError as error:
-        raise BadKey(f"{path}: the public key cannot be read: {error.strerror or error}. Check its name") from error
+        raise SettingsError(
+            f"{path}: the public key cannot be read: {error.strerror or error}. Check its name"
+        ) from error
     if "PRIVATE KEY-----" in text:
-        raise BadKey(f"{path}: a private key, which stays secret. Give the public one: {public_path(path)}")
+        raise SettingsError(f"{path}: a private key, which stays secret. Give the public one: {public_path(path)}")
     found = re.fullmatch(rf"ed25519 ([A-Za-z0-9+/]{{43}}=) ({_NAME})\s*", text)
     if found is None:
-        raise BadKey(f"{path}: expected one line 'ed25519 KEY NAME', as bam-sign keygen writes it. Copy it again")
+        raise SettingsError(
+            f"{path}: expected one line 'ed25519 KEY NAME', as bam-sign keygen writes it. Copy it again"
+        )
     return PublicKey(found[2], found[1])
 
 
@@ -183,14 +194,14 @@ def trusted_keys(folder: Path) -> list[PublicKey]:
     """The keys in a folder; none if there is no such folder.
 
     Raises:
-        BadKey: A file there is no key, or another user could change the folder or a key; `folder` is a file.
+        SettingsError: A file there is no key, or another user could change the folder or a key; `folder` is a file.
     """
     if folder.is_file():
-        raise BadKey(f"{folder}: a file, and a folder of public keys is expected. Give its folder")
+        raise SettingsError(f"{folder}: a file, and a folder of public keys is expected. Give its folder")
     paths = sorted(folder.glob("*.pub"))
     for path in (folder, *paths) if paths else ():
         if why := who_else(path):
-            raise BadKey(f"{path}: another user can change whom this computer trusts: {why}")
+            raise SettingsError(f"{path}: another user can change whom this computer trusts: {why}")
     return [read_public_key(path) for path in paths]
 
 
@@ -198,7 +209,7 @@ def trust(path: Path, folder: Path) -> Path:
     """Copy the public key at `path` into `folder`; where it is now.
 
     Raises:
-        BadKey: There is no key at `path`, or another one of that name is trusted already.
+        SettingsError: There is no key at `path`, or another one of that name is trusted already.
         OutputError: It cannot be written.
     """
     key = read_public_key(path)
@@ -206,7 +217,9 @@ def trust(path: Path, folder: Path) -> Path:
     if place.exists():
         if read_public_key(place).text == key.text:
             return place
-        raise BadKey(f"{place}: another key of that name is trusted. Remove that file first, if it is to be replaced")
+        raise SettingsError(
+            f"{place}: another key of that name is trusted. Remove that file first, if it is to be replaced"
+        )
     try:
         folder.mkdir(mode=0o755, parents=True, exist_ok=True)  # also where others of a group may change new folders
     except OSError as error:
@@ -224,7 +237,7 @@ def sign(path: Path, key_path: Path) -> Signature:
     """Sign a checkpoint after verifying its members; an existing signature is replaced.
 
     Raises:
-        BadKey: As of `read_private_key`.
+        SettingsError: As of `read_private_key`.
         CheckpointError: The checkpoint is damaged.
         OutputError: The file cannot be written, and is unchanged.
     """
@@ -260,8 +273,8 @@ def verify(checkpoint: Checkpoint, folder: Path) -> Signature:
 
     Raises:
         UntrustedCheckpoint: It is not signed, or by a key that is not trusted.
-        AlteredCheckpoint: The signature is not one of this manifest, or a member is not as signed; names the member.
-        BadKey: A file in `folder` is no key.
+        CheckpointError: The signature is not one of this manifest, or a member is not as signed; names the member.
+        SettingsError: A file in `folder` is no key.
     """
     from cryptography.exceptions import InvalidSignature
     from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PublicKey
@@ -273,13 +286,13 @@ def verify(checkpoint: Checkpoint, folder: Path) -> Signature:
         found = msgspec.json.decode(data, type=Signature)
         text, raw = (base64.b64decode(encoded, validate=True) for encoded in (found.public_key, found.signature))
     except (msgspec.MsgspecError, ValueError) as error:
-        raise AlteredCheckpoint(path, SIGNATURE, f"{SIGNATURE}: {error}. Sign it again") from error
+        raise CheckpointError(path, f"{SIGNATURE}: {error}. Sign it again", member=SIGNATURE) from error
     manifest = _manifest(checkpoint)
     try:
         Ed25519PublicKey.from_public_bytes(text).verify(raw, _signed(found.signer, found.created, manifest))
     except (InvalidSignature, ValueError) as error:  # ValueError: a key of another length
         why = f"{MANIFEST} or {SIGNATURE} was altered after {found.signer} signed: the signature does not fit"
-        raise AlteredCheckpoint(path, MANIFEST, f"{why}. {AGAIN}") from error
+        raise CheckpointError(path, f"{why}. {AGAIN}", member=MANIFEST) from error
     with open_zip(path) as archive:  # the other members were compared when it was opened
         for name, info in list_members(path, archive).items():
             if name.startswith(RESUME):
@@ -295,7 +308,7 @@ def _manifest(checkpoint: Checkpoint) -> bytes:
     """The bytes of the manifest, which must be unchanged since the checkpoint was opened."""
     data = _member(checkpoint.path, MANIFEST)
     if hashlib.sha256(data).hexdigest() != checkpoint.digest:
-        raise AlteredCheckpoint(checkpoint.path, MANIFEST, f"{MANIFEST} was replaced while it was read. Try again")
+        raise CheckpointError(checkpoint.path, f"{MANIFEST} was replaced while it was read. Try again", member=MANIFEST)
     return data
 
 

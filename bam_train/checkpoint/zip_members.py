@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from bam_train.checkpoint.manifest import AGAIN, MANIFEST, MOST_MANIFEST
-from bam_train.errors import AlteredCheckpoint, NotACheckpoint, OutputError
+from bam_train.errors import CheckpointError, OutputError
 
 CHUNK = 2**20  # bytes read at once
 MOST_MEMBERS = 10_000
@@ -40,7 +40,7 @@ def open_zip(path: Path) -> Iterator[zipfile.ZipFile]:
     """Open the zip; any damage that zipfile finds becomes an error of one line."""
     try:
         if path.is_dir():
-            raise NotACheckpoint(
+            raise CheckpointError(
                 path,
                 "is a folder, expected a checkpoint.zip. Give the file in it; bam-export makes one of RLlib's folders",
             )
@@ -48,19 +48,19 @@ def open_zip(path: Path) -> Iterator[zipfile.ZipFile]:
             record: Any = zipfile._EndRecData(file)  # type: ignore[attr-defined]
         found = record[zipfile._ECD_SIZE] if record else 0  # type: ignore[attr-defined]
         if found > _MOST_DIRECTORY:
-            raise NotACheckpoint(path, f"lists members in {found} bytes, expected at most {_MOST_DIRECTORY}. {AGAIN}")
+            raise CheckpointError(path, f"lists members in {found} bytes, expected at most {_MOST_DIRECTORY}. {AGAIN}")
         with zipfile.ZipFile(path) as archive:
             yield archive
     except OutputError:  # an OSError, of whoever writes what is read here
         raise
     except FileNotFoundError as error:
-        raise NotACheckpoint(path, "no such file. Train one with bam-train, or check the name") from error
+        raise CheckpointError(path, "no such file. Train one with bam-train, or check the name") from error
     except OSError as error:
         why = error.strerror or error
-        raise NotACheckpoint(path, f"cannot be read: {why}. Check its permissions and the disk") from error
+        raise CheckpointError(path, f"cannot be read: {why}. Check its permissions and the disk") from error
     except _DAMAGE as error:
         why = "" if str(error) == "File is not a zip file" else f" ({error})"
-        raise NotACheckpoint(
+        raise CheckpointError(
             path, f"not a whole zip file{why}: truncated, altered or something else. {AGAIN}"
         ) from error
 
@@ -71,32 +71,32 @@ def list_members(path: Path, archive: zipfile.ZipFile) -> dict[str, zipfile.ZipI
     for info in archive.infolist():
         name = info.filename
         if name in infos:
-            raise AlteredCheckpoint(path, name, f"holds {name} twice. {AGAIN}")
+            raise CheckpointError(path, f"holds {name} twice. {AGAIN}", member=name)
         if name.startswith("/") or "\\" in name or ":" in name.partition("/")[0] or ".." in name.split("/"):
-            raise AlteredCheckpoint(path, name, f"holds {name}, a name that points outside of the zip. {AGAIN}")
+            raise CheckpointError(path, f"holds {name}, a name that points outside of the zip. {AGAIN}", member=name)
         if info.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
             found = info.compress_type
-            raise AlteredCheckpoint(path, name, f"{name} is packed by method {found}, expected deflate. {AGAIN}")
+            raise CheckpointError(path, f"{name} is packed by method {found}, expected deflate. {AGAIN}", member=name)
         infos[name] = info
     if MANIFEST not in infos:
-        raise NotACheckpoint(
+        raise CheckpointError(
             path,
             f"has no {MANIFEST}: not made by bam-train, or not whole. A plain stable-baselines3 file can be run by "
             "bam-eval --trust-pickle --env ... --algo ...",
         )
     if len(infos) > MOST_MEMBERS:
-        raise NotACheckpoint(path, f"has {len(infos)} members, expected at most {MOST_MEMBERS}. {AGAIN}")
+        raise CheckpointError(path, f"has {len(infos)} members, expected at most {MOST_MEMBERS}. {AGAIN}")
     size, packed = path.stat().st_size, sum(info.compress_size for info in infos.values())
     if packed > size:  # members that overlap
-        raise NotACheckpoint(path, f"claims {packed} bytes of members in a file of {size}. {AGAIN}")
+        raise CheckpointError(path, f"claims {packed} bytes of members in a file of {size}. {AGAIN}")
     for name, info in infos.items():
         if info.file_size > most_bytes(name):
             text = f"{name} has {info.file_size} bytes, expected at most {most_bytes(name)}. {AGAIN}"
-            raise AlteredCheckpoint(path, name, text)
+            raise CheckpointError(path, text, member=name)
     for start, what in (("", "beside those for --resume"), (RESUME, "for --resume")):
         total = sum(info.file_size for name, info in infos.items() if name.startswith(RESUME) is bool(start))
         if total > (most := most_bytes(start)):
-            raise NotACheckpoint(path, f"has {total} bytes of members {what}, expected at most {most}. {AGAIN}")
+            raise CheckpointError(path, f"has {total} bytes of members {what}, expected at most {most}. {AGAIN}")
     return infos
 
 
@@ -110,21 +110,21 @@ def chunks(path: Path, archive: zipfile.ZipFile, info: zipfile.ZipInfo, expected
                 sha256.update(chunk)
                 yield chunk
     except _DAMAGE as error:
-        raise AlteredCheckpoint(path, name, f"{name} is damaged ({error}). {AGAIN}") from error
+        raise CheckpointError(path, f"{name} is damaged ({error}). {AGAIN}", member=name) from error
     if found != info.file_size:
-        raise AlteredCheckpoint(path, name, f"{name} has {found} bytes, expected {info.file_size}. {AGAIN}")
+        raise CheckpointError(path, f"{name} has {found} bytes, expected {info.file_size}. {AGAIN}", member=name)
     if expected is not None and sha256.hexdigest() != expected:
         text = f"{name} was altered: its sha256 is {sha256.hexdigest()[:12]}..., expected {expected[:12]}.... {AGAIN}"
-        raise AlteredCheckpoint(path, name, text)
+        raise CheckpointError(path, text, member=name)
 
 
 def require_same_members(path: Path, found: set[str], expected: set[str]) -> None:
     """Refuse a file that lacks a member of the manifest, or has one that it does not list, other than its signature."""
     found = found - {MANIFEST, SIGNATURE}
     for name in sorted(expected - found):
-        raise AlteredCheckpoint(path, name, f"{name} is missing, although {MANIFEST} lists it. {AGAIN}")
+        raise CheckpointError(path, f"{name} is missing, although {MANIFEST} lists it. {AGAIN}", member=name)
     for name in sorted(found - expected):
-        raise AlteredCheckpoint(path, name, f"{name} was added: {MANIFEST} does not list it. {AGAIN}")
+        raise CheckpointError(path, f"{name} was added: {MANIFEST} does not list it. {AGAIN}", member=name)
 
 
 def most_bytes(name: str) -> int:

@@ -55,7 +55,7 @@ def deploy_checkpoint(config: DeployConfig, signals: SignalMemory) -> int:
     from bam_train.deploy.checkpoint_admission import Admission
     from bam_train.deploy.deployment import Deployment
     from bam_train.deploy.journal import Journal
-    from bam_train.errors import NoDetector
+    from bam_train.errors import SettingsError
 
     checkpoint = Checkpoint.open(config.checkpoint)
     if config.print_guards:
@@ -64,7 +64,7 @@ def deploy_checkpoint(config: DeployConfig, signals: SignalMemory) -> int:
         return _print_contract(config, checkpoint, place)
     if config.unusual is not None and not checkpoint.has(DETECTOR):
         remedy = f"Add one: bam-eval {checkpoint.path} --add-detector"
-        raise NoDetector(f"--unusual: {checkpoint.path} has no detector of unusual observations. {remedy}")
+        raise SettingsError(f"--unusual: {checkpoint.path} has no detector of unusual observations. {remedy}")
     admission = Admission(checkpoint, config.keys, config.allow_unsigned, config.trials, config.i_know)
     options: Any = {"episodes": config.episodes, "yes": config.yes, "render": config.render, "named": config.env}
     options |= {"wiggle": config.wiggle, "motion": config.motion, "arm": config.robot_model}

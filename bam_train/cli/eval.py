@@ -140,11 +140,11 @@ def _add_detector(subject: _Subject, path: Path) -> None:
     """Add a detector of unusual observations to a checkpoint, of new episodes of its policy."""
     from bam_train.checkpoint import Checkpoint
     from bam_train.checkpoint.zip_members import SIGNATURE, list_members, open_zip
-    from bam_train.errors import NotACheckpoint
+    from bam_train.errors import CheckpointError
     from bam_train.trainers.detection import THOROUGH, add_own_detector
 
     if subject.checkpoint is None:
-        raise NotACheckpoint(path, "a plain stable-baselines3 file has no place for a detector. Train with bam-train")
+        raise CheckpointError(path, "a plain stable-baselines3 file has no place for a detector. Train with bam-train")
     with open_zip(path) as archive:
         was_signed = SIGNATURE in list_members(path, archive)
     add_own_detector(path, subject.policy, subject.env, subject.env_kwargs, steps=THOROUGH)
@@ -182,13 +182,13 @@ def _foreign(config: EvalConfig, path: Path) -> _Subject:
     """A plain stable-baselines3 zip, if the user trusts its maker."""
     from bam_envs.core.registry import resolve_id
     from bam_train.environments import parity_if_needed, require_env_kwargs
-    from bam_train.errors import NotACheckpoint, SettingsError
+    from bam_train.errors import CheckpointError, SettingsError
     from bam_train.settings import read_env_kwargs
     from bam_train.trainers import require_algorithm
     from bam_train.trainers.sb3.plain_sb3_zip import load_trusted
 
     if not config.trust_pickle:
-        raise NotACheckpoint(
+        raise CheckpointError(
             path,
             "a plain stable-baselines3 file, not made by bam-train. Loading it runs whatever code is in it: "
             "if you trust its maker, add --trust-pickle, --env and --algo",

@@ -77,7 +77,7 @@ def _train(
     """
     from bam_train.cli.train_display import LiveDisplay, MayClose, PlainDisplay, say_next, summarise
     from bam_train.environments import is_batched
-    from bam_train.errors import LearntNothing, OutputError, SettingsError
+    from bam_train.errors import OutputError, SettingsError, TrainingFailed
     from bam_train.settings import file_stem
     from bam_train.trainers import load_trainer
     from bam_train.trainers.base import hardware, origin
@@ -146,7 +146,9 @@ def _train(
         raise outcome.failure
     if outcome.shortfall is not None:
         remedy = f"Try --seed {settings.seed + 1}, more --steps or other settings (docs/training.md); do not deploy it"
-        raise LearntNothing(f"nothing was learnt in {outcome.steps:,} steps: {outcome.shortfall}. {remedy}")
+        raise TrainingFailed(
+            f"nothing was learnt in {outcome.steps:,} steps: {outcome.shortfall}. {remedy}", exit_status=3
+        )
     return 128 + came[0] if came else 0
 
 

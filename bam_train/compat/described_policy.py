@@ -36,7 +36,7 @@ from msgspec import Meta, Struct
 from bam_envs.core.wording import did_you_mean
 from bam_train.checkpoint.manifest import Chunk
 from bam_train.compat.foreign_policy import Affine, ForeignPolicy, Port, Units
-from bam_train.errors import NotACheckpoint
+from bam_train.errors import CheckpointError
 from bam_train.settings import tomllib
 
 _PIXEL = 255.0
@@ -96,7 +96,7 @@ def described_policy(path: Path) -> ForeignPolicy:
     """The policy that a TOML file describes.
 
     Raises:
-        NotACheckpoint: The file, or the network beside it, cannot be read or says too little.
+        CheckpointError: The file, or the network beside it, cannot be read or says too little.
     """
     path = path.expanduser()
     try:
@@ -109,9 +109,9 @@ def described_policy(path: Path) -> ForeignPolicy:
         graph = network.read_bytes()
     except OSError as error:
         which = "it" if error.filename == str(path) else f"its network, {error.filename},"
-        raise NotACheckpoint(path, f"{which} cannot be read: {error.strerror or error}. Check the name") from error
+        raise CheckpointError(path, f"{which} cannot be read: {error.strerror or error}. Check the name") from error
     except (ValueError, msgspec.MsgspecError) as error:  # ValueError: also of TOML
-        raise NotACheckpoint(path, f"does not describe a policy: {error}") from error
+        raise CheckpointError(path, f"does not describe a policy: {error}") from error
     source: dict[str, Any] = {"description": str(path.absolute()), "network": str(network.absolute())}
     return ForeignPolicy(
         str(path),

@@ -19,7 +19,7 @@ from bam_train.checkpoint import safetensors_file
 from bam_train.checkpoint.manifest import Chunk
 from bam_train.compat.foreign_policy import Affine, ForeignPolicy, Port, Units
 from bam_train.data import DataSet
-from bam_train.errors import AlteredCheckpoint, CheckpointMismatch, FormatError, NotACheckpoint, SettingsError
+from bam_train.errors import CheckpointError, CheckpointMismatch, FormatError, SettingsError
 from bam_train.trainers.frozen_network import Layer, trace
 
 Array = NDArray[Any]
@@ -43,7 +43,7 @@ def lerobot_policy(folder: Path, *, data: Path | None = None, units: Units | Non
         units: What joints are measured in: degrees, or -100 to 100 of their range; a gripper is 0 to 100 in both.
 
     Raises:
-        NotACheckpoint: The folder is missing, or has no policy of LeRobot in it.
+        CheckpointError: The folder is missing, or has no policy of LeRobot in it.
         CheckpointMismatch: It is of a kind that cannot be exported, or its data set is not known.
         SettingsError: LeRobot is not installed, or the units are needed.
     """
@@ -169,7 +169,7 @@ def _statistics(folder: Path, name: str) -> dict[str, Array]:
     try:
         return safetensors_file.parse((folder / name).read_bytes())
     except (OSError, FormatError) as error:
-        raise AlteredCheckpoint(folder, name, f"{name} cannot be read: {error}") from error
+        raise CheckpointError(folder, f"{name} cannot be read: {error}", member=name) from error
 
 
 def _steps(folder: Path, name: str) -> list[dict[str, Any]]:
@@ -214,9 +214,9 @@ def _json(folder: Path, name: str) -> dict[str, Any]:
         content = json.loads((folder / name).read_bytes())
     except FileNotFoundError as error:
         text = f"has no {name}: no folder pretrained_model of LeRobot. Give .../checkpoints/last/pretrained_model"
-        raise NotACheckpoint(folder, text) from error
+        raise CheckpointError(folder, text) from error
     except (OSError, ValueError, RecursionError) as error:
-        raise AlteredCheckpoint(folder, name, f"{name} cannot be read: {error}") from error
+        raise CheckpointError(folder, f"{name} cannot be read: {error}", member=name) from error
     if not isinstance(content, dict):
-        raise AlteredCheckpoint(folder, name, f"{name} holds a {type(content).__name__}, expected an object")
+        raise CheckpointError(folder, f"{name} holds a {type(content).__name__}, expected an object", member=name)
     return content

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from bam_train.errors import AlteredCheckpoint, CheckpointMismatch, NotACheckpoint
+from bam_train.errors import CheckpointError, CheckpointMismatch
 
 OLD_STATE, MODULE, ARGUMENTS = "policy_state.pkl", "module_state.pkl", "class_and_ctor_args.pkl"
 AGAIN = "Copy it again from its source"
@@ -34,18 +34,18 @@ class Directory:
     ray_version: str
     """Version of Ray that wrote it; "" if unknown."""
 
-    def altered(self, path: Path, text: str) -> AlteredCheckpoint:
+    def altered(self, path: Path, text: str) -> CheckpointError:
         """The error for a file that cannot be used."""
         folder = Path(os.path.abspath(self.given))
         above = folder if path.is_relative_to(folder) else self.root
         member = path.relative_to(above).as_posix() if above else str(path)
-        return AlteredCheckpoint(self.given, member, f"{member} {text}")
+        return CheckpointError(self.given, f"{member} {text}", member=member)
 
     def read_bytes(self, path: Path) -> bytes:
         """Read a file.
 
         Raises:
-            AlteredCheckpoint: It is missing, not a regular file, or too large.
+            CheckpointError: It is missing, not a regular file, or too large.
         """
         try:
             return _content(path, 2**31)
@@ -63,20 +63,20 @@ def find_policy(given: Path, name: str | None = None) -> Directory:
         name: Name of the policy, if there are several.
 
     Raises:
-        NotACheckpoint: The directory is missing, or not of RLlib.
+        CheckpointError: The directory is missing, or not of RLlib.
         CheckpointMismatch: There are several policies and no name, no policy of this name, or an unknown version.
     """
     given = given.expanduser()
     try:
         if not given.is_dir():
             wrong = "is a file, expected a checkpoint directory of RLlib" if given.exists() else "no such directory"
-            raise NotACheckpoint(given, f"{wrong}. Give one that algo.save_to_path or algo.save wrote")
+            raise CheckpointError(given, f"{wrong}. Give one that algo.save_to_path or algo.save wrote")
         next(given.iterdir(), None)
     except OSError as error:
-        raise NotACheckpoint(given, f"cannot be read: {error.strerror or error}") from error
+        raise CheckpointError(given, f"cannot be read: {error.strerror or error}") from error
     root, policies, old = _policies(Path(os.path.abspath(given)))
     if not policies:
-        raise NotACheckpoint(given, _not_rllib(given))
+        raise CheckpointError(given, _not_rllib(given))
     names = ", ".join(policies)
     if name is not None and name not in policies:
         raise CheckpointMismatch(given, f"has no policy {name!r}; it has {names}")
@@ -132,13 +132,13 @@ def _facts(folder: Path) -> dict[str, Any]:
         except FileNotFoundError:
             continue
         except OSError as error:
-            raise AlteredCheckpoint(folder, name, f"{name} cannot be read: {error.strerror or error}") from error
+            raise CheckpointError(folder, f"{name} cannot be read: {error.strerror or error}", member=name) from error
         except (ValueError, RecursionError) as error:
-            raise AlteredCheckpoint(folder, name, f"{name} is not JSON ({error}). {AGAIN}") from error
+            raise CheckpointError(folder, f"{name} is not JSON ({error}). {AGAIN}", member=name) from error
         if not isinstance(facts, Mapping):
-            raise AlteredCheckpoint(folder, name, f"{name} holds a {type(facts).__name__}, expected an object")
+            raise CheckpointError(folder, f"{name} holds a {type(facts).__name__}, expected an object", member=name)
         if facts.get("format") == "msgpack":
-            raise NotACheckpoint(folder, _MSGPACK)
+            raise CheckpointError(folder, _MSGPACK)
         return dict(facts)
     return {}
 

@@ -69,7 +69,7 @@ def restore(directory: Directory) -> SavedPolicy:
     """Restore a directory with RLlib, which runs the code in it.
 
     Raises:
-        AlteredCheckpoint: RLlib cannot read the directory.
+        CheckpointError: RLlib cannot read the directory.
         PolicyError: A connector or the network cannot be frozen.
     """
     from ray.rllib.algorithms.algorithm_config import AlgorithmConfig

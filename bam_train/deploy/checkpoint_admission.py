@@ -16,7 +16,7 @@ from bam_envs.safety.guard import TRIAL_SPEED
 from bam_train.checkpoint import Checkpoint
 from bam_train.deploy.agreement import Shadow
 from bam_train.deploy.trials import Subject, TrialRecord, Trials
-from bam_train.errors import SettingsError, TrialsNeeded, UntrustedCheckpoint
+from bam_train.errors import SettingsError, UntrustedCheckpoint
 from bam_train.policy import FrozenPolicy
 
 UNSIGNED, UNPROVEN, TRIAL, SHADOW = "UNSIGNED", "UNPROVEN", "trial", "shadow: nothing is sent"
@@ -113,9 +113,9 @@ class Admission:
 
         Raises:
             UntrustedCheckpoint: The robot is real, and the checkpoint has no trusted signature.
-            AlteredCheckpoint: The checkpoint was changed after it was signed.
-            TrialsNeeded: Full speed is requested without enough trials.
-            BadTrials: The record of trials was edited, or cannot be read.
+            CheckpointError: The checkpoint was changed after it was signed.
+            SettingsError: Full speed is requested without enough trials.
+            FormatError: The record of trials was edited, or cannot be read.
             SettingsError: It is not known which robot it is; or a record of trials is given for a simulated robot that
                 is not on trial.
         """
@@ -161,7 +161,9 @@ class Admission:
         if not self.i_know:
             remedy = "Run more with --stage trial, or give --i-know"
             where = f"{self.identity} at {address}" if self.identity else address
-            raise TrialsNeeded(f"--stage full: {self.checkpoint.path} on {where}: {evidence.text}. {remedy}")
+            raise SettingsError(
+                f"--stage full: {self.checkpoint.path} on {where}: {evidence.text}. {remedy}", kind="TrialsNeeded"
+            )
         self.marks = (*self.marks, UNPROVEN)
         return [f"  {UNPROVEN}: {evidence.text}"]
 

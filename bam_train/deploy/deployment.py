@@ -96,7 +96,7 @@ class Deployment:
         switch: Handler of SIGINT and SIGTERM; None: one of its own.
 
     Raises:
-        WiringError: An agent reads a variable that no agent writes; the robot has not been connected.
+        LoopError: An agent reads a variable that no agent writes; the robot has not been connected.
     """
 
     def __init__(

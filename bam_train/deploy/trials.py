@@ -32,7 +32,7 @@ from pathlib import Path
 from typing import IO, Any
 
 from bam_train.checkpoint.ownership import who_else
-from bam_train.errors import BadTrials
+from bam_train.errors import FormatError
 
 try:
     import fcntl
@@ -134,7 +134,7 @@ class TrialRecord:
         """The evidence of the trials of `subject` so far.
 
         Raises:
-            BadTrials: A line was edited, removed, added or moved; the file or its key cannot be read.
+            FormatError: A line was edited, removed, added or moved; the file or its key cannot be read.
         """
         lines = self._read().lines if self.path.exists() else []
         void = {row.get("ended") for row in lines if row.get("void") is True}
@@ -188,8 +188,8 @@ class TrialRecord:
                 self._save(book)
         except OSError as error:
             why = error.strerror or error
-            raise BadTrials(
-                f"{self.path}: the trial cannot be recorded: {why}. Give another file with --trials"
+            raise FormatError(
+                f"{self.path}: the trial cannot be recorded: {why}. Give another file with --trials", kind="BadTrials"
             ) from error
 
     def _read(self) -> "_Book":
@@ -208,9 +208,9 @@ class TrialRecord:
         except OSError as error:
             why = f"cannot be read: {error.strerror or error}"
             if error.filename in (None, self.path, str(self.path)):
-                raise BadTrials(f"{self.path}: {why}. Give another file with --trials") from error
+                raise FormatError(f"{self.path}: {why}. Give another file with --trials", kind="BadTrials") from error
             text = f"its key {error.filename} {why}. A record is of use only to the user who made it. {_REMEDY}"
-            raise BadTrials(f"{self.path}: {text}") from error
+            raise FormatError(f"{self.path}: {text}", kind="BadTrials") from error
         book = _Book(name, key)
         for number, line in enumerate(whole.split(b"\n"), 1):
             row = _json(line)
@@ -225,7 +225,7 @@ class TrialRecord:
         return book
 
     def _require_new(self) -> None:
-        """`BadTrials` if the file at this path, now without a line, had lines before."""
+        """`FormatError` if the file at this path, now without a line, had lines before."""
         for path in self._private.glob("*.json"):
             state = _json(path.read_bytes())
             if state.get("path") == str(self.path.resolve()) and state.get("lines"):
@@ -235,15 +235,15 @@ class TrialRecord:
         """Saved key, number of lines and last HMAC of the record `name`."""
         path = self._private / f"{name}.json"
         if why := who_else(path):
-            raise BadTrials(f"{path}: another user can forge trials with this key: {why}")
+            raise FormatError(f"{path}: another user can forge trials with this key: {why}", kind="BadTrials")
         state = _json(path.read_bytes())
         try:
             return bytes.fromhex(state["key"]), int(state["lines"]), str(state["last"])
         except (LookupError, TypeError, ValueError) as error:
             raise self._bad(f"{path} is damaged") from error
 
-    def _bad(self, why: str) -> BadTrials:
-        return BadTrials(f"{self.path}: {why}. {_REMEDY}")
+    def _bad(self, why: str) -> FormatError:
+        return FormatError(f"{self.path}: {why}. {_REMEDY}", kind="BadTrials")
 
     def _save(self, book: "_Book") -> None:
         """Save key, number of lines and last HMAC atomically."""
@@ -328,15 +328,15 @@ class Trials:
 
     @property
     def evidence(self) -> Evidence:
-        """The evidence of all trials so far, including earlier deployments; raises BadTrials."""
+        """The evidence of all trials so far, including earlier deployments; raises FormatError."""
         return self.record.evidence(self.subject, self.threshold)
 
     def next_seed(self, first: int) -> int:
-        """The least seed from `first` on that no trial had so far, nor any after it; raises BadTrials."""
+        """The least seed from `first` on that no trial had so far, nor any after it; raises FormatError."""
         return self.record.next_seed(self.subject, first)
 
     def begin(self, seed: int) -> None:
-        """Record the start of a trial; raises BadTrials if that fails, and then the robot must not move."""
+        """Record the start of a trial; raises FormatError if that fails, and then the robot must not move."""
         self._running = self.record.begin(self.subject, **self.facts, seed=seed)
 
     def end(self, success: bool, reason: str, *, void: bool = False) -> None:

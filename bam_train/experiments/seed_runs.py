@@ -68,7 +68,7 @@ def group_folder(runs: Path, settings: TrainSettings) -> Iterator[tuple[RunFolde
     """The folder of the runs with these settings, which no other call uses within the ``with`` block, and its lock.
 
     Raises:
-        FolderInUse: Another call trains in it, or processes of a killed one still save.
+        OutputError: Another call trains in it, or processes of a killed one still save.
     """
     what = what_is_learnt(settings)
     stem = file_stem(settings.env, settings.algo, settings.trainer, settings.env_kwargs)

@@ -26,7 +26,7 @@ from optuna.storages import JournalStorage
 from optuna.storages.journal import JournalFileBackend, JournalFileOpenLock
 from optuna.trial import FrozenTrial, Trial, TrialState
 
-from bam_train.errors import FolderInUse, SettingsError
+from bam_train.errors import OutputError, SettingsError
 from bam_train.experiments.search_space import SearchSpace
 from bam_train.experiments.seed_runs import SeedRun, what_is_learnt
 from bam_train.files.locked_folder import LOCKS, locked
@@ -161,7 +161,7 @@ class SweepFolder:
         """A trial that no process runs: one that was begun and left, or a new one while there are fewer than `most`."""
         with writing(self.journal), locked(self.path, wait=True):
             for left in self.trials(TrialState.RUNNING):
-                with contextlib.suppress(FolderInUse):
+                with contextlib.suppress(OutputError):
                     if left.number not in own:
                         return self._taken(Trial(self.study, left._trial_id))
             if len(self.trials()) >= most:
@@ -173,7 +173,7 @@ class SweepFolder:
         lock = held.enter_context(locked(folder.path))
         if trial.number not in [one.number for one in self.trials(TrialState.RUNNING)]:
             held.close()
-            raise FolderInUse(f"{folder.path}: the trial has ended meanwhile")
+            raise OutputError(f"{folder.path}: the trial has ended meanwhile", kind="FolderInUse")
         # The same number and history give the same values, also after a break.
         self.study.sampler = optuna.samplers.TPESampler(seed=trial.number)
         for dimension in self.space.dimensions:

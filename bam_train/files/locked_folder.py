@@ -5,7 +5,7 @@ import os
 from collections.abc import Iterator
 from pathlib import Path
 
-from bam_train.errors import FolderInUse
+from bam_train.errors import OutputError
 
 try:
     import fcntl
@@ -23,7 +23,7 @@ def locked(folder: Path, wait: bool = False) -> Iterator[int | None]:
     Children that get the descriptor hold the lock as long as one of them lives.
 
     Raises:
-        FolderInUse: Another process has it, unless `wait`.
+        OutputError: Another process has it, unless `wait`.
     """
     if fcntl is None:
         yield None
@@ -34,7 +34,7 @@ def locked(folder: Path, wait: bool = False) -> Iterator[int | None]:
             fcntl.flock(lock, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
         except BlockingIOError as error:
             text = "another program trains its seeds, or its runs are being saved. Wait for its end"
-            raise FolderInUse(f"{folder}: {text}") from error
+            raise OutputError(f"{folder}: {text}", kind="FolderInUse") from error
         yield lock
     finally:
         os.close(lock)

@@ -47,7 +47,6 @@ _ON_USE = {
     "compat.bbrl.dataset_agents": ("DataLoaderAgent", "ShuffledDatasetAgent"),
     "compat.bbrl.old_gym_agents": ("AutoResetGymAgent", "NoAutoResetGymAgent"),
     "compat.bbrl.remote_agents": ("AsynchronousAgent", "NRemoteAgent", "RemoteAgent"),
-    "errors": ("RemoteAgentError",),
 }
 """Names by module of `bam_train`."""
 _MODULES = {name: module for module, names in _ON_USE.items() for name in names}

@@ -11,7 +11,7 @@ from msgspec import Struct
 
 from bam_train.checkpoint import Checkpoint
 from bam_train.checkpoint.manifest import AGAIN
-from bam_train.errors import AlteredCheckpoint, CheckpointError, OutputError
+from bam_train.errors import CheckpointError, OutputError
 from bam_train.files.atomic_file import remove_orphans
 from bam_train.settings import TrainSettings, file_stem, read_config
 from bam_train.trainers.resolve_settings import CHANGEABLE
@@ -72,7 +72,7 @@ def _earlier_best(resumed: Checkpoint) -> Output | None:
     try:
         noted = msgspec.convert(resumed.json(NOTES), _Notes).best if resumed.has(NOTES) else None
     except msgspec.ValidationError as error:
-        raise AlteredCheckpoint(resumed.path, NOTES, f"{NOTES}: {error}. {AGAIN}") from error
+        raise CheckpointError(resumed.path, f"{NOTES}: {error}. {AGAIN}", member=NOTES) from error
     if noted is None:
         return None
     path, learnt = Path(noted.path), _learnt(resumed.manifest.settings)

@@ -15,7 +15,7 @@ from bam_train.checkpoint.added_members import add_members
 from bam_train.checkpoint.detector import DETECTOR, LEAST_TICKS, MOST_NUMBERS, Detector, Rollout, make_detector
 from bam_train.data.recorded_episode import Episode
 from bam_train.environments import make_vector_env
-from bam_train.errors import NoDetector
+from bam_train.errors import SettingsError
 from bam_train.finite_envs import FiniteVectorEnv
 from bam_train.rollout import BatchPolicy, rollout
 
@@ -32,7 +32,7 @@ def add_detector(path: str | Path, *kinds: Iterable[Rollout], limit: float | Non
     """Make a detector of episodes, see `make_detector`, and add it to the checkpoint at `path`; its digest changes.
 
     Raises:
-        NoDetector: None can be made of these episodes; the checkpoint is unchanged.
+        SettingsError: None can be made of these episodes; the checkpoint is unchanged.
         CheckpointError: It cannot be read or written.
     """
     detector = make_detector(*kinds, limit=limit)
@@ -54,13 +54,15 @@ def add_own_detector(
     If that has simulated robots, these are as live ones in half of the steps; see `LiveLike`.
 
     Raises:
-        NoDetector: Too few steps, or the observations are not up to `MOST_NUMBERS` numbers.
+        SettingsError: Too few steps, or the observations are not up to `MOST_NUMBERS` numbers.
     """
     box = Checkpoint.open(path, members=False).manifest.observation_space
     if box.get("type") != "Box" or box["dtype"] == "uint8" or np.prod(box["shape"]) > MOST_NUMBERS:
-        raise NoDetector(f"a detector needs observations of at most {MOST_NUMBERS} numbers, not pictures or mappings")
+        raise SettingsError(
+            f"a detector needs observations of at most {MOST_NUMBERS} numbers, not pictures or mappings"
+        )
     if steps < LEAST_TICKS:
-        raise NoDetector(f"a detector needs at least {LEAST_TICKS} steps, found {steps}")
+        raise SettingsError(f"a detector needs at least {LEAST_TICKS} steps, found {steps}")
     if envs is not None:
         return add_detector(path, fresh_episodes(envs, env, policy, steps))
     with_own = make_vector_env(env, env_kwargs, SIDE_BY_SIDE)

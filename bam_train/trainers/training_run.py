@@ -18,15 +18,7 @@ from gymnasium.vector import VectorEnv
 from bam_envs.core.errors import BamEnvsError, RobotFault
 from bam_train.checkpoint import Checkpoint
 from bam_train.checkpoint.detector import DETECTOR, LEAST_TICKS
-from bam_train.errors import (
-    BamTrainError,
-    EnvironmentFailed,
-    NoDetector,
-    OutputError,
-    PolicyError,
-    ProcessesLost,
-    TrainingFailed,
-)
+from bam_train.errors import BamTrainError, EnvironmentFailed, OutputError, PolicyError, SettingsError, TrainingFailed
 from bam_train.evaluation import EvaluationReport, evaluate
 from bam_train.policy import FrozenPolicy
 from bam_train.rollout import BatchPolicy
@@ -154,17 +146,8 @@ class TrainingRun:
             self.trainer.train(self.settings.steps, self._between)
             if not self._stop and (self._evaluated_at < self.trainer.steps or self._kept is None):
                 self._evaluate()
-        except (ProcessesLost, RobotFault) as error:  # the state after the last update is good
-            self._save_last()
-            kept = f"go on with --resume {self.folder.last}" if self._last_steps else "nothing had been learnt yet"
-            text = f"at step {self.trainer.steps}: {str(error).rstrip('.')}. What was learnt is kept: {kept}"
-            raise TrainingFailed(text) from error
-        except (TrainingFailed, EnvironmentFailed, PolicyError) as error:  # during an update, which is not saved
-            where = "" if isinstance(error, TrainingFailed) else f"at step {self.trainer.steps}: "
-            good = f"the last good checkpoint is {self.last}" if self.last else "no checkpoint had been saved yet"
-            is_foreign = isinstance(error, EnvironmentFailed) and error.__cause__ is not None
-            trace = self.folder.write_traceback(error) if is_foreign else ""
-            raise TrainingFailed(f"{where}{error}; {good}{trace}") from error
+        except (TrainingFailed, RobotFault, EnvironmentFailed, PolicyError) as error:
+            raise self._failed(error) from error
         self._save_last()
         if self._stop and self._kept is None and not self.out.exists():
             self._kept = self.out if self._write(self.out, None, "--out") else None  # none was evaluated
@@ -218,12 +201,26 @@ class TrainingRun:
                 policy = FrozenPolicy.load(self._kept)
                 with self.trainer.undisturbed(), self.trainer.evaluation_envs() as envs:
                     add_own_detector(self._kept, policy, settings.env, settings.env_kwargs, steps=steps, envs=envs)
-        except NoDetector:
+        except SettingsError:  # it can have none
             return
         except (BamTrainError, BamEnvsError) as error:
             self.watcher.note(f"{self._kept} gets no detector of unusual observations: {error}")
             return
         self._copy()
+
+    def _failed(self, error: Exception) -> TrainingFailed:
+        """The end of a run by `error`; after an update that was not finished, its state is not saved."""
+        if isinstance(error, RobotFault) or getattr(error, "is_kept", False):
+            self._save_last()
+            kept = f"go on with --resume {self.folder.last}" if self._last_steps else "nothing had been learnt yet"
+            return TrainingFailed(
+                f"at step {self.trainer.steps}: {str(error).rstrip('.')}. What was learnt is kept: {kept}"
+            )
+        where = "" if isinstance(error, TrainingFailed) else f"at step {self.trainer.steps}: "
+        good = f"the last good checkpoint is {self.last}" if self.last else "no checkpoint had been saved yet"
+        is_foreign = isinstance(error, EnvironmentFailed) and error.__cause__ is not None
+        trace = self.folder.write_traceback(error) if is_foreign else ""
+        return TrainingFailed(f"{where}{error}; {good}{trace}")
 
     def _between(self, progress: Progress) -> bool:
         """Record, evaluate and save between two updates; False ends training."""

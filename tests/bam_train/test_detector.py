@@ -10,7 +10,7 @@ from bam_train.checkpoint import Checkpoint, safetensors_file
 from bam_train.checkpoint.added_members import add_members
 from bam_train.checkpoint.detector import DETECTOR, REASONS, Detector, Rollout, make_detector
 from bam_train.cli.eval import main as bam_eval
-from bam_train.errors import AlteredCheckpoint, NoDetector
+from bam_train.errors import CheckpointError, SettingsError
 from bam_train.policy import FrozenPolicy
 from bam_train.trainers.detection import add_detector
 
@@ -167,7 +167,7 @@ def test_a_bound_is_the_largest_of_the_kinds():
     plain, both = make_detector(kinds[0]), make_detector(*kinds)  # the third has too few
     assert 50 <= plain.model.bounds[4] < 53
     assert 70 <= both.model.bounds[4] < 73
-    with pytest.raises(NoDetector, match=r"found 10 of 900$"):
+    with pytest.raises(SettingsError, match=r"found 10 of 900$"):
         make_detector(kinds[2])
 
 
@@ -203,13 +203,15 @@ def test_only_successful_episodes_count_if_there_are_some():
 
 def test_too_few_episodes_or_too_many_numbers_are_refused():
     text = "a detector needs at least 20 successful episodes of 1000 steps in all, found 19 of 950"
-    with pytest.raises(NoDetector, match=f"^{text}$"):
+    with pytest.raises(SettingsError, match=f"^{text}$"):
         make_detector(rollouts(19, 0))
     short = [Rollout(np.zeros((1, 4)), np.zeros((1, 2))) for _ in range(2000)]
-    with pytest.raises(NoDetector, match=r"^a detector compares a step with the next one, and these episodes have one"):
+    with pytest.raises(
+        SettingsError, match=r"^a detector compares a step with the next one, and these episodes have one"
+    ):
         make_detector(short)
     wide = [Rollout(np.zeros((50, 65)), np.zeros((50, 2))) for _ in range(30)]
-    with pytest.raises(NoDetector, match=r"^a detector takes at most 64 numbers, found 65 in an observation$"):
+    with pytest.raises(SettingsError, match=r"^a detector takes at most 64 numbers, found 65 in an observation$"):
         make_detector(wide)
 
 
@@ -229,15 +231,17 @@ def test_one_of_another_environment_or_a_broken_one_is_refused(tmp_path):
     path = tmp_path / "policy.zip"
     shutil.copy(POINT, path)
     short = [Rollout(np.zeros((1, 4)), np.zeros((1, 2))) for _ in range(2000)]
-    with pytest.raises(NoDetector, match=r"^a detector compares a step with the next one, and these episodes have one"):
+    with pytest.raises(
+        SettingsError, match=r"^a detector compares a step with the next one, and these episodes have one"
+    ):
         make_detector(short)
     wide = [Rollout(one.observations[:, :3], one.actions) for one in rollouts(60, 0)]
     text = rf"{DETECTOR}: expected \(4, 2\) numbers in observation and action, found \(3, 2\). Make it again$"
     add_detector(path, wide)
-    with pytest.raises(AlteredCheckpoint, match=text):
+    with pytest.raises(CheckpointError, match=text):
         FrozenPolicy.load(path)
     add_members(path, {DETECTOR: b"nothing"})
-    with pytest.raises(AlteredCheckpoint, match="cannot be read"):
+    with pytest.raises(CheckpointError, match="cannot be read"):
         Detector.of(Checkpoint.open(path))
 
 

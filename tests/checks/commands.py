@@ -30,7 +30,7 @@ from tyro.conf import arg
 
 from bam_train.checkpoint import Checkpoint
 from bam_train.cli.flags import Count, Seed
-from bam_train.errors import LearntNothing
+from bam_train.errors import TrainingFailed
 from bam_train.evaluation import evaluate
 from bam_train.files.atomic_file import replacing
 from bam_train.policy import FrozenPolicy
@@ -72,7 +72,7 @@ class Result(NamedTuple):
     def learnt(self) -> str:
         """In a word; "?" where nothing says what learning is."""
         if self.status:
-            return "NO" if self.status == LearntNothing.exit_status else "FAILED"
+            return "NO" if self.status == TrainingFailed.exit_status else "FAILED"
         found, least = (self.reward, self.threshold) if self.success is None else (self.success, LEAST)
         return "?" if found is None or least is None else "yes" if found >= least else "NO"
 

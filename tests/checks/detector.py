@@ -37,7 +37,7 @@ from bam_envs.tasks.wrappers.late_actions import LateActions
 from bam_train.checkpoint import Checkpoint
 from bam_train.checkpoint.detector import Detector, Rollout
 from bam_train.environments import environment_of, make_env, make_vector_env
-from bam_train.errors import NoDetector
+from bam_train.errors import SettingsError
 from bam_train.policy import FrozenPolicy
 from bam_train.trainers.detection import fresh_episodes
 from tests.benchmarks import harness
@@ -282,7 +282,7 @@ def measure_detector(flags):
 def _measured(checkpoint, flags):
     policy = FrozenPolicy.from_checkpoint(checkpoint)
     if policy.detector is None:
-        raise NoDetector(f"{checkpoint.path} has no detector. Run: bam-eval {checkpoint.path} --add-detector")
+        raise SettingsError(f"{checkpoint.path} has no detector. Run: bam-eval {checkpoint.path} --add-detector")
     kinds = {
         "no shift": (flags.ticks, simulated),
         "as of live robots": (flags.like_live, partial(simulated, like_live=True)),

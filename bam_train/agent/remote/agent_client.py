@@ -34,7 +34,7 @@ from bam_envs.rosbridge.dialing import AGENT_PORT, http_refusal, no_connection, 
 from bam_envs.rosbridge.endpoint import Endpoint
 from bam_envs.rosbridge.threads import LoopThread
 from bam_train.agent.remote.agent_protocol import CHUNK, PATH, PROTOCOL, Stage, When
-from bam_train.errors import NotACheckpoint, RequestRefused
+from bam_train.errors import CheckpointError, RequestRefused
 
 PORT = AGENT_PORT
 """Default port of an agent."""
@@ -154,14 +154,14 @@ class AgentClient:
             ``lines`` of the check, and with `wait` the ``outcome``: "promoted: …", "rolled back: …", "replaced: …".
 
         Raises:
-            NotACheckpoint: The file cannot be read.
+            CheckpointError: The file cannot be read.
             RequestRefused: The agent refuses the candidate, or the trial failed.
             LinkLost: The connection ended.
         """
         try:
             data = Path(path).read_bytes()
         except OSError as error:
-            raise NotACheckpoint(path, f"cannot be read: {error.strerror}. Give a checkpoint.zip.") from error
+            raise CheckpointError(path, f"cannot be read: {error.strerror}. Give a checkpoint.zip.") from error
         about = {"size": len(data), "sha256": hashlib.sha256(data).hexdigest(), "file": Path(path).name[:100]}
         result: dict[str, Any] = self._run(
             self._push(data, {**about, "stage": stage, "when": when, "wait": wait, "why": why}, progress)

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from bam_train.cli.console import can_draw, say, tell
 from bam_train.cli.program import run_program
-from bam_train.errors import NoTerminal, SettingsError
+from bam_train.errors import SettingsError
 from bam_train.signals import SignalMemory
 
 if TYPE_CHECKING:
@@ -31,10 +31,10 @@ DRAWN = 0.1
 def play(config: PlayConfig, signals: SignalMemory) -> int:
     """Run the program with its parsed flags."""
     if not config.render and not sys.stdin.isatty():
-        raise NoTerminal("standard input is no terminal: run it in one, or in a window with --render")
+        raise SettingsError("standard input is no terminal: run it in one, or in a window with --render", exit_status=2)
     if not config.render and sys.stderr.isatty() and not can_draw():
         what = f"a terminal with TERM={os.environ['TERM']} draws no screen"
-        raise NoTerminal(f"{what}: run it in another, or in a window with --render")
+        raise SettingsError(f"{what}: run it in another, or in a window with --render", exit_status=2)
     place = _checked_place(config)
     from gymnasium.error import DependencyNotInstalled
 

@@ -5,7 +5,7 @@ an `AsynchronousAgent` that failed seems to run without end:
 
 - They work, with every start method. The default is "spawn", because torch's threads and CUDA do not survive a fork; in
   a notebook, or with agents that cannot be pickled, give ``start_method="fork"``.
-- A failure in a process raises a `RemoteAgentError` in the parent, and ends the processes; the next call restarts them.
+- A failure in a process raises a `LoopError` in the parent, and ends the processes; the next call restarts them.
 - Weights are in shared memory: ``load_state_dict`` on an agent of `get_by_name` applies to the process at once.
 - `seed` seeds the process's global generators too, before and after the start. By default process k has seed k; the
   generators of a single agent have a seed drawn from torch's.
@@ -54,7 +54,7 @@ class _ProcessAgent(Agent):
         """Seed the agent, and the process's global generators (torch, NumPy, random), now or when it starts.
 
         Raises:
-            RemoteAgentError: The agent refuses the seed, for example because it has one already.
+            LoopError: The agent refuses the seed, for example because it has one already.
         """
         self._tell("seed", seed)
         self._seed = seed
@@ -102,7 +102,7 @@ class RemoteAgent(_ProcessAgent):
 
         Raises:
             LoopError: The workspace is not shared.
-            RemoteAgentError: The agent failed, or its process ended.
+            LoopError: The agent failed, or its process ended.
         """
         if not self.workspace.is_shared:
             raise LoopError(
@@ -183,7 +183,7 @@ class NRemoteAgent(Agents):
 
         Raises:
             LoopError: The workspace is not shared, or has another batch size than all copies together.
-            RemoteAgentError: A copy failed, or its process ended; all are closed.
+            LoopError: A copy failed, or its process ended; all are closed.
         """
         parts = self._columns()
         try:

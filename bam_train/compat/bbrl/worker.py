@@ -21,7 +21,7 @@ import numpy as np
 import torch
 import torch.multiprocessing  # teaches pickle to share tensors
 
-from bam_train.errors import LoopError, RemoteAgentError
+from bam_train.errors import LoopError
 from bam_train.loop.agents.agent import Agent, agent_name
 from bam_train.signals import drop_handlers
 
@@ -29,7 +29,7 @@ PATIENCE = 5.0
 """Seconds that an idle process has to end by itself."""
 
 
-class _ChildTraceback(Exception):  # noqa: N818 - the cause of a RemoteAgentError, as Python prints it
+class _ChildTraceback(Exception):  # noqa: N818 - the cause of a LoopError, as Python prints it
     """The traceback of the other process."""
 
     def __str__(self) -> str:
@@ -37,7 +37,7 @@ class _ChildTraceback(Exception):  # noqa: N818 - the cause of a RemoteAgentErro
 
 
 class Worker:
-    """The parent's end: starts the process. Its methods raise `RemoteAgentError`.
+    """The parent's end: starts the process. Its methods raise `LoopError`.
 
     Args:
         agent: The agent to run.
@@ -83,7 +83,7 @@ class Worker:
             failed, answer = self._receive()
             if failed:
                 text, trace = answer
-                raise RemoteAgentError(f"{self.name} failed in its process: {text}", trace) from _ChildTraceback(trace)
+                raise LoopError(f"{self.name} failed in its process: {text}", trace) from _ChildTraceback(trace)
         except BaseException:
             self.close()
             raise
@@ -116,7 +116,7 @@ class Worker:
         self._connection.close()
 
     def _receive(self) -> tuple[bool, Any]:
-        """Receive the answer; raises RemoteAgentError if the process has ended."""
+        """Receive the answer; raises LoopError if the process has ended."""
         with suppress(EOFError, OSError):
             if self._connection.poll():
                 answer: tuple[bool, Any] = self._connection.recv()
@@ -129,13 +129,13 @@ class Worker:
                 " before it gave an answer; a script that starts processes needs "
                 '`if __name__ == "__main__":` around what it does, or start_method="fork"'
             )
-        raise RemoteAgentError(f"The process of {self.name} {how}.", exit_code=code)
+        raise LoopError(f"The process of {self.name} {how}.", exit_code=code)
 
     def _pickled(self, what: Any) -> bytes:
         try:
             return bytes(ForkingPickler.dumps(what))
         except (pickle.PicklingError, TypeError, AttributeError) as error:
-            raise RemoteAgentError(
+            raise LoopError(
                 f"{self.name}: cannot be sent to another process: {error}; use functions and classes of a module "
                 f'instead of local ones and lambdas, or start_method="fork".'
             ) from error

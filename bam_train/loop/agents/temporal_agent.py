@@ -10,10 +10,11 @@ from collections.abc import Callable, Iterable
 from contextlib import nullcontext
 from typing import TYPE_CHECKING, Any
 
-from bam_train.errors import LoopError, UnknownVariable, WiringError
+from bam_train.errors import LoopError
 from bam_train.loop.agents.agent import Agent, agent_name, is_live
 from bam_train.loop.agents.agents import Agents, KWAgentWrapper
 from bam_train.loop.workspace import Workspace
+from bam_train.loop.workspace.variables import unknown_variable
 
 if TYPE_CHECKING:
     from rich.progress import Progress
@@ -28,7 +29,7 @@ class TemporalAgent(Agent):
 
     Raises:
         LoopError: `agent` is not an agent.
-        WiringError: The agent moves a robot, and an inner agent reads a variable that no agent writes.
+        LoopError: The agent moves a robot, and an inner agent reads a variable that no agent writes.
     """
 
     def __init__(self, agent: Agent, name: str | None = None, *, progress: bool | Progress = False) -> None:
@@ -60,8 +61,8 @@ class TemporalAgent(Agent):
         Raises:
             LoopError: It is running already: loops are not shared by threads.
             LoopError: Neither `n_steps` nor `stop_variable`, or no workspace.
-            WiringError: An agent reads a variable that no agent writes, or no agent writes the stop variable.
-            UnknownVariable: No agent has written the stop variable at the first time.
+            LoopError: An agent reads a variable that no agent writes, or no agent writes the stop variable.
+            LoopError: No agent has written the stop variable at the first time.
         """
         if n_steps is None and stop_variable is None:
             raise LoopError("TemporalAgent: when should it stop? Give n_steps, stop_variable or both.")
@@ -111,7 +112,7 @@ class TemporalAgent(Agent):
                 advance(1)
             if stop_variable is not None:
                 if stop_variable not in workspace:
-                    raise UnknownVariable(stop_variable, workspace.keys(), "stop_variable")
+                    raise unknown_variable(stop_variable, workspace.keys(), "stop_variable")
                 if all(workspace.get(stop_variable, t).ravel().tolist()):  # quicker for a few
                     return
             t += 1
@@ -154,7 +155,7 @@ def _check(agent: Agent, held: Iterable[str], stop_variable: str | None) -> None
     if is_live(agent):
         for one in chain:
             if one.reads is None or one.writes is None:
-                raise WiringError(
+                raise LoopError(
                     f"{agent_name(one)} is in a chain with a robot and does not say what it reads and writes; "
                     f'give its class reads = ("name", ...) and writes = ("name", ...).'
                 )
@@ -164,17 +165,17 @@ def _check(agent: Agent, held: Iterable[str], stop_variable: str | None) -> None
     for one in chain:
         for name in one.reads_previous:
             if name not in everything:
-                raise WiringError(f"{agent_name(one)} reads {name!r}, which nobody writes{_close(name, everything)}")
+                raise LoopError(f"{agent_name(one)} reads {name!r}, which nobody writes{_close(name, everything)}")
         for name in one.reads or ():
             if name not in before and name in everything:
-                raise WiringError(
+                raise LoopError(
                     f"{agent_name(one)} reads {name!r}, which only an agent after it writes; put it behind that one."
                 )
             if name not in before:
-                raise WiringError(f"{agent_name(one)} reads {name!r}, which nobody writes{_close(name, before)}")
+                raise LoopError(f"{agent_name(one)} reads {name!r}, which nobody writes{_close(name, before)}")
         before.update(one.writes or ())
     if stop_variable is not None and stop_variable not in everything:
-        raise WiringError(f"stop_variable {stop_variable!r} is written by nobody{_close(stop_variable, everything)}")
+        raise LoopError(f"stop_variable {stop_variable!r} is written by nobody{_close(stop_variable, everything)}")
 
 
 def _close(name: str, known: Iterable[str]) -> str:

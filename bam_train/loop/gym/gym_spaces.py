@@ -155,7 +155,7 @@ def each_action(workspace: Any, t: int, name: str, space: Space[Any], num_envs: 
     Actions of other spaces than Box, Discrete, MultiDiscrete, MultiBinary and Dict are not checked.
 
     Args:
-        workspace: The workspace; raises `UnknownVariable` or `TimeNotWritten` if no action was written.
+        workspace: The workspace; raises `LoopError` or `LoopError` if no action was written.
         t: The time.
         name: The variable; for dict actions, the prefix of the variables' names.
         space: Action space of one environment; an action that does not fit raises `LoopError`.

@@ -25,7 +25,7 @@ class ObservingAgents:
         sink: See `Workspace`; it is not called again after it has failed.
 
     Raises:
-        WiringError: An agent reads a variable that no agent writes.
+        LoopError: An agent reads a variable that no agent writes.
     """
 
     def __init__(

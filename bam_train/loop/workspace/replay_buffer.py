@@ -11,8 +11,9 @@ from __future__ import annotations
 
 import torch
 
-from bam_train.errors import LoopError, UnknownVariable
+from bam_train.errors import LoopError
 from bam_train.loop.workspace import Workspace
+from bam_train.loop.workspace.variables import unknown_variable
 
 
 class ReplayBuffer:
@@ -41,7 +42,7 @@ class ReplayBuffer:
         They replace the oldest items of a full buffer.
 
         Raises:
-            UnknownVariable: A variable that the buffer has is missing.
+            LoopError: A variable that the buffer has is missing.
             LoopError: Another T, shape or dtype than the first `put`.
             LoopError: A variable that the buffer does not have, columns that differ in number, or no variable.
         """
@@ -97,7 +98,7 @@ class ReplayBuffer:
     def _require_alike(self, items: dict[str, torch.Tensor]) -> None:
         for name in self.variables:
             if name not in items:
-                raise UnknownVariable(name, items)
+                raise unknown_variable(name, items)
         for name, value in items.items():
             if name not in self.variables:
                 has = ", ".join(map(repr, sorted(self.variables)))

@@ -5,12 +5,12 @@ array of a list is cached until the next write through the workspace, so a secon
 not show a stored value that was changed in place since the first full read.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
 
-from bam_train.errors import LoopError, TimeNotWritten
+from bam_train.errors import LoopError
 
 
 class Variable:
@@ -122,7 +122,7 @@ class Variable:
                 self.set(to + k, self.get(begin + k))
         elif count:
             for t in (begin, begin + count - 1, to, to + count - 1):
-                self.get(t)  # raises TimeNotWritten
+                self.get(t)  # raises LoopError
             self._whole[to : to + count] = self.copied(self._whole[begin : begin + count])
 
     def detach(self) -> None:
@@ -213,8 +213,8 @@ class Variable:
                 f"{self.name!r} at all times: expected time and batch first (T x B x ...), found a single number."
             )
 
-    def _not_written(self, t: int) -> TimeNotWritten:
-        return TimeNotWritten(f"{self.name!r} is not written at t={t}; {self.kept_times()}.")
+    def _not_written(self, t: int) -> LoopError:
+        return LoopError(f"{self.name!r} is not written at t={t}; {self.kept_times()}.")
 
     def kept_times(self) -> str:
         """The times kept, for an error message."""
@@ -260,3 +260,14 @@ def to_array(value: Any) -> np.ndarray:
         value = value.detach().cpu()
         array = (value.float() if value.is_floating_point() and value.itemsize < 4 else value).numpy()
     return array
+
+
+def unknown_variable(name: str, known: Iterable[str], role: str = "") -> LoopError:
+    """The error for a variable that no agent wrote, asked for as a `role` such as ``"stop_variable"``."""
+    from bam_envs.core.wording import closest  # not above: a policy alone needs no environments
+
+    names = sorted(known)
+    close = closest(name, names, cutoff=0.6)
+    question = "." if close is None else f", did you mean {close!r}?"
+    has = f" It has {', '.join(map(repr, names))}." if names else " It is empty."
+    return LoopError(f"{role} {name!r} is not in the workspace{question}{has}".lstrip())

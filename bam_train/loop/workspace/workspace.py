@@ -25,8 +25,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from bam_train.errors import LoopError, TimeNotWritten, UnknownVariable
-from bam_train.loop.workspace.variables import Variable, kind_mismatch, no_batch
+from bam_train.errors import LoopError
+from bam_train.loop.workspace.variables import Variable, kind_mismatch, no_batch, unknown_variable
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -40,7 +40,7 @@ _LEAST_PIECE = 64
 
 
 class Workspace:
-    """Named variables over time. Methods raise `UnknownVariable` for the name of a variable that was not written.
+    """Named variables over time. Methods raise `LoopError` for the name of a variable that was not written.
 
     Args:
         workspace: A workspace to copy, without sharing memory.
@@ -79,7 +79,7 @@ class Workspace:
 
         Raises:
             LoopError: Another shape, dtype, device or kind of array than the variable has.
-            TimeNotWritten: t has left the window, or is negative beyond the first.
+            LoopError: t has left the window, or is negative beyond the first.
         """
         variable = self.variables.get(name)
         is_first = variable is None
@@ -100,12 +100,12 @@ class Workspace:
         """The value at time t, B x ...; -1 is the last.
 
         Raises:
-            TimeNotWritten: It was not written at t, or t has left the window.
+            LoopError: It was not written at t, or t has left the window.
         """
         try:
             variable = self.variables[name]
         except KeyError:
-            raise UnknownVariable(name, self.variables) from None
+            raise unknown_variable(name, self.variables) from None
         try:
             return variable.get(t)
         except (TypeError, IndexError):
@@ -234,7 +234,7 @@ class Workspace:
             array = one.view()
             start = one.index(t, array) - self.first_time
             if len(start) and not 0 <= int(start.min()) <= int(start.max()) <= len(array) - window_size:
-                raise TimeNotWritten(
+                raise LoopError(
                     f"{name!r}: windows of {window_size} from t={int(start.min()) + self.first_time} to "
                     f"{int(start.max()) + self.first_time} are wanted; {one.kept_times()}."
                 )
@@ -291,7 +291,7 @@ class Workspace:
         inside = None
         if not no_final_state:
             if filter_key not in self.variables:
-                raise UnknownVariable(filter_key, self.variables, "filter_key")
+                raise unknown_variable(filter_key, self.variables, "filter_key")
             done = self.variables[filter_key]
             for name, one in self.variables.items():
                 if one.time_size() != done.time_size():
@@ -346,7 +346,7 @@ class Workspace:
         try:
             return self.variables[name]
         except KeyError:
-            raise UnknownVariable(name, self.variables) from None
+            raise unknown_variable(name, self.variables) from None
 
     def _new(self, name: str, value: Any, where: str) -> Variable:
         """An empty variable for values of this kind."""
@@ -374,7 +374,7 @@ class Workspace:
         if not 0 <= begin < end:
             raise LoopError(f"{name!r}: expected times with 0 <= from < to, found from {begin} to {end}.")
         if begin < self.first_time:
-            raise TimeNotWritten(f"{name!r} has lost t={begin}: times before {self.first_time} have left the window.")
+            raise LoopError(f"{name!r} has lost t={begin}: times before {self.first_time} have left the window.")
 
     def _forget(self, stop: int) -> None:
         """Forget the times before `stop`, and pass them to the sink."""

@@ -29,7 +29,7 @@ import torch
 from numpy.typing import NDArray
 
 from bam_train.checkpoint import Checkpoint
-from bam_train.errors import AlteredCheckpoint, CheckpointMismatch, FormatError
+from bam_train.errors import CheckpointError, CheckpointMismatch, FormatError
 
 Array = NDArray[Any]
 
@@ -52,7 +52,7 @@ def load(checkpoint: Checkpoint, algorithm: Any) -> None:
 
     Raises:
         CheckpointMismatch: It was made by another version of Ray.
-        AlteredCheckpoint: A state cannot be read, or does not fit the algorithm.
+        CheckpointError: A state cannot be read, or does not fit the algorithm.
     """
     require_version(checkpoint)
     state = read(checkpoint)
@@ -73,7 +73,7 @@ def read(checkpoint: Checkpoint) -> dict[str, Any]:
     """The nested state of the whole algorithm: arrays and plain values.
 
     Raises:
-        AlteredCheckpoint: A state cannot be read, or holds other objects; the message names it.
+        CheckpointError: A state cannot be read, or holds other objects; the message names it.
     """
     tree: dict[str, Any] = {}
     for name in sorted(checkpoint.manifest.sha256):
@@ -85,13 +85,15 @@ def read(checkpoint: Checkpoint) -> dict[str, Any]:
             if not isinstance(state, dict):
                 raise FormatError(f"holds a {type(state).__name__}, expected a table of names")
         except FormatError as error:
-            raise AlteredCheckpoint(checkpoint.path, name, f"{name} {error}. Train anew, or get it again") from error
+            raise CheckpointError(
+                checkpoint.path, f"{name} {error}. Train anew, or get it again", member=name
+            ) from error
         inner = tree
         for part in path.parent.relative_to(FOLDER).parts:
             inner = inner.setdefault(part, {})
         inner.update(state)
     if not tree:
-        raise AlteredCheckpoint(checkpoint.path, FOLDER, f"has no {FOLDER}; it was not made by RLlib")
+        raise CheckpointError(checkpoint.path, f"has no {FOLDER}; it was not made by RLlib", member=FOLDER)
     return tree
 
 

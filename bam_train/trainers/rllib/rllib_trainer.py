@@ -26,7 +26,7 @@ from bam_envs.core.spaces import space_to_json
 from bam_train.checkpoint import Checkpoint, write_checkpoint
 from bam_train.data import DataSet
 from bam_train.environments import control_period, make_env, require_fit
-from bam_train.errors import ProcessesLost, SettingsError, TrainingFailed
+from bam_train.errors import SettingsError, TrainingFailed
 from bam_train.policy import FrozenPolicy
 from bam_train.settings import RLlibSettings
 from bam_train.trainers.algorithms import RLLIB_ALGORITHMS
@@ -359,7 +359,7 @@ class RunnerWatch:
         """Train one iteration; returns RLlib's result, and messages about runners for the user, one line each.
 
         Raises:
-            ProcessesLost: A runner dies repeatedly, or all runners are lost; the message has the cause if it is known.
+            TrainingFailed: A runner dies repeatedly, or all runners are lost; the message has the cause if it is known.
             TrainingFailed: A learner or the cluster died.
         """
         try:
@@ -387,7 +387,7 @@ class RunnerWatch:
             self._seen_at = now
         elif (waited := now - self._seen_at) > LONGEST_ALONE:
             text = f"all {len(self._all)} env runners died{self._cause}, and none came back in {waited:.0f} s"
-            raise ProcessesLost(text)
+            raise TrainingFailed(text, is_kept=True)
         return back
 
     def _look(self) -> None:
@@ -405,7 +405,9 @@ class RunnerWatch:
             updates = self._update - deaths[0] + 1
             if len(deaths) > MOST_DEATHS and updates <= WINDOW:
                 within = f"{updates} update{'s' if updates > 1 else ''}"
-                raise ProcessesLost(f"env runner {index} died {len(deaths)} times within {within}{self._cause}")
+                raise TrainingFailed(
+                    f"env runner {index} died {len(deaths)} times within {within}{self._cause}", is_kept=True
+                )
         left = len(self._all) - len(self._gone)
         goes_on = f"training goes on with {left} of {len(self._all)} env runners"
         self._lines.append(goes_on if left else "no env runner is left: waiting for one to come back")

@@ -15,7 +15,7 @@ from bam_train.checkpoint import GOLDEN, POLICY
 from bam_train.checkpoint.manifest import MANIFEST
 from bam_train.checkpoint.zip_members import open_zip
 from bam_train.environments import control_period, make_env
-from bam_train.errors import CheckpointMismatch, NotACheckpoint
+from bam_train.errors import CheckpointError, CheckpointMismatch
 from bam_train.policy import FrozenPolicy
 from bam_train.trainers.algorithms import SB3_ALGORITHMS
 from bam_train.trainers.base import origin
@@ -31,7 +31,7 @@ def is_plain_sb3(path: Path) -> bool:
     try:
         with open_zip(path) as archive:
             names = set(archive.namelist())
-    except NotACheckpoint:
+    except CheckpointError:
         return False  # missing or damaged; `Checkpoint.open` raises the error
     return "data" in names and MANIFEST not in names
 
@@ -78,7 +78,7 @@ def export_trusted(
         raise UnknownName("algorithm", algo, SB3_ALGORITHMS)
     if not is_plain_sb3(path):
         with open_zip(path):
-            raise NotACheckpoint(path, "is not a zip of stable-baselines3, or already a checkpoint of bam-train")
+            raise CheckpointError(path, "is not a zip of stable-baselines3, or already a checkpoint of bam-train")
     env = make_env(env_id, env_kwargs)
     describe = getattr(env.unwrapped, "describe", dict)
     model, members = _frozen(path, algo, env_id, env, statistics)

@@ -10,7 +10,7 @@ from bam_envs import __version__
 from bam_envs.core.errors import InvalidValue, LinkLost, NoServer
 from bam_envs.rosbridge.server import BridgeServer
 from bam_train.agent.remote.agent_client import AgentClient, agent_url
-from bam_train.errors import NotACheckpoint, RequestRefused
+from bam_train.errors import CheckpointError, RequestRefused
 from tests.raising import raising
 
 
@@ -84,7 +84,7 @@ def test_a_push_that_is_refused_before_it_is_sent(new_agent, new_server, tmp_pat
     small = new_server(most_upload=1_000_000)
     with raising(RequestRefused, "The upload has 2.0 MB, and 1.0 MB is the most that this agent takes."):
         new_agent(url=small.url).push(path)
-    with pytest.raises(NotACheckpoint) as missing:
+    with pytest.raises(CheckpointError) as missing:
         new_agent().push(tmp_path / "none.zip")
     assert str(missing.value).endswith("none.zip: cannot be read: No such file or directory. Give a checkpoint.zip.")
 

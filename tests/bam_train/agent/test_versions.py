@@ -16,7 +16,7 @@ import pytest
 
 from bam_train.agent.versions import KEPT, Versions, load_policy
 from bam_train.checkpoint import Checkpoint
-from bam_train.errors import AlteredCheckpoint, CheckpointError, FolderInUse, OutputError, RequestRefused, SettingsError
+from bam_train.errors import CheckpointError, OutputError, RequestRefused, SettingsError
 from tests.raising import raising
 
 _PROGRAM = """
@@ -139,7 +139,7 @@ def test_the_oldest_versions_without_a_name_are_removed(versions, some):
 def test_a_file_that_was_changed_after_it_was_verified_is_not_kept(versions, some, forge):
     (one,) = some(1)
     forge(one.path, seed=99)
-    with raising(AlteredCheckpoint, f"{one.path}: was changed while it was read. Push it again"):
+    with raising(CheckpointError, f"{one.path}: was changed while it was read. Push it again"):
         versions.add(one)
     assert files(versions) == []
 
@@ -226,7 +226,7 @@ def test_the_folder_survives_a_kill_at_any_moment(versions, some):
 
 def test_a_second_agent_is_refused_until_the_first_ends(versions):
     with versions.held():
-        with pytest.raises(FolderInUse) as caught, Versions(versions.folder).held():
+        with pytest.raises(OutputError) as caught, Versions(versions.folder).held():
             pass
         other = f"another bam-agent (process {os.getpid()})"
         assert str(caught.value) == f"{versions.folder}: {other} uses it. End that one, or give another --folder"
@@ -241,7 +241,7 @@ def test_the_lock_of_a_killed_agent_is_free(versions):
     )
     with subprocess.Popen([sys.executable, "-c", program, str(versions.folder)], stdout=subprocess.PIPE) as process:
         process.stdout.readline()
-        with pytest.raises(FolderInUse, match=rf"\(process {process.pid}\)"), versions.held():
+        with pytest.raises(OutputError, match=rf"\(process {process.pid}\)"), versions.held():
             pass
         process.kill()
     with versions.held():

@@ -18,7 +18,7 @@ from bam_train.checkpoint import MANIFEST, POLICY, Checkpoint, safetensors_file,
 from bam_train.checkpoint.signature import make_key, public_path, sign, trust, verify
 from bam_train.cli.sign import main
 from bam_train.deploy.checkpoint_admission import Admission
-from bam_train.errors import AlteredCheckpoint, BadKey, CheckpointError, OutputError, UntrustedCheckpoint
+from bam_train.errors import CheckpointError, OutputError, SettingsError, UntrustedCheckpoint
 from bam_train.policy import onnx_session
 
 SIGNATURE = "bam/signature.json"
@@ -119,7 +119,7 @@ def test_every_change_is_refused_by_the_members_name_before_the_policy_is_loaded
     monkeypatch.setattr(onnx_session, "OnnxSession", lambda *_: pytest.fail("a session was made"))
     write(signed, change(name)(members_of(signed)))
     for allow in (False, True):
-        with pytest.raises(AlteredCheckpoint) as caught:
+        with pytest.raises(CheckpointError) as caught:
             admit(signed, keys, allow_unsigned=allow)
         assert caught.value.member in {name, *(NAMES[NAMES.index(name) - 1 :][:1] if change is swapped else ())}
         assert caught.value.member in str(caught.value)
@@ -132,7 +132,7 @@ def test_every_change_is_refused_by_the_members_name_before_the_policy_is_loaded
 def test_an_added_member_is_refused_by_its_name(signed, keys, monkeypatch, name):
     monkeypatch.setattr(onnx_session, "OnnxSession", lambda *_: pytest.fail("a session was made"))
     write(signed, members_of(signed) | {name: b"more"})
-    with pytest.raises(AlteredCheckpoint) as caught:
+    with pytest.raises(CheckpointError) as caught:
         admit(signed, keys)
     assert caught.value.member == name
     outside = "a name that points outside of the zip" in str(caught.value)
@@ -149,7 +149,7 @@ def test_new_digests_do_not_make_up_for_a_change(signed, keys, forge):
     text = (
         r"bam/manifest\.json or bam/signature\.json was altered after alice signed: the signature does not fit\. Copy"
     )
-    with pytest.raises(AlteredCheckpoint, match=text):
+    with pytest.raises(CheckpointError, match=text):
         admit(signed, keys, allow_unsigned=True)
 
 
@@ -159,7 +159,7 @@ def test_what_was_changed_after_a_stranger_signed_is_refused_too(signed, tmp_pat
     assert other != members[MANIFEST]
     for change in ({MANIFEST: other}, {"bam/resume/rng.json": b"[1, 3]"}):
         write(signed, members | change)
-        with pytest.raises(AlteredCheckpoint):
+        with pytest.raises(CheckpointError):
             admit(signed, tmp_path / "nobody", allow_unsigned=True)
 
 
@@ -180,14 +180,14 @@ def test_every_field_of_the_signature_counts(signed, keys, tmp_path, field, valu
         value = make_key(tmp_path / "bob.key", "bob").text
         trust(tmp_path / "bob.pub", keys)
     write(signed, members | {SIGNATURE: json.dumps(signature | {field: value}).encode()})
-    with pytest.raises(AlteredCheckpoint, match="the signature does not fit"):
+    with pytest.raises(CheckpointError, match="the signature does not fit"):
         admit(signed, keys)
 
 
 @pytest.mark.parametrize("data", [b"{", b"[]", b'{"format": 2}', b"\xff", b"[" * 10_000])
 def test_a_signature_that_is_none_is_named(signed, keys, data):
     write(signed, members_of(signed) | {SIGNATURE: data})
-    with pytest.raises(AlteredCheckpoint, match=r"bam/signature\.json: .*\. Sign it again") as caught:
+    with pytest.raises(CheckpointError, match=r"bam/signature\.json: .*\. Sign it again") as caught:
         admit(signed, keys)
     assert caught.value.member == SIGNATURE
 
@@ -197,13 +197,13 @@ def test_a_signature_of_other_letters_is_named(signed, keys, field):
     members = members_of(signed)
     signature = json.loads(members[SIGNATURE])
     write(signed, members | {SIGNATURE: json.dumps(signature | {field: "é" * len(signature[field])}).encode()})
-    with pytest.raises(AlteredCheckpoint, match=r"bam/signature\.json: .*\. Sign it again"):
+    with pytest.raises(CheckpointError, match=r"bam/signature\.json: .*\. Sign it again"):
         admit(signed, keys)
 
 
 def test_a_signature_of_an_absurd_size_is_not_read(signed, keys):
     write(signed, members_of(signed) | {SIGNATURE: bytes(2**24)})
-    with pytest.raises(AlteredCheckpoint, match=r"bam/signature\.json has 16777216 bytes, expected at most 16384"):
+    with pytest.raises(CheckpointError, match=r"bam/signature\.json has 16777216 bytes, expected at most 16384"):
         admit(signed, keys)
 
 
@@ -249,7 +249,7 @@ def test_a_file_that_is_replaced_between_two_readings_is_noticed(signed, keys, c
     members = members_of(signed)
     signed.write_bytes(whole)
     write(signed, members_of(signed) | {MANIFEST: members[MANIFEST]})
-    with pytest.raises(AlteredCheckpoint, match=r"bam/manifest\.json was replaced while it was read\. Try again"):
+    with pytest.raises(CheckpointError, match=r"bam/manifest\.json was replaced while it was read\. Try again"):
         verify(checkpoint, keys)
 
 
@@ -266,7 +266,7 @@ def test_a_key_is_secret_and_is_not_overwritten(tmp_path, key):
     with pytest.raises(OutputError, match=r": a folder\. Name the private key in it, such as \S+/alice\.key$"):
         make_key(tmp_path, "bob")
     with pytest.raises(
-        BadKey, match=r"carl\.pub: that is a name for a public key\. Give the private one: \S+carl\.key$"
+        SettingsError, match=r"carl\.pub: that is a name for a public key\. Give the private one: \S+carl\.key$"
     ):
         make_key(tmp_path / "carl.pub", "carl")
     assert not list(tmp_path.glob("carl*"))
@@ -309,7 +309,7 @@ def elliptic():
 def test_a_key_that_cannot_be_used_is_one_line(signed, key, change, text):
     before = signed.read_bytes()
     change(key)
-    with pytest.raises(BadKey, match=text):
+    with pytest.raises(SettingsError, match=text):
         sign(signed, key)
     assert signed.read_bytes() == before
 
@@ -321,7 +321,7 @@ def test_a_key_without_its_public_file_has_the_name_of_its_file(signed, key, key
 
 @pytest.mark.parametrize("name", ["", "a b", "-x", "a" * 65, "ä"])
 def test_a_signer_needs_a_name(tmp_path, name):
-    with pytest.raises(BadKey, match="expected 1 to 64 letters, digits"):
+    with pytest.raises(SettingsError, match="expected 1 to 64 letters, digits"):
         make_key(tmp_path / "x.key", name)
     assert list(tmp_path.iterdir()) == []
 
@@ -336,7 +336,7 @@ def test_others_must_not_decide_whom_this_computer_trusts(signed, keys, tmp_path
         path.chmod(mode | bits)
         for folder in (keys, tmp_path / "link"):
             with pytest.raises(
-                BadKey, match=rf": {change}: others can write to \S+/{path.name}\. Run: chmod go-w \S+$"
+                SettingsError, match=rf": {change}: others can write to \S+/{path.name}\. Run: chmod go-w \S+$"
             ):
                 verify(Checkpoint.open(signed), folder)
         path.chmod(mode | bits | stat.S_ISVTX)
@@ -350,11 +350,11 @@ def test_others_must_not_decide_whom_this_computer_trusts(signed, keys, tmp_path
         else:
             owner = os.geteuid()
             patch.setattr(os, "geteuid", lambda: owner + 1)
-        with pytest.raises(BadKey, match=rf"{keys}: {change}: {keys} belongs to \S+\. Run: chown \S+ {keys}$"):
+        with pytest.raises(SettingsError, match=rf"{keys}: {change}: {keys} belongs to \S+\. Run: chown \S+ {keys}$"):
             verify(Checkpoint.open(signed), keys)
     os.chown(keys, os.geteuid(), -1)
     (keys / "broken.pub").write_text("nonsense")
-    with pytest.raises(BadKey, match=r"broken\.pub: expected one line"):
+    with pytest.raises(SettingsError, match=r"broken\.pub: expected one line"):
         verify(Checkpoint.open(signed), keys)
 
 
@@ -373,16 +373,18 @@ def test_a_file_in_the_place_of_a_folder_is_named(signed, key, tmp_path):
         make_key(file / "x.key", "alice")
     with pytest.raises(OutputError, match=rf"{file}: cannot be made a folder: File exists\. Choose another place$"):
         trust(file, file)
-    with pytest.raises(BadKey, match=rf"^{file}: a file, and a folder of public keys is expected\. Give its folder$"):
+    with pytest.raises(
+        SettingsError, match=rf"^{file}: a file, and a folder of public keys is expected\. Give its folder$"
+    ):
         verify(Checkpoint.open(signed), file)
 
 
 def test_another_key_of_a_trusted_name_is_refused(tmp_path, keys, key):
     assert trust(public_path(key), keys) == keys / "alice.pub"
-    with pytest.raises(BadKey, match=r"a private key, which stays secret\. Give the public one: \S+alice\.pub$"):
+    with pytest.raises(SettingsError, match=r"a private key, which stays secret\. Give the public one: \S+alice\.pub$"):
         trust(key, keys)
     make_key(tmp_path / "other.key", "alice")
-    with pytest.raises(BadKey, match=r"another key of that name is trusted\. Remove that file first"):
+    with pytest.raises(SettingsError, match=r"another key of that name is trusted\. Remove that file first"):
         trust(tmp_path / "other.pub", keys)
 
 

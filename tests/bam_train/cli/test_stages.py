@@ -23,7 +23,7 @@ from bam_train.cli.deploy import main as deploy
 from bam_train.deploy.checkpoint_admission import Admission
 from bam_train.deploy.trials import Subject, TrialRecord, Trials
 from bam_train.environments.made_env import with_live_robot
-from bam_train.errors import BadTrials, SettingsError, TrialsNeeded
+from bam_train.errors import FormatError, SettingsError
 from bam_train.recording.recording import Recording
 from tests.bam_train.deploy.test_deployment import Driven, raises
 from tests.bam_train.deploy.test_deployment import run as run_deployment
@@ -68,7 +68,7 @@ def test_on_trial_until_trials_show_enough_for_full_speed(admission):
     assert one.marks == ("UNSIGNED", "trial")
     try_it(one.trials, *[True] * 32)
     early = admission()
-    with pytest.raises(TrialsNeeded) as caught:
+    with pytest.raises(SettingsError) as caught:
         early(REAL, FULL)
     assert str(caught.value) == (
         f"--stage full: {early.checkpoint.path} on {URL}/: 32 of 32 trials succeeded; 1 more without a failure would "
@@ -87,10 +87,10 @@ def test_another_checkpoint_or_robot_begins_anew(admission):
     one = admission()
     one(REAL, ON_TRIAL)
     try_it(one.trials, *[True] * 33)
-    with pytest.raises(TrialsNeeded, match="0 of 0 trials succeeded"):
+    with pytest.raises(SettingsError, match="0 of 0 trials succeeded"):
         admission()(REAL, replace(FULL, url="ws://10.0.0.6:9090"))
     with pytest.raises(
-        TrialsNeeded, match="0 of 0 trials succeeded; 7 more without a failure would show more than 60 %"
+        SettingsError, match="0 of 0 trials succeeded; 7 more without a failure would show more than 60 %"
     ):
         admission(trial_threshold=0.6)(REAL, FULL)
 
@@ -100,7 +100,7 @@ def test_trials_in_simulation_say_nothing_of_a_real_robot_at_that_address(admiss
     one(SIMULATED, ON_TRIAL)
     try_it(one.trials, *[True] * 33)
     assert '"simulated": true' in one.record.read_text()
-    with pytest.raises(TrialsNeeded, match="0 of 0 trials succeeded"):
+    with pytest.raises(SettingsError, match="0 of 0 trials succeeded"):
         admission()(REAL, FULL)
 
 
@@ -124,7 +124,7 @@ def test_an_edited_record_is_refused_at_every_stage(admission, tmp_path):
     path = tmp_path / "trials.jsonl"
     path.write_text(path.read_text().replace('"success": false', '"success": true'))
     for place in (ON_TRIAL, FULL):
-        with pytest.raises(BadTrials, match="line 3 was edited"):
+        with pytest.raises(FormatError, match="line 3 was edited"):
             admission(i_know=True)(REAL, place)
 
 

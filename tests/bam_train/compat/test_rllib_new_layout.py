@@ -13,7 +13,7 @@ import pytest
 pytest.importorskip("ray")
 
 from bam_train.compat.rllib_export import export
-from bam_train.errors import AlteredCheckpoint, CheckpointMismatch
+from bam_train.errors import CheckpointError, CheckpointMismatch
 
 NEW = "learner_group/learner/rl_module/default_policy"
 CONNECTORS = "env_runner/env_to_module_connector"
@@ -73,7 +73,7 @@ def test_nothing_is_run_unless_it_is_trusted(copied, tmp_path):
     text = "is read by RLlib itself, which runs whatever code is in its pickles. If you trust its maker, add "
     assert str(error.value) == f"{root}: {text}--trust-pickle"
     assert not (tmp_path / "mark").exists()
-    with pytest.raises(AlteredCheckpoint, match="cannot be restored by RLlib"):
+    with pytest.raises(CheckpointError, match="cannot be restored by RLlib"):
         export(root, trust=True)
     assert (tmp_path / "mark").exists()
 
@@ -102,7 +102,7 @@ def test_damage_is_one_line_and_names_the_folder(copied, member):
     (path,) = root.glob(f"{member}*")
     for bad in (path.read_bytes()[:-40], b""):
         path.write_bytes(bad)
-        with pytest.raises(AlteredCheckpoint) as error:
+        with pytest.raises(CheckpointError) as error:
             export(root, trust=True)
         assert str(error.value).startswith(f"{root}: {Path(member).parent}/")
         assert "\n" not in str(error.value)

@@ -16,7 +16,7 @@ import pytest
 
 from bam_train.compat.rllib_directory import find_policy
 from bam_train.compat.rllib_export import export
-from bam_train.errors import AlteredCheckpoint, BamTrainError, CheckpointMismatch, NotACheckpoint
+from bam_train.errors import BamTrainError, CheckpointError, CheckpointMismatch
 
 HERE = Path(__file__).parent / "old_layout"
 OLD = "policies/default_policy"
@@ -67,7 +67,7 @@ def test_a_payload_is_not_run(copied, tmp_path):
     ):
         path.write_bytes(pickle.dumps(planted))
         for trust in (False, True):
-            with pytest.raises(AlteredCheckpoint) as error:
+            with pytest.raises(CheckpointError) as error:
                 export(root, trust=trust)
             assert error.value.member == MEMBER
             assert "\n" not in str(error.value)
@@ -99,11 +99,11 @@ def test_a_missing_file_and_a_cut_one(copied):
     root = copied()
     path = root / MEMBER
     path.write_bytes(path.read_bytes()[:-100])
-    with pytest.raises(AlteredCheckpoint) as error:
+    with pytest.raises(CheckpointError) as error:
         export(root)
     assert str(error.value).startswith(f"{root}: {MEMBER} is not a whole pickle of RLlib's: ")
     path.unlink()
-    with pytest.raises(AlteredCheckpoint) as error:
+    with pytest.raises(CheckpointError) as error:
         export(root)
     assert str(error.value) == f"{root}: {MEMBER} is missing. Copy it again from its source, whole"
 
@@ -114,12 +114,12 @@ def test_what_never_ends_is_not_read(copied):
     for make in (os.mkfifo, lambda path: path.symlink_to("/dev/zero")):
         path.unlink()
         make(path)
-        with pytest.raises(AlteredCheckpoint, match="cannot be read: it is not a file"):
+        with pytest.raises(CheckpointError, match="cannot be read: it is not a file"):
             export(root)
     path.unlink()
     with path.open("wb") as file:
         file.truncate(2**40)
-    with pytest.raises(AlteredCheckpoint, match="cannot be read: it has 1099511627776 bytes, expected at most 2147483"):
+    with pytest.raises(CheckpointError, match="cannot be read: it has 1099511627776 bytes, expected at most 2147483"):
         export(root)
 
 
@@ -154,6 +154,6 @@ def test_no_directories_of_rllib(tmp_path):
         "packed": "was written as msgpack; expected pickles. Save it again without use_msgpack",
     }
     for name, message in says.items():
-        with pytest.raises(NotACheckpoint) as error:
+        with pytest.raises(CheckpointError) as error:
             find_policy(tmp_path / name)
         assert str(error.value) == f"{tmp_path / name}: {message}"

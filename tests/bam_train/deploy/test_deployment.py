@@ -23,7 +23,7 @@ from bam_envs.testing.drivers import DrivenRobot
 from bam_train.cli.program import guarded
 from bam_train.deploy.deployment import Deployment
 from bam_train.deploy.journal import Ending, Journal
-from bam_train.errors import WiringError
+from bam_train.errors import LoopError
 from bam_train.loop import Agent, CopyTAgent
 
 DONE = Ending("episodes done", 0)
@@ -466,7 +466,7 @@ def test_an_agent_that_reads_what_nobody_writes_is_refused_before_the_robot_is_c
 
     robot = FakeRobot()
     env = gym.wrappers.TimeLimit(RobotEnv(robot, PickTask(1)), 7)
-    with pytest.raises(WiringError, match=r"^Lost reads 'camera', which nobody writes\. Written are 'action', "):
+    with pytest.raises(LoopError, match=r"^Lost reads 'camera', which nobody writes\. Written are 'action', "):
         run(env, agents=[Lost()])
     with pytest.raises(ResetNeeded, match="not connected"):
         robot.step(np.zeros((1, 7)))

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from bam_train.deploy.trials import ALPHA, Evidence, Subject, TrialRecord, Trials
-from bam_train.errors import BadTrials
+from bam_train.errors import FormatError
 
 PICK = Subject("ab12", "ws://10.0.0.5:9090")
 
@@ -143,7 +143,7 @@ def test_a_key_that_others_can_replace_proves_nothing(record):
     private = record.path.parents[1] / "private"
     private.chmod(0o777)
     why = rf"another user can forge trials with this key: others can write to {private}\."
-    with pytest.raises(BadTrials, match=why):
+    with pytest.raises(FormatError, match=why):
         counts(record)
     private.chmod(0o700)
     assert counts(record) == (1, 1)
@@ -195,7 +195,7 @@ def test_every_edit_is_found(record, change, text):
     edit(record, change)
     before = record.path.read_bytes()
     for act in (lambda: counts(record), lambda: try_it(record, True)):
-        with pytest.raises(BadTrials) as caught:
+        with pytest.raises(FormatError) as caught:
             act()
         assert f"{record.path}: {text}" in str(caught.value)
         assert str(caught.value).endswith("Restore it from a copy, or move it away and begin the trials again")
@@ -208,7 +208,7 @@ def test_every_byte_of_a_line_counts(record):
     for at in range(0, len(whole), 3):
         if whole[at : at + 1] not in b" \n":
             record.path.write_bytes(whole[:at] + bytes([whole[at] ^ 1]) + whole[at + 1 :])
-            with pytest.raises(BadTrials):
+            with pytest.raises(FormatError):
                 counts(record)
 
 
@@ -245,7 +245,7 @@ def test_an_emptied_record_is_refused_and_one_that_was_moved_away_begins_again(r
     try_it(record, False)
     record.path.write_bytes(b"")
     for act in (lambda: counts(record), lambda: try_it(record, True)):
-        with pytest.raises(BadTrials, match=r"its lines were removed: it had 3\. Restore it from a copy"):
+        with pytest.raises(FormatError, match=r"its lines were removed: it had 3\. Restore it from a copy"):
             act()
     assert record.path.read_bytes() == b""
     moved.replace(record.path)
@@ -269,20 +269,20 @@ def test_killed_between_two_lines(record):
 def test_another_users_record_and_a_damaged_key_are_one_line(record, tmp_path):
     try_it(record, True)
     stranger = TrialRecord(record.path, tmp_path / "stranger")
-    with pytest.raises(BadTrials, match=r"A record is of use only to the user who made it\. Restore it"):
+    with pytest.raises(FormatError, match=r"A record is of use only to the user who made it\. Restore it"):
         counts(stranger)
     (state,) = (tmp_path / "private").iterdir()
     state.write_text('{"key": 1}')
-    with pytest.raises(BadTrials, match=r"\.json is damaged\. Restore it"):
+    with pytest.raises(FormatError, match=r"\.json is damaged\. Restore it"):
         counts(record)
 
 
 def test_a_place_where_nothing_can_be_written_is_named(tmp_path):
     (tmp_path / "file").write_text("")
     record = TrialRecord(tmp_path / "file" / "trials.jsonl", tmp_path / "private")
-    with pytest.raises(BadTrials, match=r"the trial cannot be recorded: .*\. Give another file with --trials"):
+    with pytest.raises(FormatError, match=r"the trial cannot be recorded: .*\. Give another file with --trials"):
         Trials(record, PICK, 0.9, {}).begin(0)
-    with pytest.raises(BadTrials, match=r"cannot be read: Not a directory\. Give another file with --trials$"):
+    with pytest.raises(FormatError, match=r"cannot be read: Not a directory\. Give another file with --trials$"):
         record._read()
-    with pytest.raises(BadTrials, match=r"cannot be read: Is a directory\. Give another file with --trials$"):
+    with pytest.raises(FormatError, match=r"cannot be read: Is a directory\. Give another file with --trials$"):
         counts(TrialRecord(tmp_path, tmp_path / "private"))

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from bam_envs.core.errors import MissingExtra
-from bam_train.errors import LoopError, UnknownVariable
+from bam_train.errors import LoopError
 from bam_train.loop import Workspace
 from bam_train.loop.workspace.plotting import MAX_LINES, plot, to_dataframe
 
@@ -159,7 +159,7 @@ def test_images_are_refused_by_name_and_left_out_without_one(kind):
 
 
 def test_what_cannot_be_drawn(ws):
-    with pytest.raises(UnknownVariable):
+    with pytest.raises(LoopError):
         plot(ws, "rewrd")
     with pytest.raises(LoopError) as error:
         plot(ws, "reward", batch=[0, 2])

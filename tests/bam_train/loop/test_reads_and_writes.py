@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from bam_train.errors import WiringError
+from bam_train.errors import LoopError
 from bam_train.loop import Agent, Agents, CopyTAgent, KWAgentWrapper, TemporalAgent, Workspace
 
 
@@ -31,7 +31,7 @@ class Robot(Env):
 
 
 def refused(*agents, ws=None, **kwargs):
-    with pytest.raises(WiringError) as error:
+    with pytest.raises(LoopError) as error:
         TemporalAgent(Agents(*agents))(Workspace() if ws is None else ws, **({"n_steps": 2} | kwargs))
     assert [agent.calls for agent in agents] == [0] * len(agents)
     return str(error.value)
@@ -80,7 +80,7 @@ def test_an_agent_that_does_not_say_what_it_writes_may_write_anything():
 
 def test_wrappers_are_looked_into():
     inner = Step(("osb",), ("action",))
-    with pytest.raises(WiringError, match="'osb'"):
+    with pytest.raises(LoopError, match="'osb'"):
         TemporalAgent(Agents(Env(), KWAgentWrapper(Agents(inner), gain=2)))(Workspace(), n_steps=1)
     assert inner.calls == 0
 
@@ -104,14 +104,14 @@ def test_a_users_wrapper_may_write_more_than_what_is_in_it():
 
 
 def test_a_chain_with_a_robot_is_checked_when_it_is_built():
-    with pytest.raises(WiringError, match="'osb'"):
+    with pytest.raises(LoopError, match="'osb'"):
         TemporalAgent(Agents(Robot(), Step(("osb",), ("action",))))
     TemporalAgent(Agents(Robot(), Step(("obs",), ("action",))))
 
 
 @pytest.mark.parametrize("agent", [Step(None, ("action",)), Step(("obs",), None)])
 def test_in_a_chain_with_a_robot_every_agent_has_to_say(agent):
-    with pytest.raises(WiringError) as error:
+    with pytest.raises(LoopError) as error:
         TemporalAgent(Agents(Robot(), agent))
     assert str(error.value) == (
         "Step is in a chain with a robot and does not say what it reads and writes; "

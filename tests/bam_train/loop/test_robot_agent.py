@@ -6,7 +6,7 @@ from bam_envs.core.errors import ResetNeeded
 from bam_envs.core.robot_env import RobotEnv
 from bam_envs.robots.fake import FakeRobot
 from bam_envs.tasks.pick import PickTask
-from bam_train.errors import LoopError, WiringError
+from bam_train.errors import LoopError
 from bam_train.loop import Agent, Agents, KWAgentWrapper, PolicyAgent, RobotAgent, TemporalAgent, Workspace
 
 
@@ -90,7 +90,7 @@ def test_wiring_is_checked_before_the_robot_is_connected():
     env = robot_env()
     robot = env.unwrapped.robot
     wrong = PolicyAgent(None, ["env/env_ops"], single=True)
-    with pytest.raises(WiringError) as caught:
+    with pytest.raises(LoopError) as caught:
         TemporalAgent(Agents(RobotAgent(env), wrong))
     assert str(caught.value) == (
         "PolicyAgent reads 'env/env_ops', which nobody writes, did you mean 'env/env_obs'? Written are "
@@ -195,7 +195,7 @@ def test_a_wrong_call_halts_a_robot_that_is_waiting():
     loop = TemporalAgent(Agents(RobotAgent(env), Choose(np.zeros(5, np.float32))))
     loop(workspace, n_steps=2)
     before = robot.halts
-    with pytest.raises(WiringError, match=r"^stop_variable 'env/don' is written by nobody, did you mean 'env/done'\?"):
+    with pytest.raises(LoopError, match=r"^stop_variable 'env/don' is written by nobody, did you mean 'env/done'\?"):
         loop(workspace, t=2, stop_variable="env/don")
     assert robot.halts > before
 
@@ -207,5 +207,5 @@ def test_an_agent_that_joins_later_has_to_say_what_it_does():
 
     loop = TemporalAgent(Agents(RobotAgent(robot_env()), Choose(np.zeros(5, np.float32))))
     loop.agent.agents.append(Silent())
-    with pytest.raises(WiringError, match=r"^Silent is in a chain with a robot and does not say"):
+    with pytest.raises(LoopError, match=r"^Silent is in a chain with a robot and does not say"):
         loop(Workspace(), n_steps=1)

@@ -2,7 +2,7 @@
 
 import pytest
 
-from bam_train.errors import LoopError, UnknownVariable
+from bam_train.errors import LoopError
 from bam_train.loop import Agent, Agents, TemporalAgent, Workspace
 
 
@@ -72,7 +72,7 @@ def test_neither_steps_nor_a_stop_variable(kind):
 
 
 def test_a_stop_variable_that_nobody_writes(kind):
-    with pytest.raises(UnknownVariable) as error:
+    with pytest.raises(LoopError) as error:
         TemporalAgent(Clock(kind))(Workspace(), stop_variable="dnoe")
     assert str(error.value) == "stop_variable 'dnoe' is not in the workspace, did you mean 'done'? It has 'done', 'x'."
 

@@ -16,7 +16,7 @@ from bam_envs.remote.serve.env_server import EnvServer
 from bam_envs.remote.serve.tcp_server import TcpServer
 from bam_envs.robots.linked import link_profile
 from bam_train.checkpoint import write_checkpoint
-from bam_train.errors import AlteredCheckpoint, CheckpointMismatch, NotACheckpoint, OutputError, SettingsError
+from bam_train.errors import CheckpointError, CheckpointMismatch, OutputError, SettingsError
 from bam_train.settings import SETTINGS, file_stem
 from bam_train.trainers import TRAINERS, load_trainer, require_algorithm
 from bam_train.trainers.algorithms import ALGORITHMS
@@ -388,7 +388,7 @@ def test_a_best_checkpoint_goes_on_in_its_own_place(saved, here):
 def test_notes_of_another_form_are_refused(saved, fields, here, notes, message):
     members = {"bam/resume/notes.json": json.dumps(notes).encode()}
     resumed = write_checkpoint(here / "odd.zip", fields(saved.settings, 3000), members)
-    with pytest.raises(AlteredCheckpoint) as caught:
+    with pytest.raises(CheckpointError) as caught:
         choose_output(saved.settings, None, False, resumed)
     assert str(caught.value).startswith(f"{here / 'odd.zip'}: bam/resume/notes.json: {message}")
 
@@ -417,5 +417,5 @@ def test_a_checkpoint_that_a_run_cannot_begin_with_is_refused_at_once(corridor_c
     assert str(caught.value) == text
     with pytest.raises(CheckpointMismatch, match="was trained by ppo of sb3: dqn of sb3 cannot begin with it; "):
         resolve({**given, "algo": "dqn"})
-    with pytest.raises(NotACheckpoint, match=r"^nowhere\.zip: no such file\."):
+    with pytest.raises(CheckpointError, match=r"^nowhere\.zip: no such file\."):
         resolve({**given, "start": "nowhere.zip"})

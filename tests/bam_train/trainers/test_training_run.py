@@ -9,7 +9,7 @@ from types import SimpleNamespace
 import pytest
 
 from bam_envs.core.errors import LinkLost
-from bam_train.errors import EnvironmentFailed, OutputError, PolicyError, ProcessesLost, TrainingFailed
+from bam_train.errors import EnvironmentFailed, OutputError, PolicyError, TrainingFailed
 from bam_train.evaluation import EvaluationReport, wilson_interval
 from bam_train.settings import TrainSettings
 from bam_train.trainers import training_run as run_module
@@ -291,7 +291,7 @@ KEPT = "What was learnt is kept: go on with --resume {last}"
         (EnvironmentFailed("reward is inf"), "at step 60: reward is inf; the last good checkpoint is {last}", "30"),
         (PolicyError("action[0] is nan"), "at step 60: action[0] is nan; the last good checkpoint is {last}", "30"),
         (LinkLost("tcp://a:9: the link dropped."), f"at step 60: tcp://a:9: the link dropped. {KEPT}", "60"),
-        (ProcessesLost("env runner 2 died"), f"at step 60: env runner 2 died. {KEPT}", "60"),
+        (TrainingFailed("env runner 2 died", is_kept=True), f"at step 60: env runner 2 died. {KEPT}", "60"),
     ],
 )
 def test_a_failure_names_the_last_good_checkpoint(start, failure, text, kept):

@@ -12,7 +12,7 @@ import pytest
 
 from bam_train.checkpoint import Checkpoint
 from bam_train.cli.experiments import seeds
-from bam_train.errors import FolderInUse
+from bam_train.errors import OutputError
 from bam_train.experiments.seed_runs import News, group_folder
 from bam_train.settings import TrainSettings
 from bam_train.trainers.run_folder import RunFolder, read_records
@@ -103,7 +103,7 @@ def test_two_calls_do_not_train_the_same_seeds(here):
     settings = TrainSettings(env="CartPole-v1", algo="ppo")
     text = "runs/CartPole-v1-ppo: another program trains its seeds, or its runs are being saved. Wait for its end"
     again = group_folder(Path("runs"), settings)
-    with group_folder(Path("runs"), settings), pytest.raises(FolderInUse) as error:
+    with group_folder(Path("runs"), settings), pytest.raises(OutputError) as error:
         again.__enter__()
     assert str(error.value) == text
 

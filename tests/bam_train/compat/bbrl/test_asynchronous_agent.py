@@ -6,7 +6,7 @@ import torch
 from remote_test_agents import Trouble, Walker
 
 from bam_train.compat.bbrl.remote_agents import AsynchronousAgent
-from bam_train.errors import LoopError, RemoteAgentError
+from bam_train.errors import LoopError
 from bam_train.loop import Agent, Agents, TemporalAgent, Workspace
 
 pytestmark = [
@@ -95,7 +95,7 @@ def test_failures(started, what):
     while agent.is_running():
         pass
     agent(t=0, n_steps=2, at=1, what=what)  # nobody asked for the workspace before
-    with pytest.raises(RemoteAgentError, match=r"no such joint|was ended by SIGKILL"):
+    with pytest.raises(LoopError, match=r"no such joint|was ended by SIGKILL"):
         result(agent)
     assert (agent.is_running(), agent.get_workspace()) == (False, None)
     agent(t=0, n_steps=1)

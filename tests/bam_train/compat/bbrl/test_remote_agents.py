@@ -17,7 +17,7 @@ from remote_test_agents import Trouble, Walker
 
 from bam_train.compat.bbrl.remote_agents import NRemoteAgent, RemoteAgent
 from bam_train.compat.bbrl.shared_workspace import shared_workspace
-from bam_train.errors import LoopError, RemoteAgentError
+from bam_train.errors import LoopError
 from bam_train.loop import Agent, Agents, ParallelGymAgent, SeedableAgent, TemporalAgent, Workspace, make_env
 
 pytestmark = [
@@ -217,7 +217,7 @@ def test_workspaces_that_do_not_fit(created, started):
 
 def test_what_an_agent_raises_is_raised_here(created):
     remote, workspace = created(loop(Trouble()))
-    with pytest.raises(RemoteAgentError) as caught:
+    with pytest.raises(LoopError) as caught:
         remote(workspace, **STEPS, at=1)
     assert str(caught.value) == "TemporalAgent failed in its process: ValueError: no such joint"
     assert 'raise ValueError("no such joint")' in caught.value.traceback
@@ -237,7 +237,7 @@ def test_what_an_agent_raises_is_raised_here(created):
 )
 def test_a_process_that_ends(started, what, message, code):
     remote, workspace = started(loop(Trouble()))
-    with pytest.raises(RemoteAgentError) as caught:
+    with pytest.raises(LoopError) as caught:
         remote(workspace, **STEPS, at=2, what=what)
     assert (str(caught.value), caught.value.exit_code) == (message, code)
     assert multiprocessing.active_children() == []
@@ -255,7 +255,7 @@ def test_one_that_dies_ends_the_others(created):
             signal.pause()
 
     remote, workspace = created(loop(Half()))
-    with pytest.raises(RemoteAgentError, match=r"^The process of TemporalAgent was ended by SIGKILL\.$"):
+    with pytest.raises(LoopError, match=r"^The process of TemporalAgent was ended by SIGKILL\.$"):
         remote(workspace, **STEPS, at=0, what="die")
     assert multiprocessing.active_children() == []
 
@@ -266,7 +266,7 @@ def test_one_that_died_while_idle(started):
     (process,) = multiprocessing.active_children()
     os.kill(process.pid, signal.SIGKILL)
     process.join()
-    with pytest.raises(RemoteAgentError, match=r"^The process of TemporalAgent was ended by SIGKILL\.$"):
+    with pytest.raises(LoopError, match=r"^The process of TemporalAgent was ended by SIGKILL\.$"):
         remote(workspace, **STEPS)
     remote(workspace, **STEPS)
 
@@ -278,13 +278,13 @@ def test_a_seed_that_is_refused(started):
     remote, workspace = started(Agents(Seeded()))
     remote.seed(1)
     remote(workspace, t=0)
-    with pytest.raises(RemoteAgentError, match=r"^Agents failed in its process: LoopError: Seeded is seeded with 1"):
+    with pytest.raises(LoopError, match=r"^Agents failed in its process: LoopError: Seeded is seeded with 1"):
         remote.seed(2)
 
 
 def test_arguments_that_cannot_be_sent(started):
     remote, workspace = started()
-    with pytest.raises(RemoteAgentError, match=r"^TemporalAgent: cannot be sent to another process: .*lambda"):
+    with pytest.raises(LoopError, match=r"^TemporalAgent: cannot be sent to another process: .*lambda"):
         remote(workspace, **STEPS, scale=lambda: None)
     remote(workspace, **STEPS)
     assert workspace["x"][:, 0, 1].tolist() == [1, 2, 3]
@@ -295,7 +295,7 @@ def test_agents_that_cannot_be_sent(started):
         pass
 
     remote, workspace = started(Local(), start_method="spawn")
-    with pytest.raises(RemoteAgentError, match=r"""^Local: cannot be sent .* or start_method="fork"\.$"""):
+    with pytest.raises(LoopError, match=r"""^Local: cannot be sent .* or start_method="fork"\.$"""):
         remote(workspace, t=0)
     assert multiprocessing.active_children() == []
 
@@ -306,7 +306,7 @@ def test_agents_of_modules_that_only_this_process_has(started, monkeypatch):
     exec("from remote_test_agents import Walker\nclass Own(Walker):\n    pass", notebook.__dict__)
     monkeypatch.setitem(sys.modules, "notebook", notebook)
     remote, workspace = started(Agents(notebook.Own()), start_method="spawn")
-    with pytest.raises(RemoteAgentError) as caught:
+    with pytest.raises(LoopError) as caught:
         remote(workspace, t=0)
     assert str(caught.value) == (
         "Agents failed in its process: LoopError: No module named 'notebook'; define what the agent is made of in a "

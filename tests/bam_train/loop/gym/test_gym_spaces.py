@@ -8,7 +8,7 @@ import pytest
 import torch
 from gymnasium import spaces
 
-from bam_train.errors import LoopError, UnknownVariable
+from bam_train.errors import LoopError
 from bam_train.loop import ParallelGymAgent, Workspace
 
 BOX = spaces.Box(-1, 1, (2,), np.float32)
@@ -129,12 +129,12 @@ def test_a_missing_action(toys):
     ws = Workspace()
     agent(ws, t=0)
     ws.set("acton", 0, torch.zeros(2))
-    with pytest.raises(UnknownVariable, match=r"^'action' is not in the workspace, did you mean 'acton'\? It has "):
+    with pytest.raises(LoopError, match=r"^'action' is not in the workspace, did you mean 'acton'\? It has "):
         agent(ws, t=1)
 
 
 def test_an_action_in_one_piece_where_the_space_is_a_dict(toys):
-    with pytest.raises(UnknownVariable, match=r"^'action/go' is not in the workspace, did you mean 'action'\?"):
+    with pytest.raises(LoopError, match=r"^'action/go' is not in the workspace, did you mean 'action'\?"):
         step_with(toys, spaces.Dict(go=spaces.Discrete(2)), torch.tensor([0, 1]))
 
 

@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from bam_train.errors import LoopError, UnknownVariable
+from bam_train.errors import LoopError
 from bam_train.loop import Workspace
 from bam_train.loop.workspace.replay_buffer import ReplayBuffer
 
@@ -97,7 +97,7 @@ def state(buffer):
             LoopError,
             "'done' in the replay buffer: expected dtype torch.bool, found torch.float32.",
         ),
-        (full(x=torch.zeros(2, 1)), UnknownVariable, "'done' is not in the workspace. It has 'x'."),
+        (full(x=torch.zeros(2, 1)), LoopError, "'done' is not in the workspace. It has 'x'."),
         (
             full(x=torch.zeros(2, 1), done=torch.zeros(2, 1) > 0, new=torch.zeros(2, 1)),
             LoopError,

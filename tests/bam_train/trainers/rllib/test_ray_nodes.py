@@ -19,7 +19,7 @@ import ray
 from ray.cluster_utils import Cluster
 
 from bam_train.checkpoint import Checkpoint
-from bam_train.errors import ProcessesLost, SettingsError
+from bam_train.errors import SettingsError, TrainingFailed
 from bam_train.trainers.resolve_settings import resolve
 from bam_train.trainers.rllib.ray_cluster import contained
 from bam_train.trainers.rllib.rllib_trainer import RLlibTrainer
@@ -142,7 +142,7 @@ def test_a_runner_that_dies_again_and_again(registered, tmp_path, monkeypatch):
     monkeypatch.setattr("bam_train.trainers.rllib.rllib_trainer.MOST_DEATHS", 1)
     settings = train_settings(None, 256, env=registered(Broken), num_envs=1, num_env_runners=1)
     with contextlib.closing(RLlibTrainer.create(settings)) as trainer:
-        with pytest.raises(ProcessesLost) as caught:
+        with pytest.raises(TrainingFailed) as caught:
             trainer.train(10**9, Plan(trainer, [lambda: False]))
         assert str(caught.value).startswith("env runner 1 died 2 times within ")
         why = r" updates \(EnvironmentFailed: test/Faulty-v0 failed at step \d+ of an episode: ConnectionError: "

@@ -16,7 +16,7 @@ import pytest
 pytest.importorskip("ray")
 
 from bam_train.checkpoint import Checkpoint, write_checkpoint
-from bam_train.errors import AlteredCheckpoint, CheckpointMismatch
+from bam_train.errors import CheckpointError, CheckpointMismatch
 from bam_train.trainers.resolve_settings import resolve, resolve_resumed
 from bam_train.trainers.rllib import rllib_state as state
 from bam_train.trainers.rllib.rllib_state import extras_of, read_state
@@ -152,7 +152,7 @@ def test_nothing_in_any_member_is_run(checkpoint, tmp_path):
     assert len(states) >= 4
     assert len(pickles) > len(states)
     for name in states:
-        with pytest.raises(AlteredCheckpoint) as caught:
+        with pytest.raises(CheckpointError) as caught:
             state.read(altered(checkpoint, {name: payload}))
         assert caught.value.member == name
         assert f"{name} names pathlib" in str(caught.value)
@@ -164,7 +164,7 @@ def test_nothing_in_any_member_is_run(checkpoint, tmp_path):
 @pytest.mark.parametrize("data", [b"", b"\x80\x05", b"hello", pickle.dumps([1, 2])])
 def test_a_state_that_cannot_be_read_is_named(checkpoint, data):
     name = f"{state.FOLDER}env_runner/state.pkl"
-    with pytest.raises(AlteredCheckpoint) as caught:
+    with pytest.raises(CheckpointError) as caught:
         state.read(altered(checkpoint, {name: data}))
     assert caught.value.member == name
     assert f"altered.zip: {name} " in str(caught.value)
@@ -172,7 +172,7 @@ def test_a_state_that_cannot_be_read_is_named(checkpoint, data):
 
 
 def test_numbers_that_do_not_fit_are_named(checkpoint):
-    with pytest.raises(AlteredCheckpoint) as caught:
+    with pytest.raises(CheckpointError) as caught:
         RLlibTrainer.load(altered(checkpoint, {state.EXTRAS: b'{"no_such_table": {"default_policy": 1}}'}))
     assert caught.value.member == state.EXTRAS
 
@@ -185,6 +185,6 @@ def test_a_packed_array_is_not_unpickled(checkpoint, tmp_path):
     (name,) = (name for name in checkpoint.manifest.sha256 if name.endswith("MeanStdFilter/state.pkl"))
     own = read_state(checkpoint.read(name))
     own[None]["running_stats"][0]["mean_array"] = packed
-    with pytest.raises(AlteredCheckpoint, match="a packed array cannot be read: Object arrays"):
+    with pytest.raises(CheckpointError, match="a packed array cannot be read: Object arrays"):
         RLlibTrainer.load(altered(checkpoint, {name: pickle.dumps(own)}))
     assert not target.exists()

@@ -16,7 +16,7 @@ import pytest
 import torch
 
 from bam_train.checkpoint import Checkpoint
-from bam_train.errors import AlteredCheckpoint
+from bam_train.errors import CheckpointError
 from bam_train.settings import TrainSettings
 from bam_train.trainers.sb3 import sb3_resume as resume
 from bam_train.trainers.sb3.sb3_trainer import SB3Trainer
@@ -176,7 +176,7 @@ def test_a_resume_state_of_another_network_is_refused(walk, tmp_path):
     other = TrainSettings.from_mapping(
         {**checkpoint.manifest.settings, "hyperparameters": {"policy_kwargs": {"net_arch": [4]}}}
     )
-    with pytest.raises(AlteredCheckpoint, match=r"bam/resume/model does not fit these settings: "):
+    with pytest.raises(CheckpointError, match=r"bam/resume/model does not fit these settings: "):
         SB3Trainer.load(checkpoint, SB3Trainer.complete(other))
 
 
@@ -224,7 +224,7 @@ def test_a_state_that_no_run_has_is_refused(half, tmp_path, forge, names, value,
         inner = inner[name]
     inner[names[-1]] = value
     forge(path, {"bam/resume/state.json": json.dumps(tree).encode()})
-    with pytest.raises(AlteredCheckpoint) as caught:
+    with pytest.raises(CheckpointError) as caught:
         SB3Trainer.load(Checkpoint.open(path)).train(128, lambda progress: False)
     text = str(caught.value).removeprefix(f"{path}: bam/resume/state does not fit these settings: ")
     assert text.startswith(message)
