@@ -1,5 +1,7 @@
 """Ctrl-C (SIGINT), SIGTERM and SIGHUP: the only module that installs handlers for them; processes that they spare.
 
+A program alone installs one before, as `bam_train.cli` is imported.
+
 Python runs handlers in the main thread, between two bytecodes. So they are installed in the main thread only; in other
 threads the functions of this module do nothing.
 """
@@ -116,6 +118,23 @@ class SignalMemory(contextlib.ExitStack):
             interrupt(self.came[0])
 
 
+@contextlib.contextmanager
+def reinstalled(number: int) -> Iterator[None]:
+    """Within the ``with`` block, foreign code may reset the handler of a signal; it is installed again at the end."""
+    try:
+        yield
+    finally:
+        handler = signal.getsignal(number)
+        if handler is not None and threading.current_thread() is threading.main_thread():
+            signal.signal(number, handler)
+
+
+def ignore(*numbers: int) -> None:
+    """In a child process, ignore signals of a terminal, which its whole process group gets; the parent ends it."""
+    for number in numbers:
+        signal.signal(number, signal.SIG_IGN)
+
+
 def drop_handlers() -> None:
     """In a forked process: remove the handlers that the fork has copied, then unblock all signals.
 
@@ -124,7 +143,7 @@ def drop_handlers() -> None:
     for number in signal.valid_signals():
         if callable(signal.getsignal(number)):
             signal.signal(number, signal.SIG_DFL)
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    ignore(signal.SIGINT)
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
     signal.pthread_sigmask(signal.SIG_UNBLOCK, signal.valid_signals())
 

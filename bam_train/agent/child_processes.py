@@ -22,7 +22,7 @@ from bam_train.agent.agent_messages import Channel, Front, Listening, Message, R
 from bam_train.environments import make_env
 from bam_train.errors import SettingsError
 from bam_train.files.log_lines import begin_log
-from bam_train.signals import at_end_of_parent, await_end, start_child
+from bam_train.signals import at_end_of_parent, await_end, ignore, start_child
 
 _log = logging.getLogger(__name__)
 _START = 30.0  # longest start [s]
@@ -155,7 +155,7 @@ class SimulatedBox:
 
 def main() -> None:
     """Run the simulated robot, in its process, until the standard input ends."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    ignore(signal.SIGINT)
     begin_log("bam-agent: simulated robot", logging.ERROR)
     env_id, env_kwargs, name = json.loads(sys.argv[1])
     options = ServeOptions(port=0, name=name, fast=True)

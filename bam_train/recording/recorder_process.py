@@ -8,7 +8,6 @@ chunk, and every `_SETTLE` seconds one compressed chunk with an index replaces t
 import base64
 import json
 import os
-import signal
 import struct
 import sys
 import time
@@ -24,6 +23,7 @@ from mcap.records import Channel, Chunk, Message, Schema
 from mcap.writer import CompressionType, Writer
 
 from bam_train.recording.ring import EVENT, IMAGE, LAYOUT, PIXELS, TICK, TIMES, Ring
+from bam_train.signals import SIGNALS, ignore
 
 _POLL = 0.02
 """Time between two polls of the ring [s]."""
@@ -206,8 +206,7 @@ def drain(ring: Ring, file: RecordingFile, parent: int) -> None:
 
 def main() -> None:
     """Take the descriptor of the ring and the deployment's process number from the command line."""
-    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-        signal.signal(number, signal.SIG_IGN)  # the deployment ends this process by closing the ring
+    ignore(*SIGNALS)  # the deployment ends this process by closing the ring
     with suppress(OSError):
         os.nice(5)
     ring, parent = Ring(int(sys.argv[1])), int(sys.argv[2])

@@ -1,12 +1,22 @@
 from __future__ import annotations
 
 import copy
+import ctypes
 import signal
 import threading
 
 import pytest
 
-from bam_train.signals import SignalMemory, Terminated, at_quit, before_quitting, handled, interrupt, waiting
+from bam_train.signals import (
+    SignalMemory,
+    Terminated,
+    at_quit,
+    before_quitting,
+    handled,
+    interrupt,
+    reinstalled,
+    waiting,
+)
 
 
 def test_each_signal_reaches_the_handler_and_afterwards_the_one_before():
@@ -26,6 +36,17 @@ def test_a_signal_that_timeout_sends_twice_is_one_also_for_the_handler_around():
             signal.raise_signal(signal.SIGTERM)
         signal.raise_signal(signal.SIGTERM)
     assert (outer, inner) == ([], [signal.SIGTERM])
+
+
+def test_a_handler_that_foreign_code_has_reset_is_installed_again():
+    came, ignore = [], 1
+    with handled(came.append, [signal.SIGUSR1]):
+        with reinstalled(signal.SIGUSR1):
+            ctypes.CDLL(None).signal(signal.SIGUSR1, ignore)
+            signal.raise_signal(signal.SIGUSR1)
+        assert came == []
+        signal.raise_signal(signal.SIGUSR1)
+    assert came == [signal.SIGUSR1]
 
 
 def test_what_is_ignored_stays_ignored_unless_it_is_asked_for():

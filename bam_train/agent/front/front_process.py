@@ -26,6 +26,7 @@ from bam_train.agent.front.robot_front import FrontProcess
 from bam_train.agent.remote.agent_protocol import PATH
 from bam_train.errors import BamTrainError
 from bam_train.files.log_lines import begin_log
+from bam_train.signals import ignore
 
 CONSOLE = Path(__file__).parents[1] / "console"
 """The files of the web console: plain HTML, CSS and modules."""
@@ -46,7 +47,7 @@ def console_pages() -> Mapping[str, Page]:
 
 def main() -> None:
     """Run the process; its argument is the number of the socket that the resident left open."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the resident ends it
+    ignore(signal.SIGINT)  # the resident ends it
     begin_log("bam-agent")
     end = adopted(int(sys.argv[1]))
     about = Front.from_bytes(end.recv(2**20))

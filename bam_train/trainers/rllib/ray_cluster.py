@@ -18,7 +18,6 @@ import socket
 import subprocess
 import sys
 import tempfile
-import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -29,7 +28,7 @@ import ray.rllib  # sets up its loggers
 
 from bam_train.errors import SettingsError, TrainingFailed
 from bam_train.settings import RLlibSettings
-from bam_train.signals import at_quit, interrupt, waiting
+from bam_train.signals import at_quit, interrupt, reinstalled, waiting
 from bam_train.trainers.base import cores
 
 psutil: Any = importlib.import_module("psutil")  # Ray brings its own copy
@@ -219,12 +218,8 @@ def _starting() -> Iterator[None]:
 
 def _shut_down(**options: bool) -> None:
     """Shut Ray down; its C++ part resets SIGTERM to kill the process, so the handler is installed again."""
-    try:
+    with reinstalled(signal.SIGTERM):
         ray.shutdown(**options)
-    finally:
-        handler = signal.getsignal(signal.SIGTERM)
-        if handler is not None and threading.current_thread() is threading.main_thread():
-            signal.signal(signal.SIGTERM, handler)
 
 
 # Existing clusters
