@@ -30,9 +30,6 @@ from bam_train.policy.background import Background
 from bam_train.recording.recorder import ERROR, INFO, Recorder
 from bam_train.signals import handled, interrupt
 
-WINDOW = 1000
-"""Minimum number of ticks that the workspace of a deployment keeps: 50 s at 20 Hz."""
-
 
 class Stopped(BaseException):
     """A signal that ends the deployment."""
@@ -83,20 +80,13 @@ class Deployment:
             `Background`.
         pacer: The deadlines.
         journal: Updated at every tick.
-        observers: Called with each `EpisodeStep` once the policy has decided, so they must be fast.
-        agents: Agents of the interaction loop, run after the policy on the variables that `RobotAgent` and
-            `PolicyAgent` write; they declare what they read and write.
-        window: Minimum number of ticks that the workspace of `agents` and `sink` keeps.
-        sink: ``sink(first_time, {variable: array (n, 1, ...)})`` gets every tick once, in order, episode by episode.
-            It is called between two ticks, so it must be fast; if it fails, the deployment ends.
+        observers: Called with each `EpisodeStep` once the policy has decided, so they must be fast; if one fails, the
+            deployment ends. A ``flush()`` that one has is called after every episode, once the robot rests.
         recorder: Records every tick, if given; it has started, and is closed at the end. If it fails, the deployment
             goes on.
         trials: Where each episode is recorded as a trial, if given; may be exchanged between two episodes.
         between_ticks: Called between a deadline and the policy; whether the episode ends there.
         switch: Handler of SIGINT and SIGTERM; None: one of its own.
-
-    Raises:
-        LoopError: An agent reads a variable that no agent writes; the robot has not been connected.
     """
 
     def __init__(
@@ -107,9 +97,6 @@ class Deployment:
         journal: Journal,
         *,
         observers: Sequence[Callable[[EpisodeStep], None]] = (),
-        agents: Sequence[Any] = (),
-        window: int = WINDOW,
-        sink: Callable[[int, dict[str, Any]], None] | None = None,
         recorder: Recorder | None = None,
         trials: Trials | None = None,
         between_ticks: Callable[[], bool] = lambda: False,
@@ -121,17 +108,9 @@ class Deployment:
         self._loop = EpisodeLoop(
             env, self._beside(policy), pacer, journal, raise_again=self.switch.raise_again, between_ticks=between_ticks
         )
-        self._flush: Callable[[], None] = lambda: None
         self._closing = self._closed = False
         self._flight = FlightLog(recorder, env, journal)
-        extra: list[Callable[[EpisodeStep], None]] = []
-        if agents or sink is not None:
-            from bam_train.loop.gym.observing_agents import ObservingAgents  # nothing of a robot's path needs them
-
-            extra = [observing := ObservingAgents(env, agents, window=window, sink=sink)]
-            self._flush = observing.flush
-        comparison = _Comparison(env, self._loop, journal)
-        self._loop.observers += [*extra, *observers, comparison, self._flight.record]
+        self._loop.observers += [*observers, _Comparison(env, self._loop, journal), self._flight.record]
 
     def connect(self) -> None:
         """Open the link to the robot, if there is one, without moving it; fails before the loop if it is missing."""
@@ -195,6 +174,11 @@ class Deployment:
     def _begins(self, seed: int) -> None:
         if self.trials is not None:
             self.trials.begin(seed)  # before the first command
+
+    def _flush(self) -> None:
+        for observer in self._loop.observers:
+            if (flush := getattr(observer, "flush", None)) is not None:
+                flush()
 
     def _halt(self) -> None:
         if (robot := robot_of(self.env)) is not None:

@@ -23,6 +23,7 @@ from bam_train.loop.workspace import Workspace as Workspace
 
 if TYPE_CHECKING:
     from bam_train.loop.gym.gym_agent import GymAgent as GymAgent
+    from bam_train.loop.gym.observing_agents import ObservingAgents as ObservingAgents
     from bam_train.loop.gym.parallel_gym_agent import ParallelGymAgent as ParallelGymAgent
     from bam_train.loop.gym.parallel_gym_agent import make_env as make_env
     from bam_train.loop.gym.robot_agent import PolicyAgent as PolicyAgent
@@ -37,6 +38,7 @@ _ON_USE = {
     "loop.gym.parallel_gym_agent": ("ParallelGymAgent", "make_env"),
     "loop.gym.vec_gym_agent": ("VecGymAgent",),
     "loop.gym.robot_agent": ("PolicyAgent", "RobotAgent"),
+    "loop.gym.observing_agents": ("ObservingAgents",),
     "loop.workspace.replay_buffer": ("ReplayBuffer",),
     "loop.workspace.returns": ("cumulated_reward", "doubleqlearning_temporal_difference", "gae", "temporal_difference"),
     "loop.gym.video_agent": ("record_video",),

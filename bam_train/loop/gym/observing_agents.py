@@ -14,22 +14,28 @@ from bam_train.loop.gym.gym_spaces import names
 from bam_train.loop.gym.robot_agent import RESULTS, results
 from bam_train.loop.workspace import Sink, Workspace
 
+WINDOW = 1000
+"""Minimum number of ticks that are kept by default: 50 s at 20 Hz."""
+
 
 class ObservingAgents:
-    """Runs agents on each `EpisodeStep` of a deployment; the variables are ``action`` and those of `RobotAgent`.
+    """Runs agents on each `EpisodeStep`, as one of ``Deployment(observers=[…])``.
+
+    The variables are ``action`` and those of `RobotAgent`.
 
     Args:
         env: The environment of the deployment, which is neither stepped nor closed here.
-        agents: The agents.
+        agents: The agents, which declare what they read and write.
         window: Minimum number of ticks that the workspace keeps.
-        sink: See `Workspace`; it is not called again after it has failed.
+        sink: ``sink(first_time, {variable: array (n, 1, ...)})`` gets every tick once, in order, episode by episode. It
+            is called between two ticks, so it must be fast; it is not called again after it has failed.
 
     Raises:
         LoopError: An agent reads a variable that no agent writes.
     """
 
     def __init__(
-        self, env: gym.Env[Any, Any], agents: Sequence[Agent], *, window: int, sink: Sink | None = None
+        self, env: gym.Env[Any, Any], agents: Sequence[Agent] = (), *, window: int = WINDOW, sink: Sink | None = None
     ) -> None:
         self._workspace = Workspace(window=window, sink=None if sink is None else _silent_once_broken(sink))
         self._chain = TemporalAgent(Agents(_StepWriter(env), *agents)).agent  # which checks what they read

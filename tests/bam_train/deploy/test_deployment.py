@@ -24,7 +24,7 @@ from bam_train.cli.program import guarded
 from bam_train.deploy.deployment import Deployment
 from bam_train.deploy.journal import Ending, Journal
 from bam_train.errors import LoopError
-from bam_train.loop import Agent, CopyTAgent
+from bam_train.loop import Agent, CopyTAgent, ObservingAgents
 
 DONE = Ending("episodes done", 0)
 
@@ -81,8 +81,10 @@ class Driven(gym.Wrapper):
         super().close()
 
 
-def run(env, policy=None, episodes=3, seed=7, watcher=None, **options):
+def run(env, policy=None, episodes=3, seed=7, watcher=None, *, agents=(), sink=None, **options):
     journal, pacer = Journal(episodes), Pacer(None)
+    if agents or sink:
+        options["observers"] = [ObservingAgents(env, agents, window=40, sink=sink)]
     ending = Deployment(env, policy or Right(), pacer, journal, **options).run(watcher or Silent(), seed=seed)
     return ending, journal, pacer
 
@@ -391,7 +393,7 @@ def test_a_sink_that_fails_is_a_fault_and_is_not_called_again():
         calls.append(first)
         raise OSError(28, "No space left on device")
 
-    ending, _, _ = run(Endless(), window=40, sink=sink)
+    ending, _, _ = run(Endless(), sink=sink)
     assert ending == Ending("fault: OSError: [Errno 28] No space left on device", 1)
     assert calls == [0]
 
@@ -493,7 +495,8 @@ def test_memory_stays_flat(limit):
     env = Endless() if limit is None else gym.wrappers.TimeLimit(Endless(), limit)
     policy = SimpleNamespace(reset=lambda: None, act=lambda observation: 1)
     journal = Journal(10**6, records=deque(maxlen=100))
-    deployment = Deployment(env, policy, Pacer(None), journal, window=100, sink=lambda first, piece: None)
+    observer = ObservingAgents(env, window=100, sink=lambda first, piece: None)
+    deployment = Deployment(env, policy, Pacer(None), journal, observers=[observer])
     try:
         deployment.run(Looks(), seed=0)
     finally:
