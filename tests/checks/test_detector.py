@@ -1,5 +1,8 @@
 """A small part of what the script measures."""
 
+from bam_train.checkpoint import Checkpoint
+from bam_train.policy import FrozenPolicy
+from tests.benchmarks.harness import CHECKPOINTS
 from tests.checks import detector
 
 
@@ -18,3 +21,10 @@ def test_episodes_of_training_and_behind_guards_are_usual_and_a_frozen_encoder_i
 
 def test_the_greatest_mean_of_a_poisson_number():
     assert [round(detector.at_most(count), 3) for count in (0, 1, 5)] == [2.996, 4.744, 10.513]
+
+
+def test_a_base_by_another_name_of_its_environment_drives_behind_guards():
+    checkpoint = Checkpoint.open(CHECKPOINTS / "mir100-navigation-ppo.zip")
+    policy = FrozenPolicy.from_checkpoint(checkpoint)
+    [episode] = detector.behind_guards(checkpoint, policy, 1, 70_000_000, trial=True)
+    assert (episode.success, episode.pace) == (True, 0.25)
