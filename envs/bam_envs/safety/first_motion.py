@@ -24,6 +24,8 @@ GAP, KNOWN_GAP = 1e4, 4 * math.pi
 """Greatest distance of a command from the measured joint [rad]: in any unit, and in one that was proved before."""
 STILL, SAG = 0.002, 0.03
 """Motion of a joint commanded to stay that counts as none, and that its load explains: a weak servo sags [rad]."""
+NEAR_ZERO = 2 * math.pi * math.pi / 180
+"""Greatest position of a joint that is divided by the degrees of a radian once more [rad]."""
 TINY = 0.0005
 """Motion of all joints that no unit makes large [rad]."""
 TOGETHER = ((0.002, 0.15), (0.006, 0.15))
@@ -79,6 +81,11 @@ class ProofMotion:
         Raises:
             NotAsCommanded: The arm does not move as commanded.
         """
+        if every and self._is_timed and all(abs(at) <= NEAR_ZERO for at in self._start):
+            raise NotAsCommanded(
+                f"all joints are measured within {NEAR_ZERO:.2f} rad of 0, as by a driver or a profile that takes "
+                "radians for degrees, with which a motion would look like none: correct the scale, or jog a joint away"
+            )
         yield from self._stay(GAP if every else KNOWN_GAP)
         yield from self._together() if every else self._ramp(self._all(TINY), self._rest, 0.0)
         there = self._rest

@@ -225,6 +225,10 @@ def test_an_arm_that_does_as_it_is_told_is_proved_once_and_remembered():
             {"command": Wiring((0, 1, 2, 3, 5, 4)), "start": (*HOME[:4], 0.5, 0.5)},
             "wrist_3_joint moved .* when wrist_2_joint was commanded: the commands have another order",
         ),
+        (
+            {"start": (0.2, 0, 0, 0, 0, 0)},
+            r"\(G25\): the guards shorten the motion that proves the commands, at the edge of where the arm may go",
+        ),
         ({"stuck": range(6)}, "all joints were commanded to move, and none moved: look for a protective stop"),
         ({"stuck": [3]}, r"wrist_1_joint was commanded to move \+0.020 rad, and did not move: look for"),
     ],
@@ -234,6 +238,16 @@ def test_a_wrong_arm_is_stopped_with_its_reason(options, expected):
     with pytest.raises(SafetyStop, match="still stopped by first motion"):
         robot.step(np.zeros((1, 7)))
     assert re.search(expected, why), why
+
+
+def test_radians_that_are_taken_for_degrees_are_found_before_anything_moves():
+    arm = WiredArm(state=Wiring(scale=[np.pi / 180] * 6))
+    assert driven(arm)[1] == (
+        "The robot was stopped by first motion (G25): all joints are measured within 0.11 rad of 0, as by a driver or "
+        "a profile that takes radians for degrees, with which a motion would look like none: correct the scale, or jog "
+        "a joint away. When it is safe, call resume()."
+    )
+    assert arm.now == 0.0
 
 
 def test_an_arm_that_ignores_everything_is_named_within_three_seconds():
