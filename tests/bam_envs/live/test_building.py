@@ -262,7 +262,7 @@ def test_a_robot_that_talks_nonsense_is_halted(lax, robot_on, start_pose):
         halts = scripted.halts
         scripted.mangle = lambda topic, message: message | {"name": []} if topic == "/joint_states" else message
         with pytest.raises(ProtocolError) as caught:
-            [robot.step(state.command) for _ in range(10)]
+            [robot.step(state.command) for _ in range(100)]
         assert str(caught.value) == f"/joint_states: {', '.join(JOINTS)} missing; found: no name."
         scripted.wait_for(lambda: scripted.halts > halts)
     finally:

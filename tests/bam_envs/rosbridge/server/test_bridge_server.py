@@ -370,7 +370,7 @@ def test_what_comes_is_bounded_otherwise_than_answers(new_server, new_client):
 
 
 def test_sockets_that_say_nothing_are_closed_and_keep_nobody_out(new_server, new_client):
-    server = new_server(options=ServerOptions(open_timeout=0.3, max_clients=1))
+    server = new_server(options=ServerOptions(open_timeout=1.0, max_clients=1))
     silent = [socket.create_connection(("127.0.0.1", server.port)) for _ in range(200)]
     silent[-1].sendall(b"GET / HTTP/1.1\r\n")
     new_client(server.url).sync()
