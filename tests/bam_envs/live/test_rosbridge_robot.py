@@ -23,7 +23,6 @@ from bam_envs.core.errors import (
     UnknownName,
 )
 from bam_envs.core.robot import Initial
-from bam_envs.core.timing import Deadline
 from bam_envs.live.rosbridge_robot import RosbridgeRobot
 from bam_envs.robots.profile import load_profile
 from bam_envs.robots.ur5e import JOINTS, arm_spec
@@ -69,14 +68,6 @@ def connect():
     yield start
     for robot in robots:
         robot.close()
-
-
-def until(found):
-    """Wait until `found()`."""
-    deadline = Deadline(DEADLINE)
-    while not found():
-        assert not deadline.passed
-        time.sleep(0.005)
 
 
 def raised(kind, act):
@@ -226,7 +217,7 @@ def test_lockstep(server, robot_on, connect, simulation):
         np.testing.assert_array_equal(state.signals["joint_position"], command[:, :6])
 
 
-def test_a_robot_that_answers_commands_owes_an_answer_to_what_does_not_arrive(server, robot_on, connect):
+def test_a_robot_that_answers_commands_owes_an_answer_to_what_does_not_arrive(server, robot_on, connect, until):
     scripted = robot_on(server, info=RobotInfo("ur5e", simulated=True, lockstep=False, period=0.05))
     ahead = [0.0]
     robot, gate = connect(server.url, clock=lambda: time.monotonic() + ahead[0])
@@ -294,7 +285,7 @@ def test_a_base_in_lockstep(server, robot_on, connect):
     )
 
 
-def test_a_cut_link_delivers_nothing_afterwards(server, robot_on, connect, start_pose):
+def test_a_cut_link_delivers_nothing_afterwards(server, robot_on, connect, start_pose, until):
     robot_on(server)
     robot, gate = connect(server.url)
     command = gate.state.command + 0.01
@@ -318,7 +309,7 @@ def test_a_cut_link_delivers_nothing_afterwards(server, robot_on, connect, start
 
 
 @pytest.mark.parametrize("told", [False, True])
-def test_a_halt_that_cannot_be_sent_is_told_once(server, robot_on, connect, caplog, told):
+def test_a_halt_that_cannot_be_sent_is_told_once(server, robot_on, connect, caplog, told, until):
     """By the error of the step that found the link down, or else by a line of its own."""
     robot_on(server)
     robot, gate = connect(server.url)
@@ -406,7 +397,7 @@ def test_a_halt_overtakes_a_call_that_runs(lax, robot_on, connect):
     assert not asking.is_alive()
 
 
-def test_what_a_halt_says(server, robot_on, connect):
+def test_what_a_halt_says(server, robot_on, connect, until):
     scripted = robot_on(server)
     robot, gate = connect(server.url)
     robot.halt()
@@ -547,7 +538,7 @@ def test_what_a_robot_must_not_say(lax, robot_on, connect, changes, message):
     assert raised(ProtocolError, other.connect) == text
 
 
-def test_a_refused_command_and_a_late_one(server, robot_on, connect):
+def test_a_refused_command_and_a_late_one(server, robot_on, connect, until):
     """A late one is refused without a word; so the next one counts."""
     said = [RemoteError("expired: 0.2 s after its deadline")]
 
@@ -634,7 +625,7 @@ def drive(url, results):
 
 
 @pytest.mark.filterwarnings("ignore:.*fork.*:DeprecationWarning")
-def test_in_a_forked_worker(server, robot_on, connect):
+def test_in_a_forked_worker(server, robot_on, connect, until):
     scripted = robot_on(server)
     robot, gate = connect(server.url)
     context = multiprocessing.get_context("fork")
@@ -644,8 +635,7 @@ def test_in_a_forked_worker(server, robot_on, connect):
     assert results.get(timeout=60) == [[0.085]]
     worker.join(DEADLINE)
     assert worker.exitcode == 0
-    while robot.not_ready() is not None:  # for a second, somebody else has just commanded it
-        time.sleep(0.05)
+    until(lambda: robot.not_ready() is None)  # for a second, somebody else has just commanded it
     before = len(scripted.on(JOINT_COMMANDS))
     gate.step(gate.state.command)  # this process goes on
     scripted.wait_for(lambda: len(scripted.on(JOINT_COMMANDS)) > before)
