@@ -186,6 +186,34 @@ def test_a_controller_that_begins_where_the_arm_is_measured_is_known(server, rob
         link.close()
 
 
+@pytest.mark.parametrize(
+    ("topic", "field", "off"),
+    [("controller_state", "feedback", 0.0), ("controller_state", "feedback", 0.06), ("state", "actual", -3.0)],
+)
+def test_a_controller_that_measures_a_joint_elsewhere_is_sent_nothing(
+    server, robot_on, connected, start_pose, topic, field, off
+):
+    """Such as where the profile has the scale of a joint wrong: a motion would show that too late."""
+    scripted, name = robot_on(server), "scaled_joint_trajectory_controller"
+    kind, there = "control_msgs/JointTrajectoryControllerState", [*HOME[[1, 0]], *HOME[2:5], HOME[5] + off]
+    server.advertise(f"/{name}/{topic}", kind, latch=True)
+    server.publish(f"/{name}/{topic}", {"joint_names": list(SWAPPED), field: {"positions": there}})
+    robot = connected()
+    if off == 0.0:
+        assert robot.is_unproved
+        return
+    with pytest.raises(NotReady) as caught:
+        robot.reset(ROW, start_pose)
+    assert str(caught.value) == (
+        f"The commands of {server.url} are not proved: {name} measures wrist_3_joint at {HOME[5] + off:.3f} rad, and "
+        f"the profile ur5e reads {HOME[5]:.3f} rad: another joint, sign, offset or scale in the profile, or in the "
+        "driver. Nothing has moved."
+    )
+    robot.close()
+    rests = {message["points"][0]["time_from_start"]["sec"] for message in scripted.on(TRAJECTORY)}
+    assert rests <= {1_000_000}  # of the halt: it stays where it is
+
+
 def test_whose_commands_need_no_proof(server):
     profile, at = load_profile("ur5e"), Endpoint(server.url)
     link = RosbridgeLink(server.url)

@@ -176,7 +176,7 @@ class BusyArm(WiredArm):
 
 
 EACH = st.lists(st.sampled_from(UNITS), min_size=6, max_size=6)
-# No motion shows before it is large where a single joint is measured smaller than it is.
+# A joint that is measured smaller than it is shows no motion before it is large.
 SHOWN = st.lists(st.sampled_from([one for one in UNITS if abs(one) >= 1.0]), min_size=6, max_size=6)
 BUSY = st.fixed_dictionaries(
     {
@@ -191,7 +191,7 @@ BUSY = st.fixed_dictionaries(
 @settings(max_examples=60, deadline=None)
 @given(
     wirings(EACH) | st.none(),
-    wirings(SHOWN | st.sampled_from([[one] * 6 for one in UNITS])) | st.none(),
+    wirings(SHOWN) | st.none(),
     st.sampled_from(["trajectory", "position"]),
     st.lists(st.floats(-2.9, 2.9), min_size=6, max_size=6),
     BUSY,
