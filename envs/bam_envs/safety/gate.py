@@ -716,7 +716,7 @@ class SafeRobot(metaclass=Sealed):
                     self._live.reach, self._live.joints_only = reach, True
                 states.append(self._advance(rest.copy(), approach=True, proving=True))
                 is_shortened |= any(abs(self._sent[at] - rest[at]) > STILL for at in columns if self._sent)
-                measured = self._measured()
+                measured, motion.age = self._measured(), self.age()
                 joints, reach = moves.send([measured[at] for at in columns])
         except StopIteration:
             pass

@@ -166,9 +166,14 @@ class BusyArm(WiredArm):
     def __init__(self, *arguments, noise, late, slider, **options):
         super().__init__(*arguments, **options)
         self.noise, self.late, self.slider, self.rng = noise, late, slider, np.random.default_rng(1)
+        self.before = 0  # parts of a period that the newest measurement is old
+
+    def age(self):
+        return self.before * self.spec.period / PARTS
 
     def measure(self):
         now, before = self.joints, int(self.rng.random() * self.late * PARTS / self.spec.period)
+        self.before = before
         self.joints = self.trace[-1 - min(len(self.trace) - 1, before)] + self.rng.normal(0.0, self.noise, 6)
         state = super().measure()
         self.joints = now
