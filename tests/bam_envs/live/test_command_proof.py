@@ -252,6 +252,28 @@ def test_a_proof_is_remembered_for_a_robot_that_is_known_and_not_for_the_end_of_
         link.close()
 
 
+def test_a_remembered_proof_is_void_where_the_controller_takes_another_order_now(server):
+    link, orders = RosbridgeLink(server.url), [JOINTS, SWAPPED]
+    service = "/forward_position_controller/get_parameters"
+    server.serve(service, "x/X", lambda *asked: {"values": [{"type": 9, "string_array_value": list(orders[0])}]})
+    link.connect()
+
+    def proof(name):
+        profile, endpoint = load_profile(name), Endpoint(server.url, robot_name="left arm")
+        return rosbridge_robot.needed_proof(link, None, profile, profile.sinks(), endpoint)
+
+    try:
+        assert "nothing has shown them yet" in proof("ur5e_position").fault
+        proof("ur5e").done(0.1)
+        assert (proof("ur5e_position").is_known, proof("ur5e_position").fault) == (True, "")
+        del orders[0]
+        assert proof("ur5e_position").fault.startswith(
+            f"forward_position_controller takes the joints in the order {', '.join(SWAPPED)}, and the profile "
+        )
+    finally:
+        link.close()
+
+
 def test_a_proof_belongs_to_a_robot_with_its_controllers(tmp_path, monkeypatch):
     from bam_envs.live.command_proof import CommandProof
 
