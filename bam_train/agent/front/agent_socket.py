@@ -25,9 +25,9 @@ from bam_envs import __version__
 from bam_envs.core.errors import BamEnvsError, InvalidValue, NotInCommand, ProtocolError
 from bam_envs.rosbridge.bus import Caller
 from bam_envs.rosbridge.server.client_session import Packet
-from bam_envs.rosbridge.server.refusals import Refusals
 from bam_envs.rosbridge.server.server_connection import BridgeConnection
 from bam_envs.rosbridge.threads import Workers
+from bam_envs.rosbridge.tokens import Refusals
 from bam_train.agent.front.hub import AgentHub, Person
 from bam_train.agent.remote import agent_protocol as protocol
 from bam_train.errors import BamTrainError, OutputError, RequestRefused, kind_of

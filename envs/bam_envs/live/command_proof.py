@@ -1,8 +1,9 @@
 """Which robot is at an address, and what shows that commands of an arm reach the joints that are meant.
 
 A message either names its joints, or depends on the order in which a controller lists them, which the robot's side is
-asked for. Sign, offset and unit show in a small motion only (`SafeRobot.prove`), which is safe where a message says in
-which time a position is to be reached. What was proved is remembered for the same robot with the same controllers.
+asked for. A trajectory controller tells where it measures its joints, which must be where the profile reads them. Sign,
+offset and unit show in a small motion (`SafeRobot.prove`), which is safe where a message says in which time a position
+is to be reached. What was proved is remembered for the same robot with the same controllers.
 """
 
 from __future__ import annotations
@@ -20,21 +21,27 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from bam_envs.core.errors import BamEnvsError, InvalidValue, LinkLost, NotReady, RemoteError
+import numpy as np
+
+from bam_envs.core.errors import BamEnvsError, InvalidValue, LinkLost, NotReady, ProtocolError, RemoteError
 from bam_envs.core.location import config_folder
 from bam_envs.live import bringup
-from bam_envs.ros.codec import RobotInfo
+from bam_envs.ros.codec import RobotInfo, decode_source, from_si
+from bam_envs.ros.messages import same_type
 from bam_envs.ros.profile_tables import RobotProfile, Sink
 from bam_envs.rosbridge.bus import Message
 from bam_envs.rosbridge.client import RosbridgeLink
 from bam_envs.rosbridge.endpoint import Endpoint, is_loopback
 from bam_envs.rosbridge.ros_bus import RosBus
+from bam_envs.safety.first_motion import MOST
 
 _LOG = logging.getLogger(__name__)
 BOOL = 1
 """`type` of a boolean in rcl_interfaces/ParameterValue."""
 ANSWER_WITHIN = 2.0
 """Longest wait for the answer of a service of the robot's side [s]."""
+STATE = "control_msgs/JointTrajectoryControllerState"
+"""Type of the topic on which a trajectory controller tells where its joints are."""
 
 
 @dataclass(frozen=True)
@@ -47,9 +54,13 @@ class Controllers:
     """Topic of a command whose numbers have no names -> its joints in the order of its controller; None: not told."""
     from_measured: tuple[str, ...] = ()
     """Controllers that begin each trajectory where the arm is measured, and so jerk it back with every command."""
+    apart: str = ""
+    """How one of them measures a joint elsewhere than the profile reads it; empty if that is not known of any."""
 
     def fault(self, profile: RobotProfile, sinks: Sequence[Sink]) -> str:
         """Why a command of `sinks` might reach another joint than is meant; empty if it cannot."""
+        if self.apart:
+            return self.apart
         for sink in sinks:
             if sink.topic not in self.joints:
                 continue
@@ -67,14 +78,19 @@ class Controllers:
         return ""
 
 
-def ask_controllers(link: RosBus, profile: RobotProfile, sinks: Sequence[Sink]) -> Controllers:
-    """Ask the robot's side for the joints of the controllers that take the commands of `sinks`. Moves nothing."""
+def ask_controllers(link: RosBus, profile: RobotProfile, sinks: Sequence[Sink], joints: Any = None) -> Controllers:
+    """Ask the robot's side about the controllers that take the commands of `sinks`. Moves nothing.
+
+    `joints` is a message with the measured joints, with which they are compared; None: they are not.
+    """
     answer = _ask(link, link.namespace + profile.controllers, "", {}) if profile.controllers else {}
     rows: Any = answer.get("controller")
     listed = tuple(one for one in rows if isinstance(one, Mapping)) if isinstance(rows, list) else ()
-    joints = {sink.topic: _joints(link, listed, _controller(sink)) for sink in sinks if not sink.is_named}
-    timed = [_controller(sink) for sink in sinks if sink.is_timed]
-    return Controllers(listed, joints, tuple(name for name in timed if _begins_where_measured(link, name)))
+    order = {sink.topic: _joints(link, listed, _controller(sink)) for sink in sinks if not sink.is_named}
+    timed = [sink for sink in sinks if sink.is_timed]
+    from_measured = tuple(name for name in map(_controller, timed) if _begins_where_measured(link, name))
+    apart = [] if joints is None else [_apart(link, profile, sink, joints) for sink in timed]
+    return Controllers(listed, order, from_measured, next(filter(None, apart), ""))
 
 
 def _controller(sink: Sink) -> str:
@@ -95,6 +111,31 @@ def _begins_where_measured(link: RosBus, controller: str) -> bool:
     found = _parameters(link, controller, "interpolate_from_desired_state", "open_loop_control")
     known = [one.get("bool_value") for one in found if one.get("type") == BOOL]
     return bool(known) and not any(known)
+
+
+def _apart(link: RosBus, profile: RobotProfile, sink: Sink, joints: Any) -> str:
+    """How the controller of `sink` measures a joint elsewhere than `profile` reads it in the message `joints`."""
+    source, labels = profile.source("joint_position"), profile.signal("joint_position").labels
+    base = f"{link.namespace}/{_controller(sink)}"
+    names = (f"{base}/controller_state", f"{base}/state")
+    types = {name: _ask(link, "/rosapi/topic_type", "rosapi/TopicType", {"topic": name}).get("type") for name in names}
+    topics = [name for name, kind in types.items() if same_type(str(kind), STATE)]
+    state = _first(link, topics[0], STATE) if topics else None
+    try:
+        here = dict(zip(labels, decode_source(source, joints, len(labels)).tolist(), strict=True))
+        measured: Any = (state or {}).get("feedback") or (state or {})["actual"]
+        there = dict(zip((state or {})["joint_names"], measured["positions"], strict=True))
+        read = from_si(sink, np.array([here[label] for label in sink.labels]))
+        gaps = {name: (float(there[name]), at) for name, at in zip(sink.names, read, strict=True)}
+    except (KeyError, TypeError, ValueError, ProtocolError):  # it does not tell
+        return ""
+    for name, (theirs, ours) in gaps.items():
+        if abs(theirs - ours) > MOST:
+            return (
+                f"{_controller(sink)} measures {name} at {theirs:.3f} rad, and the profile {profile.name} reads "
+                f"{ours:.3f} rad: another joint, sign, offset or scale in the profile, or in the driver"
+            )
+    return ""
 
 
 def _joints(link: RosBus, listed: Sequence[Mapping[str, Any]], controller: str) -> tuple[str, ...] | None:
@@ -143,6 +184,7 @@ def needed_proof(
     sinks: Sequence[Sink],
     endpoint: Endpoint,
     identity: str | None = None,
+    joints: Any = None,
 ) -> CommandProof | None:
     """The proof that a real arm needs before it moves; None for others, and for an arm of a live agent, which has it.
 
@@ -153,12 +195,13 @@ def needed_proof(
         sinks: The topics of its commands.
         endpoint: The address of the robot.
         identity: Its serial number or name, empty if neither is known; None: it is asked for.
+        joints: The newest message with its measured joints; None: there is none.
     """
     if (info is not None and (info.simulated or info.agent)) or not _joint_labels(profile):
         return None
     identity = robot_identity(endpoint, profile, info) if identity is None else identity
     is_one = is_one_robot(endpoint, identity)
-    return CommandProof(profile, sinks, ask_controllers(link, profile, sinks), identity or endpoint.url, is_one)
+    return CommandProof(profile, sinks, ask_controllers(link, profile, sinks, joints), identity or endpoint.url, is_one)
 
 
 class CommandProof:
@@ -320,10 +363,13 @@ def _asked(link: RosbridgeLink, profile: RobotProfile) -> str:
     return ""
 
 
-def _first(link: RosbridgeLink, topic: str, kind: str) -> Message | None:
+def _first(link: RosBus, topic: str, kind: str) -> Message | None:
     """The first message on `topic` within `NAME_WITHIN`; None if there is none."""
     came: queue.SimpleQueue[Message] = queue.SimpleQueue()
-    link.subscribe(topic, kind, lambda message, caller: came.put(message))
-    with suppress(queue.Empty):
+    leave = link.subscribe(topic, kind, lambda message, caller: came.put(message))
+    try:
         return came.get(timeout=NAME_WITHIN)
-    return None
+    except queue.Empty:
+        return None
+    finally:
+        leave()

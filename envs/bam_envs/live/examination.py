@@ -238,7 +238,6 @@ def inspect_robot(
         offered = {sink.address: asked.offered(link.namespace + sink.address, sink) for sink in sinks if not sink.topic}
         types = {**types, **offered}
     identity = robot_identity(endpoint, profile, info)
-    proof = needed_proof(link, info, narrowed, sinks, endpoint, identity)
     inbox = Mailbox(keeps_all=True)
     are_echoed = pings and _are_echoed(link, inbox, timeout)
     unheard, start = {sink.topic for sink in topical}, time.monotonic()
@@ -258,6 +257,9 @@ def inspect_robot(
         raise LinkLost(f"{link.url}: the link dropped while the robot's topics were checked.")
     letters = {topic: tuple(inbox.letters[topic]) for topic in wanted.keys() - unheard}
     seconds, ahead = time.monotonic() - start, time.time() - time.monotonic()
+    source = next((one for one in required if one.signal == "joint_position"), None)
+    mine = [one.message for one in letters.get(source.topic, ()) if concerns(source, one.message)] if source else []
+    proof = needed_proof(link, info, narrowed, sinks, endpoint, identity, mine[-1] if mine else None)
     facts = letters, seconds, ahead, link.clock_offset, proof, identity
     return Inspection(profile, info, (*required, *extra), sinks, types, *facts, **measured)
 

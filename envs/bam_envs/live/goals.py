@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 
 from bam_envs.core.errors import BamEnvsError, LinkLost, RemoteError
 from bam_envs.core.robot import SignalSpec
-from bam_envs.ros.messages import write_stamp
 from bam_envs.ros.profile_tables import Sink
+from bam_envs.rosbridge.actionlib import ENDS, goal_id
 from bam_envs.rosbridge.bus import ABORTED, CANCELED, SUCCEEDED, Caller, Message
 from bam_envs.rosbridge.ros_bus import Reply, RosBus, bare_reason
 
@@ -29,8 +29,6 @@ _STEP = 0.02
 """Least change of a number for which a goal is sent, as a share of its range; the ends of the range are always sent."""
 _ANSWER_WITHIN = 10.0
 """Longest time that a service may take for its answer [s]."""
-_STATUSES = {2: CANCELED, 3: SUCCEEDED, 4: ABORTED, 5: ABORTED, 8: CANCELED}
-"""The ends of a goal in actionlib_msgs/GoalStatus: preempted, succeeded, aborted, rejected, recalled."""
 _ENDS = {CANCELED: "was canceled", ABORTED: "was aborted"}
 
 
@@ -91,7 +89,7 @@ class Goals:
         status = status if isinstance(status, Mapping) else {}
         identity: Any = status.get("goal_id")
         if isinstance(identity, Mapping) and isinstance(identity.get("id"), str):
-            end = _STATUSES.get(status.get("status", 0), status.get("status"))
+            end = ENDS.get(status.get("status", 0), status.get("status"))
             self._took(sink, identity["id"], {"status": end, "values": message.get("result")})
 
     def send(self, sink: Sink, values: Array, message: dict[str, Any]) -> None:
@@ -142,13 +140,13 @@ class Goals:
             request |= {"op": "call_service", "service": name, "type": kind, "timeout": _ANSWER_WITHIN}
         self._running[sink.labels] = _Running(identity, name, time.monotonic())
         if sink.action and self._is_ros1:
-            self.link.publish(f"{name}/goal", {"goal_id": _goal_id(identity), "goal": message})
+            self.link.publish(f"{name}/goal", {"goal_id": goal_id(identity), "goal": message})
             return
         self.link.ask_soon(request, partial(self._took, sink, identity))
 
     def _cancel(self, running: "_Running") -> None:
         if self._is_ros1:
-            self.link.publish_soon(f"{running.name}/cancel", _goal_id(running.identity))
+            self.link.publish_soon(f"{running.name}/cancel", goal_id(running.identity))
             return
         self.link.send_soon({"op": "cancel_action_goal", "id": running.identity, "action": running.name})
 
@@ -170,11 +168,6 @@ class Goals:
         asked = ", ".join(f"{label} {value:.3g}" for label, value in zip(sink.labels, last.tolist(), strict=True))
         what = f"the {'action' if sink.action else 'service'} {self._namespace}{sink.address}"
         self._report(RemoteError(f"{self.link.url}: {what} {trouble} ({asked}). Look at the gripper and its driver."))
-
-
-def _goal_id(identity: str) -> dict[str, Any]:
-    """An actionlib_msgs/GoalID; the stamp 0 means that nothing but the id tells which goal it is."""
-    return {"stamp": write_stamp(0.0, ros1=True), "id": identity}
 
 
 def _trouble(sink: Sink, url: str, reply: Reply) -> str:

@@ -276,7 +276,9 @@ class RosbridgeRobot:
             self._goals.cancel()  # whatever came of those of an older connection
 
     def _needed_proof(self, control: RosBus) -> CommandProof | None:
-        return needed_proof(control, self.info, self.profile, self._sinks, self._endpoint)
+        letter = self._state.mailbox.newest().get("joint_position")
+        joints = None if letter is None else letter.message
+        return needed_proof(control, self.info, self.profile, self._sinks, self._endpoint, joints=joints)
 
     @property
     def enabling(self) -> tuple[Enable, ...]:

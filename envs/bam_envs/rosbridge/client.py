@@ -213,18 +213,18 @@ class RosbridgeLink(RosBus, Ros):  # type: ignore[misc]
             task.cancel()
 
     async def _first(self) -> Connection:
-        timeout = self.endpoint.connect_timeout
-        deadline, delay = time.monotonic() + timeout, _FIRST_DELAY
+        left = max(self.endpoint.connect_timeout, _LEAST_TRY)
+        deadline, delay = time.monotonic() + left, _FIRST_DELAY
         while True:
             self._require_open()
             try:
-                return await self._open(max(deadline - time.monotonic(), _LEAST_TRY))
+                return await self._open(left)
             except NoServer as error:
                 # A server that refuses connections may still be starting; other errors persist.
                 if not isinstance(error.__cause__, ConnectionRefusedError) or time.monotonic() + delay >= deadline:
                     raise
             await asyncio.sleep(delay)
-            delay = min(2 * delay, _LONGEST_DELAY)
+            delay, left = min(2 * delay, _LONGEST_DELAY), max(deadline - time.monotonic(), _LEAST_TRY)
 
     async def _stay_connected(self, connection: Connection) -> None:
         delay = _FIRST_DELAY

@@ -288,12 +288,9 @@ class Connection(RosBridgeProtocol, WebSocketClientProtocol):  # type: ignore[mi
     # ---- receiving
 
     def onMessage(self, payload: bytes, is_binary: bool) -> None:  # noqa: N802 - Autobahn's name
-        """Take a message in JSON or CBOR."""
-        if self.error is None:
-            self.on_message(payload)
-
-    def on_message(self, payload: bytes) -> None:
         """Take a message in JSON or CBOR; one without meaning is passed over."""
+        if self.error is not None:
+            return
         try:
             self._dispatch(decode_server_frame(payload))
         except BamEnvsError as error:  # a meaningless message, or an answer to it that cannot be sent

@@ -35,7 +35,10 @@ async def open_port(address: Address, timeout: float, *, stand_in: str = LiveRob
 
 async def _open_tcp(address: Address) -> socket.socket:
     loop = asyncio.get_running_loop()
-    infos = await loop.getaddrinfo(address.host, address.port, type=socket.SOCK_STREAM)
+    try:  # a number needs no look-up, which takes a thread, and on a busy computer its time
+        infos = socket.getaddrinfo(*address[:2], type=socket.SOCK_STREAM, flags=socket.AI_NUMERICHOST)
+    except socket.gaierror:
+        infos = await loop.getaddrinfo(*address[:2], type=socket.SOCK_STREAM)
     for place, (family, kind, protocol, _, target) in enumerate(infos):
         plain = socket.socket(family, kind, protocol)
         plain.setblocking(False)

@@ -23,7 +23,8 @@ from bam_envs.core.errors import BamEnvsError, InvalidValue, LinkLost, ProtocolE
 from bam_envs.core.wording import brief
 from bam_envs.ros.interfaces import normal_name
 from bam_envs.ros.messages import write_stamp
-from bam_envs.rosbridge.bus import UNKNOWN_CALLER, Bus, Handler, Listener, Message, answer, deliver, tell
+from bam_envs.rosbridge.actionlib import ActionTopics
+from bam_envs.rosbridge.bus import UNKNOWN_CALLER, Action, Bus, Handler, Listener, Message, answer, deliver, tell
 from bam_envs.rosbridge.encoding import dump_json
 from bam_envs.rosbridge.threads import LoopThread, Workers
 
@@ -291,6 +292,12 @@ class RosBus(Bus):
         if not isinstance(values, dict):
             raise ProtocolError(f"{service}: expected a response with fields, found {values!r}.")
         return values
+
+    def act(self, action: Action) -> bool:
+        """Offer an action over the topics of actionlib through a bridge of ROS 1; False for another one."""
+        if self.ros == "ros1":
+            ActionTopics(self, action)
+        return self.ros == "ros1"
 
     # ---- the link
 

@@ -1,4 +1,4 @@
-"""Who comes into a server: the shared secrets that clients show, the limit on guesses, and the places of clients.
+"""Who comes into a server: the shared secrets that clients show, the limit on guesses, the places of clients, the log.
 
 Some places are kept for higher roles, and who says nothing gives way.
 """
@@ -29,6 +29,8 @@ _LATELY = 60.0
 _MOST_ADDRESSES = 4096
 _KEPT = 4
 """A quarter of the places is kept for each higher role."""
+_REPEAT_PERIOD = 1.0  # least time between two equal lines of the log [s]
+_MOST_LINES = 1024  # different lines that are remembered
 
 
 def read_token(path: str | Path) -> str:
@@ -238,3 +240,27 @@ def who_leaves(newcomer: Client, present: Sequence[AnyClient]) -> AnyClient | No
 
 def _rank(client: Client) -> int:
     return 0 if client.role is None else ROLES.index(client.role)
+
+
+class Refusals:
+    """Logs who was refused, and why. Equal lines come at most once a second, with the number of those left out.
+
+    Not thread-safe.
+    """
+
+    def __init__(self, logger: logging.Logger, clock: Callable[[], float] = time.monotonic) -> None:
+        self._logger, self._clock = logger, clock
+        self._seen: dict[tuple[str, str], tuple[float, int]] = {}  # the oldest first
+
+    def note(self, who: str, why: str) -> None:
+        """Log one refusal. `why` is one line that shows no secret, and of what a stranger sent only a short part."""
+        now, key = self._clock(), (who, why)
+        at, more = self._seen.get(key, (now - _REPEAT_PERIOD, 0))
+        if now - at < _REPEAT_PERIOD:
+            self._seen[key] = at, more + 1
+            return
+        self._logger.warning("%s was refused: %s%s", who, why, f" (and {more} times before)" if more else "")
+        self._seen.pop(key, None)
+        self._seen[key] = now, 0
+        if len(self._seen) > _MOST_LINES:
+            del self._seen[next(iter(self._seen))]

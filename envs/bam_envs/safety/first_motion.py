@@ -16,14 +16,18 @@ MOST, FASTEST = 0.05, 0.1
 """Farthest motion [rad] and highest speed [rad/s] of a joint before its commands are proved."""
 REST_REACH = 1e6
 """Time in which an arm is to reach the position of a halt before its commands are proved [s]: it stays where it is."""
-PROOF, SLOW = 0.02, 0.09
+PROOF, SLOW = 0.02, 0.085
 """Motion of each joint that proves its commands [rad], and the highest speed of a correct or wrong joint [rad/s]."""
 SETTLE, WAIT = 0.55, 0.2
 """Duration of the last stage in which the arm is commanded to stay, and least rest after a motion [s]."""
+SHORTEST = 4
+"""Least time in which a command is to be reached before the arm has shown that it stays [periods]."""
 GAP, KNOWN_GAP = 1e4, 4 * math.pi
 """Greatest distance of a command from the measured joint [rad]: in any unit, and in one that was proved before."""
 STILL, SAG = 0.002, 0.03
 """Motion of a joint commanded to stay that counts as none, and that its load explains: a weak servo sags [rad]."""
+NEAR_ZERO = 2 * math.pi * math.pi / 180
+"""Greatest position of a joint that is divided by the degrees of a radian once more [rad]."""
 TINY = 0.0005
 """Motion of all joints that no unit makes large [rad]."""
 TOGETHER = ((0.002, 0.15), (0.006, 0.15))
@@ -67,6 +71,8 @@ class ProofMotion:
         self._signs = [1.0 if value <= most else -1.0 for value, most in zip(start, middle, strict=True)]
         self._base = start.copy()  # where the joints are measured when they are commanded to `start`
         self._rest = [0.0] * len(start)
+        self.age = 0.0
+        """Age of the measured joints that come next [s], as on a busy computer."""
         self.measured_lag = 0.0
         """Delay of the joint that moved last behind its commands [s]."""
 
@@ -79,6 +85,11 @@ class ProofMotion:
         Raises:
             NotAsCommanded: The arm does not move as commanded.
         """
+        if every and self._is_timed and all(abs(at) <= NEAR_ZERO for at in self._start):
+            raise NotAsCommanded(
+                f"all joints are measured within {NEAR_ZERO:.2f} rad of 0, as by a driver or a profile that takes "
+                "radians for degrees, with which a motion would look like none: correct the scale, or jog a joint away"
+            )
         yield from self._stay(GAP if every else KNOWN_GAP)
         yield from self._together() if every else self._ramp(self._all(TINY), self._rest, 0.0)
         there = self._rest
@@ -96,9 +107,9 @@ class ProofMotion:
         smaller is the gap that is still possible, and the shorter the commanded time.
         """
         goal = [at + way for at, way in zip(self._start, self._all(TINY), strict=True)]
-        delay = 1 + self._ticks(self._lag)  # commands that may not show yet
         closed = [0.0]  # share of a gap that was closed after each command
         while self._is_timed:
+            delay = 1 + self._ticks(self._lag + self.age)  # commands that may not show yet
             gap = min(greatest, SAG + STILL / max(closed[max(0, len(closed) - delay)], 1e-9))
             if gap <= MOST:
                 break
@@ -106,12 +117,14 @@ class ProofMotion:
             self._require_still((yield goal, gap / SLOW), STILL + SAG * min(1.0, closed[-1]))
         ticks, measured = self._ticks(SETTLE), self._start
         for tick in range(ticks + self._ticks(self._lag)):
-            measured = yield goal, max(1, ticks - tick) * self._period if self._is_timed else None
+            reach = max(SHORTEST, ticks + SHORTEST - 1 - tick) * self._period
+            measured = yield goal, reach if self._is_timed else None
             self._require_still(measured, SAG)
         self._base = [at - way for at, way in zip(measured, self._all(TINY), strict=True)]
         if max(abs(now - begin) for now, begin in zip(self._base, self._start, strict=True)) > STILL:
-            yield from self._ramp(self._all(TINY), self._all(2 * TINY), SETTLE)  # a sag, or TINY in another unit?
-            measured = yield from self._ramp(self._all(2 * TINY), self._all(TINY), SETTLE)
+            once, twice, reach = self._all(TINY), self._all(2 * TINY), SHORTEST * self._period
+            yield from self._ramp(once, twice, SETTLE, reach)  # a sag, or TINY in another unit?
+            measured = yield from self._ramp(twice, once, SETTLE, reach)
         return measured
 
     def _require_still(self, measured: Numbers, most: float) -> None:
@@ -145,13 +158,13 @@ class ProofMotion:
             raise NotAsCommanded(f"{name} was commanded to move {there[joint]:+.3f} rad, and {did}: {LIKELY}")
         return there
 
-    def _ramp(self, begin: Numbers, end: Numbers, seconds: float) -> Moves:
-        """Go from `begin` to `end` (k,), relative to the start, and rest there."""
+    def _ramp(self, begin: Numbers, end: Numbers, seconds: float, reach: float | None = None) -> Moves:
+        """Go from `begin` to `end` (k,), relative to the start, and rest there; for `reach` see `Step`."""
         ticks, measured = self._ticks(seconds), self._base
         for tick in range(1, ticks + self._ticks(max(WAIT, self._lag + 0.075)) + 1):
             share = min(1.0, tick / max(1, ticks))
             way = [one + (other - one) * share for one, other in zip(begin, end, strict=True)]
-            measured = yield [at + one for at, one in zip(self._start, way, strict=True)], None
+            measured = yield [at + one for at, one in zip(self._start, way, strict=True)], reach
             for joint, row in enumerate(zip(begin, end, measured, strict=True)):
                 self._require_near(joint, *row, begin, end)
                 if tick == ticks and abs(row[1] - row[0]) == PROOF:

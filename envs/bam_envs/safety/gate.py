@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from bam_envs.core.errors import InvalidValue, ResetNeeded, SafetyStop, StaleState, StartNotReached
 from bam_envs.core.robot import EnvIds, Initial, Robot, RobotSpec, RobotState
-from bam_envs.safety.first_motion import OPENS_WITHIN, PROOF, FirstMotion, NotAsCommanded, ProofMotion
+from bam_envs.safety.first_motion import OPENS_WITHIN, PROOF, STILL, FirstMotion, NotAsCommanded, ProofMotion
 from bam_envs.safety.following import Following, JointFollowing
 from bam_envs.safety.guard import (
     TIMING_GUARDS,
@@ -705,7 +705,7 @@ class SafeRobot(metaclass=Sealed):
             self.spec.lag if self.limits.lag is None else self.limits.lag,
             is_timed=proof is not None and proof.is_timed,
         )
-        states: list[RobotState] = []
+        states, is_shortened = list[RobotState](), False
         moves = motion.moves(every=anew or proof is None or not proof.is_known)
         try:
             joints, reach = next(moves)
@@ -715,12 +715,14 @@ class SafeRobot(metaclass=Sealed):
                 if proof is not None:
                     self._live.reach, self._live.joints_only = reach, True
                 states.append(self._advance(rest.copy(), approach=True, proving=True))
-                measured = self._measured()
+                is_shortened |= any(abs(self._sent[at] - rest[at]) > STILL for at in columns if self._sent)
+                measured, motion.age = self._measured(), self.age()
                 joints, reach = moves.send([measured[at] for at in columns])
         except StopIteration:
             pass
         except NotAsCommanded as error:
-            self._stop(self._first_motion, f"{error}")
+            edge = "the guards shorten the motion that proves the commands, at the edge of where the arm may go"
+            self._stop(self._first_motion, f"{edge}: jog it away" if is_shortened else f"{error}")
         finally:
             if proof is not None:
                 self._live.reach, self._live.joints_only = None, False

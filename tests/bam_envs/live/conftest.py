@@ -261,7 +261,7 @@ def commands_are_proved(request, monkeypatch, tmp_path_factory):
     """Leave the motion that proves commands out, where a test is not about it."""
     monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path_factory.mktemp("config")))
     if request.node.get_closest_marker("proves") is None:
-        monkeypatch.setattr(rosbridge_robot, "needed_proof", lambda *arguments: None)
+        monkeypatch.setattr(rosbridge_robot, "needed_proof", lambda *arguments, **options: None)
 
 
 @pytest.fixture

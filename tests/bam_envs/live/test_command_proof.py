@@ -186,6 +186,34 @@ def test_a_controller_that_begins_where_the_arm_is_measured_is_known(server, rob
         link.close()
 
 
+@pytest.mark.parametrize(
+    ("topic", "field", "off"),
+    [("controller_state", "feedback", 0.0), ("controller_state", "feedback", 0.06), ("state", "actual", -3.0)],
+)
+def test_a_controller_that_measures_a_joint_elsewhere_is_sent_nothing(
+    server, robot_on, connected, start_pose, topic, field, off
+):
+    """Such as where the profile has the scale of a joint wrong: a motion would show that too late."""
+    scripted, name = robot_on(server), "scaled_joint_trajectory_controller"
+    kind, there = "control_msgs/JointTrajectoryControllerState", [*HOME[[1, 0]], *HOME[2:5], HOME[5] + off]
+    server.advertise(f"/{name}/{topic}", kind, latch=True)
+    server.publish(f"/{name}/{topic}", {"joint_names": list(SWAPPED), field: {"positions": there}})
+    robot = connected()
+    if off == 0.0:
+        assert robot.is_unproved
+        return
+    with pytest.raises(NotReady) as caught:
+        robot.reset(ROW, start_pose)
+    assert str(caught.value) == (
+        f"The commands of {server.url} are not proved: {name} measures wrist_3_joint at {HOME[5] + off:.3f} rad, and "
+        f"the profile ur5e reads {HOME[5]:.3f} rad: another joint, sign, offset or scale in the profile, or in the "
+        "driver. Nothing has moved."
+    )
+    robot.close()
+    rests = {message["points"][0]["time_from_start"]["sec"] for message in scripted.on(TRAJECTORY)}
+    assert rests <= {1_000_000}  # of the halt: it stays where it is
+
+
 def test_whose_commands_need_no_proof(server):
     profile, at = load_profile("ur5e"), Endpoint(server.url)
     link = RosbridgeLink(server.url)
@@ -220,6 +248,28 @@ def test_a_proof_is_remembered_for_a_robot_that_is_known_and_not_for_the_end_of_
         server.serve("/dashboard_client/get_serial_number", "x/X", lambda *asked: {"serial_number": 2019550123})
         proof().done(0.1)
         assert proof(name="2019550123").is_known
+    finally:
+        link.close()
+
+
+def test_a_remembered_proof_is_void_where_the_controller_takes_another_order_now(server):
+    link, orders = RosbridgeLink(server.url), [JOINTS, SWAPPED]
+    service = "/forward_position_controller/get_parameters"
+    server.serve(service, "x/X", lambda *asked: {"values": [{"type": 9, "string_array_value": list(orders[0])}]})
+    link.connect()
+
+    def proof(name):
+        profile, endpoint = load_profile(name), Endpoint(server.url, robot_name="left arm")
+        return rosbridge_robot.needed_proof(link, None, profile, profile.sinks(), endpoint)
+
+    try:
+        assert "nothing has shown them yet" in proof("ur5e_position").fault
+        proof("ur5e").done(0.1)
+        assert (proof("ur5e_position").is_known, proof("ur5e_position").fault) == (True, "")
+        del orders[0]
+        assert proof("ur5e_position").fault.startswith(
+            f"forward_position_controller takes the joints in the order {', '.join(SWAPPED)}, and the profile "
+        )
     finally:
         link.close()
 

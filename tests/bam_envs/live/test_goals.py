@@ -19,6 +19,7 @@ from bam_envs.robots.profile import load_profile
 from bam_envs.robots.ur5e import JOINTS
 from bam_envs.ros.codec import RobotInfo
 from bam_envs.rosbridge.bus import ABORTED, SUCCEEDED
+from bam_envs.rosbridge.endpoint import Endpoint
 from bam_envs.safety.gate import _clear
 
 ARM, GRIPPER = "/arm/joint_trajectory", "/gripper/gripper_cmd"
@@ -118,10 +119,10 @@ def test_a_goal_is_sent_when_the_width_changes_beside_the_commands(server, robot
     for width in (0.085, 0.085, 0.0845, 0.0, 0.0005, 0.05):
         step(width)
     step.robot.close()
+    scripted.wait_for(lambda: len(scripted.canceled) == 3 and len(scripted.on(ARM)) == 7)  # the last one holds
     assert positions(scripted) == [0.085, 0.0, 0.05]
     assert scripted.canceled == scripted.goals  # by the next one, and by the end
     commands = [(topic, caller) for topic, caller, _ in scripted.commands if topic != "/bam/halt"]
-    assert [topic for topic, _ in commands].count(ARM) == 7  # the last one holds
     assert len({caller for topic, caller in commands if topic == GRIPPER}) == 1
     assert {caller for topic, caller in commands if topic == GRIPPER}.isdisjoint(
         caller for topic, caller in commands if topic == ARM
@@ -138,6 +139,7 @@ def test_a_halt_cancels_what_runs_and_the_next_command_sends_it_again(server, ro
     scripted.on_goal = lambda goal: goal.end(SUCCEEDED, {})
     step(0.0)
     step(0.0)
+    scripted.wait_for(lambda: len(scripted.goals) == 2)
     step.robot.halt()  # it is done
     step.robot.close()
     assert positions(scripted) == [0.0, 0.0]
@@ -207,6 +209,7 @@ def test_a_gripper_may_close_by_another_action(server, robot_on, connect, profil
     for width in (0.085, 0.0, 0.0, 0.05):
         step(width)
     step.robot.close()
+    scripted.wait_for(lambda: len(scripted.canceled) == 3)
     assert [topic for topic, _, _ in scripted.commands if topic.startswith("/gripper")] == [
         *(GRIPPER, "/gripper/grasp", GRIPPER)
     ]
@@ -219,8 +222,7 @@ def test_a_gripper_may_close_by_another_action(server, robot_on, connect, profil
 def test_a_gripper_that_nobody_offers_is_refused(server, robot_on, profile, what):
     scripted = robot_on(server)
     path = profile(**(ACTION if what == "action" else SERVICE))
-    robot = RosbridgeRobot(server.url, load_profile(path))
-    robot._timeout = 0.2
+    robot = RosbridgeRobot(Endpoint(server.url, timeout=1.0), load_profile(path))
     with pytest.raises(ProtocolError) as raised:
         robot.connect()
     kind = ACTION["type"] if what == "action" else SERVICE["type"]
@@ -278,8 +280,8 @@ def test_a_gripper_of_goals_moves_at_its_own_speed(server, robot_on, profile):
     command = with_goals.reset(ROW, Initial({"joint_position": joints}, ROW)).command
     command[0, 6] = 0.0
     with_goals.step(command)
+    scripted.wait_for(lambda: positions(scripted)[-1:] == [0.0])
     with_goals.close()
-    assert positions(scripted)[-1] == 0.0
     assert with_goals.report()["gripper speed"]["altered"] == 0
 
 

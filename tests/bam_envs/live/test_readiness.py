@@ -1,12 +1,9 @@
 """What a robot says of its being ready: it is named before anything moves, and instead of what follows from it."""
 
-import time
-
 import numpy as np
 import pytest
 
 from bam_envs.core.errors import NotReady, SafetyStop
-from bam_envs.core.timing import Deadline
 from bam_envs.live.building import live_robot
 from bam_envs.robots.profile import load_profile
 from bam_envs.robots.ur5e import JOINTS
@@ -71,13 +68,6 @@ def connected(server, robot_on):
     yield connect
     for robot in robots:
         robot.close()
-
-
-def until(found):
-    deadline = Deadline(5.0)
-    while not found():
-        assert not deadline.passed
-        time.sleep(0.005)
 
 
 def test_a_robot_that_is_ready_moves(driver, connected, start_pose):
@@ -147,7 +137,7 @@ def test_an_arm_that_is_not_ready_does_not_begin(driver, connected, start_pose, 
     )
 
 
-def test_two_programs_do_not_drive_one_robot(server, robot_on, connected, start_pose):
+def test_two_programs_do_not_drive_one_robot(server, robot_on, connected, start_pose, until):
     """The second one neither moves nor holds the robot; the first one goes on."""
     first, second = connected(), live_robot(server.url)
     second.connect()
@@ -163,7 +153,7 @@ def test_two_programs_do_not_drive_one_robot(server, robot_on, connected, start_
     first.step(command)
 
 
-def test_a_command_of_somebody_else_stops_a_robot_in_motion(server, connected, start_pose):
+def test_a_command_of_somebody_else_stops_a_robot_in_motion(server, connected, start_pose, until):
     robot = connected()
     command = robot.reset(ROW, start_pose).command
     robot.step(command)
@@ -177,7 +167,7 @@ def test_a_command_of_somebody_else_stops_a_robot_in_motion(server, connected, s
         robot.step(command)
 
 
-def test_a_stop_in_mid_episode_is_named_at_once(driver, connected, start_pose):
+def test_a_stop_in_mid_episode_is_named_at_once(driver, connected, start_pose, until):
     driver.say_ready()
     robot = connected()
     command = robot.reset(ROW, start_pose).command
@@ -194,7 +184,7 @@ def test_a_stop_in_mid_episode_is_named_at_once(driver, connected, start_pose):
     robot.reset(ROW, start_pose)
 
 
-def test_what_follows_from_it_is_told_with_it(driver, connected, start_pose):
+def test_what_follows_from_it_is_told_with_it(driver, connected, start_pose, until):
     """The slider was pulled down while the arm moved: it does not follow any more, and why is said first."""
     driver.say_ready()
     robot = connected(frozen=True)

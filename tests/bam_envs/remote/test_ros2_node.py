@@ -45,20 +45,11 @@ class Box:
         return self.heard
 
 
-def wait_for(condition, timeout=10.0):
-    pause = threading.Event()
-    for _ in range(int(timeout / 0.01)):
-        if condition():
-            return
-        pause.wait(0.01)
-    pytest.fail("it never became true")
-
-
-def test_a_message_arrives_as_it_was_sent(node):
+def test_a_message_arrives_as_it_was_sent(node, until):
     speaker, hearer, box = node("speaker"), node("hearer"), Box()
     hearer.subscribe("/test/joints", "sensor_msgs/msg/JointState", box)
     speaker.advertise("/test/joints", "sensor_msgs/JointState")
-    wait_for(lambda: speaker.is_heard("/test/joints"))
+    until(lambda: speaker.is_heard("/test/joints"))
     header = {"stamp": {"sec": 3, "nanosec": 4}, "frame_id": "tag"}
     speaker.publish("/test/joints", {"header": header, "name": ["a"], "position": [0.5]})
     expected = {"header": header, "name": ["a"], "position": [0.5], "velocity": [], "effort": []}
@@ -77,12 +68,12 @@ def test_a_latched_message_waits_for_newcomers(node):
     assert box.wait() == [("it", None)]
 
 
-def test_who_unsubscribes_silences_nobody_else(node):
+def test_who_unsubscribes_silences_nobody_else(node, until):
     speaker, hearer, one, other = node("speaker"), node("hearer"), Box(), Box()
     stop = hearer.subscribe("/test/topic", "std_msgs/String", one)
     hearer.subscribe("/test/topic", "std_msgs/String", other)
     speaker.advertise("/test/topic", "std_msgs/String")
-    wait_for(lambda: speaker.is_heard("/test/topic"))
+    until(lambda: speaker.is_heard("/test/topic"))
     stop()
     speaker.publish("/test/topic", {"data": "it"})
     other.wait()
@@ -98,7 +89,7 @@ def test_what_does_not_fit_is_not_sent(node):
         speaker.publish("/test/other", {})
 
 
-def test_a_listener_that_refuses_is_logged_once(node, caplog):
+def test_a_listener_that_refuses_is_logged_once(node, caplog, until):
     speaker, hearer = node("speaker"), node("hearer")
 
     def refuse(message, caller):
@@ -108,7 +99,7 @@ def test_a_listener_that_refuses_is_logged_once(node, caplog):
     hearer.subscribe("/test/topic", "std_msgs/String", refuse)
     hearer.subscribe("/test/topic", "std_msgs/String", box)
     speaker.advertise("/test/topic", "std_msgs/String")
-    wait_for(lambda: speaker.is_heard("/test/topic"))
+    until(lambda: speaker.is_heard("/test/topic"))
     speaker.publish("/test/topic", {"data": "it"})
     box.wait()
     speaker.publish("/test/topic", {"data": "it"})
@@ -116,7 +107,7 @@ def test_a_listener_that_refuses_is_logged_once(node, caplog):
     assert caplog.messages == ["/test/topic: not now"]
 
 
-def test_a_listener_that_fails_ends_no_topic(node, caplog):
+def test_a_listener_that_fails_ends_no_topic(node, caplog, until):
     speaker, hearer, box = node("speaker"), node("hearer"), Box()
 
     def fail(message, caller):
@@ -125,14 +116,14 @@ def test_a_listener_that_fails_ends_no_topic(node, caplog):
 
     hearer.subscribe("/test/topic", "std_msgs/String", fail)
     speaker.advertise("/test/topic", "std_msgs/String")
-    wait_for(lambda: speaker.is_heard("/test/topic"))
+    until(lambda: speaker.is_heard("/test/topic"))
     for number in (1, 2):
         speaker.publish("/test/topic", {"data": "it"})
         box.wait(number)
     assert any(text.endswith(": a listener failed") for text in caplog.messages)
 
 
-def test_a_service_answers_and_topics_do_not_wait_for_it(node):
+def test_a_service_answers_and_topics_do_not_wait_for_it(node, until):
     server, client, box, go = node("server"), node("client"), Box(), threading.Event()
 
     def handle(request, caller):
@@ -142,7 +133,7 @@ def test_a_service_answers_and_topics_do_not_wait_for_it(node):
     server.serve("/test/switch", "std_srvs/SetBool", handle)
     server.subscribe("/test/stop", "std_msgs/Empty", lambda message, caller: (box(message, caller), go.set()))
     client.advertise("/test/stop", "std_msgs/Empty")
-    wait_for(lambda: client.is_heard("/test/stop") and client.is_offered("/test/switch"))
+    until(lambda: client.is_heard("/test/stop") and client.is_offered("/test/switch"))
     answers = []
     call = threading.Thread(
         target=lambda: answers.append(client.call("/test/switch", "std_srvs/SetBool", {"data": True}, 10.0))
@@ -153,7 +144,7 @@ def test_a_service_answers_and_topics_do_not_wait_for_it(node):
     assert answers == [{"success": True, "message": "done"}]
 
 
-def test_closing_ends_a_call_at_once(node):
+def test_closing_ends_a_call_at_once(node, until):
     server, client, asked, go, lost = node("server"), node("client"), threading.Event(), threading.Event(), []
 
     def handle(request, caller):
@@ -168,7 +159,7 @@ def test_closing_ends_a_call_at_once(node):
             lost.append(str(error))
 
     server.serve("/test/slow", "std_srvs/Trigger", handle)
-    wait_for(lambda: client.is_offered("/test/slow"))
+    until(lambda: client.is_offered("/test/slow"))
     caller = threading.Thread(target=call)
     caller.start()
     assert asked.wait(10)
@@ -178,7 +169,7 @@ def test_closing_ends_a_call_at_once(node):
     assert lost == ["/test/slow did not answer before this node was closed; whether it did what was asked is unknown."]
 
 
-def test_a_service_that_fails_answers_too(node, caplog):
+def test_a_service_that_fails_answers_too(node, caplog, until):
     server, client = node("server"), node("client")
 
     def fail(request, caller):
@@ -186,7 +177,7 @@ def test_a_service_that_fails_answers_too(node, caplog):
 
     server.serve("/test/fails", "std_srvs/Trigger", fail)
     server.serve("/test/breaks", "std_srvs/Trigger", lambda request, caller: {"success": "yes"})
-    wait_for(lambda: client.is_offered("/test/fails") and client.is_offered("/test/breaks"))
+    until(lambda: client.is_offered("/test/fails") and client.is_offered("/test/breaks"))
     failed = client.call("/test/fails", "std_srvs/Trigger", {}, 10.0)
     assert failed == {"success": False, "message": "it cannot"}
     assert client.call("/test/breaks", "std_srvs/Trigger", {}, 10.0) == {

@@ -51,11 +51,13 @@ def test_after_a_time_out_nothing_is_sent_before_a_reset(served, open_to, channe
             return super().step(action)
 
     env = served(Slow(spaces.Discrete(3)))
-    transport = open_to(channel=channel, timeout=0.3)
+    transport = open_to(channel=channel)
     transport.reset()
-    with pytest.raises(LinkLost, match=r"did not answer in 0\.3 s"):
+    transport.timeout = 1.0
+    with pytest.raises(LinkLost, match=r"did not answer in 1 s"):
         transport.step(1)
     assert begun.is_set()
+    transport.timeout = 30.0
     text = "so what the environment did since is unknown, and nothing was sent. Call reset"
     with pytest.raises(LinkLost, match=text):
         transport.step(2)

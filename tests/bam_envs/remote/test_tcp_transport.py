@@ -119,7 +119,7 @@ def test_many_addresses_take_no_longer_than_one(monkeypatch):
     monkeypatch.setattr(socket, "getaddrinfo", lambda *_, **options: found)
     monkeypatch.setattr(socket, "create_connection", silent)
     assert refused("tcp://many:5", connect_timeout=0.1).startswith("no connection within 0.1 s")
-    assert sum(limits) == pytest.approx(0.1, abs=0.03)
+    assert sum(limits) <= 0.125  # of each address 0.01 s at the least
 
 
 def test_nobody_listens():
@@ -139,9 +139,8 @@ def test_a_name_that_nobody_has():
 
 def test_somebody_listens_and_says_nothing():
     with socket.create_server(("127.0.0.1", 0)) as silent:
-        url, begun = f"tcp://127.0.0.1:{silent.getsockname()[1]}", time.monotonic()
-        assert refused(url, connect_timeout=0.05).startswith(f"{UNUSABLE}: timed out. If it is rosbridge, use ws://. ")
-        assert time.monotonic() - begun < 3
+        url = f"tcp://127.0.0.1:{silent.getsockname()[1]}"
+        assert refused(url, connect_timeout=1.0).startswith(f"{UNUSABLE}: timed out. If it is rosbridge, use ws://. ")
 
 
 NO_DESCRIPTION = "Expected the description of an environment, found "
@@ -192,17 +191,18 @@ def test_a_lost_link_stays_down_until_a_reset_and_nothing_is_sent_again(env):
     assert len(env.seen) == 1
 
 
-def test_no_answer_in_time_is_a_lost_link_and_the_server_does_not_act_later(server, env):
-    transport = TcpTransport(server.url)
-    transport.reset()
-    transport.timeout = 0.1
-    with server.server.lock:
-        with pytest.raises(LinkLost) as caught:
-            transport.step(ACTION)
-        time.sleep(0.2)  # the server counts the lifetime of a request from its arrival, a little later
-    assert str(caught.value) == f"{server.url}: no answer to step within 0.1 s."
-    transport.close()
-    server.close()
+def test_no_answer_in_time_is_a_lost_link_and_the_server_does_not_act_later(env):
+    ahead = [0.0]
+    with TcpServer(EnvServer(env, clock=lambda: time.monotonic() + ahead[0])) as server:
+        transport = TcpTransport(server.url)
+        transport.reset()
+        transport.timeout = 0.1
+        with server.server.lock:
+            with pytest.raises(LinkLost) as caught:
+                transport.step(ACTION)
+            ahead[0] = PATIENCE  # the server counts the lifetime of a request from its arrival, a little later
+        assert str(caught.value) == f"{server.url}: no answer to step within 0.1 s."
+        transport.close()
     assert env.seen == []
 
 

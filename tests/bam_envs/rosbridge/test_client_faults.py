@@ -102,8 +102,8 @@ def test_a_call_while_the_link_is_down_is_never_made(scripted, link, lost):
 def test_a_call_that_timed_out_is_not_made_again_after_a_cut(scripted, link):
     scripted.responses["/step"] = lambda args: None
     with pytest.raises(LinkLost) as raised:
-        link.call("/step", "std_srvs/Trigger", {}, 0.05)
-    assert str(raised.value) == f"{link.url}: /step did not answer in 0.05 s; it may still be at it."
+        link.call("/step", "std_srvs/Trigger", {}, 0.5)
+    assert str(raised.value) == f"{link.url}: /step did not answer in 0.5 s; it may still be at it."
     assert (link.is_up, link.epoch) == (True, 1)
     _restart(scripted, link)
     link.advertise("/last", STRING)
@@ -187,7 +187,7 @@ def test_connect_waits_for_a_server_that_still_starts(new_link, new_scripted, fr
 
 
 def test_connect_can_be_tried_again(new_link, new_scripted, free_port):
-    link = new_link(f"ws://127.0.0.1:{free_port}", connect=False, connect_timeout=0.5)
+    link = new_link(f"ws://127.0.0.1:{free_port}", connect=False, connect_timeout=1.0)
     with pytest.raises(NoServer):
         link.connect()
     new_scripted(port=free_port)
@@ -244,21 +244,21 @@ def test_a_server_that_does_not_read_gets_nothing_more_and_is_not_left(scripted,
 
 
 def test_a_server_that_freezes_is_lost_and_connected_again(scripted, new_link):
-    link = new_link(scripted, lost_after=0.3)
+    link = new_link(scripted, lost_after=1.0)
     lost = _loss(link)
     freeze = lambda: [connection.transport.pause_reading() for connection in scripted.connections]  # noqa: E731
     scripted.responses["/step"] = lambda args: scripted.loop.call_soon(freeze) and None
     with pytest.raises(LinkLost) as raised:
         link.call("/step", "std_srvs/Trigger", {}, 60.0)
-    assert str(raised.value) == f"{scripted.url}: nothing from the server for 0.3 s."
+    assert str(raised.value) == f"{scripted.url}: nothing from the server for 1 s."
     assert lost.reasons == [str(raised.value)]
     link.wait_up(10.0)
     assert link.epoch == 2
 
 
 def test_a_server_that_is_alive_is_not_lost(scripted, new_link):
-    link = new_link(scripted, lost_after=0.4)
-    assert not _loss(link).wait(0.6)
+    link = new_link(scripted, lost_after=1.0)
+    assert not _loss(link).wait(1.3)
     assert (link.is_up, link.epoch) == (True, 1)
 
 

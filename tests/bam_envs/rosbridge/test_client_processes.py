@@ -62,7 +62,7 @@ def test_a_forked_child_makes_its_own_link_and_harms_no_other(python, scripted):
         "Make and connect a link in the child itself."
     )
     assert texts[1] == [expected] * 4
-    assert [frame["msg"]["data"] for frame in scripted.of("publish")] == ["child", "parent"]
+    assert [frame["msg"]["data"] for frame in scripted.wait_for("publish", 2)] == ["child", "parent"]
 
 
 @pytest.mark.parametrize("method", ["fork", "spawn"])

@@ -37,7 +37,7 @@ def answering(answer=None):
 
 def failure(url, **options):
     """What the error says behind the address."""
-    link = RosbridgeLink(Endpoint(url, **{"connect_timeout": 0.3, **options}))
+    link = RosbridgeLink(Endpoint(url, **{"connect_timeout": 1.0, **options}))
     with pytest.raises(NoServer) as raised:
         link.connect()
     assert (raised.value.url, link.is_up) == (url, False)
@@ -63,7 +63,7 @@ def test_refused_at_the_port_of_live_agents():
 
 
 def test_silent():
-    text = "the port is open, and what listens there is silent for 0.3 s. Is it a rosbridge server?"
+    text = "the port is open, and what listens there is silent for 1.0 s. Is it a rosbridge server?"
     with answering() as url:
         assert failure(url) == text
     with answering() as url:
@@ -103,7 +103,7 @@ def test_another_server(answer, text):
     [
         (
             lambda server: None,
-            "a WebSocket server that answers no rosbridge request within 0.3 s. "
+            "a WebSocket server that answers no rosbridge request within 1.0 s. "
             "Is it a rosbridge server, and is its ROS node alive?",
         ),
         (

@@ -151,20 +151,58 @@ def driven(arm, initial=None):
 UNITS = (1.0, -1.0, 180 / np.pi, -180 / np.pi, np.pi / 180, 1000.0, 0.001, 2.0, 0.5, 1.1)
 
 
-def wirings():
+def wirings(scales):
     return st.builds(
         Wiring,
         st.permutations(range(6)),
-        st.lists(st.sampled_from(UNITS), min_size=6, max_size=6),
+        scales,
         st.lists(st.sampled_from([0.0, 0.41, -0.6, 0.02]) | st.floats(-6.0, 6.0), min_size=6, max_size=6),
     )
 
 
+class BusyArm(WiredArm):
+    """Its measurements have `noise` [rad] and are `late` [s] at most; nobody reports that its slider is at `slider`."""
+
+    def __init__(self, *arguments, noise, late, slider, **options):
+        super().__init__(*arguments, **options)
+        self.noise, self.late, self.slider, self.rng = noise, late, slider, np.random.default_rng(1)
+        self.before = 0  # parts of a period that the newest measurement is old
+
+    def age(self):
+        return self.before * self.spec.period / PARTS
+
+    def measure(self):
+        now, before = self.joints, int(self.rng.random() * self.late * PARTS / self.spec.period)
+        self.before = before
+        self.joints = self.trace[-1 - min(len(self.trace) - 1, before)] + self.rng.normal(0.0, self.noise, 6)
+        state = super().measure()
+        self.joints = now
+        return state
+
+
+EACH = st.lists(st.sampled_from(UNITS), min_size=6, max_size=6)
+# A joint that is measured smaller than it is shows no motion before it is large.
+SHOWN = st.lists(st.sampled_from([one for one in UNITS if abs(one) >= 1.0]), min_size=6, max_size=6)
+BUSY = st.fixed_dictionaries(
+    {
+        "lag": st.sampled_from([0.0, 0.03, 0.1]),
+        "noise": st.sampled_from([0.0, 1e-4, 5e-4]),
+        "late": st.sampled_from([0.0, 0.05, 0.1]),
+        "slider": st.sampled_from([1.0, 0.3, 0.1]),
+    }
+)
+
+
 @settings(max_examples=60, deadline=None)
-@given(wirings() | st.none(), wirings() | st.none(), st.sampled_from(["trajectory", "position"]), st.data())
-def test_no_joint_moves_far_or_fast_before_its_commands_are_proved(command, state, mode, data):
-    start = np.array(data.draw(st.lists(st.floats(-2.9, 2.9), min_size=6, max_size=6)))
-    arm = WiredArm(command, state, mode, lag=data.draw(st.sampled_from([0.0, 0.03, 0.1])), start=start)
+@given(
+    wirings(EACH) | st.none(),
+    wirings(SHOWN) | st.none(),
+    st.sampled_from(["trajectory", "position"]),
+    st.lists(st.floats(-2.9, 2.9), min_size=6, max_size=6),
+    BUSY,
+)
+def test_no_joint_moves_far_or_fast_before_its_commands_are_proved(command, state, mode, start, busy):
+    arm = BusyArm(command, state, mode, start=start, **busy)
     _, why = driven(arm)
     assert arm.farthest <= MOST
     assert arm.fastest <= FASTEST
@@ -225,6 +263,10 @@ def test_an_arm_that_does_as_it_is_told_is_proved_once_and_remembered():
             {"command": Wiring((0, 1, 2, 3, 5, 4)), "start": (*HOME[:4], 0.5, 0.5)},
             "wrist_3_joint moved .* when wrist_2_joint was commanded: the commands have another order",
         ),
+        (
+            {"start": (0.2, 0, 0, 0, 0, 0)},
+            r"\(G25\): the guards shorten the motion that proves the commands, at the edge of where the arm may go",
+        ),
         ({"stuck": range(6)}, "all joints were commanded to move, and none moved: look for a protective stop"),
         ({"stuck": [3]}, r"wrist_1_joint was commanded to move \+0.020 rad, and did not move: look for"),
     ],
@@ -234,6 +276,16 @@ def test_a_wrong_arm_is_stopped_with_its_reason(options, expected):
     with pytest.raises(SafetyStop, match="still stopped by first motion"):
         robot.step(np.zeros((1, 7)))
     assert re.search(expected, why), why
+
+
+def test_radians_that_are_taken_for_degrees_are_found_before_anything_moves():
+    arm = WiredArm(state=Wiring(scale=[np.pi / 180] * 6))
+    assert driven(arm)[1] == (
+        "The robot was stopped by first motion (G25): all joints are measured within 0.11 rad of 0, as by a driver or "
+        "a profile that takes radians for degrees, with which a motion would look like none: correct the scale, or jog "
+        "a joint away. When it is safe, call resume()."
+    )
+    assert arm.now == 0.0
 
 
 def test_an_arm_that_ignores_everything_is_named_within_three_seconds():

@@ -113,7 +113,11 @@ class ServedDriver:
             name = self._namespace + sink.address
             if sink.action:
                 if not self._bus.act(Action(name, sink.type, partial(self._begin, sink), self._cancel)):
-                    _log.warning("%s (%s) is not offered: only bam-serve's own server has actions", name, sink.type)
+                    _log.warning(
+                        "%s (%s) is not offered: only bam-serve's own server and bridges of ROS 1 have actions",
+                        name,
+                        sink.type,
+                    )
             elif sink.service:
                 self._bus.serve(name, sink.type, partial(self._request, sink))
         for one in self._profile.enable:

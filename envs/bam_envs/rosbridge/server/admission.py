@@ -15,10 +15,9 @@ from websockets.http11 import Request, Response
 from bam_envs.core.errors import InvalidValue, ProtocolError
 from bam_envs.rosbridge.encoding import decode_frame
 from bam_envs.rosbridge.server.client_session import ServerOptions
-from bam_envs.rosbridge.server.refusals import Refusals
 from bam_envs.rosbridge.server.server_connection import BridgeConnection
 from bam_envs.rosbridge.server.site import Site, is_websocket
-from bam_envs.rosbridge.tokens import Guesses, Tokens, places, who_leaves
+from bam_envs.rosbridge.tokens import Guesses, Refusals, Tokens, places, who_leaves
 
 _BEARER = "This server needs its token: send the header 'Authorization: Bearer TOKEN'"
 _TOO_OFTEN = "Too many wrong tokens came from this address; try again in a second."

@@ -36,10 +36,10 @@ from bam_envs.rosbridge.server.client_session import (
     read_text,
     read_wish,
 )
-from bam_envs.rosbridge.server.refusals import Refusals
 from bam_envs.rosbridge.server.services import Services, checked, packed_response
 from bam_envs.rosbridge.server.topics import Topic, Topics
 from bam_envs.rosbridge.sessions import FORBIDDEN
+from bam_envs.rosbridge.tokens import Refusals
 
 _FOR_WATCHERS = frozenset({"subscribe", "unsubscribe", "set_level", "fragment", "call_service", "send_action_goal"})
 _ON_HALT = frozenset({"advertise", "unadvertise", "publish"})  # what a watcher may do on the topic that halts, only

@@ -25,12 +25,11 @@ from bam_envs.rosbridge.endpoint import Address
 from bam_envs.rosbridge.server.admission import ClientAdmission, listening_error, tls_context
 from bam_envs.rosbridge.server.bridge import Bridge, Incoming
 from bam_envs.rosbridge.server.client_session import Call, ClientSession, Send, ServerOptions
-from bam_envs.rosbridge.server.refusals import Refusals
 from bam_envs.rosbridge.server.server_connection import BridgeConnection
 from bam_envs.rosbridge.server.site import Handler as SiteHandler
 from bam_envs.rosbridge.server.site import Site
 from bam_envs.rosbridge.threads import LoopThread, Workers
-from bam_envs.rosbridge.tokens import Tokens
+from bam_envs.rosbridge.tokens import Refusals, Tokens
 
 T = TypeVar("T")
 

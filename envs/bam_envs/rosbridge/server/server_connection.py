@@ -10,8 +10,7 @@ from websockets.frames import DATA_OPCODES, Frame, Opcode
 from websockets.protocol import Event, State
 
 from bam_envs.rosbridge.server.client_session import Packet, ServerOptions
-from bam_envs.rosbridge.server.refusals import Refusals
-from bam_envs.rosbridge.tokens import Role
+from bam_envs.rosbridge.tokens import Refusals, Role
 
 TRY_AGAIN_LATER = 1013  # close code of a client that does not read what it must get
 # Most sockets without a place, in all and of one address; the oldest is closed for a new one.

@@ -1,5 +1,4 @@
 import threading
-import time
 
 import gymnasium as gym
 import numpy as np
@@ -60,15 +59,6 @@ def send(link, joints, prefix=""):
     for topic, kind, message in encode_command(UR5E, ARM, command, None):
         link.advertise(prefix + topic, kind)
         link.publish(prefix + topic, message)
-
-
-def wait_for(condition, bus, timeout=10.0):
-    """Wait until `condition` is true, looking after each answer of the server."""
-    for _ in range(int(timeout / 0.01)):
-        if condition():
-            return
-        bus.call("/rosapi/get_time", "rosapi/GetTime", {}, timeout)
-    pytest.fail("it never became true")
 
 
 def test_an_environment_with_its_robot(serve_env):
@@ -162,29 +152,29 @@ class Timeless(gym.Env):
         self.closed += 1
 
 
-def test_topics_and_environment_are_one_robot_with_one_client_in_command(serve_env, link, transport):
+def test_topics_and_environment_are_one_robot_with_one_client_in_command(serve_env, link, transport, until):
     served = serve_env(fast=True, tcp=0)
     client, remote = link(served.bus.url), transport(TcpTransport, served.tcp.url)
     robot = served.env.unwrapped.robot
     start = robot.state.signals["joint_position"][0].copy()
     send(client, start + 0.01)
-    wait_for(lambda: robot.state.stamp[0] > 0.049, client)  # one command, one period
+    until(lambda: robot.state.stamp[0] > 0.049)  # one command, one period
     np.testing.assert_allclose(robot.setpoint[0, :6], start + 0.01)
     with pytest.raises(NotInCommand, match="is in command, not"):
         remote.reset(1)
     client.close()
     other = link(served.bus.url)
-    wait_for(lambda: served.lease.holder is None, other)
+    until(lambda: served.lease.holder is None)
     remote.reset(1)
     said = []
     other.on_status(lambda status: said.append(status["msg"]))
     send(other, start + 0.02)
-    wait_for(lambda: said, other)
+    until(lambda: said)
     assert "is in command, not" in said[0]
     assert [line.rpartition(" is ")[2] for line in served.lines] == ["in command", "no longer in command", "in command"]
 
 
-def test_through_somebody_elses_server(serve_env, link, transport):
+def test_through_somebody_elses_server(serve_env, link, transport, until):
     with BridgeServer(port=0) as theirs:
         served = serve_env(fast=True, via=f"{theirs.url}/lab")
         assert served.endpoints == [
@@ -199,12 +189,9 @@ def test_through_somebody_elses_server(serve_env, link, transport):
             local.close()
         client = link(theirs.url)
         send(client, served.env.unwrapped.robot.state.signals["joint_position"][0], "/lab")
-        wait_for(lambda: served.lease.holder == "a sender without a name", client)
+        until(lambda: served.lease.holder == "a sender without a name")
     down = "It is tried again until it is back; the robot rests meanwhile."
-    end = time.monotonic() + 10.0
-    while not any(down in line for line in served.lines):
-        assert time.monotonic() < end, served.lines
-        time.sleep(0.01)
+    until(lambda: any(down in line for line in served.lines))
 
 
 def test_a_robot_that_is_there_already_is_not_doubled(serve_env):
