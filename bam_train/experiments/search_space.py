@@ -128,10 +128,13 @@ def _read(name: str, text: Any) -> Dimension | None:
     shown = name.removeprefix("hyperparameters.")
     if match := _RANGE.fullmatch(text.strip()):
         kinds, low, high = match[1], float(match[2]), float(match[3])
+        if "log:" in kinds and min(low, high) <= 0:
+            found = match[2] if low <= 0 else match[3]
+            remedy = "give one such as log:1e-4..1e-2, or leave log: out"
+            raise SettingsError(f"{shown}={text}: a logarithmic range begins above 0, found {found}; {remedy}")
         if low >= high:
-            raise SettingsError(f"{shown}={text}: {match[2]} is not below {match[3]}; give {match[3]}..{match[2]}")
-        if "log:" in kinds and low <= 0:
-            raise SettingsError(f"{shown}={text}: a logarithmic range begins above 0, found {match[2]}")
+            swapped = f"{kinds}{match[3]}..{match[2]}"
+            raise SettingsError(f"{shown}={text}: {match[2]} is not below {match[3]}; give {swapped}")
         if "int:" in kinds and (low % 1 or high % 1):
             raise SettingsError(f"{shown}={text}: expected whole numbers at both ends of int:")
         return Dimension(name, low, high, "log:" in kinds, "int:" in kinds)

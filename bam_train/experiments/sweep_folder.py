@@ -87,12 +87,15 @@ class SweepFolder:
         place: The folder of runs, or the sweep's own if it is to be there already (`begun`).
         asked: Settings as `SearchSpace` takes them; of a sweep that was `begun`, those that are given again.
         seeds: Runs of a trial; None for what a sweep that was begun has.
+        is_new: Whether a sweep is begun in the folder of runs if none with these settings is there.
 
     Raises:
         SettingsError: A setting is wrong; or the folder has no sweep, or another one.
     """
 
-    def __init__(self, place: Path, asked: Mapping[str, Any], seeds: int | None, begun: bool = False) -> None:
+    def __init__(
+        self, place: Path, asked: Mapping[str, Any], seeds: int | None, begun: bool = False, is_new: bool = True
+    ) -> None:
         found = read_object(place / "config.json") or {} if begun else {}
         if begun:
             if "asked" not in found:
@@ -110,10 +113,17 @@ class SweepFolder:
             self.folder = RunFolder(place.parent, place.name, lambda path: True)
         else:
             stem = f"{file_stem(base.env, base.algo, base.trainer, base.env_kwargs)}-sweep"
+
+            def is_own(path: Path) -> bool:
+                return read_object(path / "config.json") == what
+
+            if not (is_new or any(map(is_own, place.glob(f"{stem}*")))):
+                text = "no sweep with these settings is there. Check them, or begin it without --status, --confirm"
+                raise SettingsError(f"{place}: {text} and --save-preset")
             with writing(place):
                 place.mkdir(parents=True, exist_ok=True)
             with locked(place, wait=True):  # of two calls that begin at the same time, one makes the folder
-                self.folder = RunFolder(place, stem, lambda path: read_object(path / "config.json") == what)
+                self.folder = RunFolder(place, stem, is_own)
                 self.folder.write_config(what)
         self.path, self.journal = self.folder.path, self.folder.path / "journal.log"
         self.study = self._open(hashlib.sha256(json.dumps(what, sort_keys=True).encode()).hexdigest()[:16])

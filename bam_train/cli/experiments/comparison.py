@@ -42,6 +42,7 @@ _FORMS: dict[str, Callable[[float | None], str]] = {"success": percent, "return"
 _WITHIN = {"success": (0.0, 1.0)}
 _ANY = (-math.inf, math.inf)
 _POSITIVE = (0.0, math.inf)
+NO_EVALUATION = "no evaluation is in its log; wait for the first one, or leave this run out"
 POINTS = 100
 """Points of a drawn curve."""
 
@@ -103,8 +104,8 @@ class RunComparison:
         runs = [run for row in self.rows for run in row.runs]
         self.metric: Metric = metric or ("success" if all("success" in run.curves for run in runs) else "return")
         if lacking := next((run for run in runs if self.metric not in run.curves), None):
-            has = " and ".join(lacking.curves) or "no evaluation"
-            raise SettingsError(f"{lacking.place}: {self.metric} is not in its log; there is {has}")
+            why = f"{self.metric} is not in its log; compare its {' or '.join(lacking.curves)} with --metric"
+            raise SettingsError(f"{lacking.place}: {why if lacking.curves else NO_EVALUATION}")
         goals = {run.settings.get(GOALS.get(self.metric, "")) for run in runs}
         self.level: float | None = level if level is not None else goals.pop() if len(goals) == 1 else None
         self.found = [self._compare(row) for row in self.rows]

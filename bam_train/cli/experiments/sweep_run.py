@@ -67,11 +67,12 @@ def sweep(config: SweepConfig) -> int:
     place = (config.resume or config.runs).expanduser()
     if config.save_preset is not None and config.save_preset.suffix not in (".toml", ".json"):
         raise SettingsError(f"--save-preset: expected a .toml or .json file, found {config.save_preset}")
-    folder = SweepFolder(place, given, seeds, begun)
+    searches = not config.status and config.confirm is None and config.save_preset is None
+    folder = SweepFolder(place, given, seeds, begun, is_new=searches)
     if config.status:
         tell(*_status(folder))
         return 0
-    if config.confirm is None and config.save_preset is None:
+    if searches:
         return _search(folder, trials or folder.study.user_attrs.get("trials", TRIALS), minutes, address, config.track)
     best = folder.best
     if best is None:

@@ -120,6 +120,10 @@ def test_fewer_than_three_seeds_are_no_result(run, rows, here):
 
 def test_what_is_refused(run, rows, here):
     write_row(here / "reach", (1.0, 1.0, 1.0), env="bam/reach-v0")
+    write_row(here / "begun", (0.8,))
+    (here / "begun" / "seed-0" / "outcome.json").unlink()
+    (here / "new").mkdir()
+    (here / "new" / "progress.jsonl").touch()
     rule = "--fail-if: expected worse, maybe-worse or not-better, such as worse:0.05, and two rows at least, found "
     for words, line in (
         ([], "FOLDER is missing: give a folder of runs for each row, such as runs/pick-ppo"),
@@ -127,6 +131,14 @@ def test_what_is_refused(run, rows, here):
             ["ppo", "reach"],
             "runs of different environments cannot be compared: bam/pick-v0 (ppo), bam/reach-v0 (reach). "
             "Leave one of them out",
+        ),
+        (
+            ["ppo", "new"],
+            "new: no evaluation is in its log; wait for the first one, or leave this run out",
+        ),
+        (
+            ["ppo", "begun", "--metric", "score"],
+            "begun/seed-0: score is not in its log; compare its success or return with --metric",
         ),
         (["ppo", "sac", "--fail-if", "bad"], f"{rule}'bad' and 2"),
         (["ppo", "--fail-if", "worse"], f"{rule}'worse' and 1"),

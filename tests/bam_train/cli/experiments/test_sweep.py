@@ -88,7 +88,12 @@ def trained(monkeypatch):
         (("lr=1e-4..1e-2",), "Unknown ppo hyperparameter 'lr'. Did you mean 'learning_rate'?"),
         (("gama=0.9..0.99",), "Unknown ppo hyperparameter 'gama'. Did you mean 'gamma'?"),
         (("gamma=0.99..0.9",), "gamma=0.99..0.9: 0.99 is not below 0.9; give 0.9..0.99"),
-        (("learning_rate=log:0..1",), "learning_rate=log:0..1: a logarithmic range begins above 0, found 0"),
+        (("gae_lambda=log:0.9..0.5",), "gae_lambda=log:0.9..0.5: 0.9 is not below 0.5; give log:0.5..0.9"),
+        (
+            ("learning_rate=log:1e-4..-1",),
+            "learning_rate=log:1e-4..-1: a logarithmic range begins above 0, found -1; "
+            "give one such as log:1e-4..1e-2, or leave log: out",
+        ),
         (("gamma=0.9..1.5",), "gamma: expected a number from 0 to 1, found 1.5"),
         (("n_steps=int:1.5..3",), "n_steps=int:1.5..3: expected whole numbers at both ends of int:"),
         (("n_steps=1.5..3",), "n_steps: expected a whole number, found 1.5"),
@@ -121,6 +126,12 @@ def test_refused_before_anything_is_searched(run, monkeypatch):
     assert run(main, *SEARCHED, "--minutes", "0") == (2, "", said)
     line = "bam-sweep: nowhere: no sweep is there. Check the name after --resume, such as runs/pick-ppo-sweep\n"
     assert run(main, "--resume", "nowhere", "--status") == (1, "", line)
+    line = (
+        "bam-sweep: runs: no sweep with these settings is there. Check them, or begin it without --status, --confirm "
+        "and --save-preset\n"
+    )
+    for flags in (("--status",), ("--confirm", "3"), ("--save-preset", "best.toml")):
+        assert run(main, *SEARCHED, *flags) == (1, "", line)
     Path("sweep.toml").write_text("trials = 'many'\n")
     line = "bam-sweep: trials: expected a whole number of at least 1, found 'many'\n"
     assert run(main, "sweep.toml", *SEARCHED) == (1, "", line)
