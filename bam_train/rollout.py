@@ -96,6 +96,7 @@ def rollout(
     """
     begun, rest = envs.num_envs, getattr(envs.unwrapped, "rest", None)
     kept = [keep(number) for number in range(begun)]
+    begins_to_rest = not all(kept)
     try:
         for step in islice(play(envs, policy, seed=seed, parts=parts), limit):
             for episode in step.ended:
@@ -105,8 +106,9 @@ def rollout(
                 begun += 1
             if not any(kept):
                 return
-            if step.ended and rest is not None:
+            if rest is not None and (step.ended or begins_to_rest):
                 rest(~np.array(kept))
+                begins_to_rest = False
     finally:
         if rest is not None:
             rest(np.zeros(envs.num_envs, dtype=bool))

@@ -16,7 +16,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 from gymnasium import spaces
 
 from bam_envs.core.errors import UnknownName
@@ -27,7 +26,7 @@ from bam_train.checkpoint import GOLDEN, POLICY, Checkpoint, safetensors_file, w
 from bam_train.compat.rllib_directory import Directory, find_policy
 from bam_train.compat.rllib_layouts import SavedPolicy, read_old_policy, restore, states, training_settings
 from bam_train.environments import (
-    control_period,
+    described,
     first_difference,
     make_env,
     must_be_named,
@@ -40,8 +39,7 @@ from bam_train.policy.frozen_policy import TOLERANCE
 from bam_train.settings import TrainSettings
 from bam_train.trainers.algorithms import RLLIB_ALGORITHMS
 from bam_train.trainers.base import origin
-from bam_train.trainers.frozen_network import pack
-from bam_train.trainers.rllib.rllib_freezing import AnySpace, FrozenModule, PolicyParts, RLlibPolicy, golden
+from bam_train.trainers.rllib.rllib_freezing import AnySpace, FrozenModule, PolicyParts, RLlibPolicy
 from bam_train.trainers.zero_based_spaces import space_from_zero
 
 EXPORTED = "exported"
@@ -136,17 +134,13 @@ def export(
     fitted = partial(_in_environment, saved, env_id, warn)
     kwargs, (parts, signals, period) = parity_if_needed(env_id, {**kwargs, **(env_kwargs or {})}, fitted, warn)
     parts = replace(parts, algorithm=_algorithm(saved, algo))
-    module = FrozenModule(parts)
-    graph = module.onnx_file()
     if saved.module is None:  # the network in PyTorch
-        by, observations = "PyTorch", module.golden_observations()
-        with torch.no_grad():
-            actions = module(*map(torch.as_tensor, observations.values())).numpy()
-        arrays = pack(observations, np.asarray(actions, parts.action_space.dtype))
+        by, own = "PyTorch", None
     else:
-        by = f"RLlib {metadata.version('ray')}"
         env_spaces = parts.observation_space, parts.action_space
-        arrays = golden(module, RLlibPolicy(saved.module, saved.env_to_module, saved.config, env_spaces))
+        own = partial(RLlibPolicy, saved.module, saved.env_to_module, saved.config, env_spaces)
+        by = f"RLlib {metadata.version('ray')}"
+    graph, arrays = FrozenModule(parts, own).members()
     frozen = FrozenPolicy.from_graph(graph, *map(space_to_json, (parts.observation_space, parts.action_space)))
     worst, _ = frozen.worst_difference(safetensors_file.parse(arrays))
     if not worst <= TOLERANCE:  # NaN too
@@ -231,8 +225,7 @@ def _in_environment(
 ) -> tuple[PolicyParts, dict[str, Any], float | None]:
     """The parts with the environment's spaces, its signals and its period; raises CheckpointMismatch if they differ."""
     with contextlib.closing(make_env(env_id, env_kwargs)) as env:
-        describe = getattr(env.unwrapped, "describe", None)
-        signals, period = describe() if describe else {}, control_period(env)
+        signals, period = described(env)
         ours = env.observation_space, env.action_space
     parts = saved.parts if saved.whole else _guessed(saved, env_id, ours[0], warn)
     pairs = [("action_space", parts.action_space, ours[1])]

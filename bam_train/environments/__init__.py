@@ -3,6 +3,7 @@
 from bam_train.environments.interface import (
     AnyEnv,
     control_period,
+    described,
     first_difference,
     fit_pairs,
     interface_in,
@@ -27,6 +28,7 @@ __all__ = [
     "ENTRY_POINTS",
     "AnyEnv",
     "control_period",
+    "described",
     "environment_of",
     "first_difference",
     "fit_pairs",

@@ -26,6 +26,12 @@ def control_period(env: gym.Env[Any, Any]) -> float | None:
     return 1.0 / float(rate) if rate else None
 
 
+def described(env: gym.Env[Any, Any]) -> tuple[dict[str, Any], float | None]:
+    """The signals of an environment, {} if it describes none, and its `control_period`."""
+    describe = getattr(env.unwrapped, "describe", dict)
+    return describe(), control_period(env)
+
+
 def require_fit(checkpoint: Checkpoint, env: AnyEnv, place: Location = HERE, env_id: str | None = None) -> None:
     """Check that `env` fits the checkpoint's policy.
 

@@ -25,6 +25,8 @@ from bam_train.rollout import BatchPolicy, PlayedEpisode, rollout
 
 FIRST_SEED = 1_000_000
 """The default seed of the first episode: far from the small seeds that training uses."""
+LOOK = 16
+"""Episodes that show whether a policy fails too often, of four times as many or more."""
 
 _Z95 = 1.959963984540054  # 97.5 % quantile of the normal distribution, for a two-sided 95 % interval
 
@@ -119,7 +121,8 @@ def evaluate(
         seed: Seed of the first episode; episode k gets ``seed + k``.
         num_envs: Number of environments stepped together; by default that of `default_num_envs`.
         env: A vector environment of `make_vector_env`, used instead of a new one; it is left open.
-        most_failures: With more episodes that fail it ends after the wave in progress, but not before a quarter of all.
+        most_failures: With more episodes that fail it ends after the wave in progress, but not before `LOOK` episodes,
+            or a quarter of all if those are fewer.
         on_progress: Called after every wave with the number of episodes done and the number of all episodes.
 
     Raises:
@@ -136,11 +139,13 @@ def evaluate(
     made = nullcontext(env) if env is not None else closing(make_vector_env(env_id, env_kwargs, num_envs))
     with made as envs:
         starts, done = number_of_starts(envs), list[PlayedEpisode]()
-        for wave in waves(FiniteVectorEnv(envs, env_id), policy, episodes=episodes, seed=seed):
+        least = min(LOOK, episodes / 4)
+        first = LOOK if most_failures < LOOK == least else None
+        for wave in waves(FiniteVectorEnv(envs, env_id), policy, episodes=episodes, seed=seed, first=first):
             done += wave
             if on_progress is not None:
                 on_progress(len(done), min(episodes, starts or episodes))
-            if len(done) >= episodes / 4 and sum(e.success is False for e in done) > most_failures:
+            if len(done) >= least and sum(e.success is False for e in done) > most_failures:
                 break
     return summarise(env_id, done, seed, starts)
 
@@ -152,9 +157,11 @@ def number_of_starts(env: VectorEnv[Any, Any, Any]) -> int | None:
 
 
 def waves(
-    env: VectorEnv[Any, Any, Any], policy: BatchPolicy, *, episodes: int, seed: int
+    env: VectorEnv[Any, Any, Any], policy: BatchPolicy, *, episodes: int, seed: int, first: int | None = None
 ) -> Iterator[list[PlayedEpisode]]:
     """Play `episodes` episodes, one in each environment at a time; yields those of each wave that count.
+
+    The first wave has at most `first` episodes.
 
     Episode k starts from ``reset(seed=seed + k)``. Where there are so many starts and no more, such as pictures of a
     test split, an episode counts if its start is new: a second one would say the same.
@@ -163,15 +170,15 @@ def waves(
     starts, played, seen = number_of_starts(env), 0, set[int]()
     left, drawn = min(episodes, starts or episodes), None if starts is None else lambda *_: (inner.task.drawn,)
     while left:
-        count = env.num_envs if starts else min(env.num_envs, left)
+        count = env.num_envs if starts else min(env.num_envs, left if played else first or left, left)
         ended = rollout(env, policy, seed=seed + played, keep=partial(gt, count), parts=drawn)
         wave = sorted(ended, key=lambda one: one.env_id)
         if starts is not None:
-            first: dict[int, PlayedEpisode] = {}
+            new: dict[int, PlayedEpisode] = {}
             for one in wave:
-                first.setdefault(int(one.parts[0][0]), one)
-            wave = [one for start, one in first.items() if start not in seen]
-            seen.update(first)
+                new.setdefault(int(one.parts[0][0]), one)
+            wave = [one for start, one in new.items() if start not in seen]
+            seen.update(new)
         wave = wave[:left]
         left, played = left - len(wave), played + count
         yield wave

@@ -115,7 +115,7 @@ class SweepFolder:
             stem = f"{file_stem(base.env, base.algo, base.trainer, base.env_kwargs)}-sweep"
 
             def is_own(path: Path) -> bool:
-                return read_object(path / "config.json") == what
+                return bool(read_object(path / "config.json") == what)
 
             if not (is_new or any(map(is_own, place.glob(f"{stem}*")))):
                 text = "no sweep with these settings is there. Check them, or begin it without --status, --confirm"

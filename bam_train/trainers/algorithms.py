@@ -146,13 +146,13 @@ def without_notice() -> contextlib.AbstractContextManager[object]:
     return contextlib.redirect_stderr(io.StringIO())
 
 
-def load_trainer(name: str) -> type[Trainer]:
+def load_trainer(name: str) -> type[Trainer[Any]]:
     """Import the class of a trainer with its library; raises MissingExtra without the library."""
     if name not in TRAINERS:
         raise SettingsError(f"Unknown trainer {name!r}. {did_you_mean(name, TRAINERS)}")
     try:
         with without_notice():
-            trainer: type[Trainer] = pkgutil.resolve_name(TRAINERS[name].reference)
+            trainer: type[Trainer[Any]] = pkgutil.resolve_name(TRAINERS[name].reference)
     except ModuleNotFoundError as error:
         raise MissingExtra(str(error.name).partition(".")[0], TRAINERS[name].extra, f"The {name} trainer") from error
     return trainer

@@ -199,11 +199,15 @@ class FrozenNetwork(Layer):
         return {key: value[keep] for key, value in drawn.items()}
 
     def members(self, n: int = 256, given: Mapping[str, Array] | None = None) -> tuple[bytes, bytes]:
-        """The ONNX file, and `golden_observations` with the actions that torch computes.
-
-        If the policy is recurrent, they are the steps of one episode.
-        """
+        """The ONNX file, and `golden_observations` with `own_actions` for them, as safetensors."""
         observations = self.golden_observations(n, given)
+        return self.onnx_file(), pack(observations, self.own_actions(observations))
+
+    def own_actions(self, observations: Mapping[str, Array]) -> Array:
+        """The actions of the library that trained the policy, here those that torch computes. Shape: (n, ...).
+
+        If the policy is recurrent, the observations by key, (n, ...), are the steps of one episode.
+        """
         batch = tuple(map(torch.as_tensor, observations.values()))
         state, actions = [one[:1] for one in self.state.values()], []
         with torch.no_grad():
@@ -211,7 +215,7 @@ class FrozenNetwork(Layer):
                 outputs = self(*one, *state)
                 action, *state = outputs if isinstance(outputs, tuple) else (outputs,)
                 actions.append(action.numpy())
-        return self.onnx_file(), pack(observations, np.concatenate(actions))
+        return np.concatenate(actions)
 
 
 def trace(

@@ -160,7 +160,7 @@ def _implied(given: Mapping[str, Any]) -> dict[str, Any]:
 def _complete(settings: TrainSettings, tell: Tell) -> TrainSettings:
     """Check settings and add the trainer's defaults, as far as possible without its library, which takes seconds."""
     try:
-        if settings.trainer == "sb3":
+        if isinstance(settings, SB3Settings) and settings.trainer == "sb3":
             return complete_settings(settings)
         if settings.trainer == "rllib":
             take_hyperparameters(RLLIB_ALGORITHMS[settings.algo], settings.hyperparameters)
@@ -171,7 +171,8 @@ def _complete(settings: TrainSettings, tell: Tell) -> TrainSettings:
             str(error.name), TRAINERS[settings.trainer].extra, f"The {settings.trainer} trainer"
         ) from error
     tell(f"{settings.algo} on {settings.env}: the {settings.trainer} trainer is loaded, which takes a few seconds")
-    return load_trainer(settings.trainer).complete(settings)
+    completed: TrainSettings = load_trainer(settings.trainer).complete(settings)
+    return completed
 
 
 def own_settings(checkpoint: Checkpoint, env: str | None = None, *, elsewhere: bool = False) -> dict[str, Any]:

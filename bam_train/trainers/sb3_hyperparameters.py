@@ -19,7 +19,7 @@ from bam_envs.core.validation import Finite, Fraction, NonNegative, Positive, Po
 from bam_envs.core.wording import did_you_mean, listed
 from bam_train.environments import make_env, make_vector_env
 from bam_train.errors import SettingsError
-from bam_train.settings import NAMES, TrainSettings
+from bam_train.settings import NAMES, SB3Settings
 from bam_train.trainers.algorithms import SB3_ALGORITHMS, Algorithm
 from bam_train.trainers.library_arguments import linear_start, parameters, table, take
 
@@ -71,7 +71,7 @@ _RANGES = {
 """Ranges of numbers outside which no algorithm can learn, although the library accepts them."""
 
 
-def complete_settings(settings: TrainSettings) -> TrainSettings:
+def complete_settings(settings: SB3Settings) -> SB3Settings:
     """Add the algorithm's defaults, and the number of environments that servers run.
 
     Raises:

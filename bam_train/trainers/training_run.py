@@ -99,7 +99,7 @@ class TrainingRun:
 
     def __init__(
         self,
-        trainer: Trainer,
+        trainer: Trainer[Any],
         folder: RunFolder,
         out: Path,
         watcher: RunWatcher,
@@ -370,8 +370,6 @@ class TrainingRun:
 
 EVALUATION_SEED = 2_000_000
 """First seed of evaluations, far from the small seeds of training and from bam-eval's."""
-LOOK = 16
-"""Episodes that show whether a policy succeeds at all."""
 
 
 def evaluate_for_goal(
@@ -379,10 +377,9 @@ def evaluate_for_goal(
 ) -> tuple[EvaluationReport, str]:
     """Evaluate a policy; returns the report (the worse of two), and which goal of the run was reached, "" for none.
 
-    First `LOOK` episodes are played, if all are many more; then all, if any of those succeeded; then, if the goal was
-    reached, as many other episodes, which must reach it too. Failures that rule `until_success` out end an evaluation,
-    but not the last one of a run, which plays all. Episode k has the seed EVALUATION_SEED + seed + k; `envs` are left
-    open.
+    If the goal was reached, as many other episodes are played, which must reach it too. Failures that rule
+    `until_success` out end an evaluation, see `evaluate`, but not the last one of a run, which plays all. Episode k has
+    the seed EVALUATION_SEED + seed + k; `envs` are left open.
     """
     episodes, wanted, most = settings.eval_episodes, settings.until_success, math.inf
     if wanted is not None and settings.stop_reward is None and not last:
@@ -393,8 +390,6 @@ def evaluate_for_goal(
         given: dict[str, Any] = {"episodes": count, "seed": seed, "env": envs, "most_failures": most}
         return evaluate(policy, settings.env, settings.env_kwargs, **given)
 
-    if most < LOOK <= episodes / 8 and (look := play(0, LOOK)).successes == 0:
-        return look, ""
     report = play(0, episodes)
     if not _reached(report, settings):
         return report, ""

@@ -69,10 +69,13 @@ def test_numbers_do_not_depend_on_how_many_run_side_by_side(corridor, num_envs):
     )
 
 
-@pytest.mark.parametrize(("episodes", "most", "played"), [(12, 1, 4), (12, 5, 6), (12, 12, 12), (32, 1, 8)])
-def test_more_failures_than_wanted_end_it_after_a_wave_and_a_quarter_of_the_episodes(corridor, episodes, most, played):
+@pytest.mark.parametrize(
+    ("episodes", "most", "num_envs", "played"),
+    [(12, 1, 2, 4), (12, 5, 2, 6), (12, 12, 2, 12), (32, 1, 2, 8), (80, 1, 2, 16), (80, 1, 40, 16), (80, 20, 40, 40)],
+)
+def test_more_failures_than_wanted_end_it_after_a_wave(corridor, episodes, most, num_envs, played):
     slow = {"slow": True}  # nobody succeeds
-    report = evaluate(Always(), corridor, slow, episodes=episodes, num_envs=2, most_failures=most)
+    report = evaluate(Always(), corridor, slow, episodes=episodes, num_envs=num_envs, most_failures=most)
     assert (report.episodes, report.successes) == (played, 0)
 
 
@@ -183,7 +186,9 @@ def test_an_episode_depends_on_its_seed_and_on_no_other_episode(env_id):
     rows = make_vector_env(env_id, options, 4)
     policy = Steady(rows.single_action_space.shape[0])
     together = evaluate(policy, env_id, episodes=4, seed=3, env=rows)
+    one_first = [one for wave in waves(rows, policy, episodes=4, seed=3, first=1) for one in wave]
     rows.close()
+    assert summarise(env_id, one_first, 3) == together
     assert together.length_mean > 1
     assert together == evaluate(policy, env_id, options, episodes=4, seed=3, num_envs=1)
     assert together == evaluate(policy, env_id, options, episodes=4, seed=3, num_envs=3)

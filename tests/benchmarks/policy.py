@@ -46,14 +46,14 @@ def contenders(flags):
     from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
     from bam_train.policy import FrozenPolicy
-    from bam_train.trainers.sb3.sb3_freezing import freeze
+    from bam_train.trainers.sb3.sb3_freezing import FrozenModel
 
     torch.set_num_threads(1)
     observation, action = spaces.Box(-1, 1, (flags.observation,)), spaces.Box(-1, 1, (flags.action,))
     env = DummyVecEnv([lambda: Blank(observation, action)])
     normaliser = VecNormalize(env, training=False) if flags.normalise else None
     model = PPO("MlpPolicy", normaliser or env, policy_kwargs={"net_arch": list(flags.layers)}, device="cpu")
-    graph = freeze(model, normaliser, observation, action)
+    graph = FrozenModel(model, normaliser, observation, action).onnx_file()
     frozen = FrozenPolicy.from_graph(graph, space_to_json(observation), space_to_json(action))
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = options.inter_op_num_threads = 1

@@ -131,7 +131,7 @@ class GraspTrainer(TorchTrainer[TrainSettings]):
 
     def members(self) -> tuple[bytes, bytes]:
         """The policy's ONNX file, and its golden actions for pictures of the environments."""
-        found: tuple[bytes, bytes] = self.finite_policy().members(_GOLDEN, self._observation)
+        found: tuple[bytes, bytes] = self.frozen().members(_GOLDEN, self._observation)
         return found
 
     def state(self) -> dict[str, Any]:

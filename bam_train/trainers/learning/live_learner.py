@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import contextlib
 import copy
+import json
 from collections.abc import Mapping
 from functools import partial
 from itertools import islice
@@ -33,7 +34,7 @@ from bam_train.trainers.learning.experience import Experience
 from bam_train.trainers.learning.networks import Descent
 from bam_train.trainers.learning.replay_memory import ActionCode
 from bam_train.trainers.learning.rlpd import Actor, Rlpd
-from bam_train.trainers.learning.torch_trainer import STATE, TorchLearner
+from bam_train.trainers.learning.torch_trainer import NOTES, STATE, TorchLearner
 
 ALGORITHM, TRAINER = "rlpd", "live"
 _LARGEST = 500_000  # transitions that are kept
@@ -211,8 +212,8 @@ class LiveLearner(TorchLearner[SB3Settings]):
 
     def save_candidate(self, path: Path, *, explores: bool = True) -> Checkpoint:
         """Write a checkpoint that can be deployed, without what a run goes on from."""
-        members = self.finite_policy(explores=explores).members()
-        return self.write(path, members, {}, {"explores": explores}, None)
+        members = self.frozen(explores=explores).members()
+        return self.write(path, members, {}, {NOTES: json.dumps({"explores": explores}).encode()})
 
     # ---- the first policy
 

@@ -4,35 +4,27 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import functools
 import json
 from collections import deque
-from collections.abc import Iterator, Mapping
-from pathlib import Path
-from typing import TYPE_CHECKING, Any, Generic, TypeVar
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
-from gymnasium.vector import VectorEnv
 
-from bam_envs.core.spaces import space_to_json
-from bam_train.checkpoint import GOLDEN, POLICY, Checkpoint, write_checkpoint
+from bam_train.checkpoint import Checkpoint
 from bam_train.checkpoint.safetensors_file import pack
-from bam_train.environments import control_period, make_env, require_fit
+from bam_train.environments import make_env, require_fit
 from bam_train.errors import TrainingFailed
-from bam_train.policy import FrozenPolicy
 from bam_train.rollout import PlayedEpisode, play
 from bam_train.settings import TrainSettings
 from bam_train.trainers.algorithms import ALGORITHMS
-from bam_train.trainers.base import OnProgress, Progress, Statistics, manifest
+from bam_train.trainers.base import OnProgress, Progress, Settings, Statistics, Trainer
 from bam_train.trainers.learner_hyperparameters import read_hyperparameters
 from bam_train.trainers.resolve_settings import own_settings
-from bam_train.trainers.run_folder import TensorBoardFiles
 
 if TYPE_CHECKING:
     from typing_extensions import Self
-
-Settings = TypeVar("Settings", bound=TrainSettings)
 
 STATE, NOTES = "bam/resume/state", "bam/resume/notes.json"
 _LOGGED = 200  # entries of TensorBoard in a run
@@ -60,11 +52,9 @@ def restore(part: Any, state: Any) -> None:
         part.load_state_dict(state)
 
 
-class TorchLearner(Generic[Settings]):
-    """Base class of a learner; a subclass sets `spaces` and `parts`, and defines `policy`."""
+class TorchLearner(Trainer[Settings]):
+    """Base class of a learner; a subclass sets `parts`, and defines `policy`."""
 
-    spaces: tuple[Any, Any]
-    """Spaces of observations and actions of one environment."""
     parts: dict[str, Any]
     """Networks, optimisers and random generators by name; see `state_of`."""
 
@@ -72,14 +62,13 @@ class TorchLearner(Generic[Settings]):
         torch.set_num_threads(settings.threads)
         torch.manual_seed(settings.seed)
         self.settings, self.options = settings, self.read_options(settings)
-        self._steps = 0
         self._rng = np.random.default_rng(settings.seed)
 
     def policy(self) -> Any:
         """A copy of the current policy, a `FrozenNetwork`."""
         raise NotImplementedError
 
-    def finite_policy(self, **asked: Any) -> Any:
+    def frozen(self, **asked: Any) -> Any:
         """The current policy; `asked` goes to `policy`.
 
         Raises:
@@ -91,11 +80,6 @@ class TorchLearner(Generic[Settings]):
             raise TrainingFailed(f"{text}; expected finite numbers: try a smaller learning_rate")
         return policy
 
-    def members(self) -> tuple[bytes, bytes]:
-        """The current policy as an ONNX file, and its golden actions."""
-        found: tuple[bytes, bytes] = self.finite_policy().members()
-        return found
-
     def state(self) -> dict[str, Any]:
         """What a run goes on from, besides torch's random numbers."""
         return {**state_of(self.parts)}
@@ -103,10 +87,6 @@ class TorchLearner(Generic[Settings]):
     def load_state(self, state: Any) -> None:
         """Restore the result of `state`."""
         restore(self.parts, state)
-
-    def facts(self) -> dict[str, Any]:
-        """Further fields of the manifest."""
-        return {}
 
     @classmethod
     def read_options(cls, settings: Settings) -> Any:
@@ -134,57 +114,18 @@ class TorchLearner(Generic[Settings]):
             self.load_state(state)
             torch.set_rng_state(state["torch"])
 
-    @functools.cached_property
-    def described(self) -> tuple[dict[str, Any], float | None]:
-        """Signals and period [s] of the environment."""
-        with contextlib.closing(make_env(self.settings.env, self.settings.env_kwargs)) as env:
-            describe = getattr(env.unwrapped, "describe", None)
-            return describe() if describe else {}, control_period(env)
-
-    @property
-    def steps(self) -> int:
-        """Steps trained since the start of the run."""
-        return self._steps
-
-    def save(self, path: Path, scores: Mapping[str, Any], notes: Mapping[str, Any]) -> Checkpoint:
-        """Write a checkpoint that can be resumed and deployed."""
-        with self.undisturbed():
-            members = self.members()
-        return self.write(path, members, scores, notes, {**self.state(), "torch": torch.get_rng_state()})
-
-    def write(
-        self, path: Path, members: tuple[bytes, bytes], scores: Any, notes: Any, state: dict[str, Any] | None
-    ) -> Checkpoint:
-        """Write a checkpoint, from which a run can go on if there is a `state`."""
-        signals, period = self.described
-        known = {"signals": signals, "period": period, "steps": self.steps, "scores": scores}
-        written = {POLICY: members[0], GOLDEN: members[1], NOTES: json.dumps(dict(notes)).encode()}
-        written |= {} if state is None else pack(STATE, state)
-        return write_checkpoint(path, {**manifest(self.settings, self.spaces, known), **self.facts()}, written)
-
-    def freeze(self, **asked: Any) -> FrozenPolicy:
-        """Freeze the current policy; `asked` goes to `policy`."""
-        with self.undisturbed():
-            graph = self.finite_policy(**asked).onnx_file()
-        return FrozenPolicy.from_graph(graph, *map(space_to_json, self.spaces))
-
-    @contextlib.contextmanager
-    def undisturbed(self) -> Iterator[None]:
-        """Restore torch's random number generator after the ``with`` block."""
-        before = torch.get_rng_state()
-        try:
-            yield
-        finally:
-            torch.set_rng_state(before)
+    def resume_members(self, notes: Mapping[str, Any]) -> dict[str, bytes]:
+        """The notes, and the `state` with torch's random numbers."""
+        state = {**self.state(), "torch": torch.get_rng_state()}
+        return {NOTES: json.dumps(dict(notes)).encode(), **pack(STATE, state)}
 
 
 class TorchTrainer(TorchLearner[Settings]):
-    """Base class of a `Trainer`; a subclass sets `envs`, if it has any, and defines `advance`.
+    """Base class of a trainer; a subclass sets `envs`, if it has any, and defines `advance`.
 
     Where its environments are played, it is the policy that is played; see `BatchPolicy`.
     """
 
-    evaluations = "choose"
     recent = 100
     """Most episodes in the statistics."""
     envs: Any = None
@@ -198,7 +139,6 @@ class TorchTrainer(TorchLearner[Settings]):
         self.ended: deque[PlayedEpisode] = deque(maxlen=self.recent)
         """The last episodes of training."""
         self._logged, self._due = 0, 0.0  # step of the last log; updates that are due
-        self._board: TensorBoardFiles | None = None
 
     def advance(self, total: int) -> None:
         """Train a little, of a run of `total` steps, and count the steps."""
@@ -251,26 +191,16 @@ class TorchTrainer(TorchLearner[Settings]):
             if self._steps - self._logged >= steps // _LOGGED:
                 self._logged = self._steps
                 self.log(self.metrics)
-            if not on_progress(Progress(self._steps, steps, lambda: Statistics.of(self.ended, self.metrics))):
+            if not on_progress(Progress(self._steps, steps, self._statistics)):
                 return
 
-    def log_to(self, folder: Path) -> None:
-        """Write TensorBoard files into a folder from now on."""
-        self._board = TensorBoardFiles(folder)
-
-    def log(self, metrics: Mapping[str, float]) -> None:
-        """Write numbers into TensorBoard's files."""
-        if self._board is not None:
-            self._board.write(dict(metrics), self.steps)
-
-    @contextlib.contextmanager
-    def evaluation_envs(self) -> Iterator[VectorEnv[Any, Any, Any] | None]:
-        """None: others are made."""
-        yield None
+    def _statistics(self) -> Statistics:
+        known = [one.success for one in self.ended if one.success is not None]
+        totals, lengths = [one.total for one in self.ended], [one.length for one in self.ended]
+        return Statistics.of(totals, lengths, known, self.metrics)
 
     def close(self) -> None:
         """Close environments and log files."""
-        if self._board is not None:
-            self._board.close()
+        super().close()
         if self.envs is not None:
             self.envs.close()

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from torch import nn
 
 from bam_train.errors import PolicyError, SettingsError
-from bam_train.trainers.frozen_network import FrozenNetwork, Layer, Normalised, OneHot, action_head, pack, to
+from bam_train.trainers.frozen_network import FrozenNetwork, Layer, Normalised, OneHot, action_head, to
 from bam_train.trainers.rllib.rllib_state import unpacked_array
 from bam_train.trainers.zero_based_spaces import less_start, plus_start
 
@@ -161,12 +161,17 @@ def _filter_of(connector: Any) -> Filter:
 class FrozenModule(FrozenNetwork):
     """A copy of a policy of RLlib, from raw observations to actions.
 
+    Args:
+        parts: What the actions depend on.
+        make_policy: Makes RLlib's own policy, where it is there.
+
     Raises:
         PolicyError: The network or a space is of a kind that cannot be frozen.
     """
 
-    def __init__(self, parts: PolicyParts) -> None:
+    def __init__(self, parts: PolicyParts, make_policy: Callable[[], RLlibPolicy] | None = None) -> None:
         super().__init__(parts.observation_space)
+        self._make_policy = make_policy
         space, actions, given = parts.observation_space, parts.action_space, parts.filter
         floats = isinstance(space, spaces.Box) and np.issubdtype(space.dtype, np.floating)
         if not parts.flatten and not isinstance(space, spaces.Box):
@@ -199,6 +204,12 @@ class FrozenModule(FrozenNetwork):
             if given is not None and isinstance(leaf, spaces.Box):
                 mean, spread = (numbers.ravel()[part] for numbers in (given.offset, given.divisor))
                 self.moments[key] = mean.reshape(leaf.shape), spread.reshape(leaf.shape)
+
+    def own_actions(self, observations: Mapping[str, Array]) -> Array:
+        """RLlib's own, or torch's where there is no RLlib; see `FrozenNetwork`."""
+        if self._make_policy is None:
+            return super().own_actions(observations)
+        return self._make_policy().actions(one_by_one(observations))
 
     def _require_fit(self) -> None:
         """Raise PolicyError unless the weights fit the observation and action space."""
@@ -347,16 +358,6 @@ class RLlibPolicy:
         actions = np.stack([np.asarray(action) for action in batch.get("actions_for_env", batch["actions"])])
         dtype = np.int64 if isinstance(action_space, spaces.Discrete) else action_space.dtype
         return np.asarray(plus_start(action_space, actions), dtype)
-
-
-def golden(frozen: FrozenModule, policy: RLlibPolicy, n: int = 256) -> bytes:
-    """Draw n observations, or fewer if they are large, and record RLlib's deterministic actions for them.
-
-    Returns:
-        A safetensors file with ``observation`` (or ``observation.<key>``), (n, ...), and ``action``, (n, ...).
-    """
-    observations = frozen.golden_observations(n)
-    return pack(observations, policy.actions(one_by_one(observations)))
 
 
 def one_by_one(observations: Mapping[str, Array]) -> list[Any]:

@@ -31,13 +31,13 @@ from bam_train.settings import RLlibSettings
 from bam_train.trainers.algorithms import RLLIB_ALGORITHMS, Algorithm
 from bam_train.trainers.library_arguments import fits, require_known, take
 from bam_train.trainers.rllib import register_foreign
+from bam_train.trainers.rllib.mean_std_filter import MeanStdFilter
 from bam_train.trainers.rllib.ray_cluster import learners
 from bam_train.trainers.rllib.robot_env_runner import (
     CAUSES,
     PROBE_TIMEOUT,
     RESTART_DELAY,
     SAMPLE_TIMEOUT,
-    MeanStdFilter,
     ReportingEnvRunner,
     RobotEnvRunner,
     log_end,

@@ -7,7 +7,6 @@ import dataclasses
 import functools
 import logging
 import math
-import random
 import time
 import warnings
 from collections import deque
@@ -18,23 +17,20 @@ from typing import Any, cast
 import numpy as np
 import torch
 from gymnasium import spaces
-from gymnasium.vector import VectorEnv
 from ray.exceptions import RayError
 from ray.rllib.core import COMPONENT_ENV_TO_MODULE_CONNECTOR, DEFAULT_MODULE_ID
 
-from bam_envs.core.spaces import space_to_json
-from bam_train.checkpoint import Checkpoint, write_checkpoint
+from bam_train.checkpoint import Checkpoint
 from bam_train.data import DataSet
-from bam_train.environments import control_period, make_env, require_fit
+from bam_train.environments import described, make_env, require_fit
 from bam_train.errors import SettingsError, TrainingFailed
-from bam_train.policy import FrozenPolicy
 from bam_train.settings import RLlibSettings
 from bam_train.trainers.algorithms import RLLIB_ALGORITHMS
-from bam_train.trainers.base import OnProgress, Progress, Statistics, manifest
+from bam_train.trainers.base import OnProgress, Progress, Statistics, Trainer
 from bam_train.trainers.resolve_settings import learnt_episodes, own_settings
 from bam_train.trainers.rllib import rllib_state
 from bam_train.trainers.rllib.ray_cluster import cluster
-from bam_train.trainers.rllib.rllib_freezing import FrozenModule, RLlibPolicy, golden, input_spaces, parts_of
+from bam_train.trainers.rllib.rllib_freezing import FrozenModule, RLlibPolicy, input_spaces, parts_of
 from bam_train.trainers.rllib.rllib_hyperparameters import (
     complete,
     complete_normalize,
@@ -43,7 +39,6 @@ from bam_train.trainers.rllib.rllib_hyperparameters import (
     refusals,
 )
 from bam_train.trainers.rllib.robot_env_runner import CAUSES, ENDS
-from bam_train.trainers.run_folder import TensorBoardFiles
 from bam_train.trainers.zero_based_spaces import space_from_zero
 
 _EPISODES = 100
@@ -56,25 +51,19 @@ MOST_DEATHS, WINDOW = 5, 20
 LONGEST_ALONE = 180.0  # longest wait while all runners are dead [s]; a busy computer starts one in half a minute
 
 
-class RLlibTrainer:
-    """A run of one algorithm of RLlib; made by `create` or `load`."""
-
-    evaluations = "choose"
+class RLlibTrainer(Trainer[RLlibSettings]):
+    """A run of one algorithm of RLlib; made by `create` or `load`. Steps of an offline one are those learnt from."""
 
     def __init__(self, settings: RLlibSettings, seed: int) -> None:
         self.settings = settings
         self.notices: list[str] = []
         with contextlib.closing(make_env(settings.env, settings.env_kwargs)) as env:
-            self._spaces = env.observation_space, env.action_space
-            describe = getattr(env.unwrapped, "describe", None)
-            self._signals, self._period = describe() if describe else {}, control_period(env)
+            self.spaces, self.described = (env.observation_space, env.action_space), described(env)
         self._ends = {name: deque[float](maxlen=_EPISODES) for name in ("return", "length", "success")}
         self.timers: dict[str, Any] = {}
         """Seconds of each part of the last iteration, smoothed, under RLlib's names."""
         self._learnt: dict[str, Any] = {}
         """Metrics of RLlib's learner for the last iteration."""
-        self._steps = 0
-        self._tensorboard: TensorBoardFiles | None = None
         runners, each = settings.num_env_runners, envs_each(settings)
         if runners and each * runners != settings.num_envs:
             self.notices.append(
@@ -86,7 +75,7 @@ class RLlibTrainer:
         with contextlib.ExitStack() as stack:
             stack.enter_context(cluster(settings))
             with refusals(settings):
-                self._config = make_config(settings, *self._spaces, seed)
+                self._config = make_config(settings, *self.spaces, seed)
                 self.algorithm = self._config.build_algo()
             stack.callback(self.algorithm.stop)
             with contextlib.suppress(OSError):  # a folder below ~/ray_results, into which RLlib then writes nothing
@@ -159,15 +148,6 @@ class RLlibTrainer:
             self.close()
             raise
 
-    def log_to(self, folder: Path) -> None:
-        """Write TensorBoard files into a folder from now on."""
-        self._tensorboard = TensorBoardFiles(folder)
-
-    @property
-    def steps(self) -> int:
-        """Steps trained since the start of the run; for an offline algorithm, recorded steps learnt from."""
-        return self._steps
-
     def train(self, steps: int, on_progress: OnProgress) -> None:
         """Train until the run has at least `steps` steps, or `on_progress` returns False."""
         while self.steps < steps:
@@ -208,19 +188,13 @@ class RLlibTrainer:
         return {name: number for name, number in numbers.items() if math.isfinite(number)}
 
     def _statistics(self) -> Statistics:
-        means = {name: float(np.mean(values)) if values else None for name, values in self._ends.items()}
-        return Statistics(
-            episodes=len(self._ends["return"]),
-            return_mean=means["return"],
-            length_mean=means["length"],
-            success_rate=means["success"],
-            metrics=self._metrics(),
-        )
+        ends = self._ends
+        return Statistics.of(ends["return"], ends["length"], ends["success"], self._metrics())
 
     @functools.cached_property
     def _policy(self) -> tuple[Any, Any]:
         """A module in this process, and the connectors before it; not those that learn or collect."""
-        observed, acted = map(space_from_zero, self._spaces)
+        observed, acted = map(space_from_zero, self.spaces)
         before = self._config.build_env_to_module_connector(env=None, spaces=input_spaces((observed, acted)))
         given = {DEFAULT_MODULE_ID: (before.observation_space, acted)}
         with self.undisturbed():
@@ -238,21 +212,16 @@ class RLlibTrainer:
         if (runner := self.algorithm.env_runner) is not None:
             state = runner.get_state(components=COMPONENT_ENV_TO_MODULE_CONNECTOR)
             self._policy[1].set_state(state[COMPONENT_ENV_TO_MODULE_CONNECTOR])
-        return kind(module, self._policy[1], self._config, self._spaces, **options)
+        return kind(module, self._policy[1], self._config, self.spaces, **options)
 
-    def save(self, path: Path, scores: Mapping[str, Any], notes: Mapping[str, Any]) -> Checkpoint:
-        """Write a checkpoint that can be resumed and deployed."""
-        with self.undisturbed():
-            module = self._module()
-            frozen = FrozenModule(self._of(parts_of, module))
-            members = {
-                "bam/policy.onnx": frozen.onnx_file(),
-                "bam/golden.safetensors": golden(frozen, self._of(RLlibPolicy, module)),
-                **rllib_state.members(self.algorithm, notes),
-            }
-        known = {"signals": self._signals, "period": self._period, "steps": self.steps, "scores": scores}
-        fields = {**manifest(self.settings, self._spaces, known), "data": self._learnt_from}
-        return write_checkpoint(path, fields, members)
+    def frozen(self) -> FrozenModule:
+        """A copy of the current policy."""
+        module = self._module()
+        return FrozenModule(self._of(parts_of, module), functools.partial(self._of, RLlibPolicy, module))
+
+    def resume_members(self, notes: Mapping[str, Any]) -> dict[str, bytes]:
+        """The notes, and RLlib's whole algorithm."""
+        return rllib_state.members(self.algorithm, notes)
 
     @functools.cached_property
     def _learnt_from(self) -> dict[str, Any]:
@@ -263,42 +232,18 @@ class RLlibTrainer:
         steps = sum(data.facts(index)["length"] for index in range(len(data)))
         return {"digest": data.digest, "episodes": data.digests, "steps": steps}
 
-    def freeze(self) -> FrozenPolicy:
-        """Freeze the current policy."""
-        with self.undisturbed():
-            graph = FrozenModule(self._of(parts_of, self._module())).onnx_file()
-        return FrozenPolicy.from_graph(graph, *map(space_to_json, self._spaces))
+    def facts(self) -> dict[str, Any]:
+        """The data that were learnt from."""
+        return {"data": self._learnt_from}
 
     def exploring(self) -> RLlibPolicy:
         """The current policy, drawing its actions as in training."""
         with self.undisturbed():
             return cast(RLlibPolicy, self._of(RLlibPolicy, self._module(), explore=True))
 
-    @contextlib.contextmanager
-    def undisturbed(self) -> Iterator[None]:
-        """Restore the random number generators of training after the ``with`` block, between two iterations."""
-        before = random.getstate(), np.random.get_state(), torch.get_rng_state()
-        try:
-            yield
-        finally:
-            random.setstate(before[0])
-            np.random.set_state(before[1])
-            torch.set_rng_state(before[2])
-
-    @contextlib.contextmanager
-    def evaluation_envs(self) -> Iterator[VectorEnv[Any, Any, Any] | None]:
-        """None: evaluation makes its own environments."""
-        yield None
-
-    def log(self, metrics: Mapping[str, float]) -> None:
-        """Add numbers to the trainer's in TensorBoard."""
-        if self._tensorboard is not None:
-            self._tensorboard.write(metrics, self.steps)
-
     def close(self) -> None:
         """Close environments, log files and Ray."""
-        if self._tensorboard is not None:
-            self._tensorboard.close()
+        super().close()
         self._open.close()
 
 

@@ -14,7 +14,7 @@ from bam_envs.core.spaces import space_to_json
 from bam_train.checkpoint import GOLDEN, POLICY
 from bam_train.checkpoint.manifest import MANIFEST
 from bam_train.checkpoint.zip_members import open_zip
-from bam_train.environments import control_period, make_env
+from bam_train.environments import described, make_env
 from bam_train.errors import CheckpointError, CheckpointMismatch
 from bam_train.policy import FrozenPolicy
 from bam_train.trainers.algorithms import SB3_ALGORITHMS
@@ -80,15 +80,15 @@ def export_trusted(
         with open_zip(path):
             raise CheckpointError(path, "is not a zip of stable-baselines3, or already a checkpoint of bam-train")
     env = make_env(env_id, env_kwargs)
-    describe = getattr(env.unwrapped, "describe", dict)
     model, members = _frozen(path, algo, env_id, env, statistics)
+    signals, period = described(env)
     fields = {
         "env": env_id,
         "env_kwargs": dict(env_kwargs),
         "observation_space": space_to_json(env.observation_space),
         "action_space": space_to_json(env.action_space),
-        "signals": describe(),
-        "period": control_period(env),
+        "signals": signals,
+        "period": period,
         "algorithm": algo,
         "trainer": "sb3",
         "settings": {
@@ -108,7 +108,7 @@ def export_trusted(
 
 def _frozen(path: Path, algo: str, env_id: str, env: Any, statistics: Path | None) -> tuple[Any, dict[str, bytes]]:
     """The model of a trusted zip, its graph and golden actions."""
-    from bam_train.trainers.sb3.sb3_freezing import FrozenModel, golden
+    from bam_train.trainers.sb3.sb3_freezing import FrozenModel
 
     algorithm, normaliser = SB3_ALGORITHMS[algo].load(), None
     try:
@@ -117,9 +117,8 @@ def _frozen(path: Path, algo: str, env_id: str, env: Any, statistics: Path | Non
             from stable_baselines3.common.vec_env import VecNormalize
 
             normaliser = VecNormalize.load(str(statistics), model.get_env())
-        space = env.observation_space, env.action_space
-        graph = FrozenModel(model, normaliser, *space).onnx_file()
-        return model, {POLICY: graph, GOLDEN: golden(model, normaliser, *space)}
+        graph, golden = FrozenModel(model, normaliser, env.observation_space, env.action_space).members()
+        return model, {POLICY: graph, GOLDEN: golden}
     except (*_MISFIT, *_DAMAGE, OSError) as error:
         why = textwrap.shorten(str(error) or type(error).__name__, 160, placeholder=" ...")
         why = why if why.endswith("...") else f"{why.rstrip('.')}."

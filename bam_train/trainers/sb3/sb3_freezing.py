@@ -6,6 +6,7 @@ the CPU: the model is not changed and no random number is drawn.
 """
 
 import copy
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -26,7 +27,6 @@ from bam_train.trainers.frozen_network import (
     Normalised,
     OneHot,
     action_head,
-    pack,
     to,
 )
 from bam_train.trainers.zero_based_spaces import less_start, plus_start
@@ -163,6 +163,7 @@ class FrozenModel(FrozenNetwork):
         action_space: AnySpace,
     ) -> None:
         super().__init__(observation_space)
+        self.model, self.normaliser, self.spaces = model, normaliser, (observation_space, action_space)
         policy = model.policy
         seen = leaves(policy.observation_space)
         if set(seen) != set(self.leaves):
@@ -198,50 +199,27 @@ class FrozenModel(FrozenNetwork):
         encoded = [encoder(tensor) for encoder, tensor in zip(self.encoders, observation, strict=True)]
         return self.extractor(dict(zip(self.leaves, encoded, strict=True)) if self.is_dict else encoded[0])
 
-
-def freeze(model: BaseAlgorithm, normaliser: VecNormalize | None, observed: AnySpace, acted: AnySpace) -> bytes:
-    """Write the model's deterministic policy as an ONNX file; arguments and errors as of `FrozenModel`."""
-    return FrozenModel(model, normaliser, observed, acted).onnx_file()
-
-
-def golden(model: BaseAlgorithm, normaliser: VecNormalize | None, observed: AnySpace, acted: AnySpace) -> bytes:
-    """Draw observations and record ``model.predict(..., deterministic=True)``; arguments as of `FrozenModel`.
-
-    Returns:
-        A safetensors file with ``observation`` (or ``observation.<key>``), (n, ...), and ``action``, (n, ...); for a
-        recurrent policy, the steps of one episode.
-    """
-    observations = FrozenModel(model, normaliser, observed, acted).golden_observations()
-    return pack(observations, trainer_actions(model, normaliser, observed, acted, observations))
-
-
-def trainer_actions(
-    model: BaseAlgorithm,
-    normaliser: VecNormalize | None,
-    observation_space: AnySpace,
-    action_space: AnySpace,
-    observations: dict[str, np.ndarray],
-) -> np.ndarray:
-    """The trainer's actions, (n, ...), for raw observations by key, (n, ...), in the environment's action space."""
-    is_dict = isinstance(observation_space, spaces.Dict)
-    seen = less_start(observation_space, observations if is_dict else observations[""])
-    if normaliser is not None:
-        transpose = unwrap_vec_wrapper(normaliser, VecTransposeImage)
-        seen = normaliser.normalize_obs(seen if transpose is None else transpose.transpose_observations(seen))
-    modes = [(module, module.training) for module in model.policy.modules()]
-    try:
-        if hasattr(model.policy, "lstm_actor"):  # one episode, an observation a step
-            state, each = None, []
-            for t in range(len(next(iter(observations.values())))):
-                now = {key: array[t : t + 1] for key, array in seen.items()} if is_dict else seen[t : t + 1]
-                action, state = model.predict(now, state, episode_start=np.array([t == 0]), deterministic=True)
-                each.append(action[0])
-            actions = np.stack(each)
-        else:
-            actions = model.predict(seen, deterministic=True)[0]
-    finally:  # `predict` switches to evaluation mode
-        for module, training in modes:
-            module.training = training
-    if isinstance(action_space, spaces.MultiBinary):
-        return actions.astype(np.int8)
-    return np.asarray(plus_start(action_space, actions))
+    def own_actions(self, observations: Mapping[str, np.ndarray]) -> np.ndarray:
+        """What ``model.predict(..., deterministic=True)`` says, in the environment's action space."""
+        model, normaliser, (observation_space, action_space) = self.model, self.normaliser, self.spaces
+        seen = less_start(observation_space, observations if self.is_dict else observations[""])
+        if normaliser is not None:
+            transpose = unwrap_vec_wrapper(normaliser, VecTransposeImage)
+            seen = normaliser.normalize_obs(seen if transpose is None else transpose.transpose_observations(seen))
+        modes = [(module, module.training) for module in model.policy.modules()]
+        try:
+            if hasattr(model.policy, "lstm_actor"):  # one episode, an observation a step
+                state, each = None, []
+                for t in range(len(next(iter(observations.values())))):
+                    now = {key: array[t : t + 1] for key, array in seen.items()} if self.is_dict else seen[t : t + 1]
+                    action, state = model.predict(now, state, episode_start=np.array([t == 0]), deterministic=True)
+                    each.append(action[0])
+                actions = np.stack(each)
+            else:
+                actions = model.predict(seen, deterministic=True)[0]
+        finally:  # `predict` switches to evaluation mode
+            for module, training in modes:
+                module.training = training
+        if isinstance(action_space, spaces.MultiBinary):
+            return actions.astype(np.int8)
+        return np.asarray(plus_start(action_space, actions))

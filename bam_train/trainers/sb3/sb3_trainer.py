@@ -20,20 +20,18 @@ from gymnasium.vector import VectorEnv
 from stable_baselines3.common.logger import KVWriter, Logger
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
-from bam_envs.core.spaces import space_to_json
-from bam_train.checkpoint import Checkpoint, write_checkpoint
+from bam_train.checkpoint import Checkpoint
 from bam_train.data.record_dataset import RecordVectorDataset, info_of
-from bam_train.environments import control_period, require_fit
+from bam_train.environments import described, require_fit
 from bam_train.errors import SettingsError, TrainingFailed
-from bam_train.policy import FrozenPolicy
 from bam_train.settings import SB3Settings
 from bam_train.trainers import sb3_hyperparameters as hyperparameters
 from bam_train.trainers.algorithms import SB3_ALGORITHMS
-from bam_train.trainers.base import OnProgress, Progress, Statistics, manifest
+from bam_train.trainers.base import OnProgress, Progress, Statistics, Trainer
 from bam_train.trainers.resolve_settings import own_settings, require_start
 from bam_train.trainers.run_folder import TensorBoardFiles
 from bam_train.trainers.sb3 import sb3_resume as resume
-from bam_train.trainers.sb3.sb3_freezing import freeze, golden
+from bam_train.trainers.sb3.sb3_freezing import FrozenModel
 from bam_train.trainers.sb3.sb3_model import make_model
 from bam_train.trainers.sb3.sb3_vec_env import BatchVecEnv, make_training_env, one_env
 
@@ -46,20 +44,17 @@ class _Stop(Exception):  # noqa: N818 - never leaves this module
     """Ends `learn` between two updates."""
 
 
-class SB3Trainer:
+class SB3Trainer(Trainer[SB3Settings]):
     """A run of one algorithm of stable-baselines3 or sb3-contrib; made by `create` or `load`."""
-
-    evaluations = "choose"
 
     def __init__(self, settings: SB3Settings, model: Any, venv: VecEnv) -> None:
         self.settings, self.model, self.venv = settings, model, venv
         self.notices: list[str] = []
         env = one_env(venv)
-        describe = getattr(env.unwrapped, "describe", None)
-        self._signals, self._period = describe() if describe else {}, control_period(env)
+        self.described = described(env)
         # The environment's spaces, before normalisation, image transposition and counting from 0.
         name = "single_{}_space" if isinstance(venv, BatchVecEnv) else "{}_space"
-        self._spaces: tuple[Any, Any] = getattr(env, name.format("observation")), getattr(env, name.format("action"))
+        self.spaces = getattr(env, name.format("observation")), getattr(env, name.format("action"))
         self._normaliser: VecNormalize | None = model.get_vec_normalize_env()
         self._waiting: resume.Waiting | None = None
         self._on_progress: OnProgress = lambda progress: True
@@ -185,43 +180,25 @@ class SB3Trainer:
         episodes, successes = self.model.ep_info_buffer or (), self.model.ep_success_buffer or ()
         logged = self.model.logger.name_to_value.items()
         numbers = {name: float(value) for name, value in logged if name.startswith("train/")}
-        return Statistics(
-            episodes=len(episodes),
-            return_mean=float(np.mean([episode["r"] for episode in episodes])) if episodes else None,
-            length_mean=float(np.mean([episode["l"] for episode in episodes])) if episodes else None,
-            success_rate=float(np.mean(successes)) if successes else None,
-            metrics={name: value for name, value in numbers.items() if math.isfinite(value)},
-        )
+        return Statistics.of([one["r"] for one in episodes], [one["l"] for one in episodes], successes, numbers)
 
-    def save(self, path: Path, scores: Mapping[str, Any], notes: Mapping[str, Any]) -> Checkpoint:
-        """Write a checkpoint that can be resumed and deployed."""
+    def frozen(self) -> FrozenModel:
+        """A copy of the current policy."""
         self._require_finite_weights()
-        with self.undisturbed(), self._finite_distributions():
-            file = io.BytesIO()  # with the members of stable-baselines3, whose `load` can then open the checkpoint
-            self.model.save(file, exclude=["collect_rollouts"])
-            with zipfile.ZipFile(file) as archive:
-                members = {name: archive.read(name) for name in archive.namelist()}
-            members["bam/policy.onnx"] = freeze(self.model, self._normaliser, *self._spaces)
-            members["bam/golden.safetensors"] = golden(self.model, self._normaliser, *self._spaces)
-        members |= resume.members(self.model, self.venv, self._normaliser, self._waiting, notes)
-        known = {"signals": self._signals, "period": self._period, "steps": self.steps, "scores": scores}
-        return write_checkpoint(path, manifest(self.settings, self._spaces, known), members)
+        return FrozenModel(self.model, self._normaliser, *self.spaces)
 
-    def freeze(self) -> FrozenPolicy:
-        """Freeze the current policy."""
-        self._require_finite_weights()
-        with self.undisturbed():
-            graph = freeze(self.model, self._normaliser, *self._spaces)
-        return FrozenPolicy.from_graph(graph, *map(space_to_json, self._spaces))
+    def members(self) -> tuple[bytes, bytes]:
+        """The current policy as an ONNX file, and its golden actions."""
+        with self._finite_distributions():
+            return super().members()
 
-    @contextlib.contextmanager
-    def undisturbed(self) -> Iterator[None]:
-        """Restore the random number generators of training after the ``with`` block, between two updates."""
-        before = resume.random_states(self.model)
-        try:
-            yield
-        finally:
-            resume.load_random_states(self.model, before)
+    def resume_members(self, notes: Mapping[str, Any]) -> dict[str, bytes]:
+        """Members of a checkpoint from which the run goes on, and those that stable-baselines3's `load` opens."""
+        file = io.BytesIO()
+        self.model.save(file, exclude=["collect_rollouts"])
+        with zipfile.ZipFile(file) as archive:
+            members = {name: archive.read(name) for name in archive.namelist()}
+        return members | resume.members(self.model, self.venv, self._normaliser, self._waiting, notes)
 
     @contextlib.contextmanager
     def evaluation_envs(self) -> Iterator[VectorEnv[Any, Any, Any] | None]:

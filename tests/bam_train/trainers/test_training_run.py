@@ -201,14 +201,12 @@ def test_success_must_be_confirmed_by_fresh_episodes(start):
     assert (outcome.reason, outcome.steps, outcome.best["steps"]) == ("success", 90, 90)
 
 
-def test_without_a_success_among_sixteen_episodes_no_more_are_played_and_the_last_evaluation_is_whole(start):
-    none, some = report(0.0, episodes=16), report(1 / 16, episodes=16)
-    results = {30: [none], 60: [some, report(0.1)], 90: [some, report(1.0), report(0.9)], 100: report(0.0)}
-    run, _, watcher = start(results, until_success=0.95, eval_episodes=128)
+def test_failures_that_rule_the_goal_out_end_every_evaluation_but_the_last(start):
+    run, _, watcher = start(at(0.1, 0.1, 0.1, 0.1), until_success=0.95, eval_episodes=128)
     failures = []
     watcher.evaluated = lambda *_: failures.append(start.most_failures)
     run.run()
-    assert [asked[2] for asked in start.seeds] == [16, 16, 128, 16, 128, 128, 128]
+    assert [asked[2] for asked in start.seeds] == [128] * 4
     assert failures == pytest.approx([6.4, 6.4, 6.4, float("inf")])
 
 

@@ -18,7 +18,7 @@ from bam_train.checkpoint import safetensors_file
 from bam_train.errors import PolicyError
 from bam_train.policy import FrozenPolicy
 from bam_train.trainers.algorithms import RLLIB_ALGORITHMS
-from bam_train.trainers.rllib.rllib_freezing import FrozenModule, RLlibPolicy, golden, one_by_one, parts_of
+from bam_train.trainers.rllib.rllib_freezing import FrozenModule, RLlibPolicy, one_by_one, parts_of
 from tests.one_ray import make_connectors_quickly
 
 make_connectors_quickly()
@@ -72,7 +72,7 @@ class Live:
                     piece(rl_module=None, episodes=[episode], batch={}, explore=False, shared_data={})
 
     def frozen(self):
-        return FrozenModule(parts_of(self.module, self.before, self.config, self.spaces))
+        return FrozenModule(parts_of(self.module, self.before, self.config, self.spaces), lambda: self.own)
 
     def policy(self):
         return FrozenPolicy.from_graph(self.frozen().onnx_file(), *map(space_to_json, self.spaces))
@@ -173,7 +173,7 @@ def test_the_live_module_is_left_as_it_was():
     live = Live(pieces=[MeanStdFilter])
     before = {name: weight.clone() for name, weight in live.module.state_dict().items()}
     state = live.before.get_state()
-    golden(live.frozen(), live.own)
+    live.frozen().members()
     live.policy()
     assert live.before.get_state() == state
     assert all(torch.equal(weight, before[name]) for name, weight in live.module.state_dict().items())
@@ -181,7 +181,7 @@ def test_the_live_module_is_left_as_it_was():
 
 def test_golden_actions_are_rllibs():
     live = Live(pieces=[MeanStdFilter])
-    arrays = safetensors_file.parse(golden(live.frozen(), live.own, n=50))
+    arrays = safetensors_file.parse(live.frozen().members(50)[1])
     assert {name: array.shape for name, array in arrays.items()} == {"observation": (50, 3), "action": (50, 2)}
     np.testing.assert_array_equal(arrays["action"], live.actions({"": arrays["observation"]}))
 
@@ -209,14 +209,12 @@ def test_starts_of_whole_numbers():
     """RLlib counts from 0; a trainer that shifts the environment's numbers gives the environment's own spaces."""
     live = Live(seen=Discrete(4), acts=Discrete(3), pieces=[FlattenObservations])
     parts = parts_of(live.module, live.before, live.config, (Discrete(4, start=5), Discrete(3, start=-1)))
-    frozen = FrozenModule(parts)
-    policy = FrozenPolicy.from_graph(
-        frozen.onnx_file(), *map(space_to_json, (parts.observation_space, parts.action_space))
-    )
+    given = live.module, live.before, live.config, (parts.observation_space, parts.action_space)
+    graph, golden = FrozenModule(parts, lambda: RLlibPolicy(*given)).members(50)
+    policy = FrozenPolicy.from_graph(graph, *map(space_to_json, given[-1]))
     found = policy.act_batch(np.arange(5, 9))
     np.testing.assert_array_equal(found, live.actions({"": np.arange(4)}) - 1)
-    own = RLlibPolicy(live.module, live.before, live.config, (parts.observation_space, parts.action_space))
-    arrays = safetensors_file.parse(golden(frozen, own, n=50))
+    arrays = safetensors_file.parse(golden)
     np.testing.assert_array_equal(arrays["action"], policy.act_batch(arrays["observation"]))
 
 

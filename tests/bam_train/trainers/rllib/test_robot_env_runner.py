@@ -18,7 +18,8 @@ from ray.rllib.env.single_agent_env_runner import SingleAgentEnvRunner
 from ray.rllib.utils.filter import RunningStat
 
 from bam_train.trainers.rllib import register
-from bam_train.trainers.rllib.robot_env_runner import MeanStdFilter, RobotEnvRunner, forget_deltas, push
+from bam_train.trainers.rllib.mean_std_filter import MeanStdFilter, forget_deltas, push
+from bam_train.trainers.rllib.robot_env_runner import RobotEnvRunner
 
 BOX = gym.spaces.Box(-10, 10, (2,), np.float32)
 

@@ -20,11 +20,11 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from bam_envs.core.spaces import space_to_json
-from bam_train.checkpoint import Checkpoint, safetensors_file, write_checkpoint
+from bam_train.checkpoint import GOLDEN, POLICY, Checkpoint, safetensors_file, write_checkpoint
 from bam_train.errors import PolicyError
 from bam_train.policy import FrozenPolicy
 from bam_train.policy.onnx_session import OnnxSession
-from bam_train.trainers.sb3.sb3_freezing import FrozenModel, freeze, golden, trainer_actions
+from bam_train.trainers.sb3.sb3_freezing import FrozenModel
 
 ROWS = 100
 VECTOR = spaces.Box(-1, 1, (6,))
@@ -88,7 +88,7 @@ def make(
 def freeze_it(
     model: BaseAlgorithm, normaliser: Any, observation: gym.Space[Any], action: gym.Space[Any]
 ) -> FrozenPolicy:
-    graph = freeze(model, normaliser, observation, action)
+    graph = FrozenModel(model, normaliser, observation, action).onnx_file()
     return FrozenPolicy.from_graph(graph, space_to_json(observation), space_to_json(action))
 
 
@@ -110,8 +110,9 @@ def assert_parity(
     action_space: gym.Space[Any],
 ) -> None:
     policy = freeze_it(model, normaliser, observation_space, action_space)
-    drawn = shaded(FrozenModel(model, normaliser, observation_space, action_space).draw(ROWS, np.random.default_rng(2)))
-    expected = trainer_actions(model, normaliser, observation_space, action_space, drawn)
+    module = FrozenModel(model, normaliser, observation_space, action_space)
+    drawn = shaded(module.draw(ROWS, np.random.default_rng(2)))
+    expected = module.own_actions(drawn)
     single = [policy.act(row(observation_space, drawn, k)) for k in range(ROWS)]
     batch = policy.act_batch(row(observation_space, drawn, slice(None)))
     unit = np.maximum((action_space.high - action_space.low) / 2, 1) if isinstance(action_space, spaces.Box) else 1
@@ -219,7 +220,7 @@ def test_normalised_images():
 def test_a_normaliser_of_rewards_only_changes_nothing():
     model, normaliser = make(PPO, VECTOR, ARM)
     env = VecNormalize(DummyVecEnv([lambda: Blank(VECTOR, ARM)]), norm_obs=False)
-    assert freeze(model, env, VECTOR, ARM) == freeze(model, normaliser, VECTOR, ARM)
+    assert FrozenModel(model, env, VECTOR, ARM).onnx_file() == FrozenModel(model, normaliser, VECTOR, ARM).onnx_file()
 
 
 RECURRENT = {
@@ -239,16 +240,10 @@ def test_recurrent_policies_carry_their_state_and_forget_it(case: Any):
     model, normaliser = make(RecurrentPPO, observation_space, action_space, normalise, **copy.deepcopy(settings))
     policy = freeze_it(model, normaliser, observation_space, action_space)
     assert policy.recurrent
-    drawn = FrozenModel(model, normaliser, observation_space, action_space).draw(50, np.random.default_rng(2))
+    module = FrozenModel(model, normaliser, observation_space, action_space)
+    drawn = module.draw(50, np.random.default_rng(2))
     episodes = np.split(np.arange(50), [1, 30, 31])
-    expected = np.concatenate(
-        [
-            trainer_actions(
-                model, normaliser, observation_space, action_space, {key: x[steps] for key, x in drawn.items()}
-            )
-            for steps in episodes
-        ]
-    )
+    expected = np.concatenate([module.own_actions({key: x[steps] for key, x in drawn.items()}) for steps in episodes])
     found = []
     for steps in episodes:
         policy.reset()
@@ -279,19 +274,20 @@ def test_freezing_draws_no_random_number_and_leaves_the_model_as_it_was():
         modes = [module.training for module in model.policy.modules()]
         weights = {name: tensor.clone() for name, tensor in model.policy.state_dict().items()}
         before = torch.get_rng_state(), np.random.get_state()[1].copy(), random.getstate()
-        graph, actions = freeze(model, normaliser, VECTOR, ARM), golden(model, normaliser, VECTOR, ARM)
+        graph, actions = FrozenModel(model, normaliser, VECTOR, ARM).members()
         assert torch.equal(torch.get_rng_state(), before[0])
         np.testing.assert_array_equal(np.random.get_state()[1], before[1])
         assert random.getstate() == before[2]
         assert [module.training for module in model.policy.modules()] == modes
         assert all(torch.equal(tensor, weights[name]) for name, tensor in model.policy.state_dict().items())
         assert all(tensor.requires_grad for tensor in model.policy.parameters() if tensor.is_leaf)
-        assert graph == freeze(model, normaliser, VECTOR, ARM)
-        assert algorithm is RecurrentPPO or actions == golden(model, normaliser, VECTOR, ARM)
+        again = FrozenModel(model, normaliser, VECTOR, ARM).members()
+        assert graph == again[0]
+        assert algorithm is RecurrentPPO or actions == again[1]
 
 
 def test_the_graph_says_what_it_takes_and_nothing_of_this_machine():
-    graph_bytes = freeze(make(PPO, MIXED, ARM, **copy.deepcopy(SMALL_CNNS))[0], None, MIXED, ARM)
+    graph_bytes = FrozenModel(make(PPO, MIXED, ARM, **copy.deepcopy(SMALL_CNNS))[0], None, MIXED, ARM).onnx_file()
     session = OnnxSession(graph_bytes)
     assert [(name, one.dtype, one.shape) for name, one in session.inputs.items()] == [
         (f"observation.{key}", space.dtype, (None, *space.shape)) for key, space in MIXED.items()
@@ -320,7 +316,7 @@ def test_the_graph_says_what_it_takes_and_nothing_of_this_machine():
 )
 def test_spaces_that_do_not_fit(observation_space: gym.Space[Any], action_space: gym.Space[Any], text: str):
     with pytest.raises(PolicyError, match=text):
-        freeze(make(PPO, VECTOR, ARM)[0], None, observation_space, action_space)
+        FrozenModel(make(PPO, VECTOR, ARM)[0], None, observation_space, action_space).onnx_file()
 
 
 def test_unknown_policies_and_lstms_are_refused():
@@ -328,11 +324,11 @@ def test_unknown_policies_and_lstms_are_refused():
     model.policy = torch.nn.Module()
     model.policy.observation_space = VECTOR
     with pytest.raises(PolicyError, match="policy Module cannot be frozen; expected one of stable-baselines3's own"):
-        freeze(model, None, VECTOR, ARM)
+        FrozenModel(model, None, VECTOR, ARM).onnx_file()
     model, _ = make(RecurrentPPO, VECTOR, ARM)
     model.policy.lstm_actor = torch.nn.LSTM(6, 8, bidirectional=True)
     with pytest.raises(PolicyError, match="an LSTM that is bidirectional, projects or has no bias cannot be frozen"):
-        freeze(model, None, VECTOR, ARM)
+        FrozenModel(model, None, VECTOR, ARM).onnx_file()
 
 
 # Golden actions
@@ -359,16 +355,14 @@ def test_golden_actions_are_the_trainers(
     action = arrays.pop("action")
     assert action.shape == (rows, *action_space.shape)
     drawn = {name.removeprefix("observation").removeprefix("."): array for name, array in arrays.items()}
-    np.testing.assert_array_equal(trainer_actions(model, None, observation_space, action_space, drawn), action)
+    np.testing.assert_array_equal(FrozenModel(model, None, observation_space, action_space).own_actions(drawn), action)
     FrozenPolicy.load(path)
 
 
 def test_golden_choices_are_clear_ones():
     model, _ = make(DQN, VECTOR, spaces.Discrete(3))
     module = FrozenModel(model, None, VECTOR, spaces.Discrete(3))
-    observation = torch.as_tensor(
-        safetensors_file.parse(golden(model, None, VECTOR, model.action_space))["observation"]
-    )
+    observation = torch.as_tensor(safetensors_file.parse(module.members()[1])["observation"])
     best = module.scores(observation).topk(2)[0]
     assert (best[:, 0] - best[:, 1]).min() > 0.01
 
@@ -378,10 +372,7 @@ def save(tmp_path: Path, manifest_fields: Any) -> Any:
     """Makes a checkpoint of a model; its path."""
 
     def save(model: Any, normaliser: Any, *own_spaces: Any) -> Path:
-        frozen = {
-            "bam/policy.onnx": freeze(model, normaliser, *own_spaces),
-            "bam/golden.safetensors": golden(model, normaliser, *own_spaces),
-        }
+        frozen = dict(zip((POLICY, GOLDEN), FrozenModel(model, normaliser, *own_spaces).members(), strict=True))
         return write_checkpoint(tmp_path / "a.zip", manifest_fields(*own_spaces), frozen).path
 
     return save
