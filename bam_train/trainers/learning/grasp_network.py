@@ -40,8 +40,6 @@ class Grid:
     columns: int
     bins: tuple[int, ...]
     """Columns, rows, rotations, and widths if there are any."""
-    has_axis: bool
-    """Whether the depth has a last axis of length 1."""
 
     @classmethod
     def of(cls, observation: spaces.Space[Any], action: spaces.Space[Any]) -> Grid:
@@ -53,7 +51,7 @@ class Grid:
             )
         if not isinstance(action, spaces.MultiDiscrete) or action.shape not in ((3,), (4,)):
             raise SettingsError(f"grasps: expected one grasp as MultiDiscrete of 3 or 4 numbers, found {action}")
-        return cls(depth.shape[0], depth.shape[1], tuple(action.nvec.tolist()), len(depth.shape) == 3)
+        return cls(depth.shape[0], depth.shape[1], tuple(action.nvec.tolist()))
 
     @property
     def rotations(self) -> int:

@@ -135,7 +135,7 @@ def test_the_table_of_trainers():
 @pytest.mark.parametrize("name", sorted(path.name for path in PRESETS.iterdir() if path.name != "__pycache__"))
 def test_every_preset_is_complete_and_of_an_environment_that_is_here(name):
     runs = [(trainer, algo) for trainer, table in ALGORITHMS.items() for algo in table]
-    here = [*ENVIRONMENTS, "CartPole-v1", "Pendulum-v1"]
+    here = [*ENVIRONMENTS, "Acrobot-v1", "CartPole-v1", "MountainCarContinuous-v0", "Pendulum-v1"]
     found = [(env, *run) for env in here for run in runs if f"{file_stem(env, run[1], run[0])}.toml" == name]
     assert len(found) == 1
     env, trainer, algo = found[0]

@@ -59,16 +59,6 @@ WRONG = [
 ]
 
 
-EARLY = [row for row in WRONG if isinstance(row[2], (int, float)) and row[1] != "model_config"]
-
-
-@pytest.mark.parametrize(("algo", "name", "value", "text"), EARLY)
-def test_hyperparameters_are_refused_before_rllib_is_imported(algo, name, value, text):
-    with pytest.raises(SettingsError) as caught:
-        take_hyperparameters(RLLIB_ALGORITHMS[algo], {name: value})
-    assert text in str(caught.value)
-
-
 @pytest.mark.parametrize("name", sorted(RLLIB_ALGORITHMS))
 def test_every_hyperparameter_is_plausible(name):
     take_hyperparameters(RLLIB_ALGORITHMS[name], hyperparameters.complete(RLLIB_ALGORITHMS[name], {}))
