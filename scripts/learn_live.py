@@ -9,6 +9,7 @@ import argparse
 import sys
 from contextlib import closing
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import gymnasium as gym
@@ -107,7 +108,7 @@ def learn(name: str, args: argparse.Namespace) -> None:
         SB3Settings(ENV, "rlpd", steps=args.steps, seed=args.seed, trainer="live", start=SHIPPED)
     )
     log, driver, said, seen = TransitionLog(), FrozenPolicy.load(SHIPPED), 0, learner.experience
-    with closing(make_robot(name)) as env:
+    with closing(make_robot(name)) as env, TemporaryDirectory() as folder:
         while learner.steps < args.steps:
             person, episode = seen.interventions + LONGEST <= SHARE * args.steps, len(seen.outcomes)
             step, done = 0, False
@@ -123,7 +124,7 @@ def learn(name: str, args: argparse.Namespace) -> None:
                 learner.add(transitions)
             learner.learn(sys.maxsize)
             if (episode + 1) % PUSH_EVERY == 0 and learner.is_ready:
-                driver = learner.freeze(explores=True)
+                driver = FrozenPolicy.load(learner.save_candidate(Path(folder) / "driver.zip").path)  # one that explores
             if learner.steps // args.every > said or learner.steps >= args.steps:
                 said = learner.steps // args.every
                 what = f"  {name}: {learner.steps} steps, {seen.interventions} of a person"
