@@ -100,6 +100,7 @@ def test_trajectories_for_the_joints_alone(server, robot_on):
     robot.step(state.command)
     robot.close()
     topic = "/scaled_joint_trajectory_controller/joint_trajectory"
+    scripted.wait_for(lambda: scripted.halts and scripted.commands[-1][0] == topic)  # the hold follows the halt
     assert {topic for topic, _, _ in scripted.commands} == {topic, "/bam/halt"}
     assert scripted.on(topic)[0]["joint_names"] == list(SIX.command.labels)
     assert scripted.on(topic)[-1]["points"][0]["positions"] == scripted.signals["joint_position"].tolist()

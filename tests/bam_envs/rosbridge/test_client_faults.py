@@ -401,7 +401,7 @@ def test_close_leaves_nothing_behind(scripted, new_link, until):
     for thread in closing:
         thread.join()
     assert [frame["op"] for frame in scripted.wait_for("unadvertise")] == ["unadvertise"]
-    assert scripted.of("unadvertise_service") == [{"op": "unadvertise_service", "service": "/act"}]
+    assert scripted.wait_for("unadvertise_service") == [{"op": "unadvertise_service", "service": "/act"}]
     scripted.wait_connected(0)
     until(lambda: set(threading.enumerate()) <= before)
     assert not link.is_up
