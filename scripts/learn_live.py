@@ -124,7 +124,7 @@ def learn(name: str, args: argparse.Namespace) -> None:
                 learner.add(transitions)
             learner.learn(sys.maxsize)
             if (episode + 1) % PUSH_EVERY == 0 and learner.is_ready:
-                driver = FrozenPolicy.load(learner.save_candidate(Path(folder) / "driver.zip").path)  # one that explores
+                driver = FrozenPolicy.load(learner.save_candidate(Path(folder) / "driver.zip").path)
             if learner.steps // args.every > said or learner.steps >= args.steps:
                 said = learner.steps // args.every
                 what = f"  {name}: {learner.steps} steps, {seen.interventions} of a person"
