@@ -105,7 +105,11 @@ def test_signals_are_the_arms_own():
         ("link = 6", "link = 7", "so101: capsules: there is no link 7; the last is 6."),
         (r"\[0, 2, 0.023\]", "[0, 9, 0.023]", "so101: slack: there is no link 9; the last is 6."),
         ("link = 6", "link = -1", "capsules[11]: link: expected a whole number of at least 0, found -1"),
-        ("radius = 0.0558", 'radius = "thick"', "capsules[0]: radius: expected a number above 0, found 'thick'"),
+        (
+            "radius = 0.0558",
+            'radius = "thick"',
+            "capsules[0]: radius: expected a number of metres above 0 and of at most 10, found 'thick'",
+        ),
         ("low = -1.91986", "low = nan", "joints[0]: low: expected a finite number, found nan"),
         ("axis = .0.0, 0.0, 1.0.", "axis = [0, 0, 0]", "joints[0]: shoulder_pan: axis: 0, 0, 0 is no direction."),
         (
@@ -113,7 +117,22 @@ def test_signals_are_the_arms_own():
             "quat = [0, 0, 0, 0]",
             "joints[0]: quat: the quaternion 0, 0, 0, 0 is no orientation; leave it out for none.",
         ),
-        ("open = 0.05", "open = -0.05", "gripper: open: expected a number above 0, found -0.05"),
+        ("open = 0.05", "open = 50", "gripper: open: expected a number of metres above 0 and of at most 10, found 50"),
+        (
+            r"xyz = \[[^]]*",
+            "xyz = [0, 0, 162.5",
+            "tool: xyz[2]: expected a number of metres from -10 to 10, found 162.5",
+        ),
+        (
+            r"xyz = \[[^]]*",
+            "xyz = [0, 0",
+            "tool: xyz: expected a list of 3 numbers of metres from -10 to 10, found [0, 0]",
+        ),
+        (
+            "mass = 0.1",
+            "mass = 1e9",
+            "gripper: mass: expected a number of kilograms above 0 and of at most 1000, found 1000000000.0",
+        ),
         (r"gripper = \{.*", "gripper = 3", "gripper: expected a table of named values, found 3"),
         ("joints = .", "joints = 3\nlegs = [", "joints: expected a list of tables of named values, found 3"),
         (r"\[\[0.161,", "[[0.361,", "so101: workspace: the lowest corner must come first."),

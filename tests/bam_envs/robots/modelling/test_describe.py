@@ -363,6 +363,12 @@ def scaled(text, factor):
         ),
         (scaled(six_joints(), 1000), GRIPPER, None, "{}: the arm is 1.2e+03 m long; are its lengths in metres?"),
         (
+            six_joints().replace('<mass value="2"/>', '<mass value="1e9"/>'),
+            GRIPPER,
+            None,
+            "{}: pan: mass: expected a number of kilograms above 0 and of at most 1000, found 1000000000.0",
+        ),
+        (
             seven_joints().replace("<worldbody>", '<option foo="1"/><worldbody>'),
             GRIPPER,
             None,
