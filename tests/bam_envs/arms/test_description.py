@@ -1,5 +1,6 @@
 """Descriptions of arms: what a file must say, where it is looked for, and what makes two of them differ."""
 
+import itertools
 import math
 import re
 from dataclasses import replace
@@ -8,7 +9,7 @@ from importlib import metadata
 import numpy as np
 import pytest
 
-from bam_envs.arms.capsules import Outline, fitted_capsules
+from bam_envs.arms.capsules import Outline, fitted_capsules, segment_distances
 from bam_envs.arms.description import ArmDescription, robot_model
 from bam_envs.core import robot_models
 from bam_envs.core.errors import InvalidValue, UnknownName
@@ -251,11 +252,25 @@ def test_what_changes_how_an_arm_moves_changes_its_digest(read):
     assert found["joints.4.name"] == ("wrist_roll", None)
 
 
-@pytest.mark.parametrize("name", ["fr3", "gen3", "so101", "xarm7"])
-def test_two_links_with_a_slack_are_compared_however_seldom_they_touch(name):
-    outline = Outline(robot_model(name).chain)
-    compared = set(map(tuple, outline.links[outline.pairs].tolist()))
-    assert {(one, other) for one, other, _ in robot_model(name).slack} <= compared
+@pytest.mark.parametrize("name", ["gen3", "so101", "xarm7"])
+def test_capsules_that_touch_seldom_are_compared(name):
+    """Some of these touch in one of 2,000 postures, or in fewer; none of those that are left out does in 20,000."""
+    chain = robot_model(name).chain
+    outline, size = Outline(chain), chain.num_joints
+    q = chain.low + np.random.default_rng(5).random((20_000, size)) * (chain.high - chain.low)
+    ends, links = outline.segments(q), np.minimum(outline.links, size)
+    compared = set(map(tuple, outline.pairs.tolist()))
+    left_out = [
+        (one, other)
+        for one, other in itertools.combinations(range(len(links)), 2)
+        if links[other] - links[one] > 2 and (one, other) not in compared
+    ]
+    for one, other in left_out:
+        gap = segment_distances(ends[:, one, 0], ends[:, one, 1], ends[:, other, 0], ends[:, other, 1])
+        assert (gap - outline.radius[one] - outline.radius[other]).min() > 0.0, (one, other)
+    assert {(one, other) for one, other, _ in chain.slack} <= {
+        (int(outline.links[one]), int(outline.links[other])) for one, other in compared
+    }
 
 
 def test_another_tool_mount_or_limit_is_another_arm():
