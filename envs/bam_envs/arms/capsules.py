@@ -12,7 +12,7 @@ _DIRECTIONS = 500
 _GAIN = 0.8  # two capsules instead of one must have less than this share of its volume
 _NEARLY_ALWAYS = 0.5  # share of postures
 _TRIALS = 250  # steps of the search for a thinner capsule
-_NEAR = 0.02  # distance of capsules of two links with a slack that touch in other postures than those looked at [m]
+_NEAR = 0.06  # capsules that come no nearer in the postures looked at do not touch in others [m]
 
 
 _Fit = tuple[Array, Array, float]
@@ -204,7 +204,7 @@ class Outline:
         return np.array([self._slack.get((int(self.links[i]), int(self.links[j])), 0.0) for i, j in self.pairs])
 
     def _pairs(self, every: bool) -> NDArray[np.int64]:
-        """Pairs of capsules on links with a joint between them that are apart in some posture, and not in all."""
+        """Pairs of capsules on links with a joint between them that are apart in some posture, and near in one."""
         links = self.links
         rows = [
             pair for pair in itertools.combinations(range(len(links)), 2) if abs(links[pair[0]] - links[pair[1]]) > 1
@@ -223,10 +223,9 @@ class Outline:
         ends = [(int(links[i]), int(links[j])) for i, j in rows]
         known = np.array([pair in self._slack for pair in ends])
         near = (np.diff(np.minimum(links[self.pairs], last), axis=1)[:, 0] == 2) & ~known
-        share, least = (gaps < 0.0).mean(axis=0), gaps.min(axis=0)
-        touching = {pair for pair, gap in zip(ends, least, strict=True) if gap < 0.0}
-        seldom = known & [pair not in touching for pair in ends] & (least < _NEAR)
-        kept: NDArray[np.int64] = self.pairs[seldom | (share > 0.0) & ~(near & (share > _NEARLY_ALWAYS) & (not every))]
+        share = (gaps < 0.0).mean(axis=0)
+        touching = np.where(near, (share > 0.0) & ((share <= _NEARLY_ALWAYS) | every), gaps.min(axis=0) < _NEAR)
+        kept: NDArray[np.int64] = self.pairs[touching]
         return kept
 
 

@@ -16,10 +16,10 @@ from bam_envs.core.errors import InvalidValue, UnknownName
 from bam_envs.core.kinematics import ArmGeometry
 from bam_envs.core.robot import RobotSpec, SignalSpec
 from bam_envs.core.robot_models import Description, find_model
-from bam_envs.core.validation import Finite, NonEmpty, NonNegative, NonNegativeInt, Positive
+from bam_envs.core.validation import Finite, Length, Mass, Metres, NonEmpty, NonNegative, NonNegativeInt, Positive
 
 Array = NDArray[np.float64]
-Vector = tuple[Finite, Finite, Finite]
+Vector = tuple[Metres, Metres, Metres]
 Quaternion = tuple[Finite, Finite, Finite, Finite]
 Box = tuple[Vector, Vector]
 """Middle and half edges [m]."""
@@ -57,7 +57,7 @@ class JointRow(Placed):
     """One revolute joint and the link that it turns."""
 
     name: NonEmpty
-    axis: Vector = (0.0, 0.0, 1.0)
+    axis: tuple[Finite, Finite, Finite] = (0.0, 0.0, 1.0)
     """Axis in the joint's frame."""
     low: Finite
     """Lowest position [rad]."""
@@ -71,7 +71,7 @@ class JointRow(Placed):
     """Greatest jerk [rad/s^3]."""
     effort: Positive
     """Greatest torque [N m]."""
-    mass: Positive
+    mass: Mass
     """Mass of the link [kg]."""
 
     def __post_init__(self) -> None:
@@ -84,13 +84,13 @@ class JointRow(Placed):
 class Gripper:
     """A gripper with two parallel pads."""
 
-    open: Positive
+    open: Length
     """Width between the pads when it is open [m]."""
     speed: Positive = 0.1
     """Fastest change of the width [m/s]."""
     force: Positive = 40.0
     """Force between the pads in simulation [N]."""
-    mass: Positive = 0.5
+    mass: Mass = 0.5
     """Mass [kg]."""
     joint: NonEmpty = "gripper_width"
     """Name of its joint in a live robot's messages."""

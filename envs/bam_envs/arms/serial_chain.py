@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bam_envs.core.kinematics import ArmGeometry
-from bam_envs.core.validation import Finite, NonNegativeInt, Positive
+from bam_envs.core.validation import Length, Metres, NonNegativeInt
 
 Array = NDArray[np.float64]
 TILT_LEVER = 0.3
@@ -48,11 +48,11 @@ class Capsule:
 
     link: NonNegativeInt
     """0 for the base, k for what joint k turns, one more than the joints for the gripper (in the tool's frame)."""
-    start: tuple[Finite, Finite, Finite] = (0.0, 0.0, 0.0)
+    start: tuple[Metres, Metres, Metres] = (0.0, 0.0, 0.0)
     """One end, in the link's frame [m]."""
-    end: tuple[Finite, Finite, Finite] = (0.0, 0.0, 0.0)
+    end: tuple[Metres, Metres, Metres] = (0.0, 0.0, 0.0)
     """The other end [m]."""
-    radius: Positive
+    radius: Length
     """Radius [m]."""
 
 

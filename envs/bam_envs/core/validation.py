@@ -38,6 +38,9 @@ Fraction = Annotated[float, Meta(ge=0, le=1)]
 PositiveInt = Annotated[int, Meta(ge=1)]
 NonNegativeInt = Annotated[int, Meta(ge=0)]
 Port = Annotated[int, Meta(ge=0, le=65535)]
+Metres = Annotated[float, Meta(ge=-10, le=10, description="a number of metres from -10 to 10")]
+Length = Annotated[float, Meta(gt=0, le=10, description="a number of metres above 0 and of at most 10")]
+Mass = Annotated[float, Meta(gt=0, le=1000, description="a number of kilograms above 0 and of at most 1000")]
 RobotName = Annotated[
     str,
     Meta(
@@ -141,6 +144,8 @@ def expected(kind: Any) -> str:
     if base in (list, tuple, Sequence) and arguments:
         if base is not tuple or arguments[-1] is ...:
             return f"a list of {_plural(expected(arguments[0]))}"
+        if len(set(arguments)) == 1 < len(arguments):
+            return f"a list of {len(arguments)} {_plural(expected(arguments[0]))}"
         return f"a list [{', '.join(map(expected, arguments))}]"
     if base in (dict, Mapping):
         rest = _plural(expected(arguments[1])) if arguments and arguments[1] is not Any else "named values"

@@ -68,7 +68,7 @@ def test_what_fits_is_converted(value: Any, kind: Any, found: Any) -> None:
         (3, Annotated[float, Meta(le=2, description="a rate [Hz]")], "it: expected a rate [Hz], found 3"),
         ([1, "x"], tuple[float, ...], "it[1]: expected a number, found 'x'"),
         ("x", list[Positive], "it: expected a list of numbers above 0, found 'x'"),
-        ([1.0], tuple[float, float], "it: expected a list [a number, a number], found [1.0]"),
+        ([1.0], tuple[float, float], "it: expected a list of 2 numbers, found [1.0]"),
         (
             {"a": {"b": [0]}},
             dict[str, dict[str, list[PositiveInt]]],

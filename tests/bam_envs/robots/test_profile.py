@@ -247,7 +247,7 @@ names = ["lift_joint"] -> partial = true -> state[0]: partial and ignore need na
 ["lift_joint"] -> ["a", "b"] -> state[0]: names must name the 1 numbers of field, not 2.
 scale = 0.001\n\n[[c -> scale = 0\n\n[[c -> state[0]: scale must not be 0.
 scale = 0.001\n\n[[c -> scale = [1, 2]\n\n[[c -> state[0]: scale must have 1 or 1 values, not 2.
-scale = 0.001\n\n[[c -> skip = 3\n\n[[c -> state[0]: skip: expected a list [a whole number of at least 0, a whole
+scale = 0.001\n\n[[c -> skip = 3\n\n[[c -> state[0]: skip: expected a list of 2 whole numbers of at least 0, found 3
 scale = 0.001\n\n[[c -> within = [2, 1]\n\n[[c -> state[0]: within must be two numbers, the least first, not [2.0, 1.0].
 scale = 0.001\n\n[[c -> max_age = 9\n\n[[c -> state[0]: max_age: expected a number above 0 and at most 1, found 9.0
 fields = ["data"] -> -> commands.position[0]: std_msgs/Float64 needs fields; only sensor_msgs/JointState, std_msgs/

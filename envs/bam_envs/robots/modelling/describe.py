@@ -12,6 +12,7 @@ from bam_envs.arms.description import ArmDescription, Gripper, JointRow, Placed,
 from bam_envs.arms.serial_chain import Capsule, SerialChain
 from bam_envs.arms.work_area import find_work_area
 from bam_envs.core.errors import InvalidValue
+from bam_envs.core.validation import check_fields
 from bam_envs.robots.modelling.model_files import Array, ReadArm, Shapes, read_arm
 
 SPEED, ACCELERATION, JERK = 1.5, 6.0, 120.0
@@ -57,6 +58,8 @@ def describe(
     if not 0.15 < reach < _FARTHEST:
         raise InvalidValue(f"{model}: the arm is {reach:.3g} m long; are its lengths in metres?")
     joints = _joints(read)
+    for row in joints:
+        check_fields(row, lambda key, row=row: f"{model}: {row.name}: {key}")  # type: ignore[misc]
     tool = _placed(read.tool)
     width = read.width
     first = ArmDescription(

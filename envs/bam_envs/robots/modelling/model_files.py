@@ -46,9 +46,12 @@ _REMEDIES = {
     "is empty": _FETCH,
     "invalid header": _FETCH,
     "Error opening": "put that file where it is looked for, beside this one",
+    "Unrecognized XML model type": "give an MJCF or URDF file; a part of one is read through the file that includes it",
 }
 """What to do about a file that MuJoCo refuses, by words in its text."""
 _SETTLING = 2.0  # time for a linkage to come to rest [s]
+_ABOVE = 4  # folders above a xacro file beside which its packages are looked for
+_JAW = re.compile("jaw|grip|finger|claw", re.IGNORECASE)
 _FINGERTIP = 0.03  # depth of a finger's tip along the gripper [m]
 
 
@@ -257,12 +260,19 @@ def _expanded(path: Path) -> str:
         xacrodoc: Any = importlib.import_module("xacrodoc")
     except ImportError as error:
         raise MissingExtra("xacrodoc", "robots", f"The xacro file {path}") from error
+    for above in list(path.resolve().parents[:_ABOVE])[::-1]:  # the nearest last, which is the one that counts
+        folders = {folder.name: folder for folder in above.parent.iterdir() if folder.is_dir()}
+        xacrodoc.packages.update_package_cache(folders)
     try:
         return str(xacrodoc.XacroDoc.from_file(str(path)).to_urdf_string())
     except Exception as error:  # of its parser, of packages that are not found
         text = _line(error)
-        remedy = " Source the workspace of the package first, or give the URDF." if "ackage" in text else ""
-        raise InvalidValue(f"{path} cannot be expanded: {text}.{remedy}") from error
+        if lacking := re.search(r"ackage not found: (\S+)", text):
+            raise InvalidValue(
+                f"{path} cannot be expanded: its package {lacking[1]} is not beside the folder of the file. Put it "
+                "there, source its workspace first, or give the URDF."
+            ) from error
+        raise InvalidValue(f"{path} cannot be expanded: {text}.") from error
 
 
 def _readable(file: str, folder: str) -> str:
@@ -322,7 +332,7 @@ def _named_body(spec: Any, site: str | None, model: str, gripper: str | None) ->
 def _last_body(spec: Any, gripper: str | None) -> Any:
     """The body at the end of the one chain of revolute joints, before its fingers; None if unclear.
 
-    Without a `gripper`, a last joint to which nothing else is fixed is its jaw.
+    Without a `gripper`, a last joint to which nothing else is fixed is its jaw, or frames alone if it is called so.
     """
     hinge, joints, body = mujoco.mjtJoint.mjJNT_HINGE, 0, spec.worldbody
     while True:
@@ -332,8 +342,14 @@ def _last_body(spec: Any, gripper: str | None) -> Any:
             break
         body = following[0]
         joints += len(body.joints)
-    if gripper is None and body.joints and not body.bodies:
-        body, joints = body.parent, joints - 1
+    jaw = body
+    while joints and not jaw.joints and not jaw.geoms:
+        jaw = jaw.parent
+    frames = jaw.find_all("body")
+    named = any(_JAW.search(one.name) for one in (jaw, *jaw.joints))
+    last = not frames or (named and not any(one.joints or one.geoms for one in frames))
+    if gripper is None and joints and jaw.joints and last:
+        body, joints = jaw.parent, joints - 1
     return body if joints >= _FEWEST_JOINTS and body.name else None
 
 
@@ -347,6 +363,8 @@ def _attach(spec: Any, body: Any, gripper: str, folder: str) -> None:
     roots = list(other.worldbody.bodies)
     if not roots:
         raise InvalidValue(f"{gripper}: there is no body in it.")
+    for name in (one for one in dir(spec.option) if not one.startswith("_")):  # MuJoCo warns where they differ
+        setattr(other.option, name, getattr(spec.option, name))
     try:
         body.add_frame().attach_body(roots[0], "gripper_", "")
     except ValueError as error:
@@ -654,14 +672,14 @@ class _Reader:
         farthest = max(tips.reach for tips in shapes)
         near = [tips for tips in shapes if tips.reach > farthest - _FINGERTIP]  # a jaw that opens wide turns away
         narrow, wide = min(near, key=lambda tips: tips.gap), max(near, key=lambda tips: tips.gap)
-        if wide.gap - narrow.gap < 0.003:
+        if (opening := wide.gap - max(0.0, narrow.gap)) < 0.003:
             raise InvalidValue(f"{self._where}: its gripper does not open. Give --gripper parallel:WIDTH instead.")
         data.qpos[:] = wide.state
         mujoco.mj_kinematics(model, data)
         pose = np.eye(4)
         pose[:3, :3] = flange[:3, :3] @ wide.axes
         pose[:3, 3] = flange[:3, :3] @ narrow.point + flange[:3, 3]
-        return pose, round(min(wide.gap - max(0.0, narrow.gap), WIDEST), 4)
+        return pose, round(min(opening, WIDEST), 4)
 
     def _finger_joints(self, bodies: Any) -> list[int]:
         return [joint for joint in range(self._model.njnt) if bodies[self._model.jnt_bodyid[joint]]]

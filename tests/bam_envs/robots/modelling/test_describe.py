@@ -81,7 +81,8 @@ def seven_joints():
 
 
 FINGER = 'type="slide" range="0 0.04"'
-HAND = f"""<mujoco><worldbody><body name="hand"><geom type="box" size="0.03 0.08 0.03" pos="0 0 0.03" mass="0.5"/>
+HAND = f"""<mujoco><option gravity="0 0 0"/><worldbody><body name="hand">
+<geom type="box" size="0.03 0.08 0.03" pos="0 0 0.03" mass="0.5"/>
 <body name="left" pos="0 0 0.06"><joint name="finger1" axis="0 1 0" {FINGER}/>
 <geom type="box" size="0.008 0.006 0.022" pos="0 0.006 0.022" mass="0.02"/></body>
 <body name="right" pos="0 0 0.06"><joint name="finger2" axis="0 -1 0" {FINGER}/>
@@ -159,6 +160,16 @@ def test_the_end_of_the_one_chain_is_taken_where_no_name_tells_it(tmp_path):
     assert read.notes[0] == ("the end of the arm is hand0, as --tip was not given and none of the usual names is there")
     (tmp_path / "hand.xml").write_text(seven_joints().replace("attachment_site", "end"), encoding="utf-8")
     assert "the end of the arm is link7" in read_arm(str(tmp_path / "hand.xml"), GRIPPER, None).notes[0]
+
+
+@pytest.mark.parametrize(("jaw", "end"), [("jaw", "b5"), ("turn", "tip")])
+def test_a_last_joint_that_frames_follow_is_a_jaw_if_it_is_called_so(tmp_path, jaw, end):
+    text = FIVE.replace("</body>", '<body name="tip"/></body>', 1).replace("</body>", '<body name="palm"/></body>', 2)
+    text = text.replace('<body name="palm"/></body>', "</body>", 1).replace('"jaw"', f'"{jaw}"')
+    (tmp_path / "lab.xml").write_text(text, encoding="utf-8")
+    read = read_arm(str(tmp_path / "lab.xml"), None if end == "b5" else GRIPPER, None)
+    assert read.notes[0].startswith(f"the end of the arm is {end}, ")
+    assert len(read.names) == (5 if end == "b5" else 6)
 
 
 def test_nothing_is_known_of_a_gripper_that_has_no_shapes_so_its_capsules_count_in_full(described):
@@ -362,6 +373,12 @@ def scaled(text, factor):
             "{}: its gripper does not open. Give --gripper parallel:WIDTH instead.",
         ),
         (scaled(six_joints(), 1000), GRIPPER, None, "{}: the arm is 1.2e+03 m long; are its lengths in metres?"),
+        (
+            six_joints().replace('<mass value="2"/>', '<mass value="1e9"/>'),
+            GRIPPER,
+            None,
+            "{}: pan: mass: expected a number of kilograms above 0 and of at most 1000, found 1000000000.0",
+        ),
         (
             seven_joints().replace("<worldbody>", '<option foo="1"/><worldbody>'),
             GRIPPER,
@@ -628,6 +645,26 @@ def test_a_urdf_with_prefixes_that_are_not_declared_and_with_xacro(tmp_path):
     space = '<robot xmlns:xacro="http://www.ros.org/wiki/xacro"'
     text = text.replace("<robot", f"{space}", 1).replace('velocity="2.5"', 'velocity="${speed}"')
     path.write_text(text.replace("<link", '<xacro:property name="speed" value="2.0"/><link', 1), encoding="utf-8")
+    assert read_arm(str(path), GRIPPER, None).velocity == [2.0] * 6
+
+
+def test_the_packages_of_a_xacro_file_are_found_beside_it(tmp_path):
+    pytest.importorskip("xacrodoc")
+    path = tmp_path / "lab_description" / "urdf" / "lab.xacro"
+    path.parent.mkdir(parents=True)
+    space = '<robot xmlns:xacro="http://www.ros.org/wiki/xacro"'
+    text = six_joints().replace("<robot", space, 1).replace('velocity="2.5"', 'velocity="${speed}"')
+    include = '<xacro:include filename="$(find lab_limits)/limits.xacro"/><link'
+    path.write_text(text.replace("<link", include, 1), encoding="utf-8")
+    with pytest.raises(InvalidValue) as caught:
+        read_arm(str(path), GRIPPER, None)
+    assert str(caught.value) == (
+        f"{path} cannot be expanded: its package lab_limits is not beside the folder of the file. Put it there, "
+        "source its workspace first, or give the URDF."
+    )
+    (tmp_path / "lab_limits").mkdir()
+    limits = f'{space} name="limits"><xacro:property name="speed" value="2.0"/></robot>'
+    (tmp_path / "lab_limits" / "limits.xacro").write_text(limits, encoding="utf-8")
     assert read_arm(str(path), GRIPPER, None).velocity == [2.0] * 6
 
 
