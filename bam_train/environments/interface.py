@@ -41,24 +41,21 @@ def require_fit(checkpoint: Checkpoint, env: AnyEnv, place: Location = HERE, env
     Raises:
         CheckpointMismatch: Names the first thing that differs, and both values.
     """
-    pairs = fit_pairs(checkpoint, env)
-    differences = (first_difference(theirs, ours, name) for name, theirs, ours in pairs)
-    difference = next(filter(None, differences), None)
+    difference = first_difference(*fit_pairs(checkpoint, env))
     if difference is None:
         return
     name, theirs, ours = difference
     if env_id is not None and not registry.are_same(env_id, checkpoint.manifest.env):
         raise CheckpointMismatch(
             checkpoint.path,
-            f"was trained on {checkpoint.manifest.env}, where {name} is {short_json(theirs)}, and it is "
-            f"{short_json(ours)} in {env_id}; give a checkpoint of {env_id}",
+            f"was trained on {checkpoint.manifest.env}, where {name} is {theirs}, and it is "
+            f"{ours} in {env_id}; give a checkpoint of {env_id}",
         )
     place_text = f"at {place.text}" if isinstance(place, Remote) else f"in {checkpoint.manifest.env} as installed"
     remedy = "serve the version" if isinstance(place, Remote) else "install the version"
     raise CheckpointMismatch(
         checkpoint.path,
-        f"{name} is {short_json(theirs)} in the checkpoint and {short_json(ours)} {place_text}; "
-        f"train it anew, or {remedy} it was trained with",
+        f"{name} is {theirs} in the checkpoint and {ours} {place_text}; train it anew, or {remedy} it was trained with",
     )
 
 
@@ -99,8 +96,13 @@ def interface_pairs(checkpoint: Checkpoint, interface: Mapping[str, Any]) -> lis
     return pairs
 
 
-def first_difference(theirs: Any, ours: Any, name: str) -> tuple[str, Any, Any] | None:
-    """The first difference of two JSON values: its name and both values; None if they are equal."""
+def first_difference(*pairs: tuple[str, Any, Any]) -> tuple[str, str, str] | None:
+    """The first difference of pairs of JSON values, each with its name: what differs, and both values in short."""
+    found = next(filter(None, (_difference(*pair) for pair in pairs)), None)
+    return None if found is None else (found[0], short_json(found[1]), short_json(found[2]))
+
+
+def _difference(name: str, theirs: Any, ours: Any) -> tuple[str, Any, Any] | None:
     if isinstance(theirs, dict) and isinstance(ours, dict):
         keys: list[Any] = sorted(theirs.keys() | ours.keys(), key=lambda key: (key != "type", key != "shape", key))
         pairs = [(f"{name}.{key}", theirs.get(key), ours.get(key)) for key in keys]
@@ -108,7 +110,7 @@ def first_difference(theirs: Any, ours: Any, name: str) -> tuple[str, Any, Any] 
         pairs = [(f"{name}[{i}]", a, b) for i, (a, b) in enumerate(zip(theirs, ours, strict=True))]
     else:
         return None if theirs == ours else (name, theirs, ours)
-    return next((found for pair in pairs if (found := first_difference(pair[1], pair[2], pair[0]))), None)
+    return next(filter(None, (_difference(*pair) for pair in pairs)), None)
 
 
 def _names_and_units(signals: Mapping[str, Any]) -> dict[str, Any]:

@@ -89,8 +89,8 @@ def filter_data(config: flags.FilterConfig) -> None:
 
 def show_stats(config: flags.StatsConfig) -> None:
     """Print tables of groups and numbers."""
-    from bam_train.cli.envs import aligned
     from bam_train.data.views.summary import groups, numbers
+    from bam_train.files.log_lines import aligned
 
     data = _open(config.place)
     by_group, each = groups(data, config.by), numbers(data)
