@@ -109,10 +109,10 @@ def show_stats(config: flags.StatsConfig) -> None:
 
 def plot_data(config: flags.PlotConfig) -> None:
     """Draw a data set."""
-    from bam_train.data.views.figures import plot, require_picture_path
-    from bam_train.files.atomic_file import require_writable
+    from bam_train.data.views.figures import plot
+    from bam_train.files.pictures import require_picture_path
 
-    path = require_writable(require_picture_path(config.out))
+    path = require_picture_path(config.out)
     against = None if config.against is None else _open(config.against)
     drawn = plot(_open(config.place), path, config.kind, against, config.episodes)
     tell(f"{path}: {', '.join(drawn)}")
