@@ -72,7 +72,7 @@ def interface_of(env: AnyEnv) -> dict[str, Any]:
     single = "single_" if isinstance(env, VectorEnv) else ""
     spaces = {name: space_to_json(getattr(env, single + name)) for name in ("observation_space", "action_space")}
     describe, period = getattr(env.unwrapped, "describe", None), getattr(env.unwrapped, "period", None)
-    signals = {} if describe is None else _names_and_units(describe())
+    signals = {} if describe is None else names_and_units(describe())
     plain: dict[str, Any] = json.loads(json.dumps({**spaces, "signals": signals}))  # tuples as lists
     return {**plain, "period": None if period is None else float(period)}
 
@@ -80,7 +80,7 @@ def interface_of(env: AnyEnv) -> dict[str, Any]:
 def interface_in(manifest: Manifest) -> dict[str, Any]:
     """As `interface_of`, of the environment of a manifest."""
     spaces = {name: getattr(manifest, name) for name in ("observation_space", "action_space")}
-    return {**spaces, "signals": _names_and_units(manifest.signals), "period": manifest.period}
+    return {**spaces, "signals": names_and_units(manifest.signals), "period": manifest.period}
 
 
 def interface_pairs(checkpoint: Checkpoint, interface: Mapping[str, Any]) -> list[tuple[str, Any, Any]]:
@@ -88,7 +88,7 @@ def interface_pairs(checkpoint: Checkpoint, interface: Mapping[str, Any]) -> lis
     manifest = checkpoint.manifest
     pairs = [(name, getattr(manifest, name), interface[name]) for name in ("observation_space", "action_space")]
     if interface["signals"] and manifest.signals:
-        pairs.append(("signals", _names_and_units(manifest.signals), interface["signals"]))
+        pairs.append(("signals", names_and_units(manifest.signals), interface["signals"]))
     period = interface["period"]
     if period is not None and manifest.period is not None:
         same = math.isclose(period, manifest.period, rel_tol=1e-9)
@@ -113,8 +113,8 @@ def _difference(name: str, theirs: Any, ours: Any) -> tuple[str, Any, Any] | Non
     return next(filter(None, (_difference(*pair) for pair in pairs)), None)
 
 
-def _names_and_units(signals: Mapping[str, Any]) -> dict[str, Any]:
-    """The names and units of the signals that `RobotEnv.describe` returns, by kind."""
+def names_and_units(signals: Mapping[str, Any]) -> dict[str, Any]:
+    """The names and units of the signals that `RobotEnv.describe` returns, or a data set has, by kind."""
     return {kind: [{key: entry.get(key) for key in ("name", "unit")} for entry in signals[kind]] for kind in signals}
 
 

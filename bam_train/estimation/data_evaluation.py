@@ -13,7 +13,7 @@ import numpy as np
 from bam_envs.core.spaces import space_to_json
 from bam_train.checkpoint import Checkpoint
 from bam_train.data import DataSet
-from bam_train.environments import first_difference, interface_pairs
+from bam_train.environments import first_difference, interface_pairs, names_and_units
 from bam_train.errors import BadDataSet, CheckpointMismatch
 from bam_train.estimation.behaviour import action_ratios
 from bam_train.estimation.estimates import Array, Estimate, doubly_robust, importance_sampling, self_normalised
@@ -151,10 +151,7 @@ def require_same_interface(checkpoint: Checkpoint, data: DataSet) -> None:
     checkpoint.requires_env(data.info.env, f"That is the environment of {data.place}; give data of its own one")
     info = data.info
     spaces = {name: space_to_json(getattr(info, name)) for name in ("observation_space", "action_space")}
-    names = {
-        kind: [{key: one.get(key) for key in ("name", "unit")} for one in info.contract[kind]] for kind in info.contract
-    }
-    interface = {**spaces, "signals": names, "period": info.period}
+    interface = {**spaces, "signals": names_and_units(info.contract), "period": info.period}
     if found := first_difference(*interface_pairs(checkpoint, interface)):
         what, one, other = found
         text = f"{what} is {one} in the checkpoint and {other} in {data.place}"
