@@ -14,6 +14,7 @@ from bam_train.data.data_set_writer import require_same
 from bam_train.data.recorded_episode import Array, Episode
 from bam_train.errors import SettingsError
 from bam_train.files.pictures import new_figure, require_picture_path, save_figure
+from bam_train.recording.recorder import number_names
 
 if TYPE_CHECKING:
     from matplotlib.figure import SubFigure
@@ -90,13 +91,6 @@ def _some_of_each_end(data: DataSet) -> list[int]:
     return sorted(index for members in ends.values() for index in members[:most])
 
 
-def _labels(data: DataSet, kind: str, size: int) -> list[str]:
-    given = data.info.contract.get(kind) or []
-    if len(given) == size:
-        return [str(one.get("name")) for one in given]
-    return [f"{kind} {i}" for i in range(size)]
-
-
 def _named(data: DataSet, episodes: Sequence[Episode]) -> dict[str, Array]:
     """Each number of observations and actions that is no picture, by name. Shape: (steps,)."""
     found: dict[str, Array] = {}
@@ -107,7 +101,7 @@ def _named(data: DataSet, episodes: Sequence[Episode]) -> dict[str, Array]:
             values = one.observations if kind == "observation" else one.actions
             parts.append(np.concatenate([leaf.of(values)[: len(one)].reshape(len(one), -1) for leaf in leaves], axis=1))
         table = np.concatenate(parts).astype(np.float64) if leaves else np.zeros((0, 0))
-        labels = _labels(data, kind, table.shape[1])
+        labels = number_names({kind: table}, [str(one.get("name")) for one in data.info.contract.get(kind) or ()])
         found |= {
             f"{'' if kind == 'observation' else 'action: '}{label}": table[:, i] for i, label in enumerate(labels)
         }
