@@ -6,6 +6,7 @@ import json
 import os
 import time
 from collections import Counter
+from collections.abc import Sequence
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -93,9 +94,7 @@ def import_(config: flags.ImportConfig) -> None:
         name: value for name in ("task", "group") if (value := getattr(config, name)) is not None
     }
     options["again"] = config.again
-    if not config.recordings:
-        say("bam-data import: RECORDING is missing. Run bam-data import --help")
-        raise SystemExit(2)
+    _require(config.recordings, "import: RECORDING")
     env_kwargs = read_env_kwargs(config.set)
     for path in config.recordings:
         if recordings.is_rows(path):
@@ -201,10 +200,8 @@ def show_info(config: flags.InfoConfig) -> None:
 def merge_data(config: flags.MergeConfig) -> None:
     """Merge data sets."""
     from bam_train.data.selection import merge
-    from bam_train.errors import SettingsError
 
-    if not config.places:
-        raise SettingsError("PLACE is missing. Name the data sets to merge")
+    _require(config.places, "merge: PLACE")
     _tell_added(config.out, *merge([_open(place) for place in config.places], config.out))
 
 
@@ -278,6 +275,13 @@ def show_episode(config: flags.ShowConfig) -> None:
     facts = data.facts(config.episode)
     end = {True: "success", False: "failure", None: "success not known"}[facts["success"]]
     tell(f"{path}: episode {config.episode % len(data)}, {pictures} pictures, return {facts['return']:.4g}, {end}")
+
+
+def _require(given: Sequence[object], what: str) -> None:
+    """End with status 2 unless something is given in the place of `what`, such as ``merge: PLACE``."""
+    if not given:
+        say(f"bam-data {what} is missing. Run bam-data {what.partition(':')[0]} --help")
+        raise SystemExit(2)
 
 
 def _open(place: str) -> DataSet:
