@@ -253,20 +253,20 @@ def plot_data(config: flags.PlotConfig) -> None:
 
     path = require_picture_path(config.out)
     against = None if config.against is None else _open(config.against)
-    drawn = plot(_open(config.place), path, config.kind, against, config.episodes)
+    data = _open(config.place)
+    _require_episodes(data, "--episodes", config.episodes)
+    drawn = plot(data, path, config.kind, against, config.episodes)
     tell(f"{path}: {', '.join(drawn)}")
 
 
 def show_episode(config: flags.ShowConfig) -> None:
     """Make a film of an episode."""
     from bam_train.data.views.film import frames
-    from bam_train.errors import SettingsError
     from bam_train.files.video import open_video, require_video_path
 
     path = require_video_path(config.out)
     data = _open(config.place)
-    if not -len(data) <= config.episode < len(data):
-        raise SettingsError(f"--episode: {config.place} has {len(data)} episodes, and there is no {config.episode}")
+    _require_episodes(data, "--episode", [config.episode])
     pictures = 0
     with open_video(path, 1 / data.info.period) as add:
         for frame in frames(data, config.episode, config.camera):
@@ -282,6 +282,14 @@ def _require(given: Sequence[object], what: str) -> None:
     if not given:
         say(f"bam-data {what} is missing. Run bam-data {what.partition(':')[0]} --help")
         raise SystemExit(2)
+
+
+def _require_episodes(data: DataSet, flag: str, indices: Sequence[int]) -> None:
+    from bam_train.errors import SettingsError
+
+    for index in indices:
+        if not -len(data) <= index < len(data):
+            raise SettingsError(f"{flag}: {data.place} has {len(data)} episodes, and there is no {index}")
 
 
 def _open(place: str) -> DataSet:
