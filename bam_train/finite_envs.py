@@ -37,7 +37,20 @@ class FiniteEnv(gym.Wrapper[Any, Any, Any, Any]):
         return results
 
 
-class FiniteVectorEnv(VectorWrapper):
+class TransparentVectorWrapper(VectorWrapper):
+    """A wrapper with all attributes of its environments, which others may use too: they close themselves."""
+
+    def __getattr__(self, name: str) -> Any:
+        """Any other attribute is the environments'."""
+        if name == "env":  # it is being copied or unpickled
+            raise AttributeError(name)
+        return getattr(self.env, name)
+
+    def __del__(self) -> None:
+        """Nothing."""
+
+
+class FiniteVectorEnv(TransparentVectorWrapper):
     """A vector environment whose observations and rewards are finite; its environments restart in the same step.
 
     Errors name it `env_id`, or by its class.
@@ -48,15 +61,6 @@ class FiniteVectorEnv(VectorWrapper):
         self._name = env_id or type(envs.unwrapped).__name__
         self.episode_steps = np.zeros(envs.num_envs, np.int64)
         """Steps of each running episode. Shape: (n,)."""
-
-    def __getattr__(self, name: str) -> Any:
-        """Any other attribute is the environment's."""
-        if name == "env":  # it is being copied or unpickled
-            raise AttributeError(name)
-        return getattr(self.env, name)
-
-    def __del__(self) -> None:
-        """Nothing: the environment, which others may use too, closes itself."""
 
     def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Begin an episode in every environment, or in those of ``options["reset_mask"]``."""

@@ -102,13 +102,10 @@ def _fit(checkpoint: Checkpoint, request: CandidateRequest) -> str:
         text = f"was trained on {trained}, and the agent runs {env}. Push a checkpoint for that"
         raise CheckpointMismatch(checkpoint.path, text)
     saved, given = _options(checkpoint.manifest.env_kwargs, request)
-    for name, theirs, ours in [("env_kwargs", saved, given), *interface_pairs(checkpoint, interface)]:
-        difference = first_difference(theirs, ours, name)
-        if difference is not None:
-            what, *values = difference
-            one, other = (short_json(value) for value in values)
-            text = f"{what} is {one} in the checkpoint and {other} in {env} as the agent runs it"
-            raise CheckpointMismatch(checkpoint.path, f"{text}. Push a checkpoint that was trained for that")
+    if found := first_difference(("env_kwargs", saved, given), *interface_pairs(checkpoint, interface)):
+        what, one, other = found
+        text = f"{what} is {one} in the checkpoint and {other} in {env} as the agent runs it"
+        raise CheckpointMismatch(checkpoint.path, f"{text}. Push a checkpoint that was trained for that")
     period, number = interface["period"], sum(map(len, interface["signals"].values()))
     signals = f"{number} signal{'' if number == 1 else 's'}"
     return f"fits {env}: spaces, {signals}, period {'unknown' if period is None else f'{period:g} s'}"

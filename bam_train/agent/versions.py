@@ -21,12 +21,8 @@ from bam_train.checkpoint import MANIFEST, POLICY, Checkpoint
 from bam_train.checkpoint.detector import Detector
 from bam_train.errors import CheckpointError, OutputError, RequestRefused, SettingsError
 from bam_train.files.atomic_file import remove_orphans, replacing
+from bam_train.files.locks import lock
 from bam_train.policy import FrozenPolicy
-
-try:
-    import fcntl
-except ImportError:  # Windows: two agents must not share a folder
-    fcntl = None  # type: ignore[assignment]
 
 CHAMPION, CANDIDATE, PREVIOUS, GIVEN = "champion", "candidate", "previous", "given"
 KEPT = 20
@@ -81,8 +77,7 @@ class Versions:
             file = _open_lock(self.folder / _HOLDER)
         with file:
             try:
-                if fcntl is not None:
-                    fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                lock(file, wait=False)
             except BlockingIOError as error:
                 other = f"another bam-agent (process {file.read(20).decode('ascii', 'replace').strip()})"
                 raise OutputError(
@@ -219,8 +214,7 @@ class Versions:
     def _changing(self) -> Iterator[None]:
         """Within the ``with`` block, nobody else moves a name or removes a version."""
         with self._writing(), _open_lock(self.folder / _CHANGE) as file:
-            if fcntl is not None:
-                fcntl.flock(file, fcntl.LOCK_EX)
+            lock(file)
             yield
 
     @contextlib.contextmanager
@@ -262,7 +256,7 @@ def _require_same(copy: Path, checkpoint: Checkpoint) -> None:
 
 
 def _open_lock(path: Path) -> IO[bytes]:
-    """The file at `path` for `fcntl.flock`, made if need be."""
+    """The file at `path` for `lock`, made if need be."""
     return os.fdopen(os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600), "r+b")
 
 

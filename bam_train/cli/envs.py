@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from bam_train.cli.console import tell
 from bam_train.cli.program import run_program
+from bam_train.files.log_lines import aligned
 
 if TYPE_CHECKING:
     from bam_train.cli.flags import EnvsConfig
@@ -56,12 +57,6 @@ def overview_lines(facts: list[dict[str, Any]]) -> list[str]:
     theirs = "robo-gym's ids work too, with robo-gym's options; Rob is the one with a live robot:"
     bams = "BAM's ids work too: " + ", ".join(f"{name} is {alias.env_id}" for name, alias in BAM_NAMES.items()) + "."
     return [*table, "", theirs, *aligned(list(map(list, pairs.items()))), "", bams, more]
-
-
-def aligned(table: list[list[str]]) -> list[str]:
-    """The lines of a table, with aligned columns."""
-    widths = [max(map(len, column)) for column in zip(*table, strict=True)]
-    return ["  ".join(map(str.ljust, cells, widths)).rstrip() for cells in table]
 
 
 def details(name: str, arm: str | None = None) -> dict[str, Any]:

@@ -32,6 +32,7 @@ from bam_train.environments import (
     must_be_named,
     parity_if_needed,
     require_env_kwargs,
+    short_json,
 )
 from bam_train.errors import CheckpointMismatch, PolicyError, SettingsError
 from bam_train.policy import FrozenPolicy
@@ -228,19 +229,22 @@ def _in_environment(
         signals, period = described(env)
         ours = env.observation_space, env.action_space
     parts = saved.parts if saved.whole else _guessed(saved, env_id, ours[0], warn)
-    pairs = [("action_space", parts.action_space, ours[1])]
+    pairs = [("action_space", _from_zero(parts.action_space), _from_zero(ours[1]))]
     if saved.whole:
-        pairs.append(("observation_space", parts.observation_space, ours[0]))
-    for name, *both in pairs:  # the trainer may have used whole numbers that count from 0
-        there, here = (space_to_json(space_from_zero(space)) for space in both)
-        differing = first_difference(there, here, name)
-        if differing is not None:
-            text = f"{differing[0]} is {_short(differing[1])} in the directory and {_short(differing[2])} in {env_id}"
-            raise CheckpointMismatch(saved.directory.given, f"{text}; {_GIVE_ENV}")
+        pairs.append(("observation_space", _from_zero(parts.observation_space), _from_zero(ours[0])))
+    if found := first_difference(*pairs):
+        what, there, here = found
+        text = f"{what} is {there} in the directory and {here} in {env_id}"
+        raise CheckpointMismatch(saved.directory.given, f"{text}; {_GIVE_ENV}")
     if isinstance(parts.action_space, (spaces.Discrete, spaces.MultiDiscrete)) and np.any(parts.action_space.start):
         text = "RLlib counts actions from 0 whatever their start; it cannot be frozen"
         raise PolicyError(f"action space {parts.action_space}: {text}")
     return replace(parts, observation_space=ours[0], action_space=ours[1]), signals, period
+
+
+def _from_zero(space: Any) -> dict[str, Any]:
+    """A space as JSON; the trainer may have used whole numbers that count from 0."""
+    return space_to_json(space_from_zero(space))
 
 
 _GIVE_ENV = "give the environment it was trained on with --env"
@@ -265,9 +269,4 @@ def _guessed(saved: SavedPolicy, env_id: str, ours: AnySpace, warn: Callable[[st
 
 def _space(space: AnySpace) -> str:
     """A short text for a space."""
-    return f"{type(space).__name__}{space.shape}" if isinstance(space, spaces.Box) else _short(space_to_json(space))
-
-
-def _short(value: Any) -> str:
-    text = json.dumps(value)
-    return text if len(text) <= 60 else f"{text[:57]}..."
+    return f"{type(space).__name__}{space.shape}" if isinstance(space, spaces.Box) else short_json(space_to_json(space))

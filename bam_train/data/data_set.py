@@ -18,7 +18,7 @@ from bam_train.data.arrow_columns import from_arrow
 from bam_train.data.file_pair import Copy, Head, sha256
 from bam_train.data.layout import Files, file_name, row_digest, sealed
 from bam_train.data.recorded_episode import Array, DataSetInfo, Episode, Transitions, Values, digest_of, nested
-from bam_train.environments import first_difference, short_json
+from bam_train.environments import first_difference
 from bam_train.errors import BadDataSet, PlaceError
 from bam_train.files.place import Place
 
@@ -79,9 +79,9 @@ class DataSet:
         said["features"] = {name: head["features"].get(name) for name in truth["features"].keys() - new}
         for name, one in said.items():
             true = {key: truth[name][key] for key in one} if isinstance(one, dict) else truth[name]
-            if found := first_difference(one, true, name):
+            if found := first_difference((name, one, true)):
                 what, wrong, right = found
-                raise self._files.damaged(f"{layout.INFO}: {what} is {short_json(wrong)}, expected {short_json(right)}")
+                raise self._files.damaged(f"{layout.INFO}: {what} is {wrong}, expected {right}")
 
     def _read_rows(self, count: int) -> list[dict[str, Any]]:
         rows: list[dict[str, Any]] = []

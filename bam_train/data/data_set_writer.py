@@ -15,7 +15,7 @@ from bam_train.data.file_pair import Columns, Head, kind_of
 from bam_train.data.layout import BAM, COPIES, DATA, DEFAULTS, EPISODES, INFO, Files, WriterLock, file_name
 from bam_train.data.mending import mend
 from bam_train.data.recorded_episode import Array, DataSetInfo, Episode, Leaf, digest_of
-from bam_train.environments import first_difference, short_json
+from bam_train.environments import first_difference
 from bam_train.errors import BadDataSet
 from bam_train.files.place import Place
 
@@ -181,9 +181,8 @@ def require_same(place: str, there: DataSetInfo, given: DataSetInfo, whose: str 
     for one in (old, new):  # a robot's limits may differ from those of its simulation
         rows = one["contract"].items()
         one["contract"] = {kind: {row.get("name"): row.get("unit") for row in group} for kind, group in rows}
-    for name in ("env", "env_kwargs", "observation_space", "action_space", "period", "contract"):
-        difference = first_difference(old[name], new[name], name)
-        if difference is not None:
-            what, theirs, ours = difference
-            text = f"{what} is {short_json(theirs)} there, and {short_json(ours)} of {whose or 'the new episodes'}"
-            raise BadDataSet(f"{place}: {text}; {remedy or f'write {brief(given.env)} into another place'}")
+    names = ("env", "env_kwargs", "observation_space", "action_space", "period", "contract")
+    if found := first_difference(*((name, old[name], new[name]) for name in names)):
+        what, theirs, ours = found
+        text = f"{what} is {theirs} there, and {ours} of {whose or 'the new episodes'}"
+        raise BadDataSet(f"{place}: {text}; {remedy or f'write {brief(given.env)} into another place'}")

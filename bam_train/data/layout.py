@@ -30,12 +30,8 @@ from typing import IO, Any
 
 from bam_train.data.arrow_columns import Arrow
 from bam_train.errors import BadDataSet, NoSuchPlace, PlaceError
+from bam_train.files.locks import LOCKS, lock
 from bam_train.files.place import Place
-
-try:
-    import fcntl
-except ImportError:  # Windows
-    fcntl = None  # type: ignore[assignment]
 
 LOCK, MENDING = "meta/.writer", "meta/.mending"
 UNREADABLE = (OSError, ValueError, LookupError, TypeError, MemoryError, NotImplementedError, OverflowError)
@@ -205,8 +201,7 @@ class WriterLock:
         except OSError as error:
             raise BadDataSet(f"{self._text}: cannot be written: {error.strerror}; choose another place") from error
         try:
-            if fcntl is not None:
-                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            lock(file, wait=False)
         except OSError:
             file.seek(0)
             who = file.read() or "another process"
@@ -234,7 +229,7 @@ def _may_live(who: str) -> bool:
     """Whether a writer may still write; of one on another computer nobody knows."""
     _, process, _, host, *_ = [*who.split(), *[""] * 5]
     try:
-        if fcntl is not None and host == socket.gethostname():
+        if LOCKS and host == socket.gethostname():
             os.kill(int(process), 0)
     except ProcessLookupError:
         return False

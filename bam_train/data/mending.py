@@ -24,7 +24,7 @@ from bam_train.data.file_pair import Columns, Copy, Head, sha256
 from bam_train.data.layout import Files, file_name, sealed, tasks_table
 from bam_train.data.recorded_episode import DataSetInfo, Episode
 from bam_train.data.salvage import Pair, read_pair
-from bam_train.environments import first_difference, short_json
+from bam_train.environments import first_difference
 from bam_train.errors import BadDataSet
 
 ASIDE = "damaged"
@@ -183,13 +183,12 @@ def _said(files: Files, reader: _Reader) -> dict[str, Any]:
         return {}
     own = Head(reader.info, reader.extra).content()
     features: dict[str, Any] = said["features"] if isinstance(said.get("features"), dict) else {}
-    pairs = {"fps": (own["fps"], said.get("fps"))}
-    pairs |= {name: (one, features[name]) for name, one in own["features"].items() if name in features}
-    for name, (one, other) in pairs.items() if not reader.is_sealed else ():
-        if found := first_difference(one, other, name):
-            what, ours, theirs = found
-            text = f"{what} is {short_json(ours)} in {layout.BAM} and {short_json(theirs)} in {layout.INFO}"
-            raise BadDataSet(f"{files.text}: {text}: one of them is damaged. Get both files from a copy")
+    pairs = [("fps", own["fps"], said.get("fps"))]
+    pairs += [(name, one, features[name]) for name, one in own["features"].items() if name in features]
+    if not reader.is_sealed and (found := first_difference(*pairs)):
+        what, one, other = found
+        text = f"{what} is {one} in {layout.BAM} and {other} in {layout.INFO}"
+        raise BadDataSet(f"{files.text}: {text}: one of them is damaged. Get both files from a copy")
     return said
 
 
@@ -235,9 +234,9 @@ def _differences(files: Files, head: Head, said: dict[str, Any], last: Copy | No
         there = value if key == "splits" and _counts(said) else said.get(key)
         if key == "features" and isinstance(there, dict):
             there = {name: there.get(name) for name in value}
-        if found := first_difference(there, value, key):
+        if found := first_difference((key, there, value)):
             what, wrong, true = found
-            yield f"{layout.INFO}: {what} is {short_json(wrong)}, expected {short_json(true)}"
+            yield f"{layout.INFO}: {what} is {wrong}, expected {true}"
     if not head.file:
         return
     for name, is_right in ((layout.TASKS, _has_tasks), (layout.STATS, _has_stats)):

@@ -11,7 +11,7 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
-from gymnasium.vector import AutoresetMode, VectorEnv, VectorWrapper
+from gymnasium.vector import AutoresetMode, VectorEnv
 from numpy.typing import NDArray
 
 from bam_envs.core.robot_env import RobotEnv, RobotVectorEnv
@@ -23,6 +23,7 @@ from bam_train.data.recorded_episode import Array, DataSetInfo, Episode, Leaf, n
 from bam_train.environments import AnyEnv, control_period
 from bam_train.errors import BadDataSet, SettingsError
 from bam_train.files.place import Place
+from bam_train.finite_envs import TransparentVectorWrapper
 from bam_train.rollout import last_observations
 
 Keep = Callable[[int, "int | None"], bool]
@@ -341,17 +342,8 @@ class RecordDataset(_Recorder, gym.Wrapper[Any, Any, Any, Any]):
             super().close()  # type: ignore[no-untyped-call]
 
 
-class RecordVectorDataset(_Recorder, VectorWrapper):
+class RecordVectorDataset(_Recorder, TransparentVectorWrapper):
     """`RecordDataset` of several environments."""
-
-    def __getattr__(self, name: str) -> Any:
-        """Any other attribute is the environments'."""
-        if name == "env":  # it is being copied or unpickled
-            raise AttributeError(name)
-        return getattr(self.env, name)
-
-    def __del__(self) -> None:
-        """Nothing: the environments, which others may use too, close themselves."""
 
     def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Begin an episode in every environment, or in those of ``options["reset_mask"]``."""

@@ -72,8 +72,10 @@ def info_of_rows(source: Path, env: str | None, env_kwargs: Mapping[str, Any]) -
     """What all episodes of Parquet rows have in common, by their environment, which is made.
 
     Raises:
-        BadDataSet: No environment is given, or one whose observations or actions are several arrays.
+        BadDataSet: It is a data set; no environment is given, or one whose observations or actions are several arrays.
     """
+    if Files(source).exists(INFO):
+        raise BadDataSet(f"{source}: is a data set already; add it to another one with bam-data merge")
     if env is None:
         raise BadDataSet(f"{source}: Parquet rows do not name their environment; add --env ENV")
     env = resolve_id(env)
@@ -241,8 +243,6 @@ def _rows(source: Path, columns: list[str]) -> Arrow:
     import pyarrow as pa
     import pyarrow.parquet as pq
 
-    if Files(source).exists(INFO):
-        raise BadDataSet(f"{source}: is a data set already; add it to another one with bam-data merge")
     try:
         files = pq.ParquetDataset(local_path(source))
         if missing := [name for name in columns if name not in files.schema.names]:

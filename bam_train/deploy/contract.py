@@ -19,7 +19,7 @@ from bam_envs.robots.profile import load_profile, profile_for
 from bam_envs.rosbridge.client import RosbridgeLink
 from bam_envs.rosbridge.endpoint import Endpoint
 from bam_train.checkpoint import Checkpoint
-from bam_train.environments import first_difference, fit_pairs, short_json
+from bam_train.environments import first_difference, fit_pairs
 from bam_train.errors import ContractRefused
 
 _WIDEST = 60
@@ -134,12 +134,12 @@ def fit_checks(checkpoint: Checkpoint, env: Any) -> Iterator[Check]:
     env_id = env.spec.id if env.spec is not None else checkpoint.manifest.env
     yield Check("environment", checkpoint.manifest.env, env_id, fits=True)
     for name, saved, present in fit_pairs(checkpoint, env):
-        what, difference = name.replace("_", " "), first_difference(saved, present, "")
+        what, difference = name.replace("_", " "), first_difference(("", saved, present))
         if difference is None:
             yield Check(what, _in_short(saved), _in_short(present), fits=True)
         else:
             at, expected, found = difference
-            yield Check(f"{what}{at}", short_json(expected), short_json(found), fits=False)
+            yield Check(f"{what}{at}", expected, found, fits=False)
 
 
 def _in_short(value: Any) -> str:

@@ -4,7 +4,7 @@ import json
 import math
 import platform
 import time
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from importlib.metadata import version
 from pathlib import Path
 from time import perf_counter
@@ -27,7 +27,7 @@ from bam_train.deploy.episode import OBSERVATION, EpisodeStep
 from bam_train.deploy.journal import Journal
 from bam_train.environments import control_period
 from bam_train.files.place import with_addresses
-from bam_train.recording.recorder import WARNING, Recorder
+from bam_train.recording.recorder import WARNING, Recorder, number_kinds, number_names
 
 STAGES = ("step", "wait", "late", "policy", "age", "record")
 """Names of the latencies in /latency; see `FlightLog`."""
@@ -198,16 +198,22 @@ class FlightLog:
             spec = self._robot.spec
             present = [signal for signal in spec.signals if signal.name in state.signals]
             signals = [f"{signal.name}.{label}" for signal in present for label in signal.labels]
-            layout = {"/state": ["stamp", *signals], "/truth": _named(truth), "/command": list(spec.command.labels)}
+            layout = {
+                "/state": ["stamp", *signals],
+                "/truth": number_names(truth),
+                "/command": list(spec.command.labels),
+            }
             measured = [unit for signal in present for unit in signal.units]
             units = {"/state": dict(zip(signals, measured, strict=True))}
             units["/command"] = dict(zip(spec.command.labels, spec.command.units, strict=True))
         pictures = {name.removeprefix(f"{OBSERVATION}/") for name in self._pictures}
-        layout["/observation"] = _named(arrays, [one for one in labels.get("observation", ()) if one not in pictures])
-        layout["/action"] = _named({"": action}, labels.get("action"))
+        layout["/observation"] = number_names(
+            arrays, [one for one in labels.get("observation", ()) if one not in pictures]
+        )
+        layout["/action"] = number_names({"": action}, labels.get("action"))
         layout |= {topic: list(names) for topic, names in _SCALARS.items()}
         kinds = {"truth": truth, "observation": arrays, "action": {"": action}}
-        extra = {kind: json.dumps({name: _kind(array) for name, array in of.items()}) for kind, of in kinds.items()}
+        extra = {kind: number_kinds(of) for kind, of in kinds.items()}
         extra["units"] = json.dumps(units)
         self._recorder.declare({topic: names for topic, names in layout.items() if names}, extra)
 
@@ -228,15 +234,3 @@ def _is_picture(array: NDArray[Any]) -> bool:
 def _numeric(truth: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
     """The parts of a state's truth that are numbers."""
     return {name: array for name, array in truth.items() if array.dtype.kind in "fiub" and array.size}
-
-
-def _named(arrays: Mapping[str, NDArray[Any]], labels: Iterable[str] | None = None) -> list[str]:
-    """A name for each number of `arrays`: the labels where there are as many, else such as ``name.0`` or ``0``."""
-    names = [f"{name}.{i}".lstrip(".") for name, array in arrays.items() for i in range(array.size)]
-    given = list(labels or ())
-    return given if len(given) == len(names) else names
-
-
-def _kind(array: NDArray[Any]) -> list[Any]:
-    """Dtype and shape of an array (1, ...), without the batch."""
-    return [array.dtype.str, *array.shape[1:]]

@@ -33,11 +33,7 @@ from typing import IO, Any
 
 from bam_train.checkpoint.ownership import who_else
 from bam_train.errors import FormatError
-
-try:
-    import fcntl
-except ImportError:  # Windows: two programs must not write to one record at once
-    fcntl = None  # type: ignore[assignment]
+from bam_train.files.locks import lock
 
 ALPHA = 0.05
 """Maximum probability that a policy passes although its success rate is not above the threshold."""
@@ -302,9 +298,8 @@ def _json(line: bytes) -> dict[str, Any]:
 def _locked(path: Path) -> Iterator[IO[bytes]]:
     """The file at `path`, created if necessary, locked against other programs."""
     with os.fdopen(os.open(path, os.O_RDWR | os.O_CREAT, 0o644), "r+b") as file:
-        if fcntl is not None:
-            with contextlib.suppress(OSError):  # a file system without locks
-                fcntl.flock(file, fcntl.LOCK_EX)
+        with contextlib.suppress(OSError):  # a file system without locks
+            lock(file)
         yield file
 
 

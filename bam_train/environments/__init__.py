@@ -9,6 +9,7 @@ from bam_train.environments.interface import (
     interface_in,
     interface_of,
     interface_pairs,
+    names_and_units,
     require_fit,
     short_json,
 )
@@ -40,6 +41,7 @@ __all__ = [
     "make_env",
     "make_vector_env",
     "must_be_named",
+    "names_and_units",
     "parity_if_needed",
     "require_env_kwargs",
     "require_fit",

@@ -41,24 +41,21 @@ def require_fit(checkpoint: Checkpoint, env: AnyEnv, place: Location = HERE, env
     Raises:
         CheckpointMismatch: Names the first thing that differs, and both values.
     """
-    pairs = fit_pairs(checkpoint, env)
-    differences = (first_difference(theirs, ours, name) for name, theirs, ours in pairs)
-    difference = next(filter(None, differences), None)
+    difference = first_difference(*fit_pairs(checkpoint, env))
     if difference is None:
         return
     name, theirs, ours = difference
     if env_id is not None and not registry.are_same(env_id, checkpoint.manifest.env):
         raise CheckpointMismatch(
             checkpoint.path,
-            f"was trained on {checkpoint.manifest.env}, where {name} is {short_json(theirs)}, and it is "
-            f"{short_json(ours)} in {env_id}; give a checkpoint of {env_id}",
+            f"was trained on {checkpoint.manifest.env}, where {name} is {theirs}, and it is "
+            f"{ours} in {env_id}; give a checkpoint of {env_id}",
         )
     place_text = f"at {place.text}" if isinstance(place, Remote) else f"in {checkpoint.manifest.env} as installed"
     remedy = "serve the version" if isinstance(place, Remote) else "install the version"
     raise CheckpointMismatch(
         checkpoint.path,
-        f"{name} is {short_json(theirs)} in the checkpoint and {short_json(ours)} {place_text}; "
-        f"train it anew, or {remedy} it was trained with",
+        f"{name} is {theirs} in the checkpoint and {ours} {place_text}; train it anew, or {remedy} it was trained with",
     )
 
 
@@ -75,7 +72,7 @@ def interface_of(env: AnyEnv) -> dict[str, Any]:
     single = "single_" if isinstance(env, VectorEnv) else ""
     spaces = {name: space_to_json(getattr(env, single + name)) for name in ("observation_space", "action_space")}
     describe, period = getattr(env.unwrapped, "describe", None), getattr(env.unwrapped, "period", None)
-    signals = {} if describe is None else _names_and_units(describe())
+    signals = {} if describe is None else names_and_units(describe())
     plain: dict[str, Any] = json.loads(json.dumps({**spaces, "signals": signals}))  # tuples as lists
     return {**plain, "period": None if period is None else float(period)}
 
@@ -83,7 +80,7 @@ def interface_of(env: AnyEnv) -> dict[str, Any]:
 def interface_in(manifest: Manifest) -> dict[str, Any]:
     """As `interface_of`, of the environment of a manifest."""
     spaces = {name: getattr(manifest, name) for name in ("observation_space", "action_space")}
-    return {**spaces, "signals": _names_and_units(manifest.signals), "period": manifest.period}
+    return {**spaces, "signals": names_and_units(manifest.signals), "period": manifest.period}
 
 
 def interface_pairs(checkpoint: Checkpoint, interface: Mapping[str, Any]) -> list[tuple[str, Any, Any]]:
@@ -91,7 +88,7 @@ def interface_pairs(checkpoint: Checkpoint, interface: Mapping[str, Any]) -> lis
     manifest = checkpoint.manifest
     pairs = [(name, getattr(manifest, name), interface[name]) for name in ("observation_space", "action_space")]
     if interface["signals"] and manifest.signals:
-        pairs.append(("signals", _names_and_units(manifest.signals), interface["signals"]))
+        pairs.append(("signals", names_and_units(manifest.signals), interface["signals"]))
     period = interface["period"]
     if period is not None and manifest.period is not None:
         same = math.isclose(period, manifest.period, rel_tol=1e-9)
@@ -99,8 +96,13 @@ def interface_pairs(checkpoint: Checkpoint, interface: Mapping[str, Any]) -> lis
     return pairs
 
 
-def first_difference(theirs: Any, ours: Any, name: str) -> tuple[str, Any, Any] | None:
-    """The first difference of two JSON values: its name and both values; None if they are equal."""
+def first_difference(*pairs: tuple[str, Any, Any]) -> tuple[str, str, str] | None:
+    """The first difference of pairs of JSON values, each with its name: what differs, and both values in short."""
+    found = next(filter(None, (_difference(*pair) for pair in pairs)), None)
+    return None if found is None else (found[0], short_json(found[1]), short_json(found[2]))
+
+
+def _difference(name: str, theirs: Any, ours: Any) -> tuple[str, Any, Any] | None:
     if isinstance(theirs, dict) and isinstance(ours, dict):
         keys: list[Any] = sorted(theirs.keys() | ours.keys(), key=lambda key: (key != "type", key != "shape", key))
         pairs = [(f"{name}.{key}", theirs.get(key), ours.get(key)) for key in keys]
@@ -108,11 +110,11 @@ def first_difference(theirs: Any, ours: Any, name: str) -> tuple[str, Any, Any] 
         pairs = [(f"{name}[{i}]", a, b) for i, (a, b) in enumerate(zip(theirs, ours, strict=True))]
     else:
         return None if theirs == ours else (name, theirs, ours)
-    return next((found for pair in pairs if (found := first_difference(pair[1], pair[2], pair[0]))), None)
+    return next(filter(None, (_difference(*pair) for pair in pairs)), None)
 
 
-def _names_and_units(signals: Mapping[str, Any]) -> dict[str, Any]:
-    """The names and units of the signals that `RobotEnv.describe` returns, by kind."""
+def names_and_units(signals: Mapping[str, Any]) -> dict[str, Any]:
+    """The names and units of the signals that `RobotEnv.describe` returns, or a data set has, by kind."""
     return {kind: [{key: entry.get(key) for key in ("name", "unit")} for entry in signals[kind]] for kind in signals}
 
 

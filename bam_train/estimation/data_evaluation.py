@@ -13,7 +13,7 @@ import numpy as np
 from bam_envs.core.spaces import space_to_json
 from bam_train.checkpoint import Checkpoint
 from bam_train.data import DataSet
-from bam_train.environments import first_difference, interface_pairs, short_json
+from bam_train.environments import first_difference, interface_pairs, names_and_units
 from bam_train.errors import BadDataSet, CheckpointMismatch
 from bam_train.estimation.behaviour import action_ratios
 from bam_train.estimation.estimates import Array, Estimate, doubly_robust, importance_sampling, self_normalised
@@ -151,14 +151,11 @@ def require_same_interface(checkpoint: Checkpoint, data: DataSet) -> None:
     checkpoint.requires_env(data.info.env, f"That is the environment of {data.place}; give data of its own one")
     info = data.info
     spaces = {name: space_to_json(getattr(info, name)) for name in ("observation_space", "action_space")}
-    names = {
-        kind: [{key: one.get(key) for key in ("name", "unit")} for one in info.contract[kind]] for kind in info.contract
-    }
-    for name, theirs, ours in interface_pairs(checkpoint, {**spaces, "signals": names, "period": info.period}):
-        if found := first_difference(theirs, ours, name):
-            what, one, other = found
-            text = f"{what} is {short_json(one)} in the checkpoint and {short_json(other)} in {data.place}"
-            raise CheckpointMismatch(checkpoint.path, f"{text}; evaluate it on data of its own environment")
+    interface = {**spaces, "signals": names_and_units(info.contract), "period": info.period}
+    if found := first_difference(*interface_pairs(checkpoint, interface)):
+        what, one, other = found
+        text = f"{what} is {one} in the checkpoint and {other} in {data.place}"
+        raise CheckpointMismatch(checkpoint.path, f"{text}; evaluate it on data of its own environment")
 
 
 def unseen_indices(checkpoint: Checkpoint, data: DataSet, seen: Seen) -> list[int]:

@@ -15,9 +15,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from bam_train.evaluation import Z95
+
 Array = NDArray[Any]
-Z95 = 1.959963984540054
-"""97.5 % quantile of the normal distribution."""
 FEWEST = 10.0
 """Effective episodes below which an interval means nothing: a few episodes have nearly all of the weight."""
 

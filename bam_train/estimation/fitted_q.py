@@ -17,8 +17,9 @@ from typing import Any
 
 import numpy as np
 
-from bam_train.estimation.estimates import Z95, Array, Estimate
+from bam_train.estimation.estimates import Array, Estimate
 from bam_train.estimation.steps import Steps
+from bam_train.evaluation import Z95
 
 MEMBERS = 5
 """Networks, of which each has its own draw of the episodes."""

@@ -21,7 +21,6 @@ from bam_train.environments import (
     make_vector_env,
     require_env_kwargs,
     require_fit,
-    short_json,
 )
 from bam_train.errors import CheckpointMismatch, SettingsError
 from bam_train.estimation.data_evaluation import (
@@ -124,11 +123,10 @@ def require_comparable(candidate: Checkpoint, champion: Checkpoint) -> None:
     """Refuse a candidate of another environment, other spaces, units or rate than those of the champion."""
     theirs, remedy = champion.manifest, f"Compare it with a champion of {candidate.manifest.env}"
     candidate.requires_env(theirs.env, f"{champion.path} is the champion of that one. {remedy}")
-    for name, ours, other in interface_pairs(candidate, interface_in(theirs)):
-        if found := first_difference(ours, other, name):
-            what, one, another = found
-            text = f"{what} is {short_json(one)}, and {short_json(another)} in the champion {champion.path}"
-            raise CheckpointMismatch(candidate.path, f"{text}; a gate compares policies that see and do the same")
+    if found := first_difference(*interface_pairs(candidate, interface_in(theirs))):
+        what, one, other = found
+        text = f"{what} is {one}, and {other} in the champion {champion.path}"
+        raise CheckpointMismatch(candidate.path, f"{text}; a gate compares policies that see and do the same")
 
 
 def count_pairs(candidate: list[PlayedEpisode], champion: list[PlayedEpisode]) -> Pairs:

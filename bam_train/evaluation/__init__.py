@@ -2,6 +2,7 @@
 
 from bam_train.evaluation.evaluation import (
     FIRST_SEED,
+    Z95,
     EvaluationReport,
     default_num_envs,
     evaluate,
@@ -14,6 +15,7 @@ from bam_train.evaluation.evaluation import (
 
 __all__ = [
     "FIRST_SEED",
+    "Z95",
     "EvaluationReport",
     "default_num_envs",
     "evaluate",

@@ -28,7 +28,8 @@ FIRST_SEED = 1_000_000
 LOOK = 16
 """Episodes that show whether a policy fails too often, of four times as many or more."""
 
-_Z95 = 1.959963984540054  # 97.5 % quantile of the normal distribution, for a two-sided 95 % interval
+Z95 = 1.959963984540054
+"""97.5 % quantile of the normal distribution, for a two-sided 95 % interval."""
 
 
 @dataclass(frozen=True)
@@ -65,9 +66,9 @@ def wilson_interval(successes: float, episodes: int) -> tuple[float, float]:
 
     Centre (p + z²/2n) / (1 + z²/n), half width z sqrt(p(1-p)/n + z²/4n²) / (1 + z²/n).
     """
-    p, z2n = successes / episodes, _Z95**2 / episodes
+    p, z2n = successes / episodes, Z95**2 / episodes
     centre = (p + z2n / 2) / (1 + z2n)
-    half = _Z95 * math.sqrt(p * (1 - p) / episodes + z2n / (4 * episodes)) / (1 + z2n)
+    half = Z95 * math.sqrt(p * (1 - p) / episodes + z2n / (4 * episodes)) / (1 + z2n)
     low = 0.0 if successes == 0 else max(0.0, centre - half)
     high = 1.0 if successes == episodes else min(1.0, centre + half)
     return low, high

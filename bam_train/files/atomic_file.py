@@ -13,12 +13,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from bam_train.errors import OutputError
-
-try:
-    import fcntl
-except ImportError:  # Windows: files that were left stay
-    fcntl = None  # type: ignore[assignment]
-
+from bam_train.files.locks import LOCKS, lock
 
 REPLACED: list[Callable[[Path], None]] = []
 """Called with each file that `replacing` has replaced."""
@@ -48,7 +43,7 @@ def replacing(target: Path, suffix: str = ".tmp") -> Iterator[Path]:
     descriptor, path = _locked(target, suffix)
     try:
         yield path
-        if fcntl is not None:
+        if LOCKS:
             os.fsync(descriptor)
         mask = os.umask(0o022)
         os.umask(mask)
@@ -57,7 +52,7 @@ def replacing(target: Path, suffix: str = ".tmp") -> Iterator[Path]:
     finally:
         with contextlib.suppress(OSError):
             path.unlink()
-        if fcntl is not None:
+        if LOCKS:
             os.close(descriptor)
     with contextlib.suppress(OSError):  # make the rename itself durable, where the system can
         folder = os.open(target.parent, os.O_RDONLY)
@@ -72,11 +67,11 @@ def replacing(target: Path, suffix: str = ".tmp") -> Iterator[Path]:
 def _locked(target: Path, suffix: str) -> tuple[int, Path]:
     while True:
         descriptor, name = tempfile.mkstemp(dir=target.parent, prefix=f".{target.name}.", suffix=suffix)
-        if fcntl is None:
+        if not LOCKS:  # Windows, which renames no open file
             os.close(descriptor)
             return -1, Path(name)
         with contextlib.suppress(OSError):  # a file system without locks
-            fcntl.flock(descriptor, fcntl.LOCK_EX)
+            lock(descriptor)
         if os.fstat(descriptor).st_nlink:
             return descriptor, Path(name)
         os.close(descriptor)  # removed by `remove_orphans` before it was locked
@@ -86,8 +81,8 @@ def remove_orphans(target: Path) -> None:
     """Remove temporary files of `target`, and of name-2, name-3, … beside it, whose writers are dead; never fails."""
     pattern = re.compile(rf"\.{re.escape(target.stem)}(-\d+)?{re.escape(target.suffix)}\.\w{{8}}\.tmp")
     with contextlib.suppress(OSError):
-        for path in target.parent.iterdir() if fcntl is not None else ():
+        for path in target.parent.iterdir() if LOCKS else ():
             if pattern.fullmatch(path.name):
                 with contextlib.suppress(OSError), path.open("rb+") as file:
-                    fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)  # BlockingIOError: a process still writes it
+                    lock(file, wait=False)  # BlockingIOError: a process still writes it
                     path.unlink()

@@ -192,6 +192,8 @@ class Place:
             raise
         except FileNotFoundError as error:
             why = _explained(error, self) if self.local is None else ""
+            if why.startswith("no connection"):  # as fsspec says of addresses of the web
+                raise PlaceError(self, f"cannot be {done}: {why}") from error
             raise NoSuchPlace(self, why or "no such file or folder. Check the name") from error
         except Exception as error:  # each kind of service has its own exceptions
             if self.local is None:
@@ -279,6 +281,7 @@ _EXPLAINED = {
     **dict.fromkeys(("NoCredentialsError", "PartialCredentialsError"), f"no credentials. {_CREDENTIALS}"),
     "DefaultCredentialsError": "no credentials of Google. Set GOOGLE_APPLICATION_CREDENTIALS to the file with them",
     **dict.fromkeys(("ConnectionError", "HTTPClientError", "ClientPayloadError", "TimeoutError"), _NO_CONNECTION),
+    **dict.fromkeys(("ClientConnectionError", "gaierror"), _NO_CONNECTION),
 }
 """Codes of S3's errors, and classes of exceptions, with what a user should know; codes count first."""
 

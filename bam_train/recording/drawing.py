@@ -12,10 +12,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bam_envs.core.errors import MissingExtra, ProtocolError
+from bam_envs.core.errors import ProtocolError
 from bam_envs.ros.images import decode_image
-from bam_train.errors import FormatError, OutputError
-from bam_train.files.atomic_file import replacing
+from bam_train.errors import FormatError
+from bam_train.files.pictures import new_figure, save_figure
 from bam_train.recording.recording import Recording
 
 if TYPE_CHECKING:
@@ -34,14 +34,10 @@ def plot(recording: Recording, path: Path) -> None:
         MissingExtra: matplotlib is not installed.
         OutputError: The file cannot be written.
     """
-    try:
-        from matplotlib.figure import Figure
-    except ImportError as error:
-        raise MissingExtra("matplotlib", "notebook", "--plot") from error
-    plots = _plots(recording)
     if not recording.ticks:
         raise FormatError(f"{recording.path}: no whole tick is in it; there is nothing to draw")
-    figure = Figure(figsize=(10, 0.8 + 1.7 * len(plots)), layout="constrained")
+    plots = _plots(recording)
+    figure = new_figure("--plot", 10, 0.8 + 1.7 * len(plots))
     axes = figure.subplots(len(plots), 1, sharex=True, squeeze=False)[:, 0]
     for panel, (name, draw) in zip(axes, plots, strict=True):
         draw(panel)
@@ -53,12 +49,7 @@ def plot(recording: Recording, path: Path) -> None:
             panel.legend(loc="center left", bbox_to_anchor=(1, 0.5), fontsize="x-small")
     axes[0].set_title(f"{recording.path.name}: {recording.metadata.get('env', '')}", fontsize="medium")
     axes[-1].set_xlabel("time [s]")
-    try:
-        with replacing(path) as temporary:
-            figure.savefig(temporary, dpi=100, format=path.suffix[1:] or "png")
-    except (OSError, ValueError) as error:
-        why = getattr(error, "strerror", None) or error
-        raise OutputError(f"{path}: cannot be written: {why}. Choose another .png") from error
+    save_figure(figure, path)
 
 
 def _plots(recording: Recording) -> list[tuple[str, Callable[[Axes], None]]]:

@@ -52,6 +52,18 @@ _CHECK = 64
 """Number of records between two checks that the process is alive."""
 
 
+def number_names(arrays: Mapping[str, NDArray[Any]], labels: Iterable[str] | None = None) -> list[str]:
+    """A name for each number of arrays (n, ...): the labels if there are as many, else such as ``name.0`` or ``0``."""
+    names = [f"{name}.{i}".lstrip(".") for name, array in arrays.items() for i in range(int(np.prod(array.shape[1:])))]
+    given = list(labels or ())
+    return given if len(given) == len(names) else names
+
+
+def number_kinds(arrays: Mapping[str, NDArray[Any]]) -> str:
+    """Dtype and shape of arrays (n, ...), without n, by name; JSON."""
+    return json.dumps({name: [array.dtype.str, *array.shape[1:]] for name, array in arrays.items()})
+
+
 class Camera(Protocol):
     """A camera whose images are recorded, such as `bam_envs.live.camera.LiveCamera`."""
 

@@ -83,16 +83,17 @@ def test_period(corridor, monkeypatch):
     ("theirs", "ours", "difference"),
     [
         ({"a": 1}, {"a": 1}, None),
-        ({"a": 1}, {"a": 2}, ("x.a", 1, 2)),
-        ({"a": 1}, {}, ("x.a", 1, None)),
-        ({"high": [1, 2], "low": 0}, {"high": [1, 3], "low": 0}, ("x.high[1]", 2, 3)),
-        ({"high": [1, 2], "shape": [2]}, {"high": [1, 2, 3], "shape": [3]}, ("x.shape[0]", 2, 3)),
-        ({"type": "Box", "shape": [2]}, {"type": "Discrete", "n": 2}, ("x.type", "Box", "Discrete")),
-        ([1, 2], [1], ("x", [1, 2], [1])),
+        ({"a": 1}, {"a": 2}, ("x.a", "1", "2")),
+        ({"a": 1}, {}, ("x.a", "1", "null")),
+        ({"high": [1, 2], "low": 0}, {"high": [1, 3], "low": 0}, ("x.high[1]", "2", "3")),
+        ({"high": [1, 2], "shape": [2]}, {"high": [1, 2, 3], "shape": [3]}, ("x.shape[0]", "2", "3")),
+        ({"type": "Box", "shape": [2]}, {"type": "Discrete", "n": 2}, ("x.type", '"Box"', '"Discrete"')),
+        ([1, 2], [1], ("x", "[1, 2]", "[1]")),
+        ("a" * 70, 1, ("x", f'"{"a" * 56}...', "1")),
     ],
 )
 def test_first_difference(theirs, ours, difference):
-    assert first_difference(theirs, ours, "x") == difference
+    assert first_difference(("same", 1, 1), ("x", theirs, ours), ("later", 1, 2)) == (difference or ("later", "1", "2"))
 
 
 def describe(**changes):

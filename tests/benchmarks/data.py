@@ -1,4 +1,4 @@
-"""Data sets: collecting them, drawing batches, the recorder of a deployment, and reading them from a disk and from S3.
+"""Data sets: collecting them, drawing batches, and reading them from a disk and from S3.
 
 The S3 service is a stand-in that serves byte ranges of a local folder in another process: it measures what our side
 costs, without a network.
@@ -19,8 +19,7 @@ from statistics import median
 import gymnasium as gym
 import numpy as np
 
-from tests.benchmarks import harness
-from tests.benchmarks.harness import Peer, at_least, at_most, in_turns, number, percentiles, program, ratio
+from tests.benchmarks.harness import Peer, at_least, at_most, in_turns, number, ratio
 
 NUMBERS, STEPS = 1000, 200
 """float32 of an observation, and steps of an episode, in what is read from S3."""
@@ -100,18 +99,6 @@ def measure_batches(flags):
     yield at_least(
         "batches of 256 transitions, of d3rlpy's", 20 * ratio(times["theirs"], times["ours"]), 10, "x", found
     )
-
-
-def measure_recorder(flags):
-    """The recorder's share of a tick of bam-deploy ``--record PLACE``, as the recording itself says."""
-    from bam_train.recording.recording import Recording
-
-    with tempfile.TemporaryDirectory() as folder:
-        command = program("deploy", harness.PICK, "--episodes", flags.times(10), "--record", "data")
-        subprocess.run(command, cwd=folder, check=True, capture_output=True)
-        [path] = Path(folder, "recordings").glob("*.mcap")
-        took = Recording.open(path).tables["/latency"].column("record")
-    yield percentiles("recorder's share of a real tick", took[np.isfinite(took)], "us", p50=30)
 
 
 class Ranges(BaseHTTPRequestHandler):

@@ -1,19 +1,13 @@
-"""How smoothly an arm moves with the controllers that take a policy's commands: jerk, lag and success.
+"""How smoothly an arm moves behind each driver's controller: jerk, lag and success, against commands that are held.
 
-The policy runs in closed loop, behind the guards of a live robot, on the simulated arm, whose own drives follow a set
-point like a spring and a damper. What the set points are between two commands is what differs:
-
-held            forward_position_controller: the newest command, at once
-trajectory N    joint_trajectory_controller, one point that is reached after N periods; it begins at the set point, as
-                with ``interpolate_from_desired_state: true``
-  measured      the same, and it begins where the joint is measured, as with ``false``, which is the default
-  at rest       as trajectory N, with velocity zero at the point: a cubic spline instead of a straight line
+The policy of bam/pick (of a UR5e), or the scripted one, runs in closed loop, behind the guards of a live robot, on the
+simulated arm, whose own drives follow a set point like a spring and a damper. The controller, of a mode of the driver's
+profile at its own rate, makes the set points between two commands: a command is held, or reached after some periods, on
+a straight line or at rest, on a cubic spline.
 
 Each is measured with commands that are on time, and with each of them late by up to --late seconds. The jerk [rad/s^3]
-is that of the median episode, as now and then the arm touches the cube.
-
-The stacks are drivers with their arm: the controller of a mode of their profile, at its own rate, behind the policy of
-bam/pick (of a UR5e) or the scripted one. Physics take steps of 1 ms, and the jerk is that of positions 5 ms apart.
+is of the median episode, as now and then the arm touches the cube. Physics take steps of 1 ms, and the jerk is of
+positions 5 ms apart.
 """
 
 from contextlib import closing, suppress
@@ -47,8 +41,8 @@ class Flags(harness.Flags):
     """Most that a command is late [s]."""
     smoothing: float = 0.03
     """Time constant with which the robot itself smooths set points, of a UR about 0.03 [s]; 0: stiff drives."""
-    controller: tuple[str, ...] = ()
-    """These controllers and stacks alone."""
+    stack: tuple[str, ...] = ()
+    """These stacks alone."""
 
 
 LIVE_LAG = load_profile("ur5e_position").spec(mode="position").lag
@@ -56,24 +50,12 @@ LIVE_LAG = load_profile("ur5e_position").spec(mode="position").lag
 
 
 class Controller(NamedTuple):
-    """When a command is reached [periods]; whether it begins where the joint is measured, and ends at rest."""
+    """When a command is reached [periods], and whether the joint is at rest then."""
 
     reach: float = 0.0
-    measured: bool = False
     at_rest: bool = False
     rate: float = 1e9
     """Of its set points [Hz]."""
-
-
-CONTROLLERS = {
-    "held": Controller(),
-    "trajectory 1": Controller(1.0),
-    "trajectory 1, measured": Controller(1.0, measured=True),
-    "trajectory 1.5": Controller(1.5),
-    "trajectory 1.5, measured": Controller(1.5, measured=True),
-    "trajectory 2": Controller(2.0),
-    "trajectory 2, at rest": Controller(2.0, at_rest=True),
-}
 
 
 STACKS = {
@@ -145,10 +127,7 @@ class DrivenArm(SimulatedArm):
 
     def _take(self, goal):
         """A new command replaces the one that runs."""
-        here, speed = self._at(self._now)
-        if self.controller.measured:
-            here, speed = self.physics.qpos[0, : self._size].copy(), self.physics.qvel[0, : self._size].copy()
-        self._from, self._velocity, self._to, self._begun = here, speed, goal, self._now
+        (self._from, self._velocity), self._to, self._begun = self._at(self._now), goal, self._now
 
     def _at(self, now):
         """Set point [rad] and its speed [rad/s]."""
@@ -206,7 +185,7 @@ def measure_stacks(flags):
     from bam_train.policy import FrozenPolicy
 
     for name, (arm, profile, mode, rate) in STACKS.items():
-        if flags.controller and name not in flags.controller:
+        if flags.stack and name not in flags.stack:
             continue
         policy = FrozenPolicy.load(flags.checkpoint) if arm == "ur5e" else scripted_policy("bam/pick-v0", arm)
         now, held = _controller(profile, mode, rate, ENVIRONMENTS["bam/pick-v0"].period)
@@ -219,18 +198,3 @@ def measure_stacks(flags):
             found = f"{after[0]:.0f}, {share:.2f} of {before[0]:.0f} held; {lag:.0f} ms; {after[3]:.0%}"
             when = "late" if late else "on time"
             yield harness.at_most(f"{name}, {arm}, {when}", after[0], GOAL, "rad/s^3", found=found)
-
-
-def measure_controllers(flags):
-    """Each controller."""
-    from bam_train.policy import FrozenPolicy
-
-    policy = FrozenPolicy.load(flags.checkpoint)
-    yield "controller                commands   jerk rms   99.9 %   lag [ms]   success"
-    for name in [one for one in CONTROLLERS if one in flags.controller or not flags.controller]:
-        for late in (0.0, flags.late):
-            rms, peak, lag, success = play(
-                DrivenArm(CONTROLLERS[name], late, flags.smoothing), policy, flags.times(flags.episodes)
-            )
-            when = "late" if late else "on time"
-            yield f"{name:<26}{when:<10}{rms:>9.0f}{peak:>9.0f}{1000 * lag:>11.0f}{success:>10.0%}"

@@ -68,7 +68,7 @@ def check(config: CheckArmConfig) -> int | None:
     from bam_envs.arms.description import ArmDescription
     from bam_envs.core.robot_models import Description, find_model
     from bam_envs.robots.base_description import base_model
-    from bam_train.cli.envs import aligned
+    from bam_train.files.log_lines import aligned
 
     robot = find_model(config.name, Description)
     tell(f"{robot.name}: {robot.title}", "")
@@ -301,7 +301,7 @@ def _profile_lines(profile: RobotProfile) -> Iterator[str]:
 def list_models(config: ListArmsConfig) -> int | None:
     """List the robots."""
     from bam_envs.core.robot_models import known_models
-    from bam_train.cli.envs import aligned
+    from bam_train.files.log_lines import aligned
 
     rows = [_row(name, path) for name, path in sorted(known_models().items())]
     tell(*aligned([["name", "kind", "what", "file"], *rows]), "")

@@ -194,7 +194,7 @@ class PlotConfig(DataFlags):
     """
 
     out: Annotated[Path, tyro.conf.arg(metavar="FILE")]
-    """The picture, a .png, .svg or .pdf file; missing folders are made."""
+    """The picture, a .png, .jpg, .svg or .pdf file; missing folders are made."""
     kind: Annotated[tuple[Kind, ...], tyro.conf.UseAppendAction, tyro.conf.arg(metavar="KIND")] = ()
     """What is drawn, any number of times: episodes (side by side), numbers (distributions of observations and actions),
     success (over time), table (where on the table it fails); by default all that the data set has."""

@@ -25,11 +25,11 @@ MOST_EVENTS = 20
 
 def replay(config: ReplayConfig) -> None:
     """Run the program with its parsed flags."""
-    from bam_train.files.atomic_file import require_writable
+    from bam_train.files.pictures import require_picture_path
     from bam_train.files.video import require_video_path
     from bam_train.recording.recording import Recording
 
-    picture = None if config.plot is None else require_writable(config.plot)
+    picture = None if config.plot is None else require_picture_path(config.plot)
     video = None if config.video is None else require_video_path(config.video)
     recording = Recording.open(config.recording)
     checkpoint = _checkpoint(config, recording)

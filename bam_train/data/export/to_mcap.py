@@ -16,6 +16,7 @@ import numpy as np
 
 from bam_train.data.data_set import DataSet
 from bam_train.data.recorded_episode import Array, DataSetInfo, Episode
+from bam_train.recording.recorder import number_kinds, number_names
 from bam_train.recording.recorder_process import RecordingFile
 from bam_train.recording.ring import EVENT, LAYOUT, PIXELS, TICK, TIMES
 
@@ -81,19 +82,14 @@ def _add(
     tables["/status"] = _later(_status(episode, guards), 1, 0, 0)
     tables["/latency"] = np.zeros((steps + 1, 0))
     tables["/episode"] = _ends(number, episode)
-    names = {
-        "/observation": _labels(observed, info.contract.get("observation")),
-        "/action": _labels(acted, info.contract.get("action")),
-        "/command": _labels({"": episode.columns.get("command", np.zeros((1, 0)))}, info.contract.get("command")),
-        "/columns": _labels(numbers, None),
-        "/status": ["code", "guard"],
-        "/latency": [],
-        "/episode": list(_END),
-    }
-    kinds = {"observation": observed, "action": acted}
-    extra = {kind: json.dumps({name: _kind(array) for name, array in of.items()}) for kind, of in kinds.items()}
-    layout = {"layout": {topic: names[topic] for topic in tables}, "extra": extra if number == 0 else {}}
-    _record(file, LAYOUT, times[0], json.dumps(layout).encode())
+    commands = {"": episode.columns.get("command", np.zeros((1, 0)))}
+    layout = {"/status": ["code", "guard"], "/latency": [], "/episode": list(_END)}
+    for kind, arrays in (("observation", observed), ("action", acted), ("command", commands), ("columns", numbers)):
+        given = [str(one["name"]) for one in info.contract.get(kind) or ()]
+        layout[f"/{kind}"] = number_names(arrays, given)
+    extra = {kind: number_kinds(of) for kind, of in (("observation", observed), ("action", acted))}
+    declared = {"layout": {topic: layout[topic] for topic in tables}, "extra": extra if number == 0 else {}}
+    _record(file, LAYOUT, times[0], json.dumps(declared).encode())
     text = f"episode {number + 1} begins: {json.dumps(episode.facts)}"
     _record(file, EVENT, times[0], bytes([2]) + text.encode(errors="replace"))
     rows = np.concatenate(list(tables.values()), axis=1)
@@ -142,14 +138,3 @@ def _ends(number: int, episode: Episode) -> Array:
     table[:, 5] = np.nan
     table[-1, 5] = np.nan if episode.success is None else episode.success
     return table
-
-
-def _labels(arrays: dict[str, Array], given: Any) -> list[str]:
-    """Names of the numbers: the contract's where there are as many, else such as ``name.0``."""
-    names = [f"{name}.{i}".lstrip(".") for name, array in arrays.items() for i in range(int(np.prod(array.shape[1:])))]
-    labels = [str(one["name"]) for one in given or ()]
-    return labels if len(labels) == len(names) else names
-
-
-def _kind(array: Array) -> list[Any]:
-    return [array.dtype.str, *array.shape[1:]]

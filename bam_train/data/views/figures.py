@@ -9,33 +9,20 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from bam_envs.core.errors import MissingExtra
 from bam_train.data.data_set import DataSet
 from bam_train.data.data_set_writer import require_same
 from bam_train.data.recorded_episode import Array, Episode
-from bam_train.errors import OutputError, SettingsError
-from bam_train.files.atomic_file import replacing
+from bam_train.errors import SettingsError
+from bam_train.files.pictures import new_figure, require_picture_path, save_figure
+from bam_train.recording.recorder import number_names
 
 if TYPE_CHECKING:
     from matplotlib.figure import SubFigure
 
 KINDS = ("episodes", "numbers", "success", "table")
 MOST_NUMBERS, MOST_SAMPLES, MOST_EPISODES = 48, 300, 6
-SUFFIXES = (".png", ".svg", ".pdf")
 _WINDOW = 20
 """Episodes of the running success."""
-
-
-def require_picture_path(path: Path) -> Path:
-    """Refuse a file that `plot` does not write; returns it.
-
-    Raises:
-        SettingsError: It ends in none of `SUFFIXES`.
-    """
-    if path.suffix.lower() not in SUFFIXES:
-        kinds = ", ".join(SUFFIXES)
-        raise SettingsError(f"{path}: expected a picture that ends in {kinds}, found {path.suffix or 'no suffix'!r}")
-    return path
 
 
 def plot(
@@ -49,10 +36,6 @@ def plot(
         MissingExtra: matplotlib is not installed.
     """
     require_picture_path(path)
-    try:
-        from matplotlib.figure import Figure
-    except ImportError as error:
-        raise MissingExtra("matplotlib", "notebook", "bam-data plot") from error
     if not len(data):
         raise SettingsError(f"{data.place}: has no episodes to draw; record some first")
     if against is not None:
@@ -68,7 +51,7 @@ def plot(
     drawn = [kind for kind in KINDS if (kind in kinds if kinds else kind not in lacking)]
     samples = list(data.episodes(_spread(len(data))))
     heights = [_HEIGHTS[kind](data) for kind in drawn]
-    figure = Figure(figsize=(12, sum(heights)), layout="constrained")
+    figure = new_figure("bam-data plot", 12, sum(heights))
     parts = figure.subfigures(len(drawn), 1, height_ratios=heights, squeeze=False)[:, 0]
     for part, kind in zip(parts, drawn, strict=True):
         if kind == "episodes":
@@ -79,11 +62,7 @@ def plot(
             _success(part, data)
         else:
             _table(part, data)
-    try:
-        with replacing(path) as temporary:
-            figure.savefig(temporary, dpi=100, format=path.suffix[1:].lower())
-    except (OSError, ValueError) as error:
-        raise OutputError(f"{path}: cannot be written: {getattr(error, 'strerror', None) or error}") from error
+    save_figure(figure, path)
     return drawn
 
 
@@ -112,13 +91,6 @@ def _some_of_each_end(data: DataSet) -> list[int]:
     return sorted(index for members in ends.values() for index in members[:most])
 
 
-def _labels(data: DataSet, kind: str, size: int) -> list[str]:
-    given = data.info.contract.get(kind) or []
-    if len(given) == size:
-        return [str(one.get("name")) for one in given]
-    return [f"{kind} {i}" for i in range(size)]
-
-
 def _named(data: DataSet, episodes: Sequence[Episode]) -> dict[str, Array]:
     """Each number of observations and actions that is no picture, by name. Shape: (steps,)."""
     found: dict[str, Array] = {}
@@ -129,7 +101,7 @@ def _named(data: DataSet, episodes: Sequence[Episode]) -> dict[str, Array]:
             values = one.observations if kind == "observation" else one.actions
             parts.append(np.concatenate([leaf.of(values)[: len(one)].reshape(len(one), -1) for leaf in leaves], axis=1))
         table = np.concatenate(parts).astype(np.float64) if leaves else np.zeros((0, 0))
-        labels = _labels(data, kind, table.shape[1])
+        labels = number_names({kind: table}, [str(one.get("name")) for one in data.info.contract.get(kind) or ()])
         found |= {
             f"{'' if kind == 'observation' else 'action: '}{label}": table[:, i] for i, label in enumerate(labels)
         }

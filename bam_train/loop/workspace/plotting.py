@@ -11,6 +11,7 @@ import numpy as np
 
 from bam_envs.core.errors import MissingExtra
 from bam_train.errors import LoopError
+from bam_train.files.pictures import new_figure
 from bam_train.loop.workspace.variables import to_array
 
 if TYPE_CHECKING:
@@ -52,12 +53,8 @@ def plot(workspace: Recorded, *names: str, batch: int | Sequence[int] | None = N
         LoopError: There is nothing to draw, a variable holds images, or it lacks one of the batch columns.
         MissingExtra: matplotlib is not installed.
     """
-    try:
-        from matplotlib.figure import Figure
-    except ImportError as error:
-        raise MissingExtra("matplotlib", "notebook", "Workspace.plot()") from error
     arrays = _arrays(workspace, names, "plot()")
-    figure = Figure(figsize=(8, 0.6 + 1.9 * len(arrays)), layout="constrained")
+    figure = new_figure("Workspace.plot()", 8, 0.6 + 1.9 * len(arrays))
     figure._repr_png_ = partial(_png, figure)  # type: ignore[attr-defined]
     rows = figure.subplots(len(arrays), 1, sharex=True, squeeze=False)[:, 0]
     for axes, (name, array) in zip(rows, arrays.items(), strict=True):

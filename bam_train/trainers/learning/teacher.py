@@ -13,7 +13,7 @@ from bam_envs.core.robot_models import DEFAULT_ARM
 from bam_envs.core.spaces import space_to_json
 from bam_envs.tasks.scripted import scripted_policy
 from bam_train.checkpoint import Checkpoint
-from bam_train.environments import first_difference, short_json
+from bam_train.environments import first_difference
 from bam_train.errors import CheckpointMismatch
 from bam_train.policy import FrozenPolicy
 from bam_train.settings import ImitationSettings
@@ -65,8 +65,7 @@ class Teacher:
 
 
 def _require_same(checkpoint: Checkpoint, name: str, theirs: Any, space: Any) -> None:
-    difference = first_difference(theirs, space_to_json(space), name)
-    if difference is not None:
-        where, saved, here = difference
-        text = f"cannot teach: {where} is {short_json(saved)} in it and {short_json(here)} in the environment"
+    if found := first_difference((name, theirs, space_to_json(space))):
+        where, saved, here = found
+        text = f"cannot teach: {where} is {saved} in it and {here} in the environment"
         raise CheckpointMismatch(checkpoint.path, text)

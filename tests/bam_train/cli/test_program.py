@@ -313,6 +313,8 @@ OUT_OF_RANGE = [
         (["export"], "export: PLACE, --to and --out are missing. Run bam-data export"),
         (["split", "d", "--out=a"], "split: --rest is missing. Run bam-data split"),
         (["collect", "d"], "collect: --policy is missing. Run bam-data collect"),
+        (["merge", "--out=a"], "merge: PLACE is missing. Run bam-data merge"),
+        (["import", "d"], "import: RECORDING is missing. Run bam-data import"),
     ],
 )
 def test_missing_options_are_named(run, arguments, text):

@@ -91,7 +91,7 @@ def test_episodes_go_from_file_to_file_and_may_have_no_end(import_):
     assert (one.actions.tolist(), other.actions.tolist()) == ([2, 5, 2], [5, 2, 5])
     assert (other.terminated, other.truncated, other.facts["end"]) == (False, True, "cut off")
     again = "bam-data import: data: is a data set already; add it to another one with bam-data merge\n"
-    assert import_("more", "data", "--env", ENV) == (1, "", again)
+    assert import_("more", "data", "--env", ENV) == import_("more", "data") == (1, "", again)
 
 
 OTHER = "expected finite numbers, found others or rows without one; record it again"

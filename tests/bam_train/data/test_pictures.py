@@ -46,8 +46,10 @@ def test_what_cannot_be_drawn(tmp_path, run):
     other = f'{tmp_path}/c: env is "bam/reach-v0" there, and "bam/pick-v0" of {tmp_path}/a'
     assert (status, err) == (1, f"bam-data plot: {other}; compare data sets of one environment\n")
     status, _, err = run(main, *given[:-1], tmp_path / "a.bmp")
-    expected = f"{tmp_path}/a.bmp: expected a picture that ends in .png, .svg, .pdf, found '.bmp'"
+    expected = f"{tmp_path}/a.bmp: expected a picture that ends in .png, .jpg, .svg, .pdf, found '.bmp'"
     assert (status, err) == (1, f"bam-data plot: {expected}\n")
+    missing = f"bam-data plot: --episodes: {tmp_path}/a has 3 episodes, and there is no 3\n"
+    assert run(main, *given, "--episodes", "-3", "3") == (1, "", missing)
     status, _, err = run(main, *given, "--kind", "table")
     assert (status, err.partition(": --kind")[2]) == (
         1,

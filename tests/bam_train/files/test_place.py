@@ -146,6 +146,19 @@ def test_a_service_that_refuses(status, code, why):
             assert time.monotonic() - start < 30
 
 
+def test_a_web_server_that_is_not_there_is_no_missing_file():
+    with answering(404, "none") as endpoint:
+        missing = Place(f"{endpoint}/x")
+        assert not missing.exists()
+        with pytest.raises(NoSuchPlace):
+            missing.size()
+    place = Place(f"{endpoint}/x")
+    for do in (Place.exists, Place.is_dir, Place.size, Place.read_bytes, local_path):
+        with pytest.raises(PlaceError, match=r"x: cannot be read: no connection \(.*\)\. Check the network") as caught:
+            do(place)
+        assert not isinstance(caught.value, NoSuchPlace)
+
+
 def test_a_service_that_is_not_there_or_says_nothing(monkeypatch):
     monkeypatch.setattr(module, "REQUEST_TIMEOUT", 1.0)
     monkeypatch.setattr(module, "ATTEMPTS", 1)

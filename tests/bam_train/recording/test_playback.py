@@ -320,6 +320,8 @@ def test_a_plot_is_whole_or_absent(small_chunks, tmp_path, capsys):
     cut.write_bytes(small_chunks[:20_000])
     before.write_text("mine")
     assert call(replay, cut, "--plot", before) == 1
+    what = f"{before}: expected a picture that ends in .png, .jpg, .svg, .pdf, found '.txt'"
+    assert capsys.readouterr() == ("", f"bam-replay: {what}\n")  # before the work
     assert before.read_text() == "mine"
     assert call(replay, cut, "--plot", plot) == 0
     assert plot.read_bytes().startswith(b"\x89PNG")

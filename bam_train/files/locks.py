@@ -1,19 +1,31 @@
-"""Folders that one process uses at a time."""
+"""Locks of files and folders between processes, which end with their process; on Windows there are none."""
 
 import contextlib
 import os
 from collections.abc import Iterator
 from pathlib import Path
+from typing import IO
 
 from bam_train.errors import OutputError
 
 try:
     import fcntl
-except ImportError:  # Windows: nothing keeps two calls from the same folder
+except ImportError:
     fcntl = None  # type: ignore[assignment]
 
 LOCKS = fcntl is not None
-"""Whether a folder can be locked."""
+"""Whether the system has locks."""
+
+
+def lock(file: int | IO[bytes] | IO[str], *, wait: bool = True) -> None:
+    """Lock an open file or folder; without locks it does nothing.
+
+    Raises:
+        BlockingIOError: Another process has it, unless `wait`.
+        OSError: The file system has no locks.
+    """
+    if fcntl is not None:
+        fcntl.flock(file, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
 
 
 @contextlib.contextmanager
@@ -25,16 +37,16 @@ def locked(folder: Path, wait: bool = False) -> Iterator[int | None]:
     Raises:
         OutputError: Another process has it, unless `wait`.
     """
-    if fcntl is None:
+    if not LOCKS:
         yield None
         return
-    lock = os.open(folder, os.O_RDONLY)
+    descriptor = os.open(folder, os.O_RDONLY)
     try:
         try:
-            fcntl.flock(lock, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
+            lock(descriptor, wait=wait)
         except BlockingIOError as error:
             text = "another program trains its seeds, or its runs are being saved. Wait for its end"
             raise OutputError(f"{folder}: {text}", kind="FolderInUse") from error
-        yield lock
+        yield descriptor
     finally:
-        os.close(lock)
+        os.close(descriptor)
