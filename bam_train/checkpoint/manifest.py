@@ -45,6 +45,9 @@ class Chunk:
     ensemble: float | None = None
     """The actions of all chunks for a step are averaged, the i-th oldest with the weight exp(-ensemble i), and a chunk
     is due in every step (temporal ensembling: Zhao et al. 2023); None: the newest chunk counts."""
+    when_lost: Literal["finish", "halt"] = "finish"
+    """If the server that computes the chunks is lost: the actions that wait are executed, and the robot halts if no
+    chunk comes until then; or it halts at once."""
 
 
 @dataclass(frozen=True)
