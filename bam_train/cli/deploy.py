@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from bam_train.cli.flags import DeployConfig
     from bam_train.deploy.checkpoint_admission import Admission
     from bam_train.deploy.deployment import Deployment
-    from bam_train.policy.policy_server import PolicyLink
+    from bam_train.policy.policy_link import PolicyLink
     from bam_train.recording.recorder import Recorder
 
 
@@ -219,7 +219,7 @@ def _policy_server(config: DeployConfig) -> PolicyLink | None:
     """The link to the policy server of the flags, connected."""
     from bam_envs.core.location import Credentials
     from bam_train.errors import SettingsError
-    from bam_train.policy.policy_server import PolicyLink
+    from bam_train.policy.policy_link import PolicyLink
 
     files = config.policy_ca_file, config.policy_token_file
     if config.policy_server is not None:

@@ -5,8 +5,6 @@ from __future__ import annotations
 import contextlib
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,36 +13,17 @@ from numpy.typing import NDArray
 
 from bam_envs.core.robot_models import portable_model
 from bam_envs.core.spaces import space_to_json
-from bam_train.checkpoint import GOLDEN, POLICY, Checkpoint, safetensors_file, write_checkpoint
+from bam_train.compat.exported import Exported, exported
 from bam_train.compat.foreign_graph import as_ours, as_theirs, mapped_graph, with_known_sizes
 from bam_train.compat.foreign_policy import ForeignPolicy, Meaning, fit_rows, meaning, part_key, part_of
 from bam_train.deploy.contract import Contract
-from bam_train.environments import control_period, make_env
+from bam_train.environments import described, make_env
 from bam_train.errors import ContractRefused, PolicyError
 from bam_train.policy import FrozenPolicy
-from bam_train.policy.frozen_policy import TOLERANCE
 from bam_train.policy.onnx_session import OnnxSession
-from bam_train.trainers.base import origin
 
 Array = NDArray[Any]
-EXPORTED = "exported"
-"""Setting of the manifest with the source of an exported checkpoint; runs have no setting of this name."""
 _ROWS, _BUDGET = 64, 200_000  # golden observations: at most so many, and about so many bytes, but 4
-
-
-@dataclass(frozen=True)
-class ForeignExport:
-    """A policy of others that fits an environment."""
-
-    members: Mapping[str, bytes]
-    fields: Mapping[str, Any]
-    """Of the manifest."""
-    difference: float
-    """The largest difference from its own actions."""
-
-    def write(self, path: Path) -> Checkpoint:
-        """Write the checkpoint.zip; raises OutputError if it cannot be written there."""
-        return write_checkpoint(path, self.fields, self.members)
 
 
 def export_foreign(
@@ -53,7 +32,7 @@ def export_foreign(
     env_kwargs: Mapping[str, Any],
     *,
     tell: Callable[[str], None] = lambda text: None,
-) -> ForeignExport:
+) -> Exported:
     """Join a policy of others to an environment.
 
     Args:
@@ -68,7 +47,7 @@ def export_foreign(
     """
     policy = with_known_sizes(policy)
     with contextlib.closing(make_env(env_id, env_kwargs)) as env:
-        period = control_period(env)
+        signals, period = described(env)
         contract = Contract(tuple(fit_rows(policy, env, period)))
         if contract.refused:
             for line in contract.lines():
@@ -78,7 +57,6 @@ def export_foreign(
             text = f"{first.what}: expected {first.expected}, found {first.found}{more}"
             raise ContractRefused(first.what, f"{policy.place} does not fit {env_id}: {text}; nothing was written")
         observation, action = env.observation_space, env.action_space
-        signals: dict[str, Any] = getattr(env.unwrapped, "describe", dict)()
     if not isinstance(action, spaces.Box):
         raise PolicyError(f"{policy.place}: {env_id} takes {action}, and policies of others give numbers")
     taken, given = _meanings(policy, observation, signals), meaning(policy.output, *_numbers(signals, "action"))
@@ -90,27 +68,9 @@ def export_foreign(
         text = "its network is not as it is described; check chunk, and names and size of inputs and output"
         raise PolicyError(f"{policy.place}: {text}: {error}") from error
     golden = _golden(policy, taken, given, action.shape)
-    worst, row = frozen.worst_difference(golden)
-    if not worst <= TOLERANCE:  # NaN too
-        text = f"its graph differs by {worst:.3g} in row {row} from the actions of {policy.by}"
-        raise PolicyError(f"{policy.place}: {text}, expected at most {TOLERANCE}: this network cannot be exported")
-    fields = {
-        "env": env_id,
-        "env_kwargs": _portable(env_kwargs),
-        "observation_space": jsons[0],
-        "action_space": jsons[1],
-        "signals": signals,
-        "period": period,
-        "algorithm": policy.algorithm,
-        "trainer": policy.trainer,
-        "settings": {EXPORTED: {**policy.source, "golden": policy.by}},
-        "steps": policy.steps,
-        "seed": 0,
-        "scores": {},
-        "chunk": asdict(policy.chunk),
-        **origin(),
-    }
-    return ForeignExport({POLICY: graph, GOLDEN: safetensors_file.dump(golden)}, fields, worst)
+    facts = {"env": env_id, "env_kwargs": _portable(env_kwargs), "signals": signals, "period": period}
+    facts |= {"algorithm": policy.algorithm, "trainer": policy.trainer, "steps": policy.steps}
+    return exported(policy.place, frozen, graph, golden, policy.source, policy.by, **facts)
 
 
 def _portable(env_kwargs: Mapping[str, Any]) -> dict[str, Any]:

@@ -18,7 +18,7 @@ from bam_train.deploy.agreement import Shadow
 from bam_train.deploy.trials import Subject, TrialRecord, Trials
 from bam_train.errors import SettingsError, UntrustedCheckpoint
 from bam_train.policy import FrozenPolicy
-from bam_train.policy.policy_server import PolicyLink
+from bam_train.policy.policy_link import PolicyLink
 
 UNSIGNED, UNPROVEN, TRIAL, SHADOW = "UNSIGNED", "UNPROVEN", "trial", "shadow: nothing is sent"
 """Marks of a deployment: no trusted signature; full speed without enough trials; on trial; somebody else drives."""

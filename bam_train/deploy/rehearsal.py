@@ -20,7 +20,7 @@ from bam_train.environments import environment_of, make_env, require_fit
 from bam_train.errors import LateChunk, SettingsError
 from bam_train.evaluation import wilson_interval
 from bam_train.policy import FrozenPolicy
-from bam_train.policy.background import Background, Request
+from bam_train.policy.background import Background, ChunkRequest
 from bam_train.policy.chunks import Plan
 from bam_train.rollout import BatchPolicy, play, success_of
 
@@ -196,7 +196,7 @@ class _Elsewhere(Background):
         return self.act(observations[0] if one is None else one)[None]
 
 
-class _LateRequest(Request):
+class _LateRequest(ChunkRequest):
     """A chunk that takes as long as its computation, and the way of the observation there and its own way back.
 
     A lost message is sent again, and takes the longest time of the link.

@@ -38,7 +38,7 @@ class Background:
         period: Time between two steps [s].
         fade: See `Plan`; None: a change-over fades in `bam_train.policy.chunks.FADE` steps.
         is_held: Whether a guard held the robot in the last step, so that its action was not executed.
-        request: Asks the policy for a chunk; a `Request`.
+        request: Asks the policy for a chunk; a `ChunkRequest`.
     """
 
     def __init__(
@@ -48,13 +48,13 @@ class Background:
         *,
         fade: NDArray[Any] | None = None,
         is_held: Callable[[], bool] = lambda: False,
-        request: Callable[[FrozenPolicy, Plan], Request] | None = None,
+        request: Callable[[FrozenPolicy, Plan], ChunkRequest] | None = None,
     ) -> None:
         self.policy, self._period, self._is_held = policy, period, is_held
-        self._fade, self._request = np.asarray(np.inf) if fade is None else fade, request or Request
+        self._fade, self._request = np.asarray(np.inf) if fade is None else fade, request or ChunkRequest
         self._plan = policy.plan(self._fade)
-        self._asked: Request | None = None
-        self._requests: list[Request] = []
+        self._asked: ChunkRequest | None = None
+        self._requests: list[ChunkRequest] = []
         self._lost: LinkLost | None = None
         self._took: deque[float] = deque(maxlen=8)
         close_at_exit(self)
@@ -133,7 +133,7 @@ class Background:
         self._took.append(asked.took)
 
 
-class Request:
+class ChunkRequest:
     """The computation of one chunk in a thread, for what a plan has seen."""
 
     def __init__(self, policy: FrozenPolicy, plan: Plan) -> None:

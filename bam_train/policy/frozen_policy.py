@@ -20,7 +20,7 @@ from bam_train.policy.chunks import ONE_BY_ONE, Plan
 
 if TYPE_CHECKING:
     from bam_train.policy.onnx_session import OnnxSession
-    from bam_train.policy.policy_server import PolicyLink
+    from bam_train.policy.policy_link import PolicyLink
 
 TOLERANCE = 1e-5
 """Largest difference from the trainer's action; relative to half the range of a Box that is wider than 2."""

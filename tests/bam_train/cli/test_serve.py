@@ -12,7 +12,7 @@ from bam_envs.remote.serve.serve_options import ServeOptions
 from bam_train.cli.flags import ServeConfig
 from bam_train.cli.serve import main
 from bam_train.policy.onnx_session import Tensor
-from bam_train.policy.policy_server import PolicyLink
+from bam_train.policy.policy_link import PolicyLink
 
 
 @pytest.fixture

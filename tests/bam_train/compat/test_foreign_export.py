@@ -200,7 +200,7 @@ def test_a_zip_of_stable_baselines3(run, tmp_path, capsys):
     status, said, err = run(main, path, "--env", "CartPole-v1", "--algo", "ppo", "--trust-pickle", "--out", out)
     warning = f"bam-export: warning: reading {path} runs whatever code is in it (--trust-pickle)\n"
     assert (status, err) == (0, warning)
-    assert said.splitlines()[0] == f"{out}: ppo on CartPole-v1, 0 steps, out of {path}"
+    assert said.splitlines()[0] == f"{out}: ppo on CartPole-v1, out of {path}"
     policy, seen = FrozenPolicy.load(out), np.array([0.1, -0.2, 0.05, 0.3], np.float32)
     assert policy.act(seen) == model.predict(seen, deterministic=True)[0]
     status, _, err = run(main, path, "--env", "CartPole-v1", "--algo", "ppo")

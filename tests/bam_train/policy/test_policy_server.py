@@ -17,7 +17,8 @@ from bam_train.errors import PolicyError
 from bam_train.policy import FrozenPolicy
 from bam_train.policy.background import Background
 from bam_train.policy.chunks import Plan
-from bam_train.policy.policy_server import PolicyLink, ServedPolicy
+from bam_train.policy.policy_link import PolicyLink
+from bam_train.policy.policy_server import ServedPolicy
 from tests.bam_train.checkpoint.test_checkpoint import FIELDS
 from tests.bam_train.policy.test_chunks import BOX1, acts, chunked
 
