@@ -120,7 +120,7 @@ def _golden(
             arrays[name] = rng.integers(0, 256, (rows, *past, *part.shape), dtype=np.uint8)
             continue
         drawn = np.zeros((rows, *past, *part.shape))
-        drawn[..., means.order] = means.si(port.norm.inverse(rng.normal(size=(rows, *past, len(means.order)))))
+        drawn[..., means.order] = means.si(port.data(rng.normal(size=(rows, *past, len(means.order)))))
         arrays[name] = np.clip(drawn, part.low, part.high).astype(part.dtype)
     answer = policy.answer or _graph(policy)
     chunks = []

@@ -120,15 +120,14 @@ class _Nodes:
         if port.is_image:
             axes = [*range(1 + past), *(1 + past + axis for axis in (2, 0, 1))]
             pixels = self._add("Transpose", [self._cast(name, 1)], perm=axes)
-            norm = Affine(*(np.reshape(one, (-1, 1, 1)) for one in (port.norm.scale, port.norm.offset)))
-            self._affine(pixels, norm, np.float32, target)
+            self._affine(pixels, _by_channel(port), np.float32, target)
             return
         ours = self._add("Gather", [name, self._constant(means.order)], axis=-1)
-        self._cast(self._affine(self._cast(ours, 11), port.norm.after(means.si.inverse), np.float64), 1, target)
+        self._cast(self._affine(self._cast(ours, 11), port.data.inverse.after(means.si.inverse), np.float64), 1, target)
 
     def out(self, name: str, port: Port, means: Meaning, shape: tuple[int, ...]) -> None:
         """From the output `name` of the network to our action."""
-        theirs = self._affine(self._cast(name, 11), means.si.after(port.norm), np.float64)
+        theirs = self._affine(self._cast(name, 11), means.si.after(port.data), np.float64)
         ours = self._add("Gather", [theirs, self._constant(np.argsort(means.order))], axis=-1)
         self._add("Reshape", [self._cast(ours, 1), self._constant(np.array([-1, *shape]))], "action")
 
@@ -152,6 +151,12 @@ class _Nodes:
         return target
 
 
+def _by_channel(port: Port) -> Affine:
+    """From the pixels of an image, channels first, to what the network takes."""
+    norm = port.data.inverse
+    return Affine(norm.scale.reshape(-1, 1, 1), norm.offset.reshape(-1, 1, 1))
+
+
 def as_theirs(policy: ForeignPolicy, taken: Mapping[str, tuple[Array, Meaning]]) -> dict[str, Array]:
     """Arrays of ours, by names of inputs, as the network takes them: what the nodes compute, in NumPy."""
     inputs = {}
@@ -159,14 +164,13 @@ def as_theirs(policy: ForeignPolicy, taken: Mapping[str, tuple[Array, Meaning]])
         array, means = taken[port.name]
         if port.is_image:
             pixels = np.moveaxis(array.astype(np.float64), -1, -3)
-            norm = Affine(*(np.reshape(one, (-1, 1, 1)) for one in (port.norm.scale, port.norm.offset)))
-            inputs[port.name] = norm(pixels).astype(np.float32)
+            inputs[port.name] = _by_channel(port)(pixels).astype(np.float32)
         else:
-            inputs[port.name] = port.norm(means.si.inverse(array[..., means.order])).astype(np.float32)
+            inputs[port.name] = port.data.inverse(means.si.inverse(array[..., means.order])).astype(np.float32)
     return inputs
 
 
 def as_ours(policy: ForeignPolicy, output: Array, means: Meaning, shape: tuple[int, ...]) -> Array:
     """What the network gives as actions of ours, float32."""
-    theirs = means.si(policy.output.norm(output))
+    theirs = means.si(policy.output.data(output))
     return theirs[..., np.argsort(means.order)].reshape(-1, *shape).astype(np.float32)

@@ -17,7 +17,7 @@ from torch import nn
 
 from bam_train.checkpoint import safetensors_file
 from bam_train.checkpoint.manifest import Chunk
-from bam_train.compat.foreign_policy import Affine, ForeignPolicy, Port, Units
+from bam_train.compat.foreign_policy import PIXEL, ForeignPolicy, Port, Units
 from bam_train.data import DataSet
 from bam_train.errors import CheckpointError, CheckpointMismatch, FormatError, SettingsError
 from bam_train.trainers.frozen_network import Layer, trace
@@ -67,14 +67,12 @@ def lerobot_policy(folder: Path, *, data: Path | None = None, units: Units | Non
     network = _Act(folder)
     norms = {name: _norms(folder, found) for name, found in steps.items()}
 
-    def port(feature: str, shape: tuple[int, ...], norm: Affine) -> Port:
+    def port(feature: str, shape: tuple[int, ...], norm: tuple[Array, Array]) -> Port:
         there = next((old for old, new in renamed.items() if new == feature), feature)
         part = there.removeprefix(_IMAGES).removeprefix("observation.")
-        if len(shape) == 3:
-            channels = np.ones(shape[0])
-            return Port(feature, part, shape, norm.after(Affine(channels / 255, 0 * channels)))
-        names = () if ours is not None else _names(folder, info, there)
-        return Port(feature, part, shape, norm, names, units or "si")
+        mean, std = (tuple(one * (PIXEL if len(shape) == 3 else 1.0)) for one in norm)
+        names = () if ours is not None or len(shape) == 3 else _names(folder, info, there)
+        return Port(feature, part, shape, names, units or "si", mean, std)
 
     inputs = [port(name, shape, norms["preprocessor"](name, shape)) for name, shape in network.features.items()]
     output = port(_ACTION, network.shape, norms["postprocessor"](_ACTION, network.shape))
@@ -137,11 +135,11 @@ class _Act(Layer):
 
 
 def _norms(folder: Path, steps: list[dict[str, Any]]) -> Any:
-    """A function of a feature and its shape: how a processor normalises it; of an action, how that is undone."""
+    """A function of a feature and its shape: the mean and the deviation by which a processor normalises it."""
     found = [step for step in steps if step["registry_name"].endswith("normalizer_processor")]
 
-    def norm(feature: str, shape: tuple[int, ...]) -> Affine:
-        result = Affine(np.ones(shape[0]), np.zeros(shape[0]))
+    def norm(feature: str, shape: tuple[int, ...]) -> tuple[Array, Array]:
+        result = np.zeros(shape[0]), np.ones(shape[0])
         for step in found:
             config, arrays = step["config"], _statistics(folder, step["state_file"])
             mode = config["norm_map"].get(config["features"].get(feature, {}).get("type"), "IDENTITY")
@@ -151,15 +149,13 @@ def _norms(folder: Path, steps: list[dict[str, Any]]) -> Any:
             if mode != "MEAN_STD" and mode not in _ENDS:
                 raise CheckpointMismatch(folder, f"normalises {feature} by {mode}, which is not known here")
             numbers = {key: np.ravel(value).astype(np.float64) for key, value in stats.items()}
-            back, eps = feature == _ACTION, float(config["eps"])
+            eps = float(config["eps"])
             if mode == "MEAN_STD":
-                mean, std = numbers["mean"], numbers["std"]
-                result = Affine(std, mean) if back else Affine(1 / (std + eps), -mean / (std + eps))
+                result = numbers["mean"], numbers["std"] + (0.0 if feature == _ACTION else eps)
             else:
                 low, high = (numbers[key] for key in _ENDS[mode])
                 span = np.where(high == low, eps, high - low)
-                to_data = Affine(span / 2, span / 2 + low)
-                result = to_data if back else to_data.inverse
+                result = span / 2 + low, span / 2
         return result
 
     return norm
