@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import math
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -13,9 +14,10 @@ from numpy.typing import NDArray
 
 from bam_envs.core.robot_models import portable_model
 from bam_envs.core.spaces import space_to_json
+from bam_train.checkpoint.detector import DETECTOR, MOST_NUMBERS, Detector, detector_of_ranges
 from bam_train.compat.exported import Exported, exported
 from bam_train.compat.foreign_graph import as_ours, as_theirs, mapped_graph, with_known_sizes
-from bam_train.compat.foreign_policy import ForeignPolicy, Meaning, fit_rows, meaning, part_key, part_of
+from bam_train.compat.foreign_policy import ForeignPolicy, Meaning, Port, fit_rows, meaning, part_key, part_of
 from bam_train.deploy.contract import Contract
 from bam_train.environments import described, make_env
 from bam_train.errors import ContractRefused, PolicyError
@@ -70,7 +72,29 @@ def export_foreign(
     golden = _golden(policy, taken, given, action.shape)
     facts = {"env": env_id, "env_kwargs": _portable(env_kwargs), "signals": signals, "period": period}
     facts |= {"algorithm": policy.algorithm, "trainer": policy.trainer, "steps": policy.steps}
-    return exported(policy.place, frozen, graph, golden, policy.source, policy.by, **facts)
+    made = exported(policy.place, frozen, graph, golden, policy.source, policy.by, **facts)
+    detector = _detector(policy, taken, given, action)
+    return made if detector is None else replace(made, members={**made.members, DETECTOR: detector.to_bytes()})
+
+
+def _detector(
+    policy: ForeignPolicy, taken: Mapping[str, tuple[str, Any, Meaning]], given: Meaning, action: spaces.Box
+) -> Detector | None:
+    """The detector of unusual observations, of the ranges of the numbers in the data; None if they are not known."""
+    seen = sorted((taken[port.name], port) for port in policy.inputs if not port.is_image)
+    ranges = [_range(port, means, math.prod(part.shape)) for (_, part, means), port in seen]
+    d = sum(len(low) for low, _ in ranges)
+    low, high = np.concatenate([*ranges, _range(policy.output, given, math.prod(action.shape))], axis=1)
+    few = 0 < d <= MOST_NUMBERS and len(low) - d <= MOST_NUMBERS
+    return detector_of_ranges(low, high, d) if few and np.isfinite(low).any() else None
+
+
+def _range(port: Port, means: Meaning, count: int) -> Array:
+    """Lowest and highest value of each of ours in the data, infinite where it is not known. Shape: (2, count)."""
+    found = np.tile([[-np.inf], [np.inf]], count)
+    if port.low and port.high:
+        found[:, means.order] = means.si(np.array(port.low)), means.si(np.array(port.high))
+    return found
 
 
 def _portable(env_kwargs: Mapping[str, Any]) -> dict[str, Any]:

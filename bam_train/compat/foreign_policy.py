@@ -74,6 +74,10 @@ class Port:
     """The network takes and gives (x - mean) / std, number by number, or for each channel of an image."""
     std: tuple[Positive, ...] = ()
     """By default 1, and 255 of an image."""
+    low: tuple[float, ...] = ()
+    """Lowest value of each number in the data, in their units, for the detector of unusual observations."""
+    high: tuple[float, ...] = ()
+    """Highest value."""
 
     def __post_init__(self) -> None:
         size = self.size or (len(self.names),)
@@ -83,8 +87,8 @@ class Port:
             raise InvalidValue(f"{self.name}: give units: 'degrees', 'range' or 'si'")
         scale = PIXEL if len(size) == 3 else 1.0
         whole = {"size": size, "mean": self.mean or (0.0,) * size[0], "std": self.std or (scale,) * size[0]}
-        for name, value in {**whole, "units": self.units or "si"}.items():
-            if name in ("mean", "std") and len(value) != size[0]:
+        for name, value in {**whole, "units": self.units or "si", "low": self.low, "high": self.high}.items():
+            if name not in ("size", "units") and len(value) not in (size[0], 0):
                 raise InvalidValue(f"{self.name}: {name}: expected {size[0]} numbers, found {len(value)}")
             object.__setattr__(self, name, value)
 

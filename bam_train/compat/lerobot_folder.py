@@ -23,6 +23,8 @@ from bam_train.errors import CheckpointError, CheckpointMismatch, FormatError, S
 from bam_train.trainers.frozen_network import Layer, trace
 
 Array = NDArray[Any]
+Norm = tuple[Array, Array, Array, Array]
+"""Mean and deviation by which numbers are normalised; their lowest and highest value in the data, empty if unknown."""
 LARGE = ("smolvla", "pi0", "pi05", "pi0_fast", "groot", "xvla", "wall_x")
 """Policies that take seconds for a chunk on a CPU."""
 _ACTION, _STATE, _IMAGES = "action", "observation.state", "observation.images."
@@ -67,12 +69,12 @@ def lerobot_policy(folder: Path, *, data: Path | None = None, units: Units | Non
     network = _Act(folder)
     norms = {name: _norms(folder, found) for name, found in steps.items()}
 
-    def port(feature: str, shape: tuple[int, ...], norm: tuple[Array, Array]) -> Port:
+    def port(feature: str, shape: tuple[int, ...], norm: Norm) -> Port:
         there = next((old for old, new in renamed.items() if new == feature), feature)
         part = there.removeprefix(_IMAGES).removeprefix("observation.")
-        mean, std = (tuple(one * (PIXEL if len(shape) == 3 else 1.0)) for one in norm)
+        mean, std, *ends = (tuple(one * (PIXEL if len(shape) == 3 else 1.0)) for one in norm)
         names = () if ours is not None or len(shape) == 3 else _names(folder, info, there)
-        return Port(feature, part, shape, names, units or "si", mean, std)
+        return Port(feature, part, shape, names, units or "si", mean, std, *(ends if len(shape) == 1 else ()))
 
     inputs = [port(name, shape, norms["preprocessor"](name, shape)) for name, shape in network.features.items()]
     output = port(_ACTION, network.shape, norms["postprocessor"](_ACTION, network.shape))
@@ -135,28 +137,29 @@ class _Act(Layer):
 
 
 def _norms(folder: Path, steps: list[dict[str, Any]]) -> Any:
-    """A function of a feature and its shape: the mean and the deviation by which a processor normalises it."""
+    """A function of a feature and its shape: how a processor normalises it."""
     found = [step for step in steps if step["registry_name"].endswith("normalizer_processor")]
 
-    def norm(feature: str, shape: tuple[int, ...]) -> tuple[Array, Array]:
-        result = np.zeros(shape[0]), np.ones(shape[0])
+    def norm(feature: str, shape: tuple[int, ...]) -> Norm:
+        mean, std, ends = np.zeros(shape[0]), np.ones(shape[0]), (np.zeros(0), np.zeros(0))
         for step in found:
             config, arrays = step["config"], _statistics(folder, step["state_file"])
-            mode = config["norm_map"].get(config["features"].get(feature, {}).get("type"), "IDENTITY")
             stats = {key.rpartition(".")[2]: value for key, value in arrays.items() if key.startswith(f"{feature}.")}
+            numbers = {key: np.ravel(value).astype(np.float64) for key, value in stats.items()}
+            ends = numbers.get("min", ends[0]), numbers.get("max", ends[1])
+            mode = config["norm_map"].get(config["features"].get(feature, {}).get("type"), "IDENTITY")
             if mode == "IDENTITY" or not stats:
                 continue
             if mode != "MEAN_STD" and mode not in _ENDS:
                 raise CheckpointMismatch(folder, f"normalises {feature} by {mode}, which is not known here")
-            numbers = {key: np.ravel(value).astype(np.float64) for key, value in stats.items()}
             eps = float(config["eps"])
             if mode == "MEAN_STD":
-                result = numbers["mean"], numbers["std"] + (0.0 if feature == _ACTION else eps)
+                mean, std = numbers["mean"], numbers["std"] + (0.0 if feature == _ACTION else eps)
             else:
                 low, high = (numbers[key] for key in _ENDS[mode])
                 span = np.where(high == low, eps, high - low)
-                result = span / 2 + low, span / 2
-        return result
+                mean, std = span / 2 + low, span / 2
+        return mean, std, *ends
 
     return norm
 

@@ -10,6 +10,7 @@ from gymnasium.spaces import flatdim
 from onnx import helper
 
 from bam_train.checkpoint import Checkpoint
+from bam_train.checkpoint.detector import vectors
 from bam_train.checkpoint.manifest import Chunk
 from bam_train.cli.export import main
 from bam_train.environments import make_env
@@ -90,6 +91,34 @@ def test_an_image_has_its_channels_first(described, run, tmp_path):
     assert run(main, described(pixels=True), "--robot-model", "so101", *cameras, "--out", out)[0] == 0
     black = {"front": np.zeros((48, 64, 3), np.uint8), "robot": SEEN}
     np.testing.assert_allclose(FrozenPolicy.load(out).act(black), SEEN, atol=1e-6)
+
+
+@pytest.mark.parametrize("pixels", [False, True])
+def test_the_ranges_in_the_data_make_the_detector(described, run, tmp_path, pixels):
+    """A number that leaves its range by more than a tenth of it is unusual from the second tick on."""
+    low, high = f"low = {[-10.0] * 5 + [0.0]}", f"high = {[30.0] * 5 + [100.0]}"
+    ranges = [(f"std = {STD}\n", f"std = {STD} \n{low}\n{high}\n")] * 2
+    cameras = ["--set", "camera=front", "--set", "image_size=64x48"] if pixels else []
+    out = tmp_path / "act.zip"
+    assert run(main, described(*ranges, pixels=pixels), "--robot-model", "so101", *cameras, "--out", out)[0] == 0
+    policy = FrozenPolicy.load(out)
+    seen = np.array([*np.radians([-10, 30, 10, 0, 20]), 0.0], np.float32)
+    usual = (
+        {"env_obs/front": np.zeros((1, 48, 64, 3), np.uint8), "env_obs/robot": seen[None]}
+        if pixels
+        else {"env_obs": seen[None]}
+    )
+
+    def levels(number, degrees, acts=seen):
+        one = vectors(usual)[0].copy()
+        one[number] = np.radians(degrees)
+        policy.detector.begin()
+        return [policy.detector.step(one, acts) > 1 for _ in range(3)]
+
+    assert levels(2, 10) == levels(0, -13) == levels(1, 33) == [False, False, False]
+    assert levels(0, -16) == levels(1, 36) == [False, True, True]
+    assert levels(2, 10, np.radians([0, 0, 0, 36, 0, 0])) == [False, True, True]
+    assert policy.detector.reason == "the policy sees and does what it did not in training"
 
 
 @pytest.mark.parametrize(
