@@ -299,8 +299,8 @@ class Detector:
 def detector_of_ranges(low: Array, high: Array, d: int) -> Detector:
     """A detector for which each number of observation and action should be in its range, or near it.
 
-    It has two features for each number, which rise from 0 to 1 where it leaves its range by a tenth of that. Answers and
-    durations are not judged.
+    It has two features for each number, which rise from 0 to 1 where it leaves its range by a tenth of that. Answers
+    and durations are not judged.
 
     Args:
         low: Lowest value of each number of an observation and then of an action, -inf where it is unknown. Shape: (n,).

@@ -103,14 +103,10 @@ def test_the_ranges_in_the_data_make_the_detector(described, run, tmp_path, pixe
     assert run(main, described(*ranges, pixels=pixels), "--robot-model", "so101", *cameras, "--out", out)[0] == 0
     policy = FrozenPolicy.load(out)
     seen = np.array([*np.radians([-10, 30, 10, 0, 20]), 0.0], np.float32)
-    usual = (
-        {"env_obs/front": np.zeros((1, 48, 64, 3), np.uint8), "env_obs/robot": seen[None]}
-        if pixels
-        else {"env_obs": seen[None]}
-    )
+    front = {"front": np.zeros((1, 48, 64, 3), np.uint8)} if pixels else {}
 
     def levels(number, degrees, acts=seen):
-        one = vectors(usual)[0].copy()
+        one = vectors({**front, "robot": seen[None]})[0].copy()
         one[number] = np.radians(degrees)
         policy.detector.begin()
         return [policy.detector.step(one, acts) > 1 for _ in range(3)]
