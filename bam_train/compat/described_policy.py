@@ -4,14 +4,16 @@
 
     network = "act.onnx"                        # beside this file
     rate = 20.0                                 # actions a second
-    chunk = { size = 50, steps = 25 }           # where it gives several actions at once
+    chunk = { size = 50, steps = 25 }           # where it gives several actions at once; see `Chunk`
 
-    [[inputs]]
+    [[inputs]]                                  # see `Port`
     name = "state"                              # of the graph
-    names = ["shoulder_pan.pos", "gripper.pos"] # each number, in its order
+    names = ["shoulder_pan.pos", ..., "gripper.pos"]  # each number, in its order
     units = "degrees"                           # or range, -100 to 100; or si
-    mean = [0.0, 50.0]                          # where the network takes (x - mean) / std
-    std = [30.0, 20.0]
+    mean = [0.0, ..., 50.0]                     # where the network takes (x - mean) / std
+    std = [30.0, ..., 20.0]
+    low = [-80.0, ..., 0.0]                     # the range in the data
+    high = [80.0, ..., 100.0]
 
     [[inputs]]
     name = "image"
@@ -20,7 +22,7 @@
 
     [output]
     name = "action"
-    names = ["shoulder_pan.pos", "gripper.pos"]
+    names = ["shoulder_pan.pos", ..., "gripper.pos"]
     units = "degrees"
 """
 
