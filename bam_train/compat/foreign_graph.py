@@ -33,7 +33,7 @@ def mapped_graph(
         PolicyError: It is no graph of a policy, or lacks an input or the output.
     """
     from google.protobuf.message import DecodeError
-    from onnx import TensorProto, helper, load_model_from_string
+    from onnx import TensorProto, compose, helper, load_model_from_string
 
     try:
         require_policy(policy.network)
@@ -50,7 +50,7 @@ def mapped_graph(
         outputs = [one.name for one in graph.output]
         raise PolicyError(f"{policy.place}: the graph's outputs are {outputs}, and {policy.output.name} is described")
     [n] = {one.type.tensor_type.shape.dim[0].dim_value or "n" for one in graph.input if one.name in found} or {"n"}
-    _prefix(graph)
+    graph = compose.add_prefix(model, _OWN).graph
     around = _Nodes(helper)
     infos: dict[str, Any] = {}
     for port, (name, space, means) in zip(policy.inputs, taken, strict=True):
@@ -95,16 +95,6 @@ def with_known_sizes(policy: ForeignPolicy) -> ForeignPolicy:
             model.graph.initializer.append(numpy_helper.from_array(np.array(size, np.int64), node.output[0]))
             model.graph.node.remove(node)
     return replace(policy, network=model.SerializeToString())
-
-
-def _prefix(graph: Any) -> None:
-    """Put `_OWN` before every name of the graph."""
-    for tensor in graph.initializer:
-        tensor.name = _OWN + tensor.name
-    for node in graph.node:
-        node.name = ""
-        for names in (node.input, node.output):
-            names[:] = [name and _OWN + name for name in names]
 
 
 class _Nodes:

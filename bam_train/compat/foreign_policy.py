@@ -22,7 +22,7 @@ from bam_envs.live.robot_checks import Check
 from bam_train.checkpoint.manifest import Chunk
 
 Array = NDArray[Any]
-Units = Literal["si", "degrees", "range"]
+Units = Literal["degrees", "range", "si"]
 PIXEL = 255.0
 """Brightest value of a pixel."""
 PERCENT = 100.0

@@ -183,18 +183,13 @@ def _steps(folder: Path, name: str) -> list[dict[str, Any]]:
 
 def _data_set(folder: Path, given: Path | None) -> tuple[dict[str, Any], Path]:
     """LeRobot's description of the data set that the policy learnt from, and where it is."""
-    place = given
-    if place is None:
-        at = (_json(folder, "train_config.json").get("dataset") or {}).get("root") if _has(folder) else None
-        place = None if at is None else Path(at)
+    place, train = given, folder / "train_config.json"
+    if place is None and train.is_file() and (at := (_json(folder, train.name).get("dataset") or {}).get("root")):
+        place = Path(at)
     if place is None or not (place / "meta/info.json").is_file():
         where = f"{place} is no data set of LeRobot" if place is not None else "its data set is not known"
         raise CheckpointMismatch(folder, f"does not say which joint each number is, and {where}. Give it with --data")
     return _json(place, "meta/info.json"), place
-
-
-def _has(folder: Path) -> bool:
-    return (folder / "train_config.json").is_file()
 
 
 def _names(folder: Path, info: Mapping[str, Any], feature: str) -> tuple[str, ...]:
