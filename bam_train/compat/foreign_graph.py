@@ -84,7 +84,7 @@ def with_known_sizes(policy: ForeignPolicy) -> ForeignPolicy:
 
     try:
         model = load_model_from_string(policy.network)
-        inferred = shape_inference.infer_shapes(model).graph
+        inferred = shape_inference.infer_shapes(model, data_prop=True).graph
     except (DecodeError, shape_inference.InferenceError) as error:
         raise PolicyError(f"{policy.place}: not an ONNX file, or damaged: {error}") from error
     values = [*inferred.value_info, *inferred.input, *inferred.output]

@@ -212,8 +212,10 @@ def test_a_graph_with_other_inputs_is_refused(described, run):
     ("config", "message"),
     [
         ({"type": "smolvla"}, "smolvla takes seconds for a chunk on a robot's computer: run it on a policy server "
-         "with a GPU; bam-export takes act"),
-        ({"type": "tdmpc"}, "is a policy of the kind tdmpc; bam-export takes act"),
+         "with a GPU; bam-export takes act and diffusion"),
+        ({"type": "tdmpc"}, "is a policy of the kind tdmpc; bam-export takes act and diffusion"),
+        ({"type": "diffusion", "noise_scheduler_type": "DDPM"}, "noise_scheduler_type is DDPM, which draws noise in "
+         'every step. In config.json set it to "DDIM", and num_inference_steps to about 10'),
         (None, "has no config.json: no folder pretrained_model of LeRobot. Give .../checkpoints/last/pretrained_model"),
     ],
 )  # fmt: skip
