@@ -155,12 +155,14 @@ class FrozenPolicy:
         return cls.from_checkpoint(Checkpoint.open(path))
 
     @classmethod
-    def from_checkpoint(cls, checkpoint: Checkpoint, server: PolicyLink | None = None) -> FrozenPolicy:
+    def from_checkpoint(
+        cls, checkpoint: Checkpoint, server: PolicyLink | None = None, *, threads: int = 1
+    ) -> FrozenPolicy:
         """Load the policy of an open checkpoint, or have a `server` run it, which must act as the checkpoint's."""
         manifest = checkpoint.manifest
         spaces, chunk = (manifest.observation_space, manifest.action_space), manifest.chunk
         if server is None:
-            policy = cls.from_graph(checkpoint.read(POLICY), *spaces, chunk=chunk)
+            policy = cls.from_graph(checkpoint.read(POLICY), *spaces, chunk=chunk, threads=threads)
         elif chunk is None:
             raise PolicyError(f"{checkpoint.path}: {ONE_BY_ONE}. Leave --policy-server out")
         else:
@@ -179,8 +181,9 @@ class FrozenPolicy:
         action_space: Mapping[str, Any],
         *,
         chunk: Chunk | None = None,
+        threads: int = 1,
     ) -> FrozenPolicy:
-        """Make a policy of an ONNX file; the spaces are in JSON form.
+        """Make a policy of an ONNX file, which runs on so many threads, 0 for all; the spaces are in JSON form.
 
         Inputs are ``observation`` or ``observation.<key>``, and ``state.<name>``; outputs ``action`` and
         ``next_state.<name>``; the first axis of each is the batch. With a `chunk`, the second axis of the action counts
@@ -196,7 +199,7 @@ class FrozenPolicy:
             require_policy(onnx)
         except FormatError as error:
             raise PolicyError(f"the policy cannot be read: {error}") from error
-        return cls(OnnxSession(onnx), observation_space, action_space, chunk)
+        return cls(OnnxSession(onnx, threads), observation_space, action_space, chunk)
 
     def reset(self, env_ids: Any = None) -> None:
         """Reset the recurrent state of `env_ids` (indices or a mask), or of all environments, as an episode starts."""
