@@ -9,6 +9,7 @@
     ├── BadDataSet                 a folder that is no data set, a damaged one, or episodes that do not belong into it
     ├── FormatError                a file or bytes that do not follow their format (safetensors, ONNX, a recording)
     ├── PolicyError                a frozen policy that cannot run, or an observation that does not fit it
+    │   └── LateChunk              no action is left, and the next ones have not come
     ├── SettingsError              a setting, an option or a key that does not exist or does not fit
     ├── LoopError                  the interaction loop: a variable that is not written, or not as before; an agent
     ├── RequestRefused             a request that a live agent refuses
@@ -79,6 +80,10 @@ class FormatError(BamTrainError, ValueError):
 
 class PolicyError(BamTrainError, ValueError):
     """A frozen policy that cannot run, or an observation that does not fit it."""
+
+
+class LateChunk(PolicyError):  # noqa: N818 - named for the cause
+    """A policy with chunks has no action left, and the next chunk has not come."""
 
 
 class SettingsError(BamTrainError, ValueError):

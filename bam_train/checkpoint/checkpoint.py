@@ -33,7 +33,6 @@ import numpy as np
 from bam_train.checkpoint import safetensors_file
 from bam_train.checkpoint.manifest import AGAIN, MANIFEST, Manifest, manifest_bytes, parse_manifest
 from bam_train.checkpoint.zip_members import (
-    CHUNK,
     RESUME,
     SIGNATURE,
     chunks,
@@ -41,6 +40,7 @@ from bam_train.checkpoint.zip_members import (
     most_bytes,
     open_zip,
     require_same_members,
+    write_member,
 )
 from bam_train.errors import CheckpointError, CheckpointMismatch, FormatError, OutputError
 from bam_train.files.atomic_file import replacing
@@ -84,6 +84,14 @@ class Checkpoint:
                 if not name.startswith(RESUME):  # may have gigabytes; `read` verifies it
                     deque(chunks(path, archive, infos[name], expected), maxlen=0)
         return cls(path, manifest, hashlib.sha256(data).hexdigest())
+
+    def manifest_bytes(self) -> bytes:
+        """The bytes of the manifest; raises CheckpointError if they changed since the checkpoint was opened."""
+        with open_zip(self.path) as archive:
+            data = b"".join(chunks(self.path, archive, list_members(self.path, archive)[MANIFEST]))
+        if hashlib.sha256(data).hexdigest() != self.digest:
+            raise CheckpointError(self.path, f"{MANIFEST} was replaced while it was read. Try again", member=MANIFEST)
+        return data
 
     def has(self, member: str) -> bool:
         """Whether a member is in the file."""
@@ -181,9 +189,7 @@ def write_checkpoint(path: str | Path, manifest_fields: Mapping[str, Any], membe
             zipfile.ZipFile(file, "w") as archive,
         ):
             for name, data in {**members, MANIFEST: manifest}.items():
-                info = zipfile.ZipInfo(name)  # its date is 1980, so that equal content makes equal bytes
-                info.external_attr = 0o644 << 16
-                archive.writestr(info, data, zipfile.ZIP_DEFLATED, 1 if len(data) > CHUNK else 6)
+                write_member(archive, name, data)
     except OSError as error:
         why = error.strerror or error
         raise OutputError(f"{path}: cannot be written: {why}. Choose another place with --out") from error

@@ -45,6 +45,8 @@ MOST_NUMBERS = 64
 LEAST_TICKS, LEAST_EPISODES = 1_000, 20
 FEW = TICKS // 10
 """With fewer ticks that determine the bounds, usual episodes of a rare kind are missing among them."""
+LEAST_MARGIN = 0.02
+"""Least distance from the range of a number at which it is unusual [rad, m]; some never move in the data."""
 TIMELY = 0.35
 """Greatest deviation of the time between two observations from the period [periods] at which an answer is judged."""
 _HIDDEN = 96
@@ -187,7 +189,7 @@ class Detector:
             model = Model.of(arrays)
             model.require_shapes()
             spaces = checkpoint.manifest.observation_space, checkpoint.manifest.action_space
-            numbers, expected = model.numbers, tuple(math.prod(space.get("shape", ())) for space in spaces)
+            numbers, expected = model.numbers, tuple(map(_size, spaces))
             if numbers != expected:
                 raise ValueError(f"expected {expected} numbers in observation and action, found {numbers}")
         except (TypeError, ValueError, KeyError) as error:
@@ -292,6 +294,45 @@ class Detector:
         if not math.isfinite(leverage):  # NaN in an observation
             self.level = _NOT_FINITE
         return self.level
+
+
+def detector_of_ranges(low: Array, high: Array, d: int) -> Detector:
+    """A detector for which each number of observation and action should be in its range, or near it.
+
+    It has two features for each number, which rise from 0 to 1 where it leaves its range by a tenth of that. Answers
+    and durations are not judged.
+
+    Args:
+        low: Lowest value of each number of an observation and then of an action, -inf where it is unknown. Shape: (n,).
+        high: Highest value, inf where it is unknown. Shape: (n,).
+        d: Numbers of an observation.
+    """
+    n, known = len(low), np.isfinite(low) & np.isfinite(high)
+    low, high = np.where(known, low, 0.0), np.where(known, high, 0.0)
+    margin = np.maximum(0.1 * (high - low), LEAST_MARGIN)
+    slope = 2.0 / margin
+    hidden, lever = np.zeros((n + 1, 2 * n)), np.zeros((3 * n + 1, 3 * n + 1))
+    hidden[:n] = np.concatenate([np.diag(slope), -np.diag(slope)], axis=1)
+    hidden[n] = np.concatenate([-slope * (high + margin), slope * (low - margin)])
+    lever[range(2 * n), range(2 * n)] = lever[3 * n, : 2 * n] = 0.5 * np.tile(known, 2)
+    bounds = [math.log1p(0.25 / len(lever)), *[1e30] * 4]
+    return Detector(Model(*(np.asarray(one, np.float32) for one in (hidden, lever, np.eye(d), [0, 0], [0, 0], bounds))))
+
+
+def vectors(observation: Any) -> Array:
+    """The numbers of observations (T, ...) that a detector compares: of a mapping, its vectors by their names.
+
+    Shape: (T, d), or that of the only array.
+    """
+    parts = [observation[key] for key in sorted(observation)] if isinstance(observation, Mapping) else [observation]
+    flat = [one for one in parts if np.ndim(one) == 2] if len(parts) > 1 else parts
+    return flat[0] if len(flat) == 1 else np.concatenate(flat, axis=1)
+
+
+def _size(space: Mapping[str, Any]) -> int:
+    """Numbers of a space, in JSON form, that a detector compares; see `vectors`."""
+    parts = list(space["spaces"].values()) if space.get("type") == "Dict" else [space]
+    return sum(math.prod(one.get("shape", ())) for one in parts if len(parts) == 1 or len(one.get("shape", ())) == 1)
 
 
 def surprises(model: Model, rollout: Rollout) -> tuple[Array, Array, Array]:

@@ -45,6 +45,13 @@ class Chunk:
     ensemble: float | None = None
     """The actions of all chunks for a step are averaged, the i-th oldest with the weight exp(-ensemble i), and a chunk
     is due in every step (temporal ensembling: Zhao et al. 2023); None: the newest chunk counts."""
+    when_lost: Literal["finish", "halt"] = "finish"
+    """If the server that computes the chunks is lost: the actions that wait are executed, and the robot halts if no
+    chunk comes until then; or it halts at once."""
+
+    def __post_init__(self) -> None:
+        if self.steps > self.size:
+            raise ValueError(f"chunk: steps is {self.steps}, expected at most its size, {self.size}")
 
 
 @dataclass(frozen=True)
@@ -214,8 +221,6 @@ def _parse(path: Path, data: bytes) -> Manifest:
     contents = msgspec.json.decode(data, type=_Contents)
     if not re.fullmatch(r"([\w.]+:)?[^:]+", manifest.env):
         raise ValueError(f"env {manifest.env!r} is no environment id, such as bam/pick-v0 or module:Env-v0")
-    if manifest.chunk is not None and manifest.chunk.steps > manifest.chunk.size:
-        raise ValueError(f"chunk.steps is {manifest.chunk.steps}, expected at most its size, {manifest.chunk.size}")
     for name in ("observation_space", "action_space"):
         _require_reasonable(name, getattr(contents, name))
     return manifest

@@ -7,12 +7,9 @@ PEM, mode 0600; and ``NAME.pub``, one line ``ed25519 BASE64 NAME``. A computer t
 """
 
 import base64
-import copy
-import hashlib
 import os
 import re
 import stat
-import zipfile
 from collections import deque
 from dataclasses import dataclass
 from datetime import datetime, timezone
@@ -23,12 +20,12 @@ import msgspec
 from msgspec import Meta
 
 from bam_envs.core.location import config_folder
+from bam_train.checkpoint.added_members import replace_members
 from bam_train.checkpoint.checkpoint import Checkpoint
 from bam_train.checkpoint.manifest import AGAIN, MANIFEST
 from bam_train.checkpoint.ownership import who_else
 from bam_train.checkpoint.zip_members import RESUME, SIGNATURE, chunks, list_members, open_zip
 from bam_train.errors import CheckpointError, OutputError, SettingsError, UntrustedCheckpoint
-from bam_train.files.atomic_file import replacing
 
 _NAME = r"[A-Za-z0-9][A-Za-z0-9_.@-]{0,63}"
 Name = Annotated[str, Meta(pattern=f"^{_NAME}$")]
@@ -244,28 +241,10 @@ def sign(path: Path, key_path: Path) -> Signature:
     key, public = read_private_key(key_path)
     checkpoint = Checkpoint.open(path)
     created = datetime.now(timezone.utc).isoformat(timespec="seconds")
-    signature = key.sign(_signed(public.name, created, _manifest(checkpoint)))
+    signature = key.sign(_signed(public.name, created, checkpoint.manifest_bytes()))
     made = Signature(1, "ed25519", public.name, created, public.text, _base64(signature))
-    target = Path(os.path.realpath(checkpoint.path))
-    with open_zip(target) as source:
-        try:
-            _copy_signed(target, source, checkpoint, made)
-        except OSError as error:  # caught here: `open_zip` would report a file that cannot be read
-            raise OutputError(f"{path}: cannot be written: {error.strerror or error}. Make room beside it") from error
+    replace_members(checkpoint, {SIGNATURE: msgspec.json.encode(made)})
     return made
-
-
-def _copy_signed(target: Path, source: zipfile.ZipFile, checkpoint: Checkpoint, signature: Signature) -> None:
-    """Replace the file by a copy with this signature."""
-    with replacing(target) as temporary, zipfile.ZipFile(temporary, "w") as archive:
-        for name, info in list_members(target, source).items():
-            if name != SIGNATURE:
-                with archive.open(copy.copy(info), "w", force_zip64=info.file_size > 2**31) as writer:
-                    for chunk in chunks(target, source, info, checkpoint.manifest.sha256.get(name)):
-                        writer.write(chunk)
-        info = zipfile.ZipInfo(SIGNATURE)
-        info.external_attr = 0o644 << 16
-        archive.writestr(info, msgspec.json.encode(signature), zipfile.ZIP_DEFLATED)
 
 
 def verify(checkpoint: Checkpoint, folder: Path) -> Signature:
@@ -279,7 +258,10 @@ def verify(checkpoint: Checkpoint, folder: Path) -> Signature:
     from cryptography.exceptions import InvalidSignature
     from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PublicKey
 
-    path, data = checkpoint.path, _member(checkpoint.path, SIGNATURE)
+    path = checkpoint.path
+    with open_zip(path) as archive:
+        infos = list_members(path, archive)
+        data = b"".join(chunks(path, archive, infos[SIGNATURE])) if SIGNATURE in infos else b""
     if not data:
         raise UntrustedCheckpoint(path, f"is not signed. Sign it with bam-sign sign {path} --key FILE")
     try:
@@ -287,7 +269,7 @@ def verify(checkpoint: Checkpoint, folder: Path) -> Signature:
         text, raw = (base64.b64decode(encoded, validate=True) for encoded in (found.public_key, found.signature))
     except (msgspec.MsgspecError, ValueError) as error:
         raise CheckpointError(path, f"{SIGNATURE}: {error}. Sign it again", member=SIGNATURE) from error
-    manifest = _manifest(checkpoint)
+    manifest = checkpoint.manifest_bytes()
     try:
         Ed25519PublicKey.from_public_bytes(text).verify(raw, _signed(found.signer, found.created, manifest))
     except (InvalidSignature, ValueError) as error:  # ValueError: a key of another length
@@ -304,25 +286,10 @@ def verify(checkpoint: Checkpoint, folder: Path) -> Signature:
     return msgspec.structs.replace(found, signer=known.name)  # signers choose their names
 
 
-def _manifest(checkpoint: Checkpoint) -> bytes:
-    """The bytes of the manifest, which must be unchanged since the checkpoint was opened."""
-    data = _member(checkpoint.path, MANIFEST)
-    if hashlib.sha256(data).hexdigest() != checkpoint.digest:
-        raise CheckpointError(checkpoint.path, f"{MANIFEST} was replaced while it was read. Try again", member=MANIFEST)
-    return data
-
-
 def _signed(signer: str, created: str, manifest: bytes) -> bytes:
     """The bytes that are signed; the lengths make the parts unambiguous."""
     parts = [b"bam-train checkpoint signature 1", signer.encode(), created.encode(), manifest]
     return b"".join(len(part).to_bytes(8, "big") + part for part in parts)
-
-
-def _member(path: Path, name: str) -> bytes:
-    """The bytes of a member; b"" if it is missing."""
-    with open_zip(path) as archive:
-        infos = list_members(path, archive)
-        return b"".join(chunks(path, archive, infos[name])) if name in infos else b""
 
 
 def _base64(data: bytes) -> str:

@@ -118,6 +118,13 @@ def chunks(path: Path, archive: zipfile.ZipFile, info: zipfile.ZipInfo, expected
         raise CheckpointError(path, text, member=name)
 
 
+def write_member(archive: zipfile.ZipFile, name: str, data: bytes) -> None:
+    """Write a member; equal content makes equal bytes."""
+    info = zipfile.ZipInfo(name)  # its date is 1980
+    info.external_attr = 0o644 << 16
+    archive.writestr(info, data, zipfile.ZIP_DEFLATED, 1 if len(data) > CHUNK else 6)
+
+
 def require_same_members(path: Path, found: set[str], expected: set[str]) -> None:
     """Refuse a file that lacks a member of the manifest, or has one that it does not list, other than its signature."""
     found = found - {MANIFEST, SIGNATURE}

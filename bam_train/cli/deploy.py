@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from bam_train.cli.flags import DeployConfig
     from bam_train.deploy.checkpoint_admission import Admission
     from bam_train.deploy.deployment import Deployment
+    from bam_train.policy.policy_link import PolicyLink
     from bam_train.recording.recorder import Recorder
 
 
@@ -65,7 +66,8 @@ def deploy_checkpoint(config: DeployConfig, signals: SignalMemory) -> int:
     if config.unusual is not None and not checkpoint.has(DETECTOR):
         remedy = f"Add one: bam-eval {checkpoint.path} --add-detector"
         raise SettingsError(f"--unusual: {checkpoint.path} has no detector of unusual observations. {remedy}")
-    admission = Admission(checkpoint, config.keys, config.allow_unsigned, config.trials, config.i_know)
+    trust = config.keys, config.allow_unsigned, config.trials, config.i_know
+    admission = Admission(checkpoint, *trust, _policy_server(config))
     options: Any = {"episodes": config.episodes, "yes": config.yes, "render": config.render, "named": config.env}
     options |= {"wiggle": config.wiggle, "motion": config.motion, "arm": config.robot_model}
     env = connected_env(checkpoint, place, signals, who="bam-deploy", admit=admission, **options)
@@ -138,13 +140,15 @@ def _rehearse(config: DeployConfig, link: str) -> int:
                 f"{trial if name == 'stage' else ''}"
             )
     checkpoint = Checkpoint.open(config.checkpoint)
-    policy = FrozenPolicy.from_checkpoint(checkpoint)
+    server = _policy_server(config)
+    policy = FrozenPolicy.from_checkpoint(checkpoint, server)
     limits: Any = {"profile": config.profile, "guards": read_guards(config.guard)}
     with closing(Rehearsal(checkpoint, link, named=config.env, **limits)) as rehearsal:
+        seed = FIRST_SEED if config.seed is None else config.seed
         report = rehearsal.run(
-            policy,
+            policy if server is None else rehearsal.elsewhere(policy, seed),
             episodes=config.episodes,
-            seed=FIRST_SEED if config.seed is None else config.seed,
+            seed=seed,
             tell=lambda line: say(f"bam-deploy: {line}"),
         )
     tell(*([json_module.dumps(report.to_json(), allow_nan=False)] if config.json else report.lines()))
@@ -209,6 +213,20 @@ def _add_to_data_set(
         again = f"bam-data import {config.record} {recorder.path}"
         raise type(error)(f"{error}. The recording is whole: run {again}") from error
     say(f"bam-deploy: {recorder.path} is in {config.record} now")
+
+
+def _policy_server(config: DeployConfig) -> PolicyLink | None:
+    """The link to the policy server of the flags, connected."""
+    from bam_envs.core.location import Credentials
+    from bam_train.errors import SettingsError
+    from bam_train.policy.policy_link import PolicyLink
+
+    files = config.policy_ca_file, config.policy_token_file
+    if config.policy_server is not None:
+        return PolicyLink(config.policy_server, Credentials.of(*files))
+    if any(files):
+        raise SettingsError("--policy-token-file and --policy-ca-file are for --policy-server; give its address too")
+    return None
 
 
 def _checked_place(config: DeployConfig) -> Location:

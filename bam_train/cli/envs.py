@@ -64,7 +64,7 @@ def details(name: str, arm: str | None = None) -> dict[str, Any]:
     from bam_envs.aliases.robo_gym_names import ROBO_GYM
     from bam_envs.core.registry import entry_of, resolve_id
     from bam_envs.core.spaces import space_to_json
-    from bam_train.environments import control_period, make_env, require_env_kwargs
+    from bam_train.environments import described, make_env, require_env_kwargs
 
     env_id = resolve_id(name)
     entry, theirs = entry_of(env_id), ROBO_GYM.get(env_id)
@@ -73,8 +73,7 @@ def details(name: str, arm: str | None = None) -> dict[str, Any]:
     require_env_kwargs(env_id, kwargs)
     env = make_env(theirs.twin if theirs is not None and theirs.is_live else env_id, kwargs)
     try:
-        describe = getattr(env.unwrapped, "describe", None)
-        period = control_period(env)
+        signals, period = described(env)
         return {
             "id": env_id,
             "summary": None if entry is None else entry.summary,
@@ -85,7 +84,7 @@ def details(name: str, arm: str | None = None) -> dict[str, Any]:
             "observation_space": space_to_json(env.observation_space),
             "action_space": space_to_json(env.action_space),
             "cameras": [] if entry is None else list(entry.cameras),
-            "signals": {} if describe is None else describe(),
+            "signals": signals,
             "note": _cannot(env.unwrapped),
         }
     finally:

@@ -37,10 +37,10 @@ def evaluate_checkpoint(config: EvalConfig) -> None:
     if config.data is not None:
         _on_data(config, config.data)
         return
+    from bam_train.compat.plain_sb3_zip import is_plain_sb3
     from bam_train.environments import make_env, make_vector_env, require_fit
     from bam_train.evaluation import default_num_envs, evaluate
     from bam_train.files.video import picture, require_video_path
-    from bam_train.trainers.sb3.plain_sb3_zip import is_plain_sb3
 
     video = None if config.video is None else require_video_path(config.video)
     path = config.checkpoint.expanduser()
@@ -181,11 +181,11 @@ def _own(config: EvalConfig, path: Path) -> _Subject:
 def _foreign(config: EvalConfig, path: Path) -> _Subject:
     """A plain stable-baselines3 zip, if the user trusts its maker."""
     from bam_envs.core.registry import resolve_id
+    from bam_train.compat.plain_sb3_zip import export_trusted
     from bam_train.environments import parity_if_needed, require_env_kwargs
     from bam_train.errors import CheckpointError, SettingsError
     from bam_train.settings import read_env_kwargs
     from bam_train.trainers import require_algorithm
-    from bam_train.trainers.sb3.plain_sb3_zip import load_trusted
 
     if not config.trust_pickle:
         raise CheckpointError(
@@ -202,9 +202,9 @@ def _foreign(config: EvalConfig, path: Path) -> _Subject:
         f"bam-eval: warning: loading {path} runs whatever code is in it (--trust-pickle). If its run normalised "
         f"observations, these figures are wrong: the normaliser is not in such a file."
     )
-    load = partial(load_trusted, path, config.algo, env)
-    env_kwargs, (policy, steps) = parity_if_needed(env, env_kwargs, load, lambda text: say(f"bam-eval: {text}"))
-    return _Subject(policy, env, env_kwargs, config.algo, steps, env_kwargs, None)
+    load = partial(export_trusted, path, config.algo, env)
+    env_kwargs, found = parity_if_needed(env, env_kwargs, load, lambda text: say(f"bam-eval: {text}"))
+    return _Subject(found.policy, env, env_kwargs, config.algo, found.fields["steps"], env_kwargs, None)
 
 
 def _table(report: EvaluationReport, subject: _Subject, path: Path) -> list[str]:

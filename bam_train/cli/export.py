@@ -11,6 +11,7 @@ from bam_train.cli.program import run_program
 
 if TYPE_CHECKING:
     from bam_train.cli.flags import ExportConfig
+    from bam_train.compat.exported import Exported
 
 KINDS = ("lerobot", "onnx", "sb3", "rllib")
 """What may stand before the file or folder: ``lerobot:outputs/train/act/checkpoints/last/pretrained_model``."""
@@ -28,12 +29,8 @@ def export_policy(config: ExportConfig) -> None:
         for name in names:
             if kind != other and getattr(config, name) is not None:
                 raise SettingsError(f"--{name} is for {other}, and {config.source} is read as {kind}; leave it out")
-    if kind == "rllib":
-        _export_directory(config, path)
-    elif kind == "sb3":
-        _export_zip(config, path)
-    else:
-        _export_network(config, kind, path)
+    make = {"rllib": _directory, "sb3": _zip}.get(kind, partial(_network, kind=kind))
+    _write(config, make(config, path=path))
 
 
 def _kind(source: str) -> tuple[str, Path]:
@@ -47,7 +44,7 @@ def _kind(source: str) -> tuple[str, Path]:
     return {".toml": "onnx", ".onnx": "onnx", ".zip": "sb3"}.get(path.suffix, "rllib"), path
 
 
-def _export_network(config: ExportConfig, kind: str, path: Path) -> None:
+def _network(config: ExportConfig, kind: str, path: Path) -> Exported:
     """A policy of LeRobot, or an ONNX file that is described."""
     from bam_envs.core.registry import resolve_id
     from bam_train.compat.foreign_export import export_foreign
@@ -63,62 +60,30 @@ def _export_network(config: ExportConfig, kind: str, path: Path) -> None:
         policy = described_policy(path)
     env = resolve_id(config.env or policy.env or JOINTS)
     kwargs = {**(policy.env_kwargs if env == policy.env else {}), **read_env_kwargs(config.set)}
-    exported = export_foreign(policy, env, kwargs, tell=lambda line: say(f"  {line}"))
-    out = _output(config, env, policy.algorithm, policy.trainer, kwargs)
-    written = exported.write(out).path
-    chunk = policy.chunk
-    several = f", {chunk.size} actions at once, {chunk.steps} of them executed" if chunk.size > 1 else ""
-    tell(
-        f"{written}: {policy.algorithm} on {env}{several}, out of {policy.place}",
-        f"  checked   against the actions of {policy.by}: they differ by {exported.difference:.1e} at most",
-        f"  next      bam-deploy {written}, bam-deploy {written} --robot URL --shadow",
-    )
+    return export_foreign(policy, env, kwargs, tell=lambda line: say(f"  {line}"))
 
 
-def _export_zip(config: ExportConfig, path: Path) -> None:
+def _zip(config: ExportConfig, path: Path) -> Exported:
     """A zip that stable-baselines3 wrote."""
     from bam_envs.core.registry import resolve_id
+    from bam_train.compat.plain_sb3_zip import export_trusted
     from bam_train.errors import SettingsError
     from bam_train.settings import read_env_kwargs
-    from bam_train.trainers.sb3.plain_sb3_zip import export_trusted
 
     if not config.trust_pickle or config.env is None or config.algo is None:
         text = "stable-baselines3 reads it, and runs whatever code is in it. If you trust its maker, give"
         raise SettingsError(f"{path}: {text} --trust-pickle, and say what it is: --env ID --algo NAME")
     env, kwargs = resolve_id(config.env), read_env_kwargs(config.set)
     say(f"bam-export: warning: reading {path} runs whatever code is in it (--trust-pickle)")
-    fields, members = export_trusted(path, config.algo.lower(), env, kwargs, config.statistics)
-    from bam_train.checkpoint import write_checkpoint
-    from bam_train.policy import FrozenPolicy
-
-    out = _output(config, env, config.algo.lower(), "sb3", kwargs)
-    FrozenPolicy.from_checkpoint(write_checkpoint(out, fields, members))
-    tell(
-        f"{out}: {config.algo.lower()} on {env}, {fields['steps']:,} steps, out of {path}",
-        f"  checked   against {fields['settings']['exported']['golden']}",
-        f"  next      bam-eval {out}, bam-deploy {out}",
-    )
+    return export_trusted(path, config.algo.lower(), env, kwargs, config.statistics)
 
 
-def _output(config: ExportConfig, env: str, algo: str, trainer: str, kwargs: dict[str, object]) -> Path:
-    """Where the checkpoint goes."""
-    from bam_train.settings import TrainSettings
-    from bam_train.trainers.best_checkpoint import choose_output
-
-    settings = TrainSettings(env=env, algo=algo, trainer=trainer, env_kwargs=kwargs)
-    output = choose_output(settings, config.out, config.force, None)
-    for notice in output.notices:
-        say(f"bam-export: {notice}")
-    return output.path
-
-
-def _export_directory(config: ExportConfig, path: Path) -> None:
+def _directory(config: ExportConfig, path: Path) -> Exported:
     """A checkpoint directory that RLlib wrote."""
     from bam_train.compat.rllib_export import export
-    from bam_train.environments import must_be_named
     from bam_train.settings import read_env_kwargs
 
-    exported = export(
+    return export(
         path,
         env=config.env,
         env_kwargs=read_env_kwargs(config.set),
@@ -127,18 +92,37 @@ def _export_directory(config: ExportConfig, path: Path) -> None:
         trust=config.trust_pickle,
         warn=lambda text: say(f"bam-export: warning: {text}"),
     )
-    parts, directory = exported.parts, exported.directory
-    path = exported.write(_output(config, exported.env, parts.algorithm, "rllib", {})).path
-    named = f" --env {exported.env}" if must_be_named(exported.env) else ""
-    made_by = f" of Ray {directory.ray_version}" if directory.ray_version else ""
-    steps = f", {exported.steps:,} steps" if exported.steps else ""
+
+
+def _write(config: ExportConfig, exported: Exported) -> None:
+    """Write the checkpoint, and say what it is and what comes next."""
+    from bam_train.compat.exported import EXPORTED
+    from bam_train.environments import must_be_named
+    from bam_train.settings import TrainSettings
+    from bam_train.trainers.best_checkpoint import choose_output
+
+    fields, chunk = exported.fields, exported.policy.chunk
+    env, algo, trainer = (fields[name] for name in ("env", "algorithm", "trainer"))
+    settings = TrainSettings(env=env, algo=algo, trainer=trainer, env_kwargs=fields["env_kwargs"])
+    output = choose_output(settings, config.out, config.force, None)
+    for notice in output.notices:
+        say(f"bam-export: {notice}")
+    path = exported.write(output.path).path
+    several = f", {chunk.size} actions at once, {chunk.steps} of them executed" if chunk and chunk.size > 1 else ""
+    steps = f", {fields['steps']:,} steps" if fields["steps"] else ""
+    ray = fields["settings"][EXPORTED].get("ray")
+    named = f"{path} --env {env}" if must_be_named(env) else path
+    resume = [f"            bam-train --resume {named} --steps N"]
+    if exported.cannot_resume:
+        resume = [f"  bam-train --resume cannot go on from it: {exported.cannot_resume}"] if trainer == "rllib" else []
+    live = trainer in ("lerobot", "onnx")
     tell(
-        f"{path}: {parts.algorithm} on {exported.env}{steps}, out of {directory.given}{made_by}",
+        f"{path}: {algo} on {env}{several}{steps}, out of {exported.place}{f' of Ray {ray}' if ray else ''}",
         f"  checked   against the actions of {exported.checked_by}: they differ by {exported.difference:.1e} at most",
-        f"  next      bam-eval {path}{named}, bam-deploy {path}{named}",
-        f"            bam-train --resume {path}{named} --steps N"
-        if not isinstance(exported.training, str)
-        else f"  bam-train --resume cannot go on from it: {exported.training}",
+        f"  next      bam-deploy {named}, bam-deploy {named} --robot URL --shadow"
+        if live
+        else f"  next      bam-eval {named}, bam-deploy {named}",
+        *resume,
     )
 
 

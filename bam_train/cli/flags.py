@@ -292,6 +292,7 @@ class DeployConfig(LocationFlags):
     GROUPS: ClassVar[Groups] = {
         "Episodes": ("episodes", "seed", "rate", "fast", "render"),
         "Where": ("robot", "robot_model", "transport", "profile", "ca_file", "token_file", "timeout", "rehearse"),
+        "Who computes the actions": ("policy_server", "policy_token_file", "policy_ca_file"),
         "How a live robot may move": (
             *("stage", "i_know", "guard", "print_guards", "unusual", "wiggle", "motion", "shadow", "trials", "yes"),
             *("keys", "allow_unsigned"),
@@ -318,6 +319,13 @@ class DeployConfig(LocationFlags):
     rehearse: Annotated[str | None, tyro.conf.arg(metavar="LINK")] = None
     """Rehearse in simulated time: the simulated robot behind a link (wifi, lte, bad or a .json file of bam-doctor) and
     the guards of a live robot."""
+    policy_server: Url = None
+    """Computer that computes the chunks of the policy: ws://10.0.0.7:9096 or tcp://10.0.0.7:9096, where bam-serve
+    --policy runs with the same checkpoint; by default this one."""
+    policy_token_file: File = None
+    """File with the token that the policy server asks for."""
+    policy_ca_file: File = None
+    """Certificates that wss:// of the policy server trusts instead of the system's."""
     motion: File = None
     """Recording (.mcap) of this robot in which each axis must have moved as commanded."""
     wiggle: bool = False
@@ -457,7 +465,8 @@ class ServeConfig(CredentialFlags, RobotModelFlag):
 
     GROUPS: ClassVar[Groups] = {
         "What is served": (
-            *("env", "robot_model", "num_envs", "set", "realtime", "fast", "image_format", "gymapi_version", "yes"),
+            *("env", "policy", "robot_model", "num_envs", "set", "realtime", "fast", "image_format", "gymapi_version"),
+            "yes",
         ),
         "Where": ("port", "bind", "tcp", "via", "rclpy", "namespace"),
         "Who may connect": ("token_file", "operator_token_file", "no_token", "lease", "cert", "key", "ca_file"),
@@ -465,6 +474,9 @@ class ServeConfig(CredentialFlags, RobotModelFlag):
 
     env: Annotated[str, tyro.conf.arg(metavar="ID")] = "bam/pick"
     """Environment: any Gymnasium id."""
+    policy: File = None
+    """Instead of an environment, serve the policy of this checkpoint.zip, which has chunks, to bam-deploy
+    --policy-server; one robot at a time."""
     num_envs: Annotated[Count, tyro.conf.arg(metavar="N")] = 1
     """Environments stepped together; several have no robot topics."""
     set: Assignments = ()

@@ -13,6 +13,8 @@ from bam_train.files.log_lines import ShownFormatter
 from bam_train.signals import SignalMemory
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from bam_train.cli.flags import ServeConfig
 
 _CHECK_PERIOD = 1.0
@@ -36,7 +38,8 @@ def serve(config: ServeConfig, signals: SignalMemory) -> None:
     handler = logging.StreamHandler()
     handler.setFormatter(ShownFormatter("bam-serve: %(message)s"))
     logging.basicConfig(level=logging.WARNING, handlers=[handler])
-    with ServedEnvironment(_consented_env(config), options, _tell) as served:
+    env = _consented_env(config) if config.policy is None else _served_policy(config, config.policy)
+    with ServedEnvironment(env, options, _tell) as served:
         for line in served.endpoints:
             _tell(line)
         forever = threading.Event()
@@ -47,6 +50,18 @@ def serve(config: ServeConfig, signals: SignalMemory) -> None:
 
 def _tell(line: str) -> None:
     say(f"bam-serve: {line}")
+
+
+def _served_policy(config: ServeConfig, path: Path) -> Any:
+    """The policy of a checkpoint as an environment."""
+    from bam_train.checkpoint import Checkpoint
+    from bam_train.errors import SettingsError
+    from bam_train.policy import FrozenPolicy
+    from bam_train.policy.policy_server import ServedPolicy
+
+    if config.set or config.robot_model is not None or config.num_envs > 1:
+        raise SettingsError("--policy serves a policy, and no environment: leave out --set, --robot-model, --num-envs")
+    return ServedPolicy(FrozenPolicy.from_checkpoint(Checkpoint.open(path), threads=0))
 
 
 def _consented_env(config: ServeConfig) -> Any:

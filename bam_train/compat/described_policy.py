@@ -4,14 +4,16 @@
 
     network = "act.onnx"                        # beside this file
     rate = 20.0                                 # actions a second
-    chunk = { size = 50, steps = 25 }           # where it gives several actions at once
+    chunk = { size = 50, steps = 25 }           # where it gives several actions at once; see `Chunk`
 
-    [[inputs]]
+    [[inputs]]                                  # see `Port`
     name = "state"                              # of the graph
-    names = ["shoulder_pan.pos", "gripper.pos"] # each number, in its order
+    names = ["shoulder_pan.pos", ..., "gripper.pos"]  # each number, in its order
     units = "degrees"                           # or range, -100 to 100; or si
-    mean = [0.0, 50.0]                          # where the network takes (x - mean) / std
-    std = [30.0, 20.0]
+    mean = [0.0, ..., 50.0]                     # where the network takes (x - mean) / std
+    std = [30.0, ..., 20.0]
+    low = [-80.0, ..., 0.0]                     # the range in the data
+    high = [80.0, ..., 100.0]
 
     [[inputs]]
     name = "image"
@@ -20,76 +22,33 @@
 
     [output]
     name = "action"
-    names = ["shoulder_pan.pos", "gripper.pos"]
+    names = ["shoulder_pan.pos", ..., "gripper.pos"]
     units = "degrees"
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
-import msgspec
-import numpy as np
-from msgspec import Meta, Struct
+from msgspec import Meta
 
-from bam_envs.core.wording import did_you_mean
+from bam_envs.core.validation import Positive, read_table
 from bam_train.checkpoint.manifest import Chunk
-from bam_train.compat.foreign_policy import Affine, ForeignPolicy, Port, Units
+from bam_train.compat.foreign_policy import ForeignPolicy, Port
 from bam_train.errors import CheckpointError
 from bam_train.settings import tomllib
 
-_PIXEL = 255.0
-_Positive = Annotated[float, Meta(gt=0)]
 
-
-class _Port(Struct, forbid_unknown_fields=True):
-    name: str
-    part: str = ""
-    size: list[int] = []
-    names: list[str] = []
-    units: Units | None = None
-    mean: list[float] = []
-    std: list[_Positive] = []
-
-    def port(self, *, is_output: bool) -> Port:
-        """What it is; raises ValueError where it does not say enough."""
-        size = tuple(self.size) or (len(self.names),)
-        if len(size) not in (1, 3) or size[0] < 1:
-            raise ValueError(f"{self.name}: give names, or size: [numbers], or [channels, height, width] of an image")
-        if self.names and self.units is None:
-            raise ValueError(f'{self.name}: units: expected "degrees", "range" or "si"')
-        is_image = len(size) == 3
-        mean = np.array(self.mean or [0.0] * size[0])
-        std = np.array(self.std or [_PIXEL if is_image else 1.0] * size[0])
-        for name, array in (("mean", mean), ("std", std)):
-            if array.shape != size[:1]:
-                raise ValueError(f"{self.name}: {name}: expected {size[0]} numbers, found {len(array)}")
-        to_data = Affine(std, mean)
-        norm = to_data if is_output else to_data.inverse
-        return Port(self.name, self.part, size, norm, tuple(self.names), self.units or "si")
-
-
-class _Described(Struct, forbid_unknown_fields=True):
+@dataclass(frozen=True)
+class _Description:
     network: str
-    inputs: Annotated[list[_Port], Meta(min_length=1)]
-    output: _Port
-    rate: _Positive
-    chunk: Chunk = Chunk(1, 1)
+    inputs: Annotated[list[dict[str, Any]], Meta(min_length=1, description="a list of tables, [[inputs]]")]
+    output: dict[str, Any]
+    rate: Positive
+    chunk: dict[str, Any] | None = None
     algorithm: str = "policy"
-
-
-def _read(text: str) -> _Described:
-    """The content of a TOML file; raises ValueError or msgspec.MsgspecError."""
-    table = tomllib.loads(text)
-    chunk = table.get("chunk")
-    for name in chunk if isinstance(chunk, dict) else ():
-        if name not in Chunk.__dataclass_fields__:
-            raise ValueError(f"chunk: there is no {name!r}. {did_you_mean(name, Chunk.__dataclass_fields__)}")
-    described = msgspec.convert(table, type=_Described)
-    if described.chunk.steps > described.chunk.size:
-        raise ValueError(f"chunk: steps is {described.chunk.steps}, expected at most its size, {described.chunk.size}")
-    return described
 
 
 def described_policy(path: Path) -> ForeignPolicy:
@@ -102,15 +61,15 @@ def described_policy(path: Path) -> ForeignPolicy:
     try:
         if path.suffix == ".onnx":
             raise ValueError("it is the network alone. Give a TOML file that says what its inputs and outputs mean")
-        described = _read(path.read_text())
-        network = path.parent / described.network
-        inputs = tuple(one.port(is_output=False) for one in described.inputs)
-        output = described.output.port(is_output=True)
+        described = read_table(_Description, tomllib.loads(path.read_text()), "the file")
+        chunk = Chunk(1, 1) if described.chunk is None else read_table(Chunk, described.chunk, "chunk")
+        inputs = tuple(_port(one, f"inputs[{i}]") for i, one in enumerate(described.inputs))
+        output, network = _port(described.output, "output"), path.parent / described.network
         graph = network.read_bytes()
     except OSError as error:
         which = "it" if error.filename == str(path) else f"its network, {error.filename},"
         raise CheckpointError(path, f"{which} cannot be read: {error.strerror or error}. Check the name") from error
-    except (ValueError, msgspec.MsgspecError) as error:  # ValueError: also of TOML
+    except ValueError as error:  # also of TOML
         raise CheckpointError(path, f"does not describe a policy: {error}") from error
     source: dict[str, Any] = {"description": str(path.absolute()), "network": str(network.absolute())}
     return ForeignPolicy(
@@ -118,9 +77,13 @@ def described_policy(path: Path) -> ForeignPolicy:
         graph,
         inputs,
         output,
-        described.chunk,
+        chunk,
         described.algorithm,
         "onnx",
         1.0 / described.rate,
         source=source,
     )
+
+
+def _port(table: dict[str, Any], place: str) -> Port:
+    return read_table(Port, table, str(table.get("name", place)))

@@ -5,8 +5,7 @@ from __future__ import annotations
 import contextlib
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass
-from pathlib import Path
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -15,36 +14,18 @@ from numpy.typing import NDArray
 
 from bam_envs.core.robot_models import portable_model
 from bam_envs.core.spaces import space_to_json
-from bam_train.checkpoint import GOLDEN, POLICY, Checkpoint, safetensors_file, write_checkpoint
+from bam_train.checkpoint.detector import DETECTOR, MOST_NUMBERS, Detector, detector_of_ranges
+from bam_train.compat.exported import Exported, exported
 from bam_train.compat.foreign_graph import as_ours, as_theirs, mapped_graph, with_known_sizes
-from bam_train.compat.foreign_policy import ForeignPolicy, Meaning, fit_rows, meaning, part_key, part_of
+from bam_train.compat.foreign_policy import ForeignPolicy, Meaning, Port, fit_rows, meaning, part_key, part_of
 from bam_train.deploy.contract import Contract
-from bam_train.environments import control_period, make_env
+from bam_train.environments import described, make_env
 from bam_train.errors import ContractRefused, PolicyError
 from bam_train.policy import FrozenPolicy
-from bam_train.policy.frozen_policy import TOLERANCE
 from bam_train.policy.onnx_session import OnnxSession
-from bam_train.trainers.base import origin
 
 Array = NDArray[Any]
-EXPORTED = "exported"
-"""Setting of the manifest with the source of an exported checkpoint; runs have no setting of this name."""
 _ROWS, _BUDGET = 64, 200_000  # golden observations: at most so many, and about so many bytes, but 4
-
-
-@dataclass(frozen=True)
-class ForeignExport:
-    """A policy of others that fits an environment."""
-
-    members: Mapping[str, bytes]
-    fields: Mapping[str, Any]
-    """Of the manifest."""
-    difference: float
-    """The largest difference from its own actions."""
-
-    def write(self, path: Path) -> Checkpoint:
-        """Write the checkpoint.zip; raises OutputError if it cannot be written there."""
-        return write_checkpoint(path, self.fields, self.members)
 
 
 def export_foreign(
@@ -53,7 +34,7 @@ def export_foreign(
     env_kwargs: Mapping[str, Any],
     *,
     tell: Callable[[str], None] = lambda text: None,
-) -> ForeignExport:
+) -> Exported:
     """Join a policy of others to an environment.
 
     Args:
@@ -68,7 +49,7 @@ def export_foreign(
     """
     policy = with_known_sizes(policy)
     with contextlib.closing(make_env(env_id, env_kwargs)) as env:
-        period = control_period(env)
+        signals, period = described(env)
         contract = Contract(tuple(fit_rows(policy, env, period)))
         if contract.refused:
             for line in contract.lines():
@@ -78,7 +59,6 @@ def export_foreign(
             text = f"{first.what}: expected {first.expected}, found {first.found}{more}"
             raise ContractRefused(first.what, f"{policy.place} does not fit {env_id}: {text}; nothing was written")
         observation, action = env.observation_space, env.action_space
-        signals: dict[str, Any] = getattr(env.unwrapped, "describe", dict)()
     if not isinstance(action, spaces.Box):
         raise PolicyError(f"{policy.place}: {env_id} takes {action}, and policies of others give numbers")
     taken, given = _meanings(policy, observation, signals), meaning(policy.output, *_numbers(signals, "action"))
@@ -90,27 +70,31 @@ def export_foreign(
         text = "its network is not as it is described; check chunk, and names and size of inputs and output"
         raise PolicyError(f"{policy.place}: {text}: {error}") from error
     golden = _golden(policy, taken, given, action.shape)
-    worst, row = frozen.worst_difference(golden)
-    if not worst <= TOLERANCE:  # NaN too
-        text = f"its graph differs by {worst:.3g} in row {row} from the actions of {policy.by}"
-        raise PolicyError(f"{policy.place}: {text}, expected at most {TOLERANCE}: this network cannot be exported")
-    fields = {
-        "env": env_id,
-        "env_kwargs": _portable(env_kwargs),
-        "observation_space": jsons[0],
-        "action_space": jsons[1],
-        "signals": signals,
-        "period": period,
-        "algorithm": policy.algorithm,
-        "trainer": policy.trainer,
-        "settings": {EXPORTED: {**policy.source, "golden": policy.by}},
-        "steps": policy.steps,
-        "seed": 0,
-        "scores": {},
-        "chunk": asdict(policy.chunk),
-        **origin(),
-    }
-    return ForeignExport({POLICY: graph, GOLDEN: safetensors_file.dump(golden)}, fields, worst)
+    facts = {"env": env_id, "env_kwargs": _portable(env_kwargs), "signals": signals, "period": period}
+    facts |= {"algorithm": policy.algorithm, "trainer": policy.trainer, "steps": policy.steps}
+    made = exported(policy.place, frozen, graph, golden, policy.source, policy.by, **facts)
+    detector = _detector(policy, taken, given, action)
+    return made if detector is None else replace(made, members={**made.members, DETECTOR: detector.to_bytes()})
+
+
+def _detector(
+    policy: ForeignPolicy, taken: Mapping[str, tuple[str, Any, Meaning]], given: Meaning, action: spaces.Box
+) -> Detector | None:
+    """The detector of unusual observations, of the ranges of the numbers in the data; None if they are not known."""
+    seen = sorted((taken[port.name], port) for port in policy.inputs if not port.is_image)
+    ranges = [_range(port, means, math.prod(part.shape)) for (_, part, means), port in seen]
+    d = sum(len(low) for low, _ in ranges)
+    low, high = np.concatenate([*ranges, _range(policy.output, given, math.prod(action.shape))], axis=1)
+    few = 0 < d <= MOST_NUMBERS and len(low) - d <= MOST_NUMBERS
+    return detector_of_ranges(low, high, d) if few and np.isfinite(low).any() else None
+
+
+def _range(port: Port, means: Meaning, count: int) -> Array:
+    """Lowest and highest value of each of ours in the data, infinite where it is not known. Shape: (2, count)."""
+    found = np.tile([[-np.inf], [np.inf]], count)
+    if port.low and port.high:
+        found[:, means.order] = means.si(np.array(port.low)), means.si(np.array(port.high))
+    return found
 
 
 def _portable(env_kwargs: Mapping[str, Any]) -> dict[str, Any]:
@@ -160,7 +144,7 @@ def _golden(
             arrays[name] = rng.integers(0, 256, (rows, *past, *part.shape), dtype=np.uint8)
             continue
         drawn = np.zeros((rows, *past, *part.shape))
-        drawn[..., means.order] = means.si(port.norm.inverse(rng.normal(size=(rows, *past, len(means.order)))))
+        drawn[..., means.order] = means.si(port.data(rng.normal(size=(rows, *past, len(means.order)))))
         arrays[name] = np.clip(drawn, part.low, part.high).astype(part.dtype)
     answer = policy.answer or _graph(policy)
     chunks = []

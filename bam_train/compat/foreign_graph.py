@@ -33,7 +33,7 @@ def mapped_graph(
         PolicyError: It is no graph of a policy, or lacks an input or the output.
     """
     from google.protobuf.message import DecodeError
-    from onnx import TensorProto, helper, load_model_from_string
+    from onnx import TensorProto, compose, helper, load_model_from_string
 
     try:
         require_policy(policy.network)
@@ -50,7 +50,7 @@ def mapped_graph(
         outputs = [one.name for one in graph.output]
         raise PolicyError(f"{policy.place}: the graph's outputs are {outputs}, and {policy.output.name} is described")
     [n] = {one.type.tensor_type.shape.dim[0].dim_value or "n" for one in graph.input if one.name in found} or {"n"}
-    _prefix(graph)
+    graph = compose.add_prefix(model, _OWN).graph
     around = _Nodes(helper)
     infos: dict[str, Any] = {}
     for port, (name, space, means) in zip(policy.inputs, taken, strict=True):
@@ -84,7 +84,7 @@ def with_known_sizes(policy: ForeignPolicy) -> ForeignPolicy:
 
     try:
         model = load_model_from_string(policy.network)
-        inferred = shape_inference.infer_shapes(model).graph
+        inferred = shape_inference.infer_shapes(model, data_prop=True).graph
     except (DecodeError, shape_inference.InferenceError) as error:
         raise PolicyError(f"{policy.place}: not an ONNX file, or damaged: {error}") from error
     values = [*inferred.value_info, *inferred.input, *inferred.output]
@@ -95,16 +95,6 @@ def with_known_sizes(policy: ForeignPolicy) -> ForeignPolicy:
             model.graph.initializer.append(numpy_helper.from_array(np.array(size, np.int64), node.output[0]))
             model.graph.node.remove(node)
     return replace(policy, network=model.SerializeToString())
-
-
-def _prefix(graph: Any) -> None:
-    """Put `_OWN` before every name of the graph."""
-    for tensor in graph.initializer:
-        tensor.name = _OWN + tensor.name
-    for node in graph.node:
-        node.name = ""
-        for names in (node.input, node.output):
-            names[:] = [name and _OWN + name for name in names]
 
 
 class _Nodes:
@@ -120,15 +110,14 @@ class _Nodes:
         if port.is_image:
             axes = [*range(1 + past), *(1 + past + axis for axis in (2, 0, 1))]
             pixels = self._add("Transpose", [self._cast(name, 1)], perm=axes)
-            norm = Affine(*(np.reshape(one, (-1, 1, 1)) for one in (port.norm.scale, port.norm.offset)))
-            self._affine(pixels, norm, np.float32, target)
+            self._affine(pixels, _by_channel(port), np.float32, target)
             return
         ours = self._add("Gather", [name, self._constant(means.order)], axis=-1)
-        self._cast(self._affine(self._cast(ours, 11), port.norm.after(means.si.inverse), np.float64), 1, target)
+        self._cast(self._affine(self._cast(ours, 11), port.data.inverse.after(means.si.inverse), np.float64), 1, target)
 
     def out(self, name: str, port: Port, means: Meaning, shape: tuple[int, ...]) -> None:
         """From the output `name` of the network to our action."""
-        theirs = self._affine(self._cast(name, 11), means.si.after(port.norm), np.float64)
+        theirs = self._affine(self._cast(name, 11), means.si.after(port.data), np.float64)
         ours = self._add("Gather", [theirs, self._constant(np.argsort(means.order))], axis=-1)
         self._add("Reshape", [self._cast(ours, 1), self._constant(np.array([-1, *shape]))], "action")
 
@@ -152,6 +141,12 @@ class _Nodes:
         return target
 
 
+def _by_channel(port: Port) -> Affine:
+    """From the pixels of an image, channels first, to what the network takes."""
+    norm = port.data.inverse
+    return Affine(norm.scale.reshape(-1, 1, 1), norm.offset.reshape(-1, 1, 1))
+
+
 def as_theirs(policy: ForeignPolicy, taken: Mapping[str, tuple[Array, Meaning]]) -> dict[str, Array]:
     """Arrays of ours, by names of inputs, as the network takes them: what the nodes compute, in NumPy."""
     inputs = {}
@@ -159,14 +154,13 @@ def as_theirs(policy: ForeignPolicy, taken: Mapping[str, tuple[Array, Meaning]])
         array, means = taken[port.name]
         if port.is_image:
             pixels = np.moveaxis(array.astype(np.float64), -1, -3)
-            norm = Affine(*(np.reshape(one, (-1, 1, 1)) for one in (port.norm.scale, port.norm.offset)))
-            inputs[port.name] = norm(pixels).astype(np.float32)
+            inputs[port.name] = _by_channel(port)(pixels).astype(np.float32)
         else:
-            inputs[port.name] = port.norm(means.si.inverse(array[..., means.order])).astype(np.float32)
+            inputs[port.name] = port.data.inverse(means.si.inverse(array[..., means.order])).astype(np.float32)
     return inputs
 
 
 def as_ours(policy: ForeignPolicy, output: Array, means: Meaning, shape: tuple[int, ...]) -> Array:
     """What the network gives as actions of ours, float32."""
-    theirs = means.si(policy.output.norm(output))
+    theirs = means.si(policy.output.data(output))
     return theirs[..., np.argsort(means.order)].reshape(-1, *shape).astype(np.float32)

@@ -15,12 +15,16 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
+from bam_envs.core.errors import InvalidValue
+from bam_envs.core.validation import Positive
 from bam_envs.core.wording import did_you_mean
 from bam_envs.live.robot_checks import Check
 from bam_train.checkpoint.manifest import Chunk
 
 Array = NDArray[Any]
-Units = Literal["si", "degrees", "range"]
+Units = Literal["degrees", "range", "si"]
+PIXEL = 255.0
+"""Brightest value of a pixel."""
 PERCENT = 100.0
 """What LeRobot's robots call the end of a joint's range, and the open gripper."""
 _GRIPPER = ("gripper", "gripper_width")
@@ -50,19 +54,48 @@ class Affine:
 
 @dataclass(frozen=True)
 class Port:
-    """An input or the output of a network."""
+    """An input or the output of a network; the fields are those of a description, see `described_policy`.
+
+    Raises:
+        InvalidValue: They do not say enough, or contradict each other.
+    """
 
     name: str
     """As the graph calls it."""
-    part: str
+    part: str = ""
     """The camera, or the vector of the observation: its key, or "" where the observation is one array."""
-    size: tuple[int, ...]
+    size: tuple[int, ...] = ()
     """Its shape in one step, without batch and chunk: (k,), or (channels, height, width) of an image."""
-    norm: Affine
-    """From their numbers to those that the network takes; of an output, from those that it gives to theirs."""
     names: tuple[str, ...] = ()
     """What each number is, such as shoulder_pan.pos; () for the environment's own numbers in its order."""
-    units: Units = "si"
+    units: Units | None = None
+    """Of the numbers with names."""
+    mean: tuple[float, ...] = ()
+    """The network takes and gives (x - mean) / std, number by number, or for each channel of an image."""
+    std: tuple[Positive, ...] = ()
+    """By default 1, and 255 of an image."""
+    low: tuple[float, ...] = ()
+    """Lowest value of each number in the data, in their units, for the detector of unusual observations."""
+    high: tuple[float, ...] = ()
+    """Highest value."""
+
+    def __post_init__(self) -> None:
+        size = self.size or (len(self.names),)
+        if len(size) not in (1, 3) or size[0] < 1:
+            raise InvalidValue(f"{self.name}: give names, or size: [numbers], or [channels, height, width] of an image")
+        if self.names and self.units is None:
+            raise InvalidValue(f"{self.name}: give units: 'degrees', 'range' or 'si'")
+        scale = PIXEL if len(size) == 3 else 1.0
+        whole = {"size": size, "mean": self.mean or (0.0,) * size[0], "std": self.std or (scale,) * size[0]}
+        for name, value in {**whole, "units": self.units or "si", "low": self.low, "high": self.high}.items():
+            if name not in ("size", "units") and len(value) not in (size[0], 0):
+                raise InvalidValue(f"{self.name}: {name}: expected {size[0]} numbers, found {len(value)}")
+            object.__setattr__(self, name, value)
+
+    @property
+    def data(self) -> Affine:
+        """From the network's numbers to those of the data."""
+        return Affine(np.array(self.std), np.array(self.mean))
 
     @property
     def is_image(self) -> bool:
@@ -130,7 +163,7 @@ def plain_name(name: str) -> str:
     return "gripper_width" if name in _GRIPPER else name
 
 
-def _si(name: str, units: Units, limits: tuple[float, float]) -> tuple[float, float]:
+def _si(name: str, units: Units | None, limits: tuple[float, float]) -> tuple[float, float]:
     """Scale and offset from a number of theirs to SI units."""
     low, high = limits
     if units == "si":

@@ -1,4 +1,4 @@
-"""Policies that LeRobot trained: the folder ``pretrained_model`` of ACT, with the statistics of its processors.
+"""Policies that LeRobot trained: the folder ``pretrained_model`` of ACT or Diffusion, with its statistics.
 
 LeRobot itself makes the network and computes the actions to compare with; it is not needed where the policy runs.
 """
@@ -7,6 +7,8 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
+from importlib import import_module
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -17,12 +19,16 @@ from torch import nn
 
 from bam_train.checkpoint import safetensors_file
 from bam_train.checkpoint.manifest import Chunk
-from bam_train.compat.foreign_policy import Affine, ForeignPolicy, Port, Units
+from bam_train.compat.foreign_policy import PIXEL, ForeignPolicy, Port, Units
 from bam_train.data import DataSet
 from bam_train.errors import CheckpointError, CheckpointMismatch, FormatError, SettingsError
 from bam_train.trainers.frozen_network import Layer, trace
 
 Array = NDArray[Any]
+Norm = tuple[Array, Array, Array, Array]
+"""Mean and deviation by which numbers are normalised; their lowest and highest value in the data, empty if unknown."""
+KINDS = {"act": "ACTPolicy", "diffusion": "DiffusionPolicy"}
+"""Policies that are exported, and their classes."""
 LARGE = ("smolvla", "pi0", "pi05", "pi0_fast", "groot", "xvla", "wall_x")
 """Policies that take seconds for a chunk on a CPU."""
 _ACTION, _STATE, _IMAGES = "action", "observation.state", "observation.images."
@@ -52,9 +58,12 @@ def lerobot_policy(folder: Path, *, data: Path | None = None, units: Units | Non
     kind = str(config.get("type"))
     if kind in LARGE:
         text = f"{kind} takes seconds for a chunk on a robot's computer: run it on a policy server with a GPU"
-        raise CheckpointMismatch(folder, f"{text}; bam-export takes act")
-    if kind != "act":
-        raise CheckpointMismatch(folder, f"is a policy of the kind {kind}; bam-export takes act")
+        raise CheckpointMismatch(folder, f"{text}; bam-export takes {' and '.join(KINDS)}")
+    if kind not in KINDS:
+        raise CheckpointMismatch(folder, f"is a policy of the kind {kind}; bam-export takes {' and '.join(KINDS)}")
+    if (scheduler := config.get("noise_scheduler_type", "DDIM")) != "DDIM":
+        text = f"noise_scheduler_type is {scheduler}, which draws noise in every step. In config.json"
+        raise CheckpointMismatch(folder, f'{text} set it to "DDIM", and num_inference_steps to about 10')
     steps = {name: _steps(folder, f"policy_{name}.json") for name in ("preprocessor", "postprocessor")}
     renamed = {old: new for step in steps["preprocessor"] for old, new in step["config"].get("rename_map", {}).items()}
     info, root = _data_set(folder, data)
@@ -64,35 +73,34 @@ def lerobot_policy(folder: Path, *, data: Path | None = None, units: Units | Non
             "its joints may be measured in degrees, or from -100 to 100. Say which: --units degrees, or --units range"
         )
         raise SettingsError(f"{folder}: {text}")
-    network = _Act(folder)
+    network = _Network(folder, kind)
     norms = {name: _norms(folder, found) for name, found in steps.items()}
 
-    def port(feature: str, shape: tuple[int, ...], norm: Affine) -> Port:
+    def port(feature: str, shape: tuple[int, ...], norm: Norm) -> Port:
         there = next((old for old, new in renamed.items() if new == feature), feature)
         part = there.removeprefix(_IMAGES).removeprefix("observation.")
-        if len(shape) == 3:
-            channels = np.ones(shape[0])
-            return Port(feature, part, shape, norm.after(Affine(channels / 255, 0 * channels)))
-        names = () if ours is not None else _names(folder, info, there)
-        return Port(feature, part, shape, norm, names, units or "si")
+        mean, std, *ends = (tuple(one * (PIXEL if len(shape) == 3 else 1.0)) for one in norm)
+        names = () if ours is not None or len(shape) == 3 else _names(folder, info, there)
+        return Port(feature, part, shape, names, units or "si", mean, std, *(ends if len(shape) == 1 else ()))
 
     inputs = [port(name, shape, norms["preprocessor"](name, shape)) for name, shape in network.features.items()]
     output = port(_ACTION, network.shape, norms["postprocessor"](_ACTION, network.shape))
-    example = tuple(torch.zeros(1, *shape) for shape in network.features.values())
-    graph = trace(network, example, [*network.features], [_ACTION], any_number=False)
-    chunk = Chunk(config["chunk_size"], config["n_action_steps"], 1, config["temporal_ensemble_coeff"])
-    version = network.version
-    source = {"directory": str(folder.absolute()), "lerobot": version, "data": str(root.absolute())}
+    try:
+        graph = trace(network, network.example(), [*network.features], [_ACTION], any_number=False)
+    except (RuntimeError, TypeError, ValueError) as error:
+        why = f"{type(error).__name__} {' '.join(str(error).split()):.160}"
+        raise CheckpointMismatch(folder, f"its network cannot be exported: {why}") from error
+    source = {"directory": str(folder.absolute()), "lerobot": network.version, "data": str(root.absolute())}
     return ForeignPolicy(
         str(folder),
         graph,
         tuple(inputs),
         output,
-        chunk,
+        network.chunk,
         kind,
         "lerobot",
         1.0 / float(info["fps"]),
-        f"LeRobot {version}",
+        f"LeRobot {network.version}",
         network.answer,
         source=source,
         env=ours.env if ours is not None else None,
@@ -100,35 +108,68 @@ def lerobot_policy(folder: Path, *, data: Path | None = None, units: Units | Non
     )
 
 
-class _Act(Layer):
-    """LeRobot's ACT, from normalised features to a chunk of normalised actions."""
+class _CenterCrop(Layer):
+    """As torchvision's, which cannot be traced."""
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, size: tuple[int, int]) -> None:
+        super().__init__()
+        self.size = size
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        """Crop images (..., height, width)."""
+        top, left = (round((int(whole) - part) / 2.0) for whole, part in zip(x.shape[-2:], self.size, strict=True))
+        return x[..., top : top + self.size[0], left : left + self.size[1]]
+
+
+class _Network(Layer):
+    """LeRobot's network, from normalised features to a chunk of normalised actions; Diffusion begins at fixed noise."""
+
+    def __init__(self, folder: Path, kind: str) -> None:
         super().__init__()
         try:
-            from importlib.metadata import version
-
-            from lerobot.policies.act.modeling_act import ACTPolicy  # type: ignore[import-not-found]
+            module = import_module(f"lerobot.policies.{kind}.modeling_{kind}")
         except ImportError as error:
             text = f"{folder}: LeRobot makes the network, and {error.name or 'lerobot'} is not installed"
             raise SettingsError(f'{text}. Run: pip install "lerobot"') from error
-        policy = ACTPolicy.from_pretrained(folder)
+        policy = getattr(module, KINDS[kind]).from_pretrained(folder)
         config, self.version = policy.config, version("lerobot")
-        self.model: nn.Module = policy.model.cpu()
-        self.images = list(config.image_features)
+        self.images, self.shape = list(config.image_features), tuple(config.action_feature.shape)
         features = {**config.image_features}
         features |= {_STATE: config.robot_state_feature} if config.robot_state_feature else {}
         features |= {"observation.environment_state": config.env_state_feature} if config.env_state_feature else {}
         self.features = {name: tuple(one.shape) for name, one in features.items()}
-        self.shape = tuple(config.action_feature.shape)
+        self.noise: torch.Tensor | None = None
+        if kind == "act":
+            self.model: nn.Module = policy.model.cpu()
+            self.chunk = Chunk(config.chunk_size, config.n_action_steps, 1, config.temporal_ensemble_coeff)
+        else:
+            self.model, past = policy.diffusion.cpu(), config.n_obs_steps
+            self.chunk = Chunk(config.horizon - past + 1, config.n_action_steps, past)
+            for part in self.model.modules():
+                if hasattr(part, "center_crop"):
+                    part.center_crop = _CenterCrop(part.center_crop.size)
+            self.noise = torch.randn(1, config.horizon, *self.shape, generator=torch.Generator().manual_seed(0))
         self.eval()
+
+    def example(self) -> tuple[torch.Tensor, ...]:
+        """One observation of zeros."""
+        past = [self.chunk.history] if self.chunk.history > 1 else []
+        return tuple(torch.zeros(1, *past, *shape) for shape in self.features.values())
 
     def forward(self, *features: torch.Tensor) -> torch.Tensor:
         """The chunk, (1, size, k)."""
         batch: dict[str, Any] = dict(zip(self.features, features, strict=True))
-        batch["observation.images"] = [batch[name] for name in self.images]
-        chunk: torch.Tensor = self.model(batch)[0]
-        return chunk
+        if self.noise is None:
+            batch["observation.images"] = [batch[name] for name in self.images]
+            chunk: torch.Tensor = self.model(batch)[0]
+            return chunk
+        if self.chunk.history == 1:
+            batch = {name: value[:, None] for name, value in batch.items()}
+        if self.images:
+            batch["observation.images"] = torch.stack([batch[name] for name in self.images], dim=-4)
+        seen = self.model._prepare_global_conditioning(batch)
+        chunk = self.model.conditional_sample(1, global_cond=seen, noise=self.noise)
+        return chunk[:, self.chunk.history - 1 :]
 
     def answer(self, inputs: Mapping[str, Array]) -> Array:
         """The chunk for arrays (1, ...) by feature."""
@@ -137,30 +178,29 @@ class _Act(Layer):
 
 
 def _norms(folder: Path, steps: list[dict[str, Any]]) -> Any:
-    """A function of a feature and its shape: how a processor normalises it; of an action, how that is undone."""
+    """A function of a feature and its shape: how a processor normalises it."""
     found = [step for step in steps if step["registry_name"].endswith("normalizer_processor")]
 
-    def norm(feature: str, shape: tuple[int, ...]) -> Affine:
-        result = Affine(np.ones(shape[0]), np.zeros(shape[0]))
+    def norm(feature: str, shape: tuple[int, ...]) -> Norm:
+        mean, std, ends = np.zeros(shape[0]), np.ones(shape[0]), (np.zeros(0), np.zeros(0))
         for step in found:
             config, arrays = step["config"], _statistics(folder, step["state_file"])
-            mode = config["norm_map"].get(config["features"].get(feature, {}).get("type"), "IDENTITY")
             stats = {key.rpartition(".")[2]: value for key, value in arrays.items() if key.startswith(f"{feature}.")}
+            numbers = {key: np.ravel(value).astype(np.float64) for key, value in stats.items()}
+            ends = numbers.get("min", ends[0]), numbers.get("max", ends[1])
+            mode = config["norm_map"].get(config["features"].get(feature, {}).get("type"), "IDENTITY")
             if mode == "IDENTITY" or not stats:
                 continue
             if mode != "MEAN_STD" and mode not in _ENDS:
                 raise CheckpointMismatch(folder, f"normalises {feature} by {mode}, which is not known here")
-            numbers = {key: np.ravel(value).astype(np.float64) for key, value in stats.items()}
-            back, eps = feature == _ACTION, float(config["eps"])
+            eps = float(config["eps"])
             if mode == "MEAN_STD":
-                mean, std = numbers["mean"], numbers["std"]
-                result = Affine(std, mean) if back else Affine(1 / (std + eps), -mean / (std + eps))
+                mean, std = numbers["mean"], numbers["std"] + (0.0 if feature == _ACTION else eps)
             else:
                 low, high = (numbers[key] for key in _ENDS[mode])
                 span = np.where(high == low, eps, high - low)
-                to_data = Affine(span / 2, span / 2 + low)
-                result = to_data if back else to_data.inverse
-        return result
+                mean, std = span / 2 + low, span / 2
+        return mean, std, *ends
 
     return norm
 
@@ -184,18 +224,13 @@ def _steps(folder: Path, name: str) -> list[dict[str, Any]]:
 
 def _data_set(folder: Path, given: Path | None) -> tuple[dict[str, Any], Path]:
     """LeRobot's description of the data set that the policy learnt from, and where it is."""
-    place = given
-    if place is None:
-        at = (_json(folder, "train_config.json").get("dataset") or {}).get("root") if _has(folder) else None
-        place = None if at is None else Path(at)
+    place, train = given, folder / "train_config.json"
+    if place is None and train.is_file() and (at := (_json(folder, train.name).get("dataset") or {}).get("root")):
+        place = Path(at)
     if place is None or not (place / "meta/info.json").is_file():
         where = f"{place} is no data set of LeRobot" if place is not None else "its data set is not known"
         raise CheckpointMismatch(folder, f"does not say which joint each number is, and {where}. Give it with --data")
     return _json(place, "meta/info.json"), place
-
-
-def _has(folder: Path) -> bool:
-    return (folder / "train_config.json").is_file()
 
 
 def _names(folder: Path, info: Mapping[str, Any], feature: str) -> tuple[str, ...]:

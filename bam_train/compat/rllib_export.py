@@ -8,7 +8,7 @@ import contextlib
 import json
 import re
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from importlib import metadata
 from importlib.util import find_spec
@@ -22,7 +22,8 @@ from bam_envs.core.errors import UnknownName
 from bam_envs.core.registry import are_same, entry_of, resolve_id
 from bam_envs.core.spaces import leaves, space_to_json
 from bam_envs.robo_gym.making import PLACES
-from bam_train.checkpoint import GOLDEN, POLICY, Checkpoint, safetensors_file, write_checkpoint
+from bam_train.checkpoint import safetensors_file
+from bam_train.compat.exported import Exported, exported
 from bam_train.compat.rllib_directory import Directory, find_policy
 from bam_train.compat.rllib_layouts import SavedPolicy, read_old_policy, restore, states, training_settings
 from bam_train.environments import (
@@ -36,67 +37,9 @@ from bam_train.environments import (
 )
 from bam_train.errors import CheckpointMismatch, PolicyError, SettingsError
 from bam_train.policy import FrozenPolicy
-from bam_train.policy.frozen_policy import TOLERANCE
-from bam_train.settings import TrainSettings
 from bam_train.trainers.algorithms import RLLIB_ALGORITHMS
-from bam_train.trainers.base import origin
 from bam_train.trainers.rllib.rllib_freezing import AnySpace, FrozenModule, PolicyParts, RLlibPolicy
 from bam_train.trainers.zero_based_spaces import space_from_zero
-
-EXPORTED = "exported"
-"""Setting of the manifest with the source of an exported checkpoint; runs have no setting of this name."""
-
-
-@dataclass(frozen=True)
-class Exported:
-    """A policy of a directory, frozen and checked."""
-
-    directory: Directory
-    parts: PolicyParts
-    """The parts, with the environment's spaces."""
-    env: str
-    """Versioned id."""
-    env_kwargs: dict[str, Any]
-    steps: int
-    signals: dict[str, Any]
-    period: float | None
-    members: dict[str, bytes]
-    """The graph, and the golden observations and actions."""
-    checked_by: str
-    """The software that computed the golden actions: RLlib with its version, or PyTorch."""
-    difference: float
-    """The largest difference from the golden actions."""
-    policy: FrozenPolicy
-    training: TrainSettings | str
-    """Settings of a run that continues from it, or the reason why none can."""
-
-    def write(self, path: Path) -> Checkpoint:
-        """Write the checkpoint.zip; raises OutputError if it cannot be written there."""
-        source = {
-            "directory": str(self.directory.given.expanduser().absolute()),
-            "policy": self.directory.name,
-            "ray": self.directory.ray_version,
-            "golden": self.checked_by,
-        }
-        settings: dict[str, Any] = {EXPORTED: source}
-        members, made_by = self.members, origin()
-        if isinstance(self.training, TrainSettings):
-            settings |= self.training.to_mapping()
-            members = {**members, **states(self.directory)}
-            made_by["versions"] = {**made_by["versions"], "ray": self.directory.ray_version}  # of these states
-        facts = {name: getattr(self, name) for name in ("env", "env_kwargs", "signals", "period", "steps")}
-        fields = {
-            **facts,
-            "observation_space": self.policy.observation_space,
-            "action_space": self.policy.action_space,
-            "algorithm": self.parts.algorithm,
-            "trainer": "rllib",
-            "settings": settings,
-            "seed": settings.get("seed", 0),
-            "scores": {},
-            **made_by,
-        }
-        return write_checkpoint(path, fields, members)
 
 
 def export(
@@ -143,16 +86,18 @@ def export(
         by = f"RLlib {metadata.version('ray')}"
     graph, arrays = FrozenModule(parts, own).members()
     frozen = FrozenPolicy.from_graph(graph, *map(space_to_json, (parts.observation_space, parts.action_space)))
-    worst, _ = frozen.worst_difference(safetensors_file.parse(arrays))
-    if not worst <= TOLERANCE:  # NaN too
-        text = f"its frozen policy differs by {worst:.3g} from the actions of {by}"
-        raise PolicyError(f"{given}: {text}, expected at most {TOLERANCE}: this network cannot be exported")
+    source = {"directory": str(given.expanduser().absolute()), "policy": directory.name, "ray": directory.ray_version}
+    facts = {"env": env_id, "env_kwargs": kwargs, "signals": signals, "period": period, "steps": saved.steps}
+    facts |= {"algorithm": parts.algorithm, "trainer": "rllib"}
+    made = exported(str(given), frozen, graph, safetensors_file.parse(arrays), source, by, **facts)
     try:
-        training: TrainSettings | str = training_settings(saved, parts, env_id, kwargs)
+        run = training_settings(saved, parts, env_id, kwargs)
     except SettingsError as error:
-        training = str(error)
-    made = directory, parts, env_id, kwargs, saved.steps, signals, period
-    return Exported(*made, {POLICY: graph, GOLDEN: arrays}, by, worst, frozen, training)
+        return replace(made, cannot_resume=str(error))
+    settings = {**made.fields["settings"], **run.to_mapping()}
+    versions = {**made.fields["versions"], "ray": directory.ray_version}  # of these states
+    fields = {**made.fields, "settings": settings, "seed": run.seed, "versions": versions}
+    return replace(made, fields=fields, members={**made.members, **states(directory)}, cannot_resume="")
 
 
 def _read(directory: Directory, trust: bool, warn: Callable[[str], None]) -> SavedPolicy:

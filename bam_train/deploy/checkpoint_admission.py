@@ -4,7 +4,7 @@ import shlex
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import gymnasium as gym
 
@@ -18,6 +18,9 @@ from bam_train.deploy.agreement import Shadow
 from bam_train.deploy.trials import Subject, TrialRecord, Trials
 from bam_train.errors import SettingsError, UntrustedCheckpoint
 from bam_train.policy import FrozenPolicy
+
+if TYPE_CHECKING:
+    from bam_train.policy.policy_link import PolicyLink
 
 UNSIGNED, UNPROVEN, TRIAL, SHADOW = "UNSIGNED", "UNPROVEN", "trial", "shadow: nothing is sent"
 """Marks of a deployment: no trusted signature; full speed without enough trials; on trial; somebody else drives."""
@@ -95,6 +98,8 @@ class Admission:
     """The record of trials; None: `TRIALS`."""
     i_know: bool = False
     """Whether full speed is allowed without enough trials."""
+    server: "PolicyLink | None" = None
+    """The server that runs the policy; None: it runs here."""
     marks: tuple[str, ...] = ()
     """Marks for `Journal.marks`, set by the call."""
     trials: Trials | None = None
@@ -133,7 +138,7 @@ class Admission:
             lines += self._stage(place.text, is_trial=stage == "trial", simulated=not is_real)
         elif self.record is not None:
             raise SettingsError("--trials: a simulated robot is on trial only with --stage trial; give that too")
-        self.policy = FrozenPolicy.from_checkpoint(self.checkpoint)
+        self.policy = FrozenPolicy.from_checkpoint(self.checkpoint, self.server)
         if stage == "shadow":
             self.policy.detector = None  # the robot answers somebody else's actions
         return lines

@@ -21,6 +21,7 @@ from bam_envs.core.robot import RobotState
 from bam_envs.core.robot_env import halt_and_close, robot_of
 from bam_envs.core.timing import Pacer, TickTimes
 from bam_envs.safety.guard import Tick
+from bam_train.checkpoint.detector import vectors
 from bam_train.deploy.episode import EpisodeLoop, EpisodeStep, Watcher
 from bam_train.deploy.flight import FlightLog
 from bam_train.deploy.journal import Ending, EpisodeRecord, Journal
@@ -294,7 +295,7 @@ class _Comparison:
         if step.number == 0 or detector is not self._of:
             detector.begin(self._pace)
             self._of = detector
-        seen, held = next(iter(step.arrays.values()))[0], getattr(self._robot, "is_held", False)
+        seen, held = vectors(step.arrays)[0], getattr(self._robot, "is_held", False)
         level = detector.step(seen, step.action, *self._answered(), held=held)
         text = f"{detector.reason} (score {level:.2f}, usual is at most 1)" if level > 1.0 else ""
         journal.compare(level, text, begins=step.number == 0)

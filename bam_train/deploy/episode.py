@@ -181,7 +181,8 @@ class EpisodeLoop:
 
     def _write_down(self, step: EpisodeStep, watcher: Watcher) -> None:
         """Into the journal, and before the operator's eyes."""
-        self._journal.warn(getattr(robot_of(self._env), "warnings", ()))
+        warnings = (*getattr(robot_of(self._env), "warnings", ()), *getattr(self.policy, "warnings", ()))
+        self._journal.warn(warnings)
         record = self._journal.step(step.reward, step.success, step.end)
         watcher.ticked(record, step.action, self._pacer)
         if step.is_last:

@@ -13,12 +13,15 @@ from bam_envs.core.errors import SafetyStop, StaleState
 from bam_envs.core.location import SIMULATED
 from bam_envs.core.registry import entry_of
 from bam_envs.live.rehearsed_robot import rehearsed_robot, time_to_stop
-from bam_envs.robots.linked import LinkedRobot
+from bam_envs.robots.linked import LinkedRobot, LinkProfile
 from bam_train.checkpoint import Checkpoint
 from bam_train.deploy.journal import EpisodeRecord
 from bam_train.environments import environment_of, make_env, require_fit
-from bam_train.errors import SettingsError
+from bam_train.errors import LateChunk, SettingsError
 from bam_train.evaluation import wilson_interval
+from bam_train.policy import FrozenPolicy
+from bam_train.policy.background import Background, ChunkRequest
+from bam_train.policy.chunks import Plan
 from bam_train.rollout import BatchPolicy, play, success_of
 
 HALTS_WITHIN = 1.0
@@ -129,11 +132,23 @@ class Rehearsal:
         inner.robot = self._gate
         self._envs = SyncVectorEnv([lambda: self.env], autoreset_mode=AutoresetMode.DISABLED)
 
+    def elsewhere(self, policy: FrozenPolicy, seed: int) -> BatchPolicy:
+        """The policy with its server behind the same link, in simulated time: a chunk comes some steps late."""
+        inner: Any = self.env.unwrapped
+        link, rng = self._linked.profile, np.random.default_rng(seed)
+        return _Elsewhere(
+            policy,
+            self._linked.spec.period,
+            fade=getattr(inner.task, "action_step", None),
+            is_held=lambda: self._gate.is_held,
+            request=lambda policy, plan: _LateRequest(policy, plan, link, self._linked.spec.period, rng),
+        )
+
     def run(self, policy: BatchPolicy, *, episodes: int, seed: int, tell: Callable[[str], None]) -> RehearsalReport:
         """Play `episodes`, at least 1; a stop by a guard ends its episode only.
 
         Args:
-            policy: A `FrozenPolicy`.
+            policy: A `FrozenPolicy`, or what `elsewhere` made of it.
             episodes: Number of episodes.
             seed: Seed of the first one.
             tell: Called with a line about each stop by a guard; the first line of each guard has the reason.
@@ -143,7 +158,7 @@ class Rehearsal:
             report.records.append(EpisodeRecord(seed + k))
             try:
                 self._play(policy, report)
-            except (SafetyStop, StaleState) as stop:
+            except (SafetyStop, StaleState, LateChunk) as stop:
                 why = str(stop).removesuffix(" When it is safe, call resume().")
                 short = why.partition(":")[0]
                 tell(f"episode with seed {seed + k}: {short if short in shown else why}")
@@ -168,3 +183,34 @@ class Rehearsal:
     def close(self) -> None:
         """Close the environment."""
         self._envs.close()
+
+
+class _Elsewhere(Background):
+    """A policy with chunks for the one environment of a rehearsal."""
+
+    def reset(self, env_ids: Any = None) -> None:
+        super().reset()
+
+    def act_batch(self, observations: Any) -> Any:
+        one = {key: value[0] for key, value in observations.items()} if isinstance(observations, Mapping) else None
+        return self.act(observations[0] if one is None else one)[None]
+
+
+class _LateRequest(ChunkRequest):
+    """A chunk that takes as long as its computation, and the way of the observation there and its own way back.
+
+    A lost message is sent again, and takes the longest time of the link.
+    """
+
+    def __init__(
+        self, policy: FrozenPolicy, plan: Plan, link: LinkProfile, period: float, rng: np.random.Generator
+    ) -> None:
+        super().__init__(policy, plan)
+        self.wait()
+        for delay, loss in ((link.state_delay, link.state_loss), (link.command_delay, link.command_loss)):
+            self.took += float(np.quantile(delay, 1.0 if rng.random() < loss else rng.random()))
+        self._late = math.ceil(self.took / period)
+
+    @property
+    def ended(self) -> bool:
+        return self._plan.tick - self._tick >= self._late

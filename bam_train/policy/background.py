@@ -14,10 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bam_envs.core.close_at_exit import close_at_exit
+from bam_envs.core.errors import LinkLost
 from bam_train.policy.chunks import Plan
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
+    from collections.abc import Callable
 
     from bam_train.policy.frozen_policy import FrozenPolicy
 
@@ -37,6 +38,7 @@ class Background:
         period: Time between two steps [s].
         fade: See `Plan`; None: a change-over fades in `bam_train.policy.chunks.FADE` steps.
         is_held: Whether a guard held the robot in the last step, so that its action was not executed.
+        request: Asks the policy for a chunk; a `ChunkRequest`.
     """
 
     def __init__(
@@ -46,12 +48,14 @@ class Background:
         *,
         fade: NDArray[Any] | None = None,
         is_held: Callable[[], bool] = lambda: False,
+        request: Callable[[FrozenPolicy, Plan], ChunkRequest] | None = None,
     ) -> None:
         self.policy, self._period, self._is_held = policy, period, is_held
-        self._fade = np.asarray(np.inf) if fade is None else fade
+        self._fade, self._request = np.asarray(np.inf) if fade is None else fade, request or ChunkRequest
         self._plan = policy.plan(self._fade)
-        self._asked: _Request | None = None
-        self._requests: list[_Request] = []
+        self._asked: ChunkRequest | None = None
+        self._requests: list[ChunkRequest] = []
+        self._lost: LinkLost | None = None
         self._took: deque[float] = deque(maxlen=8)
         close_at_exit(self)
 
@@ -61,9 +65,15 @@ class Background:
             raise AttributeError(name)
         return getattr(self.policy, name)
 
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """What the operator should know now: that the server of the policy is lost."""
+        reason = str(self._lost).partition(": ")[2].partition(". ")[0]
+        return (f"policy server: {reason}; the actions that wait are executed",) if self._lost else ()
+
     def reset(self) -> None:
         """Drop what waits, and a chunk that is on its way, as an episode starts or ends."""
-        self._plan, self._asked = self.policy.plan(self._fade), None
+        self._plan, self._asked, self._lost = self.policy.plan(self._fade), None, None
 
     def prepare(self, observation: Any) -> None:
         """Compute the first chunk, for the first observation of an episode."""
@@ -76,6 +86,7 @@ class Background:
 
         Raises:
             PolicyError: No chunk has an action for this step, or the last one cannot be used.
+            LinkLost: The same, as the server of the policy is lost.
         """
         plan = self._plan
         if plan.tick and self._is_held():
@@ -87,40 +98,51 @@ class Background:
             self._ask()
         if not (plan.tick or plan.has_action):
             self._receive(wait=True)
+        if self._lost is not None and not plan.has_action:
+            raise self._lost
         return plan.take()
 
     def close(self) -> None:
         """Drop what waits; returns when no thread of it runs, since onnxruntime must not run while Python ends."""
         self.reset()
         for request in self._requests:
-            request.thread.join()
+            request.wait()
 
     def _ask(self) -> None:
-        self._requests = [one for one in self._requests if one.thread.is_alive()]
-        self._asked = _Request(self.policy, self._plan.seen(), self._plan.step, self._plan.tick)
+        self._requests = [one for one in self._requests if not one.ended]
+        self._asked = self._request(self.policy, self._plan)
         self._requests.append(self._asked)
 
     def _receive(self, *, wait: bool = False) -> None:
-        """Take the chunk that was asked for, if it has come."""
+        """Take the chunk that was asked for, if it has come; one that a lost server owes is asked for again."""
         asked = self._asked
         if asked is None:
             return
         if wait:
-            asked.thread.join()
-        if asked.ended:
-            self._asked = None
-            self._took.append(asked.took)
+            asked.wait()
+        if not (wait or asked.ended):
+            return
+        self._asked = self._lost = None
+        try:
             asked.give(self._plan)
+        except LinkLost as error:
+            if wait or self._plan.chunk.when_lost == "halt":
+                raise
+            self._lost = error
+            return
+        self._took.append(asked.took)
 
 
-class _Request:
-    """The computation of one chunk in a thread."""
+class ChunkRequest:
+    """The computation of one chunk in a thread, for what a plan has seen."""
 
-    def __init__(self, policy: FrozenPolicy, seen: Mapping[str, NDArray[Any]], step: int, tick: int) -> None:
-        self._policy, self._seen, self._step, self._tick = policy, seen, step, tick
+    def __init__(self, policy: FrozenPolicy, plan: Plan) -> None:
+        self._policy, self._plan, self._seen = policy, plan, plan.seen()
+        self._step, self._tick = plan.step, plan.tick
         self._chunk: NDArray[Any] | None = None
         self._error: Exception | None = None
-        self.ended, self.took = False, 0.0
+        self.took = 0.0
+        """How long it took [s]."""
         self.thread = threading.Thread(target=self._run, name="bam-chunk", daemon=True)
         self.thread.start()
 
@@ -133,7 +155,15 @@ class _Request:
         except Exception as error:  # it is the loop that must end
             self._error = error
         self.took = time.perf_counter() - begun
-        self.ended = True
+
+    @property
+    def ended(self) -> bool:
+        """Whether the chunk has come, or will not come."""
+        return not self.thread.is_alive()
+
+    def wait(self) -> None:
+        """Wait for the end."""
+        self.thread.join()
 
     def give(self, plan: Plan) -> None:
         """Give the chunk to the plan; raises what the computation did."""

@@ -11,9 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bam_train.checkpoint.manifest import Chunk
-from bam_train.errors import PolicyError
+from bam_train.errors import LateChunk, PolicyError
 
 Array = NDArray[Any]
+ONE_BY_ONE = "it gives one action at a time, and has no chunks to plan"
 FADE = 8
 """Least number of steps in which one chunk takes over from another, 0.4 s at 20 Hz."""
 STEEPEST = 1.5
@@ -45,7 +46,7 @@ class Plan:
 
     def __init__(self, chunk: Chunk | None, shape: tuple[int, ...], fade: Array | None = None) -> None:
         if chunk is None:
-            raise PolicyError("the policy gives one action at a time, and has no chunks to plan")
+            raise PolicyError(f"the policy: {ONE_BY_ONE}")
         self.chunk, self._shape, self._fade = chunk, shape, fade
         self.step = 0
         """Steps executed so far."""
@@ -108,12 +109,12 @@ class Plan:
         """The action of this step.
 
         Raises:
-            PolicyError: No chunk has one.
+            LateChunk: No chunk has one.
         """
         found = [one for one in self._answers if self._covers(one)]
         if not found:
             last = f"the last one was for step {self._answers[-1].begun}" if self._answers else "none came"
-            raise PolicyError(
+            raise LateChunk(
                 f"no chunk has an action for step {self.step}: {last}, of {self.chunk.size} actions. The policy is too "
                 "slow for this computer"
             )

@@ -16,10 +16,11 @@ from bam_train.checkpoint import GOLDEN, POLICY, Checkpoint
 from bam_train.checkpoint.detector import Detector
 from bam_train.checkpoint.manifest import Chunk
 from bam_train.errors import FormatError, PolicyError
-from bam_train.policy.chunks import Plan
+from bam_train.policy.chunks import ONE_BY_ONE, Plan
 
 if TYPE_CHECKING:
     from bam_train.policy.onnx_session import OnnxSession
+    from bam_train.policy.policy_link import PolicyLink
 
 TOLERANCE = 1e-5
 """Largest difference from the trainer's action; relative to half the range of a Box that is wider than 2."""
@@ -105,6 +106,7 @@ class FrozenPolicy:
         action_space: JSON form, as in the manifest.
         recurrent: Whether the action depends on the observations since `reset`.
         detector: The detector of unusual observations in its checkpoint; None if there is none.
+        taken: The graph's inputs.
         chunk: How it gives several actions at once; None if it gives one. `act` computes a chunk when it is due, and
             takes the action of the step out of it; `bam_train.policy.background` computes it beside the steps.
     """
@@ -113,7 +115,7 @@ class FrozenPolicy:
 
     def __init__(
         self,
-        session: OnnxSession,
+        session: OnnxSession | PolicyLink,
         observation_space: Mapping[str, Any],
         action_space: Mapping[str, Any],
         chunk: Chunk | None = None,
@@ -125,15 +127,15 @@ class FrozenPolicy:
         states = {name: tensor for name, tensor in session.inputs.items() if name.startswith("state.")}
         self.chunk, self._plans = chunk, list[Plan]()
         past = () if chunk is None or chunk.history == 1 else (chunk.history,)
-        self._taken = [replace(part, shape=(*past, *part.shape)) for part in self._arrays]
-        _require_fit(session, self._taken, states)
+        self.taken = [replace(part, shape=(*past, *part.shape)) for part in self._arrays]
+        _require_fit(session, self.taken, states)
         self._zero_state = {name: np.zeros([n or 1 for n in spec.shape], spec.dtype) for name, spec in states.items()}
         self._state: dict[str, np.ndarray] | None = None
         self._outputs = ["action", *(f"next_{name}" for name in states)]
         self.recurrent = bool(states)
         n = 2 if chunk is None else 1  # a chunk may take half a second
-        shape = self._act({part.name: np.zeros((n, *part.shape), part.dtype) for part in self._taken}).shape
-        self._state, answer = None, self._answer_shape
+        shape = self._act({part.name: np.zeros((n, *part.shape), part.dtype) for part in self.taken}).shape
+        self._state, answer = None, self.answer_shape
         if shape != (n, *answer) or (chunk is not None and (states or self._action.kind != "Box")):
             raise PolicyError(f"action: expected shape {answer}, the graph gives {shape[1:]}")
         # An observation that is one array, as for most policies, is copied into an array that is allocated once.
@@ -153,13 +155,22 @@ class FrozenPolicy:
         return cls.from_checkpoint(Checkpoint.open(path))
 
     @classmethod
-    def from_checkpoint(cls, checkpoint: Checkpoint) -> FrozenPolicy:
-        """Load the policy of an open checkpoint."""
+    def from_checkpoint(
+        cls, checkpoint: Checkpoint, server: PolicyLink | None = None, *, threads: int = 1
+    ) -> FrozenPolicy:
+        """Load the policy of an open checkpoint, or have a `server` run it, which must act as the checkpoint's."""
         manifest = checkpoint.manifest
-        graph, spaces = checkpoint.read(POLICY), (manifest.observation_space, manifest.action_space)
-        policy = cls.from_graph(graph, *spaces, chunk=manifest.chunk)
-        policy.require_golden(checkpoint)
+        spaces, chunk = (manifest.observation_space, manifest.action_space), manifest.chunk
+        if server is None:
+            policy = cls.from_graph(checkpoint.read(POLICY), *spaces, chunk=chunk, threads=threads)
+        elif chunk is None:
+            raise PolicyError(f"{checkpoint.path}: {ONE_BY_ONE}. Leave --policy-server out")
+        else:
+            policy = cls(server, *spaces, chunk)
+        policy.require_golden(checkpoint, server)
         policy.detector = Detector.of(checkpoint)
+        if server is not None and chunk is not None and manifest.period is not None:
+            server.wait_at_most(chunk.size * manifest.period)
         return policy
 
     @classmethod
@@ -170,8 +181,9 @@ class FrozenPolicy:
         action_space: Mapping[str, Any],
         *,
         chunk: Chunk | None = None,
+        threads: int = 1,
     ) -> FrozenPolicy:
-        """Make a policy of an ONNX file; the spaces are in JSON form.
+        """Make a policy of an ONNX file, which runs on so many threads, 0 for all; the spaces are in JSON form.
 
         Inputs are ``observation`` or ``observation.<key>``, and ``state.<name>``; outputs ``action`` and
         ``next_state.<name>``; the first axis of each is the batch. With a `chunk`, the second axis of the action counts
@@ -187,7 +199,7 @@ class FrozenPolicy:
             require_policy(onnx)
         except FormatError as error:
             raise PolicyError(f"the policy cannot be read: {error}") from error
-        return cls(OnnxSession(onnx), observation_space, action_space, chunk)
+        return cls(OnnxSession(onnx, threads), observation_space, action_space, chunk)
 
     def reset(self, env_ids: Any = None) -> None:
         """Reset the recurrent state of `env_ids` (indices or a mask), or of all environments, as an episode starts."""
@@ -235,8 +247,8 @@ class FrozenPolicy:
 
     def answer(self, seen: Mapping[str, np.ndarray]) -> np.ndarray:
         """The graph's own answers to its inputs, (n, ...) each: actions (n, ...), or chunks (n, size, ...)."""
-        inputs = {part.name: part.checked(seen[part.name], (len(seen[part.name]),)) for part in self._taken}
-        first = self._taken[0].name
+        inputs = {part.name: part.checked(seen[part.name], (len(seen[part.name]),)) for part in self.taken}
+        first = self.taken[0].name
         if self._session.inputs[first].shape[0] != 1:
             return self._act(inputs)
         rows = range(len(inputs[first]))  # a graph that was traced for one observation
@@ -251,7 +263,8 @@ class FrozenPolicy:
         return {name: np.array(value) for name, value in self._checked(observation, ()).items()}
 
     @property
-    def _answer_shape(self) -> tuple[int, ...]:
+    def answer_shape(self) -> tuple[int, ...]:
+        """Shape of an action, or of a chunk."""
         return self._action.shape if self.chunk is None else (self.chunk.size, *self._action.shape)
 
     def _planned(self, inputs: dict[str, np.ndarray]) -> np.ndarray:
@@ -281,7 +294,7 @@ class FrozenPolicy:
 
     def _act(self, inputs: dict[str, np.ndarray]) -> np.ndarray:
         """Run the graph on checked inputs, (n, ...) each, and keep the state."""
-        inputs = {part.name: inputs[part.name].astype(part.dtype, copy=False) for part in self._taken}
+        inputs = {part.name: inputs[part.name].astype(part.dtype, copy=False) for part in self.taken}
         if not self.recurrent:
             return _int64(self._session.run(inputs, self._outputs)[0])
         n = len(inputs[self._arrays[0].name])
@@ -294,16 +307,18 @@ class FrozenPolicy:
         self._state = dict(zip(self._zero_state, state, strict=True))
         return _int64(action)
 
-    def require_golden(self, checkpoint: Checkpoint) -> None:
-        """Raise PolicyError unless the policy of a checkpoint acts as the trainer did."""
+    def require_golden(self, checkpoint: Checkpoint, server: PolicyLink | None = None) -> None:
+        """Raise PolicyError unless the policy of a checkpoint, here or on a server, acts as the trainer did."""
         try:
             worst, row = self.worst_difference(checkpoint.arrays(GOLDEN))
         except PolicyError as error:
             raise PolicyError(f"{checkpoint.path}: {GOLDEN} does not fit the policy: {error}") from error
         if not worst <= TOLERANCE:  # NaN too
+            who = "the frozen policy" if server is None else f"the policy of {server}"
+            remedy = "Save it again with this version of bam-train" if server is None else "Serve this checkpoint there"
             raise PolicyError(
-                f"{checkpoint.path}: the frozen policy differs from the trainer's by {worst:.3g} in row {row} of "
-                f"{GOLDEN}, expected at most {TOLERANCE}. Save it again with this version of bam-train"
+                f"{checkpoint.path}: {who} differs from the trainer's by {worst:.3g} in row {row} of "
+                f"{GOLDEN}, expected at most {TOLERANCE}. {remedy}"
             )
 
     def worst_difference(self, golden: Mapping[str, np.ndarray]) -> tuple[float, int]:
@@ -340,8 +355,8 @@ class FrozenPolicy:
         found = golden["action"].shape
         if found[0] > MOST_GOLDEN:
             raise PolicyError(f"expected at most {MOST_GOLDEN} rows, found {found[0]}")
-        if found[1:] != self._answer_shape:
-            raise PolicyError(f"action: expected shape {self._answer_shape}, found {found[1:]}")
+        if found[1:] != self.answer_shape:
+            raise PolicyError(f"action: expected shape {self.answer_shape}, found {found[1:]}")
         return len(golden["action"])
 
     def reply(self, golden: Mapping[str, np.ndarray], row: int) -> Any:
@@ -361,7 +376,7 @@ def _int64(array: np.ndarray) -> np.ndarray:
     return array.view(np.int64) if array.dtype.char == "q" else array
 
 
-def _require_fit(session: OnnxSession, arrays: list[ArraySpec], states: Mapping[str, Any]) -> None:
+def _require_fit(session: OnnxSession | PolicyLink, arrays: list[ArraySpec], states: Mapping[str, Any]) -> None:
     """Refuse a graph whose inputs are not the observation space's arrays, or that lacks an output."""
     names = session.inputs.keys() - states.keys()
     if names != {part.name for part in arrays}:

@@ -22,10 +22,11 @@ MOST_STRUCTURE = 2**20
 """Maximum bytes of a file besides weights, with 16 more for each field: protobuf takes many times as much memory."""
 
 OPERATIONS = frozenset(
-    """Abs Add ArgMax AveragePool BatchNormalization Cast Celu Clip Concat Constant ConstantOfShape Conv Cos CumSum Div
-    Elu Equal Erf Exp Flatten Gather Gemm GlobalAveragePool Greater HardSigmoid HardSwish Identity LayerNormalization
-    LeakyRelu Less Log LogSoftmax MatMul Max MaxPool Min Mish Mul Neg Or Pad Pow ReduceMean ReduceSum Relu Reshape Selu
-    Sigmoid Sin Slice Softmax Softplus Softsign Split Sqrt Squeeze Sub Tanh Transpose Unsqueeze Where""".split()  # noqa: SIM905 - a list of literals has one a line
+    """Abs Add ArgMax AveragePool BatchNormalization Cast Celu Clip Concat Constant ConstantOfShape Conv ConvTranspose
+    Cos CumSum Div Elu Equal Erf Exp Flatten Gather Gemm GlobalAveragePool Greater HardSigmoid HardSwish Identity
+    InstanceNormalization LayerNormalization LeakyRelu Less Log LogSoftmax MatMul Max MaxPool Min Mish Mul Neg Or Pad
+    Pow ReduceMean ReduceSum Relu Reshape Selu Sigmoid Sin Slice Softmax Softplus Softsign Split Sqrt Squeeze Sub Tanh
+    Transpose Unsqueeze Where""".split()  # noqa: SIM905 - a list of literals has one a line
 )
 """Operations of exported policies; none loops, branches or opens a file."""
 _SIZES = {"ConstantOfShape": 0, "Pad": 1, "Reshape": 1, "Slice": 1}

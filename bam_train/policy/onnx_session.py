@@ -1,4 +1,4 @@
-"""Run a policy's ONNX graph with onnxruntime, on one thread.
+"""Run a policy's ONNX graph with onnxruntime, on one thread, or on all of a policy server's.
 
 A graph may be untrusted, and onnxruntime cannot be interrupted by Ctrl-C. So its memory is bounded, and loading and the
 first run happen in a thread with a time limit. Later runs take as long as the first: the time of an operation does not
@@ -48,9 +48,9 @@ class OnnxSession:
         most_seconds: Longest time for the first run.
     """
 
-    def __init__(self, onnx: bytes) -> None:
+    def __init__(self, onnx: bytes, threads: int = 1) -> None:
         try:
-            self._session = _within(MOST_SECONDS, lambda: _load(onnx))
+            self._session = _within(MOST_SECONDS, lambda: _load(onnx, threads))
         except _FAULTS as error:
             raise PolicyError(f"onnxruntime {onnxruntime.__version__} cannot run the policy: {error}") from error
         self.inputs: dict[str, Tensor] = {}
@@ -78,9 +78,9 @@ class OnnxSession:
         return results
 
 
-def _load(onnx: bytes) -> onnxruntime.InferenceSession:
+def _load(onnx: bytes, threads: int) -> onnxruntime.InferenceSession:
     options = onnxruntime.SessionOptions()
-    options.intra_op_num_threads = options.inter_op_num_threads = 1
+    options.intra_op_num_threads, options.inter_op_num_threads = threads, 1
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")
     options.add_session_config_entry("session.use_env_allocators", "1")  # the bounded one, see the end of this file
     options.log_severity_level = 4  # its errors come as exceptions

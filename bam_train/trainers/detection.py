@@ -12,7 +12,7 @@ from bam_envs.core.robot_env import RobotVectorEnv
 from bam_envs.robots.live_like import LiveLike
 from bam_train.checkpoint import Checkpoint
 from bam_train.checkpoint.added_members import add_members
-from bam_train.checkpoint.detector import DETECTOR, LEAST_TICKS, MOST_NUMBERS, Detector, Rollout, make_detector
+from bam_train.checkpoint.detector import DETECTOR, LEAST_TICKS, MOST_NUMBERS, Detector, Rollout, make_detector, vectors
 from bam_train.data.recorded_episode import Episode
 from bam_train.environments import make_vector_env
 from bam_train.errors import SettingsError
@@ -84,7 +84,7 @@ def recorded(episode: Episode, period: float) -> Rollout:
     commands = None if sent is None else np.concatenate([np.full_like(sent[:1], np.nan, np.float64), sent[:-1]])
     if stamps is not None:
         periods = np.diff(stamps, prepend=math.nan) / period
-    return Rollout(episode.observations, episode.actions, episode.success, commands, periods)
+    return Rollout(vectors(episode.observations), episode.actions, episode.success, commands, periods)
 
 
 def unusual_episodes(detector: Detector, rollouts: Iterable[Rollout]) -> dict[str, float]:

@@ -52,9 +52,9 @@ def read(root, tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("ensemble", ["null", "0.1"])
-def test_an_exported_policy_acts_as_in_lerobot(tmp_path, ensemble):
-    assert lerobot_python(tmp_path, POLICY, tmp_path, ensemble) <= 1e-5
+@pytest.mark.parametrize(("kind", "ensemble"), [("act", "null"), ("act", "0.1"), ("diffusion", "null")])
+def test_an_exported_policy_acts_as_in_lerobot(tmp_path, kind, ensemble):
+    assert lerobot_python(tmp_path, POLICY, tmp_path, kind, ensemble) <= 1e-5
 
 
 @pytest.mark.slow

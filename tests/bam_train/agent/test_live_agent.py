@@ -318,6 +318,38 @@ def test_every_recorded_action_is_one_of_the_two_policies(start, tmp_path, forge
     assert before["identity"] == status["identity"] == "simulated bam-pick-v0"  # its trials count on
 
 
+def test_no_action_of_a_chunk_is_sent_after_a_push_a_take_over_or_a_stop(start, tmp_path, chunk_checkpoint):
+    """Each episode begins at the start pose, from which its chunks turn wrist_roll; a new plan begins where that is."""
+    checkpoint = chunk_checkpoint(size=60, steps=40)
+    program = start(tmp_path, "--policy", str(checkpoint))
+    program.state("running")
+    program.ticks(30)
+    candidate = chunk_checkpoint("other.zip", size=50, steps=40)
+    active = program.agent.push(candidate, stage="full", when="tick")["digest"]
+    program.ticks(30)
+    env = gym.make("bam/joints-v0", robot=program.url, robot_model="so101", disable_env_checker=True)
+    begun(env)
+    for _ in range(5):
+        env.step(env.unwrapped.robot.measure().command[0].astype(np.float32))
+    env.close()
+    program.state("paused")
+    program.agent.ask("resume")
+    program.ticks(30)
+    program.agent.ask("stop")
+    recorded = program.state("paused")["recording"]
+    assert program.end(signal.SIGTERM) == 128 + signal.SIGTERM
+    recording = Recording.open(recorded)
+    seen, acts = recording.arrays("observation")[""], recording.arrays("action")[""]
+    policies = [name == active[:12] for name in recording.policies()]
+    turned = 0.0
+    for episode in recording.episodes():
+        np.testing.assert_allclose(acts[episode[0]], seen[episode[0]], atol=1e-5)
+        assert len({policies[k] for k in episode}) == 1
+        turned = max(turned, np.degrees(acts[episode[-1]] - acts[episode[0]]).max())
+    assert turned > 2.0
+    assert [policies[0], policies[-1]] == [False, True]
+
+
 def test_a_lost_robot_is_waited_for_and_checked_again(start, tmp_path, serve_program):
     robot = serve_program()
     program = start(tmp_path, "--policy", str(PICK), "--robot", robot.url)

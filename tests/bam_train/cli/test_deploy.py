@@ -16,6 +16,8 @@ from bam_envs.core.errors import MissingExtra
 from bam_envs.remote.serve.serve_options import ServeOptions
 from bam_envs.remote.serve.served_environment import ServedEnvironment
 from bam_train.cli.deploy import main
+from bam_train.policy import FrozenPolicy
+from bam_train.policy.policy_server import ServedPolicy
 
 CHECKPOINTS = Path(__file__).parents[3] / "checkpoints"
 
@@ -90,6 +92,19 @@ def test_a_simulated_arm_grasps_without_a_stop(run):
         status, out, err = run(main, CHECKPOINTS / "pick-ppo.zip", *flags)
     report = json.loads(out)
     assert (status, report["successes"], report["guards"]["following"]["stopped"]) == (0, 1, 0), err
+
+
+def test_a_policy_on_another_computer(chunk_checkpoint, served, run):
+    checkpoint = chunk_checkpoint(size=20, steps=10)
+    with served(ServedPolicy(FrozenPolicy.load(checkpoint))) as urls:
+        server = ("--policy-server", urls[0])
+        status, out, err = run(main, checkpoint, *server, "--episodes", 1, "--fast", "--json")
+        assert (status, json.loads(out)["ticks"]) == (0, 600)
+        for flags in (("--policy-server", urls[0], "--policy-ca-file", "x"), ("--policy-token-file", "x")):
+            assert run(main, checkpoint, *flags, "--fast")[:2] == (1, "")
+    status, out, err = run(main, checkpoint, *server, "--fast")
+    text = f"bam-deploy: policy server {urls[0]}: refused: nothing listens there. Is the port open? Start one there: "
+    assert (status, out, err) == (1, "", f"{text}bam-serve --policy CHECKPOINT --port PORT\n")
 
 
 def test_a_simulated_arm_that_is_held_fast_is_stopped(run):

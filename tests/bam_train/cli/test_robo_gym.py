@@ -36,7 +36,8 @@ def folder(tmp_path, monkeypatch):
 def test_parity_is_tried_where_only_its_spaces_fit(env, own, below):
     said = []
     exported = export(THEIRS / env / below, warn=said.append)
-    assert (exported.env, exported.env_kwargs) == (env, {**own, "parity": True})
+    fields = exported.fields
+    assert (fields["env"], fields["env_kwargs"]) == (env, {**own, "parity": True})
     assert said == [SAID.format(env)]
     with np.load(THEIRS / f"{env}.npz") as arrays:
         found = exported.policy.act_batch(arrays["observation"])
@@ -60,7 +61,7 @@ def test_arguments_that_are_given_win(run):
         assert (status, err) == (0, "")
         assert Checkpoint.open("policy.zip").manifest.env_kwargs == {"parity": True}
     exported = export(THEIRS / ARM, env_kwargs={"ur_model": "ur10e"})
-    assert exported.env_kwargs == {"ur_model": "ur10e", "rs_state_to_info": False, "parity": True}
+    assert exported.fields["env_kwargs"] == {"ur_model": "ur10e", "rs_state_to_info": False, "parity": True}
     remedy = "give the environment it was trained on with --env"
     text = f'observation_space.high[0] is "inf" in the directory and 6.0 in {BASE}; {remedy}'
     status, _, err = run(main, THEIRS / BASE, "--set", "env_kwargs.parity=false")
@@ -99,7 +100,7 @@ def test_where_it_ran_is_no_argument():
     """An address and a window of that run are not of the policy."""
     directory = find_policy(THEIRS / BASE)
     assert read_old_policy(directory).env_kwargs == {"ip": "127.0.0.1", "gui": False}
-    assert export(THEIRS / BASE).env_kwargs == {"parity": True}
+    assert export(THEIRS / BASE).fields["env_kwargs"] == {"parity": True}
 
 
 def test_an_evaluation_says_what_it_changed(run):

@@ -11,6 +11,8 @@ import pytest
 from bam_envs.remote.serve.serve_options import ServeOptions
 from bam_train.cli.flags import ServeConfig
 from bam_train.cli.serve import main
+from bam_train.policy.onnx_session import Tensor
+from bam_train.policy.policy_link import PolicyLink
 
 
 @pytest.fixture
@@ -57,6 +59,17 @@ def test_it_says_who_is_in_command_and_one_line_for_each_way_in(start):
     transport.close()
     assert re.fullmatch(r"bam-serve: .* is in command\n", said)
     assert process.stderr.readline() == said.replace("is in command", "is no longer in command")
+
+
+def test_a_policy_is_served(start, chunk_checkpoint, corridor_checkpoint, run):
+    checkpoint = chunk_checkpoint(size=4, steps=2)
+    _, line = start("--policy", str(checkpoint), "--port", "0")
+    url = re.fullmatch(r"bam-serve: ServedPolicy on (ws://127\.0\.0\.1:\d+), fast: /gym_env/gym_api_request\n", line)[1]
+    assert PolicyLink(url).inputs == {"observation": Tensor((1, 6), "float32")}
+    text = "--policy serves a policy, and no environment: leave out --set, --robot-model, --num-envs"
+    assert run(main, "--policy", checkpoint, "--num-envs", 2) == (1, "", f"bam-serve: {text}\n")
+    text = "the policy: it gives one action at a time, and has no chunks to plan"
+    assert run(main, "--policy", corridor_checkpoint()) == (1, "", f"bam-serve: {text}\n")
 
 
 @pytest.mark.parametrize(
@@ -108,5 +121,5 @@ def test_the_flags_are_the_options_of_a_server():
     """They are written out beside them, so that ``--help`` need not import the environments."""
     flags = {field.name: field.default for field in fields(ServeConfig)}
     options = {field.name: field.default for field in fields(ServeOptions)}
-    own = {"env": "bam/pick", "robot_model": None, "num_envs": 1, "set": (), "yes": False}
+    own = {"env": "bam/pick", "policy": None, "robot_model": None, "num_envs": 1, "set": (), "yes": False}
     assert flags == own | options

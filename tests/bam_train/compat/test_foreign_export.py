@@ -10,6 +10,7 @@ from gymnasium.spaces import flatdim
 from onnx import helper
 
 from bam_train.checkpoint import Checkpoint
+from bam_train.checkpoint.detector import vectors
 from bam_train.checkpoint.manifest import Chunk
 from bam_train.cli.export import main
 from bam_train.environments import make_env
@@ -92,6 +93,30 @@ def test_an_image_has_its_channels_first(described, run, tmp_path):
     np.testing.assert_allclose(FrozenPolicy.load(out).act(black), SEEN, atol=1e-6)
 
 
+@pytest.mark.parametrize("pixels", [False, True])
+def test_the_ranges_in_the_data_make_the_detector(described, run, tmp_path, pixels):
+    """A number that leaves its range by more than a tenth of it is unusual from the second tick on."""
+    low, high = f"low = {[-10.0] * 5 + [0.0]}", f"high = {[30.0] * 5 + [100.0]}"
+    ranges = [(f"std = {STD}\n", f"std = {STD} \n{low}\n{high}\n")] * 2
+    cameras = ["--set", "camera=front", "--set", "image_size=64x48"] if pixels else []
+    out = tmp_path / "act.zip"
+    assert run(main, described(*ranges, pixels=pixels), "--robot-model", "so101", *cameras, "--out", out)[0] == 0
+    policy = FrozenPolicy.load(out)
+    seen = np.array([*np.radians([-10, 30, 10, 0, 20]), 0.0], np.float32)
+    front = {"front": np.zeros((1, 48, 64, 3), np.uint8)} if pixels else {}
+
+    def levels(number, degrees, acts=seen):
+        one = vectors({**front, "robot": seen[None]})[0].copy()
+        one[number] = np.radians(degrees)
+        policy.detector.begin()
+        return [policy.detector.step(one, acts) > 1 for _ in range(3)]
+
+    assert levels(2, 10) == levels(0, -13) == levels(1, 33) == [False, False, False]
+    assert levels(0, -16) == levels(1, 36) == [False, True, True]
+    assert levels(2, 10, np.radians([0, 0, 0, 36, 0, 0])) == [False, True, True]
+    assert policy.detector.reason == "the policy sees and does what it did not in training"
+
+
 @pytest.mark.parametrize(
     ("changes", "flags", "row"),
     [
@@ -136,17 +161,24 @@ def test_what_does_not_fit_is_a_row_and_refused(described, run, tmp_path, change
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (('units = "degrees"\n', ""), 'state: units: expected "degrees", "range" or "si"'),
+        (('units = "degrees"\n', ""), "state: give units: 'degrees', 'range' or 'si'"),
+        (('units = "degrees"', 'units = "deg"'), "state: units: expected 'degrees', 'range' or 'si', found 'deg'"),
+        (("mean = [1.0, ", 'mean = ["1", '), "state: mean[0]: expected a number, found '1'"),
+        (("std = [2.0, ", "std = [0.0, "), "state: std[0]: expected a number above 0, found 0.0"),
+        (("rate = 20.0", "rate = 0.0"), "the file: rate: expected a number above 0, found 0.0"),
+        (("[[inputs]]", "[inputs]"), "the file: inputs: expected a list of tables, [[inputs]], found "),
         (("std = [2.0, ", "std = ["), "state: std: expected 6 numbers, found 5"),
-        (('name = "state"', 'nmae = "state"'), "Object contains unknown field `nmae` - at `$.inputs[0]`"),
-        (("chunk = { size = 2", "chunk = { size = 0"), "Expected `int` >= 1 - at `$.chunk.size`"),
-        (("chunk = { size", "chunk = { sise"), "chunk: there is no 'sise'. Did you mean 'size'?"),
+        (('name = "state"', 'nmae = "state"'), "inputs[0]: unknown key 'nmae'. Did you mean 'name'?"),
+        (("chunk = { size = 2", "chunk = { size = 0"), "chunk: size: expected a whole number from 1 to 1000, found 0"),
+        (("chunk = { size", "chunk = { sise"), "chunk: unknown key 'sise'. Did you mean 'size'?"),
         (("chunk = { size = 2", "chunk = { size = 1"), "chunk: steps is 2, expected at most its size, 1"),
     ],
 )
 def test_a_description_that_says_too_little_is_one_line(described, run, change, message):
     path = described(change)
-    assert run(main, path) == (1, "", f"bam-export: {path}: does not describe a policy: {message}\n")
+    status, said, err = run(main, path)
+    assert (status, said, err.count("\n")) == (1, "", 1)
+    assert err.startswith(f"bam-export: {path}: does not describe a policy: {message}")
 
 
 def test_a_network_without_its_description(run, tmp_path):
@@ -180,8 +212,10 @@ def test_a_graph_with_other_inputs_is_refused(described, run):
     ("config", "message"),
     [
         ({"type": "smolvla"}, "smolvla takes seconds for a chunk on a robot's computer: run it on a policy server "
-         "with a GPU; bam-export takes act"),
-        ({"type": "tdmpc"}, "is a policy of the kind tdmpc; bam-export takes act"),
+         "with a GPU; bam-export takes act and diffusion"),
+        ({"type": "tdmpc"}, "is a policy of the kind tdmpc; bam-export takes act and diffusion"),
+        ({"type": "diffusion", "noise_scheduler_type": "DDPM"}, "noise_scheduler_type is DDPM, which draws noise in "
+         'every step. In config.json set it to "DDIM", and num_inference_steps to about 10'),
         (None, "has no config.json: no folder pretrained_model of LeRobot. Give .../checkpoints/last/pretrained_model"),
     ],
 )  # fmt: skip
@@ -200,7 +234,7 @@ def test_a_zip_of_stable_baselines3(run, tmp_path, capsys):
     status, said, err = run(main, path, "--env", "CartPole-v1", "--algo", "ppo", "--trust-pickle", "--out", out)
     warning = f"bam-export: warning: reading {path} runs whatever code is in it (--trust-pickle)\n"
     assert (status, err) == (0, warning)
-    assert said.splitlines()[0] == f"{out}: ppo on CartPole-v1, 0 steps, out of {path}"
+    assert said.splitlines()[0] == f"{out}: ppo on CartPole-v1, out of {path}"
     policy, seen = FrozenPolicy.load(out), np.array([0.1, -0.2, 0.05, 0.3], np.float32)
     assert policy.act(seen) == model.predict(seen, deterministic=True)[0]
     status, _, err = run(main, path, "--env", "CartPole-v1", "--algo", "ppo")

@@ -57,7 +57,7 @@ def test_actions_are_those_of_rllibs_own_restoring(rllib_directories, name, belo
         np.testing.assert_allclose(found, arrays["action"], rtol=0, atol=1e-5)
     assert said == [f"reading {rllib_directories / name / below} runs whatever code is in it (--trust-pickle)"]
     assert exported.checked_by.startswith("RLlib 2.")
-    assert (exported.steps, exported.directory.old_layout) == (100 if name == "ppo" else 0, False)
+    assert exported.fields["steps"] == (100 if name == "ppo" else 0)
 
 
 def test_nothing_is_run_unless_it_is_trusted(copied, tmp_path):
@@ -90,7 +90,7 @@ def test_several_policies(copied):
     with pytest.raises(CheckpointMismatch) as error:
         export(root, trust=True)
     assert str(error.value) == f"{root}: has 2 policies; choose one with --policy: default_policy, left"
-    assert export(root, policy="left", trust=True).parts.algorithm == "dqn"
+    assert export(root, policy="left", trust=True).fields["algorithm"] == "dqn"
     with pytest.raises(CheckpointMismatch) as error:
         export(root, policy="right", trust=True)
     assert str(error.value) == f"{root}: has no policy 'right'; it has default_policy, left"

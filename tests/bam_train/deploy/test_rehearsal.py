@@ -12,6 +12,8 @@ from bam_train.checkpoint import Checkpoint
 from bam_train.cli.deploy import main
 from bam_train.deploy.journal import EpisodeRecord
 from bam_train.deploy.rehearsal import Rehearsal, RehearsalReport
+from bam_train.policy import FrozenPolicy
+from bam_train.policy.policy_server import ServedPolicy
 
 CHECKPOINTS = Path(__file__).parents[3] / "checkpoints"
 DRIVE = CHECKPOINTS / "mir100-navigation-ppo.zip"
@@ -65,6 +67,22 @@ def test_a_stop_ends_its_episode_only(run, tmp_path):
     assert lines[0].startswith(f"{begin.format(0)}: the newest state is ")
     assert "resume" not in lines[0]
     assert lines[1:] == [begin.format(1)]
+
+
+def test_a_policy_server_is_behind_the_same_link(run, served, chunk_checkpoint, tmp_path):
+    """A chunk takes both ways: one that is shorter ends before the next one comes."""
+    link = tmp_path / "link.json"
+    link.write_text(LinkProfile([0.06, 0.06], [0.06, 0.06]).to_json())
+    for size, steps, end in ((600, 10, "truncated"), (3, 3, "stopped")):
+        checkpoint = chunk_checkpoint(size=size, steps=steps)
+        with served(ServedPolicy(FrozenPolicy.load(checkpoint))) as urls:
+            server = ("--policy-server", urls[1])
+            status, out, err = run(checkpoint, "--rehearse", link, *server, "--episodes", 1, "--json")
+        report = json.loads(out)
+        assert (status, report["stopped_by"]) == (0, {})
+        assert [(one["end"], one["length"]) for one in report["per_episode"]] == [(end, min(size, 600))]
+    late = "no chunk has an action for step 3: the last one was for step 0, of 3 actions. The policy is too slow for "
+    assert err == f"bam-deploy: episode with seed 1000000: {late}this computer\n"
 
 
 def test_it_adds_the_link_only():

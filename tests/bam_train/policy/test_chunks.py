@@ -100,7 +100,7 @@ def test_a_checkpoint_has_the_chunks_and_compares_them(tmp_path):
     write()
     with pytest.raises(PolicyError, match=r"differs from the trainer's by 0.333 in row 4"):
         FrozenPolicy.load(tmp_path / "one.zip")
-    with pytest.raises(CheckpointError, match=r"chunk.steps is 3, expected at most its size, 2"):
+    with pytest.raises(CheckpointError, match=r"chunk: steps is 3, expected at most its size, 2"):
         write(chunk={"size": 2, "steps": 3})
     with pytest.raises(CheckpointError, match=r"Expected `int` >= 1 - at `\$.chunk.size`"):
         write(chunk={"size": 0, "steps": 1})

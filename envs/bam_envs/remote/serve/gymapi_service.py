@@ -77,7 +77,7 @@ class GymApiService:
         self._clock = clock
         self._version = None if version is None else version_named(version)
         self._freshness = FreshnessCheck()
-        self._asked: Counter[str] = Counter()  # requests by the name of a caller whose version is not known
+        self._asked: Counter[str] = Counter()  # by the name of a caller of an unknown version
         self._leaving = ThreadPoolExecutor(1, "bam-gymapi-leaving")
         self._sessions = Sessions()
         # Every client can read published requests, so the tag in one proves nothing.
@@ -105,7 +105,7 @@ class GymApiService:
         version = known or JUNE_22
         try:
             request = read_request(message)
-            if caller.name and request.tag is None and known is None:
+            if caller.name and request.tag is None and known is None and request.type is not RequestType.NONE:
                 self._asked[caller.name] += 1
             if request.tag is not None and not published:  # `StringRpcService` has checked the tag of a published one
                 self._freshness.require(request.tag)

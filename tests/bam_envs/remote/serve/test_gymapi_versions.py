@@ -11,6 +11,7 @@ from gymnasium import spaces
 from websockets.sync.client import connect
 
 from bam_envs.core.errors import RemoteError
+from bam_envs.remote import RosbridgeTransport
 from bam_envs.remote.serve.env_server import EnvServer
 from bam_envs.remote.serve.gymapi_service import GymApiService
 from bam_envs.rosbridge.bus import UNKNOWN_CALLER
@@ -111,6 +112,9 @@ def test_a_client_that_leaves_because_it_cannot_read_the_answer_is_explained(ser
             client = Client(JUNE_22, call)
             client.ask(RESET)
             client.ask(CLOSE)
+        transport = RosbridgeTransport(server.url)
+        transport.connect()
+        transport.close()
     [line] = [record.getMessage() for record in caplog.records]
     assert re.fullmatch(
         r"127\.0\.0\.1:\d+ left after the first answer\. bam_gym's client of before 2025-06-22, which cannot read it, "

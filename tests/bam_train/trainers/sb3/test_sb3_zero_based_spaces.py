@@ -6,11 +6,11 @@ import pytest
 from gymnasium import spaces
 from stable_baselines3 import PPO
 
+from bam_train.compat.plain_sb3_zip import export_trusted
 from bam_train.errors import CheckpointMismatch
 from bam_train.evaluation import evaluate
 from bam_train.policy import FrozenPolicy
 from bam_train.settings import TrainSettings
-from bam_train.trainers.sb3.plain_sb3_zip import load_trusted
 from bam_train.trainers.sb3.sb3_trainer import SB3Trainer
 from bam_train.trainers.zero_based_spaces import from_zero
 
@@ -62,8 +62,8 @@ def test_what_is_trained_is_what_is_deployed(shifted, tmp_path, algo, hyperparam
 def test_a_plain_file_is_trusted_only_if_it_counted_from_zero(shifted, tmp_path):
     settings = {"n_steps": 8, "batch_size": 8, "device": "cpu"}
     PPO("MlpPolicy", from_zero(Shifted()), **settings).save(tmp_path / "zero.zip")
-    policy = load_trusted(tmp_path / "zero.zip", "ppo", shifted)[0]
+    policy = export_trusted(tmp_path / "zero.zip", "ppo", shifted).policy
     assert all(Shifted.action_space.contains(policy.act(np.int64(seen))) for seen in (3, 4, 5))
     PPO("MlpPolicy", Shifted(), **settings).save(tmp_path / "start.zip")
     with pytest.raises(CheckpointMismatch, match="spaces do not match: "):
-        load_trusted(tmp_path / "start.zip", "ppo", shifted)
+        export_trusted(tmp_path / "start.zip", "ppo", shifted)

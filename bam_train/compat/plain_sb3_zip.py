@@ -1,5 +1,6 @@
 """Zips written by stable-baselines3 itself: loading one runs any code pickled in it, so it needs the user's consent."""
 
+import contextlib
 import pickle
 import textwrap
 import zipfile
@@ -11,14 +12,14 @@ from typing import Any
 
 from bam_envs.core.errors import UnknownName
 from bam_envs.core.spaces import space_to_json
-from bam_train.checkpoint import GOLDEN, POLICY
+from bam_train.checkpoint import safetensors_file
 from bam_train.checkpoint.manifest import MANIFEST
 from bam_train.checkpoint.zip_members import open_zip
+from bam_train.compat.exported import Exported, exported
 from bam_train.environments import described, make_env
 from bam_train.errors import CheckpointError, CheckpointMismatch
 from bam_train.policy import FrozenPolicy
 from bam_train.trainers.algorithms import SB3_ALGORITHMS
-from bam_train.trainers.base import origin
 from bam_train.trainers.zero_based_spaces import from_zero
 
 # Exceptions of SB3's load for a file of another algorithm or another version, then those for a damaged one.
@@ -36,41 +37,20 @@ def is_plain_sb3(path: Path) -> bool:
     return "data" in names and MANIFEST not in names
 
 
-def load_trusted(
-    path: Path, algo: str, env_id: str, env_kwargs: Mapping[str, Any] | None = None
-) -> tuple[FrozenPolicy, int]:
-    """Load with stable-baselines3, which UNPICKLES the file; only for files whose maker is trusted.
-
-    Such a file lacks the statistics of a VecNormalize.
-
-    Returns:
-        The frozen policy, and its number of training steps.
-
-    Raises:
-        CheckpointMismatch: The file is of another algorithm, or for another environment.
-    """
-    env = make_env(env_id, env_kwargs)
-    model, members = _frozen(path, algo, env_id, env, None)
-    policy = FrozenPolicy.from_graph(
-        members[POLICY], space_to_json(env.observation_space), space_to_json(env.action_space)
-    )
-    env.close()  # type: ignore[no-untyped-call]
-    return policy, int(model.num_timesteps)
-
-
 def export_trusted(
-    path: Path, algo: str, env_id: str, env_kwargs: Mapping[str, Any], statistics: Path | None
-) -> tuple[dict[str, Any], dict[str, bytes]]:
-    """As `load_trusted`, for a checkpoint: fields of its manifest, and its members.
+    path: Path, algo: str, env_id: str, env_kwargs: Mapping[str, Any] | None = None, statistics: Path | None = None
+) -> Exported:
+    """Load with stable-baselines3, which UNPICKLES the file; only for files whose maker is trusted.
 
     Args:
         path: The zip.
         algo: Its algorithm.
         env_id: Its environment.
         env_kwargs: Arguments of the environment.
-        statistics: File of a VecNormalize, which is unpickled too.
+        statistics: File of a VecNormalize, which is unpickled too; without it, observations are not normalised.
 
     Raises:
+        CheckpointError: It is another file.
         CheckpointMismatch: A file is of another algorithm, or for another environment.
         UnknownName: There is no such algorithm.
     """
@@ -79,34 +59,17 @@ def export_trusted(
     if not is_plain_sb3(path):
         with open_zip(path):
             raise CheckpointError(path, "is not a zip of stable-baselines3, or already a checkpoint of bam-train")
-    env = make_env(env_id, env_kwargs)
-    model, members = _frozen(path, algo, env_id, env, statistics)
-    signals, period = described(env)
-    fields = {
-        "env": env_id,
-        "env_kwargs": dict(env_kwargs),
-        "observation_space": space_to_json(env.observation_space),
-        "action_space": space_to_json(env.action_space),
-        "signals": signals,
-        "period": period,
-        "algorithm": algo,
-        "trainer": "sb3",
-        "settings": {
-            "exported": {
-                "file": str(path.absolute()),
-                "golden": f"stable-baselines3 {metadata.version('stable-baselines3')}",
-            }
-        },
-        "steps": int(model.num_timesteps),
-        "seed": int(model.seed or 0),
-        "scores": {},
-        **origin(),
-    }
-    env.close()  # type: ignore[no-untyped-call]
-    return fields, members
+    with contextlib.closing(make_env(env_id, env_kwargs)) as env:
+        model, graph, golden = _frozen(path, algo, env_id, env, statistics)
+        policy = FrozenPolicy.from_graph(graph, *map(space_to_json, (env.observation_space, env.action_space)))
+        signals, period = described(env)
+    facts = {"env": env_id, "env_kwargs": dict(env_kwargs or {}), "signals": signals, "period": period}
+    facts |= {"algorithm": algo, "trainer": "sb3", "steps": int(model.num_timesteps), "seed": int(model.seed or 0)}
+    by, source = f"stable-baselines3 {metadata.version('stable-baselines3')}", {"file": str(path.absolute())}
+    return exported(str(path), policy, graph, safetensors_file.parse(golden), source, by, **facts)
 
 
-def _frozen(path: Path, algo: str, env_id: str, env: Any, statistics: Path | None) -> tuple[Any, dict[str, bytes]]:
+def _frozen(path: Path, algo: str, env_id: str, env: Any, statistics: Path | None) -> tuple[Any, bytes, bytes]:
     """The model of a trusted zip, its graph and golden actions."""
     from bam_train.trainers.sb3.sb3_freezing import FrozenModel
 
@@ -118,7 +81,7 @@ def _frozen(path: Path, algo: str, env_id: str, env: Any, statistics: Path | Non
 
             normaliser = VecNormalize.load(str(statistics), model.get_env())
         graph, golden = FrozenModel(model, normaliser, env.observation_space, env.action_space).members()
-        return model, {POLICY: graph, GOLDEN: golden}
+        return model, graph, golden
     except (*_MISFIT, *_DAMAGE, OSError) as error:
         why = textwrap.shorten(str(error) or type(error).__name__, 160, placeholder=" ...")
         why = why if why.endswith("...") else f"{why.rstrip('.')}."

@@ -8,9 +8,9 @@ import pytest
 from stable_baselines3 import PPO
 
 from bam_train.cli.eval import main
+from bam_train.compat.plain_sb3_zip import export_trusted, is_plain_sb3
 from bam_train.environments import make_env
 from bam_train.errors import CheckpointMismatch
-from bam_train.trainers.sb3.plain_sb3_zip import is_plain_sb3, load_trusted
 
 
 @pytest.fixture(scope="module")
@@ -73,15 +73,16 @@ def test_a_damaged_member_is_one_line(plain, tmp_path):
     with pytest.raises(
         CheckpointMismatch, match=r"PPO\.load cannot use it with CartPole-v1: .*Check --algo and --env$"
     ):
-        load_trusted(path, "ppo", "CartPole-v1")
+        export_trusted(path, "ppo", "CartPole-v1")
 
 
 def test_the_frozen_policy_acts_as_the_model(plain):
     model, path = plain
-    policy, steps = load_trusted(path, "ppo", "CartPole-v1")
+    found = export_trusted(path, "ppo", "CartPole-v1")
     observations = np.random.default_rng(0).normal(size=(200, 4)).astype(np.float32)
-    assert steps == load_trusted(path, "a2c", "CartPole-v1")[1] == 64  # the same policy in the same file
-    assert policy.act_batch(observations).tolist() == model.predict(observations, deterministic=True)[0].tolist()
+    other = export_trusted(path, "a2c", "CartPole-v1")  # the same policy in the same file
+    assert found.fields["steps"] == other.fields["steps"] == 64
+    assert found.policy.act_batch(observations).tolist() == model.predict(observations, deterministic=True)[0].tolist()
 
 
 @pytest.mark.parametrize(
@@ -152,7 +153,7 @@ def total(model, seed):
 @pytest.mark.parametrize(("algo", "env"), [("sac", "Pendulum-v1"), ("dqn", "CartPole-v1"), ("ppo", "Pendulum-v1")])
 def test_another_algorithm_or_environment(plain, algo, env):
     with pytest.raises(CheckpointMismatch) as caught:
-        load_trusted(plain[1], algo, env)
+        export_trusted(plain[1], algo, env)
     text = str(caught.value)
     assert text.startswith(f"{plain[1]}: {algo.upper()}.load cannot use it with {env}: ")
     assert text.endswith(". Check --algo and --env")
