@@ -30,7 +30,6 @@ from tyro.conf import arg
 
 from bam_train.checkpoint import Checkpoint
 from bam_train.cli.flags import Count, Seed
-from bam_train.errors import TrainingFailed
 from bam_train.evaluation import evaluate
 from bam_train.files.atomic_file import replacing
 from bam_train.policy import FrozenPolicy
@@ -45,6 +44,8 @@ ELSEWHERE = ("--resume", "--start", "--learner", "--print-config", "--transport"
 SAME = ("--seed", "--seeds", "--track", "--out", "--runs", "--copy-to", "--force")
 """Flags that do not change what is learnt."""
 LEAST = 0.9
+LEARNT_NOTHING = 3
+"""Exit status of bam-train for a policy that is nowhere near its goal."""
 THRESHOLDS = {"Pendulum-v1": -200.0}
 """Mean returns of environments to which Gymnasium gives no threshold; here the low end of rl-baselines3-zoo's."""
 HEADER = ("command", "seed", "steps of the checkpoint", "wall time", "CPU time", "success", "return", "learnt", "made")
@@ -72,7 +73,7 @@ class Result(NamedTuple):
     def learnt(self) -> str:
         """In a word; "?" where nothing says what learning is."""
         if self.status:
-            return "NO" if self.status == TrainingFailed.exit_status else "FAILED"
+            return "NO" if self.status == LEARNT_NOTHING else "FAILED"
         found, least = (self.reward, self.threshold) if self.success is None else (self.success, LEAST)
         return "?" if found is None or least is None else "yes" if found >= least else "NO"
 
