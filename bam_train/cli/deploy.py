@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from bam_envs.core.location import LiveRobot, Location
     from bam_train.checkpoint import Checkpoint
     from bam_train.cli.flags import DeployConfig
+    from bam_train.data.recorded_episode import DataSetInfo
     from bam_train.deploy.checkpoint_admission import Admission
     from bam_train.deploy.deployment import Deployment
     from bam_train.policy.policy_link import PolicyLink
@@ -196,23 +197,27 @@ def _add_to_data_set(
     """Add the recorded episodes to the data set of ``--record``; the recording stays, whatever happens."""
     if recorder is None or config.record is None:
         return
-    from bam_train.data.record_dataset import info_of
     from bam_train.data.recordings import add_recording, is_data_set
     from bam_train.errors import BamTrainError
     from bam_train.recording.recording import Recording
 
     if not is_data_set(str(config.record)):
         return
-
-    manifest = checkpoint.manifest
     try:
-        info = info_of(env, config.env or manifest.env, manifest.env_kwargs, manifest.period)
-        for note in add_recording(Recording.open(recorder.path), config.record, info):
+        for note in add_recording(Recording.open(recorder.path), config.record, _info(config, checkpoint, env)):
             say(f"bam-deploy: note: {note}")
     except BamTrainError as error:
         again = f"bam-data import {config.record} {recorder.path}"
         raise type(error)(f"{error}. The recording is whole: run {again}") from error
     say(f"bam-deploy: {recorder.path} is in {config.record} now")
+
+
+def _info(config: DeployConfig, checkpoint: Checkpoint, env: gym.Env[Any, Any]) -> DataSetInfo:
+    """What all recorded episodes have in common."""
+    from bam_train.data.record_dataset import info_of
+
+    manifest = checkpoint.manifest
+    return info_of(env, config.env or manifest.env, manifest.env_kwargs, manifest.period)
 
 
 def _policy_server(config: DeployConfig) -> PolicyLink | None:
@@ -276,10 +281,12 @@ def _recorder(
     """The recorder that the flags ask for, started; None for none."""
     if config.record is None and (config.no_record or config.robot is None):
         return None
-    from bam_train.data.recordings import is_data_set
+    from bam_train.data.recordings import is_data_set, require_addable
     from bam_train.deploy.checkpoint_admission import has_real_robot
     from bam_train.deploy.flight import deployment_facts, flight_recorder, recording_names, watch_cameras
 
+    if config.record is not None and is_data_set(str(config.record)):
+        require_addable(config.record, _info(config, checkpoint, env))
     if config.record is None or is_data_set(str(config.record)):
         path, *others = recording_names(checkpoint.manifest.env)
     else:

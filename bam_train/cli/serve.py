@@ -55,13 +55,17 @@ def _tell(line: str) -> None:
 def _served_policy(config: ServeConfig, path: Path) -> Any:
     """The policy of a checkpoint as an environment."""
     from bam_train.checkpoint import Checkpoint
-    from bam_train.errors import SettingsError
+    from bam_train.errors import PolicyError, SettingsError
     from bam_train.policy import FrozenPolicy
+    from bam_train.policy.chunks import ONE_BY_ONE
     from bam_train.policy.policy_server import ServedPolicy
 
     if config.set or config.robot_model is not None or config.num_envs > 1:
         raise SettingsError("--policy serves a policy, and no environment: leave out --set, --robot-model, --num-envs")
-    return ServedPolicy(FrozenPolicy.from_checkpoint(Checkpoint.open(path), threads=0))
+    policy = FrozenPolicy.from_checkpoint(Checkpoint.open(path), threads=0)
+    if policy.chunk is None:
+        raise PolicyError(f"{path}: {ONE_BY_ONE}. Run it beside the robot: bam-deploy {path}")
+    return ServedPolicy(policy)
 
 
 def _consented_env(config: ServeConfig) -> Any:

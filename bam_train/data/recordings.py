@@ -20,7 +20,7 @@ from bam_envs.core.wording import brief
 from bam_train.checkpoint.manifest import require_no_place
 from bam_train.data.arrow_columns import Arrow
 from bam_train.data.data_set import DataSet
-from bam_train.data.data_set_writer import DataSetWriter
+from bam_train.data.data_set_writer import DataSetWriter, require_same
 from bam_train.data.layout import INFO, Files
 from bam_train.data.record_dataset import info_of
 from bam_train.data.recorded_episode import Array, DataSetInfo, Episode, digest_of, nested
@@ -41,6 +41,13 @@ def is_data_set(text: str) -> bool:
     """Whether a place for a recording is a data set: an address, a folder, or a name without a suffix."""
     place = Place(text)
     return place.local is None or text.endswith("/") or place.is_dir() or not (place.suffix or place.exists())
+
+
+def require_addable(place: str | Path | Place, info: DataSetInfo) -> None:
+    """Refuse a data set that is there and damaged, or has episodes that differ in `info`; raises BadDataSet."""
+    files = Files(place)
+    if files.exists(INFO):
+        require_same(files.text, DataSet.open(files.text).info, info)
 
 
 def info_of_recording(recording: Recording, env: str | None = None) -> DataSetInfo:

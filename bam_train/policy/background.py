@@ -68,7 +68,7 @@ class Background:
     @property
     def warnings(self) -> tuple[str, ...]:
         """What the operator should know now: that the server of the policy is lost."""
-        reason = str(self._lost).partition(": ")[2].partition(". ")[0]
+        reason = str(self._lost).partition(": ")[2].partition(" (")[0].partition(". ")[0]
         return (f"policy server: {reason}; the actions that wait are executed",) if self._lost else ()
 
     def reset(self) -> None:

@@ -84,6 +84,10 @@ class PolicyLink:
     def _lost(self, error: LinkLost) -> LinkLost:
         """The error of the link, as one of the policy server."""
         reason = str(error).removeprefix(f"{self._url}: ").partition(" Start one")[0].rstrip(".")
+        for flag in ("--token-file", "--ca-file"):  # those of bam-deploy are the robot's
+            reason = reason.replace(flag, f"--policy{flag[1:]}")
+        reason += ")" * (reason.count("(") - reason.count(")"))
         if isinstance(error, NoServer):
-            return NoServer(str(self), f"{reason}{'' if reason.endswith('?') else '.'} {self._start}")
+            remedy = "" if "--policy-" in reason else f" {self._start}"
+            return NoServer(str(self), f"{reason}{'' if reason.endswith('?') else '.'}{remedy}")
         return LinkLost(f"{self}: {reason}")

@@ -16,6 +16,8 @@ from bam_envs.core.errors import MissingExtra
 from bam_envs.remote.serve.serve_options import ServeOptions
 from bam_envs.remote.serve.served_environment import ServedEnvironment
 from bam_train.cli.deploy import main
+from bam_train.data.data_set_writer import DataSetWriter
+from bam_train.data.record_dataset import info_of
 from bam_train.policy import FrozenPolicy
 from bam_train.policy.policy_server import ServedPolicy
 
@@ -132,6 +134,10 @@ def test_a_recording_that_cannot_be_made_is_one_line_and_nothing_moves(corridor_
 
     assert refusal(there) == f"{there}: a recording is there already. Choose another file\n"
     assert refusal(there, "--no-record") == "--record and --no-record exclude each other; give one of the two\n"
+    with DataSetWriter(path.parent / "digits", info_of(gym.make("bam/digits-v0"))):
+        pass
+    text = f'{path.parent / "digits"}: env is "bam/digits-v0" there, and "test/Corridor-v0" of the new episodes; '
+    assert refusal(path.parent / "digits") == f"{text}write 'test/Corridor-v0' into another place\n"
     monkeypatch.setitem(sys.modules, "pyarrow", None)
     assert refusal("data") == 'needs pyarrow, which is not installed. Run: pip install "bam-train[data]"\n'
     assert moved == []

@@ -68,8 +68,11 @@ def test_a_policy_is_served(start, chunk_checkpoint, corridor_checkpoint, run):
     assert PolicyLink(url).inputs == {"observation": Tensor((1, 6), "float32")}
     text = "--policy serves a policy, and no environment: leave out --set, --robot-model, --num-envs"
     assert run(main, "--policy", checkpoint, "--num-envs", 2) == (1, "", f"bam-serve: {text}\n")
-    text = "the policy: it gives one action at a time, and has no chunks to plan"
-    assert run(main, "--policy", corridor_checkpoint()) == (1, "", f"bam-serve: {text}\n")
+    path = corridor_checkpoint()
+    text = (
+        f"{path}: it gives one action at a time, and has no chunks to plan. Run it beside the robot: bam-deploy {path}"
+    )
+    assert run(main, "--policy", path) == (1, "", f"bam-serve: {text}\n")
 
 
 @pytest.mark.parametrize(

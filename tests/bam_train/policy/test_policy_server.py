@@ -95,7 +95,7 @@ def test_a_token_is_asked_for_and_given(served, tmp_path, which):
     with served(ServedPolicy(chunked(CHUNK)), token_file=str(right)) as urls:
         there = FrozenPolicy(PolicyLink(urls[which], Credentials.of(token_file=right)), BOX1, BOX1, CHUNK)
         assert acts(there, 1) == [101.0]
-        with pytest.raises(NoServer, match=rf"^policy server {urls[which]}: .*[tT]oken"):
+        with pytest.raises(NoServer, match=rf"^policy server {urls[which]}: .*[tT]oken.*\(--policy-token-file\)\.$"):
             PolicyLink(urls[which], Credentials.of(token_file=wrong))
 
 
