@@ -59,7 +59,7 @@ class StateFault(IntEnum):
     SILENT = 1
     """No state is published."""
     SHORT = 2
-    """The last joint is missing."""
+    """The arm's last joint is missing."""
     CLOCK = 3
     """The driver's clock has jumped by an hour."""
 
@@ -318,8 +318,8 @@ def _untagged(message: Message) -> Message:
 
 
 def _shortened(message: Message) -> Message:
-    """A sensor_msgs/JointState without its last joint; any other message unchanged."""
-    if "name" not in message:
+    """The arm's sensor_msgs/JointState without its last joint; any other message, also the gripper's, unchanged."""
+    if len(message.get("name", ())) < 2:
         return message
     return {key: value[:-1] if isinstance(value, list) else value for key, value in message.items()}
 
