@@ -115,8 +115,8 @@ def test_smoothness(bench):
     rows = bench("jerk", "--stack", "ros2_kortex")
     assert {row[0]: row[3] for row in rows} == {"ros2_kortex, gen3, on time": "met", "ros2_kortex, gen3, late": "met"}
     share, lag, success = re.fullmatch(r"\d+, ([\d.]+) of \d+ held; (\d+) ms; (\d+)%", rows[0][1]).groups()
-    assert float(share) < 0.2
-    assert 80 <= int(lag) <= 130
+    assert float(share) <= 0.05
+    assert 100 <= int(lag) <= 110
     assert success == "100"
 
 
