@@ -396,8 +396,7 @@ class SafeRobot(metaclass=Sealed):
         halts, came = self._halts, self._clock()
         try:
             getattr(self._live, "await_due", _nothing)()
-            tick = self._tick(goal, approach, came)
-            tick.proving = proving
+            tick = self._tick(goal, approach, came, proving)
             fault = self._fault(tick)
             if fault is None:
                 self._limit(tick)
@@ -409,9 +408,10 @@ class SafeRobot(metaclass=Sealed):
                 self.halt()
             raise
 
-    def _tick(self, goal: Numbers, approach: bool, came: float) -> Tick:
+    def _tick(self, goal: Numbers, approach: bool, came: float, proving: bool) -> Tick:
         pause = self._pause()
-        last = self._begin_at(pause)
+        # Before its commands are proved, an arm that was commanded to stay is not told to stay elsewhere after a pause.
+        last = self._begin_at(0.0 if proving else pause)
         rows, period = self._rows(), self._spec.period
         measured = [rows[row][column] for row, column in self._places]
         speeds = [rows[row][column] for row, column in self._speeds]
@@ -434,6 +434,7 @@ class SafeRobot(metaclass=Sealed):
             elapsed=elapsed,
             waiting=getattr(self._live, "waiting", float)(),
             approach=approach,
+            proving=proving,
             action_age=came - self._returned_at if pause else 0.0,
             kept_out=self._kept_out,
             ended=self._ended,

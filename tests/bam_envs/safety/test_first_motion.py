@@ -278,6 +278,29 @@ def test_a_wrong_arm_is_stopped_with_its_reason(options, expected):
     assert re.search(expected, why), why
 
 
+class PausedArm(WiredArm):
+    """After the command number `at`, this process pauses for a while, as on a busy computer."""
+
+    def __init__(self, *arguments, at, **options):
+        super().__init__(*arguments, **options)
+        self.at = at
+
+    def step(self, cleared):
+        state, self.at = super().step(cleared), self.at - 1
+        if self.at:
+            return state
+        for _ in range(6 * PARTS):
+            self._part(self.spec.period / PARTS)
+        return self.measure()
+
+
+@pytest.mark.parametrize("at", range(1, 24))
+def test_a_wrong_arm_is_stopped_with_its_reason_also_after_a_pause(at):
+    arm = PausedArm(Wiring(offset=[-0.6] * 6), at=at)
+    assert "was commanded to stay where it is measured, and moved" in driven(arm)[1]
+    assert arm.farthest <= MOST
+
+
 def test_radians_that_are_taken_for_degrees_are_found_before_anything_moves():
     arm = WiredArm(state=Wiring(scale=[np.pi / 180] * 6))
     assert driven(arm)[1] == (
