@@ -40,9 +40,9 @@ def patient(tmp_path):
     return write
 
 
-def diagnose(url, robot=None, profile=None):
+def diagnose(url, robot=None, profile=None, seconds=0.6):
     """The diagnosis, which is closed, and its steps by name."""
-    diagnosis = Diagnosis(LiveRobot(url, profile=profile), robot, seconds=0.6)
+    diagnosis = Diagnosis(LiveRobot(url, profile=profile), robot, seconds=seconds)
     try:
         return diagnosis, {step.name: step for step in diagnosis.steps()}
     finally:
@@ -382,7 +382,7 @@ def test_a_delay_of_the_network_is_in_both_directions(server, robot_on, patient)
 
     robot_on(server)
     with listening(lambda: asyncio.start_server(pass_on, "127.0.0.1", 0)) as url:
-        diagnosis, steps = diagnose(url, profile=patient())
+        diagnosis, steps = diagnose(url, profile=patient(), seconds=2.0)  # 40 pings, of which 10 are enough
         time.sleep(2 * delay)  # the last bytes are on their way
     assert steps["guards"].verdict != "failed"
     link = link_of(diagnosis)
