@@ -129,6 +129,16 @@ def test_no_package_imports_itself_round_a_circle(depth):
     TopologicalSorter({package: others - {package} for package, others in graph.items()}).prepare()
 
 
+@pytest.mark.parametrize(("program", "most"), [("deploy", 100), ("live.push", 60)])
+def test_what_a_program_imports(program, most):
+    """In functions too, but for types and what it loads by name, such as all that only a live robot needs."""
+    reached, found = set(), {f"bam_train.cli.{program}"}
+    while found:
+        reached |= found
+        found = {other for module in found for other in imports(module, types=False)} - reached
+    assert len(reached) <= most
+
+
 def test_folders_are_small():
     sizes = Counter(path.parent for path in SOURCES.values())
     assert [str(folder) for folder, number in sizes.items() if number > 15] == []

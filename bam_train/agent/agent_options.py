@@ -3,9 +3,8 @@
 from dataclasses import dataclass
 from pathlib import Path
 
-from bam_envs.core.location import LiveRobot
+from bam_envs.core.location import LiveRobot, is_loopback
 from bam_envs.rosbridge.dialing import AGENT_PORT
-from bam_envs.rosbridge.endpoint import is_loopback
 
 
 @dataclass(frozen=True)

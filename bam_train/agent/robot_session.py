@@ -21,8 +21,9 @@ from bam_train.deploy.checkpoint_admission import Admission, bring_up, has_real_
 from bam_train.deploy.contract import check_contract
 from bam_train.deploy.deployment import Deployment, StopSwitch
 from bam_train.deploy.episode import EpisodeStep
-from bam_train.deploy.flight import deployment_facts, flight_recorder, recording_names, watch_cameras
+from bam_train.deploy.flight import deployment_facts, flight_recorder, recording_names
 from bam_train.deploy.journal import Journal
+from bam_train.deploy.live_robot import watch_cameras
 from bam_train.environments import control_period, environment_of, interface_of, make_env
 from bam_train.errors import BamTrainError
 from bam_train.recording.recorder import Recorder
@@ -86,7 +87,7 @@ class RobotSession:
         def examine(env: Any, place: Any) -> str:
             contract = check_contract(checkpoint, env, place)
             contract.require(f"{checkpoint.path} and the robot at {place.text}")
-            return "" if contract.inspection is None else contract.inspection.identity
+            return contract.identity
 
         make = partial(make_env, self.env_id, self.env_kwargs)
         self._env, place, known = bring_up(make, at, examine, trial_if_real=stage != "full")

@@ -4,8 +4,8 @@ import math
 import os
 import sys
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
 from functools import partial
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -14,16 +14,17 @@ import gymnasium as gym
 from bam_envs.core.location import LiveRobot, Location, Remote
 from bam_envs.core.robot import RobotSpec
 from bam_envs.core.wording import listed
-from bam_envs.live.examination import Inspection
 from bam_envs.safety.guard import is_base
 from bam_train.agent.agent_states import State
 from bam_train.checkpoint import Checkpoint
 from bam_train.cli.console import say
 from bam_train.deploy.checkpoint_admission import bring_up, has_real_robot
-from bam_train.deploy.contract import Contract, check_contract
 from bam_train.environments import environment_of, make_env, require_fit
 from bam_train.errors import SettingsError
 from bam_train.signals import SignalMemory
+
+LIVE = "bam_train.deploy.live_robot"
+"""The module of what a live robot adds; it is imported only for one, with all of its link."""
 
 
 def connected_env(
@@ -70,13 +71,19 @@ def connected_env(
     mode = "human" if render is True else render or None
     make = partial(make_env, env_id, {**saved, **(env_kwargs or {})}, render_mode=mode)
 
-    def examine(env: Any, place: Location) -> Contract:
-        return Contract(()) if checkpoint is None else required_contract(checkpoint, env, place, motion)
+    live: Any = import_module(LIVE) if isinstance(place, LiveRobot) else None
+
+    def examine(env: Any, place: Location) -> Any:
+        if checkpoint is None:
+            return None
+        if live is not None:
+            return live.required_contract(checkpoint, env, place, motion, say)
+        return require_fit(checkpoint, env, place)
 
     env: gym.Env[Any, Any]
     env, place, contract = bring_up(make, place, examine, raise_again=signals.raise_again)
     try:
-        known = "" if contract.inspection is None else contract.inspection.identity
+        known = "" if contract is None else contract.identity
         is_shadow = isinstance(place, LiveRobot) and place.stage == "shadow"
         plan = [*plan_lines(env, env_id, place.text, episodes, wiggle=wiggle), *admit(env, place, known)]
         signals.raise_again()
@@ -84,55 +91,13 @@ def connected_env(
             actor = "a person" if checkpoint is None else checkpoint.path
             require_consent(env, f"{who}: {actor}", yes=yes, plan=plan)
         signals.raise_again()
-        if wiggle and contract.inspection is not None and not is_shadow:
-            require_motion(env, f"{actor} and the robot at {place.text}", contract.inspection)
+        if wiggle and contract is not None and not is_shadow:
+            live.require_motion(env, f"{actor} and the robot at {place.text}", contract.inspection, say)
             signals.raise_again()
     except BaseException:
         env.close()  # type: ignore[no-untyped-call]
         raise
     return env
-
-
-def required_contract(checkpoint: Checkpoint, env: Any, place: Location, motion: Path | None = None) -> Contract:
-    """The contract of a checkpoint with a live robot, shown in short if it is real or refused; moves nothing.
-
-    For any other environment, only spaces and signals are compared, and the contract is empty.
-
-    Raises:
-        ContractRefused: They do not fit; the table is shown.
-        CheckpointMismatch: An environment without a live robot does not fit.
-    """
-    if not isinstance(place, LiveRobot):
-        require_fit(checkpoint, env, place)
-        return Contract(())
-    contract = check_contract(checkpoint, env, place)
-    info = None if contract.inspection is None else contract.inspection.info
-    shown = contract.lines(whole=False) if contract.refused or info is None or not info.simulated else []
-    if motion is not None:
-        from bam_train.deploy.wiggle import recorded_motion
-
-        known = "" if contract.inspection is None else contract.inspection.identity
-        lines = recorded_motion(motion, env.unwrapped.robot.spec, place.text, known)
-        moved = Contract(tuple(lines))
-        contract = replace(contract, checks=(*contract.checks, *moved.checks))
-        shown += moved.lines()
-    for line in shown:
-        say(line)
-    contract.require(f"{checkpoint.path} and the robot at {place.text}")
-    return contract
-
-
-def require_motion(env: Any, who: str, inspection: Inspection) -> None:
-    """Move each axis a little; raises `ContractRefused` if an axis does not move as commanded."""
-    from bam_envs.live.arm_checks import measured_joints
-    from bam_train.deploy.wiggle import wiggle
-
-    robot = env.unwrapped.robot
-    joints = None if is_base(robot.spec) else measured_joints(inspection, robot.spec)
-    moved = Contract(tuple(wiggle(robot, None if joints is None else joints[-1])))
-    for line in moved.lines():
-        say(line)
-    moved.require(who, "the robot has moved a little, and was halted")
 
 
 _MOTION = ("joint speed", "tool speed", "gripper speed", "base speed", "turn speed", "trial box")

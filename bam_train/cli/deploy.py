@@ -8,8 +8,10 @@ from __future__ import annotations
 
 import json as json_module
 import math
-from contextlib import closing, nullcontext
+import pkgutil
+from contextlib import nullcontext
 from functools import partial
+from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -22,7 +24,7 @@ if TYPE_CHECKING:
 
     import gymnasium as gym
 
-    from bam_envs.core.location import LiveRobot, Location
+    from bam_envs.core.location import Location
     from bam_train.checkpoint import Checkpoint
     from bam_train.cli.flags import DeployConfig
     from bam_train.data.recorded_episode import DataSetInfo
@@ -32,12 +34,6 @@ if TYPE_CHECKING:
     from bam_train.recording.recorder import Recorder
 
 
-LIVE_ONLY = (
-    *("robot", "robot_name", "transport", "rate", "fast", "render", "wiggle", "motion", "stage", "i_know", "trials"),
-    *("shadow", "unusual", "record", "print_guards", "print_contract", "ca_file", "token_file", "timeout", "keys"),
-    *("allow_unsigned", "robot_model"),
-)
-"""Flags that a rehearsal has no use for."""
 FIRST_SEED = 1_000_000
 """Seed of the first episode by default, as in bam-eval."""
 ANY_ROBOT = "ws://127.0.0.1:9090"
@@ -47,9 +43,8 @@ ANY_ROBOT = "ws://127.0.0.1:9090"
 def deploy_checkpoint(config: DeployConfig, signals: SignalMemory) -> int:
     """Run the program with its parsed flags; a signal whose exception was lost ends it before the robot moves."""
     if config.rehearse is not None:
-        return _rehearse(config, config.rehearse)
+        return _dry_run("rehearse", config, config.rehearse)
     place = _checked_place(config)
-    from bam_envs.core.location import LiveRobot
     from bam_envs.core.timing import Pacer
     from bam_train.checkpoint import Checkpoint
     from bam_train.checkpoint.detector import DETECTOR
@@ -61,14 +56,14 @@ def deploy_checkpoint(config: DeployConfig, signals: SignalMemory) -> int:
 
     checkpoint = Checkpoint.open(config.checkpoint)
     if config.print_guards:
-        return print_guards(config, checkpoint, place)
-    if config.print_contract and isinstance(place, LiveRobot):
-        return _print_contract(config, checkpoint, place)
+        return _dry_run("print_guards", config, checkpoint, place)
+    if config.print_contract:
+        return _dry_run("print_contract", config, checkpoint, place)
     if config.unusual is not None and not checkpoint.has(DETECTOR):
         remedy = f"Add one: bam-eval {checkpoint.path} --add-detector"
         raise SettingsError(f"--unusual: {checkpoint.path} has no detector of unusual observations. {remedy}")
     trust = config.keys, config.allow_unsigned, config.trials, config.i_know
-    admission = Admission(checkpoint, *trust, _policy_server(config))
+    admission = Admission(checkpoint, *trust, policy_server(config))
     options: Any = {"episodes": config.episodes, "yes": config.yes, "render": config.render, "named": config.env}
     options |= {"wiggle": config.wiggle, "motion": config.motion, "arm": config.robot_model}
     env = connected_env(checkpoint, place, signals, who="bam-deploy", admit=admission, **options)
@@ -91,69 +86,9 @@ def deploy_checkpoint(config: DeployConfig, signals: SignalMemory) -> int:
     return _run(config, checkpoint, place, deployment, signals, admission, seed)
 
 
-def print_guards(config: DeployConfig, checkpoint: Checkpoint, place: Location) -> int:
-    """Print the guards between a live robot and the policy of `checkpoint`; nothing is connected."""
-    from bam_envs.core.registry import entry_of
-    from bam_train.deploy.guard_table import guard_lines, in_force
-    from bam_train.environments import environment_of, make_env
-    from bam_train.errors import SettingsError
-
-    env_id, env_kwargs = environment_of(checkpoint, config.env, arm=config.robot_model)
-    if entry_of(env_id) is None:
-        raise SettingsError(f"--print-guards: {env_id} has no robot, and so no guards")
-    env = make_env(env_id, env_kwargs, place=place)
-    robot: Any = env.unwrapped.robot  # type: ignore[attr-defined]
-    guards = robot.guards()
-    limits = in_force(guards, robot.limits, robot.spec)
-    table = {"guards": guards, "limits": limits}
-    tell(*([json_module.dumps(table)] if config.json else guard_lines(guards, limits)))
-    env.close()  # type: ignore[no-untyped-call]
-    return 0
-
-
-def _print_contract(config: DeployConfig, checkpoint: Checkpoint, place: LiveRobot) -> int:
-    """Print the whole contract of `checkpoint` with the live robot at `place`; nothing moves."""
-    from bam_train.deploy.contract import check_contract
-    from bam_train.environments import environment_of, make_env
-    from bam_train.errors import ContractRefused
-
-    made_for = environment_of(checkpoint, config.env, arm=config.robot_model)
-    with closing(make_env(*made_for, place=place)) as env:
-        contract = check_contract(checkpoint, env, place)
-    tell(*([json_module.dumps(contract.to_json())] if config.json else contract.lines()))
-    return ContractRefused.exit_status if contract.refused else 0
-
-
-def _rehearse(config: DeployConfig, link: str) -> int:
-    """Rehearse the deployment in simulation, and report it."""
-    from bam_envs.core.wording import as_flag
-    from bam_train.checkpoint import Checkpoint
-    from bam_train.deploy.guard_table import read_guards
-    from bam_train.deploy.rehearsal import Rehearsal
-    from bam_train.errors import SettingsError
-    from bam_train.policy import FrozenPolicy
-
-    for name in LIVE_ONLY:
-        if getattr(config, name):
-            trial = f". To practise a trial, start bam-serve, and give --robot {ANY_ROBOT} --stage trial"
-            raise SettingsError(
-                f"--rehearse simulates the robot, its link and its time; leave out {as_flag(name)}"
-                f"{trial if name == 'stage' else ''}"
-            )
-    checkpoint = Checkpoint.open(config.checkpoint)
-    server = _policy_server(config)
-    policy = FrozenPolicy.from_checkpoint(checkpoint, server)
-    limits: Any = {"profile": config.profile, "guards": read_guards(config.guard)}
-    with closing(Rehearsal(checkpoint, link, named=config.env, **limits)) as rehearsal:
-        seed = FIRST_SEED if config.seed is None else config.seed
-        report = rehearsal.run(
-            policy if server is None else rehearsal.elsewhere(policy, seed),
-            episodes=config.episodes,
-            seed=seed,
-            tell=lambda line: say(f"bam-deploy: {line}"),
-        )
-    tell(*([json_module.dumps(report.to_json(), allow_nan=False)] if config.json else report.lines()))
-    return 0
+def _dry_run(name: str, config: DeployConfig, *arguments: Any) -> int:
+    """Run a function of `bam_train.cli.live.dry_runs`, by name: a deployment needs nothing of it."""
+    return int(pkgutil.resolve_name(f"bam_train.cli.live.dry_runs:{name}")(config, *arguments))
 
 
 def _run(
@@ -220,14 +155,15 @@ def _info(config: DeployConfig, checkpoint: Checkpoint, env: gym.Env[Any, Any]) 
     return info_of(env, config.env or manifest.env, manifest.env_kwargs, manifest.period)
 
 
-def _policy_server(config: DeployConfig) -> PolicyLink | None:
+def policy_server(config: DeployConfig) -> PolicyLink | None:
     """The link to the policy server of the flags, connected."""
-    from bam_envs.core.location import Credentials
     from bam_train.errors import SettingsError
-    from bam_train.policy.policy_link import PolicyLink
 
     files = config.policy_ca_file, config.policy_token_file
     if config.policy_server is not None:
+        from bam_envs.core.location import Credentials
+        from bam_train.policy.policy_link import PolicyLink
+
         return PolicyLink(config.policy_server, Credentials.of(*files))
     if any(files):
         raise SettingsError("--policy-token-file and --policy-ca-file are for --policy-server; give its address too")
@@ -281,9 +217,11 @@ def _recorder(
     """The recorder that the flags ask for, started; None for none."""
     if config.record is None and (config.no_record or config.robot is None):
         return None
+    from bam_envs.core.location import LiveRobot
+    from bam_train.cli.consent import LIVE
     from bam_train.data.recordings import is_data_set, require_addable
     from bam_train.deploy.checkpoint_admission import has_real_robot
-    from bam_train.deploy.flight import deployment_facts, flight_recorder, recording_names, watch_cameras
+    from bam_train.deploy.flight import deployment_facts, flight_recorder, recording_names
 
     if config.record is not None and is_data_set(str(config.record)):
         require_addable(config.record, _info(config, checkpoint, env))
@@ -295,8 +233,9 @@ def _recorder(
     recorder.start()
     if has_real_robot(env):
         recorder.event("nobody was asked before the robot moves (--yes)" if config.yes else "the operator lets it move")
-    for warning in watch_cameras(recorder, place):
-        say(f"bam-deploy: warning: {warning}")
+    if isinstance(place, LiveRobot):
+        for warning in import_module(LIVE).watch_cameras(recorder, place):
+            say(f"bam-deploy: warning: {warning}")
     return recorder
 
 

@@ -8,10 +8,8 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import gymnasium as gym
 
-from bam_envs.core.location import LiveRobot, Location, config_folder
+from bam_envs.core.location import LiveRobot, Location, config_folder, is_one_robot
 from bam_envs.core.robot_env import robot_of
-from bam_envs.live.command_proof import is_one_robot
-from bam_envs.rosbridge.endpoint import Endpoint
 from bam_envs.safety.guard import TRIAL_SPEED
 from bam_train.checkpoint import Checkpoint
 from bam_train.deploy.agreement import Shadow
@@ -181,7 +179,7 @@ def trials_of(checkpoint: Checkpoint, record: Path | None, identity: str, addres
     Raises:
         SettingsError: Any robot may be at that address, as at the end of an SSH tunnel.
     """
-    if not simulated and not is_one_robot(Endpoint(address), identity):
+    if not simulated and not is_one_robot(address, identity):
         raise SettingsError(
             f"the robot at {address} does not tell which one it is, and every tunnel ends at such an address, so that "
             "its trials could count for another robot: name it with --robot-name NAME, always the same"

@@ -35,6 +35,11 @@ class Contract:
     """The messages of the robot that were compared."""
 
     @property
+    def identity(self) -> str:
+        """Serial number or name of the robot; empty if neither is known."""
+        return "" if self.inspection is None else self.inspection.identity
+
+    @property
     def refused(self) -> tuple[Check, ...]:
         """The lines that do not fit; a robot moves only if there are none."""
         return tuple(line for line in self.checks if line.verdict == "refused")

@@ -14,13 +14,8 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from bam_envs.core.errors import BamEnvsError
-from bam_envs.core.location import LiveRobot, Location
 from bam_envs.core.robot import RobotState
 from bam_envs.core.robot_env import RobotEnv, robot_of
-from bam_envs.live.camera import LiveCamera
-from bam_envs.robots.profile import load_profile
-from bam_envs.rosbridge.endpoint import Endpoint
 from bam_envs.safety.guard import Tick
 from bam_train.checkpoint import Checkpoint
 from bam_train.deploy.episode import OBSERVATION, EpisodeStep
@@ -79,24 +74,6 @@ def deployment_facts(checkpoint: Checkpoint, env: gym.Env[Any, Any]) -> dict[str
         "guards": getattr(robot, "report", dict)(),
         "versions": {"bam-train": version("bam-train"), "python": platform.python_version()},
     }
-
-
-def watch_cameras(recorder: Recorder, place: Location) -> list[str]:
-    """Connect and record the cameras of the live robot's profile; returns a warning for each camera left out."""
-    left_out: list[str] = []
-    if not isinstance(place, LiveRobot) or place.profile is None:
-        return left_out
-    for source in (one for one in load_profile(place.profile).cameras if not one.optional):
-        camera = LiveCamera(Endpoint.of(place), source)
-        try:
-            camera.connect()
-        except BamEnvsError as error:
-            left_out.append(f"camera {source.name} is not recorded: {error}")
-            continue
-        recorder.watch(camera)
-        if camera.file() is None:
-            left_out.append(f"camera {source.name} sends no PNG or JPEG, and is not recorded")
-    return left_out
 
 
 class FlightLog:

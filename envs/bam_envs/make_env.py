@@ -12,7 +12,7 @@ import gymnasium as gym
 
 from bam_envs.core.errors import InvalidValue, UnknownName
 from bam_envs.core.location import Credentials, LiveRobot, Location, Remote, location_of
-from bam_envs.core.registry import ENVIRONMENTS, MAKE_OPTIONS, EnvEntry, entry_of, own_options
+from bam_envs.core.registry import ENVIRONMENTS, MAKE_OPTIONS, EnvEntry, entry_of, own_options, resolve
 from bam_envs.core.validation import PositiveInt, check
 
 if TYPE_CHECKING:
@@ -85,13 +85,13 @@ def make_env(
     simulation = entry.make_robot(1, randomize, task_options)
     if not isinstance(place, LiveRobot):
         return RobotEnv(_behind(link, simulation), _late(action_delay, task), render_mode=render_mode)
-    from bam_envs.live.building import live_robot, shadow_robot
-
     if place.stage == "shadow":
-        return RobotEnv(shadow_robot(place, simulation.spec), task)
+        return RobotEnv(resolve("bam_envs.live:shadow_robot")(place, simulation.spec), task)
     tool = getattr(simulation, "tool_position", None)  # forward kinematics of an arm that is no UR5e
     straight = getattr(task, "moves_straight", False)
-    return RobotEnv(live_robot(place, simulation.spec, tool_position=tool, straight=straight), task)
+    return RobotEnv(
+        resolve("bam_envs.live:live_robot")(place, simulation.spec, tool_position=tool, straight=straight), task
+    )
 
 
 def _location(options: Mapping[str, Any], task_options: Mapping[str, Any]) -> Location:

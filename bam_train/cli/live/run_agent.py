@@ -124,7 +124,7 @@ def _admit(config: AgentConfig, signals: SignalMemory, env: Any, lines: Sequence
 
 def options_of(config: AgentConfig) -> AgentOptions:
     """The options of the agent by its flags; invalid flags are refused."""
-    from bam_envs.rosbridge.endpoint import is_loopback
+    from bam_envs.core.location import is_loopback
     from bam_train.agent.agent_options import AgentOptions
     from bam_train.errors import SettingsError
 

@@ -16,8 +16,8 @@ from pathlib import Path
 from typing import Any
 
 from bam_envs.core.errors import BamEnvsError
+from bam_envs.core.location import is_loopback
 from bam_envs.core.registry import resolve_id
-from bam_envs.rosbridge.endpoint import is_loopback
 from bam_train.agent.agent_states import State
 from bam_train.agent.remote.agent_client import AgentClient
 from bam_train.agent.transitions import decode

@@ -4,12 +4,14 @@
 knows which of them exclude each other; what a location cannot have is no field of it.
 """
 
+import ipaddress
 import os
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar, Literal, NoReturn
+from urllib.parse import urlsplit
 
 from bam_envs.core.errors import InvalidValue
 from bam_envs.core.validation import Positive, RobotName, check
@@ -25,6 +27,19 @@ them, never a file."""
 def config_folder() -> Path:
     """This user's configuration folder: ``bam-train`` below ``$XDG_CONFIG_HOME`` or ``~/.config``."""
     return Path(os.environ.get("XDG_CONFIG_HOME") or "~/.config").expanduser() / "bam-train"
+
+
+def is_loopback(host: str) -> bool:
+    """Whether a server at `host`, a name or an IP address, is one of this computer; of names, only ``localhost`` is."""
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return host == "localhost"
+
+
+def is_one_robot(url: str, identity: str) -> bool:
+    """Whether `identity`, or the address if it is empty, belongs to one robot: every tunnel ends on this computer."""
+    return bool(identity) or not is_loopback(urlsplit(url).hostname or "")
 
 
 @dataclass(frozen=True)

@@ -24,14 +24,14 @@ from typing import Any
 import numpy as np
 
 from bam_envs.core.errors import BamEnvsError, InvalidValue, LinkLost, NotReady, ProtocolError, RemoteError
-from bam_envs.core.location import config_folder
+from bam_envs.core.location import config_folder, is_one_robot
 from bam_envs.live import bringup
 from bam_envs.ros.codec import RobotInfo, decode_source, from_si
 from bam_envs.ros.messages import same_type
 from bam_envs.ros.profile_tables import RobotProfile, Sink
 from bam_envs.rosbridge.bus import Message
 from bam_envs.rosbridge.client import RosbridgeLink
-from bam_envs.rosbridge.endpoint import Endpoint, is_loopback
+from bam_envs.rosbridge.endpoint import Endpoint
 from bam_envs.rosbridge.ros_bus import RosBus
 from bam_envs.safety.first_motion import MOST
 
@@ -200,7 +200,7 @@ def needed_proof(
     if (info is not None and (info.simulated or info.agent)) or not _joint_labels(profile):
         return None
     identity = robot_identity(endpoint, profile, info) if identity is None else identity
-    is_one = is_one_robot(endpoint, identity)
+    is_one = is_one_robot(endpoint.url, identity)
     return CommandProof(profile, sinks, ask_controllers(link, profile, sinks, joints), identity or endpoint.url, is_one)
 
 
@@ -341,11 +341,6 @@ def robot_identity(endpoint: Endpoint, profile: RobotProfile, info: RobotInfo | 
             "address. Nothing has moved."
         )
     return told or endpoint.robot_name
-
-
-def is_one_robot(endpoint: Endpoint, identity: str) -> bool:
-    """Whether `identity`, or the address if it is empty, belongs to one robot: every tunnel ends on this computer."""
-    return bool(identity) or not is_loopback(endpoint.address.host)
 
 
 def _asked(link: RosbridgeLink, profile: RobotProfile) -> str:

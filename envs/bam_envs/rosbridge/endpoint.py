@@ -1,6 +1,5 @@
 """The address of a server and the credentials of a client, in one frozen value."""
 
-import ipaddress
 import re
 import ssl
 from dataclasses import dataclass, field
@@ -31,14 +30,6 @@ class Address(NamedTuple):
         """The URL without the namespace."""
         host = f"[{self.host}]" if ":" in self.host else self.host
         return f"{'wss' if self.secure else 'ws'}://{host}:{self.port}"
-
-
-def is_loopback(host: str) -> bool:
-    """Whether a server at `host`, a name or an IP address, is one of this computer; of names, only ``localhost`` is."""
-    try:
-        return ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        return host == "localhost"
 
 
 @dataclass(frozen=True)

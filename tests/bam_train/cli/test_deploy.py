@@ -276,19 +276,21 @@ def test_a_closed_pipe_is_quiet(cartpole_checkpoint):
 @pytest.mark.parametrize(
     ("program", "flags"), [("deploy", ["--fast", "--episodes", "1"]), ("eval", ["--episodes", "2"])]
 )
-def test_no_torch_and_no_simulator_of_ours(cartpole_checkpoint, program, flags):
+def test_no_torch_no_simulator_of_ours_and_nothing_of_live_robots(cartpole_checkpoint, program, flags):
     code = f"""
 import sys
 from bam_train.cli.{program} import main
 try:
     main()
 except SystemExit as done:
-    heavy = {{"torch", "stable_baselines3", "mujoco", "rich", "twisted", "onnx", "PIL"}}
-    print(done.code, sorted(heavy & set(sys.modules)))
+    heavy = {{"torch", "stable_baselines3", "mujoco", "rich", "twisted", "onnx", "PIL", "roslibpy"}}
+    heavy |= {{"bam_envs.live", "bam_envs.rosbridge", "bam_envs.ros", "bam_envs.remote.remote_env"}}
+    ours = [name for name in sys.modules if name.split(".")[0] in ("bam_envs", "bam_train")]
+    print(done.code, sorted(heavy & set(sys.modules)), len(ours) <= 100)
 """
     command = [sys.executable, "-c", code, str(cartpole_checkpoint), *flags]
     done = subprocess.run(command, capture_output=True, text=True, check=True)
-    assert done.stdout.splitlines()[-1] == "0 []"
+    assert done.stdout.splitlines()[-1] == "0 [] True"
 
 
 def test_live_display_on_a_terminal(corridor_checkpoint, run, monkeypatch):

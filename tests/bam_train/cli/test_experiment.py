@@ -107,7 +107,9 @@ def test_a_real_robot_does_not_move_unasked(monkeypatch, capsys):
     """Nobody is there to ask: it is connected, and closed again."""
     made = make_env("bam/pick-v0")
     monkeypatch.setattr("bam_train.cli.consent.make_env", lambda *arguments, **options: made)
-    monkeypatch.setattr("bam_train.cli.consent.required_contract", lambda *arguments: Contract(()))  # it would listen
+    monkeypatch.setattr(
+        "bam_train.deploy.live_robot.required_contract", lambda *arguments: Contract(())
+    )  # it would listen
     robot, closed = made.unwrapped.robot, []
     robot.info, robot.not_ready = SimpleNamespace(simulated=False, text="a real robot"), lambda: None
     robot.enabling = ()

@@ -4,12 +4,11 @@ import re
 from dataclasses import dataclass
 
 from bam_envs.core.errors import InvalidValue
-from bam_envs.core.location import Credentials
+from bam_envs.core.location import Credentials, is_loopback
 from bam_envs.core.validation import Port, Positive, RobotName, check_fields
 from bam_envs.core.wording import as_flag
 from bam_envs.remote.serve.command_lease import LEASE_SECONDS
 from bam_envs.remote.wire.gymapi_versions import version_named
-from bam_envs.rosbridge.endpoint import is_loopback
 
 _NAMESPACE = re.compile(r"(/[A-Za-z]\w*)*")
 _EXCLUDE = (("realtime", "fast"), ("via", "rclpy"), ("via", "cert"), ("rclpy", "cert"), ("no_token", "token_file"))

@@ -15,9 +15,9 @@ from websockets.datastructures import Headers
 from websockets.http11 import Request, Response
 
 from bam_envs.core.errors import InvalidValue
+from bam_envs.core.location import is_loopback
 from bam_envs.core.wording import brief
 from bam_envs.rosbridge.bus import Caller
-from bam_envs.rosbridge.endpoint import is_loopback
 from bam_envs.rosbridge.server.server_connection import BridgeConnection
 
 _TYPES = {
