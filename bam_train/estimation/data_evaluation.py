@@ -183,7 +183,8 @@ def require_contrast(data: DataSet, steps: Steps) -> None:
     """Refuse episodes that all ended alike: nothing in them tells how a policy would do worse, or better."""
     if np.ptp(steps.returns) == 0:
         text = "every episode has the same success or return, so nothing tells a good policy from a bad one"
-        raise BadDataSet(f"{data.place}: {text}. Add others, such as bam-data collect --random 0.6")
+        remedy = f"Add others: bam-data collect {data.place} --policy CHECKPOINT --random 0.6"
+        raise BadDataSet(f"{data.place}: {text}. {remedy}")
 
 
 def _divisions(data: DataSet, facts: list[dict[str, Any]], by: Sequence[str]) -> dict[str, list[str]]:

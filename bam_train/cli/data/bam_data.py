@@ -37,7 +37,6 @@ WHAT = "Record, check and convert data sets: episodes for learning."
 def collect(config: flags.CollectConfig) -> None:
     """Collect episodes in simulation."""
     from bam_train.data import collect as collecting
-    from bam_train.settings import read_env_kwargs
     from bam_train.signals import Terminated
 
     last, kept = time.monotonic(), 0
@@ -53,13 +52,9 @@ def collect(config: flags.CollectConfig) -> None:
         found = collecting.collect(
             config.place,
             config.policy,
-            config.env,
-            read_env_kwargs(config.set),
-            episodes=config.episodes,
-            seed=config.seed,
+            **config.played(),
             noise=config.noise,
             random=config.random,
-            num_envs=config.num_envs,
             facts={} if config.task is None else {"task": config.task},
             on_progress=on_progress,
         )
