@@ -176,7 +176,7 @@ def require_enough(data: DataSet, episodes: int) -> None:
     """Refuse to estimate anything from a handful of episodes."""
     if episodes < FEWEST_EPISODES:
         text = f"{episodes} episodes to evaluate on, expected at least {FEWEST_EPISODES}"
-        raise BadDataSet(f"{data.place}: has {text}. Record more: bam-data collect")
+        raise BadDataSet(f"{data.place}: has {text}. Record more: bam-data collect {data.place} --policy CHECKPOINT")
 
 
 def require_contrast(data: DataSet, steps: Steps) -> None:

@@ -208,8 +208,9 @@ def split_data(config: flags.SplitConfig) -> None:
     if config.out == config.rest:
         raise SettingsError(f"--rest: expected another place than --out, found {config.rest}")
     data = _open(config.place)
-    for place, part in zip((config.out, config.rest), split(data, config.share, config.by), strict=True):
-        _tell_added(place, *copy_episodes(data, part, place))
+    parts = dict(zip((config.out, config.rest), split(data, config.share, config.by), strict=True))
+    for place, added in zip(parts, copy_episodes(data, parts), strict=True):
+        _tell_added(place, *added)
 
 
 def filter_data(config: flags.FilterConfig) -> None:
@@ -218,7 +219,7 @@ def filter_data(config: flags.FilterConfig) -> None:
 
     data = _open(config.place)
     chosen = choose(data, config.where)
-    _tell_added(config.out, *copy_episodes(data, chosen, config.out))
+    _tell_added(config.out, *copy_episodes(data, {config.out: chosen})[0])
 
 
 def show_stats(config: flags.StatsConfig) -> None:
