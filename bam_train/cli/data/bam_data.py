@@ -173,12 +173,12 @@ def show_info(config: flags.InfoConfig) -> None:
         whole = {"place": config.place, "digest": data.digest, **info.to_json(), **(found[0] if found else {})}
         tell(json.dumps({**whole, "columns": data.features, "policies": policies, "tasks": data.tasks, "dates": dates}))
         return
+    spaces = {"observation": info.observation_space, "action": info.action_space}
     lines = [
         ("of", f"{info.env}{f' {json.dumps(info.env_kwargs)}' if info.env_kwargs else ''}"),
         ("robot", info.robot or "none"),
         ("rate", f"{1 / info.period:g} Hz"),
-        ("observation", str(info.observation_space)),
-        ("action", str(info.action_space)),
+        *((name, " ".join(str(space).split())) for name, space in spaces.items()),
         ("columns", ", ".join(data.features)),
         ("tasks", "; ".join(data.tasks)),
         ("policies", ", ".join(f"{name[:12]} ({times})" for name, times in policies.items()) or "not known"),
