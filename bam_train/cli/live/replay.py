@@ -128,14 +128,14 @@ def _seconds(recording: Recording) -> float:
 
 def _episodes(recording: Recording) -> list[dict[str, Any]]:
     """Length, return, end and success of each episode; ``"stopped"`` without an end."""
-    rows, seed = [], recording.seed
+    rows = []
     for number, ticks in enumerate(recording.episodes()):
         table, last = recording.tables["/episode"], ticks[-1]
         ends = [end for end in ("terminated", "truncated") if table.column(end)[last]]
         success = table.column("success")[last]
         rows.append(
             {
-                "seed": seed + number,
+                "seed": recording.seed(number),
                 "length": len(ticks) - 1,
                 "return": float(table.column("reward")[ticks.start : ticks.stop].sum()),
                 "success": None if success != success else bool(success),
@@ -162,9 +162,8 @@ def lines_of(recording: Recording) -> list[str]:
         how = {True: "success", False: "no success", None: row["end"]}[row["success"]]
         if row["end"] == "stopped" and not row["success"]:
             how = "stopped" if recording.complete or number < len(episodes) else "cut off"
-        lines.append(
-            f"episode {number} (seed {row['seed']}): {how} after {row['length']} steps, return {row['return']:.2f}"
-        )
+        seed = "" if row["seed"] is None else f" (seed {row['seed']})"
+        lines.append(f"episode {number}{seed}: {how} after {row['length']} steps, return {row['return']:.2f}")
     acted = [f"{guard} in {count} tick{'s' if count > 1 else ''}" for guard, count in facts["guards"].items()]
     lines.append(f"guard that acted last: {', '.join(acted)}" if acted else "no guard acted")
     for stage, row in facts["latency_ms"].items():

@@ -136,7 +136,7 @@ def test_mcap(kind, tmp_path):
     assert found.complete
     lines = lines_of(found)
     assert lines[0] == f"{tmp_path}/out.mcap: no checkpoint on bam/pick-v0 ur5e"
-    assert [line.partition(" (")[0] for line in lines[2 : 2 + len(data)]] == [
+    assert [line.partition(":")[0] for line in lines[2 : 2 + len(data)]] == [
         f"episode {k + 1}" for k in range(len(data))
     ]
     assert found.metadata["env"] == "bam/pick-v0"
