@@ -1,7 +1,8 @@
-"""Train with RLlib, save, use the policy: what training_inference_mir.py and training_inference_ur.py share."""
+"""Train, save, use the policy: what training_inference_mir.py, training_inference_ur.py and td3_mir.py share."""
 
 import contextlib
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any
@@ -20,6 +21,8 @@ from bam_train.trainers import load_trainer
 from bam_train.trainers.base import Progress
 from bam_train.trainers.best_checkpoint import choose_output
 from bam_train.trainers.resolve_settings import resolve
+
+Reports = Callable[[Progress, bool], tuple[str | None, bool]]
 
 
 @dataclass(frozen=True)
@@ -58,50 +61,58 @@ class Flags(TrainingFlags):
     """Of weights, samples and episodes."""
 
 
-def train(args: Flags, experiment: Experiment) -> tuple[Checkpoint, Any]:
+def learn(args: TrainingFlags, settings: Any, when: str, report: Reports, explores: bool = False) -> tuple[Any, Any]:
+    """Train until all steps are done, `report` says that it is enough, or a signal comes; the checkpoint and a policy.
+
+    `report` takes the progress and whether a signal came; its text is None where nothing is to be saved and told.
+    """
+    require_place(settings.env, args.robot, args.render)
+    output = choose_output(settings, args.out, False, None)
+
+    def goes_on(progress: Progress) -> bool:
+        text, enough = report(progress, asked())
+        if text is not None:
+            trainer.save(output.path, {}, {})
+            print(f"{text}, mean total reward {number(progress.statistics().return_mean)}", flush=True)
+        return not (enough or asked())
+
+    trainer: Any = load_trainer(settings.trainer).create(settings)
+    with contextlib.closing(trainer):
+        print(f"saving to {output.path} {when}", flush=True)
+        with signals_ask() as asked:
+            trainer.train(settings.steps, goes_on)
+        return Checkpoint.open(output.path), trainer.exploring() if explores else FrozenPolicy.load(output.path)
+
+
+def infer(args: TrainingFlags, learnt: tuple[Any, Any], episodes: int, seed: int, name: str) -> None:
+    """Use a policy in an environment of its own: simulated, or a live robot's."""
+    checkpoint, policy = learnt
+    with open_env(checkpoint, args.robot, who=name, episodes=episodes, yes=args.yes, render=args.render) as env:
+        for number, record in enumerate(play(env, policy, episodes=episodes, seed=FIRST_SEED + seed), 1):
+            print(f"episode {number}: total reward {record.total:.2f}{', success' * bool(record.success)}", flush=True)
+
+
+def train(args: Flags, experiment: Experiment) -> tuple[Any, Any]:
     """Train until something says stop, saving after every iteration; the checkpoint, and the policy to go on with."""
-    given = {
-        **environment_of(args, experiment.env, experiment.env_kwargs),
-        "trainer": "rllib",
-        "algo": args.run.lower(),
-    }
-    runners = max(0, args.num_cpus - 1)
-    settings = resolve({**given, "seed": args.seed, "steps": experiment.stop_timesteps, "num_env_runners": runners})
     from bam_train.trainers.base import cores
 
+    runners, iterations = max(0, args.num_cpus - 1), 0
+    given = environment_of(args, experiment.env, experiment.env_kwargs)
+    given |= {"trainer": "rllib", "algo": args.run.lower(), "num_env_runners": runners}
+    settings = resolve({**given, "seed": args.seed, "steps": experiment.stop_timesteps})
     if runners > cores():
         raise SettingsError(
             f"--num-cpus: expected at most {cores() + 1}, one to learn and one for each CPU of this computer, "
             f"found {args.num_cpus}"
         )
-    require_place(settings.env, args.robot, args.render)
-    output, iterations = choose_output(settings, args.out, False, None), 0
 
-    def goes_on(progress: Progress) -> bool:
+    def report(progress: Progress, asked: bool) -> tuple[str, bool]:
         nonlocal iterations
         iterations, mean = iterations + 1, progress.statistics().return_mean
-        trainer.save(output.path, {}, {})
-        print(f"iteration {iterations}: {progress.steps:,} steps, mean total reward {number(mean)}", flush=True)
         reached = mean is not None and mean >= experiment.stop_reward
-        return not (reached or iterations >= experiment.stop_iters or asked())
+        return f"iteration {iterations}: {progress.steps:,} steps", reached or iterations >= experiment.stop_iters
 
-    trainer: Any = load_trainer("rllib").create(settings)
-    with contextlib.closing(trainer):
-        print(f"saving to {output.path} after every iteration", flush=True)
-        with signals_ask() as asked:
-            trainer.train(settings.steps, goes_on)
-        checkpoint = Checkpoint.open(output.path)
-        return checkpoint, trainer.exploring() if args.explore_during_inference else FrozenPolicy.load(output.path)
-
-
-def run(args: Flags, experiment: Experiment, name: str) -> None:
-    """Train, then infer in an environment of its own: simulated, or a live robot's."""
-    checkpoint, policy = train(args, experiment)
-    episodes = args.num_episodes_during_inference
-    watched = {"yes": args.yes, "render": args.render}
-    with open_env(checkpoint, args.robot, who=name, episodes=episodes, **watched) as env:
-        for number, record in enumerate(play(env, policy, episodes=episodes, seed=FIRST_SEED + args.seed), 1):
-            print(f"episode {number}: total reward {record.total:.2f}{', success' * bool(record.success)}", flush=True)
+    return learn(args, settings, "after every iteration", report, args.explore_during_inference)
 
 
 def read(script: str, description: str, experiment: Experiment) -> tuple[Flags, Experiment]:
@@ -126,4 +137,9 @@ def read(script: str, description: str, experiment: Experiment) -> tuple[Flags, 
 def main(script: str, description: str, experiment: Experiment) -> int:
     """Run `script`, whose docstring is `description`; its exit status."""
     name = Path(script).stem
-    return guarded(lambda: run(*read(script, description, experiment), name), name)
+
+    def run() -> None:
+        args, complete = read(script, description, experiment)
+        infer(args, train(args, complete), args.num_episodes_during_inference, args.seed, name)
+
+    return guarded(run, name)

@@ -81,6 +81,13 @@ class EpisodeFlags(RobotModelFlag):
     num_envs: Annotated[Count | None, tyro.conf.arg(metavar="N")] = None
     """Environments stepped side by side; by default as many as is quick."""
 
+    def played(self) -> dict[str, Any]:
+        """What the flags say of ``env``, ``env_kwargs``, ``episodes``, ``seed`` and ``num_envs``."""
+        from bam_train.settings import read_env_kwargs
+
+        flags = {name: getattr(self, name) for name in ("env", "episodes", "seed", "num_envs")}
+        return {**flags, "env_kwargs": read_env_kwargs(self.set)}
+
 
 @dataclass(frozen=True, kw_only=True)
 class CredentialFlags:
@@ -238,7 +245,7 @@ class EvalConfig(EpisodeFlags, JsonFlag):
     Examples:
       bam-eval checkpoints/pick-ppo.zip
       bam-eval checkpoints/pick-ppo.zip --episodes 20 --set randomize=true --video pick.gif
-      bam-eval checkpoints/pick-ppo.zip --data data/pick
+      bam-eval checkpoints/pick-ppo.zip --data data/new
     """
 
     GROUPS: ClassVar[Groups] = {

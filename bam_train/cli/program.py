@@ -193,7 +193,7 @@ def parse(
     no_pairs = (tyro.conf.FlagCreatePairsOff,)  # --force, no --no-force
     box = io.StringIO()
     try:
-        with contextlib.redirect_stderr(box):
+        with contextlib.redirect_stderr(box), contextlib.redirect_stdout(box):  # to a terminal tyro writes colours
             parsed = tyro.cli(config, prog=prog, args=given, config=no_pairs)
     except SystemExit as stop:
         _complain(prog, f"{usage_error(box.getvalue(), config)} {remedy}")

@@ -13,7 +13,7 @@ import numpy as np
 
 from bam_envs.core.registry import resolve_id
 from bam_envs.core.robot_models import DEFAULT_ARM
-from bam_envs.core.wording import brief
+from bam_envs.core.wording import brief, closest, did_you_mean
 from bam_envs.tasks.scripted import scripted_policy
 from bam_train.checkpoint import Checkpoint
 from bam_train.data.data_set import DataSet
@@ -105,7 +105,10 @@ def collect(
         SettingsError: Something does not fit the environment.
         BadDataSet: The place holds something else.
     """
-    checkpoint = None if policy in (SCRIPTED, RANDOM) else Checkpoint.open(Path(policy).expanduser())
+    path, named = Path(policy).expanduser(), (SCRIPTED, RANDOM)
+    if not path.exists() and closest(policy, named) not in (None, policy):
+        raise SettingsError(f"--policy: {policy} is no file and no policy. {did_you_mean(policy, named)}")
+    checkpoint = None if policy in named else Checkpoint.open(path)
     if checkpoint is not None:
         env_id, kwargs = environment_of(checkpoint, env)
     elif env is None:

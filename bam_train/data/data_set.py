@@ -66,6 +66,8 @@ class DataSet:
         try:
             data = cls(files, DataSetInfo.from_json(own), head, own["columns"])
             data._require_true(head)
+        except BadDataSet:
+            raise
         except (KeyError, TypeError, ValueError, BamEnvsError) as error:
             raise files.damaged(f"{layout.BAM} or {layout.INFO} is damaged: {error!r}") from error
         return data
@@ -197,7 +199,7 @@ class DataSet:
                     table = data.read_row_groups([one - first for one in batch])
                     yield from self._of_table(name, table, last, first, batch)
                     batch, size = [], 0
-        except PlaceError:
+        except (PlaceError, BadDataSet):
             raise
         except layout.UNREADABLE as error:
             why = str(error).partition("\n")[0]

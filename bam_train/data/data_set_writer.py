@@ -22,6 +22,9 @@ from bam_train.files.place import Place
 if TYPE_CHECKING:
     from typing_extensions import Self
 
+_OF_FILES = (".mcap", ".txt", ".json", ".csv", ".zip", ".parquet", ".h5", ".hdf5", ".gif", ".mp4", ".png", ".jpg")
+"""Suffixes of files; no folder of such a name is made."""
+
 
 class DataSetWriter:
     """Appends episodes to the data set at `place`, which is made if there is none; a context manager.
@@ -45,8 +48,8 @@ class DataSetWriter:
         import pyarrow  # noqa: F401 - it writes the episodes, and without it nothing must be made
 
         self._files, self.info = Files(place), info
-        if self._files.root.suffix == ".mcap":
-            raise BadDataSet(f"{place}: is named as a recording, and a data set is a folder; leave .mcap out")
+        if (suffix := self._files.root.suffix.lower()) in _OF_FILES and not self._files.root.exists():
+            raise BadDataSet(f"{place}: is named as a file, and a data set is a folder; leave {suffix} out")
         self._flush_episodes, self._flush_bytes = flush_episodes, flush_bytes
         self._observation, self._action = info.observation_leaves, info.action_leaves
         self._waiting: list[Columns] = []

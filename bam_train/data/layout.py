@@ -163,7 +163,7 @@ class Files:
         except PlaceError:
             raise
         except UNREADABLE as error:
-            why = str(error).partition("\n")[0]
+            why = str(error).partition("\n")[0].rstrip(".")
             raise self.damaged(f"{name} is damaged or no Parquet file: {why}") from error
 
 

@@ -160,7 +160,7 @@ def episodes_of(recording: Recording, info: DataSetInfo) -> Iterator[tuple[Episo
     observed, [actions] = recording.arrays("observation"), recording.arrays("action").values()
     leaves = info.observation_leaves
     pictures = _pictures(recording, [("/".join(map(str, one.path)), one.shape) for one in leaves if one.is_image])
-    table, seed, acted = recording.tables["/episode"], recording.seed, recording.policies()
+    table, acted = recording.tables["/episode"], recording.policies()
     own = recording.metadata.get("checkpoint_sha256", "")
     for number, ticks in enumerate(recording.episodes()):
         first, last = ticks[0], ticks[-1]
@@ -169,13 +169,14 @@ def episodes_of(recording: Recording, info: DataSetInfo) -> Iterator[tuple[Episo
         facts = {
             "recording": recording.path.name,
             "number": number,
-            "seed": seed + number,
             "policy": ", ".join(
                 dict.fromkeys(own if own[:DIGEST] == name else name for name in acted[first : last + 1])
             ),
             "robot": recording.metadata.get("profile", ""),
             "date": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime(table.times[first] / 1e9)),
         }
+        if (seed := recording.seed(number)) is not None:
+            facts["seed"] = seed
         if not any(end.values()):
             end["truncated"], facts["end"], note = True, _CUT, _NO_END
         parts: dict[str, Array] = {}

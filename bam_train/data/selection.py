@@ -7,13 +7,14 @@ import hashlib
 import json
 import operator
 import re
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from bam_envs.core.wording import did_you_mean
 from bam_train.data.data_set import DataSet
 from bam_train.data.data_set_writer import DataSetWriter, require_same
+from bam_train.data.recordings import require_addable
 from bam_train.errors import BadDataSet, SettingsError
 
 _SIGNS: dict[str, Callable[[Any, Any], bool]] = {
@@ -90,9 +91,16 @@ def _holds(name: str, found: Any, sign: str, text: str) -> bool:
         raise SettingsError(f"--where: {found!r} cannot be compared with {text!r} by {sign}") from error
 
 
-def copy_episodes(data: DataSet, indices: Sequence[int], out: str | Path) -> tuple[int, int]:
-    """Add some episodes of `data` to the data set at `out`; returns as `merge`."""
-    return _copy([(data, indices)], out)
+def copy_episodes(data: DataSet, parts: Mapping[str, Sequence[int]]) -> list[tuple[int, int]]:
+    """Add the episodes of these indices of `data` to the data set at each place; returns for each as `merge`.
+
+    Raises:
+        BadDataSet: One of the places does not take them; nothing is written then.
+    """
+    for out in parts:
+        _require_other(data, out)
+        require_addable(out, data.info)
+    return [_copy([(data, indices)], out) for out, indices in parts.items()]
 
 
 def split(data: DataSet, share: float, by: str | None = None) -> tuple[list[int], list[int]]:
@@ -118,8 +126,8 @@ def split(data: DataSet, share: float, by: str | None = None) -> tuple[list[int]
 
 def _copy(sources: Iterable[tuple[DataSet, Sequence[int]]], out: str | Path) -> tuple[int, int]:
     sources = list(sources)
-    if any(_same_place(one.place, out) for one, _ in sources):
-        raise BadDataSet(f"{out}: is read and cannot be written too; choose another --out")
+    for one, _ in sources:
+        _require_other(one, out)
     added = left_out = 0
     with DataSetWriter(out, sources[0][0].info) as writer:
         there = set(DataSet.open(out).digests)
@@ -136,6 +144,7 @@ def _copy(sources: Iterable[tuple[DataSet, Sequence[int]]], out: str | Path) -> 
     return added, left_out
 
 
-def _same_place(one: str, other: str | Path) -> bool:
-    a, b = Path(one).expanduser(), Path(other).expanduser()
-    return one == str(other) or (a.exists() and b.exists() and a.samefile(b))
+def _require_other(data: DataSet, out: str | Path) -> None:
+    a, b = Path(data.place).expanduser(), Path(out).expanduser()
+    if data.place == str(out) or (a.exists() and b.exists() and a.samefile(b)):
+        raise BadDataSet(f"{out}: is read and cannot be written too; choose another place")

@@ -176,14 +176,15 @@ def require_enough(data: DataSet, episodes: int) -> None:
     """Refuse to estimate anything from a handful of episodes."""
     if episodes < FEWEST_EPISODES:
         text = f"{episodes} episodes to evaluate on, expected at least {FEWEST_EPISODES}"
-        raise BadDataSet(f"{data.place}: has {text}. Record more: bam-data collect")
+        raise BadDataSet(f"{data.place}: has {text}. Record more: bam-data collect {data.place} --policy CHECKPOINT")
 
 
 def require_contrast(data: DataSet, steps: Steps) -> None:
     """Refuse episodes that all ended alike: nothing in them tells how a policy would do worse, or better."""
     if np.ptp(steps.returns) == 0:
         text = "every episode has the same success or return, so nothing tells a good policy from a bad one"
-        raise BadDataSet(f"{data.place}: {text}. Add others, such as bam-data collect --random 0.6")
+        remedy = f"Add others: bam-data collect {data.place} --policy CHECKPOINT --random 0.6"
+        raise BadDataSet(f"{data.place}: {text}. {remedy}")
 
 
 def _divisions(data: DataSet, facts: list[dict[str, Any]], by: Sequence[str]) -> dict[str, list[str]]:

@@ -119,7 +119,8 @@ def _read(folder: Path) -> RunLog:
     try:
         run: RunLog = reader(folder, files)
     except (OSError, ValueError, KeyError, zipfile.BadZipFile) as error:
-        raise SettingsError(f"{files[0]}: cannot be read: {error}. Remove it, or leave its run out") from error
+        why = f"a row has no {error}" if isinstance(error, KeyError) else error
+        raise SettingsError(f"{files[0]}: cannot be read: {why}. Remove it, or leave its run out") from error
     return run
 
 

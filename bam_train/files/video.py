@@ -28,7 +28,8 @@ def require_video_path(path: Path) -> Path:
     """
     path = path.expanduser()
     if path.suffix.lower() not in _WRITERS:
-        raise SettingsError(f"{path}: expected a video that ends in .gif or .mp4, found {path.suffix or 'no suffix'!r}")
+        found = repr(path.suffix) if path.suffix else "no suffix"
+        raise SettingsError(f"{path}: expected a video that ends in .gif or .mp4, found {found}")
     require_writable(path)
     try:
         for module in ("PIL",) if path.suffix.lower() == ".gif" else ("imageio", "imageio_ffmpeg"):

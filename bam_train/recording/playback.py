@@ -126,7 +126,7 @@ def play(
         acts: Whether it is compared with each tick; by default with all. See `acts_in`.
     """
     acts = acts or [True] * recording.ticks
-    played, seed = _begun(recording, acts), recording.seed
+    played, seed = _begun(recording, acts), recording.seed(0) or 0
     observations, [actions] = recording.arrays("observation"), recording.arrays("action").values()
     for number, ticks in enumerate(recording.episodes()):
         policy.reset()

@@ -167,13 +167,12 @@ class Recording:
         """Number of whole ticks."""
         return len(self.guards)
 
-    @property
-    def seed(self) -> int:
-        """Seed of the first episode. Raises FormatError if the metadata has something else."""
-        text = self.metadata.get("seed", "0")
-        if not text.isdecimal():
+    def seed(self, number: int) -> int | None:
+        """Seed of an episode, counted from 0; None if the metadata has none. Raises FormatError if it is no number."""
+        text = self.metadata.get("seed")
+        if text is not None and not text.isdecimal():
             raise FormatError(f"{self.path}: its metadata says seed {text!r}, which is no number. Get the file again")
-        return int(text)
+        return None if text is None else int(text) + number
 
     def policies(self) -> list[str]:
         """The first `DIGEST` characters of the digest of the policy that acted at each tick; "" if that is unknown."""

@@ -64,6 +64,7 @@ def test_nothing_is_left_of_a_film_that_failed(tmp_path):
     ("name", "error", "text"),
     [
         ("film.avi", SettingsError, "{}/film.avi: expected a video that ends in .gif or .mp4, found '.avi'"),
+        ("film", SettingsError, "{}/film: expected a video that ends in .gif or .mp4, found no suffix"),
         ("file/film.gif", OutputError, "{0}/file/film.gif: cannot be written: {0}/file is a file; choose another file"),
         ("folder.gif", OutputError, "{}/folder.gif: cannot be written: it is a folder; choose another file"),
     ],

@@ -89,8 +89,8 @@ def measure_stop(flags):
     from bam_envs.ros.codec import HALT_TOPIC
     from tests.bam_train.agent.browsers import new_browser
 
-    topics = [f"/camera_{n}/image/compressed" for n in range(getattr(flags, "cameras", 3))]
-    rate, halts, latencies, heard = getattr(flags, "rate", 20.0), [], [], []
+    topics = [f"/camera_{n}/image/compressed" for n in range(flags.cameras)]
+    halts, latencies, heard = [], [], []
     images = itertools.cycle([jpeg(seed) for seed in range(8)])
     with contextlib.ExitStack() as stack:
         bus = stack.enter_context(served_robot()).bus
@@ -102,7 +102,7 @@ def measure_stop(flags):
             message = {"header": header(), "format": "jpeg", "data": next(images)}
             bus.publish_all([(topic, message) for topic in topics])
 
-        stack.enter_context(every(1 / rate, film))
+        stack.enter_context(every(1 / flags.rate, film))
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
         cameras = [f'[[cameras]]\nname = "camera {n}"\ntopic = "{topic}"\n' for n, topic in enumerate(topics)]
         (folder / "cameras.toml").write_text(PROFILE + "".join(cameras))
@@ -127,6 +127,6 @@ def measure_stop(flags):
             until(lambda: agent.ask("status")["state"] == "paused")
             heard.append(halts[0] - browser.execute_script("return window.pressed") / 1e3)
         drawn = (sum(browser.execute_script(DRAWN)) - before) / len(topics) / (time.monotonic() - begun)
-    yield percentiles(f"stop button to halt, {len(topics)} cameras at {rate:g} Hz", latencies, "ms", p99=100)
+    yield percentiles(f"stop button to halt, {len(topics)} cameras at {flags.rate:g} Hz", latencies, "ms", p99=100)
     yield percentiles("  of which after the press in the page", heard, "ms")
     yield f"  {len(latencies)} presses, at most {1e3 * max(latencies):.1f} ms; {drawn:.1f} images drawn a second"

@@ -1,4 +1,4 @@
-"""A deployment: guards, one tick without the network, the recorder, 100 Hz over loopback, and memory.
+"""A deployment: guards, one tick without the network, the recorder, and 100 Hz over loopback.
 
 Except at 100 Hz, the robot is a simulated one in this process, which follows its commands exactly, behind the guards of
 a live robot; its time advances with commands.
@@ -28,11 +28,9 @@ from bam_train.deploy.journal import Journal
 from bam_train.errors import SettingsError
 from bam_train.policy import FrozenPolicy
 from tests.benchmarks import harness
-from tests.benchmarks.harness import HOME, Peer, at_most, percentiles, resident
+from tests.benchmarks.harness import HOME, Peer, at_most, percentiles
 from tests.benchmarks.link import live_arm, serve_robot
 
-GROWTH = 5.0
-"""By how much memory may grow after 10,000 ticks [MB]."""
 clock = time.perf_counter
 
 
@@ -108,50 +106,26 @@ class TimedEnv(gym.Wrapper):
         return result
 
 
-class Watcher:
-    """Measures the memory of a deployment after `warm_up` ticks."""
-
-    ticks, warm = 0, 0.0
-
-    def __init__(self, warm_up):
-        self.warm_up = warm_up
-
-    def ticked(self, record, action, pacer):
-        self.ticks += 1
-        if self.ticks == self.warm_up:
-            self.warm = resident()
-
-    def ended(self, record):
-        """Nothing is shown."""
-
-
-def deploy(ticks, steps, recording=None):
-    """Run a deployment of bam/pick without waiting, in episodes of `steps`; times to a command, and the watcher."""
-    robot, link = guarded_robot()
+def deploy(ticks, steps, recording):
+    """Run a deployment of bam/pick without waiting, in episodes of `steps`: times to a command, and of the policy."""
+    (robot, link), times = guarded_robot(), []
     inner = gym.wrappers.TimeLimit(RobotEnv(robot, ENVIRONMENTS["bam/pick-v0"].make_task(1, {})), steps)
-    env = inner if recording is None else TimedEnv(inner, link)
-    policy = FrozenPolicy.from_checkpoint(Checkpoint.open(harness.PICK))
-    timed = SimpleNamespace(reset=policy.reset, act=policy.act, times=[])
+    env, policy = TimedEnv(inner, link), FrozenPolicy.from_checkpoint(Checkpoint.open(harness.PICK))
 
     def act(observation):
         begun = clock()
         action = policy.act(observation)
-        timed.times.append(clock() - begun)
+        times.append(clock() - begun)
         return action
 
-    timed.act = policy.act if recording is None else act
-    recorder, watcher = (
-        None if recording is None else flight_recorder(recording, env, {}),
-        Watcher(min(10_000, ticks // 2)),
-    )
-    if recorder is not None:
-        recorder.start()
+    recorder, timed = flight_recorder(recording, env, {}), SimpleNamespace(reset=policy.reset, act=act)
+    recorder.start()
     deployment = Deployment(env, timed, Pacer(None), Journal(-(-ticks // steps)), recorder=recorder)
     deployment.connect()
-    ending = deployment.run(watcher, seed=1)
-    if ending.status or (recorder is not None and recorder.fault):
-        raise SettingsError(f"the deployment ended: {ending.reason} {recorder and recorder.fault}")
-    return getattr(env, "times", None), timed.times, watcher
+    ending = deployment.run(SimpleNamespace(ticked=lambda *_: None, ended=lambda *_: None), seed=1)
+    if ending.status or recorder.fault:
+        raise SettingsError(f"the deployment ended: {ending.reason} {recorder.fault}")
+    return env.times, times
 
 
 def measure_tick(flags):
@@ -167,7 +141,7 @@ def measure_tick(flags):
     with tempfile.TemporaryDirectory() as folder:
         FlightLog.record = clocked
         try:
-            whole, acting, _ = deploy(flags.times(20_000), 100, Path(folder) / "bench.mcap")
+            whole, acting = deploy(flags.times(20_000), 100, Path(folder) / "bench.mcap")
         finally:
             FlightLog.record = record
     whole, shares = np.array(whole), np.array(shares)
@@ -205,13 +179,3 @@ def measure_rate(flags):
     yield percentiles("  late by", late, "ms")
     yield percentiles("  age of states", ages, "ms")
     yield at_most("  ticks lost", int((np.array(late) > 0.01).sum()), 0)
-
-
-def measure_memory(flags):
-    """Growth of a deployment in accelerated time, in episodes and in a single one."""
-    ticks = flags.times(1_000_000)
-    for what, steps in (("episodes of 100", 100), ("one episode", ticks)):
-        watcher = deploy(ticks, steps)[-1]
-        growth = (resident() - watcher.warm) / 1e6
-        found = f"{growth:+.2f} MB after {watcher.ticks:,}"
-        yield at_most(f"memory of a deployment, {what}", growth, GROWTH, "MB", found)

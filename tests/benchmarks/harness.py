@@ -72,6 +72,11 @@ def number(value):
     return f"{value:,.0f}" if abs(value) >= 100 else f"{value:.3g}"
 
 
+def table_row(*cells):
+    """A line of a table in Markdown."""
+    return f"| {' | '.join(cells)} |"
+
+
 def at_most(what, value, goal, unit="", found=None):
     """The row of a value that must not be greater than its goal; `found` is shown instead of the value."""
     return Row(what, found or f"{number(value)} {unit}".strip(), f"<= {number(goal)} {unit}", bool(value <= goal))

@@ -2,8 +2,7 @@
 
 Figures are CPU time with one torch thread: medians over rounds in which the contenders take turns. A ratio is the
 median of the rounds' ratios. "At most" is the ratio of the policy and the environments alone, which no loop passes: it
-falls on a busy machine, which slows PyTorch and Gymnasium too. Without bbrl our own figures are printed alone. The
-memory of a deployment's loop is in ``python -m tests.benchmarks deploy``.
+falls on a busy machine, which slows PyTorch and Gymnasium too. Without bbrl our own figures are printed alone.
 """
 
 import gc

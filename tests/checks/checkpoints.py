@@ -3,9 +3,8 @@
 Command, seed and steps come from each checkpoint's manifest, wall time from the run that made it (`--runs`) or, without
 that, from the table as it is; the success rates are measured here, over episodes that neither training nor its
 evaluations have seen. The first one is that of ``bam-eval CHECKPOINT --episodes 1000``: a policy that was trained with
-randomised physics, late actions or a link is evaluated with them. The second one is without them; ``python -m
-tests.checks links`` evaluates all with them. Where there is a training and a test split, it is the test split that
-counts, and each image of it counts once.
+randomised physics, late actions or a link is evaluated with them. The second one is without them. Where there is a
+training and a test split, it is the test split that counts, and each image of it counts once.
 """
 
 import json
@@ -26,7 +25,7 @@ from bam_train.evaluation import FIRST_SEED, evaluate
 from bam_train.policy import FrozenPolicy
 from bam_train.settings import differences, file_stem
 from bam_train.trainers.resolve_settings import resolve
-from tests.benchmarks.harness import CHECKPOINTS
+from tests.benchmarks.harness import CHECKPOINTS, table_row
 
 HEADER = ("checkpoint", "command", "seed", "steps", "wall time", "success", "plain", "size")
 FLAGS = (
@@ -134,6 +133,6 @@ def main(flags):
     for path in flags.checkpoints or sorted(CHECKPOINTS.glob("*.zip")):
         lines.append(row(path, flags.episodes, flags.runs, known))
         print("  ".join(lines[-1]), flush=True)
-    table = "\n".join(f"| {' | '.join(cells)} |" for cells in lines)
+    table = "\n".join(table_row(*cells) for cells in lines)
     flags.page.write_text(_TABLE.sub(lambda match: f"{match[1]}\n{table}\n\n{match[2]}", text), encoding="utf-8")
     return 0

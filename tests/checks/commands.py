@@ -34,7 +34,7 @@ from bam_train.evaluation import evaluate
 from bam_train.files.atomic_file import replacing
 from bam_train.policy import FrozenPolicy
 from bam_train.trainers.base import origin
-from tests.benchmarks.harness import CHECKPOINTS, ROOT
+from tests.benchmarks.harness import CHECKPOINTS, ROOT, table_row
 
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
 LOG = CHECKPOINTS / "commands.md"
@@ -140,8 +140,8 @@ def row(words: tuple[str, ...], seed: int, result: Result) -> str:
     success = "-" if result.success is None else f"{result.success:.1%}"
     reward = "-" if result.reward is None else f"{result.reward:.2f}"
     made, commit = origin()["created"][:10], str(origin()["git_commit"])[:7]
-    numbers = f"{result.steps:,} | {result.seconds:.0f} s | {result.cpu:.0f} s | {success} | {reward} | {result.learnt}"
-    return f"| `{shlex.join(words)}` | {seed} | {numbers} | {made}, {commit} |"
+    numbers = f"{result.steps:,}", f"{result.seconds:.0f} s", f"{result.cpu:.0f} s", success, reward, result.learnt
+    return table_row(f"`{shlex.join(words)}`", str(seed), *numbers, f"{made}, {commit}")
 
 
 def read_log(log: Path) -> dict[tuple[str, str], str]:
@@ -157,7 +157,7 @@ def write_log(log: Path, rows: dict[tuple[str, str], str]) -> None:
     kept = sorted((key for key in rows if key[0] in known), key=lambda key: (known.index(key[0]), int(key[1])))
     versions = ", ".join(f"{name} {version}" for name, version in origin()["versions"].items())
     foot = f"\nThe newest rows: {os.cpu_count()} CPU cores, {versions}.\n"
-    table = [f"| {' | '.join(HEADER)} |", "| --- " * len(HEADER) + "|", *(rows[key] for key in kept)]
+    table = [table_row(*HEADER), table_row(*["---"] * len(HEADER)), *(rows[key] for key in kept)]
     with replacing(log) as path:
         path.write_text(HEAD + "\n".join(table) + "\n" + foot)
 

@@ -269,7 +269,7 @@ def row(detector: Detector, shift: str, episodes: list[Rollout]) -> tuple[str, b
     when = f"{np.median(at[found]):.0f}" if found.any() else "-"
     cells = [shift, str(len(episodes)), f"{failed.sum()}", f"{found.sum()}", f"{(early & failed).sum()}", when]
     cells += [f"{(~failed).sum()}", f"{seen.sum()}"]
-    return "| " + " | ".join(cells) + " |", bool(found.sum() >= 0.9 * failed.sum())
+    return harness.table_row(*cells), bool(found.sum() >= 0.9 * failed.sum())
 
 
 def measure_detector(flags):

@@ -37,7 +37,6 @@ WHAT = "Record, check and convert data sets: episodes for learning."
 def collect(config: flags.CollectConfig) -> None:
     """Collect episodes in simulation."""
     from bam_train.data import collect as collecting
-    from bam_train.settings import read_env_kwargs
     from bam_train.signals import Terminated
 
     last, kept = time.monotonic(), 0
@@ -53,13 +52,9 @@ def collect(config: flags.CollectConfig) -> None:
         found = collecting.collect(
             config.place,
             config.policy,
-            config.env,
-            read_env_kwargs(config.set),
-            episodes=config.episodes,
-            seed=config.seed,
+            **config.played(),
             noise=config.noise,
             random=config.random,
-            num_envs=config.num_envs,
             facts={} if config.task is None else {"task": config.task},
             on_progress=on_progress,
         )
@@ -178,12 +173,12 @@ def show_info(config: flags.InfoConfig) -> None:
         whole = {"place": config.place, "digest": data.digest, **info.to_json(), **(found[0] if found else {})}
         tell(json.dumps({**whole, "columns": data.features, "policies": policies, "tasks": data.tasks, "dates": dates}))
         return
+    spaces = {"observation": info.observation_space, "action": info.action_space}
     lines = [
         ("of", f"{info.env}{f' {json.dumps(info.env_kwargs)}' if info.env_kwargs else ''}"),
         ("robot", info.robot or "none"),
         ("rate", f"{1 / info.period:g} Hz"),
-        ("observation", str(info.observation_space)),
-        ("action", str(info.action_space)),
+        *((name, " ".join(str(space).split())) for name, space in spaces.items()),
         ("columns", ", ".join(data.features)),
         ("tasks", "; ".join(data.tasks)),
         ("policies", ", ".join(f"{name[:12]} ({times})" for name, times in policies.items()) or "not known"),
@@ -213,8 +208,9 @@ def split_data(config: flags.SplitConfig) -> None:
     if config.out == config.rest:
         raise SettingsError(f"--rest: expected another place than --out, found {config.rest}")
     data = _open(config.place)
-    for place, part in zip((config.out, config.rest), split(data, config.share, config.by), strict=True):
-        _tell_added(place, *copy_episodes(data, part, place))
+    parts = dict(zip((config.out, config.rest), split(data, config.share, config.by), strict=True))
+    for place, added in zip(parts, copy_episodes(data, parts), strict=True):
+        _tell_added(place, *added)
 
 
 def filter_data(config: flags.FilterConfig) -> None:
@@ -223,7 +219,7 @@ def filter_data(config: flags.FilterConfig) -> None:
 
     data = _open(config.place)
     chosen = choose(data, config.where)
-    _tell_added(config.out, *copy_episodes(data, chosen, config.out))
+    _tell_added(config.out, *copy_episodes(data, {config.out: chosen})[0])
 
 
 def show_stats(config: flags.StatsConfig) -> None:

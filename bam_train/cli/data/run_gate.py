@@ -39,7 +39,6 @@ def decide(config: GateConfig) -> dict[str, Any]:
     from bam_train.data import DataSet
     from bam_train.errors import SettingsError
     from bam_train.estimation.release_gate import compare, compare_on_data
-    from bam_train.settings import read_env_kwargs
 
     if config.no_simulation and config.data is None:
         raise SettingsError("--no-simulation leaves nothing to compare on; give --data too")
@@ -52,12 +51,8 @@ def decide(config: GateConfig) -> dict[str, Any]:
         simulated = compare(
             candidate,
             champion,
-            config.env,
-            read_env_kwargs(config.set),
+            **config.played(),
             margin=config.margin,
-            episodes=config.episodes,
-            seed=config.seed,
-            num_envs=config.num_envs,
             on_progress=lambda done, _: say(f"bam-gate: {done} pairs") if done % 512 == 0 else None,
         )
     verdicts = [one.verdict for one in (simulated, recorded) if one is not None]

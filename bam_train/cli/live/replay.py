@@ -57,6 +57,8 @@ def _checkpoint(config: ReplayConfig, recording: Recording) -> Checkpoint | str:
     if config.checkpoint is not None:
         return Checkpoint.open(config.checkpoint)
     path = Path(recording.metadata.get("checkpoint", ""))
+    if "checkpoint" not in recording.metadata:
+        return "it names no checkpoint; give one with --checkpoint"
     if not path.is_file():
         return f"its checkpoint {path} is not here; give it with --checkpoint"
     checkpoint = Checkpoint.open(path)
@@ -95,11 +97,9 @@ def facts_of(recording: Recording) -> dict[str, Any]:
     """The summary as JSON values; times in the unit of their name."""
     import numpy as np
 
-    from bam_train.deploy.flight import STAGES
-
     counts = {guard: recording.guards.count(guard) for guard in sorted(set(recording.guards) - {""})}
     stages = {}
-    for name in STAGES if recording.ticks else ():
+    for name in recording.tables["/latency"].names[1:] if recording.ticks else ():  # none in an export of bam-data
         numbers = recording.tables["/latency"].column(name)
         if len(known := numbers[np.isfinite(numbers)]):
             p50, p99, most = (round(1e3 * float(x), 3) for x in (*np.percentile(known, [50, 99]), known.max()))
@@ -128,14 +128,14 @@ def _seconds(recording: Recording) -> float:
 
 def _episodes(recording: Recording) -> list[dict[str, Any]]:
     """Length, return, end and success of each episode; ``"stopped"`` without an end."""
-    rows, seed = [], recording.seed
+    rows = []
     for number, ticks in enumerate(recording.episodes()):
         table, last = recording.tables["/episode"], ticks[-1]
         ends = [end for end in ("terminated", "truncated") if table.column(end)[last]]
         success = table.column("success")[last]
         rows.append(
             {
-                "seed": seed + number,
+                "seed": recording.seed(number),
                 "length": len(ticks) - 1,
                 "return": float(table.column("reward")[ticks.start : ticks.stop].sum()),
                 "success": None if success != success else bool(success),
@@ -149,12 +149,12 @@ def lines_of(recording: Recording) -> list[str]:
     """The summary for people."""
     facts, metadata = facts_of(recording), recording.metadata
     end = "complete" if recording.complete else "its end is missing: it was cut off or damaged"
-    policy = Path(metadata.get("checkpoint", "")).name or "no checkpoint"
+    policy = f"{Path(metadata.get('checkpoint', '')).name} ({metadata.get('checkpoint_sha256', '')[:12]})"
     address = metadata.get("address")
     on = " ".join(filter(None, [metadata.get("env"), address and f"at {address}", metadata.get("robot")]))
     marks = f", {metadata['marks']}" if metadata.get("marks") else ""
     lines = [
-        f"{recording.path}: {policy} ({metadata.get('checkpoint_sha256', '')[:12]}) on {on}{marks}",
+        f"{recording.path}: {policy if 'checkpoint' in metadata else 'no checkpoint'} on {on}{marks}",
         f"{recording.ticks} ticks in {duration(facts['seconds'])}, {end}",
     ]
     episodes = facts["per_episode"]
@@ -162,9 +162,8 @@ def lines_of(recording: Recording) -> list[str]:
         how = {True: "success", False: "no success", None: row["end"]}[row["success"]]
         if row["end"] == "stopped" and not row["success"]:
             how = "stopped" if recording.complete or number < len(episodes) else "cut off"
-        lines.append(
-            f"episode {number} (seed {row['seed']}): {how} after {row['length']} steps, return {row['return']:.2f}"
-        )
+        seed = "" if row["seed"] is None else f" (seed {row['seed']})"
+        lines.append(f"episode {number}{seed}: {how} after {row['length']} steps, return {row['return']:.2f}")
     acted = [f"{guard} in {count} tick{'s' if count > 1 else ''}" for guard, count in facts["guards"].items()]
     lines.append(f"guard that acted last: {', '.join(acted)}" if acted else "no guard acted")
     for stage, row in facts["latency_ms"].items():

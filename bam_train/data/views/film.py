@@ -27,6 +27,8 @@ def frames(data: DataSet, index: int, camera: str | None = None) -> Iterator[Fra
     """
     episode = data[index]
     cameras = {leaf.column.removeprefix("observation.images."): leaf for leaf in _cameras(data)}
+    if camera is not None and not cameras:
+        raise SettingsError(f"--camera: {data.place} has no recorded pictures; leave it out")
     if camera is not None and camera not in cameras:
         raise SettingsError(f"--camera: {data.place} has no {camera!r}. {did_you_mean(camera, cameras)}")
     if cameras:

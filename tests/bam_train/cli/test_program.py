@@ -87,9 +87,13 @@ Options:
         (["stray"], "prog: unexpected argument stray. Run prog --help\n"),
     ],
 )
-def test_a_command_line_that_cannot_be_read_is_one_line(arguments, line, capsys):
-    assert ended(arguments) == 2
-    assert capsys.readouterr().err == line
+def test_a_command_line_that_cannot_be_read_is_one_line(arguments, line, capsys, monkeypatch):
+    """Also in a terminal, where the box of several lines would have colours."""
+    monkeypatch.setenv("TERM", "xterm")
+    for is_terminal in (False, True):
+        monkeypatch.setattr(sys.stdout, "isatty", lambda is_terminal=is_terminal: is_terminal)
+        assert ended(arguments) == 2
+        assert capsys.readouterr().err == line
 
 
 @pytest.mark.parametrize(

@@ -166,3 +166,4 @@ def test_a_damaged_file_is_one_line(tmp_path, kind, folder):
     with pytest.raises(BadDataSet, match="run bam-data check") as found:
         list(DataSet.open(tmp_path / "d"))
     assert "\n" not in str(found.value)
+    assert str(found.value).count("run bam-data check") == 1

@@ -59,7 +59,8 @@ def test_nothing_is_made_without_pyarrow(tmp_path, counting, monkeypatch):
     ("name", "why"),
     [
         ("a.zip", "is a file, and a data set is a folder; choose another place"),
-        ("b.mcap", "is named as a recording, and a data set is a folder; leave .mcap out"),
+        ("b.mcap", "is named as a file, and a data set is a folder; leave .mcap out"),
+        ("c.txt", "is named as a file, and a data set is a folder; leave .txt out"),
     ],
 )
 def test_a_file_is_no_place_for_a_data_set(tmp_path, counting, name, why):
@@ -254,6 +255,7 @@ def test_further_columns_of_a_step(tmp_path, counting):
     ("arguments", "text"),
     [
         ({"policy": "random"}, "--policy random is of no environment; give --env too"),
+        ({"policy": "scriptd"}, "--policy: scriptd is no file and no policy. Did you mean 'scripted'?"),
         ({"policy": "random", "env": "CartPole-v1", "noise": 0.1}, "--noise is for continuous actions, found Discrete"),
     ],
 )

@@ -20,7 +20,7 @@ def test_merge_keeps_order_digests_and_facts(tmp_path):
     assert [found.facts(i) for i in range(7)] == [b.facts(i) for i in range(7)]
     assert found[6].columns["guard"].tolist() == b[6].columns["guard"].tolist()
     assert merge([a, b], out) == (0, 12)
-    with pytest.raises(BadDataSet, match="b: is read and cannot be written too; choose another --out"):
+    with pytest.raises(BadDataSet, match="b: is read and cannot be written too; choose another place"):
         merge([a, b], b.place)
 
 
@@ -82,7 +82,7 @@ def test_a_split_stays_when_episodes_are_added(tmp_path):
 def test_programs(tmp_path, monkeypatch, run):
     monkeypatch.chdir(tmp_path)
     data = record("a")
-    copy_episodes(data, [1, 3], "b")
+    copy_episodes(data, {"b": [1, 3]})
 
     assert run(main, "filter", "a", "--out", "c", "--where", "success=true") == (0, "c: 3 episodes added\n", "")
     none = "bam-data filter: --where: none of the 6 episodes of a fits index>8\n"
@@ -93,6 +93,9 @@ def test_programs(tmp_path, monkeypatch, run):
         "d: 6 episodes added; 5 left out, which are in it already\n",
         "",
     )
+    taken = "bam-data split: a: is read and cannot be written too; choose another place\n"
+    assert run(main, "split", "a", "--out", "train", "--rest", "a") == (1, "", taken)
+    assert not (tmp_path / "train").exists()
     status, out, _ = run(main, "split", "a", "--out", "train", "--rest", "test", "--share", "0.5")
     assert (status, len(DataSet.open("train")) + len(DataSet.open("test"))) == (0, 6)
     status, out, _ = run(main, "info", "a", "--json")
@@ -111,6 +114,8 @@ def test_programs(tmp_path, monkeypatch, run):
     assert run(main, "stats", "a")[1].startswith("     episodes  steps  success (95 %)")
     assert "  robot       ur5e\n" in run(main, "info", "a")[1]
     assert run(main, "export", "a", "--to", "mcap", "--out", "a.mcap")[1].startswith("a.mcap: 6 episodes as mcap\n")
+    no_pictures = "bam-data show: --camera: a has no recorded pictures; leave it out\n"
+    assert run(main, "show", "a", "--camera", "front") == (1, "", no_pictures)
     assert run(main, "export", "a", "--to", "hdf5", "--out", "a.mcap") == (
         1,
         "",

@@ -157,4 +157,5 @@ def test_data_without_failures_tells_nothing(corridor_checkpoint, make_data, run
     text = "every episode has the same success or return, so nothing tells a good policy from a bad one"
     for main_, arguments in ((main, [path]), (gate.main, [path, path, "--no-simulation"])):
         error = run(main_, *arguments, "--data", place)[2]
-        assert error.endswith(f": {place}: {text}. Add others, such as bam-data collect --random 0.6\n")
+        remedy = f"bam-data collect {place} --policy CHECKPOINT --random 0.6"
+        assert error.endswith(f": {place}: {text}. Add others: {remedy}\n")

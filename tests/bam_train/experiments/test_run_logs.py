@@ -124,7 +124,8 @@ def test_what_is_no_run(tmp_path):
     with pytest.raises(SettingsError) as error:
         read_runs(tmp_path)
     assert str(error.value) == f"{tmp_path}: no run is in it; {expected}, in it or in the folders in it"
-    for name, text in (("evaluations.npz", "no zip"), ("a.monitor.csv", "r,l,t\n"), ("b/monitor.csv", "")):
+    files = {"evaluations.npz": "no zip", "a.monitor.csv": "r,l,t\n", "b/monitor.csv": "", "progress.jsonl": "{}\n"}
+    for name, text in files.items():
         path = tmp_path / name.replace(".", "-") / name
         write(path, text)
         with pytest.raises(SettingsError, match=rf"{path}: cannot be read: .* Remove it, or leave its run out$"):

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from bam_envs.testing.assertions import assert_same_value
+from bam_train.cli.live.replay import lines_of
 from bam_train.data import DataSet, DataSetInfo, DataSetWriter, Episode
 from bam_train.data.export import export
 from bam_train.errors import OutputError, SettingsError
@@ -133,6 +134,11 @@ def test_mcap(kind, tmp_path):
     export(data, "mcap", tmp_path / "out.mcap")
     found = Recording.open(tmp_path / "out.mcap")
     assert found.complete
+    lines = lines_of(found)
+    assert lines[0] == f"{tmp_path}/out.mcap: no checkpoint on bam/pick-v0 ur5e"
+    assert [line.partition(":")[0] for line in lines[2 : 2 + len(data)]] == [
+        f"episode {k + 1}" for k in range(len(data))
+    ]
     assert found.metadata["env"] == "bam/pick-v0"
     assert [len(ticks) for ticks in found.episodes()] == [len(one) + 1 for one in data]
     observed, actions = found.arrays("observation"), found.arrays("action")
