@@ -66,10 +66,11 @@ def _network(config: ExportConfig, kind: str, path: Path) -> Exported:
 def _zip(config: ExportConfig, path: Path) -> Exported:
     """A zip that stable-baselines3 wrote."""
     from bam_envs.core.registry import resolve_id
-    from bam_train.compat.plain_sb3_zip import export_trusted
+    from bam_train.compat.plain_sb3_zip import export_trusted, require_plain_sb3
     from bam_train.errors import SettingsError
     from bam_train.settings import read_env_kwargs
 
+    require_plain_sb3(path)
     if not config.trust_pickle or config.env is None or config.algo is None:
         text = "stable-baselines3 reads it, and runs whatever code is in it. If you trust its maker, give"
         raise SettingsError(f"{path}: {text} --trust-pickle, and say what it is: --env ID --algo NAME")

@@ -12,6 +12,7 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
+from bam_envs.core.registry import entry_of
 from bam_envs.core.robot_models import portable_model
 from bam_envs.core.spaces import space_to_json
 from bam_train.checkpoint.detector import DETECTOR, MOST_NUMBERS, Detector, detector_of_ranges
@@ -40,14 +41,16 @@ def export_foreign(
     Args:
         policy: The policy.
         env_id: Versioned id of the environment that it will run in.
-        env_kwargs: Its arguments.
+        env_kwargs: Its arguments; its rate, if it may have several, is the policy's by default.
         tell: Called with the lines of the contract where the two do not fit.
 
     Raises:
         ContractRefused: A joint is missing, or named twice; the rate or an image differs.
         PolicyError: Its graph cannot be used, or does not act as its own library does.
     """
-    policy = with_known_sizes(policy)
+    policy, entry = with_known_sizes(policy), entry_of(env_id)
+    if entry is not None and "rate" in entry.options() and policy.rate not in (None, 1 / entry.period):
+        env_kwargs = {"rate": policy.rate, **env_kwargs}
     with contextlib.closing(make_env(env_id, env_kwargs)) as env:
         signals, period = described(env)
         contract = Contract(tuple(fit_rows(policy, env, period)))
@@ -65,10 +68,11 @@ def export_foreign(
     graph = mapped_graph(policy, [taken[port.name] for port in policy.inputs], (action, given))
     jsons = space_to_json(observation), space_to_json(action)
     try:
+        if policy.answer is None:
+            _require_described(policy)
         frozen = FrozenPolicy.from_graph(graph, *jsons, chunk=policy.chunk)
     except PolicyError as error:
-        text = "its network is not as it is described; check chunk, and names and size of inputs and output"
-        raise PolicyError(f"{policy.place}: {text}: {error}") from error
+        raise PolicyError(f"{policy.place}: {error}") from error
     golden = _golden(policy, taken, given, action.shape)
     facts = {"env": env_id, "env_kwargs": _portable(env_kwargs), "signals": signals, "period": period}
     facts |= {"algorithm": policy.algorithm, "trainer": policy.trainer, "steps": policy.steps}
@@ -153,6 +157,21 @@ def _golden(
         chunk = as_ours(policy, np.asarray(answer(as_theirs(policy, one))), given, shape)
         chunks.append(chunk)
     return {**arrays, "action": np.stack(chunks)}
+
+
+def _require_described(policy: ForeignPolicy) -> None:
+    """Raise PolicyError unless inputs and output of the network have the shapes of its description."""
+    session, past = OnnxSession(policy.network), (policy.chunk.history,) if policy.chunk.history > 1 else ()
+    inputs = {port.name: np.zeros((1, *past, *port.size), np.float32) for port in policy.inputs}
+    for name, zeros in inputs.items():
+        told, found = list(zeros.shape[1:]), ["any" if n is None else n for n in session.inputs[name].shape[1:]]
+        if len(found) != len(told) or any(one not in ("any", n) for one, n in zip(found, told, strict=True)):
+            text = f"input {name}: the graph takes {found}, and {told} is described"
+            raise PolicyError(f"{text}. Correct its names or size, or the history of the chunk")
+    gives, told = session.run(inputs, [policy.output.name])[0].shape, [policy.chunk.size, *policy.output.size]
+    if gives[0] != 1 or math.prod(gives) != math.prod(told):
+        text = f"output {policy.output.name}: the graph gives {list(gives[1:])}, and {told} is described"
+        raise PolicyError(f"{text}. Correct the size of the chunk, or its names")
 
 
 def _graph(policy: ForeignPolicy) -> Callable[[Mapping[str, Array]], Array]:

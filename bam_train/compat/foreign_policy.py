@@ -129,6 +129,11 @@ class ForeignPolicy:
     env_kwargs: Mapping[str, Any] = field(default_factory=dict)
     """Arguments of that."""
 
+    @property
+    def rate(self) -> float | None:
+        """Actions in a second."""
+        return None if self.period is None else round(1 / self.period, 6)
+
 
 @dataclass(frozen=True)
 class Meaning:
@@ -180,7 +185,8 @@ def fit_rows(policy: ForeignPolicy, env: gym.Env[Any, Any], period: float | None
     signals: Mapping[str, Any] = getattr(env.unwrapped, "describe", lambda: {"observation": [], "action": []})()
     if policy.period is not None and period is not None:
         same = math.isclose(policy.period, period, rel_tol=1e-3)
-        yield Check("period", f"{policy.period:g} s", f"{period:g} s", fits=same)
+        found = f"{1 / period:g} Hz" if same else f"{1 / period:g} Hz. Leave --env and --set rate= out"
+        yield Check("rate", f"{policy.rate:g} Hz", found, fits=same)
     box: Any = env.action_space
     yield from _vector_rows("action", policy.output, signals["action"], math.prod(box.shape or ()), whole=True)
     for port in policy.inputs:

@@ -37,28 +37,31 @@ def is_plain_sb3(path: Path) -> bool:
     return "data" in names and MANIFEST not in names
 
 
+def require_plain_sb3(path: Path) -> None:
+    """Raise CheckpointError unless the file is a zip of stable-baselines3 without our manifest."""
+    if not is_plain_sb3(path):
+        with open_zip(path):
+            raise CheckpointError(path, "is not a zip of stable-baselines3, or already a checkpoint of bam-train")
+
+
 def export_trusted(
     path: Path, algo: str, env_id: str, env_kwargs: Mapping[str, Any] | None = None, statistics: Path | None = None
 ) -> Exported:
     """Load with stable-baselines3, which UNPICKLES the file; only for files whose maker is trusted.
 
     Args:
-        path: The zip.
+        path: The zip, for which `is_plain_sb3` holds.
         algo: Its algorithm.
         env_id: Its environment.
         env_kwargs: Arguments of the environment.
         statistics: File of a VecNormalize, which is unpickled too; without it, observations are not normalised.
 
     Raises:
-        CheckpointError: It is another file.
         CheckpointMismatch: A file is of another algorithm, or for another environment.
         UnknownName: There is no such algorithm.
     """
     if algo not in SB3_ALGORITHMS:
         raise UnknownName("algorithm", algo, SB3_ALGORITHMS)
-    if not is_plain_sb3(path):
-        with open_zip(path):
-            raise CheckpointError(path, "is not a zip of stable-baselines3, or already a checkpoint of bam-train")
     with contextlib.closing(make_env(env_id, env_kwargs)) as env:
         model, graph, golden = _frozen(path, algo, env_id, env, statistics)
         policy = FrozenPolicy.from_graph(graph, *map(space_to_json, (env.observation_space, env.action_space)))

@@ -9,6 +9,7 @@ import numpy as np
 from gymnasium import spaces
 
 from bam_envs.core.wording import brief
+from bam_envs.live.arm_checks import arm_in
 from bam_train.agent.front.jog import Jogger
 from bam_train.environments import control_period
 from bam_train.errors import SettingsError
@@ -106,7 +107,8 @@ class JointHand(Hand):
         inner: Any = env.unwrapped
         self._env, model, spec = inner, getattr(inner.task, "model", None), inner.robot.spec
         self._now, self._count, self._period = 0.0, 0, spec.period
-        self._jogger = Jogger(spec, spec.period, geometry=getattr(model, "geometry", None), clock=lambda: self._now)
+        geometry = getattr(model, "geometry", None) or arm_in(inner.task, spec)
+        self._jogger = Jogger(spec, spec.period, geometry=geometry, clock=lambda: self._now)
 
     @property
     def memory(self) -> Any:

@@ -28,7 +28,7 @@ _Rows: TypeAlias = dict[str, list[tuple[int, dict[str, Any]]]]
 """Topic to time [ns] and content of each message."""
 _MAX_CHUNK = 2**28  # of an unpacked chunk [bytes]; a camera's largest picture is far smaller
 _LENGTH = (LookupError, OverflowError, EOFError, MemoryError)
-_DAMAGE = (McapError, ZstdError, msgspec.MsgspecError, struct.error, ValueError, *_LENGTH)
+DAMAGE = (McapError, ZstdError, msgspec.MsgspecError, struct.error, ValueError, *_LENGTH)
 _FOREIGN = (msgspec.MsgspecError, ValueError, LookupError, TypeError, OverflowError, RecursionError)
 """Exceptions for messages with unexpected content."""
 _decode = msgspec.json.Decoder().decode
@@ -131,7 +131,7 @@ class Recording:
         except OSError as error:
             why = error.strerror or error
             raise FormatError(f"{self.path}: cannot be read: {why}. Give a .mcap file of bam-deploy") from error
-        except _DAMAGE:
+        except DAMAGE:
             return  # what was read so far is the recording
 
     def _take(self, rows: _Rows, record: McapRecord | tuple[str, Message]) -> None:

@@ -111,10 +111,10 @@ def served():
 def chunk_checkpoint(tmp_path):
     """Makes a checkpoint.zip for an SO-101 whose chunks keep every joint but wrist_roll, which turns by 0.1 deg a step.
 
-    The arguments are those of `Chunk`.
+    The arguments are those of `Chunk`, and actions in a second.
     """
 
-    def make(name="act.zip", **chunk):
+    def make(name="act.zip", rate=20.0, **chunk):
         from onnx import TensorProto, helper, numpy_helper
 
         size, names = chunk["size"], ["shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll"]
@@ -138,7 +138,7 @@ def chunk_checkpoint(tmp_path):
         table = ", ".join(f"{key} = {json.dumps(value)}" for key, value in chunk.items())
         ports = f'names = {json.dumps([*names, "gripper"])}\nunits = "degrees"\n'
         (tmp_path / "act.toml").write_text(
-            f'network = "act.onnx"\nrate = 20.0\nchunk = {{ {table} }}\n'
+            f'network = "act.onnx"\nrate = {rate}\nchunk = {{ {table} }}\n'
             f'[[inputs]]\nname = "state"\n{ports}[output]\nname = "actions"\n{ports}'
         )
         policy = described_policy(tmp_path / "act.toml")

@@ -4,15 +4,9 @@ import json
 import sys
 from pathlib import Path
 
+import lerobot_beside_torch  # noqa: F401
 import numpy as np
 import torch
-
-# The torchvision of PyPI is built for CUDA; see lerobot_reader.py.
-if "+cpu" in torch.__version__:
-    library = torch.library.Library("torchvision", "DEF")
-    for name in ("nms", "qnms"):
-        library.define(f"{name}(Tensor dets, Tensor scores, float iou_threshold) -> Tensor")
-
 from lerobot.configs.types import FeatureType, PolicyFeature
 from lerobot.policies.act.configuration_act import ACTConfig
 from lerobot.policies.act.modeling_act import ACTPolicy

@@ -3,15 +3,8 @@
 import json
 import sys
 
+import lerobot_beside_torch  # noqa: F401
 import torch
-
-# The torchvision of PyPI is built for CUDA, so its library of operators does not load beside a torch for the CPU, and
-# its import fails. These are the two that the import asks for; no data set calls them.
-if "+cpu" in torch.__version__:
-    library = torch.library.Library("torchvision", "DEF")
-    for name in ("nms", "qnms"):
-        library.define(f"{name}(Tensor dets, Tensor scores, float iou_threshold) -> Tensor")
-
 from datasets import load_dataset
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 

@@ -1,26 +1,33 @@
 """LeRobot 0.4.4 and Hugging Face datasets open a data set as it was recorded, and as it was exported.
 
-A policy of LeRobot, exported by `bam-export`, acts as in LeRobot.
+A policy of LeRobot, exported by `bam-export`, acts as in LeRobot. LeRobot's own programs drive our simulated arm.
 """
 
 import json
 import os
+import pty
 import subprocess
 import sys
+import threading
 from pathlib import Path
 
+import gymnasium as gym
 import numpy as np
+import pyarrow.parquet as pq
 import pytest
 
+from bam_envs.remote.serve.serve_options import ServeOptions
+from bam_envs.remote.serve.served_environment import ServedEnvironment
 from bam_train.data import DataSet
 from bam_train.data.layout import Files
 from bam_train.data.mending import mend
 from tests.bam_train.data.export.test_export import record
 from tests.peers.conftest import PEERS
 
-FOLDER = PEERS / "lerobot"
-READER = Path(__file__).parent / "lerobot_reader.py"
-POLICY = Path(__file__).parent / "lerobot_policy.py"
+FOLDER, HERE = PEERS / "lerobot", Path(__file__).parent
+READER, POLICY, ARM = HERE / "lerobot_reader.py", HERE / "lerobot_policy.py", HERE / "lerobot_arm.py"
+RECORD = (HERE / "lerobot_beside_torch.py", "lerobot.scripts.lerobot_record")
+NAMES = [f"{one}.pos" for one in ("shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll", "gripper")]
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -30,21 +37,31 @@ def lerobot(peers):
         (pytest.fail if os.environ.get("CI") == "true" else pytest.skip)("no peers: run tests/peers/install_peers")
 
 
-def lerobot_python(tmp_path, *arguments):
-    """The last line that a script printed which imports LeRobot."""
+@pytest.fixture(scope="module")
+def plugin(tmp_path_factory):
+    """The folder in which pip installed our plug-in for LeRobot."""
+    folder = tmp_path_factory.mktemp("plugin")
+    pip = [sys.executable, "-m", "pip", "install", "--quiet", "--disable-pip-version-check", "--no-index", "--no-deps"]
+    plugin = HERE.parents[1] / "lerobot_plugin"
+    subprocess.run([*pip, "--no-build-isolation", "--target", folder, plugin], check=True, timeout=300)
+    return folder
+
+
+def lerobot_program(tmp_path, *arguments, plugin=FOLDER, stdin=subprocess.DEVNULL):
+    """What a program printed which imports LeRobot."""
     env = {name: value for name, value in os.environ.items() if not name.startswith(("PYTEST", "PYTHON"))}
-    env |= {"PYTHONPATH": str(FOLDER), "HF_HUB_OFFLINE": "1", "HF_HOME": str(tmp_path / "hf"), "OMP_NUM_THREADS": "1"}
-    done = subprocess.run(
-        [sys.executable, *arguments],
-        env=env,
-        capture_output=True,
-        text=True,
-        check=False,
-        timeout=600,
-        cwd=tmp_path,
-    )
+    env |= {"PYTHONPATH": f"{plugin}{os.pathsep}{FOLDER}", "HF_HOME": str(tmp_path / "hf")}
+    env |= {"HF_HUB_OFFLINE": "1", "OMP_NUM_THREADS": "1"}
+    command = [sys.executable, *map(str, arguments)]
+    options = {"capture_output": True, "text": True, "check": False, "timeout": 600, "cwd": tmp_path}
+    done = subprocess.run(command, env=env, stdin=stdin, **options)
     assert done.returncode == 0, done.stdout + done.stderr
-    return json.loads(done.stdout.splitlines()[-1])
+    return done.stdout
+
+
+def lerobot_python(tmp_path, *arguments, **options):
+    """The last line that a script printed, as JSON."""
+    return json.loads(lerobot_program(tmp_path, *arguments, **options).splitlines()[-1])
 
 
 def read(root, tmp_path):
@@ -86,3 +103,74 @@ def test_every_episode_is_read(tmp_path):
         assert theirs["next.terminated"][-1] == ours.terminated
         assert theirs["task"] == ["bam/pick-v0"] * len(ours)
         np.testing.assert_array_equal(np.uint8(found["pictures"][index]), ours.observations["camera"][:-1])
+
+
+@pytest.fixture
+def served_arm():
+    """An SO-101 behind rosbridge, with a camera: its address, and the environment behind that."""
+    options = {"robot_model": "so101", "camera": "front", "image_size": "64x48", "disable_env_checker": True}
+    env = gym.make("bam/joints-v0", **options)
+    with ServedEnvironment(env, ServeOptions(port=0)) as served:
+        yield served.bus.url, env.unwrapped
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("moves", ["moves", "stays"])
+def test_our_arm_moves_with_an_action_and_never_before(served_arm, plugin, tmp_path, moves):
+    """Not with a wrong one either, in LeRobot's units."""
+    url, env = served_arm
+    before = env.robot.setpoint
+    said = lerobot_python(tmp_path, ARM, url, moves, plugin=plugin)
+    assert said["features"] == [False, *NAMES]
+    assert said["errors"] == [
+        "ResetNeeded: The arm is not connected. Call connect() first.",
+        "ResetNeeded: bam_keys moves the tool of a bam_arm. Connect one first: --robot.type=bam_arm",
+        f"InvalidValue: The action must be {', '.join(NAMES)}, not shoulder_pan.pos.",
+        said["errors"][3],
+    ]
+    assert said["errors"][3].startswith("InvalidValue: The action must be finite numbers, not [")
+    assert said["connected"] == pytest.approx(said["before"], abs=1e-6)
+    if moves == "stays":
+        np.testing.assert_array_equal(env.robot.setpoint, before)
+    else:
+        assert said["sent"] == pytest.approx(said["goal"], abs=0.5)
+        assert said["after"] == pytest.approx(said["goal"], abs=1.0)
+
+
+@pytest.mark.slow
+def test_lerobot_record_drives_our_arm_with_keys_and_with_a_policy(served_arm, plugin, tmp_path):
+    url, _ = served_arm
+    lerobot_python(tmp_path, POLICY, tmp_path, "act", "null")
+    robot = ["--robot.type=bam_arm", f"--robot.url={url}", "--robot.camera=front", "--robot.image_size=64x48"]
+    data = ["--dataset.single_task=wave", "--dataset.num_episodes=1", "--dataset.episode_time_s=3"]
+    data += ["--dataset.push_to_hub=false", "--dataset.vcodec=h264", "--play_sounds=false"]
+    ours, theirs = pty.openpty()
+    done = threading.Event()
+
+    def hold_a_key():
+        while not done.wait(0.05):
+            os.write(ours, b"w")
+
+    holding = threading.Thread(target=hold_a_key)
+    holding.start()
+    drivers = {"keys": ["--teleop.type=bam_keys"], "eval_act": [f"--policy.path={tmp_path / 'pretrained_model'}"]}
+    try:
+        for name, driver in drivers.items():
+            where = [f"--dataset.repo_id=bam/{name}", f"--dataset.root={tmp_path / name}"]
+            lerobot_program(tmp_path, *RECORD, *robot, *data, *where, *driver, plugin=plugin, stdin=theirs)
+    finally:
+        done.set()
+        holding.join()
+        os.close(ours)
+        os.close(theirs)
+    for name in drivers:
+        info = json.loads((tmp_path / name / "meta" / "info.json").read_text())
+        assert (info["robot_type"], info["fps"], info["features"]["action"]["names"]) == ("bam_arm", 30, NAMES)
+        [path] = (tmp_path / name / "data").rglob("*.parquet")
+        table = pq.read_table(path)
+        seen, acts = (np.stack(table[key].to_pylist()) for key in ("observation.state", "action"))
+        assert len(seen) == info["total_frames"] > 1
+        assert np.isfinite(acts).all()
+        assert np.abs(seen[-1] - seen[0]).max() > 1.0
+        [video] = (tmp_path / name / "videos" / "observation.images.front").rglob("*.mp4")
+        assert video.stat().st_size > 1000

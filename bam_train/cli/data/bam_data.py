@@ -79,7 +79,7 @@ def collect(config: flags.CollectConfig) -> None:
 
 def import_(config: flags.ImportConfig) -> None:
     """Add recordings or Parquet rows to a data set."""
-    from bam_train.data import DataSet, recordings
+    from bam_train.data import DataSet, recordings, rosbags
     from bam_train.errors import SettingsError
     from bam_train.files.place import Place
     from bam_train.recording.recording import Recording
@@ -92,7 +92,11 @@ def import_(config: flags.ImportConfig) -> None:
     _require(config.recordings, "import: RECORDING")
     env_kwargs = read_env_kwargs(config.set)
     for path in config.recordings:
-        if recordings.is_rows(path):
+        if rosbags.is_bag(path):
+            info = rosbags.info_of_bag(env_kwargs)
+            parts = rosbags.episodes_of_bag(path, info, config.profile)
+            notes = recordings.add_episodes(path, parts, config.place, info, **options)
+        elif recordings.is_rows(path):
             if os.path.abspath(Place(path).path) == os.path.abspath(Place(config.place).path):
                 raise SettingsError(f"{config.place}: has the Parquet rows; give another PLACE for the data set")
             info = recordings.info_of_rows(path, config.env, env_kwargs)

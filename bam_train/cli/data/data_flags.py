@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 import tyro
 from msgspec import Meta
 
-from bam_train.cli.flags import Assignments, CheckpointFile, Count, EnvId, EpisodeFlags, JsonFlag, Seed
+from bam_train.cli.flags import Assignments, CheckpointFile, Count, EnvId, EpisodeFlags, JsonFlag, Name, Seed
 
 Share = Annotated[float, Meta(ge=0, le=1), tyro.conf.arg(metavar="SHARE")]
 Places = Annotated[tyro.conf.Positional[tuple[str, ...]], tyro.conf.arg(metavar="PLACE...")]
@@ -77,12 +77,17 @@ class ImportConfig(DataFlags):
     Folders of Parquet files with one row a step are taken too. They have the columns eps_id, obs, actions, rewards,
     new_obs, terminateds and truncateds, and do not name their environment.
 
+    Bags of ROS 2 (MCAP, also the folder of ros2 bag record) of an arm become episodes of bam/joints: its states and
+    commands by a profile of its topics, sampled at the environment's rate, with actions of the commands. A gap in the
+    states ends an episode.
+
     Episodes that the data set has are left out. One that was cut off is added as truncated, with the fact "end": "cut
     off".
 
     Examples:
       bam-data import data/robot recordings/2026-11-23T150901Z-pick.mcap --group blue-cube
       bam-data import data/pick rows --env bam/pick --set randomize=true
+      bam-data import data/arm bag_0.mcap --set robot_model=so101 --set rate=30 --profile so101
     """
 
     recordings: Annotated[tyro.conf.Positional[tuple[Path, ...]], tyro.conf.arg(metavar="RECORDING...")]
@@ -90,7 +95,9 @@ class ImportConfig(DataFlags):
     env: EnvId = None
     """Environment of the recordings; needed for some_module:Env-v0 and for Parquet rows."""
     set: Assignments = ()
-    """An argument of the environment of Parquet rows, any number of times: randomize=true."""
+    """An argument of the environment of Parquet rows or a bag, any number of times: randomize=true."""
+    profile: Name = None
+    """Topics of the robot of a bag: a shipped profile's name, or a .toml or .yaml file; by default the arm's."""
     task: Annotated[str | None, tyro.conf.arg(metavar="TEXT")] = None
     """What the episodes are about, as a sentence; by default the environment's id."""
     again: bool = False

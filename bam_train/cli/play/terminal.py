@@ -48,11 +48,15 @@ def keys_in(data: bytes) -> tuple[list[str], bytes]:
 
 
 class Terminal:
-    """The terminal that is standard input, while the ``with`` block runs; its settings come back however that ends."""
+    """The terminal that is standard input, while the ``with`` block runs; its settings come back however that ends.
 
-    def __init__(self) -> None:
+    Args:
+        draws: Whether there is a screen to `show`, if standard error is a terminal.
+    """
+
+    def __init__(self, *, draws: bool = True) -> None:
         self._in, self._out = sys.stdin.fileno(), sys.stderr.fileno()
-        self._draws = sys.stderr.isatty()
+        self._draws = draws and sys.stderr.isatty()
         self._rest = b""
         self._keys: list[tuple[str, float]] = []
         self.let: list[str] = []

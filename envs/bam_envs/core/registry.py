@@ -159,7 +159,7 @@ _ENTRIES = (
         "bam_envs.tasks.reach:JointsTask",
         "bam_envs.robots.physics.mujoco_arm:arm_scene",
         max_episode_steps=600,
-        robot_options=("robot_model",),
+        robot_options=("robot_model", "rate"),
         cameras=_CAMERAS,
     ),
     EnvEntry(

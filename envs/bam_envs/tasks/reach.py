@@ -4,16 +4,18 @@
 """
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from gymnasium import spaces
+from msgspec import Meta
 
 from bam_envs.arms.description import ArmDescription
 from bam_envs.arms.description import robot_model as model_called
 from bam_envs.core.robot import EnvIds, Initial, RobotState
 from bam_envs.core.robot_models import DEFAULT_ARM
 from bam_envs.core.task import Array, Floats, Label, Memory, Score, draw_seeds, labelled_box, limited
+from bam_envs.core.validation import check
 from bam_envs.tasks.tool_control import FASTEST, JOINT_STEP, PACE, PERIOD, JointPace, WorkSpace
 
 START_NOISE = 0.1
@@ -23,6 +25,7 @@ JOINT_MARGIN = 0.1  # commands stay this far from the joint limits [rad]
 LEASH = 0.15
 """Farthest distance of the commanded joints from the measured ones [rad]."""
 
+Rate = Annotated[float, Meta(ge=5, le=100, description="a number of actions a second from 5 to 100")]
 WIDTH = "gripper_width"
 """Name of the gripper's number in observations, actions and commands."""
 
@@ -85,6 +88,7 @@ class ReachTask(Memory):
         self.goal = np.zeros((num_envs, 3))
         """Goals [m]. Shape: (n, 3)."""
         self._pace, self._sent = JointPace(self.space.description), np.zeros((num_envs, self.space.size))
+        self._fastest = FASTEST
 
     @staticmethod
     def labels(space: GoalSpace) -> tuple[Label, ...]:
@@ -137,7 +141,7 @@ class ReachTask(Memory):
         ]
 
     def command(self, action: Floats, state: RobotState) -> Array:
-        """Joints [rad] within `FASTEST` and `JointPace`, and the open gripper [m]. Shape: (n, joints + 1)."""
+        """Joints [rad] as fast as tool and `JointPace` allow, and the open gripper [m]. Shape: (n, joints + 1)."""
         measured, sent = state.signals["joint_position"], state.command[:, :-1]
         before = limited(sent - self._sent, -self._pace.step, self._pace.step)
         wanted = sent + limited(action, -1.0, 1.0).astype(np.float64) * JOINT_STEP
@@ -148,9 +152,9 @@ class ReachTask(Memory):
         for _ in range(3):
             step = self.space.arm.tool_position(sent + travel) - tool
             length = np.sqrt(np.einsum("ij,ij->i", step, step))
-            if length.max() <= FASTEST:
+            if length.max() <= self._fastest:
                 break
-            travel *= np.where(length > FASTEST, 0.99 * FASTEST / np.maximum(length, 1e-9), 1.0)[:, None]
+            travel *= np.where(length > self._fastest, 0.99 * self._fastest / np.maximum(length, 1e-9), 1.0)[:, None]
         sinks = (tool[:, 2] + step[:, 2] < self.space.lowest) & (step[:, 2] < 0)
         joints = sent + np.where(sinks[:, None], 0.0, travel)
         self._sent = sent
@@ -180,6 +184,7 @@ class JointsTask(ReachTask):
 
     Args:
         robot_model: The arm: the name of a description, or its file.
+        rate: Actions in a second, 5 to 100.
 
     Start:
         Each joint is within 0.1 rad of the home pose.
@@ -203,15 +208,16 @@ class JointsTask(ReachTask):
 
     memory: Mapping[str, str] = {"sent": "_sent"}
 
-    def __init__(self, num_envs: int = 1, *, robot_model: Any = DEFAULT_ARM) -> None:
+    def __init__(self, num_envs: int = 1, *, robot_model: Any = DEFAULT_ARM, rate: float = 1 / PERIOD) -> None:
         super().__init__(num_envs, robot_model=robot_model)
-        description = self.space.description
+        description, period = self.space.description, 1 / check(rate, Rate, "rate= of bam/joints")
+        self._pace, self._fastest = JointPace(description, period), FASTEST * period / PERIOD
         self.space.lowest = float(self.space.box[0, 2])
         self.action_labels = (
             *(Label(one.name, "joint position", "rad", low=one.low, high=one.high) for one in description.joints),
             Label(WIDTH, "opening of the gripper", "m", low=0.0, high=self.space.open),
         )
-        self._slide = PACE * PERIOD * description.gripper.speed
+        self._slide = PACE * period * description.gripper.speed
         self.action_step: Array = np.append(self._pace.step, self._slide)
         """Greatest change of each number of an action that is followed within a period. Shape: (joints + 1,)."""
         self.observation_labels = self.robot_labels = self.labels(self.space)

@@ -101,16 +101,17 @@ class JointPace:
 
     Args:
         description: The arm.
+        period: Time between two commands [s].
     """
 
-    def __init__(self, description: ArmDescription) -> None:
+    def __init__(self, description: ArmDescription, period: float = PERIOD) -> None:
         usual, rows = Limits(), description.joints
-        gains = [min(row.acceleration, row.jerk * PERIOD, usual.joint_acceleration) for row in rows]
+        gains = [min(row.acceleration, row.jerk * period, usual.joint_acceleration) for row in rows]
         speeds = [SHARE_AT_ONCE * min(row.velocity, usual.joint_speed) for row in rows]
-        self.change_limit = (PACE * PERIOD) ** 2 * np.array(gains)
+        self.change_limit = (PACE * period) ** 2 * np.array(gains)
         """Greatest change of a step [rad]. Shape: (k,)."""
-        braking = (PACE * PERIOD) ** 2 * usual.joint_acceleration
-        self.step = np.minimum(PACE * PERIOD * np.array(speeds), braking)
+        braking = (PACE * period) ** 2 * usual.joint_acceleration
+        self.step = np.minimum(PACE * period * np.array(speeds), braking)
         """Longest step [rad]. Shape: (k,)."""
         self.brakes = float(min(1.0, (self.change_limit / self.step).min()))
         """Share of the distance from an end of the work area that a step may cover: the arm can stop there."""

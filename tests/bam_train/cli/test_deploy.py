@@ -109,6 +109,17 @@ def test_a_policy_on_another_computer(chunk_checkpoint, served, run):
     assert (status, out, err) == (1, "", f"{text}bam-serve --policy CHECKPOINT --port PORT\n")
 
 
+@pytest.mark.parametrize(("rate", "status"), [(30.0, 0), (20.0, 3)])
+def test_a_policy_of_others_runs_at_its_own_rate(chunk_checkpoint, served, run, rate, status):
+    checkpoint = chunk_checkpoint(size=20, steps=10, rate=30.0)
+    env = gym.make("bam/joints-v0", robot_model="so101", rate=rate, disable_env_checker=True)
+    with served(env, fast=True) as urls:
+        found, out, _ = run(main, checkpoint, "--robot", urls[0], "--print-contract")
+    rows = [" ".join(line.split()) for line in out.splitlines() if "period" in line]
+    expected = ["period [s] 0.0333333 0.0333333 ok", f"robot's period 0.0333333 s {1 / rate:g} s"]
+    assert (found, rows) == (status, [expected[0], f"{expected[1]} {'refused' if status else 'ok'}"])
+
+
 def test_a_simulated_arm_that_is_held_fast_is_stopped(run):
     env = gym.make("bam/pick-v0", disable_env_checker=True)
     env.reset()

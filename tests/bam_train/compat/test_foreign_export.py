@@ -64,16 +64,17 @@ def described(tmp_path):
     return write
 
 
-@pytest.mark.parametrize("units", ["degrees", "range"])
-def test_order_and_units_become_those_of_the_robot(described, run, tmp_path, units):
+@pytest.mark.parametrize(("units", "rate"), [("degrees", 20.0), ("range", 30.0)])
+def test_order_units_and_rate_become_those_of_the_robot(described, run, tmp_path, units, rate):
     out = tmp_path / "act.zip"
-    status, said, err = run(main, described(units=units), "--robot-model", "so101", "--out", out)
+    path = described(("rate = 20.0", f"rate = {rate}"), units=units)
+    status, said, err = run(main, path, "--robot-model", "so101", "--out", out)
     assert (status, err) == (0, "")
     assert said.splitlines()[0] == (
         f"{out}: act on bam/joints-v0, 2 actions at once, 2 of them executed, out of {tmp_path / 'act.toml'}"
     )
     manifest = Checkpoint.open(out).manifest
-    assert (manifest.chunk, manifest.period, manifest.trainer) == (Chunk(2, 2), 0.05, "onnx")
+    assert (manifest.chunk, manifest.period, manifest.trainer) == (Chunk(2, 2), 1 / rate, "onnx")
     assert [one["name"] for one in manifest.signals["action"]] == [*JOINTS, "gripper_width"]
     policy, env = FrozenPolicy.load(out), make_env("bam/joints-v0", {"robot_model": "so101"})
     assert flatdim(env.observation_space) == 6
@@ -141,13 +142,17 @@ def test_the_ranges_in_the_data_make_the_detector(described, run, tmp_path, pixe
             [],
             "action: wrist_rol.pos a joint of the robot none. Did you mean 'wrist_roll'? refused",
         ),
-        ([("rate = 20.0", "rate = 30.0")], [], "period 0.0333333 s 0.05 s refused"),
+        (
+            [("rate = 20.0", "rate = 30.0")],
+            ["--set", "rate=20"],
+            "rate 30 Hz 20 Hz. Leave --env and --set rate= out refused",
+        ),
         ([], ["--set", "image_size=32"], "image front 64 x 48, 3 channels 32 x 32, 3 channels refused"),
     ],
 )
 def test_what_does_not_fit_is_a_row_and_refused(described, run, tmp_path, changes, flags, row):
-    pixels = bool(flags)
-    size = ["--set", "camera=front", *flags] if pixels else []
+    pixels = "image_size=32" in flags
+    size = ["--set", "camera=front", *flags] if pixels else flags
     path = described(*changes, pixels=pixels)
     status, said, err = run(main, path, "--robot-model", "so101", *size, "--out", tmp_path / "act.zip")
     assert (status, said) == (3, "")
@@ -194,12 +199,25 @@ def test_a_network_without_its_description(run, tmp_path):
     )
 
 
-def test_a_network_with_other_chunks_than_described(described, run):
-    path = described(("chunk = { size = 2", "chunk = { size = 3"))
-    status, _, err = run(main, path, "--robot-model", "so101")
-    text = "its network is not as it is described; check chunk, and names and size of inputs and output: "
-    assert status == 1
-    assert err.startswith(f"bam-export: {path}: {text}")
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        (
+            [("chunk = { size = 2", "chunk = { size = 3")],
+            "output actions: the graph gives [2, 6], and [3, 6] is described. Correct the size of the chunk, or its "
+            "names",
+        ),
+        (
+            [('"state"\nnames = ["wrist_roll.pos", ', '"state"\nnames = ['), ("mean = [1.0, ", "mean = ["),
+             ("std = [2.0, ", "std = [")],
+            "input state: the graph takes [6], and [5] is described. Correct its names or size, or the history of the "
+            "chunk",
+        ),
+    ],
+)  # fmt: skip
+def test_a_network_with_other_shapes_than_described(described, run, changes, message):
+    path = described(*changes)
+    assert run(main, path, "--robot-model", "so101") == (1, "", f"bam-export: {path}: {message}\n")
 
 
 def test_a_graph_with_other_inputs_is_refused(described, run):
@@ -242,6 +260,12 @@ def test_a_zip_of_stable_baselines3(run, tmp_path, capsys):
         1,
         f"bam-export: {path}: stable-baselines3 reads it, and runs whatever code is in it. If you trust its maker, "
         "give --trust-pickle, and say what it is: --env ID --algo NAME\n",
+    )
+    gone = tmp_path / "gone.zip"
+    assert run(main, f"sb3:{gone}", "--env", "CartPole-v1", "--algo", "ppo", "--trust-pickle") == (
+        1,
+        "",
+        f"bam-export: {gone}: no such file. Train one with bam-train, or check the name\n",
     )
     assert run(main, path, "--units", "degrees") == (
         1,

@@ -100,6 +100,21 @@ def test_joints_are_found_that_move_the_tool_along_the_key_or_hold_it(name):
     env.close()
 
 
+def test_the_tool_of_a_described_arm_follows_the_keys():
+    env = make_env("bam/joints-v0", {"robot_model": "so101"})
+    env.reset(seed=0)
+    hand, task = hand_for(env), env.unwrapped.task
+    sent = []
+    for keys in [{"KeyR", "KeyC"}] * 20:
+        env.step(hand.action(*moved(keys, 0.05)))
+        sent.append(env.unwrapped.state.command[0].copy())
+    way = np.diff(task.arm.tool_position(np.array([sent[0][:-1], sent[-1][:-1]])), axis=0)[0]
+    assert way[2] > 0.6 * 19 * 0.05 * 0.05
+    assert np.abs(way[:2]).max() < 0.25 * way[2]
+    assert sent[-1][-1] < 0.5 * sent[0][-1]
+    env.close()
+
+
 @pytest.mark.parametrize("name", JOINTS)
 def test_the_action_for_a_command_leads_to_it(name):
     env = make_env(name)

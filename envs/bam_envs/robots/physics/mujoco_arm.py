@@ -1,7 +1,8 @@
-"""An arm with a parallel gripper, simulated: position control, 20 Hz commands, 5 ms physics."""
+"""An arm with a parallel gripper, simulated: position control, 20 Hz commands or others, 5 ms physics or finer."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import replace
 from functools import partial
@@ -27,7 +28,7 @@ Array = NDArray[np.float64]
 GRIPPER_LEASH = 0.011
 """Farthest distance of the gripper's set point ahead of its fingers [m]: enough for full force, and to open at once."""
 LAG = 0.05  # delay of the joints behind their set points [s]: damping by stiffness of the actuators
-PHYSICS_STEPS = 10  # per period
+PHYSICS_STEPS = 10  # per period of up to 50 ms; a longer one has twice as many, and so on
 
 
 class SimulatedArm:
@@ -42,6 +43,7 @@ class SimulatedArm:
         randomize: Masses, friction, sizes and gains that differ each episode, a noisy tracker and delayed commands.
         cameras: Its cameras, ``front`` and ``wrist``, whose images are signals.
         robot_model: The arm; see `bam_envs.arms.description.robot_model`.
+        rate: Commands in a second.
         looks: ``"random"`` for light, colours, texture and poses of cameras that differ each episode, or ``"fixed"``.
     """
 
@@ -54,12 +56,15 @@ class SimulatedArm:
         cameras: tuple[CameraSpec, ...] = (),
         looks: str = "fixed",
         robot_model: Any = DEFAULT_ARM,
+        rate: float = 20.0,
     ) -> None:
         self.num_robots, self.description = num_robots, model_called(robot_model)
         self.randomize, self._looks = randomize, looks
         self.coarse = False
         """Whether `connect` builds coarse physics, to train on; see `coarse_physics`."""
-        self.spec = replace(self.description.spec(with_object=with_object), lag=LAG, cameras=cameras)
+        usual = self.description.spec(with_object=with_object)
+        self.spec = replace(usual, period=1 / rate, lag=LAG, cameras=cameras)
+        self._steps, self._is_usual = PHYSICS_STEPS * math.ceil(1 / rate / usual.period), rate * usual.period == 1.0
         self._joints, self._open = self.description.num_joints, self.description.gripper.open
         command = self.spec.command
         self._lowest, self._highest, self._max_rate = map(np.array, (command.low, command.high, command.max_rate))
@@ -71,7 +76,7 @@ class SimulatedArm:
         self._all = np.arange(num_robots)
         self._setpoint = np.zeros((num_robots, self._joints + 1))
         self._command = np.zeros((num_robots, self._joints + 1))
-        self._ramp = (np.arange(1, PHYSICS_STEPS + 1) / PHYSICS_STEPS)[None, :, None]
+        self._ramp = (np.arange(1, self._steps + 1) / self._steps)[None, :, None]
 
     def connect(self) -> None:
         """Build the physics."""
@@ -83,11 +88,14 @@ class SimulatedArm:
         from bam_envs.robots.physics.mujoco_batch import Physics
 
         scene = partial(scene_spec, self.description, with_object=self._with_object)
-        if self.coarse:
+        if self.coarse and self._is_usual:
             given: dict[str, Any] = {"with_object": self._with_object, "varied": self.randomize}
             self._physics = CoarsePhysics(self.description, self.num_robots, **given)
         else:
-            self._physics = Physics(scene().compile(), self.num_robots, varied=self.randomize)
+            model = scene().compile()
+            if not self._is_usual:
+                model.opt.timestep = self.spec.period / self._steps
+            self._physics = Physics(model, self.num_robots, varied=self.randomize)
         self._imperfection = Imperfection(self._physics) if self.randomize else None
         if self.spec.cameras:
             from bam_envs.robots.physics.cameras import Cameras
@@ -171,10 +179,10 @@ class SimulatedArm:
         abandoned, the next command begins in the middle of the period.
 
         Raises:
-            InvalidValue: `parts` is not 1, 2, 5 or 10.
+            InvalidValue: `parts` is not 1, 2, 5 or 10, or another divisor of the physics steps of a period.
         """
-        if parts not in range(1, PHYSICS_STEPS + 1) or PHYSICS_STEPS % parts:
-            raise InvalidValue(f"A period has {PHYSICS_STEPS} physics steps; it cannot be divided into {parts!r}.")
+        if parts not in range(1, self._steps + 1) or self._steps % parts:
+            raise InvalidValue(f"A period has {self._steps} physics steps; it cannot be divided into {parts!r}.")
         return self._slices(self._travel(checked_command(command, self._command.shape)), parts)
 
     def rest(self, resting: NDArray[np.bool_]) -> None:
