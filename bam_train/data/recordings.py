@@ -24,7 +24,6 @@ from bam_train.data.data_set_writer import DataSetWriter, require_same
 from bam_train.data.layout import INFO, Files
 from bam_train.data.record_dataset import info_of
 from bam_train.data.recorded_episode import Array, DataSetInfo, Episode, digest_of, nested
-from bam_train.data.rosbags import is_bag
 from bam_train.environments import make_env, must_be_named, require_env_kwargs
 from bam_train.errors import BadDataSet, FormatError
 from bam_train.files.place import Place, local_path
@@ -34,8 +33,8 @@ _CUT, _NO_END = "cut off", "it has no end, and is taken as truncated"
 
 
 def is_rows(source: Path) -> bool:
-    """Whether it is a Parquet file or a folder, and neither a recording nor a bag."""
-    return source.suffix == ".parquet" or (Place(source).is_dir() and not is_bag(source))
+    """Whether it is a Parquet file or a folder, and neither a recording nor a bag, whose metadata are in YAML."""
+    return source.suffix == ".parquet" or (Place(source).is_dir() and not Path(source, "metadata.yaml").is_file())
 
 
 def is_data_set(text: str) -> bool:
