@@ -24,18 +24,19 @@ from bam_train.data.data_set_writer import DataSetWriter, require_same
 from bam_train.data.layout import INFO, Files
 from bam_train.data.record_dataset import info_of
 from bam_train.data.recorded_episode import Array, DataSetInfo, Episode, digest_of, nested
-from bam_train.data.rosbags import is_bag
 from bam_train.environments import make_env, must_be_named, require_env_kwargs
 from bam_train.errors import BadDataSet, FormatError
 from bam_train.files.place import Place, local_path
 from bam_train.recording.recording import DIGEST, Recording
 
+BAG = "metadata.yaml"
+"""What the folder of a bag of ROS has."""
 _CUT, _NO_END = "cut off", "it has no end, and is taken as truncated"
 
 
 def is_rows(source: Path) -> bool:
     """Whether it is a Parquet file or a folder, and neither a recording nor a bag."""
-    return source.suffix == ".parquet" or (Place(source).is_dir() and not is_bag(source))
+    return source.suffix == ".parquet" or (Place(source).is_dir() and not (source / BAG).is_file())
 
 
 def is_data_set(text: str) -> bool:
