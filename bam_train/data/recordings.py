@@ -29,12 +29,14 @@ from bam_train.errors import BadDataSet, FormatError
 from bam_train.files.place import Place, local_path
 from bam_train.recording.recording import DIGEST, Recording
 
+BAG = "metadata.yaml"
+"""What the folder of a bag of ROS has."""
 _CUT, _NO_END = "cut off", "it has no end, and is taken as truncated"
 
 
 def is_rows(source: Path) -> bool:
-    """Whether it is a Parquet file or a folder, and neither a recording nor a bag, whose metadata are in YAML."""
-    return source.suffix == ".parquet" or (Place(source).is_dir() and not Path(source, "metadata.yaml").is_file())
+    """Whether it is a Parquet file or a folder, and neither a recording nor a bag."""
+    return source.suffix == ".parquet" or (Place(source).is_dir() and not (source / BAG).is_file())
 
 
 def is_data_set(text: str) -> bool:

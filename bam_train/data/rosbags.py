@@ -25,6 +25,7 @@ from bam_envs.ros.profile_tables import RobotProfile
 from bam_envs.safety.guard import measured_places
 from bam_train.data.record_dataset import info_of
 from bam_train.data.recorded_episode import Array, DataSetInfo, Episode, nested
+from bam_train.data.recordings import BAG
 from bam_train.environments import make_env, require_env_kwargs
 from bam_train.errors import FormatError
 from bam_train.recording.recording import DAMAGE
@@ -37,7 +38,7 @@ _FIRST = np.zeros(1, np.int64)
 def is_bag(source: Path) -> bool:
     """Whether it is an MCAP file, or a folder with some, that ROS wrote."""
     if source.is_dir():
-        return (source / "metadata.yaml").is_file()
+        return (source / BAG).is_file()
     try:
         with source.open("rb") as file:
             return str(_reader(file).get_header().profile).startswith("ros")
