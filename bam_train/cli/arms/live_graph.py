@@ -159,6 +159,7 @@ class GraphProfile:
             "state": [*self._state_rows(), *self._object_rows()],
             "commands": sinks,
             "enable": [*self._enabling()],
+            "limits": next((dict(one.limits) for one in self._known if one.robot == arm.name), {}),
         }
         if self._base is not None:  # what a graph need not show: whether the robot is ready, and which one it is
             self.table = {"extends": self._base.name, **self.table}
@@ -419,4 +420,6 @@ def profile_toml(profile: Any) -> str:
         lines += ["", f"[[{name}]]", *(f"{key} = {toml_text(value)}" for key, value in row.items())]
         if row.get("signal") == _WIDTH and not profile.is_known:
             lines += ["# scale = 1.0   # width in m = position of the joint x scale + offset", "# offset = 0.0"]
+    if table.get("limits"):
+        lines += ["", "[limits]", *(f"{key} = {toml_text(value)}" for key, value in table["limits"].items())]
     return "\n".join(lines) + "\n"

@@ -25,7 +25,7 @@ SHORTEST = 4
 GAP, KNOWN_GAP = 1e4, 4 * math.pi
 """Greatest distance of a command from the measured joint [rad]: in any unit, and in one that was proved before."""
 STILL, SAG = 0.002, 0.03
-"""Motion of a joint commanded to stay that counts as none, and that its load explains: a weak servo sags [rad]."""
+"""Motion of a joint commanded to stay that counts as none, and the most that its load explains [rad]."""
 NEAR_ZERO = 2 * math.pi * math.pi / 180
 """Greatest position of a joint that is divided by the degrees of a radian once more [rad]."""
 TINY = 0.0005
@@ -62,11 +62,21 @@ class ProofMotion:
         period: Time between two commands [s].
         lag: Longest delay of the measured joints behind the commands [s].
         is_timed: Whether a command says in which time it is to be reached; otherwise it is executed at once.
+        sag: How far the load of a weak servo moves a joint that is commanded to stay [rad], `SAG` at most.
     """
 
     def __init__(
-        self, labels: Sequence[str], start: Numbers, middle: Numbers, period: float, lag: float, *, is_timed: bool
+        self,
+        labels: Sequence[str],
+        start: Numbers,
+        middle: Numbers,
+        period: float,
+        lag: float,
+        *,
+        is_timed: bool,
+        sag: float = SAG,
     ) -> None:
+        self._sag = min(SAG, sag)
         self._labels, self._start, self._period, self._lag, self._is_timed = labels, start, period, lag, is_timed
         self._signs = [1.0 if value <= most else -1.0 for value, most in zip(start, middle, strict=True)]
         self._base = start.copy()  # where the joints are measured when they are commanded to `start`
@@ -110,16 +120,16 @@ class ProofMotion:
         closed = [0.0]  # share of a gap that was closed after each command
         while self._is_timed:
             delay = 1 + self._ticks(self._lag + self.age)  # commands that may not show yet
-            gap = min(greatest, SAG + STILL / max(closed[max(0, len(closed) - delay)], 1e-9))
+            gap = min(greatest, self._sag + STILL / max(closed[max(0, len(closed) - delay)], 1e-9))
             if gap <= MOST:
                 break
             closed.append(closed[-1] + self._period * SLOW / gap)
-            self._require_still((yield goal, gap / SLOW), STILL + SAG * min(1.0, closed[-1]))
+            self._require_still((yield goal, gap / SLOW), STILL + self._sag * min(1.0, closed[-1]))
         ticks, measured = self._ticks(SETTLE), self._start
         for tick in range(ticks + self._ticks(self._lag)):
             reach = max(SHORTEST, ticks + SHORTEST - 1 - tick) * self._period
             measured = yield goal, reach if self._is_timed else None
-            self._require_still(measured, SAG)
+            self._require_still(measured, STILL + self._sag)
         self._base = [at - way for at, way in zip(measured, self._all(TINY), strict=True)]
         if max(abs(now - begin) for now, begin in zip(self._base, self._start, strict=True)) > STILL:
             once, twice, reach = self._all(TINY), self._all(2 * TINY), SHORTEST * self._period
@@ -131,9 +141,10 @@ class ProofMotion:
         moved = [now - before for now, before in zip(measured, self._start, strict=True)]
         at = max(range(len(moved)), key=lambda joint: abs(moved[joint]))
         if abs(moved[at]) > most + TINY:
+            sags = "; or, of a weak servo, the load: allow it with --guard follow_tolerance=0.03" if most < SAG else ""
             raise NotAsCommanded(
                 f"{self._labels[at]} was commanded to stay where it is measured, and moved {moved[at]:+.3f} rad: "
-                "commands and measurements differ in the order of the joints, in a sign, an offset or the unit"
+                f"commands and measurements differ in the order of the joints, in a sign, an offset or the unit{sags}"
             )
 
     def _together(self) -> Moves:

@@ -705,6 +705,7 @@ class SafeRobot(metaclass=Sealed):
             self.spec.period,
             self.spec.lag if self.limits.lag is None else self.limits.lag,
             is_timed=proof is not None and proof.is_timed,
+            sag=self.limits.follow_tolerance,
         )
         states, is_shortened = list[RobotState](), False
         moves = motion.moves(every=anew or proof is None or not proof.is_known)
