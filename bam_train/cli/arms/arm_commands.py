@@ -218,44 +218,65 @@ def _draw(description: Description, path: Path) -> None:
         robot.close()
 
 
-def write_profile(config: ProfileConfig) -> int | None:
-    """Write the profile of a robot from its live graph."""
+def write_profile(config: ProfileConfig) -> None:
+    """Write the profile of a robot from its live graph or a contract of rosetta, or the contract of its profile."""
     from bam_envs.arms.description import ArmDescription
-    from bam_envs.core.location import LiveRobot
     from bam_envs.core.robot_models import Description, find_model
     from bam_envs.robots.base_description import base_model
-    from bam_envs.robots.profile import read_profile
-    from bam_envs.rosbridge.client import RosbridgeLink
-    from bam_envs.rosbridge.endpoint import Endpoint
+    from bam_envs.robots.profile import profile_for, read_profile
     from bam_train.cli.arms.base_graph import BaseGraphProfile
-    from bam_train.cli.arms.live_graph import GraphProfile, profile_toml, read_graph
+    from bam_train.cli.arms.live_graph import GraphProfile, profile_toml
+    from bam_train.cli.arms.rosetta_contract import contract_text
 
     robot = find_model(config.name, Description)
     path = config.out or Path("robots") / "profiles" / f"{robot.name}.toml"
-    if path.exists() and not config.force:
-        raise InvalidValue(f"{path} exists; give another name with --out, or --force to replace it.")
-    link = RosbridgeLink(Endpoint.of(LiveRobot(config.url, config.credentials)), name="profile")
+    for flag, file in (("--rosetta", config.rosetta), ("--out", None if config.url is None else path)):
+        if file is not None and file.exists() and not config.force:
+            raise InvalidValue(f"{file} exists; give another name with {flag}, or --force to replace it.")
+    if config.url is not None:
+        graph = _graph(config, config.url, robot.name)
+        if not config.force:
+            _require_named(robot, graph)
+        found: GraphProfile | BaseGraphProfile
+        if isinstance(robot, ArmDescription):
+            found = GraphProfile(robot, graph)
+        else:
+            found = BaseGraphProfile(base_model(robot), graph)
+        profile = read_profile(profile_toml(found), str(path))
+        if isinstance(robot, ArmDescription):
+            found.notes += _against_urdf(robot, graph, profile, forced=config.force)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(profile_toml(found), encoding="utf-8")
+        tell(f"wrote {path}:", *(f"  {line}" for line in _profile_lines(profile)))
+        if found.notes:
+            tell("notes, written at its head:", *(f"  {note}" for note in found.notes))
+    elif config.rosetta is None:
+        raise InvalidValue("Where is the robot? Give its address or a contract with --from, or --rosetta FILE.")
+    else:
+        spec = robot.spec(with_object=False) if isinstance(robot, ArmDescription) else base_model(robot).spec()
+        profile = profile_for(spec)
+    if config.rosetta is not None:
+        config.rosetta.parent.mkdir(parents=True, exist_ok=True)
+        config.rosetta.write_text(contract_text(profile), encoding="utf-8")
+        tell(f"wrote {config.rosetta}: a contract of rosetta")
+
+
+def _graph(config: ProfileConfig, source: str, name: str) -> LiveGraph:
+    """The graph at an address, or of a contract of rosetta."""
+    from bam_envs.core.location import LiveRobot
+    from bam_envs.rosbridge.client import RosbridgeLink
+    from bam_envs.rosbridge.endpoint import Endpoint
+    from bam_train.cli.arms.live_graph import read_graph
+    from bam_train.cli.arms.rosetta_contract import contract_graph
+
+    if Path(source).suffix in (".yaml", ".yml"):
+        return contract_graph(Path(source).expanduser(), name)
+    link = RosbridgeLink(Endpoint.of(LiveRobot(source, config.credentials)), name="profile")
     try:
         link.connect()
-        graph = read_graph(link)
+        return read_graph(link)
     finally:
         link.close()
-    if not config.force:
-        _require_named(robot, graph)
-    found: GraphProfile | BaseGraphProfile
-    if isinstance(robot, ArmDescription):
-        found = GraphProfile(robot, graph)
-    else:
-        found = BaseGraphProfile(base_model(robot), graph)
-    profile = read_profile(profile_toml(found), str(path))
-    if isinstance(robot, ArmDescription):
-        found.notes += _against_urdf(robot, graph, profile, forced=config.force)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(profile_toml(found), encoding="utf-8")
-    tell(f"wrote {path}:", *(f"  {line}" for line in _profile_lines(profile)))
-    if found.notes:
-        tell("notes, written at its head:", *(f"  {note}" for note in found.notes))
-    return None
 
 
 def _require_named(robot: Description, graph: LiveGraph) -> None:

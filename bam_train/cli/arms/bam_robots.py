@@ -75,16 +75,21 @@ class ProfileConfig(CredentialFlags):
     """Write the live profile of a robot from its graph: topics, joints, controllers, gripper and services.
 
     It asks rosapi and the controller manager behind rosbridge, and moves nothing. The file is found by the name of the
-    robot; comments at its head say what was assumed.
+    robot; comments at its head say what was assumed. A contract of rosetta takes the place of the graph, and is written
+    with --rosetta.
 
     Examples:
       bam-robots profile lab --from ws://10.0.0.5:9090
+      bam-robots profile lab --from lab_contract.yaml
+      bam-robots profile so101 --rosetta so101_contract.yaml
     """
 
     name: ModelName
     """Name of the robot, or the file of its description."""
-    url: Annotated[str, tyro.conf.arg(name="from", metavar="URL")]
-    """Address of the robot behind rosbridge."""
+    url: Annotated[str | None, tyro.conf.arg(name="from", metavar="URL|FILE")] = None
+    """Address of the robot behind rosbridge, or a contract of rosetta (.yaml)."""
+    rosetta: File = None
+    """Write the contract of the profile; without --from, of the profile that the robot has."""
     out: File = None
     """The file (default robots/profiles/NAME.toml)."""
     force: bool = False

@@ -6,7 +6,7 @@ assumed, and a note says so.
 """
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import MISSING, asdict, dataclass, fields, is_dataclass
+from dataclasses import MISSING, asdict, dataclass, field, fields, is_dataclass
 from typing import Any
 
 from bam_envs.arms.description import ArmDescription
@@ -61,6 +61,10 @@ class LiveGraph:
     """What the robot calls itself, or its profile; empty: it does not tell."""
     urdf: tuple[Letter, ...] = ()
     """Its URDF, as it came."""
+    commands: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    """Joints that topics of commands take, in their order, where a contract says them."""
+    cameras: tuple[Row, ...] = ()
+    """Its cameras, where a contract says them."""
 
 
 def read_graph(link: RosbridgeLink) -> LiveGraph:
@@ -160,6 +164,7 @@ class GraphProfile:
             "commands": sinks,
             "enable": [*self._enabling()],
             "limits": next((dict(one.limits) for one in self._known if one.robot == arm.name), {}),
+            **({"cameras": [*graph.cameras]} if graph.cameras else {}),
         }
         if self._base is not None:  # what a graph need not show: whether the robot is ready, and which one it is
             self.table = {"extends": self._base.name, **self.table}
@@ -219,8 +224,8 @@ class GraphProfile:
     def _state_rows(self) -> Iterator[Row]:
         names, sets = list(self._names.values()), self.graph.joints[self._topic]
         partial = {"partial": True} if len(sets) > 1 else {}
-        for field in ("position", "velocity"):
-            row = {"signal": f"joint_{field}", "topic": self._topic, "type": _STATES, "field": field, "names": names}
+        for what in ("position", "velocity"):
+            row = {"signal": f"joint_{what}", "topic": self._topic, "type": _STATES, "field": what, "names": names}
             yield {**row, **partial}
         beside = {name for one in self.graph.joints[self._gripper["topic"]] for name in one}
         others = sorted(beside - {*names, *self._gripper["names"]})
@@ -321,6 +326,11 @@ class GraphProfile:
 
     def _topics_alone(self) -> Iterator[tuple[str, str, str, list[str], bool]]:
         """The same by the names of topics, where nothing lists the controllers."""
+        if self.graph.commands:
+            yield from (
+                ("", self.graph.topics[topic], topic, [*names], True) for topic, names in self.graph.commands.items()
+            )
+            return
         self.notes.append("nothing lists the controllers: which joints each takes is assumed")
         for topic, kind in self.graph.topics.items():
             if kind == _TRAJECTORY and "gripper" not in topic:
@@ -332,10 +342,10 @@ class GraphProfile:
         for sink in known:
             if all(map(self._offers, sink.forms)):
                 return entry_row(sink) | self._joint_unit(sink.type)
-        for kind, field in _GOALS.items():
+        for kind, place in _GOALS.items():
             actions = sorted(name for name, one in self.graph.actions.items() if one == kind)
             if actions:
-                row: Row = {"action": actions[0], "type": kind, "labels": [_WIDTH], "fields": [field]}
+                row: Row = {"action": actions[0], "type": kind, "labels": [_WIDTH], "fields": [place]}
                 if kind == "control_msgs/ParallelGripperCommand":
                     row["constants"] = {"command.name[0]": self._gripper["names"][0]}
                 row |= self._joint_unit(kind)
@@ -415,7 +425,7 @@ def profile_toml(profile: Any) -> str:
         lines.append('# controllers = "/controller_manager/list_controllers"   # nothing there lists them')
     tables = [("state", row) for row in table["state"]]
     tables += [(f"commands.{mode}", row) for mode, rows in table["commands"].items() for row in rows]
-    tables += [("enable", row) for row in table.get("enable", ())]
+    tables += [(name, row) for name in ("enable", "cameras") for row in table.get(name, ())]
     for name, row in tables:
         lines += ["", f"[[{name}]]", *(f"{key} = {toml_text(value)}" for key, value in row.items())]
         if row.get("signal") == _WIDTH and not profile.is_known:

@@ -264,7 +264,9 @@ def test_a_graph_that_does_not_fit_is_one_line(run, graph, tmp_path, options, me
 
 
 def test_the_address_is_called_as_the_help_says(run):
-    assert "  --from URL         Address of the robot behind rosbridge.\n" in run(main, "profile", "--help")[1]
+    assert (
+        "--from URL|FILE    Address of the robot behind rosbridge, or a contract" in run(main, "profile", "--help")[1]
+    )
     status, _, err = run(main, "profile", "gen3", "--form", "ws://127.0.0.1:9")
     remedy = "Run bam-robots profile --help\n"
     assert (status, err) == (2, f"bam-robots profile: unknown option --form, did you mean --from? {remedy}")
@@ -285,3 +287,105 @@ def test_no_server_no_rosapi_and_a_file_that_is_there(run, graph, tmp_path):
     (tmp_path / "robots" / "profiles" / "gen3.toml").write_text("")
     status, _, err = run(main, "profile", "gen3", "--from", url)
     assert (status, "robots/profiles/gen3.toml exists; give another name with --out, or --force" in err) == (1, True)
+
+
+CONTRACT = """robot_type: so_lab
+fps: 30
+observations:
+  observation.images.wrist:
+    channel: {topic: /wrist/image_raw/compressed, type: sensor_msgs/msg/CompressedImage}
+    align: {strategy: hold, timeline: header}
+    apply: [resize: [512, 512]]
+  observation.state:
+    - channel: {topic: /follower/joint_states, type: sensor_msgs/msg/JointState}
+      select: [position.jaw, position.roll, position.wrist_flex, position.elbow, position.lift, position.pan]
+      apply: [rad2deg]
+    - channel: {topic: /imu, type: sensor_msgs/msg/Imu}
+      select: [orientation.x, orientation.y]
+actions:
+  action:
+    channel: {topic: /leader/joint_states, type: sensor_msgs/msg/JointState}
+    select: [position.jaw, position.roll, position.wrist_flex, position.elbow, position.lift, position.pan]
+"""
+RENAMED = {"shoulder_pan": "pan", "shoulder_lift": "lift", "elbow_flex": "elbow", "wrist_roll": "roll"}
+
+
+@pytest.fixture
+def contract(tmp_path, monkeypatch):
+    """Writes a contract with changes, beside the description of the arm that it is about."""
+    monkeypatch.chdir(tmp_path)
+    lab(
+        "solab",
+        "so101",
+        ('joint = "gripper"', 'joint = "jaw"'),
+        *((f'"{old}"', f'"{new}"') for old, new in RENAMED.items()),
+    )
+
+    def write(old="", new=""):
+        (tmp_path / "contract.yaml").write_text(CONTRACT.replace(old, new, 1))
+        return tmp_path / "contract.yaml"
+
+    return write
+
+
+def test_a_contract_of_rosetta_says_topics_joints_and_their_order(run, contract, tmp_path):
+    status, out, err = run(main, "profile", "solab", "--from", contract())
+    assert (status, err) == (0, "")
+    assert out.splitlines()[1:3] == ["  states: /follower/joint_states, /object_pose", "  joints: /leader/joint_states"]
+    read = load_profile(tmp_path / "robots" / "profiles" / "solab.toml")
+    [sink] = read.sinks()
+    assert (sink.topic, sink.type) == ("/leader/joint_states", "sensor_msgs/JointState")
+    assert sink.labels == ("gripper_width", "roll", "wrist_flex", "elbow", "lift", "pan")
+    assert sink.names == ("jaw", *sink.labels[1:])
+    assert read.source("joint_position").names == ("pan", "lift", "elbow", "wrist_flex", "roll")
+    assert (read.source("gripper_width").topic, read.source("gripper_width").names) == (
+        "/follower/joint_states",
+        ("jaw",),
+    )
+    assert [(one.name, one.topic) for one in read.cameras] == [("wrist", "/wrist/image_raw/compressed")]
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (
+            ("so_lab", "stone"),
+            "the robot there calls itself stone, and solab was named. Give bam-robots profile stone --from {path}, or "
+            "--force if it is solab.",
+        ),
+        (
+            ("position.elbow,", "position.knee,"),
+            "/follower/joint_states has no elbow of solab; it has jaw, knee, lift, pan, roll, wrist_flex. Is another "
+            "arm there? Else correct the names in its description.",
+        ),
+        (
+            ("actions:", "acts:"),
+            "no contract of rosetta: expected robot_type, and observations and actions with channels of topic and "
+            "type; KeyError: 'actions'.",
+        ),
+        (("fps: 30", "fps: ["), "cannot be read: while parsing a flow sequence"),
+    ],
+)
+def test_a_contract_that_does_not_fit_is_one_line(run, contract, tmp_path, change, message):
+    path = contract(*change)
+    status, out, err = run(main, "profile", "solab", "--from", path)
+    assert (status, out, err.count("\n")) == (1, "", 1)
+    assert err.startswith(f"bam-robots profile: {path}: {message.format(path=path)}")
+    assert not (tmp_path / "robots" / "profiles").exists()
+
+
+@pytest.mark.parametrize(("name", "shipped"), [("so101", "ros2_so_arm100"), ("mir100", "mir100")])
+def test_a_written_contract_gives_the_same_states_and_commands(run, tmp_path, monkeypatch, name, shipped):
+    monkeypatch.chdir(tmp_path)
+    assert run(main, "profile", name, "--rosetta", "contract.yaml") == (
+        0,
+        "wrote contract.yaml: a contract of rosetta\n",
+        "",
+    )
+    status, _, err = run(main, "profile", name, "--rosetta", "contract.yaml")
+    assert (status, "contract.yaml exists; give another name with --rosetta, or --force" in err) == (1, True)
+    assert run(main, "profile", name, "--from", "contract.yaml")[0] == 0
+    read, expected = load_profile(tmp_path / "robots" / "profiles" / f"{name}.toml"), load_profile(shipped)
+    assert read.sinks() == tuple(replace(one, controller="") for one in expected.sinks())
+    for signal in ("joint_position", "gripper_width") if name == "so101" else ("base_velocity",):
+        assert read.source(signal) == expected.source(signal)

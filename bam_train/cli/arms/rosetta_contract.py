@@ -1,0 +1,99 @@
+"""Contracts of rosetta, a bridge between LeRobot and ROS 2: read as the graph of a robot, and written of a profile.
+
+A contract names topics, types and joints, as a live graph does; what it does not say is assumed in the same way.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from bam_envs.core.errors import InvalidValue
+from bam_envs.ros.messages import bare_type, has_header
+from bam_envs.ros.profile_tables import RobotProfile, Sink, Source
+from bam_train.cli.arms.live_graph import LiveGraph, Row
+
+_IMAGES = "observation.images."
+_SIGNALS = ("joint_position", "gripper_width", "base_velocity")
+"""What the state of a written contract has."""
+
+
+def contract_graph(path: Path, robot: str) -> LiveGraph:
+    """The topics, joints and cameras of a contract; a robot that it writes as ``so_101`` is called so101.
+
+    Raises:
+        InvalidValue: It cannot be read, or is no contract.
+    """
+    try:
+        table: Any = yaml.safe_load(path.read_text(encoding="utf-8"))
+        told, sections = str(table["robot_type"]), ("observations", "actions")
+        seen, acts = ([*_entries(table[name])] for name in sections)
+        topics = {one["topic"]: bare_type(one["type"]) for one in map(_channel, table.get("adjunct") or ())}
+        topics |= {key[1]: bare_type(kind) for key, kind, _ in (*seen, *acts)}
+    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+        raise InvalidValue(f"{path}: cannot be read: {' '.join(str(error).split())}.") from error
+    except (AttributeError, KeyError, TypeError) as error:
+        raise InvalidValue(
+            f"{path}: no contract of rosetta: expected robot_type, and observations and actions with channels of topic "
+            f"and type; {type(error).__name__}: {error}."
+        ) from error
+    states: dict[str, tuple[str, ...]] = {}
+    for (_, topic), kind, names in seen:
+        if bare_type(kind) == "sensor_msgs/JointState":
+            states[topic] = tuple(dict.fromkeys((*states.get(topic, ()), *names)))
+    cameras = tuple(
+        {"name": key.removeprefix(_IMAGES), "topic": topic, "type": bare_type(kind), "optional": True}
+        for (key, topic), kind, _ in seen
+        if key.startswith(_IMAGES)
+    )
+    name = robot if told.replace("_", "") == robot.replace("_", "") else told
+    commands = {topic: names for (_, topic), _, names in acts}
+    joints = {topic: (names,) for topic, names in states.items()}
+    return LiveGraph(str(path), topics, frozenset(), {}, "", (), joints, name, commands=commands, cameras=cameras)
+
+
+def _entries(section: Row) -> Iterator[tuple[tuple[str, str], str, tuple[str, ...]]]:
+    """Key and topic, type, and the joints of each entry of a section."""
+    for key, rows in section.items():
+        for row in rows if isinstance(rows, list) else [rows]:
+            channel, names = _channel(row), [str(one).rpartition(".")[2] for one in row.get("select") or ()]
+            yield (str(key), str(channel["topic"])), str(channel["type"]), tuple(dict.fromkeys(names))
+
+
+def _channel(row: Row) -> Row:
+    channel: Row = row["channel"]
+    return channel
+
+
+def contract_text(profile: RobotProfile) -> str:
+    """The contract of a robot: its state, its cameras, and its first command mode, in the units of its topics."""
+    images = {
+        f"{_IMAGES}{one.name}": {**_bound(one.topic, one.type), "apply": [{"resize": [480, 640]}]}
+        for one in profile.cameras
+        if not one.name.endswith("_depth")  # which rosetta does not read
+    }
+    sources = [one for one in profile.state if one.signal in _SIGNALS]
+    state = [{**_bound(one.topic, one.type), "select": _select(one, one.field)} for one in sources]
+    sinks = [one for one in profile.sinks() if one.topic]
+    action = [
+        {**_bound(one.topic, one.type, safety="zeros" if one.hold == "zero" else "hold"), "select": _select(one)}
+        for one in sinks
+    ]
+    table = {"robot_type": profile.robot or profile.name, "robot_interface": "ros2", "fps": round(1 / profile.period)}
+    table |= {"observations": {**images, "observation.state": state}, "actions": {"action": action}}
+    return str(yaml.safe_dump(table, sort_keys=False))
+
+
+def _bound(topic: str, kind: str, **more: str) -> Row:
+    package, _, name = bare_type(kind).partition("/")
+    timeline = "header" if has_header(kind) else "receive"
+    channel = {"topic": topic, "type": f"{package}/msg/{name}", **more}
+    return {"channel": channel, "align": {"strategy": "hold", "timeline": timeline}}
+
+
+def _select(entry: Source | Sink, field: str = "position") -> list[str]:
+    """Its numbers as rosetta selects them."""
+    return [*entry.fields] or [f"{field}.{name}" for name in entry.names]
