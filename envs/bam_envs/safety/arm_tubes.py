@@ -9,7 +9,7 @@ with joint 1: neither that joint nor the last one changes a distance. The tubes 
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
-from itertools import accumulate, combinations
+from itertools import combinations
 from operator import mul, sub
 from typing import NamedTuple
 
@@ -33,20 +33,18 @@ _CAP = 0.03
 5.7 cm before it [m]."""
 _BASE, _SHOULDER, _UPPER, _FOREARM, _WRIST_1, _WRIST_2, _WRIST_3, _ELBOW = range(8)
 _PAIRS = (
-    *((first, other, 1) for first in (_BASE, _SHOULDER) for other in (_FOREARM, _WRIST_1, _WRIST_2, _WRIST_3)),
-    *((_UPPER, other, 2) for other in (_WRIST_1, _WRIST_2, _WRIST_3)),
-    (_FOREARM, _WRIST_3, 3),
+    *((first, other) for first in (_BASE, _SHOULDER) for other in (_FOREARM, _WRIST_1, _WRIST_2, _WRIST_3)),
+    *((_UPPER, other) for other in (_WRIST_1, _WRIST_2, _WRIST_3)),
+    (_FOREARM, _WRIST_3),
 )
-"""Pairs of tubes that can touch and share no joint, and the first joint, from 0, that changes their distance."""
+"""Pairs of tubes that can touch and share no joint."""
 
 
 class LinkPair(NamedTuple):
     """Pairs of tubes on two links that can touch."""
 
-    low: int
-    """The first joint, from 0, that changes their distance."""
-    high: int
-    """The first joint after it that does not."""
+    levers: Sequence[float]
+    """How far a turn of each joint changes their distance at most [m/rad]. Shape: (k,)."""
     pairs: Sequence[Pair]
     around: Pair
     """A tube around all of these tubes of the one link and one around those of the other, which are computed first."""
@@ -61,13 +59,15 @@ class Tubes:
 
     Args:
         groups: The tubes that can touch.
-        levers: How far a turn of each joint moves what is beyond it at most [m/rad]. Shape: (k,).
+        levers: How far a turn of each joint moves the lowest point up or down at most [m/rad]. Shape: (k,).
     """
 
     def __init__(self, groups: Sequence[LinkPair], levers: Sequence[float]) -> None:
-        self._groups, self._levers = groups, levers
+        self._groups = groups
+        self._levers = np.array([*[group.levers for group in groups], levers])
+        self._most: list[float] = self._levers.max(axis=0).tolist()
         self._in = [{tube for pair in group.pairs for tube in pair[:2]} for group in groups]
-        self._at: Sequence[float] = [math.inf] * len(levers)  # the joints of these lower bounds
+        self._at: Sequence[float] = [0.0] * len(levers)  # the joints of these lower bounds
         self._near, self._height, self._least = [-math.inf] * len(groups), -math.inf, -math.inf
 
     def segments(self, q: Sequence[float], tubes: Iterable[int]) -> dict[int, Segment]:
@@ -87,16 +87,14 @@ class Tubes:
         """Whether two tubes, or the lowest point and the `table`, are nearer than `margin` [m] at the joints `q` (k,).
 
         A distance is computed again only when the joints that change it have turned far enough since the last time to
-        bring it within the margin: a turn moves a tube by at most its angle times the length of the arm beyond.
+        bring it within the margin; see `LinkPair.levers`.
         """
-        moved = list(map(mul, self._levers, map(abs, map(sub, q, self._at))))
-        if min(self._least, self._height - table) - sum(moved) >= margin:
+        turned = list(map(abs, map(sub, q, self._at)))
+        if min(self._least, self._height - table) - sum(map(mul, self._most, turned)) >= margin:
             return False
-        turned_by, near, due = list(accumulate(moved, initial=0.0)), self._near, []
-        for place, (low, high, _, _) in enumerate(self._groups):
-            near[place] -= turned_by[high] - turned_by[low]
-            if not near[place] >= margin:
-                due.append(place)
+        *lost, sunk = (self._levers @ turned).tolist()
+        near = list(map(sub, self._near, lost))
+        due = [place for place, apart in enumerate(near) if not apart >= margin]
         if due:
             pairs = [self._groups[place].around for place in due]
             segments, closer = self.segments(q, {tube for pair in pairs for tube in pair[:2]}), []
@@ -108,10 +106,10 @@ class Tubes:
                 segments = self.segments(q, {tube for place in closer for tube in self._in[place]})
                 for place in closer:
                     near[place] = self._groups[place].nearest(segments)
-        self._height -= turned_by[-1]
+        self._height -= sunk
         if not self._height - table >= margin:
             self._height = self.lowest(q)
-        self._at, self._least = list(q), min(near, default=math.inf)
+        self._at, self._near, self._least = list(q), near, min(near, default=math.inf)
         return min(self._least, self._height - table) < margin
 
 
@@ -121,13 +119,18 @@ class ArmTubes(Tubes):
     def __init__(self, geometry: ArmGeometry, outline: ArmOutline, *, tool: bool) -> None:
         self._arm, self._outline, self._tool = geometry, outline, geometry.tool if tool else 0.0
         self._radii = [outline.base, *[outline.upper_arm] * 2, outline.forearm, *[outline.wrist] * 3, outline.forearm]
-        end = geometry.d6 + self._tool
-        wrist = geometry.d5 + end
-        levers = abs(geometry.a2) + abs(geometry.a3) + wrist, abs(geometry.a3) + wrist, wrist, end
-        radii = self._radii
-        pairs = [(one, other, radii[one] + radii[other]) for one, other, _ in _PAIRS]
-        groups = [LinkPair(joint, 5, [pair], pair) for pair, (*_, joint) in zip(pairs, _PAIRS, strict=True)]
-        super().__init__(groups, [0.0, *levers, 0.0])
+        end, upper, fore = max(geometry.d6 + self._tool, _CAP), abs(geometry.a2), abs(geometry.a3)
+        wrist = math.hypot(geometry.d5, end)
+        # How far tubes beyond joints 4 and 5, and those before joints 2 and 3, reach from the axes of these joints.
+        beyond = {_WRIST_2: (max(geometry.d5, _CAP), 0.0), _WRIST_3: (wrist, end)}
+        before = {_BASE: (geometry.d1, geometry.d1 + upper), **dict.fromkeys((_SHOULDER, _UPPER), (0.0, upper))}
+        groups = []
+        for one, other in _PAIRS:
+            (turn_2, turn_3), (turn_4, turn_5) = before.get(one, (0.0, 0.0)), beyond.get(other, (0.0, 0.0))
+            pair = one, other, self._radii[one] + self._radii[other]
+            levers = [0.0, min(turn_2, upper + fore + turn_4), min(turn_3, fore + turn_4), turn_4, turn_5, 0.0]
+            groups.append(LinkPair(levers, [pair], pair))
+        super().__init__(groups, [0.0, upper + fore + wrist, fore + wrist, wrist, end, 0.0])
 
     def lowest(self, q: Sequence[float]) -> float:
         """Height of the lowest point of the arm at the joints `q` (6,) [rad], up to its flange [m]."""
@@ -176,17 +179,21 @@ class ChainTubes(Tubes):
             spare = self._radii[one] + self._radii[other] - slack
             pairs.setdefault((kept[one].link, kept[other].link), []).append((one, other, spare))
         hulls, groups = list[Capsule](), list[LinkPair]()
-        for (link, far), members in pairs.items():
+        for members in pairs.values():
+            sides = [[kept[tube] for tube in {*tubes}] for tubes in list(zip(*members, strict=True))[:2]]
             around = members[0]
             if len(members) > 1:
-                ends = [_around([kept[tube] for tube in {*tubes}]) for tubes in list(zip(*members, strict=True))[:2]]
+                ends = [_around(side) for side in sides]
                 slack = max(self._radii[one] + self._radii[other] - spare for one, other, spare in members)
                 place = len(kept) + len(hulls)
                 around = place, place + 1, ends[0].radius + ends[1].radius - slack
                 hulls += ends
-            groups.append(LinkPair(min(link, size), min(far, size), members, around))
+            groups.append(LinkPair(_levers(chain, *sorted(sides, key=lambda side: side[0].link)), members, around))
         self._shapes = [(one.link, *one.start, *one.end) for one in (*kept, *hulls)]
-        super().__init__(groups, _levers(chain, kept))
+        levers = [_levers(chain, [], [one]) for one in kept if 2 < one.link <= size]
+        lowest = [max(column) for column in zip([0.0] * size, *levers, strict=True)]
+        lowest[0] *= math.hypot(*(chain.placements[0, :2, :3] @ chain.axes[0]))  # a turn about a vertical axis: nothing
+        super().__init__(groups, lowest)
 
     def lowest(self, q: Sequence[float]) -> float:
         """Height of the lowest point of the links at the joints `q` (k,) [rad], from the third to the flange [m]."""
@@ -207,17 +214,37 @@ class ChainTubes(Tubes):
         return found
 
 
-def _levers(chain: SerialChain, capsules: Sequence[Capsule]) -> list[float]:
-    """How far a turn of each joint moves what is beyond it at most [m/rad]. Shape: (k,)."""
-    size = chain.num_joints
-    extent = [0.0] * (size + 2)
-    for one in capsules:
-        extent[one.link] = max(extent[one.link], math.hypot(*one.start) + one.radius, math.hypot(*one.end) + one.radius)
-    steps = [math.hypot(*place[:3, 3]) for place in (*chain.placements[1:], chain.tool_placement)]
-    levers, beyond = [0.0] * size, extent[size + 1]
-    for joint in reversed(range(size)):
-        levers[joint] = beyond = max(extent[joint + 1], steps[joint] + beyond)
+def _levers(chain: SerialChain, near: Sequence[Capsule], far: Sequence[Capsule]) -> list[float]:
+    """How far a turn of each joint changes the distance of `near` capsules, or the base, from `far` ones. Shape: (k,).
+
+    A turn moves the one relative to the other by at most its angle times how far either of them reaches from its axis;
+    a joint that is not between them moves neither. [m/rad]
+    """
+    levers, steps = [0.0] * chain.num_joints, chain.placements[:, :3, 3]
+    (low, behind), (high, points) = (_ends(chain, capsules) for capsules in (near, far))
+    rest = 0.0
+    for joint in reversed(range(low, high)):  # from the frame of the far link to that of the joint
+        levers[joint] = _reach(points, chain.axes[joint]) + rest
+        rest, points = rest + float(np.linalg.norm(points, axis=1).max()), steps[joint, None]
+    rest = 0.0
+    for joint in range(low, high if near else low):  # from the frame of the near link to that before the joint
+        apart = behind - steps[joint]
+        levers[joint] = min(levers[joint], _reach(apart, chain.placements[joint, :3, :3] @ chain.axes[joint]) + rest)
+        rest, behind = rest + float(np.linalg.norm(apart, axis=1).max()), np.zeros((1, 3))
     return levers
+
+
+def _ends(chain: SerialChain, capsules: Sequence[Capsule]) -> tuple[int, Array]:
+    """The link of `capsules`, for a gripper the last one, and their ends in its frame (n, 3) [m]."""
+    size, link = chain.num_joints, capsules[0].link if capsules else 0
+    place = chain.mount if link == 0 else chain.tool_placement if link > size else np.eye(4)
+    ends = np.array([end for one in capsules for end in (one.start, one.end)]).reshape(-1, 3)
+    return min(link, size), ends @ place[:3, :3].T + place[:3, 3]
+
+
+def _reach(points: Array, axis: Array) -> float:
+    """Greatest distance of `points` (n, 3) from a line along `axis` through the origin, in their unit."""
+    return float(np.linalg.norm(np.cross(points, axis), axis=1).max())
 
 
 def tubes_of(arm: Arm, *, tool: bool) -> Tubes | None:
