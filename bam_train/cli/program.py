@@ -253,7 +253,9 @@ def usage_error(box: str, config: type[Any]) -> str:
         end = f", did you mean {close}?" if close else "."
         return f"{flag}: expected {', '.join(names[:-1])} or {names[-1]}, found {found!r}{end}"
     if match := re.search(r"Missing value for argument '(\S+)'", text):
-        return f"{match[1]} needs a value." if match[1].startswith("--") else f"{match[1].upper()} is missing."
+        kind = hints.get(match[1].lstrip("-").replace("-", "_"))
+        wanted = "" if kind is None else f": {expected(kind)}"
+        return f"{match[1]} needs a value{wanted}." if match[1].startswith("--") else f"{match[1].upper()} is missing."
     if match := re.search(r"Missing from [^:]*: (.*)", text):
         *rest, last = [part.split()[0] for part in match[1].split("(required)") if part.strip()]
         return f"{', '.join(rest)} and {last} are missing." if rest else f"{last} is missing."

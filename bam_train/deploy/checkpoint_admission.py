@@ -1,6 +1,5 @@
 """What comes before a robot moves: it is brought up, and the checkpoint is admitted: its signature, its trials."""
 
-import shlex
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -8,7 +7,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import gymnasium as gym
 
-from bam_envs.core.location import LiveRobot, Location, config_folder, is_one_robot
+from bam_envs.core.location import LiveRobot, Location, config_folder, is_one_robot, serving
 from bam_envs.core.robot_env import robot_of
 from bam_envs.safety.guard import TRIAL_SPEED
 from bam_train.checkpoint import Checkpoint
@@ -72,9 +71,7 @@ def _with_stand_in(place: Location, env: Any) -> Location:
     """The place of a live robot with the command that serves a simulated one for the environment `env`."""
     if not isinstance(place, LiveRobot) or env.spec is None:
         return place
-    model = env.spec.kwargs.get("robot_model")
-    arm = [] if model is None else ["--robot-model", str(model)]
-    return replace(place, stand_in=shlex.join(["bam-serve", "--env", env.spec.id.rpartition("-v")[0], *arm]))
+    return replace(place, stand_in=serving(env.spec.id, env.spec.kwargs.get("robot_model")))
 
 
 def _connect(env: Any, raise_again: Callable[[], None]) -> None:

@@ -26,6 +26,8 @@ class ServedPolicy(gym.Env[Array, dict[str, Array]]):
     """
 
     metadata: dict[str, Any] = {"render_modes": []}  # noqa: RUF012 - as Gymnasium has it
+    served_as = "a policy"
+    """What a server says that it serves."""
 
     def __init__(self, policy: FrozenPolicy) -> None:
         policy.plan()

@@ -31,7 +31,7 @@ def examine(config: DoctorConfig, signals: SignalMemory) -> int:
     """Run the program with its parsed flags; returns the exit status, also 1 if --measure wrote no file."""
     _require_valid(config)
     from bam_envs.arms.description import robot_model
-    from bam_envs.core.location import LiveRobot
+    from bam_envs.core.location import LiveRobot, serving
     from bam_envs.live.diagnosis import STEPS, Diagnosis
     from bam_envs.robots.profile import fitting_profile, profile_for
 
@@ -43,10 +43,12 @@ def examine(config: DoctorConfig, signals: SignalMemory) -> int:
             checkpoint, env = _opened(config, place)
             opened.callback(env.close)
             robot = env.unwrapped.robot
+            place = replace(place, stand_in=serving(env.spec.id, env.spec.kwargs.get("robot_model")))
             more = [(CONTRACT, lambda inspection: _contract(checkpoint, env, inspection, contracts))]
         elif config.robot_model is not None:
             spec, named = robot_model(config.robot_model).spec(with_object=False), config.profile
             place = replace(place, profile=profile_for(spec) if named is None else fitting_profile(named, spec))
+            place = replace(place, stand_in=serving("bam/pick", config.robot_model))
         diagnosis = Diagnosis(place, robot, seconds=config.seconds)
         opened.callback(diagnosis.close)
         steps: list[DiagnosisStep] = []

@@ -6,6 +6,7 @@ knows which of them exclude each other; what a location cannot have is no field 
 
 import ipaddress
 import os
+import shlex
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -40,6 +41,13 @@ def is_loopback(host: str) -> bool:
 def is_one_robot(url: str, identity: str) -> bool:
     """Whether `identity`, or the address if it is empty, belongs to one robot: every tunnel ends on this computer."""
     return bool(identity) or not is_loopback(urlsplit(url).hostname or "")
+
+
+def serving(env_id: str, robot_model: object = None) -> str:
+    """The command that serves an environment here, without a port."""
+    name = env_id.rpartition("-v")[0] if env_id.startswith("bam/") and "-v" in env_id else env_id
+    model = [] if robot_model is None else ["--robot-model", str(robot_model)]
+    return shlex.join(["bam-serve", "--env", name, *model])
 
 
 @dataclass(frozen=True)

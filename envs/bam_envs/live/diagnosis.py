@@ -117,7 +117,7 @@ class Diagnosis:
 
     def _port(self) -> Findings:
         address, start = self.endpoint.address, time.monotonic()
-        asyncio.run(open_port(address, self._timeout)).close()
+        asyncio.run(open_port(address, self._timeout, stand_in=self._at.stand_in)).close()
         return [f"{address.host}:{address.port} is open, connected in {_ms(time.monotonic() - start)}"], []
 
     def _websocket(self) -> Findings:

@@ -9,8 +9,9 @@ import gymnasium as gym
 from gymnasium import Space
 
 from bam_envs.core.close_at_exit import close_at_exit
-from bam_envs.core.errors import InvalidValue, ResetNeeded, UnknownName
+from bam_envs.core.errors import InvalidValue, ResetNeeded
 from bam_envs.core.location import NO_CREDENTIALS, Credentials, Remote
+from bam_envs.core.wording import closest
 from bam_envs.remote.remote_vector_env import Described, RemoteVectorEnv
 from bam_envs.remote.wire.transport import EnvSpecMessage, Info, Transport
 
@@ -180,10 +181,15 @@ def open_transport(
     """
     scheme, separator, rest = url.partition("://")
     if not separator or (not rest.strip("/") and scheme != "ros2"):
-        raise InvalidValue(f"A transport is a URL such as tcp://10.0.0.5:5555 or ws://10.0.0.5:9090, not {url!r}.")
+        meant = "" if separator or ":" not in url else f" Did you mean {f'ws://{url}'!r}?"
+        expected = "A transport is a URL such as tcp://10.0.0.5:5555 or ws://10.0.0.5:9090"
+        raise InvalidValue(f"{expected}, not {url!r}.{meant}")
     if scheme not in _CLASSES:
         schemes = ", ".join(f"{one}://" for one in _CLASSES)
-        raise InvalidValue(f"{url}: {UnknownName('transport', scheme, _CLASSES)} It must be one of {schemes}.")
+        web = {"http": "ws", "https": "wss"}.get(scheme)
+        close = web or closest(scheme, _CLASSES)
+        meant = f" Did you mean {f'{close}://{rest}'!r}?" if close else ""
+        raise InvalidValue(f"{url}: unknown transport {scheme}://; there are {schemes}.{meant}")
     options |= {"credentials": credentials} | ({} if timeout is None else {"timeout": timeout})
     module, _, name = _CLASSES[scheme].partition(":")
     make: Any = getattr(importlib.import_module(module), name)

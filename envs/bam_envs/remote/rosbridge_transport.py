@@ -11,7 +11,7 @@ import gymnasium as gym
 from gymnasium import Space
 
 from bam_envs.core.errors import LinkLost, NoServer, ProtocolError, RemoteError, UnknownName
-from bam_envs.core.location import NO_CREDENTIALS, Credentials
+from bam_envs.core.location import NO_CREDENTIALS, Credentials, serving
 from bam_envs.core.registry import resolve_id
 from bam_envs.core.validation import PositiveInt, check
 from bam_envs.remote.wire.gymapi_codec import DEFAULT, EnvCodec
@@ -90,7 +90,7 @@ class RosbridgeTransport:
         gymapi_version: str | None = None,
         autoreset: bool | None = None,
     ) -> None:
-        self.endpoint = Endpoint(url, credentials, token, connect_timeout, timeout)
+        self.endpoint = Endpoint(url, credentials, token, connect_timeout, timeout, stand_in=serving(env_id or "ENV"))
         self.channel = check(channel, Literal["service", "topics"], "channel")
         self.url, self.env_id, self.timeout, self.take = url, env_id, timeout, take
         self._spaces, self._num_envs = (observation_space, action_space), check(num_envs, PositiveInt, "num_envs")

@@ -9,7 +9,7 @@ from typing import Any
 from urllib.parse import urlsplit
 
 from bam_envs.core.errors import InvalidValue, LinkLost, NoServer, ProtocolError, RemoteError
-from bam_envs.core.location import NO_CREDENTIALS, Credentials
+from bam_envs.core.location import NO_CREDENTIALS, Credentials, serving
 from bam_envs.remote.wire.tcp_wire import (
     FrameSocket,
     Hello,
@@ -146,7 +146,7 @@ class TcpTransport:
             raise LinkLost(f"{self.url}: this transport is closed; make a new one.")
 
     def _open(self) -> EnvSpecMessage:
-        limit, start = self.endpoint.connect_timeout, f"Start one: bam-serve --env {self.env_id or 'bam/pick'} --tcp"
+        limit, start = self.endpoint.connect_timeout, f"Start one: {serving(self.env_id or 'ENV')} --tcp"
         deadline = time.monotonic() + limit
         try:
             self._frames = FrameSocket(_dial(self._address, deadline))

@@ -20,14 +20,17 @@ def test_each_scheme_has_its_class():
 
 URL = "A transport is a URL such as tcp://10.0.0.5:5555 or ws://10.0.0.5:9090, not "
 TCP = "A TCP address is tcp://host:port, such as tcp://10.0.0.5:5555, not "
-UNKNOWN = "Unknown transport 'tcq'. Did you mean 'tcp'? It must be one of tcp://, ws://, wss://, ros2://."
+SCHEMES = "there are tcp://, ws://, wss://, ros2://."
 
 
 @pytest.mark.parametrize(
     ("url", "text"),
     [
-        ("tcq://x:1", f"tcq://x:1: {UNKNOWN}"),
-        *((url, f"{URL}{url!r}.") for url in ("10.0.0.5:9090", "ws://", "")),
+        ("tcq://x:1", f"tcq://x:1: unknown transport tcq://; {SCHEMES} Did you mean 'tcp://x:1'?"),
+        ("http://x:1", f"http://x:1: unknown transport http://; {SCHEMES} Did you mean 'ws://x:1'?"),
+        ("mqtt://x:1", f"mqtt://x:1: unknown transport mqtt://; {SCHEMES}"),
+        ("10.0.0.5:9090", f"{URL}'10.0.0.5:9090'. Did you mean 'ws://10.0.0.5:9090'?"),
+        *((url, f"{URL}{url!r}.") for url in ("ws://", "")),
         *((url, f"{TCP}{url!r}.") for url in ("tcp://x", "tcp://x:0", "tcp://x:1/space")),
         ("tcp://a..b:1", "'tcp://a..b:1' is not a TCP address: "),
         ("tcp://[::1:1", "'tcp://[::1:1' is not a TCP address: Invalid IPv6 URL."),

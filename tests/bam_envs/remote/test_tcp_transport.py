@@ -126,7 +126,7 @@ def test_nobody_listens():
     with socket.create_server(("127.0.0.1", 0)) as free:
         port = free.getsockname()[1]
     assert refused(f"tcp://127.0.0.1:{port}") == (
-        f"refused: nothing listens there. Is the port open? Start one: bam-serve --env bam/pick --tcp {port}"
+        f"refused: nothing listens there. Is the port open? Start one: bam-serve --env ENV --tcp {port}"
     )
     assert refused(f"tcp://127.0.0.1:{port}", env_id="bam/reach").endswith(f"bam-serve --env bam/reach --tcp {port}")
 
@@ -158,7 +158,7 @@ def test_somebody_else_listens(answer, text):
     with answering(answer) as (url, _):
         said = refused(url)
     assert said.startswith(f"{UNUSABLE}: {text}")
-    assert said.endswith(" Start one: bam-serve --env bam/pick --tcp PORT, at a free port.")
+    assert said.endswith(" Start one: bam-serve --env ENV --tcp PORT, at a free port.")
 
 
 def test_requests_carry_session_epoch_sequence_and_deadline():

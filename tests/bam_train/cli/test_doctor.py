@@ -62,6 +62,10 @@ def test_the_first_failing_step_is_named(run, nobody, tmp_path):
     assert unwritten == f"bam-doctor: {path} was not written: the link was not measured"
     assert why.startswith(f"bam-doctor: port failed: {nobody}: refused: nothing listens there. Is the port open?")
     assert not path.exists()
+    for named in (("--robot-model", "fr3"), ("--checkpoint", PICK.with_name("mir100-navigation-ppo.zip"))):
+        env = "bam/pick --robot-model fr3" if named[1] == "fr3" else "bam/mir100-navigation"
+        _, _, err = run(doctor, nobody, *named)
+        assert f"Start one with `bam-serve --env {env} --port {nobody.rpartition(':')[2]}`" in err
 
 
 def test_a_refused_contract(run, served, forge, tmp_path):

@@ -83,7 +83,7 @@ Options:
         (["--qqq"], "prog: unknown option --qqq. Run prog --help\n"),
         (["--steps", "many"], "prog: --steps: expected a whole number, found 'many'. Run prog --help\n"),
         (["--steps", "1e5"], "prog: --steps: expected a whole number, found '1e5'; write 100000. Run prog --help\n"),
-        (["--steps"], "prog: --steps needs a value. Run prog --help\n"),
+        (["--steps"], "prog: --steps needs a value: a whole number. Run prog --help\n"),
         (["stray"], "prog: unexpected argument stray. Run prog --help\n"),
     ],
 )

@@ -63,8 +63,9 @@ def test_it_says_who_is_in_command_and_one_line_for_each_way_in(start):
 
 def test_a_policy_is_served(start, chunk_checkpoint, corridor_checkpoint, run):
     checkpoint = chunk_checkpoint(size=4, steps=2)
-    _, line = start("--policy", str(checkpoint), "--port", "0")
-    url = re.fullmatch(r"bam-serve: ServedPolicy on (ws://127\.0\.0\.1:\d+), fast: /gym_env/gym_api_request\n", line)[1]
+    process, line = start("--policy", str(checkpoint), "--port", "0", "--tcp", "0")
+    url = re.fullmatch(r"bam-serve: a policy on (ws://127\.0\.0\.1:\d+), fast: /gym_env/gym_api_request\n", line)[1]
+    assert re.fullmatch(r"bam-serve: a policy on tcp://127\.0\.0\.1:\d+\n", process.stderr.readline())
     assert PolicyLink(url).inputs == {"observation": Tensor((1, 6), "float32")}
     text = "--policy serves a policy, and no environment: leave out --set, --robot-model, --num-envs"
     assert run(main, "--policy", checkpoint, "--num-envs", 2) == (1, "", f"bam-serve: {text}\n")

@@ -126,7 +126,8 @@ class ServedEnvironment:
         )
         started.callback(service.close)
         service.start()
-        name, pace = server.spec().env_id, "real time" if realtime else "fast"
+        served_as, pace = getattr(self.env, "served_as", ""), "real time" if realtime else "fast"
+        name = served_as or server.spec().env_id
         offered = self._offered(profile, self._not_offered())
         if offered:
             node = getattr(bus, "url", "a bus")
@@ -137,7 +138,7 @@ class ServedEnvironment:
             token, operator = self._token, self._operator_token
             tcp = TcpServer(server, options.bind, options.tcp, token=token, operator_token=operator)
             self.tcp = started.enter_context(tcp)
-            self.endpoints.append(f"{name} on {self.tcp.url}, the environment alone")
+            self.endpoints.append(f"{name} on {self.tcp.url}{'' if served_as else ', the environment alone'}")
 
     @property
     def prefix(self) -> str:
