@@ -49,7 +49,7 @@ class TrainSettings:
     """Algorithm: ppo, a2c, sac, td3, ddpg, dqn, tqc, trpo, qrdqn, crossq or recurrent-ppo.
     With --trainer rllib: ppo, appo, impala, sac, tqc, dqn, bc, marwil, cql or iql. With --data: bc, iql, cql, td3bc,
     awac, cal-ql, plas or rebrac. With --teacher: dagger. For grasps from a picture: grasp-q. By default that of the
-    environment's first preset."""
+    environment's first preset; with --data, bc, or iql if some episodes failed."""
     steps: _Steps = 100_000
     """Environment steps of the whole run, also after --resume; with --data, updates (default: the preset's, or 100000;
     20000 updates)."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import math
 import re
 import zipfile
 from collections.abc import Iterator, Mapping, Sequence
@@ -43,6 +44,8 @@ class Curve:
     """Shape: (k,)."""
     seconds: Array | None = None
     """Time since the start of the run [s]. Shape: (k,)."""
+    within: tuple[float, float] = (-math.inf, math.inf)
+    """Lowest and highest value of an episode, as far as they are known."""
 
     def at(self, steps: float) -> float:
         """The newest value at these steps; NaN before the first one."""
@@ -124,9 +127,9 @@ def _read(folder: Path) -> RunLog:
     return run
 
 
-def _curve(rows: list[tuple[Any, Any, Any]]) -> Curve:
+def _curve(rows: list[tuple[Any, Any, Any]], within: tuple[float, float] = Curve.within) -> Curve:
     steps, seconds, values = (np.array(column, dtype=float) for column in zip(*rows, strict=True))
-    return Curve(steps, values, None if np.isnan(seconds).any() else seconds)
+    return Curve(steps, values, None if np.isnan(seconds).any() else seconds, within)
 
 
 def _own(folder: Path, files: list[Path]) -> RunLog:
@@ -145,8 +148,14 @@ def curves_of(evaluations: Sequence[Mapping[str, Any]]) -> dict[str, Curve]:
     for metric, name in (("success", "success_rate"), ("return", "return_mean")):
         rows = [(one["steps"], one["seconds"], one[name]) for one in evaluations if one.get(name) is not None]
         if rows:
-            curves[metric] = _curve(rows)
+            curves[metric] = _curve(rows, (0.0, 1.0) if metric == "success" else _extremes(evaluations))
     return curves
+
+
+def _extremes(evaluations: Sequence[Mapping[str, Any]]) -> tuple[float, float]:
+    """The lowest and the highest return of an episode; infinite if an evaluation does not say."""
+    low, high = ([one.get(name) for one in evaluations] for name in ("return_min", "return_max"))
+    return -math.inf if None in low else min(low), math.inf if None in high else max(high)
 
 
 def counts(curves: Mapping[str, Curve], settings: Mapping[str, Any]) -> Curve | None:
@@ -180,9 +189,8 @@ def _zoo(folder: Path, files: list[Path]) -> RunLog:
     """rl-zoo3's folder ``ENV_1``, with the arguments of the run in ``ENV_1/ENV/args.yml``; or an EvalCallback's."""
     with np.load(files[0], allow_pickle=False) as found:
         steps = found["timesteps"].astype(float)
-        curves = {"return": Curve(steps, found["results"].mean(axis=1))}
-        if "successes" in found:
-            curves["success"] = Curve(steps, found["successes"].mean(axis=1))
+        kept = {"return": found["results"], **({"success": found["successes"]} if "successes" in found else {})}
+        curves = {name: Curve(steps, one.mean(axis=1), None, (one.min(), one.max())) for name, one in kept.items()}
     match = re.fullmatch(r"(.+)_\d+", folder.name)
     arguments = folder / match[1] / "args.yml" if match else folder
     text = arguments.read_text(encoding="utf-8") if arguments.is_file() else ""
@@ -208,7 +216,7 @@ def _monitors(folder: Path, files: list[Path]) -> RunLog:
     for metric, name in (("return", "r"), ("success", "is_success")):
         if name in rows[0][1]:
             each = [float({"True": 1, "False": 0}.get(row[name], row[name])) for _, row in rows]
-            curves[metric] = Curve(steps, _running_mean(np.array(each)), seconds)
+            curves[metric] = Curve(steps, _running_mean(np.array(each)), seconds, (min(each), max(each)))
     return RunLog(folder, curves, env)
 
 
@@ -227,7 +235,7 @@ def _events(folder: Path, files: list[Path]) -> RunLog:
             start, scalars = events.FirstEventTimestamp(), events.Scalars(tag)
             rows = [(counted.get(one.step, one.step), one.wall_time - start, one.value) for one in scalars]
             if known := [row for row in rows if np.isfinite(row[2])]:
-                curves[metric] = _curve(known)
+                curves[metric] = _curve(known, {"success": (0.0, 1.0)}.get(metric, Curve.within))
     return RunLog(folder, curves)
 
 

@@ -96,7 +96,7 @@ def unusual_episodes(detector: Detector, rollouts: Iterable[Rollout]) -> dict[st
 def fresh_episodes(
     envs: VectorEnv[Any, Any, Any], env: str, policy: BatchPolicy, steps: int, seed: int = SEED
 ) -> list[Rollout]:
-    """Whole episodes of `policy` of about `steps` steps in all: every one that begins before as many are done.
+    """Whole episodes of `policy`: every one that begins before `steps` steps are done, of whole and running ones.
 
     A robot that is slower, see `LiveLike`, has more time in proportion.
     """
@@ -105,6 +105,8 @@ def fresh_episodes(
     limit = getattr(inner, "max_episode_steps", None)
 
     def seen(observations: Any, actions: Any) -> tuple[Any, ...]:
+        nonlocal count
+        count += envs.num_envs
         paces = robot.pace if isinstance(robot, LiveLike) else np.ones(envs.num_envs)
         if isinstance(robot, LiveLike):
             inner.max_episode_steps = None if limit is None else np.ceil(limit / paces)
@@ -120,7 +122,6 @@ def fresh_episodes(
         limit=steps,  # an episode of that many steps has no end
     )
     for episode in played:
-        count += episode.length
         observed, acted, sent, paces = episode.parts
         commands = None if robot is None else sent
         done.append(Rollout(observed, acted, episode.success, commands, pace=float(paces[-1])))

@@ -83,6 +83,8 @@ def resolve(given: Mapping[str, Any], tell: Tell = lambda text: None) -> TrainSe
     env = _resolve_env(asked.env, elsewhere=bool(asked.transport or run.get("data")))
     require_algorithm(asked.trainer, asked.algo)
     preset = read_preset(env, asked.algo, asked.trainer)
+    if asked.env_kwargs.get("link") is not None:  # commands arrive in the middle of a period
+        preset.pop("coarse_physics", None)
     usual = {"steps": OFFLINE_STEPS} if asked.trainer == "offline" else {}
     tuned = preset.pop("hyperparameters", {})
     settings = TrainSettings.from_mapping(merge({**usual, **preset}, run, {"env": env}))
@@ -140,7 +142,7 @@ def _best_algorithm(name: str) -> str | None:
 def _implied(given: Mapping[str, Any]) -> dict[str, Any]:
     """The trainer of an algorithm that no other one has; or the trainer, environment and arguments of a data set.
 
-    Without an algorithm, that of the environment's first preset.
+    Without an algorithm, that of the environment's first preset; of a data set, cloning unless some episodes failed.
     """
     if "env" in given and not {"algo", "data", "trainer"} & given.keys():
         algo = _best_algorithm(_resolve_env(given["env"], elsewhere="transport" in given))
@@ -153,8 +155,10 @@ def _implied(given: Mapping[str, Any]) -> dict[str, Any]:
     trainer = given.get("trainer", "offline")
     if trainer != "offline" and given.get("env") is not None:
         return {}  # the trainer checks whether they fit
-    info = DataSet.open(given["data"]).info
-    return {"trainer": trainer, "env": info.env, **({"env_kwargs": info.env_kwargs} if info.env_kwargs else {})}
+    data = DataSet.open(given["data"])
+    info, failed = data.info, any(data.facts(index)["success"] is False for index in range(len(data)))
+    implied = {"trainer": trainer, "env": info.env, "algo": "iql" if failed else "bc"}
+    return {**implied, **({"env_kwargs": info.env_kwargs} if info.env_kwargs else {})}
 
 
 def _complete(settings: TrainSettings, tell: Tell) -> TrainSettings:

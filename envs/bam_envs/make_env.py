@@ -120,7 +120,7 @@ def _require_robot(entry: EnvEntry, **given: object) -> None:
     kind, differs = ("live robot", "randomize") if entry.simulated_only else ("robot", "")
     names = [name for name, value in given.items() if value is not None and name != differs]
     if names and not entry.has_robot:
-        raise InvalidValue(f"{entry.id} has no {kind}; leave out what is for one: {', '.join(names)}.")
+        raise InvalidValue(f"{entry.id} has no {kind}: leave out {', '.join(names)}.")
 
 
 def _behind(link: Any, robot: Robot) -> Robot:

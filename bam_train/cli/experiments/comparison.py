@@ -39,8 +39,6 @@ ALIKE = ("seed", "threads", "address", "device")
 INTERVALS = ("score", "difference", "better", "steps", "seconds")
 """Fields of `RowResult` that are intervals."""
 _FORMS: dict[str, Callable[[float | None], str]] = {"success": percent, "return": number, "score": number}
-_WITHIN = {"success": (0.0, 1.0)}
-_ANY = (-math.inf, math.inf)
 _POSITIVE = (0.0, math.inf)
 NO_EVALUATION = "no evaluation is in its log; wait for the first one, or leave this run out"
 POINTS = 100
@@ -63,6 +61,11 @@ class Row:
     def final(self, metric: Metric) -> Array:
         """The last value of each run. Shape: (n,)."""
         return np.array([run.curves[metric].values[-1] for run in self.runs])
+
+    def within(self, metric: str) -> tuple[float, float]:
+        """Lowest and highest value of an episode of the runs, beyond which no interval goes."""
+        low, high = zip(*(run.curves[metric].within for run in self.runs if metric in run.curves), strict=True)
+        return min(low), max(high)
 
 
 @dataclass(frozen=True)
@@ -121,7 +124,7 @@ class RunComparison:
         if row is not first:
             ours, theirs, matched = _matched(row, first, self.metric)
             less, better = statistics.difference(ours, theirs, matched), statistics.improvement(ours, theirs, matched)
-        score = estimate(values, _WITHIN.get(self.metric, _ANY))
+        score = estimate(values, row.within(self.metric))
         return RowResult(row.name, len(values), score, less, better, matched, reached, steps, seconds)
 
     @property
@@ -240,7 +243,7 @@ class RunComparison:
             grid = np.linspace(min(end, max(float(one[0]) for one in each)), end, POINTS)
             values = [run.curves[self.metric].values for run in row.runs]
             curves = np.array([np.interp(grid, *pair) for pair in zip(each, values, strict=True)])
-            lines.append((grid, *statistics.bands(curves, _WITHIN.get(self.metric, _ANY))))
+            lines.append((grid, *statistics.bands(curves, row.within(self.metric))))
         return self._plot(lines, axis, f"{self.metric} (interquartile mean, 95 % interval)")
 
     def _plot(self, lines: Iterable[tuple[Any, ...]], across: str, up: str) -> bytes:
@@ -305,7 +308,7 @@ def summary_lines(group: Path) -> list[str]:
     for metric in GOALS:
         known = [value for run in row.runs if (value := _last(run, metric)) is not None]
         if known:
-            score = _shown(estimate(known, _WITHIN.get(metric, _ANY)), _FORMS[metric])
+            score = _shown(estimate(known, row.within(metric)), _FORMS[metric])
             lines.append(f"{metric} of {len(known)} seeds: interquartile mean {score}")
     few = f"warning: fewer than {FEWEST} seeds: no interval, and no conclusion"
     return [*lines, few if len(row.runs) < FEWEST else f"interval: {METHOD}", *_origins([row])]

@@ -381,7 +381,7 @@ def resolve_id(name: str) -> str:
         _import_for(module, name)
     versions = [spec for spec in gym.registry.values() if bare and bare in (spec.id, spec.id.rpartition("-v")[0])]
     if not versions:
-        raise UnknownName("environment", name, gym.registry, examples=ENVIRONMENTS)
+        raise UnknownName("environment", name, gym.registry, examples=[*ENVIRONMENTS, "another of Gymnasium's"])
     newest = max(versions, key=lambda spec: spec.version or 0).id
     return f"{module}:{newest}" if module else newest
 

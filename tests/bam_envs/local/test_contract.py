@@ -165,4 +165,4 @@ def test_what_is_for_a_robot_is_refused(env_id, option):
     (name,) = option
     with pytest.raises(InvalidValue) as caught:
         gym.make(env_id, **option)
-    assert str(caught.value) == f"{env_id} has no robot; leave out what is for one: {name}."
+    assert str(caught.value) == f"{env_id} has no robot: leave out {name}."

@@ -193,7 +193,7 @@ def test_a_picture_for_people(make):
         ({"objects": 0}, "objects: expected a whole number of at least 1, found 0"),
         ({"bins": [10, 10]}, "bins must be 3 numbers, not 2."),
         ({"size": 1000}, "size must be at most 512 pixels, not 1000."),
-        ({"robot": "ws://127.0.0.1:1"}, "bam/grasp-xyr-v0 has no live robot; leave out what is for one: robot."),
+        ({"robot": "ws://127.0.0.1:1"}, "bam/grasp-xyr-v0 has no live robot: leave out robot."),
     ],
 )
 def test_options_are_checked(options, text):

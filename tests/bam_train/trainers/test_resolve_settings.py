@@ -16,6 +16,7 @@ from bam_envs.remote.serve.env_server import EnvServer
 from bam_envs.remote.serve.tcp_server import TcpServer
 from bam_envs.robots.linked import link_profile
 from bam_train.checkpoint import write_checkpoint
+from bam_train.data.collect import collect
 from bam_train.errors import CheckpointError, CheckpointMismatch, OutputError, SettingsError
 from bam_train.settings import SETTINGS, file_stem
 from bam_train.trainers import TRAINERS, load_trainer, require_algorithm
@@ -56,6 +57,24 @@ def test_no_preset_and_no_algorithm():
         resolve({"env": "MountainCar-v0"})
 
 
+@pytest.mark.parametrize(("random", "algo"), [(0.0, "bc"), (1.0, "iql")])
+def test_without_an_algorithm_a_data_set_with_failures_is_for_iql(tmp_path, random, algo):
+    collect(tmp_path / "d", "scripted", "bam/reach", episodes=2, random=random)
+    settings = resolve({"data": str(tmp_path / "d")})
+    assert (settings.env, settings.trainer, settings.algo) == ("bam/reach-v0", "offline", algo)
+    assert resolve({"data": str(tmp_path / "d"), "algo": "bc"}).algo == "bc"
+
+
+def test_a_preset_has_no_coarse_physics_behind_a_link():
+    """Commands arrive there in the middle of a period."""
+    given = {"env": "bam/pick", "algo": "ppo"}
+    assert resolve(given).coarse_physics
+    assert not resolve({**given, "env_kwargs": {"link": "wifi"}}).coarse_physics
+    asked = resolve({**given, "env_kwargs": {"link": "wifi"}, "coarse_physics": True})
+    assert asked.coarse_physics  # the trainer says why it cannot be
+    assert not resolve({**given, "coarse_physics": False}).coarse_physics
+
+
 def test_there_are_as_many_environments_as_the_servers_have():
     with TcpServer(EnvServer(gym.make_vec("bam/reach-v0", num_envs=2))) as server:
         given = {"env": "bam/reach", "algo": "ppo", "transport": [server.url]}
@@ -74,6 +93,7 @@ ROBO_GYM = {"env": "NoObstacleNavigationMir100Sim", "algo": "ppo"}
     ("given", "text"),
     [
         ({"env": "bam/pik"}, "Unknown environment 'bam/pik'. Did you mean 'bam/pick-v0'?"),
+        ({"env": "NoSuch-v0"}, "bam/grasp-6d-v0, another of Gymnasium's."),
         ({"env": "no_such_module:A-v0"}, "needs the module 'no_such_module', which is neither installed"),
         ({"algo": "sacc"}, "Unknown algorithm 'sacc'. Did you mean 'sac'?"),
         ({"algo": None}, "algo: expected a name, found nothing. Give --algo NAME"),

@@ -79,6 +79,18 @@ def test_other_forms(run, rows):
     ]
 
 
+def test_no_interval_goes_beyond_the_returns_of_episodes(run, here):
+    write_row(here / "ppo", (0.9, 0.95, 1.0, 0.8))
+    given = "ppo", "--format", "json", "--metric", "return"
+    before = json.loads(run(main, *given)[1])["rows"][0]
+    assert before["score_high"] > 9.0
+    for path in here.glob("ppo/*/progress.jsonl"):
+        rows = [{**json.loads(row), "return_min": 7.0, "return_max": 9.0} for row in path.read_text().splitlines()]
+        path.write_text("".join(json.dumps(row) + "\n" for row in rows))
+    found = json.loads(run(main, *given)[1])["rows"][0]
+    assert (before["score"], found["score"], found["score_low"], found["score_high"]) == (8.325, 8.325, 7.0, 9.0)
+
+
 def test_the_report_is_one_file(run, rows, here):
     assert run(main, "ppo", "sac", "--report", "out/compare.html")[0] == 0
     text = (here / "out" / "compare.html").read_text()
