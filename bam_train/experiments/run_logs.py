@@ -154,8 +154,11 @@ def curves_of(evaluations: Sequence[Mapping[str, Any]]) -> dict[str, Curve]:
 
 def _extremes(evaluations: Sequence[Mapping[str, Any]]) -> tuple[float, float]:
     """The lowest and the highest return of an episode; infinite if an evaluation does not say."""
-    low, high = ([one.get(name) for one in evaluations] for name in ("return_min", "return_max"))
-    return -math.inf if None in low else min(low), math.inf if None in high else max(high)
+    low, high = (
+        [float(one[name]) for one in evaluations if one.get(name) is not None] for name in ("return_min", "return_max")
+    )
+    known = len(low) == len(high) == len(evaluations)
+    return (min(low), max(high)) if known else Curve.within
 
 
 def counts(curves: Mapping[str, Curve], settings: Mapping[str, Any]) -> Curve | None:

@@ -103,6 +103,7 @@ def fresh_episodes(
     inner: Any = envs.unwrapped
     robot = inner.robot if isinstance(inner, RobotVectorEnv) else None
     limit = getattr(inner, "max_episode_steps", None)
+    done, count = list[Rollout](), 0
 
     def seen(observations: Any, actions: Any) -> tuple[Any, ...]:
         nonlocal count
@@ -112,7 +113,6 @@ def fresh_episodes(
             inner.max_episode_steps = None if limit is None else np.ceil(limit / paces)
         return observations, actions, np.zeros((len(paces), 0)) if robot is None else inner.state.command, paces
 
-    done, count = list[Rollout](), 0
     played = rollout(
         FiniteVectorEnv(envs, env),
         policy,
