@@ -249,9 +249,7 @@ def read_assignments(texts: Sequence[str]) -> dict[str, Any]:
             path = ["hyperparameters", *path]
         if len(path) > 1 and path[0] not in TABLES:
             raise SettingsError(f"--set {text}: {path[0]} is not a table; expected {path[0]}=value")
-        for name in reversed(path):
-            value = {name: value}
-        layer = merge(layer, value)
+        layer = merge(layer, nested(path, value))
     return layer
 
 
@@ -337,6 +335,13 @@ def walk(table: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]
             yield from walk(value, f"{prefix}{name}.")
         else:
             yield f"{prefix}{name}", value
+
+
+def nested(path: Sequence[str], value: Any) -> Any:
+    """The table with one entry, whose name has these parts: the inverse of `walk`."""
+    for name in reversed(path):
+        value = {name: value}
+    return value
 
 
 def file_stem(env: str, algo: str, trainer: str = "sb3", env_kwargs: Mapping[str, Any] | None = None) -> str:

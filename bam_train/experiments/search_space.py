@@ -14,7 +14,7 @@ from typing import Any
 
 from bam_envs.core.wording import brief
 from bam_train.errors import SettingsError
-from bam_train.settings import TABLES, TrainSettings, merge, parse_assignment, walk
+from bam_train.settings import TABLES, TrainSettings, merge, nested, parse_assignment, walk
 from bam_train.trainers.resolve_settings import resolve
 
 _NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
@@ -78,7 +78,7 @@ class SearchSpace:
         found = dict(walk(given))
         self.dimensions = [one for name, value in found.items() if (one := _read(name, value)) is not None]
         searched = {one.name for one in self.dimensions}
-        self._fixed = merge(*(_nested(name, value) for name, value in found.items() if name not in searched))
+        self._fixed = merge(*(nested(name.split("."), value) for name, value in found.items() if name not in searched))
         self.base = resolve(self._fixed)
         """The settings of the preset, without a search."""
         if not self.dimensions:
@@ -100,7 +100,7 @@ class SearchSpace:
         return {one.name: json.dumps(found[one.name]) if one.choices else found[one.name] for one in self.dimensions}
 
     def _resolve(self, values: Mapping[str, Any]) -> TrainSettings:
-        return resolve(merge(self._fixed, *(_nested(name, value) for name, value in values.items())))
+        return resolve(merge(self._fixed, *(nested(name.split("."), value) for name, value in values.items())))
 
     def _checked(self, one: Dimension) -> Dimension:
         """The dimension, of whole numbers if the setting takes no others; refuses values that it does not take."""
@@ -113,12 +113,6 @@ class SearchSpace:
         except SettingsError:
             return Dimension(one.name, one.low, one.high, one.log, whole=True)
         return one
-
-
-def _nested(name: str, value: Any) -> dict[str, Any]:
-    for part in reversed(name.split(".")):
-        value = {part: value}
-    return value  # type: ignore[no-any-return]
 
 
 def _read(name: str, text: Any) -> Dimension | None:

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Iterable
+from contextlib import closing, nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -63,19 +64,15 @@ def add_own_detector(
         )
     if steps < LEAST_TICKS:
         raise SettingsError(f"a detector needs at least {LEAST_TICKS} steps, found {steps}")
-    if envs is not None:
-        return add_detector(path, fresh_episodes(envs, env, policy, steps))
-    with_own = make_vector_env(env, env_kwargs, SIDE_BY_SIDE)
-    try:
-        inner: Any = with_own.unwrapped
-        if not (isinstance(inner, RobotVectorEnv) and inner.robot.spec.command.labels):
-            return add_detector(path, fresh_episodes(with_own, env, policy, steps))
+    made = nullcontext(envs) if envs is not None else closing(make_vector_env(env, env_kwargs, SIDE_BY_SIDE))
+    with made as played:
+        inner: Any = played.unwrapped
+        if envs is not None or not (isinstance(inner, RobotVectorEnv) and inner.robot.spec.command.labels):
+            return add_detector(path, fresh_episodes(played, env, policy, steps))
         limit = inner.max_episode_steps
-        plain = fresh_episodes(with_own, env, policy, steps // 2)
+        plain = fresh_episodes(played, env, policy, steps // 2)
         inner.robot = LiveLike(inner.robot)
-        return add_detector(path, plain, fresh_episodes(with_own, env, policy, steps // 2, SEED + steps), limit=limit)
-    finally:
-        with_own.close()
+        return add_detector(path, plain, fresh_episodes(played, env, policy, steps // 2, SEED + steps), limit=limit)
 
 
 def recorded(episode: Episode, period: float) -> Rollout:

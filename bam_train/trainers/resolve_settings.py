@@ -83,17 +83,16 @@ def resolve(given: Mapping[str, Any], tell: Tell = lambda text: None) -> TrainSe
     env = _resolve_env(asked.env, elsewhere=bool(asked.transport or run.get("data")))
     require_algorithm(asked.trainer, asked.algo)
     preset = read_preset(env, asked.algo, asked.trainer)
-    if asked.env_kwargs.get("link") is not None:  # commands arrive in the middle of a period
+    if asked.env_kwargs:  # other arms learn less on it, and a link sends in the middle of a period
         preset.pop("coarse_physics", None)
     usual = {"steps": OFFLINE_STEPS} if asked.trainer == "offline" else {}
     tuned = preset.pop("hyperparameters", {})
     settings = TrainSettings.from_mapping(merge({**usual, **preset}, run, {"env": env}))
     require_env_kwargs(env, settings.env_kwargs)
-    if "robot_model" in settings.env_kwargs and entry_of(env) is not None:
-        arm = portable_model(settings.env_kwargs["robot_model"])
-        settings = replace(settings, env_kwargs={**settings.env_kwargs, "robot_model": arm})
-    if "link" in settings.env_kwargs and entry_of(env) is not None:
-        settings = replace(settings, env_kwargs={**settings.env_kwargs, "link": portable(settings.env_kwargs["link"])})
+    for name, kept in (("robot_model", portable_model), ("link", portable)):
+        if name in settings.env_kwargs and entry_of(env) is not None:
+            own_value: Any = kept(settings.env_kwargs[name])
+            settings = replace(settings, env_kwargs={**settings.env_kwargs, name: own_value})
     try:
         require_no_place(settings.env_kwargs)
     except ValueError as error:

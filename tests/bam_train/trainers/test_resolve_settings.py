@@ -65,11 +65,12 @@ def test_without_an_algorithm_a_data_set_with_failures_is_for_iql(tmp_path, rand
     assert resolve({"data": str(tmp_path / "d"), "algo": "bc"}).algo == "bc"
 
 
-def test_a_preset_has_no_coarse_physics_behind_a_link():
-    """Commands arrive there in the middle of a period."""
+def test_a_preset_has_coarse_physics_for_the_usual_environment_only():
+    """Other arms learn less on it, and a link sends in the middle of a period."""
     given = {"env": "bam/pick", "algo": "ppo"}
     assert resolve(given).coarse_physics
-    assert not resolve({**given, "env_kwargs": {"link": "wifi"}}).coarse_physics
+    for others in ({"link": "wifi"}, {"robot_model": "fr3"}, {"randomize": True}):
+        assert not resolve({**given, "env_kwargs": others}).coarse_physics
     asked = resolve({**given, "env_kwargs": {"link": "wifi"}, "coarse_physics": True})
     assert asked.coarse_physics  # the trainer says why it cannot be
     assert not resolve({**given, "coarse_physics": False}).coarse_physics
