@@ -24,6 +24,13 @@ def say(text: str = "") -> None:
     print(shown(text), file=sys.stderr, flush=True)
 
 
+def say_in_handler(text: str) -> None:
+    """Write a line to standard error in a signal handler, which may have interrupted the printing of another line."""
+    show_cursor = "\x1b[?25h" if can_draw() else ""  # a live panel has hidden it
+    with contextlib.suppress(OSError):  # the reader has closed it
+        os.write(2, f"{show_cursor}{shown(text)}\n".encode())
+
+
 def tell(*lines: str) -> None:
     """Print the results of a program on standard output, line by line."""
     print("\n".join(map(shown, lines)), flush=True)

@@ -13,7 +13,7 @@ from bam_envs.core.timing import Pacer
 from bam_envs.live.building import require_robot_address
 from bam_train.checkpoint import Checkpoint
 from bam_train.cli.consent import connected_env, require_screen
-from bam_train.cli.console import say
+from bam_train.cli.console import say_in_handler
 from bam_train.cli.flags import EnvId, File, Url
 from bam_train.deploy.deployment import Deployment
 from bam_train.deploy.journal import EpisodeRecord, Journal
@@ -73,7 +73,7 @@ def signals_ask() -> Iterator[Callable[[], bool]]:
             interrupt(number)
         came.append(number)
         again = "Ctrl-C again" if number == signal.SIGINT else "another signal"
-        say(f"finishing the update and saving; {again} quits at once")
+        say_in_handler(f"finishing the update and saving; {again} quits at once")
 
     with handled(handle):
         yield lambda: bool(came)

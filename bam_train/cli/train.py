@@ -18,7 +18,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from bam_train.cli.console import can_draw, count, say, tell
+from bam_train.cli.console import can_draw, count, say, say_in_handler, tell
 from bam_train.cli.program import guarded, run_program
 from bam_train.signals import at_end_of_parent, before_quitting, handled
 
@@ -175,16 +175,10 @@ def _learn(config: TrainConfig, url: str, given: dict[str, Any], checkpoint: Che
 def _stop_on_signals(run: TrainingRun, came: list[int]) -> Callable[[int], None]:
     """Handler of signals: the first one stops `run` after its update, the second ends the process."""
 
-    def write(line: str) -> None:
-        """Write to standard error without print, which the signal may have interrupted."""
-        show_cursor = b"\x1b[?25h" if can_draw() else b""  # a live panel has hidden it
-        with contextlib.suppress(OSError):  # the reader has closed it
-            os.write(2, show_cursor + line.encode())
-
     def stop(number: int) -> None:
         if came:  # end the process at once: an exception might be caught, or wait for threads
             kept = f"the last checkpoint on the disk is {run.last}" if run.last else "no checkpoint had been saved yet"
-            write(f"bam-train: quit at once; {kept}\n")
+            say_in_handler(f"bam-train: quit at once; {kept}")
             run.folder.remove_unfinished()
             before_quitting()
             os._exit(128 + number)
@@ -192,7 +186,7 @@ def _stop_on_signals(run: TrainingRun, came: list[int]) -> Callable[[int], None]
         doing = "all is saved; ending" if run.done else "finishing the update and saving"
         run.stop()
         again = "Ctrl-C again" if number == signal.SIGINT else "another signal"
-        write(f"{doing}; {again} quits at once\n")
+        say_in_handler(f"{doing}; {again} quits at once")
 
     return stop
 

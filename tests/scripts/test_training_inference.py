@@ -137,10 +137,7 @@ def test_sigterm_saves(run_here, tmp_path):
     assert lines[0] == "saving to checkpoints/ur-reach-rllib-ppo.zip after every iteration"
     assert lines[1].startswith("iteration 1: 4,096 steps")
     assert lines[-1].startswith("iteration ")
-    assert done.stderr.splitlines() == [
-        "finishing the update and saving; another signal quits at once",
-        "training_inference_ur: ended by SIGTERM",
-    ]
+    assert done.stderr == "training_inference_ur: ended by SIGTERM\n"
     assert Checkpoint.open(saved).manifest.env_kwargs == {"ur_model": "ur5", "parity": True}
 
 

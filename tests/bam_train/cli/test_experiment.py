@@ -1,5 +1,6 @@
 """What experiment scripts share: their command line, Ctrl-C, and the environment of a checkpoint."""
 
+import io
 import os
 import signal
 import sys
@@ -11,6 +12,7 @@ import pytest
 
 from bam_envs.core.errors import InvalidValue, LinkLost
 from bam_train.checkpoint import Checkpoint
+from bam_train.cli.console import say
 from bam_train.cli.experiment import TrainingFlags, environment_of, open_env, require_place, signals_ask
 from bam_train.deploy.contract import Contract
 from bam_train.environments import make_env
@@ -28,25 +30,52 @@ PICK = Path(__file__).parents[3] / "checkpoints" / "pick-ppo.zip"
         (signal.SIGHUP, Terminated, "another signal"),
     ],
 )
-def test_the_first_signal_asks_and_leaving_does_what_it_wants(number, kind, again, capsys):
+def test_the_first_signal_asks_and_leaving_does_what_it_wants(number, kind, again, capfd):
     before = signal.getsignal(number)
     sent = [number] * (2 if number == signal.SIGTERM else 1)  # `timeout` sends it to the process, and to its group
     with pytest.raises(KeyboardInterrupt) as caught:
         under_signals(*sent)
     assert type(caught.value) is kind
     said = f"finishing the update and saving; {again} quits at once\n"
-    assert capsys.readouterr() == ("asked\nleft\n", said)
+    assert capfd.readouterr() == ("asked\nleft\n", said)
     assert signal.getsignal(number) is before
 
 
-def under_signals(*numbers):
-    """A block that is sent these."""
+def under_signals(*numbers, while_printing=""):
+    """A block that is sent these, and prints a line."""
     with signals_ask() as asked:
         assert not asked()
+        if while_printing:
+            say(while_printing)
         for number in numbers:
             os.kill(os.getpid(), number)
         print("asked" if asked() else "not asked")
         print("left")
+
+
+class Interrupted(io.RawIOBase):
+    """A standard error whose first line is interrupted by Ctrl-C while it is written."""
+
+    lines = b""
+
+    def writable(self):
+        return True
+
+    def write(self, text):
+        is_first, self.lines = not self.lines, self.lines + bytes(text)
+        if is_first:
+            signal.raise_signal(signal.SIGINT)
+        return len(text)
+
+
+def test_ctrl_c_while_a_line_is_printed(monkeypatch, capfd):
+    raw = Interrupted()
+    monkeypatch.setattr(sys, "stderr", io.TextIOWrapper(io.BufferedWriter(raw)))
+    with pytest.raises(KeyboardInterrupt):
+        under_signals(while_printing="seed 0: training")
+    assert raw.lines == b"seed 0: training\n"
+    said = "finishing the update and saving; Ctrl-C again quits at once\n"
+    assert capfd.readouterr() == ("asked\nleft\n", said)
 
 
 def test_the_second_signal_interrupts(capsys):
