@@ -8,14 +8,14 @@ from tests.checks import detector
 
 def test_episodes_of_training_and_behind_guards_are_usual_and_a_frozen_encoder_is_not(monkeypatch):
     monkeypatch.setattr(detector, "SIDE_BY_SIDE", 8)
-    flags = detector.Flags(ticks=80, like_live=80, guarded=100, steps=800, shift="elbow")
+    flags = detector.Flags(ticks=80, like_live=80, guarded=100, steps=1600, shift="elbow")
     lines = list(detector.measure_detector(flags))
     kinds = ("no shift", "as of live robots", "behind guards, at full speed", "behind guards, on trial")
     for line, where in zip(lines[1:5], kinds, strict=True):
         assert line.startswith(f"{where}: ")
         assert " h: 0 false alarms, at most " in line
     shift, episodes, failed, flagged, *_ = (cell.strip() for cell in lines[7].strip("|").split("|"))
-    assert (shift, episodes, failed, flagged) == ("elbow's encoder frozen", "15", "14", "14")
+    assert (shift, episodes, failed, flagged) == ("elbow's encoder frozen", "17", "16", "16")
     assert lines[-1] == "\n1 of 1 shifts: at least 90 % of the failed episodes flagged before they end"
 
 

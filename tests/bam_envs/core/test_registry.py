@@ -93,8 +93,8 @@ def test_names_that_mean_something(name, env_id):
         ("bam/pik", "Unknown environment 'bam/pik'. Did you mean 'bam/pick-v0'?"),
         ("bam/pick-v7", "Unknown environment 'bam/pick-v7'. Did you mean 'bam/pick-v0'?"),
         ("CartPol-v1", "Unknown environment 'CartPol-v1'. Did you mean 'CartPole-v1'?"),
-        ("", f"Unknown environment ''. Choose from: {', '.join(ENVIRONMENTS)}."),
-        ("Qwxyz", f"Unknown environment 'Qwxyz'. Choose from: {', '.join(ENVIRONMENTS)}."),
+        ("", f"Unknown environment ''. Choose from: {', '.join(ENVIRONMENTS)}, another of Gymnasium's."),
+        ("Qwxyz", f"Unknown environment 'Qwxyz'. Choose from: {', '.join(ENVIRONMENTS)}, another of Gymnasium's."),
     ],
 )
 def test_names_that_mean_nothing(name, text):
