@@ -69,7 +69,9 @@ def described_policy(path: Path) -> ForeignPolicy:
     except OSError as error:
         which = "it" if error.filename == str(path) else f"its network, {error.filename},"
         raise CheckpointError(path, f"{which} cannot be read: {error.strerror or error}. Check the name") from error
-    except ValueError as error:  # also of TOML
+    except tomllib.TOMLDecodeError as error:
+        raise CheckpointError(path, f"is not TOML: {error}. Correct it there") from error
+    except ValueError as error:
         raise CheckpointError(path, f"does not describe a policy: {error}") from error
     source: dict[str, Any] = {"description": str(path.absolute()), "network": str(network.absolute())}
     return ForeignPolicy(

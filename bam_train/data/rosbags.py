@@ -136,7 +136,7 @@ def _parts(file: Path, profile: RobotProfile, spec: RobotSpec) -> list[list[tupl
     if missing or not sampler.is_commanded:
         what = f"no message on {', '.join(missing)}" if missing else f"no command on {', '.join(sampler.sinks)}"
         text = f"{file}: has {what}, as the profile {profile.name} names it. It has {_offered(file)}"
-        raise FormatError(f"{text}. Give the profile that fits with --profile")
+        raise FormatError(f"{text}. Give its arm with --set robot_model=NAME, or its profile with --profile")
     return parts
 
 

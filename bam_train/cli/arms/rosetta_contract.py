@@ -36,9 +36,10 @@ def contract_graph(path: Path, robot: str) -> LiveGraph:
     except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
         raise InvalidValue(f"{path}: cannot be read: {' '.join(str(error).split())}.") from error
     except (AttributeError, KeyError, TypeError) as error:
+        lacks = f": no {error}" if isinstance(error, KeyError) else ""
         raise InvalidValue(
-            f"{path}: no contract of rosetta: expected robot_type, and observations and actions with channels of topic "
-            f"and type; {type(error).__name__}: {error}."
+            f"{path}: not a contract of rosetta{lacks}. Give a YAML file with robot_type, and with observations and "
+            "actions, which have channels with a topic and a type."
         ) from error
     states: dict[str, tuple[str, ...]] = {}
     for (_, topic), kind, names in seen:

@@ -102,10 +102,10 @@ def import_(config: flags.ImportConfig) -> None:
             info = recordings.info_of_rows(path, config.env, env_kwargs)
             episodes = recordings.episodes_of_rows(path, info)
             notes = recordings.add_episodes(path, episodes, config.place, info, **options)
-        elif env_kwargs:
-            raise SettingsError(f"--set: {path} says the arguments of its environment; leave --set out")
         else:
             recording = Recording.open(path)
+            if env_kwargs:
+                raise SettingsError(f"--set: {path} says the arguments of its environment; leave --set out")
             info = recordings.info_of_recording(recording, config.env)
             notes = recordings.add_recording(recording, config.place, info, **options)
         for note in notes:

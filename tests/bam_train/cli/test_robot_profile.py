@@ -360,9 +360,11 @@ def test_a_contract_of_rosetta_says_topics_joints_and_their_order(run, contract,
         ),
         (
             ("actions:", "acts:"),
-            "no contract of rosetta: expected robot_type, and observations and actions with channels of topic and "
-            "type; KeyError: 'actions'.",
+            "not a contract of rosetta: no 'actions'. Give a YAML file with robot_type, and with observations and "
+            "actions, which have channels with a topic and a type.",
         ),
+        (("robot_type:", "- robot_type:"), "cannot be read: while parsing a block collection"),
+        (("actions:", "actions: []\nacts:"), "not a contract of rosetta. Give a YAML file with robot_type"),
         (("fps: 30", "fps: ["), "cannot be read: while parsing a flow sequence"),
     ],
 )

@@ -192,6 +192,10 @@ def test_a_network_without_its_description(run, tmp_path):
     text = "it is the network alone. Give a TOML file that says what its inputs and outputs mean"
     for source in (path, f"onnx:{path}"):
         assert run(main, source) == (1, "", f"bam-export: {path}: does not describe a policy: {text}\n")
+    path.with_suffix(".toml").write_text("network = ")
+    said = "is not TOML: Invalid value (at end of document). Correct it there"
+    assert run(main, path.with_suffix(".toml")) == (1, "", f"bam-export: {path.with_suffix('.toml')}: {said}\n")
+    path.with_suffix(".toml").unlink()
     status, _, err = run(main, path.with_suffix(".toml"))
     assert (status, err) == (
         1,

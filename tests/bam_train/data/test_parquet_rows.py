@@ -126,7 +126,10 @@ def test_what_cannot_be_imported_is_one_line(import_):
         (["a.parquet", "--env", ENV], "a.parquet: cannot be read as Parquet: "),
         (["none", "--env", ENV], "none: lacks the column eps_id, obs, new_obs, actions, "),
         (nested, "a.parquet: Parquet rows have one array a step, and the spaces of test/Rows-v0 are Dict("),
-        (["b.mcap", "--set", "a=1"], "--set: b.mcap says the arguments of its environment; leave --set out"),
+        (
+            ["b.mcap", "--set", "a=1"],
+            "b.mcap: cannot be read: No such file or directory. Give a .mcap file of bam-deploy",
+        ),
     ):
         status, out, err = import_("data", *arguments)
         assert (status, out, err.count("\n"), Path("data").exists()) == (1, "", 1, False)

@@ -59,6 +59,9 @@ def test_recordings_are_imported_once_and_up_to_their_cut(folder, capsys):
         f": episode 0 and 1 more: is in {folder / 'deployed'} already; bam-data import --again adds it all the same\n"
     )
     assert capsys.readouterr().err.endswith(said)
+    assert run(bam_data.main, "import", folder / "deployed", recording, "--set", "rate=30") == 1
+    said = f"--set: {recording} says the arguments of its environment; leave --set out\n"
+    assert capsys.readouterr().err == f"bam-data import: {said}"
     assert len(DataSet.open(folder / "deployed")) == 2
     cut, data = folder / "cut.mcap", recording.read_bytes()
     whole = list(DataSet.open(folder / "deployed"))

@@ -161,12 +161,12 @@ OFFERED = "as the profile ros2_so_arm100 names it. It has "
         (
             lambda path: write(path, states_to="/arm/joint_states"),
             f"has no message on /joint_states, {OFFERED}/arm/joint_states (sensor_msgs/JointState), {COMMANDS} "
-            "(std_msgs/Float64MultiArray). Give the profile that fits with --profile",
+            "(std_msgs/Float64MultiArray). Give its arm with --set robot_model=NAME, or its profile with --profile",
         ),
         (
             lambda path: write(path, commands=False),
             f"has no command on {COMMANDS}, /joint_trajectory_controller/joint_trajectory, {OFFERED}/joint_states "
-            "(sensor_msgs/JointState). Give the profile that fits with --profile",
+            "(sensor_msgs/JointState). Give its arm with --set robot_model=NAME, or its profile with --profile",
         ),
         (
             json_encoded,
