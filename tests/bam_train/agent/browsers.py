@@ -6,8 +6,8 @@ import os
 import shutil
 import signal
 import time
-from pathlib import Path
 
+import psutil
 import pytest
 
 FLAGS = (
@@ -135,18 +135,11 @@ class Page:
 
 def renderers(root):
     """The processes below `root` that run pages."""
-    parents = {}
-    for folder in Path("/proc").glob("[0-9]*"):
-        with contextlib.suppress(OSError):
-            state = (folder / "stat").read_text().rpartition(")")[2].split()
-            parents[int(folder.name)] = int(state[1]), (folder / "cmdline").read_bytes()
-    found, family = [], {root}
-    for pid in sorted(parents):  # children have higher numbers, but for a wrap-around
-        parent, command = parents[pid]
-        if parent in family:
-            family.add(pid)
-            if b"--type=renderer" in command:
-                found.append(pid)
+    found = []
+    for process in psutil.Process(root).children(recursive=True):
+        with contextlib.suppress(psutil.Error):  # it has ended
+            if "--type=renderer" in " ".join(process.cmdline()):
+                found.append(process.pid)
     return found
 
 
