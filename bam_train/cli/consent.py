@@ -91,7 +91,7 @@ def connected_env(
             actor = "a person" if checkpoint is None else checkpoint.path
             require_consent(env, f"{who}: {actor}", yes=yes, plan=plan)
         signals.raise_again()
-        if wiggle and contract is not None and not is_shadow:
+        if wiggle and contract is not None and contract.inspection is not None and not is_shadow:
             live.require_motion(env, f"{actor} and the robot at {place.text}", contract.inspection, say)
             signals.raise_again()
     except BaseException:
