@@ -1,8 +1,10 @@
 """Steps/s of the environments with random actions; those of MuJoCo against the bare physics of the same model.
 
-Measured in turns; the figures are medians. The actions are drawn beforehand: sampling is the policy's cost.
+Measured in turns; the figures are medians. The actions are drawn beforehand: sampling is the policy's cost. Where
+panda-gym is installed (``pip install panda-gym``), bam/pick is compared with its PandaPickAndPlace too.
 """
 
+import importlib.util
 import os
 import time
 from dataclasses import dataclass
@@ -15,7 +17,7 @@ from bam_envs.core.errors import InvalidValue
 from bam_envs.core.registry import ENVIRONMENTS, resolve_id
 from bam_train.cli.flags import Count
 from tests.benchmarks import harness
-from tests.benchmarks.harness import at_least, in_turns, ratio
+from tests.benchmarks.harness import Row, at_least, in_turns, ratio
 
 PICK = "bam/pick-v0"
 GOALS = {
@@ -102,6 +104,26 @@ def measure_steps(flags):
         yield at_least("  one of it", rates["single"], 2_500 * (env_id == PICK))
         envs.close()
         env.close()
+
+
+def measure_panda(flags):
+    """A batch of bam/pick by CPU time, on usual and on coarse physics, against PandaPickAndPlace of panda-gym."""
+    n, steps = flags.num_envs or 64, flags.times(100)
+    usual, coarse = (gym.make_vec(PICK, num_envs=n) for _ in range(2))
+    coarse.unwrapped.robot.coarse = True
+    works = {"usual": stepper(usual, steps), "coarse": stepper(coarse, steps)}
+    if importlib.util.find_spec("panda_gym"):
+        importlib.import_module("panda_gym")
+        works["panda"] = stepper(gym.make("PandaPickAndPlace-v3", disable_env_checker=True), 2 * steps)
+    times = in_turns(works, flags.times(9))
+    for name in ("usual", "coarse"):
+        what, found = f"{PICK} x {n}, {name} physics, steps a CPU second", f"{n * steps / median(times[name]):,.0f}"
+        if "panda" not in times:
+            yield Row(what, found, "pip install panda-gym")
+            continue
+        theirs = 2 * steps / median(times["panda"])
+        many = n / 2 * ratio(times["panda"], times[name])
+        yield at_least(what, many, 12, "x", f"{found}, {many:.1f} x PandaPickAndPlace's {theirs:,.0f}")
 
 
 def measure_images(flags):
