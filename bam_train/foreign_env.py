@@ -26,6 +26,7 @@ class ForeignEnv(gym.Wrapper[Any, Any, Any, Any]):
 
     def __init__(self, env: gym.Env[Any, Any], env_id: str) -> None:
         super().__init__(env)
+        self.metadata = {**env.metadata}  # Gymnasium's vector environments write theirs into the one of the class
         self._name, self._steps, self._seen = env_id, 0, 0
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:

@@ -3,6 +3,7 @@
 import gymnasium as gym
 import numpy as np
 import pytest
+from gymnasium.vector import AutoresetMode
 
 from bam_envs.core.errors import LinkLost
 from bam_train.environments import make_env, make_vector_env
@@ -90,3 +91,11 @@ def test_faults_of_a_robot_stay_what_they_are(fails):
     with pytest.raises(LinkLost) as caught:
         env.reset()
     assert caught.value is lost
+
+
+def test_vector_environments_of_one_class_keep_their_own_automatic_resets():
+    theirs = gym.make_vec("CartPole-v1", 1, vectorization_mode="sync")
+    ours = make_vector_env("CartPole-v1", None, 1)
+    modes = [envs.metadata["autoreset_mode"] for envs in (theirs, ours)]
+    gym.make_vec("CartPole-v1", 1, vectorization_mode="sync").close()
+    assert [*modes, ours.metadata["autoreset_mode"]] == [AutoresetMode.NEXT_STEP, *2 * [AutoresetMode.SAME_STEP]]
