@@ -416,7 +416,7 @@ class ExportConfig(RobotModelFlag):
 
     Examples:
       bam-export lerobot:train/act/checkpoints/last/pretrained_model --units degrees --robot-model so101 --out act.zip
-      bam-export act.toml --set camera=front --set image_size=640x480
+      bam-export act.toml --robot-model so101
       bam-export sb3:model.zip --env CartPole-v1 --algo ppo --trust-pickle
       bam-export ray_results/run/checkpoint_000010 --trust-pickle
     """

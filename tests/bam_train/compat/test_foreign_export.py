@@ -88,8 +88,9 @@ def test_order_units_and_rate_become_those_of_the_robot(described, run, tmp_path
 
 def test_an_image_has_its_channels_first(described, run, tmp_path):
     out = tmp_path / "act.zip"
-    cameras = ["--set", "camera=front", "--set", "image_size=64x48"]
-    assert run(main, described(pixels=True), "--robot-model", "so101", *cameras, "--out", out)[0] == 0
+    assert run(main, described(pixels=True), "--robot-model", "so101", "--out", out)[0] == 0
+    kwargs = Checkpoint.open(out).manifest.env_kwargs
+    assert (kwargs["camera"], kwargs["image_size"]) == (["front"], [64, 48])  # the policy's, without --set
     black = {"front": np.zeros((48, 64, 3), np.uint8), "robot": SEEN}
     np.testing.assert_allclose(FrozenPolicy.load(out).act(black), SEEN, atol=1e-6)
 
@@ -99,9 +100,8 @@ def test_the_ranges_in_the_data_make_the_detector(described, run, tmp_path, pixe
     """A number that leaves its range by more than a tenth of it is unusual from the second tick on."""
     low, high = f"low = {[-10.0] * 5 + [0.0]}", f"high = {[30.0] * 5 + [100.0]}"
     ranges = [(f"std = {STD}\n", f"std = {STD} \n{low}\n{high}\n")] * 2
-    cameras = ["--set", "camera=front", "--set", "image_size=64x48"] if pixels else []
     out = tmp_path / "act.zip"
-    assert run(main, described(*ranges, pixels=pixels), "--robot-model", "so101", *cameras, "--out", out)[0] == 0
+    assert run(main, described(*ranges, pixels=pixels), "--robot-model", "so101", "--out", out)[0] == 0
     policy = FrozenPolicy.load(out)
     seen = np.array([*np.radians([-10, 30, 10, 0, 20]), 0.0], np.float32)
     front = {"front": np.zeros((1, 48, 64, 3), np.uint8)} if pixels else {}
@@ -148,13 +148,17 @@ def test_the_ranges_in_the_data_make_the_detector(described, run, tmp_path, pixe
             "rate 30 Hz 20 Hz. Leave --env and --set rate= out refused",
         ),
         ([], ["--set", "image_size=32"], "image front 64 x 48, 3 channels 32 x 32, 3 channels refused"),
+        (
+            [('part = "front"', 'part = "top"')],
+            [],
+            "input image top the observation has one array. Choose its images with --set camera= and --set image_size= "
+            "refused",
+        ),
     ],
 )
 def test_what_does_not_fit_is_a_row_and_refused(described, run, tmp_path, changes, flags, row):
-    pixels = "image_size=32" in flags
-    size = ["--set", "camera=front", *flags] if pixels else flags
-    path = described(*changes, pixels=pixels)
-    status, said, err = run(main, path, "--robot-model", "so101", *size, "--out", tmp_path / "act.zip")
+    path = described(*changes, pixels="image" in row)
+    status, said, err = run(main, path, "--robot-model", "so101", *flags, "--out", tmp_path / "act.zip")
     assert (status, said) == (3, "")
     *table, last = [" ".join(line.split()) for line in err.splitlines()]
     assert row in table

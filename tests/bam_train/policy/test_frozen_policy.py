@@ -227,7 +227,7 @@ def test_a_graph_that_does_not_fit_its_spaces_is_refused(observation_space: Any,
     ("op", "inputs", "output", "text"),
     [
         ("Tanh", {}, "x", r"outputs are \['x'\], expected \['action'\]"),
-        ("NoSuchThing", {}, "action", "the policy cannot be read: operation 'NoSuchThing' is none of a policy's"),
+        ("NoSuchThing", {}, "action", "the policy cannot be read: operation 'NoSuchThing' is not allowed. "),
         (
             "Tanh",
             {"state.x": ("float32", ["m"])},

@@ -85,14 +85,29 @@ GROWING = [
             "operation If: its 'else",
         ),
         (of(node("Scan", ["observation"], ["action"], body=BODY, num_scan_inputs=1)), "operation Scan: its 'body'"),
-        (of(node("Loop", ["n", "", "observation"], ["action"]), n=np.int64(2**62)), "operation 'Loop' is none of a"),
-        (of(node("Tile", ["observation", "n"], ["action"]), n=np.array([1, 10**9])), "operation 'Tile' is none of a"),
-        (of(node("Expand", ["observation", "n"], ["action"]), n=np.array([10**9, 4])), "operation 'Expand' is none"),
-        (of(node("Tanh", ["observation"], ["action"], domain="com.microsoft")), "operation 'com.microsoft.Tanh' is"),
-        (of(node("RandomNormalLike", ["observation"], ["action"])), "operation 'RandomNormalLike' is none of a policy"),
+        (
+            of(node("Loop", ["n", "", "observation"], ["action"]), n=np.int64(2**62)),
+            "operation 'Loop' is not allowed. Export the network without it; allowed are Abs, ",
+        ),
+        (
+            of(node("Tile", ["observation", "n"], ["action"]), n=np.array([1, 10**9])),
+            "operation 'Tile' is not allowed. Export the network without it; allowed are Abs, ",
+        ),
+        (
+            of(node("Expand", ["observation", "n"], ["action"]), n=np.array([10**9, 4])),
+            "operation 'Expand' is not allowed. Export the network without it; allowed are Abs, ",
+        ),
+        (
+            of(node("Tanh", ["observation"], ["action"], domain="com.microsoft")),
+            "operation 'com.microsoft.Tanh' is not allowed. Export the network without it; allowed are Abs, ",
+        ),
+        (
+            of(node("RandomNormalLike", ["observation"], ["action"])),
+            "operation 'RandomNormalLike' is not allowed. Export the network without it; allowed are Abs, ",
+        ),
         (
             of(node("Shape", ["observation"], ["s"]), node("Reshape", ["observation", "s"], ["action"])),
-            "operation 'Shape' is none of a policy's",
+            "operation 'Shape' is not allowed. Export the network without it; allowed are Abs, ",
         ),
         (
             of(
@@ -223,11 +238,11 @@ IN_ANOTHER_FILE = "tensor 'w': its numbers are in another file; export with ever
 @pytest.mark.parametrize(
     ("data", "text"),
     [
-        (b"", "not an ONNX file: it has no graph"),
+        (b"", "not an ONNX file, or damaged: it has no graph. Export it again, or copy it again from its source"),
         (b"PK\x03\x04 a zip", "not an ONNX file"),
         (b"\x3f", "not an ONNX file"),
         (b"\x38\x05", "not an ONNX file"),
-        (b"\x08" + b"\xff" * 11, "not an ONNX file: a number of more than 64 bits"),
+        (b"\x08" + b"\xff" * 11, "not an ONNX file, or damaged: a number has more than 64 bits"),
         (WHOLE[:-5], "not an ONNX file"),
         (with_weight(lambda weight: setattr(weight, "data_location", TensorProto.EXTERNAL)), IN_ANOTHER_FILE),
         (with_weight(lambda weight: weight.external_data.add(key="location", value="/etc/passwd")), IN_ANOTHER_FILE),
