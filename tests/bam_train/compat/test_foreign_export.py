@@ -200,11 +200,11 @@ def test_a_network_without_its_description(run, tmp_path):
     said = "is not TOML: Invalid value (at end of document). Correct it there"
     assert run(main, path.with_suffix(".toml")) == (1, "", f"bam-export: {path.with_suffix('.toml')}: {said}\n")
     path.with_suffix(".toml").unlink()
-    status, _, err = run(main, path.with_suffix(".toml"))
-    assert (status, err) == (
-        1,
-        f"bam-export: {path.with_suffix('.toml')}: it cannot be read: No such file or directory. Check the name\n",
-    )
+    gone = str(path.with_suffix(".toml"))
+    told = "no such file or folder. Check the name; a word before it may be lerobot:, onnx:, sb3:, rllib:"
+    assert run(main, gone) == (1, "", f"bam-export: {gone!r}: {told}\n")
+    said = f"{path.with_suffix('.toml')}: it cannot be read: No such file or directory. Check the name"
+    assert run(main, f"onnx:{path.with_suffix('.toml')}") == (1, "", f"bam-export: {said}\n")
 
 
 @pytest.mark.parametrize(
@@ -240,6 +240,7 @@ def test_a_graph_with_other_inputs_is_refused(described, run):
         ({"type": "smolvla"}, "smolvla takes seconds for a chunk on a robot's computer: run it on a policy server "
          "with a GPU; bam-export takes act and diffusion"),
         ({"type": "tdmpc"}, "is a policy of the kind tdmpc; bam-export takes act and diffusion"),
+        ({}, "is a policy of the kind that config.json does not name (type); bam-export takes act and diffusion"),
         ({"type": "diffusion", "noise_scheduler_type": "DDPM"}, "noise_scheduler_type is DDPM, which draws noise in "
          'every step. In config.json set it to "DDIM", and num_inference_steps to about 10'),
         (None, "has no config.json: no folder pretrained_model of LeRobot. Give .../checkpoints/last/pretrained_model"),
