@@ -153,7 +153,7 @@ class Checkpoint:
 
         if not are_same(env_id, self.manifest.env):
             trained = self.manifest.env
-            remedy = remedy or f"Use --env {trained}, or train one for {env_id}"
+            remedy = remedy or f"Name that one, or train a policy for {env_id}"
             raise CheckpointMismatch(self.path, f"was trained on {trained}, not on {env_id}. {remedy}")
 
 

@@ -18,6 +18,21 @@ if TYPE_CHECKING:
     from bam_train.policy import FrozenPolicy
 
 
+_ONLY_WITH = {"data": ("seen", "by"), "video": ("video_episodes",)}
+"""Flag to others that count with it alone."""
+_NOT_WITH_DATA = {
+    "episodes",
+    "num_envs",
+    "set",
+    "video",
+    "record",
+    "robot_model",
+    "add_detector",
+    "algo",
+    "trust_pickle",
+}
+
+
 class _Subject(NamedTuple):
     """A policy to evaluate, and its environment."""
 
@@ -34,6 +49,7 @@ class _Subject(NamedTuple):
 
 def evaluate_checkpoint(config: EvalConfig) -> None:
     """Run the program with its parsed flags."""
+    _require_use(config)
     if config.data is not None:
         _on_data(config, config.data)
         return
@@ -82,6 +98,20 @@ def evaluate_checkpoint(config: EvalConfig) -> None:
         tell(*_table(report, subject, path))
     if video is not None:
         _record(config, subject, video)
+
+
+def _require_use(config: EvalConfig) -> None:
+    """Refuse a flag that would not count."""
+    from bam_envs.core.wording import as_flag
+    from bam_train.errors import SettingsError
+
+    given = {name for name, value in vars(config).items() if value != getattr(type(config), name, value)}
+    for flag, names in _ONLY_WITH.items():
+        for name in names:
+            if name in given and flag not in given:
+                raise SettingsError(f"{as_flag(name)} is for {as_flag(flag)}; give that too, or leave it out")
+    for name in sorted(_NOT_WITH_DATA & given if "data" in given else ()):
+        raise SettingsError(f"{as_flag(name)} is of no use with --data, which plays nothing; leave it out")
 
 
 def _recorded(config: EvalConfig, subject: _Subject, envs: Any) -> AbstractContextManager[Any]:

@@ -35,10 +35,15 @@ def export_policy(config: ExportConfig) -> None:
 
 def _kind(source: str) -> tuple[str, Path]:
     """What the source is, by the word before it or by its name."""
+    from bam_train.errors import SettingsError
+
     kind, colon, rest = source.partition(":")
     if colon and kind in KINDS:
         return kind, Path(rest)
     path = Path(source)
+    if not source or not path.expanduser().exists():
+        words = ", ".join(f"{one}:" for one in KINDS)
+        raise SettingsError(f"{source!r}: no such file or folder. Check the name; a word before it may be {words}")
     if (path.expanduser() / "model.safetensors").is_file():
         return "lerobot", path
     return {".toml": "onnx", ".onnx": "onnx", ".zip": "sb3"}.get(path.suffix, "rllib"), path

@@ -274,8 +274,8 @@ class EvalConfig(EpisodeFlags, JsonFlag):
     trust_pickle: bool = False
     """Load a plain stable-baselines3 zip, which runs whatever code is in it."""
     data: DataSetName = None
-    """Play nothing, and estimate from the recorded episodes of this data set how good the policy is; then only --env,
-    --seed, --json, --seen and --by count."""
+    """Play nothing, and estimate from the recorded episodes of this data set how good the policy is, with no other
+    flags than --env, --seed, --json, --seen and --by."""
     seen: Literal["refuse", "skip", "use"] = "refuse"
     """What becomes of episodes of --data that the policy learnt from."""
     by: Annotated[tuple[str, ...], tyro.conf.UseAppendAction, tyro.conf.arg(metavar="FACT")] = ()
@@ -416,7 +416,7 @@ class ExportConfig(RobotModelFlag):
 
     Examples:
       bam-export lerobot:train/act/checkpoints/last/pretrained_model --units degrees --robot-model so101 --out act.zip
-      bam-export act.toml --set camera=front --set image_size=640x480
+      bam-export act.toml --robot-model so101
       bam-export sb3:model.zip --env CartPole-v1 --algo ppo --trust-pickle
       bam-export ray_results/run/checkpoint_000010 --trust-pickle
     """

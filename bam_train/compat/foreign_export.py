@@ -41,16 +41,16 @@ def export_foreign(
     Args:
         policy: The policy.
         env_id: Versioned id of the environment that it will run in.
-        env_kwargs: Its arguments; its rate, if it may have several, is the policy's by default.
+        env_kwargs: Its arguments; rate, cameras and size of images, where it may have several, are the policy's by
+            default.
         tell: Called with the lines of the contract where the two do not fit.
 
     Raises:
         ContractRefused: A joint is missing, or named twice; the rate or an image differs.
         PolicyError: Its graph cannot be used, or does not act as its own library does.
     """
-    policy, entry = with_known_sizes(policy), entry_of(env_id)
-    if entry is not None and "rate" in entry.options() and policy.rate not in (None, 1 / entry.period):
-        env_kwargs = {"rate": policy.rate, **env_kwargs}
+    policy = with_known_sizes(policy)
+    env_kwargs = {**_usual(policy, env_id), **env_kwargs}
     with contextlib.closing(make_env(env_id, env_kwargs)) as env:
         signals, period = described(env)
         contract = Contract(tuple(fit_rows(policy, env, period)))
@@ -79,6 +79,20 @@ def export_foreign(
     made = exported(policy.place, frozen, graph, golden, policy.source, policy.by, **facts)
     detector = _detector(policy, taken, given, action)
     return made if detector is None else replace(made, members={**made.members, DETECTOR: detector.to_bytes()})
+
+
+def _usual(policy: ForeignPolicy, env_id: str) -> dict[str, Any]:
+    """The arguments with which the environment has the rate and the images of a policy, where it may have several."""
+    entry, images = entry_of(env_id), {port.part: port.size for port in policy.inputs if port.is_image}
+    if entry is None:
+        return {}
+    usual: dict[str, Any] = {}
+    if "rate" in entry.options() and policy.rate not in (None, 1 / entry.period):
+        usual["rate"] = policy.rate
+    if images.keys() <= {*entry.cameras} and len({*images.values()}) == 1:
+        [(_, height, width)] = {*images.values()}
+        usual |= {"camera": [*images], "image_size": [width, height]}
+    return usual
 
 
 def _detector(

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from bam_train.compat.foreign_policy import Affine, ForeignPolicy, Meaning, Port
 from bam_train.errors import FormatError, PolicyError
-from bam_train.policy.onnx_graph import require_policy
+from bam_train.policy.onnx_graph import damaged, require_policy
 
 Array = NDArray[Any]
 _OWN = "theirs/"
@@ -39,7 +39,7 @@ def mapped_graph(
         require_policy(policy.network)
         model = load_model_from_string(policy.network)
     except (FormatError, DecodeError) as error:
-        raise PolicyError(f"{policy.place}: {error}") from error
+        raise PolicyError(f"{policy.place}: its network: {error}") from error
     graph = model.graph
     fixed = {tensor.name for tensor in graph.initializer}
     found = [one.name for one in graph.input if one.name not in fixed]
@@ -86,7 +86,7 @@ def with_known_sizes(policy: ForeignPolicy) -> ForeignPolicy:
         model = load_model_from_string(policy.network)
         inferred = shape_inference.infer_shapes(model, data_prop=True).graph
     except (DecodeError, shape_inference.InferenceError) as error:
-        raise PolicyError(f"{policy.place}: not an ONNX file, or damaged: {error}") from error
+        raise PolicyError(f"{policy.place}: its network: {damaged(error)}") from error
     values = [*inferred.value_info, *inferred.input, *inferred.output]
     sizes = {one.name: [side.dim_value for side in one.type.tensor_type.shape.dim] for one in values}
     for node in list(model.graph.node):

@@ -193,10 +193,9 @@ def fit_rows(policy: ForeignPolicy, env: gym.Env[Any, Any], period: float | None
         space: Any = part_of(env.observation_space, port)
         what = f"input {port.name}"
         if space is None:
-            parts = (
-                ", ".join(env.observation_space) if isinstance(env.observation_space, gym.spaces.Dict) else "one array"
-            )
-            yield Check(what, port.part or "a vector", f"the observation has {parts}", fits=False)
+            found = f"the observation has {', '.join(filter(None, _parts(env.observation_space))) or 'one array'}"
+            found += ". Choose its images with --set camera= and --set image_size=" if port.is_image else ""
+            yield Check(what, port.part or "a vector", found, fits=False)
         elif port.is_image:
             channels, height, width = port.size
             found = (

@@ -55,7 +55,7 @@ def lerobot_policy(folder: Path, *, data: Path | None = None, units: Units | Non
     """
     folder = folder.expanduser()
     config = _json(folder, "config.json")
-    kind = str(config.get("type"))
+    kind = str(config.get("type", "that config.json does not name (type)"))
     if kind in LARGE:
         text = f"{kind} takes seconds for a chunk on a robot's computer: run it on a policy server with a GPU"
         raise CheckpointMismatch(folder, f"{text}; bam-export takes {' and '.join(KINDS)}")

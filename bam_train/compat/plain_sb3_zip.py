@@ -40,8 +40,12 @@ def is_plain_sb3(path: Path) -> bool:
 def require_plain_sb3(path: Path) -> None:
     """Raise CheckpointError unless the file is a zip of stable-baselines3 without our manifest."""
     if not is_plain_sb3(path):
-        with open_zip(path):
-            raise CheckpointError(path, "is not a zip of stable-baselines3, or already a checkpoint of bam-train")
+        with open_zip(path) as archive:
+            is_ours = MANIFEST in archive.namelist()
+        text = (
+            "is a checkpoint of bam-train already" if is_ours else "is not a zip of stable-baselines3. Check the name"
+        )
+        raise CheckpointError(path, text)
 
 
 def export_trusted(

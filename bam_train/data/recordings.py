@@ -260,7 +260,9 @@ def _rows(source: Path, columns: list[str]) -> Arrow:
             raise BadDataSet(f"{source}: {text}")
         table = files.read(columns)
     except (OSError, pa.ArrowInvalid) as error:
-        raise BadDataSet(f"{source}: cannot be read as Parquet: {' '.join(str(error).split())}") from error
+        raise BadDataSet(
+            f"{source}: cannot be read as Parquet: {' '.join(str(error).split())}. Give files of Parquet alone"
+        ) from error
     if not len(table):
         raise BadDataSet(f"{source}: has no rows")
     return table

@@ -106,9 +106,7 @@ def require_env_kwargs(env: str, given: Mapping[str, Any]) -> None:
         raise SettingsError(f"--robot-model: {env} takes none{own}. Leave it out; these take one: {those}")
     for name in given:
         if name not in known | refused:  # the constructor explains why it refuses these
-            raise SettingsError(
-                f"env_kwargs: unknown setting {name!r} of {env}. {did_you_mean(in_our_words(name), known)}"
-            )
+            raise SettingsError(f"unknown argument {name!r} of {env}. {did_you_mean(in_our_words(name), known)}")
     try:
         require_values(theirs, given) if theirs else require_kinds(env, options | {"randomize": False}, given)
         entry.read_cameras(given)

@@ -53,11 +53,7 @@ class Pairs:
 
     def verdict(self, margin: float) -> Verdict:
         """What the interval says; see `verdict_of`."""
-        if self._is_more_than(0.0):
-            return "better"
-        if self._is_less_than(0.0):
-            return "worse"
-        return "not worse" if self._is_more_than(-margin) else "undecided"
+        return verdict_of(self.interval(), margin)
 
     def is_decided(self, margin: float) -> bool:
         """Whether more pairs would hardly change the verdict: better, worse, or equal but for the margin."""

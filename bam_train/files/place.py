@@ -257,6 +257,8 @@ def _at_address(place: Place, scheme: str) -> tuple[Any, str]:
         raise PlaceError(place, f"needs {package}, which is not installed. Run: pip install {what}") from error
     except Exception as error:  # each kind of service has its own
         text = f"{scheme}:// is unknown. Give a path, or an address that fsspec knows, such as s3:// or gs://"
+        if scheme in ("ws", "wss", "tcp"):
+            text = "is the address of a robot or a server, and a file is meant here. Check the order of what you gave"
         if scheme in available_protocols():
             text = f"cannot be opened: {_line(error)}"
         raise PlaceError(place, text) from error

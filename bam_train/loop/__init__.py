@@ -10,16 +10,10 @@ The core needs NumPy only. Names that need torch, and names for programs written
 import importlib
 from typing import TYPE_CHECKING, Any
 
-from bam_train.loop.agents import Agents as Agents
-from bam_train.loop.agents import CopyTAgent as CopyTAgent
-from bam_train.loop.agents import EpisodesDone as EpisodesDone
-from bam_train.loop.agents import KWAgentWrapper as KWAgentWrapper
-from bam_train.loop.agents import PrintAgent as PrintAgent
-from bam_train.loop.agents import SeedableAgent as SeedableAgent
-from bam_train.loop.agents.agent import Agent as Agent
-from bam_train.loop.agents.agent import import_torch
-from bam_train.loop.agents.temporal_agent import TemporalAgent as TemporalAgent
-from bam_train.loop.workspace import Workspace as Workspace
+from bam_train.loop.agents.agent import Agent, import_torch
+from bam_train.loop.agents.agents import Agents, CopyTAgent, EpisodesDone, KWAgentWrapper, PrintAgent, SeedableAgent
+from bam_train.loop.agents.temporal_agent import TemporalAgent
+from bam_train.loop.workspace.workspace import Workspace
 
 if TYPE_CHECKING:
     from bam_train.loop.gym.gym_agent import GymAgent as GymAgent

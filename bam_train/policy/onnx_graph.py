@@ -62,10 +62,15 @@ def require_policy(data: bytes) -> None:
         if model.training_info or model.functions:
             raise FormatError("it holds functions or training, expected a graph alone")
         if not model.HasField("graph"):
-            raise FormatError("not an ONNX file: it has no graph")
+            raise damaged("it has no graph")
         _require_graph(model.graph)
     except (DecodeError, IndexError, UnicodeDecodeError) as error:
-        raise FormatError(f"not an ONNX file, or damaged: {error}") from error
+        raise damaged(error) from error
+
+
+def damaged(why: object) -> FormatError:
+    """The error for a file that is no ONNX file, or not whole."""
+    return FormatError(f"not an ONNX file, or damaged: {why}. Export it again, or copy it again from its source")
 
 
 def _require_graph(graph: Any) -> None:
@@ -92,7 +97,8 @@ def _require_node(node: Any, varying: set[str]) -> None:
         if attribute.HasField("t"):
             _require_tensor(attribute.t)
     if op not in OPERATIONS:
-        raise FormatError(f"operation {op!r} is none of a policy's")
+        allowed = ", ".join(sorted(OPERATIONS))
+        raise FormatError(f"operation {op!r} is not allowed. Export the network without it; allowed are {allowed}")
     if varying.intersection(node.input[_SIZES.get(op, len(node.input)) :]):
         raise FormatError(f"operation {op}: the size of its result depends on the observation")
 
@@ -136,7 +142,7 @@ def _split(data: memoryview) -> Iterator[tuple[int, memoryview]]:
         else:
             at += {1: 8, 5: 4}.get(key & 7, len(data))
         if at > len(data):
-            raise FormatError("not an ONNX file: it ends in the middle of a message")
+            raise damaged("it ends in the middle of a message")
         yield key >> 3, data[start:at]
 
 
@@ -147,7 +153,7 @@ def _varint(data: memoryview, at: int) -> tuple[int, int]:
         value |= (data[at + shift // 7] & 0x7F) << shift
         if data[at + shift // 7] < 0x80:
             return value, at + shift // 7 + 1
-    raise FormatError("not an ONNX file: a number of more than 64 bits")
+    raise damaged("a number has more than 64 bits")
 
 
 def _model_class() -> Any:

@@ -66,7 +66,7 @@ class Event:
 
 @dataclass
 class Recording:
-    """A recording of `bam-deploy`; `open` reads it."""
+    """A recording of `bam-deploy` or `bam-agent`; `open` reads it."""
 
     path: Path
     metadata: dict[str, str] = field(default_factory=dict)
@@ -88,7 +88,7 @@ class Recording:
         """Read a recording up to its end, or to the place where it is cut off or damaged; without its pictures.
 
         Raises:
-            FormatError: There is no such file, or it is not a recording of `bam-deploy`.
+            FormatError: There is no such file, or it is not a recording.
         """
         recording = cls(Path(path).expanduser())
         rows: _Rows = {topic: [] for topic in TICKS}
@@ -102,7 +102,8 @@ class Recording:
         if not all(rows[topic] for topic in _ALWAYS):
             rows.clear()  # not one whole tick
         if not recording.metadata and not rows:
-            raise FormatError(f"{path}: not a recording of bam-deploy. Give a .mcap file that it wrote")
+            text = "not a recording. Give a .mcap file that bam-deploy or bam-agent wrote"
+            raise FormatError(f"{path}: {text}; bam-data import takes a bag of ROS 2 too")
         try:
             recording._fill({topic: messages for topic, messages in rows.items() if messages})
         except (TypeError, ValueError, AttributeError) as error:
@@ -130,7 +131,9 @@ class Recording:
                         yield (topics[part.channel_id], part) if isinstance(part, Message) else part
         except OSError as error:
             why = error.strerror or error
-            raise FormatError(f"{self.path}: cannot be read: {why}. Give a .mcap file of bam-deploy") from error
+            raise FormatError(
+                f"{self.path}: cannot be read: {why}. Give a .mcap file of bam-deploy or bam-agent"
+            ) from error
         except DAMAGE:
             return  # what was read so far is the recording
 

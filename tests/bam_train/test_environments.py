@@ -208,13 +208,13 @@ def test_the_module_that_is_imported_is_the_one_that_was_named(strange, corridor
 @pytest.mark.parametrize(
     ("kwargs", "message"),
     [
-        ({"randomise": True}, "env_kwargs: unknown setting 'randomise' of bam/pick-v0. Did you mean 'randomize'?"),
+        ({"randomise": True}, "unknown argument 'randomise' of bam/pick-v0. Did you mean 'randomize'?"),
         ({"randomize": "\x1b[2J"}, "env_kwargs: randomize= of bam/pick-v0 must be True or False, not"),
-        ({"task_options": {}}, "env_kwargs: unknown setting 'task_options' of bam/pick-v0."),
-        ({"render_mode": "human"}, "env_kwargs: unknown setting 'render_mode' of bam/pick-v0."),
+        ({"task_options": {}}, "unknown argument 'task_options' of bam/pick-v0."),
+        ({"render_mode": "human"}, "unknown argument 'render_mode' of bam/pick-v0."),
         (
             {"timeout": 5.0},
-            "env_kwargs: unknown setting 'timeout' of bam/pick-v0. "
+            "unknown argument 'timeout' of bam/pick-v0. "
             "Choose from: action_delay, camera, depth, image_size, link, looks, max_episode_steps, randomize, "
             "robot_model, segmentation.",
         ),

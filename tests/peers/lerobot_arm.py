@@ -32,4 +32,18 @@ with arm:
             said["sent"] = arm.send_action(goal)
             time.sleep(0.02)
         said["goal"], said["after"] = goal, arm.get_observation()
+    if sys.argv[2] != "stays":  # on the way to the end of the range the arm is left, or its link is cut
+        away, begun = "wrist_roll.pos", arm.get_observation()["wrist_roll.pos"]
+        far = {**arm.get_observation(), away: 95.0}
+        try:
+            while abs(arm.get_observation()[away] - begun) < 3 or sys.argv[2] == "unplugged":
+                arm.send_action(far)
+        except Exception as error:
+            said["errors"].append(type(error).__name__)
+            refused(arm.get_observation)
+if sys.argv[2] == "moves":
+    with arm:
+        said["left"] = [arm.get_observation()]
+        time.sleep(0.5)
+        said["left"].append(arm.get_observation())
 print(json.dumps(said))

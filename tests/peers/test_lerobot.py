@@ -107,18 +107,18 @@ def test_every_episode_is_read(tmp_path):
 
 @pytest.fixture
 def served_arm():
-    """An SO-101 behind rosbridge, with a camera: its address, and the environment behind that."""
+    """An SO-101 behind rosbridge, with a camera: its address, the environment behind that, and what cuts the link."""
     options = {"robot_model": "so101", "camera": "front", "image_size": "64x48", "disable_env_checker": True}
     env = gym.make("bam/joints-v0", **options)
     with ServedEnvironment(env, ServeOptions(port=0)) as served:
-        yield served.bus.url, env.unwrapped
+        yield served.bus.url, env.unwrapped, served.close
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("moves", ["moves", "stays"])
 def test_our_arm_moves_with_an_action_and_never_before(served_arm, plugin, tmp_path, moves):
-    """Not with a wrong one either, in LeRobot's units."""
-    url, env = served_arm
+    """Not with a wrong one either, in LeRobot's units, and not on after `disconnect` in the middle of a motion."""
+    url, env, _ = served_arm
     before = env.robot.setpoint
     said = lerobot_python(tmp_path, ARM, url, moves, plugin=plugin)
     assert said["features"] == [False, *NAMES]
@@ -135,11 +135,35 @@ def test_our_arm_moves_with_an_action_and_never_before(served_arm, plugin, tmp_p
     else:
         assert said["sent"] == pytest.approx(said["goal"], abs=0.5)
         assert said["after"] == pytest.approx(said["goal"], abs=1.0)
+        assert said["left"][0]["wrist_roll.pos"] < 90.0
+        assert said["left"][1] == pytest.approx(said["left"][0], abs=0.5)
+
+
+@pytest.mark.slow
+def test_our_arm_says_so_when_its_link_is_cut_in_the_middle_of_a_motion(served_arm, plugin, tmp_path):
+    url, env, close = served_arm
+    before = env.robot.setpoint
+    done = threading.Event()
+
+    def cut_once_it_moves():
+        while np.abs(env.robot.setpoint - before)[..., 4].max() < 0.2 and not done.wait(0.01):
+            pass
+        close()
+
+    cutting = threading.Thread(target=cut_once_it_moves)
+    cutting.start()
+    try:
+        said = lerobot_python(tmp_path, ARM, url, "unplugged", plugin=plugin)
+    finally:
+        done.set()
+        cutting.join()
+    assert said["errors"][4] == "LinkLost"
+    assert said["errors"][5].startswith("LinkLost: ")
 
 
 @pytest.mark.slow
 def test_lerobot_record_drives_our_arm_with_keys_and_with_a_policy(served_arm, plugin, tmp_path):
-    url, _ = served_arm
+    url, *_ = served_arm
     lerobot_python(tmp_path, POLICY, tmp_path, "act", "null")
     robot = ["--robot.type=bam_arm", f"--robot.url={url}", "--robot.camera=front", "--robot.image_size=64x48"]
     data = ["--dataset.single_task=wave", "--dataset.num_episodes=1", "--dataset.episode_time_s=3"]

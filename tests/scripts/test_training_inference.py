@@ -46,7 +46,7 @@ WRONG = [
     (["--stop-reward", "high"], 2, "--stop-reward: expected a number, found 'high'. Run python "),
     (["--run", "PPOO"], 1, "Unknown algorithm 'ppoo'. Did you mean 'ppo'?"),
     (["--env", "bam/pik"], 1, "Unknown environment 'bam/pik'. Did you mean 'bam/pick-v0'?"),
-    (["--env", "bam/pick", "--parity"], 1, "env_kwargs: unknown setting 'parity' of bam/pick-v0. "),
+    (["--env", "bam/pick", "--parity"], 1, "unknown argument 'parity' of bam/pick-v0. "),
     (
         ["--run", "BC"],
         1,

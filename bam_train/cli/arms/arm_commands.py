@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import re
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -10,6 +11,7 @@ import numpy as np
 
 from bam_envs.core.errors import InvalidValue
 from bam_train.cli.console import say, tell
+from bam_train.files.place import Place
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -22,7 +24,7 @@ if TYPE_CHECKING:
     from bam_train.cli.arms.bam_robots import AddArmConfig, CheckArmConfig, ListArmsConfig, ProfileConfig
     from bam_train.cli.arms.live_graph import LiveGraph
 
-_PICTURES = (".png", ".jpg")
+_PICTURES = {".png": "PNG", ".jpg": "JPEG"}
 _STRAY = 0.05
 """Distance from the links around it from which a capsule is no part of an arm [m]."""
 _POSTURES = 2000  # in which kinematics are compared with MuJoCo's
@@ -32,7 +34,7 @@ def add(config: AddArmConfig) -> int | None:
     """Write the description of an arm."""
     from bam_envs.core.robot_models import ModelName, known_models
     from bam_envs.core.validation import check as check_value
-    from bam_envs.robots.modelling.describe import describe, write_description
+    from bam_envs.robots.modelling.describe import as_toml, describe
     from bam_envs.robots.modelling.model_files import is_urdf
 
     if (config.mjcf is None) == (config.urdf is None):
@@ -51,7 +53,7 @@ def add(config: AddArmConfig) -> int | None:
     if is_urdf(Path(model)) != (config.mjcf is None) and Path(model).is_file():
         tell(f"{model} is {'MJCF' if config.mjcf is None else 'a URDF'}, and is read as such")
     arm, notes = describe(config.name, model, config.gripper, config.site or config.tip, tell=say)
-    write_description(arm, notes, path)
+    Place(path).write(as_toml(arm, notes).encode())
     tell(f"wrote {path}: {arm.num_joints} joints, gripper {1000 * arm.gripper.open:.0f} mm, {_area(arm)}")
     if notes:
         tell("assumed, and written at its head:", *(f"  {note}" for note in notes))
@@ -202,7 +204,6 @@ def _draw(description: Description, path: Path) -> None:
 
     if path.suffix.lower() not in _PICTURES:
         raise InvalidValue(f"--picture {path}: expected a name that ends in {' or '.join(_PICTURES)}.")
-    path.parent.mkdir(parents=True, exist_ok=True)
     robot: SimulatedArm | SimulatedBase
     start: dict[str, Any] = {"obstacle_pose": np.array([[[1.5, 0.5, 0.3], [-0.5, -1.5, 1.0]]])}
     if isinstance(description, ArmDescription):
@@ -213,7 +214,9 @@ def _draw(description: Description, path: Path) -> None:
     robot.connect()
     try:
         robot.reset(np.arange(1), Initial(start, np.zeros(1, np.int64)))
-        Image.fromarray(robot.render("rgb_array", [])).save(path)
+        image = io.BytesIO()
+        Image.fromarray(robot.render("rgb_array", [])).save(image, format=_PICTURES[path.suffix.lower()])
+        Place(path).write(image.getvalue())
     finally:
         robot.close()
 
@@ -245,8 +248,7 @@ def write_profile(config: ProfileConfig) -> None:
         profile = read_profile(profile_toml(found), str(path))
         if isinstance(robot, ArmDescription):
             found.notes += _against_urdf(robot, graph, profile, forced=config.force)
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(profile_toml(found), encoding="utf-8")
+        Place(path).write(profile_toml(found).encode())
         tell(f"wrote {path}:", *(f"  {line}" for line in _profile_lines(profile)))
         if found.notes:
             tell("notes, written at its head:", *(f"  {note}" for note in found.notes))
@@ -256,8 +258,7 @@ def write_profile(config: ProfileConfig) -> None:
         spec = robot.spec(with_object=False) if isinstance(robot, ArmDescription) else base_model(robot).spec()
         profile = profile_for(spec)
     if config.rosetta is not None:
-        config.rosetta.parent.mkdir(parents=True, exist_ok=True)
-        config.rosetta.write_text(contract_text(profile), encoding="utf-8")
+        Place(config.rosetta).write(contract_text(profile).encode())
         tell(f"wrote {config.rosetta}: a contract of rosetta")
 
 

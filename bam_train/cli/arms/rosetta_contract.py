@@ -5,13 +5,14 @@ A contract names topics, types and joints, as a live graph does; what it does no
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 import yaml
 
 from bam_envs.core.errors import InvalidValue
+from bam_envs.robots.profile import syntax_fault
 from bam_envs.ros.messages import bare_type, has_header
 from bam_envs.ros.profile_tables import RobotProfile, Sink, Source
 from bam_train.cli.arms.live_graph import LiveGraph, Row
@@ -19,6 +20,8 @@ from bam_train.cli.arms.live_graph import LiveGraph, Row
 _IMAGES = "observation.images."
 _SIGNALS = ("joint_position", "gripper_width", "base_velocity")
 """What the state of a written contract has."""
+_Entry = tuple[tuple[str, str], str, tuple[str, ...]]
+"""Key and topic, type, and what is selected, of an entry of a section."""
 
 
 def contract_graph(path: Path, robot: str) -> LiveGraph:
@@ -33,35 +36,47 @@ def contract_graph(path: Path, robot: str) -> LiveGraph:
         seen, acts = ([*_entries(table[name])] for name in sections)
         topics = {one["topic"]: bare_type(one["type"]) for one in map(_channel, table.get("adjunct") or ())}
         topics |= {key[1]: bare_type(kind) for key, kind, _ in (*seen, *acts)}
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-        raise InvalidValue(f"{path}: cannot be read: {' '.join(str(error).split())}.") from error
+    except OSError as error:
+        raise InvalidValue(f"{path}: cannot be read: {error.strerror or error}. Check the name.") from error
+    except (UnicodeDecodeError, yaml.YAMLError) as error:
+        raise InvalidValue(f"{path}: is not YAML: {syntax_fault(error)}. Correct it there.") from error
     except (AttributeError, KeyError, TypeError) as error:
         lacks = f": no {error}" if isinstance(error, KeyError) else ""
         raise InvalidValue(
             f"{path}: not a contract of rosetta{lacks}. Give a YAML file with robot_type, and with observations and "
             "actions, which have channels with a topic and a type."
         ) from error
-    states: dict[str, tuple[str, ...]] = {}
-    for (_, topic), kind, names in seen:
-        if bare_type(kind) == "sensor_msgs/JointState":
-            states[topic] = tuple(dict.fromkeys((*states.get(topic, ()), *names)))
+    for (_, topic), _, selected in acts:
+        for one in selected:
+            if one.startswith(("velocity.", "effort.")):
+                text = f"the action on {topic} selects {one}, and the joints of an arm are commanded by position"
+                raise InvalidValue(f"{path}: {text}. Name a topic of positions there, such as that of a trajectory.")
+    states = [one for one in seen if bare_type(one[1]) == "sensor_msgs/JointState"]
     cameras = tuple(
         {"name": key.removeprefix(_IMAGES), "topic": topic, "type": bare_type(kind), "optional": True}
         for (key, topic), kind, _ in seen
         if key.startswith(_IMAGES)
     )
     name = robot if told.replace("_", "") == robot.replace("_", "") else told
-    commands = {topic: names for (_, topic), _, names in acts}
-    joints = {topic: (names,) for topic, names in states.items()}
-    return LiveGraph(str(path), topics, frozenset(), {}, "", (), joints, name, commands=commands, cameras=cameras)
+    joints = {topic: (names,) for topic, names in _joints(states).items()}
+    return LiveGraph(str(path), topics, frozenset(), {}, "", (), joints, name, commands=_joints(acts), cameras=cameras)
 
 
-def _entries(section: Row) -> Iterator[tuple[tuple[str, str], str, tuple[str, ...]]]:
-    """Key and topic, type, and the joints of each entry of a section."""
+def _entries(section: Row) -> Iterator[_Entry]:
     for key, rows in section.items():
         for row in rows if isinstance(rows, list) else [rows]:
-            channel, names = _channel(row), [str(one).rpartition(".")[2] for one in row.get("select") or ()]
-            yield (str(key), str(channel["topic"])), str(channel["type"]), tuple(dict.fromkeys(names))
+            channel = _channel(row)
+            selected = tuple(map(str, row.get("select") or ()))
+            yield (str(key), str(channel["topic"])), str(channel["type"]), selected
+
+
+def _joints(entries: Sequence[_Entry]) -> dict[str, tuple[str, ...]]:
+    """The joints of each topic, which ``position.JOINT`` selects; the name of a joint may have a point too."""
+    found: dict[str, tuple[str, ...]] = {}
+    for (_, topic), _, selected in entries:
+        names = [one.partition(".")[2] or one for one in selected]
+        found[topic] = tuple(dict.fromkeys((*found.get(topic, ()), *names)))
+    return found
 
 
 def _channel(row: Row) -> Row:

@@ -14,9 +14,9 @@ import numpy as np
 import torch
 
 from bam_train.errors import LoopError
-from bam_train.loop.workspace import Workspace
 from bam_train.loop.workspace.tensor_variable import TensorVariable
 from bam_train.loop.workspace.variables import Variable
+from bam_train.loop.workspace.workspace import Workspace
 
 
 class _SharedVariable(Variable):

@@ -26,17 +26,10 @@ from bam_envs.core.wording import did_you_mean
 from bam_train.data.data_set import DataSet
 from bam_train.errors import OutputError, SettingsError
 
-_HERE = "bam_train.data.export"
-FORMATS = {
-    "minari": f"{_HERE}.to_minari:write",
-    "d3rlpy": f"{_HERE}.to_d3rlpy:write",
-    "lerobot": f"{_HERE}.to_lerobot:write",
-    "rllib": f"{_HERE}.to_rllib:write",
-    "hdf5": f"{_HERE}.to_hdf5:write",
-    "mcap": f"{_HERE}.to_mcap:write",
-}
-"""Each takes a data set, indices of episodes and a path to write, and returns how to open what was written."""
-_FOLDERS = ("minari", "lerobot", "rllib")
+_HDF5 = (".h5", ".hdf5")
+FORMATS = {"minari": (), "d3rlpy": _HDF5, "lerobot": (), "rllib": (), "hdf5": _HDF5, "mcap": (".mcap",)}
+"""How the name of a file of each may end; () where it is a folder. ``write`` of its module ``to_...`` takes a data set,
+indices of episodes and a path to write, and returns how to open what was written."""
 
 
 def export(data: DataSet, kind: str, out: Path, indices: Sequence[int] | None = None) -> str:
@@ -46,17 +39,19 @@ def export(data: DataSet, kind: str, out: Path, indices: Sequence[int] | None = 
         How to open it, in one line of Python or of a shell.
 
     Raises:
-        SettingsError: There is no such format, or it has no place for these spaces.
+        SettingsError: There is no such format, `out` ends otherwise, or it has no place for these spaces.
         OutputError: There is something at `out`, or it cannot be written.
         BadDataSet: The data set is damaged, or has no episode.
     """
     if kind not in FORMATS:
         raise SettingsError(f"--to: there is no format {kind!r}. {did_you_mean(kind, FORMATS)}")
+    if FORMATS[kind] and out.suffix not in FORMATS[kind]:
+        raise SettingsError(f"--out {out}: expected the name of a file that ends in {' or '.join(FORMATS[kind])}")
     chosen = range(len(data)) if indices is None else indices
     if not len(chosen):
         raise SettingsError(f"{data.place}: there is no episode to export; record some first")
-    write: Callable[[DataSet, Sequence[int], Path], str] = pkgutil.resolve_name(FORMATS[kind])
-    with _new(out.expanduser(), is_folder=kind in _FOLDERS) as path:
+    write: Callable[[DataSet, Sequence[int], Path], str] = pkgutil.resolve_name(f"{__name__}.to_{kind}:write")
+    with _new(out.expanduser(), is_folder=not FORMATS[kind]) as path:
         opened = write(data, chosen, path)
     return opened.replace(str(path), str(out))
 

@@ -18,7 +18,7 @@ from functools import cache
 from typing import TYPE_CHECKING, Any
 
 from bam_train.errors import LoopError
-from bam_train.loop.workspace import Workspace
+from bam_train.loop.workspace.workspace import Workspace
 
 if TYPE_CHECKING:
     # Instances have nn.Module's members once torch is imported.

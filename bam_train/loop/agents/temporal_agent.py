@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, Any
 from bam_train.errors import LoopError
 from bam_train.loop.agents.agent import Agent, agent_name, is_live
 from bam_train.loop.agents.agents import Agents, KWAgentWrapper
-from bam_train.loop.workspace import Workspace
 from bam_train.loop.workspace.variables import unknown_variable
+from bam_train.loop.workspace.workspace import Workspace
 
 if TYPE_CHECKING:
     from rich.progress import Progress

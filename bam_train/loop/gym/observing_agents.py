@@ -7,12 +7,12 @@ import gymnasium as gym
 import numpy as np
 
 from bam_envs.core.robot_env import robot_of
-from bam_train.loop.agents import Agents
 from bam_train.loop.agents.agent import Agent
+from bam_train.loop.agents.agents import Agents
 from bam_train.loop.agents.temporal_agent import TemporalAgent
 from bam_train.loop.gym.gym_spaces import names
 from bam_train.loop.gym.robot_agent import RESULTS, results
-from bam_train.loop.workspace import Sink, Workspace
+from bam_train.loop.workspace.workspace import Sink, Workspace
 
 WINDOW = 1000
 """Minimum number of ticks that are kept by default: 50 s at 20 Hz."""

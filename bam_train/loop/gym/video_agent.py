@@ -8,11 +8,11 @@ from typing import Any
 import gymnasium as gym
 
 from bam_train.files.video import Frame, open_video, picture, require_video_path
-from bam_train.loop.agents import Agents, KWAgentWrapper
 from bam_train.loop.agents.agent import Agent, import_torch
+from bam_train.loop.agents.agents import Agents, KWAgentWrapper
 from bam_train.loop.agents.temporal_agent import TemporalAgent
 from bam_train.loop.gym.parallel_gym_agent import ParallelGymAgent
-from bam_train.loop.workspace import Workspace
+from bam_train.loop.workspace.workspace import Workspace
 
 
 class VideoAgent(Agent):

@@ -12,8 +12,8 @@ from __future__ import annotations
 import torch
 
 from bam_train.errors import LoopError
-from bam_train.loop.workspace import Workspace
 from bam_train.loop.workspace.variables import unknown_variable
+from bam_train.loop.workspace.workspace import Workspace
 
 
 class ReplayBuffer:

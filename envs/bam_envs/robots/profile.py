@@ -304,13 +304,21 @@ def _parsed(where: str, text: str) -> Table:
     try:
         data = tomllib.loads(text) if language == "TOML" else yaml.safe_load(text)
     except (ValueError, RecursionError, yaml.YAMLError) as error:  # YAML's dates and numbers are left to Python's
-        raise InvalidValue(f"{where} is not {language}: {' '.join(str(error).split())}.") from error
+        raise InvalidValue(f"{where} is not {language}: {syntax_fault(error)}. Correct it there.") from error
     table: Table = check(data, Table, where)
     if "dead_man" in table:  # the former name of command_timeout
         if "command_timeout" in table:
             raise InvalidValue(f"{where}: command_timeout comes twice: dead_man is its former name. Give one of them.")
         table["command_timeout"] = table.pop("dead_man")
     return table
+
+
+def syntax_fault(error: Exception) -> str:
+    """What a parser of TOML or YAML did not understand, and the line, without the text around it."""
+    mark = getattr(error, "problem_mark", None)
+    if mark is None:
+        return " ".join(str(error).split())
+    return f"{getattr(error, 'problem', '')} (at line {mark.line + 1}, column {mark.column + 1})"
 
 
 def _profile(where: str, table: Table) -> RobotProfile:

@@ -302,6 +302,8 @@ def test_files(write, tmp_path):
     assert refusal(write("name =")).startswith("FILE is not TOML: ")
     for text in ("a: [", "a: 2020-13-45", "a: !!int b", "[" * 1000):
         assert refusal(write(text, "b.yaml")).startswith("FILE is not YAML: ")
+    told = "FILE is not YAML: mapping values are not allowed here (at line 2, column 3). Correct it there."
+    assert refusal(write("a: b\nc d: e: f".replace("c d", " c"), "b.yaml")) == told
     assert refusal(write("- 1", "b.yaml")) == "FILE: expected a table of named values, found [1]"
     assert (
         refusal(write("state: 3\nname: a\nkind: arm\nrobot: ur5e", "b.yaml"))

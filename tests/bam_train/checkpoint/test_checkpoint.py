@@ -380,7 +380,7 @@ def test_another_environment_is_refused_and_a_name_of_robo_gym_is_no_other(path:
     checkpoint = Checkpoint.open(path)
     for name in ("bam/mir100-navigation-v0", "NoObstacleNavigationMir100Sim-v0", "NoObstacleNavigationMir100Rob-v0"):
         checkpoint.requires_env(name)
-    text = r"was trained on bam/mir100-navigation-v0, not on \S+\. Use --env bam/mir100-navigation-v0"
+    text = r"was trained on bam/mir100-navigation-v0, not on \S+\. Name that one, or train a policy for "
     for name in ("bam/reach-v0", "ObstacleAvoidanceMir100Sim-v0"):
         with pytest.raises(CheckpointMismatch, match=text):
             checkpoint.requires_env(name)

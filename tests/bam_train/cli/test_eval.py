@@ -112,14 +112,19 @@ def refused(run, *arguments):
     [
         (
             ("--env", "CartPole-v1"),
-            "{}: was trained on test/Corridor-v0, not on CartPole-v1. "
-            "Use --env test/Corridor-v0, or train one for CartPole-v1",
+            "{}: was trained on test/Corridor-v0, not on CartPole-v1. Name that one, or train a policy for CartPole-v1",
         ),
         (("--env", "bam/pik"), "Unknown environment 'bam/pik'. Did you mean 'bam/pick-v0'?"),
         (("--algo", "sac"), "{}: was trained by ppo, not by sac; leave --algo out"),
+        (("--by", "site"), "--by is for --data; give that too, or leave it out"),
+        (("--video-episodes", "2"), "--video-episodes is for --video; give that too, or leave it out"),
+        (
+            ("--data", "d", "--robot-model", "fr3"),
+            "--robot-model is of no use with --data, which plays nothing; leave it out",
+        ),
     ],
 )
-def test_another_environment_or_algorithm(corridor_checkpoint, run, flags, text):
+def test_what_does_not_fit_is_one_line(corridor_checkpoint, run, flags, text):
     path = corridor_checkpoint()
     assert refused(run, path, *flags) == text.format(path)
 

@@ -187,7 +187,7 @@ def test_what_it_refuses(run, monkeypatch, arguments, status, said):
         (["bam/reach", "--stage", "full"], "--stage is for a live robot; give its address with --robot too"),
         (
             ["bam/reach", "--set", "max_episode_stesp=3"],
-            "env_kwargs: unknown setting 'max_episode_stesp' of bam",
+            "unknown argument 'max_episode_stesp' of bam",
         ),
     ],
 )

@@ -72,10 +72,10 @@ def test_arguments_that_are_given_win(run):
     ("assignment", "text"),
     [
         ("env_kwargs=1", "--set env_kwargs=1: expected NAME=VALUE, such as randomize=true or parity=true"),
-        ("party=true", f"env_kwargs: unknown setting 'party' of {BASE}. Did you mean 'parity'?"),
+        ("party=true", f"unknown argument 'party' of {BASE}. Did you mean 'parity'?"),
         (
             "env_kwargs.party=true",
-            f"env_kwargs: unknown setting 'party' of {BASE}. Did you mean 'parity'?",
+            f"unknown argument 'party' of {BASE}. Did you mean 'parity'?",
         ),
         ("env_kwargs.parity=1", f"env_kwargs: parity= of {BASE} must be True or False, not 1."),
     ],

@@ -363,9 +363,19 @@ def test_a_contract_of_rosetta_says_topics_joints_and_their_order(run, contract,
             "not a contract of rosetta: no 'actions'. Give a YAML file with robot_type, and with observations and "
             "actions, which have channels with a topic and a type.",
         ),
-        (("robot_type:", "- robot_type:"), "cannot be read: while parsing a block collection"),
         (("actions:", "actions: []\nacts:"), "not a contract of rosetta. Give a YAML file with robot_type"),
-        (("fps: 30", "fps: ["), "cannot be read: while parsing a flow sequence"),
+        (
+            ("fps: 30", "fps: ["),
+            "is not YAML: expected ',' or ']', but got ':' (at line 4, column 27). Correct it there.\n",
+        ),
+        (
+            (
+                "type: sensor_msgs/msg/JointState}\n    select: [position.jaw",
+                "type: sensor_msgs/msg/JointState}\n    select: [velocity.jaw",
+            ),
+            "the action on /leader/joint_states selects velocity.jaw, and the joints of an arm are commanded by "
+            "position. Name a topic of positions there, such as that of a trajectory.\n",
+        ),
     ],
 )
 def test_a_contract_that_does_not_fit_is_one_line(run, contract, tmp_path, change, message):
@@ -387,6 +397,8 @@ def test_a_written_contract_gives_the_same_states_and_commands(run, tmp_path, mo
     status, _, err = run(main, "profile", name, "--rosetta", "contract.yaml")
     assert (status, "contract.yaml exists; give another name with --rosetta, or --force" in err) == (1, True)
     assert run(main, "profile", name, "--from", "contract.yaml")[0] == 0
+    status, _, err = run(main, "profile", name, "--rosetta", "contract.yaml/a.yaml")
+    assert (status, err.count("\n"), "contract.yaml/a.yaml: cannot be written: " in err) == (1, 1, True)
     read, expected = load_profile(tmp_path / "robots" / "profiles" / f"{name}.toml"), load_profile(shipped)
     assert read.sinks() == tuple(replace(one, controller="") for one in expected.sinks())
     for signal in ("joint_position", "gripper_width") if name == "so101" else ("base_velocity",):

@@ -157,7 +157,7 @@ ERRORS = [  # one of each kind; the rest is in the tests of settings, hyperparam
     ({"env": "CartPol-v1"}, "Unknown environment 'CartPol-v1'. Did you mean 'CartPole-v1'?"),
     (
         {"env": "bam/pick", "set": ("env_kwargs.randomise=true",)},
-        "env_kwargs: unknown setting 'randomise' of bam/pick-v0. Did you mean 'randomize'?",
+        "unknown argument 'randomise' of bam/pick-v0. Did you mean 'randomize'?",
     ),
     ({"set": ("gamma=1.5",)}, "gamma: expected a number from 0 to 1, found 1.5"),
     ({"algo": "pop"}, "Unknown algorithm 'pop'. Did you mean 'ppo'?"),

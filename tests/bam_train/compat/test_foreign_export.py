@@ -88,8 +88,9 @@ def test_order_units_and_rate_become_those_of_the_robot(described, run, tmp_path
 
 def test_an_image_has_its_channels_first(described, run, tmp_path):
     out = tmp_path / "act.zip"
-    cameras = ["--set", "camera=front", "--set", "image_size=64x48"]
-    assert run(main, described(pixels=True), "--robot-model", "so101", *cameras, "--out", out)[0] == 0
+    assert run(main, described(pixels=True), "--robot-model", "so101", "--out", out)[0] == 0
+    kwargs = Checkpoint.open(out).manifest.env_kwargs
+    assert (kwargs["camera"], kwargs["image_size"]) == (["front"], [64, 48])  # the policy's, without --set
     black = {"front": np.zeros((48, 64, 3), np.uint8), "robot": SEEN}
     np.testing.assert_allclose(FrozenPolicy.load(out).act(black), SEEN, atol=1e-6)
 
@@ -99,9 +100,8 @@ def test_the_ranges_in_the_data_make_the_detector(described, run, tmp_path, pixe
     """A number that leaves its range by more than a tenth of it is unusual from the second tick on."""
     low, high = f"low = {[-10.0] * 5 + [0.0]}", f"high = {[30.0] * 5 + [100.0]}"
     ranges = [(f"std = {STD}\n", f"std = {STD} \n{low}\n{high}\n")] * 2
-    cameras = ["--set", "camera=front", "--set", "image_size=64x48"] if pixels else []
     out = tmp_path / "act.zip"
-    assert run(main, described(*ranges, pixels=pixels), "--robot-model", "so101", *cameras, "--out", out)[0] == 0
+    assert run(main, described(*ranges, pixels=pixels), "--robot-model", "so101", "--out", out)[0] == 0
     policy = FrozenPolicy.load(out)
     seen = np.array([*np.radians([-10, 30, 10, 0, 20]), 0.0], np.float32)
     front = {"front": np.zeros((1, 48, 64, 3), np.uint8)} if pixels else {}
@@ -148,13 +148,17 @@ def test_the_ranges_in_the_data_make_the_detector(described, run, tmp_path, pixe
             "rate 30 Hz 20 Hz. Leave --env and --set rate= out refused",
         ),
         ([], ["--set", "image_size=32"], "image front 64 x 48, 3 channels 32 x 32, 3 channels refused"),
+        (
+            [('part = "front"', 'part = "top"')],
+            [],
+            "input image top the observation has one array. Choose its images with --set camera= and --set image_size= "
+            "refused",
+        ),
     ],
 )
 def test_what_does_not_fit_is_a_row_and_refused(described, run, tmp_path, changes, flags, row):
-    pixels = "image_size=32" in flags
-    size = ["--set", "camera=front", *flags] if pixels else flags
-    path = described(*changes, pixels=pixels)
-    status, said, err = run(main, path, "--robot-model", "so101", *size, "--out", tmp_path / "act.zip")
+    path = described(*changes, pixels="image" in row)
+    status, said, err = run(main, path, "--robot-model", "so101", *flags, "--out", tmp_path / "act.zip")
     assert (status, said) == (3, "")
     *table, last = [" ".join(line.split()) for line in err.splitlines()]
     assert row in table
@@ -196,11 +200,11 @@ def test_a_network_without_its_description(run, tmp_path):
     said = "is not TOML: Invalid value (at end of document). Correct it there"
     assert run(main, path.with_suffix(".toml")) == (1, "", f"bam-export: {path.with_suffix('.toml')}: {said}\n")
     path.with_suffix(".toml").unlink()
-    status, _, err = run(main, path.with_suffix(".toml"))
-    assert (status, err) == (
-        1,
-        f"bam-export: {path.with_suffix('.toml')}: it cannot be read: No such file or directory. Check the name\n",
-    )
+    gone = str(path.with_suffix(".toml"))
+    told = "no such file or folder. Check the name; a word before it may be lerobot:, onnx:, sb3:, rllib:"
+    assert run(main, gone) == (1, "", f"bam-export: {gone!r}: {told}\n")
+    said = f"{path.with_suffix('.toml')}: it cannot be read: No such file or directory. Check the name"
+    assert run(main, f"onnx:{path.with_suffix('.toml')}") == (1, "", f"bam-export: {said}\n")
 
 
 @pytest.mark.parametrize(
@@ -236,6 +240,7 @@ def test_a_graph_with_other_inputs_is_refused(described, run):
         ({"type": "smolvla"}, "smolvla takes seconds for a chunk on a robot's computer: run it on a policy server "
          "with a GPU; bam-export takes act and diffusion"),
         ({"type": "tdmpc"}, "is a policy of the kind tdmpc; bam-export takes act and diffusion"),
+        ({}, "is a policy of the kind that config.json does not name (type); bam-export takes act and diffusion"),
         ({"type": "diffusion", "noise_scheduler_type": "DDPM"}, "noise_scheduler_type is DDPM, which draws noise in "
          'every step. In config.json set it to "DDIM", and num_inference_steps to about 10'),
         (None, "has no config.json: no folder pretrained_model of LeRobot. Give .../checkpoints/last/pretrained_model"),

@@ -16,7 +16,7 @@ from bam_train.errors import BadDataSet, PlaceError
 from bam_train.files.place import Place
 from tests.bam_train.data import episode_samples as samples
 from tests.bam_train.data.episode_samples import episode, info_of
-from tests.object_store import Proxy, answering, bucket_fixture, environment  # noqa: F401
+from tests.object_store import Proxy, bucket_fixture  # noqa: F401
 
 INFO = info_of()
 
@@ -44,15 +44,6 @@ def test_reading_what_is_not_there_names_the_bucket(bucket, capsys, command):
         with pytest.raises(SystemExit) as stop:
             main([command, place])
         assert (stop.value.code, capsys.readouterr().err) == (1, f"bam-data {command}: {place}: {text}\n")
-
-
-def test_reading_without_the_right_names_the_credentials(monkeypatch):
-    with answering(403, "AccessDenied") as endpoint, environment(endpoint):
-        place = f"s3://b/d?endpoint_override={endpoint}"
-        with pytest.raises(
-            PlaceError, match=r"not allowed with these credentials\. Ask the owner of b for the right, or"
-        ):
-            DataSet.open(place)
 
 
 def test_damage_in_a_bucket_is_mended(bucket):

@@ -5,7 +5,6 @@ import os
 import socket
 import sys
 import threading
-import time
 from pathlib import Path
 from urllib.parse import urlsplit
 
@@ -81,6 +80,11 @@ def test_what_is_missing(folder):
             "nowhere://a",
             "nowhere://a: nowhere:// is unknown. Give a path, or an address that fsspec knows, such as s3:// or gs://",
         ),
+        (
+            "ws://robot:9090",
+            "ws://robot:9090: is the address of a robot or a server, and a file is meant here. Check the order of "
+            "what you gave",
+        ),
         ("s3://me:secret@b/x", "s3://...@b/x: holds credentials. Give them in the environment or in ~/.aws instead"),
         ("s3://b/x?regio=1", "s3://b/x?regio=1: unknown option regio; there are endpoint_override and region"),
         ("file://host/x", "file://host/x: expected file:///FOLDER/NAME, a path on this computer"),
@@ -138,12 +142,10 @@ def test_a_service_that_refuses(status, code, why):
     with answering(status, code) as endpoint, environment(endpoint):
         reads = [(Place.read_bytes, "read"), (Place.size, "read")]
         for do, done in (*reads, (lambda place: place.write(b"1"), "written")):
-            start = time.monotonic()
             with pytest.raises(PlaceError) as caught:
                 do(Place(f"s3://b/x?endpoint_override={endpoint}"))
             assert str(caught.value).startswith(f"s3://b/x?endpoint_override={endpoint}: cannot be {done}: {why}")
             assert "\n" not in str(caught.value)
-            assert time.monotonic() - start < 30
 
 
 def test_a_web_server_that_is_not_there_is_no_missing_file():

@@ -85,14 +85,23 @@ GROWING = [
             "operation If: its 'else",
         ),
         (of(node("Scan", ["observation"], ["action"], body=BODY, num_scan_inputs=1)), "operation Scan: its 'body'"),
-        (of(node("Loop", ["n", "", "observation"], ["action"]), n=np.int64(2**62)), "operation 'Loop' is none of a"),
-        (of(node("Tile", ["observation", "n"], ["action"]), n=np.array([1, 10**9])), "operation 'Tile' is none of a"),
-        (of(node("Expand", ["observation", "n"], ["action"]), n=np.array([10**9, 4])), "operation 'Expand' is none"),
-        (of(node("Tanh", ["observation"], ["action"], domain="com.microsoft")), "operation 'com.microsoft.Tanh' is"),
-        (of(node("RandomNormalLike", ["observation"], ["action"])), "operation 'RandomNormalLike' is none of a policy"),
+        (
+            of(node("Loop", ["n", "", "observation"], ["action"]), n=np.int64(2**62)),
+            "operation 'Loop' is not allowed. Export the network without it; allowed are Abs, ",
+        ),
+        (of(node("Tile", ["observation", "n"], ["action"]), n=np.array([1, 10**9])), "operation 'Tile' is not allowed"),
+        (
+            of(node("Expand", ["observation", "n"], ["action"]), n=np.array([10**9, 4])),
+            "operation 'Expand' is not allowed",
+        ),
+        (
+            of(node("Tanh", ["observation"], ["action"], domain="com.microsoft")),
+            "operation 'com.microsoft.Tanh' is not allowed",
+        ),
+        (of(node("RandomNormalLike", ["observation"], ["action"])), "operation 'RandomNormalLike' is not allowed"),
         (
             of(node("Shape", ["observation"], ["s"]), node("Reshape", ["observation", "s"], ["action"])),
-            "operation 'Shape' is none of a policy's",
+            "operation 'Shape' is not allowed",
         ),
         (
             of(
@@ -167,14 +176,12 @@ def test_a_policy_that_takes_too_long_is_stopped():
 def test_a_policy_that_takes_long_is_interrupted_by_ctrl_c():
     before = signal.signal(signal.SIGALRM, signal.default_int_handler)
     signal.setitimer(signal.ITIMER_REAL, 0.5)
-    begin = time.perf_counter()
     try:
         with pytest.raises(KeyboardInterrupt):
             FrozenPolicy.from_graph(slow(), BOX, BOX)
     finally:
         signal.setitimer(signal.ITIMER_REAL, 0)
         signal.signal(signal.SIGALRM, before)
-    assert time.perf_counter() - begin < 5.0
 
 
 def test_more_golden_actions_than_anybody_writes_are_refused():
@@ -223,11 +230,11 @@ IN_ANOTHER_FILE = "tensor 'w': its numbers are in another file; export with ever
 @pytest.mark.parametrize(
     ("data", "text"),
     [
-        (b"", "not an ONNX file: it has no graph"),
+        (b"", "not an ONNX file, or damaged: it has no graph. Export it again, or copy it again from its source"),
         (b"PK\x03\x04 a zip", "not an ONNX file"),
         (b"\x3f", "not an ONNX file"),
         (b"\x38\x05", "not an ONNX file"),
-        (b"\x08" + b"\xff" * 11, "not an ONNX file: a number of more than 64 bits"),
+        (b"\x08" + b"\xff" * 11, "not an ONNX file, or damaged: a number has more than 64 bits"),
         (WHOLE[:-5], "not an ONNX file"),
         (with_weight(lambda weight: setattr(weight, "data_location", TensorProto.EXTERNAL)), IN_ANOTHER_FILE),
         (with_weight(lambda weight: weight.external_data.add(key="location", value="/etc/passwd")), IN_ANOTHER_FILE),

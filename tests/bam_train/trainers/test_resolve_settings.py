@@ -114,12 +114,12 @@ ROBO_GYM = {"env": "NoObstacleNavigationMir100Sim", "algo": "ppo"}
             "env_kwargs: randomize: the environment runs at tcp://a:1; give its arguments to bam-serve there",
         ),
         *(
-            ({"env_kwargs": {name: "ws://a:1"}}, f"env_kwargs: unknown setting '{name}' of bam/reach-v0.")
+            ({"env_kwargs": {name: "ws://a:1"}}, f"unknown argument '{name}' of bam/reach-v0.")
             for name in ("robot", "transport", "profile", "ca_file", "token_file")
         ),
         (
             {**ROBO_GYM, "env_kwargs": {"ur_model": "ur10e"}},
-            "env_kwargs: unknown setting 'ur_model' of NoObstacleNavigationMir100Sim-v0. Choose from: action_delay, ",
+            "unknown argument 'ur_model' of NoObstacleNavigationMir100Sim-v0. Choose from: action_delay, ",
         ),
     ],
 )

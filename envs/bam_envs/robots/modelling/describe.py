@@ -317,12 +317,6 @@ def _plain(values: Array) -> tuple[float, ...]:
     return tuple(round(float(one), 12) + 0.0 for one in values)
 
 
-def write_description(description: ArmDescription, notes: list[str], path: Path) -> None:
-    """Write `path`, a TOML file, with the notes as comments at its head."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(as_toml(description, notes), encoding="utf-8")
-
-
 def as_toml(description: ArmDescription, notes: list[str]) -> str:
     """The text of a description's file."""
     table = dataclasses.asdict(description)

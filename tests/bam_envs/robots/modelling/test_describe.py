@@ -12,7 +12,7 @@ from bam_envs.arms.capsules import Outline
 from bam_envs.arms.work_area import covers
 from bam_envs.core.errors import InvalidValue, UnknownName
 from bam_envs.core.robot_models import read_description
-from bam_envs.robots.modelling.describe import as_toml, describe, write_description
+from bam_envs.robots.modelling.describe import as_toml, describe
 from bam_envs.robots.modelling.model_files import read_arm
 from bam_envs.tasks.scripted import scripted_policy
 from tests.bam_envs.making import solved
@@ -213,10 +213,8 @@ def test_a_jaw_that_turns_against_a_fixed_finger(described):
 @pytest.mark.parametrize("name", ARMS)
 def test_it_is_read_as_it_was_written(described, name, tmp_path):
     arm, notes = described[name]
-    path = tmp_path / "robots" / f"{name}.toml"
-    write_description(arm, notes, path)
-    text = path.read_text(encoding="utf-8")
-    assert text == as_toml(arm, notes)
+    path, text = tmp_path / f"{name}.toml", as_toml(arm, notes)
+    path.write_text(text, encoding="utf-8")
     assert text.splitlines()[: len(notes)] == [f"# {note}" for note in notes]
     again = read_description(path)
     assert again == arm
@@ -267,7 +265,7 @@ def test_all_shapes_of_the_links_are_inside_the_capsules(described, folder, name
 @pytest.mark.parametrize("name", ARMS)
 def test_the_scripted_pick_succeeds_with_it(described, name, tmp_path):
     path = tmp_path / f"{name}.toml"
-    write_description(*described[name], path)
+    path.write_text(as_toml(*described[name]), encoding="utf-8")
     envs = gym.make_vec("bam/pick-v0", num_envs=20, robot_model=str(path))
     assert solved(envs, scripted_policy("bam/pick-v0", str(path))) == 20
 

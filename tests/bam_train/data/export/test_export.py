@@ -181,4 +181,6 @@ def test_what_cannot_be_exported_is_one_line(tmp_path):
     with pytest.raises(OutputError, match="data: is there already; choose another place"):
         export(data, "lerobot", tmp_path / "data")
     with pytest.raises(SettingsError, match="there is no episode to export"):
-        export(data, "hdf5", tmp_path / "out", [])
+        export(data, "hdf5", tmp_path / "out.h5", [])
+    with pytest.raises(SettingsError, match=r"--out .*/out.txt: expected the name of a file that ends in .h5 or .hdf5"):
+        export(data, "d3rlpy", tmp_path / "out.txt")
