@@ -141,7 +141,7 @@ def test_an_existing_checkpoint_is_not_overwritten(bam_train):
 
 def test_resume_counts_from_the_first_step_and_needs_nothing_else(bam_train):
     bam_train(steps=100, eval_every=1000)
-    last, checkpoint = Path("runs/CartPole-v1-ppo/last.zip"), Path("checkpoints/CartPole-v1-ppo.zip")
+    checkpoint = Path("checkpoints/CartPole-v1-ppo.zip")
     nothing = dict.fromkeys(("env", "algo", "eval_every", "eval_episodes"))
     status, _, err = bam_train(**nothing, resume=checkpoint, steps=192, set=())
     assert status == 0
@@ -149,8 +149,6 @@ def test_resume_counts_from_the_first_step_and_needs_nothing_else(bam_train):
     assert "no preset" not in err
     assert "CartPole-v1 cannot save running episodes: new ones begin" in err
     assert Checkpoint.open("runs/CartPole-v1-ppo-2/last.zip").manifest.steps == 192
-    text = f"{last}: has trained 128 of 128 steps already; give a larger total with --steps"
-    assert bam_train(resume=last) == (1, "", f"bam-train: {text}\n")
 
 
 ERRORS = [  # one of each kind; the rest is in the tests of settings, hyperparameters and run folders
@@ -159,8 +157,6 @@ ERRORS = [  # one of each kind; the rest is in the tests of settings, hyperparam
         {"env": "bam/pick", "set": ("env_kwargs.randomise=true",)},
         "env_kwargs: unknown setting 'randomise' of bam/pick-v0. Did you mean 'randomize'?",
     ),
-    ({"set": ("gamma=1.5",)}, "gamma: expected a number from 0 to 1, found 1.5"),
-    ({"algo": "pop"}, "Unknown algorithm 'pop'. Did you mean 'ppo'?"),
     ({"set": ("n_steps",)}, "--set n_steps: expected name=value, such as --set learning_rate=3e-4, found 'n_steps'"),
     (
         {"out": Path("/proc/version/a.zip")},
@@ -176,7 +172,6 @@ ERRORS = [  # one of each kind; the rest is in the tests of settings, hyperparam
         {"resume": Path("no.zip")},
         "--resume no.zip: no such file. Check the name; a run keeps runs/NAME/last.zip",
     ),
-    ({"steps": 0}, "steps: expected a whole number from 1 to 1000000000000000, found 0"),
 ]
 
 
