@@ -98,13 +98,14 @@ def test_a_run_that_cannot_be_recorded(bam_train, here, flags, text):
 
 
 def test_a_run_that_has_learnt_nothing_is_no_success(bam_train):
-    status, _, err = bam_train(algo="a2c", set=("n_steps=32",), stop_reward=475.0)
+    status, _, err = bam_train(algo="trpo", set=("n_steps=32", "batch_size=32"), stop_reward=475.0)
     assert status == 3
     lines = err.splitlines()
-    assert lines[:2] == ["a2c on CartPole-v1, seed 0", "no preset: the library's defaults, but for n_steps"]
+    told = "no preset: the library's defaults, but for n_steps, batch_size"
+    assert lines[:2] == ["trpo on CartPole-v1, seed 0", told]
     last = r"bam-train: nothing was learnt in 128 steps: return \d+(\.\d+)?, and the goal is 475\. Try --seed 1, "
     assert re.match(last, lines[-1])
-    assert "  bam-eval checkpoints/CartPole-v1-a2c.zip" in lines
+    assert "  bam-eval checkpoints/CartPole-v1-trpo.zip" in lines
 
 
 def test_print_config_is_read_back(bam_train, here):
