@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from bam_train.cli.flags import EvalConfig
     from bam_train.evaluation import EvaluationReport
     from bam_train.policy import FrozenPolicy
+    from bam_train.rollout import PlayedEpisode
 
 
 _ONLY_WITH = {"data": ("seen", "by"), "video": ("video_episodes",)}
@@ -69,10 +70,11 @@ def evaluate_checkpoint(config: EvalConfig) -> None:
             env.reset(seed=0)
             picture(env)
 
-    told = 0
+    done = told = 0
 
-    def on_progress(done: int, episodes: int) -> None:
-        nonlocal told
+    def on_wave(wave: list[PlayedEpisode], episodes: int) -> None:
+        nonlocal done, told
+        done += len(wave)
         if told + 0.05 * episodes <= done < episodes:
             told = done
             say(f"bam-eval: {done} of {episodes} episodes")
@@ -88,7 +90,7 @@ def evaluate_checkpoint(config: EvalConfig) -> None:
                 episodes=config.episodes,
                 seed=config.seed,
                 env=used,
-                on_progress=on_progress,
+                on_wave=on_wave,
             )
     if config.json:
         facts = {"checkpoint": str(path), "algorithm": subject.algorithm, "steps": subject.steps}

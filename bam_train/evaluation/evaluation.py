@@ -7,7 +7,7 @@ of one episode each; the steps after the end of an episode, while others are sti
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing, nullcontext
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from operator import gt
 from typing import Any
@@ -21,7 +21,7 @@ from bam_train.environments import is_batched, make_vector_env
 from bam_train.errors import SettingsError
 from bam_train.files.video import Frame, picture
 from bam_train.finite_envs import FiniteVectorEnv
-from bam_train.rollout import BatchPolicy, PlayedEpisode, rollout
+from bam_train.rollout import BatchPolicy, Parts, PlayedEpisode, rollout
 
 FIRST_SEED = 1_000_000
 """The default seed of the first episode: far from the small seeds that training uses."""
@@ -110,7 +110,8 @@ def evaluate(
     num_envs: int | None = None,
     env: VectorEnv[Any, Any, Any] | None = None,
     most_failures: float = math.inf,
-    on_progress: Callable[[int, int], None] | None = None,
+    parts: Callable[[VectorEnv[Any, Any, Any]], Parts | None] = lambda _: None,
+    on_wave: Callable[[list[PlayedEpisode], int], object] | None = None,
 ) -> EvaluationReport:
     """Run `episodes` seeded episodes of the environment `env_id` under `policy` and summarise them.
 
@@ -124,7 +125,9 @@ def evaluate(
         env: A vector environment of `make_vector_env`, used instead of a new one; it is left open.
         most_failures: With more episodes that fail it ends after the wave in progress, but not before `LOOK` episodes,
             or a quarter of all if those are fewer.
-        on_progress: Called after every wave with the number of episodes done and the number of all episodes.
+        parts: Called with the environments; gives what is kept of each step, see `rollout`. Nothing is kept if there
+            are only so many different starts.
+        on_wave: Called after every wave with its episodes and the number of all episodes.
 
     Raises:
         SettingsError: `episodes`, `seed` or `num_envs` out of range.
@@ -142,10 +145,11 @@ def evaluate(
         starts, done = number_of_starts(envs), list[PlayedEpisode]()
         least = min(LOOK, episodes / 4)
         first = LOOK if most_failures < LOOK == least else None
-        for wave in waves(FiniteVectorEnv(envs, env_id), policy, episodes=episodes, seed=seed, first=first):
+        given: dict[str, Any] = {"episodes": episodes, "seed": seed, "first": first, "parts": parts(envs)}
+        for wave in waves(FiniteVectorEnv(envs, env_id), policy, **given):
             done += wave
-            if on_progress is not None:
-                on_progress(len(done), min(episodes, starts or episodes))
+            if on_wave is not None:
+                on_wave(wave, min(episodes, starts or episodes))
             if len(done) >= least and sum(e.success is False for e in done) > most_failures:
                 break
     return summarise(env_id, done, seed, starts)
@@ -158,27 +162,33 @@ def number_of_starts(env: VectorEnv[Any, Any, Any]) -> int | None:
 
 
 def waves(
-    env: VectorEnv[Any, Any, Any], policy: BatchPolicy, *, episodes: int, seed: int, first: int | None = None
+    env: VectorEnv[Any, Any, Any],
+    policy: BatchPolicy,
+    *,
+    episodes: int,
+    seed: int,
+    first: int | None = None,
+    parts: Parts | None = None,
 ) -> Iterator[list[PlayedEpisode]]:
     """Play `episodes` episodes, one in each environment at a time; yields those of each wave that count.
 
-    The first wave has at most `first` episodes.
+    The first wave has at most `first` episodes. `parts` are as of `evaluate`.
 
     Episode k starts from ``reset(seed=seed + k)``. Where there are so many starts and no more, such as pictures of a
     test split, an episode counts if its start is new: a second one would say the same.
     """
     inner: Any = env.unwrapped
     starts, played, seen = number_of_starts(env), 0, set[int]()
-    left, drawn = min(episodes, starts or episodes), None if starts is None else lambda *_: (inner.task.drawn,)
+    left, parts = min(episodes, starts or episodes), parts if starts is None else lambda *_: (inner.task.drawn,)
     while left:
         count = env.num_envs if starts else min(env.num_envs, left if played else first or left, left)
-        ended = rollout(env, policy, seed=seed + played, keep=partial(gt, count), parts=drawn)
+        ended = rollout(env, policy, seed=seed + played, keep=partial(gt, count), parts=parts)
         wave = sorted(ended, key=lambda one: one.env_id)
         if starts is not None:
             new: dict[int, PlayedEpisode] = {}
             for one in wave:
                 new.setdefault(int(one.parts[0][0]), one)
-            wave = [one for start, one in new.items() if start not in seen]
+            wave = [replace(one, parts=()) for start, one in new.items() if start not in seen]
             seen.update(new)
         wave = wave[:left]
         left, played = left - len(wave), played + count

@@ -4,9 +4,10 @@ import math
 from collections.abc import Iterable
 from contextlib import closing, nullcontext
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
+from gymnasium import spaces
 from gymnasium.vector import VectorEnv
 
 from bam_envs.core.robot_env import RobotVectorEnv
@@ -18,7 +19,7 @@ from bam_train.data.recorded_episode import Episode
 from bam_train.environments import make_vector_env
 from bam_train.errors import SettingsError
 from bam_train.finite_envs import FiniteVectorEnv
-from bam_train.rollout import BatchPolicy, rollout
+from bam_train.rollout import BatchPolicy, Parts, PlayedEpisode, rollout
 
 SEED = 4_000_000
 """First seed of the episodes, far from those of training and evaluations."""
@@ -49,10 +50,12 @@ def add_own_detector(
     *,
     steps: int = WANTED,
     envs: VectorEnv[Any, Any, Any] | None = None,
+    played: Iterable[PlayedEpisode] = (),
 ) -> Detector:
     """As `add_detector`, of about `steps` steps of the checkpoint's own policy in new episodes of its environment.
 
-    If that has simulated robots, these are as live ones in half of the steps; see `LiveLike`.
+    If that has simulated robots, these are as live ones in half of the steps; see `LiveLike`. Episodes that the policy
+    has `played` already, with the parts of `parts_of`, take the place of new ones.
 
     Raises:
         SettingsError: Too few steps, or the observations are not up to `MOST_NUMBERS` numbers.
@@ -65,14 +68,39 @@ def add_own_detector(
     if steps < LEAST_TICKS:
         raise SettingsError(f"a detector needs at least {LEAST_TICKS} steps, found {steps}")
     made = nullcontext(envs) if envs is not None else closing(make_vector_env(env, env_kwargs, SIDE_BY_SIDE))
-    with made as played:
-        inner: Any = played.unwrapped
-        if envs is not None or not (isinstance(inner, RobotVectorEnv) and inner.robot.spec.command.labels):
-            return add_detector(path, fresh_episodes(played, env, policy, steps))
-        limit = inner.max_episode_steps
-        plain = fresh_episodes(played, env, policy, steps // 2)
+    with made as rows:
+        inner: Any = rows.unwrapped
+        is_robot = envs is None and isinstance(inner, RobotVectorEnv) and bool(inner.robot.spec.command.labels)
+        limit, wanted, plain = getattr(inner, "max_episode_steps", None), steps // (1 + is_robot), list[Rollout]()
+        for episode in played:
+            if wanted > 0:
+                plain.append(_rollout(episode))
+                wanted -= episode.length
+        if wanted > 0:
+            plain += fresh_episodes(rows, env, policy, wanted)
+        if not is_robot:
+            return add_detector(path, plain)
         inner.robot = LiveLike(inner.robot)
-        return add_detector(path, plain, fresh_episodes(played, env, policy, steps // 2, SEED + steps), limit=limit)
+        return add_detector(path, plain, fresh_episodes(rows, env, policy, steps // 2, SEED + steps), limit=limit)
+
+
+def parts_of(envs: VectorEnv[Any, Any, Any]) -> Parts | None:
+    """What a detector is made of in each step: observation, action, and the command before, if there are robots.
+
+    None if a detector cannot have such observations.
+    """
+    space, inner = envs.single_observation_space, cast("Any", envs.unwrapped)
+    if not isinstance(space, spaces.Box) or space.dtype == np.uint8 or np.prod(space.shape) > MOST_NUMBERS:
+        return None
+    is_robot = isinstance(inner, RobotVectorEnv)
+    return lambda observations, actions: (observations, actions, *([inner.state.command] if is_robot else []))
+
+
+def _rollout(episode: PlayedEpisode) -> Rollout:
+    """An episode with the parts of `parts_of`, and maybe its pace in each step."""
+    observed, acted, *more = episode.parts
+    pace = float(more[1][-1]) if more[1:] else 1.0
+    return Rollout(observed, acted, episode.success, more[0] if more else None, pace=pace)
 
 
 def recorded(episode: Episode, period: float) -> Rollout:
@@ -99,27 +127,22 @@ def fresh_episodes(
     """
     inner: Any = envs.unwrapped
     robot = inner.robot if isinstance(inner, RobotVectorEnv) else None
-    limit = getattr(inner, "max_episode_steps", None)
-    done, count = list[Rollout](), 0
+    limit, count, own = getattr(inner, "max_episode_steps", None), 0, cast("Parts", parts_of(envs))
 
-    def seen(observations: Any, actions: Any) -> tuple[Any, ...]:
+    def parts(observations: Any, actions: Any) -> tuple[Any, ...]:
         nonlocal count
         count += envs.num_envs
-        paces = robot.pace if isinstance(robot, LiveLike) else np.ones(envs.num_envs)
-        if isinstance(robot, LiveLike):
-            inner.max_episode_steps = None if limit is None else np.ceil(limit / paces)
-        return observations, actions, np.zeros((len(paces), 0)) if robot is None else inner.state.command, paces
+        if not isinstance(robot, LiveLike):
+            return own(observations, actions)
+        inner.max_episode_steps = None if limit is None else np.ceil(limit / robot.pace)
+        return *own(observations, actions), robot.pace
 
     played = rollout(
         FiniteVectorEnv(envs, env),
         policy,
         seed=seed,
         keep=lambda _: count < steps,
-        parts=seen,
+        parts=parts,
         limit=steps,  # an episode of that many steps has no end
     )
-    for episode in played:
-        observed, acted, sent, paces = episode.parts
-        commands = None if robot is None else sent
-        done.append(Rollout(observed, acted, episode.success, commands, pace=float(paces[-1])))
-    return done
+    return [_rollout(episode) for episode in played]

@@ -21,10 +21,10 @@ from bam_train.checkpoint.detector import DETECTOR, LEAST_TICKS
 from bam_train.errors import BamTrainError, EnvironmentFailed, OutputError, PolicyError, SettingsError, TrainingFailed
 from bam_train.evaluation import EvaluationReport, evaluate
 from bam_train.policy import FrozenPolicy
-from bam_train.rollout import BatchPolicy
+from bam_train.rollout import BatchPolicy, PlayedEpisode
 from bam_train.settings import TrainSettings
 from bam_train.trainers.base import Progress, Statistics, Trainer
-from bam_train.trainers.detection import WANTED, add_detector, add_own_detector
+from bam_train.trainers.detection import WANTED, add_detector, add_own_detector, parts_of
 from bam_train.trainers.resolve_settings import read_preset
 from bam_train.trainers.run_folder import Copies, RunFolder, unwritable
 
@@ -120,6 +120,7 @@ class TrainingRun:
         self._stop, self._reached = False, ""
         self._evaluated_at = trainer.steps if best or any(one["kind"] == "evaluation" for one in before) else 0
         self._scores: Scores = {}  # the newest evaluation
+        self._played: list[PlayedEpisode] = []  # episodes of the best one, for a detector
         self._kept: Path | None = out if best else None
         self._last_steps = 0
         self._failures: dict[str, OutputError] = {}
@@ -188,7 +189,7 @@ class TrainingRun:
     def add_detector(self) -> None:
         """Add a detector to the best checkpoint, after `run`; a run that was stopped, or is a short trial, gets none.
 
-        It is made of new episodes, or of the data set that the policy has learnt from.
+        It is made of episodes of its evaluation and new ones, or of the data set that the policy has learnt from.
         """
         settings, steps = self.settings, min(WANTED, self.trainer.steps // 10)
         if self._stop or self._kept is None or steps < 2 * LEAST_TICKS or Checkpoint.open(self._kept).has(DETECTOR):
@@ -200,7 +201,8 @@ class TrainingRun:
             else:
                 policy = FrozenPolicy.load(self._kept)
                 with self.trainer.undisturbed(), self.trainer.evaluation_envs() as envs:
-                    add_own_detector(self._kept, policy, settings.env, settings.env_kwargs, steps=steps, envs=envs)
+                    given: dict[str, Any] = {"steps": steps, "envs": envs, "played": self._played}
+                    add_own_detector(self._kept, policy, settings.env, settings.env_kwargs, **given)
         except SettingsError:  # it can have none
             return
         except (BamTrainError, BamEnvsError) as error:
@@ -285,7 +287,8 @@ class TrainingRun:
             return
         with self.trainer.undisturbed(), self.trainer.evaluation_envs() as envs:
             last = steps >= self.settings.steps
-            report, self._reached = evaluate_for_goal(self.trainer.freeze(), self.settings, last=last, envs=envs)
+            found = evaluate_for_goal(self.trainer.freeze(), self.settings, last=last, envs=envs)
+            report, self._reached, played = found
         if report.success_rate is None and self.settings.until_success is not None and not self._scores:
             self.watcher.note(f"{self.settings.env} reports no is_success, so --until-success has no effect")
         self._scores = {**report.to_json(), "steps": steps}
@@ -296,6 +299,7 @@ class TrainingRun:
         self.trainer.log({name: value for name, value in numbers.items() if value is not None})
         self.watcher.evaluated(steps, report, better and self.trainer.evaluations == "choose")
         if better:
+            self._played = played
             self._keep()
 
     def _add(self, kind: str, steps: int, figures: Scores) -> None:
@@ -374,28 +378,36 @@ EVALUATION_SEED = 2_000_000
 
 def evaluate_for_goal(
     policy: BatchPolicy, settings: TrainSettings, *, last: bool, envs: VectorEnv[Any, Any, Any] | None
-) -> tuple[EvaluationReport, str]:
+) -> tuple[EvaluationReport, str, list[PlayedEpisode]]:
     """Evaluate a policy; returns the report (the worse of two), and which goal of the run was reached, "" for none.
+
+    The third result are episodes, about `WANTED` steps at most, if a detector can be made of them; see `parts_of`.
 
     If the goal was reached, as many other episodes are played, which must reach it too. Failures that rule
     `until_success` out end an evaluation, see `evaluate`, but not the last one of a run, which plays all. Episode k has
     the seed EVALUATION_SEED + seed + k; `envs` are left open.
     """
     episodes, wanted, most = settings.eval_episodes, settings.until_success, math.inf
+    played: list[PlayedEpisode] = []
+
+    def on_wave(wave: list[PlayedEpisode], _: int) -> None:
+        if all(one.parts for one in wave) and sum(one.length for one in played) < WANTED:
+            played.extend(wave)
+
     if wanted is not None and settings.stop_reward is None and not last:
         most = (1 - wanted) * episodes + 1e-9
 
     def play(first: int, count: int) -> EvaluationReport:
         seed = EVALUATION_SEED + settings.seed + first
         given: dict[str, Any] = {"episodes": count, "seed": seed, "env": envs, "most_failures": most}
-        return evaluate(policy, settings.env, settings.env_kwargs, **given)
+        return evaluate(policy, settings.env, settings.env_kwargs, **given, parts=parts_of, on_wave=on_wave)
 
     report = play(0, episodes)
     if not _reached(report, settings):
-        return report, ""
+        return report, "", played
     again = play(episodes, episodes)
     worse = min(report, again, key=lambda report: (report.success_rate or 0.0, report.return_mean or 0.0))
-    return worse, _reached(again, settings)
+    return worse, _reached(again, settings), played
 
 
 def _reached(found: EvaluationReport | Statistics, settings: TrainSettings) -> str:

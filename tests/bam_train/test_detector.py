@@ -11,8 +11,9 @@ from bam_train.checkpoint.added_members import add_members
 from bam_train.checkpoint.detector import DETECTOR, REASONS, Detector, Rollout, make_detector
 from bam_train.cli.eval import main as bam_eval
 from bam_train.errors import CheckpointError, SettingsError
+from bam_train.evaluation import evaluate
 from bam_train.policy import FrozenPolicy
-from bam_train.trainers.detection import add_detector
+from bam_train.trainers.detection import add_detector, add_own_detector, parts_of, unusual_episodes
 
 POINT = Path(__file__).parents[2] / "checkpoints" / "mir100-navigation-ppo.zip"
 """A small checkpoint: 4 numbers an observation, 2 an action."""
@@ -225,6 +226,32 @@ def test_a_checkpoint_keeps_it(tmp_path, detector):
     assert {name: checkpoint.manifest.sha256[name] for name in before if name != DETECTOR} == {
         name: digest for name, digest in before.items() if name != DETECTOR
     }
+
+
+class Counted:
+    """A policy; counts how often all its environments begin."""
+
+    def __init__(self, policy):
+        self.act_batch, self.begun = policy.act_batch, 0
+
+    def reset(self, env_ids=None):
+        self.begun += env_ids is None
+
+
+@pytest.mark.parametrize(("episodes", "rollouts"), [(0, 2), (20, 2), (40, 1)])
+def test_episodes_of_an_evaluation_take_the_place_of_new_ones(tmp_path, episodes, rollouts):
+    path, env, played = tmp_path / "policy.zip", "bam/mir100-navigation-v0", []
+    shutil.copy(POINT, path)
+    policy = Counted(FrozenPolicy.load(POINT))
+    if episodes:
+        evaluate(policy, env, episodes=episodes, parts=parts_of, on_wave=lambda wave, _: played.extend(wave))
+    assert [tuple(part.shape[1:] for part in one.parts) for one in played] == [((4,), (2,), (2,))] * episodes
+    policy.begun = 0
+    found = add_own_detector(path, policy, env, {}, steps=4_000, played=played)
+    assert policy.begun == rollouts
+    assert FrozenPolicy.load(path).detector.to_bytes() == found.to_bytes()
+    usual = [Rollout(*one.parts[:2], one.success, one.parts[2]) for one in played]
+    assert unusual_episodes(found, usual)["alarms"] == 0
 
 
 def test_one_of_another_environment_or_a_broken_one_is_refused(tmp_path):

@@ -115,10 +115,11 @@ def test_arms_whose_episode_has_ended_rest_until_the_next_wave():
 def test_a_given_environment_is_used_again_and_left_open(corridor):
     envs = make_vector_env(corridor, None, 4)
     policy, seen = Always(1), []
-    first = evaluate(policy, corridor, episodes=6, seed=1, env=envs, on_progress=lambda *counts: seen.append(counts))
-    assert first == evaluate(policy, corridor, episodes=6, seed=1, env=envs)
+    given = {"episodes": 6, "seed": 1, "env": envs}
+    first = evaluate(policy, corridor, **given, on_wave=lambda wave, count: seen.append((len(wave), count)))
+    assert first == evaluate(policy, corridor, **given)
     assert set(policy.batches) == {4}
-    assert seen == [(4, 6), (6, 6)]  # after every wave
+    assert seen == [(4, 6), (2, 6)]
     assert not envs.closed
     envs.close()
     envs = gym.make_vec(corridor, 2, vectorization_mode="sync")

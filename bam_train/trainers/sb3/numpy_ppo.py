@@ -4,8 +4,11 @@ For layers this small most of torch's time is its overhead and its tanh. The upd
 float32, on the same minibatches: weights, the state of Adam and the log are where it has them.
 """
 
+import contextlib
 import functools
+import inspect
 import math
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -25,8 +28,37 @@ _LOG_SQRT_2PI = 0.5 * math.log(2 * math.pi)
 _threads = functools.cache(ThreadpoolController)
 
 
+@contextlib.contextmanager
+def _without_compiler() -> Iterator[None]:
+    """Use optimisers without the import of torch's compiler, which their wrapped methods do: a second of CPU time."""
+    names = ("add_param_group", "state_dict", "load_state_dict")
+    wrapped = {name: getattr(torch.optim.Optimizer, name) for name in names}
+    for name, method in wrapped.items():
+        setattr(torch.optim.Optimizer, name, inspect.unwrap(method))
+    try:
+        yield
+    finally:
+        for name, method in wrapped.items():
+            setattr(torch.optim.Optimizer, name, method)
+
+
 class NumpyPPO(PPO):  # type: ignore[misc]
     """As `PPO`, which computes a policy, optimiser or setting that `fits` does not know."""
+
+    @_without_compiler()
+    def _setup_model(self) -> None:
+        super()._setup_model()
+
+    @_without_compiler()
+    def get_parameters(self) -> dict[str, dict[str, Any]]:
+        """The weights of the policy and the state of its optimiser."""
+        found: dict[str, dict[str, Any]] = super().get_parameters()
+        return found
+
+    @_without_compiler()
+    def set_parameters(self, *args: Any, **kwargs: Any) -> None:
+        """Set what `get_parameters` returned; see `PPO`."""
+        super().set_parameters(*args, **kwargs)
 
     def collect_rollouts(self, *args: Any, **kwargs: Any) -> bool:
         """Fill the rollout buffer, see `PPO`; the weights stay as they are meanwhile."""

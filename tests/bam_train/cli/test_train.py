@@ -98,13 +98,14 @@ def test_a_run_that_cannot_be_recorded(bam_train, here, flags, text):
 
 
 def test_a_run_that_has_learnt_nothing_is_no_success(bam_train):
-    status, _, err = bam_train(algo="a2c", set=("n_steps=32",), stop_reward=475.0)
+    status, _, err = bam_train(algo="trpo", set=("n_steps=32", "batch_size=32"), stop_reward=475.0)
     assert status == 3
     lines = err.splitlines()
-    assert lines[:2] == ["a2c on CartPole-v1, seed 0", "no preset: the library's defaults, but for n_steps"]
+    told = "no preset: the library's defaults, but for n_steps, batch_size"
+    assert lines[:2] == ["trpo on CartPole-v1, seed 0", told]
     last = r"bam-train: nothing was learnt in 128 steps: return \d+(\.\d+)?, and the goal is 475\. Try --seed 1, "
     assert re.match(last, lines[-1])
-    assert "  bam-eval checkpoints/CartPole-v1-a2c.zip" in lines
+    assert "  bam-eval checkpoints/CartPole-v1-trpo.zip" in lines
 
 
 def test_print_config_is_read_back(bam_train, here):
@@ -141,7 +142,7 @@ def test_an_existing_checkpoint_is_not_overwritten(bam_train):
 
 def test_resume_counts_from_the_first_step_and_needs_nothing_else(bam_train):
     bam_train(steps=100, eval_every=1000)
-    last, checkpoint = Path("runs/CartPole-v1-ppo/last.zip"), Path("checkpoints/CartPole-v1-ppo.zip")
+    checkpoint = Path("checkpoints/CartPole-v1-ppo.zip")
     nothing = dict.fromkeys(("env", "algo", "eval_every", "eval_episodes"))
     status, _, err = bam_train(**nothing, resume=checkpoint, steps=192, set=())
     assert status == 0
@@ -149,8 +150,6 @@ def test_resume_counts_from_the_first_step_and_needs_nothing_else(bam_train):
     assert "no preset" not in err
     assert "CartPole-v1 cannot save running episodes: new ones begin" in err
     assert Checkpoint.open("runs/CartPole-v1-ppo-2/last.zip").manifest.steps == 192
-    text = f"{last}: has trained 128 of 128 steps already; give a larger total with --steps"
-    assert bam_train(resume=last) == (1, "", f"bam-train: {text}\n")
 
 
 ERRORS = [  # one of each kind; the rest is in the tests of settings, hyperparameters and run folders
@@ -159,8 +158,6 @@ ERRORS = [  # one of each kind; the rest is in the tests of settings, hyperparam
         {"env": "bam/pick", "set": ("env_kwargs.randomise=true",)},
         "unknown argument 'randomise' of bam/pick-v0. Did you mean 'randomize'?",
     ),
-    ({"set": ("gamma=1.5",)}, "gamma: expected a number from 0 to 1, found 1.5"),
-    ({"algo": "pop"}, "Unknown algorithm 'pop'. Did you mean 'ppo'?"),
     ({"set": ("n_steps",)}, "--set n_steps: expected name=value, such as --set learning_rate=3e-4, found 'n_steps'"),
     (
         {"out": Path("/proc/version/a.zip")},
@@ -176,7 +173,6 @@ ERRORS = [  # one of each kind; the rest is in the tests of settings, hyperparam
         {"resume": Path("no.zip")},
         "--resume no.zip: no such file. Check the name; a run keeps runs/NAME/last.zip",
     ),
-    ({"steps": 0}, "steps: expected a whole number from 1 to 1000000000000000, found 0"),
 ]
 
 

@@ -166,7 +166,7 @@ def test_every_preset_is_complete_and_of_an_environment_that_is_here(name):
         resolve(
             {"env": env, "algo": algo, "trainer": trainer, "teacher": "scripted" if trainer == "imitation" else None}
         )
-    assert read_preset("CartPole-v1", "a2c") == {}
+    assert read_preset("MountainCar-v0", "a2c") == {}
 
 
 @pytest.fixture

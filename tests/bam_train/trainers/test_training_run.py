@@ -93,7 +93,7 @@ def start(tmp_path, monkeypatch):
         trainer, watcher = Counter(TrainSettings.from_mapping({**given, **extra}), begin, save_takes), Watcher()
         start.seeds = []
 
-        def evaluate(policy, env_id, env_kwargs, *, episodes, seed, env, most_failures):
+        def evaluate(policy, env_id, env_kwargs, *, episodes, seed, env, most_failures, **_):
             assert env is trainer.rows
             start.seeds.append((policy.steps, seed, episodes))
             start.most_failures = most_failures

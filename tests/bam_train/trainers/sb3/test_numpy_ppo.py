@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import copy
+import subprocess
+import sys
 
 import gymnasium as gym
 import numpy as np
@@ -92,3 +94,16 @@ def test_anything_else_is_updated_by_stable_baselines3(options, env, monkeypatch
     assert not fits(ours)
     monkeypatch.setattr(numpy_ppo, "_Update", None)
     np.testing.assert_array_equal(update(ours, 1), update(theirs, 1))
+
+
+def test_it_is_made_saved_and_loaded_without_the_compiler_of_torch():
+    code = f"""
+import io, sys
+from bam_train.trainers.sb3.numpy_ppo import NumpyPPO
+model = NumpyPPO("MlpPolicy", {ENV!r}, **{SMALL!r}).learn(40)
+model.save(io.BytesIO())
+model.set_parameters(model.get_parameters())
+print(model._n_updates, "torch._dynamo" in sys.modules)
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout == "3 False\n"

@@ -176,16 +176,6 @@ def test_stopping_between_updates(walk):
     trainer.train(20, lambda progress: pytest.fail("there is nothing to train"))
 
 
-def test_one_seed_one_result_and_another_seed_another(walk):
-    def weights(seed):
-        trainer = SB3Trainer.create(completed(walk, hyperparameters=FIRST, seed=seed))
-        trainer.train(96, lambda progress: True)
-        return torch.cat([parameter.detach().flatten() for parameter in trainer.model.policy.parameters()])
-
-    assert torch.equal(weights(1), weights(1))
-    assert not torch.equal(weights(1), weights(2))
-
-
 @pytest.mark.parametrize(
     ("algo", "hyperparameters", "message"),
     [
