@@ -13,6 +13,7 @@ import threading
 import time
 from collections.abc import Callable, Mapping
 from concurrent.futures import Future
+from contextlib import suppress
 from functools import partial
 from typing import Any
 
@@ -168,12 +169,11 @@ class RosbridgeLink(RosBus, Ros):  # type: ignore[misc]
 
     async def _main(self, ready: Future[None]) -> None:
         self._main_task, self.factory.manager.loop = asyncio.current_task(), asyncio.get_running_loop()
-        try:
+        with suppress(asyncio.CancelledError):  # by `_stop`; not `finally`, which would also run in a forked child
             await self._stay_connected(ready)
-        except asyncio.CancelledError:  # by `_stop`; not in `finally`, which would also run in a forked child
-            if not ready.done():
-                ready.set_exception(LinkLost(f"{self.url}: this link was closed. Make a new one."))
-            await self._leave()
+        if not ready.done():
+            ready.set_exception(LinkLost(f"{self.url}: this link was closed. Make a new one."))
+        await self._leave()
 
     def _stop(self) -> None:
         task, self._main_task = self._main_task, None  # once: a second cancellation would interrupt `_leave`
@@ -183,7 +183,7 @@ class RosbridgeLink(RosBus, Ros):  # type: ignore[misc]
     async def _stay_connected(self, ready: Future[None]) -> None:
         """Connect, and after each loss again. An error before the first connection ends it."""
         delay, first_by = _FIRST_DELAY, time.monotonic() + self.endpoint.connect_timeout
-        while True:
+        while not self._closed and self._main_task is asyncio.current_task():
             left = self.endpoint.connect_timeout if ready.done() else first_by - time.monotonic()
             try:
                 connection = await self._open(max(left, _LEAST_TRY))
@@ -199,7 +199,7 @@ class RosbridgeLink(RosBus, Ros):  # type: ignore[misc]
                 since = time.monotonic()
                 if not ready.done():
                     ready.set_result(None)
-                await connection.ended.wait()
+                await connection.watch(self._lost_after)
                 # A connection that repeatedly breaks at once is reopened after longer and longer delays.
                 if time.monotonic() - since > _STEADY:
                     delay = _FIRST_DELAY
@@ -208,11 +208,9 @@ class RosbridgeLink(RosBus, Ros):  # type: ignore[misc]
 
     async def _open(self, timeout: float) -> Connection:
         deadline = time.monotonic() + timeout
-        self._require_open()
         connection = await open_connection(self.endpoint, timeout, self._max_message, self._take, self._note_end)
         try:
             await self._probe(connection, deadline - time.monotonic(), timeout)
-            connection.watch(self._lost_after)
             self._require_open()
             # All declarations before `_up`, so that nothing is published before it is advertised.
             self._begin(connection)

@@ -7,10 +7,10 @@ Longer than most files: how a connection begins, and every way in which it ends,
 
 import asyncio
 import logging
-import math
 import re
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from typing import Any
 
 import txaio
@@ -104,7 +104,6 @@ class Connection(RosBridgeProtocol, WebSocketClientProtocol):  # type: ignore[mi
         self._asked: dict[str, str] = {}  # id of each request of roslibpy's that waits -> the op of its response
         self._fragments, self._passed_over = Fragments(max_message), 0
         self._cut_by: Exception | None = None
-        self._watching: asyncio.Task[None] | None = None
 
     # ---- opening
 
@@ -121,20 +120,16 @@ class Connection(RosBridgeProtocol, WebSocketClientProtocol):  # type: ignore[mi
                 return
         super().data_received(data)
 
-    def watch(self, lost_after: float) -> None:
-        """End the connection when the server gives no sign of life for `lost_after` [s] from now on."""
-        if lost_after < math.inf:
-            self._heard_at = time.monotonic()
-            self._watching = asyncio.get_running_loop().create_task(self._watch(lost_after))
-
-    async def _watch(self, lost_after: float) -> None:
-        every = lost_after / _PINGS
+    async def watch(self, lost_after: float) -> None:
+        """Wait for the end of the connection, and end it when the server is silent for `lost_after` [s]."""
+        every, self._heard_at = lost_after / _PINGS, time.monotonic()
         while self.error is None:
             # A server that does not read its pending messages answers no ping either.
             if not self.transport.get_write_buffer_size():
                 self.sendPing()
             woken = time.monotonic() + min(every, max(0.0, self._heard_at + lost_after - time.monotonic()))
-            await asyncio.sleep(woken - time.monotonic())
+            with suppress(asyncio.TimeoutError):
+                await asyncio.wait_for(self.ended.wait(), woken - time.monotonic())
             now = time.monotonic()
             if now - woken > every:
                 self._heard_at = now  # this process itself was paused, and messages may be unread
@@ -204,8 +199,6 @@ class Connection(RosBridgeProtocol, WebSocketClientProtocol):  # type: ignore[mi
         self._on_end(self, error)
         for identity in list(self._asked):
             self._fail(identity, str(error))
-        if self._watching is not None and self._watching is not asyncio.current_task():
-            self._watching.cancel()
         self.ended.set()
 
     def onCloseFrame(self, code: int | None, reason: bytes | None) -> bool | None:  # noqa: N802 - Autobahn's name

@@ -88,7 +88,6 @@ class RosBus(Bus):
         self._may_answer = threading.Semaphore(_MOST_ANSWERING)
         self._up: Any = None  # the present connection
         self._waiting: dict[str, Callable[[Reply], None]] = {}  # by id of the request that is not answered
-        self._announced: dict[str, str] = {}  # declarations sent on it: id of the declaration -> its frame
         self._why = "not connected yet: call connect()"  # there is none
         self._closed = False
 
@@ -182,14 +181,16 @@ class RosBus(Bus):
         self._require_process()
         topic, identity = request["topic"], f"{request['op']}:{request['topic']}"
         with self._lock:  # also around `_announce`, so that requests reach the network thread in order
-            known = self._declared.get(identity) or {**request, "id": identity}
+            before = self._declared.get(identity)
+            known = before or {**request, "id": identity}
             if known["type"] != normal_name(kind):
                 raise InvalidValue(f"Topic {topic!r} is of type {known['type']} here already; found {kind!r}.")
             wish = ("throttle_rate", "queue_length") if listener else ()
             self._declared[identity] = known = {**known, **{name: min(known[name], request[name]) for name in wish}}
             if listener:  # a new table each time, so that delivery can iterate over the old one without a lock
                 self._listeners[topic] = {**self._listeners.get(topic, {}), listener[0]: listener[1]}
-            self._announce(known)
+            if known != before:
+                self._announce(known)
 
     def _unsubscribe(self, topic: str, key: object) -> None:
         self._require_process()
@@ -364,26 +365,25 @@ class RosBus(Bus):
                 best, self.ros, self.clock_offset = trip, now[0], asked + trip / 2 - now[1]
 
     def _announce(self, request: dict[str, Any]) -> None:
-        """Send `request` if there is a connection; the next one gets all declarations anyway."""
-        self._thread.post(partial(self._tell, request["id"], dump_json(request)))
+        """Send `request`, in the lock, if there is a connection; the next one gets all declarations anyway."""
+        connection, frame = self._up, dump_json(request)
 
-    def _tell(self, identity: str, frame: str) -> None:
-        if self._up is None or self._announced.get(identity) == frame:
-            return
-        self._announced[identity] = frame
-        try:
-            self._send(self._up, frame)
-        except LinkLost as error:
-            _LOG.warning("%s was not declared: %s", identity, error)
+        def send() -> None:
+            try:
+                self._send(connection, frame)
+            except LinkLost as error:
+                _LOG.info("%s was not declared: %s", request["id"], error)
+
+        if connection is not None:
+            self._thread.post(send)
 
     def _begin(self, connection: Any) -> None:
         """Declare everything to a new connection, and use it from now on; on the network thread."""
-        with self._lock:
-            self._announced = {name: dump_json(request) for name, request in self._declared.items()}
-        self._send(connection, *self._announced.values())
-        self.epoch += 1
-        with self._changed:
+        with self._lock:  # what is declared a moment later is sent behind it
+            self._send(connection, *map(dump_json, self._declared.values()))
+            self.epoch += 1
             self._up = connection
+        with self._changed:
             self._changed.notify_all()
 
     def _farewell(self, *operations: str) -> list[str]:
