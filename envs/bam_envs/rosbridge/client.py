@@ -13,17 +13,18 @@ import threading
 import time
 from collections.abc import Callable, Mapping
 from concurrent.futures import Future
+from contextlib import suppress
 from functools import partial
 from typing import Any
 
-from roslibpy import Feedback, GoalStatus, Result, Ros, ServiceResponse
+from roslibpy import Ros
 
-from bam_envs.core.errors import BamEnvsError, InvalidValue, LinkLost, NoServer
+from bam_envs.core.errors import BamEnvsError, InvalidValue, LinkLost, NoServer, ProtocolError, RemoteError
 from bam_envs.rosbridge.bus import Message, tell
 from bam_envs.rosbridge.client_connection import Connection, LinkFactory, open_connection
 from bam_envs.rosbridge.encoding import dump_json
 from bam_envs.rosbridge.endpoint import Endpoint
-from bam_envs.rosbridge.ros_bus import SEND_WITHIN, Reply, RosBus, bare_reason
+from bam_envs.rosbridge.ros_bus import SEND_WITHIN, RosBus, bare_reason
 from bam_envs.rosbridge.threads import LoopThread
 
 _LOG = logging.getLogger(__name__)
@@ -59,7 +60,7 @@ class RosbridgeLink(RosBus, Ros):  # type: ignore[misc]
         self.endpoint = Endpoint(endpoint) if isinstance(endpoint, str) else endpoint
         address = self.endpoint.address
         super().__init__(address.url, address.namespace, name)
-        self.factory, self.is_connecting = LinkFactory(), False
+        self.factory, self.is_connecting = LinkFactory(self._use), False
         if not lost_after > 0.0:
             raise InvalidValue(f"lost_after: expected a time above 0 s, found {lost_after!r}.")
         self._lost_after, self._max_message = lost_after, max_message
@@ -112,6 +113,8 @@ class RosbridgeLink(RosBus, Ros):  # type: ignore[misc]
         """Whether a message can be sent now."""
         return (connection := self._up) is not None and connection.can_send
 
+    is_connected = is_up
+
     # ---- what roslibpy's Topic, Service and ActionClient call
 
     @property
@@ -123,7 +126,8 @@ class RosbridgeLink(RosBus, Ros):  # type: ignore[misc]
         """Send an operation now or not at all; a declaration is kept, and repeated after a cut."""
         request = dict(message)
         if request["op"] not in _DECLARE + _WITHDRAW:
-            self._thread.do(partial(self._send, self._require_up(), dump_json(request)), SEND_WITHIN)
+            frame = dump_json(request)
+            self._use(lambda connection: connection.send(frame))
             return
         self._require_process()
         identity = request.setdefault("id", f"serve:{request.get('service')}")
@@ -134,39 +138,13 @@ class RosbridgeLink(RosBus, Ros):  # type: ignore[misc]
                 self._declared.pop(identity, None)
             self._announce(request)
 
-    def call_async_service(
-        self, message: Message, callback: Callable[[Any], Any] | None, errback: Callable[[Any], Any] | None
-    ) -> None:
-        """Call a service now or not at all; a cut is an error of the call."""
-
-        def took(reply: Reply) -> None:
-            failed = isinstance(reply, BamEnvsError) or reply.get("result") is False
-            values = str(reply) if isinstance(reply, BamEnvsError) else reply.get("values")
-            if (back := errback if failed else callback) is not None:
-                back(values if failed else ServiceResponse(values))
-
-        self._thread.do(self._asking(self._require_up(), dict(message), took)[0], SEND_WITHIN)
-
-    def call_async_action(
-        self,
-        message: Message,
-        resultback: Callable[[Any], Any],
-        feedback: Callable[[Any], Any],
-        errback: Callable[[Any], Any],
-    ) -> None:
-        """Send a goal now or not at all; a cut is an error of the goal, whose action may go on."""
-
-        def took(reply: Reply) -> None:
-            if isinstance(reply, BamEnvsError):
-                errback({"status": GoalStatus.UNKNOWN, "values": str(reply)})
-                return
-            values = reply.get("values", {})
-            status = reply.get("status", values.get("status") if isinstance(values, Mapping) else None)
-            result = {"status": GoalStatus(status or 0), "values": values}
-            (errback(result) if reply.get("result") is False else resultback(Result(result)))
-
-        request, news = dict(message), lambda values: feedback(Feedback(values))
-        self._thread.do(self._asking(self._require_up(), request, took, news)[0], SEND_WITHIN)
+    def on_ready(self, callback: Callable[[], object], run_in_thread: bool = True) -> None:
+        """Call `callback` now, or when there is a connection."""
+        call = partial(self.call_in_thread, callback) if run_in_thread else callback
+        if self.is_up:
+            call()
+        else:
+            self.factory.once("ready", lambda _: call())
 
     def blocking_call_from_thread(self, callback: Callable[[Any], Any], timeout: float | None) -> Any:
         """Run a request on the network thread and wait for its result; `LinkLost` if the link is down."""
@@ -176,19 +154,12 @@ class RosbridgeLink(RosBus, Ros):  # type: ignore[misc]
 
     # ---- used by any thread
 
+    def _use(self, callback: Callable[[Connection], object]) -> None:
+        """Call `callback` with the connection on the network thread, now or not at all."""
+        self._thread.do(partial(callback, self._require_up()), SEND_WITHIN)
+
     def _send(self, connection: Connection, *frames: str) -> None:
         connection.send(*frames)
-
-    def _asking(
-        self,
-        connection: Connection,
-        request: Message,
-        took: Callable[[Reply], None],
-        news: Callable[[Any], Any] | None = None,
-    ) -> tuple[Callable[[], None], Callable[[], object]]:
-        identity, frame = str(request["id"]), dump_json(request)
-        ask = partial(connection.ask, identity, frame, took, news)
-        return ask, partial(self._thread.post, partial(connection.forget, identity))
 
     def _require_open(self) -> None:
         if self._closed:
@@ -198,81 +169,82 @@ class RosbridgeLink(RosBus, Ros):  # type: ignore[misc]
 
     async def _main(self, ready: Future[None]) -> None:
         self._main_task, self.factory.manager.loop = asyncio.current_task(), asyncio.get_running_loop()
-        try:
-            connection = await self._first()
-            ready.set_result(None)
-            await self._stay_connected(connection)
-        except asyncio.CancelledError:  # by `_stop`; not in `finally`, which would also run in a forked child
-            if not ready.done():
-                ready.set_exception(LinkLost(f"{self.url}: this link was closed. Make a new one."))
-            await self._leave()
+        with suppress(asyncio.CancelledError):  # by `_stop`; not `finally`, which would also run in a forked child
+            await self._stay_connected(ready)
+        if not ready.done():
+            ready.set_exception(LinkLost(f"{self.url}: this link was closed. Make a new one."))
+        await self._leave()
 
     def _stop(self) -> None:
         task, self._main_task = self._main_task, None  # once: a second cancellation would interrupt `_leave`
         if task is not None:
             task.cancel()
 
-    async def _first(self) -> Connection:
-        left = max(self.endpoint.connect_timeout, _LEAST_TRY)
-        deadline, delay = time.monotonic() + left, _FIRST_DELAY
-        while True:
-            self._require_open()
+    async def _stay_connected(self, ready: Future[None]) -> None:
+        """Connect, and after each loss again. An error before the first connection ends it."""
+        delay, first_by = _FIRST_DELAY, time.monotonic() + self.endpoint.connect_timeout
+        while not self._closed and self._main_task is asyncio.current_task():
+            left = self.endpoint.connect_timeout if ready.done() else first_by - time.monotonic()
             try:
-                return await self._open(left)
-            except NoServer as error:
+                connection = await self._open(max(left, _LEAST_TRY))
+            except Exception as error:  # the link must keep trying
                 # A server that refuses connections may still be starting; other errors persist.
-                if not isinstance(error.__cause__, ConnectionRefusedError) or time.monotonic() + delay >= deadline:
+                waits = isinstance(error.__cause__, ConnectionRefusedError) and time.monotonic() + delay < first_by
+                if not ready.done() and not waits:
                     raise
-            await asyncio.sleep(delay)
-            delay, left = min(2 * delay, _LONGEST_DELAY), max(deadline - time.monotonic(), _LEAST_TRY)
-
-    async def _stay_connected(self, connection: Connection) -> None:
-        delay = _FIRST_DELAY
-        while True:
-            since = time.monotonic()
-            await connection.ended.wait()
-            # A connection that repeatedly breaks at once is reopened after longer and longer delays.
-            if time.monotonic() - since > _STEADY:
-                delay = _FIRST_DELAY
-            while connection.error is not None:
-                await asyncio.sleep(delay)
-                delay = min(2 * delay, _LONGEST_DELAY)
-                try:
-                    connection = await self._open(self.endpoint.connect_timeout)
-                except BamEnvsError as error:
-                    self._why = bare_reason(self.url, error)
-                except Exception as error:  # the link must keep trying
+                if not isinstance(error, BamEnvsError):
                     _LOG.exception("%s: connecting failed", self.url)
-                    self._why = f"{type(error).__name__}: {error}"
+                self._why = bare_reason(self.url, error)
+            else:
+                since = time.monotonic()
+                if not ready.done():
+                    ready.set_result(None)
+                await connection.watch(self._lost_after)
+                # A connection that repeatedly breaks at once is reopened after longer and longer delays.
+                if time.monotonic() - since > _STEADY:
+                    delay = _FIRST_DELAY
+            await asyncio.sleep(delay)
+            delay = min(2 * delay, _LONGEST_DELAY)
 
     async def _open(self, timeout: float) -> Connection:
-        deadline, hooks = time.monotonic() + timeout, (self.epoch + 1, self._take, self._note_end)
-        connection = await open_connection(self.endpoint, timeout, self._max_message, *hooks)
+        deadline = time.monotonic() + timeout
+        connection = await open_connection(self.endpoint, timeout, self._max_message, self._take, self._note_end)
         try:
-            await connection.probe(deadline - time.monotonic(), timeout)
-            connection.watch(self._lost_after)
+            await self._probe(connection, deadline - time.monotonic(), timeout)
             self._require_open()
-            # All of them before `_up`, so that nothing is published before it is advertised.
-            self.epoch, self.ros = connection.epoch, connection.ros or self.ros
-            self.clock_offset = connection.clock_offset
+            # All declarations before `_up`, so that nothing is published before it is advertised.
             self._begin(connection)
         except BaseException as error:
             connection.drop(error if isinstance(error, BamEnvsError) else LinkLost(f"{self.url}: no answer."))
             raise
-        self.factory.connection = connection
         tell(partial(self.factory.emit, "ready"), connection)
         return connection
 
+    async def _probe(self, connection: Connection, within: float, timeout: float) -> None:
+        """Check `within` [s] that a rosbridge server answers; `NoServer` has the `timeout` of the whole attempt [s]."""
+        try:
+            await asyncio.wait_for(self._learn_clock(connection), within)
+        except asyncio.TimeoutError as error:
+            raise NoServer(
+                self.url,
+                f"a WebSocket server that answers no rosbridge request within {timeout:.1f} s. "
+                "Is it a rosbridge server, and is its ROS node alive?",
+            ) from error
+        except NoServer:
+            raise
+        except (LinkLost, ProtocolError) as error:
+            reason = bare_reason(self.url, error).removeprefix("the link dropped: ")
+            raise NoServer(self.url, f"closed the connection before it answered a request: {reason}.") from error
+
     def _note_end(self, connection: Connection, error: BamEnvsError) -> None:
-        if connection is self._up:
-            self.factory.connection = None
-            self._note_down(error)
+        was_up = self._up is not None
+        self._note_down(error)
+        if was_up:
             tell(partial(self.factory.emit, "close"), connection)
 
     async def _leave(self) -> None:
         self._why = "it was closed; make a new one"
         connection, self._up = self._up, None
-        self.factory.connection = None
         if connection is not None:
             try:
                 connection.send(*self._farewell("advertise", "advertise_service"))
@@ -283,19 +255,28 @@ class RosbridgeLink(RosBus, Ros):  # type: ignore[misc]
     # ---- the network thread: receiving
 
     def _take(self, connection: Connection, message: dict[str, Any]) -> None:
-        operation = message.get("op")
+        operation, identity = message.get("op"), str(message.get("id"))
         if operation == "publish":
             self._take_published(message.get("topic"), message.get("msg"))
             self._emit(message["topic"], message["msg"])
+        elif operation in ("service_response", "action_result"):
+            self._answered(identity, message)
+        elif operation == "call_service" and self._up is None and identity in self._waiting:
+            # Only before the server is known: later, one of its requests may have an id like ours.
+            echo = NoServer(self.url, "an echo server: it sends back what it is sent. Is it the right port?")
+            self._answered(identity, echo)
         elif operation == "call_service":
             service = str(message.get("service"))
             if service in self._handlers or not self._emit(service, message):
                 self._answer(connection, message)
         elif operation == "status":
+            # A server may answer a request that it cannot read only with a status of the same id.
+            if message.get("level") == "error":
+                self._answered(identity, RemoteError(str(message.get("msg"))))
             self.statuses.append(message)
             for callback in self._status_callbacks:
                 tell(callback, message)
-        else:
+        elif operation != "action_feedback":
             connection.pass_over(f"a message with op {operation!r:.40}")
 
     def _emit(self, name: str, news: Mapping[str, Any]) -> bool:

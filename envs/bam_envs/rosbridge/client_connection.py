@@ -7,23 +7,23 @@ Longer than most files: how a connection begins, and every way in which it ends,
 
 import asyncio
 import logging
-import math
 import re
 import time
 from collections.abc import Callable
-from concurrent.futures import Future
+from contextlib import suppress
 from typing import Any
 
 import txaio
+from roslibpy import GoalStatus
 from roslibpy.comm import RosBridgeProtocol
 from roslibpy.event_emitter import EventEmitterMixin
 
-from bam_envs.core.errors import BamEnvsError, InvalidValue, LinkLost, NoServer, ProtocolError, RemoteError
+from bam_envs.core.errors import BamEnvsError, InvalidValue, LinkLost, NoServer, ProtocolError
 from bam_envs.rosbridge.bus import tell
 from bam_envs.rosbridge.dialing import http_refusal, no_connection, open_port, silent
 from bam_envs.rosbridge.encoding import Fragments, decode_server_frame, dump_json
 from bam_envs.rosbridge.endpoint import Address, Endpoint
-from bam_envs.rosbridge.ros_bus import Reply, bare_reason, read_clock
+from bam_envs.rosbridge.ros_bus import bare_reason
 
 TWISTED = (
     "This process uses roslibpy's Twisted transport, and a live robot needs its asyncio transport: make each "
@@ -38,12 +38,10 @@ except RuntimeError as error:  # a process has one of the two transports
 _LOG = logging.getLogger(__name__)
 logging.getLogger(f"{__name__}.Connection").setLevel(logging.CRITICAL)  # a link reports its errors itself
 _CLOSE_WITHIN = 1.0  # longest time for a closing handshake [s]
-_CLOCK_PROBES = 3
 _PINGS = 5  # pings to a server before its silence is a loss
 _MOST_UNSENT = 1024 * 1024  # bytes that may wait for the server to read before sending fails
 _MOST_PASSED_OVER = 20  # meaningless messages of one connection, after which it is closed
 _LONGEST_REFUSAL = 64 * 1024  # bytes of an HTTP response that is not that of a WebSocket server
-_DEAD_NODE = "context is invalid"  # answer of rosbridge_suite to every request after its node has shut down
 
 
 def send_now(socket: Any, url: str, down: str, max_message: int, *frames: str) -> None:
@@ -67,37 +65,24 @@ def send_now(socket: Any, url: str, down: str, max_message: int, *frames: str) -
 
 
 class LinkFactory(EventEmitterMixin):  # type: ignore[misc]
-    """What `roslibpy.Ros` asks of its transport; ready while there is a `connection`."""
+    """What `roslibpy.Ros` asks of its transport; `on_ready` calls with the connection, now or not at all."""
 
-    def __init__(self) -> None:
+    def __init__(self, on_ready: Callable[[Callable[["Connection"], object]], None]) -> None:
         super().__init__()
+        self.on_ready = on_ready
         self.manager = AsyncioEventLoopManager()  # its loop is that of the link, which runs
-        self.connection: Connection | None = None
         self.heard: set[str] = set()  # events that have listeners
-
-    @property
-    def is_connected(self) -> bool:
-        """Whether a message can be sent now."""
-        return self.connection is not None and self.connection.can_send
 
     def on(self, event: str, f: Callable[..., object] | None = None) -> Any:
         """Call `f` at each `event`: the name of a topic or a service, ``ready``, ``close``."""
         self.heard.add(event)
         return super().on(event, f)
 
-    def on_ready(self, callback: Callable[["Connection"], object]) -> None:
-        """Call `callback` with the connection, now or when there is one."""
-        if self.connection is not None:
-            callback(self.connection)
-        else:
-            self.once("ready", callback)
-
 
 class Connection(RosBridgeProtocol, WebSocketClientProtocol):  # type: ignore[misc]
-    """Connection number `epoch` of a link to the server of `url`; `max_message` is the link's.
+    """A connection of a link to the server of `url`; `max_message` is the link's.
 
-    `on_message` takes each message that is not an answer: publish, call_service, status. `on_end` is called once, at
-    the end of the connection, before pending requests get the error.
+    `on_message` takes each whole message; `on_end` is called once, at the end of the connection.
     """
 
     log = txaio.make_logger()
@@ -106,24 +91,19 @@ class Connection(RosBridgeProtocol, WebSocketClientProtocol):  # type: ignore[mi
         self,
         url: str,
         max_message: int,
-        epoch: int = 0,
         on_message: Callable[["Connection", dict[str, Any]], None] = lambda *_: None,
         on_end: Callable[["Connection", BamEnvsError], None] = lambda *_: None,
     ) -> None:
         super().__init__()
-        self.url, self.epoch = url, epoch
+        self.url = url
         self.error: BamEnvsError | None = None  # why it ended; None before
         self.ended = asyncio.Event()
-        self.ros: str | None = None  # as in `RosbridgeLink`; both are known after `probe`
-        self.clock_offset: float | None = None  # to within half a round trip
         self.handshake = b""  # the server's response to the opening handshake, up to its end if it refuses
         self._max_message, self._on_message, self._on_end = max_message, on_message, on_end
         self._heard_at = time.monotonic()  # when the server last gave a sign of life [s]
-        self._probed = False  # whether the server has answered a request
-        self._pending: dict[str, tuple[Callable[[Reply], None], Callable[[Any], None] | None]] = {}
+        self._asked: dict[str, str] = {}  # id of each request of roslibpy's that waits -> the op of its response
         self._fragments, self._passed_over = Fragments(max_message), 0
         self._cut_by: Exception | None = None
-        self._watching: asyncio.Task[None] | None = None
 
     # ---- opening
 
@@ -140,64 +120,16 @@ class Connection(RosBridgeProtocol, WebSocketClientProtocol):  # type: ignore[mi
                 return
         super().data_received(data)
 
-    async def probe(self, within: float, timeout: float) -> None:
-        """Check `within` [s] that a rosbridge server answers, and learn its clock.
-
-        `NoServer` if it does not, with the `timeout` of the whole attempt [s].
-        """
-        try:
-            await asyncio.wait_for(self._probe(), within)
-        except asyncio.TimeoutError as error:
-            raise NoServer(
-                self.url,
-                f"a WebSocket server that answers no rosbridge request within {timeout:.1f} s. "
-                "Is it a rosbridge server, and is its ROS node alive?",
-            ) from error
-        self._probed = True
-
-    async def _probe(self) -> None:
-        best = math.inf
-        for probe in range(_CLOCK_PROBES):
-            asked = time.time()
-            now = read_clock(await self._ask_time(f"ready:{self.epoch}:{probe}"))
-            trip = time.time() - asked
-            if now is not None and trip < best:
-                best, self.ros, self.clock_offset = trip, now[0], asked + trip / 2 - now[1]
-            if self.ros is None:
-                return
-
-    async def _ask_time(self, identity: str) -> object:
-        # Any answer will do, even that there is no such service: it shows that the server's node works.
-        request = {"op": "call_service", "id": identity, "service": "/rosapi/get_time", "type": "rosapi/GetTime"}
-        answer: Future[Reply] = Future()
-        self.ask(identity, dump_json({**request, "args": {}}), answer.set_result)
-        reply = await asyncio.wrap_future(answer)
-        if isinstance(reply, RemoteError):
-            return None
-        if isinstance(reply, NoServer):
-            raise reply
-        if isinstance(reply, BamEnvsError):
-            reason = bare_reason(self.url, reply).removeprefix("the link dropped: ")
-            raise NoServer(self.url, f"closed the connection before it answered a request: {reason}.") from reply
-        values = reply.get("values")
-        if isinstance(values, str) and _DEAD_NODE in values:
-            raise NoServer(self.url, f"its ROS node has ended and its socket has not ({values}). Restart the bridge.")
-        return values
-
-    def watch(self, lost_after: float) -> None:
-        """End the connection when the server gives no sign of life for `lost_after` [s] from now on."""
-        if lost_after < math.inf:
-            self._heard_at = time.monotonic()
-            self._watching = asyncio.get_running_loop().create_task(self._watch(lost_after))
-
-    async def _watch(self, lost_after: float) -> None:
-        every = lost_after / _PINGS
+    async def watch(self, lost_after: float) -> None:
+        """Wait for the end of the connection, and end it when the server is silent for `lost_after` [s]."""
+        every, self._heard_at = lost_after / _PINGS, time.monotonic()
         while self.error is None:
             # A server that does not read its pending messages answers no ping either.
             if not self.transport.get_write_buffer_size():
                 self.sendPing()
             woken = time.monotonic() + min(every, max(0.0, self._heard_at + lost_after - time.monotonic()))
-            await asyncio.sleep(woken - time.monotonic())
+            with suppress(asyncio.TimeoutError):
+                await asyncio.wait_for(self.ended.wait(), woken - time.monotonic())
             now = time.monotonic()
             if now - woken > every:
                 self._heard_at = now  # this process itself was paused, and messages may be unread
@@ -217,19 +149,32 @@ class Connection(RosBridgeProtocol, WebSocketClientProtocol):  # type: ignore[mi
         send_now(self, self.url, down, self._max_message, *frames)
 
     def send_message(self, payload: bytes) -> None:
-        """Send an encoded message from any thread, as roslibpy's own protocols do."""
-        self.factory.loop.call_soon_threadsafe(tell, self.send, payload.decode())
+        """Send an encoded message of roslibpy's; on the network thread."""
+        self.send(payload.decode())
 
-    def ask(
-        self, identity: str, frame: str, took: Callable[[Reply], None], news: Callable[[Any], None] | None = None
-    ) -> None:
-        """Send a request; `took` gets the response or an error, `news` the feedback. Raises the errors of `send`."""
-        self.send(frame)
-        self._pending[identity] = took, news
+    def send_ros_service_request(self, message: Any, *hooks: Any) -> None:
+        """Call a service for roslibpy, or raise the errors of `send`; its end is an error of the call."""
+        self._ask("service_response", message, super().send_ros_service_request, *hooks)
 
-    def forget(self, identity: str) -> None:
-        """Stop waiting for an answer."""
-        self._pending.pop(identity, None)
+    def send_ros_action_goal(self, message: Any, *hooks: Any) -> None:
+        """Send a goal for roslibpy, or raise the errors of `send`; its end is an error of the goal."""
+        self._ask("action_result", message, super().send_ros_action_goal, *hooks)
+
+    def _ask(self, answer: str, message: Any, send: Callable[..., object], *hooks: Any) -> None:
+        dump_json(message)  # refuses what roslibpy would send: numbers that are not finite
+        send(message, *hooks)
+        self._asked[str(message["id"])] = answer
+
+    def _answer(self, message: dict[str, Any]) -> None:
+        """Give roslibpy a response to one of its requests."""
+        if (identity := str(message.get("id"))) in self._asked:
+            if message["op"] != "action_feedback":
+                del self._asked[identity]
+            tell(self.on_message, dump_json({"values": {}, **message}).encode())
+
+    def _fail(self, identity: str, text: str) -> None:
+        failure = {"op": self._asked[identity], "id": identity, "values": text, "result": False}
+        self._answer({**failure, "status": GoalStatus.UNKNOWN.value})
 
     # ---- ending
 
@@ -252,11 +197,8 @@ class Connection(RosBridgeProtocol, WebSocketClientProtocol):  # type: ignore[mi
             return
         self.error = error
         self._on_end(self, error)
-        pending, self._pending = self._pending, {}
-        for took, _ in pending.values():
-            tell(took, error)
-        if self._watching is not None and self._watching is not asyncio.current_task():
-            self._watching.cancel()
+        for identity in list(self._asked):
+            self._fail(identity, str(error))
         self.ended.set()
 
     def onCloseFrame(self, code: int | None, reason: bytes | None) -> bool | None:  # noqa: N802 - Autobahn's name
@@ -309,31 +251,18 @@ class Connection(RosBridgeProtocol, WebSocketClientProtocol):  # type: ignore[mi
             )
 
     def _dispatch(self, message: dict[str, Any]) -> None:
-        operation, identity = message.get("op"), str(message.get("id"))
-        if operation in ("service_response", "action_result"):
-            self._resolve(identity, message)
-        elif operation == "action_feedback":
-            news = self._pending.get(identity, (None, None))[1]
-            if news is not None:
-                tell(news, message.get("values"))
-        elif operation == "fragment":
+        operation = message.get("op")
+        if operation == "fragment":
             self._fragments.expire(self._heard_at)
             whole = self._fragments.add(message, self._heard_at)
             if whole is not None:
                 self._dispatch(decode_server_frame(whole.encode()))
-        # Only before the server is known: later, one of its requests may have an id like ours.
-        elif operation == "call_service" and not self._probed and identity in self._pending:
-            echo = NoServer(self.url, "an echo server: it sends back what it is sent. Is it the right port?")
-            self._resolve(identity, echo)
-        else:
-            # A server may answer a request that it cannot read only with a status of the same id.
-            if operation == "status" and message.get("level") == "error":
-                self._resolve(identity, RemoteError(str(message.get("msg"))))
-            self._on_message(self, message)
-
-    def _resolve(self, identity: str, reply: Reply) -> None:
-        if identity in self._pending:
-            tell(self._pending.pop(identity)[0], reply)
+            return
+        if operation in ("service_response", "action_result", "action_feedback"):
+            self._answer(message)
+        elif operation == "status" and message.get("level") == "error" and str(message.get("id")) in self._asked:
+            self._fail(str(message["id"]), str(message.get("msg")))
+        self._on_message(self, message)
 
 
 # ---- opening, and the reasons why there is no connection

@@ -5,8 +5,10 @@ the first unsubscribe.
 Longer than most files: what is declared, sent and answered shares one lock and one network thread.
 """
 
+import asyncio
 import itertools
 import logging
+import math
 import os
 import threading
 import time
@@ -19,7 +21,7 @@ from contextlib import suppress
 from functools import partial
 from typing import Any
 
-from bam_envs.core.errors import BamEnvsError, InvalidValue, LinkLost, ProtocolError, RemoteError
+from bam_envs.core.errors import BamEnvsError, InvalidValue, LinkLost, NoServer, ProtocolError, RemoteError
 from bam_envs.core.wording import brief
 from bam_envs.ros.interfaces import normal_name
 from bam_envs.ros.messages import write_stamp
@@ -36,17 +38,19 @@ _NAMES = {"advertise": ("id", "topic"), "subscribe": ("id", "topic"), "advertise
 _MOST_ANSWERING = 64  # requests of the server that are answered at the same time; more of them are refused
 _ENDED = "Timeout exceeded"  # servers' error for a call that they end; rosbridge from 2.2 on does so after 5 s
 _NEARLY = 0.9
+_CLOCK_PROBES = 3
+_DEAD_NODE = "context is invalid"  # answer of rosbridge_suite to every request after its node has shut down
 
 Reply = dict[str, Any] | BamEnvsError
 """The response to a request, or why there is none."""
 
 
-def bare_reason(url: str, error: BamEnvsError) -> str:
+def bare_reason(url: str, error: Exception) -> str:
     """The text of `error` without the address and the full stop, for a text that begins with the address."""
     return str(error).removeprefix(f"{url}: ").rstrip(".")
 
 
-def read_clock(values: object) -> tuple[str, float] | None:
+def _read_clock(values: object) -> tuple[str, float] | None:
     """``"ros1"`` or ``"ros2"``, and the time [s], in a response of ``/rosapi/get_time``; None if it has none."""
     now = values.get("time") if isinstance(values, Mapping) else None
     for ros, seconds, nanoseconds in (("ros2", "sec", "nanosec"), ("ros1", "secs", "nsecs")):
@@ -83,7 +87,7 @@ class RosBus(Bus):
         self._workers = Workers(_MOST_ANSWERING, f"bam-link-{name}-service")
         self._may_answer = threading.Semaphore(_MOST_ANSWERING)
         self._up: Any = None  # the present connection
-        self._announced: dict[str, str] = {}  # declarations sent on it: id of the declaration -> its frame
+        self._waiting: dict[str, Callable[[Reply], None]] = {}  # by id of the request that is not answered
         self._why = "not connected yet: call connect()"  # there is none
         self._closed = False
 
@@ -102,11 +106,9 @@ class RosBus(Bus):
     def _send(self, connection: Any, *frames: str) -> None:
         """Write frames to `connection` now, all or none; on the network thread."""
 
-    @abstractmethod
-    def _asking(
-        self, connection: Any, request: dict[str, Any], took: Callable[[Reply], None]
-    ) -> tuple[Callable[[], None], Callable[[], object]]:
-        """Two functions: one sends a request on the network thread, and its reply goes to `took`; one forgets it."""
+    def _ask(self, connection: Any, request: Message, frame: str) -> None:
+        """Send a request, whose `frame` is made already; its response goes to `_answered`; on the network thread."""
+        self._send(connection, frame)
 
     # ---- topics
 
@@ -179,14 +181,16 @@ class RosBus(Bus):
         self._require_process()
         topic, identity = request["topic"], f"{request['op']}:{request['topic']}"
         with self._lock:  # also around `_announce`, so that requests reach the network thread in order
-            known = self._declared.get(identity) or {**request, "id": identity}
+            before = self._declared.get(identity)
+            known = before or {**request, "id": identity}
             if known["type"] != normal_name(kind):
                 raise InvalidValue(f"Topic {topic!r} is of type {known['type']} here already; found {kind!r}.")
             wish = ("throttle_rate", "queue_length") if listener else ()
             self._declared[identity] = known = {**known, **{name: min(known[name], request[name]) for name in wish}}
             if listener:  # a new table each time, so that delivery can iterate over the old one without a lock
                 self._listeners[topic] = {**self._listeners.get(topic, {}), listener[0]: listener[1]}
-            self._announce(known)
+            if known != before:
+                self._announce(known)
 
     def _unsubscribe(self, topic: str, key: object) -> None:
         self._require_process()
@@ -248,14 +252,13 @@ class RosBus(Bus):
         if kind:
             request["type"] = normal_name(kind)
         response: Future[Reply] = Future()
-        ask, forget = self._asking(connection, request, response.set_result)
         try:
-            self._thread.do(ask, timeout)
+            self._thread.do(self._asking(connection, request, response.set_result), timeout)
             reply = response.result(begun + timeout - time.monotonic())
         except NoResultYet as error:
             raise LinkLost(f"{self.url}: {service} did not answer in {timeout:g} s; it may still be at it.") from error
         finally:
-            forget()
+            self._thread.post(partial(self._waiting.pop, request["id"], None))
         if isinstance(reply, BamEnvsError):
             raise reply
         return self._response(service, reply, time.monotonic() - begun, timeout)
@@ -265,7 +268,7 @@ class RosBus(Bus):
 
         Its reply, or why there is none, goes to `took` on the network thread. `LinkLost` if the link is down.
         """
-        ask, _ = self._asking(self._require_up(), request, took)
+        ask = self._asking(self._require_up(), request, took)
 
         def send() -> None:
             try:
@@ -274,6 +277,20 @@ class RosBus(Bus):
                 tell(took, error)
 
         self._thread.post(send)
+
+    def _asking(self, connection: Any, request: Message, took: Callable[[Reply], None]) -> Callable[[], None]:
+        """A function for the network thread that sends a request; its reply goes to `took`."""
+        identity, frame = str(request["id"]), dump_json(request)
+
+        def ask() -> None:
+            self._ask(connection, request, frame)
+            self._waiting[identity] = took
+
+        return ask
+
+    def _answered(self, identity: str, reply: Reply) -> None:
+        if identity in self._waiting:
+            tell(self._waiting.pop(identity), reply)
 
     def _response(self, service: str, reply: Mapping[str, Any], waited: float, timeout: float) -> dict[str, Any]:
         values = reply.get("values")
@@ -321,26 +338,52 @@ class RosBus(Bus):
         """A time [s] in the server's spelling; in that of ROS 2 if it is not known."""
         return write_stamp(t, ros1=self.ros == "ros1")
 
-    def _announce(self, request: dict[str, Any]) -> None:
-        """Send `request` if there is a connection; the next one gets all declarations anyway."""
-        self._thread.post(partial(self._tell, request["id"], dump_json(request)))
+    async def _learn_clock(self, connection: Any) -> None:
+        """Ask the server for its time, and take its clock and its spelling from the quickest of the answers."""
+        best, self.clock_offset = math.inf, None
+        for number in range(_CLOCK_PROBES):
+            response: asyncio.Future[Reply] = asyncio.get_running_loop().create_future()
+            # Any answer will do, even that there is no such service: it shows that the server's node works.
+            request = {"op": "call_service", "id": f"ready:{number}", "service": "/rosapi/get_time"}
+            asked = time.time()
+            try:
+                self._asking(connection, {**request, "type": "rosapi/GetTime", "args": {}}, response.set_result)()
+                reply = await response
+            finally:
+                self._waiting.pop(request["id"], None)
+            trip = time.time() - asked
+            if isinstance(reply, BamEnvsError) and not isinstance(reply, RemoteError):
+                raise reply
+            values = None if isinstance(reply, BamEnvsError) else reply.get("values")
+            if isinstance(values, str) and _DEAD_NODE in values:
+                raise NoServer(
+                    self.url, f"its ROS node has ended and its socket has not ({values}). Restart the bridge."
+                )
+            if (now := _read_clock(values)) is None:
+                return
+            if trip < best:
+                best, self.ros, self.clock_offset = trip, now[0], asked + trip / 2 - now[1]
 
-    def _tell(self, identity: str, frame: str) -> None:
-        if self._up is None or self._announced.get(identity) == frame:
-            return
-        self._announced[identity] = frame
-        try:
-            self._send(self._up, frame)
-        except LinkLost as error:
-            _LOG.warning("%s was not declared: %s", identity, error)
+    def _announce(self, request: dict[str, Any]) -> None:
+        """Send `request`, in the lock, if there is a connection; the next one gets all declarations anyway."""
+        connection, frame = self._up, dump_json(request)
+
+        def send() -> None:
+            try:
+                self._send(connection, frame)
+            except LinkLost as error:
+                _LOG.info("%s was not declared: %s", request["id"], error)
+
+        if connection is not None:
+            self._thread.post(send)
 
     def _begin(self, connection: Any) -> None:
         """Declare everything to a new connection, and use it from now on; on the network thread."""
-        with self._lock:
-            self._announced = {name: dump_json(request) for name, request in self._declared.items()}
-        self._send(connection, *self._announced.values())
-        with self._changed:
+        with self._lock:  # what is declared a moment later is sent behind it
+            self._send(connection, *map(dump_json, self._declared.values()))
+            self.epoch += 1
             self._up = connection
+        with self._changed:
             self._changed.notify_all()
 
     def _farewell(self, *operations: str) -> list[str]:
@@ -349,9 +392,12 @@ class RosBus(Bus):
         return [dump_json({"op": f"un{one['op']}", **{name: one[name] for name in _NAMES[one["op"]]}}) for one in gone]
 
     def _note_down(self, error: BamEnvsError) -> None:
-        self._up, self._why = None, bare_reason(self.url, error)
-        for callback in self._down_callbacks:
-            tell(callback, LinkLost(str(error)))
+        if self._up is not None:
+            self._up, self._why = None, bare_reason(self.url, error)
+            for callback in self._down_callbacks:
+                tell(callback, LinkLost(str(error)))
+        for identity in list(self._waiting):
+            self._answered(identity, error)
 
     def _require_up(self) -> Any:
         self._require_process()

@@ -1,8 +1,9 @@
 """A link over a `roslibpy.Ros` of other code, which connects it, reconnects it and closes it."""
 
+import asyncio
 import os
-import time
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import TimeoutError as NoAnswer
 from contextlib import suppress
 from functools import partial
 from typing import Any
@@ -11,13 +12,12 @@ from roslibpy import Message as Request
 from roslibpy import Ros
 from roslibpy.comm import select_factory
 
-from bam_envs.core.errors import InvalidValue, LinkLost, NoServer, RemoteError
+from bam_envs.core.errors import InvalidValue, LinkLost, NoServer
 from bam_envs.core.wording import brief
 from bam_envs.rosbridge.bus import Handler, Message, tell
 from bam_envs.rosbridge.client_connection import TWISTED, send_now
-from bam_envs.rosbridge.encoding import dump_json
 from bam_envs.rosbridge.endpoint import Endpoint
-from bam_envs.rosbridge.ros_bus import SEND_WITHIN, Reply, RosBus, read_clock
+from bam_envs.rosbridge.ros_bus import SEND_WITHIN, Reply, RosBus
 
 _MAX_MESSAGE = 64 * 1024 * 1024
 _ANSWER_WITHIN = 3.0
@@ -44,7 +44,6 @@ class UserRosLink(RosBus):
         address = endpoint_of(ros).address
         super().__init__(address.url, address.namespace, "roslibpy")
         self._ros = ros
-        self._waiting: set[Callable[[Reply], None]] = set()  # for replies
         self._has_asked = False  # since the last message was published
         self._hooks: dict[str, Callable[[Any], None]] = {  # by event of roslibpy's; a topic and a service is one, too
             "ready": partial(tell, self._begin),
@@ -60,12 +59,12 @@ class UserRosLink(RosBus):
             raise NoServer(self.url, "the roslibpy.Ros is not connected: call its run() before.")
         self._thread.loop = self._ros.factory.manager.loop
         self._thread.do(self._attach)
-        self._require_up()
-        asked = time.time()
-        with suppress(RemoteError):
-            now = read_clock(self.call("/rosapi/get_time", "rosapi/GetTime", {}, _ANSWER_WITHIN))
-            if now is not None:
-                self.ros, self.clock_offset = now[0], (asked + time.time()) / 2 - now[1]
+        learning = asyncio.run_coroutine_threadsafe(self._learn_clock(self._require_up()), self._thread.loop)
+        try:
+            learning.result(_ANSWER_WITHIN)
+        except NoAnswer as error:
+            learning.cancel()
+            raise LinkLost(f"{self.url}: /rosapi/get_time did not answer in {_ANSWER_WITHIN:g} s.") from error
 
     def close(self) -> None:
         """Stop using `ros`, which stays connected. Idempotent; does nothing in a forked child."""
@@ -110,29 +109,21 @@ class UserRosLink(RosBus):
         if self._thread.loop is not None:
             self._ros.on(event, hook)
 
-    def _asking(
-        self, connection: Any, request: dict[str, Any], took: Callable[[Reply], None]
-    ) -> tuple[Callable[[], None], Callable[[], object]]:
-        dump_json(request)  # refuses what roslibpy would send: numbers that are not finite
+    def _ask(self, connection: Any, request: Message, frame: str) -> None:
         is_goal = request["op"] == "send_action_goal"
 
         def back(result: bool, values: Any) -> None:
-            if took in self._waiting:
-                self._waiting.discard(took)
-                reply = {"result": result, "values": values["values"] if is_goal else values}
-                reply |= {"status": values["status"].value} if is_goal else {}
-                took({name: dict(one) if isinstance(one, Mapping) else one for name, one in reply.items()})
+            reply = {"result": result, "values": values["values"] if is_goal else values}
+            reply |= {"status": values["status"].value} if is_goal else {}
+            plain = {name: dict(one) if isinstance(one, Mapping) else one for name, one in reply.items()}
+            self._answered(request["id"], plain)
 
-        def ask() -> None:
-            self._send(connection)
-            self._waiting.add(took)
-            done, failed = partial(back, True), partial(back, False)
-            if is_goal:
-                connection.send_ros_action_goal(Request(request), done, lambda news: None, failed)
-            else:
-                connection.send_ros_service_request(Request(request), done, failed)
-
-        return ask, lambda: self._waiting.discard(took)
+        self._send(connection)
+        done, failed = partial(back, True), partial(back, False)
+        if is_goal:
+            connection.send_ros_action_goal(Request(request), done, lambda news: None, failed)
+        else:
+            connection.send_ros_service_request(Request(request), done, failed)
 
     # ---- the network thread
 
@@ -143,10 +134,6 @@ class UserRosLink(RosBus):
         if self._ros.is_connected:
             self._ros.factory.on_ready(self._hooks["ready"])
 
-    def _begin(self, connection: Any) -> None:
-        self.epoch += 1
-        super()._begin(connection)
-
     def _send(self, connection: Any, *frames: str) -> None:
         send_now(connection, self.url, "", _MAX_MESSAGE, *frames)
 
@@ -155,12 +142,7 @@ class UserRosLink(RosBus):
             self._answer(self._up, dict(request))
 
     def _note_close(self, connection: Any) -> None:
-        error = LinkLost(f"{self.url}: the link dropped: the connection of the roslibpy.Ros was closed.")
-        if self._up is not None:
-            self._note_down(error)
-        waiting, self._waiting = self._waiting, set()
-        for took in waiting:
-            tell(took, error)
+        self._note_down(LinkLost(f"{self.url}: the link dropped: the connection of the roslibpy.Ros was closed."))
 
     def _leave(self) -> None:
         for event, hook in self._hooks.items():

@@ -173,11 +173,14 @@ def test_a_controller_that_holds_gets_set_points_between_commands(server, robot_
     for _ in range(4):
         state = gate.step(command)
     np.testing.assert_array_equal(state.command, command)
+    # Holds come over another connection, and may overtake set points.
+    scripted.wait_for(lambda: len(scripted.on(JOINT_COMMANDS)) == 4 * 10)
+    points = np.array([message["data"] for message in scripted.on(JOINT_COMMANDS)])
     robot.halt()
-    # Holds follow the halt: the gripper's after its four commands, then the arm's.
-    scripted.wait_for(lambda: len(scripted.on(GRIPPER_COMMANDS)) == 5 and scripted.commands[-1][0] == JOINT_COMMANDS)
-    points = np.array([message["data"] for message in scripted.on(JOINT_COMMANDS)])[:-1]  # the last one holds
-    assert len(points) == 4 * 10
+    # The gripper's hold follows its four commands, and then comes the arm's.
+    scripted.wait_for(
+        lambda: len(scripted.on(GRIPPER_COMMANDS)) == 5 and len(scripted.on(JOINT_COMMANDS)) == 4 * 10 + 1
+    )
     # Each command begins a cubic that ends at rest two periods later, of which one is driven: a little beyond the goal.
     way = points[:, 0] - start[0]
     np.testing.assert_allclose(way[9::10], [0.1, 0.1875, 0.203125, 0.2015625], atol=1e-9)
