@@ -16,7 +16,21 @@ from bam_envs.core.errors import InvalidValue, UnknownName
 from bam_envs.core.kinematics import ArmGeometry
 from bam_envs.core.robot import RobotSpec, SignalSpec
 from bam_envs.core.robot_models import Description, find_model
-from bam_envs.core.validation import Finite, Length, Mass, Metres, NonEmpty, NonNegative, NonNegativeInt, Positive
+from bam_envs.core.validation import (
+    Finite,
+    Length,
+    Mass,
+    Metres,
+    MetresPerS,
+    NewtonMetres,
+    Newtons,
+    NonEmpty,
+    NonNegative,
+    NonNegativeInt,
+    RadPerS,
+    RadPerS2,
+    RadPerS3,
+)
 
 Array = NDArray[np.float64]
 Vector = tuple[Metres, Metres, Metres]
@@ -63,13 +77,13 @@ class JointRow(Placed):
     """Lowest position [rad]."""
     high: Finite
     """Highest position [rad]."""
-    velocity: Positive
+    velocity: RadPerS
     """Fastest motion [rad/s]."""
-    acceleration: Positive
+    acceleration: RadPerS2
     """Greatest acceleration [rad/s^2]."""
-    jerk: Positive
+    jerk: RadPerS3
     """Greatest jerk [rad/s^3]."""
-    effort: Positive
+    effort: NewtonMetres
     """Greatest torque [N m]."""
     mass: Mass
     """Mass of the link [kg]."""
@@ -86,9 +100,9 @@ class Gripper:
 
     open: Length
     """Width between the pads when it is open [m]."""
-    speed: Positive = 0.1
+    speed: MetresPerS = 0.1
     """Fastest change of the width [m/s]."""
-    force: Positive = 40.0
+    force: Newtons = 40.0
     """Force between the pads in simulation [N]."""
     mass: Mass = 0.5
     """Mass [kg]."""

@@ -22,7 +22,7 @@ from msgspec import Meta
 from bam_envs.core.errors import BamEnvsError, InvalidValue, UnknownName
 from bam_envs.core.location import config_folder
 from bam_envs.core.registry import resolve
-from bam_envs.core.validation import NonEmpty, check, read_table, type_hints
+from bam_envs.core.validation import DATA_SHEET, NonEmpty, Positive, check, read_table, type_hints
 
 tomllib: Any = importlib.import_module("tomllib" if sys.version_info >= (3, 11) else "tomli")
 
@@ -109,8 +109,11 @@ def _in_text(text: str, where: str) -> Description:
     return description_of(table, where)
 
 
-def description_of(table: Mapping[str, Any], where: str) -> Description:
-    """The description in `table`, with the tables in it; `where` begins errors. What has a drive is a base."""
+def description_of(table: Mapping[str, Any], where: str, *, saved: bool = False) -> Description:
+    """The description in `table`, with the tables in it; `where` begins errors. What has a drive is a base.
+
+    One that was `saved` with a policy may have limits that are greater than any robot's: such were once described.
+    """
     kind: type[Description] = resolve(_BASE if {"drive", "footprint", "lasers"} & table.keys() else _ARM)
     read, hints = dict(table), type_hints(kind)
     for key, part in kind.PARTS.items():
@@ -118,16 +121,17 @@ def description_of(table: Mapping[str, Any], where: str) -> Description:
             continue
         if get_origin(hints[key]) is tuple:
             rows = check(read[key], list[dict[str, Any]], f"{where}: {key}")
-            read[key] = tuple(_read(part, row, f"{where}: {key}[{at}]") for at, row in enumerate(rows))
+            read[key] = tuple(_read(part, row, f"{where}: {key}[{at}]", saved) for at, row in enumerate(rows))
         else:
-            read[key] = _read(part, read[key], f"{where}: {key}")
-    return _read(kind, read, where)
+            read[key] = _read(part, read[key], f"{where}: {key}", saved)
+    return _read(kind, read, where, saved)
 
 
-def _read(kind: type[T], table: object, where: str) -> T:
+def _read(kind: type[T], table: object, where: str, saved: bool) -> T:
     """`read_table`; also an error in what several values mean together begins with `where`."""
+    hints = {key: Positive if saved and hint in DATA_SHEET else hint for key, hint in type_hints(kind).items()}
     try:
-        return read_table(kind, table, where)
+        return read_table(kind, table, where, hints=hints)
     except BamEnvsError as error:
         text = str(error)
         raise InvalidValue(text if text.startswith(where) else f"{where}: {text}") from error
@@ -204,7 +208,7 @@ def portable_model(name: "str | Mapping[str, Any] | Description") -> str | dict[
 def _in_table(table: Mapping[str, Any]) -> Description:
     """The description in a table of a checkpoint; `InvalidValue` if it is not the one with its digest."""
     plain = {key: value for key, value in table.items() if key != "digest"}
-    robot = description_of(plain, "robot_model")
+    robot = description_of(plain, "robot_model", saved="digest" in table)
     if "digest" in table and table["digest"] != robot.digest:
         raise InvalidValue(f"robot_model: the description of {robot.name} was changed: it does not have its digest.")
     return robot

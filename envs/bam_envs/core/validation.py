@@ -41,6 +41,15 @@ Port = Annotated[int, Meta(ge=0, le=65535)]
 Metres = Annotated[float, Meta(ge=-10, le=10, description="a number of metres from -10 to 10")]
 Length = Annotated[float, Meta(gt=0, le=10, description="a number of metres above 0 and of at most 10")]
 Mass = Annotated[float, Meta(gt=0, le=1000, description="a number of kilograms above 0 and of at most 1000")]
+MetresPerS = Annotated[float, Meta(gt=0, le=20, description="a data sheet's m/s, above 0 and at most 20")]
+MetresPerS2 = Annotated[float, Meta(gt=0, le=100, description="a data sheet's m/s^2, above 0 and at most 100")]
+RadPerS = Annotated[float, Meta(gt=0, le=50, description="a data sheet's rad/s, above 0 and at most 50")]
+RadPerS2 = Annotated[float, Meta(gt=0, le=1e4, description="a data sheet's rad/s^2, above 0 and at most 10000")]
+RadPerS3 = Annotated[float, Meta(gt=0, le=1e6, description="a data sheet's rad/s^3, above 0 and at most 1000000")]
+Newtons = Annotated[float, Meta(gt=0, le=5000, description="a data sheet's N, above 0 and at most 5000")]
+NewtonMetres = Annotated[float, Meta(gt=0, le=5000, description="a data sheet's N m, above 0 and at most 5000")]
+DATA_SHEET = frozenset((MetresPerS, MetresPerS2, RadPerS, RadPerS2, RadPerS3, Newtons, NewtonMetres))
+"""The limits of robots, none of which is greater."""
 RobotName = Annotated[
     str,
     Meta(
@@ -69,7 +78,7 @@ def check(value: Any, kind: Any, name: str, error: type[Exception] = InvalidValu
     try:
         return msgspec.convert(value, kind)
     except msgspec.ValidationError:
-        if isinstance(value, float) and value.is_integer() and _fits(int(value), kind):
+        if isinstance(value, float) and value.is_integer() and fits(int(value), kind):
             return int(value)
     place, part, wanted = _misfit(value, kind, name)
     raise error(f"{place}: expected {expected(wanted)}, found {brief(part)}")
@@ -90,7 +99,14 @@ def check_fields(instance: Any, name: Callable[[str], str] = str, error: type[Ex
         check(getattr(instance, field), hint, name(field), error)
 
 
-def read_table(kind: type[T], data: object, where: str, error: type[Exception] = InvalidValue) -> T:
+def read_table(
+    kind: type[T],
+    data: object,
+    where: str,
+    error: type[Exception] = InvalidValue,
+    *,
+    hints: Mapping[str, Any] | None = None,
+) -> T:
     """The dataclass `kind` with the values of the table `data` from TOML, YAML or JSON.
 
     Args:
@@ -98,11 +114,12 @@ def read_table(kind: type[T], data: object, where: str, error: type[Exception] =
         data: The table.
         where: File and table, with which the error begins.
         error: Exception to raise.
+        hints: The annotation of each field, where those of `kind` do not count.
 
     Raises:
         error: `data` is not a table, a key is unknown (with the closest match) or missing, or a value does not fit.
     """
-    table, hints = check(data, dict[str, Any], where, error), type_hints(kind)
+    table, hints = check(data, dict[str, Any], where, error), hints or type_hints(kind)
     check_keys(table, hints, where, error)
     for field in fields(kind):  # type: ignore[arg-type]
         if field.name not in table and field.default is MISSING and field.default_factory is MISSING:
@@ -186,7 +203,8 @@ def _plural(text: str) -> str:
     return f"{text[: noun.start()].removeprefix('a ')}{noun[0]}s{text[noun.end() :]}"
 
 
-def _fits(value: object, kind: Any) -> bool:
+def fits(value: object, kind: Any) -> bool:
+    """Whether `value` is a `kind`, a type or annotation."""
     try:
         msgspec.convert(value, kind)
     except msgspec.ValidationError:
@@ -197,7 +215,7 @@ def _fits(value: object, kind: Any) -> bool:
 def _misfit(value: Any, kind: Any, name: str) -> tuple[str, Any, Any]:
     """The innermost part of `value` that does not fit `kind`: its place, itself, what it should be."""
     for place, part, wanted in _parts(value, kind, name):
-        if not _fits(part, wanted):
+        if not fits(part, wanted):
             return _misfit(part, wanted, place)
     return name, value, kind
 

@@ -12,7 +12,18 @@ from msgspec import Meta
 from bam_envs.core.errors import InvalidValue
 from bam_envs.core.robot import BaseBody, RobotSpec, Scanner, SignalSpec
 from bam_envs.core.robot_models import Description, find_model
-from bam_envs.core.validation import Finite, NonEmpty, NonNegative, NonNegativeInt, Positive
+from bam_envs.core.validation import (
+    Finite,
+    Length,
+    MetresPerS,
+    MetresPerS2,
+    NonEmpty,
+    NonNegative,
+    NonNegativeInt,
+    Positive,
+    RadPerS,
+    RadPerS2,
+)
 
 Point = tuple[Finite, Finite]
 Beams = Annotated[int, Meta(ge=2, le=4096)]
@@ -31,11 +42,11 @@ _FAR = (1000.0, 1000.0, math.pi)
 class Footprint:
     """What a base covers of the floor: a circle, a rectangle or a convex polygon."""
 
-    radius: Positive | None = None
+    radius: Length | None = None
     """Radius of a circle [m]."""
-    length: Positive | None = None
+    length: Length | None = None
     """Length of a rectangle, along x [m]."""
-    width: Positive | None = None
+    width: Length | None = None
     """Width of a rectangle [m]."""
     ahead: Finite = 0.0
     """Distance of the middle of a circle or a rectangle ahead of the base's frame [m]."""
@@ -78,15 +89,15 @@ class DriveRow:
     """How a base drives, and how fast."""
 
     kind: Literal["differential", "omnidirectional"] = "differential"
-    speed: Positive
+    speed: MetresPerS
     """Maximum speed forwards and backwards [m/s]."""
-    turn: Positive
+    turn: RadPerS
     """Maximum turning speed [rad/s]."""
-    acceleration: Positive
+    acceleration: MetresPerS2
     """Maximum acceleration [m/s^2]."""
-    turn_acceleration: Positive
+    turn_acceleration: RadPerS2
     """Maximum turning acceleration [rad/s^2]."""
-    sideways: Positive | None = None
+    sideways: MetresPerS | None = None
     """Maximum speed sideways [m/s]; None: that of an omnidirectional drive is `speed`."""
 
     def __post_init__(self) -> None:
@@ -104,7 +115,7 @@ class LaserRow:
     """Name of the signal of its ranges."""
     pose: tuple[Finite, Finite, Finite] = (0.0, 0.0, 0.0)
     """x, y [m] and yaw [rad] in the base's frame."""
-    height: Positive = 0.2
+    height: Length = 0.2
     """Of its rays above the floor [m]."""
     range: tuple[NonNegative, Positive]
     """Least and greatest range that is measured [m]."""
@@ -169,7 +180,7 @@ class BaseDescription(Description):
     footprint: Footprint
     drive: DriveRow
     lasers: tuple[LaserRow, ...] = ()
-    height: Positive = 0.3
+    height: Length = 0.3
     """Height, for pictures [m]."""
 
     def __post_init__(self) -> None:

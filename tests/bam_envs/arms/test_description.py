@@ -13,7 +13,7 @@ from bam_envs.arms.capsules import Outline, fitted_capsules, segment_distances
 from bam_envs.arms.description import ArmDescription, robot_model
 from bam_envs.core import robot_models
 from bam_envs.core.errors import InvalidValue, UnknownName
-from bam_envs.core.robot_models import known_models, read_description
+from bam_envs.core.robot_models import known_models, portable_model, read_description
 from bam_envs.robots.profile import load_profile
 
 SHIPPED = known_models(ArmDescription)
@@ -134,6 +134,36 @@ def test_signals_are_the_arms_own():
             "mass = 1e9",
             "gripper: mass: expected a number of kilograms above 0 and of at most 1000, found 1000000000.0",
         ),
+        (
+            "velocity = 4.7",
+            "velocity = 1e9",
+            "joints[0]: velocity: expected a data sheet's rad/s, above 0 and at most 50, found 1000000000.0",
+        ),
+        (
+            "acceleration = 20.0",
+            "acceleration = 1e9",
+            "joints[0]: acceleration: expected a data sheet's rad/s^2, above 0 and at most 10000, found 1000000000.0",
+        ),
+        (
+            "jerk = 200.0",
+            "jerk = 1e9",
+            "joints[0]: jerk: expected a data sheet's rad/s^3, above 0 and at most 1000000, found 1000000000.0",
+        ),
+        (
+            "effort = 2.9",
+            "effort = 1e6",
+            "joints[0]: effort: expected a data sheet's N m, above 0 and at most 5000, found 1000000.0",
+        ),
+        (
+            r"speed = 0[.]\S*",
+            "speed = 0,",
+            "gripper: speed: expected a data sheet's m/s, above 0 and at most 20, found 0",
+        ),
+        (
+            r"force = \S*",
+            "force = 1e9,",
+            "gripper: force: expected a data sheet's N, above 0 and at most 5000, found 1000000000.0",
+        ),
         (r"gripper = \{.*", "gripper = 3", "gripper: expected a table of named values, found 3"),
         ("joints = .", "joints = 3\nlegs = [", "joints: expected a list of tables of named values, found 3"),
         (r"\[\[0.161,", "[[0.361,", "so101: workspace: the lowest corner must come first."),
@@ -233,6 +263,16 @@ def test_a_file_and_a_description_are_taken_as_they_are(tmp_path):
     assert robot_model(arm) is arm
     path.write_text(SO101.replace("open = 0.05", "open = 0.04"), encoding="utf-8")
     assert robot_model(str(path)).gripper.open == 0.04, "a file that was changed is read again"
+
+
+def test_an_arm_that_was_saved_with_a_policy_keeps_the_placeholder_that_stood_for_a_limit():
+    arm = robot_model("so101")
+    fast = replace(arm, joints=(replace(arm.joints[0], velocity=1000.0, effort=1e6), *arm.joints[1:]))
+    table = portable_model(fast)
+    assert robot_model(table) == fast
+    del table["digest"]
+    with pytest.raises(InvalidValue, match=r"^robot_model: joints\[0\]: velocity: expected a data sheet's rad/s, "):
+        robot_model(table)
 
 
 def test_what_changes_how_an_arm_moves_changes_its_digest(read):

@@ -73,7 +73,14 @@ def changed(*keys, **values):
             changed("drive", kind="tracks"),
             ": drive: kind: expected 'differential' or 'omnidirectional', found",
         ),
-        (changed("drive", speed=-1.0), ": drive: speed: expected a number above 0, found -1.0"),
+        (
+            changed("drive", speed=-1.0),
+            ": drive: speed: expected a data sheet's m/s, above 0 and at most 20, found -1.0",
+        ),
+        (
+            changed("drive", acceleration=1e9),
+            ": drive: acceleration: expected a data sheet's m/s^2, above 0 and at most 100, found 1000000000.0",
+        ),
         (changed("drive", turn=None), ": drive: the key 'turn' is missing"),
         (
             changed("drive", kind="differential"),

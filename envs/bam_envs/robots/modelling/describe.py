@@ -12,7 +12,7 @@ from bam_envs.arms.description import ArmDescription, Gripper, JointRow, Placed,
 from bam_envs.arms.serial_chain import Capsule, SerialChain
 from bam_envs.arms.work_area import find_work_area
 from bam_envs.core.errors import InvalidValue
-from bam_envs.core.validation import check_fields
+from bam_envs.core.validation import NewtonMetres, RadPerS, check_fields, fits
 from bam_envs.robots.modelling.model_files import Array, ReadArm, Shapes, read_arm
 
 SPEED, ACCELERATION, JERK = 1.5, 6.0, 120.0
@@ -57,7 +57,7 @@ def describe(
     reach = float(np.linalg.norm(read.placements[:, :3, 3], axis=1).sum())
     if not 0.15 < reach < _FARTHEST:
         raise InvalidValue(f"{model}: the arm is {reach:.3g} m long; are its lengths in metres?")
-    joints = _joints(read)
+    joints = joint_rows(read)
     for row in joints:
         check_fields(row, lambda key, row=row: f"{model}: {row.name}: {key}")  # type: ignore[misc]
     tool = _placed(read.tool)
@@ -258,18 +258,19 @@ def postures(chain: SerialChain, seed: int = 0) -> Array:
     return q
 
 
-def _joints(read: ReadArm) -> tuple[JointRow, ...]:
-    """The joints, with defaults for the limits that the files do not name."""
-    rows, size = [], len(read.names)
+def joint_rows(read: ReadArm) -> tuple[JointRow, ...]:
+    """The joints, with defaults for the limits that the files do not name, each with a note."""
+    rows, size, slow = [], len(read.names), dict[str, list[str]]()
     lengths = np.linalg.norm(read.placements[:, :3, 3], axis=1)
     for at, name in enumerate(read.names):
         placed = _placed(read.placements[at])
         beyond = float(lengths[at + 1 :].sum() + np.linalg.norm(read.tool[:3, 3]))
         effort, velocity = read.effort[at], read.velocity[at]
-        if effort is None:
-            effort = round(EFFORT_PER_REACH * max(beyond, 0.1), 1)
-            read.notes.append(f"{name}: no torque in the files, so {effort:g} N m")
-        if velocity is None:
+        if effort is None or not fits(effort, NewtonMetres):
+            why, effort = _why("torque", effort, "N m"), round(EFFORT_PER_REACH * max(beyond, 0.1), 1)
+            read.notes.append(f"{name}: {why}, so {effort:g} N m")
+        if velocity is None or not fits(velocity, RadPerS):
+            slow.setdefault(_why("speed", velocity, "rad/s"), []).append(name)
             velocity = SPEED
         axis = tuple(round(float(one), 9) + 0.0 for one in read.axes[at])
         rows.append(
@@ -287,14 +288,18 @@ def _joints(read: ReadArm) -> tuple[JointRow, ...]:
                 mass=round(read.mass[at], 3),
             )
         )
-    slow = [name for name, velocity in zip(read.names, read.velocity, strict=True) if velocity is None]
-    if slow:
-        which = f"all {size} joints" if len(slow) == size else ", ".join(slow)
-        read.notes.append(f"{which}: no speed in the files, so {SPEED:g} rad/s")
+    for why, names in slow.items():
+        which = f"all {size} joints" if len(names) == size else ", ".join(names)
+        read.notes.append(f"{which}: {why}, so {SPEED:g} rad/s")
     read.notes.append(
         f"all {size} joints: no acceleration or jerk in the files, so {ACCELERATION:g} rad/s^2, {JERK:g} rad/s^3"
     )
     return tuple(rows)
+
+
+def _why(what: str, found: float | None, unit: str) -> str:
+    """Why a limit in the files does not count."""
+    return f"no {what} in the files" if found is None else f"the {what} of {found:g} {unit} in the files is no limit"
 
 
 def _placed(matrix: Array) -> Placed:

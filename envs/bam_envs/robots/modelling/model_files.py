@@ -10,7 +10,7 @@ import math
 import re
 import tempfile
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from difflib import get_close_matches
 from pathlib import Path
@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bam_envs.core.errors import InvalidValue, MissingExtra, UnknownName
+from bam_envs.core.validation import NewtonMetres, RadPerS, fits
 from bam_envs.core.wording import closest, did_you_mean
 from bam_envs.robots.modelling.mesh_parts import model_in_parts
 from bam_envs.robots.physics.mujoco_batch import mujoco
@@ -67,6 +68,7 @@ class ReadArm:
     high: list[float]
     velocity: list[float | None]
     effort: list[float | None]
+    """None where the files have no limit; one that is greater than a joint's can be is a placeholder."""
     mass: list[float]
     points: list[Array]
     """Points of each link in its frame [m]: base, then what each joint turns."""
@@ -215,9 +217,14 @@ def _urdf(path: Path, folder: str) -> tuple[str, dict[str, tuple[float | None, f
             low, high, *given = (_number(path, name, limit, key) for key in ("lower", "upper", "velocity", "effort"))
             if low > high:
                 raise InvalidValue(f"{path}: {name}: its lower limit {low:g} is above its upper limit {high:g}.")
-            speed, effort = (value if 0.0 < value < np.inf else None for value in given)
-            limits[name] = speed, effort
+            limits[name] = _believable(given[:1], RadPerS), _believable(given[1:], NewtonMetres)
     return ElementTree.tostring(root, encoding="unicode"), limits
+
+
+def _believable(limits: Sequence[float | None], kind: Any) -> float | None:
+    """The first of `limits` of a joint that is a `kind`, else the first that is too great for one, else None."""
+    given = [one for one in limits if one is not None and 0.0 < one < np.inf]
+    return next((one for one in given if fits(one, kind)), next(iter(given), None))
 
 
 def _parsed(text: str) -> ElementTree.Element:
@@ -579,7 +586,7 @@ class _Reader:
                 elif model.actuator_gaintype[actuator] == 0 and model.actuator_biastype[actuator] == 0:
                     ranges.append(model.actuator_ctrlrange[actuator])
         efforts = [self._limits.get(name, (None, None))[1], *(float(np.abs(one).max()) for one in ranges)]
-        return next((one for one in efforts if one is not None and 0.0 < one < np.inf), None)
+        return _believable(efforts, NewtonMetres)
 
     def _owners(self, joints: list[int]) -> NDArray[np.int64]:
         """For each body the link it is fixed to: 0 the base, k what joint k turns, k + 1 the gripper, -1 other."""

@@ -12,7 +12,7 @@ from bam_envs.arms.capsules import Outline
 from bam_envs.arms.work_area import covers
 from bam_envs.core.errors import InvalidValue, UnknownName
 from bam_envs.core.robot_models import read_description
-from bam_envs.robots.modelling.describe import as_toml, describe
+from bam_envs.robots.modelling.describe import as_toml, describe, joint_rows
 from bam_envs.robots.modelling.model_files import read_arm
 from bam_envs.tasks.scripted import scripted_policy
 from tests.bam_envs.making import solved
@@ -606,13 +606,28 @@ def test_a_joint_that_turns_without_end_is_noted(tmp_path):
     assert read.notes[0] == "w3 turns without end: its limits are +-2 pi"
 
 
-@pytest.mark.parametrize(("speed", "effort"), [("0", None), ("-2.5", 2.5), ("inf", None)])
-def test_a_speed_of_nothing_is_not_taken(tmp_path, speed, effort):
+@pytest.mark.parametrize(
+    ("given", "effort", "notes"),
+    [
+        ("0", 70.7, ["pan: no torque in the files, so 70.7 N m", "pan: no speed in the files, so 1.5 rad/s"]),
+        ("-2.5", 2.5, ["pan: no speed in the files, so 1.5 rad/s"]),
+        ("inf", 70.7, ["pan: no torque in the files, so 70.7 N m", "pan: no speed in the files, so 1.5 rad/s"]),
+        (
+            "1e6",
+            70.7,
+            [
+                "pan: the torque of 1e+06 N m in the files is no limit, so 70.7 N m",
+                "pan: the speed of 1e+06 rad/s in the files is no limit, so 1.5 rad/s",
+            ],
+        ),
+    ],
+)
+def test_a_speed_and_a_torque_that_say_nothing_are_not_taken(tmp_path, given, effort, notes):
     path = tmp_path / "lab.urdf"
-    path.write_text(six_joints().replace('velocity="2.5" effort="80"', f'velocity="{speed}" effort="{speed}"', 1))
+    path.write_text(six_joints().replace('velocity="2.5" effort="80"', f'velocity="{given}" effort="{given}"', 1))
     read = read_arm(str(path), GRIPPER, None)
-    assert read.velocity == [None, *[2.5] * 5]
-    assert read.effort == [effort, 80, 80, 20, 20, 20]
+    assert [(row.velocity, row.effort) for row in joint_rows(read)][:2] == [(1.5, effort), (2.5, 80.0)]
+    assert read.notes[1:-1] == notes
 
 
 def test_a_finger_that_follows_another_in_a_urdf(tmp_path):
