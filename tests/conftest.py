@@ -22,6 +22,7 @@ settings.register_profile("quick", max_examples=30, deadline=None, derandomize=T
 settings.register_profile("thorough", max_examples=1000, deadline=None)
 settings.load_profile("quick")  # pytest --hypothesis-profile=thorough for the other
 
+gc.disable()  # until `pytest_collection_finish`
 signal.signal(signal.SIGINT, signal.default_int_handler)  # also where the shell that started it ignores them
 for name in ("SIGTERM", "SIGHUP"):
     if hasattr(signal, name):
@@ -93,9 +94,9 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
 
 
 def pytest_collection_finish() -> None:
-    """Leave what all modules have imported out of every later search for garbage, which is half a second of them."""
-    gc.collect()
+    """Leave what all modules have imported out of every search for garbage, which is half a second each."""
     gc.freeze()
+    gc.enable()
 
 
 def pytest_runtest_setup(item: pytest.Item) -> None:
