@@ -7,7 +7,7 @@ import time
 import lerobot_beside_torch  # noqa: F401
 from lerobot_robot_bam import BamArm, BamArmConfig, BamKeys, BamKeysConfig
 
-arm = BamArm(BamArmConfig(url=sys.argv[1], units="range", rate=20.0))
+arm = BamArm(BamArmConfig(url=sys.argv[1], units="range", rate=20.0, stage="trial"))
 said = {"features": [arm.is_connected, *arm.action_features], "errors": []}
 
 
