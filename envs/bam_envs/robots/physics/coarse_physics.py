@@ -27,8 +27,6 @@ def coarse_model(description: ArmDescription, *, with_object: bool) -> Any:
     spec = scene_spec(description, with_object=with_object)
     spec.option.timestep *= FINE / COARSE
     spec.option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_ISLAND)  # so few constraints are solved faster together
-    if not with_object:  # the arm weighs nothing: it is compensated
-        spec.option.gravity = [0.0, 0.0, 0.0]
     return spec.compile()
 
 
