@@ -23,15 +23,16 @@ MOST_FALSE = 2.0
 """Most postures without a collision that may count as one [%]; more of them make the work area small."""
 
 
-def fitted_capsules(points: Array, link: int, most: int = 2, power: int = 2) -> list[Capsule]:
+def fitted_capsules(points: Array, link: int, most: int = 2, power: int = 2, seed: int = 0) -> list[Capsule]:
     """Capsules around all `points` (n, 3) [m] on the surface of a link, in the frame of the points; `most` at most.
 
     The least of their volumes is taken, with the radius to the given `power`: 3 gives thinner, longer ones.
+    The search is random, from `seed` on.
     """
     if len(points) == 0:
         return []
     outer = _outermost(points)
-    rng = np.random.default_rng(0)
+    rng = np.random.default_rng(seed)
     best = [_thinner(outer, _capsule(outer, power), rng, power)]
     while len(best) < most:
         gaps = [_distances(outer, start, end) - radius for start, end, radius in best]

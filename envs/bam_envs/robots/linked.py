@@ -166,17 +166,13 @@ class LinkedRobot:
         """The current state of the robots; without signals before `reset`."""
         self.newest = nothing
         """The newest state that has arrived; the one returned last."""
+        self.age = np.zeros(n)
+        """Age of the newest state that has arrived [s]. Shape: (n,)."""
         self._env_ids = np.arange(n)
 
     def connect(self) -> None:
         """Make the robots ready."""
         self.robot.connect()
-
-    @property
-    def age(self) -> Array:
-        """Age of the newest state that has arrived [s]. Shape: (n,)."""
-        age: Array = (self._count - self._newest[:, _STATES]).astype(np.float64) * self.spec.period
-        return age
 
     def reset(self, env_ids: EnvIds, initial: Initial) -> RobotState:
         """Bring these robots to `initial`; messages on their way are dropped."""
@@ -277,6 +273,7 @@ class LinkedRobot:
     def _store(self, there: RobotState) -> RobotState:
         signals = dict(self._arrived_state)
         stamp = signals.pop(_STAMP)[:, 0]
+        self.age = (self._count - self._newest[:, _STATES]).astype(np.float64) * self.spec.period
         self.there, self.newest = there, RobotState(signals, stamp, self._last_sent, there.truth)
         return self.newest
 

@@ -139,23 +139,21 @@ class ToolSpeed(Guard):
         self._joints = columns_in(spec.command, "rad")
         self._pick = picker(self._joints)
         self._checked: tuple[Numbers, Numbers, float] | None = None
-        self._there: tuple[Numbers, tuple[float, float, float]] | None = (
-            None  # the last command that was found slow enough, and its tool
-        )
+        # Where the tool is at the last command, and at the one after it that was found slow enough.
+        self._here: tuple[Numbers, tuple[float, float, float]] = [], (0.0, 0.0, 0.0)
+        self._there = self._here
 
     def limit(self, tick: Tick) -> bool:
         """Shorten the step of all joints."""
         last, wanted, reach = self._pick(tick.last), self._pick(tick.command), self.limit_value * tick.period
         if self._checked == (last, wanted, reach):  # called twice in a tick, and few commands change in between
             return False
-        known = self._there
-        start = known[1] if known is not None and known[0] == last else self._tool(last)
-        there = self._tool(wanted)
-        if math.dist(start, there) <= reach * ROUNDING:
-            self._checked, self._there = (last, wanted, reach), (wanted, there)
+        if self._here[0] != last:
+            self._here = self._there if self._there[0] == last else (last, self._tool(last))
+        slowed, there = within_reach(self._tool, last, wanted, reach, self._here[1])
+        self._checked, self._there = (last, slowed, reach), (slowed, there)
+        if slowed is wanted:
             return False
-        slowed = within_reach(self._tool, last, wanted, reach)
-        self._checked = last, slowed, reach
         for at, value in zip(self._joints, slowed, strict=True):
             tick.command[at] = value
         return True
@@ -327,16 +325,22 @@ class MeasuredJump(Guard):
         return text
 
 
-def within_reach(tool: ToolPoint, here: Numbers, there: Numbers, reach: float) -> Numbers:
-    """The joints `there` (k,), moved so near to `here` that the tool travels `reach` [m] at most."""
-    start, near = tool(here), there
+def within_reach(
+    tool: ToolPoint, here: Numbers, there: Numbers, reach: float, start: tuple[float, float, float] | None = None
+) -> tuple[Numbers, tuple[float, float, float]]:
+    """The joints `there` (k,), moved so near to `here` that the tool travels `reach` [m] at most, and the tool there.
+
+    `start` is the tool at `here`, where it is known.
+    """
+    start, near = start or tool(here), there
     for _ in range(_ROUNDS):
-        travel = math.dist(start, tool(near))
+        end = tool(near)
+        travel = math.dist(start, end)
         if travel <= reach * ROUNDING:
-            return near
+            return near, end
         share = 0.999 * reach / travel
         near = [begin + (end - begin) * share for begin, end in zip(here, near, strict=True)]
-    return here
+    return here, start
 
 
 def longest_step(distance: float, change: float) -> float:

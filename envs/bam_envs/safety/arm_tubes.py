@@ -10,14 +10,13 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from itertools import combinations
-from operator import mul, sub
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from bam_envs.arms.capsules import Outline
-from bam_envs.arms.serial_chain import Arm, Capsule, SerialChain
+from bam_envs.arms.serial_chain import Arm, Capsule, Pose, SerialChain, chain_of
 from bam_envs.core.kinematics import ArmGeometry, ArmOutline
 
 Array = NDArray[np.float64]
@@ -28,6 +27,8 @@ Pair = tuple[int, int, float]
 """Two tubes, and the distance of their segments at which their links touch [m]."""
 _ENOUGH = 0.03
 """A distance of tubes around all tubes of two links that is this much above a margin [m] needs no closer look."""
+_SOON = 4.0
+"""A distance that would be computed again within so many more ticks is computed with the first."""
 _CAP = 0.03
 """How far tubes of wrists 2 and 3 begin before the axis of the joint between: flat housings of UR3 to UR10 end 4.8 to
 5.7 cm before it [m]."""
@@ -63,14 +64,24 @@ class Tubes:
     """
 
     def __init__(self, groups: Sequence[LinkPair], levers: Sequence[float]) -> None:
-        self._groups = groups
-        self._levers = np.array([*[group.levers for group in groups], levers])
-        self._most: list[float] = self._levers.max(axis=0).tolist()
+        self._groups, self._levers = groups, np.array([*[group.levers for group in groups], levers])
         self._in = [{tube for pair in group.pairs for tube in pair[:2]} for group in groups]
-        self._at: Sequence[float] = [0.0] * len(levers)  # the joints of these lower bounds
-        self._near, self._height, self._least = [-math.inf] * len(groups), -math.inf, -math.inf
+        # How far the distances of all groups, and of the lowest point, are above the margin at the joints `_at`, at
+        # least [m]; and what was asked for.
+        self._room, self._at, self._asked = np.zeros(len(self._levers)), np.zeros(len(levers)), (math.nan, math.nan)
+        self._posed: tuple[list[float], Any] = [], None
 
-    def segments(self, q: Sequence[float], tubes: Iterable[int]) -> dict[int, Segment]:
+    def posture(self, q: Sequence[float]) -> Any:
+        """What `segments` and `lowest` need at the joints `q` (k,) [rad]."""
+        raise NotImplementedError
+
+    def posed(self, q: Sequence[float]) -> Any:
+        """`posture`, computed once for all that is asked of it."""
+        if (here := [*q]) != self._posed[0]:
+            self._posed = here, self.posture(q)
+        return self._posed[1]
+
+    def segments(self, q: Sequence[float], tubes: Iterable[int]) -> Mapping[int, Segment]:
         """The segments of some `tubes` at the joints `q` (k,) [rad]."""
         raise NotImplementedError
 
@@ -89,28 +100,26 @@ class Tubes:
         A distance is computed again only when the joints that change it have turned far enough since the last time to
         bring it within the margin; see `LinkPair.levers`.
         """
-        turned = list(map(abs, map(sub, q, self._at)))
-        if min(self._least, self._height - table) - sum(map(mul, self._most, turned)) >= margin:
+        here = np.array(q)
+        lost = self._levers @ np.abs(here - self._at)
+        self._room -= lost
+        self._at = here
+        if self._asked != (margin, table):
+            self._room[:], self._asked = -math.inf, (margin, table)
+        if self._room[self._room.argmin()] > 0.0:
             return False
-        *lost, sunk = (self._levers @ turned).tolist()
-        near = list(map(sub, self._near, lost))
-        due = [place for place, apart in enumerate(near) if not apart >= margin]
-        if due:
-            pairs = [self._groups[place].around for place in due]
-            segments, closer = self.segments(q, {tube for pair in pairs for tube in pair[:2]}), []
-            for place, pair in zip(due, pairs, strict=True):
-                near[place] = apart = _distance(segments, pair)
-                if not apart >= margin + _ENOUGH and len(self._groups[place].pairs) > 1:
-                    closer.append(place)
-            if closer:
-                segments = self.segments(q, {tube for place in closer for tube in self._in[place]})
-                for place in closer:
-                    near[place] = self._groups[place].nearest(segments)
-        self._height -= sunk
-        if not self._height - table >= margin:
-            self._height = self.lowest(q)
-        self._at, self._near, self._least = list(q), near, min(near, default=math.inf)
-        return min(self._least, self._height - table) < margin
+        for row in np.flatnonzero(~(self._room > _SOON * lost)).tolist():  # of one posture, it costs less
+            apart = self._apart(row, margin, q) if row < len(self._groups) else self.lowest(q) - table
+            self._room[row] = apart - margin
+        return bool(self._room[self._room.argmin()] < 0.0)
+
+    def _apart(self, row: int, margin: float, q: Sequence[float]) -> float:
+        """Distance of two links, at most; of the tubes around them if that is far above the margin [m]."""
+        group = self._groups[row]
+        apart = _distance(self.segments(q, group.around[:2]), group.around)
+        if apart >= margin + _ENOUGH or len(group.pairs) == 1:
+            return apart
+        return group.nearest(self.segments(q, self._in[row]))
 
 
 class ArmTubes(Tubes):
@@ -142,7 +151,12 @@ class ArmTubes(Tubes):
         thick = max(shape.upper_arm, shape.forearm)
         return min(elbow - thick, wrist_1 - shape.forearm, min(wrist_2, flange) - shape.wrist)
 
-    def segments(self, q: Sequence[float], tubes: Iterable[int]) -> dict[int, Segment]:
+    def segments(self, q: Sequence[float], tubes: Iterable[int]) -> Mapping[int, Segment]:
+        """All of them at the joints `q` (6,) [rad]."""
+        segments: dict[int, Segment] = self.posed(q)
+        return segments
+
+    def posture(self, q: Sequence[float]) -> dict[int, Segment]:
         """Base, shoulder, upper arm, forearm, wrists 1 to 3 (up to the end of the tool), elbow, at `q` (6,) [rad]."""
         arm, shape, low = self._arm, self._outline, q[1] + q[2] + q[3]
         sine, cosine, reach = math.sin(low), math.cos(low), arm.d6 + self._tool
@@ -195,9 +209,13 @@ class ChainTubes(Tubes):
         lowest[0] *= math.hypot(*(chain.placements[0, :2, :3] @ chain.axes[0]))  # a turn about a vertical axis: nothing
         super().__init__(groups, lowest)
 
+    def posture(self, q: Sequence[float]) -> Sequence[Pose]:
+        """Poses of the links."""
+        return self._chain.poses(q)
+
     def lowest(self, q: Sequence[float]) -> float:
         """Height of the lowest point of the links at the joints `q` (k,) [rad], from the third to the flange [m]."""
-        poses, lowest = self._chain.poses(q), math.inf
+        poses, lowest = self.posed(q), math.inf
         for link, x, y, z, radius in self._moving:
             _, _, _, _, _, _, _, _, g, h, i, height = poses[link]
             lowest = min(lowest, g * x + h * y + i * z + height - radius)
@@ -205,7 +223,7 @@ class ChainTubes(Tubes):
 
     def segments(self, q: Sequence[float], tubes: Iterable[int]) -> dict[int, Segment]:
         """The segments of some of the capsules at the joints `q` (k,) [rad]."""
-        poses, found = self._chain.poses(q), dict[int, Segment]()
+        poses, found = self.posed(q), dict[int, Segment]()
         for tube in tubes:
             link, x, y, z, u, v, w = self._shapes[tube]
             a, b, c, px, d, e, f, py, g, h, i, pz = poses[link]
@@ -232,6 +250,14 @@ def _levers(chain: SerialChain, near: Sequence[Capsule], far: Sequence[Capsule])
         levers[joint] = min(levers[joint], _reach(apart, chain.placements[joint, :3, :3] @ chain.axes[joint]) + rest)
         rest, behind = rest + float(np.linalg.norm(apart, axis=1).max()), np.zeros((1, 3))
     return levers
+
+
+def tool_levers(arm: Arm | None) -> list[float]:
+    """How far a turn of each joint of `arm` moves its tool at most [m/rad]. Shape: (k,); empty if it is not known."""
+    if arm is None:
+        return []
+    chain = chain_of(arm)
+    return _levers(chain, [], [Capsule(link=chain.num_joints + 1, radius=1.0)])
 
 
 def _ends(chain: SerialChain, capsules: Sequence[Capsule]) -> tuple[int, Array]:

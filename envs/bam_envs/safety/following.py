@@ -245,7 +245,7 @@ class JointFollowing(Following):
             places.append(place)
         changed = near != wanted
         if farther and self._tool is not None:  # at most the tool's limit for one period from there
-            reached = within_reach(self._tool, places, near, self._tool_reach)
+            reached, _ = within_reach(self._tool, places, near, self._tool_reach)
             changed, near = changed or reached is not near, reached
         if not changed:
             self._stuck = 0
@@ -276,7 +276,7 @@ class JointFollowing(Following):
         rows = zip(wanted, last, steps, strict=True)
         near = [min(max(value, begin - step), begin + step) for value, begin, step in rows]
         if self._tool is not None:
-            near = within_reach(self._tool, last, near, self._tool_reach * share)
+            near, _ = within_reach(self._tool, last, near, self._tool_reach * share)
         for at, value in zip(self._joints, near, strict=True):
             command[at] = value
 

@@ -12,6 +12,7 @@ import time
 import weakref
 from collections.abc import Callable, Sequence
 from dataclasses import fields
+from itertools import accumulate
 from typing import Any, NoReturn, final
 
 import numpy as np
@@ -32,6 +33,7 @@ from bam_envs.safety.guard import (
     columns_in,
     is_base,
     measured_places,
+    picker,
     position_range,
     require_bounded,
 )
@@ -86,7 +88,7 @@ class ClearedCommand(metaclass=Sealed):
         return command
 
 
-_CLEARED: weakref.WeakKeyDictionary[ClearedCommand, tuple[object, Array]] = weakref.WeakKeyDictionary()
+_CLEARED: dict[ClearedCommand, tuple[object, Array]] = {}
 
 
 def _clear(robot: object, command: Array) -> ClearedCommand:
@@ -192,7 +194,7 @@ class SafeRobot(metaclass=Sealed):
         places = measured_places(robot.spec, command.units)
         speeds = measured_places(robot.spec, [f"{unit}/s" for unit in command.units])
         self._read = tuple(dict.fromkeys(name for _, name, _ in (*places, *speeds)))
-        self._places, self._speeds = self._columns(places), self._columns(speeds)
+        self._places, self._speeds = picker(self._columns(places)), picker(self._columns(speeds))
         unmeasured = {*columns_in(command, "rad")} - {place for place, _, _ in places}
         if unmeasured:  # the guards need the position of the arm
             names = ", ".join(command.labels[at] for at in sorted(unmeasured))
@@ -412,9 +414,8 @@ class SafeRobot(metaclass=Sealed):
         pause = self._pause()
         # Before its commands are proved, an arm that was commanded to stay is not told to stay elsewhere after a pause.
         last = self._begin_at(0.0 if proving else pause)
-        rows, period = self._rows(), self._spec.period
-        measured = [rows[row][column] for row, column in self._places]
-        speeds = [rows[row][column] for row, column in self._speeds]
+        values, period = self._values(), self._spec.period
+        measured, speeds = self._places(values), self._speeds(values)
         before = self._unmeasured if self._before is None else self._before
         self._before = measured
         time_passed = min(period, pause or period)
@@ -480,22 +481,26 @@ class SafeRobot(metaclass=Sealed):
         self._restart()
         return last
 
-    def _columns(self, places: list[tuple[int, str, int]]) -> list[tuple[int, int]]:
-        """Where in `_rows` each number of the command is measured. Shape: (m,)."""
-        known = {place: (self._read.index(name), column) for place, name, column in places}
-        return [known.get(place, (len(self._read), 0)) for place in range(len(self._unmeasured))]
+    def _columns(self, places: list[tuple[int, str, int]]) -> list[int]:
+        """Where in `_values` each number of the command is measured. Shape: (m,)."""
+        sizes = {signal.name: len(signal.labels) for signal in self._spec.signals}
+        begins = dict(zip(self._read, accumulate((sizes[name] for name in self._read), initial=0), strict=False))
+        known = {place: begins[name] + column for place, name, column in places}
+        return [known.get(place, sum(sizes[name] for name in self._read)) for place in range(len(self._unmeasured))]
 
-    def _rows(self) -> list[Numbers]:
-        """The newest values of the signals that are read, and NaN for what is not measured."""
+    def _values(self) -> Numbers:
+        """The newest values of the signals that are read, one after the other, then NaN for what is not measured."""
         if self._state is None:
             raise ResetNeeded("Nothing is known of the robot yet. Call reset() first.")
-        signals = self._state.signals
-        return [*[signals[name][0].tolist() for name in self._read], [math.nan]]
+        signals, values = self._state.signals, Numbers()
+        for name in self._read:
+            values += signals[name][0].tolist()
+        values.append(math.nan)
+        return values
 
     def _measured(self) -> Numbers:
         """The measured value of each number of the command; NaN if not measured. Shape: (m,)."""
-        rows = self._rows()
-        return [rows[row][column] for row, column in self._places]
+        return self._places(self._values())
 
     def _fresh_state(self) -> RobotState:
         """The newest state, or `StaleState`: even holding an outdated position would be a motion.
@@ -579,11 +584,10 @@ class SafeRobot(metaclass=Sealed):
 
     def _send(self, tick: Tick, halts: int) -> RobotState:
         """Send the command; halt the robot if that fails."""
-        command = np.array([tick.command])
-        handed: Any = command if self._live is None else _clear(self._robot, command)
         if self._tell is not None:
             self._tell(self._code, self._status, stopped=False)
-        done, self._sent_at = False, self._clock()
+        done, self._sent_at, command = False, self._clock(), np.array([tick.command])
+        handed: Any = command if self._live is None else _clear(self._robot, command)  # at the last: it is taken back
         try:
             self._state = self._robot.step(handed)
             done, self._returned_at = True, self._clock()

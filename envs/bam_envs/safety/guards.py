@@ -332,9 +332,9 @@ def _region_guards(
     if least is None:  # without a gripper the length of the tool is an assumption
         least = limits.table_height if has_gripper else -math.inf
     low, high = (limits.box_x_min, limits.box_y_min, least), (limits.box_x_max, limits.box_y_max, limits.box_z_max)
-    kept_out: list[Guard] = [WorkspaceBox(spec, limits, low, high, tool_point_of(position))]
+    kept_out: list[Guard] = [WorkspaceBox(spec, limits, low, high, position)]
     if limits.trial_box is not None:
-        kept_out.append(TrialBox(spec, limits, limits.trial_box, tool_point_of(position)))
+        kept_out.append(TrialBox(spec, limits, limits.trial_box, position))
     known = arm_of(position)
     tubes = None if known is None else tubes_of(known, tool=has_gripper)
     if tubes is not None:

@@ -7,12 +7,13 @@ already may stay or leave, and must not go farther in.
 
 import math
 from collections.abc import Sequence
-from operator import sub
+from operator import mul, sub
 
+from bam_envs.arms.serial_chain import arm_of
 from bam_envs.core.errors import InvalidValue
 from bam_envs.core.robot import RobotSpec
-from bam_envs.safety.arm_tubes import Tubes
-from bam_envs.safety.guard import Guard, Limits, Numbers, Tick, ToolPoint, columns_in, picker
+from bam_envs.safety.arm_tubes import Tubes, tool_levers
+from bam_envs.safety.guard import Guard, Limits, Numbers, Tick, ToolPosition, columns_in, picker, tool_point_of
 
 _HALVINGS = 6
 """Number of bisections: the allowed share of a step is found to 1/64."""
@@ -40,7 +41,7 @@ class ForbiddenRegion(Guard):
     def rest(self, last: Numbers, step: Numbers, share: float = 1.0) -> Numbers:
         """Where the joints come to rest after `share` of `step` from `last`, if they brake together. Shape: (k,)."""
         # Braking takes n steps, each shorter by the same amount: together they have (n - 1) / 2 times the first length.
-        braking = math.ceil(share * max(map(abs, step)) / self._change - 1e-6)
+        braking = math.ceil(share * max(max(step), -min(step)) / self._change - 1e-6)
         share *= 1.0 + max(0, braking - 1) / 2.0
         return [start + share * way for start, way in zip(last, step, strict=True)]
 
@@ -75,7 +76,7 @@ class WorkspaceBox(ForbiddenRegion):
         limits: Its limits; `joint_acceleration` is used.
         low: Lowest x, y and z [m], in ``base_link``; minus infinity for no limit.
         high: Highest x, y and z [m].
-        tool: Forward kinematics of one pose.
+        tool_position: Forward kinematics, (n, k) [rad] to (n, 3) [m].
 
     Raises:
         InvalidValue: `low` is not below `high`.
@@ -85,20 +86,39 @@ class WorkspaceBox(ForbiddenRegion):
     setting = "box_x_min, box_x_max, box_y_min, box_y_max, box_z_min, box_z_max"
 
     def __init__(
-        self, spec: RobotSpec, limits: Limits, low: Sequence[float], high: Sequence[float], tool: ToolPoint
+        self,
+        spec: RobotSpec,
+        limits: Limits,
+        low: Sequence[float],
+        high: Sequence[float],
+        tool_position: ToolPosition,
     ) -> None:
         super().__init__(spec, limits)
         self._low, self._high = (*map(float, low),), (*map(float, high),)
         require_room(self._low, self._high)
-        self._tool = tool
+        self._tool, size = tool_point_of(tool_position), len(self._joints)
+        self._levers = tool_levers(arm_of(tool_position)) or [math.inf] * size
+        self._at, self._room = [0.0] * size, -math.inf  # how far inside the tool is at the joints `_at`, at least [m]
         edges = [most - least for least, most in zip(self._low, self._high, strict=True)]
         self.limit_value = max(edge for edge in edges if edge < math.inf)
 
     def depth(self, joints: Sequence[float]) -> float:
         """Distance of the tool outside the box, along the axis where it is farthest [m]."""
+        return max(0.0, -self._inside(joints))
+
+    def _inside(self, joints: Sequence[float]) -> float:
+        """Distance of the tool from the nearest side of the box [m]; below 0 outside."""
         x, y, z = self._tool(joints)
         low, high = self._low, self._high
-        return max(low[0] - x, x - high[0], low[1] - y, y - high[1], low[2] - z, z - high[2], 0.0)
+        return min(x - low[0], high[0] - x, y - low[1], high[1] - y, z - low[2], high[2] - z)
+
+    def is_outside(self, joints: Sequence[float]) -> bool:
+        """As in the base class; computed again only when the joints have turned far enough to bring the tool out."""
+        self._room -= sum(map(mul, self._levers, map(abs, map(sub, joints, self._at))))
+        self._at = [*joints]
+        if not self._room > 0.0:
+            self._room = self._inside(joints)
+        return self._room >= -_TOUCH
 
     def start_fault(self, start: Numbers) -> str | None:
         """Why the arm must not go to `start` (m,)."""

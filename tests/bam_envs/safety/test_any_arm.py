@@ -18,7 +18,7 @@ from bam_envs.robots.physics.mujoco_arm import SimulatedArm
 from bam_envs.safety.arm_tubes import ChainTubes, tubes_of
 from bam_envs.safety.gate import SafeRobot
 from bam_envs.safety.guard import Limits, Tick
-from bam_envs.safety.region_guards import Collision
+from bam_envs.safety.region_guards import Collision, WorkspaceBox
 from bam_envs.safety.singularity import Singularity
 from bam_envs.tasks.pick import PickTask
 from bam_envs.tasks.scripted import scripted_policy
@@ -176,12 +176,14 @@ def test_no_tube_comes_near_between_two_computations(name, tool, start, turns):
 @pytest.mark.parametrize("name", CHAINS)
 @settings(max_examples=25)
 @given(st.integers(0, 10_000), TURNS)
-def test_collision_misses_nothing_between_two_computations(name, start, turns):
+def test_collision_and_box_miss_nothing_between_two_computations(name, start, turns):
     arm = robot_model(name)
     spec = arm.spec(with_object=False)
-    guard, fresh = (Collision(spec, Limits(), ChainTubes(arm.chain, tool=True)) for _ in range(2))
-    for q in walk(arm.chain, start, turns):
-        assert guard.is_outside(q) == (fresh.depth(q) <= 1e-9)
+    box = Limits(), [-0.3, -0.2, 0.05], [0.3, 0.4, 0.5], arm.arm.tool_position
+    for kind, arguments in ((Collision, (Limits(), ChainTubes(arm.chain, tool=True))), (WorkspaceBox, box)):
+        guard, fresh = kind(spec, *arguments), kind(spec, *arguments)
+        for q in walk(arm.chain, start, turns):
+            assert guard.is_outside(q) == (fresh.depth(q) <= 1e-9)
 
 
 @pytest.mark.parametrize("name", CHAINS)

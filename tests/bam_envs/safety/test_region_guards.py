@@ -33,7 +33,7 @@ def tick_of(last, goal, **numbers):
 
 
 def box_of(low, high):
-    return WorkspaceBox(ARM, Limits(), low, high, UR5E_GRIPPER.tool_point)
+    return WorkspaceBox(ARM, Limits(), low, high, UR5E_GRIPPER.tool_position)
 
 
 def reset(robot, joints=ARM_HOME):

@@ -22,7 +22,8 @@ EFFORT_PER_REACH = 60.0
 _POSTURES = 10_000
 """Postures in which the outline is compared with the links."""
 _GIVEN_UP = 0.1
-_REFITS, _FALSE = 32, 0.015  # times that links get other capsules, and the share of false alarms that is good enough
+_WAYS = ((0, 1, 0), (2, 0, 0), (0, 0, 1), (2, 1, 0))  # what a link gets: more capsules, thinner ones, another search
+_REFITS, _FALSE = 40, 0.0125  # times that links get other capsules, and the share of false alarms that is good enough
 DEEP = 0.005
 """A collision deeper than this is to be found [m]."""
 _CLEARANCE = 0.005  # that the guards keep, so that they act where links touch [m]
@@ -33,6 +34,8 @@ _MANY = 150  # postures in which two links touch, that show how far apart their 
 _ROUNDS, _WORST, _AROUND, _STRAY = 4, 20, 10, 0.1  # of a search: postures kept in each, others about each, within [rad]
 _ANYWHERE = 5.6  # travel of a first joint with which an arm works in any direction [rad]
 _ASIDE = 0.02  # of the middle of all postures from the base, that tells the direction of an arm [m]
+Form = tuple[int, int, int]
+"""How the capsules of a link are fitted: their number, the power of their radius, and the seed of the search."""
 Apart = Mapping[tuple[int, int], Array]
 """Distances of two links in many postures [m]; see `Shapes.distances`."""
 _FARTHEST = 3.0  # an arm longer than this has its lengths in another unit [m]
@@ -134,7 +137,7 @@ def _turned(arm: ArmDescription) -> ArmDescription:
 def _outlined(arm: ArmDescription, read: ReadArm, given_up: float = 0.0) -> tuple[ArmDescription, str]:
     """The arm with capsules around its links, and how well they find its collisions with itself.
 
-    Two links whose capsules touch too often while the links are apart get more of them, then thinner ones.
+    Two links whose capsules touch too often while the links are apart get thinner ones, more of them, or others.
 
     Args:
         arm: The description without capsules.
@@ -142,22 +145,23 @@ def _outlined(arm: ArmDescription, read: ReadArm, given_up: float = 0.0) -> tupl
         given_up: The share of the slightest collisions of two links that need not be found.
     """
     groups = [*enumerate(read.points), *((arm.num_joints + 1, points) for points in read.grip)]
-    fits = [{(2, 2): fitted_capsules(points, link)} for link, points in groups]
+    usual = (2, 2, 0)  # number of capsules, power of their radius, seed of the search
+    fits = [{usual: fitted_capsules(points, link)} for link, points in groups]
 
-    def fitted(forms: Mapping[int, tuple[int, int]]) -> ArmDescription:
+    def fitted(forms: Mapping[int, Form]) -> ArmDescription:
         capsules: list[Capsule] = []
         for known, (link, points) in zip(fits, groups, strict=True):
-            if (form := forms.get(link, (2, 2))) not in known:
+            if (form := forms.get(link, usual)) not in known:
                 known[form] = fitted_capsules(points, link, *form)
             capsules += known[form]
         return dataclasses.replace(arm, capsules=tuple(capsules), slack=())
 
-    best, forms, kept = fitted({}), dict[int, tuple[int, int]](), dict[int, tuple[int, int]]()
+    best, forms, kept = fitted({}), dict[int, Form](), dict[int, Form]()
     q = postures(arm.chain)
     apart = {} if read.shapes is None else read.shapes.distances(q)
     if not apart:
         return best, ""
-    share, missed, worst, spent = 1.0, len(q), list[tuple[int, int]](), set[tuple[int, int]]()
+    share, missed, worst, spent = 1.0, len(q), list[tuple[int, int]](), set[tuple[int, Form]]()
     tried = set[tuple[Capsule, ...]]()
     while len(tried) < _REFITS:
         trial = fitted(forms)
@@ -167,13 +171,13 @@ def _outlined(arm: ArmDescription, read: ReadArm, given_up: float = 0.0) -> tupl
             wrong, overlooked, blamed = judged(trial, q, apart)
             if (overlooked, wrong) < (missed, share):
                 best, share, missed, kept, worst, spent = trial, wrong, overlooked, forms, blamed, set()
-        ways = ((link, more) for pair in worst for more in (0, 2) for link in pair)
+        ways = ((link, more) for pair in worst for more in _WAYS for link in pair)
         way = next((way for way in ways if way not in spent), None)
         if share <= _FALSE or way is None:
             break
         spent.add(way)
-        (link, more), (count, power) = way, kept.get(way[0], (2, 2))
-        forms = {**kept, link: (count + more, power if more else power + 1)}
+        (link, (count, power, seed)), before = way, kept.get(way[0], usual)
+        forms = {**kept, link: (before[0] + count, before[1] + power, before[2] + seed)}
     if not given_up and read.shapes is not None:
         best = dataclasses.replace(best, slack=tuple(_sure_slack(best, q, apart, read.shapes)))
         share, missed, _ = judged(best, q, apart)
