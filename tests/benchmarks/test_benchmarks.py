@@ -6,7 +6,7 @@ import sys
 import pytest
 
 from tests.bam_train.agent.browsers import require_browser
-from tests.benchmarks import harness
+from tests.benchmarks import harness, loop
 from tests.benchmarks.harness import Flags, at_least, at_most, in_turns, percentiles, ratio, rows_of
 
 
@@ -156,7 +156,8 @@ def test_deployment(bench):
     assert all(found[name] in ("met", "MISSED") for name in rows)
 
 
-def test_loop(bench):
+def test_loop(bench, monkeypatch):
+    monkeypatch.setattr(loop, "STEPS", 200)
     rows = bench("loop", "--only", "notebook", "read", "vector")
     assert [row[0] for row in rows] == [
         "notebook's agents, 10,000 steps",

@@ -570,13 +570,13 @@ def test_a_gripper_points_along_another_axis_of_the_end_where_z_is_across_the_ar
     assert np.linalg.det(read.tool[:3, :3]) == pytest.approx(1.0)
 
 
-def test_an_arm_that_faces_another_way_is_turned_to_face_x(folder, tmp_path):
+def test_an_arm_that_faces_another_way_is_turned_to_face_x(described, tmp_path):
     text = FIVE.replace('name="base"', 'name="base" quat="1 0 0 -1"')
     (tmp_path / "five.xml").write_text(text, encoding="utf-8")
     arm, notes = describe("five", str(tmp_path / "five.xml"), None, "b5")
     turned = "the base is turned by 90 degrees about z, to face x (mount), as poses of a live robot are"
     assert notes[-1] == turned
-    straight, _ = describe("five", str(folder / "five.xml"), None, "b5")
+    straight, _ = described["five"]
     assert (arm.workspace, arm.joint_names) == (straight.workspace, straight.joint_names)
     np.testing.assert_allclose(
         arm.chain.tool_position(np.zeros((1, 5))), straight.chain.tool_position(np.zeros((1, 5))), atol=1e-9
