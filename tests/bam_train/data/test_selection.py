@@ -116,7 +116,7 @@ def test_programs(tmp_path, monkeypatch, run):
     assert run(main, "export", "a", "--to", "mcap", "--out", "a.mcap")[1].startswith("a.mcap: 6 episodes as mcap\n")
     no_pictures = "bam-data show: --camera: a has no recorded pictures; leave it out\n"
     assert run(main, "show", "a", "--camera", "front") == (1, "", no_pictures)
-    assert run(main, "export", "a", "--to", "hdf5", "--out", "a.mcap") == (
+    assert run(main, "export", "a", "--to", "mcap", "--out", "a.mcap") == (
         1,
         "",
         "bam-data export: a.mcap: is there already; choose another place\n",
