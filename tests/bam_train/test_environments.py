@@ -69,13 +69,13 @@ def test_what_cannot_be_made(corridor, env_id, kwargs, message):
         assert "\n" not in str(caught.value)
 
 
-def test_period(corridor, monkeypatch):
+def test_period(corridor):
     for env_id, entry in ENVIRONMENTS.items():
         assert control_period(make_env(env_id)) == entry.period
     assert control_period(make_env("CartPole-v1")) == 0.02
     env = make_env(corridor)
     assert control_period(env) == 0.05
-    monkeypatch.setattr(type(env.unwrapped), "metadata", {})
+    env.metadata = {}
     assert control_period(env) is None
 
 

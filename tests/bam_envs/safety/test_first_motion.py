@@ -353,6 +353,25 @@ def test_late_arms_are_proved(lag):
     assert driven(WiredArm(lag=lag))[1] is None
 
 
+class StarvedArm(WiredArm):
+    """An arm whose computer does nothing for half a second."""
+
+    def __init__(self, at):
+        super().__init__()
+        self.at = at
+
+    def _part(self, seconds):
+        if self.at <= self.now < self.at + 0.5:
+            self.now += seconds
+        else:
+            super()._part(seconds)
+
+
+@pytest.mark.parametrize("at", np.arange(0.0, 6.0, 0.25))
+def test_an_arm_that_a_busy_computer_holds_up_is_waited_for(at):
+    assert driven(StarvedArm(at))[1] is None
+
+
 class LateStates(WiredArm):
     """A late arm, some of whose states are nearly as old as they may be, as on a busy computer."""
 
