@@ -90,4 +90,5 @@ class PolicyLink:
         if isinstance(error, NoServer):
             remedy = "" if "--policy-" in reason else f" {self._start}"
             return NoServer(str(self), f"{reason}{'' if reason.endswith('?') else '.'}{remedy}")
-        return LinkLost(f"{self}: {reason}")
+        again = self._start.replace("Start one", "If it ended, start it again")
+        return LinkLost(f"{self}: {reason}. {again}")
