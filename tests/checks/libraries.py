@@ -51,9 +51,9 @@ ROW = r"^(\| ([\w/-]*(?:v1|pick)) \| ([\w-]+).*)$"
 HEAD = """# Libraries compared
 
 PPO until an evaluation over 100 fresh episodes (200 of bam/pick) shows the mean return 475 (CartPole-v1), -200
-(Pendulum-v1) or 99 % of successes (bam/pick): medians, least and most over seeds, of runs that reached it, from the start
-of the process to its end. All have the settings of our presets; SBX goes without gSDE, which it lacks. Written by `python
--m tests.checks libraries`. The times are those of a computer that did other things too; CPU time says more.
+(Pendulum-v1) or 99 % of successes (bam/pick): medians, least and most over seeds, of runs that reached it, from the
+start of the process to its end. All have the settings of our presets; SBX goes without gSDE, which it lacks. Written by
+`python -m tests.checks libraries`. The times are those of a computer that did other things too; CPU time says more.
 
 """
 
