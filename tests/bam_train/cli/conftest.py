@@ -25,12 +25,11 @@ LONGEST = 300.0
 class Program:
     """A program in a process group of its own, as a shell starts it, with its standard error a pipe."""
 
-    def __init__(self, context, folder, arguments, module, cores):
+    def __init__(self, context, folder, arguments, module):
         reader, writer = context.Pipe(duplex=False)
         code = f"""
 import os, sys
 os.setsid()
-os.sched_setaffinity(0, sorted(os.sched_getaffinity(0))[:{cores}])
 os.chdir({str(folder)!r})
 os.dup2(writer.fileno(), 2)
 sys.stderr = open(2, "w", buffering=1, closefd=False)
@@ -73,15 +72,12 @@ main({list(arguments)!r})
 
 @pytest.fixture
 def start_forked():
-    """``start_forked(modules, folder, *arguments)`` starts a `Program`, forked from a process with these modules.
-
-    `cores` are how many it may use at the most.
-    """
+    """``start_forked(modules, folder, *arguments)`` starts a `Program`, forked from a process with these modules."""
     context, programs = multiprocessing.get_context("forkserver"), []
 
-    def start(modules, folder, *arguments, program="bam_train.cli.train", cores=None):
+    def start(modules, folder, *arguments, program="bam_train.cli.train"):
         context.set_forkserver_preload(["pytest", "torch._dynamo", "bam_train.cli.train", *modules])
-        programs.append(Program(context, folder, arguments, program, cores))
+        programs.append(Program(context, folder, arguments, program))
         return programs[-1]
 
     yield start

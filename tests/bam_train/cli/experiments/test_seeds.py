@@ -109,12 +109,12 @@ def test_two_calls_do_not_train_the_same_seeds(here):
 
 
 def test_interrupted_then_killed_and_gone_on_with_by_the_same_command(start_forked, here):
-    """On one core is one run at a time."""
-    words = (*SHORT, *QUICK, "--steps", "3072", "--seeds")
+    """`--threads` beyond the cores leave one run at a time."""
+    words = (*SHORT, *QUICK, "--steps", "2048", "--threads", "1000", "--seeds")
     folder = here / "runs" / "CartPole-v1-ppo" / "seed-0"
     reached = []
-    program = start_forked((), here, *words, "0,3", cores=1)
-    program.wait_for("512 of 3072 steps, return ")
+    program = start_forked((), here, *words, "0,3")
+    program.wait_for("512 of 2048 steps, return ")
     program.send(signal.SIGINT)
     status, said = program.end()
     assert status == 130
@@ -127,8 +127,8 @@ def test_interrupted_then_killed_and_gone_on_with_by_the_same_command(start_fork
     reached.append(Checkpoint.open(folder / "last.zip").manifest.steps)
     assert not (folder.with_name("seed-3") / "last.zip").exists()
 
-    program = start_forked((), here, *words, "0,3", cores=1)
-    program.wait_for("1024 of 3072 steps, return ")
+    program = start_forked((), here, *words, "0,3")
+    program.wait_for("1024 of 2048 steps, return ")
     (child,) = psutil.Process(program.pid).children()
     for process in (program.pid, child.pid):
         os.kill(process, signal.SIGKILL)
@@ -136,13 +136,13 @@ def test_interrupted_then_killed_and_gone_on_with_by_the_same_command(start_fork
     program.close()
     reached.append(read_records(folder / "progress.jsonl")[-1]["steps"])
 
-    status, said = start_forked((), here, *words, "0", cores=1).end()
+    status, said = start_forked((), here, *words, "0").end()
     assert status == 0, said
     assert "warning: fewer than 3 seeds: no interval, and no conclusion" in said
     assert [one.name for one in (here / "runs").iterdir()] == ["CartPole-v1-ppo"]
     records = read_records(folder / "progress.jsonl")
-    assert 512 <= reached[0] < reached[1] < records[-1]["steps"] == 3072
-    assert [one["steps"] for one in records if one["kind"] == "evaluation"] == [*range(512, 3073, 512)]
+    assert 512 <= reached[0] < reached[1] < records[-1]["steps"] == 2048
+    assert [one["steps"] for one in records if one["kind"] == "evaluation"] == [512, 1024, 1536, 2048]
     seconds = [one["seconds"] for one in records]
     assert seconds == sorted(seconds)
     assert json.loads((folder / "outcome.json").read_text())["reason"] == "steps"

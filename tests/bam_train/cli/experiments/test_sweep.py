@@ -332,10 +332,9 @@ def test_the_best_is_confirmed_on_new_seeds_and_becomes_a_preset(run, trained):
 def test_killed_in_mid_search_nothing_is_lost(start_forked, here):
     place = Path("runs/CartPole-v1-ppo-sweep")
     words = ("--env", "CartPole-v1", "--algo", "ppo", "--steps", "1024", "--eval-every", "256", "--eval-episodes", "1")
-    words += ("--set", "n_epochs=1", "--set", "n_steps=64,128", "--set", "policy_kwargs.net_arch=[8]")
-    words += ("--trials", "2", "--seeds", "1")
-    alone = {"program": "bam_train.cli.experiments.sweep", "cores": 1}
-    program = start_forked((), here, *words, **alone)
+    quick = ("--set", "n_epochs=1", "--set", "n_steps=64,128", "--set", "policy_kwargs.net_arch=[8]")
+    rest = ("--threads", "1000", "--trials", "2", "--seeds", "1")
+    program = start_forked((), here, *words, *quick, *rest, program="bam_train.cli.experiments.sweep")
     program.wait_for("trial 0 done")
     children = []
     while not children:  # the process of the second trial
@@ -348,7 +347,7 @@ def test_killed_in_mid_search_nothing_is_lost(start_forked, here):
     folder = SweepFolder(place, {}, None, begun=True)
     assert [one.state for one in folder.trials()] == [TrialState.COMPLETE, TrialState.RUNNING]
     params, outcome = folder.trials()[1].params, (place / "trial-0" / "outcome.json").read_bytes()
-    program = start_forked((), here, *words, **alone)
+    program = start_forked((), here, *words, *quick, *rest, program="bam_train.cli.experiments.sweep")
     status, said = program.end()
     assert status == 0, said
     assert "trial 0" not in said
