@@ -34,7 +34,6 @@ class TestWithoutPhysics(TaskContract):
 
 class Simulated(TaskContract):
     id = "bam/isaac-reach-v0"
-    steps = 40
     options = PARITY
     randomize = False
 
@@ -79,7 +78,9 @@ class Simulated(TaskContract):
             pytest.param(*one, marks=pytest.mark.slow)
             for one in (
                 ("bam/reach-v0", {}, False),
+                ("bam/pick-v0", {}, False),
                 ("bam/pick-place-v0", {}, False),
+                ("bam/ur-reach-v0", {}, False),
                 ("bam/ur-reach-v0", PARITY, False),
                 ("bam/ur-reach-v0", {"ur_model": "ur3"}, True),
                 ("bam/ur-empty-v0", {**PARITY, "ur_model": "ur16e"}, False),
@@ -94,6 +95,7 @@ class Simulated(TaskContract):
                 ("bam/navigation-v0", PARITY, False),
                 ("bam/avoidance-v0", {}, False),
                 ("bam/reach-v0", {"robot_model": "so101"}, True),
+                ("bam/reach-v0", {"robot_model": "ur10e"}, False),
                 ("bam/pick-v0", {"robot_model": "ur10e"}, True),
                 ("bam/pick-place-v0", {"robot_model": "so101"}, True),
                 ("bam/pick-place-v0", {"robot_model": "fr3"}, False),
